@@ -1,0 +1,52 @@
+# From a fresh clone, with Python 3.11 or later and a package index: `make demo` and `make test`.
+# PYTHON names the interpreter for a new environment, VENV its folder, DIST the folder for wheels, ARGS goes to pytest.
+
+PYTHON ?= python3
+VENV ?= .venv
+DIST ?= dist
+ARGS ?=
+
+BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip --disable-pip-version-check
+PLUGINS := $(patsubst %/pyproject.toml,%,$(wildcard plugins/*/pyproject.toml))
+PROJECTS := pyproject.toml $(PLUGINS:%=%/pyproject.toml)
+PACKAGES := lidarspec $(wildcard plugins/*/lidarspec_*)
+USERS := $(VENV)/.installed
+DEVELOPERS := $(VENV)/.installed-dev
+RECENT := import sys; sys.exit(sys.version_info < (3, 11))
+
+.PHONY: demo test lint types wheels clean
+
+demo: $(USERS)
+	@$(BIN)/lidarspec demo -s ldrobot-stl27l
+
+test: $(DEVELOPERS)
+	@$(BIN)/python -m pytest $(ARGS)
+
+lint: $(DEVELOPERS)
+	@$(BIN)/ruff check .
+	@$(BIN)/ruff format --check .
+
+types: $(DEVELOPERS)
+	@$(BIN)/mypy $(PACKAGES)
+
+wheels: $(DEVELOPERS)
+	@for project in . $(PLUGINS); do $(BIN)/python -m build --wheel --no-isolation --outdir $(DIST) $$project || exit 1; done
+
+clean:
+	rm -rf .venv dist .hypothesis .mypy_cache .pytest_cache .ruff_cache
+	find lidarspec plugins tests -name __pycache__ -type d -prune -exec rm -rf {} +
+
+# An environment without a working pip, as a failed attempt leaves it behind, is made again.
+$(USERS): $(PROJECTS)
+	@$(BIN)/python -c 'import pip; $(RECENT)' 2>/dev/null || $(PYTHON) -c '$(RECENT)' \
+		|| { echo "lidarspec needs Python 3.11 or later, and '$(PYTHON)' is not: name one, as in make PYTHON=python3.12 demo" >&2; exit 1; }
+	@$(BIN)/python -c 'import pip' 2>/dev/null || $(PYTHON) -m venv $(VENV)
+	@echo "installing lidarspec and its sensors into $(VENV), this once"
+	@$(PIP) install --quiet --editable . $(PLUGINS:%=--editable %)
+	@touch $@
+
+$(DEVELOPERS): $(USERS)
+	@echo "installing the tools for tests, lint and types into $(VENV), this once"
+	@$(PIP) install --quiet --editable '.[dev]'
+	@touch $@

@@ -1,0 +1,300 @@
+"""From captured frames to UDP payloads, and back: link layers, IPv4, IPv6, fragments.
+
+Knows nothing of files. A frame goes through `ip_packet`, if it is a fragment then through `Reassembly.add`, and through
+`udp`; whichever step finds that no datagram comes of it raises `Refused` with the reason.
+
+Two fields are not trusted. Checksums: where the capturing machine is the sender, its network card fills them in only after
+the capture. The length of an unfragmented packet, where more is claimed than is there: a lidar in the field puts the IPv4
+length of its data packets, 1234, also into packets of 540 bytes. UDP's own length decides whether the payload is whole.
+
+Source: RFC 768 (UDP), RFC 791 (IPv4), RFC 8200 (IPv6), RFC 5722 (overlapping fragments), RFC 6946 (atomic fragments),
+IEEE 802.1Q (VLAN tags), and the link-layer header types of tcpdump.org.
+"""
+
+from __future__ import annotations
+
+import ipaddress
+import struct
+from bisect import bisect_left
+from collections import OrderedDict
+from functools import lru_cache
+from typing import Literal, NamedTuple
+
+ETHERNET = 1
+LARGEST_PAYLOAD = 65_507  # 65,535 bytes of IPv4 packet, less 20 of its header and 8 of UDP's
+_LARGEST_PACKET = 65_535
+
+_LOOPBACK = {0, 108}
+_RAW = {12, 101, 228, 229}
+_ETHERTYPE_LINKS = {ETHERNET: (12, 14), 113: (14, 16), 276: (0, 20)}  # offset of the EtherType, length of the header
+_VLAN_TAGS = {0x8100, 0x88A8, 0x9100}
+_IP_ETHERTYPES = {0x0800, 0x86DD}
+_IP_FAMILIES = {2, 10, 24, 28, 30}  # AF_INET everywhere; AF_INET6 of Linux, NetBSD, FreeBSD and macOS
+
+_UDP = 17
+_FRAGMENT = 44
+_EXTENSIONS = {0, 43, 60}  # hop-by-hop options, routing, destination options
+
+_ETHERNET_HEADER = struct.Struct(">6s6sH")
+_IPV4_HEADER = struct.Struct(">BxHHHBB2s4s4s")
+_IPV6_HEADER = struct.Struct(">4xHBx16s16s")
+_UDP_HEADER = struct.Struct(">HHHH")
+_TO_MAC, _FROM_MAC = bytes.fromhex("020000000001"), bytes.fromhex("020000000002")  # locally administered, nobody's
+_DO_NOT_FRAGMENT, _TIME_TO_LIVE = 0x4000, 64
+
+
+class Refused(Exception):
+    """A packet that gives no datagram.
+
+    Attributes:
+        reason: "other" (not UDP), "short" (fewer bytes than its headers say) or "malformed" (headers that cannot be).
+    """
+
+    def __init__(self, reason: Literal["other", "short", "malformed"]) -> None:
+        super().__init__(reason)
+        self.reason = reason
+
+
+class Fragment(NamedTuple):
+    """Where the body of a packet belongs in the whole: bytes from `start` on, with `more` to come after it."""
+
+    ident: int
+    start: int
+    more: bool
+
+
+class IpPacket(NamedTuple):
+    """An IP packet that carries UDP, or a fragment of one; addresses as on the wire, 4 or 16 bytes."""
+
+    source: bytes
+    destination: bytes
+    protocol: int
+    body: bytes
+    fragment: Fragment | None = None
+
+
+def ip_packet(frame: bytes, link: int) -> IpPacket:
+    """The IP packet in a captured frame, padding cut off.
+
+    Args:
+        frame: the bytes from the link layer's first on, as many as were captured.
+        link: the link-layer type, as in a pcap header.
+
+    Raises:
+        Refused: the frame carries no UDP over IP, or not all of it.
+    """
+    try:
+        start = _ip_start(frame, link)
+        version = frame[start] >> 4
+        if version == 4:
+            return _ipv4(frame, start)
+        if version == 6:
+            return _ipv6(frame, start)
+    except (struct.error, IndexError):
+        raise Refused("short") from None
+    raise Refused("malformed")
+
+
+def udp(packet: IpPacket) -> tuple[int, int, bytes]:
+    """Source port, destination port and payload of a whole packet.
+
+    Raises:
+        Refused: no UDP follows the extension headers, or its length does not fit.
+    """
+    try:
+        protocol, body = _past_extensions(packet.protocol, packet.body)
+        if protocol != _UDP:
+            raise Refused("malformed" if protocol == _FRAGMENT else "other")
+        source, destination, length, _ = _UDP_HEADER.unpack_from(body)
+    except struct.error:
+        raise Refused("short") from None
+    if length < _UDP_HEADER.size:
+        raise Refused("malformed")
+    if length > len(body):
+        raise Refused("short")
+    return source, destination, body[_UDP_HEADER.size : length]
+
+
+@lru_cache(maxsize=256)
+def address(packed: bytes) -> str:
+    """The usual text of an address of 4 or 16 bytes."""
+    return str(ipaddress.ip_address(packed))
+
+
+def udp_frame(payload: bytes, source: tuple[bytes, int], destination: tuple[bytes, int]) -> bytes:
+    """An Ethernet frame with an IPv4 and a UDP header before `payload`, the UDP checksum 0 (not computed).
+
+    Args:
+        payload: at most `LARGEST_PAYLOAD` bytes.
+        source, destination: address of 4 bytes, and port.
+    """
+    length = _UDP_HEADER.size + len(payload)
+    fields = (0x45, _IPV4_HEADER.size + length, 0, _DO_NOT_FRAGMENT, _TIME_TO_LIVE, _UDP)
+    blank = _IPV4_HEADER.pack(*fields, b"\0\0", source[0], destination[0])
+    # The ones' complement sum of 16-bit words is the whole header as one number modulo 0xFFFF, where 0xFFFF stands for 0.
+    checksum = 0xFFFF - (int.from_bytes(blank) % 0xFFFF or 0xFFFF)
+    ip_header = _IPV4_HEADER.pack(*fields, checksum.to_bytes(2), source[0], destination[0])
+    udp_header = _UDP_HEADER.pack(source[1], destination[1], length, 0)
+    return _ETHERNET_HEADER.pack(_TO_MAC, _FROM_MAC, 0x0800) + ip_header + udp_header + payload
+
+
+def _ip_start(frame: bytes, link: int) -> int:
+    if link in _RAW:
+        return 0
+    if link in _LOOPBACK:
+        # The family stands in the byte order of the capturing machine; families are small, so the smaller reading is right.
+        if min(*struct.unpack_from("<I", frame), *struct.unpack_from(">I", frame)) not in _IP_FAMILIES:
+            raise Refused("other")
+        return 4
+    if link not in _ETHERTYPE_LINKS:
+        raise Refused("other")
+    at, start = _ETHERTYPE_LINKS[link]
+    ethertype = frame[at] << 8 | frame[at + 1]
+    while ethertype in _VLAN_TAGS:
+        ethertype = frame[start + 2] << 8 | frame[start + 3]
+        start += 4
+    if ethertype not in _IP_ETHERTYPES:
+        raise Refused("other")
+    return start
+
+
+def _ipv4(frame: bytes, start: int) -> IpPacket:
+    first, total, ident, place, _, protocol, _, source, destination = _IPV4_HEADER.unpack_from(frame, start)
+    header = (first & 0x0F) * 4
+    if header < _IPV4_HEADER.size or total < header:
+        raise Refused("malformed")
+    if protocol != _UDP:
+        raise Refused("other")
+    body = frame[start + header : start + total]
+    fragment = _fragment(ident, (place & 0x1FFF) * 8, total - header, more=bool(place & 0x2000))
+    if fragment is not None and len(body) < total - header:
+        raise Refused("short")
+    return IpPacket(source, destination, protocol, body, fragment)
+
+
+def _ipv6(frame: bytes, start: int) -> IpPacket:
+    length, protocol, source, destination = _IPV6_HEADER.unpack_from(frame, start)
+    body_start = start + _IPV6_HEADER.size
+    body = frame[body_start : body_start + length]
+    missing = length - len(body)
+    fragment = None
+    protocol, body = _past_extensions(protocol, body)
+    if protocol == _FRAGMENT:
+        protocol, place, ident = struct.unpack_from(">BxHI", body)
+        body = body[8:]
+        fragment = _fragment(ident, place & 0xFFF8, len(body) + missing, more=bool(place & 1))
+    if protocol != _UDP and protocol not in _EXTENSIONS:
+        raise Refused("other")
+    if fragment is not None and missing:
+        raise Refused("short")
+    return IpPacket(source, destination, protocol, body, fragment)
+
+
+def _past_extensions(protocol: int, body: bytes) -> tuple[int, bytes]:
+    at = 0
+    while protocol in _EXTENSIONS:
+        protocol, units = struct.unpack_from(">BB", body, at)
+        at += (units + 1) * 8
+    return protocol, body[at:]
+
+
+def _fragment(ident: int, start: int, size: int, *, more: bool) -> Fragment | None:
+    if not more and not start:
+        return None
+    if not size or (more and size % 8) or start + size > _LARGEST_PACKET:
+        raise Refused("malformed")
+    return Fragment(ident, start, more)
+
+
+class _Partial:
+    """The fragments of one packet, none overlapping another."""
+
+    __slots__ = ("at", "parts", "protocol", "size", "starts", "total")
+
+    def __init__(self, at: int) -> None:
+        self.at = at
+        self.parts: dict[int, bytes] = {}
+        self.starts: list[int] = []  # the keys of `parts`, sorted
+        self.size = 0
+        self.total: int | None = None
+        self.protocol = _UDP
+
+    def add(self, start: int, body: bytes, *, more: bool) -> bool:
+        """Whether the body was taken in: it overlaps nothing and agrees with the others about the end."""
+        stop = start + len(body)
+        index = bisect_left(self.starts, start)
+        before, after = self.starts[index - 1 : index], self.starts[index : index + 1]
+        if any(earlier + len(self.parts[earlier]) > start for earlier in before) or any(later < stop for later in after):
+            return False
+        if more and self.total is not None and stop >= self.total:
+            return False
+        if not more and (after or self.total is not None):
+            return False
+        if not more:
+            self.total = stop
+        self.starts.insert(index, start)
+        self.parts[start] = body
+        self.size += len(body)
+        return True
+
+
+class Reassembly:
+    """Puts fragments together, in whatever order they come, in bounded memory.
+
+    A packet whose fragments overlap is given up (RFC 5722), except that a fragment seen twice is ignored. The oldest
+    packets are given up where more than `MOST_PACKETS` or `MOST_BYTES` wait, and those older than `PATIENCE_NS`.
+
+    Attributes:
+        dropped: fragments of packets that were given up.
+    """
+
+    MOST_PACKETS = 256
+    MOST_BYTES = 4 << 20
+    PATIENCE_NS = 5_000_000_000  # at 10,000 datagrams/s the 16-bit identification of IPv4 comes round after 6.5 s
+    _OVERHEAD = 160  # bytes of objects around each fragment, so that tiny ones count for what they take
+
+    def __init__(self) -> None:
+        self.dropped = 0
+        self._partials: OrderedDict[tuple[bytes, bytes, int], _Partial] = OrderedDict()
+        self._held = 0
+
+    def add(self, packet: IpPacket, fragment: Fragment, at: int) -> IpPacket | None:
+        """The whole packet, if this fragment was the last one missing.
+
+        Args:
+            packet: what `ip_packet` returned, with its `fragment`.
+            at: capture time in ns.
+        """
+        while self._partials and next(iter(self._partials.values())).at < at - self.PATIENCE_NS:
+            self._drop()
+        key = packet.source, packet.destination, fragment.ident
+        partial = self._partials.setdefault(key, _Partial(at))
+        if partial.parts.get(fragment.start) == packet.body:
+            return None
+        if not partial.add(fragment.start, packet.body, more=fragment.more):
+            self.dropped += 1
+            self._drop(key)
+            return None
+        self._held += len(packet.body) + self._OVERHEAD
+        if fragment.start == 0:
+            partial.protocol = packet.protocol
+        if partial.size == partial.total:
+            self._remove(key)
+            body = b"".join(partial.parts[start] for start in partial.starts)
+            return IpPacket(packet.source, packet.destination, partial.protocol, body)
+        while len(self._partials) > self.MOST_PACKETS or self._held > self.MOST_BYTES:
+            self._drop()
+        return None
+
+    def finish(self) -> None:
+        """Gives up all that is still incomplete."""
+        while self._partials:
+            self._drop()
+
+    def _drop(self, key: tuple[bytes, bytes, int] | None = None) -> None:
+        self.dropped += len(self._remove(key or next(iter(self._partials))).parts)
+
+    def _remove(self, key: tuple[bytes, bytes, int]) -> _Partial:
+        partial = self._partials.pop(key)
+        self._held -= partial.size + self._OVERHEAD * len(partial.parts)
+        return partial

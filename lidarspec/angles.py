@@ -1,0 +1,103 @@
+"""The vocabulary of `points` functions: what NumPy's ufuncs do not say about angles, order and tables.
+
+Each works on NumPy arrays and on the columns that the engine passes; a column knows where packets and losses are, an
+array is taken as one run of values. The engine's other evaluators understand the same names.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+Array = Any
+
+
+def spread(start: Array, end: Array, count: Array, *, full: float) -> Array:
+    """Even steps from start to end, both included, for each packet.
+
+    Args:
+        start, end: first and last angle of each packet, shape (n, 1), in the unit of `full`.
+        count: points per packet, a number or a column (n, 1); 1 gives `start`.
+        full: the whole circle in that unit; an end below the start is one turn further.
+
+    Returns:
+        float64, shape (n, count), not wrapped, so that differences stay positive; with a column as `count`, the
+        longest one, and what is beyond a packet's own count is never used.
+    """
+    if isinstance(count, int | np.integer):
+        return start + wrap(end - start, full) * (np.arange(int(count)) / max(int(count) - 1, 1))
+    steps = count.steps() if hasattr(count, "steps") else np.arange(int(np.max(count, initial=0)))
+    return start + wrap(end - start, full) / np.maximum(count - 1, 1) * steps
+
+
+def wrap(a: Array, full: float) -> Array:
+    """The same angles within [0, full)."""
+    turned = np.mod(a, full)
+    return np.where(turned >= full, 0.0, turned)
+
+
+def following(a: Array, step: int = 1) -> Array:
+    """The value `step` places later in stream order, over packet borders, padding left out.
+
+    Returns:
+        float64, the shape of `a`; nan across a loss (a jump of the sequence, skipped bytes) and at the end.
+    """
+    return _shifted(a, step)
+
+
+def previous(a: Array, step: int = 1) -> Array:
+    """The value `step` places earlier in stream order; nan across a loss and at the beginning. See `following`."""
+    return _shifted(a, -step)
+
+
+def last(a: Array, where: Array | None = None) -> Array:
+    """The most recent value, this one included, at which `where` was true; nan before the first.
+
+    Args:
+        where: a condition of the shape of `a`; by default where `a` is a number.
+    """
+    if hasattr(a, "latest"):
+        return a.latest(where)
+    if hasattr(where, "latest"):
+        return (where * 0 + a).latest(where)
+    values = np.asarray(a, np.float64)
+    known = ~np.isnan(values) if where is None else np.broadcast_to(where, values.shape)
+    spots = np.maximum.accumulate(np.where(known.ravel(), np.arange(values.size), -1))
+    return np.where(spots >= 0, values.ravel()[spots], np.nan).reshape(values.shape)
+
+
+def stack(*columns: Array) -> Array:
+    """Several columns side by side as a new innermost axis: (n, b) each gives (n, b, k)."""
+    return _applied(lambda *arrays: np.stack(np.broadcast_arrays(*arrays), axis=-1), *columns)
+
+
+def take(table: Array, index: Array) -> Array:
+    """The entries of a table, shape (m,), at `index`; nan where the index is not in it."""
+    entries = np.asarray(table, np.float64)
+
+    def look_up(spots: Any) -> Any:
+        inside = (spots >= 0) & (spots < len(entries))
+        found = entries[np.where(inside, spots, 0).astype(np.intp)] if len(entries) else np.zeros(np.shape(spots))
+        return np.where(inside, found, np.nan)
+
+    return _applied(look_up, index)
+
+
+def _shifted(a: Array, step: int) -> Array:
+    if hasattr(a, "shifted"):
+        return a.shifted(step)
+    values = np.asarray(a, np.float64)
+    flat = np.full(values.size, np.nan)
+    if abs(step) < values.size:
+        flat[max(-step, 0) : values.size - max(step, 0)] = values.ravel()[max(step, 0) : values.size - max(-step, 0)]
+    return flat.reshape(values.shape)
+
+
+def _applied(function: Callable[..., Any], *values: Array) -> Array:
+    """`function` of arrays; where one of them is a column, the column's way of applying it."""
+    for value in values:
+        if hasattr(value, "applied"):
+            return value.applied(function, *values)
+    return function(*(np.asarray(value) for value in values))

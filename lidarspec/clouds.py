@@ -1,0 +1,150 @@
+"""Point clouds: flat arrays in SI units, REP-103 axes and REP-117 ranges."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float32]
+
+#: names of the columns that a cloud can have, in the order in which files list them.
+COLUMNS = ("x", "y", "z", "range", "azimuth", "elevation", "intensity", "time", "ring", "return_index")
+
+#: x y z intensity ring time at PCL's offsets.
+STRUCTURED = np.dtype(
+    {
+        "names": ["x", "y", "z", "intensity", "ring", "time"],
+        "formats": ["<f4", "<f4", "<f4", "<f4", "<u2", "<f4"],
+        "offsets": [0, 4, 8, 16, 20, 24],
+        "itemsize": 32,
+    }
+)
+
+#: largest float32 below pi: azimuths stay in [-pi, pi) in either precision.
+_PI = np.nextafter(np.float32(np.pi), np.float32(0))
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class PointCloud:
+    """N points in stream order.
+
+    Attributes:
+        x, y, z: (N,) float32 metres, REP-103 (x forward, y left, z up); nan unless `valid`.
+        range: (N,) float32 metres; inf for no return, nan where the sensor marks a point as wrong.
+        azimuth: (N,) float32 radians in [-pi, pi), counter-clockwise.
+        elevation: (N,) float32 radians above the horizon.
+        time: (N,) float64 seconds since `stamp_ns`.
+        intensity: (N,) float32, the wire's number; None where the sensor has none.
+        ring: (N,) uint16, None where the sensor has none.
+        return_index: (N,) uint8, None where the sensor has none.
+        valid: (N,) bool, True for real returns.
+        stamp_ns: int64 nanoseconds.
+        shape: (columns, rows) where the points are organised so, else None.
+        nominal: True where a default calibration stood in for the sensor's own.
+    """
+
+    x: Floats
+    y: Floats
+    z: Floats
+    range: Floats
+    azimuth: Floats
+    elevation: Floats
+    time: NDArray[np.float64]
+    valid: NDArray[np.bool_]
+    intensity: Floats | None = None
+    ring: NDArray[np.uint16] | None = None
+    return_index: NDArray[np.uint8] | None = None
+    stamp_ns: int = 0
+    shape: tuple[int, int] | None = None
+    nominal: np.bool_ = np.bool_(False)
+
+    def __len__(self) -> int:
+        return len(self.x)
+
+    def __repr__(self) -> str:
+        near, far = (f(self.range[self.valid], initial=start) for f, start in ((np.min, np.inf), (np.max, 0)))
+        span = f", {near:.2f}..{far:.2f} m" if self.valid.any() else ""
+        return f"PointCloud({len(self)} points, {int(self.valid.sum())} valid{span}{', nominal calibration' if self.nominal else ''})"
+
+    @property
+    def columns(self) -> Mapping[str, NDArray[Any]]:
+        """The columns that this cloud has, by name."""
+        return {name: getattr(self, name) for name in COLUMNS if getattr(self, name) is not None}
+
+    @property
+    def xyz(self) -> Floats:
+        """(N, 3) float32 metres."""
+        return np.stack([self.x, self.y, self.z], axis=1)
+
+    def __getitem__(self, which: Any) -> PointCloud:
+        """Some of the points, by mask, indices or slice; organised only if the slice holds whole columns."""
+        picked = {f.name: _pick(getattr(self, f.name), which) for f in fields(self)}
+        shape = None
+        if self.shape and isinstance(which, slice) and which.step in (None, 1):
+            first, number = which.indices(len(self))[0], len(picked["x"])
+            rows = self.shape[1]
+            shape = (number // rows, rows) if first % rows == 0 and number % rows == 0 else None
+        return PointCloud(**{**picked, "shape": shape})
+
+    def to_structured(self) -> NDArray[Any]:
+        """A structured array (N,) with PCL's layout: x y z intensity ring time, itemsize 32; what is missing is 0."""
+        found = np.zeros(len(self), STRUCTURED)
+        for name in STRUCTURED.names or ():
+            column = getattr(self, name)
+            if column is not None:
+                found[name] = column
+        return found
+
+
+def _pick(value: Any, which: Any) -> Any:
+    return value[which] if isinstance(value, np.ndarray) and value.ndim else value
+
+
+def joined(clouds: Sequence[PointCloud]) -> PointCloud:
+    """Clouds of one sensor, one after another; times count from the first one's stamp."""
+    clouds = [cloud for cloud in clouds if len(cloud)] or list(clouds[:1])
+    if len(clouds) == 1:
+        return clouds[0]
+    stamp = clouds[0].stamp_ns
+    columns: dict[str, Any] = {}
+    for name in (*COLUMNS, "valid"):
+        parts = [getattr(cloud, name) for cloud in clouds]
+        columns[name] = None if any(part is None for part in parts) else np.concatenate(parts)
+    columns["time"] = np.concatenate([cloud.time + (cloud.stamp_ns - stamp) * 1e-9 for cloud in clouds])
+    rows = {cloud.shape[1] for cloud in clouds if cloud.shape}
+    shape = (
+        (sum(cloud.shape[0] for cloud in clouds if cloud.shape), rows.pop()) if len(rows) == 1 and all(c.shape for c in clouds) else None
+    )
+    return PointCloud(**columns, stamp_ns=stamp, shape=shape, nominal=np.bool_(any(cloud.nominal for cloud in clouds)))
+
+
+def restamped(cloud: PointCloud) -> PointCloud:
+    """The same points with times counted from the first one."""
+    if not len(cloud):
+        return cloud
+    shift = int(np.rint(cloud.time[0] * 1e9))
+    values = {f.name: getattr(cloud, f.name) for f in fields(cloud)}
+    return PointCloud(**{**values, "time": cloud.time - cloud.time[0], "stamp_ns": cloud.stamp_ns + shift})
+
+
+#: directions in REP-103: (axis index, sign).
+_DIRECTIONS = {"forward": (0, 1), "back": (0, -1), "left": (1, 1), "right": (1, -1), "up": (2, 1), "down": (2, -1)}
+
+
+def axis_matrix(axes: Sequence[str]) -> NDArray[np.float64]:
+    """The matrix that turns REP-103 coordinates into those of axes named by where x, y and z point."""
+    matrix = np.zeros((3, 3))
+    for row, name in enumerate(axes):
+        column, sign = _DIRECTIONS[name]
+        matrix[row, column] = sign
+    return matrix
+
+
+def narrowed(angle: NDArray[np.float64]) -> Floats:
+    """Radians as float32 in [-pi, pi)."""
+    turned = np.mod(angle + np.pi, 2 * np.pi) - np.pi
+    return np.clip(turned.astype(np.float32), -_PI, _PI)

@@ -1,0 +1,121 @@
+"""What every sensor can do: the methods of `Sensor`, carried out by the floors below."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from lidarspec import examples, parsing
+from lidarspec.building import build, limits
+from lidarspec.codecs import codec
+from lidarspec.clouds import axis_matrix
+from lidarspec.decoder import Decoder, Found, backend as checked_backend, feed_all, is_stream
+from lidarspec.errors import MissingField, OutOfRange, SpecError, UnknownCommand, UnknownField, UnknownOption, UsageError
+from lidarspec.packets import Packets
+from lidarspec.plugins import registry
+from lidarspec.scans import Scan, scans_of
+from lidarspec.spec import Configure, Sensor, install, replaced
+from lidarspec.streams import PacketStream
+
+#: options that the engine itself understands, for every sensor.
+FRAMES_OF_REFERENCE = ("rep103", "vendor")
+
+
+class StandardEngine:
+    """The engine; it holds nothing, everything is a function of the sensor."""
+
+    def parse(self, sensor: Sensor, data: bytes, *, frame: str | None, verify: bool) -> Any:
+        return parsing.parse(sensor, data, frame=frame, verify=verify)
+
+    def build(self, sensor: Sensor, frame: str, value: Any, values: Mapping[str, Any], *, units: bool) -> bytes:
+        return build(sensor, frame, value, values, units=units)
+
+    def example(self, sensor: Sensor, frame: str, *, seed: int) -> bytes:
+        return examples.example(sensor, frame, seed=seed)
+
+    def command(self, sensor: Sensor, name: str, arguments: Mapping[str, Any]) -> bytes:
+        if name not in sensor.commands:
+            raise UnknownCommand(name, sensor.commands, place=sensor.id)
+        command, place = sensor.commands[name], f"{sensor.id} {name}"
+        unknown = set(arguments) - set(command.args)
+        if unknown:
+            raise UnknownField(min(unknown), command.args, place=place)
+        if command.frame is None:
+            return b""
+        fields = codec(sensor.frames[command.frame]).schema.fields
+        values: dict[str, Any] = {}
+        for path, value in command.values.items():
+            _put(values, path, value)
+        for argument, (path, low, high) in command.args.items():
+            if argument not in arguments:
+                raise MissingField(argument, place=place)
+            value = arguments[argument]
+            if not low <= value <= high:
+                raise OutOfRange(argument, value, low, high, unit=fields[path].unit, place=place)
+            raw = round((value - fields[path].offset) / fields[path].scale)
+            bottom, top = limits(fields[path])
+            _put(values, path, min(max(raw, bottom), top))
+        return build(sensor, command.frame, None, values)
+
+    def decoder(self, sensor: Sensor, *, stream: bool | None, backend: str) -> Decoder:
+        interpreted = checked_backend(backend) == "construct"
+        return Decoder(sensor, stream=not sensor.datagrams if stream is None else stream, interpreted=interpreted)
+
+    def split(self, sensor: Sensor, data: Any, *, backend: str) -> list[Found]:
+        return feed_all(self.decoder(sensor, stream=is_stream(data), backend=backend), data)
+
+    def decode(self, sensor: Sensor, data: Any, *, frame: str | None, backend: str) -> Packets:
+        decoder = self.decoder(sensor, stream=is_stream(data), backend=backend)
+        stream = PacketStream(sensor, frame or sensor.data_frame, decoder.stats, interpreted=decoder.interpreted)
+        return stream.add(feed_all(decoder, data), whole=True)
+
+    def scans(self, sensor: Sensor, data: Any, *, backend: str) -> Iterator[Scan]:
+        return scans_of(sensor, [self.decode(sensor, data, frame=None, backend=backend)])
+
+    def configure(self, sensor: Sensor, options: Mapping[str, Any]) -> Sensor:
+        own = {name: value for name, value in options.items() if name in ("frame", "answer")}
+        rest = {name: value for name, value in options.items() if name not in own}
+        _check_own(sensor, own)
+        found = sensor
+        if rest:
+            function = sensor.configure.function
+            if function is None:
+                raise UnknownOption(min(rest), ("frame", "answer"), place=sensor.id)
+            try:
+                found = function(sensor, **rest)
+            except TypeError as error:
+                if "keyword" in str(error) or "argument" in str(error):
+                    raise UnknownOption(min(rest), ("frame", "answer"), place=sensor.id, hint=f": {error}") from None
+                raise
+        configure = Configure(found, sensor.configure.function)
+        return replaced(found, options={**sensor.options, **options}, configure=configure)
+
+    def rebuild(self, sensor_id: str, options: Mapping[str, Any]) -> Sensor:
+        sensor = registry().sensor(sensor_id)
+        return self.configure(sensor, options) if options else sensor
+
+
+def _check_own(sensor: Sensor, own: Mapping[str, Any]) -> None:
+    if "frame" in own:
+        if own["frame"] not in FRAMES_OF_REFERENCE:
+            raise UsageError(f"{sensor.id}: frame is one of {', '.join(FRAMES_OF_REFERENCE)}, not {own['frame']!r}")
+        if own["frame"] == "vendor" and sensor.vendor_axes is None:
+            raise UsageError(f"{sensor.id} declares no axes of its vendor")
+        if sensor.vendor_axes is not None:
+            try:
+                axis_matrix(sensor.vendor_axes)
+            except KeyError as error:
+                raise SpecError(f"no direction {error}", path="vendor_axes", sensor=sensor.id) from None
+    answers = [name for name, frame in sensor.frames.items() if frame.data]
+    if "answer" in own and own["answer"] not in answers:
+        raise UsageError(f"{sensor.id}: answer is one of {', '.join(answers)}, not {own['answer']!r}")
+
+
+def _put(values: dict[str, Any], path: str, value: Any) -> None:
+    *parents, last = path.split(".")
+    for parent in parents:
+        values = values.setdefault(parent, {})
+    values[last] = value
+
+
+install(StandardEngine())

@@ -1,0 +1,145 @@
+"""Errors, by whose fault they are.
+
+``SpecError`` is the plugin author's, ``WireError`` the bytes', ``UsageError`` the caller's, ``SourceError`` the
+system's, ``CommandError`` the device's. Noise on a stream is none of them: decoders count it. Each error builds its
+own text from typed arguments, so that the place of a fault can be read from the exception as well as from the text.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
+
+class LidarSpecError(Exception):
+    """The base of every exception that lidarspec raises on purpose; any other one that leaves it is a bug."""
+
+
+class SpecError(LidarSpecError):
+    """The description of a sensor is wrong or cannot be used: the fault of the plugin's author.
+
+    Attributes:
+        path: field path or name of the place in the spec, "" where it concerns the whole.
+        reason: what is wrong there.
+    """
+
+    def __init__(self, reason: str, *, path: str = "", sensor: str = "") -> None:
+        self.reason, self.path, self.sensor = reason, path, sensor
+        super().__init__(": ".join(part for part in (sensor, path, reason) if part))
+
+
+class WireError(LidarSpecError):
+    """Bytes that are not the frame they were taken for.
+
+    Attributes:
+        sensor, frame: ids, "" where not known.
+        offset: byte offset of the fault within the data given.
+        path: field path with array indices, "" where it concerns the whole frame.
+        expected, got: what the spec asks for, and what was there.
+        data: the bytes that were given.
+    """
+
+    def __init__(
+        self,
+        reason: str,
+        *,
+        sensor: str = "",
+        frame: str = "",
+        offset: int = 0,
+        path: str = "",
+        expected: object = None,
+        got: object = None,
+        data: bytes = b"",
+    ) -> None:
+        self.reason, self.sensor, self.frame, self.offset, self.path = reason, sensor, frame, offset, path
+        self.expected, self.got, self.data = expected, got, data
+        super().__init__(": ".join(part for part in (" ".join(part for part in (sensor, frame) if part), reason) if part))
+
+
+class UsageError(LidarSpecError):
+    """A call that cannot be carried out as it was made: the caller's fault."""
+
+
+def did_you_mean(name: str, known: Iterable[str]) -> str:
+    """A closing clause such as ``; did you mean 'speed'?``, or an empty text where nothing is close."""
+    close = difflib.get_close_matches(name, list(known), n=1, cutoff=0.5)
+    return f"; did you mean {close[0]!r}?" if close else ""
+
+
+class UnknownName(UsageError):
+    """A name that is not among those known; the message suggests the closest one."""
+
+    what = "name"
+
+    def __init__(self, name: str, known: Iterable[str] = (), *, place: str = "", hint: str = "") -> None:
+        known = sorted(known)
+        self.name, self.known, self.place = name, tuple(known), place
+        suggestion = did_you_mean(name, known)
+        listed = f" (known: {', '.join(known)})" if known and not suggestion and len(known) <= 12 else ""
+        where = f"{place}: " if place else ""
+        super().__init__(f"{where}unknown {self.what} {name!r}{suggestion}{listed}{hint}")
+
+
+class UnknownSensor(UnknownName):
+    """No installed sensor has this id or alias."""
+
+    what = "sensor"
+
+
+class UnknownFrame(UnknownName):
+    """The sensor has no frame type of this name."""
+
+    what = "frame"
+
+
+class UnknownField(UnknownName, AttributeError):
+    """The frame has no field of this path."""
+
+    what = "field"
+
+
+class UnknownCommand(UnknownName):
+    """The sensor has no command of this name."""
+
+    what = "command"
+
+
+class UnknownOption(UnknownName):
+    """The sensor cannot be configured with this option."""
+
+    what = "option"
+
+
+class UnknownFormat(UnknownName):
+    """No file format is known by this suffix."""
+
+    what = "format"
+
+
+class MissingField(UsageError):
+    """A frame was to be built without a value that only the caller can give."""
+
+    def __init__(self, path: str, *, place: str = "") -> None:
+        self.path = path
+        super().__init__(f"{place + ': ' if place else ''}field {path!r} is missing")
+
+
+class OutOfRange(UsageError):
+    """A value that its field, or its command's argument, cannot take."""
+
+    def __init__(self, path: str, value: object, low: object, high: object, *, unit: str = "", place: str = "") -> None:
+        self.path, self.value, self.low, self.high = path, value, low, high
+        end = f" {unit}" if unit else ""
+        super().__init__(f"{place + ': ' if place else ''}{path} = {value} is outside {low} .. {high}{end}")
+
+
+class SourceError(LidarSpecError):
+    """A port, socket or file that cannot be opened, read or written: the system's fault."""
+
+
+class CommandError(LidarSpecError):
+    """The device refused a command, or answered with something else."""
+
+
+class ReplyTimeout(CommandError):
+    """The device gave no answer to a command within its time."""

@@ -1,0 +1,108 @@
+"""Valid frames with seeded random content, for tests, docs and the REPL."""
+
+from __future__ import annotations
+
+import random
+import string
+from typing import Any
+
+import construct
+import numpy as np
+from construct import Construct
+from numpy.typing import NDArray
+
+from lidarspec.building import build
+from lidarspec.codecs import CompiledCodec, codec, plausibility
+from lidarspec.construction import clean
+from lidarspec.errors import SpecError, UnknownFrame
+from lidarspec.layout import Layout
+from lidarspec.schema import peeled
+from lidarspec.schema import FieldInfo
+from lidarspec.spec import Sensor
+from lidarspec.tables import Group, Rows
+
+#: random frames made at once, and how often, before a sensor's own `sweep` has to help.
+BATCH, TRIES = 64, 40
+
+
+def example(sensor: Sensor, frame: str, *, seed: int = 0) -> bytes:
+    """See `Sensor.example`."""
+    if frame not in sensor.frames:
+        raise UnknownFrame(frame, sensor.frames, place=sensor.id)
+    source = random.Random(f"{sensor.id} {frame} {seed}")
+    engine = codec(sensor.frames[frame])
+    if not isinstance(engine, CompiledCodec):
+        return build(sensor, frame, _random(sensor.frames[frame].prepared, source, construct.Container()), {})
+    for _ in range(TRIES):
+        layout, chosen = engine.tree.choose(source)
+        rows = np.frombuffer(source.randbytes(BATCH * layout.size), np.uint8).reshape(BATCH, layout.size).copy()
+        found = _plausible(sensor, frame, layout, _headed(rows, layout, chosen))
+        if found is not None:
+            return found
+    return _swept(sensor, frame, engine, source)
+
+
+def _headed(rows: NDArray[np.uint8], layout: Layout, chosen: dict[str, int]) -> NDArray[np.uint8]:
+    """Random frames with the header values of their layout, constants and checksums set."""
+    for path, value in chosen.items():
+        layout.leaves[path].store(rows, value)
+    layout.seal(rows)
+    return rows
+
+
+def _plausible(sensor: Sensor, frame: str, layout: Layout, rows: NDArray[np.uint8]) -> bytes | None:
+    table = Rows(codec(sensor.frames[frame]).schema, [Group(layout, np.arange(len(rows)), rows)])
+    if sensor.frames[frame].plausible is None:
+        return rows[0].tobytes()
+    errors: list[str] = []
+    good = np.flatnonzero(plausibility(sensor.frames[frame], table, errors) == 0)
+    if errors:
+        raise SpecError(errors[0].strip().splitlines()[-1], path=f"{frame}.plausible", sensor=sensor.id)
+    return rows[good[0]].tobytes() if len(good) else None
+
+
+def _swept(sensor: Sensor, frame: str, engine: CompiledCodec, source: random.Random) -> bytes:
+    """A frame around the values that the sensor's `sweep` declares, where random ones are never plausible."""
+    if sensor.sweep is None or not sensor.frames[frame].data:
+        raise SpecError("no random frame passes `plausible`, and there is no `sweep` to start from", path=frame, sensor=sensor.id)
+    for _ in range(TRIES):
+        values = sensor.sweep(source.randrange(10_000))
+        layout, chosen = engine.tree.choose(source)
+        rows = np.frombuffer(source.randbytes(layout.size), np.uint8).reshape(1, layout.size).copy()
+        for path, value in values.items():
+            leaf = layout.leaves.get(path)
+            if leaf is not None and path not in chosen:
+                leaf.store(rows, np.rint((np.asarray(value, np.float64) - leaf.info.offset) / leaf.info.scale).astype(np.int64))
+        found = _plausible(sensor, frame, layout, _headed(rows, layout, chosen))
+        if found is not None:
+            return found
+    raise SpecError("neither random frames nor those along `sweep` pass `plausible`", path=frame, sensor=sensor.id)
+
+
+def _random(con: Construct, source: random.Random, given: Any) -> Any:
+    """A random value for a construct that has no compiled layout."""
+    con, info = peeled(con, FieldInfo(""))
+    if info.const is not None:
+        return info.const
+    if isinstance(con, construct.Struct):
+        values = construct.Container()
+        for child in con.subcons:
+            if child.name is not None:
+                values[child.name] = _random(child, source, values)
+        return values
+    if isinstance(con, construct.Array):
+        number = con.count(given) if callable(con.count) else con.count
+        return [_random(con.subcon, source, given) for _ in range(number)]
+    if isinstance(con, construct.NullTerminated) or not isinstance(con, construct.Subconstruct):
+        return _leaf(con, source)
+    if isinstance(con, construct.Adapter):
+        return clean(con.parse(con.subcon.build(_random(con.subcon, source, given))))
+    return _random(con.subcon, source, given)
+
+
+def _leaf(con: Construct, source: random.Random) -> Any:
+    if isinstance(con, construct.NullTerminated):
+        return "".join(source.choices(string.digits, k=source.randint(1, 4))).encode()
+    if isinstance(con, construct.IfThenElse | construct.Switch) or con is construct.Pass:
+        return None
+    return con.parse(source.randbytes(con.sizeof()))

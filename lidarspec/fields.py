@@ -1,0 +1,170 @@
+"""What a struct needs beyond construct: a unit on a field, and a checksum that seals a struct.
+
+Both are ordinary construct classes, so that they nest in anything; neither changes the raw integers of the wire.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+from construct import Construct, Container, Subconstruct
+
+from lidarspec.bits import bytes_of
+from lidarspec.checksums import Checksum
+from lidarspec.construction import MarkedStruct, Mismatch, bit_width, member, unwrap, verifying
+
+
+class Scaled(Subconstruct):  # type: ignore[misc]
+    """A number on the wire with what it measures: ``physical = raw * scale + offset`` in `unit`.
+
+    Parses and builds the raw number; the unit is used where physical values are asked for, and never twice.
+
+    Args:
+        subcon: a construct field that parses to a number.
+        scale: the size of one raw step, in `unit`.
+        unit: "m", "s", "deg", "deg/s", "Hz", ... ("" for a pure number).
+        offset: physical value of raw 0, in `unit`.
+    """
+
+    def __init__(self, subcon: Construct, scale: float, unit: str, offset: float = 0) -> None:
+        super().__init__(subcon)
+        self.scale, self.unit, self.offset = scale, unit, offset
+
+    def _parse(self, stream: Any, context: Any, path: str) -> Any:
+        return self.subcon._parsereport(stream, context, path)
+
+    def _build(self, obj: Any, stream: Any, context: Any, path: str) -> Any:
+        return self.subcon._build(obj, stream, context, path)
+
+
+class Checksummed(Subconstruct):  # type: ignore[misc]
+    """A struct sealed by one of its own fields, wherever in it that field stands. May nest.
+
+    Args:
+        struct: a construct Struct.
+        field: dotted name of the field (or fields, low bits first) that holds the checksum.
+        algorithm: a `Checksum`; where left out, a ``lidarspec_checksum`` hook has to supply it.
+        over: names of consecutive fields that the checksum covers; by default every byte of the struct except
+            those that hold a bit of `field`.
+        absent: values of the field that mean "not filled": they pass, and stay as they are when built.
+    """
+
+    def __init__(
+        self,
+        struct: Construct,
+        field: str | Sequence[str],
+        algorithm: Checksum | None = None,
+        over: str | Iterable[str] | None = None,
+        absent: Iterable[int] = (),
+    ) -> None:
+        super().__init__(struct)
+        self.fields = (field,) if isinstance(field, str) else tuple(field)
+        self.algorithm = algorithm
+        self.over = (over,) if isinstance(over, str) else tuple(over) if over is not None else None
+        self.absent = frozenset(absent)
+
+    def _parse(self, stream: Any, context: Any, path: str) -> Any:
+        start = stream.tell()
+        obj = self.subcon._parsereport(stream, context, path)
+        if not verifying(context, checksums=True):
+            return obj
+        end = stream.tell()
+        stream.seek(start)
+        data = stream.read(end - start)
+        stored, computed = self._stored(obj), self._computed(data, obj, start)
+        if stored != computed and stored not in self.absent:
+            name = self.fields[0]
+            width = (self._width() + 3) // 4
+            expected, got = (f"0x{value:0{width}x}" for value in (computed, stored))
+            reason = "checksum"
+            raise Mismatch(f"{path} -> {name.replace('.', ' -> ')}", self._span(obj, name)[0], expected, got, reason)
+        return obj
+
+    def _build(self, obj: Any, stream: Any, context: Any, path: str) -> Any:
+        given = [member(obj, name, None) for name in self.fields]
+        blank = obj
+        for name, value in zip(self.fields, given, strict=True):
+            blank = _replaced(blank, name, self._zero(name) if value is None else value)
+        trial = io.BytesIO()
+        self.subcon._build(blank, trial, context, path)
+        data = trial.getvalue()
+        parsed = self.subcon._parsereport(io.BytesIO(data), _unverified(context), path)
+        if None not in given and self._stored(parsed) in self.absent:
+            return self.subcon._build(blank, stream, context, path)
+        sealed = self._filled(blank, self._computed(data, parsed, 0))
+        return self.subcon._build(sealed, stream, context, path)
+
+    def covered(self, obj: Any, size: int, base: int = 0) -> list[tuple[int, int]]:
+        """The byte ranges (start, end) within the struct that the checksum covers, for one parsed frame."""
+        if self.over is not None:
+            spans = [self._span(obj, name) for name in self.over]
+            return [(spans[0][0] - base, spans[-1][1] - base)]
+        held = sorted(self._span(obj, name) for name in self.fields)
+        edges = [0, *(edge - base for span in held for edge in span), size]
+        return [(a, b) for a, b in zip(edges[::2], edges[1::2], strict=True) if b > a]
+
+    def _computed(self, data: bytes, obj: Any, base: int) -> int:
+        if self.algorithm is None:
+            raise Mismatch("", 0, "a checksum algorithm", "none; a lidarspec_checksum hook has to supply it", "checksum")
+        return self.algorithm(b"".join(data[a:b] for a, b in self.covered(obj, len(data), base)))
+
+    def _stored(self, obj: Any) -> int:
+        value = shift = 0
+        for name in self.fields:
+            part = member(obj, name)
+            if isinstance(part, bytes):
+                part = int.from_bytes(part, self.algorithm.order if self.algorithm else "little")
+            value |= int(part) << shift
+            shift += bit_width(self._field(name))
+        return value
+
+    def _filled(self, obj: Any, value: int) -> Any:
+        for name in self.fields:
+            con = self._field(name)
+            width = bit_width(con)
+            part: int | bytes = value & ((1 << width) - 1)
+            if isinstance(self._zero(name), bytes):
+                assert self.algorithm is not None
+                part = int(part).to_bytes(width // 8, self.algorithm.order)
+            obj = _replaced(obj, name, part)
+            value >>= width
+        return obj
+
+    def _width(self) -> int:
+        return sum(bit_width(self._field(name)) for name in self.fields)
+
+    def _field(self, name: str) -> Construct:
+        con = self.subcon
+        for part in name.split("."):
+            con = unwrap(unwrap(con)._subcons[part])
+        return con
+
+    def _zero(self, name: str) -> int | bytes:
+        return self._field(name).parse(bytes(8 * bit_width(self._field(name))))  # type: ignore[no-any-return]
+
+    def _span(self, obj: Any, name: str) -> tuple[int, int]:
+        """Where a dotted field stands, in bytes of the stream that was parsed; a bit field by the bytes that hold it."""
+        con, parts = self.subcon, name.split(".")
+        for depth, part in enumerate(parts):
+            start, end = obj["_marks"][part]
+            con, obj = unwrap(con, bits=False)._subcons[part], obj[part]
+            if unwrap(con, bits=False) is not unwrap(con):
+                inside = bytes_of(con, parts[depth + 1 :])
+                return start + min(inside), start + max(inside) + 1
+        return start, end
+
+
+def _replaced(obj: Any, name: str, value: object) -> Any:
+    head, _, rest = name.partition(".")
+    copy = Container(obj)
+    copy[head] = _replaced(copy.get(head, {}), rest, value) if rest else value
+    return copy
+
+
+def _unverified(context: Any) -> Any:
+    """The same context for parsing back what was just built, with checks off."""
+    copy = Container(context)
+    copy["_params"] = Container(_verify=False)
+    return copy

@@ -1,0 +1,215 @@
+"""Finding frames in a byte stream: the one rule, the same for every sensor.
+
+A stream decodes to the leftmost valid candidate, then on after its last byte; an invalid candidate advances by one
+byte. At one offset the order of the frame types decides. A type with `after` is looked for only while the frame that
+it names is the last seen of those named by any `after`; a type with `confirm` counts only in unbroken runs.
+
+All candidates of a piece are judged in bulk; then a walk goes over those that are not rejected. So the work is
+linear in the input however often headers appear in it, and the result is that of the byte-by-byte rule.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarspec.codecs import CHECKSUM, CONSTANT, IMPLAUSIBLE, LENGTH, PLUGIN, SHORT, VALID, Codec
+
+#: which counter a rejected candidate raises.
+COUNTED = {LENGTH: "bad_length", CHECKSUM: "bad_checksum", IMPLAUSIBLE: "implausible", PLUGIN: "plugin_errors"}
+
+
+@dataclass(eq=False)
+class Candidates:
+    """The candidates of one frame type in a piece of a stream, by offset."""
+
+    codec: Codec
+    offsets: NDArray[np.intp]
+    status: NDArray[np.uint8]
+    sizes: NDArray[np.intp]
+    errors: tuple[str, ...]
+
+    @classmethod
+    def find(cls, codec: Codec, buffer: NDArray[np.uint8]) -> Candidates:
+        """Those whose constants at the start match as far as the bytes go."""
+        match = np.ones(len(buffer), np.bool_)
+        for spot, (mask, value) in codec.prefix.items():
+            if spot < len(buffer):
+                there = buffer[spot:] if mask == 0xFF else buffer[spot:] & np.uint8(mask)
+                match[: len(buffer) - spot] &= there == value
+        offsets = np.flatnonzero(match)
+        survey = codec.survey(buffer, offsets)
+        kept = survey.status != CONSTANT
+        return cls(codec, offsets[kept], survey.status[kept], survey.sizes[kept], survey.errors)
+
+
+@dataclass
+class Mode:
+    """What the walk remembers between pieces: the last frame named by any `after`, and a run of weak frames under way."""
+
+    after: str | None = None
+    run: str | None = None
+    run_end: int = -1
+
+
+@dataclass
+class Piece:
+    """The outcome for one piece: frames as (type index, offset, size), where the rest begins and how long it has to be
+    at least (`need`, 0 if unknown), and what was rejected."""
+
+    kinds: list[int] = field(default_factory=list)
+    offsets: list[int] = field(default_factory=list)
+    sizes: list[int] = field(default_factory=list)
+    end: int = 0
+    need: int = 0
+    rejected: dict[str, int] = field(default_factory=dict)
+    errors: list[str] = field(default_factory=list)
+
+
+class Framing:
+    """The frame types of one stream, ready to be looked for.
+
+    Args:
+        codecs: those of the incoming frame types, by name, in the order that decides at one offset.
+    """
+
+    def __init__(self, codecs: Mapping[str, Codec]) -> None:
+        self.names, self.codecs = list(codecs), list(codecs.values())
+        self.named = {codec.frame.after for codec in self.codecs} - {None}
+
+    def scan(self, buffer: NDArray[np.uint8], mode: Mode, *, base: int, final: bool) -> Piece:
+        """Cut one piece.
+
+        Args:
+            buffer: the bytes not yet decided and those after them.
+            mode: remembered between pieces, changed here.
+            base: offset of the buffer in the stream.
+            final: give up candidates that need more bytes than there are.
+
+        Returns:
+            The frames, and in `end` the first byte that has to be looked at again together with what follows.
+        """
+        piece = Piece()
+        found = [Candidates.find(codec, buffer) for codec in self.codecs]
+        _Walker(self, found, mode, piece, base, len(buffer), final=final).run()
+        return piece
+
+    def active(self, index: int, mode: Mode) -> bool:
+        """Whether a type is looked for now."""
+        after = self.codecs[index].frame.after
+        return after is None or after == mode.after
+
+
+class _Walker:
+    """One pass over the candidates of a piece."""
+
+    def __init__(
+        self, framing: Framing, found: Sequence[Candidates], mode: Mode, piece: Piece, base: int, length: int, *, final: bool
+    ) -> None:
+        self.framing, self.found, self.mode, self.piece = framing, found, mode, piece
+        self.base, self.length, self.final = base, length, final
+        self.position = 0
+        self.tables: list[dict[int, int]] = []
+        for candidates in found:
+            live = np.flatnonzero((candidates.status == VALID) | (candidates.status == SHORT))
+            self.tables.append(dict(zip(candidates.offsets[live].tolist(), live.tolist(), strict=True)))
+        self.spots = sorted(set().union(*self.tables))
+
+    def run(self) -> None:
+        """Accept what is valid from left to right, until the end or a candidate that needs more bytes."""
+        counted = 0
+        for spot in self.spots:
+            if spot < self.position:
+                continue
+            taken = self._at(spot)
+            if taken is None:
+                self._count(counted, spot)
+                self.piece.end = spot
+                return
+            if taken >= 0:
+                self._count(counted, spot, before=taken)
+                self._accept(taken, spot)
+                counted = self.position
+        self._count(counted, self.length)
+        self.piece.end = max(self.length, self.position)
+
+    def _at(self, spot: int) -> int | None:
+        """The type that is accepted at an offset, -1 if none is, None if that takes more bytes than there are."""
+        for index, table in enumerate(self.tables):
+            entry = table.get(spot)
+            if entry is None or not self.framing.active(index, self.mode):
+                continue
+            candidates = self.found[index]
+            if candidates.status[entry] == SHORT:
+                if not self.final:
+                    self.piece.need = int(candidates.sizes[entry])
+                    return None
+                continue
+            confirmed = self._confirmed(index, spot)
+            if confirmed is None:
+                return None
+            if confirmed:
+                return index
+            candidates.status[entry] = IMPLAUSIBLE
+        return -1
+
+    def _accept(self, index: int, spot: int) -> None:
+        name = self.framing.names[index]
+        size = int(self.found[index].sizes[self.tables[index][spot]])
+        self.piece.kinds.append(index)
+        self.piece.offsets.append(spot)
+        self.piece.sizes.append(size)
+        self.position = spot + size
+        weak = self.framing.codecs[index].frame.confirm > 1
+        self.mode.run, self.mode.run_end = (name, self.base + self.position) if weak else (None, -1)
+        if name in self.framing.named:
+            self.mode.after = name
+
+    def _confirmed(self, index: int, spot: int) -> bool | None:
+        """Whether enough valid frames of a weak type follow each other from here; None if that cannot be known yet."""
+        wanted = self.framing.codecs[index].frame.confirm
+        if wanted == 1 or (self.mode.run == self.framing.names[index] and self.mode.run_end == self.base + spot):
+            return True
+        candidates, table = self.found[index], self.tables[index]
+        for _ in range(wanted):
+            if spot >= self.length:
+                return False if self.final else None
+            earlier = self._earlier(index, spot)
+            if earlier is None or earlier:
+                return None if earlier is None else False
+            entry = table.get(spot)
+            if entry is None or candidates.status[entry] not in (VALID, SHORT):
+                return False
+            if candidates.status[entry] == SHORT:
+                return False if self.final else None
+            spot += int(candidates.sizes[entry])
+        return True
+
+    def _earlier(self, index: int, spot: int) -> bool | None:
+        """Whether a type that comes first in the order stands at an offset; None if that cannot be known yet."""
+        for other in range(index):
+            entry = self.tables[other].get(spot)
+            if entry is None or not self.framing.active(other, self.mode):
+                continue
+            status = self.found[other].status[entry]
+            if status == VALID and self.framing.codecs[other].frame.confirm == 1:
+                return True
+            if status == SHORT and not self.final:
+                return None
+        return False
+
+    def _count(self, start: int, stop: int, *, before: int = 0) -> None:
+        """Count what was rejected from `start` up to `stop`, and at `stop` by the types that come before `before`."""
+        for index, candidates in enumerate(self.found):
+            if not len(candidates.offsets) or not self.framing.active(index, self.mode):
+                continue
+            low, high = np.searchsorted(candidates.offsets, [start, stop + (index < before)])
+            for status, number in enumerate(np.bincount(candidates.status[low:high], minlength=PLUGIN + 1).tolist()):
+                name = COUNTED.get(LENGTH if status == SHORT else status)
+                if number and name:
+                    self.piece.rejected[name] = self.piece.rejected.get(name, 0) + number
+                    if status == PLUGIN:
+                        self.piece.errors += candidates.errors[:1]

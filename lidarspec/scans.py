@@ -1,0 +1,174 @@
+"""Scans: one revolution or frame period each, cut by the sensor's declared rule."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarspec.clouds import PointCloud, joined, restamped
+from lidarspec.columns import Carry
+from lidarspec.cuts import Cutter
+from lidarspec.packets import Packets
+from lidarspec.packets import joined as joined_packets
+from lidarspec.points import Evaluated, guarded
+from lidarspec.reorder import Reorder
+from lidarspec.spec import Sensor
+
+
+@dataclass(frozen=True, eq=False)
+class LaserScan:
+    """A planar scan with ROS's names: `ranges[i]` is at ``angle_min + i * angle_increment``, inf where there is no return.
+
+    Attributes:
+        ranges, intensities: (n,) float32.
+        angle_min, angle_max, angle_increment: radians, counter-clockwise; ``angle_max = angle_min + (n - 1) * angle_increment``.
+        time_increment, scan_time: seconds.
+        range_min, range_max: metres, the sensor's.
+        stamp_ns: of the first point.
+    """
+
+    angle_min: float
+    angle_max: float
+    angle_increment: float
+    time_increment: float
+    scan_time: float
+    range_min: float
+    range_max: float
+    ranges: NDArray[np.float32]
+    intensities: NDArray[np.float32]
+    stamp_ns: int = 0
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Scan:
+    """The points between two cuts.
+
+    Attributes:
+        points: in stream order.
+        rate_hz: one over the time to the next scan; nan where that is not known.
+        complete: whether both ends were seen; the first and the last piece of a stream are not complete.
+        sensor: whose.
+    """
+
+    points: PointCloud
+    rate_hz: float
+    complete: bool
+    sensor: Sensor
+
+    @property
+    def stamp_ns(self) -> int:
+        """Time of the first point, int64 ns."""
+        return self.points.stamp_ns
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def __repr__(self) -> str:
+        ranges = self.points.range[self.points.valid]
+        span = f"{ranges.min():.2f}..{ranges.max():.2f} m" if len(ranges) else "no returns"
+        rate = f"{self.rate_hz:.1f} Hz, " if np.isfinite(self.rate_hz) else ""
+        return f"Scan({len(self)} points, {rate}{span}, {'complete' if self.complete else 'partial'})"
+
+    def to_bins(self, n: int) -> NDArray[np.float32]:
+        """The nearest return in each of n equal sectors from -pi on: (n,) float32 metres, inf where there is none."""
+        return self._binned(n)[0]
+
+    def to_laserscan(self, n: int | None = None) -> LaserScan:
+        """The scan on an even grid of n angles over the whole turn, by default as many as there are points."""
+        count = max(len(self), 1) if n is None else n
+        ranges, intensities = self._binned(count, centred=True)
+        step = 2 * np.pi / count
+        period = (
+            1 / self.rate_hz if np.isfinite(self.rate_hz) and self.rate_hz > 0 else float(np.ptp(self.points.time)) if len(self) else 0.0
+        )
+        near, far = self.sensor.range_limits
+        return LaserScan(-np.pi, -np.pi + (count - 1) * step, step, period / count, period, near, far, ranges, intensities, self.stamp_ns)
+
+    def _binned(self, n: int, *, centred: bool = False) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        valid = self.points.valid
+        turns = (self.points.azimuth[valid].astype(np.float64) + np.pi) / (2 * np.pi) * n
+        spots = (np.rint(turns) if centred else np.floor(turns)).astype(np.intp) % n
+        ranges = self.points.range[valid]
+        nearest = np.lexsort((ranges, spots))
+        first = np.ones(len(nearest), np.bool_)
+        first[1:] = np.diff(spots[nearest]) > 0
+        chosen = nearest[first]
+        found, strength = np.full(n, np.inf, np.float32), np.zeros(n, np.float32)
+        found[spots[chosen]] = ranges[chosen]
+        if self.points.intensity is not None:
+            strength[spots[chosen]] = self.points.intensity[valid][chosen]
+        return found, strength
+
+
+class ScanStream:
+    """Scans out of batches of packets; remembers what the next batch needs."""
+
+    def __init__(self, sensor: Sensor) -> None:
+        self._sensor = sensor
+        self._reorder = Reorder(enabled=sensor.sequence is not None)
+        self._cutter = Cutter(sensor.scan)
+        self._waiting: Packets | None = None
+        self._carry: Carry = {}
+        self._parts: list[PointCloud] = []
+        self._started = False
+
+    def add(self, packets: Packets) -> list[Scan]:
+        """The scans that these packets complete."""
+        return [scan for batch in self._reorder.push(packets) for scan in self._push(batch, final=False)]
+
+    def finish(self) -> list[Scan]:
+        """The scans that waited for more, and the piece that is left."""
+        found = [scan for batch in self._reorder.finish() for scan in self._push(batch, final=False)]
+        if self._waiting is not None and len(self._waiting):
+            waiting, self._waiting = self._waiting, None
+            found += self._push(waiting, final=True)
+        left = self._close(None, complete=False)
+        return found + ([left] if left else [])
+
+    def _push(self, packets: Packets, *, final: bool) -> list[Scan]:
+        if self._waiting is not None and len(self._waiting):
+            packets = joined_packets([self._waiting, packets])
+        self._waiting = None
+        found = guarded(packets, self._carry, final=final)
+        if found is None:
+            return []
+        self._carry = found.carry
+        if found.ready < len(packets):
+            self._waiting = packets.take(slice(found.ready, None))
+        return list(self._cut(packets, found))
+
+    def _cut(self, packets: Packets, found: Evaluated) -> Iterator[Scan]:
+        start = 0
+        for cut in self._cutter.cuts(packets, found):
+            self._parts.append(found.cloud[start:cut] if cut > start else found.cloud[:0])
+            following = found.cloud[cut : cut + 1]
+            scan = self._close(following, complete=self._started)
+            if scan is not None:
+                self._started = True
+                yield scan
+            start = cut
+        self._parts.append(found.cloud[start:] if start else found.cloud)
+
+    def _close(self, following: PointCloud | None, *, complete: bool) -> Scan | None:
+        parts = [part for part in self._parts if len(part)]
+        self._parts = []
+        if not parts:
+            return None
+        cloud = restamped(joined(parts))
+        rate = np.nan
+        if following is not None and len(following):
+            period = (restamped(following).stamp_ns - cloud.stamp_ns) * 1e-9
+            rate = 1 / period if period > 0 else np.nan
+        return Scan(cloud, float(rate) if complete else np.nan, complete, self._sensor)
+
+
+def scans_of(sensor: Sensor, batches: Iterable[Packets]) -> Iterator[Scan]:
+    """Every scan of batches of one stream."""
+    stream = ScanStream(sensor)
+    for batch in batches:
+        yield from stream.add(batch)
+    yield from stream.finish()

@@ -1,0 +1,174 @@
+"""The fields of a frame type as a table, read off its construct tree without any bytes.
+
+Path, axes, type, unit and text of each field; where it stands is `layout`'s business, since that can depend on the
+header. Both engines (compiled and interpreted) make their columns by this table, so that they agree on types.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import construct
+import numpy as np
+from construct import Array, BitsInteger, Bytes, BytesInteger, Const, Construct, FormatField, Struct
+
+from lidarspec.fields import Checksummed, Scaled
+
+
+@dataclass(frozen=True, eq=False)
+class FieldInfo:
+    """One field of a frame.
+
+    Attributes:
+        path: dotted, without indices: "points.distance".
+        axes: paths of the arrays it is in, outermost first; a bytes field adds its own path.
+        dtype: type of the raw value in native byte order; None where construct alone knows it.
+        kind: "int", "float", "bytes" or "other".
+        scale, offset, unit: ``physical = raw * scale + offset``.
+        bits: width in bits; 0 where not fixed.
+        const: the value it must have, None where free.
+        labels: meanings of raw values (construct's Enum).
+        optional: whether some headers leave it out.
+    """
+
+    path: str
+    axes: tuple[str, ...] = ()
+    dtype: np.dtype[Any] | None = None
+    kind: str = "other"
+    scale: float = 1
+    offset: float = 0
+    unit: str = ""
+    docs: str = ""
+    bits: int = 0
+    const: Any = None
+    labels: Mapping[int, str] = field(default_factory=dict)
+    optional: bool = False
+
+    @property
+    def name(self) -> str:
+        """The last part of the path."""
+        return self.path.rpartition(".")[2]
+
+    @property
+    def scaled(self) -> bool:
+        """Whether the physical value is another number than the raw one."""
+        return self.scale != 1 or self.offset != 0
+
+
+@dataclass(frozen=True, eq=False)
+class Schema:
+    """All fields of a frame type, in the order of the wire, and the arrays they are in (path -> declared count)."""
+
+    fields: Mapping[str, FieldInfo]
+    arrays: Mapping[str, Any]
+
+    def chain(self) -> tuple[str, ...]:
+        """The axes of the deepest nesting of arrays; the first one of equally deep ones."""
+        return max((info.axes for info in self.fields.values() if info.kind != "bytes"), key=len, default=())
+
+    def depth(self) -> int:
+        """How many arrays are nested at most."""
+        return len(self.chain())
+
+
+def schema(con: Construct) -> Schema:
+    """The table of fields of a construct tree, the author's or the prepared one."""
+    fields: dict[str, FieldInfo] = {}
+    arrays: dict[str, Any] = {}
+    _walk(con, FieldInfo(""), fields, arrays)
+    return Schema(fields, arrays)
+
+
+def _walk(con: Construct, info: FieldInfo, fields: dict[str, FieldInfo], arrays: dict[str, Any]) -> None:
+    con, info = peeled(con, info)
+    if isinstance(con, Checksummed | construct.Transformed | construct.Restreamed):
+        _walk(con.subcon, info, fields, arrays)
+    elif isinstance(con, Struct):
+        for child in con.subcons:
+            if child.name is not None:
+                _walk(child, replace(info, path=f"{info.path}.{child.name}" if info.path else child.name), fields, arrays)
+    elif isinstance(con, Array):
+        axis = axis_path(info)
+        arrays[axis] = con.count
+        _walk(con.subcon, replace(info, axes=(*info.axes, axis)), fields, arrays)
+    elif isinstance(con, construct.IfThenElse | construct.Switch):
+        for branch in branches(con):
+            _walk(branch, replace(info, optional=True), fields, arrays)
+    elif con is not construct.Pass and info.path:
+        leaf = _leaf(con, info)
+        if leaf.kind == "bytes":
+            arrays[leaf.axes[-1]] = con.length
+        known = fields.get(leaf.path)
+        fields[leaf.path] = leaf if known is None else _merged(known, leaf)
+
+
+def axis_path(info: FieldInfo) -> str:
+    """The name of the axis of an array at this place; an array directly in an array gets brackets."""
+    path = info.path
+    while path in info.axes:
+        path += "[]"
+    return path
+
+
+def branches(con: Construct) -> list[Construct]:
+    """The alternatives of an If, IfThenElse or Switch."""
+    if isinstance(con, construct.Switch):
+        return [*con.cases.values(), con.default]
+    return [con.thensubcon, con.elsesubcon]
+
+
+def peeled(con: Construct, info: FieldInfo) -> tuple[Construct, FieldInfo]:
+    """What is below the wrappers that only describe (name, unit, labels, constant), and what they say."""
+    while True:
+        if isinstance(con, construct.Renamed):
+            info = replace(info, docs=con.docs or info.docs)
+        elif isinstance(con, Scaled):
+            info = replace(info, scale=con.scale, offset=con.offset, unit=con.unit)
+        elif isinstance(con, construct.Enum):
+            info = replace(info, labels={int(value): str(name) for value, name in con.ksymapping.items()})
+        elif isinstance(con, Const):
+            info = replace(info, const=con.value)
+        elif not isinstance(con, construct.Default | construct.Rebuild):
+            return con, info
+        con = con.subcon
+
+
+def fields_below(con: Construct, info: FieldInfo) -> dict[str, FieldInfo]:
+    """The fields of a part of a tree, by path; `info` says where it stands."""
+    fields: dict[str, FieldInfo] = {}
+    _walk(con, info, fields, {})
+    return fields
+
+
+def _leaf(con: Construct, info: FieldInfo) -> FieldInfo:
+    if isinstance(con, FormatField):
+        code = con.fmtstr[-1]
+        kind, letter = ("float", "f") if code in "efd" else ("int", "u" if code.isupper() or code == "?" else "i")
+        return replace(info, dtype=np.dtype(f"{letter}{con.length}"), kind=kind, bits=8 * con.length)
+    if isinstance(con, BytesInteger | BitsInteger) and isinstance(con.length, int):
+        bits = con.length * (8 if isinstance(con, BytesInteger) else 1)
+        dtype = integer_type(bits, signed=bool(con.signed)) if bits <= 64 else None
+        return replace(info, dtype=dtype, kind="int" if dtype is not None else "other", bits=bits)
+    if isinstance(con, type(construct.Flag)):
+        return replace(info, dtype=np.dtype("u1"), kind="int", bits=1)
+    if isinstance(con, Bytes):
+        bits = 8 * con.length if isinstance(con.length, int) else 0
+        return replace(info, dtype=np.dtype("u1"), kind="bytes", bits=bits, axes=(*info.axes, axis_path(info)))
+    return info
+
+
+def integer_type(bits: int, *, signed: bool = False) -> np.dtype[Any]:
+    """The smallest integer type of at least so many bits."""
+    size = next(size for size in (1, 2, 4, 8) if bits <= 8 * size)
+    return np.dtype(f"{'i' if signed else 'u'}{size}")
+
+
+def _merged(known: FieldInfo, other: FieldInfo) -> FieldInfo:
+    """One column for a field that several branches declare."""
+    if known.axes != other.axes or "other" in (known.kind, other.kind) or known.dtype is None or other.dtype is None:
+        return replace(known, dtype=None, kind="other")
+    dtype = np.promote_types(known.dtype, other.dtype)
+    const = known.const if known.const == other.const else None
+    return replace(known, dtype=dtype, kind="float" if dtype.kind == "f" else known.kind, const=const)

@@ -1,0 +1,312 @@
+"""A sensor as a value: message types, commands, links, clock and geometry, written down once.
+
+Everything here is immutable and knows nothing of streams or arrays. What can be done with a sensor (parse, decode,
+...) is offered as methods, which hand over to the one `Engine` that the package installs when it is imported.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, fields
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, Literal, Protocol
+
+from construct import Construct
+
+from lidarspec.construction import prepare
+from lidarspec.errors import SpecError, UnknownFrame
+from lidarspec.geometry import Points
+from lidarspec.links import Link, is_datagram
+from lidarspec.rules import check_struct
+from lidarspec.splits import Clock, Sequence, Split
+
+if TYPE_CHECKING:
+    from lidarspec.decoder import Decoder, Found
+    from lidarspec.packets import Packets
+    from lidarspec.scans import Scan
+
+#: version of the plugin interface; the engine reads this one and the one before.
+API = 1
+STATUSES = ("manual", "vectors", "capture", "hardware")
+_ID = re.compile(r"[a-z0-9]+(-[a-z0-9]+)+")
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """One message type.
+
+    Args:
+        struct: its construct, most often a `Checksummed` Struct.
+        direction: "in" from the sensor to us, "out" from us to it.
+        data: whether it carries the points.
+        points: a `points` function of its own, for sensors that can answer in several data frames.
+        max_length: the longest it can be, in bytes; longer candidates are not frames.
+        plausible: a function of `Fields`: False where no sensor would send such values, reduced with `all` per packet.
+        after: name of the frame that has to be the last seen, of all named by any `after`, for this one to be looked for.
+        confirm: how many in an unbroken run it takes to believe any of them.
+
+    Raises:
+        SpecError: if the struct cannot describe a frame (see `lidarspec.rules`).
+    """
+
+    struct: Construct
+    direction: Literal["in", "out"] = field(default="in", kw_only=True)
+    data: bool = field(default=False, kw_only=True)
+    points: Callable[[Any], Points] | None = field(default=None, kw_only=True)
+    max_length: int = field(kw_only=True)
+    plausible: Callable[[Any], Any] | None = field(default=None, kw_only=True)
+    after: str | None = field(default=None, kw_only=True)
+    confirm: int = field(default=1, kw_only=True)
+    prepared: Construct = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        if self.direction not in ("in", "out"):
+            raise SpecError(f"direction is 'in' or 'out', not {self.direction!r}")
+        if self.max_length < 1 or self.confirm < 1:
+            raise SpecError("max_length and confirm are at least 1")
+        object.__setattr__(self, "prepared", prepare(self.struct))
+        check_struct(self.prepared)
+
+
+@dataclass(frozen=True)
+class Command:
+    """Something that can be asked of the sensor.
+
+    Args:
+        frame: the outgoing frame that asks it; None for a command that only moves lines.
+        values: values of its fields, by path.
+        args: argument name -> (field path, lowest, highest), in the field's unit.
+        reply: the frame that answers; None where no answer is documented.
+        matches: values that fields of the reply must have for it to be the answer to this command.
+        timeout: seconds to wait for the reply.
+        settle: seconds that the sensor needs after it before the next command.
+        link: the link it goes over.
+        lines: levels of control lines, {"dtr": False}, set with it.
+        starts, stops: whether the sensor sends data after it, or no longer does.
+    """
+
+    frame: str | None = None
+    values: Mapping[str, Any] = field(default_factory=dict)
+    args: Mapping[str, tuple[str, float, float]] = field(default_factory=dict)
+    reply: str | None = None
+    matches: Mapping[str, Any] = field(default_factory=dict)
+    timeout: float = 1.0
+    settle: float = 0.0
+    link: str = "data"
+    lines: Mapping[str, bool] = field(default_factory=dict)
+    starts: bool = False
+    stops: bool = False
+
+    def __post_init__(self) -> None:
+        _freeze(self, "values", "args", "matches", "lines")
+
+
+class Engine(Protocol):
+    """What the package can do with a sensor; installed once by `lidarspec.engine`."""
+
+    def parse(self, sensor: Sensor, data: bytes, *, frame: str | None, verify: bool) -> Any: ...
+    def build(self, sensor: Sensor, frame: str, value: Any, values: Mapping[str, Any], *, units: bool) -> bytes: ...
+    def example(self, sensor: Sensor, frame: str, *, seed: int) -> bytes: ...
+    def command(self, sensor: Sensor, name: str, arguments: Mapping[str, Any]) -> bytes: ...
+    def decoder(self, sensor: Sensor, *, stream: bool | None, backend: str) -> Decoder: ...
+    def split(self, sensor: Sensor, data: Any, *, backend: str) -> list[Found]: ...
+    def decode(self, sensor: Sensor, data: Any, *, frame: str | None, backend: str) -> Packets: ...
+    def scans(self, sensor: Sensor, data: Any, *, backend: str) -> Iterator[Scan]: ...
+    def configure(self, sensor: Sensor, options: Mapping[str, Any]) -> Sensor: ...
+    def rebuild(self, sensor_id: str, options: Mapping[str, Any]) -> Sensor: ...
+
+
+_engines: list[Engine] = []
+
+
+def install(engine: Engine) -> None:
+    """Make `engine` the one that every sensor's methods hand over to."""
+    _engines[:] = [engine]
+
+
+def _installed() -> Engine:
+    return _engines[0]
+
+
+@dataclass(frozen=True)
+class Configure:
+    """``sensor.configure(...)``: the engine's options, then the sensor's own function, on a new value."""
+
+    sensor: Sensor
+    function: Callable[..., Sensor] | None
+
+    def __call__(self, **options: Any) -> Sensor:
+        """A new sensor with these options; the old one stays as it is.
+
+        Raises:
+            UnknownOption: for an option that neither the engine nor the sensor has.
+        """
+        return _installed().configure(self.sensor, options)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Sensor:
+    """One sensor, described; see DESIGN 3.5 of the documentation for each argument.
+
+    Raises:
+        SpecError: for an id, status or reference between its parts that cannot be.
+    """
+
+    id: str
+    vendor: str = field(kw_only=True)
+    model: str = field(kw_only=True)
+    frames: Mapping[str, Frame] = field(kw_only=True)
+    points: Callable[[Any], Points] | None = field(kw_only=True)
+    scan: Split = field(kw_only=True)
+    links: Mapping[str, Link] = field(kw_only=True)
+    commands: Mapping[str, Command] = field(default_factory=dict, kw_only=True)
+    clock: Clock | None = field(default=None, kw_only=True)
+    sequence: Sequence | None = field(default=None, kw_only=True)
+    fillers: bytes = field(default=b"", kw_only=True)
+    state: Mapping[str, Mapping[str, Any]] = field(default_factory=dict, kw_only=True)
+    sweep: Callable[[int], Mapping[str, Any]] | None = field(default=None, kw_only=True)
+    encode: Callable[..., Any] | None = field(default=None, kw_only=True)
+    configure: Any = field(default=None, kw_only=True)
+    on_open: tuple[str, ...] = field(default=(), kw_only=True)
+    on_close: tuple[str, ...] = field(default=(), kw_only=True)
+    range_limits: tuple[float, float] = field(kw_only=True)
+    vendor_axes: tuple[str, str, str] | None = field(default=None, kw_only=True)
+    status: str = field(kw_only=True)
+    source: str = field(kw_only=True)
+    aliases: tuple[str, ...] = field(default=(), kw_only=True)
+    api: int = field(default=API, kw_only=True)
+    options: Mapping[str, Any] = field(default_factory=dict, kw_only=True)
+
+    def __post_init__(self) -> None:
+        _freeze(self, "frames", "links", "commands", "state", "options")
+        function = self.configure.function if isinstance(self.configure, Configure) else self.configure
+        object.__setattr__(self, "configure", Configure(self, function))
+        for name in ("on_open", "on_close", "aliases"):
+            object.__setattr__(self, name, tuple(getattr(self, name)))
+        _check_sensor(self)
+
+    @property
+    def data_frame(self) -> str:
+        """The name of the frame type that carries the points.
+
+        Raises:
+            UnknownFrame: if it has none yet (a sensor that needs a file first).
+        """
+        names = [name for name, frame in self.frames.items() if frame.data]
+        if not names:
+            raise UnknownFrame("data", self.frames, place=self.id, hint="; configure the sensor first")
+        answer = self.options.get("answer")
+        return answer if answer in names else names[0]
+
+    @property
+    def datagrams(self) -> bool:
+        """Whether frames come one to a datagram."""
+        return is_datagram(self.links.get("data"))
+
+    def parse(self, data: bytes, frame: str | None = None, *, verify: bool = True) -> Any:
+        """Exactly one frame as a construct Container of raw wire integers.
+
+        Args:
+            frame: its type; found out where left out.
+            verify: False accepts wrong constants, a wrong checksum and trailing bytes.
+
+        Raises:
+            WireError: where the bytes are not such a frame: sensor, offset, field path, expected and got.
+        """
+        return _installed().parse(self, data, frame=frame, verify=verify)
+
+    def build(self, frame: str, value: Any = None, /, *, units: bool = False, **values: Any) -> bytes:
+        """The bytes of one frame; constants, counts and the checksum are filled in.
+
+        Args:
+            value: a mapping of all fields, such as what `parse` returned; `values` override it.
+            units: take physical values, and round them to the wire's steps.
+
+        Raises:
+            UsageError: for a missing or unknown field, or a value that its field cannot hold.
+        """
+        return _installed().build(self, frame, value, values, units=units)
+
+    def example(self, frame: str, *, seed: int = 0) -> bytes:
+        """The bytes of a valid frame with seeded random content."""
+        return _installed().example(self, frame, seed=seed)
+
+    def command(self, name: str, **arguments: Any) -> bytes:
+        """The bytes of a command; arguments by name, in units.
+
+        Raises:
+            UnknownCommand, OutOfRange: for what the sensor does not take.
+        """
+        return _installed().command(self, name, arguments)
+
+    def decoder(self, *, stream: bool | None = None, backend: str = "auto") -> Decoder:
+        """A new incremental decoder, sans-IO and independent of every other.
+
+        Args:
+            stream: True reads a byte stream, False one datagram for each `feed`; by default what the data link says.
+        """
+        return _installed().decoder(self, stream=stream, backend=backend)
+
+    def split(self, data: Any, *, backend: str = "auto") -> list[Found]:
+        """Every incoming frame of all types in stream order; `data` as in `decode`."""
+        return _installed().split(self, data, backend=backend)
+
+    def decode(self, data: Any, frame: str | None = None, *, backend: str = "auto") -> Packets:
+        """The data frames, or those of another type, as columns.
+
+        Args:
+            data: bytes (a stream), an iterable of datagrams, or an (n, size) uint8 array of datagrams.
+            backend: "auto", "numpy", "jit" or "construct": the same results.
+        """
+        return _installed().decode(self, data, frame=frame, backend=backend)
+
+    def scans(self, data: Any, *, backend: str = "auto") -> Iterator[Scan]:
+        """Every scan of the data; the first and last piece are marked ``complete=False``."""
+        return _installed().scans(self, data, backend=backend)
+
+    def __repr__(self) -> str:
+        options = "".join(f", {name}={value!r}" for name, value in self.options.items())
+        return f"Sensor({self.id}, {self.vendor} {self.model}, frames: {', '.join(self.frames) or 'none yet'}{options})"
+
+    def __reduce__(self) -> tuple[Callable[..., Sensor], tuple[str, dict[str, Any]]]:
+        return _rebuild, (self.id, dict(self.options))
+
+
+def _rebuild(sensor_id: str, options: Mapping[str, Any]) -> Sensor:
+    return _installed().rebuild(sensor_id, options)
+
+
+def _freeze(value: object, *names: str) -> None:
+    for name in names:
+        object.__setattr__(value, name, MappingProxyType(dict(getattr(value, name))))
+
+
+def _check_sensor(sensor: Sensor) -> None:
+    if not _ID.fullmatch(sensor.id):
+        raise SpecError("an id is vendor-model in lower case with hyphens", path="id", sensor=sensor.id)
+    if sensor.status not in STATUSES:
+        raise SpecError(f"status is one of {', '.join(STATUSES)}, not {sensor.status!r}", path="status", sensor=sensor.id)
+    if not API - 1 <= sensor.api <= API:
+        raise SpecError(f"written for interface {sensor.api}; this engine reads {API - 1} and {API}", path="api", sensor=sensor.id)
+    for name, frame in sensor.frames.items():
+        _known(sensor, f"frames.{name}.after", [frame.after], sensor.frames)
+    for name, command in sensor.commands.items():
+        _known(sensor, f"commands.{name}", [command.frame, command.reply], sensor.frames)
+        _known(sensor, f"commands.{name}.link", [command.link], sensor.links)
+    _known(sensor, "state", sensor.state, sensor.frames)
+    _known(sensor, "on_open, on_close", [*sensor.on_open, *sensor.on_close], sensor.commands)
+    if sensor.points is None and any(frame.data and frame.points is None for frame in sensor.frames.values()):
+        raise SpecError("a data frame without a points function", path="points", sensor=sensor.id)
+
+
+def _known(sensor: Sensor, path: str, names: Iterable[str | None], table: Mapping[str, Any]) -> None:
+    for name in names:
+        if name is not None and name not in table and sensor.frames:
+            raise SpecError(f"{name!r} is not among {', '.join(table) or 'none'}", path=path, sensor=sensor.id)
+
+
+def replaced(value: Any, **changes: Any) -> Any:
+    """A copy of a frozen dataclass with changes, `init=False` fields made anew."""
+    given = {f.name: getattr(value, f.name) for f in fields(value) if f.init}
+    return type(value)(**{**given, **changes})

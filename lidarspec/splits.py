@@ -1,0 +1,84 @@
+"""Where a scan ends, what the clock is and how packets are counted: declared rules, carried out by the engine."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+#: a field path, several that add up, or a function of the frame's `Fields` (returning a column or several).
+Source = str | tuple[str, ...] | Callable[[Any], Any]
+
+
+@dataclass(frozen=True)
+class OnWrap:
+    """Cut where a circular column passes `at`.
+
+    Args:
+        name: a field path of an angle ("blocks.azimuth": cut between the rows of that array) or a point column
+            ("azimuth": cut between points).
+        at: the angle, in the unit of the field; radians for a point column.
+    """
+
+    name: str
+    at: float = 0.0
+
+
+@dataclass(frozen=True)
+class OnFlag:
+    """Cut before every packet (or row of an array) in which the field `name` is not 0."""
+
+    name: str
+
+
+@dataclass(frozen=True)
+class OnChange:
+    """Cut before every packet (or row) in which the field `name` differs from the one before."""
+
+    name: str
+
+
+@dataclass(frozen=True)
+class OnRewind:
+    """Cut before every packet in which the field `name` is lower than in the one before."""
+
+    name: str
+
+
+@dataclass(frozen=True)
+class Every:
+    """Cut every so many seconds of the packets' time, for sensors without a physical period."""
+
+    seconds: float
+
+
+Split = OnWrap | OnFlag | OnChange | OnRewind | Every
+
+
+@dataclass(frozen=True)
+class Clock:
+    """The sensor's own clock.
+
+    Args:
+        source: the field, the fields that add up (seconds and microseconds), or a function of `Fields` that returns
+            a column, or several that add up, in seconds. Terms are summed as integer nanoseconds.
+        wraps_at: seconds after which it starts again at 0; None if it does not.
+    """
+
+    source: Source
+    wraps_at: float | None = None
+
+
+@dataclass(frozen=True)
+class Sequence:
+    """A counter of packets; a jump is a loss.
+
+    Args:
+        field: path of the counter.
+        first, last: its lowest and highest value; `last` may be a function of `Fields`, and is the field's largest
+            value where it is left out.
+    """
+
+    field: str
+    first: int = 0
+    last: int | Callable[[Any], Any] | None = None

@@ -1,0 +1,1 @@
+"""CSPC lidars."""

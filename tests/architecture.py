@@ -1,0 +1,198 @@
+"""The plan of the house: which module stands on which floor, and the rules that hold it, as functions from source to complaints.
+
+Nothing is imported to be judged; the rules read syntax trees.
+"""
+
+from __future__ import annotations
+
+import ast
+import re
+import sys
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from graphlib import CycleError, TopologicalSorter
+from pathlib import Path
+
+FLOORS = (
+    "errors checksums angles fields units bits construction",
+    "spec hookspecs geometry links rules splits",
+    "layout framing plan plugins schema walk",
+    "decoder packets points columns clouds streams",
+    "session scans simulator explain engine wiretable",
+    "device transports recordings pcap _pcap_records _ip sources",
+    "testing formats export view demo",
+    "cli",
+    "__main__",
+)
+FLOOR_OF = {name: floor for floor, names in enumerate(FLOORS) for name in names.split()}
+IO_FLOOR = FLOOR_OF["transports"]
+TOP = len(FLOORS) - 1
+
+IO = {"asyncio", "logging", "serial", "socket", "threading", "time"}
+CONSTRUCT = {"bits", "construction", "fields", "layout", "rules", "schema", "spec", "walk"}
+CONFINED = {"construct": CONSTRUCT, "pluggy": {"hookspecs", "plugins"}, "serial": {"transports.serial"}}
+
+TYPE_CHECKING = {"TYPE_CHECKING", "typing.TYPE_CHECKING"}
+PLUGINS_MAY_IMPORT = {"construct", "numpy"} | sys.stdlib_module_names
+FILE_LINES = 350
+FUNCTION_LINES = 60
+
+
+@dataclass(frozen=True)
+class Module:
+    """One source file: its dotted name, its text, and whether it is the __init__ of a package."""
+
+    name: str
+    text: str
+    is_package: bool
+
+    @cached_property
+    def tree(self) -> ast.Module:
+        return ast.parse(self.text, self.name)
+
+
+def read(package: Path) -> dict[str, Module]:
+    """Every module of a package, by dotted name."""
+    modules = {}
+    for path in sorted(package.rglob("*.py")):
+        parts = path.relative_to(package.parent).with_suffix("").parts
+        is_package = parts[-1] == "__init__"
+        name = ".".join(parts[:-1] if is_package else parts)
+        modules[name] = Module(name, path.read_text(encoding="utf-8"), is_package)
+    return modules
+
+
+def imports(module: Module, *, typing: bool = False) -> Iterator[tuple[int, str]]:
+    """Line and full dotted name of everything that the module imports, at any depth; of `if TYPE_CHECKING` blocks only with `typing`."""
+    pending: list[ast.AST] = [module.tree]
+    while pending:
+        node = pending.pop()
+        match node:
+            case ast.If() if not typing and ast.unparse(node.test) in TYPE_CHECKING:
+                pending.extend(node.orelse)
+                continue
+            case ast.Import():
+                yield from ((node.lineno, alias.name) for alias in node.names)
+            case ast.ImportFrom():
+                origin = absolute(module, node)
+                yield from ((node.lineno, f"{origin}.{alias.name}") for alias in node.names)
+            case ast.Call(args=[ast.Constant(value=str(name)), *_]) if ast.unparse(node.func).endswith(("import_module", "__import__")):
+                yield node.lineno, name
+        pending.extend(ast.iter_child_nodes(node))
+
+
+def absolute(module: Module, node: ast.ImportFrom) -> str:
+    """The dotted name that `from ...x import` stands for."""
+    if not node.level:
+        return str(node.module)
+    parts = module.name.split(".")
+    base = parts[: len(parts) - node.level + module.is_package]
+    return ".".join([*base, node.module] if node.module else base)
+
+
+def resolve(name: str, modules: Mapping[str, Module]) -> str | None:
+    """The module of the tree that an imported name is in, itself or as an attribute; None for what is outside."""
+    while name not in modules:
+        name, dot, _ = name.rpartition(".")
+        if not dot:
+            return None
+    return name
+
+
+def floor(name: str) -> int | None:
+    """The floor of a module by dotted name; a subpackage stands on one floor as a whole."""
+    _, *inside = name.split(".")
+    return FLOOR_OF.get(inside[0]) if inside else TOP
+
+
+def climbing(modules: Mapping[str, Module]) -> list[str]:
+    """Modules without a floor, imports that go up, and the first circle."""
+    complaints = [f"{name} stands on no floor: add it to FLOORS" for name in modules if floor(name) is None]
+    graph: dict[str, set[str]] = {name: set() for name in modules}
+    for module in modules.values():
+        here = floor(module.name)
+        for line, imported in imports(module):
+            target = resolve(imported, modules)
+            if target is None:
+                continue
+            graph[module.name].add(target)
+            there = floor(target)
+            if here is not None and there is not None and there > here:
+                complaints.append(f"{module.name}:{line} (floor {here}) imports {target} (floor {there})")
+    try:
+        TopologicalSorter(graph).prepare()
+    except CycleError as circle:
+        complaints.append("circle: " + " imports ".join(reversed(circle.args[1])))
+    return complaints
+
+
+def misplaced_imports(modules: Mapping[str, Module]) -> list[str]:
+    """I/O below its floor, and libraries outside the modules that they are confined to."""
+    complaints = []
+    for module in modules.values():
+        here = floor(module.name)
+        inside = module.name.partition(".")[2]
+        for line, imported in imports(module):
+            library = imported.partition(".")[0]
+            if library in IO and here is not None and here < IO_FLOOR:
+                complaints.append(f"{module.name}:{line} imports {library} below floor {IO_FLOOR}")
+            if library in CONFINED and inside not in CONFINED[library]:
+                complaints.append(f"{module.name}:{line} imports {library}, which is for {', '.join(sorted(CONFINED[library]))}")
+    return complaints
+
+
+def private_imports(modules: Mapping[str, Module], public: Collection[str]) -> list[str]:
+    """What a plugin takes that is not a public name of lidarspec, and not numpy, construct or the standard library."""
+    complaints = []
+    for module in modules.values():
+        own = module.name.partition(".")[0]
+        for line, imported in imports(module, typing=True):
+            library, _, rest = imported.partition(".")
+            if library == "lidarspec" and rest and rest not in public:
+                complaints.append(f"{module.name}:{line} imports {imported}, which is not public")
+            elif library not in PLUGINS_MAY_IMPORT | {own, "lidarspec"}:
+                complaints.append(f"{module.name}:{line} imports {library}")
+        complaints += [f"{module.name}:{line} uses {name}, which is not public" for line, name in attributes(module) if name not in public]
+    return complaints
+
+
+def attributes(module: Module) -> Iterator[tuple[int, str]]:
+    """Line and name of every attribute that is read from lidarspec itself."""
+    nodes = list(ast.walk(module.tree))
+    aliases = [alias for node in nodes if isinstance(node, ast.Import) for alias in node.names if alias.name == "lidarspec"]
+    bound = {alias.asname or alias.name for alias in aliases}
+    for node in nodes:
+        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id in bound:
+            yield node.lineno, node.attr
+
+
+def oversized(modules: Mapping[str, Module]) -> list[str]:
+    """Files and functions that cannot be read in one sitting."""
+    complaints = []
+    for module in modules.values():
+        lines = len(module.text.splitlines())
+        if lines > FILE_LINES:
+            complaints.append(f"{module.name} has {lines} lines")
+        for node in ast.walk(module.tree):
+            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef) and node.end_lineno is not None:
+                lines = node.end_lineno - node.lineno + 1
+                if lines > FUNCTION_LINES:
+                    complaints.append(f"{module.name}:{node.lineno} {node.name} has {lines} lines")
+    return complaints
+
+
+def word(name: str) -> re.Pattern[str]:
+    """Matches a vendor, model or id as a word, however it is joined; one of one or two characters only in its own case."""
+    parts = [re.escape(part) for part in re.split(r"[\W_]+", name) if part]
+    return re.compile(r"(?<![^\W_])" + r"[\W_]?".join(parts) + r"(?![^\W_])", re.IGNORECASE if len(name) > 2 else 0)
+
+
+def named_sensors(modules: Mapping[str, Module], names: Collection[str]) -> list[str]:
+    """Mentions of a sensor, by its id, vendor or model."""
+    complaints = []
+    for module in modules.values():
+        for name in names:
+            if found := word(name).search(module.text):
+                complaints.append(f"{module.name}:{module.text.count(chr(10), 0, found.start()) + 1} names {name}")
+    return complaints
