@@ -226,7 +226,7 @@ class _Partial:
         before, after = self.starts[index - 1 : index], self.starts[index : index + 1]
         if any(earlier + len(self.parts[earlier]) > start for earlier in before) or any(later < stop for later in after):
             return False
-        if more and self.total is not None and stop >= self.total:
+        if more and self.total is not None and stop > self.total:
             return False
         if not more and (after or self.total is not None):
             return False

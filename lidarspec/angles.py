@@ -60,7 +60,7 @@ def last(a: Array, where: Array | None = None) -> Array:
     """
     if hasattr(a, "latest"):
         return a.latest(where)
-    if hasattr(where, "latest"):
+    if where is not None and hasattr(where, "latest"):
         return (where * 0 + a).latest(where)
     values = np.asarray(a, np.float64)
     known = ~np.isnan(values) if where is None else np.broadcast_to(where, values.shape)

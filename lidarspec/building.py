@@ -55,9 +55,8 @@ class _Values:
         self._table, self._place, self._units = table, place, units
         self._known = set(table.fields) | {path.rpartition(".")[0] for path in table.fields} | set(table.arrays)
         for path in list(self._known):
-            while "." in path:
-                path = path.rpartition(".")[0]
-                self._known.add(path)
+            parts = path.split(".")
+            self._known |= {".".join(parts[:depth]) for depth in range(1, len(parts))}
 
     def checked(self, value: Any, path: str, shown: str = "") -> Any:
         info = self._table.fields.get(path)
@@ -165,7 +164,7 @@ def _scope(given: Any, path: str) -> Any:
     return given if isinstance(given, dict) else None
 
 
-class _Asked(Exception):  # noqa: N818
+class _Asked(Exception):
     """Carries the path of the first field that an expression asks for."""
 
 

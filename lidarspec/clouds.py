@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 import numpy as np
@@ -60,7 +60,7 @@ class PointCloud:
     return_index: NDArray[np.uint8] | None = None
     stamp_ns: int = 0
     shape: tuple[int, int] | None = None
-    nominal: np.bool_ = np.bool_(False)
+    nominal: np.bool_ = field(default_factory=np.bool_)
 
     def __len__(self) -> int:
         return len(self.x)

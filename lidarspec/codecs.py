@@ -7,6 +7,7 @@ computable layout and as the reference.
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import io
 import traceback
@@ -90,10 +91,10 @@ class CompiledCodec:
             if not whole.all():
                 cut = which[~whole]
                 status[cut] = [_partial(buffer[offsets[i] :], layout) for i in cut]
-                which = which[whole]
+            there = which[whole]
             step = max(BLOCK // max(layout.size, 1), 1)
-            for start in range(0, len(which), step):
-                part = which[start : start + step]
+            for start in range(0, len(there), step):
+                part = there[start : start + step]
                 status[part] = self._judge(_rows(buffer, offsets[part], layout.size), layout, errors)
         return Survey(status, sizes, tuple(errors))
 
@@ -212,10 +213,8 @@ def _prefix(frame: Frame) -> dict[int, tuple[int, int]]:
         raise TooLong
 
     state = Walk(stop, frame.max_length)
-    try:
+    with contextlib.suppress(NotCompilable, TooLong, SpecError):
         state.run(frame.prepared)
-    except (NotCompilable, TooLong, SpecError):
-        pass
     return dict(state.constants)
 
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from lidarspec.codecs import VALID, Codec, codec
 from lidarspec.errors import UsageError
-from lidarspec.framing import COUNTED, SHORT, Framing, Mode
+from lidarspec.framing import COUNTED, Framing, Mode
 from lidarspec.spec import Sensor
 
 #: bytes of a stream looked at in one go.
@@ -119,7 +119,7 @@ class Decoder:
             data: the next bytes of the stream, or one datagram.
             at: their arrival time in ns, if known.
         """
-        view = memoryview(np.ascontiguousarray(data) if isinstance(data, np.ndarray) else data).cast("B")
+        view = np.ascontiguousarray(data).data.cast("B") if isinstance(data, np.ndarray) else memoryview(data).cast("B")
         self.stats.bytes_in += len(view)
         if not self.stream:
             return self._datagram(view.tobytes(), at)
@@ -196,7 +196,7 @@ def _starts(buffer: NDArray[np.uint8], engine: Codec) -> bool:
 def _first_mode(sensor: Sensor) -> str | None:
     """`configure(answer=...)` starts as if the frame that the answer comes after had been seen."""
     answer = sensor.options.get("answer")
-    return sensor.frames[answer].after if answer in sensor.frames else None
+    return sensor.frames[answer].after if isinstance(answer, str) and answer in sensor.frames else None
 
 
 def backend(name: str) -> str:

@@ -7,9 +7,10 @@ from typing import Any
 
 from lidarspec import examples, parsing
 from lidarspec.building import build, limits
-from lidarspec.codecs import codec
 from lidarspec.clouds import axis_matrix
-from lidarspec.decoder import Decoder, Found, backend as checked_backend, feed_all, is_stream
+from lidarspec.codecs import codec
+from lidarspec.decoder import Decoder, Found, feed_all, is_stream
+from lidarspec.decoder import backend as checked_backend
 from lidarspec.errors import MissingField, OutOfRange, SpecError, UnknownCommand, UnknownField, UnknownOption, UsageError
 from lidarspec.packets import Packets
 from lidarspec.plugins import registry

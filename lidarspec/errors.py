@@ -92,7 +92,7 @@ class UnknownFrame(UnknownName):
     what = "frame"
 
 
-class UnknownField(UnknownName, AttributeError):
+class UnknownField(UnknownName, AttributeError):  # type: ignore[misc]  # AttributeError.name is the same thing
     """The frame has no field of this path."""
 
     what = "field"

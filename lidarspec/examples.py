@@ -16,8 +16,7 @@ from lidarspec.codecs import CompiledCodec, codec, plausibility
 from lidarspec.construction import clean
 from lidarspec.errors import SpecError, UnknownFrame
 from lidarspec.layout import Layout
-from lidarspec.schema import peeled
-from lidarspec.schema import FieldInfo
+from lidarspec.schema import FieldInfo, peeled
 from lidarspec.spec import Sensor
 from lidarspec.tables import Group, Rows
 

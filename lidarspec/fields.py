@@ -13,7 +13,7 @@ from construct import Construct, Container, Subconstruct
 
 from lidarspec.bits import bytes_of
 from lidarspec.checksums import Checksum
-from lidarspec.construction import MarkedStruct, Mismatch, bit_width, member, unwrap, verifying
+from lidarspec.construction import Mismatch, bit_width, member, unwrap, verifying
 
 
 class Scaled(Subconstruct):  # type: ignore[misc]

@@ -7,6 +7,7 @@ end a `Layout`, or the reason why there is none. Candidates are sorted through i
 
 from __future__ import annotations
 
+import contextlib
 import random
 import traceback
 from collections.abc import Iterator
@@ -165,10 +166,8 @@ class HeaderTree:
     def _prefix(self) -> dict[int, tuple[int, int]]:
         """The constants whose place depends on no header field."""
         state = Walk(_stop, self._limit)
-        try:
+        with contextlib.suppress(_Stop, TooLong):
             state.run(self._con)
-        except (_Stop, TooLong):
-            pass
         return dict(state.constants)
 
 

@@ -95,7 +95,7 @@ class Packets:
 
     def points(self) -> PointCloud:
         """The points of all packets in stream order; see `PointCloud`."""
-        return _points(self)
+        return _evaluators[0](self)
 
     def take(self, which: Any) -> Packets:
         """Some of the packets: by indices, a mask or a slice."""
@@ -118,13 +118,12 @@ class Packets:
         return Batch(self.table, self.breaks, self.state, self.sensor.state, dict(carry or {}))
 
 
-_points: Callable[[Packets], PointCloud]
+_evaluators: list[Callable[[Packets], PointCloud]] = []
 
 
 def install_points(function: Callable[[Packets], PointCloud]) -> None:
-    """Make `function` what ``Packets.points()`` calls; done by the module above that evaluates `points`."""
-    global _points
-    _points = function
+    """Make `function` what ``Packets.points()`` calls; done by the module that evaluates `points`."""
+    _evaluators[:] = [function]
 
 
 def joined(parts: Sequence[Packets]) -> Packets:

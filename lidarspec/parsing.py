@@ -36,9 +36,9 @@ def parse_typed(sensor: Sensor, data: bytes, *, frame: str | None = None, verify
         except WireError as fault:
             faults.append(fault)
     if not verify:
-        for fault in sorted(faults, key=_progress, reverse=True):
+        for likely in sorted(faults, key=_progress, reverse=True):
             try:
-                return fault.frame, _parse_as(sensor, fault.frame, data, verify=False)
+                return likely.frame, _parse_as(sensor, likely.frame, data, verify=False)
             except WireError:
                 continue
     raise _likeliest(sensor, data, faults)

@@ -230,7 +230,8 @@ def _module(file: Path) -> ModuleType:
     if not file.is_file():
         raise SourceError(f"{file}: no such file")
     module_spec = importlib.util.spec_from_file_location(f"lidarspec_file_{file.stem}", file)
-    assert module_spec is not None and module_spec.loader is not None
+    assert module_spec is not None
+    assert module_spec.loader is not None
     module = importlib.util.module_from_spec(module_spec)
     try:
         module_spec.loader.exec_module(module)

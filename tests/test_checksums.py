@@ -251,7 +251,7 @@ def test_algorithms_are_equal_and_hashed_by_their_parameters() -> None:
 @pytest.mark.parametrize("algorithm", ALGORITHMS, ids=name_of)
 def test_takes_every_kind_of_bytes_and_pickles(algorithm: Checksum) -> None:
     for data in (random_rows(1, length).tobytes() for length in (46, 47, 3000)):
-        assert algorithm(bytearray(data)) == algorithm(memoryview(b"x" + data)[1:]) == algorithm(data)
+        assert algorithm(bytearray(data)) == algorithm(memoryview(data[::-1])[::-1]) == algorithm(data)
         copy = pickle.loads(pickle.dumps(algorithm))
         assert (copy, hash(copy), copy(data)) == (algorithm, hash(algorithm), algorithm(data))
 

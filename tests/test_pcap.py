@@ -65,8 +65,23 @@ def test_sections_of_both_orders_forget_the_interfaces_before() -> None:
         (made.option(9, b"\x09") + made.option(14, struct.pack("<q", -5)), -1_999_999_993),
         (made.option(9, b"\x09\x00") + made.option(14, b"\x05"), 3_000_000_007_000),
         (struct.pack("<HHq", 14, 0xFFFF, 5), 3_000_000_007_000),
+        (struct.pack("<HHI", 14, 8, 5), 3_000_000_007_000),
+        (struct.pack("<HH", 9, 1), 3_000_000_007_000),
     ],
-    ids=["none", "ns", "s", "2^-20", "2^-127", "after a name", "offset", "offset back", "wrong sizes", "cut"],
+    ids=[
+        "none",
+        "ns",
+        "s",
+        "2^-20",
+        "2^-127",
+        "after a name",
+        "offset",
+        "offset back",
+        "wrong sizes",
+        "size beyond the block",
+        "offset cut",
+        "resolution cut",
+    ],
 )
 def test_time_options(options: bytes, expected: int) -> None:
     capture = made.section() + made.interface(options=options) + made.packet(FRAME, ticks=3_000_000_007)

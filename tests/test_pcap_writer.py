@@ -82,7 +82,8 @@ def test_full_disk_leaves_whole_records_and_one_clear_error(tmp_path: Path, buff
     path = tmp_path / "full.pcap"
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     with open(path, "wb", buffering) as file:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (24 + 2 * 1058 + 500, before[1]))
+        file.write(b"before")
+        resource.setrlimit(resource.RLIMIT_FSIZE, (6 + 24 + 2 * 1058 + 500, before[1]))
         try:
             writer = PcapWriter(file)
             with pytest.raises(SourceError, match="cannot write"):
@@ -90,9 +91,9 @@ def test_full_disk_leaves_whole_records_and_one_clear_error(tmp_path: Path, buff
         finally:
             resource.setrlimit(resource.RLIMIT_FSIZE, before)
         if buffering < 1058:
-            assert path.stat().st_size == 24 + 2 * 1058
+            assert path.stat().st_size == 6 + 24 + 2 * 1058
             writer.write(DATAGRAM)
-    datagrams, stats = made.read(path.read_bytes())
+    datagrams, stats = made.read(path.read_bytes()[6:])
     assert datagrams == ([BIG, BIG, DATAGRAM] if buffering < 1058 else [BIG] * len(datagrams))
     assert stats == CaptureStats(packets=len(datagrams), datagrams=len(datagrams))
 

@@ -1,0 +1,136 @@
+"""A sensor on a source: packets and scans as they come."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from types import TracebackType
+
+from lidarspec.decoder import Counters, Decoder, Found
+from lidarspec.detect import detected
+from lidarspec.errors import UsageError
+from lidarspec.files import Chunk, Transport
+from lidarspec.packets import Packets
+from lidarspec.plugins import sensor as named_sensor
+from lidarspec.scans import Scan, ScanStream
+from lidarspec.sources import transport
+from lidarspec.spec import Sensor
+from lidarspec.streams import PacketStream
+
+#: bytes or datagrams decoded together when a file is read.
+BATCH_BYTES, BATCH_CHUNKS = 1 << 18, 1024
+
+
+class Device:
+    """A sensor read from a source; a context manager.
+
+    Attributes:
+        sensor: the sensor, given or detected.
+        stats: the counters of everything read so far.
+        warnings: what is to be said about the source, such as a file that is cut off.
+    """
+
+    def __init__(self, source: str | Path, sensor: Sensor, *, backend: str = "auto") -> None:
+        self.sensor, self._source = sensor, source
+        self._transport: Transport = transport(source)
+        self._decoder: Decoder = sensor.decoder(stream=not self._transport.datagrams, backend=backend)
+        self._senders: dict[str, str] = {}
+
+    @property
+    def stats(self) -> Counters:
+        """The counters."""
+        self._decoder.stats.foreign = getattr(self._transport, "foreign", 0)
+        return self._decoder.stats
+
+    @property
+    def warnings(self) -> list[str]:
+        """What is to be said about the source."""
+        return list(getattr(self._transport, "warnings", []))
+
+    def frames(self) -> Iterator[list[Found]]:
+        """Every incoming frame, in batches."""
+        size = number = 0
+        found: list[Found] = []
+        for chunk in self._transport.chunks():
+            new = self._decoder.feed(chunk.data, chunk.at)
+            self._check_sender(chunk, new)
+            found += new
+            size, number = size + len(chunk.data), number + 1
+            if size >= BATCH_BYTES or number >= BATCH_CHUNKS:
+                yield found
+                found, size, number = [], 0, 0
+        yield found + self._decoder.finish()
+
+    def packets(self, frame: str | None = None) -> Iterator[Packets]:
+        """The packets of the data frame, or of another type, in batches."""
+        name = frame or self.sensor.data_frame
+        stream = PacketStream(self.sensor, name, self._decoder.stats, interpreted=self._decoder.interpreted, state=self._first_state())
+        for found in self.frames():
+            packets = stream.add(found)
+            if len(packets):
+                yield packets
+
+    def scans(self) -> Iterator[Scan]:
+        """Every scan; the first and last piece are marked ``complete=False``."""
+        stream = ScanStream(self.sensor)
+        for packets in self.packets():
+            yield from stream.add(packets)
+        yield from stream.finish()
+
+    def close(self) -> None:
+        """Give the source back."""
+        self._transport.close()
+
+    def __enter__(self) -> Device:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None) -> None:
+        self.close()
+
+    def __repr__(self) -> str:
+        return f"Device({self.sensor.id} on {self._source}: {self.stats})"
+
+    def _check_sender(self, chunk: Chunk, found: list[Found]) -> None:
+        """Frames of several senders must not be mixed into one cloud."""
+        if chunk.sender is None:
+            return
+        for item in found:
+            first = self._senders.setdefault(item.frame, chunk.sender[0])
+            if first != chunk.sender[0]:
+                senders = f"{first} and {chunk.sender[0]}"
+                raise UsageError(f"{self._source}: {senders} both send {item.frame} frames; choose one with ?src={first}")
+
+    def _first_state(self) -> list[Found]:
+        """The first frame of each type that `points` takes its state from: a file is read as if it stood at the start."""
+        wanted = set(self.sensor.state)
+        if not wanted or not Path(str(self._source).partition("?")[0]).is_file():
+            return []
+        first: dict[str, Found] = {}
+        source = transport(self._source)
+        decoder = self.sensor.decoder(stream=not source.datagrams)
+        try:
+            for chunk in source.chunks():
+                for item in decoder.feed(chunk.data, chunk.at):
+                    if item.frame in wanted:
+                        first.setdefault(item.frame, item)
+                if len(first) == len(wanted):
+                    break
+        finally:
+            source.close()
+        return list(first.values())
+
+
+def open(source: str | Path, sensor: str | Sensor | None = None, *, backend: str = "auto") -> Device:
+    """A sensor on any SOURCE.
+
+    Args:
+        source: see DESIGN 3.2; a file, or "-" for standard input.
+        sensor: an id, a path to a sensor's module, or a Sensor; found out from a file where left out.
+
+    Raises:
+        SourceError: where the source cannot be opened.
+        UsageError: where several sensors fit, or none, and `sensor` was left out.
+    """
+    if sensor is None:
+        sensor = detected(source)
+    return Device(source, sensor if isinstance(sensor, Sensor) else named_sensor(sensor), backend=backend)
