@@ -216,10 +216,10 @@ def _asked_for(expression: Any) -> tuple[str, ...] | None:
     try:
         found = expression(_Recorder())
     except _Asked as asked:
-        return asked.args[0] or None  # type: ignore[no-any-return]
+        return tuple(asked.args[0]) or None
     except Exception:
         return None
-    return object.__getattribute__(found, "_path") if isinstance(found, _Recorder) else None
+    return tuple(object.__getattribute__(found, "_path")) if isinstance(found, _Recorder) else None
 
 
 def _solved(expression: Any, scope: Container, holder: Container, field: str, length: int, info: FieldInfo | None, axis: str) -> int:
@@ -233,7 +233,7 @@ def _solved(expression: Any, scope: Container, holder: Container, field: str, le
         except Exception:
             return False
 
-    for value in (length, *range(min(top, 65535) + 1)):
+    for value in (length, *range(int(min(top, 65535)) + 1)):
         if value <= top and gives(value):
-            return value
+            return int(value)
     raise UsageError(f"{axis}: no value of {field} gives {length} elements")

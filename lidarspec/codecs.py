@@ -49,7 +49,10 @@ class Codec(Protocol):
 
     frame: Frame
     schema: Schema
-    prefix: Mapping[int, tuple[int, int]]
+
+    @property
+    def prefix(self) -> Mapping[int, tuple[int, int]]:
+        """The constants at the start: offset -> (mask, value)."""
 
     def survey(self, buffer: NDArray[np.uint8], offsets: NDArray[np.intp]) -> Survey:
         """Whether the candidates at these offsets are frames; those whose prefix does not match must be left out."""

@@ -99,7 +99,7 @@ class Column(NDArrayOperatorsMixin):
         """`function` of arrays, lined up by axes; columns on the left, arrays by their last axes as in NumPy."""
         arrays, axes, ready = aligned(values, self.batch)
         found = np.asarray(function(*arrays))
-        names = (*axes, *(f"<{found.ndim - 1 - len(axes)}>" for _ in range(found.ndim - 1 - len(axes))))
+        names = (*axes, *(f"<{index}>" for index in range(len(axes), found.ndim - 1)))
         return Column(found, names, self.batch, ready=ready)
 
     def on(self, *axes: str) -> Column:
@@ -238,7 +238,7 @@ def _tail(values: NDArray[np.float64], segments: NDArray[np.intp], end: int, siz
     if end == 0 or size == 0:
         return np.empty(0)
     kept = segments[start:end] == segments[end - 1]
-    return values[start:end][kept]
+    return np.asarray(values[start:end][kept])
 
 
 def field_column(info: FieldInfo, table: Table, depth: int, batch: Batch, which: NDArray[np.intp] | None = None) -> Column:

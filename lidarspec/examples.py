@@ -52,12 +52,12 @@ def _headed(rows: NDArray[np.uint8], layout: Layout, chosen: dict[str, int]) -> 
 def _plausible(sensor: Sensor, frame: str, layout: Layout, rows: NDArray[np.uint8]) -> bytes | None:
     table = Rows(codec(sensor.frames[frame]).schema, [Group(layout, np.arange(len(rows)), rows)])
     if sensor.frames[frame].plausible is None:
-        return rows[0].tobytes()
+        return bytes(rows[0].tobytes())
     errors: list[str] = []
     good = np.flatnonzero(plausibility(sensor.frames[frame], table, errors) == 0)
     if errors:
         raise SpecError(errors[0].strip().splitlines()[-1], path=f"{frame}.plausible", sensor=sensor.id)
-    return rows[good[0]].tobytes() if len(good) else None
+    return bytes(rows[good[0]].tobytes()) if len(good) else None
 
 
 def _swept(sensor: Sensor, frame: str, engine: CompiledCodec, source: random.Random) -> bytes:

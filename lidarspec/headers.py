@@ -76,7 +76,7 @@ class HeaderTree:
             self._root, self._size = _Node(), 0
         groups: list[Group] = []
         short: list[NDArray[np.intp]] = []
-        stack = [(self._root, np.arange(len(offsets)))]
+        stack = [(self._root, np.arange(len(offsets)))] if len(offsets) else []
         while stack:
             node, which = stack.pop()
             if node.result is None and node.leaf is None:

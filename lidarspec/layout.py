@@ -43,7 +43,7 @@ class Leaf:
     def load(self, rows: Bytes2D) -> NDArray[Any]:
         """The raw values of frames given as rows of bytes (C-contiguous), shape (n, *shape), native byte order."""
         if self.wire is not None:
-            return self._view(rows, self.wire, 0).astype(self.wire.newbyteorder("="))
+            return np.asarray(self._view(rows, self.wire, 0).astype(self.wire.newbyteorder("=")))
         assert self.info.dtype is not None
         if not self._packed:
             return self._bits(rows, self.elements[0])
@@ -79,12 +79,11 @@ class Leaf:
         wide = np.dtype(f"u{self.info.dtype.itemsize}")
         total = np.zeros((len(rows), *self.shape[: len(self.strides)]), wide)
         for part in element.segments:
-            total |= ((self._view(rows, np.dtype("u1"), part.byte) & np.uint8(part.mask)) >> part.low).astype(wide) << wide.type(
-                part.target
-            )
+            bits = (self._view(rows, np.dtype("u1"), part.byte) & np.uint8(part.mask)) >> part.low
+            total |= bits.astype(wide) << wide.type(part.target)
         if element.signed:
             sign = wide.type(1 << (element.width - 1))
-            return ((total ^ sign) - sign).view(self.info.dtype)
+            return np.asarray(((total ^ sign) - sign).view(self.info.dtype))
         return total.astype(self.info.dtype)
 
     def at(self, offset: int) -> Leaf:
@@ -135,7 +134,7 @@ class Seal:
     def intact(self, rows: Bytes2D) -> NDArray[np.bool_]:
         """Which frames carry the right value, or one that means "not filled"."""
         stored = self.stored(rows)
-        return (stored == self.computed(rows)) | np.isin(stored, np.array(self.absent, np.uint64))
+        return np.asarray(stored == self.computed(rows)) | np.isin(stored, np.array(self.absent, np.uint64))
 
 
 @dataclass(frozen=True, eq=False)

@@ -171,7 +171,7 @@ def _with_points(frame: Frame, points: Any) -> Frame:
 
 
 def _is_hook(function: Any) -> bool:
-    return getattr(function, f"{hookspecs.NAMESPACE}_impl", None) is not None
+    return inspect.isroutine(function) and getattr(function, f"{hookspecs.NAMESPACE}_impl", None) is not None
 
 
 def _check_hooks(plugin: Any, name: str) -> None:

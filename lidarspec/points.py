@@ -82,10 +82,11 @@ def evaluate(packets: Packets, carry: Carry | None = None, *, final: bool = True
 
 def _columns(result: Points, batch: Batch) -> dict[str, Column]:
     """The parts of the result as columns; numbers and arrays get the batch's axes."""
-    anchor = Column(np.zeros((1,) * (1 + batch.table.schema.depth())), (None,) * batch.table.schema.depth(), batch)
     parts = {f.name: getattr(result, f.name) for f in fields(result)}
     if isinstance(result, Polar):
         parts |= dict(zip(("ox", "oy", "oz"), parts.pop("origin"), strict=True))
+    depth = max([batch.table.schema.depth(), *(len(value.axes) for value in parts.values() if isinstance(value, Column))])
+    anchor = Column(np.zeros((1,) * (1 + depth)), (None,) * depth, batch)
     return {name: value if isinstance(value, Column) else _anchored(value, anchor) for name, value in parts.items() if value is not None}
 
 

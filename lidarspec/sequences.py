@@ -17,6 +17,8 @@ from lidarspec.splits import Sequence
 
 #: how far back a packet may come and still be a late one; further back the sensor has started again.
 LATE = 64
+#: the same where the packet would stand before the first one of all, which is more likely a turn that was missed.
+EARLY = 10
 #: counters with at least so many values start again at 0 only when the sensor does.
 LONG = 1 << 16
 
@@ -64,7 +66,8 @@ class SequenceTracker:
             return self._index, restart
         ahead = (number - self._number) % period
         behind = period - ahead
-        if ahead == 0 or behind <= min(LATE, period // 2):
+        reach = LATE if self._index - behind >= self._first else EARLY
+        if ahead == 0 or behind <= min(reach, period // 2):
             return self._back(0 if ahead == 0 else behind), False
         if period >= LONG and ahead > period // 2:
             self._begin(number, period)

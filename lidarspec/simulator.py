@@ -7,6 +7,7 @@ Where direction depends on range this is repeated; a beam that finds no fixed po
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -65,7 +66,7 @@ def _swept(sensor: Sensor, engine: CompiledCodec, sweeps: Sequence[Mapping[str, 
         known = layouts.get(tuple(_raw(engine, values, path) for path in asked)) if layouts else None
         if known is None:
             asked = []
-            known = walk(engine.frame.prepared, lambda leaf, v=values: _asked(engine, v, leaf, asked), engine.frame.max_length).layout()
+            known = walk(engine.frame.prepared, functools.partial(_asked, engine, values, asked), engine.frame.max_length).layout()
             layouts[tuple(_raw(engine, values, path) for path in asked)] = known
         groups.setdefault(id(known), (known, []))[1].append(index)
     made = []
@@ -81,7 +82,7 @@ def _swept(sensor: Sensor, engine: CompiledCodec, sweeps: Sequence[Mapping[str, 
     return Rows(engine.schema, made)
 
 
-def _asked(engine: CompiledCodec, values: Mapping[str, Any], leaf: Leaf, asked: list[str]) -> int:
+def _asked(engine: CompiledCodec, values: Mapping[str, Any], asked: list[str], leaf: Leaf) -> int:
     if leaf.info.path not in asked:
         asked.append(leaf.info.path)
     return _raw(engine, values, leaf.info.path)
@@ -152,7 +153,9 @@ class _Measurement:
                     found.append(_Target(path, inner))
             self._store(path, np.array(0))
         if not found:
-            raise SpecError("no field in metres makes the range of a point: the sensor has to give `encode`", path="points", sensor=self._sensor.id)
+            raise SpecError(
+                "no field in metres makes the range of a point: the sensor has to give `encode`", path="points", sensor=self._sensor.id
+            )
         return found
 
     def _evaluate(self) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
@@ -193,7 +196,8 @@ class _Measurement:
 
 
 def _part(array: NDArray[Any], inner: tuple[int, ...]) -> NDArray[Any]:
-    return array[(..., *inner)] if inner else array
+    corner: Any = (..., *inner)
+    return np.asarray(array[corner])
 
 
 def _raw_ranges(sensor: Sensor, leaf: Leaf, metres: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -26,7 +26,9 @@ def transport(source: str | Path) -> Transport:
     if scheme is not None and not Path(text).exists():
         found: Transport | None = registry().call("lidarspec_source", url=text)
         if found is None:
-            raise UsageError(f"no transport is installed for {scheme[1]!r} sources; files and '-' (standard input) are read by lidarspec itself")
+            raise UsageError(
+                f"no transport is installed for {scheme[1]!r} sources; files and '-' (standard input) are read by lidarspec itself"
+            )
         return found
     path, mark, query = text.rpartition("?")
     if mark and not Path(text).exists():

@@ -10,7 +10,7 @@ import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, fields
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Literal, Protocol
+from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeVar
 
 from construct import Construct
 
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 #: version of the plugin interface; the engine reads this one and the one before.
 API = 1
 STATUSES = ("manual", "vectors", "capture", "hardware")
+Value = TypeVar("Value", "Frame", "Sensor")
 _ID = re.compile(r"[a-z0-9]+(-[a-z0-9]+)+")
 
 
@@ -306,7 +307,7 @@ def _known(sensor: Sensor, path: str, names: Iterable[str | None], table: Mappin
             raise SpecError(f"{name!r} is not among {', '.join(table) or 'none'}", path=path, sensor=sensor.id)
 
 
-def replaced(value: Any, **changes: Any) -> Any:
-    """A copy of a frozen dataclass with changes, `init=False` fields made anew."""
+def replaced(value: Value, **changes: Any) -> Value:
+    """A copy of a frame or sensor with changes; what is derived from its parts is made anew."""
     given = {f.name: getattr(value, f.name) for f in fields(value) if f.init}
     return type(value)(**{**given, **changes})

@@ -71,7 +71,8 @@ class Rows:
         for group in self.groups:
             leaf = group.layout.leaves.get(path)
             if leaf is not None:
-                column[(group.where, *(slice(0, length) for length in leaf.shape))] = leaf.load(group.rows)
+                corner: Any = (group.where, *(slice(0, length) for length in leaf.shape))
+                column[corner] = leaf.load(group.rows)
         return column
 
     def present(self, path: str) -> NDArray[np.bool_] | None:
@@ -99,7 +100,7 @@ class Rows:
         for group in self.groups:
             spot = np.flatnonzero(group.where == index)
             if len(spot):
-                return group.rows[spot[0]].tobytes()
+                return bytes(group.rows[spot[0]].tobytes())
         raise IndexError(index)
 
     def take(self, which: NDArray[np.intp]) -> Rows:
@@ -162,7 +163,8 @@ class Records:
         for index, value in enumerate(found):
             if value is not None:
                 array = np.asarray(value, dtype)
-                column[(index, *(slice(0, length) for length in array.shape))] = array
+                corner: Any = (index, *(slice(0, length) for length in array.shape))
+                column[corner] = array
         return column
 
     def present(self, path: str) -> NDArray[np.bool_] | None:

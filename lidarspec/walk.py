@@ -170,7 +170,7 @@ def _field(state: Walk, con: Construct, place: _Place) -> None:
     if isinstance(con, FormatField):
         size, wire = con.length, info.dtype
         if wire is not None:
-            wire = wire.newbyteorder({">": ">", "<": "<"}.get(con.fmtstr[0], "="))
+            wire = wire.newbyteorder(con.fmtstr[0] if con.fmtstr[0] in "<>" else "=")
     elif isinstance(con, Bytes):
         size, wire = _count(con.length, place), np.dtype("u1")
         shape, strides = (*shape, size), (*strides, 1)

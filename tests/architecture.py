@@ -16,11 +16,11 @@ from pathlib import Path
 
 FLOORS = (
     "errors checksums angles fields units bits construction",
-    "spec hookspecs geometry links rules splits",
-    "layout framing plan plugins schema walk",
-    "decoder packets points columns clouds streams",
-    "session scans simulator explain engine wiretable",
-    "device transports recordings pcap _pcap_records _ip sources",
+    "spec hookspecs geometry links rules splits files",
+    "schema layout walk headers tables columns codecs framing plan plugins",
+    "decoder packets streams sequences clouds points cuts reorder",
+    "session scans scenes simulator explain parsing building examples engine wiretable",
+    "device detect transports recordings pcap _pcap_records _ip sources",
     "testing formats export view demo",
     "cli",
     "__main__",
@@ -30,7 +30,7 @@ IO_FLOOR = FLOOR_OF["transports"]
 TOP = len(FLOORS) - 1
 
 IO = {"asyncio", "logging", "serial", "socket", "threading", "time"}
-CONSTRUCT = {"bits", "construction", "fields", "layout", "rules", "schema", "spec", "walk"}
+CONSTRUCT = {"bits", "construction", "fields", "rules", "schema", "spec", "walk", "headers", "codecs", "parsing", "building", "examples"}
 CONFINED = {"construct": CONSTRUCT, "pluggy": {"hookspecs", "plugins"}, "serial": {"transports.serial"}}
 
 TYPE_CHECKING = {"TYPE_CHECKING", "typing.TYPE_CHECKING"}

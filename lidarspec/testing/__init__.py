@@ -1,0 +1,27 @@
+"""A test kit for sensors: what the engine promises for every sensor, as a class for pytest.
+
+    from lidarspec.testing import SensorConformance
+
+    class TestMine(SensorConformance):
+        sensor = "acme-x1"        # an id, a Sensor value, or a file such as "./acme.py"
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from lidarspec.testing.conformance import SensorConformance as SensorConformance
+
+__all__ = ["SensorConformance"]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in __all__:
+        raise AttributeError(f"module 'lidarspec.testing' has no attribute {name!r}")
+    import pytest
+
+    pytest.register_assert_rewrite("lidarspec.testing.conformance", "lidarspec.testing.comparisons")
+    from lidarspec.testing.conformance import SensorConformance
+
+    return SensorConformance

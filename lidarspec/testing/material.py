@@ -1,0 +1,113 @@
+"""What the conformance tests are fed: conversations out of a sensor's own examples, their edits, cuts and noise."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Iterator
+from typing import Any
+
+from lidarspec.codecs import codec
+from lidarspec.errors import UsageError
+from lidarspec.schema import FieldInfo
+from lidarspec.spec import Sensor
+
+#: frames up to this length are cut at every byte, longer ones at so many places.
+SHORT = 300
+
+
+def incoming(sensor: Sensor) -> list[str]:
+    """The names of the frame types that the sensor sends."""
+    return [name for name, frame in sensor.frames.items() if frame.direction == "in"]
+
+
+def conversation(sensor: Sensor, *, seed: int = 0, rounds: int = 3) -> list[tuple[str, bytes]]:
+    """Frames of all incoming types as the sensor could send them: (type, bytes), each where it is looked for and believed."""
+    found: list[tuple[str, bytes]] = []
+    for turn in range(rounds):
+        for name in incoming(sensor):
+            frame, first = sensor.frames[name], seed * 1000 + turn * 10
+            if frame.after is not None:
+                found.append((frame.after, sensor.example(frame.after, seed=first)))
+            number = frame.confirm + 2 if frame.data or frame.confirm > 1 else 1
+            found += [(name, sensor.example(name, seed=first + index)) for index in range(number)]
+    return found
+
+
+def stream(sensor: Sensor, *, seed: int = 0, rounds: int = 3) -> bytes:
+    """The bytes of a conversation."""
+    return b"".join(data for _, data in conversation(sensor, seed=seed, rounds=rounds))
+
+
+def delivery(sensor: Sensor, frames: list[tuple[str, bytes]]) -> Any:
+    """Frames as the data link delivers them: datagrams, or one run of bytes."""
+    parts = [data for _, data in frames]
+    return parts if sensor.datagrams else b"".join(parts)
+
+
+def places(length: int, source: random.Random) -> list[int]:
+    """Where to cut so many bytes: everywhere if they are few, else at the ends and at random."""
+    if length <= SHORT:
+        return list(range(length))
+    return sorted({0, 1, 2, 3, length - 2, length - 1, *source.sample(range(length), SHORT // 2)})
+
+
+def pieces(data: bytes, source: random.Random) -> Iterator[bytes]:
+    """The bytes in chunks of random sizes, empty ones among them."""
+    start = 0
+    while start < len(data):
+        size = source.choice((0, 1, 1, 2, 3, 7, 20, 100, 1000))
+        yield data[start : start + size]
+        start += size
+
+
+def mutated(data: bytes, source: random.Random) -> bytes:
+    """The bytes with a few of them changed, dropped, doubled or put in, or cut short."""
+    found = bytearray(data)
+    for _ in range(source.choice((1, 1, 2, 4))):
+        spot = source.randrange(len(found) + 1)
+        kind = source.randrange(5)
+        if kind == 0:
+            found[spot : spot + 1] = source.randbytes(1)
+        elif kind == 1:
+            del found[spot : spot + source.randint(1, 3)]
+        elif kind == 2:
+            found[spot:spot] = source.randbytes(source.randint(1, 3))
+        elif kind == 3:
+            found[spot : spot + 1] = source.choice((b"\x00", b"\xff", b"\x7f", b"\x80"))
+        else:
+            found[spot:spot] = found[max(spot - 4, 0) : spot]
+    return bytes(found)
+
+
+def edited(sensor: Sensor, name: str, data: bytes, source: random.Random) -> tuple[str, int, bytes] | None:
+    """A frame with one field set to a drawn value: (path, value, bytes); None where no frame can carry it."""
+    engine = codec(sensor.frames[name])
+    held = sealed(engine)
+    free = [info for info in engine.schema.fields.values() if info.kind == "int" and info.const is None and info.path not in held]
+    parsed = sensor.parse(data, frame=name)
+    if not free:
+        return None
+    info = source.choice(free)
+    value = drawn(info, source)
+    target = parsed
+    *parents, last = info.path.split(".")
+    for step in (*parents, last):
+        if isinstance(target, list):
+            if not target:
+                return None
+            target = source.choice(target)
+        if not isinstance(target, dict) or target.get(step) is None:
+            return None
+        if step == last and target[step] is not parsed and not isinstance(target[step], dict | list):
+            target[step] = value
+        target = target[step]
+    if isinstance(target, list):
+        while target and isinstance(target[0], list):
+            target = target[0]
+        if not target:
+            return None
+        target[0] = value
+    try:
+        return info.path, value, sensor.build(name, parsed)
+    except UsageError:
+        return None
