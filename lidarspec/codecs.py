@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import io
+import math
 import traceback
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -187,7 +188,7 @@ def plausibility(frame: Frame, table: Table, errors: list[str]) -> NDArray[np.ui
 
 def _all(array: NDArray[Any], answer: Any, batch: Batch) -> NDArray[np.bool_]:
     """Whether a condition holds everywhere in each frame, padding left out."""
-    flat = array.reshape(len(array), -1).astype(np.bool_)
+    flat = array.reshape(len(array), math.prod(array.shape[1:])).astype(np.bool_)
     mask = unpadded(answer.axes, array.shape, batch) if isinstance(answer, Column) else None
     return np.asarray((flat if mask is None else flat | ~mask).all(axis=1))
 

@@ -8,6 +8,7 @@ batch it comes from: where packets were lost, how long variable arrays are, and 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -165,7 +166,7 @@ class Rows1D:
 
     def __init__(self, column: Column) -> None:
         self._shape = (len(column.batch), *column.shape[1:])
-        flat = np.broadcast_to(column.array, self._shape).reshape(len(column.batch), -1)
+        flat = np.broadcast_to(column.array, self._shape).reshape(self._shape[0], math.prod(self._shape[1:]))
         self._mask = unpadded(column.axes, self._shape, column.batch)
         self.values = np.asarray((flat if self._mask is None else flat[self._mask]).reshape(-1), np.float64)
         per_packet = np.full(len(flat), flat.shape[1]) if self._mask is None else self._mask.sum(axis=1)
@@ -193,7 +194,7 @@ def unpadded(axes: tuple[str | None, ...], shape: tuple[int, ...], batch: Batch)
         inside = np.arange(shape[1 + index]) < counts[:, None]
         inside = inside.reshape(len(counts), *(shape[1 + i] if i == index else 1 for i in range(len(axes))))
         mask = inside if mask is None else mask & inside
-    return None if mask is None else np.broadcast_to(mask, shape).reshape(shape[0], -1)
+    return None if mask is None else np.broadcast_to(mask, shape).reshape(shape[0], math.prod(shape[1:]))
 
 
 def aligned(values: tuple[Any, ...], batch: Batch) -> tuple[list[NDArray[Any]], tuple[str | None, ...], int]:

@@ -82,7 +82,7 @@ class Cutter:
         period = (times - self._start) // int(rule.seconds * 1e9)
         before = np.concatenate([[period[0] if self._before is None else self._before], period[:-1]])
         self._before = float(period[-1])
-        starts = _starts(found.counts.reshape(found.ready, -1).sum(axis=1))
+        starts = _starts(found.counts.sum(axis=tuple(range(1, found.counts.ndim))))
         return starts[np.flatnonzero(period > before)].tolist()  # type: ignore[no-any-return]
 
 
@@ -101,8 +101,8 @@ def _rows(column: Column, found: Evaluated) -> tuple[NDArray[np.float64], NDArra
     counts = found.counts
     shape = np.broadcast_shapes((found.ready, *column.shape[1 : 1 + levels]), counts.shape[: 1 + levels])
     wide = np.broadcast_to(counts, (*shape, *counts.shape[1 + levels :]))
-    points = wide.reshape(*shape, -1).sum(axis=-1).reshape(-1)
-    values = np.broadcast_to(column.array[: found.ready].reshape(-1, *column.shape[1 : 1 + levels]), shape).reshape(-1)
+    points = wide.sum(axis=tuple(range(1 + levels, wide.ndim))).reshape(-1)
+    values = np.broadcast_to(column.array[: found.ready].reshape(len(column.array[: found.ready]), *column.shape[1 : 1 + levels]), shape).reshape(-1)
     starts = _starts(points)
     kept = points > 0 if levels else np.ones(len(points), np.bool_)
     return values[kept], starts[kept]

@@ -118,7 +118,7 @@ def _flattened(packets: Packets, result: Points, columns: dict[str, Column], bat
 
 def _flat(array: NDArray[Any], shape: tuple[int, ...], mask: NDArray[np.bool_] | None, ready: int) -> NDArray[Any]:
     full = np.broadcast_to(array, shape)[:ready]
-    return full.reshape(-1) if mask is None else full.reshape(ready, -1)[mask[:ready]]
+    return full.reshape(-1) if mask is None else full.reshape(mask[:ready].shape)[mask[:ready]]
 
 
 def make_cloud(flat: dict[str, NDArray[Any]], **extra: Any) -> PointCloud:
