@@ -9,7 +9,7 @@ from __future__ import annotations
 import copy
 import math
 import struct
-from typing import Any
+from typing import Any, NamedTuple
 
 import construct
 from construct import (
@@ -28,6 +28,9 @@ from construct import (
 
 _MISSING = object()
 
+#: what a constant without a name is called.
+UNNAMED = "(constant)"
+
 
 class Mismatch(ConstructError):  # type: ignore[misc]
     """A value on the wire that is not what the spec asks for; made a `WireError` by the engine."""
@@ -35,6 +38,26 @@ class Mismatch(ConstructError):  # type: ignore[misc]
     def __init__(self, path: str, offset: int, expected: object, got: object, reason: str) -> None:
         super().__init__(f"{reason}: expected {expected}, got {got}", path=path)
         self.offset, self.expected, self.got, self.reason = offset, expected, got, reason
+
+
+class Seen(NamedTuple):
+    """A part that was parsed: construct's path, first byte and the one after its last, the value, and the construct if it is a seal.
+
+    Within a bit block `start` and `end` count what the block was unpacked to.
+    """
+
+    path: str
+    start: int
+    end: int
+    value: Any
+    seal: Any = None
+
+
+def note(context: Any, seen: Seen) -> None:
+    """Add to the list that a parse was given as ``_trail``, so that a parse that fails has still said how far it came."""
+    trail = context._params.get("_trail")
+    if trail is not None:
+        trail.append(seen)
 
 
 class WireNaN(float):
@@ -63,6 +86,7 @@ class MarkedStruct(Struct):  # type: ignore[misc]
         for con in self.subcons:
             start = stream.tell()
             value = con._parsereport(stream, inner, path)
+            note(context, Seen(f"{path} -> {con.name or UNNAMED}", start, stream.tell(), value))
             if con.name:
                 obj[con.name] = inner[con.name] = value
                 marks[con.name] = (start, stream.tell())
@@ -89,7 +113,9 @@ class IndexedArray(Array):  # type: ignore[misc]
         found = construct.ListContainer()
         for index in range(count):
             context._index = index
+            start = stream.tell()
             found.append(self.subcon._parsereport(stream, context, f"{path}[{index}]"))
+            note(context, Seen(f"{path}[{index}]", start, stream.tell(), found[-1]))
         return found
 
     def _build(self, obj: Any, stream: Any, context: Any, path: str) -> Any:

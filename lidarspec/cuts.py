@@ -18,13 +18,46 @@ from lidarspec.splits import Every, OnChange, OnFlag, OnRewind, OnWrap, Split
 AWAY = 1 / 8
 
 
+class Turning:
+    """Which way an angle turns: the way of the last half turn, and at the start of what it has turned so far.
+
+    Each step is judged by those before it alone, so that batches do not change where scans are cut.
+    """
+
+    def __init__(self) -> None:
+        self._direction, self._total, self._furthest = 0, 0.0, 0.0
+
+    def push(self, steps: NDArray[np.float64]) -> NDArray[np.float64]:
+        """1 or -1 for each of the next steps, (k,), given in turns."""
+        totals = np.cumsum(np.concatenate([[self._total], steps]))[1:]
+        self._total = float(totals[-1]) if len(totals) else self._total
+        found, start, size = np.ones(len(totals)), 0, 64
+        while start < len(totals):
+            part = totals[start : start + size]
+            if self._direction == 0:
+                found[start : start + len(part)] = np.where(part < 0, -1, 1)
+                turned = np.flatnonzero(np.abs(part) >= 0.5)
+            else:
+                found[start : start + len(part)] = self._direction
+                ahead = self._direction * part
+                furthest = np.maximum(np.maximum.accumulate(ahead), self._furthest)
+                turned = np.flatnonzero(furthest - ahead >= 0.5)
+                self._furthest = float(furthest[-1])
+            start, size = start + len(part), size * 2
+            if len(turned):
+                start, size = start - len(part) + int(turned[0]), 64
+                self._direction = -self._direction or (1 if part[turned[0]] > 0 else -1)
+                self._furthest = self._direction * float(part[turned[0]])
+        return found
+
+
 class Cutter:
     """The cuts of one stream of points."""
 
     def __init__(self, rule: Split) -> None:
         self._rule = rule
         self._before: float | None = None
-        self._armed, self._travel = True, 0.0
+        self._armed, self._turning = True, Turning()
         self._start: int | None = None
 
     def cuts(self, packets: Packets, found: Evaluated) -> list[int]:
@@ -62,8 +95,7 @@ class Cutter:
         before = np.concatenate([[values[0] if self._before is None else self._before], values[:-1]])
         self._before = float(values[-1])
         steps = np.mod(values - before + full / 2, full) - full / 2
-        self._travel = float(np.clip(self._travel + steps.sum(), -full / 2, full / 2))
-        direction = -1 if self._travel < 0 else 1
+        direction = self._turning.push(steps / full)
         turned, earlier = np.mod(direction * (values - at), full), np.mod(direction * (before - at), full)
         away = np.flatnonzero((turned > full * AWAY) & (turned < full * (1 - AWAY)))
         found, since = [], 0
@@ -102,7 +134,9 @@ def _rows(column: Column, found: Evaluated) -> tuple[NDArray[np.float64], NDArra
     shape = np.broadcast_shapes((found.ready, *column.shape[1 : 1 + levels]), counts.shape[: 1 + levels])
     wide = np.broadcast_to(counts, (*shape, *counts.shape[1 + levels :]))
     points = wide.sum(axis=tuple(range(1 + levels, wide.ndim))).reshape(-1)
-    values = np.broadcast_to(column.array[: found.ready].reshape(len(column.array[: found.ready]), *column.shape[1 : 1 + levels]), shape).reshape(-1)
+    values = np.broadcast_to(
+        column.array[: found.ready].reshape(len(column.array[: found.ready]), *column.shape[1 : 1 + levels]), shape
+    ).reshape(-1)
     starts = _starts(points)
     kept = points > 0 if levels else np.ones(len(points), np.bool_)
     return values[kept], starts[kept]

@@ -15,7 +15,7 @@ from lidarspec.plugins import sensor as named_sensor
 from lidarspec.scans import Scan, ScanStream
 from lidarspec.sources import transport
 from lidarspec.spec import Sensor
-from lidarspec.streams import PacketStream
+from lidarspec.streams import PacketStream, data_frame
 
 #: bytes or datagrams decoded together when a file is read.
 BATCH_BYTES, BATCH_CHUNKS = 1 << 18, 1024
@@ -63,10 +63,17 @@ class Device:
 
     def packets(self, frame: str | None = None) -> Iterator[Packets]:
         """The packets of the data frame, or of another type, in batches."""
-        name = frame or self.sensor.data_frame
-        stream = PacketStream(self.sensor, name, self._decoder.stats, interpreted=self._decoder.interpreted, state=self._first_state())
+        stream: PacketStream | None = None
+        waiting: list[Found] = []
         for found in self.frames():
-            packets = stream.add(found)
+            waiting += found
+            name = frame or data_frame(self.sensor, waiting)
+            if stream is None and name is not None:
+                stats, interpreted = self._decoder.stats, self._decoder.interpreted
+                stream = PacketStream(self.sensor, name, stats, interpreted=interpreted, state=self._first_state())
+            if stream is None:
+                continue
+            packets, waiting = stream.add(waiting), []
             if len(packets):
                 yield packets
 

@@ -16,7 +16,7 @@ from lidarspec.packets import Packets
 from lidarspec.plugins import registry
 from lidarspec.scans import Scan, scans_of
 from lidarspec.spec import Configure, Sensor, install, replaced
-from lidarspec.streams import PacketStream
+from lidarspec.streams import PacketStream, data_frame
 
 #: options that the engine itself understands, for every sensor.
 FRAMES_OF_REFERENCE = ("rep103", "vendor")
@@ -67,8 +67,9 @@ class StandardEngine:
 
     def decode(self, sensor: Sensor, data: Any, *, frame: str | None, backend: str) -> Packets:
         decoder = self.decoder(sensor, stream=is_stream(data), backend=backend)
-        stream = PacketStream(sensor, frame or sensor.data_frame, decoder.stats, interpreted=decoder.interpreted)
-        return stream.add(feed_all(decoder, data), whole=True)
+        found = feed_all(decoder, data)
+        name = frame or data_frame(sensor, found) or sensor.data_frame
+        return PacketStream(sensor, name, decoder.stats, interpreted=decoder.interpreted).add(found, whole=True)
 
     def scans(self, sensor: Sensor, data: Any, *, backend: str) -> Iterator[Scan]:
         return scans_of(sensor, [self.decode(sensor, data, frame=None, backend=backend)])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import random
-import string
 from typing import Any
 
 import construct
@@ -12,7 +11,7 @@ from construct import Construct
 from numpy.typing import NDArray
 
 from lidarspec.building import build
-from lidarspec.codecs import CompiledCodec, codec, plausibility
+from lidarspec.codecs import VALID, CompiledCodec, InterpretedCodec, codec, plausibility
 from lidarspec.construction import clean
 from lidarspec.errors import SpecError, UnknownFrame
 from lidarspec.layout import Layout
@@ -31,7 +30,7 @@ def example(sensor: Sensor, frame: str, *, seed: int = 0) -> bytes:
     source = random.Random(f"{sensor.id} {frame} {seed}")
     engine = codec(sensor.frames[frame])
     if not isinstance(engine, CompiledCodec):
-        return build(sensor, frame, _random(sensor.frames[frame].prepared, source, construct.Container()), {})
+        return _interpreted(sensor, frame, engine, source)
     for _ in range(TRIES):
         layout, chosen = engine.tree.choose(source)
         rows = np.frombuffer(source.randbytes(BATCH * layout.size), np.uint8).reshape(BATCH, layout.size).copy()
@@ -39,6 +38,15 @@ def example(sensor: Sensor, frame: str, *, seed: int = 0) -> bytes:
         if found is not None:
             return found
     return _swept(sensor, frame, engine, source)
+
+
+def _interpreted(sensor: Sensor, frame: str, engine: InterpretedCodec, source: random.Random) -> bytes:
+    """A frame that construct alone can read."""
+    for _ in range(BATCH * TRIES):
+        data = build(sensor, frame, _random(engine.frame.prepared, source, construct.Container()), {})
+        if engine.survey(np.frombuffer(data, np.uint8), np.zeros(1, np.intp)).status[0] == VALID:
+            return data
+    raise SpecError("no random frame is valid", path=frame, sensor=sensor.id)
 
 
 def _headed(rows: NDArray[np.uint8], layout: Layout, chosen: dict[str, int]) -> NDArray[np.uint8]:
@@ -101,7 +109,7 @@ def _random(con: Construct, source: random.Random, given: Any) -> Any:
 
 def _leaf(con: Construct, source: random.Random) -> Any:
     if isinstance(con, construct.NullTerminated):
-        return "".join(source.choices(string.digits, k=source.randint(1, 4))).encode()
+        return str(source.randrange(10 ** source.randint(1, 4))).encode()
     if isinstance(con, construct.IfThenElse | construct.Switch) or con is construct.Pass:
         return None
     return con.parse(source.randbytes(con.sizeof()))

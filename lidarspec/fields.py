@@ -13,7 +13,7 @@ from construct import Construct, Container, Subconstruct
 
 from lidarspec.bits import bytes_of
 from lidarspec.checksums import Checksum
-from lidarspec.construction import Mismatch, bit_width, member, unwrap, verifying
+from lidarspec.construction import Mismatch, Seen, bit_width, member, note, unwrap, verifying
 
 
 class Scaled(Subconstruct):  # type: ignore[misc]
@@ -68,9 +68,10 @@ class Checksummed(Subconstruct):  # type: ignore[misc]
     def _parse(self, stream: Any, context: Any, path: str) -> Any:
         start = stream.tell()
         obj = self.subcon._parsereport(stream, context, path)
+        end = stream.tell()
+        note(context, Seen(path, start, end, obj, self))
         if not verifying(context, checksums=True):
             return obj
-        end = stream.tell()
         stream.seek(start)
         data = stream.read(end - start)
         stored, computed = self._stored(obj), self._computed(data, obj, start)
@@ -95,6 +96,10 @@ class Checksummed(Subconstruct):  # type: ignore[misc]
             return self.subcon._build(blank, stream, context, path)
         sealed = self._filled(blank, self._computed(data, parsed, 0))
         return self.subcon._build(sealed, stream, context, path)
+
+    def verdict(self, data: bytes, obj: Any, base: int = 0) -> tuple[int, int]:
+        """The checksum that stands in one parsed struct and the one that should, for its bytes, which began at `base`."""
+        return self._stored(obj), self._computed(data, obj, base)
 
     def covered(self, obj: Any, size: int, base: int = 0) -> list[tuple[int, int]]:
         """The byte ranges (start, end) within the struct that the checksum covers, for one parsed frame."""

@@ -28,6 +28,7 @@ class Polar:
         return_index: 0 for the first or only return, 1 for the second ...; None where there is one.
         invalid: True where the sensor marks a point as wrong (becomes nan).
         origin: (x, y, z) in metres of where the beam starts, columns allowed, in REP-103 axes.
+        nominal: True where a default calibration stands in for the sensor's own, which the cloud then says.
     """
 
     range: Array
@@ -39,6 +40,7 @@ class Polar:
     return_index: Array | None = None
     invalid: Array = False
     origin: tuple[Array, Array, Array] = (0, 0, 0)
+    nominal: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,6 +55,7 @@ class Cartesian:
     ring: Array | None = None
     return_index: Array | None = None
     invalid: Array = False
+    nominal: bool = False
 
 
 Points = Polar | Cartesian

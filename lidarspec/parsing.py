@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from functools import partial
 from typing import Any
 
 import construct
@@ -36,7 +37,7 @@ def parse_typed(sensor: Sensor, data: bytes, *, frame: str | None = None, verify
         except WireError as fault:
             faults.append(fault)
     if not verify:
-        for likely in sorted(faults, key=_progress, reverse=True):
+        for likely in sorted(faults, key=partial(_progress, sensor), reverse=True):
             try:
                 return likely.frame, _parse_as(sensor, likely.frame, data, verify=False)
             except WireError:
@@ -52,9 +53,10 @@ def _parse_as(sensor: Sensor, name: str, data: bytes, *, verify: bool) -> Any:
         parsed = frame.prepared.parse_stream(stream, _verify=verify)
     except Mismatch as fault:
         path = field_path(fault.path)
+        offset = _first_byte(sensor, name, data, path, fault.offset)
         raise WireError(
-            f"{path} at byte {fault.offset}: {fault.reason} {fault.got}, expected {fault.expected}",
-            offset=fault.offset,
+            f"{path} at byte {offset}: {fault.reason} {fault.got}, expected {fault.expected}",
+            offset=offset,
             path=path,
             expected=fault.expected,
             got=fault.got,
@@ -78,6 +80,17 @@ def _parse_as(sensor: Sensor, name: str, data: bytes, *, verify: bool) -> Any:
     return parsed
 
 
+def _first_byte(sensor: Sensor, name: str, data: bytes, path: str, offset: int) -> int:
+    """Where a field begins; within a bit block construct counts bits, and the layout knows the byte."""
+    layout = layout_of(sensor, name, data)
+    leaf = layout.leaves.get("".join(_without_indices(path))) if isinstance(layout, Layout) else None
+    if leaf is None or leaf.wire is not None or not leaf.elements:
+        return offset
+    indices = [int(part.partition("]")[0]) for part in path.split("[")[1:]]
+    start = leaf.offset + sum(index * stride for index, stride in zip(indices, leaf.strides, strict=False))
+    return start + min(segment.byte for segment in leaf.elements[0].segments)
+
+
 def _truncated(sensor: Sensor, name: str, data: bytes, path: str) -> WireError:
     """Where the bytes end, and what the field there would have needed."""
     layout = layout_of(sensor, name, data)
@@ -88,7 +101,8 @@ def _truncated(sensor: Sensor, name: str, data: bytes, path: str) -> WireError:
         left = len(data) - start
         needs = f" needs {size} byte{'s' if size != 1 else ''}, {left} left"
     reason = f"frame ends at byte {len(data)}{total}: {path or 'the first field'}{needs or ' is cut off'}"
-    return WireError(reason, offset=len(data) - left, path=path, sensor=sensor.id, frame=name, expected=total, got=len(data), data=data)
+    size = layout.size if isinstance(layout, Layout) else None
+    return WireError(reason, offset=len(data) - left, path=path, sensor=sensor.id, frame=name, expected=size, got=len(data), data=data)
 
 
 def _at_end(layout: Layout, path: str, end: int) -> tuple[int, int]:
@@ -116,14 +130,16 @@ def layout_of(sensor: Sensor, name: str, data: bytes) -> Layout | Refused | None
     return engine.tree.layout(data) if hasattr(engine, "tree") else None
 
 
-def _progress(fault: WireError) -> tuple[int, int]:
-    """How far a type was right before it failed: a checksum comes after everything else."""
-    whole = fault.reason.find("checksum") >= 0 or fault.reason.find("after the frame") >= 0
+def _progress(sensor: Sensor, fault: WireError) -> tuple[int, int]:
+    """How far a type was right before it failed: a frame of this very size, or one in front, comes before all others."""
+    layout = layout_of(sensor, fault.frame, fault.data)
+    fits = isinstance(layout, Layout) and layout.size == len(fault.data)
+    whole = fault.reason.find("after the frame") >= 0 or (fits and fault.reason.find("checksum") >= 0)
     return (1, len(fault.data)) if whole else (0, fault.offset)
 
 
 def _likeliest(sensor: Sensor, data: bytes, faults: list[WireError]) -> WireError:
-    best = max(faults, key=_progress)
+    best = max(faults, key=partial(_progress, sensor))
     if best.offset > 0 or len(sensor.frames) == 1:
         return best
     starts = []

@@ -82,7 +82,7 @@ def evaluate(packets: Packets, carry: Carry | None = None, *, final: bool = True
 
 def _columns(result: Points, batch: Batch) -> dict[str, Column]:
     """The parts of the result as columns; numbers and arrays get the batch's axes."""
-    parts = {f.name: getattr(result, f.name) for f in fields(result)}
+    parts = {f.name: getattr(result, f.name) for f in fields(result) if f.name != "nominal"}
     if isinstance(result, Polar):
         parts |= dict(zip(("ox", "oy", "oz"), parts.pop("origin"), strict=True))
     depth = max([batch.table.schema.depth(), *(len(value.axes) for value in parts.values() if isinstance(value, Column))])
@@ -111,7 +111,7 @@ def _flattened(packets: Packets, result: Points, columns: dict[str, Column], bat
         vendor_axes=packets.sensor.vendor_axes if packets.sensor.options.get("frame") == "vendor" else None,
         stamp_ns=base,
         shape=(ready * int(np.prod(shape[1:-1])), shape[-1]) if organised else None,
-        nominal=np.bool_(batch.nominal),
+        nominal=np.bool_(batch.nominal or result.nominal),
     )
     return Evaluated(cloud, ready, batch.carried(ready), inside[:ready].astype(np.intp), found, axes)
 

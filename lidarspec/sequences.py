@@ -40,12 +40,15 @@ class SequenceTracker:
         if info is None or info.axes:
             raise SpecError("a sequence is a field of the header", path=self._rule.field)
         numbers = batch.table.raw(self._rule.field).astype(np.int64)
+        there = batch.table.present(self._rule.field)
         periods = self._periods(batch, (1 << info.bits) - 1) - self._rule.first + 1
-        if self._in_order(numbers, periods):
+        if (there is None or bool(there.all())) and self._in_order(numbers, periods):
             index = self._index + 1 + np.arange(len(numbers))
             self._number, self._index = int(numbers[-1]), int(index[-1])
             return index, np.zeros(len(numbers), np.bool_)
-        found = [self._step(number, period) for number, period in zip(numbers.tolist(), periods.tolist(), strict=True)]
+        numbered = np.ones(len(numbers), np.bool_) if there is None else there
+        steps = zip(numbers.tolist(), periods.tolist(), numbered.tolist(), strict=True)
+        found = [self._step(number, period) if known else self._unnumbered() for number, period, known in steps]
         return np.array([index for index, _ in found], np.int64), np.array([jump for _, jump in found], np.bool_)
 
     def _in_order(self, numbers: NDArray[np.int64], periods: NDArray[np.int64]) -> bool:
@@ -79,10 +82,15 @@ class SequenceTracker:
         self._missing = {index for index in self._missing if index > self._index - LATE}
         return self._index, ahead > 1
 
+    def _unnumbered(self) -> tuple[int, bool]:
+        """A packet whose header leaves the counter out follows the one before it."""
+        self._index += 1
+        return self._index, False
+
     def _begin(self, number: int, period: int) -> None:
         """A first packet, or the sensor started again: nothing is known to be lost."""
         start = (number - self._rule.first) % period
-        turns = 0 if self._number is None else self._index // period + 2
+        turns = 0 if self._index < 0 else self._index // period + 2
         self._number, self._period, self._index = number, period, turns * period + start
         self._first, self._missing = self._index, set()
 

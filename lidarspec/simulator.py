@@ -74,12 +74,19 @@ def _swept(sensor: Sensor, engine: CompiledCodec, sweeps: Sequence[Mapping[str, 
         rows = np.zeros((len(members), layout.size), np.uint8)
         for path in sorted({path for index in members for path in sweeps[index]}):
             leaf = layout.leaves.get(path)
+            if leaf is None and _elsewhere(sensor, path):
+                continue
             if leaf is None:
                 raise SpecError("sweep gives a value to a field that the frame does not have", path=path, sensor=sensor.id)
             leaf.store(rows, _steps(leaf, np.array([np.asarray(sweeps[index][path], np.float64) for index in members])))
         layout.seal(rows)
         made.append(Group(layout, np.array(members, np.intp), rows))
     return Rows(engine.schema, made)
+
+
+def _elsewhere(sensor: Sensor, path: str) -> bool:
+    """Whether the field is one that some data frames of the sensor have, though not in this form."""
+    return any(frame.data and path in codec(frame).schema.fields for frame in sensor.frames.values())
 
 
 def _asked(engine: CompiledCodec, values: Mapping[str, Any], asked: list[str], leaf: Leaf) -> int:
@@ -105,10 +112,16 @@ def _steps(leaf: Leaf, values: NDArray[np.float64]) -> NDArray[Any]:
 
 @dataclass(frozen=True, eq=False)
 class _Target:
-    """A field that ranges come from, and the index of the innermost axes of the points that belongs to it."""
+    """A field that ranges come from, and the index of the innermost axes of the points that belongs to it.
+
+    Attributes:
+        step, zero: metres of one raw step, a number or (n, ...), and metres of raw 0.
+    """
 
     path: str
     inner: tuple[int, ...]
+    step: Any
+    zero: float = 0.0
 
 
 class _Measurement:
@@ -125,7 +138,7 @@ class _Measurement:
         stored = [self._physical(target.path) for target in targets]
         for attempt in range(ROUNDS):
             beams = self._beams()
-            measured = [_raw_ranges(self._sensor, self._leaf(t.path), _part(scene.measure(*beams), t.inner)) for t in targets]
+            measured = [_raw_ranges(self._sensor, self._leaf(t.path), t, _part(scene.measure(*beams), t.inner)) for t in targets]
             moved = [~np.isclose(new, old) for new, old in zip(measured, stored, strict=True)]
             if not any(mask.any() for mask in moved):
                 break
@@ -147,15 +160,37 @@ class _Measurement:
             self._store(path, np.array(PROBE))
             answer = self._evaluate()[0]
             expected = PROBE * info.scale + info.offset
-            extra = answer.ndim - 1 - max(self._table.schema.depth(), 0)
-            for inner in np.ndindex(*answer.shape[answer.ndim - extra :]) if extra > 0 else [()]:
+            for inner in self._inner(answer):
                 if np.isclose(_part(answer, inner), expected).any():
-                    found.append(_Target(path, inner))
+                    found.append(_Target(path, inner, info.scale, info.offset))
             self._store(path, np.array(0))
+        found = found or self._proportional()
         if not found:
             raise SpecError(
                 "no field in metres makes the range of a point: the sensor has to give `encode`", path="points", sensor=self._sensor.id
             )
+        return found
+
+    def _inner(self, answer: NDArray[Any]) -> list[tuple[int, ...]]:
+        """The indices of the axes of the points that are further in than those of the fields."""
+        extra = answer.ndim - 1 - self._table.schema.depth()
+        return list(np.ndindex(*answer.shape[answer.ndim - extra :])) if extra > 0 else [()]
+
+    def _proportional(self) -> list[_Target]:
+        """The elements of arrays without a unit of their own to which the ranges are in proportion: the header has the unit."""
+        found = []
+        for path, info in self._table.schema.fields.items():
+            if info.unit or info.kind != "int" or not info.axes or not self._table.groups:
+                continue
+            before, answers = self._table.raw(path), []
+            for probe in (PROBE, 2 * PROBE):
+                self._store(path, np.array(probe))
+                answers.append(self._evaluate()[0])
+            self._store(path, before)
+            for inner in self._inner(answers[0]):
+                once, twice = (_part(answer, inner) for answer in answers)
+                if ((once > 0) & np.isclose(twice, 2 * once)).any():
+                    found.append(_Target(path, inner, once / PROBE))
         return found
 
     def _evaluate(self) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
@@ -200,9 +235,10 @@ def _part(array: NDArray[Any], inner: tuple[int, ...]) -> NDArray[Any]:
     return np.asarray(array[corner])
 
 
-def _raw_ranges(sensor: Sensor, leaf: Leaf, metres: NDArray[np.float64]) -> NDArray[np.float64]:
+def _raw_ranges(sensor: Sensor, leaf: Leaf, target: _Target, metres: NDArray[np.float64]) -> NDArray[np.float64]:
     """Ranges as raw values of their field; 0 where the sensor or the field does not reach."""
     near, far = sensor.range_limits
-    raw = np.rint((np.nan_to_num(metres, posinf=0) - leaf.info.offset) / leaf.info.scale)
+    with np.errstate(all="ignore"):
+        raw = np.rint((np.nan_to_num(metres, posinf=0) - target.zero) / target.step)
     top = float((1 << leaf.info.bits) - 1) if leaf.info.kind == "int" else np.inf
     return np.where((metres >= near) & (metres <= far) & (raw > 0) & (raw <= top), raw, 0)

@@ -25,6 +25,9 @@ from lidarspec.units import exact, factor
 
 Times = NDArray[np.int64]
 
+#: no clock reads more nanoseconds than this (285 years): damaged readings must not overflow.
+_FURTHEST = 9 * 10**18
+
 
 class PacketStream:
     """The packets of one frame type out of a decoder's frames.
@@ -44,7 +47,7 @@ class PacketStream:
         self._others = [name for name, other in sensor.frames.items() if other.direction == "in" and not other.data and name != frame]
         self._state: dict[str, bytes] = {found.frame: found.data for found in state}
         data = sensor.frames[frame].data
-        self._sequence = SequenceTracker(sensor.sequence, stats) if sensor.sequence and data else None
+        self._sequence = SequenceTracker(sensor.sequence, stats) if sensor.sequence and data and _counted(sensor, frame) else None
         self._clock = Unwrapper(sensor.clock.wraps_at) if sensor.clock and data else None
         self._gap, self._number = False, 0
 
@@ -121,6 +124,25 @@ class PacketStream:
         return table, which
 
 
+def data_frame(sensor: Sensor, found: Sequence[Found]) -> str | None:
+    """The data frame type that an input is read by where none is asked for: the configured one, or the first that arrived.
+
+    Returns:
+        None where the sensor has several, none is configured, and none has arrived yet.
+    """
+    names = [name for name, frame in sensor.frames.items() if frame.data]
+    if len(names) < 2 or sensor.options.get("answer") in names:
+        return sensor.data_frame
+    return next((item.frame for item in found if item.frame in names), None)
+
+
+def _counted(sensor: Sensor, frame: str) -> bool:
+    """Whether packets of this type are counted: not, if only other data frames have the counter."""
+    assert sensor.sequence is not None
+    having = [name for name, other in sensor.frames.items() if other.data and sensor.sequence.field in codec(other).schema.fields]
+    return frame in having or not having
+
+
 class Unwrapper:
     """A clock that starts again at `wraps_at` seconds, made to run on; exact over any number of wraps.
 
@@ -157,7 +179,8 @@ def clock_ns(sensor: Sensor, batch: Batch) -> Times:
         columns = terms if isinstance(terms, tuple | list) else (terms,)
         return sum((_nanoseconds(np.asarray(column), len(batch)) for column in columns), np.zeros(len(batch), np.int64))
     total = np.zeros(len(batch), np.int64)
-    for path in (source,) if isinstance(source, str) else source:
+    paths = (source,) if isinstance(source, str) else source
+    for path in paths:
         info = batch.table.schema.fields.get(path)
         per_unit = factor(info.unit, "s") if info else None
         if info is None or per_unit is None or info.axes:
@@ -165,10 +188,15 @@ def clock_ns(sensor: Sensor, batch: Batch) -> Times:
         raw = batch.table.raw(path)
         step, zero = exact(info.scale) * per_unit * 10**9, exact(info.offset) * per_unit * 10**9
         if raw.dtype.kind in "ui" and step.denominator == 1 and zero.denominator == 1 and step < 2**62:
-            total += raw.astype(np.int64) * int(step) + int(zero)
+            total += _within(raw, _FURTHEST // len(paths) // max(int(step), 1)) * int(step) + int(zero)
         else:
             total += _nanoseconds(raw.astype(np.float64) * float(step / 10**9) + float(zero / 10**9), len(batch))
     return total
+
+
+def _within(raw: NDArray[Any], furthest: int) -> Times:
+    edges = np.iinfo(raw.dtype)
+    return np.clip(raw, max(edges.min, -furthest), min(edges.max, furthest)).astype(np.int64)
 
 
 def _nanoseconds(seconds: Any, number: int) -> Times:

@@ -1,9 +1,9 @@
 """A test kit for sensors: what the engine promises for every sensor, as a class for pytest.
 
-    from lidarspec.testing import SensorConformance
+from lidarspec.testing import SensorConformance
 
-    class TestMine(SensorConformance):
-        sensor = "acme-x1"        # an id, a Sensor value, or a file such as "./acme.py"
+class TestMine(SensorConformance):
+    sensor = "acme-x1"        # an id, a Sensor value, or a file such as "./acme.py"
 """
 
 from __future__ import annotations

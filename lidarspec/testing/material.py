@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import random
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import Any
 
+from lidarspec.building import limits
 from lidarspec.codecs import codec
-from lidarspec.errors import UsageError
+from lidarspec.errors import UsageError, WireError
 from lidarspec.schema import FieldInfo
 from lidarspec.spec import Sensor
 
@@ -79,35 +81,58 @@ def mutated(data: bytes, source: random.Random) -> bytes:
     return bytes(found)
 
 
-def edited(sensor: Sensor, name: str, data: bytes, source: random.Random) -> tuple[str, int, bytes] | None:
-    """A frame with one field set to a drawn value: (path, value, bytes); None where no frame can carry it."""
+def edited(sensor: Sensor, name: str, data: bytes, source: random.Random) -> tuple[bytes, str, int, int] | None:
+    """A frame with one integer set to a drawn value: (bytes, path, value, what is read back); None where no frame can carry it."""
     engine = codec(sensor.frames[name])
-    held = sealed(engine)
-    free = [info for info in engine.schema.fields.values() if info.kind == "int" and info.const is None and info.path not in held]
     parsed = sensor.parse(data, frame=name)
-    if not free:
+    numbers = [spot for spot in integers(parsed) if _free(engine.schema.fields.get(spot[2]))]
+    if not numbers:
         return None
-    info = source.choice(free)
-    value = drawn(info, source)
-    target = parsed
-    *parents, last = info.path.split(".")
-    for step in (*parents, last):
-        if isinstance(target, list):
-            if not target:
-                return None
-            target = source.choice(target)
-        if not isinstance(target, dict) or target.get(step) is None:
-            return None
-        if step == last and target[step] is not parsed and not isinstance(target[step], dict | list):
-            target[step] = value
-        target = target[step]
-    if isinstance(target, list):
-        while target and isinstance(target[0], list):
-            target = target[0]
-        if not target:
-            return None
-        target[0] = value
+    holder, key, path = source.choice(numbers)
+    place = next(index for index, spot in enumerate(integers(parsed)) if spot[0] is holder and spot[1] == key)
+    holder[key] = drawn(engine.schema.fields[path], source)
     try:
-        return info.path, value, sensor.build(name, parsed)
+        built = sensor.build(name, parsed)
     except UsageError:
         return None
+    after = list(integers(sensor.parse(built, frame=name)))
+    target, key, _ = after[place]
+    return built, path, holder[key], target[key]
+
+
+def integers(parsed: Any, path: str = "") -> Iterator[tuple[Any, Any, str]]:
+    """The integers of a parsed frame: (container, key in it, field path)."""
+    entries: Iterable[tuple[Any, Any]] = parsed.items() if isinstance(parsed, dict) else enumerate(parsed)
+    for key, value in entries:
+        below = path if isinstance(parsed, list) else f"{path}.{key}" if path else key
+        if isinstance(value, dict | list):
+            yield from integers(value, below)
+        elif type(value) is int:
+            yield parsed, key, below
+
+
+def drawn(info: FieldInfo, source: random.Random) -> int:
+    """A value of a field, often one at an edge of its range."""
+    low, high = limits(info)
+    return source.choice((low, low + 1, high, high - 1, source.randint(low, high), source.randint(low, high)))
+
+
+def seals(sensor: Sensor, name: str, data: bytes) -> set[str]:
+    """The fields of a frame that hold a checksum, and so are not the caller's."""
+    layout = getattr(codec(sensor.frames[name]), "tree", None)
+    found = layout.layout(data) if layout is not None else None
+    return {leaf.info.path for seal in getattr(found, "seals", ()) for leaf in seal.leaves}
+
+
+def _free(info: FieldInfo | None) -> bool:
+    return info is not None and info.kind == "int" and info.const is None
+
+
+def fitting(sensor: Sensor, data: bytes) -> list[str]:
+    """The frame types that these bytes can be."""
+    found = []
+    for name in sensor.frames:
+        with contextlib.suppress(WireError):
+            sensor.parse(data, frame=name)
+            found.append(name)
+    return found

@@ -1,1 +1,251 @@
-"""CSPC lidars."""
+"""CSPC M1C1_Mini and its relative COIN-D4: 360 degree triangulation and time-of-flight lidars, started over a UART.
+
+Source: CSPC M1C1_Mini development manual, sections 1 and 2. What it does not say comes from the vendor's SDK
+(ros_cspc_lidar_coin_d4a, sdk/lidar_information.h), the manual's edition v1.1 (2020-01-22), or captures of a COIN-D4
+and a COIN-D6.
+
+Known errors and gaps of the manual: the printed sum of the device information, 0x0402, is 0x0403 (v1.1 has it right);
+the corrections of the angle example, 10.9442 and 11.8653 degrees, are 10.9445 and 11.8674 at 1000 and 8000 mm, and
+71.1718 is 71.171875; the figure with the order of the checksum is lost (the grouping here fits every captured packet);
+no baud rate, no rule for packets that cross 360 degrees or have one sample (the formula divides by LSN - 1), no command
+for the announced switch between 5.5 and 7 Hz. Besides the fillers FE and FF, a COIN-D4 sends FA FA once, in no manual.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import numpy as np
+from construct import Array, BitsInteger, BitStruct, Bytes, ByteSwapped, Const, Construct, Int8ul, Int16ul, Struct, this
+
+from lidarspec import (
+    Checksummed,
+    Command,
+    Fields,
+    Frame,
+    OnFlag,
+    Polar,
+    Scaled,
+    Sensor,
+    Serial,
+    Sum,
+    UsageError,
+    WordXor,
+    Xor,
+    hookimpl,
+    last,
+    spread,
+)
+
+STEPS = 380  # points a turn: 360 degrees by the step of the manual's angle example, 0.9473 degrees
+SAMPLES = 25  # samples of a full packet (the manual's angle example)
+LOW_EXPOSURE, LOW_SPEED = 2, 5.5  # Exp_M and Hz of the slower of the two speeds (manual 1c and 2.2.3, Exp_M)
+
+COMMAND = Checksummed(
+    Struct(
+        "header" / Const(b"\xaa\x55"),
+        "mode" / Int8ul * "F0 start, F1 low exposure, F2 high exposure, F5 stop; FC version (SDK)",
+        "checksum" / Int8ul,
+    ),
+    field="checksum",
+    algorithm=Xor(),
+)
+
+ACK = Checksummed(
+    Struct(
+        "header" / Const(b"\xa5\x5a"),
+        "mode" / Int8ul * "the command's mode ^ A0",
+        "length" / Const(7, Int8ul) * "of the data: firmware and reserved",
+        "firmware" / Int8ul * "to start: 3 is V3.0",
+        "reserved" / Bytes(6),
+        "checksum" / Int8ul,
+    ),
+    field="checksum",
+    algorithm=Xor(),
+)
+
+INFO = Checksummed(
+    Struct(
+        "header" / Const(b"\xa5\x5a"),
+        "length" / Const(20, Int16ul) * "of the data: all that follows the type",
+        "sum" / Int16ul,
+        "type" / Const(0x01, Int8ul) * "device information",
+        "model" / Bytes(12) * "ASCII, ends with 00",
+        "zero_angle" / Scaled(Int16ul, 1, "deg") * "from the data's zero to the one marked on the housing, clockwise",
+        "direction" / Int8ul * "0: clockwise",
+        "correction" / Int8ul * "1: the host has to correct the angles",
+        "reserved" / Bytes(3),
+        "revision" / Int8ul * "of the software",
+    ),
+    field="sum",
+    algorithm=Sum(16),
+)
+
+SCAN_START = Checksummed(
+    Struct(
+        "header" / Const(b"\xa5\x5a"),
+        "length" / Const(0, Int16ul) * "0: point packets follow without end",
+        "sum" / Int16ul,
+        "type" / Const(0x81, Int8ul) * "scan data begins",
+    ),
+    field="sum",
+    algorithm=Sum(16),
+)
+
+
+def angle() -> Construct:
+    """FSA and LSA: 1/64 degree above a check bit that is always 1 (manual 2.2.3)."""
+    return ByteSwapped(BitStruct("angle" / Scaled(BitsInteger(15), 1 / 64, "deg"), "check" / Const(1, BitsInteger(1))))
+
+
+DATA = Checksummed(
+    Struct(
+        "header" / Const(b"\xaa\x55"),
+        "mt"
+        / BitStruct(
+            "frequency" / Scaled(BitsInteger(7), 0.1, "Hz") * "of scans, in a start packet; firmware number in the next packet; else 0",
+            "start" / BitsInteger(1) * "1: start packet, a turn begins",
+        ),
+        "lsn" / Int8ul * "number of samples",
+        "fsa" / angle() * "angle of the first sample",
+        "lsa" / angle() * "angle of the last sample",
+        "cs" / Int16ul,
+        "samples"
+        / Array(
+            this.lsn,
+            ByteSwapped(
+                BitStruct(
+                    "distance" / Scaled(BitsInteger(14), 0.001, "m") * "0: no return",
+                    "intensity" / BitsInteger(8),
+                    "exposure" / BitsInteger(2) * "1 high, 2 low",
+                )
+            ),
+        ),
+    ),
+    field="cs",
+    algorithm=WordXor(head=8, groups=(1, 2)),
+)
+
+
+def ack_plausible(f: Fields) -> Any:
+    """Modes of commands are F0 to FF, and the answer's is that with A0 taken off (manual 2.1.3, SDK)."""
+    return (f.mode >= 0x50) & (f.mode <= 0x5F)
+
+
+def plausible(f: Fields) -> Any:
+    """Angles below 360 degrees, a sample at least, and in a start packet one alone (manual 2.2.3, M&T)."""
+    return (f.fsa.angle < 360) & (f.lsa.angle < 360) & (f.lsn >= 1) & ((f.mt.start == 0) | (f.lsn == 1))
+
+
+def correction(distance: Any) -> Any:
+    """The angle correction in degrees for a distance in metres, 0 where there is no return.
+
+    Source: manual 2.2.3, AngCorrect; the distance there is in millimetres.
+    """
+    mm = np.maximum(distance * 1000, 1)
+    return np.where(distance > 0, np.rad2deg(np.arctan(19.16 * (mm - 90.15) / (90.15 * mm))), 0)
+
+
+def points_from(zero: str) -> Callable[[Fields], Polar]:
+    """The points function with angles counted from the zero of the data, or from the one marked on the housing."""
+
+    def points(f: Fields) -> Polar:
+        raw = spread(f.fsa.angle, f.lsa.angle, f.lsn, full=360.0)  # degrees, (n, LSN)
+        clockwise = raw - np.where(f.state.info.correction == 1, correction(f.samples.distance), 0)
+        if zero == "housing":
+            clockwise = clockwise + f.state.info.zero_angle
+        rate = last(f.mt.frequency, where=(f.mt.start == 1) & (f.mt.frequency > 0)) * 360  # degrees per second
+        return Polar(
+            range=f.samples.distance,
+            azimuth=-np.deg2rad(clockwise),  # clockwise (manual, section 1a)
+            intensity=f.samples.intensity,
+            time=np.nan_to_num((raw - f.fsa.angle) / rate),
+        )
+
+    return points
+
+
+def configure(sensor: Sensor, *, zero: str = "data") -> Sensor:
+    """The sensor with angles counted from the zero of the data (as on the wire), or from the housing's mark.
+
+    Raises:
+        UsageError: for another zero than "data" and "housing".
+
+    Source: manual 2.2.2, bytes 13 and 14; it does not say whether the host should add the angle.
+    """
+    if zero not in ("data", "housing"):
+        raise UsageError(f"{sensor.id}: zero is 'data' or 'housing', not {zero!r}")
+    return dataclasses.replace(sensor, points=points_from(zero))
+
+
+def sweep(i: int) -> dict[str, float]:
+    """Packet i of turns at 5.5 Hz, the slower speed: a start packet, then packets of 25 samples and a shorter one."""
+    packet = i % (1 + -(-(STEPS - 1) // SAMPLES))
+    first = 0 if packet == 0 else 1 + (packet - 1) * SAMPLES
+    samples = 1 if packet == 0 else min(SAMPLES, STEPS - first)
+    return {
+        "mt.frequency": LOW_SPEED if packet == 0 else 0.0,
+        "mt.start": int(packet == 0),
+        "lsn": samples,
+        "fsa.angle": first * 360 / STEPS,
+        "lsa.angle": (first + samples - 1) * 360 / STEPS,
+        "samples.exposure": LOW_EXPOSURE,
+    }
+
+
+def asking(mode: int, **more: Any) -> Command:
+    """The command of this mode that is answered with an acknowledgement of the same mode."""
+    return Command("command", {"mode": mode}, reply="ack", matches={"mode": mode ^ 0xA0}, **more)
+
+
+M1C1_MINI = Sensor(
+    "cspc-m1c1-mini",
+    vendor="CSPC",
+    model="M1C1_Mini",
+    frames={
+        "ack": Frame(ACK, max_length=12, plausible=ack_plausible),
+        "info": Frame(INFO, max_length=27),
+        "scan_start": Frame(SCAN_START, max_length=7),
+        "data": Frame(DATA, data=True, max_length=10 + 3 * 255, plausible=plausible),
+        "command": Frame(COMMAND, direction="out", max_length=4),
+    },
+    points=points_from("data"),
+    scan=OnFlag("mt.start"),
+    # 150 000 for this 3-byte format and DTR low: the SDK; 115 200: v1.1, for the older 2-byte format.
+    links={"data": Serial(150_000, 115_200, dtr=False)},
+    commands={
+        "start": asking(0xF0, starts=True),
+        "stop": asking(0xF5, stops=True),
+        "low_exposure": Command("command", {"mode": 0xF1}),
+        "high_exposure": Command("command", {"mode": 0xF2}),
+        "get_version": asking(0xFC),
+    },
+    fillers=b"\xfe\xff",
+    state={"info": {"correction": 1, "zero_angle": 12}},  # the device information printed in the manual, 2.2.2
+    sweep=sweep,
+    configure=configure,
+    on_open=("start",),
+    on_close=("stop",),
+    range_limits=(0.001, 16.383),  # what the field can hold; the manual gives none
+    vendor_axes=("forward", "right", "up"),
+    status="vectors",
+    source="CSPC M1C1_Mini development manual (3-byte samples), sections 1 and 2; baud rate and FC from the vendor's SDK",
+)
+
+COIN_D4 = dataclasses.replace(
+    M1C1_MINI,
+    id="cspc-coin-d4",
+    model="COIN-D4",
+    links={"data": Serial(230_400, dtr=False)},
+    state={"info": {"correction": 0, "zero_angle": 0}},  # the device information of a live unit
+    status="capture",
+    source="the M1C1_Mini's manual; baud rate from the vendor's SDK; a captured start-up of a COIN-D4",
+)
+
+
+@hookimpl
+def lidarspec_sensors() -> Iterable[Sensor]:
+    """The CSPC sensors."""
+    return [M1C1_MINI, COIN_D4]

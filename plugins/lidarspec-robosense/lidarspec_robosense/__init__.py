@@ -1,1 +1,14 @@
-"""RoboSense lidars."""
+"""RoboSense lidars, one module for each model."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from lidarspec import Sensor, hookimpl
+from lidarspec_robosense.m1 import M1
+
+
+@hookimpl
+def lidarspec_sensors() -> Iterable[Sensor]:
+    """The RoboSense sensors."""
+    return [M1]

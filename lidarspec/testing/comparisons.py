@@ -1,0 +1,105 @@
+"""When two ways through the engine count as equal, and what every cloud has to look like."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarspec.clouds import PointCloud
+from lidarspec.codecs import codec
+from lidarspec.construction import member
+from lidarspec.decoder import Found
+from lidarspec.packets import Packets
+from lidarspec.spec import Sensor
+
+
+def cuts(found: Iterable[Found]) -> list[tuple[str, int, bytes]]:
+    """(type, offset, bytes) of frames, without when they arrived."""
+    return [(item.frame, item.offset, item.data) for item in found]
+
+
+def assert_same_packets(one: Packets, other: Packets) -> None:
+    """Fail unless both hold the same raw numbers, places, times, breaks and counters."""
+    assert one.raw.dtype == other.raw.dtype
+    for path in one.table.schema.fields:
+        assert same(one.table.raw(path), other.table.raw(path)), f"raw {path} differs"
+        assert same(one[path], other[path]), f"{path} differs"
+    for array in one.table.schema.arrays:
+        assert same(one.count(array), other.count(array)), f"the lengths of {array} differ"
+    for name in ("offset", "time_ns", "host_ns", "index", "breaks"):
+        assert same(getattr(one, name), getattr(other, name)), f"{name} differs"
+    assert one.stats == other.stats
+
+
+def assert_same_points(one: PointCloud, other: PointCloud) -> None:
+    """Fail unless both clouds are equal to the last bit."""
+    assert_same_places(one, other)
+    assert same(one.time, other.time)
+    assert (one.stamp_ns, bool(one.nominal)) == (other.stamp_ns, bool(other.nominal))
+
+
+def assert_same_places(one: PointCloud, other: PointCloud) -> None:
+    """Fail unless both clouds are equal but for the rounding of times, which are summed in another order."""
+    assert one.columns.keys() == other.columns.keys()
+    for name in one.columns.keys() - {"time"}:
+        assert same(one.columns[name], other.columns[name]), f"{name} differs"
+    assert same(one.valid, other.valid)
+    assert one.time.shape == other.time.shape
+    assert np.allclose(one.time, other.time, rtol=1e-12, atol=1e-6, equal_nan=True)
+    assert abs(one.stamp_ns - other.stamp_ns) <= 1000
+    assert one.shape == other.shape
+
+
+def assert_well_formed(cloud: PointCloud) -> None:
+    """Fail unless the cloud keeps the conventions: types, angles, REP-117, and no place without a return."""
+    valid = cloud.valid
+    assert cloud.x.dtype == cloud.y.dtype == cloud.z.dtype == cloud.range.dtype == np.float32
+    assert cloud.time.dtype == np.float64
+    assert all(len(column) == len(cloud) for column in cloud.columns.values())
+    assert np.isfinite(cloud.xyz[valid]).all()
+    assert np.isfinite(cloud.range[valid]).all()
+    assert np.isnan(cloud.xyz[~valid]).all()
+    assert (cloud.range[valid] >= 0).all()
+    known = cloud.azimuth[np.isfinite(cloud.azimuth)]
+    assert ((known >= -np.pi) & (known < np.pi)).all()
+
+
+def same(one: NDArray[Any], other: NDArray[Any]) -> bool:
+    """Whether two arrays are equal in shape, type and value; nan equals nan."""
+    return one.dtype == other.dtype and one.shape == other.shape and np.array_equal(one, other, equal_nan=one.dtype.kind == "f")
+
+
+def assert_backends_agree(sensor: Sensor, data: Any) -> None:
+    """Fail unless the compiled and the interpreted path give the same frames, packets, points and counters, and no plugin failed."""
+    split = [cuts(sensor.split(data, backend=backend)) for backend in ("auto", "construct")]
+    assert split[0] == split[1]
+    for name, frame in sensor.frames.items():
+        if frame.direction == "out":
+            continue
+        compiled, interpreted = (sensor.decode(data, frame=name, backend=backend) for backend in ("auto", "construct"))
+        assert not compiled.stats.plugin_errors, compiled.stats.tracebacks[0]
+        assert_same_packets(compiled, interpreted)
+        if frame.data:
+            cloud = compiled.points()
+            assert_well_formed(cloud)
+            assert_same_points(cloud, interpreted.points())
+
+
+def assert_command(sensor: Sensor, name: str, arguments: Mapping[str, float]) -> None:
+    """Fail unless the command's frame parses back to its fixed values, and to its arguments within half a step."""
+    command = sensor.commands[name]
+    data = sensor.command(name, **arguments)
+    if command.frame is None:
+        assert data == b""
+        return
+    parsed = sensor.parse(data, frame=command.frame)
+    assert sensor.build(command.frame, parsed) == data
+    for path, value in command.values.items():
+        assert member(parsed, path) == value
+    fields = codec(sensor.frames[command.frame]).schema.fields
+    for argument, value in arguments.items():
+        info = fields[command.args[argument][0]]
+        assert abs(member(parsed, info.path) * info.scale + info.offset - value) <= abs(info.scale) * 0.5001

@@ -1,0 +1,142 @@
+"""RoboSense RS-LiDAR-M1: solid-state lidar of five channels over UDP; every point carries its own angles.
+
+Source: RS-LiDAR-M1 user guide, 2.1.2 and Table 5 (the data blocks); RS-LiDAR-M1P user guide, pages 9 to 14 (header,
+tail, formulas, worked example), with which the vendor's rs_driver agrees.
+
+Known errors and gaps of the guides: the time of a group of points is printed as "titime_offset", and is the packet's
+timestamp plus time_offset; the offset 32768 of the angles stands on the M1P's next page only; z of the worked example is
+printed as 2.17 and is 2.1647; the formula raw - 80 of mems_tmp gives -46 degC for the guide's own capture, so the raw
+byte is kept; 750 000 points per second do not agree with 630 packets in a frame (787 500); the layout of DIFOP differs
+between firmwares from byte 28 on, so only what is before has names.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from construct import Array, Bytes, BytesInteger, Const, Int8ub, Int16ub, Int32ub, Struct
+
+from lidarspec import Clock, Fields, Frame, OnRewind, Polar, Scaled, Sensor, Sequence, Udp
+
+BLOCKS, CHANNELS = 25, 5
+SINGLE, DUAL = 630, 1260  # packets of a frame (rs_driver; M1P user guide: the counter restarts with each frame)
+FRAME_RATE = 10  # Hz (M1P user guide, page 6)
+FIRING = 10e-6 / 3  # seconds between blocks: 0, 3, 7, 10, 13, 17 us in the M1P guide's capture
+LINE = 125  # firings of a line in `sweep`, which makes 126 lines 0.2 degrees apart
+
+DATA = Struct(
+    "magic" / Const(b"\x55\xaa\x5a\xa5"),
+    "pkt_psn" / Int16ub * "1 to 630, with dual return to 1260, in each frame",
+    "protocol_version" / Int16ub,
+    "wave_mode" / Int8ub * "0 dual, 4 strongest, 5 last, 6 first",
+    "time_sync_mode" / Int8ub * "0 internal, 1 PPS, 2 PTP, 3 gPTP",
+    "seconds" / Scaled(BytesInteger(6), 1, "s"),
+    "microseconds" / Scaled(Int32ub, 1e-6, "s"),
+    "reserved" / Bytes(10),
+    "lidar_type" / Int8ub * "0x10: M1",
+    "mems_tmp" / Int8ub * "degC + 80, or signed degC, by firmware",
+    "blocks"
+    / Array(
+        BLOCKS,
+        Struct(
+            "time_offset" / Scaled(Int8ub, 1e-6, "s") * "after the packet's time",
+            "return_seq" / Int8ub * "0 single return, 1 first (nearer), 2 second (farther)",
+            "channels"
+            / Array(
+                CHANNELS,
+                Struct(
+                    "radius" / Scaled(Int16ub, 0.005, "m") * "0: no return",
+                    "elevation" / Scaled(Int16ub, 0.01, "deg", offset=-327.68),
+                    "azimuth" / Scaled(Int16ub, 0.01, "deg", offset=-327.68),
+                    "intensity" / Int8ub,
+                    "reserved" / Bytes(2),
+                ),
+            ),
+        ),
+    ),
+    "tail" / Bytes(3) * "reserved",
+)
+
+DIFOP = Struct(
+    "magic" / Const(b"\xa5\xff\x00\x5a\x11\x11\x55\x55"),
+    "reserved" / Bytes(1),
+    "frame_rate" / Scaled(Int8ub, 1, "Hz"),
+    "lidar_ip" / Bytes(4),
+    "host_ip" / Bytes(4),
+    "mac" / Bytes(6),
+    "msop_port" / Int16ub,
+    "difop_port" / Int16ub,
+    "rest" / Bytes(228) * "by firmware",
+)
+
+
+def plausible(f: Fields) -> Any:
+    """The counter starts at 1 (M1P user guide, header)."""
+    return f.pkt_psn >= 1
+
+
+def packets_per_frame(f: Fields) -> Any:
+    """The last number of the counter; only wave mode 0 is dual return."""
+    return np.where(f.wave_mode == 0, DUAL, SINGLE)
+
+
+def points(f: Fields) -> Polar:
+    """Range and direction as on the wire, which has REP-103 axes already (M1P user guide, page 13)."""
+    channels = f.blocks.channels
+    return Polar(
+        range=channels.radius,
+        azimuth=np.deg2rad(channels.azimuth),
+        elevation=np.deg2rad(channels.elevation),
+        intensity=channels.intensity,
+        time=f.blocks.time_offset,
+        ring=np.arange(CHANNELS),
+        return_index=np.maximum(f.blocks.return_seq - 1, 0),
+    )
+
+
+def sweep(i: int) -> dict[str, Any]:
+    """Packet i of frames with single return: lines from +12.5 to -12.5 degrees, to and fro over a fifth of 120 degrees.
+
+    Source: field of view, number of packets and where the channels look are the guide's; the lines are assumed.
+    """
+    number, time = i % SINGLE, i / (SINGLE * FRAME_RATE)
+    line, spot = np.divmod(number * BLOCKS + np.arange(BLOCKS), LINE)
+    across = (spot + 0.5) / LINE - 0.5
+    azimuth = np.where(line % 2, across, -across)[:, None] * 24 + np.array([48, 24, 0, -24, -48])
+    elevation = 12.5 - 25 * line / (SINGLE * BLOCKS // LINE - 1)
+    return {
+        "pkt_psn": number + 1,
+        "protocol_version": 0,
+        "wave_mode": 4,
+        "time_sync_mode": 0,
+        "seconds": int(time),
+        "microseconds": time % 1,
+        "lidar_type": 0x10,
+        "mems_tmp": 105,
+        "blocks.time_offset": np.round(np.arange(BLOCKS) * FIRING, 6),
+        "blocks.return_seq": np.zeros(BLOCKS),
+        "blocks.channels.elevation": np.repeat(elevation[:, None], CHANNELS, axis=1),
+        "blocks.channels.azimuth": azimuth,
+    }
+
+
+M1 = Sensor(
+    "robosense-m1",
+    vendor="RoboSense",
+    model="RS-LiDAR-M1",
+    frames={
+        "data": Frame(DATA, data=True, max_length=1210, plausible=plausible),
+        "difop": Frame(DIFOP, max_length=256),
+    },
+    points=points,
+    scan=OnRewind("pkt_psn"),
+    links={"data": Udp(6699, 7788)},
+    clock=Clock(("seconds", "microseconds")),
+    sequence=Sequence("pkt_psn", first=1, last=packets_per_frame),
+    sweep=sweep,
+    range_limits=(0.2, 200.0),  # rs_driver's limits for this model
+    vendor_axes=("forward", "left", "up"),
+    status="vectors",
+    source="RS-LiDAR-M1 user guide 2.1.2 (Table 5); RS-LiDAR-M1P user guide, pages 9 to 14; rs_driver",
+)

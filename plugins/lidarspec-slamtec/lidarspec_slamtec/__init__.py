@@ -1,0 +1,164 @@
+"""Slamtec RPLIDAR A1, A3, S2 and C1: 360 degree serial lidars of one family, which answer in six kinds of data frames.
+
+Source: RPLIDAR interface protocol and the vendor's SDK (sl_lidar_cmd.h, handler_capsules.cpp, sl_lidar_driver.cpp); bauds and
+ranges from the models' data sheets.
+
+A response descriptor says which kind follows, and each kind is looked for after its descriptor alone. Where a recording
+begins in the middle of a stream, ``configure(answer="express")`` starts as if the descriptor had been seen; it also chooses
+which kind is the data. The kinds: `node` (the default), `express`, `ultra`, `dense`, `ultra_dense` and `hq`.
+
+One rule cuts scans for all of them: where the azimuth of the points passes zero. Nodes and HQ capsules mark the first node
+past zero by a bit, which is the same place; a turn of capsules ends where the start angle drops, which lies up to a capsule
+beside it. So scans begin at the same angle whatever the answer.
+
+Nodes have no checksum, and are believed in unbroken runs of ten: the module `nodes` has the measured rates of false ones.
+No frame says when its points were taken: all points of one bear its time.
+
+How far it is proven: requests, descriptors, information and configuration answers against a live A1's exchange; nodes,
+express and ultra capsules against bytes built after the SDK; dense, ultra-dense and HQ capsules against the SDK's arithmetic
+by hand. Whether a C1 obeys the speed command is not known: the SDK's rule by model number would take PWM for it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable, Mapping
+
+from lidarspec import Command, Frame, OnWrap, Sensor, Serial, UsageError, hookimpl
+from lidarspec_slamtec import capsules, nodes
+from lidarspec_slamtec.answers import ANSWERS, DESCRIPTORS
+from lidarspec_slamtec.commands import BY_DTR, BY_PWM, BY_SPEED, COMMANDS, express
+from lidarspec_slamtec.requests import REQUESTS
+
+DTHETA = ("unsigned", "signed")
+
+EXPRESS = Frame(
+    capsules.EXPRESS,
+    data=True,
+    points=capsules.express_points(),
+    sweep=capsules.sweep_by(capsules.EXPRESS_STEP),
+    max_length=84,
+    plausible=capsules.plausible,
+    after="express_descriptor",
+)
+ULTRA = Frame(
+    capsules.ULTRA,
+    data=True,
+    points=capsules.ultra_points,
+    max_length=132,
+    plausible=capsules.plausible,
+    after="ultra_descriptor",
+)
+DENSE = Frame(
+    capsules.DENSE,
+    data=True,
+    points=capsules.dense_points,
+    sweep=capsules.sweep_by(capsules.DENSE_STEP),
+    max_length=84,
+    plausible=capsules.plausible,
+    after="dense_descriptor",
+)
+ULTRA_DENSE = Frame(
+    capsules.ULTRA_DENSE,
+    data=True,
+    points=capsules.ultra_dense_points,
+    max_length=170,
+    plausible=capsules.plausible,
+    after="ultra_dense_descriptor",
+)
+HQ = Frame(nodes.HQ, data=True, points=nodes.hq_points, sweep=nodes.hq_sweep, max_length=781, after="hq_descriptor")
+NODE = Frame(
+    nodes.NODE,
+    data=True,
+    points=nodes.node_points,
+    sweep=nodes.node_sweep,
+    max_length=5,
+    plausible=nodes.plausible,
+    after="scan_descriptor",
+    confirm=nodes.CONFIRM,
+)
+
+FRAMES = {
+    **DESCRIPTORS,
+    **ANSWERS,
+    "node": NODE,
+    "express": EXPRESS,
+    "ultra": ULTRA,
+    "dense": DENSE,
+    "ultra_dense": ULTRA_DENSE,
+    "hq": HQ,
+    **REQUESTS,
+}
+
+
+def configure(sensor: Sensor, *, dtheta: str | None = None, mode: int | None = None) -> Sensor:
+    """The sensor with another reading of express capsules, or another scan mode when it is opened.
+
+    Args:
+        dtheta: "unsigned" (as the SDK reads the compensation of express capsules) or "signed" (as the protocol says).
+        mode: the scan mode that opening starts, instead of a scan of nodes; `answer` has to be the kind that it answers in.
+
+    Raises:
+        UsageError: for another dtheta, or a mode that is not a number from 0 to 255.
+    """
+    if dtheta is not None:
+        if dtheta not in DTHETA:
+            raise UsageError(f"{sensor.id}: dtheta is one of {', '.join(DTHETA)}, not {dtheta!r}")
+        changed = dataclasses.replace(EXPRESS, points=capsules.express_points(signed=dtheta == "signed"))
+        sensor = dataclasses.replace(sensor, frames={**sensor.frames, "express": changed})
+    if mode is not None:
+        if mode not in range(0x100):
+            raise UsageError(f"{sensor.id}: mode is a number from 0 to 255, not {mode!r}")
+        commands = {**sensor.commands, "mode_scan": express(mode)}
+        sensor = dataclasses.replace(sensor, commands=commands, on_open=("stop", "start_motor", "mode_scan"))
+    return sensor
+
+
+def rplidar(
+    name: str, *, baud: int, motor: Mapping[str, Command], range_limits: tuple[float, float], status: str, source: str
+) -> Sensor:
+    """One model of the family."""
+    return Sensor(
+        f"slamtec-rplidar-{name.lower()}",
+        vendor="Slamtec",
+        model=f"RPLIDAR {name}",
+        frames=FRAMES,
+        points=None,
+        scan=OnWrap("azimuth"),
+        links={"data": Serial(baud)},
+        commands={**COMMANDS, **motor},
+        configure=configure,
+        on_open=("stop", "start_motor", "scan"),
+        on_close=("stop", "stop_motor"),
+        range_limits=range_limits,
+        vendor_axes=("forward", "right", "up"),
+        status=status,
+        source=f"RPLIDAR interface protocol and SDK; {source}",
+        aliases=(f"rplidar-{name.lower()}",),
+    )
+
+
+A1 = rplidar(
+    "A1",
+    baud=115_200,
+    motor=BY_DTR,
+    range_limits=(0.15, 12.0),
+    status="vectors",
+    source="A1M8 data sheet; an A1's exchange",
+)
+A3 = rplidar(
+    "A3",
+    baud=256_000,
+    motor=BY_PWM,
+    range_limits=(0.2, 25.0),
+    status="vectors",
+    source="A3M1 data sheet; ultra capsules built after the SDK",
+)
+S2 = rplidar("S2", baud=1_000_000, motor=BY_SPEED, range_limits=(0.05, 30.0), status="manual", source="S2 data sheet")
+C1 = rplidar("C1", baud=460_800, motor=BY_SPEED, range_limits=(0.05, 12.0), status="manual", source="C1 data sheet")
+
+
+@hookimpl
+def lidarspec_sensors() -> Iterable[Sensor]:
+    """The RPLIDAR models."""
+    return [A1, A3, S2, C1]

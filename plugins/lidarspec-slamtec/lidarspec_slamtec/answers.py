@@ -1,0 +1,99 @@
+"""What comes back: single answers behind their descriptors, and the descriptors that announce a stream of data frames.
+
+Every descriptor is ``A5 5A``, 30 bits of length, 2 bits of mode (0: one answer, 1: an endless stream) and a type. A single
+answer is one frame together with its descriptor. A descriptor of a stream is a frame of its own: the data frames of its
+kind are looked for from there on, until another one comes.
+
+Source: RPLIDAR interface protocol, "response descriptors" and "requests with single response"; configuration keys and the
+widths of their values from the vendor's SDK (sl_lidar_cmd.h).
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from construct import BitsInteger, BitStruct, Bytes, ByteSwapped, Const, Construct, Int8ul, Int16ul, Int32ul, Struct, Switch, this
+
+from lidarspec import Fields, Frame, Scaled, take
+
+SINGLE, STREAM = 0, 1  # the modes of a descriptor
+LONGEST_NAME = 64  # bytes of the name of a scan mode (SDK, LidarScanMode)
+
+#: keys of configuration values; the first two are of the sensor, the others of one of its scan modes.
+MODE_COUNT, TYPICAL_MODE, US_PER_SAMPLE, MAX_DISTANCE, ANSWER_TYPE, MODE_NAME = 0x70, 0x7C, 0x71, 0x74, 0x75, 0x7F
+
+_VALUES: dict[int, tuple[int, Construct]] = {
+    MODE_COUNT: (2, "mode_count" / Int16ul),
+    TYPICAL_MODE: (2, "typical_mode" / Int16ul),
+    US_PER_SAMPLE: (4, "us_per_sample" / Scaled(Int32ul, 1 / 256, "us")),
+    MAX_DISTANCE: (4, "max_distance" / Scaled(Int32ul, 1 / 256, "m")),
+    ANSWER_TYPE: (1, "answer_type" / Int8ul * "type of the descriptor that announces the mode's data frames"),
+}
+_SIZES = np.full(MODE_NAME + 1, np.nan)
+_SIZES[list(_VALUES)] = [size for size, _ in _VALUES.values()]
+
+
+def descriptor(kind: int, mode: int, length: Construct) -> tuple[Construct, ...]:
+    """The fields of a descriptor of this type and mode."""
+    block = BitStruct("mode" / Const(mode, BitsInteger(2)) * "0: one answer, 1: an endless stream", "length" / length)
+    return ("start" / Const(b"\xa5\x5a"), "descriptor" / ByteSwapped(block), "type" / Const(kind, Int8ul))
+
+
+def single(kind: int, size: int, *fields: Construct) -> Frame:
+    """A single answer of `size` bytes behind its descriptor."""
+    return Frame(Struct(*descriptor(kind, SINGLE, Const(size, BitsInteger(30))), *fields), max_length=7 + size)
+
+
+def announcing(kind: int, size: int) -> Frame:
+    """The descriptor of an endless stream of data frames of `size` bytes."""
+    return Frame(Struct(*descriptor(kind, STREAM, Const(size, BitsInteger(30)))), max_length=7)
+
+
+def config_plausible(f: Fields) -> Any:
+    """The length fits the value, where the width of the value is known."""
+    size = take(_SIZES, f.key)
+    return np.isnan(size) | (f.descriptor.length == 4 + size)
+
+
+CONFIG = Struct(
+    *descriptor(0x20, SINGLE, BitsInteger(30)),
+    "key" / Int32ul,
+    "value"
+    / Switch(
+        this.key,
+        {key: Struct(field) for key, (_, field) in _VALUES.items()},
+        default=Struct("data" / Bytes(this._.descriptor.length - 4) * "7F: the mode's name, ends with 00"),
+    ),
+)
+CONFIG_SET = Struct(
+    *descriptor(0x21, SINGLE, BitsInteger(30)),
+    "key" / Int32ul,
+    "data" / Bytes(this.descriptor.length - 4),
+)
+
+ANSWERS = {
+    "info": single(
+        0x04,
+        20,
+        "model" / Int8ul * "high nibble: series, low nibble: model in it",
+        "firmware_minor" / Int8ul,
+        "firmware_major" / Int8ul,
+        "hardware" / Int8ul,
+        "serial" / Bytes(16),
+    ),
+    "health": single(0x06, 3, "status" / Int8ul * "0 good, 1 warning, 2 error", "error" / Int16ul),
+    "sample_rate": single(0x15, 4, "standard" / Scaled(Int16ul, 1, "us"), "express" / Scaled(Int16ul, 1, "us")),
+    "config": Frame(CONFIG, max_length=7 + 4 + LONGEST_NAME, plausible=config_plausible),
+    "config_set": Frame(CONFIG_SET, max_length=7 + 4 + LONGEST_NAME),
+    "accessory": single(0xFF, 4, "flags" / Int32ul * "bit 0: the accessory board drives the motor by PWM"),
+}
+
+DESCRIPTORS = {
+    "scan_descriptor": announcing(0x81, 5),
+    "express_descriptor": announcing(0x82, 84),
+    "hq_descriptor": announcing(0x83, 781),
+    "ultra_descriptor": announcing(0x84, 132),
+    "dense_descriptor": announcing(0x85, 84),
+    "ultra_dense_descriptor": announcing(0x86, 170),
+}

@@ -1,0 +1,188 @@
+"""Capsules: many distances behind the angle of the first one. The other angles need the start of the next capsule.
+
+Point k of N stands at ``start + (next start - start) * k / N``, less a compensation of its own. Where bytes were lost, at the
+end of the input, and before a capsule with the S bit (the first after a start) there is no next capsule, and the points of
+the last one have no direction. All four kinds begin alike: their checksum, the XOR of the bytes from the third on, stands
+in two nibbles beside the sync nibbles A and 5.
+
+Source: RPLIDAR interface protocol, "EXPRESS_SCAN"; what it does not say (dense and ultra-dense capsules, the ultra capsule's
+angles, that dtheta is unsigned) from the vendor's SDK (sl_lidar_cmd.h, handler_capsules.cpp). The SDK averages neighbours
+of an ultra-dense capsule that differ by up to 2 mm; that is a filter, and is left out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+from construct import Array, BitsInteger, BitStruct, ByteSwapped, Const, Construct, Int16ul, Int32ul, Struct
+
+from lidarspec import Checksummed, Fields, Polar, Scaled, Xor, following, stack, take, wrap
+
+EXPRESS_CABINS, ULTRA_CABINS, DENSE_CABINS, ULTRA_DENSE_CABINS = 16, 32, 40, 32
+SIGNED = 32  # dtheta has six bits; read as signed, this one and those above are negative
+EXPRESS_STEP, DENSE_STEP = 16.0, 18.0  # degrees of a simulated capsule: 720 and 800 points a turn
+
+#: the ultra capsule's scale: values from STARTS on begin at BASES millimetres and go on in steps of 1, 2, 4, 8 and 16.
+_STARTS, _BASES = np.array([0, 512, 1280, 1792, 3328]), np.array([0, 512, 2048, 4096, 16384])
+_CODES = np.arange(1 << 12)
+LEVELS = np.searchsorted(_STARTS, _CODES, side="right") - 1
+MILLIMETRES = _BASES[LEVELS] + ((_CODES - _STARTS[LEVELS]) << LEVELS)
+
+#: the ultra-dense capsule's four scales begin at these millimetres.
+SCALES = np.array([0, 2046, 8187, 24567])
+
+
+def nibble(sync: int) -> Construct:
+    """One of the first two bytes: a sync nibble above a nibble of the checksum."""
+    return BitStruct("sync" / Const(sync, BitsInteger(4)), "checksum" / BitsInteger(4))
+
+
+def capsule(*fields: Construct) -> Checksummed:
+    """A capsule of these fields behind its sync and checksum."""
+    struct = Struct("low" / nibble(0xA), "high" / nibble(0x5), *fields)
+    return Checksummed(struct, field=("low.checksum", "high.checksum"), algorithm=Xor())
+
+
+def start() -> Construct:
+    """The angle of the first point, and whether this is the first capsule after a start."""
+    flag = "sync" / BitsInteger(1) * "S, 1: first after a start"
+    return "start" / ByteSwapped(BitStruct(flag, "angle" / Scaled(BitsInteger(15), 1 / 64, "deg")))
+
+
+def sample() -> Construct:
+    """14 bits of distance above the two high bits of its angle's compensation."""
+    distance = "distance" / Scaled(BitsInteger(14), 0.001, "m") * "0: no return"
+    return ByteSwapped(BitStruct(distance, "dtheta_high" / BitsInteger(2)))
+
+
+EXPRESS = capsule(
+    start(),
+    "cabins"
+    / Array(
+        EXPRESS_CABINS,
+        Struct(
+            "first" / sample(),
+            "second" / sample(),
+            "dtheta_low" / BitStruct("second" / BitsInteger(4), "first" / BitsInteger(4)) * "1/8 degree",
+        ),
+    ),
+)
+ULTRA = capsule(
+    start(),
+    "cabins"
+    / Array(
+        ULTRA_CABINS,
+        ByteSwapped(
+            BitStruct(
+                "predict2" / BitsInteger(10, signed=True) * "from the next major; 511, -512: no return",
+                "predict1" / BitsInteger(10, signed=True) * "from this major; 511, -512: no return",
+                "major" / BitsInteger(12) * "0: no return",
+            )
+        ),
+    ),
+)
+DENSE = capsule(start(), "distances" / Array(DENSE_CABINS, Scaled(Int16ul, 0.001, "m")) * "0: no return")
+ULTRA_DENSE = capsule(
+    "time_stamp" / Int32ul * "unit not documented",
+    "status" / Int16ul,
+    start(),
+    "cabins"
+    / Array(
+        ULTRA_DENSE_CABINS,
+        ByteSwapped(
+            BitStruct(
+                "second_high" / BitsInteger(4),
+                "first_high" / BitsInteger(4),
+                "second_low" / BitsInteger(14),
+                "second_scale" / BitsInteger(2),
+                "first_low" / BitsInteger(14),
+                "first_scale" / BitsInteger(2),
+            )
+        ),
+    ),
+)
+
+
+def plausible(f: Fields) -> Any:
+    """The first angle is below 360 degrees."""
+    return f.start.angle < 360
+
+
+def step(f: Fields, count: int) -> Any:
+    """Degrees from one of `count` points to the next, (n, 1); nan where there is no next capsule."""
+    after = np.where(following(f.start.sync) == 0, following(f.start.angle), np.nan)
+    return wrap(after - f.start.angle, 360.0) / count
+
+
+def headings(f: Fields, cabins: int, points: int) -> Any:
+    """Degrees clockwise of each point, not compensated, (n, cabins, points)."""
+    count, between = cabins * points, step(f, cabins * points)
+    return stack(*(f.start.angle + between * np.arange(place, count, points) for place in range(points)))
+
+
+def express_points(*, signed: bool = False) -> Callable[[Fields], Polar]:
+    """The points function of express capsules with dtheta read as unsigned (SDK) or signed (protocol)."""
+
+    def points(f: Fields) -> Polar:
+        first, second, low = f.cabins.first, f.cabins.second, f.cabins.dtheta_low
+        eighths = stack(first.dtheta_high * 16 + low.first, second.dtheta_high * 16 + low.second)
+        if signed:
+            eighths = np.where(eighths >= SIGNED, eighths - 2 * SIGNED, eighths)
+        clockwise = headings(f, EXPRESS_CABINS, 2) - eighths / 8
+        return Polar(range=stack(first.distance, second.distance), azimuth=-np.deg2rad(clockwise))
+
+    return points
+
+
+def dense_points(f: Fields) -> Polar:
+    """40 points a capsule, without compensation."""
+    clockwise = f.start.angle + step(f, DENSE_CABINS) * np.arange(DENSE_CABINS)
+    return Polar(range=f.distances, azimuth=-np.deg2rad(clockwise))
+
+
+def predicted(base: Any, level: Any, prediction: Any) -> Any:
+    """Millimetres of a predicted distance, in steps of its base's scale; 0 for the two values that mean no return."""
+    return np.where((prediction == 511) | (prediction == -512), 0, base + prediction * np.exp2(level))
+
+
+def compensation(mm: Any) -> Any:
+    """Degrees that an ultra capsule's point lies before its heading, by its distance.
+
+    Source: handler_capsules.cpp: 7.5 degrees below 50 mm, else 8 degrees less two terms in 1/65536 rad of 98361 by the
+    distance in quarters of a millimetre, a whole number.
+    """
+    ratio = np.floor(98361 / np.maximum(mm * 4, 200))
+    return np.where(mm >= 50, 8 - np.rad2deg((ratio * 64 + ratio**3 / 98304) / 65536), 7.5)
+
+
+def ultra_points(f: Fields) -> Polar:
+    """96 points a capsule: a major distance in each cabin, and two that are predicted from it and from the next one's."""
+    code, code_after = f.cabins.major, following(f.cabins.major)
+    major, after, after_level = take(MILLIMETRES, code), take(MILLIMETRES, code_after), take(LEVELS, code_after)
+    lacking = (major == 0) & (after > 0)
+    base, level = np.where(lacking, after, major), np.where(lacking, after_level, take(LEVELS, code))
+    first = predicted(base, level, f.cabins.predict1)
+    second = predicted(after, after_level, f.cabins.predict2)
+    mm = stack(major, first, second)
+    return Polar(range=mm / 1000, azimuth=-np.deg2rad(headings(f, ULTRA_CABINS, 3) - compensation(mm)))
+
+
+def ultra_dense_points(f: Fields) -> Polar:
+    """64 points a capsule: by its scale, 10 to 13 bits of distance in steps of 2 to 5 mm, and above them 8 to 5 bits of quality."""
+    cabins = f.cabins
+    scale = stack(cabins.first_scale, cabins.second_scale)
+    code = stack(cabins.first_high * (1 << 14) + cabins.first_low, cabins.second_high * (1 << 14) + cabins.second_low)
+    size = np.exp2(10 + scale)
+    quality = np.floor(code / size)
+    return Polar(
+        range=(take(SCALES, scale) + (2 + scale) * (code - quality * size)) / 1000,
+        azimuth=-np.deg2rad(headings(f, ULTRA_DENSE_CABINS, 2)),
+        intensity=quality * np.exp2(scale),
+    )
+
+
+def sweep_by(degrees: float) -> Callable[[int], Mapping[str, Any]]:
+    """The sweep of capsules that are so many degrees apart."""
+    return lambda i: {"start.angle": i * degrees % 360, "start.sync": int(i == 0)}

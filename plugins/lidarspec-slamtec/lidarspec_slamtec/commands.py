@@ -1,0 +1,80 @@
+"""What can be asked of an RPLIDAR, and how its motor is driven: by the line DTR, by PWM or by a speed.
+
+Source: RPLIDAR interface protocol, "requests"; how long to wait after them and the motor's commands from the vendor's SDK
+(sl_lidar_driver.cpp). No command but stop is answered while scan data is sent.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from lidarspec import Command
+from lidarspec_slamtec import answers
+
+AFTER_STOP = 0.1  # seconds (SDK; the protocol asks for at least 1 ms)
+AFTER_RESET = 0.002  # seconds (protocol)
+AFTER_MOTOR = 0.5  # seconds (SDK, startMotor)
+FULL_DUTY, USUAL_DUTY = 1023, 660  # SDK, MAX_MOTOR_PWM and DEFAULT_MOTOR_PWM
+USUAL_SPEED = 600  # rpm: 10 turns a second (data sheets of S2 and C1)
+
+
+def plain(cmd: int, **more: Any) -> Command:
+    """A request without payload."""
+    return Command("request", {"cmd.number": cmd}, **more)
+
+
+def about_sensor(key: int) -> Command:
+    """The request for a configuration value of the sensor."""
+    return Command("config_request", {"key": key}, reply="config", matches={"key": key})
+
+
+def about_mode(key: int) -> Command:
+    """The request for a configuration value of one of its scan modes."""
+    return Command("mode_config_request", {"key": key}, args={"mode": ("mode", 0, 0xFFFF)}, reply="config", matches={"key": key})
+
+
+def express(mode: int | None = None) -> Command:
+    """The request for capsules: of one scan mode, or of the one that is given as argument.
+
+    Which descriptor answers depends on the mode (get_answer_type tells), so that no reply is declared.
+    """
+    values = {"flags": 0, "param": 0} | ({} if mode is None else {"mode": mode})
+    return Command("express_request", values, args={"mode": ("mode", 0, 0xFF)} if mode is None else {}, starts=True)
+
+
+COMMANDS = {
+    "stop": plain(0x25, settle=AFTER_STOP, stops=True),
+    "reset": plain(0x40, settle=AFTER_RESET, stops=True),
+    "scan": plain(0x20, reply="scan_descriptor", starts=True),
+    "force_scan": plain(0x21, reply="scan_descriptor", starts=True),
+    "express_scan": express(),
+    "get_info": plain(0x50, reply="info"),
+    "get_health": plain(0x52, reply="health"),
+    "get_samplerate": plain(0x59, reply="sample_rate"),
+    "get_config": Command("config_request", args={"key": ("key", 0, 0xFFFF_FFFF)}, reply="config"),
+    "get_mode_config": Command(
+        "mode_config_request", args={"key": ("key", 0, 0xFFFF_FFFF), "mode": ("mode", 0, 0xFFFF)}, reply="config"
+    ),
+    "get_mode_count": about_sensor(answers.MODE_COUNT),
+    "get_typical_mode": about_sensor(answers.TYPICAL_MODE),
+    "get_us_per_sample": about_mode(answers.US_PER_SAMPLE),
+    "get_max_distance": about_mode(answers.MAX_DISTANCE),
+    "get_answer_type": about_mode(answers.ANSWER_TYPE),
+    "get_mode_name": about_mode(answers.MODE_NAME),
+}
+
+BY_DTR = {
+    "start_motor": Command(lines={"dtr": False}, settle=AFTER_MOTOR),
+    "stop_motor": Command(lines={"dtr": True}),
+}
+BY_PWM = {
+    "start_motor": Command("pwm_request", {"duty": USUAL_DUTY}, settle=AFTER_MOTOR),
+    "stop_motor": Command("pwm_request", {"duty": 0}),
+    "motor_duty": Command("pwm_request", args={"duty": ("duty", 0, FULL_DUTY)}),
+    "get_accessory": Command("accessory_request", {"reserved": 0}, reply="accessory"),
+}
+BY_SPEED = {
+    "start_motor": Command("rpm_request", {"speed": USUAL_SPEED}, settle=AFTER_MOTOR),
+    "stop_motor": Command("rpm_request", {"speed": 0}),
+    "motor_speed": Command("rpm_request", args={"speed": ("speed", 0, 0xFFFF)}),
+}

@@ -1,0 +1,1 @@
+"""Each family of sensors against its manuals, test vectors and real captures."""

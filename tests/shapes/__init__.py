@@ -1,0 +1,50 @@
+"""Small invented sensors, one mechanism each, so that the engine is general before it is large; every test runs over all of them."""
+
+from __future__ import annotations
+
+from lidarspec import Sensor
+from tests.shapes import (
+    ahead,
+    bits,
+    calibration,
+    clock,
+    commands,
+    count,
+    datagrams,
+    echoes,
+    grid,
+    middle,
+    modes,
+    nested,
+    nibbles,
+    numbers,
+    options,
+    state,
+    text,
+    twins,
+    weak,
+)
+
+_MODULES = (
+    count,
+    bits,
+    middle,
+    nibbles,
+    nested,
+    weak,
+    twins,
+    ahead,
+    state,
+    calibration,
+    options,
+    clock,
+    echoes,
+    text,
+    modes,
+    commands,
+    grid,
+    numbers,
+    datagrams,
+)
+
+SHAPES: dict[str, Sensor] = {module.SENSOR.id: module.SENSOR for module in _MODULES}

@@ -1,0 +1,38 @@
+"""A weak frame: five bytes, held together by a start bit, its inverse and a check bit; three in a row make it believable."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from construct import BitsInteger, BitStruct, ByteSwapped, Int16ul, Struct
+
+from lidarspec import Fields, Frame, OnFlag, Polar, Scaled, Sensor, Serial
+
+DATA = Struct(
+    "head" / BitStruct("quality" / BitsInteger(6), "inverse" / BitsInteger(1), "start" / BitsInteger(1)),
+    "beam" / ByteSwapped(BitStruct("angle" / Scaled(BitsInteger(15), 1 / 64, "deg"), "check" / BitsInteger(1))),
+    "distance" / Scaled(Int16ul, 0.00025, "m"),
+)
+
+
+def plausible(f: Fields) -> Any:
+    return (f.head.start != f.head.inverse) & (f.beam.check == 1) & (f.beam.angle < 360)
+
+
+def points(f: Fields) -> Polar:
+    return Polar(range=f.distance, azimuth=-np.deg2rad(f.beam.angle), intensity=f.head.quality)
+
+
+SENSOR = Sensor(
+    "shape-weak",
+    vendor="Shapes",
+    model="Weak",
+    frames={"data": Frame(DATA, data=True, max_length=5, plausible=plausible, confirm=3)},
+    points=points,
+    scan=OnFlag("head.start"),
+    links={"data": Serial(115_200)},
+    range_limits=(0.15, 16.0),
+    status="manual",
+    source="invented for the tests: a weak frame",
+)

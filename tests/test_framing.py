@@ -1,0 +1,260 @@
+"""Framing, against the brute-force oracle: damaged streams, any split of them, and inputs that have broken other parsers."""
+
+from __future__ import annotations
+
+import random
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+
+import lidarspec
+from lidarspec import Decoder, Sensor
+from lidarspec.testing import material
+from lidarspec.testing.comparisons import assert_backends_agree, cuts
+from tests.damage import BURSTS, RATES, damaged
+from tests.oracle import Cut, Oracle
+from tests.shapes import SHAPES
+
+EVERY = {**lidarspec.sensors(), **SHAPES}
+STREAMS = {name: sensor for name, sensor in EVERY.items() if not sensor.datagrams}
+#: about so many bytes to a stream: the oracle takes its time.
+LENGTH = 2500
+
+each_stream = pytest.mark.parametrize("sensor", STREAMS.values(), ids=STREAMS)
+
+
+class Books:
+    """A decoder whose books are checked after every call: each byte is in a frame, skipped or pending."""
+
+    def __init__(self, sensor: Sensor, *, backend: str = "auto") -> None:
+        self.decoder: Decoder = sensor.decoder(backend=backend)
+        self.found: list[Cut] = []
+
+    def feed(self, chunk: bytes) -> Books:
+        return self._entered(cuts(self.decoder.feed(chunk)))
+
+    def finish(self) -> list[Cut]:
+        return self._entered(cuts(self.decoder.finish())).found
+
+    def _entered(self, found: list[Cut]) -> Books:
+        self.found += found
+        stats = self.decoder.stats
+        assert stats.bytes_in == sum(len(data) for _, _, data in self.found) + stats.bytes_skipped + stats.pending
+        assert sum(stats.frames.values()) == len(self.found)
+        return self
+
+
+def decoded(sensor: Sensor, data: bytes) -> list[Cut]:
+    """The frames of a stream that comes in chunks of random sizes."""
+    books = Books(sensor)
+    for chunk in material.pieces(data, random.Random(len(data))):
+        books.feed(chunk)
+    return books.finish()
+
+
+def conversation(sensor: Sensor, *, seed: int = 0, length: int = LENGTH) -> bytes:
+    rounds = max(length // len(material.stream(sensor, rounds=1)), 1)
+    return material.stream(sensor, seed=seed, rounds=rounds)
+
+
+@each_stream
+@pytest.mark.parametrize("rate", RATES)
+def test_every_recoverable_frame_is_recovered(sensor: Sensor, rate: float) -> None:
+    data = damaged(conversation(sensor), rate, 1)
+    assert decoded(sensor, data) == Oracle(sensor, data).frames()
+
+
+@each_stream
+@pytest.mark.parametrize("burst", BURSTS)
+def test_every_recoverable_frame_is_recovered_after_bursts(sensor: Sensor, burst: int) -> None:
+    data = damaged(conversation(sensor, seed=1), 0.05, 2, burst=burst)
+    assert decoded(sensor, data) == Oracle(sensor, data).frames()
+
+
+@each_stream
+def test_noise_made_of_headers_is_cut_as_the_rule_says(sensor: Sensor) -> None:
+    source = random.Random(sensor.id)
+    heads = [data[: source.randint(1, 6)] for _, data in material.conversation(sensor, rounds=2)] + [b"\x00", b"\xff", b"\xfe"]
+    data = b"".join(source.choices([*heads, material.stream(sensor, rounds=1)], [*[9] * len(heads), 2 * len(heads)], k=60))[:6000]
+    assert decoded(sensor, data) == Oracle(sensor, data).frames()
+
+
+@each_stream
+def test_stray_bytes_between_frames_cost_none(sensor: Sensor) -> None:
+    frames = material.conversation(sensor)
+    first = frames[0][1][:1]
+    for stray in (b"\xfe", b"\xff", b"\x00", first, first * 3):
+        data = b"".join(stray + frame for _, frame in frames)
+        assert decoded(sensor, data) == Oracle(sensor, data).frames()
+
+
+@each_stream
+def test_the_head_of_a_frame_before_frames_costs_none(sensor: Sensor) -> None:
+    whole = material.stream(sensor, rounds=1)
+    name, frame = material.conversation(sensor, rounds=1)[-1]
+    for end in range(min(len(frame), 50)):
+        data = frame[:end] + whole
+        assert decoded(sensor, data) == Oracle(sensor, data).frames()
+
+
+@each_stream
+@pytest.mark.parametrize("byte", [b"\x00", b"\xff"], ids=["zeros", "ones"])
+def test_constant_lines_are_cut_as_the_rule_says(sensor: Sensor, byte: bytes) -> None:
+    data = byte * 300 + material.stream(sensor, rounds=1) + byte * 300
+    assert decoded(sensor, data) == Oracle(sensor, data).frames()
+
+
+@each_stream
+def test_headers_alone_never_make_a_frame_that_the_oracle_does_not_see(sensor: Sensor) -> None:
+    for _, frame in material.conversation(sensor, rounds=1):
+        for size in (1, 2, 3, 4):
+            data = frame[:size] * (400 // size)
+            assert decoded(sensor, data) == Oracle(sensor, data).frames()
+
+
+@pytest.mark.parametrize("sensor", EVERY.values(), ids=EVERY)
+def test_datagrams_of_any_size_raise_on_nothing(sensor: Sensor) -> None:
+    frame = sensor.example(sensor.data_frame, seed=3)
+    data = [b"", frame[:1], frame[:-1], frame, frame + b"\x00", bytes(65507), b"\xff" * 65507, frame, b"\x00" * len(frame)]
+    assert_backends_agree(sensor, data)
+    decoder = sensor.decoder(stream=False)
+    found = [item for datagram in data for item in decoder.feed(datagram)] + decoder.finish()
+    stats = decoder.stats
+    assert stats.bytes_in == sum(map(len, data)) == sum(len(item.data) for item in found) + stats.bytes_skipped
+    if sensor.frames[sensor.data_frame].after is None and sensor.frames[sensor.data_frame].confirm == 1:
+        assert [item.data for item in found].count(frame) == 2
+
+
+@each_stream
+def test_idle_gives_up_what_waits_and_looks_at_it_again(sensor: Sensor) -> None:
+    frames = material.conversation(sensor, rounds=2)
+    whole = b"".join(data for _, data in frames)
+    for end in (1, 2, 3, len(frames[-1][1]) - 1):
+        data = frames[-1][1][:end] + whole[: -end or None]
+        books = Books(sensor).feed(data)
+        books.finish()
+        assert books.decoder.stats.pending == 0
+        assert books.found == Oracle(sensor, data).frames()
+        books.feed(whole)
+        books.finish()
+        assert len(books.found) >= len(Oracle(sensor, data).frames())
+
+
+@each_stream
+def test_idle_between_chunks_is_the_rule_on_each_part(sensor: Sensor) -> None:
+    """Between two calls of `idle` the rule holds, and nothing that was given up comes back."""
+    if any(frame.confirm > 1 or frame.after for frame in sensor.frames.values()):
+        pytest.skip("what this sensor sends depends on what came before")
+    data = conversation(sensor, seed=2, length=600)
+    parts = [data[:200], data[200:350], data[350:]]
+    books, expected, base = Books(sensor), [], 0
+    for part in parts:
+        books.feed(part).finish()
+        expected += [(name, base + offset, frame) for name, offset, frame in Oracle(sensor, part).frames()]
+        base += len(part)
+    assert books.found == expected
+
+
+@each_stream
+def test_decoders_fed_in_turn_do_not_know_of_each_other(sensor: Sensor) -> None:
+    inputs = [damaged(conversation(sensor, seed=seed), 1e-3, seed) for seed in (3, 4)]
+    alone = [decoded(sensor, data) for data in inputs]
+    together = [Books(sensor), Books(sensor)]
+    for start in range(0, max(map(len, inputs)), 13):
+        for books, data in zip(together, inputs, strict=True):
+            books.feed(data[start : start + 13])
+    assert [books.finish() for books in together] == alone
+
+
+def test_decoders_in_threads_do_not_know_of_each_other() -> None:
+    work = [(sensor, damaged(conversation(sensor, seed=seed), 1e-3, seed)) for seed in range(4) for sensor in STREAMS.values()]
+    alone = [decoded(*item) for item in work]
+    with ThreadPoolExecutor(8) as pool:
+        assert list(pool.map(lambda item: decoded(*item), work)) == alone
+
+
+def test_a_frame_inside_a_frame_belongs_to_it() -> None:
+    sensor = SHAPES["shape-options"]
+    inner = sensor.build(
+        "data", options=dict(extended=0, coarse=0, kind=0), rows=0, columns=0, angle=0, distances=[], extension=None, extra=None
+    )
+    words = [int.from_bytes(inner[spot : spot + 2].ljust(2, b"\0"), "little") for spot in range(0, len(inner), 2)]
+    options = dict(extended=0, coarse=0, kind=0)
+    outer = sensor.build("data", options=options, rows=1, columns=len(words), angle=100, distances=words, extension=None, extra=None)
+    assert inner[:8] in outer
+    assert [data for _, _, data in decoded(sensor, outer + inner)] == [outer, inner]
+    broken = outer[:-1] + bytes([outer[-1] ^ 1])
+    assert [data for _, _, data in decoded(sensor, broken)] == [inner]
+
+
+def test_a_false_header_whose_length_swallows_good_frames_gives_them_back() -> None:
+    sensor = SHAPES["shape-count"]
+    frames = [sensor.build("data", count=2, first=0, last=100, samples=[dict(distance=0x1234, quality=1)] * 2) for _ in range(5)]
+    data = b"\xaa\x55\x28" + b"".join(frames)
+    books = Books(sensor).feed(data)
+    assert books.found == []
+    assert [frame for _, _, frame in books.finish()] == frames
+
+
+def test_a_claim_beyond_the_longest_length_is_not_waited_for() -> None:
+    sensor = SHAPES["shape-count"]
+    frame = sensor.example("data", seed=1)
+    books = Books(sensor).feed(b"\xaa\x55\xff" + frame)
+    assert [data for _, _, data in books.found] == [frame]
+    assert books.decoder.stats.bad_length == 1
+
+
+def test_the_longest_length_itself_is_allowed() -> None:
+    sensor = SHAPES["shape-count"]
+    samples = [dict(distance=index, quality=7) for index in range(40)]
+    frame = sensor.build("data", first=0, last=100, samples=samples)
+    assert len(frame) == sensor.frames["data"].max_length
+    assert [data for _, _, data in decoded(sensor, frame)] == [frame]
+    longer = sensor.build("data", first=0, last=100, samples=[*samples, samples[0]])
+    assert decoded(sensor, longer) == []
+
+
+def test_rejections_are_counted_by_their_reason() -> None:
+    sensor = SHAPES["shape-count"]
+    good = sensor.build("data", first=0, last=100, samples=[dict(distance=0x1234, quality=1)])
+    far = sensor.build("data", first=36000, last=100, samples=[dict(distance=0x1234, quality=1)])
+    wrong = good[:-1] + bytes([good[-1] ^ 0xFF])
+    stats = sensor.decode(good + far + wrong + good[:5] + good).stats
+    assert (stats.frames, stats.implausible, stats.bad_checksum) == ({"data": 2}, 1, 2)
+    assert stats.bytes_skipped == len(far) + len(wrong) + 5
+
+
+def test_fillers_are_skipped_bytes_with_a_count_of_their_own() -> None:
+    sensor = SHAPES["shape-middle"]
+    frame = sensor.example("data", seed=1)
+    found = sensor.split(b"\xfe\xff" + frame + b"\xfe" + frame + b"\xfe\x01\xff" + frame)
+    assert [item.gap for item in found] == [0, 0, 1]
+    stats = sensor.decode(b"\xfe\xff" + frame + b"\xfe" + frame + b"\xfe\x01\xff" + frame).stats
+    assert (stats.bytes_skipped, stats.bytes_filler) == (6, 5)
+
+
+def test_what_a_descriptor_announces_is_what_is_looked_for() -> None:
+    sensor = SHAPES["shape-modes"]
+    plain, express = sensor.example("plain", seed=1), sensor.example("express", seed=1)
+    begin_plain, begin_express = sensor.example("begin_plain"), sensor.example("begin_express")
+    data = plain + begin_plain + plain + plain + express + begin_express + express + plain + begin_plain + plain
+    assert decoded(sensor, data) == Oracle(sensor, data).frames()
+    assert [found.frame for found in sensor.split(begin_plain + plain + begin_express + express)] == [
+        "begin_plain",
+        "plain",
+        "begin_express",
+        "express",
+    ]
+    assert sensor.split(plain) == []
+    chosen = sensor.configure(answer="express")
+    assert [found.frame for found in chosen.split(express + plain)] == ["express"]
+    assert len(chosen.decode(express).points()) == 4
+
+
+def test_runs_of_weak_frames_count_whole_or_not_at_all() -> None:
+    sensor = SHAPES["shape-weak"]
+    frames = [sensor.example("data", seed=seed) for seed in range(6)]
+    for number in range(7):
+        data = b"\x00" * 7 + b"".join(frames[:number]) + b"\x00" * 7
+        assert [data for _, _, data in decoded(sensor, data)] == (frames[:number] if number >= 3 else [])
+        assert decoded(sensor, data) == Oracle(sensor, data).frames()
