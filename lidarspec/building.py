@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+import functools
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import construct
@@ -142,26 +143,35 @@ def _fill_counts(con: Construct, given: Container, table: Schema) -> None:
     for axis, expression in table.arrays.items():
         if not callable(expression) or "[]" in axis:
             continue
-        parent, _, name = axis.rpartition(".")
-        scope = _scope(given, parent)
-        if scope is None or not isinstance(scope.get(name), list | bytes):
+        inner, _, name = axis.rpartition(".")
+        scope, asked = _scope(given, inner), _asked_for(expression)
+        if scope is None or not isinstance(scope.get(name), list | bytes) or asked is None:
             continue
-        asked = _asked_for(expression)
-        if asked is None:
-            continue
+        parent = inner
+        while asked[0] == "_":
+            parent, asked = parent.rpartition(".")[0], asked[1:]
         *levels, field = asked
-        holder = scope
+        holder = _scope(given, parent)
         for level in levels:
             holder = holder.setdefault(level, Container())
         if holder.get(field) is None:
             info = table.fields.get(".".join(part for part in (parent, *asked) if part))
-            holder[field] = _solved(expression, scope, holder, field, len(scope[name]), info, axis)
+            context = functools.partial(_context, given, inner)
+            holder[field] = _solved(expression, context, holder, field, len(scope[name]), info, axis)
 
 
 def _scope(given: Any, path: str) -> Any:
     for name in path.split(".") if path else ():
         given = given.get(name) if isinstance(given, dict) else None
     return given if isinstance(given, dict) else None
+
+
+def _context(given: Container, path: str) -> Container:
+    """What an expression sees that stands in the struct at `path`: its fields, and under ``_`` those further out."""
+    context = Container(given)
+    for name in path.split(".") if path else ():
+        context = Container(context[name], _=context)
+    return context
 
 
 class _Asked(Exception):
@@ -222,14 +232,16 @@ def _asked_for(expression: Any) -> tuple[str, ...] | None:
     return tuple(object.__getattribute__(found, "_path")) if isinstance(found, _Recorder) else None
 
 
-def _solved(expression: Any, scope: Container, holder: Container, field: str, length: int, info: FieldInfo | None, axis: str) -> int:
+def _solved(
+    expression: Any, context: Callable[[], Container], holder: Container, field: str, length: int, info: FieldInfo | None, axis: str
+) -> int:
     """The value of the count field that gives this length."""
     top = limits(info)[1] if info is not None and info.kind == "int" else 65535
 
     def gives(value: int) -> bool:
         holder[field] = value
         try:
-            return bool(expression(scope) == length)
+            return bool(expression(context()) == length)
         except Exception:
             return False
 

@@ -24,7 +24,7 @@ from lidarspec.columns import Batch, Column, Fields, unpadded
 from lidarspec.construction import Mismatch
 from lidarspec.errors import SpecError
 from lidarspec.headers import HeaderTree, Refused
-from lidarspec.layout import Layout
+from lidarspec.layout import Layout, Seal
 from lidarspec.schema import Schema, schema
 from lidarspec.spec import Frame
 from lidarspec.tables import Group, Records, Rows, Table
@@ -119,7 +119,7 @@ class CompiledCodec:
             open_ = np.flatnonzero(status == VALID)
             if len(open_):
                 some = rows if len(open_) == len(rows) else rows[open_]
-                status[open_[~seal.intact(some)]] = CHECKSUM
+                status[open_] = intactness(seal, some, errors)
         open_ = np.flatnonzero(status == VALID)
         if self.frame.plausible is not None and len(open_):
             table = Rows(self.schema, [Group(layout, np.arange(len(open_)), rows if len(open_) == len(rows) else rows[open_])])
@@ -170,6 +170,15 @@ class InterpretedCodec:
         if self.frame.plausible is None:
             return VALID, size
         return int(plausibility(self.frame, Records(self.schema, [parsed], [data[:size]]), errors)[0]), size
+
+
+def intactness(seal: Seal, rows: NDArray[np.uint8], errors: list[str]) -> NDArray[np.uint8]:
+    """`VALID`, `CHECKSUM` or `PLUGIN` for each frame, by one of its checksums."""
+    try:
+        return np.where(seal.intact(rows), VALID, CHECKSUM).astype(np.uint8)
+    except Exception:
+        errors += [traceback.format_exc()] * len(rows)
+        return np.full(len(rows), PLUGIN, np.uint8)
 
 
 def plausibility(frame: Frame, table: Table, errors: list[str]) -> NDArray[np.uint8]:

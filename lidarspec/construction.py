@@ -53,11 +53,11 @@ class Seen(NamedTuple):
     seal: Any = None
 
 
-def note(context: Any, seen: Seen) -> None:
-    """Add to the list that a parse was given as ``_trail``, so that a parse that fails has still said how far it came."""
+def note(context: Any, path: str, start: int, end: int, value: Any, seal: Any = None) -> None:
+    """Add a `Seen` to the list that a parse was given as ``_trail``, so that a parse that fails has still said how far it came."""
     trail = context._params.get("_trail")
     if trail is not None:
-        trail.append(seen)
+        trail.append(Seen(path, start, end, value, seal))
 
 
 class WireNaN(float):
@@ -86,7 +86,7 @@ class MarkedStruct(Struct):  # type: ignore[misc]
         for con in self.subcons:
             start = stream.tell()
             value = con._parsereport(stream, inner, path)
-            note(context, Seen(f"{path} -> {con.name or UNNAMED}", start, stream.tell(), value))
+            note(context, f"{path} -> {con.name or UNNAMED}", start, stream.tell(), value)
             if con.name:
                 obj[con.name] = inner[con.name] = value
                 marks[con.name] = (start, stream.tell())
@@ -115,7 +115,7 @@ class IndexedArray(Array):  # type: ignore[misc]
             context._index = index
             start = stream.tell()
             found.append(self.subcon._parsereport(stream, context, f"{path}[{index}]"))
-            note(context, Seen(f"{path}[{index}]", start, stream.tell(), found[-1]))
+            note(context, f"{path}[{index}]", start, stream.tell(), found[-1])
         return found
 
     def _build(self, obj: Any, stream: Any, context: Any, path: str) -> Any:

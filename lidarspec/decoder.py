@@ -6,7 +6,7 @@ with the next. Datagram links frame by datagram. However the input is cut, the f
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any
 
@@ -15,11 +15,16 @@ from numpy.typing import NDArray
 
 from lidarspec.codecs import VALID, Codec, codec
 from lidarspec.errors import UsageError
-from lidarspec.framing import COUNTED, Framing, Mode
+from lidarspec.framing import COUNTED, Framing, Mode, Piece
 from lidarspec.spec import Sensor
 
 #: bytes of a stream looked at in one go.
 PIECE = 1 << 16
+
+#: datagrams judged together.
+TOGETHER = 1024
+
+Data = bytes | bytearray | memoryview | NDArray[np.uint8]
 
 BACKENDS = ("auto", "numpy", "jit", "construct")
 
@@ -90,6 +95,38 @@ class Found:
     gap: int = 0
 
 
+@dataclass(frozen=True, eq=False)
+class Spans:
+    """Frames of a piece of input as arrays, in stream order.
+
+    Attributes:
+        names: the types; `kinds` are indices into them.
+        buffer: the bytes that the frames stand in, at `starts`, `sizes` long.
+        offsets, gaps, at: as in `Found`; `at` is -1 where nobody knows it.
+    """
+
+    names: tuple[str, ...]
+    buffer: NDArray[np.uint8]
+    kinds: NDArray[np.intp]
+    starts: NDArray[np.intp]
+    sizes: NDArray[np.intp]
+    offsets: NDArray[np.int64]
+    gaps: NDArray[np.int64]
+    at: NDArray[np.int64]
+
+    def data(self, index: int) -> bytes:
+        """The bytes of one frame."""
+        return self.buffer[self.starts[index] : self.starts[index] + self.sizes[index]].tobytes()
+
+    def found(self) -> list[Found]:
+        """The frames one by one."""
+        rows = zip(self.kinds.tolist(), self.offsets.tolist(), self.gaps.tolist(), self.at.tolist(), strict=True)
+        return [
+            Found(self.names[kind], offset, self.data(index), None if at < 0 else at, gap)
+            for index, (kind, offset, gap, at) in enumerate(rows)
+        ]
+
+
 class Decoder:
     """Finds the frames of one sensor in what it is fed.
 
@@ -112,81 +149,134 @@ class Decoder:
         self._gap = 0
         self._fillers = np.array(sorted(set(sensor.fillers)), np.uint8)
 
-    def feed(self, data: bytes | bytearray | memoryview | NDArray[np.uint8], at: int | None = None) -> list[Found]:
+    def feed(self, data: Data, at: int | None = None) -> list[Found]:
         """The frames that these bytes complete, in stream order. Raises on no bytes whatever.
 
         Args:
             data: the next bytes of the stream, or one datagram.
             at: their arrival time in ns, if known.
         """
-        view = np.ascontiguousarray(data).data.cast("B") if isinstance(data, np.ndarray) else memoryview(data).cast("B")
-        self.stats.bytes_in += len(view)
-        if not self.stream:
-            return self._datagram(view.tobytes(), at)
-        found: list[Found] = []
-        for start in range(0, len(view), PIECE):
-            self._pending += view[start : start + PIECE]
-            if len(self._pending) >= self._need:
-                found += self._scan(at, final=False)
-        self.stats.pending = len(self._pending)
-        return found
+        return [found for spans in self.spans(data, at) for found in spans.found()]
 
     def idle(self) -> list[Found]:
         """The line fell silent: candidates that wait for bytes are given up, and their bytes looked at again."""
-        found = self._scan(None, final=True) if self._pending else []
-        self.stats.pending = len(self._pending)
-        return found
+        return [found for spans in self.rest() for found in spans.found()]
 
     def finish(self) -> list[Found]:
         """The input ended; the same as `idle`."""
         return self.idle()
 
-    def _scan(self, at: int | None, *, final: bool) -> list[Found]:
+    def spans(self, data: Data, at: int | None = None) -> list[Spans]:
+        """The same as `feed`, as arrays."""
+        view = np.ascontiguousarray(data).data.cast("B") if isinstance(data, np.ndarray) else memoryview(data).cast("B")
+        if not self.stream:
+            return [self.datagrams([view], [at])]
+        self.stats.bytes_in += len(view)
+        found: list[Spans] = []
+        for start in range(0, len(view), PIECE):
+            self._pending += view[start : start + PIECE]
+            if len(self._pending) >= self._need:
+                found.append(self._scan(at, final=False))
+        self.stats.pending = len(self._pending)
+        return found
+
+    def rest(self) -> list[Spans]:
+        """The same as `idle` and `finish`, as arrays."""
+        found = [self._scan(None, final=True)] if self._pending else []
+        self.stats.pending = len(self._pending)
+        return found
+
+    def datagrams(self, data: Sequence[Any], at: Sequence[int | None] | None = None) -> Spans:
+        """Datagrams, each one frame, whole, or none."""
+        sizes = np.array([len(one) for one in data], np.intp)
+        starts = np.cumsum(sizes) - sizes
+        buffer = np.frombuffer(b"".join(data), np.uint8)
+        self.stats.bytes_in += len(buffer)
+        if self._framing.named:
+            kinds = np.array([self._judge(buffer[a : a + n]) for a, n in zip(starts.tolist(), sizes.tolist(), strict=True)], np.intp)
+        else:
+            kinds = self._judge_all(buffer, starts, sizes)
+        lost = np.where(kinds < 0, sizes, 0)
+        for index in np.flatnonzero(lost):
+            lost[index] -= self._skip(buffer[starts[index] : starts[index] + sizes[index]])
+        good = np.flatnonzero(kinds >= 0)
+        before = np.concatenate([[-self._gap], np.cumsum(lost)[good]])
+        self._gap = int(lost.sum() - before[-1])
+        offsets, self._base = self._base + starts, self._base + len(buffer)
+        times = np.full(len(data), -1, np.int64) if at is None else np.array([-1 if one is None else one for one in at], np.int64)
+        spans = Spans(tuple(self._codecs), buffer, kinds[good], starts[good], sizes[good], offsets[good], np.diff(before), times[good])
+        self._count(spans.kinds)
+        return spans
+
+    def _scan(self, at: int | None, *, final: bool) -> Spans:
         buffer = np.frombuffer(self._pending, np.uint8)
         piece = self._framing.scan(buffer, self._mode, base=self._base, final=final)
-        found, position = [], 0
-        for kind, offset, size in zip(piece.kinds, piece.offsets, piece.sizes, strict=True):
-            self._skip(buffer[position:offset])
-            position = offset + size
-            found.append(self._found(self._framing.names[kind], self._base + offset, self._pending[offset:position], at))
-        self._skip(buffer[position : piece.end])
+        gaps = self._gaps(buffer, piece)
         for name, number in piece.rejected.items():
             setattr(self.stats, name, getattr(self.stats, name) + number)
         self.stats.tracebacks += piece.errors[: 5 - len(self.stats.tracebacks)]
+        times = np.full(len(gaps), -1 if at is None else at, np.int64)
+        spans = Spans(
+            tuple(self._codecs), buffer, piece.kinds, piece.offsets, piece.sizes, self._base + piece.offsets.astype(np.int64), gaps, times
+        )
+        self._count(piece.kinds)
         self._pending, self._base, self._need = self._pending[piece.end :], self._base + piece.end, piece.need
-        return found
+        return spans
 
-    def _found(self, name: str, offset: int, data: bytes, at: int | None) -> Found:
-        self.stats.frames[name] = self.stats.frames.get(name, 0) + 1
-        found = Found(name, offset, data, at, self._gap)
-        self._gap = 0
-        return found
+    def _gaps(self, buffer: NDArray[np.uint8], piece: Piece) -> NDArray[np.int64]:
+        """The bytes skipped before each frame, fillers left out; counts them."""
+        ends = np.concatenate([[0], piece.offsets + piece.sizes])
+        starts = np.concatenate([piece.offsets, [max(piece.end, int(ends[-1]))]])
+        gaps = (starts - ends).astype(np.int64)
+        for index in np.flatnonzero(gaps).tolist() if len(self._fillers) else ():
+            gaps[index] -= self._skip(buffer[ends[index] : starts[index]])
+        if not len(self._fillers):
+            self.stats.bytes_skipped += int(gaps.sum())
+        gaps[0] += self._gap
+        self._gap = int(gaps[-1])
+        return np.asarray(gaps[:-1])
 
-    def _skip(self, skipped: NDArray[np.uint8]) -> None:
-        if not len(skipped):
-            return
+    def _skip(self, skipped: NDArray[np.uint8]) -> int:
+        """Count skipped bytes; the number of fillers among them."""
         fillers = int(np.isin(skipped, self._fillers).sum()) if len(self._fillers) else 0
         self.stats.bytes_skipped += len(skipped)
         self.stats.bytes_filler += fillers
-        self._gap += len(skipped) - fillers
+        return fillers
 
-    def _datagram(self, data: bytes, at: int | None) -> list[Found]:
-        """A datagram is one frame, whole, or none."""
-        offset, self._base = self._base, self._base + len(data)
-        buffer, rejected = np.frombuffer(data, np.uint8), 0
+    def _count(self, kinds: NDArray[np.intp]) -> None:
+        for name, number in zip(self._codecs, np.bincount(kinds, minlength=len(self._codecs)).tolist(), strict=True):
+            if number:
+                self.stats.frames[name] = self.stats.frames.get(name, 0) + number
+
+    def _judge_all(self, buffer: NDArray[np.uint8], starts: NDArray[np.intp], sizes: NDArray[np.intp]) -> NDArray[np.intp]:
+        """The type of each datagram, -1 where it is none."""
+        kinds = np.full(len(starts), -1, np.intp)
+        for index, engine in enumerate(self._codecs.values()):
+            left = np.flatnonzero((kinds < 0) & (sizes > 0))
+            for spot, (mask, value) in engine.prefix.items():
+                left = left[sizes[left] > spot]
+                left = left[buffer[starts[left] + spot] & mask == value]
+            survey = engine.survey(buffer, starts[left])
+            kinds[left[(survey.status == VALID) & (survey.sizes == sizes[left])]] = index
+        for index in np.flatnonzero(kinds < 0).tolist():
+            kinds[index] = self._judge(buffer[starts[index] : starts[index] + sizes[index]])
+        return kinds
+
+    def _judge(self, buffer: NDArray[np.uint8]) -> int:
+        """The type of one datagram, -1 where it is none; counts why."""
+        rejected = 0
         for index, (name, engine) in enumerate(self._codecs.items()):
             if not self._framing.active(index, self._mode) or not _starts(buffer, engine):
                 continue
             survey = engine.survey(buffer, np.zeros(1, np.intp))
-            if survey.status[0] == VALID and survey.sizes[0] == len(data):
+            if survey.status[0] == VALID and survey.sizes[0] == len(buffer):
                 self._mode.after = name if name in self._framing.named else self._mode.after
-                return [self._found(name, offset, data, at)]
+                return index
             rejected = max(rejected, int(survey.status[0]))
             self.stats.tracebacks += survey.errors[: 5 - len(self.stats.tracebacks)]
         counter = COUNTED.get(rejected, "bad_length")
         setattr(self.stats, counter, getattr(self.stats, counter) + 1)
-        self._skip(buffer)
-        return []
+        return -1
 
 
 def _starts(buffer: NDArray[np.uint8], engine: Codec) -> bool:
@@ -210,13 +300,25 @@ def backend(name: str) -> str:
     return name
 
 
-def feed_all(decoder: Decoder, data: Any) -> list[Found]:
+def spans_of(decoder: Decoder, data: Any) -> list[Spans]:
     """Every frame of a whole input: bytes as a stream, an iterable or (n, size) array as datagrams."""
-    found: list[Found] = []
-    chunks: Iterable[Any] | Sequence[Any] = [data] if isinstance(data, bytes | bytearray | memoryview) else data
-    for chunk in chunks:
-        found += decoder.feed(chunk)
-    return found + decoder.finish()
+    if is_stream(data):
+        return decoder.spans(data) + decoder.rest()
+    if isinstance(data, np.ndarray):
+        data = [memoryview(row) for row in np.ascontiguousarray(data, np.uint8)]
+    everything = list(data)
+    return [decoder.datagrams(everything[start : start + TOGETHER]) for start in range(0, len(everything), TOGETHER)]
+
+
+def packed(found: Sequence[Found]) -> Spans:
+    """Frames given one by one as arrays."""
+    names = tuple(dict.fromkeys(item.frame for item in found))
+    sizes = np.array([len(item.data) for item in found], np.intp)
+    columns = [np.array(column, np.int64) for column in zip(*((f.offset, f.gap, -1 if f.at is None else f.at) for f in found), strict=True)]
+    offsets, gaps, at = columns or [np.empty(0, np.int64)] * 3
+    kinds = np.array([names.index(item.frame) for item in found], np.intp)
+    buffer = np.frombuffer(b"".join(item.data for item in found), np.uint8)
+    return Spans(names, buffer, kinds, np.cumsum(sizes) - sizes, sizes, offsets, gaps, at)
 
 
 def is_stream(data: Any) -> bool:

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import itertools
 import random
 from dataclasses import dataclass
 
 from lidarspec.decoder import Counters
 from lidarspec.scans import Scan, ScanStream
-from lidarspec.simulator import simulate
+from lidarspec.simulator import opening, simulate
 from lidarspec.spec import Sensor
 from lidarspec.streams import PacketStream
 
@@ -40,15 +39,17 @@ def run(sensor: Sensor, *, turns: int = 5, errors: float = 0.01, seed: int = 1, 
     packets, scans = PacketStream(sensor, sensor.data_frame, decoder.stats), ScanStream(sensor)
     found: list[Scan] = []
     sent = intact = 0
+    if decoder.stream:
+        decoder.feed(opening(sensor))
     for start in range(0, most, BATCH):
         chunks = [_damaged(frame, source, errors, stream=decoder.stream) for frame in simulate(sensor, BATCH, start=start)]
         sent, intact = sent + len(chunks), intact + sum(unharmed for _, unharmed in chunks)
         data = [data for data, _ in chunks if data]
-        pieces = [b"".join(data)] if decoder.stream else data
-        found += scans.add(packets.add(list(itertools.chain.from_iterable(decoder.feed(piece) for piece in pieces))))
+        spans = decoder.spans(b"".join(data)) if decoder.stream else [decoder.datagrams(data)]
+        found += scans.add(packets.add(spans))
         if sum(scan.complete for scan in found) >= turns:
             break
-    found += scans.add(packets.add(decoder.finish())) + scans.finish()
+    found += scans.add(packets.add(decoder.rest())) + scans.finish()
     return DemoResult(sensor, tuple(found), decoder.stats, sent, intact)
 
 

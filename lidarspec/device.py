@@ -6,7 +6,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from types import TracebackType
 
-from lidarspec.decoder import Counters, Decoder, Found
+import numpy as np
+
+from lidarspec.decoder import Counters, Decoder, Spans
 from lidarspec.detect import detected
 from lidarspec.errors import UsageError
 from lidarspec.files import Chunk, Transport
@@ -47,25 +49,23 @@ class Device:
         """What is to be said about the source."""
         return list(getattr(self._transport, "warnings", []))
 
-    def frames(self) -> Iterator[list[Found]]:
+    def spans(self) -> Iterator[list[Spans]]:
         """Every incoming frame, in batches."""
-        size = number = 0
-        found: list[Found] = []
-        for chunk in self._transport.chunks():
-            new = self._decoder.feed(chunk.data, chunk.at)
-            self._check_sender(chunk, new)
-            found += new
-            size, number = size + len(chunk.data), number + 1
-            if size >= BATCH_BYTES or number >= BATCH_CHUNKS:
-                yield found
-                found, size, number = [], 0, 0
-        yield found + self._decoder.finish()
+        chunks = self._transport.chunks()
+        while batch := _batch(chunks):
+            if self._decoder.stream:
+                found = [spans for chunk in batch for spans in self._decoder.spans(chunk.data, chunk.at)]
+            else:
+                found = [self._decoder.datagrams([chunk.data for chunk in batch], [chunk.at for chunk in batch])]
+                self._check_senders(batch, found[0])
+            yield found
+        yield self._decoder.rest()
 
     def packets(self, frame: str | None = None) -> Iterator[Packets]:
         """The packets of the data frame, or of another type, in batches."""
         stream: PacketStream | None = None
-        waiting: list[Found] = []
-        for found in self.frames():
+        waiting: list[Spans] = []
+        for found in self.spans():
             waiting += found
             name = frame or data_frame(self.sensor, waiting)
             if stream is None and name is not None:
@@ -97,34 +97,47 @@ class Device:
     def __repr__(self) -> str:
         return f"Device({self.sensor.id} on {self._source}: {self.stats})"
 
-    def _check_sender(self, chunk: Chunk, found: list[Found]) -> None:
+    def _check_senders(self, batch: list[Chunk], found: Spans) -> None:
         """Frames of several senders must not be mixed into one cloud."""
-        if chunk.sender is None:
-            return
-        for item in found:
-            first = self._senders.setdefault(item.frame, chunk.sender[0])
-            if first != chunk.sender[0]:
-                senders = f"{first} and {chunk.sender[0]}"
-                raise UsageError(f"{self._source}: {senders} both send {item.frame} frames; choose one with ?src={first}")
+        ends = np.cumsum([len(chunk.data) for chunk in batch])
+        for kind, place in zip(found.kinds.tolist(), np.searchsorted(ends, found.starts, side="right").tolist(), strict=True):
+            sender = batch[place].sender
+            first = self._senders.setdefault(found.names[kind], sender[0]) if sender else None
+            if sender and first != sender[0]:
+                raise UsageError(
+                    f"{self._source}: {first} and {sender[0]} both send {found.names[kind]} frames; choose one with ?src={first}"
+                )
 
-    def _first_state(self) -> list[Found]:
+    def _first_state(self) -> dict[str, bytes]:
         """The first frame of each type that `points` takes its state from: a file is read as if it stood at the start."""
         wanted = set(self.sensor.state)
         if not wanted or not Path(str(self._source).partition("?")[0]).is_file():
-            return []
-        first: dict[str, Found] = {}
+            return {}
+        first: dict[str, bytes] = {}
         source = transport(self._source)
         decoder = self.sensor.decoder(stream=not source.datagrams)
         try:
             for chunk in source.chunks():
                 for item in decoder.feed(chunk.data, chunk.at):
                     if item.frame in wanted:
-                        first.setdefault(item.frame, item)
+                        first.setdefault(item.frame, item.data)
                 if len(first) == len(wanted):
                     break
         finally:
             source.close()
-        return list(first.values())
+        return first
+
+
+def _batch(chunks: Iterator[Chunk]) -> list[Chunk]:
+    """The next chunks, as many as are worth decoding together."""
+    found: list[Chunk] = []
+    size = 0
+    for chunk in chunks:
+        found.append(chunk)
+        size += len(chunk.data)
+        if size >= BATCH_BYTES or len(found) >= BATCH_CHUNKS:
+            break
+    return found
 
 
 def open(source: str | Path, sensor: str | Sensor | None = None, *, backend: str = "auto") -> Device:

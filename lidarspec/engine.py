@@ -9,7 +9,7 @@ from lidarspec import examples, parsing
 from lidarspec.building import build, limits
 from lidarspec.clouds import axis_matrix
 from lidarspec.codecs import codec
-from lidarspec.decoder import Decoder, Found, feed_all, is_stream
+from lidarspec.decoder import Decoder, Found, is_stream, spans_of
 from lidarspec.decoder import backend as checked_backend
 from lidarspec.errors import MissingField, OutOfRange, SpecError, UnknownCommand, UnknownField, UnknownOption, UsageError
 from lidarspec.packets import Packets
@@ -63,11 +63,12 @@ class StandardEngine:
         return Decoder(sensor, stream=not sensor.datagrams if stream is None else stream, interpreted=interpreted)
 
     def split(self, sensor: Sensor, data: Any, *, backend: str) -> list[Found]:
-        return feed_all(self.decoder(sensor, stream=is_stream(data), backend=backend), data)
+        found = spans_of(self.decoder(sensor, stream=is_stream(data), backend=backend), data)
+        return [one for spans in found for one in spans.found()]
 
     def decode(self, sensor: Sensor, data: Any, *, frame: str | None, backend: str) -> Packets:
         decoder = self.decoder(sensor, stream=is_stream(data), backend=backend)
-        found = feed_all(decoder, data)
+        found = spans_of(decoder, data)
         name = frame or data_frame(sensor, found) or sensor.data_frame
         return PacketStream(sensor, name, decoder.stats, interpreted=decoder.interpreted).add(found, whole=True)
 

@@ -62,8 +62,9 @@ class UsageError(LidarSpecError):
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:
     """A closing clause such as ``; did you mean 'speed'?``, or an empty text where nothing is close."""
-    close = difflib.get_close_matches(name, list(known), n=1, cutoff=0.5)
-    return f"; did you mean {close[0]!r}?" if close else ""
+    by_letters = {other.lower(): other for other in known}
+    close = difflib.get_close_matches(name.lower(), list(by_letters), n=1, cutoff=0.5)
+    return f"; did you mean {by_letters[close[0]]!r}?" if close else ""
 
 
 class UnknownName(UsageError):

@@ -70,10 +70,11 @@ def _plausible(sensor: Sensor, frame: str, layout: Layout, rows: NDArray[np.uint
 
 def _swept(sensor: Sensor, frame: str, engine: CompiledCodec, source: random.Random) -> bytes:
     """A frame around the values that the sensor's `sweep` declares, where random ones are never plausible."""
-    if sensor.sweep is None or not sensor.frames[frame].data:
+    sweep = sensor.frames[frame].sweep or (sensor.sweep if sensor.frames[frame].data else None)
+    if sweep is None:
         raise SpecError("no random frame passes `plausible`, and there is no `sweep` to start from", path=frame, sensor=sensor.id)
     for _ in range(TRIES):
-        values = sensor.sweep(source.randrange(10_000))
+        values = sweep(source.randrange(10_000))
         layout, chosen = engine.tree.choose(source)
         rows = np.frombuffer(source.randbytes(layout.size), np.uint8).reshape(1, layout.size).copy()
         for path, value in values.items():

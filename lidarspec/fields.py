@@ -13,7 +13,7 @@ from construct import Construct, Container, Subconstruct
 
 from lidarspec.bits import bytes_of
 from lidarspec.checksums import Checksum
-from lidarspec.construction import Mismatch, Seen, bit_width, member, note, unwrap, verifying
+from lidarspec.construction import Mismatch, bit_width, member, note, unwrap, verifying
 
 
 class Scaled(Subconstruct):  # type: ignore[misc]
@@ -69,7 +69,7 @@ class Checksummed(Subconstruct):  # type: ignore[misc]
         start = stream.tell()
         obj = self.subcon._parsereport(stream, context, path)
         end = stream.tell()
-        note(context, Seen(path, start, end, obj, self))
+        note(context, path, start, end, obj, self)
         if not verifying(context, checksums=True):
             return obj
         stream.seek(start)

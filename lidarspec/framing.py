@@ -4,14 +4,17 @@ A stream decodes to the leftmost valid candidate, then on after its last byte; a
 byte. At one offset the order of the frame types decides. A type with `after` is looked for only while the frame that
 it names is the last seen of those named by any `after`; a type with `confirm` counts only in unbroken runs.
 
-All candidates of a piece are judged in bulk; then a walk goes over those that are not rejected. So the work is
-linear in the input however often headers appear in it, and the result is that of the byte-by-byte rule.
+All candidates of a piece are judged in bulk. Where no type needs memory, those that are taken are found in bulk too, with
+a step for each conflict only; else a walk goes over the candidates that are not rejected. So the work is linear in the
+input however often headers appear in it, and the result is that of the byte-by-byte rule.
 """
 
 from __future__ import annotations
 
+import bisect
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,16 +60,32 @@ class Mode:
 
 @dataclass
 class Piece:
-    """The outcome for one piece: frames as (type index, offset, size), where the rest begins and how long it has to be
-    at least (`need`, 0 if unknown), and what was rejected."""
+    """The outcome for one piece.
 
-    kinds: list[int] = field(default_factory=list)
-    offsets: list[int] = field(default_factory=list)
-    sizes: list[int] = field(default_factory=list)
+    Attributes:
+        kinds, offsets, sizes: of the frames: index of the type, first byte, number of bytes.
+        end: where the rest begins, which has to be looked at again together with what follows.
+        need: how long the rest has to be at least before that makes sense; 0 if unknown.
+        rejected: number of rejected candidates by counter.
+        errors: tracebacks out of plugins.
+    """
+
+    kinds: NDArray[np.intp] = field(default_factory=lambda: np.empty(0, np.intp))
+    offsets: NDArray[np.intp] = field(default_factory=lambda: np.empty(0, np.intp))
+    sizes: NDArray[np.intp] = field(default_factory=lambda: np.empty(0, np.intp))
     end: int = 0
     need: int = 0
     rejected: dict[str, int] = field(default_factory=dict)
     errors: list[str] = field(default_factory=list)
+
+    def reject(self, candidates: Candidates, which: NDArray[Any] | slice) -> None:
+        """Count some candidates as rejected, each under its reason."""
+        for status, number in enumerate(np.bincount(candidates.status[which], minlength=PLUGIN + 1).tolist()):
+            name = COUNTED.get(LENGTH if status == SHORT else status)
+            if number and name:
+                self.rejected[name] = self.rejected.get(name, 0) + number
+                if status == PLUGIN:
+                    self.errors += candidates.errors[:1]
 
 
 class Framing:
@@ -79,6 +98,7 @@ class Framing:
     def __init__(self, codecs: Mapping[str, Codec]) -> None:
         self.names, self.codecs = list(codecs), list(codecs.values())
         self.named = {codec.frame.after for codec in self.codecs} - {None}
+        self._plain = not self.named and all(codec.frame.confirm == 1 for codec in self.codecs)
 
     def scan(self, buffer: NDArray[np.uint8], mode: Mode, *, base: int, final: bool) -> Piece:
         """Cut one piece.
@@ -92,8 +112,10 @@ class Framing:
         Returns:
             The frames, and in `end` the first byte that has to be looked at again together with what follows.
         """
-        piece = Piece()
         found = [Candidates.find(codec, buffer) for codec in self.codecs]
+        if self._plain:
+            return leftmost(found, len(buffer), final=final)
+        piece = Piece()
         _Walker(self, found, mode, piece, base, len(buffer), final=final).run()
         return piece
 
@@ -101,6 +123,58 @@ class Framing:
         """Whether a type is looked for now."""
         after = self.codecs[index].frame.after
         return after is None or after == mode.after
+
+
+def leftmost(found: Sequence[Candidates], length: int, *, final: bool) -> Piece:
+    """The rule for types that need no memory (no `after`, no `confirm`), for a whole piece at once."""
+    live = [np.flatnonzero((c.status == VALID) | ((c.status == SHORT) & (not final))) for c in found]
+    kinds = np.repeat(np.arange(len(found)), [len(which) for which in live])
+    offsets = np.concatenate([c.offsets[which] for c, which in zip(found, live, strict=True)])
+    sizes = np.concatenate([c.sizes[which] for c, which in zip(found, live, strict=True)])
+    short = np.concatenate([c.status[which] == SHORT for c, which in zip(found, live, strict=True)])
+    if len(found) > 1:
+        order = np.lexsort((kinds, offsets))
+        first = np.ones(len(order), np.bool_)
+        first[1:] = np.diff(offsets[order]) > 0
+        kinds, offsets, sizes, short = (array[order[first]] for array in (kinds, offsets, sizes, short))
+    chosen = _chain(offsets, np.where(short, length + 1, offsets + sizes))
+    piece = Piece(end=length)
+    if len(chosen) and short[chosen[-1]]:
+        piece.end, piece.need = int(offsets[chosen[-1]]), int(sizes[chosen[-1]])
+        chosen = chosen[:-1]
+    piece.kinds, piece.offsets, piece.sizes = kinds[chosen], offsets[chosen], sizes[chosen]
+    _count_rejected(piece, found, final=final)
+    return piece
+
+
+def _chain(offsets: NDArray[np.intp], ends: NDArray[np.intp]) -> NDArray[np.intp]:
+    """Indices of the candidates that are taken from left to right, each from the end of the one before."""
+    after = np.searchsorted(offsets, ends)
+    jumps = np.flatnonzero(after != np.arange(1, len(offsets) + 1)).tolist()
+    if not jumps:
+        return np.arange(len(offsets))
+    runs, start = [], 0
+    while start < len(offsets):
+        spot = bisect.bisect_left(jumps, start)
+        last = jumps[spot] if spot < len(jumps) else len(offsets) - 1
+        runs.append(np.arange(start, last + 1))
+        start = int(after[last])
+    return np.concatenate(runs)
+
+
+def _count_rejected(piece: Piece, found: Sequence[Candidates], *, final: bool) -> None:
+    """Count the candidates outside the frames, and at a frame's first byte those of the types that come before its own."""
+    ends = piece.offsets + piece.sizes
+    for kind, candidates in enumerate(found):
+        refused = (candidates.status != VALID) & ((candidates.status != SHORT) | final)
+        spots = candidates.offsets
+        before = np.searchsorted(piece.offsets, spots, side="right") - 1
+        counted = refused & (spots < piece.end)
+        if len(ends):
+            held = np.maximum(before, 0)
+            inside = (before >= 0) & (spots < ends[held])
+            counted &= ~inside | ((spots == piece.offsets[held]) & (kind < piece.kinds[held]))
+        piece.reject(candidates, counted)
 
 
 class _Walker:
@@ -112,6 +186,7 @@ class _Walker:
         self.framing, self.found, self.mode, self.piece = framing, found, mode, piece
         self.base, self.length, self.final = base, length, final
         self.position = 0
+        self.taken: list[tuple[int, int, int]] = []
         self.tables: list[dict[int, int]] = []
         for candidates in found:
             live = np.flatnonzero((candidates.status == VALID) | (candidates.status == SHORT))
@@ -120,21 +195,22 @@ class _Walker:
 
     def run(self) -> None:
         """Accept what is valid from left to right, until the end or a candidate that needs more bytes."""
-        counted = 0
+        self.piece.end = self._walk()
+        self._count(self.position, self.piece.end)
+        columns = np.array(self.taken, np.intp).reshape(len(self.taken), 3).T
+        self.piece.kinds, self.piece.offsets, self.piece.sizes = columns
+
+    def _walk(self) -> int:
         for spot in self.spots:
             if spot < self.position:
                 continue
             taken = self._at(spot)
             if taken is None:
-                self._count(counted, spot)
-                self.piece.end = spot
-                return
+                return spot
             if taken >= 0:
-                self._count(counted, spot, before=taken)
+                self._count(self.position, spot, before=taken)
                 self._accept(taken, spot)
-                counted = self.position
-        self._count(counted, self.length)
-        self.piece.end = max(self.length, self.position)
+        return self.length
 
     def _at(self, spot: int) -> int | None:
         """The type that is accepted at an offset, -1 if none is, None if that takes more bytes than there are."""
@@ -159,9 +235,7 @@ class _Walker:
     def _accept(self, index: int, spot: int) -> None:
         name = self.framing.names[index]
         size = int(self.found[index].sizes[self.tables[index][spot]])
-        self.piece.kinds.append(index)
-        self.piece.offsets.append(spot)
-        self.piece.sizes.append(size)
+        self.taken.append((index, spot, size))
         self.position = spot + size
         weak = self.framing.codecs[index].frame.confirm > 1
         self.mode.run, self.mode.run_end = (name, self.base + self.position) if weak else (None, -1)
@@ -207,9 +281,4 @@ class _Walker:
             if not len(candidates.offsets) or not self.framing.active(index, self.mode):
                 continue
             low, high = np.searchsorted(candidates.offsets, [start, stop + (index < before)])
-            for status, number in enumerate(np.bincount(candidates.status[low:high], minlength=PLUGIN + 1).tolist()):
-                name = COUNTED.get(LENGTH if status == SHORT else status)
-                if number and name:
-                    self.piece.rejected[name] = self.piece.rejected.get(name, 0) + number
-                    if status == PLUGIN:
-                        self.piece.errors += candidates.errors[:1]
+            self.piece.reject(candidates, slice(low, high))

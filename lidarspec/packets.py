@@ -13,7 +13,7 @@ from lidarspec.decoder import Counters
 from lidarspec.errors import UnknownField
 from lidarspec.schema import Schema
 from lidarspec.spec import Sensor
-from lidarspec.tables import Records, Rows, Table
+from lidarspec.tables import Table
 
 if TYPE_CHECKING:
     from lidarspec.clouds import PointCloud
@@ -131,19 +131,19 @@ def joined(parts: Sequence[Packets]) -> Packets:
     if len(parts) == 1:
         return parts[0]
     head = parts[0]
-    kind = Records if isinstance(head.table, Records) else Rows
     state = {}
     for name in head.state:
         tables = [part.state[name][0] for part in parts]
         known = [table for table in tables if table is not None]
         starts = np.cumsum([0] + [0 if table is None else len(table) for table in tables])
         which = [np.where(part.state[name][1] < 0, -1, part.state[name][1] + start) for part, start in zip(parts, starts[:-1], strict=True)]
-        state[name] = (_joined_tables(known) if known else None, np.concatenate(which))
+        state[name] = (joined_tables(known) if known else None, np.concatenate(which))
     columns = {key: np.concatenate([getattr(part, key) for part in parts]) for key in ("offset", "time_ns", "host_ns", "index", "breaks")}
-    return Packets(head.sensor, head.frame, kind.joined([part.table for part in parts]), **columns, state=state, stats=parts[-1].stats)  # type: ignore[misc]
+    return Packets(head.sensor, head.frame, joined_tables([part.table for part in parts]), **columns, state=state, stats=parts[-1].stats)
 
 
-def _joined_tables(tables: Sequence[Any]) -> Table:
+def joined_tables(tables: Sequence[Any]) -> Table:
+    """Several tables of one frame type, one after another."""
     return type(tables[0]).joined(tables)  # type: ignore[no-any-return]
 
 

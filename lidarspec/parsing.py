@@ -101,8 +101,8 @@ def _truncated(sensor: Sensor, name: str, data: bytes, path: str) -> WireError:
         left = len(data) - start
         needs = f" needs {size} byte{'s' if size != 1 else ''}, {left} left"
     reason = f"frame ends at byte {len(data)}{total}: {path or 'the first field'}{needs or ' is cut off'}"
-    size = layout.size if isinstance(layout, Layout) else None
-    return WireError(reason, offset=len(data) - left, path=path, sensor=sensor.id, frame=name, expected=size, got=len(data), data=data)
+    whole = layout.size if isinstance(layout, Layout) else None
+    return WireError(reason, offset=len(data) - left, path=path, sensor=sensor.id, frame=name, expected=whole, got=len(data), data=data)
 
 
 def _at_end(layout: Layout, path: str, end: int) -> tuple[int, int]:

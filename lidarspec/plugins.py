@@ -12,7 +12,7 @@ import importlib.util
 import inspect
 import traceback
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -20,7 +20,8 @@ from typing import Any
 import pluggy
 
 from lidarspec import hookspecs
-from lidarspec.errors import LidarSpecError, SourceError, SpecError, UnknownSensor
+from lidarspec.checksums import Checksum
+from lidarspec.errors import LidarSpecError, SourceError, SpecError, UnknownSensor, UsageError
 from lidarspec.fields import Checksummed
 from lidarspec.rules import children
 from lidarspec.spec import Frame, Sensor, replaced
@@ -135,15 +136,21 @@ class Registry:
         return getattr(self._manager.hook, hook)(**arguments)
 
     def _sealed(self, sensor: Sensor, frame: Frame) -> Frame:
-        algorithm = self._manager.hook.lidarspec_checksum(sensor=sensor, frame=frame)
-        if algorithm is None:
-            return frame
-        changed = replaced(frame)
-        seal = next(iter(_seals(changed.prepared)), None)
-        if seal is None:
-            raise SpecError("a lidarspec_checksum hook answers for a frame without a checksum", sensor=sensor.id)
-        seal.algorithm = algorithm
-        return changed
+        """The frame with the checksum of the first hook that has one for it; a hook that fails is named and passed over."""
+        arguments = {"sensor": sensor, "frame": frame}
+        for hook in reversed(self._manager.hook.lidarspec_checksum.get_hookimpls()):
+            try:
+                algorithm = hook.function(**{name: arguments[name] for name in hook.argnames})
+                if algorithm is not None:
+                    return _resealed(frame, algorithm)
+            except Exception as error:
+                self._failed(hook.plugin_name, f"lidarspec_checksum for {sensor.id}: {type(error).__name__}: {error}")
+        return frame
+
+    def _failed(self, name: str, reason: str) -> None:
+        for index, plugin in enumerate(self.plugins):
+            if f"{plugin.distribution}:{plugin.entry_point.partition(' = ')[0]}" == name and not plugin.error:
+                self.plugins[index] = replace(plugin, error=reason, traceback=traceback.format_exc())
 
     def _check(self, sensor: Any, own: list[Any]) -> None:
         if not isinstance(sensor, Sensor):
@@ -160,6 +167,17 @@ class Registry:
 def _seals(con: Any) -> list[Checksummed]:
     found = [con] if isinstance(con, Checksummed) else []
     return found + [seal for child in children(con) for seal in _seals(child)]
+
+
+def _resealed(frame: Frame, algorithm: Any) -> Frame:
+    if not isinstance(algorithm, Checksum):
+        raise SpecError(f"returns a Checksum or None, not {type(algorithm).__name__}")
+    changed = replaced(frame)
+    seal = next(iter(_seals(changed.prepared)), None)
+    if seal is None:
+        raise SpecError("answers for a frame without a checksum")
+    seal.algorithm = algorithm
+    return changed
 
 
 def _with_points(frame: Frame, points: Any) -> Frame:
@@ -217,12 +235,19 @@ def _from_file(text: str) -> Sensor:
     file = Path(f"{path}.py" if colon else text)
     module = _module(file)
     local = Registry()
-    ids = local.add(module, name=str(file))
+    try:
+        ids = local.add(module, name=str(file))
+    except LidarSpecError:
+        raise
+    except (Exception, SystemExit) as error:
+        raise SpecError(f"{type(error).__name__}: {error}", path=str(file)) from error
     if not ids:
         raise SpecError("lidarspec_sensors returns no sensor", path=str(file))
+    if len(ids) > 1 and not wanted:
+        raise UsageError(f"{file} describes several sensors, name one: {', '.join(f'{file}:{name}' for name in ids)}")
     chosen = local._loaded.get(wanted or ids[0])
-    if chosen is None or (len(ids) > 1 and not wanted):
-        raise UnknownSensor(wanted or text, [f"{file}:{name}" for name in ids], place=str(file))
+    if chosen is None:
+        raise UnknownSensor(wanted, ids, place=str(file))
     return registry().hooked(local.hooked(chosen))
 
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from lidarspec.packets import Packets, joined
 
-#: how many packets are kept back while one before them is missing.
+#: how many packets are kept back while one before them is missing, or may be, as at the beginning.
 WINDOW = 10
 
 
@@ -22,8 +22,8 @@ class Reorder:
         """The packets that are now in order; at most one batch."""
         if not self._enabled or not len(packets):
             return [packets] if len(packets) else []
-        first = int(packets.index[0])
-        if self._held is None and (self._next is None or first == self._next) and bool((np.diff(packets.index) == 1).all()):
+        first, settled = int(packets.index[0]), self._next is not None or len(packets) > WINDOW
+        if settled and self._held is None and self._next in (None, first) and bool((np.diff(packets.index) == 1).all()):
             self._next = int(packets.index[-1]) + 1
             return [packets]
         return self._ordered(packets)
@@ -33,7 +33,7 @@ class Reorder:
         held, self._held = self._held, None
         if held is None:
             return []
-        return [self._marked(held.take(np.argsort(held.index, kind="stable")))]
+        return [self._marked(held.take(np.argsort(held.index, kind="stable")), self._next)]
 
     def _ordered(self, packets: Packets) -> list[Packets]:
         known = 0 if self._held is None else len(self._held)
@@ -42,8 +42,7 @@ class Reorder:
         released: list[int] = []
         before = self._next
         for spot, index in enumerate(everything.index.tolist()[known:], start=known):
-            self._next = index if self._next is None else self._next
-            if index < self._next or index in waiting:
+            if index in waiting or (self._next is not None and index < self._next):
                 continue
             waiting[index] = spot
             if len(waiting) > WINDOW:

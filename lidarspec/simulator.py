@@ -31,6 +31,8 @@ from lidarspec.walk import walk
 ROUNDS = 16
 #: raw value that a range field is given to see which points answer to it.
 PROBE = 100
+#: packets simulated beyond those asked for, since directions may depend on the next packet.
+AHEAD = 1
 
 
 def simulate(sensor: Sensor, packets: int, *, start: int = 0, scene: Scene | None = None) -> list[bytes]:
@@ -40,21 +42,28 @@ def simulate(sensor: Sensor, packets: int, *, start: int = 0, scene: Scene | Non
         UsageError: where the sensor declares no `sweep`.
         SpecError: where its ranges cannot be traced back to fields.
     """
-    if sensor.sweep is None:
-        raise UsageError(f"{sensor.id} declares no sweep, and cannot be simulated")
     frame = sensor.data_frame
+    sweep = sensor.frames[frame].sweep or sensor.sweep
+    if sweep is None:
+        raise UsageError(f"{sensor.id} declares no sweep for {frame!r} frames, and cannot be simulated")
     engine = codec(sensor.frames[frame])
     if not isinstance(engine, CompiledCodec):
         raise SpecError(f"cannot be simulated, since it is not compiled: {engine.reason}", path=frame, sensor=sensor.id)
-    table = _swept(sensor, engine, [sensor.sweep(start + index) for index in range(packets)])
+    table = _swept(sensor, engine, [sweep(start + index) for index in range(packets + AHEAD)])
     _Measurement(sensor, frame, table).fill(scene or Room())
     for group in table.groups:
         group.layout.seal(group.rows)
-    frames = [b""] * packets
+    frames = [b""] * len(table)
     for group in table.groups:
         for place, row in zip(group.where.tolist(), group.rows, strict=True):
             frames[place] = row.tobytes()
-    return frames
+    return frames[:packets]
+
+
+def opening(sensor: Sensor) -> bytes:
+    """What the sensor sends before its data frames: the frame that they come after; empty where they need none."""
+    after = sensor.frames[sensor.data_frame].after
+    return b"" if after is None else sensor.example(after)
 
 
 def _swept(sensor: Sensor, engine: CompiledCodec, sweeps: Sequence[Mapping[str, Any]]) -> Rows:
@@ -157,13 +166,14 @@ class _Measurement:
         for path, info in self._table.schema.fields.items():
             if factor(info.unit, "m") is None or not self._table.groups or path not in self._table.groups[0].layout.leaves:
                 continue
+            before = self._table.raw(path)
             self._store(path, np.array(PROBE))
             answer = self._evaluate()[0]
             expected = PROBE * info.scale + info.offset
             for inner in self._inner(answer):
                 if np.isclose(_part(answer, inner), expected).any():
                     found.append(_Target(path, inner, info.scale, info.offset))
-            self._store(path, np.array(0))
+            self._store(path, before)
         found = found or self._proportional()
         if not found:
             raise SpecError(

@@ -46,6 +46,7 @@ class Frame:
         plausible: a function of `Fields`: False where no sensor would send such values, reduced with `all` per packet.
         after: name of the frame that has to be the last seen, of all named by any `after`, for this one to be looked for.
         confirm: how many in an unbroken run it takes to believe any of them.
+        sweep: a `sweep` function of its own, for sensors that can answer in several data frames.
 
     Raises:
         SpecError: if the struct cannot describe a frame (see `lidarspec.rules`).
@@ -59,6 +60,7 @@ class Frame:
     plausible: Callable[[Any], Any] | None = field(default=None, kw_only=True)
     after: str | None = field(default=None, kw_only=True)
     confirm: int = field(default=1, kw_only=True)
+    sweep: Callable[[int], Mapping[str, Any]] | None = field(default=None, kw_only=True)
     prepared: Construct = field(init=False, repr=False)
 
     def __post_init__(self) -> None:

@@ -7,7 +7,7 @@ the last frame of each other type, and whether bytes were skipped since the last
 from __future__ import annotations
 
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from lidarspec.codecs import Codec, codec
 from lidarspec.columns import Batch, Fields
-from lidarspec.decoder import Counters, Found
+from lidarspec.decoder import Counters, Spans
 from lidarspec.errors import SpecError, UnknownFrame
-from lidarspec.packets import Packets, StateOf
+from lidarspec.packets import Packets, StateOf, joined_tables
 from lidarspec.sequences import SequenceTracker
 from lidarspec.spec import Sensor
 from lidarspec.tables import Table
@@ -36,42 +36,47 @@ class PacketStream:
         sensor, frame: whose, and of which type.
         stats: the decoder's counters; lost, duplicate and late packets are added to them.
         interpreted: parse with construct.
-        state: frames of other types that count as seen before the first packet.
+        state: frames of other types, by name, that count as seen before the first packet.
     """
 
-    def __init__(self, sensor: Sensor, frame: str, stats: Counters, *, interpreted: bool = False, state: Sequence[Found] = ()) -> None:
+    def __init__(
+        self, sensor: Sensor, frame: str, stats: Counters, *, interpreted: bool = False, state: Mapping[str, bytes] | None = None
+    ) -> None:
         if frame not in sensor.frames:
             raise UnknownFrame(frame, sensor.frames, place=sensor.id)
         self.sensor, self.frame, self.stats, self._interpreted = sensor, frame, stats, interpreted
         self._codec: Codec = codec(sensor.frames[frame], interpreted=interpreted)
         self._others = [name for name, other in sensor.frames.items() if other.direction == "in" and not other.data and name != frame]
-        self._state: dict[str, bytes] = {found.frame: found.data for found in state}
+        self._state: dict[str, bytes] = dict(state or {})
         data = sensor.frames[frame].data
         self._sequence = SequenceTracker(sensor.sequence, stats) if sensor.sequence and data and _counted(sensor, frame) else None
         self._clock = Unwrapper(sensor.clock.wraps_at) if sensor.clock and data else None
         self._gap, self._number = False, 0
 
-    def add(self, found: Sequence[Found], *, whole: bool = False) -> Packets:
+    def add(self, found: Sequence[Spans], *, whole: bool = False) -> Packets:
         """The packets among these frames.
 
         Args:
             whole: the frames are a whole input: packets before the first frame of another type see that one as state.
         """
-        mine, breaks, seen = self._sorted(found)
-        table = self._codec.table(item.data for item in mine)
-        state = {name: self._state_of(name, seen[name], whole=whole) for name in self._others}
-        gaps = np.array(breaks, np.bool_)
+        parts = [self._part(spans, _mine(spans, self.frame)) for spans in found]
+        table = self._table(found, [where for where, _ in parts])
+        gaps = np.concatenate([breaks for _, breaks in parts]) if parts else np.empty(0, np.bool_)
+        seen = self._others_in(found, [where for where, _ in parts])
+        state = {name: self._state_of(name, *seen[name], number=len(table), whole=whole) for name in self._others}
         batch = Batch(table, gaps, state, self.sensor.state)
-        index = np.arange(self._number, self._number + len(mine), dtype=np.int64)
-        self._number += len(mine)
-        if self._sequence is not None:
+        index = np.arange(self._number, self._number + len(table), dtype=np.int64)
+        self._number += len(table)
+        if self._sequence is not None and len(table):
             index, jumps = self._guarded(lambda: self._sequence.push(batch), (index, gaps))  # type: ignore[union-attr]
             gaps = gaps | jumps
-        host = np.array([item.at or 0 for item in mine], np.int64)
+        offset, at = (
+            _column([getattr(spans, name)[where] for spans, (where, _) in zip(found, parts, strict=True)]) for name in ("offsets", "at")
+        )
+        host = np.maximum(at, 0)
         time = host
-        if self._clock is not None and len(mine):
+        if self._clock is not None and len(table):
             time = self._guarded(lambda: self._clock.push(clock_ns(self.sensor, batch), host), host)  # type: ignore[union-attr]
-        offset = np.array([item.offset for item in mine], np.int64)
         return Packets(
             self.sensor,
             self.frame,
@@ -93,29 +98,44 @@ class PacketStream:
             self.stats.error(traceback.format_exc())
             return otherwise
 
-    def _sorted(self, found: Sequence[Found]) -> tuple[list[Found], list[bool], dict[str, tuple[list[bytes], list[int]]]]:
-        """Our frames, whether something was lost before each, and the other frames with how many came before each."""
-        mine: list[Found] = []
-        breaks: list[bool] = []
-        seen: dict[str, tuple[list[bytes], list[int]]] = {name: ([], []) for name in self._others}
-        for item in found:
-            self._gap = self._gap or item.gap > 0
-            if item.frame == self.frame:
-                mine.append(item)
-                breaks.append(self._gap)
-                self._gap = False
-            elif item.frame in seen:
-                seen[item.frame][0].append(item.data)
-                seen[item.frame][1].append(len(mine))
-        return mine, breaks, {name: (*value, len(mine)) for name, value in seen.items()}  # type: ignore[misc]
+    def _part(self, spans: Spans, where: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
+        """Our frames in a piece, and whether something was lost before each, since ours before it."""
+        losses = np.cumsum(spans.gaps > 0)
+        marks = np.concatenate([[0], losses[where]])
+        breaks = np.diff(marks) > 0
+        if len(where):
+            breaks[0] |= self._gap
+        left = bool(len(losses)) and bool(losses[-1] > marks[-1])
+        self._gap = left or (self._gap and not len(where))
+        return where, breaks
 
-    def _state_of(self, name: str, seen: Any, *, whole: bool) -> StateOf:
-        frames, before, number = seen
-        before = list(before)
+    def _table(self, found: Sequence[Spans], where: Sequence[NDArray[np.intp]]) -> Table:
+        tables = [
+            self._codec.gather(spans.buffer, spans.starts[mine], spans.sizes[mine])
+            for spans, mine in zip(found, where, strict=True)
+            if len(mine)
+        ]
+        return joined_tables(tables) if tables else self._codec.table([])
+
+    def _others_in(self, found: Sequence[Spans], where: Sequence[NDArray[np.intp]]) -> dict[str, tuple[list[bytes], list[int]]]:
+        """The frames of other types, and how many of ours came before each."""
+        seen: dict[str, tuple[list[bytes], list[int]]] = {name: ([], []) for name in self._others}
+        number = 0
+        for spans, mine in zip(found, where, strict=True):
+            if len(mine) < len(spans.kinds):
+                for index in np.setdiff1d(np.arange(len(spans.kinds)), mine).tolist():
+                    name = spans.names[spans.kinds[index]]
+                    if name in seen:
+                        seen[name][0].append(spans.data(index))
+                        seen[name][1].append(number + int(np.searchsorted(mine, index)))
+            number += len(mine)
+        return seen
+
+    def _state_of(self, name: str, frames: list[bytes], before: list[int], *, number: int, whole: bool) -> StateOf:
         if name in self._state:
             frames, before = [self._state[name], *frames], [0, *before]
         elif whole and before:
-            before[0] = 0
+            before = [0, *before[1:]]
         which = np.searchsorted(np.array(before, np.intp), np.arange(number), side="right").astype(np.intp) - 1
         if not frames:
             return None, which
@@ -124,7 +144,7 @@ class PacketStream:
         return table, which
 
 
-def data_frame(sensor: Sensor, found: Sequence[Found]) -> str | None:
+def data_frame(sensor: Sensor, found: Sequence[Spans]) -> str | None:
     """The data frame type that an input is read by where none is asked for: the configured one, or the first that arrived.
 
     Returns:
@@ -133,7 +153,8 @@ def data_frame(sensor: Sensor, found: Sequence[Found]) -> str | None:
     names = [name for name, frame in sensor.frames.items() if frame.data]
     if len(names) < 2 or sensor.options.get("answer") in names:
         return sensor.data_frame
-    return next((item.frame for item in found if item.frame in names), None)
+    arrived = ((spans.names, spans.kinds[np.isin(spans.kinds, _kinds(spans, names))]) for spans in found)
+    return next((known[kinds[0]] for known, kinds in arrived if len(kinds)), None)
 
 
 def _counted(sensor: Sensor, frame: str) -> bool:
@@ -141,6 +162,18 @@ def _counted(sensor: Sensor, frame: str) -> bool:
     assert sensor.sequence is not None
     having = [name for name, other in sensor.frames.items() if other.data and sensor.sequence.field in codec(other).schema.fields]
     return frame in having or not having
+
+
+def _kinds(spans: Spans, names: Sequence[str]) -> list[int]:
+    return [index for index, name in enumerate(spans.names) if name in names]
+
+
+def _mine(spans: Spans, frame: str) -> NDArray[np.intp]:
+    return np.flatnonzero(np.isin(spans.kinds, _kinds(spans, [frame])))
+
+
+def _column(parts: Sequence[NDArray[np.int64]]) -> NDArray[np.int64]:
+    return np.concatenate(parts) if parts else np.empty(0, np.int64)
 
 
 class Unwrapper:
@@ -196,7 +229,7 @@ def clock_ns(sensor: Sensor, batch: Batch) -> Times:
 
 def _within(raw: NDArray[Any], furthest: int) -> Times:
     edges = np.iinfo(raw.dtype)
-    return np.clip(raw, max(edges.min, -furthest), min(edges.max, furthest)).astype(np.int64)
+    return np.asarray(np.clip(raw, max(edges.min, -furthest), min(edges.max, furthest)), np.int64)
 
 
 def _nanoseconds(seconds: Any, number: int) -> Times:

@@ -161,8 +161,8 @@ class Records:
         dtype = info.dtype if info.dtype is not None else _common_type(found)
         column = np.zeros((len(self), *lengths), dtype)
         for index, value in enumerate(found):
-            if value is not None:
-                array = np.asarray(value, dtype)
+            array = np.asarray([] if value is None else value, dtype)
+            if array.size:
                 corner: Any = (index, *(slice(0, length) for length in array.shape))
                 column[corner] = array
         return column

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from lidarspec.codecs import codec
-from lidarspec.decoder import Decoder
+from lidarspec.decoder import Decoder, packed
 from lidarspec.errors import OutOfRange, WireError
 from lidarspec.packets import joined
 from lidarspec.plugins import sensor as known_sensor
@@ -113,7 +113,7 @@ class SensorConformance:
         for name in material.incoming(subject):
             stats = [Decoder(subject, stream=True).stats for _ in range(2)]
             single, batch = (PacketStream(subject, name, each) for each in stats)
-            assert_same_packets(joined([single.add([item]) for item in found]), batch.add(found))
+            assert_same_packets(joined([single.add([packed([item])]) for item in found]), batch.add([packed(found)]))
 
     def test_scans_do_not_depend_on_batches(self, subject: Sensor) -> None:
         found = subject.split(material.delivery(subject, material.conversation(subject, rounds=5)))
@@ -121,7 +121,7 @@ class SensorConformance:
         def scans(size: int) -> list[Scan]:
             stats = Decoder(subject, stream=True).stats
             stream = PacketStream(subject, subject.data_frame, stats)
-            scans = list(scans_of(subject, [stream.add(found[start : start + size]) for start in range(0, len(found), size)]))
+            scans = list(scans_of(subject, [stream.add([packed(found[start : start + size])]) for start in range(0, len(found), size)]))
             assert not stats.plugin_errors, stats.tracebacks[0]
             return scans
 

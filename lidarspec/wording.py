@@ -1,0 +1,220 @@
+"""The rows of an explained frame, and the words for them: numbers, bits, points and places as people read them."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+from lidarspec.clouds import PointCloud
+from lidarspec.errors import WireError
+
+#: bytes in a line of a hexdump, lines before the marked one, and bytes in a line of an explanation.
+DUMPED, BEFORE, LINED = 16, 2, 8
+#: the widest column of paths.
+PATHS = 36
+DEGREES_PER_TURN = 360
+
+
+class Point(NamedTuple):
+    """One point of a cloud in metres and degrees; x y z nan and range inf or nan where there is no return."""
+
+    x: float
+    y: float
+    z: float
+    range: float
+    azimuth_deg: float
+    elevation_deg: float
+
+    @classmethod
+    def of(cls, cloud: PointCloud, index: int) -> Point:
+        """Point number `index` of a cloud."""
+        place = [float(column[index]) for column in (cloud.x, cloud.y, cloud.z, cloud.range)]
+        return cls(*place, math.degrees(cloud.azimuth[index]), math.degrees(cloud.elevation[index]))
+
+    def __str__(self) -> str:
+        if math.isnan(self.azimuth_deg + self.elevation_deg):
+            return "direction not known from this frame alone"
+        level = round(self.elevation_deg, 2) == 0
+        direction = f"at {fixed(self.azimuth_deg, 2)} deg" + ("" if level else f", {fixed(self.elevation_deg, 2)} deg up")
+        if math.isnan(self.x):
+            return f"{direction} -> {'no return' if math.isinf(self.range) else 'not valid'}"
+        height = "" if level and fixed(self.z, 3) == "0.000" else f" z {fixed(self.z, 3)}"
+        return f"{direction} -> x {fixed(self.x, 3)} y {fixed(self.y, 3)}{height}"
+
+
+@dataclass(frozen=True)
+class Value:
+    """One field of a row.
+
+    Attributes:
+        path: with array indices: "points[1].intensity".
+        raw: the number or bytes of the wire.
+        physical: the number in `unit`; None for what is no number.
+        digits: decimals that show every step of it.
+        label: the name of the raw value, where it has one.
+        bits: which bits of the row's bytes it is; "" for whole bytes.
+        docs: the author's text.
+    """
+
+    path: str
+    raw: Any
+    physical: float | None = None
+    unit: str = ""
+    digits: int = 0
+    label: str = ""
+    bits: str = ""
+    docs: str = ""
+
+    @property
+    def name(self) -> str:
+        """The last part of the path."""
+        return self.path.rpartition(".")[2]
+
+    def __str__(self) -> str:
+        if self.physical is None:
+            return ascii_text(self.raw) if isinstance(self.raw, bytes | bytearray) else repr(self.raw)
+        if self.label:
+            return f"{self.raw} {self.label}"
+        number = fixed(self.physical, self.digits) if math.isfinite(self.physical) else str(self.physical)
+        turns = f" = {self.physical / DEGREES_PER_TURN:.1f} Hz" if self.unit == "deg/s" else ""
+        return f"{number} {self.unit}".strip() + turns
+
+    def to_dict(self) -> dict[str, Any]:
+        """The value for JSON: bytes as hexadecimal text, no entry for what is not there, null for nan and infinity."""
+        raw = self.raw.hex(" ") if isinstance(self.raw, bytes | bytearray) else number(self.raw)
+        physical = {} if self.physical is None else {"value": number(self.physical)}
+        more = {name: getattr(self, name) for name in ("unit", "label", "bits", "docs") if getattr(self, name)}
+        return {"path": self.path, "raw": raw, **physical, **more}
+
+
+@dataclass(frozen=True)
+class Row:
+    """Some bytes of a frame: one field, one bit block, or one element of an array of structs.
+
+    Attributes:
+        offset, data: where they stand, and they.
+        path: the field or element; "" for bytes that belong to none.
+        values: the fields in them.
+        remarks: what else is to be said: constants, the verdict of a checksum, what is missing.
+        right: False where the bytes are not what the spec asks for.
+        points: the points that this element gives.
+    """
+
+    offset: int
+    data: bytes
+    path: str
+    values: tuple[Value, ...] = ()
+    remarks: tuple[str, ...] = ()
+    right: bool = True
+    points: tuple[Point, ...] = ()
+
+    @property
+    def meaning(self) -> str:
+        """Values in their units, the author's text, remarks and points, in one line."""
+        alone = len(self.values) == 1 and not self.values[0].bits
+        first = set(re.findall(r"\[(\d+)\]", self.path)) <= {"0"}
+        units = [value.unit for value in self.values if value.unit and "[" in self.path]
+        words = [_named(value, plain=alone or units.count(value.unit) == 1, bits=first) for value in self.values]
+        docs = self.values[0].docs if alone else ""
+        told = ", ".join([word for word in words if word and not (alone and self.remarks)] + [str(point) for point in self.points[:1]])
+        return "; ".join(part for part in (told, *self.remarks, docs, *(str(point) for point in self.points[1:])) if part)
+
+    def lines(self, paths: int, width: int) -> Iterator[str]:
+        """The row as text: one line, and further ones where its bytes are many."""
+        parts = [self.data[start : start + width] for start in range(0, len(self.data), width)] or [b""]
+        for index, part in enumerate(parts):
+            rest = f"{self.path:<{paths}}  {self.meaning}" if index == 0 else ""
+            yield f"{self.offset + index * width:04x}  {part.hex(' '):<{3 * width - 1}}  {rest}".rstrip()
+
+    def to_dict(self) -> dict[str, Any]:
+        """The row for JSON."""
+        found = {"offset": self.offset, "hex": self.data.hex(" "), "path": self.path, "meaning": self.meaning, "right": self.right}
+        points = [{name: number(value) for name, value in point._asdict().items()} for point in self.points]
+        return {**found, "values": [value.to_dict() for value in self.values]} | ({"points": points} if points else {})
+
+
+@dataclass(frozen=True)
+class Explanation:
+    """A frame explained: rows that name every byte exactly once, in order.
+
+    Attributes:
+        sensor, frame: ids.
+        data: the bytes.
+        rows: one for each field, bit block or array element.
+        fault: what is wrong with the frame as a whole; None if it is valid.
+        notes: what concerns the whole frame.
+    """
+
+    sensor: str
+    frame: str
+    data: bytes
+    rows: tuple[Row, ...]
+    fault: WireError | None = None
+    notes: tuple[str, ...] = ()
+
+    def __str__(self) -> str:
+        paths = min(max((len(row.path) for row in self.rows), default=0), PATHS)
+        width = min(max((len(row.data) for row in self.rows), default=1), LINED)
+        return "\n".join([text for row in self.rows for text in row.lines(paths, width)] + [f"note: {note}" for note in self.notes])
+
+    def to_dict(self) -> dict[str, Any]:
+        """The explanation for JSON."""
+        fault = None if self.fault is None else {"reason": self.fault.reason, "offset": self.fault.offset, "path": self.fault.path}
+        head = {"sensor": self.sensor, "frame": self.frame, "size": len(self.data), "fault": fault, "notes": list(self.notes)}
+        return {**head, "rows": [row.to_dict() for row in self.rows]}
+
+    def with_points(self, points: Sequence[tuple[Point, ...]]) -> Explanation:
+        """The same with points for each row."""
+        return replace(self, rows=tuple(replace(row, points=found) for row, found in zip(self.rows, points, strict=True)))
+
+
+def _named(value: Value, *, plain: bool, bits: bool) -> str:
+    """A value with its name, unless the unit says enough, and with its bits; those of an array's elements are told once."""
+    text = str(value)
+    where = f" ({value.bits})" if value.bits and bits else ""
+    return f"{text}{where}" if plain else f"{value.name} {text or value.raw.hex(' ')}{where}"
+
+
+def number(value: Any) -> Any:
+    """A value as JSON takes it: null for nan and infinity."""
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def fixed(value: float, digits: int) -> str:
+    """A number with so many decimals, and no minus before a zero."""
+    text = f"{value:.{digits}f}"
+    return text if text.strip("-0.") else text.removeprefix("-")
+
+
+def ascii_text(data: bytes) -> str:
+    """Printable ASCII, which zeros may follow, in quotes; nothing for other bytes."""
+    text = bytes(data).rstrip(b"\0").decode("ascii", "replace")
+    return repr(text) if len(text) > 3 and text.isascii() and text.isprintable() else ""
+
+
+def hexdump(error: WireError) -> str:
+    """The bytes around the place of an error, sixteen to a line, with the place and its field marked; "" without bytes."""
+    size = _marked(error)
+    first = min(error.offset, len(error.data)) // DUMPED * DUMPED
+    if error.offset == len(error.data) and first == len(error.data) and first:
+        first -= DUMPED
+    found = ["  ..."] * (first > BEFORE * DUMPED)
+    for start in range(max(first - BEFORE * DUMPED, 0), first + 1, DUMPED):
+        left, right = (error.data[start + half : start + half + 8].hex(" ") for half in (0, 8))
+        found.append(f"  {start:04x}  {left:<23}  {right}".rstrip())
+    place = error.offset - first
+    columns = [8 + 3 * index + (index >= 8) for index in (place, min(place + size, DUMPED) - 1)]
+    marks = "^" * (max(columns[1], columns[0]) + 2 - columns[0])
+    return "\n".join([*found, f"{' ' * columns[0]}{marks} {error.path}".rstrip()]) if error.data else ""
+
+
+def _marked(error: WireError) -> int:
+    """How many bytes to mark."""
+    left = max(len(error.data) - error.offset, 1)
+    if isinstance(error.got, str):
+        digits = error.got.removeprefix("0x").replace(" ", "")
+        return min((len(digits) + 1) // 2, left) or 1
+    return left if error.got == len(error.data) else 1
