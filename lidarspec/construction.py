@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import copy
 import math
+import re
 import struct
 from typing import Any, NamedTuple
 
@@ -227,8 +228,8 @@ def clean(parsed: Any) -> Any:
 
 
 def field_path(path: str | None) -> str:
-    """construct's "(parsing) -> points[1] -> intensity" as "points[1].intensity"."""
-    names = (path or "").split(" -> ")[1:]
+    """construct's "(parsing) -> points[1] -> intensity" as "points[1].intensity"; a text on a part without name makes a "None"."""
+    names = re.sub(r" -> None(?=$| ->|\[)", "", path or "").split(" -> ")[1:]
     return ".".join(names)
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from lidarspec.bits import BitField, leaves, probe
 from lidarspec.codecs import IMPLAUSIBLE, codec
 from lidarspec.construction import UNNAMED, Seen, field_path, unwrap
-from lidarspec.decoder import Counters, Found
+from lidarspec.decoder import Counters, Found, packed
 from lidarspec.errors import LidarSpecError, WireError
 from lidarspec.fields import Checksummed
 from lidarspec.parsing import parse_typed
@@ -28,7 +28,9 @@ from lidarspec.spec import Frame, Sensor
 from lidarspec.streams import PacketStream
 from lidarspec.units import exact
 from lidarspec.wiretable import bit_text, hexed
-from lidarspec.wording import Explanation as Explanation, Point as Point, Row as Row, Value as Value, hexdump as hexdump
+from lidarspec.wording import Explanation, Point, Row, Value, hexdump
+
+__all__ = ["Explanation", "explain", "hexdump"]
 
 #: most points of a frame without arrays that are told.
 TOLD = 4
@@ -161,7 +163,7 @@ class _Reading:
         whole = int(raw) if isinstance(raw, int) else raw
         physical = float(whole * info.scale + info.offset) if isinstance(whole, int | float) else None
         label = info.labels.get(whole, "") if isinstance(whole, int) else ""
-        digits = _digits(info) if info.kind != "float" or info.scaled else DIGITS
+        digits = None if info.kind == "float" else _digits(info)
         return Value(path, whole, physical, info.unit, digits, label, bit_text(bits) if bits else "", info.docs), info
 
 
@@ -220,7 +222,7 @@ def _points(sensor: Sensor, name: str, data: bytes, rows: Sequence[Row]) -> tupl
     if not (frame.data or frame.points):
         return none, tuple(notes)
     try:
-        packets = PacketStream(sensor, name, Counters()).add([Found(name, 0, data)])
+        packets = PacketStream(sensor, name, Counters()).add([packed([Found(name, 0, data)])])
         found = evaluate(packets)
     except LidarSpecError as error:
         return none, (*notes, f"no points: {error}")

@@ -48,6 +48,11 @@ class Candidates:
         kept = survey.status != CONSTANT
         return cls(codec, offsets[kept], survey.status[kept], survey.sizes[kept], survey.errors)
 
+    @classmethod
+    def none(cls, codec: Codec) -> Candidates:
+        """No candidates, of a type that is not looked for."""
+        return cls(codec, np.empty(0, np.intp), np.empty(0, np.uint8), np.empty(0, np.intp), ())
+
 
 @dataclass
 class Mode:
@@ -112,12 +117,22 @@ class Framing:
         Returns:
             The frames, and in `end` the first byte that has to be looked at again together with what follows.
         """
-        found = [Candidates.find(codec, buffer) for codec in self.codecs]
+        found = self._candidates(buffer, mode)
         if self._plain:
             return leftmost(found, len(buffer), final=final)
         piece = Piece()
         _Walker(self, found, mode, piece, base, len(buffer), final=final).run()
         return piece
+
+    def _candidates(self, buffer: NDArray[np.uint8], mode: Mode) -> list[Candidates]:
+        """The candidates of each type that may be looked for in this piece: now, or after a frame that stands in it."""
+        found: dict[int, Candidates] = {}
+        seen, waiting = {None, mode.after}, list(range(len(self.codecs)))
+        while ready := [index for index in waiting if self.codecs[index].frame.after in seen]:
+            found |= {index: Candidates.find(self.codecs[index], buffer) for index in ready}
+            seen |= {self.names[index] for index in ready if (found[index].status == VALID).any()}
+            waiting = [index for index in waiting if index not in found]
+        return [found[index] if index in found else Candidates.none(codec) for index, codec in enumerate(self.codecs)]
 
     def active(self, index: int, mode: Mode) -> bool:
         """Whether a type is looked for now."""

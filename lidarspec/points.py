@@ -72,12 +72,11 @@ def evaluate(packets: Packets, carry: Carry | None = None, *, final: bool = True
     try:
         with np.errstate(all="ignore"):
             result = points_function(packets.sensor, packets.frame)(found)
-            columns = _columns(result, batch)
+            if not isinstance(result, Polar | Cartesian):
+                raise TypeError(f"has to return Polar or Cartesian, not {type(result).__name__}")
+            return _flattened(packets, result, _columns(result, batch), batch, found, final=final)
     except Exception as error:
         raise SpecError(f"{type(error).__name__}: {error}", path=place, sensor=packets.sensor.id) from error
-    if isinstance(result, Polar) == isinstance(result, Cartesian):
-        raise SpecError("has to return Polar or Cartesian", path=place, sensor=packets.sensor.id)
-    return _flattened(packets, result, columns, batch, found, final=final)
 
 
 def _columns(result: Points, batch: Batch) -> dict[str, Column]:

@@ -70,7 +70,7 @@ class Rows:
         column = np.zeros((len(self), *lengths), info.dtype)
         for group in self.groups:
             leaf = group.layout.leaves.get(path)
-            if leaf is not None:
+            if leaf is not None and 0 not in leaf.shape:
                 corner: Any = (group.where, *(slice(0, length) for length in leaf.shape))
                 column[corner] = leaf.load(group.rows)
         return column
@@ -139,9 +139,11 @@ def _order(where: NDArray[np.intp]) -> NDArray[np.intp] | slice:
 
 
 def _length(layout: Layout, axis: str) -> int:
+    """The length of an array in frames of one layout; 0 in an array without elements."""
     for leaf in layout.leaves.values():
         if axis in leaf.info.axes:
-            return leaf.shape[leaf.info.axes.index(axis)]
+            depth = leaf.info.axes.index(axis)
+            return 0 if 0 in leaf.shape[:depth] else leaf.shape[depth]
     return 0
 
 

@@ -146,7 +146,8 @@ class _Table:
 
     def _leaf(self, con: Construct, place: _Place, start: Extent) -> Extent:
         size, kind = _sized(con)
-        self._add(WireRow(str(start), str(size or "varies"), kind, place.shown), place.info, place)
+        info = fields_below(con, place.info).get(place.info.path, place.info)
+        self._add(WireRow(str(start), str(size or "varies"), kind, place.shown), info, place)
         return size or Extent(0, (f"size({place.shown})",))
 
     def _block(self, con: Construct, place: _Place, start: Extent) -> Extent:

@@ -31,8 +31,8 @@ class Point(NamedTuple):
     @classmethod
     def of(cls, cloud: PointCloud, index: int) -> Point:
         """Point number `index` of a cloud."""
-        place = [float(column[index]) for column in (cloud.x, cloud.y, cloud.z, cloud.range)]
-        return cls(*place, math.degrees(cloud.azimuth[index]), math.degrees(cloud.elevation[index]))
+        x, y, z, distance = (float(column[index]) for column in (cloud.x, cloud.y, cloud.z, cloud.range))
+        return cls(x, y, z, distance, math.degrees(cloud.azimuth[index]), math.degrees(cloud.elevation[index]))
 
     def __str__(self) -> str:
         if math.isnan(self.azimuth_deg + self.elevation_deg):
@@ -53,7 +53,7 @@ class Value:
         path: with array indices: "points[1].intensity".
         raw: the number or bytes of the wire.
         physical: the number in `unit`; None for what is no number.
-        digits: decimals that show every step of it.
+        digits: decimals that show every step of it; None for a float, which has no steps.
         label: the name of the raw value, where it has one.
         bits: which bits of the row's bytes it is; "" for whole bytes.
         docs: the author's text.
@@ -63,7 +63,7 @@ class Value:
     raw: Any
     physical: float | None = None
     unit: str = ""
-    digits: int = 0
+    digits: int | None = 0
     label: str = ""
     bits: str = ""
     docs: str = ""
@@ -78,9 +78,9 @@ class Value:
             return ascii_text(self.raw) if isinstance(self.raw, bytes | bytearray) else repr(self.raw)
         if self.label:
             return f"{self.raw} {self.label}"
-        number = fixed(self.physical, self.digits) if math.isfinite(self.physical) else str(self.physical)
+        text = str(self.raw) if self.raw == self.physical and not self.digits else fixed(self.physical, self.digits)
         turns = f" = {self.physical / DEGREES_PER_TURN:.1f} Hz" if self.unit == "deg/s" else ""
-        return f"{number} {self.unit}".strip() + turns
+        return f"{text} {self.unit}".strip() + turns
 
     def to_dict(self) -> dict[str, Any]:
         """The value for JSON: bytes as hexadecimal text, no entry for what is not there, null for nan and infinity."""
@@ -118,7 +118,7 @@ class Row:
         first = set(re.findall(r"\[(\d+)\]", self.path)) <= {"0"}
         units = [value.unit for value in self.values if value.unit and "[" in self.path]
         words = [_named(value, plain=alone or units.count(value.unit) == 1, bits=first) for value in self.values]
-        docs = self.values[0].docs if alone else ""
+        docs = self.values[0].docs if alone and first else ""
         told = ", ".join([word for word in words if word and not (alone and self.remarks)] + [str(point) for point in self.points[:1]])
         return "; ".join(part for part in (told, *self.remarks, docs, *(str(point) for point in self.points[1:])) if part)
 
@@ -183,13 +183,13 @@ def number(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def fixed(value: float, digits: int) -> str:
-    """A number with so many decimals, and no minus before a zero."""
-    text = f"{value:.{digits}f}"
+def fixed(value: float, digits: int | None) -> str:
+    """A number with so many decimals, or with seven figures, and no minus before a zero."""
+    text = f"{value:.7g}" if digits is None else f"{value:.{digits}f}"
     return text if text.strip("-0.") else text.removeprefix("-")
 
 
-def ascii_text(data: bytes) -> str:
+def ascii_text(data: bytes | bytearray) -> str:
     """Printable ASCII, which zeros may follow, in quotes; nothing for other bytes."""
     text = bytes(data).rstrip(b"\0").decode("ascii", "replace")
     return repr(text) if len(text) > 3 and text.isascii() and text.isprintable() else ""

@@ -19,7 +19,7 @@ FLOORS = (
     "spec hookspecs geometry links rules splits files",
     "schema layout walk headers tables columns codecs framing plan plugins",
     "decoder packets streams sequences clouds points cuts reorder",
-    "session scans scenes simulator explain parsing building examples engine wiretable",
+    "session scans scenes simulator explain parsing building examples engine wiretable wording",
     "device detect transports recordings pcap _pcap_records _ip sources",
     "testing formats export view demo",
     "cli",
@@ -30,7 +30,22 @@ IO_FLOOR = FLOOR_OF["transports"]
 TOP = len(FLOORS) - 1
 
 IO = {"asyncio", "logging", "serial", "socket", "threading", "time"}
-CONSTRUCT = {"bits", "construction", "fields", "rules", "schema", "spec", "walk", "headers", "codecs", "parsing", "building", "examples"}
+CONSTRUCT = {
+    "bits",
+    "construction",
+    "fields",
+    "rules",
+    "schema",
+    "spec",
+    "walk",
+    "headers",
+    "codecs",
+    "parsing",
+    "building",
+    "examples",
+    "wiretable",
+    "explain",
+}
 CONFINED = {"construct": CONSTRUCT, "pluggy": {"hookspecs", "plugins"}, "serial": {"transports.serial"}}
 
 TYPE_CHECKING = {"TYPE_CHECKING", "typing.TYPE_CHECKING"}

@@ -91,7 +91,7 @@ def test_stray_bytes_between_frames_cost_none(sensor: Sensor) -> None:
 @each_stream
 def test_the_head_of_a_frame_before_frames_costs_none(sensor: Sensor) -> None:
     whole = material.stream(sensor, rounds=1)
-    name, frame = material.conversation(sensor, rounds=1)[-1]
+    frame = material.conversation(sensor, rounds=1)[-1][1]
     for end in range(min(len(frame), 50)):
         data = frame[:end] + whole
         assert decoded(sensor, data) == Oracle(sensor, data).frames()

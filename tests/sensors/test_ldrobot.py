@@ -18,16 +18,22 @@ from tests.sensors.evidence import assert_points, capture, clockwise, decoded, v
 FILE = "vectors_serial2d.json"
 SENSOR, LD06 = ls.sensor("ldrobot-stl27l"), ls.sensor("ldrobot-ld06")
 
-WHOLE = ["ld_manual_example", "ld_stl27l_10hz_synth", "ld06_capture_1", "ld06_capture_2", "ld06_capture_3", "ld06_capture_fsharp", "ld20_capture"]
+WHOLE = [
+    "ld_manual_example",
+    "ld_stl27l_10hz_synth",
+    "ld06_capture_1",
+    "ld06_capture_2",
+    "ld06_capture_3",
+    "ld06_capture_fsharp",
+    "ld20_capture",
+]
 STREAMS = {"ld06_stream_3_capture"}
 WRONG = {"ld_manual_table_variant"}
 OTHER_MODELS = {"ld14p_start", "ld14p_stop", "ld14p_speed_6hz", "ld14p_get_motor_fw", "ld_manufacture_synth"}
 
 # 30 to 277.5 degrees in steps of 22.5; point k at 1 + k / 2 metres with intensity 10 + k; 3600 deg/s, 1 s.
 #   b8 0b: 0bb8 = 3000, 0.01 deg = 30.   66 6c: 6c66 = 27750.   d0 07 0c: 07d0 = 2000 mm, intensity 12.   CRC 1f.
-QUADRANTS = bytes.fromhex(
-    "542c 100e b80b e8030a dc050b d0070c c4090d b80b0e ac0d0f a00f10 941111 881312 7c1513 701714 641915 666c e803 1f"
-)
+QUADRANTS = bytes.fromhex("542c 100e b80b e8030a dc050b d0070c c4090d b80b0e ac0d0f a00f10 941111 881312 7c1513 701714 641915 666c e803 1f")
 
 
 def frame(start: float = 10.0, end: float = 12.0, seconds: float = 1.0, distance: float = 1.0, **more: Any) -> bytes:
@@ -172,7 +178,7 @@ def test_the_clock_runs_on_over_100_wraps() -> None:
 def test_the_clock_runs_on_between_batches() -> None:
     decoder = SENSOR.decoder()
     stream = PacketStream(SENSOR, "data", decoder.stats)
-    times = [stream.add(decoder.feed(frame(seconds=now % 30_000 / 1000))).time_ns for now in range(0, 400_000, 7_000)]
+    times = [stream.add(decoder.spans(frame(seconds=now % 30_000 / 1000))).time_ns for now in range(0, 400_000, 7_000)]
     assert np.concatenate(times).tolist() == [now * 10**6 for now in range(0, 400_000, 7_000)]
 
 

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import random
+from collections.abc import Callable
 from itertools import pairwise
 
 import numpy as np
 import pytest
 
 import lidarspec as ls
+from lidarspec.scans import ScanStream
+from lidarspec.streams import PacketStream
 from tests.sensors.evidence import decoded, same_points, vector_bytes, vectors
 
 FILE = "vectors_udp3d.json"
 SENSOR = ls.sensor("robosense-m1")
-TEMPLATE = SENSOR.build("data", units=True, **(SENSOR.parse(SENSOR.example("data", seed=1)) | {"wave_mode": 4, "seconds": 0, "microseconds": 0}))
+TEMPLATE = SENSOR.build("data", SENSOR.parse(SENSOR.example("data", seed=1)), seconds=0, microseconds=0)
 
 
 def packet(number: int, frame: int = 0, *, last: int = 630) -> bytes:
@@ -34,7 +37,7 @@ def frames(count: int, *, last: int = 630) -> list[bytes]:
 
 def numbers(scan: ls.Scan) -> list[int]:
     """The packets of a scan, by the radius of their first point."""
-    return np.rint(scan.points.range[::125] / 0.005).astype(int).tolist()
+    return [round(float(distance) / 0.005) for distance in scan.points.range[::125]]
 
 
 def same_scans(one: list[ls.Scan], other: list[ls.Scan]) -> None:
@@ -61,7 +64,7 @@ def test_frames_are_cut_where_the_vendors_driver_cuts(name: str) -> None:
 
 @pytest.mark.parametrize("last", [630, 1260])
 def test_frames_of_single_and_dual_return(last: int) -> None:
-    packets = decoded(SENSOR, frames(1, last=last)[-100:] + frames(2, last=last)[:50])
+    packets = decoded(SENSOR, frames(2, last=last)[last - 20 : last + 10])
     assert (packets.stats.lost, packets.stats.late, packets.stats.duplicates) == (0, 0, 0)
     scans = list(SENSOR.scans(frames(3, last=last)[last - 40 : -20]))
     assert [(len(scan) // 125, scan.complete) for scan in scans] == [(40, False), (last, True), (last - 20, False)]
@@ -84,9 +87,9 @@ def doubled(data: list[bytes], seed: int) -> list[bytes]:
 
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("disturbed", [shuffled, doubled])
-def test_late_and_doubled_packets_give_the_same_scans(disturbed: object, seed: int) -> None:
+def test_late_and_doubled_packets_give_the_same_scans(disturbed: Callable[[list[bytes], int], list[bytes]], seed: int) -> None:
     data = frames(3)
-    changed = (shuffled if disturbed is shuffled else doubled)(data, seed)
+    changed = disturbed(data, seed)
     assert changed != data
     packets = SENSOR.decode(changed)
     same_scans(list(SENSOR.scans(changed)), list(SENSOR.scans(data)))
@@ -104,15 +107,30 @@ def test_a_late_packet_over_the_border_of_frames_belongs_to_its_own() -> None:
 def test_lost_packets_are_counted() -> None:
     data = frames(3)
     kept = [item for place, item in enumerate(data) if place not in {5, 6, 7, 629, 630, 1000}]
-    packets = decoded(SENSOR, kept[:700])
-    assert packets.stats.lost == 5
+    packets = decoded(SENSOR, kept[:10])
+    assert packets.stats.lost == 3
+    assert packets.breaks.tolist() == [place == 5 for place in range(10)]
     scans = list(SENSOR.scans(kept))
     assert SENSOR.decode(kept).stats.lost == 6
     assert [len(scan) // 125 for scan in scans] == [626, 628, 630]
-    assert packets.breaks.sum() == 2
+
+
+def test_a_long_loss_is_counted_by_the_length_of_the_frame() -> None:
+    dual = frames(1, last=1260)
+    assert SENSOR.decode(dual[:20] + dual[720:740]).stats.lost == 700
+    single = frames(2)
+    assert SENSOR.decode(single[:100] + single[650:660]).stats.lost == 550
 
 
 def test_no_point_is_left_over_from_the_scan_before() -> None:
     for earlier, later in pairwise(SENSOR.scans(shuffled(frames(4), 9))):
         assert {number // 1000 for number in numbers(earlier)} == {numbers(earlier)[-1] // 1000}
         assert later.stamp_ns - earlier.stamp_ns == 100_000_000
+
+
+def test_packets_fed_one_by_one_give_the_same_scans() -> None:
+    data = shuffled(frames(2), 4)
+    decoder = SENSOR.decoder()
+    packets, scans = PacketStream(SENSOR, "data", decoder.stats), ScanStream(SENSOR)
+    found = [scan for item in data for scan in scans.add(packets.add(decoder.spans(item)))]
+    same_scans(found + scans.finish(), list(SENSOR.scans(frames(2))))

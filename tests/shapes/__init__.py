@@ -13,6 +13,8 @@ from tests.shapes import (
     datagrams,
     echoes,
     grid,
+    headed,
+    lengths,
     middle,
     modes,
     nested,
@@ -45,6 +47,8 @@ _MODULES = (
     grid,
     numbers,
     datagrams,
+    lengths,
+    headed,
 )
 
 SHAPES: dict[str, Sensor] = {module.SENSOR.id: module.SENSOR for module in _MODULES}

@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from lidarspec import Sensor, hookimpl
+from lidarspec_robosense.helios import HELIOS_16P
 from lidarspec_robosense.m1 import M1
 
 
 @hookimpl
 def lidarspec_sensors() -> Iterable[Sensor]:
     """The RoboSense sensors."""
-    return [M1]
+    return [M1, HELIOS_16P]

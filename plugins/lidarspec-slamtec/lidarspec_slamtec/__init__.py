@@ -104,7 +104,7 @@ def configure(sensor: Sensor, *, dtheta: str | None = None, mode: int | None = N
     if dtheta is not None:
         if dtheta not in DTHETA:
             raise UsageError(f"{sensor.id}: dtheta is one of {', '.join(DTHETA)}, not {dtheta!r}")
-        changed = dataclasses.replace(EXPRESS, points=capsules.express_points(signed=dtheta == "signed"))
+        changed = dataclasses.replace(sensor.frames["express"], points=capsules.express_points(signed=dtheta == "signed"))
         sensor = dataclasses.replace(sensor, frames={**sensor.frames, "express": changed})
     if mode is not None:
         if mode not in range(0x100):
@@ -114,9 +114,7 @@ def configure(sensor: Sensor, *, dtheta: str | None = None, mode: int | None = N
     return sensor
 
 
-def rplidar(
-    name: str, *, baud: int, motor: Mapping[str, Command], range_limits: tuple[float, float], status: str, source: str
-) -> Sensor:
+def rplidar(name: str, *, baud: int, motor: Mapping[str, Command], range_limits: tuple[float, float], status: str, source: str) -> Sensor:
     """One model of the family."""
     return Sensor(
         f"slamtec-rplidar-{name.lower()}",

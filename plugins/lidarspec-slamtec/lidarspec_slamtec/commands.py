@@ -52,9 +52,7 @@ COMMANDS = {
     "get_health": plain(0x52, reply="health"),
     "get_samplerate": plain(0x59, reply="sample_rate"),
     "get_config": Command("config_request", args={"key": ("key", 0, 0xFFFF_FFFF)}, reply="config"),
-    "get_mode_config": Command(
-        "mode_config_request", args={"key": ("key", 0, 0xFFFF_FFFF), "mode": ("mode", 0, 0xFFFF)}, reply="config"
-    ),
+    "get_mode_config": Command("mode_config_request", args={"key": ("key", 0, 0xFFFF_FFFF), "mode": ("mode", 0, 0xFFFF)}, reply="config"),
     "get_mode_count": about_sensor(answers.MODE_COUNT),
     "get_typical_mode": about_sensor(answers.TYPICAL_MODE),
     "get_us_per_sample": about_mode(answers.US_PER_SAMPLE),

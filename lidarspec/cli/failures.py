@@ -1,0 +1,71 @@
+"""Failures as one message on stderr and an exit code, by whose fault they are; never a traceback."""
+
+from __future__ import annotations
+
+import os
+import traceback
+
+import click
+
+from lidarspec import errors
+
+FINDINGS, USAGE, SOURCE, NO_DATA, DEVICE, INTERRUPTED = 1, 2, 3, 4, 5, 130
+
+#: error class -> exit code and the next command; the first that fits, "{sensor}" and "{verb}" filled in.
+CODES: tuple[tuple[type[Exception], int, str], ...] = (
+    (errors.UnknownSensor, USAGE, "lidarspec sensors"),
+    (errors.UnknownFormat, USAGE, "lidarspec convert --help"),
+    (errors.UnknownFrame, USAGE, "lidarspec show {sensor}"),
+    (errors.UnknownField, USAGE, "lidarspec show {sensor}"),
+    (errors.MissingField, USAGE, "lidarspec show {sensor}"),
+    (errors.OutOfRange, USAGE, "lidarspec show {sensor}"),
+    (errors.UsageError, USAGE, "lidarspec {verb} --help"),
+    (errors.SourceError, SOURCE, "lidarspec {verb} --help"),
+    (errors.WireError, NO_DATA, "lidarspec show {sensor}"),
+    (errors.CommandError, DEVICE, "lidarspec show {sensor}"),
+    (errors.SpecError, FINDINGS, "lidarspec plugins"),
+    (errors.LidarSpecError, FINDINGS, "lidarspec plugins"),
+    (click.UsageError, USAGE, "lidarspec {verb} --help"),
+    (click.ClickException, USAGE, "lidarspec {verb} --help"),
+    (OSError, SOURCE, "lidarspec {verb} --help"),
+)
+NEXT = "next: "
+
+
+def suggest(error: Exception, command: str) -> Exception:
+    """The same error, with the next command to type; one that it has already stays."""
+    if not any(note.startswith(NEXT) for note in getattr(error, "__notes__", ())):
+        error.add_note(NEXT + command)
+    return error
+
+
+def report(error: Exception, verb: str) -> int:
+    """Print what went wrong and what to do next; the exit code."""
+    code, command = next(((code, command) for kind, code, command in CODES if isinstance(error, kind)), (FINDINGS, ""))
+    if not command:
+        click.echo(f"a bug in lidarspec: {type(error).__name__}: {error}", err=True)
+        if os.environ.get("LIDARSPEC_DEBUG"):
+            click.echo("".join(traceback.format_exception(error)), err=True)
+        click.echo("  next: the same with LIDARSPEC_DEBUG=1, and report it with what that prints", err=True)
+        return code
+    click.echo(_message(error), err=True)
+    suggest(error, command.format(sensor=_sensor(error), verb=verb).replace("  ", " "))
+    for note in error.__notes__:
+        click.echo(f"  {note}", err=True)
+    return code
+
+
+def _message(error: Exception) -> str:
+    if isinstance(error, click.ClickException):
+        return error.format_message()
+    if isinstance(error, errors.WireError) and error.data:
+        from lidarspec.wording import hexdump
+
+        return f"{error}\n{hexdump(error)}"
+    return str(error)
+
+
+def _sensor(error: Exception) -> str:
+    """The id of the sensor that an error is about, as far as it says."""
+    place = str(getattr(error, "sensor", "") or getattr(error, "place", "") or str(error).partition(":")[0])
+    return place.partition(" ")[0] if "-" in place.partition(" ")[0] else "SENSOR"

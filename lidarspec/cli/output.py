@@ -1,0 +1,74 @@
+"""What verbs print: text or JSON, on standard output or into a file."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, TypeVar
+
+import click
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from lidarspec.errors import SourceError
+
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+
+def sensor_option(function: Function) -> Function:
+    """``-s/--sensor``."""
+    return click.option("-s", "--sensor", "sensor_id", metavar="ID", help="The sensor: an id, an alias, or a file ./mysensor.py.")(function)
+
+
+def output_options(function: Function) -> Function:
+    """``--json`` and ``-o/--output``, for verbs that print."""
+    function = click.option("-o", "--output", metavar="FILE", help="Write to a file instead of standard output.")(function)
+    return click.option("--json", "as_json", is_flag=True, help="Print JSON.")(function)
+
+
+def emit(text: str, output: str | None) -> None:
+    """Text to standard output, or into a file.
+
+    Raises:
+        SourceError: where the file cannot be written.
+    """
+    if output is None or output == "-":
+        click.echo(text)
+        return
+    try:
+        Path(output).write_text(text + "\n", encoding="utf-8")
+    except OSError as error:
+        raise SourceError(f"{output}: {error.strerror or error}") from None
+
+
+def emit_json(value: Any, output: str | None) -> None:
+    """A value as JSON; the same places as `emit`."""
+    emit(json.dumps(value, indent=2, allow_nan=False), output)
+
+
+def note(text: str) -> None:
+    """A remark beside the data, on stderr."""
+    click.echo(text, err=True)
+
+
+def table(headers: Sequence[str], rows: Sequence[Sequence[str]], output: str | None = None) -> str:
+    """Rows as aligned columns; folded to a terminal's width where there is one, each row in one line otherwise."""
+    console = Console()
+    if console.is_terminal and output is None:
+        return _folded(headers, rows, console)
+    lines = [headers, *rows]
+    widths = [max(len(line[column]) for line in lines) for column in range(len(headers))]
+    return "\n".join("  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip() for line in lines)
+
+
+def _folded(headers: Sequence[str], rows: Sequence[Sequence[str]], console: Console) -> str:
+    drawn = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style="bold")
+    for header in headers:
+        drawn.add_column(header, overflow="fold")
+    for row in rows:
+        drawn.add_row(*(Text(cell) for cell in row))
+    with console.capture() as captured:
+        console.print(drawn)
+    return captured.get().rstrip("\n")

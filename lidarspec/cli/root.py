@@ -1,0 +1,111 @@
+"""The verbs and what they share: loaded when asked for, failures told in one message, exit codes.
+
+Nothing here imports NumPy or construct, so that ``lidarspec --help`` is quick.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import os
+import sys
+from collections.abc import Sequence
+from typing import Any, NoReturn
+
+import click
+
+from lidarspec import __version__
+from lidarspec.cli.failures import INTERRUPTED, USAGE, report
+from lidarspec.errors import did_you_mean
+
+#: group -> verb -> (module, what it does); the texts are those of the verbs' own help.
+GROUPS = {
+    "look": {
+        "sensors": ("look", "The installed sensors, and how far each is proven."),
+        "show": ("look", "What a sensor is, and the wire table of each of its frames."),
+        "plugins": ("look", "The plugins that were found, and what is wrong with those that do not load."),
+        "demo": ("demo", "A simulated sensor in a room, damaged on the line, decoded and drawn."),
+    },
+    "files": {
+        "convert": ("files", "Write the points of a capture or raw file to a file, in the format of its suffix."),
+    },
+    "bytes": {
+        "parse": ("frames", "The fields of each frame in some bytes."),
+        "explain": ("frames", "Every byte of each frame: offset, hex, field, value, unit, meaning."),
+        "build": ("building", "The bytes of one frame from field=value; a unit makes a value physical."),
+    },
+}
+VERBS = {verb: place for verbs in GROUPS.values() for verb, place in verbs.items()}
+
+
+class Verbs(click.Group):
+    """The group of all verbs; a verb's module is imported when the verb is used."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        return list(VERBS)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        if cmd_name not in VERBS:
+            return None
+        module = importlib.import_module(f"lidarspec.cli.{VERBS[cmd_name][0]}")
+        found: click.Command = getattr(module, cmd_name)
+        return found
+
+    def resolve_command(self, ctx: click.Context, args: list[str]) -> tuple[str | None, click.Command | None, list[str]]:
+        if args[0] not in VERBS:
+            raise click.UsageError(f"unknown verb {args[0]!r}{did_you_mean(args[0], VERBS)}", ctx)
+        return super().resolve_command(ctx, args)
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        for group, verbs in GROUPS.items():
+            with formatter.section(group):
+                formatter.write_dl([(verb, text) for verb, (_, text) in verbs.items()])
+
+    def main(self, args: Sequence[str] | None = None, prog_name: str | None = None, **extra: Any) -> NoReturn:  # type: ignore[override]
+        """Run one verb and exit with its code; no exception leaves this."""
+        words = list(sys.argv[1:] if args is None else args)
+        sys.exit(_run(self, words))
+
+
+def _run(group: click.Group, words: list[str]) -> int:
+    for stream in (sys.stdout, sys.stderr):
+        with contextlib.suppress(AttributeError):
+            stream.reconfigure(errors="replace")  # type: ignore[union-attr]
+    try:
+        with group.make_context("lidarspec", words) as ctx:
+            group.invoke(ctx)
+        sys.stdout.flush()
+        return 0
+    except click.exceptions.NoArgsIsHelpError as help_page:
+        click.echo(help_page.ctx.get_help() if help_page.ctx else "")
+        return USAGE
+    except click.exceptions.Exit as done:
+        return done.exit_code
+    except (KeyboardInterrupt, click.Abort):
+        click.echo("interrupted", err=True)
+        return INTERRUPTED
+    except BrokenPipeError:
+        _silence()
+        return 0
+    except Exception as error:
+        with contextlib.suppress(BrokenPipeError):
+            return report(error, next((word for word in words if word in VERBS), ""))
+        _silence()
+        return 0
+
+
+def _silence() -> None:
+    """Nobody reads any more: what is still buffered goes nowhere, without a complaint at exit."""
+    with contextlib.suppress(OSError, ValueError):
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, sys.stdout.fileno())
+
+
+@click.group(cls=Verbs, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 120})
+@click.version_option(__version__, prog_name="lidarspec", message="%(prog)s %(version)s")
+def main() -> None:
+    """Every lidar's wire protocol written down once: parse, build, explain and convert what sensors send.
+
+    SOURCE is a file (.pcap, .pcapng, .bin, .hex) or - for standard input. Exit codes: 0 ok, 1 findings, 2 usage,
+    3 source cannot be opened, 4 no valid data, 5 device refused, 130 interrupted.
+    """

@@ -1,0 +1,73 @@
+"""File formats by suffix: scans to files. A file appears under its name only when it is whole."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Iterable
+from pathlib import Path
+
+from lidarspec.errors import LidarSpecError, SourceError, SpecError, UnknownFormat
+from lidarspec.files import Format
+from lidarspec.formats.arrays import NPZ
+from lidarspec.formats.text import CSV
+from lidarspec.plugins import registry
+from lidarspec.scans import Scan
+
+BUILT_IN = {known.suffix: known for known in (CSV, NPZ)}
+
+
+def formats() -> dict[str, Format]:
+    """Every format by suffix, those of plugins too; lidarspec's own come first.
+
+    Raises:
+        SpecError: where a plugin's hook fails.
+    """
+    try:
+        added = [found for plugin in registry().call("lidarspec_formats") for found in plugin]
+    except LidarSpecError:
+        raise
+    except Exception as error:
+        raise SpecError(f"{type(error).__name__}: {error}", path="lidarspec_formats") from error
+    return {**{found.suffix: found for found in added}, **BUILT_IN}
+
+
+def format_of(path: str | Path) -> Format:
+    """The format that a file name asks for by its suffix; plugins are asked only where it is not one of our own.
+
+    Raises:
+        UnknownFormat: with a suggestion.
+    """
+    suffix = Path(path).suffix.lower()
+    if suffix in BUILT_IN:
+        return BUILT_IN[suffix]
+    known = formats()
+    if suffix not in known:
+        raise UnknownFormat(suffix or str(path), known, place=str(path))
+    return known[suffix]
+
+
+def write(path: str | Path, scans: Iterable[Scan], *, every_point: bool = False) -> None:
+    """Write scans to a file in the format of its suffix.
+
+    Args:
+        path: the file; what it held is replaced once the new content is whole, and stays if that fails.
+        every_point: also the points without a valid return.
+
+    Raises:
+        UnknownFormat: for a suffix that is none.
+        SourceError: where the file cannot be written.
+    """
+    path = Path(path)
+    chosen = format_of(path)
+    part = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
+    try:
+        with contextlib.suppress(FileNotFoundError):
+            part.unlink()
+        chosen(part, scans, every_point=every_point)
+        os.replace(part, path)
+    except OSError as error:
+        raise SourceError(f"{path}: {error.strerror or error}") from None
+    finally:
+        with contextlib.suppress(OSError):
+            part.unlink()

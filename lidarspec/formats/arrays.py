@@ -1,0 +1,34 @@
+"""NumPy's .npz: one array a column, and one entry a scan for the stamps."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+
+from lidarspec.clouds import COLUMNS, PointCloud
+from lidarspec.files import Format
+from lidarspec.scans import Scan
+
+
+def write(path: Path, scans: Iterable[Scan], *, every_point: bool) -> None:
+    """Write the columns that all scans have, `scan` for each point, and for each scan `stamp_ns`, `rate_hz` and `complete`."""
+    clouds: list[PointCloud] = []
+    stamps: list[int] = []
+    rates: list[float] = []
+    complete: list[bool] = []
+    for scan in scans:
+        clouds.append(scan.points if every_point else scan.points[scan.points.valid])
+        stamps.append(scan.stamp_ns)
+        rates.append(scan.rate_hz)
+        complete.append(scan.complete)
+    names = [name for name in COLUMNS if clouds and all(name in cloud.columns for cloud in clouds)]
+    columns = {name: np.concatenate([cloud.columns[name] for cloud in clouds]) for name in names}
+    numbers = np.repeat(np.arange(len(clouds), dtype=np.int32), [len(cloud) for cloud in clouds])
+    each = {"stamp_ns": np.array(stamps, np.int64), "rate_hz": np.array(rates, np.float64), "complete": np.array(complete, np.bool_)}
+    with path.open("wb") as file:
+        np.savez(file, allow_pickle=False, **columns, scan=numbers, **each)
+
+
+NPZ = Format(".npz", "NumPy arrays, one a column", write)

@@ -1,0 +1,41 @@
+"""Comma-separated values: a header row, then one row a point; written scan by scan, so memory stays small."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarspec.clouds import COLUMNS
+from lidarspec.files import Format
+from lidarspec.scans import Scan
+
+#: how a value of each kind of number is written: seven figures tell float32 apart, and nanoseconds are kept in times.
+_WRITTEN = {"f4": "%.7g", "f8": "%.9f"}
+#: rows turned into text at once.
+ROWS = 1 << 14
+
+
+def write(path: Path, scans: Iterable[Scan], *, every_point: bool) -> None:
+    """Write the columns that the first scan has, and the number of the scan."""
+    names: tuple[str, ...] = ()
+    with path.open("w", encoding="ascii", newline="") as file:
+        for number, scan in enumerate(scans):
+            cloud = scan.points if every_point else scan.points[scan.points.valid]
+            if not names:
+                names = tuple(name for name in COLUMNS if name in cloud.columns)
+                file.write(",".join([*names, "scan"]) + "\n")
+            columns = [_column(cloud.columns.get(name), len(cloud)) for name in names]
+            template = ",".join([_WRITTEN.get(column.dtype.str[1:], "%d") for column in columns] + [f"{number}\n"])
+            for start in range(0, len(cloud), ROWS):
+                file.write("".join(map(template.__mod__, zip(*(c[start : start + ROWS].tolist() for c in columns), strict=True))))
+
+
+def _column(values: NDArray[Any] | None, length: int) -> NDArray[Any]:
+    return np.full(length, np.nan, np.float32) if values is None else values
+
+
+CSV = Format(".csv", "comma-separated values, one row a point", write)

@@ -1,0 +1,85 @@
+"""Packets whose header says how many blocks they hold and in which unit (PandarQT64, Pandar XT).
+
+    EE FF  major minor  reserved(2) | lasers blocks first_return dis_unit return_num flags
+
+Source: HesaiLidar_SDK_2.0 (udp_protocol_header.h, udp_protocol_v3_1.h, udp_protocol_v6_1.h); the length rule holds for captures of both.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from construct import Array, BitsInteger, BitStruct, Bytes, Const, Construct, If, Int8ul, Int16ul, Int32ul, Struct, this
+
+from lidarspec import Fields, Polar, Scaled
+from lidarspec_hesai.calibration import Calibration
+from lidarspec_hesai.parts import beams
+
+#: the unit of distances that every known firmware states, in millimetres; used for simulation only.
+USUAL_UNIT = 4
+
+
+def packet(major: int, minor: int, lasers: int, tail: Sequence[Construct]) -> Struct:
+    """The packet of a protocol version with so many lasers in each block."""
+    header: list[Construct] = [
+        "sync" / Const(b"\xee\xff"),
+        "major" / Const(major, Int8ul),
+        "minor" / Const(minor, Int8ul),
+        "header_reserved" / Bytes(2),
+        "lasers" / Const(lasers, Int8ul),
+        "block_count" / Int8ul,
+        "first_return" / Int8ul * "which return the first block of a shot holds",
+        "dis_unit" / Scaled(Int8ul, 1, "mm") * "one step of a distance",
+        "return_count" / Int8ul * "blocks in a row of one shot",
+        "flags" / BitStruct("reserved" / BitsInteger(7), "sequence" / BitsInteger(1)),
+    ]
+    channel = Struct("distance" / Int16ul * "steps of dis_unit; 0: no return", "reflectivity" / Int8ul, "reserved" / Int8ul)
+    block = Struct("azimuth" / Scaled(Int16ul, 0.01, "deg"), "channels" / Array(lasers, channel))
+    sequence = "sequence" / If(this.flags.sequence == 1, Int32ul)
+    return Struct(*header, "blocks" / Array(this.block_count, block), *tail, sequence)
+
+
+def longest(lasers: int, blocks: int) -> int:
+    """The length of a packet with so many blocks: header, blocks, tail and sequence."""
+    return 12 + blocks * (2 + 4 * lasers) + 24 + 4
+
+
+def plausible(f: Fields) -> Any:
+    """One to three returns, a unit, and azimuths below 360 degrees."""
+    return (f.dis_unit >= 1) & (f.return_count >= 1) & (f.return_count <= 3) & (f.blocks.azimuth < 360)
+
+
+def points_by(fired: Callable[[Any, Any, Any], Any]) -> Callable[[Calibration], Callable[[Fields], Polar]]:
+    """The points of a model, for each calibration.
+
+    Args:
+        fired: function of the number of the block, the number of blocks and the returns of a shot: seconds from the packet's time.
+    """
+
+    def points_with(channels: Calibration) -> Callable[[Fields], Polar]:
+        def points(f: Fields) -> Polar:
+            block = f.block_count.steps()[:, None]
+            return beams(
+                f,
+                channels,
+                distance=f.blocks.channels.distance * (f.dis_unit * 0.001),
+                block=block,
+                returns=f.return_count,
+                fired=fired(block, f.block_count, f.return_count),
+            )
+
+        return points
+
+    return points_with
+
+
+def header(blocks: int) -> dict[str, Any]:
+    """The header of a simulated packet with single return."""
+    return {"block_count": blocks, "first_return": 1, "dis_unit": USUAL_UNIT, "return_count": 1, "flags.sequence": 1}
+
+
+def channel_times(first: float, step: float, channels: int) -> Any:
+    """Firing times at even steps, all in microseconds."""
+    return first + step * np.arange(channels)

@@ -1,0 +1,82 @@
+"""What all packets of the family have in common: the date, the return modes, and how a shot becomes points.
+
+Source: HesaiLidar_SDK_2.0 (year rule, return modes, timing) and tier4/nebula (geometry, which reproduces its published clouds).
+"""
+
+from __future__ import annotations
+
+import datetime
+from typing import Any
+
+import numpy as np
+from construct import Int8ul, Struct
+
+from lidarspec import Fields, Polar
+from lidarspec_hesai.calibration import Calibration
+
+RETURN_MODES = "33 first, 34 second, 37 strongest, 38 last, 39 last and strongest, 3b first and last, 3c first and strongest, 3d three"
+FACTORY = "42 or 43"
+EPOCH = datetime.datetime(2024, 1, 1)  # of simulated packets
+
+UTC = Struct(
+    "year" / Int8ul * "from 70 on since 1900, below since 2000; 0: the last five bytes are Unix seconds, big-endian",
+    "month" / Int8ul,
+    "day" / Int8ul,
+    "hour" / Int8ul,
+    "minute" / Int8ul,
+    "second" / Int8ul,
+)
+
+
+def clock(f: Fields) -> tuple[Any, Any]:
+    """Whole seconds since 1970, and the microseconds within the second: two terms, each exact."""
+    utc = f.utc
+    year = np.where(utc.year < 70, utc.year + 2000, utc.year + 1900)
+    date = 86_400 * _days(year, utc.month, utc.day) + 3600 * utc.hour + 60 * utc.minute + utc.second
+    unix = (((utc.month * 256 + utc.day) * 256 + utc.hour) * 256 + utc.minute) * 256 + utc.second
+    return np.where(utc.year == 0, unix, date), f.timestamp
+
+
+def _days(year: Any, month: Any, day: Any) -> Any:
+    """Days from 1970-01-01 in the Gregorian calendar; years begin in March, so that the leap day is the last."""
+    years = np.where(month <= 2, year - 1, year)
+    months = np.where(month <= 2, month + 9, month - 3)
+    leap_days = years // 4 - years // 100 + years // 400
+    return 365 * years + leap_days + (153 * months + 2) // 5 + day - 719_469
+
+
+def beams(f: Fields, channels: Calibration, *, distance: Any, block: Any, returns: Any, fired: Any) -> Polar:
+    """The points of a packet.
+
+    Args:
+        distance: metres, (n, blocks, channels).
+        block: the number of each block, (blocks, 1).
+        returns: how many blocks in a row are echoes of one shot.
+        fired: seconds from the packet's time to the shot of each block.
+    """
+    return Polar(
+        range=distance,
+        azimuth=-np.deg2rad(f.blocks.azimuth + channels.azimuth),
+        elevation=np.deg2rad(channels.elevation),
+        intensity=f.blocks.channels.reflectivity,
+        time=fired + channels.firing,
+        ring=np.arange(len(channels)),
+        return_index=block % returns,
+        nominal=channels.nominal,
+    )
+
+
+def turning(i: int, blocks: int, per_turn: int, rate_hz: float = 10.0) -> dict[str, Any]:
+    """Azimuths, speed and time of packet i of a sensor that fires `per_turn` blocks in each turn."""
+    shots = i * blocks + np.arange(blocks)
+    now = EPOCH + datetime.timedelta(microseconds=round(1e6 * (i + 1) * blocks / (per_turn * rate_hz)))
+    date = {"year": now.year - 2000, **{name: getattr(now, name) for name in ("month", "day", "hour", "minute", "second")}}
+    return {
+        "blocks.azimuth": np.round(shots % per_turn * 360 / per_turn, 2),
+        "motor_speed": rate_hz * 60,
+        "timestamp": now.microsecond * 1e-6,
+        "return_mode": 0x37,
+        "factory": 0x42,
+        "sequence": i,
+        **{f"utc.{name}": value for name, value in date.items()},
+    }

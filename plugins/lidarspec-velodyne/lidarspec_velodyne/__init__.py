@@ -1,0 +1,82 @@
+"""Velodyne VLP-16 and HDL-32E: spinning lidars of 16 and 32 lasers over UDP.
+
+Source: velodyne_decoder (calibration files, calib_db.cpp, packet_decoder.cpp) and ros-drivers/velodyne (rawdata), which
+cite the vendor's user manuals: laser angles, firing times, focal distances. The vertical offsets that follow from the
+focal distance are documented for the VLP-16 (11.2 mm at -15 degrees); ros-drivers and nebula leave them out, so their z
+differs by up to 11 mm (VLP-16) and 17 mm (HDL-32E).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+
+from lidarspec import Clock, OnWrap, Sensor, Udp, hookimpl
+from lidarspec_velodyne.firings import Firings, configuring, points_of, sweep_of
+from lidarspec_velodyne.frames import FRAMES, HOUR, SLOTS
+
+SLOT = np.arange(SLOTS)
+
+VLP16_FIRINGS = Firings(
+    # 16 lasers, two firings of each in a block: 2.304 us apart, the second round 55.296 us after the first
+    elevation=np.tile([-15.0, 1, -13, 3, -11, 5, -9, 7, -7, 9, -5, 11, -3, 13, -1, 15], 2),
+    delay=(SLOT // 16 * 55.296 + SLOT % 16 * 2.304) * 1e-6,
+    period=2 * 55.296e-6,
+    focal_distance=0.04191,
+    product=0x22,
+)
+
+LOWER = [-30.67, -29.33, -28.00, -26.67, -25.33, -24.00, -22.67, -21.33, -20.00, -18.67, -17.33, -16.00, -14.67, -13.33, -12.00, -10.67]
+UPPER = [-9.33, -8.00, -6.67, -5.33, -4.00, -2.67, -1.33, 0.00, 1.33, 2.67, 4.00, 5.33, 6.67, 8.00, 9.33, 10.67]
+
+HDL32E_FIRINGS = Firings(
+    # 32 lasers 1.152 us apart, by turns of the lower and of the upper half
+    elevation=np.array([LOWER, UPPER]).T.ravel(),
+    delay=1.152e-6 * SLOT.astype(np.float64),
+    period=46.080e-6,
+    focal_distance=0.02883,
+    product=0x21,
+)
+
+
+def _sensor(name: str, model: str, firings: Firings, range_limits: tuple[float, float], source: str) -> Sensor:
+    return Sensor(
+        name,
+        vendor="Velodyne",
+        model=model,
+        frames=FRAMES,
+        points=points_of(firings),
+        scan=OnWrap("blocks.azimuth"),
+        links={"data": Udp(2368, 8308)},
+        clock=Clock("timestamp", wraps_at=HOUR),
+        sweep=sweep_of(firings),
+        configure=configuring(firings),
+        range_limits=range_limits,
+        vendor_axes=("right", "forward", "up"),
+        status="capture",
+        source=source,
+    )
+
+
+# range limits: the defaults of ros-drivers/velodyne for these models
+VLP16 = _sensor(
+    "velodyne-vlp16",
+    "VLP-16",
+    VLP16_FIRINGS,
+    (0.4, 130.0),
+    "velodyne_decoder 3.1 and ros-drivers/velodyne, citing the VLP-16 user manual; three captures",
+)
+HDL32E = _sensor(
+    "velodyne-hdl32e",
+    "HDL-32E",
+    HDL32E_FIRINGS,
+    (0.9, 130.0),
+    "velodyne_decoder 3.1 and ros-drivers/velodyne, citing the HDL-32E user manual; one capture",
+)
+
+
+@hookimpl
+def lidarspec_sensors() -> Iterable[Sensor]:
+    """The Velodyne sensors."""
+    return [VLP16, HDL32E]

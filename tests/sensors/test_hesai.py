@@ -1,0 +1,237 @@
+"""Hesai Pandar40P, PandarXT-32, XT-16 and PandarQT64: vectors, points and times worked out by hand, the clock, correction files."""
+
+from __future__ import annotations
+
+import datetime
+import json
+import pickle
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import lidarspec as ls
+from lidarspec.simulator import simulate
+from tests.sensors.evidence import PROTOCOLS, assert_points, decoded, same_points, vector_bytes, vectors
+
+FILE = "vectors_udp3d.json"
+SENSORS = {name: ls.sensor(f"hesai-{name}") for name in ("pandar40p", "xt32", "xt16", "qt64")}
+P40, XT32, XT16, QT64 = SENSORS.values()
+FORM = {"pandar40p": (10, 40), "xt32": (8, 32), "xt16": (8, 16), "qt64": (4, 64)}  # blocks, channels
+VECTORS = {"hesai_40p_real": P40, "hesai_xt32_real": XT32, "hesai_xt16_real": XT16, "hesai_qt64_real": QT64}
+NAMES = {"motor": "motor_speed", "ret": "return_mode", "factory": "factory", "seq": "sequence", "shutdown": "shutdown"}
+UTC = ("year", "month", "day", "hour", "minute", "second")
+HEADER = {
+    "dist_unit_mm": "dis_unit",
+    "laser_num": "lasers",
+    "block_num": "block_count",
+    "first_return": "first_return",
+    "return_num": "return_count",
+}
+
+# Three channels for each model, by its nominal table, as (block, azimuth on the wire, channel, raw distance, x y z in REP-103):
+# x = d cosE cosA, y = -d cosE sinA, z = d sinE, with A = azimuth + offset of the channel, clockwise.
+GOLDEN = {
+    # 4 m, E 15.210 (cos 0.964971, sin 0.262358), A = 31.04 - 1.042 = 29.998 (cos 0.866043, sin 0.499970)
+    # 10 m, E -0.009, A = 266.88 + 3.125 = 270.005, to the left; 100 m, E -24.569 (0.909461, -0.415789), A = 134.998
+    "pandar40p": [
+        (0, 3104, 0, 1000, (3.342824, -1.929825, 1.049430)),
+        (4, 26688, 12, 2500, (0.000873, 10.0, -0.001571)),
+        (9, 13604, 39, 25000, (-64.306374, -64.310863, -41.578879)),
+    ],
+    # E whole degrees, A as on the wire: 4 m ahead; 2 m at 15 degrees up to the right (cos 0.965926, sin 0.258819);
+    # 65535 * 4 mm = 262.14 m behind, 16 degrees down (0.961262, -0.275637)
+    "xt32": [
+        (0, 0, 15, 1000, (4.0, 0.0, 0.0)),
+        (3, 9000, 0, 500, (0.0, -1.931852, 0.517638)),
+        (7, 18000, 31, 65535, (-251.985141, 0.0, -72.255576)),
+    ],
+    # every second degree from 15 down: channel 7 is at +1 (0.999848, 0.017452), 15 at -15
+    "xt16": [
+        (0, 0, 7, 1000, (3.999391, 0.0, 0.069810)),
+        (3, 9000, 0, 500, (0.0, -1.931852, 0.517638)),
+        (7, 27000, 15, 500, (0.0, 1.931852, -0.517638)),
+    ],
+    # 2 m, E -52.121 (0.613996, -0.789309), A = 81.26 + 8.736 = 89.996; 8 m, E -0.725, A = 184.88 - 4.881 = 179.999;
+    # 5 m, E 52.133 (0.613831, 0.789438), A = 307.89 - 7.892 = 299.998 (0.499970, -0.866043)
+    "qt64": [
+        (0, 8126, 0, 500, (0.000086, -1.227992, -1.578618)),
+        (2, 18488, 31, 2000, (-7.999360, -0.000140, -0.101226)),
+        (3, 30789, 63, 1250, (1.534484, 2.658018, 3.947189)),
+    ],
+}
+
+# Microseconds from the packet's time to a channel of a block, single and dual return: offset of the shot + offset of the channel.
+TIMES = {
+    # -28.58 - 55.56 * 9 - 42.22, -28.58 - 3.62; dual: the first pair is 4 shots before the last
+    "pandar40p": [(0, 0, -570.84, -293.04), (9, 39, -32.20, -32.20), (8, 39, -87.76, -32.20)],
+    "xt32": [(0, 0, -344.0, -144.0), (7, 31, 52.872, 52.872), (6, 1, -42.488, 7.512)],
+    "xt16": [(0, 0, -344.0, -144.0), (7, 15, 51.36, 51.36)],
+    # 25.71 + 2.31; 25.71 + 166.67 + 136.45, as a pair with block 0 without the 166.67; 25.71 + 500 or 166.67 + 2.31
+    "qt64": [(0, 0, 28.02, 28.02), (1, 63, 328.83, 162.16), (3, 0, 528.02, 194.69)],
+}
+
+
+def packet(name: str, azimuths: dict[int, int] | None = None, raw: dict[tuple[int, int], int] | None = None, **more: Any) -> bytes:
+    """A packet of a model with these azimuths by block and distances by block and channel, all else as in the simulation."""
+    sensor, (blocks, channels) = SENSORS[name], FORM[name]
+    parsed = sensor.parse(simulate(sensor, 1)[0], "data")
+    for block in range(blocks):
+        parsed.blocks[block].azimuth = (azimuths or {}).get(block, 0)
+        for channel in range(channels):
+            parsed.blocks[block].channels[channel].distance = (raw or {}).get((block, channel), 0)
+    return sensor.build("data", parsed, **more)
+
+
+@pytest.mark.parametrize("name", VECTORS)
+def test_a_captured_packet_has_the_fields_and_points_of_its_vector(name: str, tmp_path: Path) -> None:
+    data, expected, params = vector_bytes(FILE, name), vectors(FILE)[name]["expected"], vectors(FILE)[name]["params"]
+    angles = zip(params["elevation_deg"], params["azimuth_offset_deg"], strict=True)
+    file = tmp_path / "angles.csv"
+    file.write_text("Channel,Elevation,Azimuth\n" + "".join(f"{i},{e},{a}\n" for i, (e, a) in enumerate(angles, start=1)))
+    sensor = VECTORS[name].configure(calibration=file, frame="vendor")
+    parsed, packets = sensor.parse(data), decoded(sensor, [data])
+    assert len(data) == expected["length"]
+    assert sensor.build("data", parsed) == data
+    assert packets.raw["blocks"]["azimuth"][0].tolist() == expected["azimuths"]
+    assert all(parsed[HEADER[key]] == value for key, value in expected.items() if key in HEADER)
+    assert int(packets.points().valid.sum()) == expected["n_nonzero"]
+    tail = expected["tail"]
+    assert all(parsed[NAMES[key]] == value for key, value in tail.items() if key in NAMES)
+    moment = datetime.datetime(*tail["utc"], tzinfo=datetime.UTC)
+    assert int(packets.time_ns[0]) == int(moment.timestamp()) * 10**9 + tail["us"] * 1000
+    cloud, channels = packets.points(), len(params["elevation_deg"])
+    for point in expected["points"]:
+        index = point["block"] * channels + point["ch"]
+        assert cloud.range[index] == pytest.approx(point["dist_m"])
+        assert cloud.intensity is not None
+        assert cloud.intensity[index] == point["reflectivity"]
+        np.testing.assert_allclose(cloud.xyz[index], point["xyz"], atol=0.0006)
+    assert not cloud.nominal
+
+
+@pytest.mark.parametrize("name", SENSORS)
+def test_points_by_hand(name: str) -> None:
+    golden, channels = GOLDEN[name], FORM[name][1]
+    azimuths, raw = {block: azimuth for block, azimuth, *_ in golden}, {(block, channel): raw for block, _, channel, raw, _ in golden}
+    cloud = decoded(SENSORS[name], [packet(name, azimuths, raw)]).points()
+    places = [block * channels + channel for block, _, channel, *_ in golden]
+    assert np.flatnonzero(cloud.valid).tolist() == places
+    assert_points(cloud, [(place, xyz) for place, (*_, xyz) in zip(places, golden, strict=True)], atol=3e-5)
+    assert cloud.ring is not None
+    assert cloud.ring[places].tolist() == [channel for _, _, channel, *_ in golden]
+    assert cloud.nominal
+    assert np.isinf(cloud.range[~cloud.valid]).all()
+    vendor = SENSORS[name].configure(frame="vendor").decode([packet(name, azimuths, raw)]).points()
+    np.testing.assert_array_equal(vendor.xyz[places], np.stack([-cloud.y, cloud.x, cloud.z], axis=1)[places])
+
+
+@pytest.mark.parametrize("name", SENSORS)
+def test_firing_times_and_echoes(name: str) -> None:
+    channels = FORM[name][1]
+    dual: dict[str, Any] = {"return_mode": 0x39} if name == "pandar40p" else {"return_count": 2}
+    single, double = (decoded(SENSORS[name], [packet(name, **more)]).points() for more in ({}, dual))
+    for block, channel, one, two in TIMES[name]:
+        place = block * channels + channel
+        assert (single.time[place] * 1e6, double.time[place] * 1e6) == (pytest.approx(one, abs=1e-3), pytest.approx(two, abs=1e-3))
+    assert single.return_index is not None
+    assert double.return_index is not None
+    assert set(single.return_index) == {0}
+    assert double.return_index[::channels].tolist() == [0, 1] * (FORM[name][0] // 2)
+
+
+@pytest.mark.parametrize("name", ["xt32", "xt16", "qt64"])
+def test_the_header_gives_blocks_unit_and_counter(name: str) -> None:
+    sensor, channels = SENSORS[name], FORM[name][1]
+    parsed = sensor.parse(packet(name, raw={(1, 2): 1000}))
+    fewer = sensor.build(
+        "data", parsed, blocks=parsed.blocks[:2], block_count=2, dis_unit=2, flags={"reserved": 0, "sequence": 0}, sequence=None
+    )
+    assert len(fewer) == 12 + 2 * (2 + 4 * channels) + 24
+    packets = decoded(sensor, [fewer, packet(name, raw={(1, 2): 1000}), fewer])
+    cloud = packets.points()
+    assert cloud.range[cloud.valid].tolist() == pytest.approx([2.0, 4.0, 2.0])
+    assert len(cloud) == channels * (2 + FORM[name][0] + 2)
+    assert (packets.stats.lost, packets.stats.duplicates) == (0, 0)
+    assert np.isnan(packets["sequence"][[0, 2]]).all()
+
+
+@pytest.mark.parametrize(
+    ("year", "date"), [(17, 2017), (0x75, 2017), (69, 2069), (70, 1970), (99, 1999), (100, 2000), (24, 2024), (200, 2100), (255, 2155)]
+)
+def test_the_clock_is_exact_to_the_microsecond(year: int, date: int) -> None:
+    days = [(2, 28), (3, 1), (12, 31), (1, 1)] + [(2, 29)] * (date % 4 == 0 and date != 2100)
+    for month, day in days:
+        utc = dict(zip(UTC, (year, month, day, 23, 59, 58), strict=True))
+        time = SENSORS["xt32"].decode([packet("xt32", utc=utc, timestamp=999_999)]).time_ns[0]
+        moment = datetime.datetime(date, month, day, 23, 59, 58, tzinfo=datetime.UTC)
+        assert int(time) == int(moment.timestamp()) * 10**9 + 999_999_000
+
+
+def test_a_year_of_0_is_followed_by_unix_seconds() -> None:
+    utc = dict(zip(UTC, b"\0" + (1_700_000_001).to_bytes(5, "big"), strict=True))
+    for name, sensor in SENSORS.items():
+        assert sensor.decode([packet(name, utc=utc, timestamp=7)]).time_ns.tolist() == [1_700_000_001_000_007_000]
+
+
+def angles(path: Path, channels: int, rows: str = "", head: str = "Channel,Elevation,Azimuth\n", tail: str = "") -> Path:
+    path.write_text(head + (rows or "".join(f"{i},{i / 2 - 5},{i / 4}\n" for i in range(1, channels + 1))) + tail)
+    return path
+
+
+@pytest.mark.parametrize("name", SENSORS)
+def test_correction_files_of_the_unit(name: str, tmp_path: Path) -> None:
+    channels, data = FORM[name][1], [packet(name, {1: 9000}, {(1, 4): 1000})]
+    marked = angles(tmp_path / "marked.csv", channels, head="EEFF,1,1\nLaser id,Elevation,Azimuth\n", tail="a1b2c3d4e5f6\n")
+    times = angles(
+        tmp_path / "times.csv", channels, rows="".join(f"{i},{-i}\n" for i in range(channels, 0, -1)), head="Channel,fire time(μs)\n"
+    )
+    own = SENSORS[name].configure(calibration=marked)
+    both = own.configure(firing_times=times)
+    clouds = [sensor.decode(data).points() for sensor in (SENSORS[name], own, both, pickle.loads(pickle.dumps(both)))]
+    place = channels + 4
+    assert [bool(cloud.nominal) for cloud in clouds] == [True, False, False, False]
+    assert np.rad2deg(clouds[1].elevation[place]) == pytest.approx(-2.5)
+    assert np.rad2deg(clouds[1].azimuth[place]) == pytest.approx(-91.25)
+    assert clouds[2].time[place] - clouds[2].time[place - 4] == pytest.approx(-4e-6)
+    same_points(clouds[2], clouds[3])
+
+
+@pytest.mark.parametrize("rows", ["1,0,0\n2,0,0\n", "1,x,0\n", "", "1,0,0\n" * 40])
+def test_a_file_of_another_model_is_refused(rows: str, tmp_path: Path) -> None:
+    with pytest.raises(ls.UsageError, match=r"angles\.csv"):
+        P40.configure(calibration=angles(tmp_path / "angles.csv", 32, rows=rows))
+
+
+def test_a_file_that_is_missing_or_has_no_numbers_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ls.UsageError, match=r"none\.csv"):
+        P40.configure(calibration=tmp_path / "none.csv")
+    with pytest.raises(ls.UsageError, match="finite"):
+        XT16.configure(calibration=angles(tmp_path / "nan.csv", 16, rows="".join(f"{i},nan,0\n" for i in range(1, 17))))
+    with pytest.raises(ls.UsageError):
+        P40.configure(angles=tmp_path / "none.csv")
+
+
+@pytest.mark.parametrize("name", SENSORS)
+def test_a_simulated_turn_is_one_whole_scan(name: str) -> None:
+    blocks, channels = FORM[name]
+    turn = {"pandar40p": 180, "xt32": 250, "xt16": 250, "qt64": 150}[name]
+    scans = list(SENSORS[name].scans(simulate(SENSORS[name], 2 * turn + 20)))
+    assert [(len(scan), scan.complete) for scan in scans[:2]] == [(turn * blocks * channels, False), (turn * blocks * channels, True)]
+    assert scans[1].rate_hz == pytest.approx(10, rel=1e-3)
+    assert scans[1].points.shape == (turn * blocks, channels)
+    assert scans[1].points.valid.all()
+
+
+def test_the_nominal_tables_are_those_of_the_vendor() -> None:
+    path = PROTOCOLS / "tables_udp3d.json"
+    if not path.exists():
+        pytest.skip(f"{path.name} is not here: set LIDARSPEC_CAPTURES to the folder of captures, with protocols beside it")
+    tables = json.loads(path.read_text(encoding="utf-8"))["hesai"]
+    for name, model in {"pandar40p": "Pandar40P", "xt32": "PandarXT-32", "xt16": "PandarXT-16", "qt64": "PandarQT64"}.items():
+        cloud, channels = SENSORS[name].decode([packet(name)]).points(), FORM[name][1]
+        table = tables[model]
+        np.testing.assert_allclose(np.rad2deg(cloud.elevation[:channels]), table["elevation_deg"], atol=1e-5)
+        np.testing.assert_allclose(np.rad2deg(-cloud.azimuth[:channels]), table["azimuth_offset_deg"], atol=1e-5)
+        np.testing.assert_allclose(np.diff(cloud.time[:channels]) * 1e6, np.diff(table["firetime_us"]), atol=1e-6)

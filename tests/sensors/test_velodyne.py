@@ -1,0 +1,246 @@
+"""Velodyne VLP-16 and HDL-32E: packets made byte by byte, points worked out by hand, the rule for the last block, a real packet."""
+
+from __future__ import annotations
+
+import pickle
+import struct
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import pytest
+
+import lidarspec as ls
+from lidarspec.simulator import simulate
+from tests.sensors.evidence import assert_points, clockwise, decoded, vector_bytes, vectors
+
+FILE = "vectors_udp3d.json"
+VLP16, HDL32E = ls.sensor("velodyne-vlp16"), ls.sensor("velodyne-hdl32e")
+STRONGEST, DUAL = 0x37, 0x39
+
+Cells = Mapping[tuple[int, int], tuple[int, int]]
+
+
+def packet(azimuths: Sequence[int], cells: Cells, *, time_us: int = 0, mode: int = STRONGEST, product: int = 0x22) -> bytes:
+    """A data packet: azimuths in hundredths of a degree, and (distance in 2 mm, intensity) by block and slot."""
+    found = b""
+    for block, azimuth in enumerate(azimuths):
+        found += struct.pack("<2sH", b"\xff\xee", azimuth)
+        found += b"".join(struct.pack("<HB", *cells.get((block, slot), (0, 0))) for slot in range(32))
+    return found + struct.pack("<IBB", time_us, mode, product)
+
+
+def steps(start: int, step: int = 40, *, each: int = 1) -> list[int]:
+    """The azimuths of twelve blocks, in hundredths of a degree; `each`: how many share one."""
+    return [(start + step * (block // each)) % 36000 for block in range(12)]
+
+
+def filled(start: int, step: int = 40, *, each: int = 1, mode: int = STRONGEST, time_us: int = 0) -> bytes:
+    """A packet in which every distance is 10 m."""
+    cells = {(block, slot): (5000, 7) for block in range(12) for slot in range(32)}
+    return packet(steps(start, step, each=each), cells, mode=mode, time_us=time_us)
+
+
+def spot(block: int, slot: int) -> int:
+    return 32 * block + slot
+
+
+def test_vlp16_points_by_hand() -> None:
+    azimuths = [4500, 4540, 4580, 20000, 20040, 20080, 20120, 20160, 20200, 20240, 20280, 35990]
+    first = packet(azimuths, {(0, 2): (5000, 17), (3, 31): (1000, 200), (11, 16): (2500, 3)})
+    cloud = decoded(VLP16, [first, packet(steps(30), {}, time_us=1327)]).points()
+    # laser = slot % 16; it fires 2.304 us * laser after its round, the second round 55.296 us after the first, a block takes
+    # 110.592 us. x = r cosE cosA, y = -r cosE sinA (clockwise), z = r sinE - 0.04191 tanE.
+    #   block 0, slot 2: 10 m, E -13; 4.608 / 110.592 = 0.0416667 of 0.40: A 45.0166667
+    #     x = 10 * .974370 * .706901 = 6.88783, y = -10 * .974370 * .707312 = -6.89184, z = -2.249511 + .04191 * .230868 = -2.23983
+    #   block 3, slot 31: 2 m, E 15; 89.856 / 110.592 = 0.8125 of 0.40: A 200.325
+    #     x = 2 * .965926 * -.937738 = -1.81157, y = -2 * .965926 * -.347347 = 0.67102, z = .517638 - .04191 * .267949 = 0.50641
+    #   block 11, slot 16: 5 m, E -15; half of 0.40 to the first block of the next packet: A 0.10
+    #     x = 5 * .965926 * .999998 = 4.82962, y = -5 * .965926 * .001745 = -0.00843, z = -1.294095 + .011230 = -1.28287
+    expected = {
+        spot(0, 2): (6.88783, -6.89184, -2.23983),
+        spot(3, 31): (-1.81157, 0.67102, 0.50641),
+        spot(11, 16): (4.82962, -0.00843, -1.28287),
+    }
+    assert_points(cloud, expected.items())
+    spots = list(expected)
+    assert cloud.ring is not None
+    assert cloud.intensity is not None
+    assert np.flatnonzero(cloud.valid).tolist() == spots
+    assert cloud.intensity[spots].tolist() == [17, 200, 3]
+    assert cloud.ring[spots].tolist() == [1, 15, 0]
+    np.testing.assert_allclose(cloud.time[spots], [4.608e-6, 421.632e-6, 1271.808e-6], atol=1e-12)
+    vendor = VLP16.configure(frame="vendor").decode([first, packet(steps(30), {})]).points()
+    np.testing.assert_allclose(vendor.xyz[spots[0]], (6.89184, 6.88783, -2.23983), atol=2e-5)  # x right, y forward
+
+
+def test_vlp16_dual_return_by_hand() -> None:
+    first = packet(steps(8800, each=2), {(10, 17): (3000, 40), (11, 17): (2000, 90)}, mode=DUAL)
+    cloud = decoded(VLP16, [first, packet(steps(9040, each=2), {}, mode=DUAL, time_us=664)]).points()
+    # blocks 10 and 11 share A 90.00, the next pair has 90.40; slot 17 is laser 1, E 1, second round: 57.6 / 110.592 = 0.5208333:
+    # A 90.2083333, cosA = -.003636, sinA = .999993
+    #   block 10, the last return, 6 m: x = -6 * .999848 * .003636 = -0.02181, y = -5.99905, z = .104714 - .000732 = 0.10398
+    #   block 11, the strongest, 4 m: x = -0.01454, y = -3.99936, z = .069810 - .000732 = 0.06908
+    expected = {spot(10, 17): (-0.02181, -5.99905, 0.10398), spot(11, 17): (-0.01454, -3.99936, 0.06908)}
+    assert_points(cloud, expected.items())
+    spots = list(expected)
+    assert cloud.return_index is not None
+    assert cloud.return_index[spots].tolist() == [0, 1]
+    np.testing.assert_allclose(cloud.time[spots], 5 * 110.592e-6 + 57.6e-6, atol=1e-12)
+    assert cloud.shape == (24, 32)
+
+
+def test_hdl32e_points_by_hand() -> None:
+    cells = {(2, 31): (10000, 11), (5, 0): (500, 12), (8, 15): (1500, 13)}
+    azimuths = [29968, 29984, 30000, 30016, 30032, 18000, 18016, 18032, 9000, 9016, 9032, 9048]
+    cloud = decoded(HDL32E, [packet(azimuths, cells, product=0x21)]).points()
+    # slot j fires 1.152 us * j after its block, which takes 46.08 us; z = r sinE - 0.02883 tanE
+    #   block 2, slot 31: 20 m, E 10.67; 35.712 / 46.08 = 0.775 of 0.16: A 300.124, cosA = .501873, sinA = -.864942
+    #     x = 20 * .982710 * .501873 = 9.86391, y = 20 * .982710 * .864942 = 16.99975, z = 20 * .185152 - .02883 * .188410 = 3.69761
+    #   block 5, slot 0: 1 m, E -30.67; A 180
+    #     x = -.860119, y = 0, z = -.510094 + .02883 * .593050 = -0.49300
+    #   block 8, slot 15: 3 m, E 0; 17.28 / 46.08 = 0.375 of 0.16: A 90.06
+    #     x = -3 * .001047 = -0.00314, y = -3.00000, z = 0
+    expected = {spot(2, 31): (9.86391, 16.99975, 3.69761), spot(5, 0): (-0.86012, 0, -0.493), spot(8, 15): (-0.00314, -3, 0)}
+    assert_points(cloud, expected.items(), atol=3e-5)
+    spots = list(expected)
+    assert cloud.ring is not None
+    assert cloud.ring[spots].tolist() == [31, 0, 23]
+    np.testing.assert_allclose(cloud.time[spots], [127.872e-6, 230.4e-6, 385.92e-6], atol=1e-12)
+
+
+def test_the_real_packet_of_the_vectors() -> None:
+    data, expected = vector_bytes(FILE, "vlp16_dual_real"), vectors(FILE)["vlp16_dual_real"]["expected"]
+    parsed = VLP16.parse(data)
+    assert VLP16.build("data", parsed) == data
+    assert (parsed.return_mode, parsed.product, parsed.timestamp) == (expected["return_mode"], expected["product"], expected["tohus"])
+    assert [block.azimuth for block in parsed.blocks] == expected["azimuths"]
+    packets = decoded(VLP16, [data])
+    cloud = packets.points()
+    assert packets.time_ns.tolist() == [expected["tohus"] * 1000]
+    assert int(cloud.valid.sum()) == expected["n_nonzero"]
+    assert cloud.intensity is not None
+    for point in expected["points"]:
+        index = spot(point["block"], point["j"])
+        assert parsed.blocks[point["block"]].channels[point["j"]].distance == point["raw"]
+        assert cloud.intensity[index] == point["intensity"]
+        assert cloud.time[index] == pytest.approx(point["t_us"] * 1e-6, abs=1e-12)
+        assert clockwise(cloud)[index] == pytest.approx(point["azimuth_deg"], abs=1e-4)
+        np.testing.assert_allclose(cloud.xyz[index], point["xyz"], atol=6e-4)
+
+
+@pytest.mark.parametrize(("each", "mode"), [(1, STRONGEST), (2, DUAL)])
+@pytest.mark.parametrize("beyond", [None, 2000, 24000])
+def test_the_last_block_where_nothing_follows_or_packets_are_lost(each: int, mode: int, beyond: int | None) -> None:
+    data = [filled(1000, 39, each=each, mode=mode)]
+    if beyond is not None:
+        data.append(filled(beyond, 39, each=each, mode=mode, time_us=9000))
+    last = steps(1000, 39, each=each)[-1] / 100
+    inner, outer = range(12 - each), range(12 - each, 12)
+    for sensor, known in ((VLP16, True), (VLP16.configure(last_block="invalid"), False)):
+        cloud = decoded(sensor, data).points()
+        valid = cloud.valid.reshape(-1, 12, 32)[0]
+        assert valid[inner].all()
+        assert valid[outer].all() == valid[outer].any() == known
+        if known:
+            np.testing.assert_allclose(clockwise(cloud)[[spot(block, 16) for block in outer]], last + 0.195, atol=2e-5)
+
+
+@pytest.mark.parametrize(("each", "mode"), [(1, STRONGEST), (2, DUAL)])
+def test_directions_run_on_over_packet_borders_and_over_zero(each: int, mode: int) -> None:
+    per_packet = 12 // each
+    starts = [(35000 + 40 * per_packet * number) % 36000 for number in range(6)]
+    data = [filled(start, each=each, mode=mode, time_us=1000 * number) for number, start in enumerate(starts)]
+    cloud = decoded(VLP16, data).points()
+    turned = (clockwise(cloud).reshape(72, 32)[::each] - 350) % 360
+    slot = np.arange(32)
+    within = 0.4 * (slot // 16 * 55.296 + slot % 16 * 2.304) / 110.592
+    np.testing.assert_allclose(turned, 0.4 * np.arange(len(turned))[:, None] + within, atol=5e-5)
+
+
+def test_the_sector_that_is_masked_is_not_bridged() -> None:
+    masked = packet([*steps(8900)[:6], *steps(27000)[:6]], {(5, 16): (500, 1)})
+    assert clockwise(decoded(VLP16, [masked]).points())[spot(5, 16)] == pytest.approx(91.2, abs=1e-4)
+
+
+def test_an_azimuth_that_falls_back_is_no_turn() -> None:
+    stuck = packet([1000, 999, *steps(1000, 0)[2:]], {(0, 16): (500, 1)})
+    assert clockwise(decoded(VLP16, [stuck]).points())[spot(0, 16)] == pytest.approx(9.995, abs=1e-4)
+
+
+def test_neither_the_product_byte_nor_an_unset_mode_changes_points() -> None:
+    for sensor in (VLP16, HDL32E):
+        clouds = [
+            sensor.decode([packet(steps(10), {(4, 9): (700, 1)}, mode=m, product=p)]).points()
+            for m, p in ((0x37, 0x22), (0, 0), (0x38, 0x21))
+        ]
+        for cloud in clouds[1:]:
+            np.testing.assert_array_equal(cloud.xyz, clouds[0].xyz)
+
+
+def test_the_clock_runs_on_over_the_hour() -> None:
+    times = [3_599_999_000, 327, 1_654]
+    packets = decoded(VLP16, [filled(0, time_us=time) for time in times])
+    assert np.diff(packets.time_ns).tolist() == [1_327_000, 1_327_000]
+
+
+def test_azimuths_of_up_to_a_whole_turn_and_flags_are_believed() -> None:
+    wrong_flag = bytearray(filled(0))
+    wrong_flag[300] = 0xFE
+    packets = decoded(VLP16, [packet([36000] * 12, {}), packet([36001] * 12, {}), bytes(wrong_flag)])
+    assert (len(packets), packets.stats.implausible) == (1, 1)
+    with pytest.raises(ls.WireError) as caught:
+        VLP16.parse(bytes(wrong_flag), "data")
+    assert (caught.value.path, caught.value.offset) == ("blocks[3].flag", 300)
+
+
+def position(nmea: bytes, *, pps: int = 2, time_us: int = 123_456_789) -> bytes:
+    """A position packet with a reading of its own in each field."""
+    inertial = struct.pack("<12H", *range(0x101, 0x10D))
+    state = struct.pack("<BBBhIBBIBBBB", 41, 38, 35, -3, 600, 4, 2, time_us, pps, 1, 99, 22)
+    return bytes(14) + inertial + bytes(149) + state + nmea.ljust(306, b"\0")
+
+
+def test_the_position_packet() -> None:
+    sentence = b"$GPRMC,220516,A,5133.82,N,00042.24,W,173.8,231.8,130694,004.2,W*70\r\n"
+    data = position(sentence)
+    assert len(data) == 512
+    parsed = VLP16.parse(data)
+    assert VLP16.build("position", parsed) == data
+    assert bytes(parsed.nmea).rstrip(b"\0") == sentence
+    assert [parsed.inertial[2].gyro, parsed.inertial[2].accel_y] == [0x109, 0x10C]
+    assert (parsed.top_board_temperature, parsed.bottom_board_temperature, parsed.adc_temperature_change) == (41, 38, -3)
+    assert (parsed.pps, parsed.thermal_status, parsed.shutdown_temperature, parsed.power_up_temperature) == (2, 1, 99, 22)
+    packets = decoded(VLP16, [data, filled(0), position(b"", pps=0, time_us=0)], "position")
+    assert packets["timestamp"].tolist() == [pytest.approx(123.456789), 0]
+    assert packets["adc_age"].tolist() == [600, 600]
+
+
+@pytest.mark.parametrize("data", [position(b"$GP\xff\xee"), position(b"", pps=4), b"\1" + position(b"")[1:], position(b"") + b"\0"])
+def test_what_is_no_position_packet(data: bytes) -> None:
+    assert len(decoded(VLP16, [data], "position")) == 0
+
+
+def test_the_option_is_checked_and_kept() -> None:
+    chosen = VLP16.configure(last_block="invalid")
+    assert pickle.loads(pickle.dumps(chosen)).options == {"last_block": "invalid"}
+    again = chosen.configure(frame="vendor")
+    assert not again.decode([filled(0)]).points().valid[spot(11, 5)]
+    assert VLP16.decode([filled(0)]).points().valid.all()
+    with pytest.raises(ls.UsageError, match="previous, invalid"):
+        VLP16.configure(last_block="mean")
+    with pytest.raises(ls.UnknownOption):
+        VLP16.configure(last="invalid")
+
+
+@pytest.mark.parametrize(("sensor", "lasers", "per_second"), [(VLP16, 16, 753.5), (HDL32E, 32, 1808.4)])
+def test_the_simulated_sensor_turns_ten_times_a_second(sensor: ls.Sensor, lasers: int, per_second: float) -> None:
+    frames = simulate(sensor, int(per_second * 0.25))
+    packets = sensor.decode(frames)
+    assert (len(packets) - 1) / np.ptp(packets.time_ns * 1e-9) == pytest.approx(per_second, rel=1e-3)
+    scans = list(sensor.scans(frames))
+    assert [scan.complete for scan in scans] == [False, True, False]
+    assert scans[1].rate_hz == pytest.approx(10, rel=2e-3)
+    cloud = scans[1].points
+    assert cloud.ring is not None
+    assert set(cloud.ring.tolist()) == set(range(lasers))
+    assert cloud.valid.mean() > 0.9

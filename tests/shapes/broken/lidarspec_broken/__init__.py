@@ -1,0 +1,1 @@
+"""One module for each way in which a plugin can be broken; see `tests/test_plugins.py`."""

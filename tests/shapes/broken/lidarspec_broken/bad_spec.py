@@ -1,0 +1,7 @@
+"""Describes a frame that loses bits, which is found when it is declared."""
+
+from construct import Flag, Int8ul, Padding, Struct
+
+from lidarspec import Frame
+
+FRAME = Frame(Struct("kind" / Int8ul, "on" / Flag, Padding(2)), max_length=4)

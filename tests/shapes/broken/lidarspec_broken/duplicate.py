@@ -1,0 +1,11 @@
+"""Adds a sensor under an id that another plugin has."""
+
+import dataclasses
+
+from lidarspec import hookimpl
+from lidarspec_broken.failing import plain
+
+
+@hookimpl
+def lidarspec_sensors():  # type: ignore[no-untyped-def]
+    return [plain("broken-fresh"), dataclasses.replace(plain("broken-fresh"), id="acme-x1")]

@@ -1,0 +1,8 @@
+"""A hook that does not exist."""
+
+from lidarspec import hookimpl
+
+
+@hookimpl
+def lidarspec_sensor():  # type: ignore[no-untyped-def]
+    return []

@@ -1,0 +1,8 @@
+"""Lists something that is no sensor."""
+
+from lidarspec import hookimpl
+
+
+@hookimpl
+def lidarspec_sensors():  # type: ignore[no-untyped-def]
+    return ["acme-x2"]

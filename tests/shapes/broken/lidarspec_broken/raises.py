@@ -1,0 +1,8 @@
+"""Fails while it lists its sensors."""
+
+from lidarspec import hookimpl
+
+
+@hookimpl
+def lidarspec_sensors():  # type: ignore[no-untyped-def]
+    return [1 / 0]

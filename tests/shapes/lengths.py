@@ -1,0 +1,45 @@
+"""Two data frames that differ in length alone: with and without a counter; whichever arrives is read."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from construct import Array, Const, Int16ul, Struct
+
+from lidarspec import Fields, Frame, OnWrap, Polar, Scaled, Sensor, Sequence, Udp
+
+PLAIN = Struct(
+    "magic" / Const(b"LN"),
+    "azimuth" / Scaled(Int16ul, 0.01, "deg"),
+    "distances" / Array(3, Scaled(Int16ul, 0.001, "m")),
+)
+COUNTED = Struct(*PLAIN.subcons, "counter" / Int16ul)
+
+
+def points(f: Fields) -> Polar:
+    return Polar(range=f.distances, azimuth=np.deg2rad(f.azimuth + np.arange(3)))
+
+
+def sweep(i: int) -> dict[str, Any]:
+    """Twelve packets a turn; the counter is for the frames that have one."""
+    return {"azimuth": i * 30.0 % 360, "counter": i % 65_536}
+
+
+SENSOR = Sensor(
+    "shape-lengths",
+    vendor="Shapes",
+    model="Lengths",
+    frames={
+        "plain": Frame(PLAIN, data=True, max_length=10, plausible=lambda f: f.azimuth < 360),
+        "counted": Frame(COUNTED, data=True, max_length=12, plausible=lambda f: f.azimuth < 360),
+    },
+    points=points,
+    scan=OnWrap("azimuth"),
+    links={"data": Udp(7003)},
+    sequence=Sequence("counter"),
+    sweep=sweep,
+    range_limits=(0.1, 60.0),
+    status="manual",
+    source="invented for the tests: data frames that differ in length alone",
+)
