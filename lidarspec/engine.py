@@ -85,7 +85,7 @@ class StandardEngine:
             if function is None:
                 raise UnknownOption(min(rest), ("frame", "answer"), place=sensor.id)
             try:
-                found = function(sensor, **rest)
+                found = registry().hooked(function(sensor, **rest))
             except TypeError as error:
                 if "keyword" in str(error) or "argument" in str(error):
                     raise UnknownOption(min(rest), ("frame", "answer"), place=sensor.id, hint=f": {error}") from None

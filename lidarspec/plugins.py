@@ -119,13 +119,14 @@ class Registry:
             return sensor if all(frames[name] is frame for name, frame in sensor.frames.items()) else replaced(sensor, frames=frames)
 
         def with_hooks(function: Any) -> Any:
-            if function is None:
-                return None
+            if function is None or getattr(function, "asks_hooks", False):
+                return function
 
             def hooked_points(fields: Any) -> Any:
                 found = points(sensor=sensor, fields=fields)
                 return function(fields) if found is None else found
 
+            hooked_points.asks_hooks = True  # type: ignore[attr-defined]  # configured sensors come here a second time
             return hooked_points
 
         frames = {name: _with_points(frame, with_hooks(frame.points)) for name, frame in frames.items()}

@@ -56,12 +56,13 @@ def points_function(sensor: Sensor, frame: str) -> Callable[[Any], Points]:
     return function
 
 
-def evaluate(packets: Packets, carry: Carry | None = None, *, final: bool = True) -> Evaluated:
+def evaluate(packets: Packets, carry: Carry | None = None, *, final: bool = True, epoch: int | None = None) -> Evaluated:
     """The points of a batch.
 
     Args:
         carry: what the batch before left.
         final: nothing follows; what depends on it becomes nan (by `following`), and no packet waits.
+        epoch: the time that the cloud's stamp is, int64 ns; by default that of the first packet.
 
     Raises:
         SpecError: where the plugin's function fails or returns columns that do not fit; the cause is chained.
@@ -74,7 +75,7 @@ def evaluate(packets: Packets, carry: Carry | None = None, *, final: bool = True
             result = points_function(packets.sensor, packets.frame)(found)
             if not isinstance(result, Polar | Cartesian):
                 raise TypeError(f"has to return Polar or Cartesian, not {type(result).__name__}")
-            return _flattened(packets, result, _columns(result, batch), batch, found, final=final)
+            return _flattened(packets, result, _columns(result, batch), batch, found, final=final, epoch=epoch)
     except Exception as error:
         raise SpecError(f"{type(error).__name__}: {error}", path=place, sensor=packets.sensor.id) from error
 
@@ -94,13 +95,15 @@ def _anchored(value: Any, anchor: Column) -> Column:
     return Column(array.reshape((1,) * (1 + len(axes) - array.ndim) + array.shape), axes, anchor.batch, ready=ready)
 
 
-def _flattened(packets: Packets, result: Points, columns: dict[str, Column], batch: Batch, found: Fields, *, final: bool) -> Evaluated:
+def _flattened(
+    packets: Packets, result: Points, columns: dict[str, Column], batch: Batch, found: Fields, *, final: bool, epoch: int | None
+) -> Evaluated:
     arrays, axes, ready = aligned(tuple(columns.values()), batch)
     ready = len(packets) if final else ready
     shape = np.broadcast_shapes((len(packets),) + (1,) * len(axes), *(array.shape for array in arrays))
     mask = unpadded(axes, shape, batch)
     flat = {name: _flat(array, shape, mask, ready) for name, array in zip(columns, arrays, strict=True)}
-    base = int(packets.time_ns[0]) if len(packets) else 0
+    base = epoch if epoch is not None else int(packets.time_ns[0]) if len(packets) else 0
     offsets = ((packets.time_ns - base) * 1e-9).reshape(-1, *(1,) * len(axes))
     flat["time"] = flat["time"] + _flat(offsets, shape, mask, ready)
     inside = np.ones(shape, np.bool_) if mask is None else mask.reshape(shape)
@@ -168,10 +171,10 @@ def _polar(flat: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
     return {"range": np.hypot(level, z), "azimuth": np.arctan2(y, x), "elevation": np.arctan2(z, level)}
 
 
-def guarded(packets: Packets, carry: Carry | None = None, *, final: bool = True) -> Evaluated | None:
+def guarded(packets: Packets, carry: Carry | None = None, *, final: bool, epoch: int) -> Evaluated | None:
     """`evaluate` for streams, which raise on nothing: a failing plugin is counted and gives no points."""
     try:
-        return evaluate(packets, carry, final=final)
+        return evaluate(packets, carry, final=final, epoch=epoch)
     except SpecError:
         packets.stats.error(traceback.format_exc())
         return None

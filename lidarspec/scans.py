@@ -114,6 +114,7 @@ class ScanStream:
         self._carry: Carry = {}
         self._parts: list[PointCloud] = []
         self._started = False
+        self._epoch: int | None = None
 
     def add(self, packets: Packets) -> list[Scan]:
         """The scans that these packets complete."""
@@ -132,7 +133,9 @@ class ScanStream:
         if self._waiting is not None and len(self._waiting):
             packets = joined_packets([self._waiting, packets])
         self._waiting = None
-        found = guarded(packets, self._carry, final=final)
+        if self._epoch is None:
+            self._epoch = int(packets.time_ns[0])  # one for the whole stream, so that batches do not change a bit of any time
+        found = guarded(packets, self._carry, final=final, epoch=self._epoch)
         if found is None:
             return []
         self._carry = found.carry

@@ -6,9 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from construct import Array, Const, Int8ul, Struct, this
 
 import lidarspec
-from lidarspec import Frame, Sensor, SpecError
+from lidarspec import Frame, Polar, Sensor, SpecError
 from lidarspec.simulator import simulate
 from lidarspec.spec import replaced
 from tests.made_captures import frame, pcap
@@ -81,6 +82,7 @@ def test_a_sweep_may_name_fields_of_the_other_form_but_none_that_do_not_exist() 
         ([None, None, None], 0, 0, [0, 1, 2]),
         ([7, None, 8, 12], 3, 0, [7, 8, 8 + 1, 13]),
         ([None, 7, 8], 0, 0, None),
+        ([None, None, None, 0, 1], 0, 0, None),
         ([7, 7, None], 0, 1, [7, 7, 8]),
     ],
 )
@@ -122,6 +124,21 @@ def test_an_array_without_elements_is_the_same_on_both_paths() -> None:
     compiled, interpreted = (headed.SENSOR.decode([empty, block(1)], backend=backend) for backend in ("auto", "construct"))
     assert compiled["blocks.channels.distance"].tolist() == interpreted["blocks.channels.distance"].tolist()
     assert interpreted.count("blocks").tolist() == [0, 1]
+    assert compiled.count("blocks").tolist() == [0, 1]
+    assert compiled.count("blocks.channels").tolist() == interpreted.count("blocks.channels").tolist() == [0, 3]
+
+
+def test_an_array_in_one_without_elements_may_have_a_length_of_its_own() -> None:
+    row = Struct("cells" / Array(this._.width, Int8ul))
+    struct = Struct("magic" / Const(b"RW"), "height" / Int8ul, "width" / Int8ul, "rows" / Array(this.height, row))
+    frame_type = Frame(struct, data=True, max_length=40)
+    sensor = replaced(headed.SENSOR, frames={"data": frame_type}, points=lambda f: Polar(f.rows.cells, 0), sequence=None, sweep=None)
+    data = [bytes.fromhex("5257 00 05"), bytes.fromhex("5257 02 03 010203 040506")]
+    for backend in ("auto", "construct"):
+        packets = sensor.decode(data, backend=backend)
+        assert packets.raw["rows"]["cells"].tolist() == [[[0] * 3] * 2, [[1, 2, 3], [4, 5, 6]]]
+        assert packets.count("rows.cells").tolist() == [0, 3]
+        assert packets.points().range.tolist() == [1, 2, 3, 4, 5, 6]
 
 
 def test_cartesian_points_can_be_nominal_too() -> None:

@@ -99,7 +99,7 @@ def test_a_captured_packet_has_the_fields_and_points_of_its_vector(name: str, tm
     assert int(packets.points().valid.sum()) == expected["n_nonzero"]
     tail = expected["tail"]
     assert all(parsed[NAMES[key]] == value for key, value in tail.items() if key in NAMES)
-    moment = datetime.datetime(*tail["utc"], tzinfo=datetime.UTC)
+    moment = datetime.datetime(*tail["utc"]).replace(tzinfo=datetime.UTC)
     assert int(packets.time_ns[0]) == int(moment.timestamp()) * 10**9 + tail["us"] * 1000
     cloud, channels = packets.points(), len(params["elevation_deg"])
     for point in expected["points"]:

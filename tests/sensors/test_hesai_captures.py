@@ -34,7 +34,8 @@ def datagrams(path: Path) -> list[bytes]:
 
 def calibrated(name: str, **more: Any) -> Sensor:
     file = next(capture(f"hesai/{name}").glob("*.csv"))
-    return ls.sensor(PUBLISHED[name]).configure(calibration=file, **more)
+    sensor: Sensor = ls.sensor(PUBLISHED[name]).configure(calibration=file, **more)
+    return sensor
 
 
 def published(name: str) -> Points:

@@ -232,10 +232,11 @@ def test_the_option_is_checked_and_kept() -> None:
         VLP16.configure(last="invalid")
 
 
-@pytest.mark.parametrize(("sensor", "lasers", "per_second"), [(VLP16, 16, 753.5), (HDL32E, 32, 1808.4)])
-def test_the_simulated_sensor_turns_ten_times_a_second(sensor: ls.Sensor, lasers: int, per_second: float) -> None:
+@pytest.mark.parametrize(("sensor", "lasers", "per_second", "product"), [(VLP16, 16, 753.5, 0x22), (HDL32E, 32, 1808.4, 0x21)])
+def test_the_simulated_sensor_turns_ten_times_a_second(sensor: ls.Sensor, lasers: int, per_second: float, product: int) -> None:
     frames = simulate(sensor, int(per_second * 0.25))
     packets = sensor.decode(frames)
+    assert packets.raw["product"].tolist() == [product] * len(packets)
     assert (len(packets) - 1) / np.ptp(packets.time_ns * 1e-9) == pytest.approx(per_second, rel=1e-3)
     scans = list(sensor.scans(frames))
     assert [scan.complete for scan in scans] == [False, True, False]

@@ -1,0 +1,79 @@
+"""`demo`: the main job with nothing attached."""
+
+from __future__ import annotations
+
+import shutil
+
+import click
+import numpy as np
+from rich.console import Console
+
+from lidarspec.cli.look import NO_SENSORS
+from lidarspec.cli.output import emit_json, sensor_option
+from lidarspec.demo import DemoResult, run
+from lidarspec.errors import UsageError
+from lidarspec.plugins import registry, sensor as named_sensor
+from lidarspec.scans import Scan
+from lidarspec.view.polar import polar_text, top_side_text
+
+#: cells of the picture at most, and lines that are kept for the summary.
+WIDEST, HIGHEST, SUMMARY = 100, 42, 8
+#: elevations below this, in radians, make a cloud a flat one.
+FLAT = 1e-3
+
+
+@click.command()
+@sensor_option
+@click.option("-n", "--count", type=click.IntRange(min=1), default=5, show_default=True, help="Whole scans to wait for.")
+@click.option("--errors", type=click.FloatRange(0, 1), default=0.01, show_default=True, help="Share of the bytes that the line damages.")
+@click.option("--json", "as_json", is_flag=True, help="Print the summary as JSON.")
+def demo(sensor_id: str | None, count: int, errors: float, as_json: bool) -> None:
+    """A simulated sensor in a room, damaged on the line, decoded and drawn."""
+    sensor = named_sensor(sensor_id) if sensor_id else next((s for s in registry().sensors().values() if s.sweep), None)
+    if sensor is None:
+        raise UsageError(NO_SENSORS)
+    result = run(sensor, turns=count, errors=errors)
+    whole = [scan for scan in result.scans if scan.complete] or list(result.scans)
+    if as_json:
+        emit_json(_facts(result, whole), None)
+        return
+    console = Console()
+    if whole:
+        console.print(_picture(whole[-1]), soft_wrap=True, highlight=False)
+    for text in _summary(result, whole, errors):
+        console.print(text, soft_wrap=True, highlight=False, markup=False)
+
+
+def _picture(scan: Scan) -> object:
+    columns, lines = shutil.get_terminal_size((80, HIGHEST))
+    width, height = min(columns, WIDEST), max(min(lines - SUMMARY, HIGHEST), 12)
+    flat = not len(scan) or float(np.nanmax(np.abs(scan.points.elevation))) < FLAT
+    return (polar_text if flat else top_side_text)(scan.points, width=width, height=height)
+
+
+def _summary(result: DemoResult, whole: list[Scan], errors: float) -> list[str]:
+    stats, name = result.stats, result.sensor.id
+    frames = sum(stats.frames.values())
+    harm = "of the bytes damaged" if stats.bytes_skipped or not stats.lost else "of the datagrams lost"
+    told = [
+        f"{name}, simulated: {result.sent} frames sent, {errors:.1%} {harm}, {result.intact} came through unharmed",
+        f"{frames} frames decoded, {stats.bad_checksum} checksum errors, {stats.bytes_skipped} of {stats.bytes_in} bytes skipped",
+    ]
+    if whole:
+        rate = float(np.nanmean([scan.rate_hz for scan in whole])) if any(np.isfinite(scan.rate_hz) for scan in whole) else float("nan")
+        points = sum(int(scan.points.valid.sum()) for scan in whole)
+        told.append(f"{len(whole)} whole scans at {rate:.1f} Hz, {points} points; the last one: {whole[-1]}")
+    return [*told, f"next: lidarspec show {name}"]
+
+
+def _facts(result: DemoResult, whole: list[Scan]) -> dict[str, object]:
+    rates = [scan.rate_hz for scan in whole if np.isfinite(scan.rate_hz)]
+    return {
+        "sensor": result.sensor.id,
+        "sent": result.sent,
+        "intact": result.intact,
+        "scans": len(whole),
+        "rate_hz": float(np.mean(rates)) if rates else None,
+        "points": sum(int(scan.points.valid.sum()) for scan in whole),
+        "stats": result.stats.to_dict(),
+    }

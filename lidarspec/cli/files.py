@@ -1,0 +1,114 @@
+"""The verbs from file to file."""
+
+from __future__ import annotations
+
+import itertools
+import os
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import click
+
+from lidarspec.cli.failures import suggest
+from lidarspec.cli.inputs import Input, no_frame
+from lidarspec.cli.output import emit_json, note, sensor_option
+from lidarspec.detect import detected, scores
+from lidarspec.device import Device, open as open_device
+from lidarspec.errors import LidarSpecError, UsageError, WireError
+from lidarspec.formats import format_of, write
+from lidarspec.plugins import sensor as named_sensor
+from lidarspec.scans import Scan
+from lidarspec.sources import transport
+
+#: datagrams and bytes looked at again to say why there is no data in a file.
+LOOKED_AT = 1 << 16
+
+
+@dataclass
+class Written:
+    """What has gone through so far."""
+
+    scans: int = 0
+    points: int = 0
+
+    def counting(self, scans: Iterable[Scan], *, every_point: bool) -> Iterator[Scan]:
+        """The scans, counted on their way."""
+        for scan in scans:
+            self.scans += 1
+            self.points += len(scan) if every_point else int(scan.points.valid.sum())
+            yield scan
+
+
+@click.command()
+@click.argument("source", metavar="IN")
+@click.argument("target", metavar="OUT")
+@sensor_option
+@click.option("-n", "--count", type=click.IntRange(min=1), help="Scans at most.")
+@click.option("--all", "every_point", is_flag=True, help="Keep points without a valid return.")
+@click.option("--json", "as_json", is_flag=True, help="Print a summary as JSON.")
+def convert(source: str, target: str, sensor_id: str | None, count: int | None, every_point: bool, as_json: bool) -> None:
+    """Write the points of a capture or raw file to a file, in the format of its suffix.
+
+    .csv and .npz hold x y z range azimuth elevation intensity time ring return_index, those that the sensor has, and the
+    number of the scan; metres, radians, and seconds since the scan's stamp.
+    """
+    format_of(target)
+    if source != "-" and os.path.exists(target) and os.path.samefile(source.partition("?")[0], target):
+        raise UsageError(f"{target} is the input: it would be overwritten")
+    sensor = detected(source) if sensor_id is None else named_sensor(sensor_id)
+    written = Written()
+    with open_device(source, sensor) as device:
+        scans = itertools.islice(device.scans(), count)
+        first = next(scans, None)
+        if first is None:
+            raise _no_data(device, source, target)
+        write(target, written.counting(itertools.chain([first], scans), every_point=every_point), every_point=every_point)
+        _sum_up(device, target, written, as_json=as_json)
+
+
+def _sum_up(device: Device, target: str, written: Written, *, as_json: bool) -> None:
+    for warning in device.warnings:
+        note(warning)
+    note(f"{target}: {written.points} points of {written.scans} scan{'s' * (written.scans != 1)} of {device.sensor.id}; {device.stats}")
+    if device.stats.tracebacks:
+        note(f"the plugin failed: {device.stats.tracebacks[0].strip().splitlines()[-1]}")
+    if as_json:
+        stats = device.stats.to_dict()
+        emit_json({"sensor": device.sensor.id, "output": target, "scans": written.scans, "points": written.points, "stats": stats}, None)
+
+
+def _no_data(device: Device, source: str, target: str) -> Exception:
+    """Why nothing came out: an empty file, a damaged frame, another sensor's bytes, or no lidar's at all."""
+    sensor, stats = device.sensor, device.stats
+    if stats.bytes_in == 0:
+        return suggest(WireError(f"{source} holds no bytes", sensor=sensor.id), f"lidarspec show {sensor.id}")
+    if stats.tracebacks:
+        return WireError(f"no points: {stats.tracebacks[0].strip().splitlines()[-1]}", sensor=sensor.id)
+    given = _again(source)
+    if given is not None:
+        others = [score.sensor.id for score in scores(list(given.chunks), datagrams=given.datagrams) if score.sensor.id != sensor.id]
+        if others:
+            error = WireError(f"no data frame in {source}; its frames are those of {', '.join(others)}", sensor=sensor.id)
+            return suggest(error, f"lidarspec convert {source} {target} -s {others[0]}")
+        if not stats.frames:
+            return no_frame(sensor, given)
+    return suggest(WireError(f"no data frame in {source}: {stats}", sensor=sensor.id), f"lidarspec explain {source} -s {sensor.id}")
+
+
+def _again(source: str) -> Input | None:
+    """The beginning of a file once more; None for what can be read only once."""
+    if not Path(source.partition("?")[0]).is_file():
+        return None
+    opened = transport(source)
+    chunks: list[bytes] = []
+    try:
+        for chunk in opened.chunks():
+            chunks.append(chunk.data[:LOOKED_AT])
+            if sum(map(len, chunks)) >= LOOKED_AT:
+                break
+    except LidarSpecError:
+        return None
+    finally:
+        opened.close()
+    return Input(source, tuple(chunks), opened.datagrams)
