@@ -6,13 +6,15 @@ import itertools
 from dataclasses import dataclass
 from pathlib import Path
 
-from lidarspec.errors import UsageError
+from lidarspec.errors import UsageError, WireError
 from lidarspec.plugins import sensors
 from lidarspec.sources import transport
 from lidarspec.spec import Sensor
 
 #: bytes and datagrams that are looked at.
 LOOKED_AT, DATAGRAMS = 1 << 17, 400
+#: bytes that an error shows.
+SHOWN = 16
 
 
 @dataclass(frozen=True)
@@ -45,19 +47,26 @@ def detected(source: str | Path) -> Sensor:
     """The one installed sensor whose frames a file holds.
 
     Raises:
-        UsageError: where none fits, or several fit equally well: they are listed.
+        WireError: where none fits.
+        UsageError: where several fit equally well: they are listed.
     """
     if str(source) == "-":
         raise UsageError("name the sensor with -s: standard input can be read only once")
     opened = transport(source)
+    chunks: list[bytes] = []
+    size = 0
     try:
-        taken = itertools.islice(opened.chunks(), DATAGRAMS if opened.datagrams else 1)
-        chunks = [chunk.data[:LOOKED_AT] for chunk in taken]
+        for chunk in itertools.islice(opened.chunks(), DATAGRAMS if opened.datagrams else None):
+            chunks.append(chunk.data[:LOOKED_AT])
+            size += len(chunks[-1])
+            if size >= LOOKED_AT:
+                break
     finally:
         opened.close()
     found = scores(chunks, datagrams=opened.datagrams)
     if not found:
-        raise UsageError(f"{source}: no installed sensor's frames are in it; see lidarspec sensors, and name one with -s")
+        what = "no installed sensor's frames are in it" if size else "it holds no bytes"
+        raise WireError(f"{source}: {what}", data=chunks[0][:SHOWN] if chunks else b"")
     best = [score.sensor.id for score in found if score.share >= found[0].share - 0.01]
     if len(best) > 1:
         raise UsageError(f"{source}: {', '.join(best)} send the same frames; name the sensor with -s")

@@ -149,7 +149,7 @@ def open(source: str | Path, sensor: str | Sensor | None = None, *, backend: str
 
     Raises:
         SourceError: where the source cannot be opened.
-        UsageError: where several sensors fit, or none, and `sensor` was left out.
+        UsageError, WireError: where several sensors fit, or none, and `sensor` was left out.
     """
     if sensor is None:
         sensor = detected(source)

@@ -46,7 +46,8 @@ class Frame:
         plausible: a function of `Fields`: False where no sensor would send such values, reduced with `all` per packet.
         after: name of the frame that has to be the last seen, of all named by any `after`, for this one to be looked for.
         confirm: how many in an unbroken run it takes to believe any of them.
-        sweep: a `sweep` function of its own, for sensors that can answer in several data frames.
+        sweep: a `sweep` function of its own, for sensors that can answer in several data frames, and for other frames that
+            random values never make.
 
     Raises:
         SpecError: if the struct cannot describe a frame (see `lidarspec.rules`).

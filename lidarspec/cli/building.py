@@ -169,7 +169,7 @@ def _scope(value: Any) -> Any:
 
 def _length(table: Schema, given: Mapping[str, Any], path: str, place: str) -> int:
     """The length of an array: declared, or from the count fields given; 0 where it follows from single elements given."""
-    declared = table.arrays.get(path)
+    declared = table.arrays[path]
     if isinstance(declared, int):
         return declared
     try:

@@ -12,7 +12,8 @@ from lidarspec.cli.look import NO_SENSORS
 from lidarspec.cli.output import emit_json, sensor_option
 from lidarspec.demo import DemoResult, run
 from lidarspec.errors import UsageError
-from lidarspec.plugins import registry, sensor as named_sensor
+from lidarspec.plugins import registry
+from lidarspec.plugins import sensor as named_sensor
 from lidarspec.scans import Scan
 from lidarspec.view.polar import polar_text, top_side_text
 
@@ -54,15 +55,15 @@ def _picture(scan: Scan) -> object:
 def _summary(result: DemoResult, whole: list[Scan], errors: float) -> list[str]:
     stats, name = result.stats, result.sensor.id
     frames = sum(stats.frames.values())
-    harm = "of the bytes damaged" if stats.bytes_skipped or not stats.lost else "of the datagrams lost"
+    harm = "of the datagrams lost" if result.sensor.datagrams else "of the bytes damaged"
     told = [
         f"{name}, simulated: {result.sent} frames sent, {errors:.1%} {harm}, {result.intact} came through unharmed",
         f"{frames} frames decoded, {stats.bad_checksum} checksum errors, {stats.bytes_skipped} of {stats.bytes_in} bytes skipped",
     ]
     if whole:
-        rate = float(np.nanmean([scan.rate_hz for scan in whole])) if any(np.isfinite(scan.rate_hz) for scan in whole) else float("nan")
-        points = sum(int(scan.points.valid.sum()) for scan in whole)
-        told.append(f"{len(whole)} whole scans at {rate:.1f} Hz, {points} points; the last one: {whole[-1]}")
+        facts = _facts(result, whole)
+        rate = f" at {facts['rate_hz']:.1f} Hz" if facts["rate_hz"] else ""
+        told.append(f"{len(whole)} whole scans{rate}, {facts['points']} points; the last one: {whole[-1]}")
     return [*told, f"next: lidarspec show {name}"]
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import traceback
+from typing import TypeVar
 
 import click
 
@@ -31,8 +32,10 @@ CODES: tuple[tuple[type[Exception], int, str], ...] = (
 )
 NEXT = "next: "
 
+Failure = TypeVar("Failure", bound=Exception)
 
-def suggest(error: Exception, command: str) -> Exception:
+
+def suggest(error: Failure, command: str) -> Failure:
     """The same error, with the next command to type; one that it has already stays."""
     if not any(note.startswith(NEXT) for note in getattr(error, "__notes__", ())):
         error.add_note(NEXT + command)
@@ -49,7 +52,10 @@ def report(error: Exception, verb: str) -> int:
         click.echo("  next: the same with LIDARSPEC_DEBUG=1, and report it with what that prints", err=True)
         return code
     click.echo(_message(error), err=True)
-    suggest(error, command.format(sensor=_sensor(error), verb=verb).replace("  ", " "))
+    sensor = _sensor(error)
+    suggest(
+        error, "lidarspec sensors" if "{sensor}" in command and not sensor else command.format(sensor=sensor, verb=verb).replace("  ", " ")
+    )
     for note in error.__notes__:
         click.echo(f"  {note}", err=True)
     return code
@@ -66,6 +72,6 @@ def _message(error: Exception) -> str:
 
 
 def _sensor(error: Exception) -> str:
-    """The id of the sensor that an error is about, as far as it says."""
-    place = str(getattr(error, "sensor", "") or getattr(error, "place", "") or str(error).partition(":")[0])
-    return place.partition(" ")[0] if "-" in place.partition(" ")[0] else "SENSOR"
+    """The id of the sensor that an error is about, "" where it says none."""
+    place = str(getattr(error, "sensor", "") or getattr(error, "place", ""))
+    return place.partition(" ")[0]

@@ -11,15 +11,17 @@ from pathlib import Path
 import click
 
 from lidarspec.cli.failures import suggest
-from lidarspec.cli.inputs import Input, no_frame
+from lidarspec.cli.inputs import Input, nearest, no_frame
 from lidarspec.cli.output import emit_json, note, sensor_option
 from lidarspec.detect import detected, scores
-from lidarspec.device import Device, open as open_device
+from lidarspec.device import Device
+from lidarspec.device import open as open_device
 from lidarspec.errors import LidarSpecError, UsageError, WireError
 from lidarspec.formats import format_of, write
 from lidarspec.plugins import sensor as named_sensor
 from lidarspec.scans import Scan
 from lidarspec.sources import transport
+from lidarspec.spec import Sensor
 
 #: datagrams and bytes looked at again to say why there is no data in a file.
 LOOKED_AT = 1 << 16
@@ -54,9 +56,10 @@ def convert(source: str, target: str, sensor_id: str | None, count: int | None, 
     number of the scan; metres, radians, and seconds since the scan's stamp.
     """
     format_of(target)
-    if source != "-" and os.path.exists(target) and os.path.samefile(source.partition("?")[0], target):
+    path = source.partition("?")[0]
+    if os.path.exists(path) and os.path.exists(target) and os.path.samefile(path, target):
         raise UsageError(f"{target} is the input: it would be overwritten")
-    sensor = detected(source) if sensor_id is None else named_sensor(sensor_id)
+    sensor = _detected(source, target) if sensor_id is None else named_sensor(sensor_id)
     written = Written()
     with open_device(source, sensor) as device:
         scans = itertools.islice(device.scans(), count)
@@ -65,6 +68,16 @@ def convert(source: str, target: str, sensor_id: str | None, count: int | None, 
             raise _no_data(device, source, target)
         write(target, written.counting(itertools.chain([first], scans), every_point=every_point), every_point=every_point)
         _sum_up(device, target, written, as_json=as_json)
+
+
+def _detected(source: str, target: str) -> Sensor:
+    try:
+        return detected(source)
+    except UsageError as error:
+        raise suggest(error, f"lidarspec convert {source} {target} -s ID") from None
+    except WireError as error:
+        given = _again(source)
+        raise error if given is None else nearest(given) from None
 
 
 def _sum_up(device: Device, target: str, written: Written, *, as_json: bool) -> None:

@@ -8,10 +8,11 @@ from typing import Any
 import click
 
 from lidarspec.cli.failures import suggest
-from lidarspec.cli.inputs import Input, Piece, fitting, no_frame, pieces, read
+from lidarspec.cli.inputs import Input, Piece, fitting, nearest, no_frame, pieces, read
 from lidarspec.cli.output import emit, emit_json, note, output_options, sensor_option, table
 from lidarspec.errors import WireError
 from lidarspec.explain import explain as explained
+from lidarspec.plugins import sensor as named_sensor
 from lidarspec.spec import Sensor
 from lidarspec.wording import LINED, Explanation, Row, number
 
@@ -52,36 +53,51 @@ def parse(words: Sequence[str], sensor_id: str | None, count: int | None, as_jso
 @output_options
 def explain(words: Sequence[str], sensor_id: str | None, frame: str | None, count: int | None, as_json: bool, output: str | None) -> None:
     """Every byte of each frame: offset, hex, field, value, unit, meaning."""
-    given, sensor, fits, found = _found(words, sensor_id, count, frame)
-    damaged = not found
-    parts = [(piece, _explained(sensor, piece)) for piece in found or [Piece(0, given.data, frame or "?")] if given.data]
-    if not parts:
+    given, sensor, fits, found = _found(words, sensor_id, count, frame, damaged=True)
+    if not given.data:
         raise no_frame(sensor, given)
+    parts = [(piece, _explained(sensor, piece)) for piece in found or [Piece(0, given.data, "?")]]
     if as_json:
         told = [{"offset": piece.offset, **part.to_dict()} for piece, part in parts]
         emit_json({"sensor": sensor.id, "fits": fits, "frames": told}, output)
     else:
         emit("\n\n".join(f"{_title(sensor, piece, part)}\n{part}" for piece, part in parts), output)
     fault = parts[0][1].fault
-    if damaged and fault is not None:
+    if fault is not None:
         raise suggest(fault, f"lidarspec show {sensor.id}")
 
 
 def _found(
-    words: Sequence[str], sensor_id: str | None, count: int | None, frame: str | None = None
+    words: Sequence[str], sensor_id: str | None, count: int | None, frame: str | None = None, *, damaged: bool = False
 ) -> tuple[Input, Sensor, list[str], list[Piece]]:
-    """The input, its sensor, the ids of all that fit, and what is in it up to frame number `count`."""
+    """The input, its sensor, the ids of all that fit, and what is in it up to frame number `count`.
+
+    Raises:
+        WireError: where no sensor was named and none fits; with `damaged`, one of which the bytes begin like a frame does.
+    """
     given = read(words)
-    sensors, guessed = fitting(given, sensor_id)
-    sensor, fits = sensors[0], [sensor.id for sensor in sensors]
-    if guessed:
-        more = f"; so do {', '.join(fits[1:])}: choose with -s" if fits[1:] else ""
-        note(f"these bytes fit {sensor.id}{more}")
+    sensor, fits = _sensor(given, sensor_id, damaged=damaged)
     found = [Piece(0, given.data, frame)] if frame else pieces(sensor, given)
-    if count is not None:
-        places = [place for place, piece in enumerate(found) if piece.frame]
-        found = found[: places[count - 1] + 1] if len(places) >= count else found
+    places = [place for place, piece in enumerate(found) if piece.frame]
+    if count is not None and len(places) >= count:
+        found = found[: places[count - 1] + 1]
     return given, sensor, fits, found
+
+
+def _sensor(given: Input, sensor_id: str | None, *, damaged: bool) -> tuple[Sensor, list[str]]:
+    """The sensor named, or the one whose bytes these are, and the ids of all whose bytes they could be."""
+    if sensor_id is not None:
+        return named_sensor(sensor_id), []
+    found = fitting(given)
+    if found:
+        fits = [sensor.id for sensor in found]
+        note(f"these bytes fit {fits[0]}" + (f"; so do {', '.join(fits[1:])}: choose with -s" if fits[1:] else ""))
+        return found[0], fits
+    fault = nearest(given)
+    if not damaged or not fault.sensor:
+        raise fault
+    note(f"these bytes fit no sensor; they come nearest to {fault.sensor}")
+    return named_sensor(fault.sensor), []
 
 
 def _explained(sensor: Sensor, piece: Piece) -> Explanation:

@@ -15,7 +15,7 @@ from lidarspec.codecs import VALID, codec
 from lidarspec.detect import scores
 from lidarspec.errors import LidarSpecError, SourceError, UsageError, WireError
 from lidarspec.parsing import parse_typed
-from lidarspec.plugins import sensor as named_sensor, sensors
+from lidarspec.plugins import sensors
 from lidarspec.sources import transport
 from lidarspec.spec import Sensor
 
@@ -23,6 +23,8 @@ from lidarspec.spec import Sensor
 REPEATED = 64
 #: sensors whose share of the bytes is this close to the best fit as well.
 AS_GOOD = 0.01
+#: constant bits that make bytes look like a frame.
+ALIKE = 8
 
 
 @dataclass(frozen=True)
@@ -69,22 +71,14 @@ def read(words: Sequence[str]) -> Input:
         raise UsageError(f"{text[:REPEATED]!r} is no file, and not hexadecimal: {error}") from None
 
 
-def fitting(given: Input, sensor_id: str | None) -> tuple[list[Sensor], bool]:
-    """The sensors whose bytes these are, the best first, and whether that was found out.
-
-    Raises:
-        WireError: where no sensor was named, and none fits.
-    """
-    if sensor_id is not None:
-        return [named_sensor(sensor_id)], False
+def fitting(given: Input) -> list[Sensor]:
+    """The installed sensors whose bytes these are, the best first; those with a type of exactly this frame before all others."""
     known = list(sensors().values())
     whole = [sensor for sensor in known if any(_is_frame(sensor, name, given.data) for name in sensor.frames)]
     if whole:
-        return whole, True
+        return whole
     found = scores(list(given.chunks), datagrams=given.datagrams) if given.data else []
-    if found:
-        return [score.sensor for score in found if score.share >= found[0].share - AS_GOOD], True
-    raise _nearest(given, known)
+    return [score.sensor for score in found if score.share >= found[0].share - AS_GOOD]
 
 
 def pieces(sensor: Sensor, given: Input) -> list[Piece]:
@@ -106,7 +100,7 @@ def pieces(sensor: Sensor, given: Input) -> list[Piece]:
     return found + ([Piece(end, data[end:], "")] if end < len(data) else [])
 
 
-def no_frame(sensor: Sensor, given: Input) -> Exception:
+def no_frame(sensor: Sensor, given: Input) -> WireError:
     """Why there is no frame of this sensor in the input, with the next command."""
     data = given.data
     longest = max((frame.max_length for frame in sensor.frames.values()), default=0)
@@ -115,12 +109,32 @@ def no_frame(sensor: Sensor, given: Input) -> Exception:
         return suggest(WireError(f"{given.name} holds no bytes", sensor=sensor.id), f"lidarspec build {sensor.id} --help")
     if len(data) > longest:
         error = WireError(f"no frame in {len(data)} bytes", sensor=sensor.id, expected="a frame", data=data[:longest])
-        return suggest(error, f"lidarspec explain {given.name}")
+        return suggest(error, "lidarspec sensors")
     try:
         parse_typed(sensor, data)
     except WireError as error:
         return suggest(error, command)
     return suggest(WireError("the bytes are not plausible", sensor=sensor.id, data=data), command)
+
+
+def nearest(given: Input) -> WireError:
+    """No sensor fits: what the one that came farthest says, with its id, or that none came far."""
+    if not given.data:
+        return suggest(WireError(f"{given.name} holds no bytes"), "lidarspec sensors")
+    known = sensors().values()
+    faults = []
+    for sensor in known:
+        try:
+            parse_typed(sensor, given.data)
+        except WireError as fault:
+            faults.append(fault)
+        except LidarSpecError:
+            continue
+    best = max((fault for fault in faults if _begins_alike(fault)), key=lambda fault: fault.offset, default=None)
+    names = ", ".join(sensor.id for sensor in known) or "none is installed"
+    if best is None:
+        return suggest(WireError(f"no frame of any installed sensor ({names})", data=given.data[:REPEATED]), "lidarspec sensors")
+    return suggest(best, f"lidarspec explain {given.name} -s {best.sensor}")
 
 
 def _file(path: str) -> Input:
@@ -165,20 +179,10 @@ def _is_frame(sensor: Sensor, name: str, data: bytes) -> bool:
     return bool(survey.status[0] == VALID and survey.sizes[0] == len(data))
 
 
-def _nearest(given: Input, known: Sequence[Sensor]) -> Exception:
-    """No sensor fits: what the one that came farthest says."""
-    if not given.data:
-        return suggest(WireError(f"{given.name} holds no bytes"), "lidarspec sensors")
-    faults = []
-    for sensor in known:
-        try:
-            parse_typed(sensor, given.data)
-        except WireError as fault:
-            faults.append(fault)
-        except LidarSpecError:
-            continue
-    best = max((fault for fault in faults if fault.frame), key=lambda fault: fault.offset, default=None)
-    names = ", ".join(sensor.id for sensor in known) or "none is installed"
-    if best is None or best.offset == 0:
-        return suggest(WireError(f"no frame of any installed sensor ({names})", data=given.data[:REPEATED]), "lidarspec sensors")
-    return suggest(best, f"lidarspec explain {given.name} -s {best.sensor}")
+def _begins_alike(fault: WireError) -> bool:
+    """Whether the bytes have the constants that the frame type begins with, and those are enough not to be chance."""
+    if not fault.frame:
+        return False
+    prefix = codec(named_sensor(fault.sensor).frames[fault.frame]).prefix
+    there = [(fault.data[spot], mask, value) for spot, (mask, value) in prefix.items() if spot < len(fault.data)]
+    return all(byte & mask == value for byte, mask, value in there) and sum(mask.bit_count() for _, mask, _ in there) >= ALIKE

@@ -9,7 +9,8 @@ import click
 
 from lidarspec.cli.output import emit, emit_json, note, output_options, table
 from lidarspec.links import Link, Serial, Tcp, Udp
-from lidarspec.plugins import registry, sensor as named_sensor
+from lidarspec.plugins import registry
+from lidarspec.plugins import sensor as named_sensor
 from lidarspec.spec import Command, Frame, Sensor
 from lidarspec.wiretable import frame_size, wire_table
 

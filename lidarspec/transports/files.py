@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO
 
-from lidarspec.errors import SourceError
+from lidarspec.errors import SourceError, WireError
 from lidarspec.files import Chunk
 from lidarspec.pcap import CaptureReader, is_capture
 
@@ -50,7 +50,7 @@ class HexTransport(FileTransport):
             try:
                 yield Chunk(bytes.fromhex(text))
             except ValueError:
-                raise SourceError(f"{self._path}, line {number}: not hexadecimal: {text.strip()[:40]!r}") from None
+                raise WireError(f"{self._path}, line {number}: not hexadecimal: {text.strip()[:40]!r}") from None
 
 
 class CaptureTransport(FileTransport):

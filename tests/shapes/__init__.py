@@ -21,6 +21,7 @@ from tests.shapes import (
     nibbles,
     numbers,
     options,
+    remarks,
     state,
     text,
     twins,
@@ -49,6 +50,7 @@ _MODULES = (
     datagrams,
     lengths,
     headed,
+    remarks,
 )
 
 SHAPES: dict[str, Sensor] = {module.SENSOR.id: module.SENSOR for module in _MODULES}

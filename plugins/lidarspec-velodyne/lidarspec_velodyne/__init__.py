@@ -65,14 +65,14 @@ VLP16 = _sensor(
     "VLP-16",
     VLP16_FIRINGS,
     (0.4, 130.0),
-    "velodyne_decoder 3.1 and ros-drivers/velodyne, citing the VLP-16 user manual; three captures",
+    "velodyne_decoder and ros-drivers/velodyne, citing the VLP-16 user manual; three captures",
 )
 HDL32E = _sensor(
     "velodyne-hdl32e",
     "HDL-32E",
     HDL32E_FIRINGS,
     (0.9, 130.0),
-    "velodyne_decoder 3.1 and ros-drivers/velodyne, citing the HDL-32E user manual; one capture",
+    "velodyne_decoder and ros-drivers/velodyne, citing the HDL-32E user manual; one capture",
 )
 
 

@@ -43,8 +43,15 @@ DATA = Struct(
 POSITION = Struct(
     "zeros" / Const(bytes(14)),
     "inertial"
-    / Array(3, Struct("gyro" / Int16ul, "temperature" / Int16ul, "accel_x" / Int16ul, "accel_y" / Int16ul))
-    * "HDL-32E: signed, in the low 12 bits of each word; else 0",
+    / Array(
+        3,
+        Struct(
+            "gyro" / Int16ul * "HDL-32E: signed, in the low 12 bits; 0.09766 deg/s; the VLP-16 sends 0",
+            "temperature" / Int16ul * "likewise; 0.1453 degC, from 25 degC",
+            "accel_x" / Int16ul * "likewise; 0.001221 g",
+            "accel_y" / Int16ul * "likewise; 0.001221 g",
+        ),
+    ),
     "reserved" / Bytes(149),
     "top_board_temperature" / Scaled(Int8ul, 1, "degC") * "this and the other readings but time, PPS and NMEA: firmware since 2018",
     "bottom_board_temperature" / Scaled(Int8ul, 1, "degC"),
