@@ -14,6 +14,8 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
+from lidarspec._version import __version__ as __version__
+
 if TYPE_CHECKING:
     from lidarspec.angles import (
         following as following,
@@ -136,7 +138,6 @@ if TYPE_CHECKING:
         Sequence as Sequence,
     )
 
-__version__ = "0.1.0"
 
 _HOMES = {
     # what a sensor is

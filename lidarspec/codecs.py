@@ -12,6 +12,7 @@ import functools
 import io
 import math
 import traceback
+import weakref
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol
@@ -28,6 +29,7 @@ from lidarspec.layout import Layout, Seal
 from lidarspec.schema import Schema, schema
 from lidarspec.spec import Frame
 from lidarspec.tables import Group, Records, Rows, Table
+from lidarspec.unpacking import Unpack, unpacker
 from lidarspec.walk import NotCompilable, TooLong, Walk
 
 VALID, SHORT, LENGTH, CONSTANT, CHECKSUM, IMPLAUSIBLE, PLUGIN = range(7)
@@ -79,6 +81,16 @@ class CompiledCodec:
                 raise NotCompilable(info.path, "its branches have different types")
         self.tree = HeaderTree(frame.prepared, frame.max_length)
         self.prefix = self.tree.prefix
+
+    def parse(self, frame: bytes) -> Any:
+        """The Container of one whole, sound frame; None where construct has to look at it."""
+        layout = self.tree.layout(frame)
+        if not isinstance(layout, Layout) or not layout.sound(frame):
+            return None
+        function = _unpackers.get(layout)
+        if function is None:
+            function = _unpackers[layout] = unpacker(self.frame.prepared, layout) or _nothing
+        return function(frame)
 
     def survey(self, buffer: NDArray[np.uint8], offsets: NDArray[np.intp]) -> Survey:
         status = np.full(len(offsets), SHORT, np.uint8)
@@ -229,6 +241,13 @@ def _prefix(frame: Frame) -> dict[int, tuple[int, int]]:
     with contextlib.suppress(NotCompilable, TooLong, SpecError):
         state.run(frame.prepared)
     return dict(state.constants)
+
+
+_unpackers: weakref.WeakKeyDictionary[Layout, Unpack] = weakref.WeakKeyDictionary()
+
+
+def _nothing(frame: bytes) -> None:
+    """Stands in where no unpacker can be made."""
 
 
 @functools.lru_cache(maxsize=2048)

@@ -89,6 +89,11 @@ class HeaderTree:
 
     def layout(self, frame: bytes) -> Layout | Refused | None:
         """The layout of one frame, or None where its header is not all there."""
+        node: _Node | None = self._root
+        while node is not None and node.leaf is not None and node.leaf.offset + node.leaf.size <= len(frame):
+            node = node.children.get(node.leaf.scalar(frame))
+        if node is not None and node.result is not None:
+            return node.result
         groups, _ = self.classify(np.frombuffer(frame, np.uint8), np.zeros(1, np.intp))
         return groups[0][0] if groups else None
 

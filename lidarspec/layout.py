@@ -6,8 +6,8 @@ A `Layout` holds for frames of one kind of header; `lidarspec.walk` makes it fro
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,6 +49,14 @@ class Leaf:
             return self._bits(rows, self.elements[0])
         columns = [self._bits(rows, element) for element in self.elements]
         return np.stack(columns, axis=-1)
+
+    def scalar(self, frame: bytes) -> int:
+        """The raw value of an integer field outside arrays, in the bytes of one frame."""
+        if self.elements:
+            return self.elements[0].value(frame[self.offset : self.offset + self.size])
+        assert self.wire is not None
+        order: Literal["big", "little"] = "big" if self.wire.byteorder == ">" else "little"
+        return int.from_bytes(frame[self.offset : self.offset + self.size], order, signed=self.wire.kind == "i")
 
     def store(self, rows: Bytes2D, values: Any) -> None:
         """Write raw values, broadcast to (n, *shape), into frames given as rows of bytes."""
@@ -131,6 +139,18 @@ class Seal:
             leaf.store(rows, part)
             shift += leaf.info.bits
 
+    def sound(self, frame: bytes) -> bool:
+        """Whether one frame carries the right value, or one that means "not filled"."""
+        stored = shift = 0
+        for leaf in self.leaves:
+            if leaf.info.kind == "bytes":
+                stored |= int.from_bytes(frame[leaf.offset : leaf.offset + leaf.size], self.algorithm.order) << shift
+            else:
+                stored |= (leaf.scalar(frame) & ((1 << leaf.info.bits) - 1)) << shift
+            shift += leaf.info.bits
+        parts = [frame[a:b] for a, b in self.spans]
+        return stored == self.algorithm(parts[0] if len(parts) == 1 else b"".join(parts)) or stored in self.absent
+
     def intact(self, rows: Bytes2D) -> NDArray[np.bool_]:
         """Which frames carry the right value, or one that means "not filled"."""
         stored = self.stored(rows)
@@ -139,18 +159,36 @@ class Seal:
 
 @dataclass(frozen=True, eq=False)
 class Layout:
-    """A frame of one kind of header: its size, fields, constants (offset -> mask, value) and checksums, inner ones first."""
+    """A frame of one kind of header.
+
+    Attributes:
+        size: in bytes.
+        leaves: where each field stands, by path.
+        constants: offset -> (mask, value).
+        seals: its checksums, inner ones first.
+        places: byte range of each named part outside arrays.
+        branches: what If and Switch chose, by path.
+    """
 
     size: int
     leaves: Mapping[str, Leaf]
     constants: Mapping[int, tuple[int, int]]
     seals: tuple[Seal, ...]
     places: Mapping[str, tuple[int, int]]
+    branches: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         spots = sorted(self.constants)
         masks, values = ([self.constants[spot][i] for spot in spots] for i in (0, 1))
         object.__setattr__(self, "_constants", (np.array(spots, np.intp), np.array(masks, np.uint8), np.array(values, np.uint8)))
+
+    def sound(self, frame: bytes) -> bool:
+        """Whether one frame has this size, all constants and the right checksums."""
+        return (
+            len(frame) == self.size
+            and all(frame[spot] & mask == value for spot, (mask, value) in self.constants.items())
+            and all(seal.sound(frame) for seal in self.seals)
+        )
 
     def seal(self, rows: Bytes2D) -> None:
         """Write the constants and checksums into frames given as rows of bytes."""

@@ -8,7 +8,7 @@ from typing import Any
 
 import construct
 
-from lidarspec.codecs import codec
+from lidarspec.codecs import CompiledCodec, codec
 from lidarspec.construction import Mismatch, clean, field_path
 from lidarspec.errors import SpecError, UnknownFrame, WireError
 from lidarspec.headers import Refused
@@ -18,6 +18,15 @@ from lidarspec.spec import Sensor
 
 def parse(sensor: Sensor, data: bytes, *, frame: str | None = None, verify: bool = True) -> Any:
     """See `Sensor.parse`."""
+    data = bytes(data)
+    for name in sensor.frames if frame is None or frame not in sensor.frames else (frame,):
+        engine = codec(sensor.frames[name])
+        if isinstance(engine, CompiledCodec):
+            found = engine.parse(data)
+            if found is not None:
+                return found
+        elif frame is None:
+            break
     return clean(parse_typed(sensor, data, frame=frame, verify=verify)[1])
 
 

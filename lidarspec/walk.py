@@ -50,6 +50,7 @@ class Walk:
     constants: dict[int, tuple[int, int]] = field(default_factory=dict)
     seals: list[Seal] = field(default_factory=list)
     places: dict[str, tuple[int, int]] = field(default_factory=dict)
+    branches: dict[str, Construct] = field(default_factory=dict)
 
     def run(self, con: Construct) -> Walk:
         """Go through a prepared struct from here."""
@@ -58,7 +59,7 @@ class Walk:
 
     def layout(self) -> Layout:
         """What was found, as a value."""
-        return Layout(self.cursor, self.leaves, self.constants, tuple(self.seals), self.places)
+        return Layout(self.cursor, self.leaves, self.constants, tuple(self.seals), self.places, self.branches)
 
 
 @dataclass(frozen=True)
@@ -120,9 +121,11 @@ def _visit(state: Walk, con: Construct, place: _Place) -> None:
     elif isinstance(inner, Array):
         _array(state, inner, place)
     elif isinstance(inner, construct.IfThenElse):
-        _visit(state, inner.thensubcon if _value(inner.condfunc, place) else inner.elsesubcon, place)
+        state.branches[info.path] = inner.thensubcon if _value(inner.condfunc, place) else inner.elsesubcon
+        _visit(state, state.branches[info.path], place)
     elif isinstance(inner, construct.Switch):
-        _visit(state, inner.cases.get(_value(inner.keyfunc, place), inner.default), place)
+        state.branches[info.path] = inner.cases.get(_value(inner.keyfunc, place), inner.default)
+        _visit(state, state.branches[info.path], place)
     elif inner is not construct.Pass:
         _field(state, inner, place)
     if state.cursor > state.limit:

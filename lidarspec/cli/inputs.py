@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import re
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
@@ -19,8 +19,8 @@ from lidarspec.plugins import sensors
 from lidarspec.sources import transport
 from lidarspec.spec import Sensor
 
-#: longest hexadecimal text that is repeated in the next command.
-REPEATED = 64
+#: longest hexadecimal text that is repeated in the next command, and of other text in a message.
+REPEATED, QUOTED = 400, 64
 #: sensors whose share of the bytes is this close to the best fit as well.
 AS_GOOD = 0.01
 #: constant bits that make bytes look like a frame.
@@ -61,14 +61,14 @@ def read(words: Sequence[str]) -> Input:
     if text == "-":
         data = sys.stdin.buffer.read()
         return Input("-", (_unhexed(data) or data,))
-    if len(words) == 1 and Path(text).exists():
+    if len(words) == 1 and os.path.exists(text):
         return _file(text)
     try:
-        return Input(text if len(text) <= REPEATED else "HEX", (_bytes(text),))
+        return Input(text if len(text) <= REPEATED else "-", (_bytes(text),))
     except ValueError as error:
         if len(words) == 1 and re.search(r"[/\\.]", text):
             raise SourceError(f"{text}: no such file") from None
-        raise UsageError(f"{text[:REPEATED]!r} is no file, and not hexadecimal: {error}") from None
+        raise UsageError(f"{text[:QUOTED]!r} is no file, and not hexadecimal: {error}") from None
 
 
 def fitting(given: Input) -> list[Sensor]:
@@ -131,9 +131,8 @@ def nearest(given: Input) -> WireError:
         except LidarSpecError:
             continue
     best = max((fault for fault in faults if _begins_alike(fault)), key=lambda fault: fault.offset, default=None)
-    names = ", ".join(sensor.id for sensor in known) or "none is installed"
     if best is None:
-        return suggest(WireError(f"no frame of any installed sensor ({names})", data=given.data[:REPEATED]), "lidarspec sensors")
+        return suggest(WireError(f"no frame of any of the {len(known)} installed sensors", data=given.data[:QUOTED]), "lidarspec sensors")
     return suggest(best, f"lidarspec explain {given.name} -s {best.sensor}")
 
 
@@ -183,6 +182,6 @@ def _begins_alike(fault: WireError) -> bool:
     """Whether the bytes have the constants that the frame type begins with, and those are enough not to be chance."""
     if not fault.frame:
         return False
-    prefix = codec(named_sensor(fault.sensor).frames[fault.frame]).prefix
+    prefix = codec(sensors()[fault.sensor].frames[fault.frame]).prefix
     there = [(fault.data[spot], mask, value) for spot, (mask, value) in prefix.items() if spot < len(fault.data)]
     return all(byte & mask == value for byte, mask, value in there) and sum(mask.bit_count() for _, mask, _ in there) >= ALIKE

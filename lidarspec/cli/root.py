@@ -14,7 +14,7 @@ from typing import Any, NoReturn
 
 import click
 
-from lidarspec import __version__
+from lidarspec._version import __version__
 from lidarspec.cli.failures import INTERRUPTED, USAGE, report
 from lidarspec.errors import did_you_mean
 

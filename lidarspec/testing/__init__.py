@@ -10,18 +10,22 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+try:
+    import pytest
+except ImportError as error:
+    raise ImportError("the test kit needs pytest: pip install 'lidarspec[testing]'") from error
+
 if TYPE_CHECKING:
     from lidarspec.testing.conformance import SensorConformance as SensorConformance
 
 __all__ = ["SensorConformance"]
 
+pytest.register_assert_rewrite("lidarspec.testing.conformance", "lidarspec.testing.comparisons")
+
 
 def __getattr__(name: str) -> Any:
     if name not in __all__:
         raise AttributeError(f"module 'lidarspec.testing' has no attribute {name!r}")
-    import pytest
-
-    pytest.register_assert_rewrite("lidarspec.testing.conformance", "lidarspec.testing.comparisons")
     from lidarspec.testing.conformance import SensorConformance
 
     return SensorConformance

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+import copy
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -11,9 +12,10 @@ from numpy.typing import NDArray
 from lidarspec.clouds import PointCloud
 from lidarspec.codecs import codec
 from lidarspec.construction import member
-from lidarspec.decoder import Found
+from lidarspec.decoder import Decoder, Found, Spans, is_stream, spans_of
 from lidarspec.packets import Packets
 from lidarspec.spec import Sensor
+from lidarspec.streams import PacketStream
 
 
 def cuts(found: Iterable[Found]) -> list[tuple[str, int, bytes]]:
@@ -74,18 +76,26 @@ def same(one: NDArray[Any], other: NDArray[Any]) -> bool:
 
 def assert_backends_agree(sensor: Sensor, data: Any) -> None:
     """Fail unless the compiled and the interpreted path give the same frames, packets, points and counters, and no plugin failed."""
-    split = [cuts(sensor.split(data, backend=backend)) for backend in ("auto", "construct")]
+    decoders = [sensor.decoder(stream=is_stream(data), backend=backend) for backend in ("auto", "construct")]
+    found = [spans_of(decoder, data) for decoder in decoders]
+    split = [cuts(one for spans in each for one in spans.found()) for each in found]
     assert split[0] == split[1]
     for name, frame in sensor.frames.items():
         if frame.direction == "out":
             continue
-        compiled, interpreted = (sensor.decode(data, frame=name, backend=backend) for backend in ("auto", "construct"))
+        compiled, interpreted = (_packets(decoder, name, each) for decoder, each in zip(decoders, found, strict=True))
         assert not compiled.stats.plugin_errors, compiled.stats.tracebacks[0]
         assert_same_packets(compiled, interpreted)
         if frame.data:
             cloud = compiled.points()
             assert_well_formed(cloud)
             assert_same_points(cloud, interpreted.points())
+
+
+def _packets(decoder: Decoder, name: str, found: Sequence[Spans]) -> Packets:
+    """The packets of one type among the frames of a whole input, which is framed once for all types."""
+    stats = copy.deepcopy(decoder.stats)
+    return PacketStream(decoder.sensor, name, stats, interpreted=decoder.interpreted).add(found, whole=True)
 
 
 def assert_command(sensor: Sensor, name: str, arguments: Mapping[str, float]) -> None:

@@ -377,3 +377,8 @@ def test_opening_starts_the_scan_mode_that_was_configured() -> None:
 def test_bauds_of_the_models() -> None:
     bauds = {sensor.id[-2:]: sensor.links["data"].baud for sensor in (A1, A3, S2, C1)}  # type: ignore[union-attr]
     assert bauds == {"a1": 115_200, "a3": 256_000, "s2": 1_000_000, "c1": 460_800}
+
+
+def test_an_input_is_read_by_the_answer_that_it_holds() -> None:
+    for answer in ANSWERS:
+        assert A1.decode(capsules(answer, 3)).frame == answer

@@ -21,6 +21,7 @@ from tests.shapes import (
     nibbles,
     numbers,
     options,
+    outer,
     remarks,
     state,
     text,
@@ -51,6 +52,7 @@ _MODULES = (
     lengths,
     headed,
     remarks,
+    outer,
 )
 
 SHAPES: dict[str, Sensor] = {module.SENSOR.id: module.SENSOR for module in _MODULES}

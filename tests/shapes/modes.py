@@ -35,6 +35,14 @@ def express(f: Fields) -> Polar:
     return Polar(range=f.distances, azimuth=np.deg2rad(f.angle + np.arange(SAMPLES)))
 
 
+def sweep_plain(i: int) -> dict[str, float]:
+    return {"angle": i * 2 % 360}
+
+
+def sweep_express(i: int) -> dict[str, float]:
+    return {"angle": i * SAMPLES % 360, "head.turn": i * SAMPLES // 360 % 128}
+
+
 SENSOR = Sensor(
     "shape-modes",
     vendor="Shapes",
@@ -42,8 +50,12 @@ SENSOR = Sensor(
     frames={
         "begin_plain": Frame(Struct("descriptor" / Const(b"\xa5\x5a\x05\x81")), max_length=4),
         "begin_express": Frame(Struct("descriptor" / Const(b"\xa5\x5a\x54\x82")), max_length=4),
-        "plain": Frame(PLAIN, data=True, points=plain, max_length=6, plausible=lambda f: f.angle < 360, after="begin_plain"),
-        "express": Frame(EXPRESS, data=True, points=express, max_length=13, plausible=lambda f: f.angle < 360, after="begin_express"),
+        "plain": Frame(
+            PLAIN, data=True, points=plain, max_length=6, plausible=lambda f: f.angle < 360, after="begin_plain", sweep=sweep_plain
+        ),
+        "express": Frame(
+            EXPRESS, data=True, points=express, max_length=13, plausible=lambda f: f.angle < 360, after="begin_express", sweep=sweep_express
+        ),
     },
     points=None,
     scan=OnWrap("azimuth"),

@@ -3,9 +3,9 @@
 Source: RPLIDAR interface protocol and the vendor's SDK (sl_lidar_cmd.h, handler_capsules.cpp, sl_lidar_driver.cpp); bauds and
 ranges from the models' data sheets.
 
-A response descriptor says which kind follows, and each kind is looked for after its descriptor alone. Where a recording
-begins in the middle of a stream, ``configure(answer="express")`` starts as if the descriptor had been seen; it also chooses
-which kind is the data. The kinds: `node` (the default), `express`, `ultra`, `dense`, `ultra_dense` and `hq`.
+A response descriptor says which kind follows, and each kind is looked for after its descriptor alone. The kind that comes
+first in an input is its data. ``configure(answer="express")`` chooses another one, and starts as if its descriptor had been
+seen, for recordings that begin in the middle. The kinds: `node`, `express`, `ultra`, `dense`, `ultra_dense` and `hq`.
 
 One rule cuts scans for all of them: where the azimuth of the points passes zero. Nodes and HQ capsules mark the first node
 past zero by a bit, which is the same place; a turn of capsules ends where the start angle drops, which lies up to a capsule

@@ -1,0 +1,38 @@
+"""The command line in a process of its own, and in this one."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+from click.testing import CliRunner, Result
+
+from lidarspec.cli import main
+
+LD06, COIN_D4 = "ldrobot/ld06_3_consecutive_frames.bin", "cspc/coin_d4_ludovatech_issue2_partial.bin"
+#: one frame of the STL-27L's format, so that tests need no capture: the example of the vendor's manual.
+EXAMPLE = bytes.fromhex("542c6808ab7ee000e4dc00e2d900e5d500e3d300e4d000e9cd00e4ca00e2c700e9c500e5c200e5c000e5be823a1a50")
+
+
+def process(*words: object, given: bytes = b"", cwd: Path | None = None) -> subprocess.CompletedProcess[bytes]:
+    """``python -m lidarspec`` with these words; no failure may show a traceback."""
+    command = [sys.executable, "-m", "lidarspec", *map(str, words)]
+    done = subprocess.run(command, input=given, capture_output=True, cwd=cwd, check=False, timeout=120)
+    assert b"Traceback" not in done.stderr, done.stderr.decode()
+    return done
+
+
+def ran(*words: object, code: int = 0, given: bytes | None = None) -> Result:
+    """The same in this process; it has to end with `code`."""
+    result = CliRunner().invoke(main, [str(word) for word in words], input=given)
+    assert result.exit_code == code, result.output
+    assert "Traceback" not in result.output
+    return result
+
+
+def printed(*words: object) -> Any:
+    """What ``--json`` prints."""
+    return json.loads(ran(*words, "--json").stdout)

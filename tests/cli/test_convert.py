@@ -1,0 +1,123 @@
+"""`convert`: real captures give the points that others published for them."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.cli.running import COIN_D4, EXAMPLE, LD06, printed, process, ran
+from tests.sensors.evidence import capture
+
+COLUMNS = ["x", "y", "z", "range", "azimuth", "elevation", "intensity", "time", "scan"]
+
+
+def read(path: Path) -> Mapping[str, np.ndarray]:
+    """The columns of a .csv file."""
+    with path.open(encoding="ascii", newline="") as file:
+        rows = list(csv.DictReader(file))
+    return {name: np.array([float(row[name]) for row in rows]) for name in rows[0]}
+
+
+def test_the_coin_d4_dump(tmp_path: Path) -> None:
+    target = tmp_path / "out.csv"
+    done = process("convert", capture(COIN_D4), target, "-s", "cspc-coin-d4")
+    assert done.returncode == 0
+    assert done.stdout == b""
+    packets = json.loads(capture(COIN_D4.replace("_partial.bin", "_expected.json")).read_text(encoding="utf-8"))
+    samples = [
+        (angle, distance, quality)
+        for packet in packets
+        for (angle, distance), quality in zip(packet["lds2d_angle_dist"], packet["vendor_quality"], strict=True)
+        if distance
+    ]
+    angle, distance, quality = np.array(samples).T
+    found = read(target)
+    assert list(found) == COLUMNS
+    assert len(found["x"]) == 97
+    np.testing.assert_allclose(found["range"], distance / 1000, rtol=1e-6)
+    np.testing.assert_allclose(found["intensity"], quality)
+    np.testing.assert_allclose(found["x"], distance / 1000 * np.cos(np.deg2rad(angle)), atol=1e-5)
+    np.testing.assert_allclose(found["y"], -distance / 1000 * np.sin(np.deg2rad(angle)), atol=1e-5)
+
+
+def test_the_ld06_frames(tmp_path: Path) -> None:
+    target = tmp_path / "out.csv"
+    ran("convert", capture(LD06), target, "-s", "ldrobot-ld06")
+    frames = json.loads(capture("ldrobot/ld_frames.json").read_text(encoding="utf-8"))
+    expected = [frame for frame in frames if frame["name"].startswith("ld06_serialpacketsimulator")]
+    angle = np.concatenate([np.linspace(frame["start"], frame["end"], 12) for frame in expected])
+    distance, intensity = np.array([point for frame in expected for point in frame["pts"]]).T
+    found = read(target)
+    assert len(found["x"]) == 36
+    np.testing.assert_allclose(found["range"], distance / 1000, rtol=1e-6)
+    np.testing.assert_allclose(found["intensity"], intensity)
+    np.testing.assert_allclose(found["x"], distance / 1000 * np.cos(np.deg2rad(angle)), atol=1e-5)
+    np.testing.assert_allclose(found["y"], -distance / 1000 * np.sin(np.deg2rad(angle)), atol=1e-5)
+    assert (np.diff(found["time"]) > 0).all()
+
+
+def test_npz_holds_the_same_columns_and_the_stamps(tmp_path: Path) -> None:
+    source = tmp_path / "in.bin"
+    source.write_bytes(EXAMPLE * 2)
+    for suffix in ("csv", "npz"):
+        ran("convert", source, tmp_path / f"out.{suffix}", "-s", "ldrobot-stl27l")
+    rows = read(tmp_path / "out.csv")
+    with np.load(tmp_path / "out.npz") as arrays:
+        assert [name for name in arrays if name in COLUMNS] == COLUMNS
+        for name in COLUMNS:
+            np.testing.assert_allclose(rows[name], arrays[name], rtol=1e-6, atol=1e-9)
+        assert arrays["stamp_ns"].dtype == np.int64
+        assert len(arrays["stamp_ns"]) == len(arrays["complete"]) == len(arrays["rate_hz"]) == int(arrays["scan"].max()) + 1
+
+
+def test_all_keeps_points_without_a_return(tmp_path: Path) -> None:
+    target = tmp_path / "out.csv"
+    assert printed("convert", capture(COIN_D4), target, "-s", "cspc-coin-d4", "--all")["points"] == 100
+    assert np.isinf(read(target)["range"]).sum() == 3
+    assert np.isnan(read(target)["x"]).sum() == 3
+
+
+def test_json_sums_up(tmp_path: Path) -> None:
+    found = printed("convert", capture(COIN_D4), tmp_path / "out.npz", "-s", "cspc-coin-d4")
+    assert (found["sensor"], found["points"], found["stats"]["frames"]["data"]) == ("cspc-coin-d4", 97, 4)
+    assert found["stats"]["bytes_in"] == 396
+
+
+def test_hexadecimal_text_and_standard_input_are_read(tmp_path: Path) -> None:
+    text, target = tmp_path / "in.hex", tmp_path / "out.csv"
+    text.write_text("\n".join([EXAMPLE[:20].hex(" "), EXAMPLE[20:].hex(" ")]), encoding="ascii")
+    ran("convert", text, target, "-s", "ldrobot-stl27l")
+    first = target.read_bytes()
+    assert process("convert", "-", target, "-s", "ldrobot-stl27l", given=EXAMPLE).returncode == 0
+    assert target.read_bytes() == first
+    assert len(read(target)["x"]) == 12
+
+
+def test_several_sensors_with_the_same_frames_have_to_be_chosen_from(tmp_path: Path) -> None:
+    source = tmp_path / "in.bin"
+    source.write_bytes(EXAMPLE * 3)
+    result = ran("convert", source, tmp_path / "out.csv", code=2)
+    assert "ldrobot-ld06, ldrobot-stl27l send the same frames" in result.stderr
+
+
+def test_scans_can_be_limited(tmp_path: Path) -> None:
+    name = "velodyne/vlp16_dual/packets.derived.pcap"
+    sensor = ("-s", "velodyne-vlp16")
+    whole = printed("convert", capture(name), tmp_path / "a.npz", *sensor)
+    some = printed("convert", capture(name), tmp_path / "b.npz", "-n", 2, *sensor)
+    assert (whole["scans"], some["scans"]) == (5, 2)
+    with np.load(tmp_path / "a.npz") as every, np.load(tmp_path / "b.npz") as first:
+        np.testing.assert_array_equal(first["x"], every["x"][every["scan"] < 2])
+
+
+@pytest.mark.parametrize("suffix", ["csv", "npz"])
+def test_the_input_is_never_overwritten(tmp_path: Path, suffix: str) -> None:
+    source = tmp_path / f"in.{suffix}"
+    source.write_bytes(EXAMPLE)
+    assert "is the input" in ran("convert", source, source, "-s", "ldrobot-stl27l", code=2).stderr
+    assert source.read_bytes() == EXAMPLE

@@ -1,0 +1,166 @@
+"""Wrong input: one clear message with its place and the next command on stderr, nothing on stdout, the documented exit code."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from tests.cli.running import EXAMPLE, process, ran
+
+TEXT = b"these are the minutes of a meeting, and no lidar was there\n"
+FILES = {
+    "empty.bin": b"",
+    "text.bin": TEXT,
+    "text.hex": TEXT,
+    "cut.bin": EXAMPLE[:20],
+    "whole.bin": EXAMPLE,
+    "damaged.bin": EXAMPLE[:-1] + b"\0",
+    "other.bin": EXAMPLE * 3,
+}
+SENSOR = ("-s", "ldrobot-stl27l")
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    for name, data in FILES.items():
+        (tmp_path / name).write_bytes(data)
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "told"),
+    [
+        (("convert", "empty.bin", "o.csv", *SENSOR), 4, ["ldrobot-stl27l", "empty.bin holds no bytes"]),
+        (("convert", "empty.bin", "o.csv"), 4, ["empty.bin holds no bytes"]),
+        (("convert", "text.bin", "o.csv", *SENSOR), 4, ["ldrobot-stl27l", "no frame in 59 bytes", "74 68 65 73 65"]),
+        (("convert", "text.bin", "o.csv"), 4, ["no frame of any", "74 68 65 73 65"]),
+        (("convert", "text.hex", "o.csv", *SENSOR), 4, ["text.hex, line 1: not hexadecimal"]),
+        (
+            ("convert", "cut.bin", "o.csv", *SENSOR),
+            4,
+            ["frame ends at byte 20 of 47: points[4].intensity needs 1 byte, 0 left", "^^ points[4]"],
+        ),
+        (("convert", "damaged.bin", "o.csv", *SENSOR), 4, ["crc at byte 46: checksum 0x00, expected 0x50", "^^ crc"]),
+        (
+            ("convert", "other.bin", "o.csv", "-s", "cspc-coin-d4"),
+            4,
+            ["its frames are those of", "next: lidarspec convert other.bin o.csv -s ldrobot"],
+        ),
+        (("convert", "missing.bin", "o.csv", *SENSOR), 3, ["missing.bin: No such file"]),
+        (("convert", "whole.bin", "nowhere/o.csv", *SENSOR), 3, ["nowhere/o.csv: No such file"]),
+        (("convert", ".", "o.csv", *SENSOR), 3, ["directory"]),
+        (("convert", "whole.bin", "o.cvs", *SENSOR), 2, ["unknown format '.cvs'", "did you mean '.csv'?"]),
+        (("convert", "whole.bin", "whole.bin", *SENSOR), 2, ["unknown format '.bin'"]),
+        (
+            ("convert", "whole.bin", "o.csv", "-s", "ldrobot-stl27"),
+            2,
+            ["unknown sensor", "did you mean 'ldrobot-stl27l'?", "next: lidarspec sensors"],
+        ),
+        (("convert", "whole.bin", "o.csv", "-s", "./missing.py"), 3, ["missing.py: no such file"]),
+        (("convert", "whole.bin"), 2, ["Missing argument 'OUT'", "next: lidarspec convert --help"]),
+        (("convert", "whole.bin", "o.csv", "--al", *SENSOR), 2, ["--al", "--all"]),
+        (("convert", "whole.bin?port=3", "o.csv", *SENSOR), 2, ["unknown option 'port'"]),
+        (("parse", "empty.bin", *SENSOR), 4, ["empty.bin holds no bytes"]),
+        (("parse", "text.bin"), 4, ["no frame of any"]),
+        (("parse", "cut.bin", *SENSOR), 4, ["points[4].intensity", "next: lidarspec explain cut.bin -s ldrobot-stl27l"]),
+        (("parse", "damaged.bin", *SENSOR), 4, ["checksum 0x00, expected 0x50"]),
+        (("parse", "missing.bin"), 3, ["missing.bin: no such file"]),
+        (("parse", "54 2"), 2, ["3 digits make no whole bytes"]),
+        (("parse", "54", "zz"), 2, ["'z' is no digit of it"]),
+        (("parse", "whole.bin", "-s", "ldrobot"), 2, ["unknown sensor 'ldrobot'"]),
+        (("explain", "text.bin", *SENSOR), 4, ["no frame in 59 bytes"]),
+        (("explain", "empty.bin", *SENSOR), 4, ["holds no bytes"]),
+        (
+            ("build", "ldrobot-stl27l", "data", "sped=3"),
+            2,
+            ["unknown field 'sped'; did you mean 'speed'?", "next: lidarspec show ldrobot-stl27l"],
+        ),
+        (("build", "ldrobot-stl27l", "dta"), 2, ["unknown frame 'dta'; did you mean 'data'?"]),
+        (("build", "ldrobot-stl27l", "data", "speed=1"), 2, ["'start_angle' is missing"]),
+        (("build", "ldrobot-stl27l", "data", "speed"), 2, ["'speed' is not field=value"]),
+        (("show", "nothing-such"), 2, ["unknown sensor"]),
+        (("shw",), 2, ["unknown verb 'shw'; did you mean 'show'?"]),
+    ],
+)
+def test_wrong_input(folder: Path, words: tuple[str, ...], code: int, told: list[str]) -> None:
+    before = sorted(os.listdir(folder))
+    done = process(*words, cwd=folder)
+    message = done.stderr.decode()
+    assert done.returncode == code, message
+    assert done.stdout == b""
+    assert all(text in message for text in told), message
+    assert message.rstrip().splitlines()[-1].startswith("  next: lidarspec "), message
+    assert sorted(os.listdir(folder)) == before
+
+
+def test_the_place_of_an_error_is_marked() -> None:
+    result = ran("parse", "54 2c 10 0e 00 00 e8 03 c8 e9 03", *SENSOR, code=4)
+    assert result.stderr.splitlines() == [
+        "ldrobot-stl27l data: frame ends at byte 11 of 47: points[1].intensity needs 1 byte, 0 left",
+        "  0000  54 2c 10 0e 00 00 e8 03  c8 e9 03",
+        "                                          ^^ points[1].intensity",
+        "  next: lidarspec explain 54 2c 10 0e 00 00 e8 03 c8 e9 03 -s ldrobot-stl27l",
+    ]
+
+
+def test_the_next_command_can_be_typed() -> None:
+    first = process("parse", EXAMPLE[:30].hex(" "), *SENSOR)
+    following = first.stderr.decode().rstrip().rpartition("next: lidarspec ")[2]
+    assert process(*following.split()).stdout.startswith(b"ldrobot-stl27l data, 30 bytes\n0000  54 2c")
+
+
+def test_a_truncated_frame_is_explained_before_it_fails() -> None:
+    result = ran("explain", EXAMPLE[:12].hex(), code=4)
+    assert "0009  dc 00 e2  points[1]  0.220 m, intensity 226" in result.stdout
+    assert "frame ends at byte 12 of 47: points[2].distance needs 2 bytes, 0 left" in result.stderr
+
+
+def test_a_closed_pipe_ends_quietly(tmp_path: Path) -> None:
+    many = tmp_path / "many.bin"
+    many.write_bytes(EXAMPLE * 400)
+    command = [sys.executable, "-m", "lidarspec", "explain", str(many), *SENSOR]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as running:
+        assert running.stdout is not None
+        assert running.stderr is not None
+        assert running.stdout.readline().startswith(b"ldrobot-stl27l data")
+        running.stdout.close()
+        assert running.stderr.read() == b""
+        assert running.wait(60) == 0
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals are sent as on POSIX")
+def test_an_interrupt_ends_with_130() -> None:
+    command = [sys.executable, "-m", "lidarspec", "parse", "-", *SENSOR]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as running:
+        deadline = time.monotonic() + 60
+        while not _reads_standard_input(running.pid) and time.monotonic() < deadline:
+            time.sleep(0.05)
+        running.send_signal(signal.SIGINT)
+        assert running.wait(60) == 130
+        assert running.stderr is not None
+        assert running.stderr.read() == b"interrupted\n"
+
+
+def _reads_standard_input(pid: int) -> bool:
+    """Whether a process has loaded what `parse` needs and now sleeps; where that cannot be seen, time has to do."""
+    try:
+        maps = Path(f"/proc/{pid}/maps").read_text(encoding="utf-8")
+        state = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rpartition(") ")[2]
+    except OSError:
+        time.sleep(3)
+        return True
+    return "_multiarray_umath" in maps and state.startswith("S")
+
+
+def test_a_bug_is_owned_up_to_without_a_traceback(tmp_path: Path) -> None:
+    broken = tmp_path / "broken.py"
+    broken.write_text("raise ZeroDivisionError('by hand')\n", encoding="utf-8")
+    done = process("show", f"./{broken.name}", cwd=tmp_path)
+    assert done.returncode == 1
+    assert b"ZeroDivisionError: by hand" in done.stderr

@@ -1,0 +1,171 @@
+"""`parse`, `explain` and `build`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+import lidarspec as ls
+from tests.cli.running import COIN_D4, EXAMPLE, LD06, printed, process, ran
+from tests.sensors.evidence import capture
+
+SENSOR = ("-s", "ldrobot-stl27l")
+FIELDS = ("speed=2152", "start_angle=324.27deg", "end_angle=334.7deg", "timestamp=6714ms")
+POINTS = [
+    (224, 228),
+    (220, 226),
+    (217, 229),
+    (213, 227),
+    (211, 228),
+    (208, 233),
+    (205, 228),
+    (202, 226),
+    (199, 233),
+    (197, 229),
+    (194, 229),
+    (192, 229),
+]
+
+
+def test_a_frame_is_parsed_from_text_in_any_spelling() -> None:
+    plain = ran("parse", EXAMPLE.hex(), *SENSOR).stdout
+    assert [line.split() for line in plain.splitlines()[:6]] == [
+        ["ldrobot-stl27l", "data,", "47", "bytes"],
+        ["field", "raw", "value"],
+        ["header", "54", "2c"],
+        ["speed", "2152", "2152", "deg/s", "=", "6.0", "Hz"],
+        ["start_angle", "32427", "324.27", "deg"],
+        ["points[0].distance", "224", "0.224", "m"],
+    ]
+    words = EXAMPLE.hex(" ").split()
+    assert ran("parse", *words, *SENSOR).stdout == plain
+    assert ran("parse", ", ".join(f"0x{word}" for word in words), *SENSOR).stdout == plain
+
+
+def test_a_frame_is_parsed_from_a_file_and_from_standard_input(tmp_path: Path) -> None:
+    raw, text = tmp_path / "f.bin", tmp_path / "f.hex"
+    raw.write_bytes(EXAMPLE)
+    text.write_text(EXAMPLE.hex(" "), encoding="ascii")
+    plain = ran("parse", EXAMPLE.hex(), *SENSOR).stdout
+    assert ran("parse", raw, *SENSOR).stdout == ran("parse", text, *SENSOR).stdout == plain
+    assert process("parse", "-", *SENSOR, given=EXAMPLE).stdout.decode() == plain
+    assert process("parse", "-", *SENSOR, given=text.read_bytes()).stdout.decode() == plain
+
+
+def test_json_holds_the_integers_of_the_wire() -> None:
+    found = printed("parse", EXAMPLE.hex(), *SENSOR)
+    (frame,) = found["frames"]
+    assert (found["sensor"], frame["frame"], frame["offset"], frame["size"]) == ("ldrobot-stl27l", "data", 0, 47)
+    assert frame["fields"]["start_angle"] == 32427
+    assert [(point["distance"], point["intensity"]) for point in frame["fields"]["points"]] == POINTS
+    assert frame["fields"]["header"] == "54 2c"
+
+
+def test_the_sensors_that_fit_are_found_and_listed() -> None:
+    result = ran("parse", EXAMPLE.hex())
+    assert "ldrobot-ld06" in result.stderr
+    assert "ldrobot-stl27l" in result.stderr
+    assert printed("parse", EXAMPLE.hex())["fits"] == ["ldrobot-ld06", "ldrobot-stl27l"]
+    assert printed("parse", ls.sensor("robosense-m1").example("difop").hex())["sensor"] == "robosense-m1"
+
+
+def test_a_stream_is_parsed_frame_by_frame_and_gaps_are_told() -> None:
+    data = b"\x00\x54" + EXAMPLE + b"\x54\x2c" + EXAMPLE
+    result = ran("parse", data.hex(), *SENSOR)
+    assert "4 bytes are in no frame" in result.stderr
+    assert [frame["offset"] for frame in printed("parse", data.hex(), *SENSOR)["frames"]] == [2, 51]
+    assert len(printed("parse", data.hex(), "-n", 1, *SENSOR)["frames"]) == 1
+
+
+def test_explain_names_every_byte_of_a_stream() -> None:
+    data = b"\x00\x54" + EXAMPLE + b"\x54\x2c" + EXAMPLE + b"\xff"
+    frames = printed("explain", data.hex(), *SENSOR)["frames"]
+    named = b"".join(bytes.fromhex(row["hex"]) for frame in frames for row in frame["rows"])
+    assert named == data
+    assert [(frame["frame"], frame["offset"]) for frame in frames] == [("", 0), ("data", 2), ("", 49), ("data", 51), ("", 98)]
+
+
+def test_explain_prints_as_the_conventions_say() -> None:
+    text = ran("explain", EXAMPLE.hex(), *SENSOR).stdout
+    assert text.splitlines()[:5] == [
+        "ldrobot-stl27l data, 47 bytes",
+        "0000  54 2c     header       start byte 0x54; type 1 and 12 points",
+        "0002  68 08     speed        2152 deg/s = 6.0 Hz",
+        "0004  ab 7e     start_angle  324.27 deg",
+        "0006  e0 00 e4  points[0]    0.224 m, intensity 228, at 35.73 deg -> x 0.182 y 0.131",
+    ]
+    assert text.splitlines()[-1] == "002e  50        crc          0x50 ok (CRC-8 poly 0x4d over 46 bytes)"
+
+
+def test_explain_takes_the_frame_type_where_bytes_do_not_tell() -> None:
+    damaged = b"\x00" + EXAMPLE[1:]
+    ran("explain", damaged.hex(), *SENSOR, code=4)
+    result = ran("explain", damaged.hex(), "--frame", "data", *SENSOR, code=4)
+    assert "wrong: 00 2c, expected 54 2c" in result.stdout
+    ran("explain", damaged.hex(), "--frame", "dat", *SENSOR, code=2)
+
+
+def test_captures_are_explained() -> None:
+    frames = printed("explain", capture(COIN_D4), "-s", "cspc-coin-d4")["frames"]
+    assert b"".join(bytes.fromhex(row["hex"]) for frame in frames for row in frame["rows"]) == capture(COIN_D4).read_bytes()
+    assert [frame["frame"] for frame in frames] == ["", "info", "scan_start", "data", "data", "data", "data", ""]
+    assert "3 data" not in ran("parse", capture(LD06), *SENSOR).stderr
+
+
+def test_build_makes_the_frame_of_the_manual() -> None:
+    points = [
+        f"points[{index}].{name}={value}"
+        for index, pair in enumerate(POINTS)
+        for name, value in zip(("distance", "intensity"), pair, strict=True)
+    ]
+    assert ran("build", "ldrobot-stl27l", "data", *FIELDS, *points).stdout.strip() == EXAMPLE.hex(" ")
+
+
+def test_build_fills_arrays_and_later_values_win() -> None:
+    words = ("points[3].intensity=7", "points[*].distance=1m", "points[*].intensity=0x05", "points[11].distance=12.5cm")
+    frame = ls.sensor("ldrobot-stl27l").parse(bytes.fromhex(ran("build", "ldrobot-stl27l", "data", *FIELDS, *words).stdout))
+    assert [point.distance for point in frame.points] == [1000] * 11 + [125]
+    assert {point.intensity for point in frame.points} == {5}
+    words = (*words, "points[3].intensity=7")
+    frame = ls.sensor("ldrobot-stl27l").parse(bytes.fromhex(ran("build", "ldrobot-stl27l", "data", *FIELDS, *words).stdout))
+    assert frame.points[3].intensity == 7
+
+
+def test_build_takes_the_length_of_an_array_from_its_count_or_its_elements() -> None:
+    common = ("mt.frequency=5.5Hz", "mt.start=0", "fsa.angle=10deg", "lsa.angle=12deg")
+    every = ("samples[*].distance=1m", "samples[*].intensity=3", "samples[*].exposure=1")
+    sensor = ls.sensor("cspc-coin-d4")
+    frame = sensor.parse(bytes.fromhex(ran("build", sensor.id, "data", *common, *every, "lsn=3").stdout))
+    assert (frame.lsn, [sample.distance for sample in frame.samples]) == (3, [1000] * 3)
+    ones = [f"samples[{index}].{field}" for index in range(2) for field in ("distance=5", "intensity=6", "exposure=1")]
+    frame = sensor.parse(bytes.fromhex(ran("build", sensor.id, "data", *common, *ones).stdout))
+    assert (frame.lsn, [sample.intensity for sample in frame.samples]) == (2, [6, 6])
+    assert "is not known" in ran("build", sensor.id, "data", *common, *every, code=2).stderr
+
+
+@pytest.mark.parametrize(
+    ("word", "told"),
+    [
+        ("speed=10m", "speed is in deg/s, and 'm' cannot be turned into that"),
+        ("start_angle=700deg", "start_angle = 700.0 is outside 0.0 .. 655.35 deg"),
+        ("speed=70000", "speed = 70000 is outside 0 .. 65535"),
+        ("speed=1.5", "give it a unit: 1.5deg/s"),
+        ("speed=fast", "takes a number, not 'fast'"),
+        ("points.distance=1m", "points.distance is in 1 array"),
+        ("points[*].range=1m", "unknown field 'points[*].range'"),
+        ("header=5g", "takes bytes in hexadecimal"),
+    ],
+)
+def test_a_value_that_a_field_cannot_take(word: str, told: str) -> None:
+    words = ("points[*].distance=1m", "points[*].intensity=5")
+    assert told in ran("build", "ldrobot-stl27l", "data", *FIELDS, *words, word, code=2).stderr
+
+
+def test_built_frames_go_to_files_and_back(tmp_path: Path) -> None:
+    raw, text = tmp_path / "start.bin", tmp_path / "start.hex"
+    for target in (raw, text):
+        ran("build", "cspc-m1c1-mini", "command", "mode=0xf0", "-o", target)
+    assert raw.read_bytes() == bytes.fromhex(text.read_text(encoding="ascii")) == b"\xaa\x55\xf0\x0f"
+    assert printed("build", "cspc-m1c1-mini", "command", "mode=240")["hex"] == "aa 55 f0 0f"
+    assert "0x0f ok (XOR-8 over 3 bytes)" in ran("explain", raw, "-s", "cspc-m1c1-mini").stdout

@@ -1,0 +1,96 @@
+"""`sensors`, `show`, `plugins`, `demo`, and the help."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+import lidarspec as ls
+from lidarspec.cli.root import VERBS, main
+from tests.cli.running import printed, process, ran
+
+
+def test_help_imports_neither_numpy_nor_construct() -> None:
+    script = (
+        "import sys\nfrom lidarspec.cli import main\n"
+        "try:\n    main(['--help'])\nexcept SystemExit as done:\n    assert done.code == 0\n"
+        "print(sorted({'numpy', 'construct', 'rich', 'pluggy', 'serial'} & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True, timeout=60)
+    assert done.stdout.splitlines()[-1] == "[]"
+
+
+def test_every_verb_says_the_same_of_itself_as_the_list_of_verbs() -> None:
+    listed = ran("--help").stdout
+    for verb, (_, text) in VERBS.items():
+        command = main.get_command(main.make_context("lidarspec", [verb]), verb)
+        assert command is not None
+        assert (command.help or "").splitlines()[0] == text
+        assert verb in listed
+        assert text in ran(verb, "--help").stdout.replace("\n ", "")
+
+
+def test_the_version_is_told() -> None:
+    assert process("--version").stdout == f"lidarspec {ls.__version__}\n".encode()
+
+
+def test_sensors_lists_what_is_installed() -> None:
+    known = {item["id"]: item for item in printed("sensors")}
+    assert list(known) == list(ls.sensors())
+    stl = known["ldrobot-stl27l"]
+    assert (stl["vendor"], stl["model"], stl["status"], stl["distribution"]) == ("LDROBOT", "STL-27L", "vectors", "lidarspec-ldrobot")
+    assert stl["links"] == {"data": {"kind": "serial", "bauds": [921600], "dtr": None, "rts": None}}
+    assert any(line.split()[0] == "robosense-m1" and "udp 6699/7788" in line for line in ran("sensors").stdout.splitlines())
+
+
+def test_show_draws_the_wire_table_of_every_frame() -> None:
+    text = ran("show", "ldrobot-stl27l").stdout
+    assert "data (points): 47 bytes" in text
+    rows = {" ".join(line.split()) for line in text.splitlines()}
+    assert "4 2 uint16 le start_angle 0.01 deg" in rows
+    assert "8 + 3*i 1 uint8 points[i].intensity" in rows
+    assert "46 1 uint8 crc CRC-8 poly 0x4d over all other bytes" in rows
+
+
+def test_show_tells_commands_and_their_bytes() -> None:
+    found = printed("show", "cspc-m1c1-mini")
+    assert found["commands"]["start"] == {"frame": "command", "arguments": {}, "hex": "aa 55 f0 0f", "reply": "ack"}
+    assert found["frames"]["data"]["size"] == "10 + 3*lsn"
+    assert "command start: aa 55 f0 0f, answered by ack" in ran("show", "cspc-m1c1-mini").stdout
+
+
+@pytest.mark.parametrize("sensor", list(ls.sensors()))
+def test_show_works_for_every_sensor(sensor: str) -> None:
+    assert set(printed("show", sensor)["frames"]) == set(ls.sensor(sensor).frames)
+
+
+def test_plugins_names_distributions() -> None:
+    found = {plugin["distribution"]: plugin for plugin in printed("plugins")}
+    assert found["lidarspec-ldrobot"]["sensors"] == ["ldrobot-stl27l", "ldrobot-ld06"]
+    assert "lidarspec-ldrobot" in ran("plugins").stdout
+
+
+def test_output_goes_to_a_file(tmp_path) -> None:  # type: ignore[no-untyped-def]
+    target = tmp_path / "sensors.json"
+    assert ran("sensors", "--json", "-o", target).stdout == ""
+    assert "ldrobot-stl27l" in target.read_text(encoding="utf-8")
+    ran("sensors", "-o", tmp_path / "none" / "x.json", code=3)
+
+
+def test_demo_draws_and_sums_up() -> None:
+    text = ran("demo", "-s", "ldrobot-stl27l", "-n", 1).stdout
+    assert sum("⠀" < character <= "⣿" for character in text) > 200
+    assert "ldrobot-stl27l, simulated:" in text
+    assert "1 whole scans at 10.0 Hz" in text or "whole scans at 10.0 Hz" in text
+    assert text.splitlines()[-1] == "next: lidarspec show ldrobot-stl27l"
+
+
+def test_demo_counts_what_the_line_did() -> None:
+    found = printed("demo", "-s", "ldrobot-stl27l", "-n", 1)
+    assert found["rate_hz"] == pytest.approx(10, abs=0.01)
+    assert found["stats"]["frames"]["data"] >= found["intact"] - 1
+    assert found["intact"] < found["sent"]
+    clean = printed("demo", "-s", "ldrobot-stl27l", "-n", 1, "--errors", 0)
+    assert clean["stats"]["bad_checksum"] == clean["stats"]["bytes_skipped"] == 0
