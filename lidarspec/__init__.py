@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 from lidarspec._version import __version__ as __version__
 
 if TYPE_CHECKING:
+    from lidarspec.access import Fields as Fields
     from lidarspec.angles import (
         following as following,
     )
@@ -46,7 +47,6 @@ if TYPE_CHECKING:
     from lidarspec.checksums import Xor as Xor
     from lidarspec.clouds import PointCloud as PointCloud
     from lidarspec.columns import Column as Column
-    from lidarspec.columns import Fields as Fields
     from lidarspec.decoder import Counters as Counters
     from lidarspec.decoder import Decoder as Decoder
     from lidarspec.decoder import Found as Found
@@ -147,7 +147,8 @@ _HOMES = {
     "fields": ("Scaled", "Checksummed"),
     "checksums": ("Checksum", "Crc", "Xor", "Sum", "WordXor", "Fold15"),
     "geometry": ("Points", "Polar", "Cartesian"),
-    "columns": ("Fields", "Column"),
+    "access": ("Fields",),
+    "columns": ("Column",),
     "angles": ("spread", "wrap", "following", "previous", "last", "stack", "take"),
     "files": ("Format", "Transport"),
     "hookspecs": ("hookimpl",),

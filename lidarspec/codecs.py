@@ -21,7 +21,8 @@ import construct
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.columns import Batch, Column, Fields, unpadded
+from lidarspec.access import Fields
+from lidarspec.columns import Batch, Column, unpadded
 from lidarspec.construction import Mismatch
 from lidarspec.errors import SpecError
 from lidarspec.headers import HeaderTree, Refused

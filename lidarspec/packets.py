@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.columns import Batch, physical
+from lidarspec.access import physical
+from lidarspec.columns import Batch
 from lidarspec.decoder import Counters
 from lidarspec.errors import UnknownField
 from lidarspec.schema import Schema

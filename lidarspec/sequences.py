@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.columns import Batch, Fields
+from lidarspec.access import Fields
+from lidarspec.columns import Batch
 from lidarspec.decoder import Counters
 from lidarspec.errors import SpecError
 from lidarspec.splits import Sequence

@@ -15,8 +15,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lidarspec.access import Fields
 from lidarspec.codecs import CompiledCodec, codec
-from lidarspec.columns import Batch, Column, Fields, aligned
+from lidarspec.columns import Batch, Column, aligned
 from lidarspec.errors import SpecError, UsageError
 from lidarspec.geometry import Polar
 from lidarspec.layout import Layout, Leaf

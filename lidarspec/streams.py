@@ -13,8 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lidarspec.access import Fields
 from lidarspec.codecs import Codec, codec
-from lidarspec.columns import Batch, Fields
+from lidarspec.columns import Batch
 from lidarspec.decoder import Counters, Spans
 from lidarspec.errors import SpecError, UnknownFrame
 from lidarspec.packets import Packets, StateOf, joined_tables

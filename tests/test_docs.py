@@ -53,7 +53,7 @@ def test_the_tutorials_session_runs_as_it_stands(tutorial: Path) -> None:
 def test_the_tutorials_test_class_passes(tutorial: Path) -> None:
     (tutorial / "test_mine.py").write_text(blocks("tutorial/first-sensor.md")[2], encoding="utf-8")
     done = subprocess.run(
-        [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "."], cwd=tutorial, capture_output=True, text=True
+        [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "."], cwd=tutorial, capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stdout
 

@@ -29,13 +29,11 @@ def test_the_coin_d4_dump(tmp_path: Path) -> None:
     assert done.returncode == 0
     assert done.stdout == b""
     packets = json.loads(capture(COIN_D4.replace("_partial.bin", "_expected.json")).read_text(encoding="utf-8"))
-    samples = [
-        (angle, distance, quality)
-        for packet in packets
-        for (angle, distance), quality in zip(packet["lds2d_angle_dist"], packet["vendor_quality"], strict=True)
-        if distance
-    ]
-    angle, distance, quality = np.array(samples).T
+    angle = np.concatenate([np.linspace(packet["fsa_deg"], packet["lsa_deg"], 25) for packet in packets])
+    rounded, distance = np.array([pair for packet in packets for pair in packet["lds2d_angle_dist"]]).T
+    np.testing.assert_allclose(angle, rounded, atol=0.3)  # that decoder steps by whole 1/64 degrees
+    quality = np.concatenate([packet["vendor_quality"] for packet in packets])
+    angle, distance, quality = (column[distance > 0] for column in (angle, distance, quality))
     found = read(target)
     assert list(found) == COLUMNS
     assert len(found["x"]) == 97
@@ -58,7 +56,8 @@ def test_the_ld06_frames(tmp_path: Path) -> None:
     np.testing.assert_allclose(found["intensity"], intensity)
     np.testing.assert_allclose(found["x"], distance / 1000 * np.cos(np.deg2rad(angle)), atol=1e-5)
     np.testing.assert_allclose(found["y"], -distance / 1000 * np.sin(np.deg2rad(angle)), atol=1e-5)
-    assert (np.diff(found["time"]) > 0).all()
+    assert found["time"].min() == 0
+    assert found["time"].max() == pytest.approx(0.006 + 11 / 4500, abs=0.0011)
 
 
 def test_npz_holds_the_same_columns_and_the_stamps(tmp_path: Path) -> None:

@@ -81,9 +81,9 @@ def test_output_goes_to_a_file(tmp_path) -> None:  # type: ignore[no-untyped-def
 
 def test_demo_draws_and_sums_up() -> None:
     text = ran("demo", "-s", "ldrobot-stl27l", "-n", 1).stdout
-    assert sum("⠀" < character <= "⣿" for character in text) > 200
+    assert sum("⠀" < character <= "⣿" for character in text) > 80
     assert "ldrobot-stl27l, simulated:" in text
-    assert "1 whole scans at 10.0 Hz" in text or "whole scans at 10.0 Hz" in text
+    assert "whole scans at 10.0 Hz" in text
     assert text.splitlines()[-1] == "next: lidarspec show ldrobot-stl27l"
 
 

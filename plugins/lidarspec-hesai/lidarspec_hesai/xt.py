@@ -69,5 +69,6 @@ XT16 = dataclasses.replace(
     frames={"data": Frame(packet(6, 1, 16, TAIL), data=True, max_length=longest(16, BLOCKS), plausible=plausible)},
     points=points_with(TABLE_16),
     configure=configuring(TABLE_16, points_with),
+    status="vectors",
     source="HesaiLidar_SDK_2.0 (udp_protocol_v6_1.h, PandarXT-16 correction files); one captured packet of tier4/nebula",
 )
