@@ -139,7 +139,7 @@ class _Reading:
         remarks: list[str] = []
         right = True
         for part, seen in group:
-            for keys, raw in self._raw(part, seen):
+            for keys, raw in leaves(seen.value):
                 value, info = self._value(part, keys, raw)
                 values.append(value)
                 if info.const is not None and value.raw != info.const:
@@ -151,20 +151,15 @@ class _Reading:
                     right = right and good
         return Row(start, self._data[start:end], path, tuple(values), tuple(remarks), right)
 
-    def _raw(self, path: str, seen: Seen) -> Iterator[tuple[Keys, Any]]:
-        """The raw values of a part: itself, or those of the fields of a bit block."""
-        return leaves(seen.value) if kind(path) in self._blocks else iter([((), seen.value)])
-
     def _value(self, part: str, keys: Keys, raw: Any) -> tuple[Value, FieldInfo]:
         path = part + "".join(f"[{key}]" if isinstance(key, int) else f".{key}" for key in keys)
         unknown = FieldInfo(plain(path), docs="constant" if path.endswith(UNNAMED) else "")
         info = self._schema.fields.get(plain(path), unknown)
         bits = self._blocks.get(kind(part), {}).get(keys)
-        whole = int(raw) if isinstance(raw, int) else raw
-        physical = float(whole * info.scale + info.offset) if isinstance(whole, int | float) else None
-        label = info.labels.get(whole, "") if isinstance(whole, int) else ""
+        physical = float(raw * info.scale + info.offset) if isinstance(raw, int | float) else None
+        label = info.labels.get(raw, "") if isinstance(raw, int) else ""
         digits = None if info.kind == "float" else _digits(info)
-        return Value(path, whole, physical, info.unit, digits, label, bit_text(bits) if bits else "", info.docs), info
+        return Value(path, raw, physical, info.unit, digits, label, bit_text(bits) if bits else "", info.docs), info
 
 
 def plain(path: str) -> str:

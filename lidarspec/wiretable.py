@@ -21,6 +21,7 @@ from lidarspec.spec import Frame
 
 INDICES = "ijklmn"
 _ITEM = re.compile(r"\['(\w+)'\]")
+_FIELD = re.compile(r"\bthis(?:\.\w+)+")
 
 
 @dataclass(frozen=True)
@@ -124,7 +125,7 @@ class _Table:
 
     def _array(self, con: Array, place: _Place, start: Extent) -> Extent:
         index = INDICES[place.depth % len(INDICES)]
-        count = con.count if isinstance(con.count, int) else formula(con.count)
+        count = con.count if isinstance(con.count, int) else formula(con.count, place.info.path)
         below = replace(place, depth=place.depth + 1, shown=f"{place.shown}[{index}]")
         element = _Table().visit(con.subcon, below, Extent())
         whole = element.times(count)
@@ -134,18 +135,18 @@ class _Table:
 
     def _choice(self, con: Any, place: _Place, start: Extent) -> Extent:
         if isinstance(con, construct.Switch):
-            key = formula(con.keyfunc)
+            key = formula(con.keyfunc, place.info.path)
             branches = [(f"if {key} == {value!r}", case) for value, case in con.cases.items()] + [
                 (f"for other values of {key}", con.default)
             ]
         else:
-            asked = formula(con.condfunc)
+            asked = formula(con.condfunc, place.info.path)
             branches = [(f"if {asked}", con.thensubcon), (f"unless {asked}", con.elsesubcon)]
         sizes = {self.visit(branch, replace(place, condition=condition), start) for condition, branch in branches}
         return sizes.pop() if len(sizes) == 1 else Extent(0, (f"size({place.shown})",))
 
     def _leaf(self, con: Construct, place: _Place, start: Extent) -> Extent:
-        size, kind = _sized(con)
+        size, kind = _sized(con, place.info.path)
         info = fields_below(con, place.info).get(place.info.path, place.info)
         self._add(WireRow(str(start), str(size or "varies"), kind, place.shown), info, place)
         return size or Extent(0, (f"size({place.shown})",))
@@ -164,13 +165,21 @@ class _Table:
         self.rows.append(replace(row, unit=unit_text(info), meaning=_text(meaning(info), place, self.seals.get(info.path, ""))))
 
 
-def formula(expression: Any) -> str:
-    """An expression of construct as its author would write it; "?" for a function that cannot be read."""
+def formula(expression: Any, path: str = "") -> str:
+    """An expression in the part at `path`, with its fields by their whole paths; "?" for a function that cannot be read."""
     text = repr(expression)
-    if callable(expression) and ("<" in text and " at 0x" in text):
+    if " at 0x" in text:
         return "?"
-    text = _ITEM.sub(r".\1", text).replace("this.", "")
+    text = _FIELD.sub(lambda found: _resolved(found[0], path), _ITEM.sub(r".\1", text))
     return text[1:-1] if text.startswith("(") and text.endswith(")") and text.count("(") == 1 else text
+
+
+def _resolved(text: str, path: str) -> str:
+    """``this.count`` or ``this._.count`` as the path from the top of the frame."""
+    scope = path.split(".")[:-1]
+    for name in text.split(".")[1:]:
+        scope = [] if name == "_root" else scope[:-1] if name == "_" else [*scope, name]
+    return ".".join(scope)
 
 
 def bit_text(bits: BitField) -> str:
@@ -219,7 +228,7 @@ def _joined(path: str, name: str) -> str:
     return f"{path}.{name}" if path and name else path or name
 
 
-def _sized(con: Construct) -> tuple[Extent | None, str]:
+def _sized(con: Construct, path: str) -> tuple[Extent | None, str]:
     """Size and type of a leaf; no size where only its bytes tell."""
     if isinstance(con, FormatField):
         code = con.fmtstr[-1]
@@ -230,7 +239,7 @@ def _sized(con: Construct) -> tuple[Extent | None, str]:
         kind = "int" if con.signed else "uint"
         return Extent(con.length), f"{kind}{8 * con.length}{' le' if con.swapped else ' be'}"
     if isinstance(con, Bytes):
-        size = Extent(con.length) if isinstance(con.length, int) else Extent(0, (formula(con.length),))
+        size = Extent(con.length) if isinstance(con.length, int) else Extent(0, (formula(con.length, path),))
         return size, "bytes"
     return None, _terminated(con)
 

@@ -78,7 +78,8 @@ class Value:
             return ascii_text(self.raw) if isinstance(self.raw, bytes | bytearray) else repr(self.raw)
         if self.label:
             return f"{self.raw} {self.label}"
-        text = str(self.raw) if self.raw == self.physical and not self.digits else fixed(self.physical, self.digits)
+        plain = isinstance(self.raw, int) and self.digits == 0 and self.physical == float(self.raw)
+        text = str(self.raw) if plain else fixed(self.physical, self.digits)
         turns = f" = {self.physical / DEGREES_PER_TURN:.1f} Hz" if self.unit == "deg/s" else ""
         return f"{text} {self.unit}".strip() + turns
 

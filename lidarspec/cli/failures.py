@@ -52,10 +52,7 @@ def report(error: Exception, verb: str) -> int:
         click.echo("  next: the same with LIDARSPEC_DEBUG=1, and report it with what that prints", err=True)
         return code
     click.echo(_message(error), err=True)
-    sensor = _sensor(error)
-    suggest(
-        error, "lidarspec sensors" if "{sensor}" in command and not sensor else command.format(sensor=sensor, verb=verb).replace("  ", " ")
-    )
+    suggest(error, _following(error, command, verb))
     for note in error.__notes__:
         click.echo(f"  {note}", err=True)
     return code
@@ -69,6 +66,16 @@ def _message(error: Exception) -> str:
 
         return f"{error}\n{hexdump(error)}"
     return str(error)
+
+
+def _following(error: Exception, command: str, verb: str) -> str:
+    """The next command; what is said of plugins, where an unknown sensor may be one of a plugin that does not load."""
+    if isinstance(error, errors.UnknownSensor):
+        from lidarspec.plugins import registry
+
+        return "lidarspec plugins" if any(plugin.error for plugin in registry().plugins) else command
+    sensor = _sensor(error)
+    return "lidarspec sensors" if "{sensor}" in command and not sensor else command.format(sensor=sensor, verb=verb).replace("  ", " ")
 
 
 def _sensor(error: Exception) -> str:

@@ -139,4 +139,4 @@ def _plain(parsed: Any) -> Any:
         return [_plain(value) for value in parsed]
     if isinstance(parsed, bytes | bytearray):
         return parsed.hex(" ")
-    return int(parsed) if isinstance(parsed, int) else number(parsed)
+    return getattr(parsed, "intvalue", None) if isinstance(parsed, str) else int(parsed) if isinstance(parsed, int) else number(parsed)

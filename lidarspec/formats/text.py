@@ -13,7 +13,7 @@ from lidarspec.clouds import COLUMNS
 from lidarspec.files import Format
 from lidarspec.scans import Scan
 
-#: how a value of each kind of number is written: seven figures tell float32 apart, and nanoseconds are kept in times.
+#: how a number of each type is written: seven figures are half a micrometre at a metre; times keep their nanoseconds.
 _WRITTEN = {"f4": "%.7g", "f8": "%.9f"}
 #: rows turned into text at once.
 ROWS = 1 << 14

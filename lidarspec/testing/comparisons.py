@@ -80,9 +80,8 @@ def assert_backends_agree(sensor: Sensor, data: Any) -> None:
     found = [spans_of(decoder, data) for decoder in decoders]
     split = [cuts(one for spans in each for one in spans.found()) for each in found]
     assert split[0] == split[1]
-    for name, frame in sensor.frames.items():
-        if frame.direction == "out":
-            continue
+    for name in dict.fromkeys((sensor.data_frame, *(name for name, _, _ in split[0]))):
+        frame = sensor.frames[name]
         compiled, interpreted = (_packets(decoder, name, each) for decoder, each in zip(decoders, found, strict=True))
         assert not compiled.stats.plugin_errors, compiled.stats.tracebacks[0]
         assert_same_packets(compiled, interpreted)

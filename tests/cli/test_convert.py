@@ -57,7 +57,7 @@ def test_the_ld06_frames(tmp_path: Path) -> None:
     np.testing.assert_allclose(found["x"], distance / 1000 * np.cos(np.deg2rad(angle)), atol=1e-5)
     np.testing.assert_allclose(found["y"], -distance / 1000 * np.sin(np.deg2rad(angle)), atol=1e-5)
     assert found["time"].min() == 0
-    assert found["time"].max() == pytest.approx(0.006 + 11 / 4500, abs=0.0011)
+    assert found["time"].max() == pytest.approx(0.005 + 11 / 4500, abs=1e-6)
 
 
 def test_npz_holds_the_same_columns_and_the_stamps(tmp_path: Path) -> None:

@@ -1,8 +1,7 @@
-"""RPLIDAR A1, A3, S2 and C1: vectors, capsules of every kind against the oracle, points worked out by hand, false nodes."""
+"""RPLIDAR A1, A3, S2 and C1: vectors, points of every answer worked out by hand, commands."""
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import pickle
 import random
@@ -14,14 +13,11 @@ import pytest
 
 import lidarspec as ls
 from lidarspec.codecs import codec
-from lidarspec.simulator import simulate
-from tests.damage import damaged
-from tests.oracle import Oracle
 from tests.sensors.evidence import assert_points, clockwise, decoded, vector_bytes, vectors
+from tests.sensors.rplidar import believing
 
 FILE = "vectors_serial2d.json"
 A1, A3, S2, C1 = (ls.sensor(f"slamtec-rplidar-{name}") for name in ("a1", "a3", "s2", "c1"))
-CONFIRM = A1.frames["node"].confirm
 
 WHOLE = {
     "rp_req_express": "express_request",
@@ -42,7 +38,6 @@ WHOLE = {
 PAIRS = {"rp_capsule_pair_synth": "express", "rp_ultra_pair_synth": "ultra"}
 EXCERPTS = {"rp_varbit"}
 
-ANSWERS = ("express", "ultra", "dense", "ultra_dense", "hq")
 #: where the vectors name something otherwise than the fields do.
 FIELDS = {
     "length": "descriptor.length",
@@ -59,46 +54,6 @@ FIELDS = {
     "check": "beam.check",
     "angle_deg": "beam.angle",
 }
-
-
-def node(degrees: float, metres: float, *, quality: int = 40, start: bool = False) -> bytes:
-    """A node of a scan."""
-    head = {"quality": quality, "start": int(start), "inverse": int(not start)}
-    return A1.build("node", head=head, beam={"angle": degrees}, distance=metres, units=True)
-
-
-def capsule(answer: str, source: random.Random, degrees: float) -> bytes:
-    """A capsule with random content that starts at this angle."""
-    parsed = A1.parse(A1.example(answer, seed=source.randrange(1 << 30)), frame=answer)
-    if answer != "hq":
-        parsed.start.angle, parsed.start.sync = round(degrees * 64) % (360 * 64), 0
-    return A1.build(answer, parsed)
-
-
-def capsules(answer: str, number: int, *, step: float = 17.0, seed: int = 1) -> bytes:
-    """A stream of such capsules behind their descriptor."""
-    source = random.Random(seed)
-    return A1.example(f"{answer}_descriptor") + b"".join(capsule(answer, source, index * step) for index in range(number))
-
-
-def turns(number: int, *, seed: int = 1) -> bytes:
-    """Nodes of turns of 500, with a few millimetres of noise and one in ten without a return."""
-    source, found = random.Random(seed), bytearray()
-    for index in range(number):
-        distance = 0.0 if source.random() < 0.1 else 2 + math.sin(index / 80) + source.gauss(0, 0.004)
-        found += node((index % 500 * 0.72 + source.uniform(0, 0.02)), distance, quality=source.randrange(48), start=index % 500 == 0)
-    return bytes(found)
-
-
-def believing(runs: int) -> ls.Sensor:
-    """An A1 that believes nodes in runs of so many, and looks for them from the start."""
-    frames = {**A1.frames, "node": dataclasses.replace(A1.frames["node"], confirm=runs)}
-    return dataclasses.replace(A1, frames=frames).configure(answer="node")
-
-
-def nodes_in(sensor: ls.Sensor, data: bytes) -> list[int]:
-    """The offsets of the nodes that are found."""
-    return [found.offset for found in sensor.split(data) if found.frame == "node"]
 
 
 def test_every_vector_of_the_family_is_used() -> None:
@@ -244,104 +199,6 @@ def test_the_compensation_of_express_capsules_signed_or_not() -> None:
         A1.configure(dtheta="both")
 
 
-@pytest.mark.parametrize("answer", ["express", "ultra", "dense", "ultra_dense"])
-def test_no_direction_goes_over_a_loss_or_a_new_start(answer: str) -> None:
-    sensor, source = A1.configure(answer=answer), random.Random(5)
-    first, second, third = (capsule(answer, source, degrees) for degrees in (10, 20, 30))
-    parsed = A1.parse(third, frame=answer)
-    parsed.start.sync = 1
-    count = len(sensor.decode(first + second).points()) // 2
-    for data in (first + second + A1.build(answer, parsed), first + second + b"\x00" + third):
-        azimuth = sensor.decode(data).points().azimuth
-        assert np.isfinite(azimuth).tolist() == [True] * count + [False] * 2 * count
-
-
-@pytest.mark.parametrize("answer", [*ANSWERS, "node"])
-def test_a_descriptor_switches_to_its_own_frames_alone(answer: str) -> None:
-    for announced in (*ANSWERS, "node"):
-        head = A1.example("scan_descriptor" if announced == "node" else f"{announced}_descriptor")
-        body = turns(20) if answer == "node" else capsules(answer, 3)[7:]
-        frames = A1.decode(head + body).stats.frames
-        assert (answer in frames) == (announced == answer)
-
-
-# Of 781 bytes, 1 % of damage leaves nothing whole; so HQ capsules are tried with less, too.
-@pytest.mark.parametrize(("answer", "rate"), [*((answer, 0.01) for answer in ANSWERS), ("hq", 0.001)])
-def test_a_damaged_stream_equals_the_oracle(answer: str, rate: float) -> None:
-    number = 24 if answer == "hq" else 60
-    data = damaged(capsules(answer, number), rate, 11)
-    found = [(item.frame, item.offset, item.data) for item in A1.split(data)]
-    assert found == Oracle(A1, data).frames()
-    intact = sum(name == answer for name, _, _ in found)
-    assert intact == 0 if (answer, rate) == ("hq", 0.01) else 5 < intact < number
-    decoded(A1.configure(answer=answer), data)
-
-
-def test_damaged_nodes_equal_the_oracle() -> None:
-    data = damaged(A1.example("scan_descriptor") + turns(600), 0.01, 12)
-    found = [(item.frame, item.offset, item.data) for item in A1.split(data)]
-    assert found == Oracle(A1, data).frames()
-    assert 300 < len(found) < 600
-
-
-def test_a_conversation_with_several_answers_equals_the_oracle() -> None:
-    parts = [A1.example("info"), A1.example("scan_descriptor"), turns(30), A1.example("health"), capsules("dense", 6), capsules("hq", 3)]
-    data = damaged(b"".join(parts) + A1.example("scan_descriptor") + turns(40, seed=2), 0.004, 5, burst=8)
-    assert [(item.frame, item.offset, item.data) for item in A1.split(data)] == Oracle(A1, data).frames()
-
-
-def test_false_nodes_are_as_rare_as_documented() -> None:
-    noise = random.Random(8).randbytes(1 << 19)
-    alone = nodes_in(believing(1), noise)
-    assert 0.95 < len(alone) / 54_100 < 1.05  # 865 530 in 8 MiB
-    assert not nodes_in(A1.configure(answer="node"), noise)
-    for answer in ANSWERS:
-        frames = capsules(answer, 100)[7:]
-        assert not nodes_in(A1.configure(answer="node"), frames)
-        assert len(nodes_in(believing(1), frames)) > 100
-
-
-def test_joining_in_the_middle_of_a_node_finds_the_true_ones() -> None:
-    data, wrong = turns(3000), {1: 0, CONFIRM: 0}
-    for runs in wrong:
-        sensor = believing(runs)
-        for spot in range(1, len(data) - 400, 211):
-            wrong[runs] += sum((offset + spot) % 5 != 0 for offset in nodes_in(sensor, data[spot : spot + 400]))
-    assert wrong[1] > 10
-    assert wrong[CONFIRM] == 0
-
-
-def test_a_short_run_of_nodes_is_not_believed() -> None:
-    sensor, data = A1.configure(answer="node"), turns(CONFIRM)
-    assert len(nodes_in(sensor, data)) == CONFIRM
-    assert not nodes_in(sensor, data[5:])
-
-
-@pytest.mark.parametrize("answer", ["node", "express", "dense", "hq"])
-def test_scans_begin_where_the_azimuth_passes_zero(answer: str) -> None:
-    sensor, number = A1.configure(answer=answer), {"node": 1440, "express": 90, "dense": 80, "hq": 40}[answer]
-    scans = list(sensor.scans(b"".join(simulate(sensor, number))))
-    whole = [scan for scan in scans if scan.complete]
-    assert len(whole) >= 2
-    for scan in whole:
-        degrees = clockwise(scan.points)
-        assert degrees[0] < 1
-        assert len(scan) == {"node": 360, "express": 720, "dense": 800, "hq": 960}[answer]
-
-
-def test_the_start_bit_stands_where_scans_begin() -> None:
-    packets = believing(1).decode(turns(1600))
-    flags = np.flatnonzero(packets["head.start"])
-    lengths = [len(scan) for scan in believing(1).scans(turns(1600))]
-    assert np.cumsum(lengths)[:-1].tolist() == flags[1:].tolist()
-
-
-def test_the_frames_that_cannot_be_simulated_say_so() -> None:
-    for answer in ("ultra", "ultra_dense"):
-        with pytest.raises(ls.UsageError, match="sweep"):
-            simulate(A1.configure(answer=answer), 1)
-
-
 @pytest.mark.parametrize("command", ["stop", "reset", "scan", "force_scan", "get_info", "get_health", "get_samplerate"])
 def test_requests_without_payload(command: str) -> None:
     codes = {"stop": 0x25, "reset": 0x40, "scan": 0x20, "force_scan": 0x21, "get_info": 0x50, "get_health": 0x52, "get_samplerate": 0x59}
@@ -377,8 +234,3 @@ def test_opening_starts_the_scan_mode_that_was_configured() -> None:
 def test_bauds_of_the_models() -> None:
     bauds = {sensor.id[-2:]: sensor.links["data"].baud for sensor in (A1, A3, S2, C1)}  # type: ignore[union-attr]
     assert bauds == {"a1": 115_200, "a3": 256_000, "s2": 1_000_000, "c1": 460_800}
-
-
-def test_an_input_is_read_by_the_answer_that_it_holds() -> None:
-    for answer in ANSWERS:
-        assert A1.decode(capsules(answer, 3)).frame == answer
