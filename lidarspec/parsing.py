@@ -18,16 +18,25 @@ from lidarspec.spec import Sensor
 
 def parse(sensor: Sensor, data: bytes, *, frame: str | None = None, verify: bool = True) -> Any:
     """See `Sensor.parse`."""
-    data = bytes(data)
+    found = _unpacked(sensor, bytes(data), frame)
+    return clean(parse_typed(sensor, data, frame=frame, verify=verify)[1]) if found is None else found
+
+
+def _unpacked(sensor: Sensor, data: bytes, frame: str | None) -> Any:
+    """A sound frame by generated code; None where construct has to say what it is, or what is wrong with it."""
     for name in sensor.frames if frame is None or frame not in sensor.frames else (frame,):
         engine = codec(sensor.frames[name])
-        if isinstance(engine, CompiledCodec):
+        if not isinstance(engine, CompiledCodec):
+            return None  # it may be of this type, which comes first
+        try:
             found = engine.parse(data)
-            if found is not None:
-                return found
-        elif frame is None:
-            break
-    return clean(parse_typed(sensor, data, frame=frame, verify=verify)[1])
+        except SpecError:
+            raise
+        except Exception:  # out of a plugin: construct meets it again, and it is told with its place
+            return None
+        if found is not None:
+            return found
+    return None
 
 
 def parse_typed(sensor: Sensor, data: bytes, *, frame: str | None = None, verify: bool = True) -> tuple[str, Any]:
