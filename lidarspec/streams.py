@@ -196,7 +196,8 @@ class Unwrapper:
         half = self._turn // 2
         steps = (np.diff(ns, prepend=raw) + half) % self._turn - half
         if self._turn >= 10**9:
-            passed = np.where(host > 0, np.diff(host, prepend=at), 0)
+            before = np.concatenate([[at], host[:-1]])
+            passed = np.where((host > 0) & (before > 0), host - before, 0)
             turns = np.where(passed > self._turn * 3 // 4, (passed - steps + half) // self._turn, 0)
             steps += turns * self._turn
         times = time + np.cumsum(steps)
