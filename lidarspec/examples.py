@@ -27,17 +27,21 @@ def example(sensor: Sensor, frame: str, *, seed: int = 0) -> bytes:
     """See `Sensor.example`."""
     if frame not in sensor.frames:
         raise UnknownFrame(frame, sensor.frames, place=sensor.id)
-    source = random.Random(f"{sensor.id} {frame} {seed}")
+    return examples(sensor, frame, random.Random(f"{sensor.id} {frame} {seed}"))[0]
+
+
+def examples(sensor: Sensor, frame: str, source: random.Random) -> list[bytes]:
+    """Some valid frames of one random header, at least one: what `example` picks from, for tests that need many."""
     engine = codec(sensor.frames[frame])
     if not isinstance(engine, CompiledCodec):
-        return _interpreted(sensor, frame, engine, source)
+        return [_interpreted(sensor, frame, engine, source)]
     for _ in range(TRIES):
         layout, chosen = engine.tree.choose(source)
         rows = np.frombuffer(source.randbytes(BATCH * layout.size), np.uint8).reshape(BATCH, layout.size).copy()
         found = _plausible(sensor, frame, layout, _headed(rows, layout, chosen))
-        if found is not None:
+        if found:
             return found
-    return _swept(sensor, frame, engine, source)
+    return [_swept(sensor, frame, engine, source)]
 
 
 def _interpreted(sensor: Sensor, frame: str, engine: InterpretedCodec, source: random.Random) -> bytes:
@@ -57,15 +61,15 @@ def _headed(rows: NDArray[np.uint8], layout: Layout, chosen: dict[str, int]) -> 
     return rows
 
 
-def _plausible(sensor: Sensor, frame: str, layout: Layout, rows: NDArray[np.uint8]) -> bytes | None:
+def _plausible(sensor: Sensor, frame: str, layout: Layout, rows: NDArray[np.uint8]) -> list[bytes]:
     table = Rows(codec(sensor.frames[frame]).schema, [Group(layout, np.arange(len(rows)), rows)])
     if sensor.frames[frame].plausible is None:
-        return bytes(rows[0].tobytes())
+        return [row.tobytes() for row in rows]
     errors: list[str] = []
     good = np.flatnonzero(plausibility(sensor.frames[frame], table, errors) == 0)
     if errors:
         raise SpecError(errors[0].strip().splitlines()[-1], path=f"{frame}.plausible", sensor=sensor.id)
-    return bytes(rows[good[0]].tobytes()) if len(good) else None
+    return [row.tobytes() for row in rows[good]]
 
 
 def _swept(sensor: Sensor, frame: str, engine: CompiledCodec, source: random.Random) -> bytes:
@@ -82,8 +86,8 @@ def _swept(sensor: Sensor, frame: str, engine: CompiledCodec, source: random.Ran
             if leaf is not None and path not in chosen:
                 leaf.store(rows, np.rint((np.asarray(value, np.float64) - leaf.info.offset) / leaf.info.scale).astype(np.int64))
         found = _plausible(sensor, frame, layout, _headed(rows, layout, chosen))
-        if found is not None:
-            return found
+        if found:
+            return found[0]
     raise SpecError("neither random frames nor those along `sweep` pass `plausible`", path=frame, sensor=sensor.id)
 
 

@@ -1,0 +1,102 @@
+"""What the works read: packets and streams that lidarspec's own simulator makes, the same in every run."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+import lidarspec as ls
+from lidarspec.pcap import Datagram, PcapWriter
+from lidarspec.simulator import opening, simulate
+
+#: sensor, frames of a full run, the answer it is configured for.
+SENSORS: dict[str, tuple[str, int, str | None]] = {
+    "m1": ("robosense-m1", 6300, None),
+    "stl27l": ("ldrobot-stl27l", 40_000, None),
+    "m1c1": ("cspc-m1c1-mini", 20_000, None),
+    "vlp16": ("velodyne-vlp16", 2000, None),
+    "xt32": ("hesai-xt32", 3000, None),
+    "rplidar": ("slamtec-rplidar-a1", 100_000, "node"),
+}
+QUICKER = 50  # times fewer frames in a quick run
+NOISE = 0.02  # share of the frames that is damaged, and share of noise among the bytes
+SEED = 27
+
+Bytes = NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
+class Noisy:
+    """A stream with noise.
+
+    Attributes:
+        data: the bytes.
+        intact: the offsets of the frames that nothing happened to.
+    """
+
+    data: bytes
+    intact: NDArray[np.int64]
+
+
+class Inputs:
+    """The inputs of one run, each made when it is first asked for.
+
+    Args:
+        folder: where capture files are written.
+        quick: make so few frames that a run takes a moment.
+    """
+
+    def __init__(self, folder: Path, *, quick: bool = False) -> None:
+        self._folder, self._quick = folder, quick
+        self.frames: Callable[[str], list[bytes]] = functools.cache(self._frames)
+        self.capture: Callable[[str], Path] = functools.cache(self._capture)
+
+    def sensor(self, key: str) -> ls.Sensor:
+        """The sensor of this name, configured."""
+        name, _, answer = SENSORS[key]
+        return ls.sensor(name).configure(answer=answer) if answer else ls.sensor(name)
+
+    def array(self, key: str) -> Bytes:
+        """The frames that have the full length, (n, size)."""
+        frames = self.frames(key)
+        size = max(map(len, frames))
+        return np.frombuffer(b"".join(frame for frame in frames if len(frame) == size), np.uint8).reshape(-1, size)
+
+    def stream(self, key: str) -> bytes:
+        """All frames in a row, after what the sensor sends before them."""
+        return opening(self.sensor(key)) + b"".join(self.frames(key))
+
+    def noisy(self, key: str) -> Noisy:
+        """The frames with one byte of every fiftieth damaged, and as many runs of noise of a frame's mean length between them."""
+        random = np.random.default_rng(SEED)
+        pieces, intact, offset = [], [], 0
+        for frame in self.frames(key):
+            noise = random.bytes(random.integers(1, 2 * len(frame))) if random.random() < NOISE else b""
+            damaged = random.random() < NOISE
+            if damaged:
+                spot = int(random.integers(len(frame)))
+                frame = frame[:spot] + bytes([frame[spot] ^ int(random.integers(1, 256))]) + frame[spot + 1 :]
+            else:
+                intact.append(offset + len(noise))
+            pieces += [noise, frame]
+            offset += len(noise) + len(frame)
+        return Noisy(b"".join(pieces), np.array(intact, np.int64))
+
+    def _frames(self, key: str) -> list[bytes]:
+        count = SENSORS[key][1]
+        return simulate(self.sensor(key), count // QUICKER if self._quick else count)
+
+    def _capture(self, key: str) -> Path:
+        """A pcap file of the frames, one datagram each."""
+        path = self._folder / f"{key}.pcap"
+        sender, receiver = ("192.168.1.200", 6699), ("192.168.1.102", 6699)
+        with path.open("wb") as file:
+            writer = PcapWriter(file)
+            for index, frame in enumerate(self.frames(key)):
+                writer.write(Datagram(frame, 1_700_000_000 * 10**9 + index * 158_730, sender, receiver))
+        return path

@@ -1,0 +1,55 @@
+"""Times of several contenders, taken in turn, so that what slows the machine down slows all of them alike."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from statistics import median
+from typing import Any
+
+import numpy as np
+
+#: bytes of a copy: far more than the caches hold.
+COPIED = 1 << 26
+
+
+@dataclass(frozen=True)
+class Contender:
+    """Something that does a work, or a part of it.
+
+    Attributes:
+        run: does it once.
+        amount: how many points (or packets, frames, whatever the work counts) that is.
+    """
+
+    run: Callable[[], Any]
+    amount: int
+
+
+Rates = dict[str, list[float]]
+
+
+def raced(contenders: Mapping[str, Contender], runs: int) -> Rates:
+    """Seconds for each of the amount, by contender, one figure for each run; each has run once before."""
+    for contender in contenders.values():
+        contender.run()
+    found: Rates = {name: [] for name in contenders}
+    for _ in range(runs):
+        for name, contender in contenders.items():
+            start = time.perf_counter()
+            contender.run()
+            found[name].append((time.perf_counter() - start) / contender.amount)
+    return found
+
+
+def times(rates: Rates, fast: str, slow: str) -> float:
+    """How many times as fast the first is as the second: the median over the runs."""
+    return median(behind / ahead for ahead, behind in zip(rates[fast], rates[slow], strict=True))
+
+
+def memcpy(*, quick: bool = False) -> Contender:
+    """A copy of a large buffer; the amount is bytes."""
+    source = np.ones(COPIED >> 4 if quick else COPIED, np.uint8)
+    target = np.zeros_like(source)
+    return Contender(lambda: np.copyto(target, source), source.size)
