@@ -137,10 +137,8 @@ def test_a_closed_pipe_ends_quietly(tmp_path: Path) -> None:
 @pytest.mark.skipif(os.name != "posix", reason="signals are sent as on POSIX")
 def test_an_interrupt_ends_with_130() -> None:
     # a test run in the background of a shell has interrupts switched off, and its children inherit that
-    restored = (
-        "import signal, runpy; signal.signal(signal.SIGINT, signal.default_int_handler); runpy.run_module('lidarspec', run_name='__main__')"
-    )
-    command = [sys.executable, "-c", restored, "parse", "-", *SENSOR]
+    restored = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"
+    command = [sys.executable, "-c", f"{restored}; from lidarspec.cli import main; main()", "parse", "-", *SENSOR]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as running:
         deadline = time.monotonic() + 60
         while not _reads_standard_input(running.pid) and time.monotonic() < deadline:
