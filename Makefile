@@ -1,5 +1,5 @@
 # From a fresh clone, with Python 3.11 or later and a package index: `make demo` and `make test`.
-# PYTHON names the interpreter for a new environment, VENV its folder, DIST the folder for wheels, ARGS goes to pytest.
+# PYTHON names the interpreter for a new environment, VENV its folder, DIST the folder for wheels, ARGS goes to pytest or the benchmarks.
 
 PYTHON ?= python3
 VENV ?= .venv
@@ -13,9 +13,10 @@ PROJECTS := pyproject.toml $(PLUGINS:%=%/pyproject.toml)
 PACKAGES := lidarspec $(wildcard plugins/*/lidarspec_*)
 USERS := $(VENV)/.installed
 DEVELOPERS := $(VENV)/.installed-dev
+PEERS := $(VENV)/.installed-bench
 RECENT := import sys; sys.exit(sys.version_info < (3, 11))
 
-.PHONY: demo test lint types wheels clean
+.PHONY: demo test lint types wheels bench bench-here clean
 
 demo: $(USERS)
 	@$(BIN)/lidarspec demo -s ldrobot-stl27l
@@ -28,13 +29,20 @@ lint: $(DEVELOPERS)
 	@$(BIN)/ruff format --check .
 
 types: $(DEVELOPERS)
-	@$(BIN)/mypy $(PACKAGES)
+	@$(BIN)/mypy $(PACKAGES) benchmarks
 
 wheels: $(DEVELOPERS)
 	@for project in . $(PLUGINS); do $(BIN)/python -m build --wheel --no-isolation --outdir $(DIST) $$project || exit 1; done
 
+# The libraries to compare with bring old versions of others along, so they have an environment of their own.
+bench:
+	@$(MAKE) --no-print-directory VENV=$(VENV)-bench bench-here
+
+bench-here: $(PEERS)
+	@$(BIN)/python benchmarks/run.py $(ARGS)
+
 clean:
-	rm -rf .venv dist .hypothesis .mypy_cache .pytest_cache .ruff_cache
+	rm -rf .venv .venv-bench dist .hypothesis .mypy_cache .pytest_cache .ruff_cache
 	find lidarspec plugins tests -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # An environment without a working pip, as a failed attempt leaves it behind, is made again.
@@ -49,4 +57,9 @@ $(USERS): $(PROJECTS)
 $(DEVELOPERS): $(USERS)
 	@echo "installing the tools for tests, lint and types into $(VENV), this once"
 	@$(PIP) install --quiet --editable '.[dev]'
+	@touch $@
+
+$(PEERS): $(USERS)
+	@echo "installing what lidarspec is measured beside into $(VENV), this once"
+	@$(PIP) install --quiet --editable '.[bench]' || echo "not all of it can be installed here; the table says what is missing" >&2
 	@touch $@

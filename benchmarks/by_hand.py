@@ -81,7 +81,8 @@ def _good(frames: Bytes) -> NDArray[np.bool_]:
     for spot, table in enumerate(_crc_tables()):
         crc ^= table.take(pairs[:, spot], mode="clip")
     start, end, time = pairs[:, 2], pairs[:, 21], pairs[:, 22]
-    return (crc == frames[:, 46]) & (start < 36000) & (end < 36000) & (time <= 30_000)
+    good: NDArray[np.bool_] = (crc == frames[:, 46]) & (start < 36000) & (end < 36000) & (time <= 30_000)
+    return good
 
 
 def stl27l_points(frames: Bytes) -> Floats:

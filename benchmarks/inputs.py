@@ -74,16 +74,16 @@ class Inputs:
     def noisy(self, key: str) -> Noisy:
         """The frames with one byte of every fiftieth damaged, and as many runs of noise of a frame's mean length between them."""
         random = np.random.default_rng(SEED)
-        pieces, intact, offset = [], [], 0
+        pieces: list[bytes | bytearray] = []
+        intact, offset = [], 0
         for frame in self.frames(key):
-            noise = random.bytes(random.integers(1, 2 * len(frame))) if random.random() < NOISE else b""
-            damaged = random.random() < NOISE
-            if damaged:
-                spot = int(random.integers(len(frame)))
-                frame = frame[:spot] + bytes([frame[spot] ^ int(random.integers(1, 256))]) + frame[spot + 1 :]
+            noise = random.bytes(int(random.integers(1, 2 * len(frame)))) if random.random() < NOISE else b""
+            sent = bytearray(frame)
+            if random.random() < NOISE:
+                sent[int(random.integers(len(frame)))] ^= int(random.integers(1, 256))
             else:
                 intact.append(offset + len(noise))
-            pieces += [noise, frame]
+            pieces += [noise, sent]
             offset += len(noise) + len(frame)
         return Noisy(b"".join(pieces), np.array(intact, np.int64))
 

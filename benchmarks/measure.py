@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -30,17 +31,31 @@ class Contender:
 Rates = dict[str, list[float]]
 
 
-def raced(contenders: Mapping[str, Contender], runs: int) -> Rates:
-    """Seconds for each of the amount, by contender, one figure for each run; each has run once before."""
-    for contender in contenders.values():
-        contender.run()
+def raced(contenders: Mapping[str, Contender], runs: int, least: float) -> Rates:
+    """Seconds for each of the amount, by contender, one figure for each run; each has run twice before.
+
+    Args:
+        least: seconds; what takes less is repeated within a run until it takes that long.
+    """
+    repeats = {name: _repeats(contender, least) for name, contender in contenders.items()}
     found: Rates = {name: [] for name in contenders}
     for _ in range(runs):
         for name, contender in contenders.items():
-            start = time.perf_counter()
-            contender.run()
-            found[name].append((time.perf_counter() - start) / contender.amount)
+            found[name].append(_seconds(contender, repeats[name]) / contender.amount)
     return found
+
+
+def _repeats(contender: Contender, least: float) -> int:
+    contender.run()
+    return max(1, math.ceil(least / _seconds(contender, 1)))
+
+
+def _seconds(contender: Contender, repeats: int) -> float:
+    """The mean time of one of several runs in a row."""
+    start = time.perf_counter()
+    for _ in range(repeats):
+        contender.run()
+    return (time.perf_counter() - start) / repeats
 
 
 def times(rates: Rates, fast: str, slow: str) -> float:

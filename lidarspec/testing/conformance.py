@@ -84,6 +84,13 @@ class SensorConformance:
                 assert subject.build(name, parsed) == data
                 assert subject.build(name, **parsed) == data
 
+    def test_values_in_units_build_the_same_bytes(self, subject: Sensor) -> None:
+        for name, frame in subject.frames.items():
+            for seed in self._seeds(frame, self.examples):
+                data = subject.example(name, seed=seed)
+                values = material.physical(subject, name, data)
+                assert values is None or subject.build(name, values, units=True) == data
+
     def test_values_survive_building_and_parsing(self, subject: Sensor, source: random.Random) -> None:
         for name, frame in subject.frames.items():
             for seed in self._seeds(frame, self.examples):

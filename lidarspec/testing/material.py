@@ -111,6 +111,19 @@ def integers(parsed: Any, path: str = "") -> Iterator[tuple[Any, Any, str]]:
             yield parsed, key, below
 
 
+def physical(sensor: Sensor, name: str, data: bytes) -> Any:
+    """A parsed frame with its scaled integers in units; None where one is too wide for a float to hold exactly."""
+    fields = codec(sensor.frames[name]).schema.fields
+    parsed = sensor.parse(data, frame=name)
+    for holder, key, path in list(integers(parsed)):
+        info = fields.get(path)
+        if info is not None and info.scaled and info.kind == "int":
+            if info.bits > 48:
+                return None
+            holder[key] = holder[key] * info.scale + info.offset
+    return parsed
+
+
 def drawn(info: FieldInfo, source: random.Random) -> int:
     """A value of a field, often one at an edge of its range."""
     low, high = limits(info)

@@ -1,0 +1,125 @@
+"""What a user would install instead: the libraries for one format each. One that is not installed is said to be missing."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.metadata
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from measure import Contender
+
+#: the distributions.
+LIBRARIES = ("dpkt", "velodyne-decoder", "ouster-sdk", "lds2d", "rplidar")
+
+
+class Missing(Exception):
+    """A library that is not installed."""
+
+
+def library(module: str) -> Any:
+    """The module of a library.
+
+    Raises:
+        Missing: where it is not installed.
+    """
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        raise Missing(module) from error
+
+
+def versions() -> dict[str, str]:
+    """The version of each library, or "not installed"."""
+    found = {}
+    for name in ("construct", "numpy", *LIBRARIES):
+        try:
+            found[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            found[name] = "not installed"
+    return found
+
+
+def velodyne_packets(frames: Sequence[bytes], points: int) -> Contender:
+    """velodyne-decoder on VLP-16 packets, 76 to a scan, its vectors of packets made beforehand."""
+    vd = library("velodyne_decoder")
+    config = vd.Config()
+    config.model = vd.Model.VLP16
+    packets = [vd.VelodynePacket(index / 754, frame) for index, frame in enumerate(frames)]
+    scans = [vd.PacketVector(packets[start : start + 76]) for start in range(0, len(packets), 76)]
+    decoder = vd.ScanDecoder(config)
+    return Contender(lambda: [decoder.decode(scan) for scan in scans], points)
+
+
+def velodyne_pcap(path: Path, points: int) -> Contender:
+    """velodyne-decoder on a pcap file of VLP-16 packets."""
+    vd = library("velodyne_decoder")
+    config = vd.Config()
+    config.model = vd.Model.VLP16
+    return Contender(lambda: list(vd.read_pcap(str(path), config)), points)
+
+
+def dpkt_payloads(path: Path, packets: int) -> Contender:
+    """dpkt's objects, from Ethernet to the payload of UDP."""
+    dpkt = library("dpkt")
+
+    def run() -> int:
+        with path.open("rb") as file:
+            return sum(len(dpkt.ethernet.Ethernet(data).data.data.data) for _, data in dpkt.pcap.Reader(file))
+
+    return Contender(run, packets)
+
+
+def ouster_payloads(path: Path, packets: int) -> Contender:
+    """The C++ reader under ouster-sdk: the payloads of a capture into one buffer."""
+    pcap = library("ouster.sdk._bindings.pcap")
+    buffer = np.empty(1 << 16, np.uint8)
+
+    def run() -> int:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", FutureWarning)  # its successor gives packets of Ouster sensors only
+            capture, info, total = pcap.replay_initialize(str(path)), pcap.PacketInfo(), 0
+            while pcap.next_packet_info(capture, info):
+                total += pcap.read_packet(capture, buffer)
+            pcap.replay_uninitialize(capture)
+            return total
+
+    return Contender(run, packets)
+
+
+def rplidar_nodes(frames: Sequence[bytes]) -> Contender:
+    """The package rplidar, what it makes of each node."""
+    parse = library("rplidar")._process_scan
+    return Contender(lambda: [parse(frame) for frame in frames], len(frames))
+
+
+def lds2d_stream(model: str, data: bytes, points: int) -> Contender:
+    """lds2d's driver on a byte stream."""
+    driver = library("lds2d").core.driver_for(model)
+    return Contender(lambda: _until_end(driver(_Recorded(data))), points)
+
+
+class _Recorded:
+    """A serial port for lds2d that has sent all its bytes in the end."""
+
+    def __init__(self, data: bytes) -> None:
+        self._data, self._spot = data, 0
+
+    def read(self, size: int) -> bytes:
+        if self._spot >= len(self._data):
+            raise EOFError
+        self._spot += size
+        return self._data[self._spot - size : self._spot]
+
+
+def _until_end(driver: Any) -> int:
+    found = 0
+    try:
+        for _ in driver.points():
+            found += 1
+    except EOFError:
+        return found
+    return found

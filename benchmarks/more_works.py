@@ -1,0 +1,141 @@
+"""The works that read captures, go on live, take single frames or begin from nothing."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Callable, Mapping
+from statistics import median
+from typing import Any
+
+import libraries
+from inputs import Inputs
+from measure import Contender, Rates, times
+from peers import construct_on
+from works import FEW, Facts, Others, Work, beside_construct, columns, points_of
+
+import lidarspec as ls
+from lidarspec.pcap import CaptureReader
+from lidarspec.streams import PacketStream
+
+RATE = 6300  # packets per second of an RS-LiDAR-M1
+TOGETHER = 63  # of them in 10 ms
+
+
+def from_capture(inputs: Inputs, key: str, title: str, more: Others | None = None) -> Work:
+    """A capture file to scans, against the same packets in memory."""
+    sensor, rows, path = inputs.sensor(key), inputs.array(key), inputs.capture(key)
+    points = len(sensor.decode(rows).points())
+
+    def scans(backend: str) -> int:
+        with ls.open(path, sensor, backend=backend) as device:
+            return sum(len(columns(scan.points)[0]) for scan in device.scans())
+
+    def facts(backend: str, rates: Rates) -> Facts:
+        return {"% of the in-memory figure": 100 * times(rates, "ours", "in memory")}
+
+    return Work(
+        title,
+        "points",
+        points,
+        path.stat().st_size,
+        lambda backend: lambda: scans(backend),
+        {**beside_construct(inputs, key), **(more or {})},
+        lambda backend: {"in memory": Contender(points_of(sensor, rows, backend), points)},
+        facts,
+    )
+
+
+def vlp16_pcap(inputs: Inputs) -> Work:
+    path, points = inputs.capture("vlp16"), 384 * len(inputs.frames("vlp16"))
+    return from_capture(inputs, "vlp16", "VLP-16 capture to scans", {"velodyne-decoder": lambda: libraries.velodyne_pcap(path, points)})
+
+
+def payloads(inputs: Inputs) -> Work:
+    path, packets = inputs.capture("m1"), len(inputs.frames("m1"))
+    others: Others = {
+        "dpkt": lambda: libraries.dpkt_payloads(path, packets),
+        "ouster-sdk": lambda: libraries.ouster_payloads(path, packets),
+    }
+
+    def run() -> int:
+        with CaptureReader(path) as reader:
+            return sum(len(datagram.data) for datagram in reader)
+
+    return Work("capture payloads, 1210 bytes", "packets", packets, path.stat().st_size, lambda _: run, others, has_backends=False)
+
+
+def live(inputs: Inputs) -> Work:
+    """Packets that come one by one and are decoded every 10 ms; what it costs to decode each by itself beside it."""
+    sensor, frames = inputs.sensor("m1"), inputs.frames("m1")
+
+    def alone(backend: str) -> dict[str, Contender]:
+        return {"one by one": Contender(as_they_come(sensor, frames[:TOGETHER], 1, backend), TOGETHER)}
+
+    def facts(backend: str, rates: Rates) -> Facts:
+        return {
+            "% of one core at 6300 packets/s": 100 * RATE * median(rates["ours"]),
+            "times decoding one by one": times(rates, "ours", "one by one"),
+        }
+
+    return Work(
+        "live RS-LiDAR-M1, every 10 ms",
+        "packets",
+        len(frames),
+        sum(map(len, frames)),
+        lambda backend: as_they_come(sensor, frames, TOGETHER, backend),
+        own=alone,
+        facts=facts,
+    )
+
+
+def as_they_come(sensor: ls.Sensor, packets: list[bytes], together: int, backend: str) -> Callable[[], None]:
+    """Decoding to points as often as so many packets have come; receiving is not counted."""
+
+    def run() -> None:
+        decoder = sensor.decoder(backend=backend)
+        stream = PacketStream(sensor, sensor.data_frame, decoder.stats, interpreted=decoder.interpreted)
+        waiting: list[bytes] = []
+        for packet in packets:
+            waiting.append(packet)
+            if len(waiting) == together:
+                columns(stream.add([decoder.datagrams(waiting)]).points())
+                waiting = []
+
+    return run
+
+
+def parse(inputs: Inputs, key: str, title: str) -> Work:
+    """One frame after another to a Container, checksum included, against construct on a plain struct."""
+    sensor, frames = inputs.sensor(key), inputs.frames(key)[:FEW]
+    others: Others = {
+        "construct": lambda: construct_on(key, frames, len(frames), compiled=False),
+        "compiled": lambda: construct_on(key, frames, len(frames), compiled=True),
+    }
+    run: Callable[[], Any] = lambda: [sensor.parse(frame) for frame in frames]  # noqa: E731
+    return Work(title, "frames", len(frames), sum(map(len, frames)), lambda _: run, others, has_backends=False)
+
+
+def importing(inputs: Inputs) -> Work:
+    """A new process that imports lidarspec and finds a sensor, against one that imports what this needs at least."""
+
+    def python(code: str) -> Callable[[], Any]:
+        return lambda: subprocess.run([sys.executable, "-c", code], check=True)
+
+    def facts(backend: str, rates: Rates) -> Facts:
+        return {"times the libraries' imports": times(rates, "libraries", "ours")}
+
+    others: Others = {"libraries": lambda: Contender(python("import numpy, construct, pluggy"), 1)}
+    ours = python("import lidarspec as ls; ls.sensor('ldrobot-stl27l')")
+    return Work("import and ls.sensor(...)", "imports", 1, 0, lambda _: ours, others, facts=facts, has_backends=False)
+
+
+ELSEWHERE: Mapping[str, Callable[[Inputs], Work]] = {
+    "m1-pcap": lambda inputs: from_capture(inputs, "m1", "RS-LiDAR-M1 capture to scans"),
+    "vlp16-pcap": vlp16_pcap,
+    "pcap": payloads,
+    "live": live,
+    "parse-stl27l": lambda inputs: parse(inputs, "stl27l", "parse one STL-27L frame"),
+    "parse-m1": lambda inputs: parse(inputs, "m1", "parse one RS-LiDAR-M1 packet"),
+    "import": importing,
+}

@@ -1,0 +1,59 @@
+"""The table."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+#: ratios that have a column of their own; the others stand in the last one.
+COLUMNS = {"construct": "construct", "compiled": "compiled construct", "plain": "plain points", "by hand": "by hand"}
+#: contenders that only a fact is made of.
+INNER = ("libraries",)
+#: characters; what is piped to a file is not folded to a terminal.
+WIDE = 180
+
+
+def shown(rows: Sequence[Mapping[str, Any]], versions: Mapping[str, str], *, quick: bool) -> None:
+    """Print the rows."""
+    console = Console()
+    if not console.is_terminal:
+        console = Console(width=WIDE)
+    table = Table(title="quick: these figures mean nothing" if quick else None, caption=_caption(versions))
+    table.add_column("work")
+    for title in ("back end", "million/s", "MB/s", "of memcpy", *(f"x {title}" for title in COLUMNS.values())):
+        table.add_column(title, justify="right")
+    table.add_column("x others; more")
+    for row in rows:
+        table.add_row(*_cells(row))
+    console.print(table)
+
+
+def _caption(versions: Mapping[str, str]) -> str:
+    return "x: times as fast as. " + ", ".join(f"{name} {version}" for name, version in versions.items())
+
+
+def _cells(row: Mapping[str, Any]) -> list[str]:
+    ratios = row["times"]
+    return [
+        row["title"],
+        row["backend"],
+        f"{_figure(row['million_per_s'])} {row['unit']}",
+        _figure(row["mb_per_s"]) if row["bytes"] else "",
+        f"{100 * row['share_of_memcpy']:.2f} %" if row["bytes"] else "",
+        *(_figure(ratios[name]) if name in ratios else "" for name in COLUMNS),
+        "; ".join(_more(row)),
+    ]
+
+
+def _more(row: Mapping[str, Any]) -> list[str]:
+    others = [f"{name} {_figure(ratio)}" for name, ratio in row["times"].items() if name not in COLUMNS and name not in INNER]
+    missing = [f"{name} not installed" for name in row["not_installed"]]
+    return [*others, *missing, *(f"{_figure(value)} {name}" for name, value in row["facts"].items())]
+
+
+def _figure(value: float) -> str:
+    """Three digits, or a whole number."""
+    return f"{value:.0f}" if value >= 100 or value == int(value) else f"{value:.3g}"

@@ -1,0 +1,119 @@
+"""Every work beside memcpy and beside what a user would pick instead: one table, one run. See docs/how-to/benchmarks.md."""
+
+from __future__ import annotations
+
+import argparse
+import importlib.util
+import json
+import os
+import platform
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+from inputs import Inputs
+from libraries import versions
+from measure import Contender, Rates, memcpy, raced, times
+from more_works import ELSEWHERE
+from report import shown
+from works import ON_BYTES, Work
+
+import lidarspec as ls
+from lidarspec.decoder import BACKENDS
+
+WORKS = {**ON_BYTES, **ELSEWHERE}
+LEAST_RUNS = 5
+RUNS = 7
+LEAST_SECONDS = 0.05  # of a run
+
+
+def working() -> list[str]:
+    """The back ends that can be used here; "auto" stands for one of them, and "construct" is the reference, not a fast one."""
+    sensor = ls.sensor("ldrobot-stl27l")
+    found = []
+    for name in BACKENDS:
+        if name in ("auto", "construct") or (name == "jit" and importlib.util.find_spec("numba") is None):
+            continue
+        try:
+            sensor.decode(sensor.example("data"), backend=name).points()
+        except (ls.LidarSpecError, ImportError):
+            continue
+        found.append(name)
+    return found
+
+
+def rows(name: str, work: Work, backends: list[str], copy: Contender, *, runs: int, least: float) -> Iterator[dict[str, Any]]:
+    """The lines of a work, one for each back end, all measured in turn."""
+    chosen = backends if work.has_backends else [""]
+    others, missing = work.present()
+    ours = {backend: {"ours": Contender(work.ours(backend), work.amount), **work.own(backend)} for backend in chosen}
+    by_backend = {f"{own} {backend}": contender for backend, owns in ours.items() for own, contender in owns.items()}
+    rates = raced({"memcpy": copy, **by_backend, **others}, runs, least)
+    for backend in chosen:
+        mine: Rates = {**rates, **{own: rates[f"{own} {backend}"] for own in ours[backend]}}
+        seconds = median(mine["ours"]) * work.amount
+        yield {
+            "work": name,
+            "title": work.title,
+            "backend": backend,
+            "unit": work.unit,
+            "amount": work.amount,
+            "bytes": work.size,
+            "runs": runs,
+            "seconds": seconds,
+            "million_per_s": work.amount / seconds / 1e6,
+            "mb_per_s": work.size / seconds / 1e6,
+            "share_of_memcpy": times(mine, "ours", "memcpy") * work.size / work.amount,
+            "times": {other: times(mine, "ours", other) for other in others},
+            "not_installed": missing,
+            "facts": work.facts(backend or "numpy", mine),
+        }
+
+
+def record(found: list[dict[str, Any]], *, quick: bool) -> dict[str, Any]:
+    """What `--json` writes."""
+    machine = {"python": platform.python_version(), "machine": platform.machine(), "system": platform.system(), "cores": os.cpu_count()}
+    return {"lidarspec": ls.__version__, "quick": quick, **machine, "libraries": versions(), "rows": found}
+
+
+def arguments() -> argparse.Namespace:
+    """The command line."""
+    parser = argparse.ArgumentParser(prog="make bench", description=__doc__)
+    parser.add_argument("--only", metavar="NAME", action="append", help=f"works whose names begin so: {', '.join(WORKS)}")
+    parser.add_argument("--json", metavar="FILE", type=Path, help="write the figures to a file as well")
+    parser.add_argument(
+        "--runs", metavar="N", type=int, default=RUNS, help=f"runs of each contender, {LEAST_RUNS} or more; default: {RUNS}"
+    )
+    parser.add_argument("--backend", metavar="NAME", action="append", choices=BACKENDS, help="back ends; default: all that work here")
+    parser.add_argument("--quick", action="store_true", help="tiny inputs: shows that everything runs, the figures mean nothing")
+    given = parser.parse_args()
+    if given.runs < LEAST_RUNS:
+        parser.error(f"--runs is {LEAST_RUNS} or more")
+    given.works = [name for name in WORKS if not given.only or name.startswith(tuple(given.only))]
+    if not given.works:
+        parser.error(f"no work begins so; there are {', '.join(WORKS)}")
+    return given
+
+
+def main() -> int:
+    """1 where a frame was lost that nothing had happened to, else 0."""
+    given = arguments()
+    backends = given.backend or working()
+    found: list[dict[str, Any]] = []
+    copy = memcpy(quick=given.quick)
+    with tempfile.TemporaryDirectory() as folder:
+        for name in given.works:
+            print(f"{name} ...", file=sys.stderr)
+            inputs = Inputs(Path(folder), quick=given.quick)
+            found += rows(name, WORKS[name](inputs), backends, copy, runs=given.runs, least=0 if given.quick else LEAST_SECONDS)
+    shown(found, versions(), quick=given.quick)
+    if given.json:
+        given.json.write_text(json.dumps(record(found, quick=given.quick), indent=2) + "\n", encoding="utf-8")
+    return int(any(row["facts"].get("intact frames lost") for row in found))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

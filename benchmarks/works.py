@@ -1,0 +1,190 @@
+"""The works on packets and streams: each beside what makes the same of the same bytes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import by_hand
+import libraries
+import numpy as np
+from inputs import Inputs
+from libraries import Missing
+from measure import Contender, Rates, times
+from peers import construct_on
+
+import lidarspec as ls
+from lidarspec.packets import Packets
+from lidarspec.points import evaluate
+
+Others = dict[str, Callable[[], Contender]]
+Facts = dict[str, float]
+
+#: frames that construct parses in one run.
+FEW = 150
+
+
+def no_facts(backend: str, rates: Rates) -> Facts:
+    """Nothing to say besides the times."""
+    return {}
+
+
+@dataclass(frozen=True)
+class Work:
+    """One line of the table for each back end.
+
+    Attributes:
+        title: what it is.
+        unit: what is counted.
+        amount, size: of one run, in that unit and in bytes; a size of 0 has no share of memcpy.
+        ours: what lidarspec does, by back end.
+        others: what it is compared with.
+        own: what each back end is compared with of its own, for `facts`.
+        facts: more numbers for the last column, by back end and rates.
+        has_backends: False where the back end changes nothing.
+    """
+
+    title: str
+    unit: str
+    amount: int
+    size: int
+    ours: Callable[[str], Callable[[], Any]]
+    others: Others = field(default_factory=dict)
+    own: Callable[[str], dict[str, Contender]] = lambda backend: {}
+    facts: Callable[[str, Rates], Facts] = no_facts
+    has_backends: bool = True
+
+    def present(self) -> tuple[dict[str, Contender], list[str]]:
+        """The others that are installed, and the names of those that are not."""
+        found: dict[str, Contender] = {}
+        missing = []
+        for name, made in self.others.items():
+            try:
+                found[name] = made()
+            except Missing:
+                missing.append(name)
+        return found, missing
+
+
+def columns(cloud: ls.PointCloud) -> tuple[Any, ...]:
+    """The columns that every work wants; an engine that makes them when they are read makes them here."""
+    return cloud.x, cloud.y, cloud.z, cloud.intensity
+
+
+def points_of(sensor: ls.Sensor, data: Any, backend: str) -> Callable[[], Any]:
+    """Decoding to x y z intensity."""
+    return lambda: columns(sensor.decode(data, backend=backend).points())
+
+
+def plainly(sensor: ls.Sensor, data: Any) -> Callable[[], Any]:
+    """The same with the plain evaluation of `points`."""
+    return lambda: columns(evaluate(sensor.decode(data, backend="numpy")).cloud)
+
+
+def evaluating(packets: Packets) -> Callable[[], Any]:
+    """Only the step from packets that are found already to points."""
+    return lambda: columns(packets.points())
+
+
+def beside_construct(inputs: Inputs, key: str) -> Others:
+    """construct, plain and compiled, on some of the clean frames that have the full length."""
+    rows = inputs.array(key)
+    frames = [row.tobytes() for row in rows[:FEW]]
+    points = len(inputs.sensor(key).decode(inputs.array(key)[:FEW]).points()) if key != "rplidar" else len(frames)
+    return {
+        "construct": lambda: construct_on(key, frames, points, compiled=False),
+        "compiled": lambda: construct_on(key, frames, points, compiled=True),
+    }
+
+
+def in_memory(inputs: Inputs, key: str, title: str, more: Others | None = None) -> Work:
+    """Packets of one length in an array."""
+    sensor, rows = inputs.sensor(key), inputs.array(key)
+    points = len(sensor.decode(rows).points())
+    others: Others = {
+        **beside_construct(inputs, key),
+        "plain": lambda: Contender(plainly(sensor, rows), points),
+    }
+    return Work(
+        title,
+        "points",
+        points,
+        rows.size,
+        lambda backend: points_of(sensor, rows, backend),
+        {**others, **(more or {})},
+        lambda backend: {"points alone": Contender(evaluating(sensor.decode(rows, backend=backend)), points)},
+        lambda backend, rates: {"% of the time for points()": 100 * times(rates, "ours", "points alone")},
+    )
+
+
+def in_stream(inputs: Inputs, key: str, title: str, data: bytes, more: Others | None = None, facts: Any = no_facts) -> Work:
+    """A byte stream to points: framing and checksums included."""
+    sensor = inputs.sensor(key)
+    points = len(sensor.decode(data).points())
+    others: Others = {**beside_construct(inputs, key), "plain": lambda: Contender(plainly(sensor, data), points)}
+    ours: Callable[[str], Any] = lambda backend: points_of(sensor, data, backend)  # noqa: E731
+    return Work(title, "points", points, len(data), ours, {**others, **(more or {})}, facts=facts)
+
+
+def m1(inputs: Inputs) -> Work:
+    rows = inputs.array("m1")
+    by_us: Others = {"by hand": lambda: Contender(lambda: by_hand.m1_points(rows), len(rows) * 125)}
+    return in_memory(inputs, "m1", "RS-LiDAR-M1 packets", by_us)
+
+
+def stl27l(inputs: Inputs) -> Work:
+    rows = inputs.array("stl27l")
+    by_us: Others = {"by hand": lambda: Contender(lambda: by_hand.stl27l_points(rows), len(rows) * 12)}
+    return in_memory(inputs, "stl27l", "STL-27L frames", by_us)
+
+
+def vlp16(inputs: Inputs) -> Work:
+    frames = inputs.frames("vlp16")
+    points = len(frames) * 384
+    return in_memory(
+        inputs, "vlp16", "VLP-16 packets, look-ahead", {"velodyne-decoder": lambda: libraries.velodyne_packets(frames, points)}
+    )
+
+
+def stl27l_stream(inputs: Inputs) -> Work:
+    """The stream in which frames are damaged and noise stands between them; intact frames that are not found are counted."""
+    noisy, sensor = inputs.noisy("stl27l"), inputs.sensor("stl27l")
+    points = len(sensor.decode(noisy.data).points())
+    frames = inputs.frames("stl27l")[:FEW]
+    more: Others = {
+        "by hand": lambda: Contender(lambda: by_hand.stl27l_stream(noisy.data), points),
+        "lds2d": lambda: libraries.lds2d_stream("LD14P", b"".join(frames), 12 * len(frames)),
+    }
+
+    def facts(backend: str, rates: Rates) -> Facts:
+        found = np.isin(noisy.intact, sensor.decode(noisy.data, backend=backend).offset)
+        return {"intact frames": len(noisy.intact), "intact frames lost": int((~found).sum())}
+
+    return in_stream(inputs, "stl27l", "STL-27L stream, 2 % noise", noisy.data, more, facts)
+
+
+def m1c1_stream(inputs: Inputs) -> Work:
+    frames = inputs.frames("m1c1")[:FEW]
+    points = sum(frame[3] for frame in frames)
+    more: Others = {"lds2d": lambda: libraries.lds2d_stream("COIN-D4", b"".join(frames), points)}
+    return in_stream(inputs, "m1c1", "M1C1_Mini stream", inputs.stream("m1c1"), more)
+
+
+def rplidar(inputs: Inputs) -> Work:
+    some = inputs.frames("rplidar")[: 10 * FEW]
+    return in_stream(
+        inputs, "rplidar", "RPLIDAR nodes (stream)", inputs.stream("rplidar"), {"rplidar": lambda: libraries.rplidar_nodes(some)}
+    )
+
+
+ON_BYTES: Mapping[str, Callable[[Inputs], Work]] = {
+    "m1": m1,
+    "stl27l": stl27l,
+    "m1c1": lambda inputs: in_memory(inputs, "m1c1", "M1C1_Mini packets of 25 samples, corrected"),
+    "vlp16": vlp16,
+    "xt32": lambda inputs: in_memory(inputs, "xt32", "Pandar XT32 packets"),
+    "rplidar": rplidar,
+    "stl27l-stream": stl27l_stream,
+    "m1c1-stream": m1c1_stream,
+}
