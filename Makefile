@@ -22,7 +22,7 @@ demo: $(USERS)
 	@$(BIN)/lidarspec demo -s ldrobot-stl27l
 
 test: $(DEVELOPERS)
-	@$(BIN)/python -m pytest $(ARGS)
+	@$(BIN)/python -m pytest -n auto $(ARGS)
 
 lint: $(DEVELOPERS)
 	@$(BIN)/ruff check .

@@ -186,11 +186,11 @@ class Decoder:
         self.stats.pending = len(self._pending)
         return found
 
-    def datagrams(self, data: Sequence[Any], at: Sequence[int | None] | None = None) -> Spans:
-        """Datagrams, each one frame, whole, or none."""
+    def datagrams(self, data: Sequence[Any] | NDArray[np.uint8], at: Sequence[int | None] | None = None) -> Spans:
+        """Datagrams, each one frame, whole, or none; a list, or the rows of an array."""
         sizes = np.array([len(one) for one in data], np.intp)
         starts = np.cumsum(sizes) - sizes
-        buffer = np.frombuffer(b"".join(data), np.uint8)
+        buffer = data.reshape(-1) if isinstance(data, np.ndarray) else np.frombuffer(b"".join(data), np.uint8)
         self.stats.bytes_in += len(buffer)
         if self._framing.named:
             kinds = np.array([self._judge(buffer[a : a + n]) for a, n in zip(starts.tolist(), sizes.tolist(), strict=True)], np.intp)
@@ -304,9 +304,7 @@ def spans_of(decoder: Decoder, data: Any) -> list[Spans]:
     """Every frame of a whole input: bytes as a stream, an iterable or (n, size) array as datagrams."""
     if is_stream(data):
         return decoder.spans(data) + decoder.rest()
-    if isinstance(data, np.ndarray):
-        data = [memoryview(row) for row in np.ascontiguousarray(data, np.uint8)]
-    everything = list(data)
+    everything = np.ascontiguousarray(data, np.uint8) if isinstance(data, np.ndarray) else list(data)
     return [decoder.datagrams(everything[start : start + TOGETHER]) for start in range(0, len(everything), TOGETHER)]
 
 

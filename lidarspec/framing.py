@@ -207,6 +207,7 @@ class _Walker:
             live = np.flatnonzero((candidates.status == VALID) | (candidates.status == SHORT))
             self.tables.append(dict(zip(candidates.offsets[live].tolist(), live.tolist(), strict=True)))
         self.spots = sorted(set().union(*self.tables))
+        self.refused = {spot for candidates in found for spot in candidates.offsets[candidates.status != VALID].tolist()}
 
     def run(self) -> None:
         """Accept what is valid from left to right, until the end or a candidate that needs more bytes."""
@@ -245,6 +246,7 @@ class _Walker:
             if confirmed:
                 return index
             candidates.status[entry] = IMPLAUSIBLE
+            self.refused.add(spot)
         return -1
 
     def _accept(self, index: int, spot: int) -> None:
@@ -292,6 +294,8 @@ class _Walker:
 
     def _count(self, start: int, stop: int, *, before: int = 0) -> None:
         """Count what was rejected from `start` up to `stop`, and at `stop` by the types that come before `before`."""
+        if start == stop and stop not in self.refused:
+            return  # one frame right after another
         for index, candidates in enumerate(self.found):
             if not len(candidates.offsets) or not self.framing.active(index, self.mode):
                 continue

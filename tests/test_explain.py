@@ -200,6 +200,14 @@ def test_constants_without_a_name_and_documented_elements_keep_their_places() ->
     assert [(row.offset, row.path) for row in found.rows] == [(0, "(constant)"), (1, "far"), (3, "pairs[0]"), (4, "pairs[1]"), (5, "check")]
 
 
+def test_a_checksum_within_a_frame_is_judged_over_its_own_bytes() -> None:
+    inner = Checksummed(Struct("far" / Scaled(Int16ul, 0.01, "m"), "sum" / Int8ul), field="sum", algorithm=ls.Sum(8))
+    sensor = variant("sync" / Const(b"\x01\x02"), "far" / Int8ul, "inner" / inner, "check" / Int8ul)
+    rows = {row.path: row for row in explain(sensor, sensor.build("data", far=1, inner={"far": 0x1234})).rows}
+    assert rows["inner.sum"].remarks == ("0x46 ok (8-bit sum over 2 bytes)",)
+    assert rows["check"].remarks[0].endswith("ok (XOR-8 over 6 bytes)")
+
+
 def test_look_ahead_and_implausible_frames_are_told() -> None:
     ahead = explain(SHAPES["shape-ahead"], SHAPES["shape-ahead"].example("data"))
     assert any("direction not known from this frame alone" in row.meaning for row in ahead.rows)
@@ -231,6 +239,7 @@ def fault(data: bytes) -> WireError:
         ),
         ("542d100e", ["  0000  54 2d 10 0e", "        ^^^^^ header"]),
         ("54", ["  0000  54", "        ^^ header"]),
+        (EXAMPLE[:8].hex(), ["  0000  54 2c 68 08 ab 7e e0 00", " " * 33 + "^^ points[0].intensity"]),
         (EXAMPLE[:16].hex(), ["  0000  54 2c 68 08 ab 7e e0 00  e4 dc 00 e2 d9 00 e5 d5", " " * 54 + "^^ points[3].distance"]),
         (
             (EXAMPLE[:-1] + b"\0").hex(),
