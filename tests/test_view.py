@@ -103,6 +103,13 @@ def most(values: Iterable[int]) -> int:
     return Counter(values).most_common(1)[0][0]
 
 
+@pytest.mark.parametrize(("bit", "place"), list(DOTS.items()))
+def test_each_dot_has_its_bit(bit: int, place: tuple[int, int]) -> None:
+    canvas = Canvas(1, 1)
+    canvas.plot(np.array([place[1] + 0.5]), np.array([place[0] + 0.5]), np.array([0.0]))
+    assert canvas.text().plain == chr(BLANK + bit)
+
+
 def test_the_canvas_sets_single_dots() -> None:
     canvas = Canvas(2, 1)
     canvas.plot(np.array([3.2]), np.array([2.9]), np.array([0.5]))

@@ -6,10 +6,10 @@ import shutil
 
 import click
 import numpy as np
-from rich.console import Console
+from rich.text import Text
 
 from lidarspec.cli.look import NO_SENSORS
-from lidarspec.cli.output import emit_json, sensor_option
+from lidarspec.cli.output import drawn, emit_json, sensor_option
 from lidarspec.demo import DemoResult, run
 from lidarspec.errors import UsageError
 from lidarspec.plugins import registry
@@ -38,14 +38,11 @@ def demo(sensor_id: str | None, count: int, errors: float, as_json: bool) -> Non
     if as_json:
         emit_json(_facts(result, whole), None)
         return
-    console = Console()
-    if whole:
-        console.print(_picture(whole[-1]), soft_wrap=True, highlight=False)
-    for text in _summary(result, whole, errors):
-        console.print(text, soft_wrap=True, highlight=False, markup=False)
+    parts = [*([drawn(_picture(whole[-1]))] if whole else []), *_summary(result, whole, errors)]
+    click.echo("\n".join(parts))
 
 
-def _picture(scan: Scan) -> object:
+def _picture(scan: Scan) -> Text:
     columns, lines = shutil.get_terminal_size((80, HIGHEST))
     width, height = min(columns, WIDEST), max(min(lines - SUMMARY, HIGHEST), 12)
     flat = not len(scan) or float(np.nanmax(np.abs(scan.points.elevation))) < FLAT
@@ -63,7 +60,7 @@ def _summary(result: DemoResult, whole: list[Scan], errors: float) -> list[str]:
     if whole:
         facts = _facts(result, whole)
         rate = f" at {facts['rate_hz']:.1f} Hz" if facts["rate_hz"] else ""
-        told.append(f"{len(whole)} whole scans{rate}, {facts['points']} points; the last one: {whole[-1]}")
+        told.append(f"{len(whole)} whole scan{'s' * (len(whole) != 1)}{rate}, {facts['points']} points; the last one: {whole[-1]}")
     return [*told, f"next: lidarspec show {name}"]
 
 

@@ -55,20 +55,25 @@ def note(text: str) -> None:
 
 def table(headers: Sequence[str], rows: Sequence[Sequence[str]], output: str | None = None) -> str:
     """Rows as aligned columns; folded to a terminal's width where there is one, each row in one line otherwise."""
-    console = Console()
-    if console.is_terminal and output is None:
-        return _folded(headers, rows, console)
+    if output is None and Console().is_terminal:
+        return drawn(_folded(headers, rows))
     lines = [headers, *rows]
     widths = [max(len(line[column]) for line in lines) for column in range(len(headers))]
     return "\n".join("  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip() for line in lines)
 
 
-def _folded(headers: Sequence[str], rows: Sequence[Sequence[str]], console: Console) -> str:
-    drawn = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style="bold")
-    for header in headers:
-        drawn.add_column(header, overflow="fold")
-    for row in rows:
-        drawn.add_row(*(Text(cell) for cell in row))
+def drawn(what: Table | Text) -> str:
+    """What rich draws, as text to echo; rich itself would end the process on a closed pipe."""
+    console = Console()
     with console.capture() as captured:
-        console.print(drawn)
+        console.print(what, soft_wrap=isinstance(what, Text), highlight=False)
     return captured.get().rstrip("\n")
+
+
+def _folded(headers: Sequence[str], rows: Sequence[Sequence[str]]) -> Table:
+    folded = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style="bold")
+    for header in headers:
+        folded.add_column(header, overflow="fold")
+    for row in rows:
+        folded.add_row(*(Text(cell) for cell in row))
+    return folded

@@ -83,7 +83,7 @@ def test_demo_draws_and_sums_up() -> None:
     text = ran("demo", "-s", "ldrobot-stl27l", "-n", 1).stdout
     assert sum("⠀" < character <= "⣿" for character in text) > 80
     assert "ldrobot-stl27l, simulated:" in text
-    assert "whole scans at 10.0 Hz" in text
+    assert "1 whole scan at 10.0 Hz" in text
     assert text.splitlines()[-1] == "next: lidarspec show ldrobot-stl27l"
 
 
