@@ -69,6 +69,8 @@ class Work:
 
 def columns(cloud: ls.PointCloud) -> tuple[Any, ...]:
     """The columns that every work wants; an engine that makes them when they are read makes them here."""
+    if cloud.shape is None:
+        return cloud.x, cloud.y, cloud.intensity  # of these sensors, the planar ones are not organised
     return cloud.x, cloud.y, cloud.z, cloud.intensity
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +26,9 @@ STRUCTURED = np.dtype(
 
 #: largest float32 below pi: azimuths stay in [-pi, pi) in either precision.
 _PI = np.nextafter(np.float32(np.pi), np.float32(0))
+
+#: radians from which on taking off whole turns loses precision.
+_FAR = 1e6
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -90,6 +93,10 @@ class PointCloud:
             shape = (number // rows, rows) if first % rows == 0 and number % rows == 0 else None
         return PointCloud(**{**picked, "shape": shape})
 
+    def time_at(self, index: int) -> float:
+        """The time of one point, without making the column where it is not made yet."""
+        return float(self.time[index])
+
     def to_structured(self) -> NDArray[Any]:
         """A structured array (N,) with PCL's layout: x y z intensity ring time, itemsize 32; what is missing is 0."""
         found = np.zeros(len(self), STRUCTURED)
@@ -104,31 +111,145 @@ def _pick(value: Any, which: Any) -> Any:
     return value[which] if isinstance(value, np.ndarray) and value.ndim else value
 
 
+class Columns(Protocol):
+    """Where a `LazyCloud` takes its columns from."""
+
+    @property
+    def size(self) -> int:
+        """The number of points."""
+
+    def column(self, name: str) -> NDArray[Any] | None:
+        """A column of `PointCloud`; None where the sensor has none."""
+
+    def time_at(self, index: int) -> float:
+        """One value of the column "time"; the others need not be made for it."""
+
+
+class _Unread:
+    """A column that is made when it is first read."""
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+
+    def __get__(self, cloud: Any, owner: Any) -> Any:
+        if cloud is None:
+            return self
+        cloud.__dict__[self._name] = found = cloud.source.column(self._name)
+        return found
+
+
+class LazyCloud(PointCloud):
+    """A cloud whose columns are made when they are first read."""
+
+    source: Columns
+
+    @classmethod
+    def of(cls, source: Columns, *, stamp_ns: int, shape: tuple[int, int] | None, nominal: np.bool_) -> LazyCloud:
+        """The cloud of these columns."""
+        found = object.__new__(cls)
+        found.__dict__.update(source=source, stamp_ns=stamp_ns, shape=shape, nominal=nominal)
+        return found
+
+    def __len__(self) -> int:
+        return self.source.size
+
+    def __getitem__(self, which: Any) -> PointCloud:
+        if isinstance(which, slice) and which.step in (None, 1):
+            first, end, _ = which.indices(len(self))
+            number, rows = max(end - first, 0), self.shape[1] if self.shape else 0
+            shape = (number // rows, rows) if rows and first % rows == 0 and number % rows == 0 else None
+            return LazyCloud.of(
+                _Sliced(self, slice(first, first + number), number), stamp_ns=self.stamp_ns, shape=shape, nominal=self.nominal
+            )
+        return super().__getitem__(which)
+
+    def time_at(self, index: int) -> float:
+        return float(self.time[index]) if "time" in self.__dict__ else self.source.time_at(index)
+
+    def __reduce__(self) -> Any:
+        return _cloud, ({f.name: getattr(self, f.name) for f in fields(self)},)
+
+
+for _name in (*COLUMNS, "valid"):
+    setattr(LazyCloud, _name, _Unread(_name))
+
+
+def _cloud(values: dict[str, Any]) -> PointCloud:
+    return PointCloud(**values)
+
+
+@dataclass(frozen=True, eq=False)
+class _Sliced:
+    """Some points of another cloud, one after another."""
+
+    cloud: PointCloud
+    which: slice
+    size: int
+
+    def column(self, name: str) -> NDArray[Any] | None:
+        found = getattr(self.cloud, name)
+        return None if found is None else found[self.which]
+
+    def time_at(self, index: int) -> float:
+        return self.cloud.time_at(self.which.start + index)
+
+
+@dataclass(frozen=True, eq=False)
+class _Joined:
+    """Several clouds one after another, with times from one stamp."""
+
+    clouds: Sequence[PointCloud]
+    stamp_ns: int
+    size: int
+
+    def column(self, name: str) -> NDArray[Any] | None:
+        if name == "time":
+            return np.concatenate([cloud.time + (cloud.stamp_ns - self.stamp_ns) * 1e-9 for cloud in self.clouds])
+        parts = [getattr(cloud, name) for cloud in self.clouds]
+        return None if any(part is None for part in parts) else np.concatenate(parts)
+
+    def time_at(self, index: int) -> float:
+        for cloud in self.clouds:
+            if index < len(cloud):
+                return cloud.time_at(index) + (cloud.stamp_ns - self.stamp_ns) * 1e-9
+            index -= len(cloud)
+        raise IndexError(index)
+
+
+@dataclass(frozen=True, eq=False)
+class _Restamped:
+    """Another cloud with times counted from its first point."""
+
+    cloud: PointCloud
+    size: int
+
+    def column(self, name: str) -> NDArray[Any] | None:
+        found: NDArray[Any] | None = getattr(self.cloud, name)
+        return found - found[0] if name == "time" and found is not None else found
+
+    def time_at(self, index: int) -> float:
+        return self.cloud.time_at(index) - self.cloud.time_at(0)
+
+
 def joined(clouds: Sequence[PointCloud]) -> PointCloud:
     """Clouds of one sensor, one after another; times count from the first one's stamp."""
     clouds = [cloud for cloud in clouds if len(cloud)] or list(clouds[:1])
     if len(clouds) == 1:
         return clouds[0]
-    stamp = clouds[0].stamp_ns
-    columns: dict[str, Any] = {}
-    for name in (*COLUMNS, "valid"):
-        parts = [getattr(cloud, name) for cloud in clouds]
-        columns[name] = None if any(part is None for part in parts) else np.concatenate(parts)
-    columns["time"] = np.concatenate([cloud.time + (cloud.stamp_ns - stamp) * 1e-9 for cloud in clouds])
     rows = {cloud.shape[1] for cloud in clouds if cloud.shape}
     shape = (
         (sum(cloud.shape[0] for cloud in clouds if cloud.shape), rows.pop()) if len(rows) == 1 and all(c.shape for c in clouds) else None
     )
-    return PointCloud(**columns, stamp_ns=stamp, shape=shape, nominal=np.bool_(any(cloud.nominal for cloud in clouds)))
+    source = _Joined(clouds, clouds[0].stamp_ns, sum(map(len, clouds)))
+    return LazyCloud.of(source, stamp_ns=source.stamp_ns, shape=shape, nominal=np.bool_(any(cloud.nominal for cloud in clouds)))
 
 
 def restamped(cloud: PointCloud) -> PointCloud:
     """The same points with times counted from the first one."""
     if not len(cloud):
         return cloud
-    shift = int(np.rint(cloud.time[0] * 1e9))
-    values = {f.name: getattr(cloud, f.name) for f in fields(cloud)}
-    return PointCloud(**{**values, "time": cloud.time - cloud.time[0], "stamp_ns": cloud.stamp_ns + shift})
+    shift = round(cloud.time_at(0) * 1e9)
+    return LazyCloud.of(_Restamped(cloud, len(cloud)), stamp_ns=cloud.stamp_ns + shift, shape=cloud.shape, nominal=cloud.nominal)
 
 
 #: directions in REP-103: (axis index, sign).
@@ -146,5 +267,8 @@ def axis_matrix(axes: Sequence[str]) -> NDArray[np.float64]:
 
 def narrowed(angle: NDArray[np.float64]) -> Floats:
     """Radians as float32 in [-pi, pi)."""
-    turned = np.mod(angle + np.pi, 2 * np.pi) - np.pi
+    turned = angle - 2 * np.pi * np.floor((angle + np.pi) / (2 * np.pi))
+    far = np.abs(angle) > _FAR
+    if far.any():
+        turned[far] = np.mod(angle[far] + np.pi, 2 * np.pi) - np.pi  # exact however many turns it is, and slow
     return np.clip(turned.astype(np.float32), -_PI, _PI)

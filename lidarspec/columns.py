@@ -21,7 +21,7 @@ from lidarspec.errors import SpecError
 from lidarspec.tables import Table
 
 #: NumPy functions that work element by element, and so keep axes; others see plain arrays.
-_ELEMENTWISE = {np.where, np.clip, np.nan_to_num, np.round, np.isclose, np.real_if_close}
+ELEMENTWISE = {np.where, np.clip, np.nan_to_num, np.round, np.isclose, np.real_if_close}
 
 Carry = dict[int, NDArray[np.float64]]
 
@@ -89,7 +89,7 @@ class Column(NDArrayOperatorsMixin):
         return self.applied(lambda *arrays: ufunc(*arrays, **kwargs), *inputs)
 
     def __array_function__(self, function: Callable[..., Any], types: Any, args: Any, kwargs: Any) -> Any:
-        if function in _ELEMENTWISE:
+        if function in ELEMENTWISE:
             return self.applied(lambda *arrays: function(*arrays, **kwargs), *args)
         plain = [np.asarray(value) if isinstance(value, Column) else value for value in args]
         return function(*plain, **kwargs)

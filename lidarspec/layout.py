@@ -168,6 +168,7 @@ class Layout:
         seals: its checksums, inner ones first.
         places: byte range of each named part outside arrays.
         branches: what If and Switch chose, by path.
+        notes: what is worked out from the layout and kept with it.
     """
 
     size: int
@@ -176,6 +177,7 @@ class Layout:
     seals: tuple[Seal, ...]
     places: Mapping[str, tuple[int, int]]
     branches: Mapping[str, Any] = field(default_factory=dict)
+    notes: dict[Any, Any] = field(default_factory=dict, repr=False)
 
     def __post_init__(self) -> None:
         spots = sorted(self.constants)

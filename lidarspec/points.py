@@ -5,7 +5,6 @@ The plain evaluation: ordinary NumPy on `Column`s. Masks, coordinates and REP-11
 
 from __future__ import annotations
 
-import traceback
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 from typing import Any
@@ -18,7 +17,7 @@ from lidarspec.clouds import PointCloud, axis_matrix, narrowed
 from lidarspec.columns import Batch, Carry, Column, aligned, unpadded
 from lidarspec.errors import SpecError
 from lidarspec.geometry import Cartesian, Points, Polar
-from lidarspec.packets import Packets, install_points
+from lidarspec.packets import Packets
 from lidarspec.spec import Sensor
 
 _OPTIONAL = ("intensity", "ring", "return_index")
@@ -76,12 +75,12 @@ def evaluate(packets: Packets, carry: Carry | None = None, *, final: bool = True
             result = points_function(packets.sensor, packets.frame)(found)
             if not isinstance(result, Polar | Cartesian):
                 raise TypeError(f"has to return Polar or Cartesian, not {type(result).__name__}")
-            return _flattened(packets, result, _columns(result, batch), batch, found, final=final, epoch=epoch)
+            return _flattened(packets, result, columns_of(result, batch), batch, found, final=final, epoch=epoch)
     except Exception as error:
         raise SpecError(f"{type(error).__name__}: {error}", path=place, sensor=packets.sensor.id) from error
 
 
-def _columns(result: Points, batch: Batch) -> dict[str, Column]:
+def columns_of(result: Points, batch: Batch) -> dict[str, Column]:
     """The parts of the result as columns; numbers and arrays get the batch's axes."""
     parts = {f.name: getattr(result, f.name) for f in fields(result) if f.name != "nominal"}
     if isinstance(result, Polar):
@@ -170,15 +169,3 @@ def _polar(flat: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
     x, y, z = (flat[name].astype(np.float64) for name in "xyz")
     level = np.hypot(x, y)
     return {"range": np.hypot(level, z), "azimuth": np.arctan2(y, x), "elevation": np.arctan2(z, level)}
-
-
-def guarded(packets: Packets, carry: Carry | None = None, *, final: bool, epoch: int) -> Evaluated | None:
-    """`evaluate` for streams, which raise on nothing: a failing plugin is counted and gives no points."""
-    try:
-        return evaluate(packets, carry, final=final, epoch=epoch)
-    except SpecError:
-        packets.stats.error(traceback.format_exc())
-        return None
-
-
-install_points(lambda packets: evaluate(packets).cloud)

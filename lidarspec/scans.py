@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 from lidarspec.clouds import PointCloud, joined, restamped
 from lidarspec.columns import Carry
 from lidarspec.cuts import Cutter
+from lidarspec.evaluation import guarded
 from lidarspec.packets import Packets
 from lidarspec.packets import joined as joined_packets
-from lidarspec.points import Evaluated, guarded
+from lidarspec.points import Evaluated
 from lidarspec.reorder import Reorder
 from lidarspec.spec import Sensor
 

@@ -17,8 +17,8 @@ from pathlib import Path
 FLOORS = (
     "_version errors checksums angles fields units bits construction",
     "spec hookspecs geometry links rules splits files",
-    "schema layout walk headers tables columns access unpacking codecs framing plan plugins",
-    "decoder packets streams sequences clouds points cuts reorder",
+    "schema layout walk headers tables columns access unpacking codecs framing plugins",
+    "decoder packets streams sequences clouds points tracing expressions windows program plan evaluation cuts reorder",
     "session scans scenes simulator explain parsing building examples engine wiretable wording",
     "device detect transports recordings pcap _pcap_records _ip sources",
     "testing formats export view demo",

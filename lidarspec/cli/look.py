@@ -9,9 +9,12 @@ import click
 
 from lidarspec.cli.output import emit, emit_json, note, output_options, table
 from lidarspec.links import Link, Serial, Tcp, Udp
+from lidarspec.plan import Plan, plan_for
 from lidarspec.plugins import registry
 from lidarspec.plugins import sensor as named_sensor
+from lidarspec.points import points_function
 from lidarspec.spec import Command, Frame, Sensor
+from lidarspec.tables import Rows
 from lidarspec.wiretable import frame_size, wire_table
 
 NO_SENSORS = "no sensor is installed: pip install 'lidarspec[all]'"
@@ -37,10 +40,15 @@ def sensors(as_json: bool, output: str | None) -> None:
 
 @click.command()
 @click.argument("sensor_id", metavar="SENSOR")
+@click.option("--plan", "as_plan", is_flag=True, help="How its points are computed, and what falls back to plain evaluation.")
 @output_options
-def show(sensor_id: str, as_json: bool, output: str | None) -> None:
+def show(sensor_id: str, as_plan: bool, as_json: bool, output: str | None) -> None:
     """What a sensor is, and the wire table of each of its frames."""
     sensor = named_sensor(sensor_id)
+    if as_plan:
+        plans = {name: _plan(sensor, name) for name, frame in sensor.frames.items() if frame.data}
+        emit_json(plans, output) if as_json else emit("\n".join(line for name in plans for line in (f"{name}:", *plans[name])), output)
+        return
     if as_json:
         frames = {name: _frame(frame) | {"rows": [vars(row) for row in wire_table(frame)]} for name, frame in sensor.frames.items()}
         commands = {name: _command(sensor, command) for name, command in sensor.commands.items()}
@@ -59,6 +67,15 @@ def show(sensor_id: str, as_json: bool, output: str | None) -> None:
         headers = ["offset", "size", "type", "field", "unit", "meaning"]
         parts.append(f"\n{name}{kind}: {frame_size(frame)} bytes\n{table(headers, rows, output)}")
     emit("\n".join(parts), output)
+
+
+def _plan(sensor: Sensor, frame: str) -> list[str]:
+    """The plan of a data frame in lines, or why there is none."""
+    packets = sensor.decode([sensor.example(frame)], frame)
+    if not isinstance(packets.table, Rows) or not packets.table.groups:
+        return ["plain evaluation: the frame is not compiled"]
+    found = plan_for(points_function(sensor, frame), packets.batch(), packets.table.groups[0])
+    return found.describe() if isinstance(found, Plan) else [f"plain evaluation: {found}"]
 
 
 @click.command()

@@ -17,6 +17,9 @@ from lidarspec.packets import Packets
 from lidarspec.spec import Sensor
 from lidarspec.streams import PacketStream
 
+#: units in the last place by which coordinates of two evaluations may differ, at the size of the range.
+ULPS = 4
+
 
 def cuts(found: Iterable[Found]) -> list[tuple[str, int, bytes]]:
     """(type, offset, bytes) of frames, without when they arrived."""
@@ -36,23 +39,47 @@ def assert_same_packets(one: Packets, other: Packets) -> None:
     assert one.stats == other.stats
 
 
-def assert_same_points(one: PointCloud, other: PointCloud) -> None:
-    """Fail unless both clouds are equal to the last bit."""
-    assert_same_places(one, other)
-    assert same(one.time, other.time)
+def assert_same_points(one: PointCloud, other: PointCloud, *, ulps: int = ULPS) -> None:
+    """Fail unless both clouds have the same points and masks, places and directions within so many units in the last place."""
+    assert_same_places(one, other, ulps=ulps)
+    assert np.allclose(one.time, other.time, rtol=0, atol=1e-11, equal_nan=True)
     assert (one.stamp_ns, bool(one.nominal)) == (other.stamp_ns, bool(other.nominal))
 
 
-def assert_same_places(one: PointCloud, other: PointCloud) -> None:
-    """Fail unless both clouds are equal but for the rounding of times, which are summed in another order."""
+def assert_same_places(one: PointCloud, other: PointCloud, *, ulps: int = ULPS) -> None:
+    """The same, but for times, which batches round differently.
+
+    Coordinates are compared at the size of the range, azimuths on the circle; everything else is equal.
+    """
     assert one.columns.keys() == other.columns.keys()
-    for name in one.columns.keys() - {"time"}:
-        assert same(one.columns[name], other.columns[name]), f"{name} differs"
     assert same(one.valid, other.valid)
+    with np.errstate(invalid="ignore"):
+        size = np.nanmax(np.abs([one.range, one.x, one.y, one.z, np.ones(len(one))]), axis=0, initial=0).astype(np.float32)
+        reach = np.where(np.isfinite(size), size, 1).astype(np.float32)
+    for name in one.columns.keys() - {"time"}:
+        first, second = one.columns[name], other.columns[name]
+        if name in ("x", "y", "z", "range"):
+            assert _close(first, second, ulps * np.spacing(np.minimum(reach, np.abs(one.range)) if name == "range" else reach)), (
+                f"{name} differs"
+            )
+        elif name in ("azimuth", "elevation"):
+            assert _close(first, second, ulps * np.spacing(np.float32(np.pi)), full=2 * np.pi), f"{name} differs"
+        else:
+            assert same(first, second), f"{name} differs"
     assert one.time.shape == other.time.shape
     assert np.allclose(one.time, other.time, rtol=1e-12, atol=1e-6, equal_nan=True)
     assert abs(one.stamp_ns - other.stamp_ns) <= 1000
     assert one.shape == other.shape
+
+
+def _close(one: NDArray[Any], other: NDArray[Any], within: Any, full: float = 0.0) -> bool:
+    """Whether numbers are as near to each other, on a circle if `full` is given; nan and infinities equal themselves."""
+    if one.dtype != other.dtype or one.shape != other.shape:
+        return False
+    with np.errstate(invalid="ignore"):
+        apart = np.abs(one.astype(np.float64) - other.astype(np.float64))
+        apart = np.minimum(apart, np.abs(full - apart)) if full else apart
+        return bool(((apart <= within) | (one == other) | (np.isnan(one) & np.isnan(other))).all())
 
 
 def assert_well_formed(cloud: PointCloud) -> None:

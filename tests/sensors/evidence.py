@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from lidarspec import Packets, PointCloud, Sensor
+from lidarspec.testing.comparisons import assert_same_points
 
 _SHARED = Path(__file__).resolve().parents[3] / "shared"
 CAPTURES = Path(os.environ.get("LIDARSPEC_CAPTURES", _SHARED / "captures"))
@@ -55,20 +56,8 @@ def decoded(sensor: Sensor, data: Any, frame: str | None = None) -> Packets:
     assert interpreted.stats == packets.stats
     assert interpreted.time_ns.tolist() == packets.time_ns.tolist()
     if frame is None:
-        same_points(interpreted.points(), packets.points())
+        assert_same_points(interpreted.points(), packets.points())
     return packets
-
-
-def same_points(one: PointCloud, other: PointCloud) -> None:
-    """Fail unless two clouds hold the same points, bit for bit; times to a hundredth of a nanosecond."""
-    assert list(one.columns) == list(other.columns)
-    for name, column in one.columns.items():
-        if name == "time":
-            np.testing.assert_allclose(column, other.time, rtol=0, atol=1e-11)
-        else:
-            np.testing.assert_array_equal(column, other.columns[name], err_msg=name)
-    np.testing.assert_array_equal(one.valid, other.valid)
-    assert (one.stamp_ns, one.shape, one.nominal) == (other.stamp_ns, other.shape, other.nominal)
 
 
 def clockwise(cloud: PointCloud) -> Any:

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 import lidarspec as ls
-from tests.sensors.evidence import assert_points, clockwise, decoded, same_points, vector_bytes, vectors
+from lidarspec.testing.comparisons import assert_same_points
+from tests.sensors.evidence import assert_points, clockwise, decoded, vector_bytes, vectors
 
 FILE = "vectors_serial2d.json"
 SENSOR, COIN = ls.sensor("cspc-m1c1-mini"), ls.sensor("cspc-coin-d4")
@@ -174,7 +175,7 @@ def test_nominal_until_the_device_information_is_known() -> None:
     assert SENSOR.decode(QUADRANTS).points().nominal
     assert not SENSOR.decode(INFO + QUADRANTS).points().nominal
     assert not SENSOR.decode(QUADRANTS + INFO).points().nominal  # of a whole input the first one applies from the start
-    same_points(decoded(SENSOR, INFO + QUADRANTS).points()[:2], decoded(SENSOR, QUADRANTS + INFO).points()[:2])
+    assert_same_points(decoded(SENSOR, INFO + QUADRANTS).points()[:2], decoded(SENSOR, QUADRANTS + INFO).points()[:2])
     np.testing.assert_array_equal(SENSOR.decode(QUADRANTS).points().xyz, SENSOR.decode(INFO + QUADRANTS).points().xyz)
 
 
@@ -218,8 +219,8 @@ def test_angles_from_the_mark_on_the_housing() -> None:
     other = SENSOR.build("info", {**SENSOR.parse(INFO), "zero_angle": 20, "correction": 0, "sum": None})
     np.testing.assert_allclose(clockwise(decoded(housing, other + QUADRANTS).points()), [50, 140, 230, 320], atol=1e-4)
     np.testing.assert_allclose(clockwise(COIN.configure(zero="housing").decode(QUADRANTS).points())[0], 30, atol=1e-4)
-    same_points(pickle.loads(pickle.dumps(housing)).decode(QUADRANTS).points(), housing.decode(QUADRANTS).points())
-    same_points(SENSOR.configure(zero="data").decode(QUADRANTS).points(), SENSOR.decode(QUADRANTS).points())
+    assert_same_points(pickle.loads(pickle.dumps(housing)).decode(QUADRANTS).points(), housing.decode(QUADRANTS).points())
+    assert_same_points(SENSOR.configure(zero="data").decode(QUADRANTS).points(), SENSOR.decode(QUADRANTS).points())
     with pytest.raises(ls.UsageError, match="'data' or 'housing'"):
         SENSOR.configure(zero="motor")
 

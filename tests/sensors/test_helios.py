@@ -12,7 +12,8 @@ import pytest
 import lidarspec as ls
 from lidarspec.pcap import CaptureReader
 from lidarspec.streams import PacketStream
-from tests.sensors.evidence import assert_points, capture, clockwise, decoded, same_points, vector_bytes, vectors
+from lidarspec.testing.comparisons import assert_same_points
+from tests.sensors.evidence import assert_points, capture, clockwise, decoded, vector_bytes, vectors
 
 FILE = "vectors_udp3d.json"
 SENSOR = ls.sensor("robosense-helios16p")
@@ -223,7 +224,7 @@ def test_a_file_is_read_with_the_first_device_information_from_its_start() -> No
         scans = list(device.scans())
     assert [scan.complete for scan in scans] == [False, True, True, True, True, False]
     assert [round(scan.rate_hz, 1) for scan in scans if scan.complete] == [10.0] * 4
-    same_points(scans[2].points, list(SENSOR.scans(data))[2].points)
+    assert_same_points(scans[2].points, list(SENSOR.scans(data))[2].points)
 
 
 def test_the_capture_is_the_same_on_both_paths_and_built_again() -> None:
@@ -242,7 +243,7 @@ def test_packets_taken_out_are_lost_and_late_ones_come_in_their_place() -> None:
     scans, whole = (list(SENSOR.scans(source)) for source in (mixed, data))
     assert len(scans) == len(whole) == 6
     for one, other in zip(scans, whole, strict=True):
-        same_points(one.points, other.points)
+        assert_same_points(one.points, other.points)
 
 
 @pytest.mark.parametrize("number", range(4))

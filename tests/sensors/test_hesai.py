@@ -13,7 +13,8 @@ import pytest
 
 import lidarspec as ls
 from lidarspec.simulator import simulate
-from tests.sensors.evidence import PROTOCOLS, assert_points, decoded, same_points, vector_bytes, vectors
+from lidarspec.testing.comparisons import assert_same_points
+from tests.sensors.evidence import PROTOCOLS, assert_points, decoded, vector_bytes, vectors
 
 FILE = "vectors_udp3d.json"
 SENSORS = {name: ls.sensor(f"hesai-{name}") for name in ("pandar40p", "xt32", "xt16", "qt64")}
@@ -195,7 +196,7 @@ def test_correction_files_of_the_unit(name: str, tmp_path: Path) -> None:
     assert np.rad2deg(clouds[1].elevation[place]) == pytest.approx(-2.5)
     assert np.rad2deg(clouds[1].azimuth[place]) == pytest.approx(-91.25)
     assert clouds[2].time[place] - clouds[2].time[place - 4] == pytest.approx(-4e-6)
-    same_points(clouds[2], clouds[3])
+    assert_same_points(clouds[2], clouds[3])
 
 
 @pytest.mark.parametrize("rows", ["1,0,0\n2,0,0\n", "1,x,0\n", "", "1,0,0\n" * 40])

@@ -12,7 +12,8 @@ import pytest
 import lidarspec as ls
 from lidarspec.scans import ScanStream
 from lidarspec.streams import PacketStream
-from tests.sensors.evidence import decoded, same_points, vector_bytes, vectors
+from lidarspec.testing.comparisons import assert_same_points
+from tests.sensors.evidence import decoded, vector_bytes, vectors
 
 FILE = "vectors_udp3d.json"
 SENSOR = ls.sensor("robosense-m1")
@@ -43,7 +44,7 @@ def numbers(scan: ls.Scan) -> list[int]:
 def same_scans(one: list[ls.Scan], other: list[ls.Scan]) -> None:
     assert [(len(scan), scan.complete) for scan in one] == [(len(scan), scan.complete) for scan in other]
     for scan, twin in zip(one, other, strict=True):
-        same_points(scan.points, twin.points)
+        assert_same_points(scan.points, twin.points)
 
 
 def test_the_template_is_a_packet() -> None:
