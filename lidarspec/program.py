@@ -22,7 +22,12 @@ from lidarspec.windows import Blocks, Window, raw_values, window
 #: points of a chunk, so that its scratch arrays stay in the cache.
 CHUNK = 1 << 16
 TURN = 2 * np.pi
-_TYPES = {"single": np.dtype(np.float32), "double": np.dtype(np.float64), "index": np.dtype(np.intp), "flag": np.dtype(np.bool_)}
+_TYPES: dict[str, np.dtype[Any]] = {
+    "single": np.dtype(np.float32),
+    "double": np.dtype(np.float64),
+    "index": np.dtype(np.intp),
+    "flag": np.dtype(np.bool_),
+}
 
 Values = Callable[[Node], NDArray[Any]]
 
@@ -135,7 +140,7 @@ class Program:
     def _table(self, node: Node, leaf: Leaf, seen: Window, kind: str) -> NDArray[Any]:
         name = (kind, seen.offset - leaf.offset, seen.size, leaf.size, key(node))
         if name not in self._tables:
-            self._tables[name] = np.ascontiguousarray(every_value(node, leaf), _TYPES[kind])
+            self._tables[name] = np.ascontiguousarray(np.asarray(every_value(node, leaf)), _TYPES[kind])
         return self._tables[name]
 
     def _load(self, leaf: Leaf, seen: Window, dtype: np.dtype[Any], kind: str) -> int:

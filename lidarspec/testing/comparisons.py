@@ -54,7 +54,7 @@ def assert_same_places(one: PointCloud, other: PointCloud, *, ulps: int = ULPS) 
     assert one.columns.keys() == other.columns.keys()
     assert same(one.valid, other.valid)
     with np.errstate(invalid="ignore"):
-        size = np.nanmax(np.abs([one.range, one.x, one.y, one.z, np.ones(len(one))]), axis=0, initial=0).astype(np.float32)
+        size = np.nanmax(np.abs(np.stack([one.range, one.x, one.y, one.z, np.ones(len(one))])), axis=0, initial=0).astype(np.float32)
         reach = np.where(np.isfinite(size), size, 1).astype(np.float32)
     for name in one.columns.keys() - {"time"}:
         first, second = one.columns[name], other.columns[name]
