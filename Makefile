@@ -16,13 +16,16 @@ DEVELOPERS := $(VENV)/.installed-dev
 PEERS := $(VENV)/.installed-bench
 RECENT := import sys; sys.exit(sys.version_info < (3, 11))
 
-.PHONY: demo test lint types wheels bench bench-here clean
+.PHONY: demo test soak lint types wheels bench bench-here clean
 
 demo: $(USERS)
 	@$(BIN)/lidarspec demo -s ldrobot-stl27l
 
 test: $(DEVELOPERS)
 	@$(BIN)/python -m pytest -n auto $(ARGS)
+
+soak: $(DEVELOPERS)
+	@$(BIN)/python -m pytest -m soak $(ARGS)
 
 lint: $(DEVELOPERS)
 	@$(BIN)/ruff check .

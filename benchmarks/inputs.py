@@ -52,7 +52,7 @@ class Inputs:
     """
 
     def __init__(self, folder: Path, *, quick: bool = False) -> None:
-        self._folder, self._quick = folder, quick
+        self.folder, self.is_quick = folder, quick
         self.frames: Callable[[str], list[bytes]] = functools.cache(self._frames)
         self.capture: Callable[[str], Path] = functools.cache(self._capture)
 
@@ -89,11 +89,11 @@ class Inputs:
 
     def _frames(self, key: str) -> list[bytes]:
         count = SENSORS[key][1]
-        return simulate(self.sensor(key), count // QUICKER if self._quick else count)
+        return simulate(self.sensor(key), count // QUICKER if self.is_quick else count)
 
     def _capture(self, key: str) -> Path:
         """A pcap file of the frames, one datagram each."""
-        path = self._folder / f"{key}.pcap"
+        path = self.folder / f"{key}.pcap"
         sender, receiver = ("192.168.1.200", 6699), ("192.168.1.102", 6699)
         with path.open("wb") as file:
             writer = PcapWriter(file)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from collections.abc import Callable, Mapping
@@ -11,7 +12,7 @@ from typing import Any
 import libraries
 from inputs import Inputs
 from measure import Contender, Rates, times
-from peers import construct_on
+from peers import STRUCTS
 from works import FEW, Facts, Others, Work, beside_construct, columns, points_of
 
 import lidarspec as ls
@@ -109,18 +110,32 @@ def parse(inputs: Inputs, key: str, title: str) -> Work:
     """One frame after another to a Container, checksum included, against construct on a plain struct."""
     sensor, frames = inputs.sensor(key), inputs.frames(key)[:FEW]
     others: Others = {
-        "construct": lambda: construct_on(key, frames, len(frames), compiled=False),
-        "compiled": lambda: construct_on(key, frames, len(frames), compiled=True),
+        "construct": lambda: Contender(one_by_one(STRUCTS[key].parse, frames), len(frames)),
+        "compiled": lambda: Contender(one_by_one(STRUCTS[key].compile().parse, frames), len(frames)),
     }
-    run: Callable[[], Any] = lambda: [sensor.parse(frame) for frame in frames]  # noqa: E731
-    return Work(title, "frames", len(frames), sum(map(len, frames)), lambda _: run, others, has_backends=False)
+    ours = one_by_one(sensor.parse, frames)
+    return Work(title, "frames", len(frames), sum(map(len, frames)), lambda _: ours, others, has_backends=False)
+
+
+def one_by_one(function: Callable[[bytes], Any], frames: list[bytes]) -> Callable[[], None]:
+    """Calls a function for each frame and keeps nothing: memory for all their Containers at once would cost more than they do."""
+
+    def run() -> None:
+        for frame in frames:
+            function(frame)
+
+    return run
 
 
 def importing(inputs: Inputs) -> Work:
     """A new process that imports lidarspec and finds a sensor, against one that imports what this needs at least."""
 
+    # As pip leaves packages behind, and not as an editable one is the first time: compiled.
+    compiled = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
+    compiled["PYTHONPYCACHEPREFIX"] = str(inputs.folder / "bytecode")
+
     def python(code: str) -> Callable[[], Any]:
-        return lambda: subprocess.run([sys.executable, "-c", code], check=True)
+        return lambda: subprocess.run([sys.executable, "-c", code], check=True, env=compiled)
 
     def facts(backend: str, rates: Rates) -> Facts:
         return {"times the libraries' imports": times(rates, "libraries", "ours")}
@@ -136,6 +151,9 @@ ELSEWHERE: Mapping[str, Callable[[Inputs], Work]] = {
     "pcap": payloads,
     "live": live,
     "parse-stl27l": lambda inputs: parse(inputs, "stl27l", "parse one STL-27L frame"),
+    "parse-m1c1": lambda inputs: parse(inputs, "m1c1", "parse one M1C1_Mini packet"),
+    "parse-vlp16": lambda inputs: parse(inputs, "vlp16", "parse one VLP-16 packet"),
+    "parse-xt32": lambda inputs: parse(inputs, "xt32", "parse one Pandar XT32 packet"),
     "parse-m1": lambda inputs: parse(inputs, "m1", "parse one RS-LiDAR-M1 packet"),
     "import": importing,
 }

@@ -16,6 +16,7 @@ from typing import Any
 
 from inputs import Inputs
 from libraries import versions
+from live_works import ON_LINES
 from measure import Contender, Rates, memcpy, raced, times
 from more_works import ELSEWHERE
 from report import shown
@@ -24,7 +25,7 @@ from works import ON_BYTES, Work
 import lidarspec as ls
 from lidarspec.decoder import BACKENDS
 
-WORKS = {**ON_BYTES, **ELSEWHERE}
+WORKS = {**ON_BYTES, **ELSEWHERE, **ON_LINES}
 LEAST_RUNS = 5
 RUNS = 7
 LEAST_SECONDS = 0.05  # of a run

@@ -14,6 +14,7 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
+from lidarspec import abilities
 from lidarspec._version import __version__ as __version__
 
 if TYPE_CHECKING:
@@ -39,6 +40,8 @@ if TYPE_CHECKING:
     from lidarspec.angles import (
         wrap as wrap,
     )
+    from lidarspec.async_device import AsyncDevice as AsyncDevice
+    from lidarspec.async_device import open_async as open_async
     from lidarspec.checksums import Checksum as Checksum
     from lidarspec.checksums import Crc as Crc
     from lidarspec.checksums import Fold15 as Fold15
@@ -111,8 +114,10 @@ if TYPE_CHECKING:
     from lidarspec.packets import Packets as Packets
     from lidarspec.plugins import sensor as sensor
     from lidarspec.plugins import sensors as sensors
+    from lidarspec.replies import Reply as Reply
     from lidarspec.scans import LaserScan as LaserScan
     from lidarspec.scans import Scan as Scan
+    from lidarspec.session import Session as Session
     from lidarspec.spec import Command as Command
     from lidarspec.spec import Frame as Frame
     from lidarspec.spec import Sensor as Sensor
@@ -155,10 +160,13 @@ _HOMES = {
     # what can be done with it
     "plugins": ("sensor", "sensors"),
     "device": ("open", "Device"),
+    "async_device": ("open_async", "AsyncDevice"),
     "decoder": ("Decoder", "Found", "Counters"),
     "packets": ("Packets",),
     "clouds": ("PointCloud",),
     "scans": ("Scan", "LaserScan"),
+    "session": ("Session",),
+    "replies": ("Reply",),
     # what can go wrong
     "errors": (
         "LidarSpecError",
@@ -182,11 +190,12 @@ _HOME = {name: module for module, names in _HOMES.items() for name in names}
 
 __all__ = list(_HOME)
 
+abilities.install(lambda: importlib.import_module("lidarspec.engine").StandardEngine())
+
 
 def __getattr__(name: str) -> Any:
     if name not in _HOME:
         raise AttributeError(f"module 'lidarspec' has no attribute {name!r}")
-    importlib.import_module("lidarspec.engine")  # installs what the methods of Sensor call
     value = getattr(importlib.import_module(f"lidarspec.{_HOME[name]}"), name)
     globals()[name] = value
     return value

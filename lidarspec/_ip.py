@@ -64,13 +64,38 @@ class Fragment(NamedTuple):
 
 
 class IpPacket(NamedTuple):
-    """An IP packet that carries UDP, or a fragment of one; addresses as on the wire, 4 or 16 bytes."""
+    """An IP packet that carries UDP, or a fragment of one; addresses as on the wire, 4 or 16 bytes; `at`: where in the frame `body` is."""
 
     source: bytes
     destination: bytes
     protocol: int
     body: bytes
+    at: int = 0
     fragment: Fragment | None = None
+
+
+class UdpPacket(NamedTuple):
+    """Ports, and which part of the IP packet's body the payload is."""
+
+    source: int
+    destination: int
+    start: int
+    stop: int
+
+
+class Headers(NamedTuple):
+    """What stands before the payload of an unfragmented UDP packet.
+
+    Attributes:
+        size: of all headers together, which is where the payload starts.
+        payload: its length.
+        free: the places of bytes that may differ between packets of one stream and tell nothing about it: the
+            identification of an unfragmented IPv4 packet, and checksums.
+    """
+
+    size: int
+    payload: int
+    free: tuple[int, ...]
 
 
 def ip_packet(frame: bytes, link: int) -> IpPacket:
@@ -95,24 +120,45 @@ def ip_packet(frame: bytes, link: int) -> IpPacket:
     raise Refused("malformed")
 
 
-def udp(packet: IpPacket) -> tuple[int, int, bytes]:
-    """Source port, destination port and payload of a whole packet.
+def udp(packet: IpPacket) -> UdpPacket:
+    """The UDP header of a whole packet.
 
     Raises:
         Refused: no UDP follows the extension headers, or its length does not fit.
     """
     try:
-        protocol, body = _past_extensions(packet.protocol, packet.body)
+        protocol, at = _past_extensions(packet.protocol, packet.body)
         if protocol != _UDP:
             raise Refused("malformed" if protocol == _FRAGMENT else "other")
-        source, destination, length, _ = _UDP_HEADER.unpack_from(body)
+        source, destination, length, _ = _UDP_HEADER.unpack_from(packet.body, at)
     except struct.error:
         raise Refused("short") from None
     if length < _UDP_HEADER.size:
         raise Refused("malformed")
-    if length > len(body):
+    if at + length > len(packet.body):
         raise Refused("short")
-    return source, destination, body[_UDP_HEADER.size : length]
+    return UdpPacket(source, destination, at + _UDP_HEADER.size, at + length)
+
+
+def headers(frame: bytes, link: int) -> Headers | None:
+    """Where the payload stands in a frame, and which bytes before it decide that; None for fragments.
+
+    Frames of the same link type and length, whose headers are equal but for the free bytes, have their payload in the same
+    place and come from the same sender: nothing else is looked at by `ip_packet` and `udp`.
+
+    Raises:
+        Refused: as `ip_packet` and `udp`.
+    """
+    packet = ip_packet(frame, link)
+    if packet.fragment is not None:
+        return None
+    part = udp(packet)
+    size = packet.at + part.start
+    start = _ip_start(frame, link)
+    free = [size - 2, size - 1]
+    if frame[start] >> 4 == 4:
+        free += [start + at for at in (4, 5, 10, 11)]
+    return Headers(size, part.stop - part.start, tuple(free))
 
 
 @lru_cache(maxsize=256)
@@ -169,7 +215,7 @@ def _ipv4(frame: bytes, start: int) -> IpPacket:
     fragment = _fragment(ident, (place & 0x1FFF) * 8, total - header, more=bool(place & 0x2000))
     if fragment is not None and len(body) < total - header:
         raise Refused("short")
-    return IpPacket(source, destination, protocol, body, fragment)
+    return IpPacket(source, destination, protocol, body, start + header, fragment)
 
 
 def _ipv6(frame: bytes, start: int) -> IpPacket:
@@ -178,24 +224,25 @@ def _ipv6(frame: bytes, start: int) -> IpPacket:
     body = frame[body_start : body_start + length]
     missing = length - len(body)
     fragment = None
-    protocol, body = _past_extensions(protocol, body)
+    protocol, at = _past_extensions(protocol, body)
     if protocol == _FRAGMENT:
-        protocol, place, ident = struct.unpack_from(">BxHI", body)
-        body = body[8:]
-        fragment = _fragment(ident, place & 0xFFF8, len(body) + missing, more=bool(place & 1))
+        protocol, place, ident = struct.unpack_from(">BxHI", body, at)
+        at += 8
+        fragment = _fragment(ident, place & 0xFFF8, len(body) - at + missing, more=bool(place & 1))
     if protocol != _UDP and protocol not in _EXTENSIONS:
         raise Refused("other")
     if fragment is not None and missing:
         raise Refused("short")
-    return IpPacket(source, destination, protocol, body, fragment)
+    return IpPacket(source, destination, protocol, body[at:], body_start + at, fragment)
 
 
-def _past_extensions(protocol: int, body: bytes) -> tuple[int, bytes]:
+def _past_extensions(protocol: int, body: bytes) -> tuple[int, int]:
+    """The protocol after the extension headers, and where it starts in the body."""
     at = 0
     while protocol in _EXTENSIONS:
         protocol, units = struct.unpack_from(">BB", body, at)
         at += (units + 1) * 8
-    return protocol, body[at:]
+    return protocol, at
 
 
 def _fragment(ident: int, start: int, size: int, *, more: bool) -> Fragment | None:

@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.columns import Batch, Column
 from lidarspec.errors import SpecError, UnknownField
-from lidarspec.schema import FieldInfo, Schema
-from lidarspec.tables import Table
+
+if TYPE_CHECKING:  # plugins import Fields for their annotations, and that should cost little
+    from lidarspec.columns import Batch, Column
+    from lidarspec.schema import FieldInfo, Schema
+    from lidarspec.tables import Table
 
 
 def field_column(info: FieldInfo, table: Table, depth: int, batch: Batch, which: NDArray[np.intp] | None = None) -> Column:
     """A field in its unit as a column of `depth` array axes; `which`: the frame of the table for each packet."""
+    from lidarspec.columns import Column
+
     array = physical(info, table)
     if which is not None:
         array = array[which]
@@ -56,6 +60,26 @@ class Fields:
         raise UnknownField(path, self._schema.fields)
 
 
+#: among the paths of `Watched`: something else than fields was looked at.
+UNKNOWN = ""
+
+
+class Watched(Fields):
+    """`Fields` that keep the paths of the fields that were looked at in `seen`."""
+
+    def __init__(self, batch: Batch, seen: set[str], schema: Schema | None = None, prefix: str = "") -> None:
+        super().__init__(batch, schema, prefix)
+        self._seen = seen
+
+    def __getattr__(self, name: str) -> Any:
+        found = super().__getattr__(name)
+        if isinstance(found, Fields):
+            return Watched(self._batch, self._seen, self._schema, f"{self._prefix}{name}.")
+        path = f"{self._prefix}{name}"
+        self._seen.add(path if path in self._schema.fields else UNKNOWN)
+        return found
+
+
 class _States:
     """``f.state``: the frames of other types that were last before each packet."""
 
@@ -90,6 +114,8 @@ class _State:
         raise UnknownField(path, known, place=f"state.{self._frame}")
 
     def _column(self, path: str, table: Table | None, which: NDArray[np.intp], defaults: Mapping[str, Any]) -> Column:
+        from lidarspec.columns import Column
+
         batch, depth = self._batch, self._batch.table.schema.depth()
         missing = which < 0
         if not missing.any() and table is not None:

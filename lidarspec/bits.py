@@ -7,9 +7,9 @@ random blocks then confirm them. So no rule about bit order stands anywhere but 
 
 from __future__ import annotations
 
-import random
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 from construct import Construct, EnumIntegerString
@@ -43,6 +43,23 @@ class BitField:
     segments: tuple[Segment, ...]
     width: int
     signed: bool
+
+    @cached_property
+    def words(self) -> tuple[tuple[str, int, int], ...] | None:
+        """The value as words, if it is whole bytes in a row: type, first byte and lowest bit of each; else None."""
+        parts = sorted(self.segments, key=lambda part: part.byte)
+        first, count = parts[0].byte, len(parts)
+        places = [(part.byte - first, part.target) for part in parts]
+        orders = {"<": [(at, 8 * at) for at in range(count)], ">": [(at, 8 * (count - 1 - at)) for at in range(count)]}
+        order = next((name for name, expected in orders.items() if places == expected), None)
+        if order is None or any(part.mask != 0xFF or part.low for part in parts):
+            return None
+        words, at = [], 0
+        while at < count:
+            size = 1 << min((count - at).bit_length() - 1, 3)
+            words.append((f"{order}u{size}", first + at, 8 * (at if order == "<" else count - at - size)))
+            at += size
+        return tuple(words)
 
     def value(self, block: bytes) -> int:
         """The value in one block of bytes."""
@@ -129,6 +146,8 @@ def _segment(run: list[int], targets: dict[int, int]) -> Segment:
 
 
 def _confirmed(con: Construct, size: int, fields: list[BitField]) -> bool:
+    import random  # nothing else that finding a sensor imports needs it
+
     source = random.Random(size)
     for _ in range(CONFIRMATIONS):
         block = source.randbytes(size)

@@ -24,8 +24,8 @@ def build(sensor: Sensor, frame: str, value: Any, values: Mapping[str, Any], *, 
     if value is not None and not isinstance(value, Mapping):
         raise UsageError(f"{sensor.id} {frame}: fields come by name, not as {type(value).__name__}")
     con, place = sensor.frames[frame].prepared, f"{sensor.id} {frame}"
-    table = schema(con)
-    given = _Values(table, place, units=units).checked({**(value or {}), **values}, "")
+    table, known = _fields(con)
+    given = _Values(table, known, place, units=units).checked({**(value or {}), **values}, "")
     try:
         _fill_counts(con, given, table)
         return bytes(con.build(_openings(con, given)))
@@ -49,15 +49,20 @@ def _usage(fault: Mismatch, place: str) -> UsageError:
     return UsageError(f"{place}: {path or 'frame'}: expected {fault.expected}, got {fault.got}")
 
 
+@functools.lru_cache(maxsize=1024)
+def _fields(con: Construct) -> tuple[Schema, frozenset[str]]:
+    """The fields of a frame type, and the paths of these and of all that holds them."""
+    table = schema(con)
+    known = set(table.fields) | set(table.arrays)
+    parts = [path.split(".") for path in known]
+    return table, frozenset(known | {".".join(names[:depth]) for names in parts for depth in range(len(names))})
+
+
 class _Values:
     """The caller's values checked against the fields: names, ranges, and units where they are physical."""
 
-    def __init__(self, table: Schema, place: str, *, units: bool) -> None:
-        self._table, self._place, self._units = table, place, units
-        self._known = set(table.fields) | {path.rpartition(".")[0] for path in table.fields} | set(table.arrays)
-        for path in list(self._known):
-            parts = path.split(".")
-            self._known |= {".".join(parts[:depth]) for depth in range(1, len(parts))}
+    def __init__(self, table: Schema, known: frozenset[str], place: str, *, units: bool) -> None:
+        self._table, self._known, self._place, self._units = table, known, place, units
 
     def checked(self, value: Any, path: str, shown: str = "") -> Any:
         info = self._table.fields.get(path)

@@ -1,15 +1,11 @@
 """Checksum algorithms as values: for one frame, or for every frame of a batch at once.
 
-A batch of CRCs runs its rows side by side, two bytes a step, through one table of 65,536 registers. Long rows are cut into
-segments that run side by side too and are then joined in pairs: a CRC is linear, so the earlier one is advanced over as many
-zero bytes as the later one is long, and they are XORed. Tables depend on the polynomial alone, not on the length of rows.
-
-Registers are kept in wire order, where the low byte is the one that meets the next data byte: for `refin` the usual
-reflected register, otherwise the usual register aligned left with its bytes swapped. One formula serves both.
+The arithmetic on rows of bytes side by side is that of `lidarspec.lanes`.
 """
 
 import struct
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import Any, Literal, TypeAlias
@@ -17,14 +13,16 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from lidarspec import lanes
+
 ByteOrder: TypeAlias = Literal["little", "big"]
 Bytes: TypeAlias = bytes | bytearray | memoryview
 Values: TypeAlias = NDArray[np.uint64]
 
 _LOOP_BYTES = 2048  # below this, a Python loop over bytes is done before NumPy's calls have started
-_BLOCK_BYTES = 1 << 18  # rows of a batch taken at a time; with their table they fit the second-level cache
-_REGISTER_BYTES = [2] * 17 + [4] * 16 + [8] * 32  # that a register is kept in, by its width
-_MIRROR = bytes(int(f"{byte:08b}"[::-1], 2) for byte in range(256))
+_NARROW_LOOP_BYTES = 256  # the same where the register is a byte
+_FEW = 4  # rows that are done one by one sooner than together
+_BLOCK_BYTES = 1 << 17  # rows of a batch taken at a time; with what is computed of them they fit the second-level cache
 
 
 class Checksum(ABC):
@@ -86,7 +84,7 @@ class Crc(Checksum):
                 register = table[(register ^ byte) & 0xFF] ^ register >> 8
         if not self.refin:
             register = int.from_bytes(register.to_bytes(size, "little"), "big") >> 8 * size - self.width
-        return (register if self.refin == self.refout else _reflected(register, self.width)) ^ self.xorout
+        return (register if self.refin == self.refout else lanes.reflected(register, self.width)) ^ self.xorout
 
     def describe(self) -> str:
         digits, order = -(-self.width // 4), ("", " refin", " refout", " reflected")[self.refin + 2 * self.refout]
@@ -94,24 +92,22 @@ class Crc(Checksum):
         return f"CRC-{self.width}{''.join(values)}{order}"
 
     def batch(self, rows: NDArray[np.uint8]) -> Values:
-        if rows.size < _LOOP_BYTES:
+        if rows.size < (_NARROW_LOOP_BYTES if self.width <= 8 else _LOOP_BYTES):
             return super().batch(rows)
-        step = max(1, _BLOCK_BYTES // rows.shape[1])
-        blocks = (rows[first : first + step] for first in range(0, len(rows), step))
-        registers = np.concatenate([_registers(block, self._loop[1], self.width, self.poly, self.refin) for block in blocks])
+        registers = _in_blocks(lambda block: lanes.registers(block, self._loop[1], self.width, self.poly, self.refin), rows)
         if not self.refin:
             registers = registers.byteswap() >> 8 * registers.itemsize - self.width
         values = registers.astype(np.uint64)
         if self.refin != self.refout:
-            mirrored = np.frombuffer(_MIRROR, np.uint8).take(values.byteswap().view(np.uint8))
+            mirrored = np.frombuffer(lanes.MIRROR, np.uint8).take(values.byteswap().view(np.uint8))
             values = mirrored.view(np.uint64) >> np.uint64(64 - self.width)
-        return values ^ np.uint64(self.xorout)
+        return values ^ np.uint64(self.xorout) if self.xorout else values
 
     @cached_property
     def _loop(self) -> tuple[tuple[int, ...], int, int]:
         """What a loop over bytes needs: its table, the register that it starts with, and the bytes of a register."""
-        table, start = _byte_table(self.width, self.poly, self.refin), _reflected(self.init, self.width)
-        return table, start if self.refin else _mirrored_bytes(start), _REGISTER_BYTES[self.width]
+        table, start = lanes.byte_table(self.width, self.poly, self.refin), lanes.reflected(self.init, self.width)
+        return table, start if self.refin else lanes.mirrored_bytes(start), lanes.REGISTER_BYTES[self.width]
 
 
 @dataclass(frozen=True)
@@ -127,7 +123,9 @@ class Xor(Checksum):
         return "XOR-8"
 
     def batch(self, rows: NDArray[np.uint8]) -> Values:
-        return np.asarray(np.bitwise_xor.reduce(rows, axis=1), np.uint64)
+        if len(rows) < _FEW:
+            return super().batch(rows)
+        return _in_blocks(lambda block: lanes.folded_xor(lanes.words(block)), rows)
 
 
 @dataclass(frozen=True)
@@ -147,7 +145,9 @@ class Sum(Checksum):
         return f"{self.width}-bit sum"
 
     def batch(self, rows: NDArray[np.uint8]) -> Values:
-        return np.asarray(rows.sum(axis=1, dtype=f"u{_REGISTER_BYTES[self.width]}"), np.uint64) & np.uint64((1 << self.width) - 1)
+        if len(rows) < _FEW:
+            return super().batch(rows)
+        return _in_blocks(lambda block: lanes.byte_sums(lanes.words(block)), rows) & np.uint64((1 << self.width) - 1)
 
 
 @dataclass(frozen=True)
@@ -170,18 +170,25 @@ class WordXor(Checksum):
 
     def __call__(self, data: Bytes) -> int:
         data = bytes(data)
-        low, high = (_xor(b"".join([data[part] for part in half])) for half in self._halves)
+        low, high = (_xor(b"".join([data[part] for part in half])) for half in self.halves)
         return low | high << 8
 
     def describe(self) -> str:
         return f"XOR-16 of {'+'.join(map(str, self.groups))}-byte words" + (f" after a head of {self.head} bytes" if self.head else "")
 
     def batch(self, rows: NDArray[np.uint8]) -> Values:
-        low, high = ([np.bitwise_xor.reduce(rows[:, part], axis=1) for part in half] for half in self._halves)
-        return np.asarray(np.bitwise_xor.reduce(low) | np.bitwise_xor.reduce(high).astype(np.uint64) << np.uint64(8))
+        if len(rows) < _FEW:
+            return super().batch(rows)
+        low, high = _word_masks(self, rows.shape[1])
+
+        def values(block: NDArray[np.uint8]) -> Values:
+            columns = lanes.words(block)
+            return lanes.folded_xor(columns & low) | lanes.folded_xor(columns & high) << np.uint64(8)
+
+        return _in_blocks(values, rows)
 
     @cached_property
-    def _halves(self) -> tuple[list[slice], list[slice]]:
+    def halves(self) -> tuple[list[slice], list[slice]]:
         """Where the low and the high bytes of the words stand."""
         low, high = [slice(0, self.head, 2)], [slice(1, self.head, 2)]
         for number, size in enumerate(self.groups):
@@ -219,20 +226,31 @@ class Fold15(Checksum):
         return (total & np.uint64(0x7FFF)) + (total >> np.uint64(15)) & np.uint64(0x7FFF)
 
 
+@lru_cache(maxsize=512)
+def _word_masks(algorithm: WordXor, length: int) -> tuple[NDArray[np.uint64], ...]:
+    """Where the low and the high bytes of the words stand among so many bytes, as masks of `lanes.words`, (words, 1)."""
+    found = []
+    for half in algorithm.halves:
+        mask = np.zeros((1, length), np.uint8)
+        for part in half:
+            mask[:, part] = 0xFF
+        found.append(lanes.words(mask))
+    return tuple(found)
+
+
+def _in_blocks(values: Callable[[NDArray[np.uint8]], NDArray[Any]], rows: NDArray[np.uint8]) -> NDArray[Any]:
+    """What a function makes of each row, asked for as many rows at a time as stay in the cache."""
+    step = max(1, _BLOCK_BYTES // max(rows.shape[1], 1))
+    if len(rows) <= step:
+        return values(rows)
+    return np.concatenate([values(rows[first : first + step]) for first in range(0, len(rows), step)])
+
+
 def _require(checksum: Checksum, **allowed: range | tuple[object, ...]) -> None:
     for name, values in allowed.items():
         value = getattr(checksum, name)
         if type(value) is not type(values[0]) or value not in values:
             raise ValueError(f"{type(checksum).__name__}: {name} must be in {values}, not {value!r}")
-
-
-def _reflected(value: int, width: int) -> int:
-    return int(f"{value:0{width}b}"[::-1], 2)
-
-
-def _mirrored_bytes(register: int) -> int:
-    """The register with the bits of each byte mirrored, which leads from one bit order to the other."""
-    return int.from_bytes(register.to_bytes(8, "little").translate(_MIRROR), "little")
 
 
 def _xor(data: bytes) -> int:
@@ -241,58 +259,3 @@ def _xor(data: bytes) -> int:
     for power in range((8 * len(data) - 1).bit_length() - 1, 2, -1):
         value ^= value >> (1 << power)
     return value & 0xFF
-
-
-@lru_cache(maxsize=256)
-def _byte_table(width: int, poly: int, refin: bool) -> tuple[int, ...]:
-    """The register after one byte, by the XOR of that byte and the register's low byte."""
-    table, feedback = list(range(256)), _reflected(poly, width)
-    for _ in range(8):
-        table = [register >> 1 ^ (feedback if register & 1 else 0) for register in table]
-    return tuple(table if refin else (_mirrored_bytes(table[byte]) for byte in _MIRROR))
-
-
-@lru_cache(maxsize=16)
-def _word_table(width: int, poly: int, refin: bool) -> NDArray[Any]:
-    """The register after two bytes, by the XOR of that little-endian word and the register's low 16 bits; shape (65536,)."""
-    table = np.array(_byte_table(width, poly, refin), f"<u{_REGISTER_BYTES[width]}")
-    first, second = np.tile(table, 256), np.repeat(np.arange(256, dtype=np.uint8), 256)
-    return np.asarray(table[first.astype(np.uint8) ^ second] ^ first >> 8)
-
-
-@lru_cache(maxsize=256)
-def _jump_table(power: int, width: int, poly: int, refin: bool) -> NDArray[Any]:
-    """The register after 2**power zero bytes, by place and value of each byte of the register; shape (bytes, 256)."""
-    if power:
-        half = _jump_table(power - 1, width, poly, refin)
-        return _jumped(half.ravel(), half).reshape(half.shape)
-    later_places = [[value << 8 * place for value in range(256)] for place in range(_REGISTER_BYTES[width] - 1)]
-    return np.array([_byte_table(width, poly, refin), *later_places], f"<u{_REGISTER_BYTES[width]}")
-
-
-def _jumped(registers: NDArray[Any], table: NDArray[Any]) -> NDArray[Any]:
-    """Registers, shape (k,) and contiguous, each advanced by a jump table."""
-    places = registers.view(np.uint8).reshape(len(registers), -1).T
-    return np.asarray(np.bitwise_xor.reduce([of_place.take(place) for of_place, place in zip(table, places, strict=True)]))
-
-
-def _registers(rows: NDArray[np.uint8], start: int, width: int, poly: int, refin: bool) -> NDArray[Any]:
-    """The register after each row, shape (n,)."""
-    (count, length), table = rows.shape, _word_table(width, poly, refin)
-    segment = min(max(64, 1 << (rows.size // 2048).bit_length()), length + length % 2)  # enough of them to hide NumPy's cost per call
-    # Zero bytes in front change nothing while the register is 0; so `start` is met in the row's first bytes.
-    padded = np.zeros((count, -(-length // segment) * segment), np.uint8)
-    padded[:, -length:] = rows
-    padded[:, -length:][:, :8] ^= np.frombuffer(start.to_bytes(8, "little"), np.uint8)[:length]
-    lanes = np.zeros(padded.size // segment, table.dtype)
-    low = lanes.view("<u2")[:: table.itemsize // 2]
-    for words in np.ascontiguousarray(padded.reshape(-1, segment).view("<u2").T):
-        after = table.take(low ^ words)
-        lanes[:] = after if width <= 16 else after ^ lanes >> 16
-    registers = lanes.reshape(count, -1)
-    while registers.shape[1] > 1:
-        odd = registers.shape[1] % 2
-        jumped = _jumped(registers[:, odd::2].ravel(), _jump_table(segment.bit_length() - 1, width, poly, refin))
-        registers = np.hstack([registers[:, :odd], jumped.reshape(count, -1) ^ registers[:, odd + 1 :: 2]])
-        segment *= 2
-    return np.asarray(registers[:, 0] ^ (start >> 8 * length))

@@ -10,49 +10,36 @@ from __future__ import annotations
 import contextlib
 import functools
 import io
-import math
 import traceback
-import weakref
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
 from typing import Any, Protocol
 
 import construct
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.access import Fields
-from lidarspec.columns import Batch, Column, unpadded
+from lidarspec.conditions import Check, Conditions
 from lidarspec.construction import Mismatch
+from lidarspec.dispatch import frame_parser
 from lidarspec.errors import SpecError
-from lidarspec.headers import HeaderTree, Refused
-from lidarspec.layout import Layout, Seal
+from lidarspec.headers import HeaderTree, Refused, rows_at
+from lidarspec.judging import CHECKSUM, CONSTANT, LENGTH, PLUGIN, SHORT, VALID, Judge, Survey, plausibility
+from lidarspec.layout import Layout
 from lidarspec.schema import Schema, schema
 from lidarspec.spec import Frame
 from lidarspec.tables import Group, Records, Rows, Table
-from lidarspec.unpacking import Unpack, unpacker
 from lidarspec.walk import NotCompilable, TooLong, Walk
 
-VALID, SHORT, LENGTH, CONSTANT, CHECKSUM, IMPLAUSIBLE, PLUGIN = range(7)
-
 #: bytes of candidates looked at in one go, so that memory stays small on hostile streams.
-BLOCK = 1 << 17
-
-
-@dataclass(frozen=True, eq=False)
-class Survey:
-    """What candidates are: a status and, where valid or short of bytes, a size for each; errors out of plugins."""
-
-    status: NDArray[np.uint8]
-    sizes: NDArray[np.intp]
-    errors: tuple[str, ...] = ()
+BLOCK = 1 << 19
 
 
 class Codec(Protocol):
-    """The engine of one frame type."""
+    """The engine of one frame type; `size` is that of all its frames, None where they differ."""
 
     frame: Frame
     schema: Schema
+    size: int | None
 
     @property
     def prefix(self) -> Mapping[int, tuple[int, int]]:
@@ -81,39 +68,59 @@ class CompiledCodec:
             if info.dtype is None:
                 raise NotCompilable(info.path, "its branches have different types")
         self.tree = HeaderTree(frame.prepared, frame.max_length)
-        self.prefix = self.tree.prefix
-
-    def parse(self, frame: bytes) -> Any:
-        """The Container of one whole, sound frame; None where construct has to look at it."""
-        layout = self.tree.layout(frame)
-        if not isinstance(layout, Layout) or not layout.sound(frame):
-            return None
-        function = _unpackers.get(layout)
-        if function is None:
-            function = _unpackers[layout] = unpacker(self.frame.prepared, layout) or _nothing
-        return function(frame)
+        self.prefix, self.size = self.tree.prefix, _size(frame)
+        #: the Container of one whole, sound frame; None where construct has to look at it
+        self.parse = frame_parser(frame.prepared, self.tree)
+        self._conditions: Conditions | None = None
 
     def survey(self, buffer: NDArray[np.uint8], offsets: NDArray[np.intp]) -> Survey:
-        status = np.full(len(offsets), SHORT, np.uint8)
-        sizes = np.zeros(len(offsets), np.intp)
         errors: list[str] = []
         groups, _ = self.tree.classify(buffer, offsets)
+        if len(groups) == 1 and len(groups[0][1]) == len(offsets) and isinstance(groups[0][0], Layout):
+            return self._alike(buffer, offsets, groups[0][0])
+        status = np.full(len(offsets), SHORT, np.uint8)
+        sizes = np.zeros(len(offsets), np.intp)
         for layout, which in groups:
             if isinstance(layout, Refused):
                 status[which] = PLUGIN if layout.error else LENGTH
                 errors += [layout.error] * len(which) if layout.error else []
                 continue
-            sizes[which] = layout.size
-            whole = offsets[which] + layout.size <= len(buffer)
-            if not whole.all():
-                cut = which[~whole]
-                status[cut] = [_partial(buffer[offsets[i] :], layout) for i in cut]
-            there = which[whole]
-            step = max(BLOCK // max(layout.size, 1), 1)
-            for start in range(0, len(there), step):
-                part = there[start : start + step]
-                status[part] = self._judge(_rows(buffer, offsets[part], layout.size), layout, errors)
+            survey = self._alike(buffer, offsets[which], layout)
+            status[which], sizes[which] = survey.status, survey.sizes
+            errors += survey.errors
         return Survey(status, sizes, tuple(errors))
+
+    def _alike(self, buffer: NDArray[np.uint8], offsets: NDArray[np.intp], layout: Layout) -> Survey:
+        """What candidates of one layout are."""
+        whole = offsets <= len(buffer) - layout.size
+        count = np.count_nonzero(whole)
+        if count == len(offsets) or (count and whole[:count].all()):
+            lead, cut = slice(0, count), slice(count, len(offsets))
+        else:
+            lead, cut = np.flatnonzero(whole), np.flatnonzero(~whole)  # type: ignore[assignment]
+        errors: list[str] = []
+        status, rows = self._judged(buffer, offsets[lead], layout, errors)
+        sizes = np.full(len(offsets), layout.size, np.intp)
+        if count < len(offsets):
+            short, sizes[cut] = _partial(buffer, offsets[cut], layout)
+            if isinstance(lead, slice):
+                status = np.concatenate([status, short])
+            else:
+                status, some, rows = np.empty(len(offsets), np.uint8), status, None
+                status[lead], status[cut] = some, short
+        return Survey(status, sizes, tuple(errors), rows)
+
+    def _judged(
+        self, buffer: NDArray[np.uint8], offsets: NDArray[np.intp], layout: Layout, errors: list[str]
+    ) -> tuple[NDArray[np.uint8], NDArray[np.uint8] | None]:
+        """The status of whole candidates of one layout; their bytes, one a row, if they are not too many."""
+        judge = self._judge(layout)
+        step = max(BLOCK // layout.size, 1)
+        if len(offsets) <= step:
+            rows = rows_at(buffer, offsets, layout.size)
+            return judge(rows, errors), rows
+        parts = [judge(rows_at(buffer, offsets[start : start + step], layout.size), errors) for start in range(0, len(offsets), step)]
+        return np.concatenate(parts), None
 
     def table(self, frames: Iterable[bytes]) -> Rows:
         frames = list(frames)
@@ -124,20 +131,23 @@ class CompiledCodec:
     def gather(self, buffer: NDArray[np.uint8], offsets: NDArray[np.intp], sizes: NDArray[np.intp]) -> Rows:
         groups, _ = self.tree.classify(buffer, offsets)
         known = [(layout, which) for layout, which in groups if isinstance(layout, Layout)]
-        return Rows(self.schema, [Group(layout, which, _rows(buffer, offsets[which], layout.size)) for layout, which in known])
+        return Rows(
+            self.schema,
+            [
+                Group(layout, which, rows_at(buffer, offsets if len(which) == len(offsets) else offsets[which], layout.size))
+                for layout, which in known
+            ],
+        )
 
-    def _judge(self, rows: NDArray[np.uint8], layout: Layout, errors: list[str]) -> NDArray[np.uint8]:
-        status = np.where(layout.constant(rows), VALID, CONSTANT).astype(np.uint8)
-        for seal in layout.seals:
-            open_ = np.flatnonzero(status == VALID)
-            if len(open_):
-                some = rows if len(open_) == len(rows) else rows[open_]
-                status[open_] = intactness(seal, some, errors)
-        open_ = np.flatnonzero(status == VALID)
-        if self.frame.plausible is not None and len(open_):
-            table = Rows(self.schema, [Group(layout, np.arange(len(open_)), rows if len(open_) == len(rows) else rows[open_])])
-            status[open_] = plausibility(self.frame, table, errors)
-        return status
+    def _judge(self, layout: Layout) -> Judge:
+        judge = layout.notes.get(Judge)
+        if judge is None:
+            checks: list[Check] | None = []
+            if self.frame.plausible is not None:
+                self._conditions = self._conditions or Conditions(self.frame.plausible, self.schema, layout)
+                checks = self._conditions.checks(layout)
+            judge = layout.notes[Judge] = Judge(self.frame, self.schema, layout, self.prefix, checks)
+        return judge
 
 
 class InterpretedCodec:
@@ -145,7 +155,7 @@ class InterpretedCodec:
 
     def __init__(self, frame: Frame, reason: str = "") -> None:
         self.frame, self.reason, self.schema = frame, reason, schema(frame.prepared)
-        self.prefix = _prefix(frame)
+        self.prefix, self.size = _prefix(frame), _size(frame)
 
     def survey(self, buffer: NDArray[np.uint8], offsets: NDArray[np.intp]) -> Survey:
         status = np.zeros(len(offsets), np.uint8)
@@ -185,51 +195,23 @@ class InterpretedCodec:
         return int(plausibility(self.frame, Records(self.schema, [parsed], [data[:size]]), errors)[0]), size
 
 
-def intactness(seal: Seal, rows: NDArray[np.uint8], errors: list[str]) -> NDArray[np.uint8]:
-    """`VALID`, `CHECKSUM` or `PLUGIN` for each frame, by one of its checksums."""
+def _partial(buffer: NDArray[np.uint8], offsets: NDArray[np.intp], layout: Layout) -> tuple[NDArray[np.uint8], NDArray[np.intp]]:
+    """Candidates whose end is not there yet: still possible, or already refuted by a constant; and how many bytes tell more."""
+    status = np.full(len(offsets), SHORT, np.uint8)
+    sizes = np.full(len(offsets), layout.size, np.intp)
+    for spot in sorted(layout.constants, reverse=True):
+        mask, value = layout.constants[spot]
+        there = offsets + spot < len(buffer)
+        status[there] = np.where(buffer[offsets[there] + spot] & mask == value, status[there], CONSTANT)
+        sizes[~there] = spot + 1
+    return status, sizes
+
+
+def _size(frame: Frame) -> int | None:
     try:
-        return np.where(seal.intact(rows), VALID, CHECKSUM).astype(np.uint8)
-    except Exception:
-        errors += [traceback.format_exc()] * len(rows)
-        return np.full(len(rows), PLUGIN, np.uint8)
-
-
-def plausibility(frame: Frame, table: Table, errors: list[str]) -> NDArray[np.uint8]:
-    """`VALID`, `IMPLAUSIBLE` or `PLUGIN` for each frame of a table, by the frame's own test."""
-    assert frame.plausible is not None
-    batch = Batch(table, np.zeros(len(table), np.bool_))
-    try:
-        with np.errstate(all="ignore"):
-            answer = frame.plausible(Fields(batch))
-        array = np.broadcast_to(np.asarray(answer), (len(table), *np.shape(answer)[1:])) if np.ndim(answer) else np.full(len(table), answer)
-        return np.where(_all(array, answer, batch), VALID, IMPLAUSIBLE).astype(np.uint8)
-    except Exception:
-        errors += [traceback.format_exc()] * len(table)
-        return np.full(len(table), PLUGIN, np.uint8)
-
-
-def _all(array: NDArray[Any], answer: Any, batch: Batch) -> NDArray[np.bool_]:
-    """Whether a condition holds everywhere in each frame, padding left out."""
-    flat = array.reshape(len(array), math.prod(array.shape[1:])).astype(np.bool_)
-    mask = unpadded(answer.axes, array.shape, batch) if isinstance(answer, Column) else None
-    return np.asarray((flat if mask is None else flat | ~mask).all(axis=1))
-
-
-def _rows(buffer: NDArray[np.uint8], offsets: NDArray[np.intp], size: int) -> NDArray[np.uint8]:
-    """The bytes of frames of one size, one a row, C-contiguous."""
-    if not len(offsets) or not size:
-        return np.zeros((len(offsets), size), np.uint8)
-    if len(buffer) == len(offsets) * size and bool((np.diff(offsets) == size).all()) and offsets[0] == 0:
-        return np.ascontiguousarray(buffer).reshape(-1, size)
-    return np.lib.stride_tricks.sliding_window_view(buffer, size)[offsets]
-
-
-def _partial(data: NDArray[np.uint8], layout: Layout) -> int:
-    """A candidate whose end is not there yet: still possible, or already refuted by a constant."""
-    for spot, (mask, value) in layout.constants.items():
-        if spot < len(data) and data[spot] & mask != value:
-            return CONSTANT
-    return SHORT
+        return int(frame.prepared.sizeof())
+    except Exception:  # of a part of the struct, which may be anybody's
+        return None
 
 
 def _prefix(frame: Frame) -> dict[int, tuple[int, int]]:
@@ -242,13 +224,6 @@ def _prefix(frame: Frame) -> dict[int, tuple[int, int]]:
     with contextlib.suppress(NotCompilable, TooLong, SpecError):
         state.run(frame.prepared)
     return dict(state.constants)
-
-
-_unpackers: weakref.WeakKeyDictionary[Layout, Unpack] = weakref.WeakKeyDictionary()
-
-
-def _nothing(frame: bytes) -> None:
-    """Stands in where no unpacker can be made."""
 
 
 @functools.lru_cache(maxsize=2048)

@@ -28,27 +28,33 @@ class Turning:
         self._direction, self._total, self._furthest = 0, 0.0, 0.0
 
     def push(self, steps: NDArray[np.float64]) -> NDArray[np.float64]:
-        """1 or -1 for each of the next steps, (k,), given in turns."""
+        """1 or -1 for each of the next steps, (k,), given in turns; of length 1 where it is the same for all."""
         totals = np.cumsum(np.concatenate([[self._total], steps]))[1:]
         self._total = float(totals[-1]) if len(totals) else self._total
-        found, start, size = np.ones(len(totals)), 0, 64
+        found: NDArray[np.float64] | None = None
+        start, size = 0, 64
+        first = self._direction
         while start < len(totals):
             part = totals[start : start + size]
             if self._direction == 0:
+                found = np.ones(len(totals)) if found is None else found
                 found[start : start + len(part)] = np.where(part < 0, -1, 1)
-                turned = np.flatnonzero(np.abs(part) >= 0.5)
+                turned = np.abs(part) >= 0.5
             else:
-                found[start : start + len(part)] = self._direction
+                if found is not None:
+                    found[start : start + len(part)] = self._direction
                 ahead = self._direction * part
                 furthest = np.maximum(np.maximum.accumulate(ahead), self._furthest)
-                turned = np.flatnonzero(furthest - ahead >= 0.5)
+                turned = furthest - ahead >= 0.5
                 self._furthest = float(furthest[-1])
             start, size = start + len(part), size * 2
-            if len(turned):
-                start, size = start - len(part) + int(turned[0]), 64
-                self._direction = -self._direction or (1 if part[turned[0]] > 0 else -1)
-                self._furthest = self._direction * float(part[turned[0]])
-        return found
+            if turned.any():
+                spot = int(turned.argmax())
+                start, size = start - len(part) + spot, 64
+                found = np.full(len(totals), float(first)) if found is None else found
+                self._direction = -self._direction or (1 if part[spot] > 0 else -1)
+                self._furthest = self._direction * float(part[spot])
+        return np.array([float(first or 1)]) if found is None else found
 
 
 class Cutter:
@@ -82,29 +88,39 @@ class Cutter:
             return np.flatnonzero(values != 0)
         if not len(values):
             return np.empty(0, np.intp)
-        before = np.concatenate([[values[0] if self._before is None else self._before], values[:-1]])
+        before = _before(values, self._before)
         self._before = float(values[-1])
         return np.flatnonzero(values < before if isinstance(rule, OnRewind) else values != before)
 
     def _wraps(self, angles: NDArray[np.float64], full: float, at: float) -> NDArray[np.intp]:
         """Places where the angle has gone on past `at`, in whichever direction the sensor turns."""
-        known = np.flatnonzero(np.isfinite(angles))
-        if not len(known):
+        finite = np.isfinite(angles)
+        known = None if finite.all() else np.flatnonzero(finite)
+        values = angles if known is None else angles[known]
+        if not len(values):
             return np.empty(0, np.intp)
-        values = angles[known]
-        before = np.concatenate([[values[0] if self._before is None else self._before], values[:-1]])
+        before = _before(values, self._before)
         self._before = float(values[-1])
-        steps = np.mod(values - before + full / 2, full) - full / 2
-        direction = self._turning.push(steps / full)
-        turned, earlier = np.mod(direction * (values - at), full), np.mod(direction * (before - at), full)
-        away = np.flatnonzero((turned > full * AWAY) & (turned < full * (1 - AWAY)))
-        found, since = [], 0
-        for spot in np.flatnonzero(earlier - turned > full / 2).tolist():
-            if self._armed or np.searchsorted(away, since) < np.searchsorted(away, spot):
+        direction = self._turning.push((_folded(values - before + full / 2, full) - full / 2) / full)
+        if len(direction) == 1:
+            turned = _folded(direction * (values - at), full)
+            earlier = _before(turned, float(_folded(direction * (before[:1] - at), full)[0]))
+        else:
+            turned, earlier = (_folded(direction * (some - at), full) for some in (values, before))
+        passed = np.flatnonzero(earlier - turned > full / 2)
+        found, away = self._armed_at(passed, (turned > full * AWAY) & (turned < full * (1 - AWAY)))
+        self._armed = self._armed or away
+        return np.array(found, np.intp) if known is None else known[np.array(found, np.intp)]
+
+    def _armed_at(self, passed: NDArray[np.intp], far: NDArray[np.bool_]) -> tuple[list[int], bool]:
+        """Those of the places where an angle passes that come after it was far away; and whether it was since the last one."""
+        found: list[int] = []
+        since = 0
+        for spot in passed.tolist():
+            if self._armed or far[since:spot].any():
                 found.append(spot)
                 self._armed, since = False, spot
-        self._armed = self._armed or bool(len(away) and away[-1] >= since)
-        return known[np.array(found, np.intp)]
+        return found, bool(far[since:].any())
 
     def _periods(self, rule: Every, packets: Packets, found: Evaluated) -> list[int]:
         times = packets.time_ns[: found.ready]
@@ -112,9 +128,9 @@ class Cutter:
             return []
         self._start = int(times[0]) if self._start is None else self._start
         period = (times - self._start) // int(rule.seconds * 1e9)
-        before = np.concatenate([[period[0] if self._before is None else self._before], period[:-1]])
+        before = _before(period.astype(np.float64), self._before)
         self._before = float(period[-1])
-        starts = _starts(found.counts.sum(axis=tuple(range(1, found.counts.ndim))))
+        starts = _starts(_sums(found.counts, 1))
         return starts[np.flatnonzero(period > before)].tolist()  # type: ignore[no-any-return]
 
 
@@ -131,15 +147,38 @@ def _rows(column: Column, found: Evaluated) -> tuple[NDArray[np.float64], NDArra
     """The values of a field row by row in stream order, and the index of the first point of each row."""
     levels = 1 + max((index for index, name in enumerate(column.axes) if name is not None), default=-1)
     counts = found.counts
-    shape = np.broadcast_shapes((found.ready, *column.shape[1 : 1 + levels]), counts.shape[: 1 + levels])
-    wide = np.broadcast_to(counts, (*shape, *counts.shape[1 + levels :]))
-    points = wide.sum(axis=tuple(range(1 + levels, wide.ndim))).reshape(-1)
-    values = np.broadcast_to(
-        column.array[: found.ready].reshape(len(column.array[: found.ready]), *column.shape[1 : 1 + levels]), shape
-    ).reshape(-1)
+    array = column.array[: found.ready]
+    if not levels and len(array) == len(counts):
+        return array.reshape(-1), _starts(_sums(counts, 1))
+    shape = np.broadcast_shapes((found.ready, *array.shape[1 : 1 + levels]), counts.shape[: 1 + levels])
+    points = _sums(np.broadcast_to(counts, (*shape, *counts.shape[1 + levels :])), 1 + levels).reshape(-1)
+    values = np.broadcast_to(array.reshape(len(array), *array.shape[1 : 1 + levels]), shape).reshape(-1)
     starts = _starts(points)
     kept = points > 0 if levels else np.ones(len(points), np.bool_)
     return values[kept], starts[kept]
+
+
+def _sums(counts: NDArray[np.intp], kept: int) -> NDArray[np.intp]:
+    """Sums over all axes but the first `kept`; along axes that repeat one number they are products."""
+    times = 1
+    while counts.ndim > kept:
+        repeats = counts.strides[-1] == 0 and counts.shape[-1] > 0
+        times *= counts.shape[-1] if repeats else 1
+        counts = counts[..., 0] if repeats else counts.sum(axis=-1)
+    return counts * times
+
+
+def _folded(angles: NDArray[np.float64], full: float) -> NDArray[np.float64]:
+    """Angles in [0, full); the same as `np.mod`, and several times as fast."""
+    return angles - np.floor(angles / full) * full
+
+
+def _before(values: NDArray[np.float64], first: float | None) -> NDArray[np.float64]:
+    """The value before each; before the first one `first`, or itself."""
+    found = np.empty_like(values)
+    found[:1] = values[:1] if first is None else first
+    found[1:] = values[:-1]
+    return found
 
 
 def _starts(points: NDArray[np.intp]) -> NDArray[np.intp]:

@@ -6,20 +6,24 @@ with the next. Datagram links frame by datagram. However the input is cut, the f
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field, fields
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.codecs import VALID, Codec, codec
+from lidarspec.codecs import Codec, codec
+from lidarspec.datagrams import Datagrams
 from lidarspec.errors import UsageError
-from lidarspec.framing import COUNTED, Framing, Mode, Piece
+from lidarspec.found import Counters, Found, Spans, packed
+from lidarspec.framing import Framing, Mode, Piece
+from lidarspec.runs import cut
 from lidarspec.spec import Sensor
 
-#: bytes of a stream looked at in one go.
-PIECE = 1 << 16
+__all__ = ["BACKENDS", "Counters", "Decoder", "Found", "Spans", "backend", "is_stream", "packed", "spans_of"]
+
+#: bytes of a stream looked at in one go, at most and at least.
+PIECE, LEAST = 6 << 16, 1 << 12
 
 #: datagrams judged together.
 TOGETHER = 1024
@@ -27,104 +31,6 @@ TOGETHER = 1024
 Data = bytes | bytearray | memoryview | NDArray[np.uint8]
 
 BACKENDS = ("auto", "numpy", "jit", "construct")
-
-
-@dataclass
-class Counters:
-    """What became of the input. ``bytes_in == bytes in frames + bytes_skipped + pending`` always holds.
-
-    Attributes:
-        frames: number of frames by type.
-        bytes_filler: declared fillers among the skipped bytes.
-        pending: bytes held because a candidate needs more.
-        bad_checksum, bad_length, implausible: rejected candidates.
-        lost, duplicates, late: packets, by the sensor's sequence.
-        kernel_drops, queue_dropped, foreign, disconnects: counted by the transports.
-        plugin_errors: exceptions out of a plugin; `tracebacks` keeps the first ones.
-    """
-
-    bytes_in: int = 0
-    frames: dict[str, int] = field(default_factory=dict)
-    bytes_skipped: int = 0
-    bytes_filler: int = 0
-    pending: int = 0
-    bad_checksum: int = 0
-    bad_length: int = 0
-    implausible: int = 0
-    lost: int = 0
-    duplicates: int = 0
-    late: int = 0
-    kernel_drops: int = 0
-    queue_dropped: int = 0
-    foreign: int = 0
-    plugin_errors: int = 0
-    disconnects: int = 0
-    tracebacks: list[str] = field(default_factory=list, repr=False, compare=False)
-
-    def to_dict(self) -> dict[str, Any]:
-        """The counters by name."""
-        return {f.name: getattr(self, f.name) for f in fields(self) if f.name != "tracebacks"}
-
-    def error(self, traceback: str, number: int = 1) -> None:
-        """Count an exception out of a plugin, and keep the first few tracebacks."""
-        self.plugin_errors += number
-        if len(self.tracebacks) < 5:
-            self.tracebacks.append(traceback)
-
-    def __str__(self) -> str:
-        parts = [f"{name} {value}" for name, value in self.to_dict().items() if value and name != "frames"]
-        return ", ".join([*(f"{number} {name} frames" for name, number in self.frames.items()), *parts]) or "nothing yet"
-
-
-@dataclass(frozen=True, slots=True)
-class Found:
-    """One frame in the input.
-
-    Attributes:
-        frame: the name of its type.
-        offset: of its first byte in everything fed so far (of its datagram's payload, joined, for datagram links).
-        data: its bytes.
-        at: arrival time in ns of the piece of input that completed it; None if the caller gave none.
-        gap: bytes (other than fillers) skipped since the frame before it.
-    """
-
-    frame: str
-    offset: int
-    data: bytes
-    at: int | None = None
-    gap: int = 0
-
-
-@dataclass(frozen=True, eq=False)
-class Spans:
-    """Frames of a piece of input as arrays, in stream order.
-
-    Attributes:
-        names: the types; `kinds` are indices into them.
-        buffer: the bytes that the frames stand in, at `starts`, `sizes` long.
-        offsets, gaps, at: as in `Found`; `at` is -1 where nobody knows it.
-    """
-
-    names: tuple[str, ...]
-    buffer: NDArray[np.uint8]
-    kinds: NDArray[np.intp]
-    starts: NDArray[np.intp]
-    sizes: NDArray[np.intp]
-    offsets: NDArray[np.int64]
-    gaps: NDArray[np.int64]
-    at: NDArray[np.int64]
-
-    def data(self, index: int) -> bytes:
-        """The bytes of one frame."""
-        return self.buffer[self.starts[index] : self.starts[index] + self.sizes[index]].tobytes()
-
-    def found(self) -> list[Found]:
-        """The frames one by one."""
-        rows = zip(self.kinds.tolist(), self.offsets.tolist(), self.gaps.tolist(), self.at.tolist(), strict=True)
-        return [
-            Found(self.names[kind], offset, self.data(index), None if at < 0 else at, gap)
-            for index, (kind, offset, gap, at) in enumerate(rows)
-        ]
 
 
 class Decoder:
@@ -147,7 +53,10 @@ class Decoder:
         self._mode = Mode(after=_first_mode(sensor))
         self._pending, self._base, self._need = b"", 0, 0
         self._gap = 0
-        self._fillers = np.array(sorted(set(sensor.fillers)), np.uint8)
+        self._fillers, self._names = bytes(sensor.fillers), tuple(self._codecs)
+        self._least = max(LEAST, 2 * self._framing.reach)
+        self._size = max(PIECE, self._least)
+        self._datagrams = Datagrams(self._framing)
 
     def feed(self, data: Data, at: int | None = None) -> list[Found]:
         """The frames that these bytes complete, in stream order. Raises on no bytes whatever.
@@ -173,114 +82,143 @@ class Decoder:
             return [self.datagrams([view], [at])]
         self.stats.bytes_in += len(view)
         found: list[Spans] = []
-        for start in range(0, len(view), PIECE):
-            self._pending += view[start : start + PIECE]
-            if len(self._pending) >= self._need:
-                found.append(self._scan(at, final=False))
+        start, lasting = 0, isinstance(data, bytes)
+        if self._pending:
+            held = len(self._pending)
+            head = b"".join((self._pending, view[: max(self._least, self._need)]))
+            start = self._cut(np.frombuffer(head, np.uint8), at, found) - held
+            if start < 0 or held + len(view) == len(head):
+                self._pending, start = head[start + held :], len(view)
+        if start < len(view):
+            rest = np.frombuffer(view[start:], np.uint8)
+            self._pending = rest[self._cut(rest, at, found, lasting=lasting) :].tobytes()
         self.stats.pending = len(self._pending)
         return found
 
     def rest(self) -> list[Spans]:
         """The same as `idle` and `finish`, as arrays."""
-        found = [self._scan(None, final=True)] if self._pending else []
-        self.stats.pending = len(self._pending)
+        found: list[Spans] = []
+        self._need = 0
+        if self._pending:
+            self._cut(np.frombuffer(self._pending, np.uint8), None, found, final=True)
+        self._pending, self.stats.pending = b"", 0
         return found
 
     def datagrams(self, data: Sequence[Any] | NDArray[np.uint8], at: Sequence[int | None] | None = None) -> Spans:
         """Datagrams, each one frame, whole, or none; a list, or the rows of an array."""
-        sizes = np.array([len(one) for one in data], np.intp)
-        starts = np.cumsum(sizes) - sizes
-        buffer = data.reshape(-1) if isinstance(data, np.ndarray) else np.frombuffer(b"".join(data), np.uint8)
-        self.stats.bytes_in += len(buffer)
-        if self._framing.named:
-            kinds = np.array([self._judge(buffer[a : a + n]) for a, n in zip(starts.tolist(), sizes.tolist(), strict=True)], np.intp)
+        if isinstance(data, np.ndarray):
+            buffer, sizes = data.reshape(-1), np.full(len(data), data.shape[1], np.intp)
         else:
-            kinds = self._judge_all(buffer, starts, sizes)
-        lost = np.where(kinds < 0, sizes, 0)
-        for index in np.flatnonzero(lost):
+            buffer, sizes = np.frombuffer(b"".join(data), np.uint8), np.array([len(one) for one in data], np.intp)
+        times = np.full(len(data), -1, np.int64) if at is None else np.array([-1 if one is None else one for one in at], np.int64)
+        return self.placed(buffer, np.cumsum(sizes) - sizes, sizes, times)
+
+    def placed(self, buffer: NDArray[np.uint8], starts: NDArray[np.intp], sizes: NDArray[np.intp], at: NDArray[np.int64]) -> Spans:
+        """Datagrams that stand in one buffer already; the same as `datagrams`, and nothing is copied.
+
+        Args:
+            buffer: one-dimensional and contiguous; what stands between the datagrams does not matter.
+            starts, sizes: of each datagram, in the order of their arrival.
+            at: their arrival times in ns, -1 where nobody knows.
+        """
+        ends = np.cumsum(sizes)
+        total = int(ends[-1]) if len(ends) else 0
+        self.stats.bytes_in += total
+        kinds = self._datagrams.kinds(buffer, starts, sizes, self._mode)
+        self._rejected(self._datagrams.rejected, self._datagrams.errors)
+        offsets, self._base = self._base + (ends - sizes), self._base + total
+        gaps = np.zeros(len(starts), np.int64)
+        if self._gap or bool((kinds < 0).any()):
+            good = kinds >= 0
+            gaps = self._lost(buffer, starts, sizes, good)
+            kinds, starts, sizes, offsets, at = (array[good] for array in (kinds, starts, sizes, offsets, at))
+        self._count(kinds)
+        return Spans(self._names, buffer, kinds, starts, sizes, offsets, gaps, at)
+
+    def _lost(
+        self, buffer: NDArray[np.uint8], starts: NDArray[np.intp], sizes: NDArray[np.intp], good: NDArray[np.bool_]
+    ) -> NDArray[np.int64]:
+        """The bytes in datagrams that are no frames before each one that is, fillers left out; counts them."""
+        lost = np.where(good, 0, sizes)
+        for index in np.flatnonzero(lost).tolist():
             lost[index] -= self._skip(buffer[starts[index] : starts[index] + sizes[index]])
-        good = np.flatnonzero(kinds >= 0)
         before = np.concatenate([[-self._gap], np.cumsum(lost)[good]])
         self._gap = int(lost.sum() - before[-1])
-        offsets, self._base = self._base + starts, self._base + len(buffer)
-        times = np.full(len(data), -1, np.int64) if at is None else np.array([-1 if one is None else one for one in at], np.int64)
-        spans = Spans(tuple(self._codecs), buffer, kinds[good], starts[good], sizes[good], offsets[good], np.diff(before), times[good])
-        self._count(spans.kinds)
-        return spans
+        return np.diff(before)
 
-    def _scan(self, at: int | None, *, final: bool) -> Spans:
-        buffer = np.frombuffer(self._pending, np.uint8)
-        piece = self._framing.scan(buffer, self._mode, base=self._base, final=final)
+    def _cut(self, buffer: NDArray[np.uint8], at: int | None, found: list[Spans], *, lasting: bool = True, final: bool = False) -> int:
+        """Cut bytes into frames, piece by piece, and add those with frames to what is found.
+
+        Args:
+            lasting: nobody will change the bytes.
+            final: nothing follows them.
+
+        Returns:
+            Where the rest begins that waits for what follows.
+        """
+        start = 0
+        while start < len(buffer) and len(buffer) - start >= self._need:
+            part = buffer[start : start + self._size]
+            last = start + len(part) == len(buffer)
+            part = part if lasting else part.copy()
+            piece = cut(self._framing, part, self._mode, base=self._base, final=final and last)
+            spans = self._entered(part, piece, at)
+            found += [spans] if len(spans.kinds) else []  # one without frames would keep its bytes
+            start, self._base = start + piece.end, self._base + piece.end
+            self._need = piece.need if piece.waiting and last else 0
+            if piece.waiting and last:
+                break
+            self._size = min(max(4 * piece.end, self._least), PIECE)
+        return start
+
+    def _entered(self, buffer: NDArray[np.uint8], piece: Piece, at: int | None) -> Spans:
+        """The frames of a piece, with all that was found in it counted."""
         gaps = self._gaps(buffer, piece)
-        for name, number in piece.rejected.items():
-            setattr(self.stats, name, getattr(self.stats, name) + number)
-        self.stats.tracebacks += piece.errors[: 5 - len(self.stats.tracebacks)]
-        times = np.full(len(gaps), -1 if at is None else at, np.int64)
-        spans = Spans(
-            tuple(self._codecs), buffer, piece.kinds, piece.offsets, piece.sizes, self._base + piece.offsets.astype(np.int64), gaps, times
-        )
+        self._rejected(piece.rejected, piece.errors)
         self._count(piece.kinds)
-        self._pending, self._base, self._need = self._pending[piece.end :], self._base + piece.end, piece.need
-        return spans
+        starts, offsets = piece.offsets, self._base + piece.offsets.astype(np.int64)
+        if piece.rows is not None:
+            buffer, starts = piece.rows.reshape(-1), np.arange(len(piece.rows)) * piece.rows.shape[1]
+        times = np.full(len(gaps), -1 if at is None else at, np.int64)
+        return Spans(self._names, buffer, piece.kinds, starts, piece.sizes, offsets, gaps, times)
 
     def _gaps(self, buffer: NDArray[np.uint8], piece: Piece) -> NDArray[np.int64]:
         """The bytes skipped before each frame, fillers left out; counts them."""
-        ends = np.concatenate([[0], piece.offsets + piece.sizes])
-        starts = np.concatenate([piece.offsets, [max(piece.end, int(ends[-1]))]])
-        gaps = (starts - ends).astype(np.int64)
-        for index in np.flatnonzero(gaps).tolist() if len(self._fillers) else ():
-            gaps[index] -= self._skip(buffer[ends[index] : starts[index]])
-        if not len(self._fillers):
+        gaps = np.empty(len(piece.offsets) + 1, np.int64)
+        gaps[:-1], gaps[-1] = piece.offsets, piece.end
+        gaps[1:] -= piece.offsets + piece.sizes
+        if self._fillers:
+            for index in np.flatnonzero(gaps).tolist():
+                stop = int(piece.offsets[index]) if index < len(piece.offsets) else piece.end
+                gaps[index] -= self._skip(buffer[stop - gaps[index] : stop])
+        else:
             self.stats.bytes_skipped += int(gaps.sum())
         gaps[0] += self._gap
         self._gap = int(gaps[-1])
-        return np.asarray(gaps[:-1])
+        return gaps[:-1]
 
     def _skip(self, skipped: NDArray[np.uint8]) -> int:
         """Count skipped bytes; the number of fillers among them."""
-        fillers = int(np.isin(skipped, self._fillers).sum()) if len(self._fillers) else 0
+        fillers = len(skipped) - len(skipped.tobytes().translate(None, self._fillers)) if self._fillers else 0
         self.stats.bytes_skipped += len(skipped)
         self.stats.bytes_filler += fillers
         return fillers
 
+    def _rejected(self, numbers: Mapping[str, int], errors: Sequence[str]) -> None:
+        for name, number in numbers.items():
+            setattr(self.stats, name, getattr(self.stats, name) + number)
+        self.stats.tracebacks += errors[: 5 - len(self.stats.tracebacks)]
+
     def _count(self, kinds: NDArray[np.intp]) -> None:
-        for name, number in zip(self._codecs, np.bincount(kinds, minlength=len(self._codecs)).tolist(), strict=True):
+        frames = self.stats.frames
+        known = len(frames)
+        for kind, number in enumerate(np.bincount(kinds).tolist() if len(kinds) else ()):
             if number:
-                self.stats.frames[name] = self.stats.frames.get(name, 0) + number
-
-    def _judge_all(self, buffer: NDArray[np.uint8], starts: NDArray[np.intp], sizes: NDArray[np.intp]) -> NDArray[np.intp]:
-        """The type of each datagram, -1 where it is none."""
-        kinds = np.full(len(starts), -1, np.intp)
-        for index, engine in enumerate(self._codecs.values()):
-            left = np.flatnonzero((kinds < 0) & (sizes > 0))
-            for spot, (mask, value) in engine.prefix.items():
-                left = left[sizes[left] > spot]
-                left = left[buffer[starts[left] + spot] & mask == value]
-            survey = engine.survey(buffer, starts[left])
-            kinds[left[(survey.status == VALID) & (survey.sizes == sizes[left])]] = index
-        for index in np.flatnonzero(kinds < 0).tolist():
-            kinds[index] = self._judge(buffer[starts[index] : starts[index] + sizes[index]])
-        return kinds
-
-    def _judge(self, buffer: NDArray[np.uint8]) -> int:
-        """The type of one datagram, -1 where it is none; counts why."""
-        rejected = 0
-        for index, (name, engine) in enumerate(self._codecs.items()):
-            if not self._framing.active(index, self._mode) or not _starts(buffer, engine):
-                continue
-            survey = engine.survey(buffer, np.zeros(1, np.intp))
-            if survey.status[0] == VALID and survey.sizes[0] == len(buffer):
-                self._mode.after = name if name in self._framing.named else self._mode.after
-                return index
-            rejected = max(rejected, int(survey.status[0]))
-            self.stats.tracebacks += survey.errors[: 5 - len(self.stats.tracebacks)]
-        counter = COUNTED.get(rejected, "bad_length")
-        setattr(self.stats, counter, getattr(self.stats, counter) + 1)
-        return -1
-
-
-def _starts(buffer: NDArray[np.uint8], engine: Codec) -> bool:
-    return all(spot < len(buffer) and buffer[spot] & mask == value for spot, (mask, value) in engine.prefix.items())
+                frames[self._names[kind]] = frames.get(self._names[kind], 0) + number
+        if len(frames) > known > 0:
+            for name in self._names:  # in their order, however the input was cut
+                if name in frames:
+                    frames[name] = frames.pop(name)
 
 
 def _first_mode(sensor: Sensor) -> str | None:
@@ -304,19 +242,11 @@ def spans_of(decoder: Decoder, data: Any) -> list[Spans]:
     """Every frame of a whole input: bytes as a stream, an iterable or (n, size) array as datagrams."""
     if is_stream(data):
         return decoder.spans(data) + decoder.rest()
-    everything = np.ascontiguousarray(data, np.uint8) if isinstance(data, np.ndarray) else list(data)
-    return [decoder.datagrams(everything[start : start + TOGETHER]) for start in range(0, len(everything), TOGETHER)]
-
-
-def packed(found: Sequence[Found]) -> Spans:
-    """Frames given one by one as arrays."""
-    names = tuple(dict.fromkeys(item.frame for item in found))
-    sizes = np.array([len(item.data) for item in found], np.intp)
-    columns = [np.array(column, np.int64) for column in zip(*((f.offset, f.gap, -1 if f.at is None else f.at) for f in found), strict=True)]
-    offsets, gaps, at = columns or [np.empty(0, np.int64)] * 3
-    kinds = np.array([names.index(item.frame) for item in found], np.intp)
-    buffer = np.frombuffer(b"".join(item.data for item in found), np.uint8)
-    return Spans(names, buffer, kinds, np.cumsum(sizes) - sizes, sizes, offsets, gaps, at)
+    if isinstance(data, np.ndarray):
+        everything, step = np.ascontiguousarray(data, np.uint8), max(PIECE // max(data.shape[1], 1), 1)
+        return [decoder.datagrams(everything[start : start + step]) for start in range(0, len(everything), step)]
+    packets = list(data)
+    return [decoder.datagrams(packets[start : start + TOGETHER]) for start in range(0, len(packets), TOGETHER)]
 
 
 def is_stream(data: Any) -> bool:

@@ -1,67 +1,137 @@
-"""The main job with nothing attached: a simulated sensor in a room, damaged on the way, decoded and summed up."""
+"""The main job with nothing attached, end to end: a simulated sensor on a real line, asked to start, read, recorded, read again.
+
+A serial sensor stands on a pseudo-terminal, or on a TCP port where the system has none; the others send UDP datagrams on loopback.
+The line does its harm on the way. What was recorded is decoded once more, and has to give the same points.
+"""
 
 from __future__ import annotations
 
-import random
+import hashlib
+import itertools
+import os
+import socket
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 from lidarspec.decoder import Counters
-from lidarspec.scans import Scan, ScanStream
-from lidarspec.simulator import opening, simulate
+from lidarspec.device import Device
+from lidarspec.device import open as open_device
+from lidarspec.errors import SourceError
+from lidarspec.faults import Faults
+from lidarspec.replies import Reply
+from lidarspec.scans import Scan
+from lidarspec.simulated import SimulatedDevice
 from lidarspec.spec import Sensor
-from lidarspec.streams import PacketStream
+from lidarspec.transports.doors import HERE
+from lidarspec.transports.serving import Served, door
 
-#: packets simulated at a time.
-BATCH = 256
+#: seconds that the scans may take beyond those that they last.
+PATIENCE = 15.0
 
 
 @dataclass(frozen=True, eq=False)
 class DemoResult:
-    """What the demo saw: the scans, the decoder's counters, and how many frames were sent and left the line unharmed."""
+    """What the demo saw.
+
+    Attributes:
+        sensor, place: whose, and where it stood.
+        replies: to the commands that opened it.
+        scans: those that came, the last one the last whole one.
+        stats: the decoder's counters.
+        sent, intact: packets that were sent, and that left the line unharmed.
+        digest: SHA-256 of the points of the whole scans.
+        again: the same of the recording.
+        recorded: bytes in the recording.
+    """
 
     sensor: Sensor
+    place: str
+    replies: tuple[Reply, ...]
     scans: tuple[Scan, ...]
     stats: Counters
     sent: int
     intact: int
+    digest: str
+    again: str
+    recorded: int
 
 
-def run(sensor: Sensor, *, turns: int = 5, errors: float = 0.01, seed: int = 1, most: int = 20_000) -> DemoResult:
-    """Simulate until so many whole scans have come out of the decoder.
+def run(sensor: Sensor, *, turns: int = 5, errors: float = 0.01, seed: int = 1) -> DemoResult:
+    """Let a simulated sensor work until so many whole scans have come.
 
     Args:
         turns: whole scans wanted.
         errors: share of the bytes of a stream that are damaged, or of the datagrams that are lost.
-        most: packets after which it ends in any case.
+
+    Raises:
+        SourceError: where no line can be had, or the scans do not come.
     """
-    source = random.Random(seed)
-    decoder = sensor.decoder()
-    packets, scans = PacketStream(sensor, sensor.data_frame, decoder.stats), ScanStream(sensor)
-    found: list[Scan] = []
-    sent = intact = 0
-    if decoder.stream:
-        decoder.feed(opening(sensor))
-    for start in range(0, most, BATCH):
-        chunks = [_damaged(frame, source, errors, stream=decoder.stream) for frame in simulate(sensor, BATCH, start=start)]
-        sent, intact = sent + len(chunks), intact + sum(unharmed for _, unharmed in chunks)
-        data = [data for data, _ in chunks if data]
-        spans = decoder.spans(b"".join(data)) if decoder.stream else [decoder.datagrams(data)]
-        found += scans.add(packets.add(spans))
-        if sum(scan.complete for scan in found) >= turns:
+    faults = Faults(loss=errors) if sensor.datagrams else Faults(errors=errors)
+    simulated = SimulatedDevice(sensor, seed=seed, faults=faults)
+    with tempfile.TemporaryDirectory(prefix="lidarspec-demo-") as folder:
+        path = Path(folder) / "demo.lsr"
+        place, replies, scans, stats = _live(simulated, path, turns)
+        line, recorded = simulated.lines["data"], path.stat().st_size
+        with open_device(path, sensor) as recording:
+            again = digest(_whole(recording.scans(), turns))
+    digested = digest([scan for scan in scans if scan.complete])
+    return DemoResult(sensor, place, replies, scans, stats, line.sent, line.intact, digested, again, recorded)
+
+
+def digest(scans: Sequence[Scan]) -> str:
+    """SHA-256 of the coordinates, ranges and intensities of scans."""
+    found = hashlib.sha256()
+    for scan in scans:
+        points = scan.points
+        for column in (points.xyz, points.range, points.intensity):
+            found.update(b"" if column is None else column.tobytes())
+    return found.hexdigest()
+
+
+def has_terminals() -> bool:
+    """Whether the system has pseudo-terminals."""
+    return hasattr(os, "openpty")
+
+
+def _live(simulated: SimulatedDevice, path: Path, turns: int) -> tuple[str, tuple[Reply, ...], tuple[Scan, ...], Counters]:
+    """The place of the sensor, its replies, its scans and the counters; everything that came is recorded."""
+    sensor = simulated.sensor
+    if sensor.datagrams:
+        port = _free_port()
+        at = f"udp://{HERE}:{port}"
+        with open_device(at, sensor, start=False, record=path) as device, Served(simulated, door(sensor, at)):
+            return at, *_read(device, turns)
+    to = "pty" if has_terminals() else f"tcp://{HERE}:0"
+    with (
+        Served(simulated, door(sensor, to), patient=True) as served,
+        open_device(served.path, sensor, start=False, record=path) as device,
+    ):
+        return served.path, *_read(device, turns)
+
+
+def _read(device: Device, turns: int) -> tuple[tuple[Reply, ...], tuple[Scan, ...], Counters]:
+    replies = tuple(device.send(name) for name in device.sensor.on_open)
+    limit = time.monotonic() + PATIENCE + turns
+    scans: list[Scan] = []
+    for scan in device.scans(wait=0.1):
+        scans += [scan] if scan is not None else []
+        if sum(one.complete for one in scans) >= turns:
+            return replies, tuple(scans), device.stats
+        if time.monotonic() > limit:
             break
-    found += scans.add(packets.add(decoder.rest())) + scans.finish()
-    return DemoResult(sensor, tuple(found), decoder.stats, sent, intact)
+    raise SourceError(
+        f"the simulated {device.sensor.id} gave {len(scans)} scans in {PATIENCE + turns:g} s, and not {turns}: {device.stats}"
+    )
 
 
-def _damaged(frame: bytes, source: random.Random, errors: float, *, stream: bool) -> tuple[bytes, bool]:
-    """A frame after the line, and whether it came through unharmed."""
-    if not stream:
-        lost = source.random() < errors
-        return (b"", False) if lost else (frame, True)
-    out = bytearray()
-    for byte in frame:
-        if source.random() >= errors:
-            out.append(byte)
-        else:
-            out += source.choice((b"", bytes([byte ^ 1 << source.randrange(8)]), bytes([byte, source.randrange(256)])))
-    return bytes(out), out == frame
+def _whole(scans: Iterator[Scan], number: int) -> list[Scan]:
+    return list(itertools.islice((scan for scan in scans if scan.complete), number))
+
+
+def _free_port() -> int:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind((HERE, 0))
+        return int(probe.getsockname()[1])

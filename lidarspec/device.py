@@ -1,26 +1,35 @@
-"""A sensor on a source: packets and scans as they come."""
+"""A sensor on a source: packets and scans as they come, commands, counters."""
 
 from __future__ import annotations
 
+import time
+import weakref
+from collections import deque
 from collections.abc import Iterator
 from pathlib import Path
 from types import TracebackType
+from typing import Any, overload
 
-import numpy as np
-
-from lidarspec.decoder import Counters, Decoder, Spans
+from lidarspec.arrivals import Arrival
+from lidarspec.decoder import Counters, Spans
 from lidarspec.detect import detected
-from lidarspec.errors import UsageError
-from lidarspec.files import Chunk, Transport
+from lidarspec.errors import SourceError, UsageError
+from lidarspec.file_input import FileInput
+from lidarspec.files import Transport
+from lidarspec.live import PERIOD, LiveInput
+from lidarspec.mounting import Mount
 from lidarspec.packets import Packets
 from lidarspec.plugins import sensor as named_sensor
+from lidarspec.reading import PacketReader
+from lidarspec.recorders import AnyRecorder, RecordTo, recorder_for
+from lidarspec.replies import Reply
 from lidarspec.scans import Scan, ScanStream
+from lidarspec.settings import named
 from lidarspec.sources import transport
 from lidarspec.spec import Sensor
-from lidarspec.streams import PacketStream, data_frame
 
-#: bytes or datagrams decoded together when a file is read.
-BATCH_BYTES, BATCH_CHUNKS = 1 << 18, 1024
+#: seconds that one wait for data takes where there is no end to waiting.
+LONG = 3600.0
 
 
 class Device:
@@ -28,65 +37,163 @@ class Device:
 
     Attributes:
         sensor: the sensor, given or detected.
-        stats: the counters of everything read so far.
-        warnings: what is to be said about the source, such as a file that is cut off.
+        mount: how it is mounted, where `lidarspec.toml` says so: scans come in the carrier's axes, packets in the sensor's.
     """
 
-    def __init__(self, source: str | Path, sensor: Sensor, *, backend: str = "auto") -> None:
-        self.sensor, self._source = sensor, source
-        self._transport: Transport = transport(source)
-        self._decoder: Decoder = sensor.decoder(stream=not self._transport.datagrams, backend=backend)
-        self._senders: dict[str, str] = {}
+    def __init__(
+        self,
+        source: str | Path,
+        sensor: Sensor,
+        *,
+        backend: str = "auto",
+        start: bool = True,
+        record: RecordTo | None = None,
+        overflow: str | None = None,
+        period: float = PERIOD,
+        mount: Mount | None = None,
+    ) -> None:
+        self.sensor, self._source, self.mount = sensor, source, mount
+        self._streams: dict[str | None, PacketReader] = {}
+        self._latest, self._unseen = ScanStream(sensor, mount), deque[Scan]()
+        self._own_recorder: AnyRecorder | None = None
+        self._input = self._opened(backend, record, overflow, period)
+        self._finalizer = weakref.finalize(self, _close, self._input, self._own_recorder)
+        if start and isinstance(self._input, LiveInput):
+            try:
+                self._input.begin()
+            except BaseException:
+                self.close()
+                raise
 
     @property
     def stats(self) -> Counters:
-        """The counters."""
-        self._decoder.stats.foreign = getattr(self._transport, "foreign", 0)
-        return self._decoder.stats
+        """The counters of everything read so far."""
+        return self._input.stats
 
     @property
     def warnings(self) -> list[str]:
-        """What is to be said about the source."""
-        return list(getattr(self._transport, "warnings", []))
+        """What is to be said about the source now: a file that is cut off, silence, a likely wrong baud rate, a small buffer."""
+        return self._input.warnings
+
+    @property
+    def state(self) -> str:
+        """How the source is doing: "streaming", "waiting" (for a first frame), "silent" (for a second), "no frames" (bytes only),
+        "disconnected", "ended" (a file) or "closed"."""
+        return self._input.state
+
+    @property
+    def queued(self) -> int | None:
+        """Chunks that have arrived and wait to be decoded; None for a file."""
+        return len(self._input.queue) if isinstance(self._input, LiveInput) else None
+
+    @property
+    def is_live(self) -> bool:
+        """Whether data come at their own pace, and not from a file."""
+        return self._input.is_live
 
     def spans(self) -> Iterator[list[Spans]]:
-        """Every incoming frame, in batches."""
-        chunks = self._transport.chunks()
-        while batch := _batch(chunks):
-            if self._decoder.stream:
-                found = [spans for chunk in batch for spans in self._decoder.spans(chunk.data, chunk.at)]
-            else:
-                found = [self._decoder.datagrams([chunk.data for chunk in batch], [chunk.at for chunk in batch])]
-                self._check_senders(batch, found[0])
-            yield found
-        yield self._decoder.rest()
+        """Every incoming frame of all types, in batches."""
+        for arrival in self._arrivals(None):
+            if arrival is not None and arrival.found:
+                yield arrival.found
 
-    def packets(self, frame: str | None = None) -> Iterator[Packets]:
-        """The packets of the data frame, or of another type, in batches."""
-        stream: PacketStream | None = None
-        waiting: list[Spans] = []
-        for found in self.spans():
-            waiting += found
-            name = frame or data_frame(self.sensor, waiting)
-            if stream is None and name is not None:
-                stats, interpreted = self._decoder.stats, self._decoder.interpreted
-                stream = PacketStream(self.sensor, name, stats, interpreted=interpreted, state=self._first_state())
-            if stream is None:
-                continue
-            packets, waiting = stream.add(waiting), []
-            if len(packets):
+    def packets(self, frame: str | None = None, *, wait: float | None = None) -> Iterator[Packets]:
+        """The packets of the data frame, or of another type, in batches, until the input ends or the device is closed.
+
+        Args:
+            frame: the name of a frame type.
+            wait: yield a batch of no packets where nothing has come for so many seconds, so that the caller has a turn.
+        """
+        reader = self._reader(frame)
+        for arrival in self._arrivals(wait):
+            packets = reader.add(arrival) if arrival is not None else reader.none()
+            if packets is not None and (len(packets) or arrival is None):
                 yield packets
 
-    def scans(self) -> Iterator[Scan]:
-        """Every scan; the first and last piece are marked ``complete=False``."""
-        stream = ScanStream(self.sensor)
-        for packets in self.packets():
-            yield from stream.add(packets)
+    @overload
+    def scans(self) -> Iterator[Scan]: ...
+
+    @overload
+    def scans(self, *, wait: float) -> Iterator[Scan | None]: ...
+
+    def scans(self, *, wait: float | None = None) -> Iterator[Any]:
+        """Every scan; the first and last piece, and those before and after an interruption, are marked ``complete=False``.
+
+        Args:
+            wait: yield None where nothing has come for so many seconds, so that the caller has a turn.
+        """
+        stream, reader = ScanStream(self.sensor, self.mount), self._reader(None)
+        for arrival in self._arrivals(wait):
+            if arrival is None:
+                yield None
+                continue
+            yield from reader.scans(stream, arrival)
+            stream = ScanStream(self.sensor, self.mount) if arrival.interrupted else stream
         yield from stream.finish()
 
+    def latest(self, timeout: float | None = None) -> Scan:
+        """The newest complete scan, newer than the one that the last call gave; waits for it. Older ones are passed over.
+
+        A file has no newest scan: it gives one after another.
+
+        Args:
+            timeout: seconds to wait.
+
+        Raises:
+            SourceError: where none comes in time, the input has ended or the device was closed.
+        """
+        deadline = None if timeout is None else time.monotonic() + timeout
+        while (found := self.newest(LONG if deadline is None else max(deadline - time.monotonic(), 0.0))) is None:
+            if deadline is not None and time.monotonic() >= deadline:
+                raise self.overdue()
+        return found
+
+    def newest(self, wait: float) -> Scan | None:
+        """The same as `latest`, but None where no scan comes within `wait` seconds."""
+        deadline, mark, reader = time.monotonic() + wait, self._input.mark(), self._reader(None)
+        while not (self._unseen and self._input.caught_up(mark)):
+            if self._input.ended:
+                raise SourceError(f"{self._source}: no further scan, since the input is {self._input.state}")
+            arrival = self._input.next(max(deadline - time.monotonic(), 0.0))
+            if arrival is None and time.monotonic() >= deadline:
+                return None
+            if arrival is not None:
+                self._unseen += [scan for scan in reader.scans(self._latest, arrival) if scan.complete]
+                self._latest = ScanStream(self.sensor, self.mount) if arrival.interrupted else self._latest
+        if not self.is_live:
+            return self._unseen.popleft()
+        found = self._unseen[-1]
+        self._unseen.clear()
+        return found
+
+    def overdue(self) -> SourceError:
+        """What to say when a scan did not come in time."""
+        error = SourceError(f"{self._source}: no scan in time; the source is {self.state}")
+        error.add_note(f"next: lidarspec doctor '{self._source}' -s {self.sensor.id}")
+        return error
+
+    def send(self, name: str, *, timeout: float | None = None, **arguments: Any) -> Reply:
+        """The reply to a command; at once with ``confirmed=False`` where none is documented.
+
+        Args:
+            name: of the command.
+            timeout: seconds to wait for the reply; by default what the sensor declares.
+            arguments: by name, in units.
+
+        Raises:
+            UnknownCommand, UnknownField, MissingField, OutOfRange: for what the sensor does not take; nothing is sent.
+            CommandError: where the device refuses, or the connection is lost; ReplyTimeout where it keeps silent.
+        """
+        return self._input.send(name, timeout=timeout, **arguments)
+
+    def leave_on(self) -> None:
+        """Let the sensor go on as it is when the device is closed."""
+        if isinstance(self._input, LiveInput):
+            self._input.stays_on = True
+
     def close(self) -> None:
-        """Give the source back."""
-        self._transport.close()
+        """Stop the sensor where it was started, and give the source back; a second call does nothing."""
+        self._finalizer()
 
     def __enter__(self) -> Device:
         return self
@@ -95,62 +202,85 @@ class Device:
         self.close()
 
     def __repr__(self) -> str:
-        return f"Device({self.sensor.id} on {self._source}: {self.stats})"
+        return f"Device({self.sensor.id} on {self._source}, {self.state}: {self.stats})"
 
-    def _check_senders(self, batch: list[Chunk], found: Spans) -> None:
-        """Frames of several senders must not be mixed into one cloud."""
-        ends = np.cumsum([len(chunk.data) for chunk in batch])
-        for kind, place in zip(found.kinds.tolist(), np.searchsorted(ends, found.starts, side="right").tolist(), strict=True):
-            sender = batch[place].sender
-            first = self._senders.setdefault(found.names[kind], sender[0]) if sender else None
-            if sender and first != sender[0]:
-                raise UsageError(
-                    f"{self._source}: {first} and {sender[0]} both send {found.names[kind]} frames; choose one with ?src={first}"
-                )
-
-    def _first_state(self) -> dict[str, bytes]:
-        """The first frame of each type that `points` takes its state from: a file is read as if it stood at the start."""
-        wanted = set(self.sensor.state)
-        if not wanted or not Path(str(self._source).partition("?")[0]).is_file():
-            return {}
-        first: dict[str, bytes] = {}
-        source = transport(self._source)
-        decoder = self.sensor.decoder(stream=not source.datagrams)
+    def _opened(self, backend: str, record: RecordTo | None, overflow: str | None, period: float) -> FileInput | LiveInput:
+        opened: Any = transport(self._source, self.sensor)
         try:
-            for chunk in source.chunks():
-                for item in decoder.feed(chunk.data, chunk.at):
-                    if item.frame in wanted:
-                        first.setdefault(item.frame, item.data)
-                if len(first) == len(wanted):
-                    break
-        finally:
-            source.close()
-        return first
+            if not hasattr(opened, "read"):
+                if record is not None:
+                    raise UsageError(f"{self._source} is a file already: there is nothing to record")
+                return FileInput(self._source, self.sensor, opened, backend=backend)
+            kept, is_own = (None, False) if record is None else recorder_for(record, self.sensor, self._source, opened)
+            self._own_recorder = kept if is_own else None
+            policy: str = getattr(opened, "overflow", "drop_oldest") if overflow is None else overflow
+            return LiveInput(self._source, self.sensor, opened, backend=backend, policy=policy, recorder=kept, period=period)
+        except BaseException:
+            _close(opened, self._own_recorder)
+            raise
+
+    def _reader(self, frame: str | None) -> PacketReader:
+        if frame not in self._streams:
+            first = self._input.first_state() if isinstance(self._input, FileInput) else {}
+            self._streams[frame] = PacketReader(self.sensor, frame, self._input.decoder, first)
+        return self._streams[frame]
+
+    def _arrivals(self, wait: float | None) -> Iterator[Arrival | None]:
+        """What arrives, until the end; None where nothing has for `wait` seconds."""
+        while not self._input.ended:
+            arrival = self._input.next(LONG if wait is None else wait)
+            if arrival is not None or not self._input.ended:
+                yield arrival
 
 
-def _batch(chunks: Iterator[Chunk]) -> list[Chunk]:
-    """The next chunks, as many as are worth decoding together."""
-    found: list[Chunk] = []
-    size = 0
-    for chunk in chunks:
-        found.append(chunk)
-        size += len(chunk.data)
-        if size >= BATCH_BYTES or len(found) >= BATCH_CHUNKS:
-            break
-    return found
+def _close(source: FileInput | LiveInput | Transport, recorder: AnyRecorder | None) -> None:
+    """Give everything back; the recording is closed even where the source fails."""
+    try:
+        source.close()
+    finally:
+        if recorder is not None:
+            recorder.close()
 
 
-def open(source: str | Path, sensor: str | Sensor | None = None, *, backend: str = "auto") -> Device:
-    """A sensor on any SOURCE.
+def open(
+    source: str | Path,
+    sensor: str | Sensor | None = None,
+    *,
+    backend: str = "auto",
+    start: bool = True,
+    record: RecordTo | None = None,
+    overflow: str | None = None,
+    period: float = PERIOD,
+) -> Device:
+    """A sensor on any SOURCE: a port, a socket, a simulated device, a file, or "-" for standard input.
 
     Args:
-        source: see DESIGN 3.2; a file, or "-" for standard input.
-        sensor: an id, a path to a sensor's module, or a Sensor; found out from a file where left out.
+        source: "/dev/ttyUSB0", "serial:///dev/ttyUSB0?baud=230400", "udp://", "tcp://host:port", "capture.pcap", or a name
+            of `lidarspec.toml` ...
+        sensor: an id, a path to a sensor's module, or a Sensor; found out where left out.
+        backend: what evaluates `points`: "auto", "numpy", "jit" or "construct".
+        start: False leaves out the commands that the sensor declares for its start, and for its end.
+        record: a new file, or a `Recorder`, for everything that arrives and is sent; or what makes one of the open transport.
+        overflow: what a live source does when the consumer is too slow: "drop_oldest", or "block"; by default the first, but
+            a simulated sensor without a pace of its own waits.
+        period: seconds between two decodings of what has come.
 
     Raises:
         SourceError: where the source cannot be opened.
         UsageError, WireError: where several sensors fit, or none, and `sensor` was left out.
+        CommandError: where the device does not start.
     """
+    device = named(source)
     if sensor is None:
         sensor = detected(source)
-    return Device(source, sensor if isinstance(sensor, Sensor) else named_sensor(sensor), backend=backend)
+    known = sensor if isinstance(sensor, Sensor) else named_sensor(sensor)
+    return Device(
+        source,
+        known,
+        backend=backend,
+        start=start,
+        record=record,
+        overflow=overflow,
+        period=period,
+        mount=None if device is None else device.mount,
+    )

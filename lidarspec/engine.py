@@ -15,7 +15,7 @@ from lidarspec.errors import MissingField, OutOfRange, SpecError, UnknownCommand
 from lidarspec.packets import Packets
 from lidarspec.plugins import registry
 from lidarspec.scans import Scan, scans_of
-from lidarspec.spec import Configure, Sensor, install, replaced
+from lidarspec.spec import Configure, Sensor, replaced
 from lidarspec.streams import PacketStream, data_frame
 
 #: options that the engine itself understands, for every sensor.
@@ -25,8 +25,7 @@ FRAMES_OF_REFERENCE = ("rep103", "vendor")
 class StandardEngine:
     """The engine; it holds nothing, everything is a function of the sensor."""
 
-    def parse(self, sensor: Sensor, data: bytes, *, frame: str | None, verify: bool) -> Any:
-        return parsing.parse(sensor, data, frame=frame, verify=verify)
+    parse = staticmethod(parsing.parse)
 
     def build(self, sensor: Sensor, frame: str, value: Any, values: Mapping[str, Any], *, units: bool) -> bytes:
         return build(sensor, frame, value, values, units=units)
@@ -119,6 +118,3 @@ def _put(values: dict[str, Any], path: str, value: Any) -> None:
     for parent in parents:
         values = values.setdefault(parent, {})
     values[last] = value
-
-
-install(StandardEngine())

@@ -7,7 +7,6 @@ own text from typed arguments, so that the place of a fault can be read from the
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Iterable
 
 
@@ -62,6 +61,8 @@ class UsageError(LidarSpecError):
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:
     """A closing clause such as ``; did you mean 'speed'?``, or an empty text where nothing is close."""
+    import difflib  # for the one call in many thousands that has to suggest something
+
     by_letters = {other.lower(): other for other in known}
     close = difflib.get_close_matches(name.lower(), list(by_letters), n=1, cutoff=0.5)
     return f"; did you mean {by_letters[close[0]]!r}?" if close else ""

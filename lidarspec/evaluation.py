@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.access import Fields
+from lidarspec.allocation import keep_freed_memory
 from lidarspec.clouds import LazyCloud, PointCloud, axis_matrix, narrowed
 from lidarspec.columns import Batch, Carry, Column
 from lidarspec.errors import SpecError
@@ -291,4 +292,5 @@ def _cloud(packets: Packets) -> PointCloud:
     return evaluated(packets).cloud
 
 
+keep_freed_memory()
 install_points(_cloud)

@@ -11,9 +11,10 @@ from construct import Construct
 from numpy.typing import NDArray
 
 from lidarspec.building import build
-from lidarspec.codecs import VALID, CompiledCodec, InterpretedCodec, codec, plausibility
+from lidarspec.codecs import CompiledCodec, InterpretedCodec, codec
 from lidarspec.construction import clean
 from lidarspec.errors import SpecError, UnknownFrame
+from lidarspec.judging import VALID, plausibility
 from lidarspec.layout import Layout
 from lidarspec.schema import FieldInfo, peeled
 from lidarspec.spec import Sensor

@@ -15,11 +15,12 @@ import construct
 import numpy as np
 
 from lidarspec.bits import BitField, leaves, probe
-from lidarspec.codecs import IMPLAUSIBLE, codec
+from lidarspec.codecs import codec
 from lidarspec.construction import UNNAMED, Seen, field_path, unwrap
 from lidarspec.decoder import Counters, Found, packed
 from lidarspec.errors import LidarSpecError, WireError
 from lidarspec.fields import Checksummed
+from lidarspec.judging import IMPLAUSIBLE
 from lidarspec.parsing import parse_typed
 from lidarspec.points import evaluate
 from lidarspec.rules import children

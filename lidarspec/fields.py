@@ -11,7 +11,6 @@ from typing import Any
 
 from construct import Construct, Container, Subconstruct
 
-from lidarspec.bits import bytes_of
 from lidarspec.checksums import Checksum
 from lidarspec.construction import Mismatch, bit_width, member, note, unwrap, verifying
 
@@ -156,6 +155,8 @@ class Checksummed(Subconstruct):  # type: ignore[misc]
             start, end = obj["_marks"][part]
             con, obj = unwrap(con, bits=False)._subcons[part], obj[part]
             if unwrap(con, bits=False) is not unwrap(con):
+                from lidarspec.bits import bytes_of  # few checksums are bit fields, and every plugin imports this module
+
                 inside = bytes_of(con, parts[depth + 1 :])
                 return start + min(inside), start + max(inside) + 1
         return start, end

@@ -4,9 +4,10 @@ A stream decodes to the leftmost valid candidate, then on after its last byte; a
 byte. At one offset the order of the frame types decides. A type with `after` is looked for only while the frame that
 it names is the last seen of those named by any `after`; a type with `confirm` counts only in unbroken runs.
 
-All candidates of a piece are judged in bulk. Where no type needs memory, those that are taken are found in bulk too, with
-a step for each conflict only; else a walk goes over the candidates that are not rejected. So the work is linear in the
-input however often headers appear in it, and the result is that of the byte-by-byte rule.
+All candidates of a piece are judged in bulk, and those that are taken are found in bulk too, with a step for each conflict
+only. A piece ends with the frame that changes what is looked for; while types with `confirm` are, `lidarspec.runs` goes
+from run to run. So the work is linear in the input however often headers appear in it, and the result is that of the
+byte-by-byte rule.
 """
 
 from __future__ import annotations
@@ -14,49 +15,66 @@ from __future__ import annotations
 import bisect
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.codecs import CHECKSUM, CONSTANT, IMPLAUSIBLE, LENGTH, PLUGIN, SHORT, VALID, Codec
+from lidarspec.codecs import Codec
+from lidarspec.judging import CHECKSUM, CONSTANT, IMPLAUSIBLE, LENGTH, PLUGIN, SHORT, VALID, taken
 
 #: which counter a rejected candidate raises.
 COUNTED = {LENGTH: "bad_length", CHECKSUM: "bad_checksum", IMPLAUSIBLE: "implausible", PLUGIN: "plugin_errors"}
 
+#: candidates of one type in a piece; where there are more, the piece is made shorter, so that memory stays small.
+MOST = 1 << 14
+
+Bytes1D = NDArray[np.uint8]
+Offsets = NDArray[np.intp]
+
+#: constants: offset, mask, value.
+Marks = tuple[tuple[int, int, int], ...]
+
 
 @dataclass(eq=False)
 class Candidates:
-    """The candidates of one frame type in a piece of a stream, by offset."""
+    """The candidates of one frame type in a piece of a stream, by offset.
 
-    codec: Codec
-    offsets: NDArray[np.intp]
+    Attributes:
+        kind: index of the type.
+        rows: the bytes of the first ones, as many as it has rows; None where they have not all one layout.
+    """
+
+    kind: int
+    offsets: Offsets
     status: NDArray[np.uint8]
-    sizes: NDArray[np.intp]
-    errors: tuple[str, ...]
+    sizes: Offsets
+    errors: tuple[str, ...] = ()
+    rows: NDArray[np.uint8] | None = None
 
     @classmethod
-    def find(cls, codec: Codec, buffer: NDArray[np.uint8]) -> Candidates:
-        """Those whose constants at the start match as far as the bytes go."""
-        match = np.ones(len(buffer), np.bool_)
-        for spot, (mask, value) in codec.prefix.items():
-            if spot < len(buffer):
-                there = buffer[spot:] if mask == 0xFF else buffer[spot:] & np.uint8(mask)
-                match[: len(buffer) - spot] &= there == value
-        offsets = np.flatnonzero(match)
+    def judged(cls, kind: int, codec: Codec, buffer: Bytes1D, offsets: Offsets) -> Candidates:
+        """Those of the offsets whose constants are right."""
         survey = codec.survey(buffer, offsets)
-        kept = survey.status != CONSTANT
-        return cls(codec, offsets[kept], survey.status[kept], survey.sizes[kept], survey.errors)
+        found = cls(kind, offsets, survey.status, survey.sizes, survey.errors, survey.rows)
+        if found.valid or not (wrong := survey.status == CONSTANT).any():
+            return found
+        return found.only(~wrong)
 
-    @classmethod
-    def none(cls, codec: Codec) -> Candidates:
-        """No candidates, of a type that is not looked for."""
-        return cls(codec, np.empty(0, np.intp), np.empty(0, np.uint8), np.empty(0, np.intp), ())
+    @cached_property
+    def valid(self) -> bool:
+        """Whether all of them are valid."""
+        return not self.status.any()
+
+    def only(self, which: NDArray[np.bool_]) -> Candidates:
+        """Some of them."""
+        rows = None if self.rows is None else taken(self.rows, which[: len(self.rows)])
+        return Candidates(self.kind, self.offsets[which], self.status[which], self.sizes[which], self.errors, rows)
 
 
 @dataclass
 class Mode:
-    """What the walk remembers between pieces: the last frame named by any `after`, and a run of weak frames under way."""
+    """What is remembered between pieces: the last frame named by any `after`, and a run of weak frames under way."""
 
     after: str | None = None
     run: str | None = None
@@ -69,28 +87,32 @@ class Piece:
 
     Attributes:
         kinds, offsets, sizes: of the frames: index of the type, first byte, number of bytes.
-        end: where the rest begins, which has to be looked at again together with what follows.
-        need: how long the rest has to be at least before that makes sense; 0 if unknown.
+        end: where the rest begins, which has to be looked at again.
+        waiting: whether the rest makes sense only together with bytes that follow the piece.
+        need: how long the rest has to be at least before that; 0 if unknown.
+        rows: the bytes of the frames, one a row, where all have one layout; None where nobody gathered them.
         rejected: number of rejected candidates by counter.
         errors: tracebacks out of plugins.
     """
 
-    kinds: NDArray[np.intp] = field(default_factory=lambda: np.empty(0, np.intp))
-    offsets: NDArray[np.intp] = field(default_factory=lambda: np.empty(0, np.intp))
-    sizes: NDArray[np.intp] = field(default_factory=lambda: np.empty(0, np.intp))
+    kinds: Offsets = field(default_factory=lambda: np.empty(0, np.intp))
+    offsets: Offsets = field(default_factory=lambda: np.empty(0, np.intp))
+    sizes: Offsets = field(default_factory=lambda: np.empty(0, np.intp))
     end: int = 0
+    waiting: bool = False
     need: int = 0
+    rows: NDArray[np.uint8] | None = None
     rejected: dict[str, int] = field(default_factory=dict)
     errors: list[str] = field(default_factory=list)
 
-    def reject(self, candidates: Candidates, which: NDArray[Any] | slice) -> None:
-        """Count some candidates as rejected, each under its reason."""
-        for status, number in enumerate(np.bincount(candidates.status[which], minlength=PLUGIN + 1).tolist()):
-            name = COUNTED.get(LENGTH if status == SHORT else status)
+    def reject(self, numbers: Sequence[int], errors: Sequence[str]) -> None:
+        """Count candidates as rejected: how many of each status."""
+        for reason, number in enumerate(numbers):
+            name = COUNTED.get(LENGTH if reason == SHORT else reason)
             if number and name:
                 self.rejected[name] = self.rejected.get(name, 0) + number
-                if status == PLUGIN:
-                    self.errors += candidates.errors[:1]
+                if reason == PLUGIN:
+                    self.errors += errors[:1]
 
 
 class Framing:
@@ -103,71 +125,159 @@ class Framing:
     def __init__(self, codecs: Mapping[str, Codec]) -> None:
         self.names, self.codecs = list(codecs), list(codecs.values())
         self.named = {codec.frame.after for codec in self.codecs} - {None}
-        self._plain = not self.named and all(codec.frame.confirm == 1 for codec in self.codecs)
+        self.marks = [marks(codec) for codec in self.codecs]
+        lengths = [codec.frame.max_length for codec in self.codecs]
+        #: no candidate waits for more bytes than these.
+        self.reach = max(lengths) + max(codec.frame.max_length * codec.frame.confirm for codec in self.codecs)
 
-    def scan(self, buffer: NDArray[np.uint8], mode: Mode, *, base: int, final: bool) -> Piece:
-        """Cut one piece.
+    def active(self, mode: Mode) -> list[int]:
+        """The types that are looked for now, in order."""
+        return [index for index, codec in enumerate(self.codecs) if codec.frame.after in (None, mode.after)]
 
-        Args:
-            buffer: the bytes not yet decided and those after them.
-            mode: remembered between pieces, changed here.
-            base: offset of the buffer in the stream.
-            final: give up candidates that need more bytes than there are.
+    def weak(self, kind: int) -> bool:
+        """Whether frames of a type are believed in runs alone."""
+        return self.codecs[kind].frame.confirm > 1
 
-        Returns:
-            The frames, and in `end` the first byte that has to be looked at again together with what follows.
-        """
-        found = self._candidates(buffer, mode)
-        if self._plain:
-            return leftmost(found, len(buffer), final=final)
-        piece = Piece()
-        _Walker(self, found, mode, piece, base, len(buffer), final=final).run()
+    def switches(self, kind: int, mode: Mode) -> bool:
+        """Whether a frame of this type changes what is looked for."""
+        return self.names[kind] in self.named and self.names[kind] != mode.after
+
+    def strong(self, buffer: Bytes1D, mode: Mode) -> tuple[Bytes1D, list[Candidates]]:
+        """The candidates of each type that is looked for and not weak, in the bytes or, where there are too many, in fewer of them."""
+        known: dict[Marks, Offsets] = {}
+        spots: dict[int, Offsets] = {}
+        for kind in self.active(mode):
+            if not self.weak(kind):
+                begin, rest = self.marks[kind][:2], self.marks[kind][2:]  # many types begin alike
+                if begin not in known:
+                    known[begin] = matches(buffer, begin)
+                spots[kind] = fitting(buffer, known[begin], rest)
+        limit = min((int(offsets[MOST]) for offsets in spots.values() if len(offsets) > MOST), default=len(buffer))
+        if limit < len(buffer):
+            buffer = buffer[: max(limit, self.reach)]
+            spots = {kind: offsets[: int(np.searchsorted(offsets, len(buffer)))] for kind, offsets in spots.items()}
+        found = [Candidates.judged(kind, self.codecs[kind], buffer, offsets) for kind, offsets in spots.items() if len(offsets)]
+        return buffer, found
+
+
+def marks(codec: Codec) -> Marks:
+    """The constants at the start of a type's frames, whole bytes first, which tell the most."""
+    found = [(spot, mask, value) for spot, (mask, value) in codec.prefix.items()]
+    return tuple(sorted(found, key=lambda mark: (mark[1] != 0xFF, mark[0])))
+
+
+def matches(buffer: Bytes1D, constants: Marks) -> Offsets:
+    """Where the constants are right as far as the bytes go."""
+    if not constants:
+        return np.arange(len(buffer))
+    length = len(buffer)
+    (first, _, _), *rest = constants
+    match = _right(buffer, *constants[0])
+    for spot, mask, value in rest[:1]:  # two together leave few offsets of noise to look at
+        inside = min(len(match), max(length - spot, 0))
+        match[:inside] &= _right(buffer, spot, mask, value)[:inside]
+    offsets = fitting(buffer, np.flatnonzero(match), tuple(rest[1:]))
+    if first:
+        offsets = np.concatenate([offsets, fitting(buffer, np.arange(max(length - first, 0), length), tuple(rest))])
+    return offsets
+
+
+def _right(buffer: Bytes1D, spot: int, mask: int, value: int) -> NDArray[np.bool_]:
+    """At which offsets a constant is right, for those where it is there."""
+    there = buffer[spot:]
+    return np.asarray((there if mask == 0xFF else there & np.uint8(mask)) == np.uint8(value))
+
+
+def fitting(buffer: Bytes1D, offsets: Offsets, constants: Marks) -> Offsets:
+    """Those of the offsets, in order, where the constants are right as far as the bytes go."""
+    for spot, mask, value in constants if len(offsets) else ():
+        inside = int(offsets.searchsorted(len(buffer) - spot))
+        found = buffer.take(offsets[:inside] + spot)
+        kept = np.flatnonzero((found if mask == 0xFF else found & np.uint8(mask)) == value)
+        if len(kept) < inside:
+            offsets = np.concatenate([offsets[kept], offsets[inside:]])
+    return offsets
+
+
+def leftmost(framing: Framing, buffer: Bytes1D, mode: Mode, *, final: bool) -> Piece:
+    """Cut one piece while no weak type is looked for.
+
+    Args:
+        buffer: the bytes not yet decided and those after them.
+        mode: remembered between pieces, changed here.
+        final: give up candidates that need more bytes than there are.
+    """
+    whole = len(buffer)
+    buffer, found = framing.strong(buffer, mode)
+    final = final and len(buffer) == whole
+    piece = Piece(end=len(buffer))
+    if not found:
         return piece
-
-    def _candidates(self, buffer: NDArray[np.uint8], mode: Mode) -> list[Candidates]:
-        """The candidates of each type that may be looked for in this piece: now, or after a frame that stands in it."""
-        found: dict[int, Candidates] = {}
-        seen, waiting = {None, mode.after}, list(range(len(self.codecs)))
-        while ready := [index for index in waiting if self.codecs[index].frame.after in seen]:
-            found |= {index: Candidates.find(self.codecs[index], buffer) for index in ready}
-            seen |= {self.names[index] for index in ready if (found[index].status == VALID).any()}
-            waiting = [index for index in waiting if index not in found]
-        return [found[index] if index in found else Candidates.none(codec) for index, codec in enumerate(self.codecs)]
-
-    def active(self, index: int, mode: Mode) -> bool:
-        """Whether a type is looked for now."""
-        after = self.codecs[index].frame.after
-        return after is None or after == mode.after
-
-
-def leftmost(found: Sequence[Candidates], length: int, *, final: bool) -> Piece:
-    """The rule for types that need no memory (no `after`, no `confirm`), for a whole piece at once."""
-    live = [np.flatnonzero((c.status == VALID) | ((c.status == SHORT) & (not final))) for c in found]
-    kinds = np.repeat(np.arange(len(found)), [len(which) for which in live])
-    offsets = np.concatenate([c.offsets[which] for c, which in zip(found, live, strict=True)])
-    sizes = np.concatenate([c.sizes[which] for c, which in zip(found, live, strict=True)])
-    short = np.concatenate([c.status[which] == SHORT for c, which in zip(found, live, strict=True)])
-    if len(found) > 1:
-        order = np.lexsort((kinds, offsets))
-        first = np.ones(len(order), np.bool_)
-        first[1:] = np.diff(offsets[order]) > 0
-        kinds, offsets, sizes, short = (array[order[first]] for array in (kinds, offsets, sizes, short))
-    chosen = _chain(offsets, np.where(short, length + 1, offsets + sizes))
-    piece = Piece(end=length)
-    if len(chosen) and short[chosen[-1]]:
-        piece.end, piece.need = int(offsets[chosen[-1]]), int(sizes[chosen[-1]])
-        chosen = chosen[:-1]
-    piece.kinds, piece.offsets, piece.sizes = kinds[chosen], offsets[chosen], sizes[chosen]
-    _count_rejected(piece, found, final=final)
+    live = merged(found, final=final)
+    chosen = _chain(live.offsets, live.sizes, live.status, len(buffer))
+    count = len(live.offsets) if chosen is None else len(chosen)
+    last = -1 if not count else count - 1 if chosen is None else int(chosen[-1])
+    if count and live.status[last] == SHORT:
+        count -= 1
+        piece.end, piece.waiting, piece.need = int(live.offsets[last]), len(buffer) == whole, int(live.sizes[last])
+    live = live.only(slice(0, count) if chosen is None else chosen[:count])
+    if framing.named:
+        live = _until_switched(framing, live, mode, piece)
+    piece.kinds, piece.offsets, piece.sizes, piece.rows = live.kinds, live.offsets, live.sizes, live.rows
+    count_rejected(piece, found, final=final)
     return piece
 
 
-def _chain(offsets: NDArray[np.intp], ends: NDArray[np.intp]) -> NDArray[np.intp]:
-    """Indices of the candidates that are taken from left to right, each from the end of the one before."""
+@dataclass(frozen=True, eq=False)
+class Live:
+    """The candidates that are valid or wait for bytes, by offset, one at each.
+
+    Attributes:
+        rows: the bytes of the valid ones, where all have one layout and were gathered.
+    """
+
+    kinds: Offsets
+    offsets: Offsets
+    sizes: Offsets
+    status: NDArray[np.uint8]
+    rows: NDArray[np.uint8] | None = None
+
+    def only(self, which: Offsets | slice) -> Live:
+        """Some of them, in order."""
+        rows = self.rows
+        if rows is not None and (not isinstance(which, slice) or which.stop < len(rows)):
+            rows = rows[which] if isinstance(which, slice) else taken(rows, which)
+        return Live(self.kinds[which], self.offsets[which], self.sizes[which], self.status[which], rows)
+
+
+def merged(found: Sequence[Candidates], *, final: bool) -> Live:
+    """The live candidates of several types in one order, at each offset those of the type that comes first."""
+    worst = VALID if final else SHORT
+    live = [one if one.valid or bool((one.status <= worst).all()) else one.only(one.status <= worst) for one in found]
+    if len(live) == 1:
+        one = live[0]
+        return Live(np.full(len(one.offsets), one.kind), one.offsets, one.sizes, one.status, one.rows)
+    kinds = np.repeat([one.kind for one in live], [len(one.offsets) for one in live])
+    offsets = np.concatenate([one.offsets for one in live])
+    order = np.lexsort((kinds, offsets))
+    order = order[np.diff(offsets[order], prepend=-1) > 0]
+    sizes, status = (np.concatenate([getattr(one, name) for one in live])[order] for name in ("sizes", "status"))
+    return Live(kinds[order], offsets[order], sizes, status)
+
+
+def _chain(offsets: Offsets, sizes: Offsets, status: NDArray[np.uint8], length: int) -> Offsets | None:
+    """Indices of the candidates that are taken from left to right, each from the end of the one before; None if all are.
+
+    One that waits for bytes takes all that there are.
+    """
+    if len(offsets) < 2:
+        return None
+    ends = offsets + sizes
+    ends[status == SHORT] = length + 1
+    if not bool((offsets[1:] < ends[:-1]).any()):
+        return None
     after = np.searchsorted(offsets, ends)
     jumps = np.flatnonzero(after != np.arange(1, len(offsets) + 1)).tolist()
-    if not jumps:
-        return np.arange(len(offsets))
     runs, start = [], 0
     while start < len(offsets):
         spot = bisect.bisect_left(jumps, start)
@@ -177,127 +287,30 @@ def _chain(offsets: NDArray[np.intp], ends: NDArray[np.intp]) -> NDArray[np.intp
     return np.concatenate(runs)
 
 
-def _count_rejected(piece: Piece, found: Sequence[Candidates], *, final: bool) -> None:
+def _until_switched(framing: Framing, live: Live, mode: Mode, piece: Piece) -> Live:
+    """The frames up to the first one that changes what is looked for; the piece ends with it."""
+    switching = np.array([framing.switches(kind, mode) for kind in range(len(framing.names))])
+    spots = np.flatnonzero(switching[live.kinds])
+    if not len(spots):
+        return live
+    last = int(spots[0])
+    mode.after = framing.names[int(live.kinds[last])]
+    piece.end, piece.waiting, piece.need = int(live.offsets[last] + live.sizes[last]), False, 0
+    return live.only(slice(0, last + 1))
+
+
+def count_rejected(piece: Piece, found: Sequence[Candidates], *, final: bool) -> None:
     """Count the candidates outside the frames, and at a frame's first byte those of the types that come before its own."""
-    ends = piece.offsets + piece.sizes
-    for kind, candidates in enumerate(found):
-        refused = (candidates.status != VALID) & ((candidates.status != SHORT) | final)
-        spots = candidates.offsets
-        before = np.searchsorted(piece.offsets, spots, side="right") - 1
-        counted = refused & (spots < piece.end)
-        if len(ends):
+    for candidates in found:
+        refused = np.flatnonzero(candidates.status > (VALID if final else SHORT)) if not candidates.valid else ()
+        if not len(refused):
+            continue
+        spots = candidates.offsets[refused]
+        counted = spots < piece.end
+        if len(piece.offsets):
+            before = np.searchsorted(piece.offsets, spots, side="right") - 1
             held = np.maximum(before, 0)
-            inside = (before >= 0) & (spots < ends[held])
-            counted &= ~inside | ((spots == piece.offsets[held]) & (kind < piece.kinds[held]))
-        piece.reject(candidates, counted)
-
-
-class _Walker:
-    """One pass over the candidates of a piece."""
-
-    def __init__(
-        self, framing: Framing, found: Sequence[Candidates], mode: Mode, piece: Piece, base: int, length: int, *, final: bool
-    ) -> None:
-        self.framing, self.found, self.mode, self.piece = framing, found, mode, piece
-        self.base, self.length, self.final = base, length, final
-        self.position = 0
-        self.taken: list[tuple[int, int, int]] = []
-        self.tables: list[dict[int, int]] = []
-        for candidates in found:
-            live = np.flatnonzero((candidates.status == VALID) | (candidates.status == SHORT))
-            self.tables.append(dict(zip(candidates.offsets[live].tolist(), live.tolist(), strict=True)))
-        self.spots = sorted(set().union(*self.tables))
-        self.refused = {spot for candidates in found for spot in candidates.offsets[candidates.status != VALID].tolist()}
-
-    def run(self) -> None:
-        """Accept what is valid from left to right, until the end or a candidate that needs more bytes."""
-        self.piece.end = self._walk()
-        self._count(self.position, self.piece.end)
-        columns = np.array(self.taken, np.intp).reshape(len(self.taken), 3).T
-        self.piece.kinds, self.piece.offsets, self.piece.sizes = columns
-
-    def _walk(self) -> int:
-        for spot in self.spots:
-            if spot < self.position:
-                continue
-            taken = self._at(spot)
-            if taken is None:
-                return spot
-            if taken >= 0:
-                self._count(self.position, spot, before=taken)
-                self._accept(taken, spot)
-        return self.length
-
-    def _at(self, spot: int) -> int | None:
-        """The type that is accepted at an offset, -1 if none is, None if that takes more bytes than there are."""
-        for index, table in enumerate(self.tables):
-            entry = table.get(spot)
-            if entry is None or not self.framing.active(index, self.mode):
-                continue
-            candidates = self.found[index]
-            if candidates.status[entry] == SHORT:
-                if not self.final:
-                    self.piece.need = int(candidates.sizes[entry])
-                    return None
-                continue
-            confirmed = self._confirmed(index, spot)
-            if confirmed is None:
-                return None
-            if confirmed:
-                return index
-            candidates.status[entry] = IMPLAUSIBLE
-            self.refused.add(spot)
-        return -1
-
-    def _accept(self, index: int, spot: int) -> None:
-        name = self.framing.names[index]
-        size = int(self.found[index].sizes[self.tables[index][spot]])
-        self.taken.append((index, spot, size))
-        self.position = spot + size
-        weak = self.framing.codecs[index].frame.confirm > 1
-        self.mode.run, self.mode.run_end = (name, self.base + self.position) if weak else (None, -1)
-        if name in self.framing.named:
-            self.mode.after = name
-
-    def _confirmed(self, index: int, spot: int) -> bool | None:
-        """Whether enough valid frames of a weak type follow each other from here; None if that cannot be known yet."""
-        wanted = self.framing.codecs[index].frame.confirm
-        if wanted == 1 or (self.mode.run == self.framing.names[index] and self.mode.run_end == self.base + spot):
-            return True
-        candidates, table = self.found[index], self.tables[index]
-        for _ in range(wanted):
-            if spot >= self.length:
-                return False if self.final else None
-            earlier = self._earlier(index, spot)
-            if earlier is None or earlier:
-                return None if earlier is None else False
-            entry = table.get(spot)
-            if entry is None or candidates.status[entry] not in (VALID, SHORT):
-                return False
-            if candidates.status[entry] == SHORT:
-                return False if self.final else None
-            spot += int(candidates.sizes[entry])
-        return True
-
-    def _earlier(self, index: int, spot: int) -> bool | None:
-        """Whether a type that comes first in the order stands at an offset; None if that cannot be known yet."""
-        for other in range(index):
-            entry = self.tables[other].get(spot)
-            if entry is None or not self.framing.active(other, self.mode):
-                continue
-            status = self.found[other].status[entry]
-            if status == VALID and self.framing.codecs[other].frame.confirm == 1:
-                return True
-            if status == SHORT and not self.final:
-                return None
-        return False
-
-    def _count(self, start: int, stop: int, *, before: int = 0) -> None:
-        """Count what was rejected from `start` up to `stop`, and at `stop` by the types that come before `before`."""
-        if start == stop and stop not in self.refused:
-            return  # one frame right after another
-        for index, candidates in enumerate(self.found):
-            if not len(candidates.offsets) or not self.framing.active(index, self.mode):
-                continue
-            low, high = np.searchsorted(candidates.offsets, [start, stop + (index < before)])
-            self.piece.reject(candidates, slice(low, high))
+            inside = (before >= 0) & (spots < piece.offsets[held] + piece.sizes[held])
+            counted &= ~inside | ((spots == piece.offsets[held]) & (candidates.kind < piece.kinds[held]))
+        if counted.any():
+            piece.reject(np.bincount(candidates.status[refused[counted]]).tolist(), candidates.errors)

@@ -12,6 +12,7 @@ import random
 import traceback
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import Any
 
 import construct
@@ -50,6 +51,20 @@ class _Short(Exception):
 
 
 Group = tuple[Layout | Refused, NDArray[np.intp]]
+
+
+def rows_at(buffer: NDArray[np.uint8], offsets: NDArray[np.intp], size: int) -> NDArray[np.uint8]:
+    """As many bytes from each of these offsets, one a row, C-contiguous; no copy where they stand back to back."""
+    count = len(offsets)
+    if not count or not size:
+        return np.zeros((count, size), np.uint8)
+    if size == 1:
+        return buffer.take(offsets).reshape(count, 1)
+    first = int(offsets[0])
+    if int(offsets[-1]) - first == (count - 1) * size and (count < 3 or bool((offsets[1:] - offsets[:-1] == size).all())):
+        return buffer[first : first + count * size].reshape(count, size)
+    windows: NDArray[Any] = np.ndarray((len(buffer) - size + 1,), f"V{size}", buffer.data, 0, (1,))
+    return windows[offsets].view(np.uint8).reshape(count, size)
 
 
 class HeaderTree:
@@ -97,6 +112,14 @@ class HeaderTree:
         groups, _ = self.classify(np.frombuffer(frame, np.uint8), np.zeros(1, np.intp))
         return groups[0][0] if groups else None
 
+    def asked(self, frame: bytes) -> list[Leaf]:
+        """The fields that decided the layout of this frame, in the order in which they were asked for."""
+        found, node = [], self._root
+        while node.leaf is not None:
+            found.append(node.leaf)
+            node = node.children[node.leaf.scalar(frame)]
+        return found
+
     def choose(self, source: random.Random) -> tuple[Layout, dict[str, int]]:
         """A layout of a header chosen at random, with the values of the fields it depends on, by path."""
         keys = sorted(_switch_keys(self._con))
@@ -130,12 +153,14 @@ class HeaderTree:
             which = which[there]
         if not len(which):
             return
-        rows = buffer[(offsets[which] + leaf.offset)[:, None] + np.arange(leaf.size)]
-        values, inverse = np.unique(leaf.at(leaf.offset).load(rows), return_inverse=True)
-        order = np.argsort(inverse, kind="stable")
-        parts = np.split(which[order], np.cumsum(np.bincount(inverse, minlength=len(values)))[:-1])
-        for value, part in zip(values.tolist(), parts, strict=True):
-            stack.append((node.children.setdefault(value, _Node()), part))
+        values = leaf.at(leaf.offset).load(rows_at(buffer, offsets[which] + leaf.offset, leaf.size))
+        order = np.argsort(values, kind="stable")
+        values = values[order]
+        edges = [0, *(np.flatnonzero(values[1:] != values[:-1]) + 1).tolist(), len(values)]
+        if len(edges) > 2:
+            which = which[order]
+        for start, stop in pairwise(edges):
+            stack.append((node.children.setdefault(int(values[start]), _Node()), which[start:stop]))
 
     def _explore(self, sample: NDArray[np.uint8]) -> None:
         """Walk the struct along one sample, and add what the walk asked for and found to the tree."""

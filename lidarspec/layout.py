@@ -85,14 +85,20 @@ class Leaf:
     def _bits(self, rows: Bytes2D, element: BitField) -> NDArray[Any]:
         assert self.info.dtype is not None
         wide = np.dtype(f"u{self.info.dtype.itemsize}")
-        total = np.zeros((len(rows), *self.shape[: len(self.strides)]), wide)
-        for part in element.segments:
-            bits = (self._view(rows, np.dtype("u1"), part.byte) & np.uint8(part.mask)) >> part.low
-            total |= bits.astype(wide) << wide.type(part.target)
+        words = element.words if wide.itemsize > 2 else None
+        if words is not None:
+            total = self._view(rows, np.dtype(words[0][0]), words[0][1]).astype(wide) << wide.type(words[0][2])
+            for word, byte, target in words[1:]:
+                total |= self._view(rows, np.dtype(word), byte).astype(wide) << wide.type(target)
+        else:
+            total = np.zeros((len(rows), *self.shape[: len(self.strides)]), wide)
+            for part in element.segments:
+                bits = (self._view(rows, np.dtype("u1"), part.byte) & np.uint8(part.mask)) >> part.low
+                total |= bits.astype(wide) << wide.type(part.target)
         if element.signed:
             sign = wide.type(1 << (element.width - 1))
             return np.asarray(((total ^ sign) - sign).view(self.info.dtype))
-        return total.astype(self.info.dtype)
+        return np.asarray(total.astype(self.info.dtype))
 
     def at(self, offset: int) -> Leaf:
         """The same field with its place counted from `offset`."""
@@ -110,6 +116,8 @@ class Seal:
 
     def stored(self, rows: Bytes2D) -> NDArray[np.uint64]:
         """The values that stand in the frames, (n,)."""
+        if len(self.leaves) == 1 and self.leaves[0].info.kind != "bytes":
+            return self.leaves[0].load(rows).astype(np.uint64)
         total, shift = np.zeros(len(rows), np.uint64), 0
         for leaf in self.leaves:
             if leaf.info.kind == "bytes":
@@ -154,7 +162,8 @@ class Seal:
     def intact(self, rows: Bytes2D) -> NDArray[np.bool_]:
         """Which frames carry the right value, or one that means "not filled"."""
         stored = self.stored(rows)
-        return np.asarray(stored == self.computed(rows)) | np.isin(stored, np.array(self.absent, np.uint64))
+        right = np.asarray(stored == self.computed(rows))
+        return right | np.isin(stored, np.array(self.absent, np.uint64)) if self.absent else right
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import functools
 import io
-from functools import partial
 from typing import Any
 
 import construct
@@ -14,29 +14,35 @@ from lidarspec.errors import SpecError, UnknownFrame, WireError
 from lidarspec.headers import Refused
 from lidarspec.layout import Layout
 from lidarspec.spec import Sensor
+from lidarspec.unpacking import Unpack
 
 
 def parse(sensor: Sensor, data: bytes, *, frame: str | None = None, verify: bool = True) -> Any:
     """See `Sensor.parse`."""
-    found = _unpacked(sensor, bytes(data), frame)
-    return clean(parse_typed(sensor, data, frame=frame, verify=verify)[1]) if found is None else found
+    data = bytes(data)
+    try:
+        for parser in _parsers(sensor, frame, len(data)):
+            found = parser(data)
+            if found is not None:
+                return found
+    except SpecError:
+        raise
+    except Exception:  # out of a plugin: construct meets it again, and it is told with its place
+        pass
+    return clean(parse_typed(sensor, data, frame=frame, verify=verify)[1])
 
 
-def _unpacked(sensor: Sensor, data: bytes, frame: str | None) -> Any:
-    """A sound frame by generated code; None where construct has to say what it is, or what is wrong with it."""
+@functools.lru_cache(maxsize=4096)
+def _parsers(sensor: Sensor, frame: str | None, size: int) -> list[Unpack]:
+    """Generated code for each frame type that a frame of this size can be, up to the first that only construct can tell."""
+    found = []
     for name in sensor.frames if frame is None or frame not in sensor.frames else (frame,):
         engine = codec(sensor.frames[name])
         if not isinstance(engine, CompiledCodec):
-            return None  # it may be of this type, which comes first
-        try:
-            found = engine.parse(data)
-        except SpecError:
-            raise
-        except Exception:  # out of a plugin: construct meets it again, and it is told with its place
-            return None
-        if found is not None:
-            return found
-    return None
+            break  # it may be of this type, which comes first
+        if engine.size in (None, size):
+            found.append(engine.parse)
+    return found
 
 
 def parse_typed(sensor: Sensor, data: bytes, *, frame: str | None = None, verify: bool = True) -> tuple[str, Any]:
@@ -55,7 +61,7 @@ def parse_typed(sensor: Sensor, data: bytes, *, frame: str | None = None, verify
         except WireError as fault:
             faults.append(fault)
     if not verify:
-        for likely in sorted(faults, key=partial(_progress, sensor), reverse=True):
+        for likely in sorted(faults, key=functools.partial(_progress, sensor), reverse=True):
             try:
                 return likely.frame, _parse_as(sensor, likely.frame, data, verify=False)
             except WireError:
@@ -157,7 +163,7 @@ def _progress(sensor: Sensor, fault: WireError) -> tuple[int, int]:
 
 
 def _likeliest(sensor: Sensor, data: bytes, faults: list[WireError]) -> WireError:
-    best = max(faults, key=partial(_progress, sensor))
+    best = max(faults, key=functools.partial(_progress, sensor))
     if best.offset > 0 or len(sensor.frames) == 1:
         return best
     starts = []

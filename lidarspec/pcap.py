@@ -10,7 +10,8 @@ from __future__ import annotations
 import ipaddress
 import os
 import struct
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
 from types import TracebackType
@@ -22,10 +23,11 @@ from lidarspec._pcap_records import (
     NANOSECOND_MAGIC,
     CapturedPacket,
     Damaged,
+    Passed,
     Source,
     Truncated,
-    captured_packets,
     is_capture,
+    records,
 )
 from lidarspec.errors import SourceError, UsageError
 
@@ -90,12 +92,14 @@ class CaptureReader:
         SourceError: the file cannot be read, or is no capture at all. Damage further on is counted, never raised.
     """
 
+    _reading: Callable[[BinaryIO], Source] = Source
+
     def __init__(self, file: BinaryIO | str | os.PathLike[str]) -> None:
         self.stats = CaptureStats()
         self._owned: BinaryIO | None = None
         if isinstance(file, str | os.PathLike):
             file = self._owned = _open(file)
-        self._source = Source(file)
+        self._source = self._reading(file)
         self._fragments = Reassembly()
         self._datagrams = self._walk()
         try:
@@ -122,12 +126,19 @@ class CaptureReader:
             self._owned.close()
 
     def _walk(self) -> Iterator[Datagram]:
-        try:
-            for packet in captured_packets(self._source):
-                datagram = self._datagram(packet)
+        with self._to_the_end():
+            found = records(self._source)
+            while self._source.begin_record():
+                datagram = self.datagram(found.read())
                 if datagram is not None:
                     self.stats.datagrams += 1
                     yield datagram
+
+    @contextmanager
+    def _to_the_end(self) -> Iterator[None]:
+        """Around the reading of all records: counts what ends it."""
+        try:
+            yield
         except Truncated:
             self.stats.truncated_tail = True
             self.stats.stopped_at = self._source.record
@@ -139,10 +150,11 @@ class CaptureReader:
         self._fragments.finish()
         self.stats.incomplete_fragments = self._fragments.dropped
 
-    def _datagram(self, packet: CapturedPacket | None) -> Datagram | None:
+    def datagram(self, packet: CapturedPacket | Passed) -> Datagram | None:
+        """The datagram that this packet is, or makes whole; counts what it is otherwise."""
         stats = self.stats
-        if packet is None:
-            stats.malformed += 1
+        if isinstance(packet, Passed):
+            stats.malformed += packet is Passed.MALFORMED
             return None
         stats.packets += 1
         try:
@@ -154,7 +166,7 @@ class CaptureReader:
                 if whole is None:
                     return None
                 ip = whole
-            source_port, destination_port, data = udp(ip)
+            part = udp(ip)
         except Refused as refused:
             if refused.reason == "other":
                 stats.other += 1
@@ -163,7 +175,8 @@ class CaptureReader:
             else:
                 stats.malformed += 1
             return None
-        return Datagram(data, packet.at, (address(ip.source), source_port), (address(ip.destination), destination_port))
+        ends = (address(ip.source), part.source), (address(ip.destination), part.destination)
+        return Datagram(ip.body[part.start : part.stop], packet.at, *ends)
 
 
 class PcapWriter:

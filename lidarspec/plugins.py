@@ -7,15 +7,13 @@ distribution and its error, rolled back, and disturbs no other.
 from __future__ import annotations
 
 import functools
-import importlib.metadata
 import importlib.util
 import inspect
 import traceback
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pluggy
 
@@ -23,8 +21,12 @@ from lidarspec import hookspecs
 from lidarspec.checksums import Checksum
 from lidarspec.errors import LidarSpecError, SourceError, SpecError, UnknownSensor, UsageError
 from lidarspec.fields import Checksummed
+from lidarspec.installed import EntryPoint, Vendor, entry_points, vendors
 from lidarspec.rules import children
 from lidarspec.spec import Frame, Sensor, replaced
+
+if TYPE_CHECKING:
+    from pathlib import Path
 
 GROUP = "lidarspec"
 HOOKS = tuple(name for name in vars(hookspecs) if name.startswith("lidarspec_"))
@@ -43,30 +45,33 @@ class Plugin:
 
 
 class Registry:
-    """The plugins of this environment, and the sensors with their hooks applied."""
+    """The plugins of this environment, and the sensors with their hooks applied.
 
-    def __init__(self) -> None:
+    Plugins whose entry point ends in a hyphen ("acme-") are loaded when they are needed, all others at once and before them. Two
+    threads may load the same one at the same time: it adds the same sensors twice.
+    """
+
+    def __init__(self, entries: Iterable[EntryPoint] = ()) -> None:
         self._manager = pluggy.PluginManager(hookspecs.NAMESPACE)
         self._manager.add_hookspecs(hookspecs)
         self._loaded: dict[str, Sensor] = {}
         self._aliases: dict[str, str] = {}
+        self._owners: dict[str, Any] = {}
         self._ready: dict[str, Sensor] = {}
-        self.plugins: list[Plugin] = []
+        entries = list(entries)
+        self._vendors = vendors(entries)
+        self._seen: dict[Vendor, Plugin] = {}
+        self._plugins = [
+            self._tried(entry, entry.name, functools.partial(self.add, name=f"{entry.distribution}:{entry.name}"))
+            for entry in entries
+            if not entry.name.endswith("-")
+        ]
 
-    def load(self, entry_points: Iterable[importlib.metadata.EntryPoint]) -> None:
-        """Load each entry point; failures are kept in `plugins`."""
-        for entry in entry_points:
-            distribution = entry.dist.name if entry.dist else "?"
-            version = entry.dist.version if entry.dist else "?"
-            try:
-                sensors = self.add(entry.load(), name=f"{distribution}:{entry.name}")
-                self.plugins.append(Plugin(distribution, version, f"{entry.name} = {entry.value}", tuple(sensors)))
-            except KeyboardInterrupt:
-                raise
-            except BaseException as error:
-                reason = str(error) if isinstance(error, LidarSpecError) else f"{type(error).__name__}: {error}"
-                text = traceback.format_exc()
-                self.plugins.append(Plugin(distribution, version, f"{entry.name} = {entry.value}", (), reason, text))
+    @property
+    def plugins(self) -> list[Plugin]:
+        """Every plugin that was found; those that could not be loaded say why."""
+        self._load(self._vendors)
+        return self._plugins + [self._seen[vendor] for vendor in self._vendors]
 
     def add(self, plugin: Any, *, name: str) -> list[str]:
         """Register one plugin (a module or object with hooks) and return the ids that it adds.
@@ -77,24 +82,65 @@ class Registry:
         _check_hooks(plugin, name)
         try:
             self._manager.register(plugin, name)
-            function = getattr(plugin, "lidarspec_sensors", None)
-            sensors = list(function()) if function is not None and _is_hook(function) else []
-            for sensor in sensors:
-                self._check(sensor, sensors)
+            sensors = self._sensors_of(plugin)
         except pluggy.PluginValidationError as error:
             self._rollback(name)
             raise SpecError(" ".join(str(error).split()), path=name) from None
         except BaseException:
             self._rollback(name)
             raise
-        for sensor in sensors:
-            self._loaded[sensor.id] = sensor
-            self._aliases |= dict.fromkeys(sensor.aliases, sensor.id)
+        self._keep(plugin, sensors)
         self._ready.clear()
         return [sensor.id for sensor in sensors]
 
+    def _load(self, vendors: Iterable[Vendor]) -> None:
+        for vendor in vendors:
+            if vendor not in self._seen:
+                add = functools.partial(self._add_vendor, vendor)
+                self._seen[vendor] = self._tried(vendor.entry, ", ".join(vendor.prefixes), add)
+
+    def _add_vendor(self, vendor: Vendor, plugin: Any) -> list[str]:
+        """Keep the sensors of a plugin that keeps its promise; it has no hook for which pluggy would have to know it."""
+        _check_hooks(plugin, vendor.entry.name)
+        for hook in HOOKS:
+            if hook != "lidarspec_sensors" and hasattr(plugin, hook):
+                raise SpecError(f"{hook} would not always be loaded: give the entry point a name without a hyphen at its end")
+        sensors = self._sensors_of(plugin)
+        for sensor in sensors:
+            for name in (sensor.id, *sensor.aliases):
+                if not name.startswith(vendor.prefixes):
+                    begin = " or ".join(map(repr, vendor.prefixes))
+                    raise SpecError(f"its entry point says that ids begin with {begin}", sensor=name)
+        self._keep(plugin, sensors)
+        return [sensor.id for sensor in sensors]
+
+    def _tried(self, entry: EntryPoint, names: str, add: Callable[[Any], list[str]]) -> Plugin:
+        """What became of an entry point that is loaded and added; whatever it raises disturbs no other."""
+        found = Plugin(entry.distribution, entry.version, f"{names} = {entry.value}")
+        try:
+            return replace(found, sensors=tuple(add(entry.load())))
+        except KeyboardInterrupt:
+            raise
+        except BaseException as error:
+            reason = str(error) if isinstance(error, LidarSpecError) else f"{type(error).__name__}: {error}"
+            return replace(found, error=reason, traceback=traceback.format_exc())
+
+    def _sensors_of(self, plugin: Any) -> list[Sensor]:
+        function = getattr(plugin, "lidarspec_sensors", None)
+        sensors = list(function()) if function is not None and _is_hook(function) else []
+        for sensor in sensors:
+            self._check(sensor, sensors, plugin)
+        return sensors
+
+    def _keep(self, plugin: Any, sensors: list[Sensor]) -> None:
+        for sensor in sensors:
+            self._loaded[sensor.id] = sensor
+            self._aliases |= dict.fromkeys(sensor.aliases, sensor.id)
+            self._owners |= dict.fromkeys((sensor.id, *sensor.aliases), plugin)
+
     def sensors(self) -> dict[str, Sensor]:
         """Every sensor by id, sorted, with its hooks applied."""
+        self._load(self._vendors)
         return {name: self.sensor(name) for name in sorted(self._loaded)}
 
     def sensor(self, name: str) -> Sensor:
@@ -103,6 +149,9 @@ class Registry:
         Raises:
             UnknownSensor: with a suggestion, or with what to install where there is no sensor at all.
         """
+        self._load(self._likely(name))
+        if name not in self._loaded and name not in self._aliases:
+            self._load(self._vendors)
         name = self._aliases.get(name, name)
         if name not in self._loaded:
             hint = "" if self._loaded else "; no sensor is installed: pip install 'lidarspec[all]'"
@@ -110,6 +159,14 @@ class Registry:
         if name not in self._ready:
             self._ready[name] = self.hooked(self._loaded[name])
         return self._ready[name]
+
+    def _likely(self, name: str) -> list[Vendor]:
+        """The plugins that could add this id, and all that could add an id of one of these, so that the first of them wins as ever."""
+        names, found = {name}, set[Vendor]()
+        while more := {vendor for vendor in self._vendors if vendor not in found and vendor.shares(names)}:
+            found |= more
+            names = {prefix for vendor in more for prefix in vendor.prefixes}
+        return [vendor for vendor in self._vendors if vendor in found]
 
     def hooked(self, sensor: Sensor) -> Sensor:
         """The sensor with the checksum and points hooks of all plugins applied to it."""
@@ -149,15 +206,15 @@ class Registry:
         return frame
 
     def _failed(self, name: str, reason: str) -> None:
-        for index, plugin in enumerate(self.plugins):
+        for index, plugin in enumerate(self._plugins):
             if f"{plugin.distribution}:{plugin.entry_point.partition(' = ')[0]}" == name and not plugin.error:
-                self.plugins[index] = replace(plugin, error=reason, traceback=traceback.format_exc())
+                self._plugins[index] = replace(plugin, error=reason, traceback=traceback.format_exc())
 
-    def _check(self, sensor: Any, own: list[Any]) -> None:
+    def _check(self, sensor: Any, own: list[Any], plugin: Any) -> None:
         if not isinstance(sensor, Sensor):
             raise SpecError(f"lidarspec_sensors returns sensors, not {type(sensor).__name__}")
         for name in (sensor.id, *sensor.aliases):
-            if name in self._loaded or name in self._aliases or sum(name in (s.id, *s.aliases) for s in own) > 1:
+            if self._owners.get(name, plugin) is not plugin or sum(name in (s.id, *s.aliases) for s in own) > 1:
                 raise SpecError("another sensor has this id already", sensor=name)
 
     def _rollback(self, name: str) -> None:
@@ -207,10 +264,8 @@ def _check_hooks(plugin: Any, name: str) -> None:
 
 @functools.cache
 def registry() -> Registry:
-    """The registry of this environment, loaded at first use."""
-    found = Registry()
-    found.load(sorted(importlib.metadata.entry_points(group=GROUP), key=lambda entry: (entry.name, entry.value)))
-    return found
+    """The registry of this environment."""
+    return Registry(entry_points(GROUP))
 
 
 def sensors() -> dict[str, Sensor]:
@@ -232,6 +287,8 @@ def sensor(name: str | Path) -> Sensor:
 
 
 def _from_file(text: str) -> Sensor:
+    from pathlib import Path
+
     path, colon, wanted = text.partition(".py:")
     file = Path(f"{path}.py" if colon else text)
     module = _module(file)

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import copy
+
 import numpy as np
+from numpy.typing import NDArray
 
 from lidarspec.packets import Packets, joined
 
@@ -22,10 +25,10 @@ class Reorder:
         """The packets that are now in order; at most one batch."""
         if not self._enabled or not len(packets):
             return [packets] if len(packets) else []
-        first, settled = int(packets.index[0]), self._next is not None or len(packets) > WINDOW
-        if settled and self._held is None and self._next in (None, first) and bool((np.diff(packets.index) == 1).all()):
-            self._next = int(packets.index[-1]) + 1
-            return [packets]
+        if self._held is None and (self._next is None or int(packets.index[0]) >= self._next):
+            steps = packets.index[1:] - packets.index[:-1]
+            if not len(steps) or int(steps.min()) > 0:
+                return self._ascending(packets, None if not len(steps) or int(steps.max()) == 1 else steps)
         return self._ordered(packets)
 
     def finish(self) -> list[Packets]:
@@ -34,6 +37,25 @@ class Reorder:
         if held is None:
             return []
         return [self._marked(held.take(np.argsort(held.index, kind="stable")), self._next)]
+
+    def _ascending(self, packets: Packets, steps: NDArray[np.int64] | None) -> list[Packets]:
+        """The same for packets none of which is late: those behind the first gap that is still open are kept back.
+
+        Args:
+            steps: of the index from each packet to the next; None where all are 1.
+        """
+        number, before = len(packets), self._next
+        gaps = [] if before == int(packets.index[0]) else [0]
+        if steps is not None:
+            gaps += (np.flatnonzero(steps > 1) + 1).tolist()
+        end = next((gap for gap in gaps if gap >= number - WINDOW), number)
+        if end < number:
+            self._held = packets.take(slice(end, None))
+            packets = packets.take(slice(0, end))
+        if not end:
+            return []
+        self._next = int(packets.index[-1]) + 1
+        return [self._marked(packets, before) if len(gaps) > (before is None) or packets.breaks.any() else packets]
 
     def _ordered(self, packets: Packets) -> list[Packets]:
         known = 0 if self._held is None else len(self._held)
@@ -57,5 +79,6 @@ class Reorder:
     def _marked(packets: Packets, before: int | None = None) -> Packets:
         """The same packets with a break wherever the index jumps, and nowhere else."""
         start = int(packets.index[0]) if before is None else before
-        packets.breaks = np.diff(packets.index, prepend=start - 1) != 1
-        return packets
+        marked = copy.copy(packets)
+        marked.breaks = np.diff(packets.index, prepend=start - 1) != 1
+        return marked

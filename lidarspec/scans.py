@@ -12,6 +12,7 @@ from lidarspec.clouds import PointCloud, joined, restamped
 from lidarspec.columns import Carry
 from lidarspec.cuts import Cutter
 from lidarspec.evaluation import guarded
+from lidarspec.mounting import Mount
 from lidarspec.packets import Packets
 from lidarspec.packets import joined as joined_packets
 from lidarspec.points import Evaluated
@@ -105,10 +106,15 @@ class Scan:
 
 
 class ScanStream:
-    """Scans out of batches of packets; remembers what the next batch needs."""
+    """Scans out of batches of packets; remembers what the next batch needs.
 
-    def __init__(self, sensor: Sensor) -> None:
-        self._sensor = sensor
+    Args:
+        sensor: whose.
+        mount: how it is mounted; the scans come in its carrier's axes.
+    """
+
+    def __init__(self, sensor: Sensor, mount: Mount | None = None) -> None:
+        self._sensor, self._mount = sensor, mount
         self._reorder = Reorder(enabled=sensor.sequence is not None)
         self._cutter = Cutter(sensor.scan)
         self._waiting: Packets | None = None
@@ -164,9 +170,10 @@ class ScanStream:
         cloud = restamped(joined(parts))
         rate = np.nan
         if following is not None and len(following):
-            period = (restamped(following).stamp_ns - cloud.stamp_ns) * 1e-9
+            period = (following.stamp_ns + round(following.time_at(0) * 1e9) - cloud.stamp_ns) * 1e-9
             rate = 1 / period if period > 0 else np.nan
-        return Scan(cloud, float(rate) if complete else np.nan, complete, self._sensor)
+        mounted = cloud if self._mount is None else self._mount.applied(cloud)
+        return Scan(mounted, float(rate) if complete else np.nan, complete, self._sensor)
 
 
 def scans_of(sensor: Sensor, batches: Iterable[Packets]) -> Iterator[Scan]:

@@ -1,7 +1,12 @@
-"""Scenes for simulated sensors: what a beam in a direction meets, and how far away."""
+"""Scenes for simulated sensors: what a beam in a direction meets, and how far away.
+
+Everything is upright boxes in the sensor's axes: x forward, y left, z up, metres, the sensor at the origin. Beams may begin beside
+the origin, and what moves stands elsewhere at another time, so both can be given for each beam.
+"""
 
 from __future__ import annotations
 
+import random
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -9,13 +14,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
+#: what broadcasts against the beams: an array, or one number for all.
+Value = Any
+Vector = tuple[Value, Value, Value]
+ORIGIN: Vector = (0.0, 0.0, 0.0)
 
 
 class Scene(Protocol):
     """Something that can be measured."""
 
-    def measure(self, azimuth: Floats, elevation: Floats) -> Floats:
-        """Metres from the sensor to what each beam meets, inf where it meets nothing; arrays of one shape."""
+    def measure(self, azimuth: Floats, elevation: Floats, origin: Vector = ORIGIN, time: Value = 0.0) -> Floats:
+        """Metres along each beam to what it meets, inf where it meets nothing.
+
+        Args:
+            azimuth, elevation: radians, of shapes that broadcast.
+            origin: where the beams begin, metres; each of the three broadcasts against the beams.
+            time: seconds since the scene began; broadcasts likewise.
+        """
 
 
 @dataclass(frozen=True)
@@ -25,26 +40,119 @@ class Box:
     low: tuple[float, float, float]
     high: tuple[float, float, float]
 
-    def span(self, direction: Floats) -> tuple[Floats, Floats]:
-        """Where beams, (3, ...), enter and leave; entering beyond leaving is a miss."""
-        with np.errstate(divide="ignore", invalid="ignore"):
-            edges = [np.array(corner).reshape(3, *(1,) * (direction.ndim - 1)) / direction for corner in (self.low, self.high)]
-        near, far = np.fmin(*edges), np.fmax(*edges)
-        return near.max(axis=0), far.min(axis=0)
+    def at(self, time: Value) -> tuple[Vector, Vector]:
+        """Its corners at a time; it stands still."""
+        return self.low, self.high
+
+    @property
+    def radius(self) -> float:
+        """From its middle to a corner."""
+        return float(np.linalg.norm(np.subtract(self.high, self.low))) / 2
+
+
+@dataclass(frozen=True)
+class Mover:
+    """A box whose middle goes along a path and back again, for ever.
+
+    Args:
+        size: of the box, metres.
+        path: (x, y) of the places that it passes in straight lines; at least two.
+        speed: metres a second.
+        floor: height of its underside.
+    """
+
+    size: tuple[float, float, float]
+    path: tuple[tuple[float, float], ...]
+    speed: float = 0.8
+    floor: float = -1.2
+
+    def at(self, time: Value) -> tuple[Vector, Vector]:
+        """Its corners at a time."""
+        places = np.array(self.path, np.float64)
+        along = np.concatenate([[0], np.cumsum(np.hypot(*np.diff(places, axis=0).T))])
+        whole = along[-1]
+        gone = np.asarray(time, np.float64) * self.speed % (2 * whole)
+        gone = np.minimum(gone, 2 * whole - gone)
+        x, y = (np.interp(gone, along, column) for column in places.T)
+        half = [side / 2 for side in self.size]
+        return (x - half[0], y - half[1], self.floor), (x + half[0], y + half[1], self.floor + self.size[2])
+
+    @property
+    def radius(self) -> float:
+        """From its middle to a corner."""
+        return float(np.linalg.norm(self.size)) / 2
 
 
 @dataclass(frozen=True)
 class Room:
-    """Walls, floor and ceiling around the sensor, and boxes in it; no symmetry, so that a mirrored picture shows."""
+    """Walls, floor and ceiling around the sensor, and boxes in it; no symmetry, so that a mirrored picture shows.
 
-    walls: Box = Box((-3.0, -2.2, -1.2), (4.6, 3.1, 1.6))
+    Args:
+        walls: None in the open, where only the boxes are met.
+        boxes, movers: what stands, and what moves.
+    """
+
+    walls: Box | None = Box((-3.0, -2.2, -1.2), (4.6, 3.1, 1.6))
     boxes: tuple[Box, ...] = (Box((2.0, 0.8, -1.2), (2.7, 1.6, 0.9)), Box((-1.6, -1.5, -1.2), (-1.1, -0.9, 1.2)))
+    movers: tuple[Mover, ...] = ()
 
-    def measure(self, azimuth: Floats, elevation: Floats) -> Floats:
+    def measure(self, azimuth: Floats, elevation: Floats, origin: Vector = ORIGIN, time: Value = 0.0) -> Floats:
+        """See `Scene.measure`."""
         level = np.cos(elevation)
-        direction = np.stack(np.broadcast_arrays(level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)))
-        found: Any = self.walls.span(direction)[1]
-        for box in self.boxes:
-            enter, leave = box.span(direction)
-            found = np.where((enter > 0) & (enter <= leave), np.minimum(found, enter), found)
-        return np.asarray(found, np.float64)
+        beams = (level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation))
+        shape = np.broadcast_shapes(*(np.shape(part) for part in (*beams, *origin, time)))
+        found = np.full(shape, np.inf)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            if self.walls is not None:
+                for low, high, start, beam in zip(self.walls.low, self.walls.high, origin, beams, strict=True):
+                    np.minimum(found, np.where(beam >= 0, high - start, start - low) / np.abs(beam), out=found)
+            bodies: tuple[Box | Mover, ...] = (*self.boxes, *self.movers)
+            for body in bodies:
+                _meet(found, body, beams, origin, time)
+        return found
+
+
+def _meet(found: Floats, body: Box | Mover, beams: Vector, origin: Vector, time: Value) -> None:
+    """Shorten the beams, in place, that meet a body from outside."""
+    low, high = body.at(time)
+    near = _near(body, low, high, beams, origin)
+    where = np.flatnonzero(np.broadcast_to(near, found.shape))
+    if not len(where):
+        return
+
+    def chosen(value: Value) -> Any:
+        return value if np.ndim(value) == 0 else np.broadcast_to(value, found.shape).reshape(-1)[where]
+
+    enter, leave = np.full(len(where), -np.inf), np.full(len(where), np.inf)
+    for corner, other, start, beam in zip(low, high, origin, beams, strict=True):
+        first, second = (chosen(corner) - chosen(start)) / chosen(beam), (chosen(other) - chosen(start)) / chosen(beam)
+        np.fmax(enter, np.fmin(first, second), out=enter)
+        np.fmin(leave, np.fmax(first, second), out=leave)
+    hit = (enter > 0) & (enter <= leave)
+    flat = found.reshape(-1)
+    flat[where[hit]] = np.minimum(flat[where[hit]], enter[hit])
+
+
+def _near(body: Box | Mover, low: Vector, high: Vector, beams: Vector, origin: Vector) -> Any:
+    """Which beams pass within the sphere around a body: the others need no closer look."""
+    middle = [(a + b) / 2 for a, b in zip(low, high, strict=True)]
+    aside = np.sqrt(sum(np.max(np.square(part)) for part in origin))
+    squared = sum(np.square(part) for part in middle) - (body.radius + aside) ** 2
+    along = sum(part * beam for part, beam in zip(middle, beams, strict=True))
+    return (squared <= 0) | (along >= np.sqrt(np.maximum(squared, 0)))
+
+
+def furnished(seed: int = 0) -> Room:
+    """A room with boxes and somebody who walks in it; each seed has its own, the same every time."""
+    walker = Mover((0.4, 0.5, 1.7), ((1.4, -1.5), (0.8, 1.9), (-1.8, 1.2)))
+    if seed == 0:
+        return Room(movers=(walker,))
+    source = random.Random(f"scene {seed}")
+    spread = source.uniform
+    walls = Box((-spread(2.5, 4), -spread(2, 3.5), -1.2), (spread(3, 6), spread(2.5, 4.5), spread(1.3, 2)))
+    boxes = []
+    for _ in range(source.randint(2, 4)):
+        x, y = source.choice((spread(-2.2, -1.2), spread(1.6, 2.6))), source.choice((spread(-1.7, -1), spread(1.2, 2)))
+        wide, deep = spread(0.2, 0.5), spread(0.2, 0.5)
+        boxes.append(Box((x - wide, y - deep, -1.2), (x + wide, y + deep, spread(-0.3, 1.2))))
+    return Room(walls, tuple(boxes), (walker,))

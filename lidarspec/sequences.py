@@ -5,12 +5,13 @@ Numbers are unwrapped to an index that runs on over restarts of the counter, so 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.access import Fields
+from lidarspec.access import UNKNOWN, Watched
 from lidarspec.columns import Batch
 from lidarspec.decoder import Counters
 from lidarspec.errors import SpecError
@@ -22,6 +23,52 @@ LATE = 64
 EARLY = 10
 #: counters with at least so many values start again at 0 only when the sensor does.
 LONG = 1 << 16
+#: results of a function that are remembered.
+REMEMBERED = 64
+
+
+class Remembered:
+    """A function of header fields, which is not called again for values that it has been called with.
+
+    Most counters and clocks depend on one or two settings of the sensor that hardly ever change, so that comparing them
+    with what they were before is much cheaper than computing with them.
+    """
+
+    def __init__(self) -> None:
+        self._paths: frozenset[str] | None = None
+        self._known: dict[tuple[int, ...], NDArray[np.int64]] = {}
+
+    def __call__(self, function: Callable[[Any], Any], batch: Batch) -> NDArray[np.int64]:
+        """What the function says, (n,), or without an axis where it is the same for all packets."""
+        key = self._key(batch, self._paths)
+        if key is not None and key in self._known:
+            return self._known[key]
+        seen: set[str] = set()
+        values = np.asarray(function(Watched(batch, seen)), np.float64)
+        values = (values.reshape(-1) if values.ndim else values).astype(np.int64)
+        self._paths = frozenset(seen) if UNKNOWN not in seen and self._paths in (None, seen) else frozenset()
+        key = self._key(batch, self._paths)
+        if key is not None and len(self._known) < REMEMBERED:
+            found = values if values.ndim == 0 else values[0]
+            if bool((values == found).all()):
+                self._known[key] = np.array(found)
+        return np.asarray(np.broadcast_to(values, (len(batch),)) if values.ndim else values, np.int64)
+
+    @staticmethod
+    def _key(batch: Batch, paths: frozenset[str] | None) -> tuple[int, ...] | None:
+        """The values of the fields, if they are integers of the header and the same in all packets."""
+        if not paths:
+            return None
+        key = []
+        for path in sorted(paths):
+            info = batch.table.schema.fields[path]
+            if info.axes or info.optional or info.dtype is None or info.dtype.kind not in "ui":
+                return None
+            raw = batch.table.raw(path)
+            if not len(raw) or bool((raw != raw[0]).any()):
+                return None
+            key.append(int(raw[0]))
+        return tuple(key)
 
 
 class SequenceTracker:
@@ -34,33 +81,61 @@ class SequenceTracker:
         self._index = -1
         self._first = 0
         self._missing: set[int] = set()
+        self._highest = Remembered()
 
-    def push(self, batch: Batch) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-        """The index of each packet, and True where packets are missing before it."""
+    def push(self, batch: Batch) -> tuple[NDArray[np.int64], NDArray[np.bool_] | None]:
+        """The index of each packet, and True where packets are missing before it; None where nowhere."""
         info = batch.table.schema.fields.get(self._rule.field)
         if info is None or info.axes:
             raise SpecError("a sequence is a field of the header", path=self._rule.field)
         numbers = batch.table.raw(self._rule.field).astype(np.int64)
         there = batch.table.present(self._rule.field)
-        periods = self._periods(batch, (1 << info.bits) - 1) - self._rule.first + 1
-        if (there is None or bool(there.all())) and self._in_order(numbers, periods):
-            index = self._index + 1 + np.arange(len(numbers))
-            self._number, self._index = int(numbers[-1]), int(index[-1])
-            return index, np.zeros(len(numbers), np.bool_)
-        numbered = np.ones(len(numbers), np.bool_) if there is None else there
-        steps = zip(numbers.tolist(), periods.tolist(), numbered.tolist(), strict=True)
+        last = self._last(batch, (1 << info.bits) - 1)
+        periods = last - self._rule.first + 1
+        if there is None or bool(there.all()):
+            return self._runs(numbers, periods)
+        each = np.broadcast_to(periods, numbers.shape)
+        steps = zip(numbers.tolist(), each.tolist(), there.tolist(), strict=True)
         found = [self._step(number, period) if known else self._unnumbered() for number, period, known in steps]
         return np.array([index for index, _ in found], np.int64), np.array([jump for _, jump in found], np.bool_)
 
-    def _in_order(self, numbers: NDArray[np.int64], periods: NDArray[np.int64]) -> bool:
-        if self._number is None or not len(numbers) or not bool((periods == self._period).all()):
-            return False
-        return bool(((np.diff(numbers, prepend=self._number) - 1) % self._period == 0).all())
+    def _runs(self, numbers: NDArray[np.int64], periods: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.bool_] | None]:
+        """The same for packets that are all numbered; those that follow one another are counted together."""
+        each = periods if periods.ndim else None
+        steady = numbers[1:] - numbers[:-1]
+        ones = steady == 1
+        if not ones.all():
+            ones |= (steady - 1) % np.maximum(periods if each is None else periods[1:], 1) == 0
+        steady = ones if each is None else ones & (each[1:] == each[:-1])
+        odd = [*(np.flatnonzero(~steady) + 1).tolist(), len(numbers)] if not steady.all() else [len(numbers)]
+        index, jumps = np.empty(len(numbers), np.int64), None
+        spot = turn = 0
+        while spot < len(numbers):
+            while odd[turn] <= spot:
+                turn += 1
+            number, period = int(numbers[spot]), int(periods if each is None else each[spot])
+            follows = self._follows(number, period)
+            end = odd[turn] if follows else spot + 1
+            if follows:
+                index[spot:end] = np.arange(self._index + 1, self._index + 1 + end - spot)
+                self._number, self._index = int(numbers[end - 1]), self._index + end - spot
+            else:
+                index[spot], jump = self._step(number, period)
+                if jump:
+                    jumps = np.zeros(len(numbers), np.bool_) if jumps is None else jumps
+                    jumps[spot] = True
+            spot = end
+        return index, jumps
 
-    def _periods(self, batch: Batch, widest: int) -> NDArray[np.int64]:
-        last: Any = widest if self._rule.last is None else self._rule.last
-        values = np.asarray(last(Fields(batch)) if callable(last) else last, np.float64)
-        return np.broadcast_to(values.reshape(-1) if values.ndim else values, (len(batch),)).astype(np.int64)
+    def _follows(self, number: int, period: int) -> bool:
+        return self._number is not None and period == self._period and (number - self._number - 1) % period == 0
+
+    def _last(self, batch: Batch, widest: int) -> NDArray[np.int64]:
+        """The highest number of the counter, for each packet or, without an axis, for all."""
+        last = self._rule.last
+        if callable(last):
+            return self._highest(last, batch)
+        return np.array(widest if last is None else last, np.int64)
 
     def _step(self, number: int, period: int) -> tuple[int, bool]:
         period = max(period, 1)
@@ -97,7 +172,7 @@ class SequenceTracker:
 
     def _back(self, behind: int) -> int:
         index = self._index - behind
-        if index in self._missing:
+        if index in self._missing and index > self._index - LATE:
             self._missing.discard(index)
             self._stats.lost -= 1
             self._stats.late += 1

@@ -1,7 +1,7 @@
 """A sensor as a value: message types, commands, links, clock and geometry, written down once.
 
 Everything here is immutable and knows nothing of streams or arrays. What can be done with a sensor (parse, decode,
-...) is offered as methods, which hand over to the one `Engine` that the package installs when it is imported.
+...) is offered as methods, which hand over to the one `lidarspec.abilities.Engine` that the package installs.
 """
 
 from __future__ import annotations
@@ -10,10 +10,11 @@ import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, fields
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 from construct import Construct
 
+from lidarspec.abilities import engine
 from lidarspec.construction import prepare
 from lidarspec.errors import SpecError, UnknownFrame
 from lidarspec.geometry import Points
@@ -30,6 +31,8 @@ if TYPE_CHECKING:
 API = 1
 STATUSES = ("manual", "vectors", "capture", "hardware")
 Value = TypeVar("Value", "Frame", "Sensor")
+#: what a sensor sends for a command: see `Command.answers`.
+Answer = str | tuple[str, Mapping[str, Any]] | bytes | float
 _ID = re.compile(r"[a-z0-9]+(-[a-z0-9]+)+")
 
 
@@ -48,6 +51,9 @@ class Frame:
         confirm: how many in an unbroken run it takes to believe any of them.
         sweep: a `sweep` function of its own, for sensors that can answer in several data frames, and for other frames that
             random values never make.
+        encode: an `encode` function of its own: the measured `Polar` of a batch to the raw values of its fields, by path.
+        rate: how many a second are sent; of data, where neither the clock nor the times of the points tell; of other frames, where
+            they are sent again and again by themselves.
 
     Raises:
         SpecError: if the struct cannot describe a frame (see `lidarspec.rules`).
@@ -62,6 +68,8 @@ class Frame:
     after: str | None = field(default=None, kw_only=True)
     confirm: int = field(default=1, kw_only=True)
     sweep: Callable[[int], Mapping[str, Any]] | None = field(default=None, kw_only=True)
+    encode: Callable[..., Mapping[str, Any]] | None = field(default=None, kw_only=True)
+    rate: float = field(default=0.0, kw_only=True)
     prepared: Construct = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -81,56 +89,46 @@ class Command:
         frame: the outgoing frame that asks it; None for a command that only moves lines.
         values: values of its fields, by path.
         args: argument name -> (field path, lowest, highest), in the field's unit.
-        reply: the frame that answers; None where no answer is documented.
-        matches: values that fields of the reply must have for it to be the answer to this command.
-        timeout: seconds to wait for the reply.
+        reply: the frame that answers, or a tuple of those that may; None where no answer is documented.
+        matches: values that fields of the reply must have for it to be the answer to this command; of several frames, each is
+            asked for the fields that it has.
+        echoes: fields of the reply that repeat the field of the same path in the request.
+        timeout: seconds to wait for the reply, each time that it is sent.
+        retries: how often it is sent again when no reply comes; only for what does no harm when it arrives twice.
         settle: seconds that the sensor needs after it before the next command.
         link: the link it goes over.
         lines: levels of control lines, {"dtr": False}, set with it.
         starts, stops: whether the sensor sends data after it, or no longer does.
+        every: seconds after which it is sent once more, again and again from its first time on (a heartbeat); 0: never.
+        answers: all that the sensor sends for it before any data, in order, for simulation: frames by name, or (name, values) with
+            physical values by path, bytes as they are, and seconds of a pause, in which it sends its fillers; or a function from the
+            raw fields of the request to these. Left out, it is the reply.
     """
 
     frame: str | None = None
     values: Mapping[str, Any] = field(default_factory=dict)
     args: Mapping[str, tuple[str, float, float]] = field(default_factory=dict)
-    reply: str | None = None
+    reply: str | tuple[str, ...] | None = None
     matches: Mapping[str, Any] = field(default_factory=dict)
+    echoes: tuple[str, ...] = ()
     timeout: float = 1.0
+    retries: int = 0
     settle: float = 0.0
     link: str = "data"
     lines: Mapping[str, bool] = field(default_factory=dict)
     starts: bool = False
     stops: bool = False
+    every: float = 0.0
+    answers: tuple[Answer, ...] | Callable[[Mapping[str, Any]], Iterable[Answer]] | None = None
 
     def __post_init__(self) -> None:
         _freeze(self, "values", "args", "matches", "lines")
+        object.__setattr__(self, "echoes", tuple(self.echoes))
 
-
-class Engine(Protocol):
-    """What the package can do with a sensor; installed once by `lidarspec.engine`."""
-
-    def parse(self, sensor: Sensor, data: bytes, *, frame: str | None, verify: bool) -> Any: ...
-    def build(self, sensor: Sensor, frame: str, value: Any, values: Mapping[str, Any], *, units: bool) -> bytes: ...
-    def example(self, sensor: Sensor, frame: str, *, seed: int) -> bytes: ...
-    def command(self, sensor: Sensor, name: str, arguments: Mapping[str, Any]) -> bytes: ...
-    def decoder(self, sensor: Sensor, *, stream: bool | None, backend: str) -> Decoder: ...
-    def split(self, sensor: Sensor, data: Any, *, backend: str) -> list[Found]: ...
-    def decode(self, sensor: Sensor, data: Any, *, frame: str | None, backend: str) -> Packets: ...
-    def scans(self, sensor: Sensor, data: Any, *, backend: str) -> Iterator[Scan]: ...
-    def configure(self, sensor: Sensor, options: Mapping[str, Any]) -> Sensor: ...
-    def rebuild(self, sensor_id: str, options: Mapping[str, Any]) -> Sensor: ...
-
-
-_engines: list[Engine] = []
-
-
-def install(engine: Engine) -> None:
-    """Make `engine` the one that every sensor's methods hand over to."""
-    _engines[:] = [engine]
-
-
-def _installed() -> Engine:
-    return _engines[0]
+    @property
+    def replies(self) -> tuple[str, ...]:
+        """The frames that may answer; none where no answer is documented."""
+        return (self.reply,) if isinstance(self.reply, str) else tuple(self.reply or ())
 
 
 @dataclass(frozen=True)
@@ -146,7 +144,7 @@ class Configure:
         Raises:
             UnknownOption: for an option that neither the engine nor the sensor has.
         """
-        return _installed().configure(self.sensor, options)
+        return engine().configure(self.sensor, options)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -218,7 +216,7 @@ class Sensor:
         Raises:
             WireError: where the bytes are not such a frame: sensor, offset, field path, expected and got.
         """
-        return _installed().parse(self, data, frame=frame, verify=verify)
+        return engine().parse(self, data, frame=frame, verify=verify)
 
     def build(self, frame: str, value: Any = None, /, *, units: bool = False, **values: Any) -> bytes:
         """The bytes of one frame; constants, counts and the checksum are filled in.
@@ -230,11 +228,11 @@ class Sensor:
         Raises:
             UsageError: for a missing or unknown field, or a value that its field cannot hold.
         """
-        return _installed().build(self, frame, value, values, units=units)
+        return engine().build(self, frame, value, values, units=units)
 
     def example(self, frame: str, *, seed: int = 0) -> bytes:
         """The bytes of a valid frame with seeded random content."""
-        return _installed().example(self, frame, seed=seed)
+        return engine().example(self, frame, seed=seed)
 
     def command(self, name: str, **arguments: Any) -> bytes:
         """The bytes of a command; arguments by name, in units.
@@ -242,7 +240,7 @@ class Sensor:
         Raises:
             UnknownCommand, OutOfRange: for what the sensor does not take.
         """
-        return _installed().command(self, name, arguments)
+        return engine().command(self, name, arguments)
 
     def decoder(self, *, stream: bool | None = None, backend: str = "auto") -> Decoder:
         """A new incremental decoder, sans-IO and independent of every other.
@@ -250,11 +248,11 @@ class Sensor:
         Args:
             stream: True reads a byte stream, False one datagram for each `feed`; by default what the data link says.
         """
-        return _installed().decoder(self, stream=stream, backend=backend)
+        return engine().decoder(self, stream=stream, backend=backend)
 
     def split(self, data: Any, *, backend: str = "auto") -> list[Found]:
         """Every incoming frame of all types in stream order; `data` as in `decode`."""
-        return _installed().split(self, data, backend=backend)
+        return engine().split(self, data, backend=backend)
 
     def decode(self, data: Any, frame: str | None = None, *, backend: str = "auto") -> Packets:
         """The data frames, or those of another type, as columns.
@@ -263,11 +261,11 @@ class Sensor:
             data: bytes (a stream), an iterable of datagrams, or an (n, size) uint8 array of datagrams.
             backend: "auto", "numpy", "jit" or "construct": the same results.
         """
-        return _installed().decode(self, data, frame=frame, backend=backend)
+        return engine().decode(self, data, frame=frame, backend=backend)
 
     def scans(self, data: Any, *, backend: str = "auto") -> Iterator[Scan]:
         """Every scan of the data; the first and last piece are marked ``complete=False``."""
-        return _installed().scans(self, data, backend=backend)
+        return engine().scans(self, data, backend=backend)
 
     def __repr__(self) -> str:
         options = "".join(f", {name}={value!r}" for name, value in self.options.items())
@@ -278,7 +276,7 @@ class Sensor:
 
 
 def _rebuild(sensor_id: str, options: Mapping[str, Any]) -> Sensor:
-    return _installed().rebuild(sensor_id, options)
+    return engine().rebuild(sensor_id, options)
 
 
 def _freeze(value: object, *names: str) -> None:
@@ -296,8 +294,10 @@ def _check_sensor(sensor: Sensor) -> None:
     for name, frame in sensor.frames.items():
         _known(sensor, f"frames.{name}.after", [frame.after], sensor.frames)
     for name, command in sensor.commands.items():
-        _known(sensor, f"commands.{name}", [command.frame, command.reply], sensor.frames)
+        _known(sensor, f"commands.{name}", [command.frame, *command.replies], sensor.frames)
         _known(sensor, f"commands.{name}.link", [command.link], sensor.links)
+        if "timeout" in command.args:
+            raise SpecError("'timeout' is how long its reply is waited for, and cannot be an argument", path=f"commands.{name}.args")
     _known(sensor, "state", sensor.state, sensor.frames)
     _known(sensor, "on_open, on_close", [*sensor.on_open, *sensor.on_close], sensor.commands)
     if sensor.points is None and any(frame.data and frame.points is None for frame in sensor.frames.values()):

@@ -8,26 +8,21 @@ from __future__ import annotations
 
 import traceback
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.access import Fields
+from lidarspec.clocks import Unwrapper, clock_ns
 from lidarspec.codecs import Codec, codec
 from lidarspec.columns import Batch
 from lidarspec.decoder import Counters, Spans
-from lidarspec.errors import SpecError, UnknownFrame
+from lidarspec.errors import UnknownFrame
 from lidarspec.packets import Packets, StateOf, joined_tables
 from lidarspec.sequences import SequenceTracker
 from lidarspec.spec import Sensor
 from lidarspec.tables import Table
-from lidarspec.units import exact, factor
-
-Times = NDArray[np.int64]
-
-#: no clock reads more nanoseconds than this (285 years): damaged readings must not overflow.
-_FURTHEST = 9 * 10**18
 
 
 class PacketStream:
@@ -53,6 +48,7 @@ class PacketStream:
         self._sequence = SequenceTracker(sensor.sequence, stats) if sensor.sequence and data and _counted(sensor, frame) else None
         self._clock = Unwrapper(sensor.clock.wraps_at) if sensor.clock and data else None
         self._gap, self._number = False, 0
+        self._tables: dict[str, tuple[bytes, Table]] = {}
 
     def add(self, found: Sequence[Spans], *, whole: bool = False) -> Packets:
         """The packets among these frames.
@@ -60,24 +56,22 @@ class PacketStream:
         Args:
             whole: the frames are a whole input: packets before the first frame of another type see that one as state.
         """
-        parts = [self._part(spans, _mine(spans, self.frame)) for spans in found]
-        table = self._table(found, [where for where, _ in parts])
-        gaps = np.concatenate([breaks for _, breaks in parts]) if parts else np.empty(0, np.bool_)
-        seen = self._others_in(found, [where for where, _ in parts])
-        state = {name: self._state_of(name, *seen[name], number=len(table), whole=whole) for name in self._others}
-        batch = Batch(table, gaps, state, self.sensor.state)
+        parts = [_Part.of(spans, self.frame) for spans in found if len(spans.kinds)]
+        breaks = _joined([self._breaks(part) for part in parts], np.bool_)
+        table = self._table(parts)
+        state = self._states(parts, len(table), whole=whole)
+        offset, host = (_joined([part.column(name) for part in parts], np.int64) for name in ("offsets", "at"))
+        host = host if not len(host) or int(host.min()) >= 0 else np.maximum(host, 0)
         index = np.arange(self._number, self._number + len(table), dtype=np.int64)
-        self._number += len(table)
-        if self._sequence is not None and len(table):
-            index, jumps = self._guarded(lambda: self._sequence.push(batch), (index, gaps))  # type: ignore[union-attr]
-            gaps = gaps | jumps
-        offset, at = (
-            _column([getattr(spans, name)[where] for spans, (where, _) in zip(found, parts, strict=True)]) for name in ("offsets", "at")
-        )
-        host = np.maximum(at, 0)
         time = host
-        if self._clock is not None and len(table):
-            time = self._guarded(lambda: self._clock.push(clock_ns(self.sensor, batch), host), host)  # type: ignore[union-attr]
+        self._number += len(table)
+        if len(table) and (self._sequence is not None or self._clock is not None):
+            batch = Batch(table, breaks, state, self.sensor.state)
+            if self._sequence is not None:
+                index, jumps = self._guarded(self._sequence.push, (index, None), batch)
+                breaks = breaks if jumps is None else breaks | jumps
+            if self._clock is not None:
+                time = self._guarded(self._times, host, batch, host)
         return Packets(
             self.sensor,
             self.frame,
@@ -86,63 +80,121 @@ class PacketStream:
             time_ns=time,
             host_ns=host,
             index=index,
-            breaks=gaps,
+            breaks=breaks,
             state=state,
             stats=self.stats,
         )
 
-    def _guarded(self, function: Callable[[], Any], otherwise: Any) -> Any:
+    def interrupt(self) -> None:
+        """Input was lost here: there is a break before the next packet."""
+        self._gap = True
+
+    def _guarded(self, function: Callable[..., Any], otherwise: Any, *args: Any) -> Any:
         try:
             with np.errstate(all="ignore"):
-                return function()
+                return function(*args)
         except Exception:
             self.stats.error(traceback.format_exc())
             return otherwise
 
-    def _part(self, spans: Spans, where: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
-        """Our frames in a piece, and whether something was lost before each, since ours before it."""
-        losses = np.cumsum(spans.gaps > 0)
-        marks = np.concatenate([[0], losses[where]])
-        breaks = np.diff(marks) > 0
-        if len(where):
+    def _times(self, batch: Batch, host: NDArray[np.int64]) -> NDArray[np.int64]:
+        assert self._clock is not None
+        return self._clock.push(clock_ns(self.sensor, batch), host)
+
+    def _breaks(self, part: _Part) -> NDArray[np.bool_]:
+        """Whether something was lost before each of our frames, since ours before it."""
+        breaks = np.zeros(part.number, np.bool_)
+        if part.spans.gaps.any():
+            losses = np.cumsum(part.spans.gaps > 0)
+            marks = losses if part.where is None else losses[part.where]
+            breaks[:1] = marks[:1] > 0
+            breaks[1:] = marks[1:] > marks[:-1]
+            left = int(losses[-1]) > (int(marks[-1]) if part.number else 0)
+        else:
+            left = False
+        if part.number:
             breaks[0] |= self._gap
-        left = bool(len(losses)) and bool(losses[-1] > marks[-1])
-        self._gap = left or (self._gap and not len(where))
-        return where, breaks
+        self._gap = left or (self._gap and not part.number)
+        return breaks
 
-    def _table(self, found: Sequence[Spans], where: Sequence[NDArray[np.intp]]) -> Table:
-        tables = [
-            self._codec.gather(spans.buffer, spans.starts[mine], spans.sizes[mine])
-            for spans, mine in zip(found, where, strict=True)
-            if len(mine)
-        ]
-        return joined_tables(tables) if tables else self._codec.table([])
+    def _table(self, parts: Sequence[_Part]) -> Table:
+        tables = [self._codec.gather(part.spans.buffer, part.column("starts"), part.column("sizes")) for part in parts if part.number]
+        if not tables:
+            return self._codec.table([])
+        return tables[0] if len(tables) == 1 else joined_tables(tables)
 
-    def _others_in(self, found: Sequence[Spans], where: Sequence[NDArray[np.intp]]) -> dict[str, tuple[list[bytes], list[int]]]:
+    def _states(self, parts: Sequence[_Part], number: int, *, whole: bool) -> dict[str, StateOf]:
+        """The frames of each other type, and which of them was the last before each packet."""
+        if all(part.where is None for part in parts):
+            return {name: self._unchanged(name, number) for name in self._others}
+        seen = self._others_in(parts)
+        return {name: self._state_of(name, *seen[name], number=number, whole=whole) for name in self._others}
+
+    def _others_in(self, parts: Sequence[_Part]) -> dict[str, tuple[list[bytes], list[int]]]:
         """The frames of other types, and how many of ours came before each."""
         seen: dict[str, tuple[list[bytes], list[int]]] = {name: ([], []) for name in self._others}
         number = 0
-        for spans, mine in zip(found, where, strict=True):
-            if len(mine) < len(spans.kinds):
-                for index in np.setdiff1d(np.arange(len(spans.kinds)), mine).tolist():
-                    name = spans.names[spans.kinds[index]]
+        for part in parts:
+            if part.where is not None:
+                mine = np.zeros(len(part.spans.kinds), np.bool_)
+                mine[part.where] = True
+                before = np.cumsum(mine)
+                for index in np.flatnonzero(~mine).tolist():
+                    name = part.spans.names[part.spans.kinds[index]]
                     if name in seen:
-                        seen[name][0].append(spans.data(index))
-                        seen[name][1].append(number + int(np.searchsorted(mine, index)))
-            number += len(mine)
+                        seen[name][0].append(part.spans.data(index))
+                        seen[name][1].append(number + int(before[index]))
+            number += part.number
         return seen
 
+    def _unchanged(self, name: str, number: int) -> StateOf:
+        """The state of packets during which no frame of this other type came."""
+        if name not in self._state:
+            return None, np.full(number, -1, np.intp)
+        return self._last(name), np.zeros(number, np.intp)
+
+    def _last(self, name: str) -> Table:
+        """The last frame of another type, as a table."""
+        data = self._state[name]
+        known = self._tables.get(name)
+        if known is None or known[0] is not data:
+            known = self._tables[name] = (data, codec(self.sensor.frames[name], interpreted=self._interpreted).table([data]))
+        return known[1]
+
     def _state_of(self, name: str, frames: list[bytes], before: list[int], *, number: int, whole: bool) -> StateOf:
+        if not frames:
+            return self._unchanged(name, number)
         if name in self._state:
             frames, before = [self._state[name], *frames], [0, *before]
-        elif whole and before:
+        elif whole:
             before = [0, *before[1:]]
         which = np.searchsorted(np.array(before, np.intp), np.arange(number), side="right").astype(np.intp) - 1
-        if not frames:
-            return None, which
         self._state[name] = frames[-1]
         table: Table = codec(self.sensor.frames[name], interpreted=self._interpreted).table(frames)
         return table, which
+
+
+@dataclass(frozen=True, eq=False)
+class _Part:
+    """Our frames in a piece of input: indices, or None where all are ours."""
+
+    spans: Spans
+    where: NDArray[np.intp] | None
+    number: int
+
+    @classmethod
+    def of(cls, spans: Spans, frame: str) -> _Part:
+        """The frames of one type in a piece."""
+        mine = spans.kinds == spans.names.index(frame) if frame in spans.names else np.zeros(len(spans.kinds), np.bool_)
+        if mine.all():
+            return cls(spans, None, len(mine))
+        where = np.flatnonzero(mine)
+        return cls(spans, where, len(where))
+
+    def column(self, name: str) -> NDArray[Any]:
+        """An array of the spans, for our frames."""
+        array: NDArray[Any] = getattr(self.spans, name)
+        return array if self.where is None else array[self.where]
 
 
 def data_frame(sensor: Sensor, found: Sequence[Spans]) -> str | None:
@@ -169,73 +221,7 @@ def _kinds(spans: Spans, names: Sequence[str]) -> list[int]:
     return [index for index, name in enumerate(spans.names) if name in names]
 
 
-def _mine(spans: Spans, frame: str) -> NDArray[np.intp]:
-    return np.flatnonzero(np.isin(spans.kinds, _kinds(spans, [frame])))
-
-
-def _column(parts: Sequence[NDArray[np.int64]]) -> NDArray[np.int64]:
-    return np.concatenate(parts) if parts else np.empty(0, np.int64)
-
-
-class Unwrapper:
-    """A clock that starts again at `wraps_at` seconds, made to run on; exact over any number of wraps.
-
-    The shorter way round decides between forward and backward, so late packets go back in time. Where the host's
-    times say that more than most of a turn has passed, they decide how many turns it was.
-    """
-
-    def __init__(self, wraps_at: float | None) -> None:
-        self._turn = int(exact(wraps_at) * 10**9) if wraps_at else 0
-        self._last: tuple[int, int, int] | None = None
-
-    def push(self, ns: Times, host: Times) -> Times:
-        """The readings of the next packets, (n,), as times that run on from those before."""
-        if not self._turn or not len(ns):
-            return ns
-        raw, time, at = self._last or (int(ns[0]), int(ns[0]), int(host[0]))
-        half = self._turn // 2
-        steps = (np.diff(ns, prepend=raw) + half) % self._turn - half
-        if self._turn >= 10**9:
-            before = np.concatenate([[at], host[:-1]])
-            passed = np.where((host > 0) & (before > 0), host - before, 0)
-            turns = np.where(passed > self._turn * 3 // 4, (passed - steps + half) // self._turn, 0)
-            steps += turns * self._turn
-        times = time + np.cumsum(steps)
-        self._last = (int(ns[-1]), int(times[-1]), int(host[-1]))
-        return times
-
-
-def clock_ns(sensor: Sensor, batch: Batch) -> Times:
-    """The sensor's own clock in each packet, (n,) int64 nanoseconds, as it stands on the wire."""
-    assert sensor.clock is not None
-    source = sensor.clock.source
-    if callable(source):
-        terms = source(Fields(batch))
-        columns = terms if isinstance(terms, tuple | list) else (terms,)
-        return sum((_nanoseconds(np.asarray(column), len(batch)) for column in columns), np.zeros(len(batch), np.int64))
-    total = np.zeros(len(batch), np.int64)
-    paths = (source,) if isinstance(source, str) else source
-    for path in paths:
-        info = batch.table.schema.fields.get(path)
-        per_unit = factor(info.unit, "s") if info else None
-        if info is None or per_unit is None or info.axes:
-            raise SpecError("a clock is a field of the header with a unit of time", path=path, sensor=sensor.id)
-        raw = batch.table.raw(path)
-        step, zero = exact(info.scale) * per_unit * 10**9, exact(info.offset) * per_unit * 10**9
-        if raw.dtype.kind in "ui" and step.denominator == 1 and zero.denominator == 1 and step < 2**62:
-            total += _within(raw, _FURTHEST // len(paths) // max(int(step), 1)) * int(step) + int(zero)
-        else:
-            total += _nanoseconds(raw.astype(np.float64) * float(step / 10**9) + float(zero / 10**9), len(batch))
-    return total
-
-
-def _within(raw: NDArray[Any], furthest: int) -> Times:
-    edges = np.iinfo(raw.dtype)
-    return np.asarray(np.clip(raw, max(edges.min, -furthest), min(edges.max, furthest)), np.int64)
-
-
-def _nanoseconds(seconds: Any, number: int) -> Times:
-    flat = np.broadcast_to(np.asarray(seconds, np.float64).reshape(-1), (number,)) if np.size(seconds) in (1, number) else None
-    if flat is None:
-        raise SpecError("a clock gives one time for each packet")
-    return np.rint(np.clip(np.nan_to_num(flat), -9e9, 9e9) * 1e9).astype(np.int64)
+def _joined(parts: Sequence[NDArray[Any]], dtype: Any) -> NDArray[Any]:
+    if len(parts) == 1:
+        return parts[0]
+    return np.concatenate(parts) if parts else np.empty(0, dtype)

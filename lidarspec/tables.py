@@ -56,6 +56,7 @@ class Rows:
     def __init__(self, schema: Schema, groups: Sequence[Group]) -> None:
         self.schema, self.groups = schema, [group for group in groups if len(group.where)]
         self._length = sum(len(group.where) for group in self.groups)
+        self._order: NDArray[np.intp] | slice | None = None
 
     def __len__(self) -> int:
         return self._length
@@ -65,7 +66,9 @@ class Rows:
         assert info.dtype is not None
         if len(self.groups) == 1 and path in self.groups[0].layout.leaves:
             values = self.groups[0].layout.leaves[path].load(self.groups[0].rows)
-            return values[_order(self.groups[0].where)] if values.dtype == info.dtype else values.astype(info.dtype)
+            if self._order is None:
+                self._order = _order(self.groups[0].where)
+            return values[self._order].astype(info.dtype, copy=False)
         lengths = [self.length(axis) for axis in info.axes]
         column = np.zeros((len(self), *lengths), info.dtype)
         for group in self.groups:
@@ -104,6 +107,10 @@ class Rows:
         raise IndexError(index)
 
     def take(self, which: NDArray[np.intp]) -> Rows:
+        if len(self.groups) == 1 and len(which) and which[-1] - which[0] == len(which) - 1 and _ascends(which):
+            only = self.groups[0]
+            if _ascends(only.where):
+                return Rows(self.schema, [Group(only.layout, np.arange(len(which)), only.rows[which[0] : which[-1] + 1])])
         place = np.full(len(self), -1, np.intp)
         place[which] = np.arange(len(which))
         groups = []
@@ -133,9 +140,11 @@ def _merged(groups: list[Group]) -> Group:
 
 def _order(where: NDArray[np.intp]) -> NDArray[np.intp] | slice:
     """What puts the rows of the only group into stream order: nothing, where they are in it."""
-    if len(where) < 2 or bool((np.diff(where) > 0).all()):
-        return slice(None)
-    return np.argsort(where)
+    return slice(None) if _ascends(where) else np.argsort(where)
+
+
+def _ascends(where: NDArray[np.intp]) -> bool:
+    return len(where) < 2 or bool((where[1:] > where[:-1]).all())
 
 
 def _length(layout: Layout, axis: str) -> int:

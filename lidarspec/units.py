@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from fractions import Fraction
 
+from lidarspec.errors import UsageError
+
 #: unit -> how many of the SI unit it is; only units that someone may type on the command line.
 _FACTORS: dict[str, dict[str, Fraction]] = {
     "m": {"m": Fraction(1), "cm": Fraction(1, 100), "mm": Fraction(1, 1000)},
@@ -43,3 +45,16 @@ def _is_number(text: str) -> bool:
     except ValueError:
         return False
     return True
+
+
+def duration(text: str) -> float:
+    """Seconds out of "10s", "500ms", "2min", or a bare number of seconds.
+
+    Raises:
+        UsageError: where it is no duration, or a negative one.
+    """
+    for unit, seconds in (("min", 60.0), ("ms", 1e-3), ("us", 1e-6), ("h", 3600.0), ("s", 1.0), ("", 1.0)):
+        number = text.strip().removesuffix(unit)
+        if text.strip().endswith(unit) and _is_number(number) and 0 <= float(number) < float("inf"):
+            return float(number) * seconds
+    raise UsageError(f"{text!r} is no duration: a number with ms, s, min or h, such as 10s")

@@ -1,16 +1,20 @@
 """One frame to the Container that construct would give, by code made from its layout: what `parse` uses where it can.
 
-For each layout a function is written once: one `struct.unpack` for all numbers, bits by mask and shift, containers and lists
-around them in the order of the struct. Constants and checksums are checked before; where anything is not as it should be,
-construct parses the frame again and says what.
+For each layout a function is written once: size, constants and checksums compared, one `struct.unpack` for all numbers, bits by
+mask and shift, containers and lists around them in the order of the struct. Where anything is not as it should be it
+returns None; construct then parses the frame again and says what.
+
+A Container is made empty and filled by name, which takes half the time of ``Container(name=value)``. Short arrays are
+written out element by element, long ones are loops over `struct.iter_unpack`.
 """
 
 from __future__ import annotations
 
+import functools
 import math
 import struct
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any
 
 import construct
@@ -19,13 +23,16 @@ from construct import Array, Bytes, BytesInteger, Construct, Container, FormatFi
 from lidarspec.bits import BitField, probe
 from lidarspec.construction import WireNaN
 from lidarspec.fields import Checksummed
-from lidarspec.layout import Layout
+from lidarspec.layout import Layout, Seal
 from lidarspec.schema import FieldInfo, axis_path, peeled
+from lidarspec.singles import single
 
 Unpack = Callable[[bytes], Any]
 
 #: format codes of unsigned numbers by size.
 _CODES = {1: "B", 2: "H", 4: "I", 8: "Q"}
+#: the most lines that an array is written out in, element by element; code has to stay small.
+_WRITTEN_OUT = 200
 
 
 class Unsupported(Exception):
@@ -33,60 +40,93 @@ class Unsupported(Exception):
 
 
 def unpacker(con: Construct, layout: Layout) -> Unpack | None:
-    """A function from the bytes of a frame of this layout to its Container; None where construct has to parse it."""
+    """A function from bytes to the Container of a sound frame of this layout, else to None; None where construct has to parse it."""
     try:
-        written = [_written(con, layout, order) for order in "<>"]
+        writer = min((_Writer(con, layout, order) for order in "<>"), key=lambda one: one.conversions)
     except Unsupported:
         return None
-    scope, writer, body = min(written, key=lambda one: one[2].count("int_("))
-    names: dict[str, Any] = {
-        **writer.names,
-        "Container": Container,
-        "ListContainer": ListContainer,
-        "unpack": struct.Struct(writer.order + scope.format).unpack,
-    }
-    exec(f"def parse(data):\n    t = unpack(data)\n    return {body}", names)  # the text is made here, of field names and numbers
-    found: Unpack = names["parse"]
+    exec(writer.text, writer.names)  # made here, of field names and numbers
+    found: Unpack = writer.names["parse"]
     return found
 
 
-def _written(con: Construct, layout: Layout, order: str) -> tuple[_Scope, _Writer, str]:
-    """The expression of a frame, with numbers of this byte order read directly."""
-    writer, scope = _Writer(layout, order), _Scope("t")
-    return scope, writer, writer.value(con, FieldInfo(""), scope)
-
-
 class _Scope:
-    """A tuple of unpacked values: the frame, or one element of an array."""
+    """Values that are unpacked together and the lines that use them: the frame, or one element of an array that is a loop."""
 
     def __init__(self, name: str) -> None:
-        self.name, self.format, self.count = name, "", 0
+        self.name, self.format = name, ""
+        self.values: list[str] = []
+        self.lines: list[str] = []
 
-    def take(self, code: str, values: int = 1) -> str:
-        """Add a format code, and the expression of the (first) value that it gives."""
+    def take(self, code: str, count: int = 1) -> list[str]:
+        """Add a format code, and the names of the values that it gives."""
         self.format += code
-        self.count += values
-        return f"{self.name}[{self.count - values}]"
+        self.values += [f"{self.name}_{len(self.values) + index}" for index in range(count)]
+        return self.values[len(self.values) - count :]
+
+    def one(self, code: str) -> str:
+        """Add a format code that gives one value, and its name."""
+        return self.take(code)[0]
+
+    @property
+    def target(self) -> str:
+        """What the tuple of values is assigned to."""
+        return f"{', '.join(self.values)}," if self.values else "_"
 
 
 class _Writer:
-    """Writes expressions for the parts of a struct."""
+    """Writes the function for a struct with numbers of one byte order read directly; `conversions` counts all others."""
 
-    def __init__(self, layout: Layout, order: str) -> None:
-        self._layout, self.order = layout, order
-        self.names: dict[str, Any] = {"int_": int.from_bytes}
+    def __init__(self, con: Construct, layout: Layout, order: str) -> None:
+        self._layout, self._order, self._variables, self.conversions = layout, order, 0, 0
+        self.names: dict[str, Any] = {"C": Container, "L": ListContainer, "int_": int.from_bytes}
+        scope = _Scope("v")
+        result = self._value(con, FieldInfo(""), scope)
+        checks = [f"    if {check}: return None" for check in self._checks()]
+        unpack = f"    {scope.target} = {self._named(struct.Struct(order + scope.format).unpack)}(data)"
+        lines = ["def parse(data):", *checks, unpack, *(f"    {line}" for line in scope.lines), f"    return {result}"]
+        self.text = "\n".join(lines)
 
-    def value(self, con: Construct, info: FieldInfo, scope: _Scope) -> str:
-        """The expression of a construct at a place, its bytes added to the scope."""
+    def _checks(self) -> Iterator[str]:
+        """Conditions under which the frame is none of this layout, or not sound."""
+        yield f"len(data) != {self._layout.size}"
+        start, run = 0, b""
+        for spot, (mask, value) in sorted(self._layout.constants.items()):
+            if mask != 0xFF:
+                yield f"data[{spot}] & {mask} != {value}"
+                continue
+            if run and spot == start + len(run):
+                run += bytes([value])
+                continue
+            if run:
+                yield f"data[{start}:{start + len(run)}] != {run!r}"
+            start, run = spot, bytes([value])
+        if run:
+            yield f"data[{start}:{start + len(run)}] != {run!r}"
+        yield from map(self._unsealed, self._layout.seals)
+
+    def _unsealed(self, seal: Seal) -> str:
+        leaf = seal.leaves[0]
+        if len(seal.leaves) > 1 or (leaf.wire is None and leaf.info.kind != "bytes"):
+            return f"not {self._named(seal.sound)}(data)"
+        big = seal.algorithm.order == "big" if leaf.wire is None or leaf.info.kind == "bytes" else leaf.wire.str[0] == ">"
+        place = f"data[{leaf.offset}:{leaf.offset + leaf.size}]"
+        stored = f"data[{leaf.offset}]" if leaf.size == 1 else f"int_({place}, {'big' if big else 'little'!r})"
+        covered = " + ".join(f"data[{start}:{end}]" for start, end in seal.spans) or "b''"
+        wrong = f"{self._named(single(seal.algorithm))}({covered}) != {stored}"
+        return f"{wrong} and {stored} not in {seal.absent!r}" if seal.absent else wrong
+
+    def _value(self, con: Construct, info: FieldInfo, scope: _Scope) -> str:
+        """The expression of a construct at a place, its bytes and lines added to the scope."""
         labels = _labels(con)
         inner, info = peeled(con, info)
         if info.const is not None and not isinstance(inner, Struct | Array):
             scope.take(f"{inner.sizeof()}x", 0)
             return self._named(info.const)
         if isinstance(inner, construct.IfThenElse | construct.Switch):
-            return self.value(self._layout.branches[info.path], FieldInfo(info.path, info.axes), scope)
+            return self._value(self._layout.branches[info.path], FieldInfo(info.path, info.axes), scope)
         if isinstance(inner, Checksummed):
-            return self.value(inner.subcon, FieldInfo(info.path, info.axes), scope)
+            return self._value(inner.subcon, FieldInfo(info.path, info.axes), scope)
         if isinstance(inner, Struct):
             return self._struct(inner, info, scope)
         if isinstance(inner, Array):
@@ -94,32 +134,36 @@ class _Writer:
         if inner is construct.Pass:
             return "None"
         if isinstance(inner, construct.Transformed):
-            return self._block(inner, info, scope)
-        text = self._scalar(inner, info, scope)
-        return text if labels is None else f"{self._named(_decoding(labels))}({text})"
+            return self._block(inner, scope)
+        return self._labelled(labels, self._scalar(inner, info, scope))
 
     def _struct(self, con: Struct, info: FieldInfo, scope: _Scope) -> str:
-        members = []
+        found = self._variable(scope, "C()")
         for child in con.subcons:
             path = info.path if child.name is None else f"{info.path}.{child.name}" if info.path else child.name
-            text = self.value(child, FieldInfo(path, info.axes), scope)
+            text = self._value(child, FieldInfo(path, info.axes), scope)
             if child.name is not None:
-                members.append(f"{child.name}={text}")
-        return f"Container({', '.join(members)})"
+                scope.lines.append(f"{found}[{child.name!r}] = {text}")
+        return found
 
     def _array(self, con: Array, info: FieldInfo, scope: _Scope) -> str:
         axis = axis_path(info)
         number = con.count if isinstance(con.count, int) else self._length(axis)
-        element = _Scope(f"e{len(info.axes)}")
-        text = self.value(con.subcon, FieldInfo(info.path, (*info.axes, axis)), element)
-        start = scope.count
-        scope.take(element.format * number, element.count * number)
-        part = f"{scope.name}[{start}:{scope.count}]"
-        if element.count == 0:
-            return f"ListContainer([{text} for _ in range({number})])"
-        if text == f"{element.name}[0]" and element.count == 1:
-            return f"ListContainer({part})"
-        return f"ListContainer([{text} for {element.name} in zip(*[iter({part})] * {element.count})])"
+        info = FieldInfo(info.path, (*info.axes, axis))
+        self._variables += 1
+        element = _Scope(f"e{self._variables}")
+        text = self._value(con.subcon, info, element)
+        if number * (len(element.lines) + 1) <= _WRITTEN_OUT:
+            return _list(self._value(con.subcon, info, scope) for _ in range(number))
+        size = struct.calcsize(self._order + element.format)
+        whole = scope.one(f"{size * number}s")
+        if [text] == element.values:
+            return f"L({self._named(struct.Struct(self._order + element.format * number).unpack)}({whole}))"
+        elements = f"{self._named(struct.Struct(self._order + element.format).iter_unpack)}({whole})" if size else f"range({number})"
+        found = self._variable(scope, "L()")
+        loop = f"for {element.target} in {elements}:"
+        scope.lines += [loop, *(f"    {line}" for line in element.lines), f"    {found}.append({text})"]
+        return found
 
     def _length(self, axis: str) -> int:
         for leaf in self._layout.leaves.values():
@@ -131,44 +175,67 @@ class _Writer:
         if isinstance(con, FormatField):
             order, code = con.fmtstr[0], con.fmtstr[-1]
             if code in "efd":
-                return f"{self._named(_floating(con.fmtstr))}({scope.take(f'{con.length}s')})"
-            if con.length == 1 or order == self.order:
-                return scope.take(_CODES[con.length] if code.isupper() else _CODES[con.length].lower())
-            return _integer(
-                scope.take(f"{con.length}s"), big=order == ">" or (order == "=" and sys.byteorder == "big"), signed=code.islower()
-            )
+                return f"{self._named(_floating(con.fmtstr))}({scope.one(f'{con.length}s')})"
+            if con.length == 1 or order == self._order:
+                return scope.one(_CODES[con.length] if code.isupper() else _CODES[con.length].lower())
+            big = order == ">" or (order == "=" and sys.byteorder == "big")
+            return self._integer(scope.one(f"{con.length}s"), big=big, signed=code.islower())
         if isinstance(con, BytesInteger) and isinstance(con.length, int) and isinstance(con.swapped, bool):
-            return _integer(scope.take(f"{con.length}s"), big=not con.swapped, signed=bool(con.signed))
+            return self._integer(scope.one(f"{con.length}s"), big=not con.swapped, signed=bool(con.signed))
         if isinstance(con, Bytes):
-            return scope.take(f"{con.length if isinstance(con.length, int) else self._length(axis_path(info))}s")
+            return scope.one(f"{con.length if isinstance(con.length, int) else self._length(axis_path(info))}s")
         raise Unsupported
 
-    def _block(self, con: Construct, info: FieldInfo, scope: _Scope) -> str:
-        size = int(con.sizeof())
-        first = scope.count
-        scope.take("B" * size, size)
-        bits = {field.keys: field for field in probe(con, size) or ()}
-        return self._bits(con.subcon, (), bits, f"{scope.name}", first)
+    def _integer(self, raw: str, *, big: bool, signed: bool) -> str:
+        self.conversions += 1
+        return f"int_({raw}, {'big' if big else 'little'!r}{', signed=True' if signed else ''})"
 
-    def _bits(self, con: Construct, keys: tuple[str | int, ...], bits: dict[Any, BitField], name: str, first: int) -> str:
+    def _block(self, con: Construct, scope: _Scope) -> str:
+        size = int(con.sizeof())
+        return self._bits(con.subcon, (), _probed(con), scope, scope.take("B" * size, size))
+
+    def _bits(self, con: Construct, keys: tuple[str | int, ...], bits: Mapping[Any, BitField], scope: _Scope, block: list[str]) -> str:
         labels = _labels(con)
         inner, info = peeled(con, FieldInfo(""))
         while isinstance(inner, construct.Transformed | construct.Restreamed):
             inner, info = peeled(inner.subcon, info)
         if isinstance(inner, Struct):
-            members = [f"{child.name}={self._bits(child, (*keys, child.name), bits, name, first)}" for child in inner.subcons]
-            return f"Container({', '.join(members)})"
+            found = self._variable(scope, "C()")
+            for child in inner.subcons:
+                text = self._bits(child, (*keys, child.name), bits, scope, block)
+                scope.lines.append(f"{found}[{child.name!r}] = {text}")
+            return found
         if isinstance(inner, Array) and isinstance(inner.count, int):
-            return f"ListContainer([{', '.join(self._bits(inner.subcon, (*keys, i), bits, name, first) for i in range(inner.count))}])"
+            return _list(self._bits(inner.subcon, (*keys, index), bits, scope, block) for index in range(inner.count))
         if info.const is not None:
             return self._named(info.const)
         if keys not in bits or inner is construct.Flag:
             raise Unsupported
-        text = " | ".join(f"({name}[{first + p.byte}] & {p.mask}) >> {p.low} << {p.target}" for p in bits[keys].segments)
-        if bits[keys].signed:
-            sign = 1 << (bits[keys].width - 1)
-            text = f"(({text}) ^ {sign}) - {sign}"
-        return f"({text})" if labels is None else f"{self._named(_decoding(labels))}({text})"
+        return self._labelled(labels, self._joined(bits[keys], block))
+
+    def _joined(self, field: BitField, block: list[str]) -> str:
+        """The expression of a value from the bits of several bytes: looked up by byte, which is quicker than a mask and a shift."""
+        parts = []
+        for segment in field.segments:
+            text, name = block[segment.byte], f"b{segment.mask}_{segment.low}_{segment.target}"
+            if segment.mask == 0xFF:
+                parts.append(f"{text} * {1 << segment.target}" if segment.target else text)
+                continue
+            self.names[name] = _looked_up(segment.mask, segment.low, segment.target)
+            parts.append(f"{name}[{text}]")
+        text = " + ".join(parts)
+        if field.signed:
+            sign = 1 << (field.width - 1)
+            return f"(({text} ^ {sign}) - {sign})"
+        return text
+
+    def _labelled(self, labels: construct.Enum | None, text: str) -> str:
+        return text if labels is None else f"{self._named(_Labels(labels))}[{text}]"
+
+    def _variable(self, scope: _Scope, value: str) -> str:
+        self._variables += 1
+        scope.lines.append(f"x{self._variables} = {value}")
+        return f"x{self._variables}"
 
     def _named(self, value: Any) -> str:
         if isinstance(value, int | bytes):
@@ -178,8 +245,30 @@ class _Writer:
         return name
 
 
-def _integer(raw: str, *, big: bool, signed: bool) -> str:
-    return f"int_({raw}, {'big' if big else 'little'!r}, signed={signed})"
+class _Labels(dict[int, Any]):
+    """What an Enum makes of a number; construct makes a new one each time, and they are all alike."""
+
+    def __init__(self, labels: construct.Enum) -> None:
+        super().__init__({value: labels._decode(value, None, None) for value in map(int, labels.ksymapping)})
+        self._labels = labels
+
+    def __missing__(self, value: int) -> Any:
+        return self._labels._decode(value, None, None)
+
+
+@functools.cache
+def _looked_up(mask: int, low: int, target: int) -> tuple[int, ...]:
+    """What each byte adds to a value by a run of its bits."""
+    return tuple((byte & mask) >> low << target for byte in range(256))
+
+
+@functools.lru_cache(maxsize=1024)
+def _probed(con: Construct) -> dict[tuple[str | int, ...], BitField]:
+    return {field.keys: field for field in probe(con, int(con.sizeof())) or ()}
+
+
+def _list(elements: Iterable[str]) -> str:
+    return f"L(({''.join(f'{element}, ' for element in elements)}))"
 
 
 def _labels(con: Construct) -> construct.Enum | None:
@@ -190,10 +279,6 @@ def _labels(con: Construct) -> construct.Enum | None:
             return None
         con = con.subcon
     return None
-
-
-def _decoding(labels: construct.Enum) -> Callable[[int], Any]:
-    return lambda value: labels._decode(value, None, None)
 
 
 def _floating(fmtstr: str) -> Callable[[bytes], float]:

@@ -15,12 +15,16 @@ from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 FLOORS = (
-    "_version errors checksums angles fields units bits construction",
-    "spec hookspecs geometry links rules splits files",
-    "schema layout walk headers tables columns access unpacking codecs framing plugins",
-    "decoder packets streams sequences clouds points tracing expressions windows program plan evaluation cuts reorder",
-    "session scans scenes simulator explain parsing building examples engine wiretable wording",
-    "device detect transports recordings pcap _pcap_records _ip sources",
+    "_version abilities errors allocation lanes polynomials checksums catalogue angles fields units bits construction",
+    "spec hookspecs geometry links rules splits files samples sumsearch crcsearch checksearch",
+    "schema layout walk headers tables columns access singles unpacking dispatch tracing conditions judging codecs framing runs plan "
+    "installed plugins",
+    "found datagrams decoder packets streams clocks sequences clouds points expressions windows program plan evaluation cuts reorder "
+    "mounting",
+    "session replies identity structure scans scenes sweeps measuring pacing simulator answering faults scenery simulated explain "
+    "parsing building examples engine wiretable wording",
+    "device async_device live watch capture arrivals reading file_input detect hearing probing diagnosis transports recordings pcap "
+    "bulk _pcap_records _pcap_alike _pcap_window _ip sources settings replaying recorders _lsr _lsr_header _appending",
     "testing formats export view demo",
     "cli",
     "__main__",
@@ -44,10 +48,11 @@ CONSTRUCT = {
     "building",
     "examples",
     "unpacking",
+    "dispatch",
     "wiretable",
     "explain",
 }
-CONFINED = {"construct": CONSTRUCT, "pluggy": {"hookspecs", "plugins"}, "serial": {"transports.serial"}}
+CONFINED = {"construct": CONSTRUCT, "pluggy": {"hookspecs", "plugins"}, "serial": {"transports.serial", "transports.ports"}}
 
 TYPE_CHECKING = {"TYPE_CHECKING", "typing.TYPE_CHECKING"}
 PLUGINS_MAY_IMPORT = {"construct", "numpy"} | sys.stdlib_module_names

@@ -58,6 +58,12 @@ def test_the_tutorials_test_class_passes(tutorial: Path) -> None:
     assert done.returncode == 0, done.stdout
 
 
+@pytest.mark.parametrize("block", [0, 1])
+def test_the_programs_on_live_sources_run_as_they_stand(block: int) -> None:
+    done = subprocess.run([sys.executable, "-c", blocks("how-to/live.md")[block]], capture_output=True, text=True, check=True)
+    assert done.stdout.startswith("Scan(2160 points, 10.0 Hz")
+
+
 def test_every_hook_has_its_heading() -> None:
     assert {name for name in vars(hookspecs) if name.startswith("lidarspec_")} <= headings("reference/hooks.md")
 

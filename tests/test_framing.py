@@ -262,3 +262,23 @@ def test_runs_of_weak_frames_count_whole_or_not_at_all() -> None:
         data = b"\x00" * 7 + b"".join(frames[:number]) + b"\x00" * 7
         assert [data for _, _, data in decoded(sensor, data)] == (frames[:number] if number >= 3 else [])
         assert decoded(sensor, data) == Oracle(sensor, data).frames()
+
+
+def test_a_frame_that_comes_first_in_the_order_ends_a_run() -> None:
+    sensor = SHAPES["shape-weak"]
+    node, info = sensor.example("data", seed=1), sensor.build("info", revision=0x12, temperature=0x34)
+    assert sensor.parse(info, frame="data")
+    for before in range(5):
+        data = node * before + info + node * 2 + info + node * 3
+        assert decoded(sensor, data) == Oracle(sensor, data).frames()
+        assert [name for name, _, _ in decoded(sensor, data)] == ["data"] * (before if before >= 3 else 0) + ["info", "info"] + ["data"] * 3
+
+
+@pytest.mark.parametrize("name", ["shape-count", "shape-options", "shape-state", "shape-modes", "shape-text", "shape-commands"])
+def test_a_frame_is_out_with_its_last_byte(name: str) -> None:
+    data = material.stream(SHAPES[name])
+    decoder = SHAPES[name].decoder()
+    for spot in range(len(data)):
+        for found in decoder.feed(data[spot : spot + 1]):
+            assert found.offset + len(found.data) == spot + 1
+    assert decoder.stats.pending == 0

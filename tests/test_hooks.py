@@ -12,6 +12,7 @@ from construct import Const, Int8ul, Struct
 import lidarspec
 from lidarspec import Checksummed, Frame, OnWrap, Polar, Sensor, Serial, SpecError, Sum, Xor, hookimpl
 from lidarspec.plugins import Registry
+from lidarspec.scans import scans_of
 from tests.shapes import SHAPES
 from tests.test_plugins import STRANGER
 
@@ -97,6 +98,9 @@ def test_a_hook_that_fails_is_a_spec_error_of_its_sensor(registry: Registry) -> 
     with pytest.raises(SpecError, match="the site's file is gone"):
         packets.points()
     assert list(sensor.scans(sensor.example("data"))) == []
+    assert list(scans_of(sensor, [packets])) == []
+    assert packets.stats.plugin_errors == 1
+    assert "the site's file is gone" in packets.stats.tracebacks[0]
 
 
 @pytest.mark.parametrize("answer", [lambda sensor, frame: 1 / 0, lambda sensor, frame: "crc"], ids=["raises", "no checksum"])
@@ -113,6 +117,7 @@ def test_a_refused_plugin_leaves_no_trace(registry: Registry) -> None:
     with pytest.raises(SpecError, match="shape-count"):
         registry.add(broken, name="late")
     assert registry.sensors().keys() == before
+    registry.add(Plugin(), name="another")  # hooks are applied anew
     sensor = registry.sensor("shape-count")
     assert len(sensor.decode(sensor.example("data")).points())
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from construct import Int16ul
 
-from lidarspec import OutOfRange, PointCloud, Sensor, UsageError, Xor
+from lidarspec import OutOfRange, PointCloud, Sensor, UsageError, Xor, spread, wrap
 from tests.shapes import SHAPES, calibration
 
 both = pytest.mark.parametrize("backend", ["auto", "construct"])
@@ -37,6 +37,15 @@ def test_counts_spread_the_angles_and_wrap(backend: str) -> None:
     packets = sensor.decode(frame(0, 10, 1, 2, 3) + frame(0, 10, 7), backend=backend)
     assert packets.count("samples").tolist() == [3, 1]
     assert packets.raw["samples"]["distance"].tolist() == [[1, 2, 3], [7, 0, 0]]
+
+
+def test_a_sweep_of_one_beam_starts_and_ends_at_its_start() -> None:
+    with np.errstate(all="raise"):
+        for count in (1, np.array([[1.0]])):
+            np.testing.assert_array_equal(spread(np.array([[350.0]]), np.array([[10.0]]), count, full=360.0), [[350.0]])
+        np.testing.assert_array_equal(spread(np.array([[350.0]]), np.array([[10.0]]), 3, full=360.0), [[350, 360, 370]])
+        np.testing.assert_array_equal(spread(np.array([[5.0]]), np.array([[5.0]]), 2, full=360.0), [[5, 5]])
+    assert wrap(np.array([360.0, -1e-20, 725.0]), 360.0).tolist() == [0, 0, 5]
 
 
 @both

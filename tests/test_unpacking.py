@@ -2,14 +2,36 @@
 
 from __future__ import annotations
 
+import random
 from typing import Any
 
 import construct
+import numpy as np
 import pytest
+from construct import (
+    Array,
+    BitsInteger,
+    BitStruct,
+    Bytes,
+    BytesInteger,
+    Const,
+    Enum,
+    Float32l,
+    Int8ub,
+    Int16sb,
+    Int16ub,
+    Int16ul,
+    Int24ul,
+    Struct,
+    Switch,
+    this,
+)
 
 import lidarspec as ls
+from lidarspec import dispatch, unpacking
 from lidarspec.codecs import CompiledCodec, codec
 from lidarspec.construction import clean
+from lidarspec.layout import Layout
 from lidarspec.spec import Sensor
 from tests.shapes import SHAPES
 
@@ -61,3 +83,62 @@ def test_damaged_frames_are_left_to_construct(sensor: Sensor, name: str) -> None
             if found is not None:
                 same(found, expected)
         data[spot] ^= 0x41
+
+
+TRIPLE = Struct(
+    "a" / BytesInteger(3, signed=True), "b" / Const(b"\x07"), "c" / Bytes(2), "d" / BitStruct("x" / BitsInteger(3), "y" / BitsInteger(5))
+)
+
+#: arrays of every kind, written out and as loops, and loops in loops.
+ARRAYS = {
+    "written out": Array(6, TRIPLE),
+    "a loop": Array(30, TRIPLE),
+    "loops in loops": Array(3, Struct("rows" / Array(4, Array(5, Int24ul)), "end" / Int8ub)),
+    "numbers": Array(40, Int16sb),
+    "few numbers": Array(3, Int16ul),
+    "numbers in a loop": Array(20, Struct("low" / Array(4, Int16sb), "high" / Array(40, Int8ub))),
+    "floats": Array(40, Float32l),
+    "bytes": Array(40, Bytes(3)),
+    "blocks": Array(40, BitStruct("p" / BitsInteger(2), "q" / Array(3, BitsInteger(2)))),
+    "constants": Array(40, Const(5, Int8ub)),
+    "constants in structs": Array(40, Struct("mark" / Const(b"ab"))),
+    "none": Array(0, TRIPLE),
+    "labels": Array(40, Enum(Int8ub, idle=1, busy=2)),
+}
+
+
+@pytest.mark.parametrize("lines", [0, 8, 10_000])
+@pytest.mark.parametrize("name", ARRAYS)
+def test_arrays_of_all_kinds(name: str, lines: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(unpacking, "_WRITTEN_OUT", lines)
+    frame = ls.Frame(Struct("head" / Const(b"\x5a"), "inside" / ARRAYS[name], "tail" / Int16ul), max_length=1 << 20)
+    engine = codec(frame)
+    assert isinstance(engine, CompiledCodec)
+    size = frame.prepared.sizeof()
+    layout = engine.tree.layout(bytes(size))
+    assert isinstance(layout, Layout)
+    rows = np.frombuffer(random.Random(name).randbytes(3 * size), np.uint8).reshape(3, size).copy()
+    layout.seal(rows)
+    for data in map(np.ndarray.tobytes, rows):
+        found = engine.parse(data)
+        assert found is not None
+        same(found, clean(frame.prepared.parse(data)))
+        assert engine.parse(data + b"\0") is None
+        assert engine.parse(data[:-1]) is None
+
+
+def test_headers_lead_to_their_own_code_also_after_some_were_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(dispatch, "_REMEMBERED", 20)
+    kinds = Switch(this.kind, {1: Int8ub, 2: Int16ub}, default=Int24ul)
+    rows = Array(this.count, Int16ul)
+    struct = Struct("head" / Const(b"\x5a"), "kind" / Int8ub, "count" / Int8ub, "rows" / rows, "more" / kinds, "end" / Int8ub)
+    engine = codec(ls.Frame(struct, max_length=700))
+    assert isinstance(engine, CompiledCodec)
+    for count in [*range(60), *range(60), 3, 3]:
+        for kind in range(4):
+            data = bytes([0x5A, kind, count]) + random.Random(count).randbytes(2 * count + {1: 1, 2: 2}.get(kind, 3) + 1)
+            same(engine.parse(data), clean(engine.frame.prepared.parse(data)))
+            assert engine.parse(data[:-1]) is None
+            assert engine.parse(b"\x5b" + data[1:]) is None
+    assert engine.parse(b"\x5a\x02") is None
+    assert engine.parse(b"") is None

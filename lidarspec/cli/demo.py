@@ -8,19 +8,19 @@ import click
 import numpy as np
 from rich.text import Text
 
+from lidarspec.cli.failures import FINDINGS
 from lidarspec.cli.look import NO_SENSORS
 from lidarspec.cli.output import drawn, emit_json, sensor_option
-from lidarspec.demo import DemoResult, run
+from lidarspec.cli.progress import size
+from lidarspec.demo import DemoResult, has_terminals, run
 from lidarspec.errors import UsageError
 from lidarspec.plugins import registry
 from lidarspec.plugins import sensor as named_sensor
 from lidarspec.scans import Scan
-from lidarspec.view.polar import polar_text, top_side_text
+from lidarspec.view.polar import look, picture
 
 #: cells of the picture at most, and lines that are kept for the summary.
 WIDEST, HIGHEST, SUMMARY = 100, 42, 8
-#: elevations below this, in radians, make a cloud a flat one.
-FLAT = 1e-3
 
 
 @click.command()
@@ -29,39 +29,43 @@ FLAT = 1e-3
 @click.option("--errors", type=click.FloatRange(0, 1), default=0.01, show_default=True, help="Share of the bytes that the line damages.")
 @click.option("--json", "as_json", is_flag=True, help="Print the summary as JSON.")
 def demo(sensor_id: str | None, count: int, errors: float, as_json: bool) -> None:
-    """A simulated sensor in a room, damaged on the line, decoded and drawn."""
+    """A simulated sensor on a port: started, read through a bad line, recorded, read again, drawn."""
     sensor = named_sensor(sensor_id) if sensor_id else next((s for s in registry().sensors().values() if s.sweep), None)
     if sensor is None:
         raise UsageError(NO_SENSORS)
     result = run(sensor, turns=count, errors=errors)
-    whole = [scan for scan in result.scans if scan.complete] or list(result.scans)
+    whole = [scan for scan in result.scans if scan.complete]
     if as_json:
         emit_json(_facts(result, whole), None)
-        return
-    parts = [*([drawn(_picture(whole[-1]))] if whole else []), *_summary(result, whole, errors)]
-    click.echo("\n".join(parts))
+    else:
+        click.echo("\n".join([drawn(_picture(whole[-1])), *_summary(result, whole, errors)]))
+    if result.digest != result.again:
+        click.get_current_context().exit(FINDINGS)
 
 
 def _picture(scan: Scan) -> Text:
     columns, lines = shutil.get_terminal_size((80, HIGHEST))
     width, height = min(columns, WIDEST), max(min(lines - SUMMARY, HIGHEST), 12)
-    flat = not len(scan) or float(np.nanmax(np.abs(scan.points.elevation))) < FLAT
-    return (polar_text if flat else top_side_text)(scan.points, width=width, height=height)
+    return picture(scan.points, width=width, height=height, look=look(scan.points)).text()
 
 
 def _summary(result: DemoResult, whole: list[Scan], errors: float) -> list[str]:
     stats, name = result.stats, result.sensor.id
     frames = sum(stats.frames.values())
     harm = "of the datagrams lost" if result.sensor.datagrams else "of the bytes damaged"
+    where = result.place if result.sensor.datagrams or has_terminals() else f"{result.place}, since this system has no pseudo-terminals"
+    passed = f"{errors:.1%} {harm}, {result.intact} came through unharmed"
     told = [
-        f"{name}, simulated: {result.sent} frames sent, {errors:.1%} {harm}, {result.intact} came through unharmed",
+        f"{name}, simulated on {where}: {result.sent} frames sent, {passed}",
+        *(str(reply) for reply in result.replies if reply.confirmed),
         f"{frames} frames decoded, {stats.bad_checksum} checksum errors, {stats.bytes_skipped} of {stats.bytes_in} bytes skipped",
     ]
-    if whole:
-        facts = _facts(result, whole)
-        rate = f" at {facts['rate_hz']:.1f} Hz" if facts["rate_hz"] else ""
-        told.append(f"{len(whole)} whole scan{'s' * (len(whole) != 1)}{rate}, {facts['points']} points; the last one: {whole[-1]}")
-    return [*told, f"next: lidarspec show {name}"]
+    facts = _facts(result, whole)
+    rate = f" at {facts['rate_hz']:.1f} Hz" if facts["rate_hz"] else ""
+    told.append(f"{len(whole)} whole scan{'s' * (len(whole) != 1)}{rate}, {facts['points']} points; the last one: {whole[-1]}")
+    same = "the same points" if result.digest == result.again else "OTHER points"
+    told.append(f"recorded ({size(result.recorded)}) and read again: {same}, SHA-256 {result.again[:16]}...")
+    return [*told, f"next: lidarspec view sim:{name}"]
 
 
 def _facts(result: DemoResult, whole: list[Scan]) -> dict[str, object]:
@@ -72,6 +76,11 @@ def _facts(result: DemoResult, whole: list[Scan]) -> dict[str, object]:
         "intact": result.intact,
         "scans": len(whole),
         "rate_hz": float(np.mean(rates)) if rates else None,
+        "place": result.place,
+        "replies": [reply.command for reply in result.replies if reply.confirmed],
+        "recorded": result.recorded,
+        "sha256": result.digest,
+        "same_when_replayed": result.digest == result.again,
         "points": sum(int(scan.points.valid.sum()) for scan in whole),
         "stats": result.stats.to_dict(),
     }

@@ -61,6 +61,8 @@ def report(error: Exception, verb: str) -> int:
 def _message(error: Exception) -> str:
     if isinstance(error, click.ClickException):
         return error.format_message()
+    if isinstance(error, OSError) and error.filename is not None:
+        return f"{error.filename}: {error.strerror}"
     if isinstance(error, errors.WireError) and error.data:
         from lidarspec.wording import hexdump
 

@@ -128,15 +128,15 @@ def _raw_text(raw: Any) -> str:
 
 
 def _raw(sensor: Sensor, piece: Piece) -> Any:
-    return _plain(sensor.parse(piece.data, piece.frame))
+    return plain(sensor.parse(piece.data, piece.frame))
 
 
-def _plain(parsed: Any) -> Any:
+def plain(parsed: Any) -> Any:
     """A parsed frame as JSON takes it: bytes as hexadecimal text, null for nan and infinity."""
     if isinstance(parsed, dict):
-        return {name: _plain(value) for name, value in parsed.items()}
+        return {name: plain(value) for name, value in parsed.items()}
     if isinstance(parsed, list):
-        return [_plain(value) for value in parsed]
+        return [plain(value) for value in parsed]
     if isinstance(parsed, bytes | bytearray):
         return parsed.hex(" ")
     return getattr(parsed, "intvalue", None) if isinstance(parsed, str) else int(parsed) if isinstance(parsed, int) else number(parsed)

@@ -113,7 +113,7 @@ def _frame(frame: Frame) -> dict[str, Any]:
 def _command(sensor: Sensor, command: Command) -> Mapping[str, Any]:
     args = {name: {"field": path, "low": low, "high": high} for name, (path, low, high) in command.args.items()}
     frame = "" if command.frame is None or args else sensor.build(command.frame, _nested(command.values)).hex(" ")
-    return {"frame": command.frame, "arguments": args, "hex": frame, "reply": command.reply}
+    return {"frame": command.frame, "arguments": args, "hex": frame, "reply": " or ".join(command.replies) or None}
 
 
 def _command_text(command: Mapping[str, Any]) -> str:

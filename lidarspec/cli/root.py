@@ -23,16 +23,30 @@ GROUPS = {
     "look": {
         "sensors": ("look", "The installed sensors, and how far each is proven."),
         "show": ("look", "What a sensor is, and the wire table of each of its frames."),
+        "ports": ("ports", "The serial ports of this computer, and the UDP ports that installed sensors send to."),
+        "detect": ("detect", "Which installed sensor sends, and at which port and baud rate."),
+        "doctor": ("doctor", "What keeps a sensor's bytes from coming, and the command that mends it."),
         "plugins": ("look", "The plugins that were found, and what is wrong with those that do not load."),
-        "demo": ("demo", "A simulated sensor in a room, damaged on the line, decoded and drawn."),
+        "demo": ("demo", "A simulated sensor on a port: started, read through a bad line, recorded, read again, drawn."),
+    },
+    "stream": {
+        "read": ("read", "The points that a sensor sends, a row each; or its packets."),
+        "view": ("view", "A sensor at work, drawn in the terminal."),
+        "record": ("record", "Everything that a source sends, with the time of its arrival, in one file that survives a crash."),
+        "replay": ("replay", "A recording or capture, sent again as it came: bit for bit, and by the clock."),
+        "sim": ("sim", "A simulated sensor on a serial port, UDP, TCP or in a file."),
+        "send": ("send", "Send a command to a sensor, and print its reply."),
+        "stats": ("stats", "How a sensor is doing: speed, rates, errors, loss, jitter, queue."),
     },
     "files": {
         "convert": ("files", "Write the points of a capture or raw file to a file, in the format of its suffix."),
+        "plot": ("plot", "A scan as an SVG picture."),
     },
     "bytes": {
         "parse": ("frames", "The fields of each frame in some bytes."),
         "explain": ("frames", "Every byte of each frame: offset, hex, field, value, unit, meaning."),
         "build": ("building", "The bytes of one frame from field=value; a unit makes a value physical."),
+        "crc": ("crc", "Which checksum seals some sample frames: XOR, sums, or a CRC of 8, 16 or 32 bits."),
     },
 }
 VERBS = {verb: place for verbs in GROUPS.values() for verb, place in verbs.items()}

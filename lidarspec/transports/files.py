@@ -8,9 +8,11 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO
 
+from lidarspec.bulk import Batch, CaptureBatches
 from lidarspec.errors import SourceError, WireError
 from lidarspec.files import Chunk
-from lidarspec.pcap import CaptureReader, is_capture
+from lidarspec.pcap import CaptureReader, CaptureStats, is_capture
+from lidarspec.transports.recordings import RecordingTransport, is_recording
 
 #: bytes read at once.
 BLOCK = 1 << 18
@@ -69,14 +71,31 @@ class CaptureTransport(FileTransport):
             if self._sender is not None and datagram.source[0] != self._sender:
                 self.foreign += 1
                 continue
-            yield Chunk(datagram.data, datagram.at, datagram.source)
-        if reader.stats.truncated_tail:
+            yield Chunk(datagram.data, datagram.at, datagram.source, datagram.destination)
+        self._warn(reader.stats)
+
+    def batches(self) -> Iterator[Batch]:
+        """The same datagrams as those of `chunks`, many at a time.
+
+        Raises:
+            SourceError: where the file cannot be read.
+        """
+        reader = CaptureBatches(self._file)
+        for batch in reader.batches():
+            mine = batch if self._sender is None else batch.of(self._sender)
+            self.foreign += len(batch) - len(mine)
+            if len(mine):
+                yield mine
+        self._warn(reader.stats)
+
+    def _warn(self, stats: CaptureStats) -> None:
+        if stats.truncated_tail:
             self.warnings.append(f"{self._path} is cut off in its last record; everything before it was read")
-        if reader.stats.snapped:
-            self.warnings.append(f"{self._path}: {reader.stats.snapped} packets were cut by the capture's snap length")
+        if stats.snapped:
+            self.warnings.append(f"{self._path}: {stats.snapped} packets were cut by the capture's snap length")
 
 
-def open_file(path: str, *, sender: str | None = None) -> FileTransport:
+def open_file(path: str, *, sender: str | None = None) -> FileTransport | RecordingTransport:
     """The transport for a file, by what it holds; "-" is standard input.
 
     Raises:
@@ -92,6 +111,9 @@ def open_file(path: str, *, sender: str | None = None) -> FileTransport:
         except OSError as error:
             raise SourceError(f"{path}: {error.strerror or error}") from None
         undo.pop_all()
+    if is_recording(head):
+        file.close()
+        return RecordingTransport(path, sender=sender)
     if is_capture(head):
         return CaptureTransport(path, file, sender=sender)
     return HexTransport(path, file) if Path(path).suffix in (".hex", ".txt") else FileTransport(path, file)

@@ -1,21 +1,91 @@
-"""A canvas of braille characters: two dots across and four down in each cell, square where a cell is twice as high as wide."""
+"""Pictures in character cells: two by four dots of braille in each, square where a cell is twice as high as wide."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from itertools import groupby
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from rich.text import Text
 
+from lidarspec.view.palette import FAINT, LABEL, PLAIN, RAMPS, STEPS, style
+
 ACROSS, DOWN = 2, 4
 #: the bit of each dot of a braille character, by row and column.
 BITS = np.array([[0x01, 0x08], [0x02, 0x10], [0x04, 0x20], [0x40, 0x80]], np.int64)
 BLANK = 0x2800
-#: colours from near to far, and of what is no point.
-NEAR_TO_FAR = ("bright_red", "yellow", "bright_green", "bright_cyan", "bright_blue", "magenta")
-FAINT = "bright_black"
+_SPACE = ord(" ")
+#: what stands for a character where only ASCII can be shown; braille by the number of its dots.
+ASCII = {"▲": "^", "▶": ">", "▼": "v", "◀": "<", "│": "|", "─": "-", "━": "#", "°": "d", "●": "*", "‖": "=", "±": "+", "·": "."}
+_BY_DOTS = " ..::oo##"
+
+
+@dataclass(frozen=True, eq=False)
+class Cells:
+    """A picture as characters and inks.
+
+    Attributes:
+        codes: (height, width) int32, the characters as code points.
+        inks: (height, width) int16, their colours, see `palette`.
+    """
+
+    codes: NDArray[np.int32]
+    inks: NDArray[np.int16]
+
+    @classmethod
+    def blank(cls, width: int, height: int) -> Cells:
+        """A picture of spaces."""
+        return cls(np.full((height, width), _SPACE, np.int32), np.zeros((height, width), np.int16))
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height in cells."""
+        return self.codes.shape[1], self.codes.shape[0]
+
+    def write(self, row: int, column: int, text: str, ink: int = PLAIN) -> None:
+        """Text from a cell on; what does not fit is cut off."""
+        width, height = self.size
+        if not 0 <= row < height or column >= width:
+            return
+        text = text[max(-column, 0) :][: width - max(column, 0)]
+        column = max(column, 0)
+        self.codes[row, column : column + len(text)] = [ord(character) for character in text]
+        self.inks[row, column : column + len(text)] = ink
+
+    def paste(self, row: int, column: int, other: Cells) -> None:
+        """Another picture with its upper left corner in a cell; what does not fit is cut off."""
+        width, height = min(other.size[0], self.size[0] - column), min(other.size[1], self.size[1] - row)
+        if width > 0 and height > 0:
+            self.codes[row : row + height, column : column + width] = other.codes[:height, :width]
+            self.inks[row : row + height, column : column + width] = other.inks[:height, :width]
+
+    def lines(self) -> list[str]:
+        """The characters alone, line by line."""
+        return ["".join(map(chr, row)) for row in self.codes.tolist()]
+
+    def text(self) -> Text:
+        """The picture for rich, in colours."""
+        found = Text(no_wrap=True)
+        for number, (line, inks) in enumerate(zip(self.lines(), self.inks.tolist(), strict=True)):
+            start = 0
+            for ink, run in groupby(inks):
+                end = start + sum(1 for _ in run)
+                found.append(line[start:end], style(ink))
+                start = end
+            if number < len(self.codes) - 1:
+                found.append("\n")
+        return found
+
+    def ascii(self) -> Cells:
+        """The same for terminals that show nothing else."""
+        codes = self.codes.copy()
+        for character in set(np.unique(codes).tolist()):
+            if character > 0x7E:
+                dots = (character - BLANK).bit_count()
+                codes[codes == character] = ord(_BY_DOTS[dots] if BLANK <= character < BLANK + 256 else ASCII.get(chr(character), "?"))
+        return Cells(codes, self.inks)
 
 
 @dataclass(eq=False)
@@ -24,65 +94,73 @@ class Canvas:
 
     Attributes:
         width, height: in cells.
+        ramp: what the colours of points show, "range" or "intensity".
         dots: (4 * height, 2 * width) bool, points.
         lines: the same for rings and axes, shown where a cell has no point.
-        shade: (height, width) float, 0 near to 1 far, for the colour of a cell's points; nan without.
-        labels: text in cells, (row, column) -> character.
+        steps: (height, width) int16, the colour of a cell's points on the ramp; -1 without.
+        labels: text in cells, (row, column) -> character and ink.
     """
 
     width: int
     height: int
+    ramp: str = "range"
     dots: NDArray[np.bool_] = field(init=False)
     lines: NDArray[np.bool_] = field(init=False)
-    shade: NDArray[np.float64] = field(init=False)
-    labels: dict[tuple[int, int], str] = field(default_factory=dict)
+    steps: NDArray[np.int16] = field(init=False)
+    labels: dict[tuple[int, int], tuple[str, int]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self.dots = np.zeros((DOWN * self.height, ACROSS * self.width), np.bool_)
         self.lines = np.zeros_like(self.dots)
-        self.shade = np.full((self.height, self.width), np.nan)
+        self.steps = np.full((self.height, self.width), -1, np.int16)
 
-    def plot(self, column: NDArray[Any], row: NDArray[Any], shade: NDArray[Any] | None = None) -> None:
-        """Set dots at fractional dot coordinates; without `shade` they belong to lines. What is outside is left out."""
-        across, down = np.floor(column).astype(np.intp), np.floor(row).astype(np.intp)
-        inside = (across >= 0) & (across < self.dots.shape[1]) & (down >= 0) & (down < self.dots.shape[0])
-        across, down = across[inside], down[inside]
-        (self.lines if shade is None else self.dots)[down, across] = True
-        if shade is not None:
-            np.fmin.at(self.shade, (down // DOWN, across // ACROSS), shade[inside])
+    def plot(self, column: NDArray[Any], row: NDArray[Any], shade: NDArray[Any]) -> None:
+        """Set dots of points at fractional dot coordinates; what is outside is left out.
 
-    def label(self, row: int, column: int, text: str) -> bool:
-        """Write text from a cell on, unless it would leave the canvas or hide a point or another label; whether it was written."""
+        Args:
+            shade: (n,) from 0 to 1, where on the ramp each is: of several in a cell the nearest, or the strongest, gives the colour.
+        """
+        across, down, inside = self._places(column, row)
+        self.dots[down, across] = True
+        steps = np.clip(shade[inside] * STEPS, 0, STEPS - 1).astype(np.uint8)
+        order = np.argsort(steps if self.ramp == "intensity" else STEPS - steps, kind="stable")
+        self.steps[down[order] // DOWN, across[order] // ACROSS] = steps[order]
+
+    def line(self, column: NDArray[Any], row: NDArray[Any]) -> None:
+        """Set dots of rings and axes."""
+        across, down, _ = self._places(column, row)
+        self.lines[down, across] = True
+
+    def label(self, row: int, column: int, text: str, ink: int = LABEL, *, over: bool = False) -> bool:
+        """Write text from a cell on, unless it would leave the canvas or hide something; whether it was written.
+
+        Args:
+            over: it may hide points.
+        """
         cells = [(row, column + index) for index in range(len(text))]
         if not (0 <= row < self.height and column >= 0 and column + len(text) <= self.width):
             return False
-        if any(cell in self.labels or not np.isnan(self.shade[cell]) for cell in cells):
+        if any(cell in self.labels or (self.steps[cell] >= 0 and not over) for cell in cells):
             return False
-        self.labels |= dict(zip(cells, text, strict=True))
+        self.labels |= {cell: (character, ink) for cell, character in zip(cells, text, strict=True)}
         return True
 
-    def text(self) -> Text:
-        """The picture, coloured; its ``plain`` has the characters alone."""
-        found = Text(no_wrap=True)
-        points, lines = _cells(self.dots), _cells(self.lines)
-        for row in range(self.height):
-            for column in range(self.width):
-                found.append(*self._cell(row, column, int(points[row, column]), int(lines[row, column])))
-            if row < self.height - 1:
-                found.append("\n")
-        return found
+    def cells(self) -> Cells:
+        """The picture."""
+        points, lines = _braille(self.dots), _braille(self.lines)
+        codes = np.where(points > 0, BLANK + points, np.where(lines > 0, BLANK + lines, _SPACE)).astype(np.int32)
+        inks = np.where(points > 0, RAMPS[self.ramp] + self.steps, np.where(lines > 0, FAINT, PLAIN)).astype(np.int16)
+        for cell, (character, ink) in self.labels.items():
+            codes[cell], inks[cell] = ord(character), ink
+        return Cells(codes, inks)
 
-    def _cell(self, row: int, column: int, points: int, lines: int) -> tuple[str, str]:
-        label = self.labels.get((row, column))
-        if label is not None:
-            return label, FAINT
-        if points:
-            step = min(int(self.shade[row, column] * len(NEAR_TO_FAR)), len(NEAR_TO_FAR) - 1)
-            return chr(BLANK + points), NEAR_TO_FAR[step]
-        return (chr(BLANK + lines), FAINT) if lines else (" ", "")
+    def _places(self, column: NDArray[Any], row: NDArray[Any]) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.bool_]]:
+        height, width = self.dots.shape
+        inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+        return column[inside].astype(np.intp), row[inside].astype(np.intp), inside
 
 
-def _cells(dots: NDArray[np.bool_]) -> NDArray[np.int64]:
+def _braille(dots: NDArray[np.bool_]) -> NDArray[np.int64]:
     """The braille bits of each cell, (height, width)."""
     blocks = dots.reshape(dots.shape[0] // DOWN, DOWN, dots.shape[1] // ACROSS, ACROSS)
-    return np.asarray((blocks * BITS[None, :, None, :]).sum(axis=(1, 3)))
+    return np.asarray(np.einsum("rdca,da->rc", blocks, BITS))

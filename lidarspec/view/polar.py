@@ -1,109 +1,96 @@
-"""Clouds in the terminal: seen from above with range rings, forward up and left left; 3D ones from the side as well."""
+"""Clouds in character cells: from above with range rings, forward up and left left; 3D ones from the right side as well."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.text import Text
 
 from lidarspec.clouds import PointCloud
-from lidarspec.view.canvas import ACROSS, DOWN, Canvas
+from lidarspec.view.canvas import ACROSS, DOWN, Canvas, Cells
+from lidarspec.view.palette import FAINT, LABEL, STRONG
 
 #: share of the points that the picture's reach takes in, where a few are far beyond all others.
 MOST, FAR_BEYOND = 99.0, 1.5
-#: rings at most, and dots from one dot of a ring to the next.
+#: rings at most between the middle and an edge, and dots from one dot of a ring to the next.
 RINGS, RING_GAP = 4, 4
 #: share of the height that the view from above gets where there are two.
 ABOVE = 0.62
+#: elevations below this, in radians, make a cloud a flat one.
+FLAT = 1e-3
+#: by how much heights may be drawn larger than lengths, and the share of the side view that they then fill at most.
+HEIGHTS, FILLED = (1, 2, 5, 10), 0.9
+#: what a reach is rounded up to, so that the picture keeps its scale from scan to scan.
+ROUND = (1.0, 1.2, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0)
+#: share of the points whose intensity is within the ramp.
+WITHIN = 98.0
 
 
-def polar(points: PointCloud, *, width: int, height: int, max_range: float | None = None) -> str:
-    """The cloud from above as lines of braille characters, `width` by `height` cells; `max_range` metres to the nearer edge."""
-    return polar_text(points, width=width, height=height, max_range=max_range).plain
+@dataclass(frozen=True)
+class Look:
+    """How a cloud is drawn.
+
+    Attributes:
+        ramp: what colours show, "range" or "intensity".
+        reach: metres from the middle to the nearer edge.
+        full: the range in metres, or the intensity, at the end of the ramp.
+        middle: what is in the middle, metres forward and left of the sensor.
+        flat: from above only.
+    """
+
+    ramp: str
+    reach: float
+    full: float
+    middle: tuple[float, float] = (0.0, 0.0)
+    flat: bool = True
 
 
-def top_side(points: PointCloud, *, width: int, height: int, max_range: float | None = None) -> str:
-    """The cloud from above and, below that, from its right side, to the same scale; forward is up, then right."""
-    return top_side_text(points, width=width, height=height, max_range=max_range).plain
-
-
-def polar_text(points: PointCloud, *, width: int, height: int, max_range: float | None = None) -> Text:
-    """The same as `polar`, coloured by range."""
+def look(points: PointCloud, *, ramp: str = "range", reach: float | None = None) -> Look:
+    """How to draw a cloud so that all of it is seen; intensity is shown only where the cloud has some."""
     cloud = points[points.valid]
-    reach = max_range or _reach(np.hypot(cloud.x, cloud.y))
-    canvas = Canvas(width, height)
-    scale = _scale(canvas, reach)
-    _from_above(canvas, cloud, reach, scale)
-    return canvas.text()
+    found = reach or reach_of(cloud)
+    if ramp == "intensity" and cloud.intensity is not None:
+        strong = float(np.percentile(cloud.intensity, WITHIN)) if len(cloud) else 0.0
+        return Look("intensity", found, rounded_up(max(strong, 1e-3)), flat=is_flat(cloud))
+    return Look("range", found, found, flat=is_flat(cloud))
 
 
-def top_side_text(points: PointCloud, *, width: int, height: int, max_range: float | None = None) -> Text:
-    """The same as `top_side`, coloured by range."""
+def picture(points: PointCloud, *, width: int, height: int, look: Look) -> Cells:
+    """The cloud in `width` by `height` cells: from above, and below that from its right side unless the look is flat."""
     cloud = points[points.valid]
-    reach = max_range or _reach(np.hypot(cloud.x, cloud.y))
-    above = Canvas(width, max(round((height - 2) * ABOVE), 1))
-    side = Canvas(width, max(height - 2 - above.height, 1))
-    scale = _scale(above, reach)
-    _from_above(above, cloud, reach, scale)
-    _from_side(side, cloud, reach, scale)
-    return Text("\n").join([Text("from above, forward is up"), above.text(), Text("from the right, forward is right"), side.text()])
+    if look.flat:
+        return _from_above(cloud, width, height, look)
+    above = max(round((height - 1) * ABOVE), 1)
+    whole = Cells.blank(width, height)
+    whole.paste(0, 0, _from_above(cloud, width, above, look))
+    side, scale = _from_side(cloud, width, max(height - 1 - above, 1), look, _scale(width, above, look.reach))
+    title = "─ from the right, forward is right" + (f", heights x{scale} " if scale > 1 else " ")
+    whole.write(above, 0, title.ljust(width, "─"), FAINT)
+    whole.write(above, 2, title[2:].rstrip("─ "), LABEL)
+    whole.paste(above + 1, 0, side)
+    return whole
 
 
-def _scale(canvas: Canvas, reach: float) -> float:
-    """Dots per metre, so that `reach` fits into half of the canvas both ways."""
-    return float((min(canvas.dots.shape) - 1) / 2 / reach)
+def is_flat(cloud: PointCloud) -> bool:
+    """Whether all points are in the sensor's plane."""
+    return not len(cloud) or float(np.nanmax(np.abs(cloud.elevation))) < FLAT
 
 
-def _reach(distance: NDArray[np.float32]) -> float:
-    """The range that the picture goes to: the farthest point's, or most points' where a few are far beyond."""
-    if not len(distance):
+def reach_of(cloud: PointCloud) -> float:
+    """The range that shows a cloud of valid points: the farthest one's, or most points' where a few are far beyond; rounded up."""
+    if not len(cloud):
         return 1.0
+    distance = np.hypot(cloud.x, cloud.y)
     farthest, most = float(distance.max()), float(np.percentile(distance, MOST))
-    return max(farthest if farthest <= FAR_BEYOND * most else most, 1e-3)
+    return rounded_up(max(farthest if farthest <= FAR_BEYOND * most else most, 1e-3))
 
 
-def _from_above(canvas: Canvas, cloud: PointCloud, reach: float, scale: float) -> None:
-    centre = _centre(canvas)
-    distance = np.hypot(cloud.x, cloud.y).astype(np.float64)
-    canvas.plot(centre[0] - cloud.y * scale, centre[1] - cloud.x * scale, np.minimum(distance / reach, 1))
-    step = ring_step(reach)
-    radii = [step * number for number in range(1, RINGS + 2) if step * number <= reach * 1.001]
-    for radius in radii:
-        turn = np.linspace(0, 2 * np.pi, max(round(2 * np.pi * radius * scale / RING_GAP), 8), endpoint=False)
-        canvas.plot(centre[0] + radius * scale * np.sin(turn), centre[1] - radius * scale * np.cos(turn))
-    middle = (int(centre[1]) // DOWN, int(centre[0]) // ACROSS)
-    canvas.label(*middle, "^")
-    for radius in radii:
-        _label_ring(canvas, middle, radius, scale)
-
-
-def _label_ring(canvas: Canvas, middle: tuple[int, int], radius: float, scale: float) -> None:
-    """The range of a ring where it crosses an axis, on the first of its four crossings that is free."""
-    text = f"{radius:g} m"
-    across, down = round(radius * scale / ACROSS), round(radius * scale / DOWN)
-    row, column = middle
-    places = [(row, column + across - len(text)), (row - down, column + 1), (row + down, column + 1), (row, column - across + 1)]
-    any(canvas.label(*place, text) for place in places)
-
-
-def _from_side(canvas: Canvas, cloud: PointCloud, reach: float, scale: float) -> None:
-    """Forward to the right and up up; the height is centred on the points."""
-    heights = cloud.z[np.abs(cloud.x) <= reach]
-    middle = float((heights.max() + heights.min()) / 2) if len(heights) else 0.0
-    centre = _centre(canvas)
-    level = centre[1] + middle * scale
-    distance = np.hypot(cloud.x, cloud.y).astype(np.float64)
-    canvas.plot(centre[0] + cloud.x * scale, level - cloud.z * scale, np.minimum(distance / reach, 1))
-    canvas.plot(np.arange(0, canvas.dots.shape[1], RING_GAP, dtype=np.float64), np.full(-(-canvas.dots.shape[1] // RING_GAP), level))
-    canvas.label(int(level) // DOWN, int(centre[0]) // ACROSS, ">")
-    canvas.label(int(level) // DOWN, 0, "z 0")
-
-
-def _centre(canvas: Canvas) -> tuple[float, float]:
-    """The middle of a canvas in dots, across and down, on the middle of a cell."""
-    return canvas.width // 2 * ACROSS + ACROSS / 2, canvas.height // 2 * DOWN + DOWN / 2
+def rounded_up(value: float) -> float:
+    """The next of a few round numbers, such as 1.2, 1.5, 2, 2.5, 3, 4 ... 10, 12."""
+    power = 10.0 ** math.floor(math.log10(value))
+    return next((step * power for step in ROUND if step * power >= value * 0.999), 10 * power)
 
 
 def ring_step(reach: float) -> float:
@@ -111,3 +98,87 @@ def ring_step(reach: float) -> float:
     rough = reach / RINGS
     power = 10.0 ** math.floor(math.log10(rough))
     return next(step * power for step in (1, 2, 5, 10) if step * power >= rough * 0.999)
+
+
+def _scale(width: int, height: int, reach: float) -> float:
+    """Dots per metre, so that `reach` fits into half of the canvas both ways."""
+    return (min(width * ACROSS, height * DOWN) - 1) / 2 / reach
+
+
+def shade(cloud: PointCloud, look: Look) -> NDArray[np.float64]:
+    """How far along the ramp each point is, from 0."""
+    if look.ramp == "intensity" and cloud.intensity is not None:
+        return cloud.intensity.astype(np.float64) / look.full
+    return np.hypot(cloud.x, cloud.y).astype(np.float64) / look.full
+
+
+def _from_above(cloud: PointCloud, width: int, height: int, look: Look) -> Cells:
+    canvas = Canvas(width, height, look.ramp)
+    scale = _scale(width, height, look.reach)
+    middle = _middle(canvas)
+    across, down = middle[0] + look.middle[1] * scale, middle[1] + look.middle[0] * scale
+    canvas.plot(across - cloud.y * scale, down - cloud.x * scale, shade(cloud, look))
+    step = ring_step(look.reach)
+    radii = [step * number for number in range(1, int((look.reach + math.hypot(*look.middle)) / step * 1.001) + 1)]
+    for radius in radii:
+        turn = np.linspace(0, 2 * np.pi, max(round(2 * np.pi * radius * scale / RING_GAP), 8), endpoint=False)
+        canvas.line(across + radius * scale * np.sin(turn), down - radius * scale * np.cos(turn))
+    home = (math.floor(down) // DOWN, math.floor(across) // ACROSS)
+    canvas.label(*home, "▲", STRONG, over=True)
+    _label_directions(canvas, home)
+    for radius in radii:
+        _label_ring(canvas, home, radius, scale)
+    return canvas.cells()
+
+
+def _label_directions(canvas: Canvas, home: tuple[int, int]) -> None:
+    """The four directions as azimuths, at the edges."""
+    row, column = home
+    canvas.label(0, column, "0° forward") or canvas.label(0, column, "0°")
+    canvas.label(row, 0, "90° ")
+    canvas.label(row, canvas.width - 5, " -90°")
+    canvas.label(canvas.height - 1, column, "180°")
+
+
+def _label_ring(canvas: Canvas, home: tuple[int, int], radius: float, scale: float) -> None:
+    """The range of a ring where it crosses an axis, on the first of its four crossings that is free."""
+    text = f"{radius:g} m"
+    across, down = round(radius * scale / ACROSS), round(radius * scale / DOWN)
+    row, column = home
+    places = [(row, column + across - len(text)), (row - down, column + 1), (row + down, column + 1), (row, column - across + 1)]
+    any(canvas.label(*place, text) for place in places)
+
+
+def _from_side(cloud: PointCloud, width: int, height: int, look: Look, scale: float) -> tuple[Cells, int]:
+    """Forward to the right and up up, and by how much heights are drawn larger; the height is centred on the points."""
+    canvas = Canvas(width, height, look.ramp)
+    inside = np.abs(cloud.x - look.middle[0]) <= canvas.dots.shape[1] / 2 / scale
+    low, high = _heights(cloud.z[inside])
+    larger = max((n for n in HEIGHTS if (high - low) * scale * n <= canvas.dots.shape[0] * FILLED), default=1)
+    middle = _middle(canvas)
+    across, level = middle[0] - look.middle[0] * scale, middle[1] + (low + high) / 2 * scale * larger
+    canvas.plot(across + cloud.x * scale, level - cloud.z * scale * larger, shade(cloud, look))
+    step = ring_step(canvas.dots.shape[0] / scale / larger)
+    half = canvas.dots.shape[0] / scale / larger / 2
+    first, last = (math.ceil(((low + high) / 2 + end * half) / step) for end in (-1, 1))
+    for number in range(first, last + 1):
+        line = level - number * step * scale * larger
+        gap = RING_GAP if number == 0 else 4 * RING_GAP
+        columns = np.arange(0, canvas.dots.shape[1], gap, dtype=np.float64)
+        canvas.line(columns, np.full(len(columns), line))
+        canvas.label(math.floor(line) // DOWN, 0, "z 0 m" if number == 0 else f"{number * step:+.4g} m")
+    canvas.label(math.floor(level) // DOWN, math.floor(across) // ACROSS, "▶", STRONG, over=True)
+    return canvas.cells(), larger
+
+
+def _heights(z: NDArray[np.float32]) -> tuple[float, float]:
+    """The lowest and highest that the side view has to show: those of most points, and the sensor's own."""
+    if not len(z):
+        return 0.0, 0.0
+    low, high = (float(value) for value in np.percentile(z, (100 - MOST, MOST)))
+    return min(low, 0.0), max(high, 0.0)
+
+
+def _middle(canvas: Canvas) -> tuple[float, float]:
+    """The middle of a canvas in dots, across and down, on the middle of a cell."""
+    return canvas.width // 2 * ACROSS + ACROSS / 2, canvas.height // 2 * DOWN + DOWN / 2

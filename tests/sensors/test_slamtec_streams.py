@@ -9,6 +9,7 @@ import pytest
 
 import lidarspec as ls
 from lidarspec.simulator import simulate
+from lidarspec_slamtec.capsules import ultra_codes
 from tests.damage import damaged
 from tests.oracle import Oracle
 from tests.sensors.evidence import clockwise, decoded
@@ -109,10 +110,14 @@ def test_the_start_bit_stands_where_scans_begin() -> None:
     assert np.cumsum(lengths)[:-1].tolist() == flags[1:].tolist()
 
 
-def test_the_frames_that_cannot_be_simulated_say_so() -> None:
-    for answer in ("ultra", "ultra_dense"):
-        with pytest.raises(ls.UsageError, match="sweep"):
-            simulate(A1.configure(answer=answer), 1)
+def test_simulated_predictions_that_cannot_reach_their_point_are_no_returns() -> None:
+    near, far = 0.3, 20.0
+    polar = ls.Polar(np.array([[[near, far, near], [far, far, near], [0.0, near, 0.0]]]), 0)
+    codes = ultra_codes(polar)
+    assert codes["cabins.predict1"][0].tolist()[0] == 511
+    assert codes["cabins.major"][0, 2] == 0
+    assert codes["cabins.predict2"][0, 2] == 511
+    assert abs(codes["cabins.predict1"][0, 1]) <= 1
 
 
 def test_an_input_is_read_by_the_answer_that_it_holds() -> None:

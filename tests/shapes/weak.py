@@ -1,18 +1,26 @@
-"""A weak frame: five bytes, held together by a start bit, its inverse and a check bit; three in a row make it believable."""
+"""A weak frame: five bytes, held together by a start bit, its inverse and a check bit; three in a row make it believable.
+
+Its info frame has a checksum, comes first in the order, and would pass for a weak one: it ends a run.
+"""
 
 from __future__ import annotations
 
 from typing import Any
 
 import numpy as np
-from construct import BitsInteger, BitStruct, ByteSwapped, Int16ul, Struct
+from construct import BitsInteger, BitStruct, ByteSwapped, Const, Int8ul, Int16ul, Struct
 
-from lidarspec import Fields, Frame, OnFlag, Polar, Scaled, Sensor, Serial
+from lidarspec import Checksummed, Fields, Frame, OnFlag, Polar, Scaled, Sensor, Serial, Sum
 
 DATA = Struct(
     "head" / BitStruct("quality" / BitsInteger(6), "inverse" / BitsInteger(1), "start" / BitsInteger(1)),
     "beam" / ByteSwapped(BitStruct("angle" / Scaled(BitsInteger(15), 1 / 64, "deg"), "check" / BitsInteger(1))),
     "distance" / Scaled(Int16ul, 0.00025, "m"),
+)
+INFO = Checksummed(
+    Struct("header" / Const(b"\x3e\x01"), "revision" / Int8ul, "temperature" / Int8ul, "sum" / Int8ul),
+    field="sum",
+    algorithm=Sum(8),
 )
 
 
@@ -28,7 +36,10 @@ SENSOR = Sensor(
     "shape-weak",
     vendor="Shapes",
     model="Weak",
-    frames={"data": Frame(DATA, data=True, max_length=5, plausible=plausible, confirm=3)},
+    frames={
+        "info": Frame(INFO, max_length=5),
+        "data": Frame(DATA, data=True, max_length=5, plausible=plausible, confirm=3),
+    },
     points=points,
     scan=OnFlag("head.start"),
     links={"data": Serial(115_200)},

@@ -41,6 +41,7 @@ from lidarspec import (
 
 STEPS = 380  # points a turn: 360 degrees by the step of the manual's angle example, 0.9473 degrees
 SAMPLES = 25  # samples of a full packet (the manual's angle example)
+SETTLING = 1.0  # seconds; the manual has "less than 3" (1b)
 LOW_EXPOSURE, LOW_SPEED = 2, 5.5  # Exp_M and Hz of the slower of the two speeds (manual 1c and 2.2.3, Exp_M)
 
 COMMAND = Checksummed(
@@ -196,8 +197,13 @@ def sweep(i: int) -> dict[str, float]:
 
 
 def asking(mode: int, **more: Any) -> Command:
-    """The command of this mode that is answered with an acknowledgement of the same mode."""
-    return Command("command", {"mode": mode}, reply="ack", matches={"mode": mode ^ 0xA0}, **more)
+    """The command of this mode that is answered with an acknowledgement of the same mode; sent twice, it does the same once."""
+    return Command("command", {"mode": mode}, reply="ack", matches={"mode": mode ^ 0xA0}, retries=1, **more)
+
+
+def started(firmware: int, model: bytes, revision: int, *noise: bytes) -> tuple[Any, ...]:
+    """What a sensor sends when it is started: fillers while the speed settles, noise, and what it is (manual 1b, 2.1.3 and 2.2)."""
+    return ("ack", {"firmware": firmware}), SETTLING, *noise, ("info", {"model": model, "revision": revision}), "scan_start"
 
 
 M1C1_MINI = Sensor(
@@ -216,11 +222,11 @@ M1C1_MINI = Sensor(
     # 150 000 for this 3-byte format and DTR low: the SDK; 115 200: v1.1, for the older 2-byte format.
     links={"data": Serial(150_000, 115_200, dtr=False)},
     commands={
-        "start": asking(0xF0, starts=True),
+        "start": asking(0xF0, starts=True, answers=started(3, b"M1C1_Mini", 4)),
         "stop": asking(0xF5, stops=True),
         "low_exposure": Command("command", {"mode": 0xF1}),
         "high_exposure": Command("command", {"mode": 0xF2}),
-        "get_version": asking(0xFC),
+        "get_version": asking(0xFC, answers=(("ack", {"firmware": 3}),)),
     },
     fillers=b"\xfe\xff",
     state={"info": {"correction": 1, "zero_angle": 12}},  # the device information printed in the manual, 2.2.2
@@ -239,6 +245,7 @@ COIN_D4 = dataclasses.replace(
     id="cspc-coin-d4",
     model="COIN-D4",
     links={"data": Serial(230_400, dtr=False)},
+    commands={**M1C1_MINI.commands, "start": asking(0xF0, starts=True, answers=started(1, b"COIN-D4", 1, b"\xfa\xfa"))},
     state={"info": {"correction": 0, "zero_angle": 0}},  # the device information of a live unit
     status="capture",
     source="the M1C1_Mini's manual; baud rate from the vendor's SDK; a captured start-up of a COIN-D4",

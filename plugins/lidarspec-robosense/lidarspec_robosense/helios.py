@@ -200,13 +200,19 @@ def sweep(i: int) -> dict[str, Any]:
     }
 
 
+def sweep_difop(i: int) -> dict[str, Any]:
+    """The device information of a sensor with the factory's settings; the angles are the default ones."""
+    addresses = {"lidar_ip": bytes([192, 168, 1, 200]), "host_ip": bytes([192, 168, 1, 102])}
+    return {"measured_rpm": TURNS * 60, "msop_port": 6699, "difop_port": 7788, "fov_end": 360.0, **addresses}
+
+
 HELIOS_16P = Sensor(
     "robosense-helios16p",
     vendor="RoboSense",
     model="RS-Helios-16P",
     frames={
         "data": Frame(DATA, data=True, max_length=1248, plausible=plausible),
-        "difop": Frame(DIFOP, max_length=1248),
+        "difop": Frame(DIFOP, max_length=1248, sweep=sweep_difop, rate=1),  # the rate: assumed, the M1's
     },
     points=points,
     scan=OnWrap("blocks.azimuth"),

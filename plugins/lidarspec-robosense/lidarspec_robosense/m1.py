@@ -12,6 +12,7 @@ between firmwares from byte 28 on, so only what is before has names.
 
 from __future__ import annotations
 
+import functools
 from typing import Any
 
 import numpy as np
@@ -23,6 +24,7 @@ BLOCKS, CHANNELS = 25, 5
 SINGLE, DUAL = 630, 1260  # packets of a frame (rs_driver; M1P user guide: the counter restarts with each frame)
 FRAME_RATE = 10  # Hz (M1P user guide, page 6)
 FIRING = 10e-6 / 3  # seconds between blocks: 0, 3, 7, 10, 13, 17 us in the M1P guide's capture
+OFFSETS = np.round(np.arange(BLOCKS) * FIRING, 6)  # seconds, as the sensor rounds them
 LINE = 125  # firings of a line in `sweep`, which makes 126 lines 0.2 degrees apart
 
 DATA = Struct(
@@ -95,16 +97,24 @@ def points(f: Fields) -> Polar:
     )
 
 
-def sweep(i: int) -> dict[str, Any]:
-    """Packet i of frames with single return: lines from +12.5 to -12.5 degrees, to and fro over a fifth of 120 degrees.
+@functools.cache
+def looking(number: int) -> tuple[Any, Any]:
+    """Elevation and azimuth in degrees, (25, 5), in a packet of this number, counted from 0, of a frame with single return.
 
+    Lines from +12.5 to -12.5 degrees, to and fro over a fifth of 120 degrees.
     Source: field of view, number of packets and where the channels look are the guide's; the lines are assumed.
     """
-    number, time = i % SINGLE, i / (SINGLE * FRAME_RATE)
     line, spot = np.divmod(number * BLOCKS + np.arange(BLOCKS), LINE)
     across = (spot + 0.5) / LINE - 0.5
     azimuth = np.where(line % 2, across, -across)[:, None] * 24 + np.array([48, 24, 0, -24, -48])
     elevation = 12.5 - 25 * line / (SINGLE * BLOCKS // LINE - 1)
+    return np.repeat(elevation[:, None], CHANNELS, axis=1), azimuth
+
+
+def sweep(i: int) -> dict[str, Any]:
+    """Packet i of frames with single return."""
+    number, time = i % SINGLE, i / (SINGLE * FRAME_RATE)
+    elevation, azimuth = looking(number)
     return {
         "pkt_psn": number + 1,
         "protocol_version": 0,
@@ -114,11 +124,16 @@ def sweep(i: int) -> dict[str, Any]:
         "microseconds": time % 1,
         "lidar_type": 0x10,
         "mems_tmp": 105,
-        "blocks.time_offset": np.round(np.arange(BLOCKS) * FIRING, 6),
-        "blocks.return_seq": np.zeros(BLOCKS),
-        "blocks.channels.elevation": np.repeat(elevation[:, None], CHANNELS, axis=1),
+        "blocks.time_offset": OFFSETS,
+        "blocks.channels.elevation": elevation,
         "blocks.channels.azimuth": azimuth,
     }
+
+
+def sweep_difop(i: int) -> dict[str, Any]:
+    """The device information of a sensor with the factory's settings."""
+    addresses = {"lidar_ip": bytes([192, 168, 1, 200]), "host_ip": bytes([192, 168, 1, 102])}
+    return {"frame_rate": FRAME_RATE, "msop_port": 6699, "difop_port": 7788, **addresses}
 
 
 M1 = Sensor(
@@ -127,7 +142,7 @@ M1 = Sensor(
     model="RS-LiDAR-M1",
     frames={
         "data": Frame(DATA, data=True, max_length=1210, plausible=plausible),
-        "difop": Frame(DIFOP, max_length=256),
+        "difop": Frame(DIFOP, max_length=256, sweep=sweep_difop, rate=1),  # M1 user guide; the M1P's: 10 a second
     },
     points=points,
     scan=OnRewind("pkt_psn"),

@@ -25,7 +25,7 @@ import dataclasses
 from collections.abc import Iterable, Mapping
 
 from lidarspec import Command, Frame, OnWrap, Sensor, Serial, UsageError, hookimpl
-from lidarspec_slamtec import capsules, nodes
+from lidarspec_slamtec import capsules, nodes, units
 from lidarspec_slamtec.answers import ANSWERS, DESCRIPTORS
 from lidarspec_slamtec.commands import BY_DTR, BY_PWM, BY_SPEED, COMMANDS, express
 from lidarspec_slamtec.requests import REQUESTS
@@ -37,6 +37,7 @@ EXPRESS = Frame(
     data=True,
     points=capsules.express_points(),
     sweep=capsules.sweep_by(capsules.EXPRESS_STEP),
+    rate=capsules.EXPRESS_RATE,
     max_length=84,
     plausible=capsules.plausible,
     after="express_descriptor",
@@ -45,6 +46,9 @@ ULTRA = Frame(
     capsules.ULTRA,
     data=True,
     points=capsules.ultra_points,
+    sweep=capsules.sweep_by(capsules.ULTRA_STEP),
+    encode=capsules.ultra_codes,
+    rate=capsules.ULTRA_RATE,
     max_length=132,
     plausible=capsules.plausible,
     after="ultra_descriptor",
@@ -54,6 +58,7 @@ DENSE = Frame(
     data=True,
     points=capsules.dense_points,
     sweep=capsules.sweep_by(capsules.DENSE_STEP),
+    rate=capsules.DENSE_RATE,
     max_length=84,
     plausible=capsules.plausible,
     after="dense_descriptor",
@@ -62,16 +67,28 @@ ULTRA_DENSE = Frame(
     capsules.ULTRA_DENSE,
     data=True,
     points=capsules.ultra_dense_points,
+    sweep=capsules.sweep_by(capsules.ULTRA_DENSE_STEP),
+    encode=capsules.ultra_dense_codes,
+    rate=capsules.ULTRA_DENSE_RATE,
     max_length=170,
     plausible=capsules.plausible,
     after="ultra_dense_descriptor",
 )
-HQ = Frame(nodes.HQ, data=True, points=nodes.hq_points, sweep=nodes.hq_sweep, max_length=781, after="hq_descriptor")
+HQ = Frame(
+    nodes.HQ,
+    data=True,
+    points=nodes.hq_points,
+    sweep=nodes.hq_sweep,
+    rate=nodes.HQ_RATE,
+    max_length=781,
+    after="hq_descriptor",
+)
 NODE = Frame(
     nodes.NODE,
     data=True,
     points=nodes.node_points,
     sweep=nodes.node_sweep,
+    rate=nodes.RATE,
     max_length=5,
     plausible=nodes.plausible,
     after="scan_descriptor",
@@ -109,13 +126,16 @@ def configure(sensor: Sensor, *, dtheta: str | None = None, mode: int | None = N
     if mode is not None:
         if mode not in range(0x100):
             raise UsageError(f"{sensor.id}: mode is a number from 0 to 255, not {mode!r}")
-        commands = {**sensor.commands, "mode_scan": express(mode)}
+        scan = dataclasses.replace(express(mode), answers=sensor.commands["express_scan"].answers)
+        commands = {**sensor.commands, "mode_scan": scan}
         sensor = dataclasses.replace(sensor, commands=commands, on_open=("stop", "start_motor", "mode_scan"))
     return sensor
 
 
-def rplidar(name: str, *, baud: int, motor: Mapping[str, Command], range_limits: tuple[float, float], status: str, source: str) -> Sensor:
-    """One model of the family."""
+def rplidar(
+    name: str, *, baud: int, motor: Mapping[str, Command], unit: units.Unit, range_limits: tuple[float, float], status: str, source: str
+) -> Sensor:
+    """One model of the family; simulated, it is this unit."""
     return Sensor(
         f"slamtec-rplidar-{name.lower()}",
         vendor="Slamtec",
@@ -124,7 +144,7 @@ def rplidar(name: str, *, baud: int, motor: Mapping[str, Command], range_limits:
         points=None,
         scan=OnWrap("azimuth"),
         links={"data": Serial(baud)},
-        commands={**COMMANDS, **motor},
+        commands=unit.answering({**COMMANDS, **motor}),
         configure=configure,
         on_open=("stop", "start_motor", "scan"),
         on_close=("stop", "stop_motor"),
@@ -140,6 +160,7 @@ A1 = rplidar(
     "A1",
     baud=115_200,
     motor=BY_DTR,
+    unit=units.A1,
     range_limits=(0.15, 12.0),
     status="vectors",
     source="A1M8 data sheet; an A1's exchange",
@@ -148,12 +169,29 @@ A3 = rplidar(
     "A3",
     baud=256_000,
     motor=BY_PWM,
+    unit=units.A3,
     range_limits=(0.2, 25.0),
     status="vectors",
     source="A3M1 data sheet; ultra capsules built after the SDK",
 )
-S2 = rplidar("S2", baud=1_000_000, motor=BY_SPEED, range_limits=(0.05, 30.0), status="manual", source="S2 data sheet")
-C1 = rplidar("C1", baud=460_800, motor=BY_SPEED, range_limits=(0.05, 12.0), status="manual", source="C1 data sheet")
+S2 = rplidar(
+    "S2",
+    baud=1_000_000,
+    motor=BY_SPEED,
+    unit=units.S2,
+    range_limits=(0.05, 30.0),
+    status="manual",
+    source="S2 data sheet",
+)
+C1 = rplidar(
+    "C1",
+    baud=460_800,
+    motor=BY_SPEED,
+    unit=units.C1,
+    range_limits=(0.05, 12.0),
+    status="manual",
+    source="C1 data sheet",
+)
 
 
 @hookimpl

@@ -22,7 +22,10 @@ from lidarspec import Checksummed, Fields, Polar, Scaled, Xor, following, stack,
 
 EXPRESS_CABINS, ULTRA_CABINS, DENSE_CABINS, ULTRA_DENSE_CABINS = 16, 32, 40, 32
 SIGNED = 32  # dtheta has six bits; read as signed, this one and those above are negative
-EXPRESS_STEP, DENSE_STEP = 16.0, 18.0  # degrees of a simulated capsule: 720 and 800 points a turn
+#: degrees of a simulated capsule: 720, 1440, 800 and 800 points a turn.
+EXPRESS_STEP, ULTRA_STEP, DENSE_STEP, ULTRA_DENSE_STEP = 16.0, 24.0, 18.0, 28.8
+#: simulated capsules a second: 254 and 127 us a point, a live A1's, for 5.5 turns; 125 us, assumed, for 10 turns.
+EXPRESS_RATE, ULTRA_RATE, DENSE_RATE, ULTRA_DENSE_RATE = (1e6 / us / points for us, points in ((254, 32), (127, 96), (125, 40), (125, 64)))
 
 #: the ultra capsule's scale: values from STARTS on begin at BASES millimetres and go on in steps of 1, 2, 4, 8 and 16.
 _STARTS, _BASES = np.array([0, 512, 1280, 1792, 3328]), np.array([0, 512, 2048, 4096, 16384])
@@ -32,6 +35,7 @@ MILLIMETRES = _BASES[LEVELS] + ((_CODES - _STARTS[LEVELS]) << LEVELS)
 
 #: the ultra-dense capsule's four scales begin at these millimetres.
 SCALES = np.array([0, 2046, 8187, 24567])
+QUALITY = 47  # of simulated points
 
 
 def nibble(sync: int) -> Construct:
@@ -181,6 +185,42 @@ def ultra_dense_points(f: Fields) -> Polar:
         azimuth=-np.deg2rad(headings(f, ULTRA_DENSE_CABINS, 2)),
         intensity=quality * np.exp2(scale),
     )
+
+
+def ultra_codes(polar: Polar) -> Mapping[str, Any]:
+    """The fields of ultra capsules that hold these ranges; a prediction that cannot reach its point says that there is no return."""
+    mm = np.asarray(polar.range) * 1000
+    code = nearest(mm[..., 0])
+    after = np.append(code.reshape(-1)[1:], 0).reshape(code.shape)
+    base = np.where(code > 0, code, after)
+    first, second = (prediction(mm[..., place], reference) for place, reference in ((1, base), (2, after)))
+    return {"cabins.major": code, "cabins.predict1": first, "cabins.predict2": second}
+
+
+def nearest(mm: Any) -> Any:
+    """The codes of the scale's values next to these distances."""
+    above = np.clip(np.searchsorted(MILLIMETRES, mm), 1, len(MILLIMETRES) - 1)
+    return np.where(mm - MILLIMETRES[above - 1] < MILLIMETRES[above] - mm, above - 1, above) * (mm > 0)
+
+
+def prediction(mm: Any, code: Any) -> Any:
+    """Steps from the distance that a code stands for to another one; 511 for no return."""
+    base, scale = MILLIMETRES[code], np.exp2(LEVELS[code])
+    steps = np.rint((mm - base) / scale)
+    return np.where((mm > 0) & (base + steps * scale > 0) & (np.abs(steps) < 511), steps, 511).astype(np.int64)
+
+
+def ultra_dense_codes(polar: Polar) -> Mapping[str, Any]:
+    """The fields of ultra-dense capsules that hold these ranges, each in the finest scale that reaches it, of one quality."""
+    mm = np.asarray(polar.range) * 1000
+    scale = np.searchsorted(SCALES, mm, side="right") - 1
+    steps = np.rint((mm - SCALES[scale]) / (2 + scale)).astype(np.int64)
+    code = np.where(mm > 0, steps + ((QUALITY >> scale) << (10 + scale)), 0)
+    found: dict[str, Any] = {}
+    for place, name in enumerate(("first", "second")):
+        own = code[..., place]
+        found |= {f"cabins.{name}_low": own & 0x3FFF, f"cabins.{name}_high": own >> 14, f"cabins.{name}_scale": scale[..., place]}
+    return found
 
 
 def sweep_by(degrees: float) -> Callable[[int], Mapping[str, Any]]:

@@ -6,6 +6,7 @@ Source: RPLIDAR interface protocol, "requests"; how long to wait after them and 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 from lidarspec import Command
@@ -18,41 +19,52 @@ FULL_DUTY, USUAL_DUTY = 1023, 660  # SDK, MAX_MOTOR_PWM and DEFAULT_MOTOR_PWM
 USUAL_SPEED = 600  # rpm: 10 turns a second (data sheets of S2 and C1)
 
 
+#: the descriptors that announce capsules (SDK, startScanExpress).
+CAPSULES = ("express_descriptor", "ultra_descriptor", "dense_descriptor", "ultra_dense_descriptor", "hq_descriptor")
+ANY_KEY = ("key", 0, 0xFFFF_FFFF)
+
+
 def plain(cmd: int, **more: Any) -> Command:
     """A request without payload."""
     return Command("request", {"cmd.number": cmd}, **more)
 
 
+def asking(frame: str, reply: str | tuple[str, ...], values: Mapping[str, int] | None = None, **more: Any) -> Command:
+    """A request with a reply; it does no harm twice: what a sensor is stays the same, and a scan begins anew."""
+    return Command(frame, values or {}, reply=reply, retries=1, **more)
+
+
 def about_sensor(key: int) -> Command:
     """The request for a configuration value of the sensor."""
-    return Command("config_request", {"key": key}, reply="config", matches={"key": key})
+    return asking("config_request", "config", {"key": key}, echoes=("key",))
 
 
 def about_mode(key: int) -> Command:
     """The request for a configuration value of one of its scan modes."""
-    return Command("mode_config_request", {"key": key}, args={"mode": ("mode", 0, 0xFFFF)}, reply="config", matches={"key": key})
+    return asking("mode_config_request", "config", {"key": key}, args={"mode": ("mode", 0, 0xFFFF)}, echoes=("key",))
 
 
 def express(mode: int | None = None) -> Command:
     """The request for capsules: of one scan mode, or of the one that is given as argument.
 
-    Which descriptor answers depends on the mode (get_answer_type tells), so that no reply is declared.
+    Which descriptor answers depends on the mode; get_answer_type tells.
     """
     values = {"flags": 0, "param": 0} | ({} if mode is None else {"mode": mode})
-    return Command("express_request", values, args={"mode": ("mode", 0, 0xFF)} if mode is None else {}, starts=True)
+    args = {"mode": ("mode", 0, 0xFF)} if mode is None else {}
+    return asking("express_request", CAPSULES, values, args=args, starts=True)
 
 
 COMMANDS = {
     "stop": plain(0x25, settle=AFTER_STOP, stops=True),
     "reset": plain(0x40, settle=AFTER_RESET, stops=True),
-    "scan": plain(0x20, reply="scan_descriptor", starts=True),
-    "force_scan": plain(0x21, reply="scan_descriptor", starts=True),
+    "scan": asking("request", "scan_descriptor", {"cmd.number": 0x20}, starts=True),
+    "force_scan": asking("request", "scan_descriptor", {"cmd.number": 0x21}, starts=True),
     "express_scan": express(),
-    "get_info": plain(0x50, reply="info"),
-    "get_health": plain(0x52, reply="health"),
-    "get_samplerate": plain(0x59, reply="sample_rate"),
-    "get_config": Command("config_request", args={"key": ("key", 0, 0xFFFF_FFFF)}, reply="config"),
-    "get_mode_config": Command("mode_config_request", args={"key": ("key", 0, 0xFFFF_FFFF), "mode": ("mode", 0, 0xFFFF)}, reply="config"),
+    "get_info": asking("request", "info", {"cmd.number": 0x50}),
+    "get_health": asking("request", "health", {"cmd.number": 0x52}),
+    "get_samplerate": asking("request", "sample_rate", {"cmd.number": 0x59}),
+    "get_config": asking("config_request", "config", args={"key": ANY_KEY}, echoes=("key",)),
+    "get_mode_config": asking("mode_config_request", "config", args={"key": ANY_KEY, "mode": ("mode", 0, 0xFFFF)}, echoes=("key",)),
     "get_mode_count": about_sensor(answers.MODE_COUNT),
     "get_typical_mode": about_sensor(answers.TYPICAL_MODE),
     "get_us_per_sample": about_mode(answers.US_PER_SAMPLE),
@@ -69,7 +81,7 @@ BY_PWM = {
     "start_motor": Command("pwm_request", {"duty": USUAL_DUTY}, settle=AFTER_MOTOR),
     "stop_motor": Command("pwm_request", {"duty": 0}),
     "motor_duty": Command("pwm_request", args={"duty": ("duty", 0, FULL_DUTY)}),
-    "get_accessory": Command("accessory_request", {"reserved": 0}, reply="accessory"),
+    "get_accessory": asking("accessory_request", "accessory", {"reserved": 0}),
 }
 BY_SPEED = {
     "start_motor": Command("rpm_request", {"speed": USUAL_SPEED}, settle=AFTER_MOTOR),

@@ -34,8 +34,10 @@ from lidarspec import Checksum, Checksummed, Crc, Fields, Polar, Scaled
 
 CONFIRM = 10  # nodes in an unbroken run; see the measurement above
 HQ_NODES = 96
-TURN = 360  # nodes of a simulated turn, about 2000 a second at 5.5 Hz
+TURN = 360  # nodes of a simulated turn
+RATE = 1e6 / 508  # nodes a second: a live A1's standard time between two, which makes 5.5 turns
 HQ_TURN = 960  # nodes of a simulated turn of HQ capsules
+HQ_RATE = 80.0  # capsules a second, which makes 8 turns; assumed
 
 NODE = Struct(
     "head"

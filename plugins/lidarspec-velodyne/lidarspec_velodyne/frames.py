@@ -16,6 +16,7 @@ from lidarspec import Fields, Frame, Scaled
 BLOCKS, SLOTS = 12, 32
 STRONGEST, DUAL = 0x37, 0x39
 HOUR = 3600.0  # seconds after which the clock starts again
+POSITIONS = 144  # position packets a second, about
 NMEA = 128  # bytes that a sentence may have (velodyne_decoder)
 
 DATA = Struct(
@@ -81,11 +82,11 @@ def plausible_position(f: Fields) -> Any:
 
 
 def sweep_position(i: int) -> dict[str, Any]:
-    """Position packet i of a sensor without a GPS receiver, about 144 a second."""
-    return {"timestamp": i * 0.006944 % HOUR, "pps": 0, "nmea": np.zeros(NMEA)}
+    """Position packet i of a sensor without a GPS receiver."""
+    return {"timestamp": i / POSITIONS % HOUR, "pps": 0, "nmea": np.zeros(NMEA)}
 
 
 FRAMES = {
     "data": Frame(DATA, data=True, max_length=1206, plausible=plausible),
-    "position": Frame(POSITION, max_length=512, plausible=plausible_position, sweep=sweep_position),
+    "position": Frame(POSITION, max_length=512, plausible=plausible_position, sweep=sweep_position, rate=POSITIONS),
 }

@@ -1,0 +1,122 @@
+"""Makes the pictures of docs/how-to/view.md: screens of `view` as SVG, from a simulated sensor and from a capture.
+
+    python docs/screens.py CAPTURES
+
+CAPTURES is the folder with velodyne/vlp16_old_firmware in it; without it the 3D screen shows a simulated sensor as well.
+"""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from itertools import groupby
+from pathlib import Path
+from xml.sax.saxutils import escape
+
+import numpy as np
+from numpy.typing import NDArray
+
+import lidarspec as ls
+from lidarspec.view.canvas import BLANK, Cells
+from lidarspec.view.feed import Feed
+from lidarspec.view.live import Window
+from lidarspec.view.palette import INKS
+
+HERE = Path(__file__).parent / "how-to" / "screens"
+#: pixels of a cell, of the margin, and of a dot.
+ACROSS, DOWN, MARGIN, DOT = 8, 16, 12, 2.3
+GROUND, PLAIN = "#101218", "#d8dae0"
+CAPTURE = "velodyne/vlp16_old_firmware/vlp-16-test-90deg-1-50-frames.pcap"
+
+
+def screen(source: str, sensor: str, *, columns: int, lines: int, seconds: float, ramp: str = "range", called: str = "") -> Cells:
+    """The window of `view` after some seconds."""
+    with ls.open(source, sensor) as device:
+        feed = Feed(device, played=True)
+        window = Window(feed, called or source, ramp=ramp)
+        end = time.monotonic() + seconds
+        while time.monotonic() < end and not feed.ended:
+            feed.pump(time.monotonic() + 0.1)
+            shown = window.cells(columns, lines)
+        return shown
+
+
+def svg(cells: Cells) -> str:
+    """A screen as an SVG document; braille is drawn dot by dot, since few fonts have it as wide as letters."""
+    columns, lines = cells.size
+    width, height = columns * ACROSS + 2 * MARGIN, lines * DOWN + 2 * MARGIN
+    return "\n".join(
+        [
+            f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" width="{width}" height="{height}" '
+            'font-family="ui-monospace, Menlo, Consolas, monospace" font-size="13">',
+            f'<rect width="100%" height="100%" rx="8" fill="{GROUND}"/><g transform="translate({MARGIN} {MARGIN})">',
+            *_dots(cells),
+            *_texts(cells),
+            "</g></svg>",
+            "",
+        ]
+    )
+
+
+def _dots(cells: Cells) -> Iterator[str]:
+    bits = np.where(_braille(cells), cells.codes - BLANK, 0)
+    places = ((0, 0), (0, 1), (0, 2), (1, 0), (1, 1), (1, 2), (0, 3), (1, 3))
+    for ink in np.unique(cells.inks[bits > 0]).tolist():
+        path = []
+        for bit, (across, down) in enumerate(places):
+            found = np.argwhere((bits >> bit & 1) & (cells.inks == ink)).tolist()
+            path += [f"M{column * ACROSS + across * 4 + 2} {row * DOWN + down * 4 + 2}h0" for row, column in found]
+        yield f'<path d="{"".join(path)}" stroke="{_colour(ink)}" stroke-width="{DOT}" stroke-linecap="round"/>'
+
+
+def _braille(cells: Cells) -> NDArray[np.bool_]:
+    return (cells.codes > BLANK) & (cells.codes < BLANK + 256)
+
+
+def _texts(cells: Cells) -> Iterator[str]:
+    inks = np.where(_braille(cells) | (cells.codes == ord(" ")), -1, cells.inks).tolist()
+    for row, line in enumerate(cells.lines()):
+        start = 0
+        for ink, run in groupby(inks[row]):
+            end = start + len(list(run))
+            if ink >= 0:
+                weight = ' font-weight="bold"' if INKS[ink].bold else ""
+                yield (
+                    f'<text x="{start * ACROSS}" y="{row * DOWN + 12}" textLength="{(end - start) * ACROSS}" '
+                    f'lengthAdjust="spacingAndGlyphs" fill="{_colour(ink)}"{weight}>{escape(line[start:end])}</text>'
+                )
+            start = end
+
+
+def _colour(ink: int) -> str:
+    rgb = INKS[ink].rgb
+    return PLAIN if rgb is None else "#" + "".join(f"{part:02x}" for part in rgb)
+
+
+def main() -> None:
+    HERE.mkdir(exist_ok=True)
+    flat = screen("sim:ldrobot-stl27l?errors=0.0001", "ldrobot-stl27l", columns=80, lines=24, seconds=4, called="/dev/ttyUSB0")
+    (HERE / "view-2d.svg").write_text(svg(flat), encoding="utf-8")
+    captures = Path(sys.argv[1]) if len(sys.argv) > 1 else None
+    source = str(captures / CAPTURE) if captures else "sim:velodyne-vlp16"
+    tall = screen(source, "velodyne-vlp16", columns=110, lines=36, seconds=2.2, called="corridor.pcap")
+    (HERE / "view-3d.svg").write_text(svg(tall), encoding="utf-8")
+    page = HERE.parent / "view.md"
+    page.write_text(
+        re.sub(r"(\$ lidarspec stats .*?\n).*?```", _shown, page.read_text(encoding="utf-8"), flags=re.DOTALL), encoding="utf-8"
+    )
+
+
+def _shown(command: re.Match[str]) -> str:
+    """A command as the page has it, and what it prints; a simulated sensor stands in for the port."""
+    words = command[1].split()[2:]
+    words[1] = "sim:ldrobot-stl27l?errors=0.0001"
+    done = subprocess.run([sys.executable, "-m", "lidarspec", *words], capture_output=True, text=True, check=True)
+    return f"{command[1]}{done.stdout}```"
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,151 @@
+"""`sim`: a simulated sensor on a serial port, UDP, TCP or in a file."""
+
+from __future__ import annotations
+
+import contextlib
+import shlex
+import signal
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import click
+
+from lidarspec.cli.failures import suggest
+from lidarspec.cli.output import emit_json, note
+from lidarspec.cli.progress import Progress, size
+from lidarspec.cli.streams import Duration, Share
+from lidarspec.errors import UsageError
+from lidarspec.faults import Faults
+from lidarspec.plugins import sensor as named_sensor
+from lidarspec.recorders import SUFFIXES
+from lidarspec.scenery import read_scene
+from lidarspec.simulated import SimulatedDevice
+from lidarspec.spec import Sensor
+from lidarspec.transports.doors import HERE, Door, UdpDoor
+from lidarspec.transports.serving import door, is_file, serve, write_file
+from lidarspec.transports.simulated import rate_of
+
+#: seconds that go into a file where nobody says how many.
+IN_A_FILE = 10.0
+
+
+@click.command(short_help="A simulated sensor on a serial port, UDP, TCP or in a file.")
+@click.argument("sensor_id", metavar="SENSOR")
+@click.option("--to", metavar="PLACE", help="pty, udp://HOST:PORT, tcp://HOST:PORT, or a file (.lsr, .pcap, .bin).  [default: pty or udp]")
+@click.option("--link", metavar="PATH", help="A symbolic link that leads to the pty.")
+@click.option("-t", "--duration", type=Duration(), help="End after so long; of a file, how much goes in.  [default: never; 10s]")
+@click.option("--rate", metavar="FACTOR", default="1", show_default=True, help="How many times faster than in reality, or max.")
+@click.option("--scene", metavar="FILE", help="What the sensor sees, a TOML file.  [default: a room]")
+@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Of the room and of what goes wrong.")
+@click.option("--errors", type=Share(), default="0", show_default=True, help="Share of the bytes that the line damages.")
+@click.option("--loss", type=Share(), default="0", show_default=True, help="Share of the packets that get lost.")
+@click.option("--reorder", type=click.IntRange(0, 1000), default=0, show_default=True, help="How many places late a datagram may come.")
+@click.option("--unplug", type=Duration(), help="Pull the plug after so long, again and again.")
+@click.option("--absent", type=Duration(), default="2s", show_default=True, help="How long it is out then.")
+@click.option("--force", is_flag=True, help="Write over a file that exists.")
+@click.option("--json", "as_json", is_flag=True, help="Print as JSON where the sensor is.")
+def sim(
+    sensor_id: str,
+    to: str | None,
+    link: str | None,
+    duration: float | None,
+    rate: str,
+    scene: str | None,
+    seed: int,
+    errors: float,
+    loss: float,
+    reorder: int,
+    unplug: float | None,
+    absent: float,
+    force: bool,
+    as_json: bool,
+) -> None:
+    """A simulated sensor on a serial port, UDP, TCP or in a file.
+
+    It behaves as its spec says: it keeps real time, answers commands, starts and stops. Where it is goes to standard
+    output, all else to standard error.
+    """
+    sensor = named_sensor(sensor_id)
+    faults = Faults(errors, loss, reorder, unplug or 0.0, absent)
+    seen = read_scene(scene) if scene is not None else None
+    device = SimulatedDevice(sensor, scene=seen, seed=seed, rate=rate_of(rate), faults=faults)
+    place = to or ("udp://" if sensor.datagrams else "pty")
+    if is_file(place):
+        if link is not None:
+            raise UsageError("a link leads to a pseudo-terminal: it goes with --to pty")
+        if Path(place).suffix.lower() not in SUFFIXES:
+            raise UsageError(f"{place!r} is no place: pty, udp://HOST:PORT, tcp://HOST:PORT, or a file ({', '.join(SUFFIXES)})")
+        written = write_file(device, place, duration or IN_A_FILE, overwrite=force)
+        _tell(sensor, place, place, as_json=as_json)
+        note(f"{_sent(device)}, {size(written)}")
+        return
+    try:
+        opened = door(sensor, place, link)
+    except UsageError as error:
+        raise suggest(error, f"lidarspec sim {sensor_id} --to {'udp://' + HERE if sensor.datagrams else 'pty'}") from None
+    try:
+        _tell(sensor, opened.where, source_of(opened), as_json=as_json)
+        with _ended_by_terminate(), Progress() as progress:
+            serve(device, opened, seconds=duration, turn=_watching(device, opened, progress))
+    finally:
+        opened.close()
+        lost = f"; nobody was there for {size(opened.unsent)}" if opened.unsent else ""
+        note(f"{_sent(device)}{lost}")
+
+
+def source_of(opened: Door) -> str:
+    """The SOURCE by which the sensor is read: from elsewhere, datagrams come in at every interface."""
+    where = opened.where
+    return "udp://" + where.removeprefix(f"udp://{opened.host}") if isinstance(opened, UdpDoor) and opened.host != HERE else where
+
+
+def _tell(sensor: Sensor, where: str, source: str, *, as_json: bool) -> None:
+    """Where the sensor is, and what to type next."""
+    following = f"lidarspec view {shlex.quote(source)} -s {sensor.id}"
+    if as_json:
+        emit_json({"sensor": sensor.id, "place": where, "source": source, "next": following}, None)
+        return
+    click.echo(where)
+    note(f"{sensor.id}, simulated\n  next: {following}")
+
+
+def _watching(device: SimulatedDevice, opened: Door, progress: Progress) -> Callable[[], None]:
+    """What is called while the sensor is at work: says which commands arrive, and that the plug was pulled."""
+    began, heard, present = time.monotonic(), 0, True
+
+    def turn() -> None:
+        nonlocal heard, present
+        for name in device.heard[heard:]:
+            progress.clear()
+            note(f"{time.monotonic() - began:.1f} s: {name}")
+        heard = len(device.heard)
+        if device.present != present and not present:
+            progress.clear()
+            note(f"{time.monotonic() - began:.1f} s: plugged in again, {opened.where}")
+        elif device.present != present:
+            progress.clear()
+            note(f"{time.monotonic() - began:.1f} s: unplugged")
+        present = device.present
+        progress(lambda: f"{time.monotonic() - began:.0f} s, {_sent(device)}")
+
+    return turn
+
+
+def _sent(device: SimulatedDevice) -> str:
+    frames = [f"{number} {name}" for name, number in device.sent.items()]
+    return f"{', '.join(frames) or 'no'} frames sent"
+
+
+@contextlib.contextmanager
+def _ended_by_terminate() -> Iterator[None]:
+    """SIGTERM ends it as Ctrl-C does, so that a link does not stay behind."""
+
+    def interrupt(number: int, frame: object) -> None:
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGTERM, interrupt)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)

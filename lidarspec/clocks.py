@@ -1,0 +1,109 @@
+"""The sensor's own clock: read from packets as integer nanoseconds, and made to run on where it starts again."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarspec.access import Fields
+from lidarspec.columns import Batch
+from lidarspec.errors import SpecError
+from lidarspec.spec import Sensor
+from lidarspec.units import exact, factor
+
+Times = NDArray[np.int64]
+
+#: no clock reads more nanoseconds than this (285 years): damaged readings must not overflow.
+_FURTHEST = 9 * 10**18
+
+
+class Unwrapper:
+    """A clock that starts again at `wraps_at` seconds, made to run on; exact over any number of wraps.
+
+    The shorter way round decides between forward and backward, so late packets go back in time. Where the host's
+    times say that more than most of a turn has passed, they decide how many turns it was.
+    """
+
+    def __init__(self, wraps_at: float | None) -> None:
+        self._turn = int(exact(wraps_at) * 10**9) if wraps_at else 0
+        self._last: tuple[int, int, int] | None = None
+
+    def push(self, ns: Times, host: Times) -> Times:
+        """The readings of the next packets, (n,), as times that run on from those before."""
+        if not self._turn or not len(ns):
+            return ns
+        raw, time, at = self._last or (int(ns[0]), int(ns[0]), int(host[0]))
+        half = self._turn // 2
+        steps = (_steps(ns, raw) + half) % self._turn - half
+        if self._turn >= 10**9:
+            before = np.concatenate([[at], host[:-1]])
+            passed = np.where((host > 0) & (before > 0), host - before, 0)
+            late = passed > self._turn * 3 // 4
+            if late.any():
+                steps += np.where(late, (passed - steps + half) // self._turn, 0) * self._turn
+        times = time + np.cumsum(steps)
+        self._last = (int(ns[-1]), int(times[-1]), int(host[-1]))
+        return times
+
+
+def clock_ns(sensor: Sensor, batch: Batch) -> Times:
+    """The sensor's own clock in each packet, (n,) int64 nanoseconds, as it stands on the wire."""
+    assert sensor.clock is not None
+    source = sensor.clock.source
+    if callable(source):
+        terms = source(Fields(batch))
+        columns = terms if isinstance(terms, tuple | list) else (terms,)
+        return sum((_nanoseconds(np.asarray(column), len(batch)) for column in columns), np.zeros(len(batch), np.int64))
+    total = np.zeros(len(batch), np.int64)
+    paths = (source,) if isinstance(source, str) else source
+    for path in paths:
+        info = batch.table.schema.fields.get(path)
+        scaling = _scaling(info.unit, info.scale, info.offset) if info else None
+        if info is None or scaling is None or info.axes:
+            raise SpecError("a clock is a field of the header with a unit of time", path=path, sensor=sensor.id)
+        raw = batch.table.raw(path)
+        step, zero = scaling
+        if raw.dtype.kind in "ui" and isinstance(step, int) and isinstance(zero, int):
+            total += _within(raw, _FURTHEST // len(paths) // max(step, 1)) * step + zero
+        else:
+            total += _nanoseconds(raw.astype(np.float64) * float(step / 10**9) + float(zero / 10**9), len(batch))
+    return total
+
+
+@lru_cache(maxsize=256)
+def _scaling(unit: str, scale: float, offset: float) -> tuple[Any, Any] | None:
+    """Nanoseconds in one step of a field and at its zero: integers where both are whole, else fractions; None if it is no time."""
+    per_unit = factor(unit, "s")
+    if per_unit is None:
+        return None
+    step, zero = (exact(part) * per_unit * 10**9 for part in (scale, offset))
+    if step.denominator == 1 and zero.denominator == 1 and step < 2**62:
+        return int(step), int(zero)
+    return step, zero
+
+
+def _steps(values: NDArray[np.int64], before: int) -> NDArray[np.int64]:
+    """Differences from one to the next, (n,), the first one to `before`."""
+    steps = np.empty(len(values), np.int64)
+    steps[0] = values[0] - before
+    np.subtract(values[1:], values[:-1], out=steps[1:])
+    return steps
+
+
+def _within(raw: NDArray[Any], furthest: int) -> Times:
+    if raw.dtype.itemsize * 8 - (raw.dtype.kind == "i") < furthest.bit_length():
+        return raw.astype(np.int64)
+    if len(raw) and int(raw.max()) <= furthest and int(raw.min()) >= -furthest:
+        return raw.astype(np.int64)
+    edges = np.iinfo(raw.dtype)
+    return np.asarray(np.clip(raw, max(int(edges.min), -furthest), min(int(edges.max), furthest)), np.int64)
+
+
+def _nanoseconds(seconds: Any, number: int) -> Times:
+    flat = np.broadcast_to(np.asarray(seconds, np.float64).reshape(-1), (number,)) if np.size(seconds) in (1, number) else None
+    if flat is None:
+        raise SpecError("a clock gives one time for each packet")
+    return np.rint(np.clip(np.nan_to_num(flat), -9e9, 9e9) * 1e9).astype(np.int64)

@@ -1,0 +1,115 @@
+"""Datagrams, each one frame, whole, or none: of which type each is, judged together.
+
+The same rule as in a stream, without the search: at the first byte of a datagram the order of the types decides, a type
+with `after` only counts while it is announced, and a frame has to be as long as its datagram.
+"""
+
+from __future__ import annotations
+
+import bisect
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarspec.framing import COUNTED, Bytes1D, Framing, Mode, Offsets
+from lidarspec.judging import VALID
+
+
+class Datagrams:
+    """The frame types of a sensor, ready to be told from each other.
+
+    Attributes:
+        rejected: number of datagrams of the last batch that are none, by counter.
+        errors: tracebacks out of plugins, of the last batch.
+    """
+
+    def __init__(self, framing: Framing) -> None:
+        self._framing = framing
+        self._marks = [np.array(marks, np.intp).reshape(-1, 3).T for marks in framing.marks]
+        self.rejected: dict[str, int] = {}
+        self.errors: list[str] = []
+
+    def kinds(self, buffer: Bytes1D, starts: Offsets, sizes: Offsets, mode: Mode) -> Offsets:
+        """The type of each datagram, as its index, -1 where it is none.
+
+        Args:
+            mode: remembered between batches, changed here.
+        """
+        self.rejected, self.errors = {}, []
+        batch = _Batch(self, buffer, starts, sizes)
+        position, parts = 0, []
+        while position < len(starts):
+            part = batch.kinds_from(position, mode)
+            parts.append(part)
+            position += len(part)
+        return parts[0] if len(parts) == 1 else np.concatenate([np.empty(0, np.intp), *parts])
+
+    def judged(self, buffer: Bytes1D, starts: Offsets, sizes: Offsets, mode: Mode) -> Offsets:
+        """The type of each datagram while nothing changes what is looked for."""
+        kinds = np.full(len(starts), -1, np.intp)
+        left = np.arange(len(starts)) if len(sizes) and sizes.min() > 0 else np.flatnonzero(sizes)
+        for kind in self._framing.active(mode):
+            if not len(left):
+                break
+            some = left[self._marked(kind, buffer, starts[left], sizes[left])]
+            if len(some):
+                survey = self._framing.codecs[kind].survey(buffer, starts[some])
+                kinds[some[(survey.status == VALID) & (survey.sizes == sizes[some])]] = kind
+                left = left[kinds[left] < 0]
+        return kinds
+
+    def judged_alone(self, datagram: Bytes1D, mode: Mode) -> int:
+        """The type of one datagram, -1 where it is none; counts why."""
+        rejected, size = 0, np.array([len(datagram)])
+        for kind in self._framing.active(mode) if len(datagram) else ():
+            if not self._marked(kind, datagram, np.zeros(1, np.intp), size).all():
+                continue
+            survey = self._framing.codecs[kind].survey(datagram, np.zeros(1, np.intp))
+            if survey.status[0] == VALID and survey.sizes[0] == len(datagram):
+                return kind
+            rejected = max(rejected, int(survey.status[0]))
+            self.errors += survey.errors
+        counter = COUNTED.get(rejected, "bad_length")
+        self.rejected[counter] = self.rejected.get(counter, 0) + 1
+        return -1
+
+    def _marked(self, kind: int, buffer: Bytes1D, starts: Offsets, sizes: Offsets) -> NDArray[np.bool_]:
+        """Which datagrams have the constants of a type."""
+        spots, masks, values = self._marks[kind]
+        last = int(spots.max(initial=-1))
+        marked = sizes > last
+        if marked.all():
+            return np.asarray((buffer.take(starts[:, None] + spots) & masks == values).all(axis=1))
+        where = np.flatnonzero(marked)
+        marked[where] = (buffer.take(starts[where][:, None] + spots) & masks == values).all(axis=1)
+        return marked
+
+
+class _Batch:
+    """Some datagrams, judged once for each of the frames that may have been announced."""
+
+    def __init__(self, types: Datagrams, buffer: Bytes1D, starts: Offsets, sizes: Offsets) -> None:
+        self._types, self._framing = types, types._framing
+        self._buffer, self._starts, self._sizes = buffer, starts, sizes
+        self._known: dict[str | None, tuple[int, Offsets, list[int]]] = {}
+
+    def kinds_from(self, position: int, mode: Mode) -> Offsets:
+        """The types from here up to the datagram that changes what is looked for."""
+        if mode.after not in self._known:
+            kinds = self._types.judged(self._buffer, self._starts[position:], self._sizes[position:], mode)
+            switching = [kind for kind in range(len(self._framing.names)) if self._framing.switches(kind, mode)]
+            spots = (np.flatnonzero(np.isin(kinds, switching)) + position).tolist() if switching else []
+            self._known[mode.after] = position, kinds, spots
+        first, kinds, spots = self._known[mode.after]
+        index = bisect.bisect_left(spots, position)
+        stop = spots[index] + 1 if index < len(spots) else len(self._starts)
+        found = kinds[position - first : stop - first]
+        for lost in np.flatnonzero(found < 0).tolist():
+            start = int(self._starts[position + lost])
+            found[lost] = self._types.judged_alone(self._buffer[start : start + int(self._sizes[position + lost])], mode)
+            if found[lost] >= 0 and self._framing.switches(int(found[lost]), mode):
+                found = found[: lost + 1]
+                break
+        if len(found) and found[-1] >= 0 and self._framing.switches(int(found[-1]), mode):
+            mode.after = self._framing.names[int(found[-1])]
+        return found

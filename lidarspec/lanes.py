@@ -1,0 +1,160 @@
+"""Rows of bytes side by side: what checksums of a whole batch compute with, whatever the algorithm.
+
+`words` turns rows into columns of eight bytes, so that one step of NumPy takes the same eight bytes of every row.
+
+A CRC is linear. A register of one byte is computed by halves: the bytes of a row in front are each advanced as far as the
+bytes behind them are away, by a table of 256, and XORed onto them, until one byte is left. A wider register runs along all
+rows at once, two bytes a step, by a table of 65,536; long rows are cut into segments that run side by side and are joined in
+pairs. Tables depend on the polynomial and the distance alone.
+
+Registers are kept in wire order, where the low byte is the one that meets the next data byte: for `refin` the usual
+reflected register, otherwise the usual register aligned left with its bytes swapped. One formula serves both.
+"""
+
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+REGISTER_BYTES = [2] * 17 + [4] * 16 + [8] * 32  # that a register is kept in, by its width
+MIRROR = bytes(int(f"{byte:08b}"[::-1], 2) for byte in range(256))
+
+
+def words(rows: NDArray[np.uint8], *, zeros_first: bool = False) -> NDArray[np.uint64]:
+    """The rows, filled up with zeros, as columns of little-endian words of eight bytes; shape (words, n), contiguous."""
+    (count, length), width = rows.shape, -(-rows.shape[1] // 8) * 8
+    spare = 8 * (width - length)
+    if length < 8 or rows.strides[1] != 1:
+        padded = np.zeros((count, width), np.uint8)
+        padded[:, width - length if zeros_first else 0 :][:, :length] = rows
+        return np.ascontiguousarray(padded.view("<u8").T)
+    found = np.empty((width // 8, count), "<u8")
+    shift = (length - width) if zeros_first else 0
+    for index, column in enumerate(found):
+        start = min(max(8 * index + shift, 0), length - 8)
+        column[:] = rows[:, start : start + 8].view("<u8")[:, 0]
+    if spare and zeros_first:
+        found[0] <<= np.uint64(spare)
+    elif spare:
+        found[-1] >>= np.uint64(spare)
+    return found
+
+
+def folded_xor(columns: NDArray[np.uint64]) -> NDArray[np.uint64]:
+    """The XOR of the eight bytes of the words of each row, over all its words; (n,)."""
+    total = np.bitwise_xor.reduce(columns, axis=0)
+    for bits in (32, 16, 8):
+        total ^= total >> np.uint64(bits)
+    return np.asarray(total & np.uint64(0xFF))
+
+
+def byte_sums(columns: NDArray[np.uint64]) -> NDArray[np.uint64]:
+    """The sum of all bytes of each row; (n,)."""
+    total = np.zeros(columns.shape[1], np.uint64)
+    even = np.uint64(0x00FF00FF00FF00FF)
+    for first in range(0, len(columns), 128):  # so many pairs of bytes fit into 16 bits
+        some = columns[first : first + 128]
+        pairs = np.add.reduce((some & even) + (some >> np.uint64(8) & even), axis=0)
+        for bits in (48, 32, 16, 0):
+            total += pairs >> np.uint64(bits) & np.uint64(0xFFFF)
+    return total
+
+
+def registers(rows: NDArray[np.uint8], start: int, width: int, poly: int, refin: bool) -> NDArray[Any]:
+    """The register after each row, shape (n,), in an integer of the bytes that it takes."""
+    return (_narrow if width <= 8 else _wide)(rows, start, width, poly, refin)
+
+
+def _narrow(rows: NDArray[np.uint8], start: int, width: int, poly: int, refin: bool) -> NDArray[np.uint8]:
+    """`registers` of at most one byte, in one byte."""
+    if not rows.shape[1]:
+        return np.full(len(rows), start, np.uint8)
+    left = words(rows, zeros_first=True)
+    if start:
+        left[0] ^= np.uint64(start << 8 * (-rows.shape[1] % 8))
+    while len(left) > 1:
+        half, distance = len(left) // 2, (len(left) + 1) // 2
+        moved = left[:half].tobytes().translate(_advance(8 * distance, width, poly, refin))
+        left = left[half:]
+        left[-half:] ^= np.frombuffer(moved, np.uint64).reshape(half, -1)
+    lanes: NDArray[Any] = left[0]
+    for size in (4, 2, 1):
+        parts = lanes.view(f"<u{size}")
+        moved = parts[::2].tobytes().translate(_advance(size, width, poly, refin))
+        lanes = np.frombuffer(moved, f"<u{size}") ^ parts[1::2]
+    return np.frombuffer(lanes.tobytes().translate(_advance(1, width, poly, refin)), np.uint8)
+
+
+def _wide(rows: NDArray[np.uint8], start: int, width: int, poly: int, refin: bool) -> NDArray[Any]:
+    """`registers` of any width."""
+    (count, length), table = rows.shape, _word_table(width, poly, refin)
+    segment = min(max(64, 1 << (rows.size // 2048).bit_length()), length + length % 2)  # enough of them to hide NumPy's cost per call
+    # Zero bytes in front change nothing while the register is 0; so `start` is met in the row's first bytes.
+    padded = np.zeros((count, -(-length // segment) * segment), np.uint8)
+    padded[:, -length:] = rows
+    padded[:, -length:][:, :8] ^= np.frombuffer(start.to_bytes(8, "little"), np.uint8)[:length]
+    lanes = np.zeros(padded.size // segment, table.dtype)
+    low = lanes.view("<u2")[:: table.itemsize // 2]
+    for pair in np.ascontiguousarray(padded.reshape(-1, segment).view("<u2").T):
+        after = table.take(low ^ pair)
+        lanes[:] = after if width <= 16 else after ^ lanes >> 16
+    found = lanes.reshape(count, -1)
+    while found.shape[1] > 1:
+        odd = found.shape[1] % 2
+        jumped = _jumped(found[:, odd::2].ravel(), _jump_table(segment.bit_length() - 1, width, poly, refin))
+        found = np.hstack([found[:, :odd], jumped.reshape(count, -1) ^ found[:, odd + 1 :: 2]])
+        segment *= 2
+    return np.asarray(found[:, 0] ^ (start >> 8 * length))
+
+
+def reflected(value: int, width: int) -> int:
+    """The value with its bits in the opposite order."""
+    return int(f"{value:0{width}b}"[::-1], 2)
+
+
+def mirrored_bytes(register: int) -> int:
+    """The register with the bits of each byte mirrored, which leads from one bit order to the other."""
+    return int.from_bytes(register.to_bytes(8, "little").translate(MIRROR), "little")
+
+
+@lru_cache(maxsize=256)
+def byte_table(width: int, poly: int, refin: bool) -> tuple[int, ...]:
+    """The register after one byte, by the XOR of that byte and the register's low byte."""
+    table, feedback = list(range(256)), reflected(poly, width)
+    for _ in range(8):
+        table = [register >> 1 ^ (feedback if register & 1 else 0) for register in table]
+    return tuple(table if refin else (mirrored_bytes(table[byte]) for byte in MIRROR))
+
+
+@lru_cache(maxsize=1024)
+def _advance(distance: int, width: int, poly: int, refin: bool) -> bytes:
+    """What a byte becomes that many bytes further on, for a register of at most one byte."""
+    if distance == 1:
+        return bytes(byte_table(width, poly, refin))
+    half = _advance(distance // 2, width, poly, refin)
+    return half.translate(half if distance % 2 == 0 else _advance(distance - distance // 2, width, poly, refin))
+
+
+@lru_cache(maxsize=16)
+def _word_table(width: int, poly: int, refin: bool) -> NDArray[Any]:
+    """The register after two bytes, by the XOR of that little-endian word and the register's low 16 bits; shape (65536,)."""
+    table = np.array(byte_table(width, poly, refin), f"<u{REGISTER_BYTES[width]}")
+    first, second = np.tile(table, 256), np.repeat(np.arange(256, dtype=np.uint8), 256)
+    return np.asarray(table[first.astype(np.uint8) ^ second] ^ first >> 8)
+
+
+@lru_cache(maxsize=256)
+def _jump_table(power: int, width: int, poly: int, refin: bool) -> NDArray[Any]:
+    """The register after 2**power zero bytes, by place and value of each byte of the register; shape (bytes, 256)."""
+    if power:
+        half = _jump_table(power - 1, width, poly, refin)
+        return _jumped(half.ravel(), half).reshape(half.shape)
+    later_places = [[value << 8 * place for value in range(256)] for place in range(REGISTER_BYTES[width] - 1)]
+    return np.array([byte_table(width, poly, refin), *later_places], f"<u{REGISTER_BYTES[width]}")
+
+
+def _jumped(found: NDArray[Any], table: NDArray[Any]) -> NDArray[Any]:
+    """Registers, shape (k,) and contiguous, each advanced by a jump table."""
+    places = found.view(np.uint8).reshape(len(found), -1).T
+    return np.asarray(np.bitwise_xor.reduce([of_place.take(place) for of_place, place in zip(table, places, strict=True)]))

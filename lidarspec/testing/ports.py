@@ -1,0 +1,42 @@
+"""Simulated sensors on real ports, for tests of programs that talk to sensors."""
+
+from __future__ import annotations
+
+from contextlib import AbstractContextManager
+from pathlib import Path
+
+from lidarspec.faults import Faults
+from lidarspec.plugins import sensor as named_sensor
+from lidarspec.scenes import Scene
+from lidarspec.simulated import SimulatedDevice
+from lidarspec.spec import Sensor
+from lidarspec.transports.serving import Served, door
+
+
+def virtual_port(
+    sensor: str | Sensor,
+    *,
+    to: str = "pty",
+    link: str | Path | None = None,
+    scene: Scene | None = None,
+    seed: int = 0,
+    rate: float = 1.0,
+    faults: Faults | None = None,
+) -> AbstractContextManager[Served]:
+    """A simulated sensor on a real port, as a context: a pseudo-terminal, or a socket.
+
+    Args:
+        sensor: an id or a Sensor.
+        to: "pty", "udp://127.0.0.1:PORT" or "tcp://127.0.0.1:PORT"; TCP port 0 takes one that is free.
+        link: a symbolic link that leads to the pseudo-terminal, also after it was unplugged and came back.
+        scene, seed, rate, faults: as of `SimulatedDevice`.
+
+    Returns:
+        What has a `path` to open, the `device` with the names of the commands that it `heard`, `unplug` and `plug`.
+
+    Raises:
+        SourceError: where the port cannot be had.
+    """
+    known = sensor if isinstance(sensor, Sensor) else named_sensor(sensor)
+    device = SimulatedDevice(known, scene=scene, seed=seed, rate=rate, faults=faults)
+    return Served(device, door(known, to, link))

@@ -1,0 +1,173 @@
+"""Serial ports: opened for one program alone, read as bytes come, found again when they were unplugged.
+
+After a hang-up pyserial raises SerialException, a bare OSError, `termios.error` (no OSError), or TypeError out of a port that
+is closed meanwhile; all of them mean that the device is gone. On POSIX the port is read through its descriptor: waiting, then
+one `read` of everything there, with a short pause after each so that a fast line does not wake us for every byte.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import time
+
+import serial
+
+from lidarspec.errors import SourceError, UsageError
+from lidarspec.files import Chunk
+from lidarspec.links import Serial
+from lidarspec.spec import Sensor
+from lidarspec.transports.live import Address, LiveBase, failure, lost, named, readable, reason
+
+try:
+    from termios import error as TermiosError
+except ImportError:  # no POSIX
+    TermiosError = OSError  # type: ignore[assignment,misc]
+
+#: everything that a port which went away raises.
+GONE = (serial.SerialException, OSError, TermiosError, TypeError, ValueError)
+#: bytes read at once, and seconds between two reads, in which a fast line gathers some.
+BLOCK, PAUSE = 1 << 16, 0.002
+#: seconds that a device may take to accept what is written.
+WRITE_TIMEOUT = 2.0
+OPTIONS = ("baud", "dtr", "rts")
+
+
+class SerialTransport(LiveBase):
+    """A serial port, 8N1.
+
+    Args:
+        port: its name, "/dev/ttyUSB0" or "COM4".
+        baud: any rate that the port can make.
+        dtr, rts: levels of the control lines while it is open; None leaves them to the system.
+
+    Raises:
+        SourceError: where it cannot be opened: missing, in use, no permission, no such rate.
+    """
+
+    def __init__(self, port: str, baud: int, *, dtr: bool | None = None, rts: bool | None = None, sensor: Sensor | None = None) -> None:
+        super().__init__()
+        self.label, self.baud = port, baud
+        self._levels, self._sensor = {"dtr": dtr, "rts": rts}, sensor
+        self._rested = 0.0
+        self._port = self._open()
+
+    def read(self, timeout: float) -> list[Chunk]:
+        pause = self._rested - time.monotonic()
+        if pause > 0:
+            time.sleep(pause)
+        try:
+            data = self._read_posix(timeout) if os.name == "posix" else self._read_any(timeout)
+        except GONE as error:
+            if self.closed:
+                return []
+            raise lost(self.label, _cause(error)) from None
+        self._rested = time.monotonic() + PAUSE if data else 0.0
+        return [Chunk(data, self.clock.now())] if data else []
+
+    def write(self, data: bytes) -> None:
+        try:
+            self._port.write(data)
+        except GONE as error:
+            raise lost(self.label, _cause(error)) from None
+
+    def lines(self, *, dtr: bool | None = None, rts: bool | None = None) -> None:
+        for name, level in (("dtr", dtr), ("rts", rts)):
+            if level is None:
+                continue
+            self._levels[name] = level
+            try:
+                setattr(self._port, name, level)
+            except GONE as error:
+                if not _has_no_lines(error):
+                    raise lost(self.label, _cause(error)) from None
+
+    def reopen(self) -> None:
+        self._shut()
+        self._port = self._open()
+
+    def close(self) -> None:
+        self.closed = True
+        self._shut()
+
+    def _shut(self) -> None:
+        with contextlib.suppress(*GONE):
+            self._port.close()
+
+    def _open(self) -> serial.Serial:
+        port = serial.Serial(baudrate=self.baud, timeout=0, write_timeout=WRITE_TIMEOUT, exclusive=True)
+        port.port = self.label
+        for name, level in self._levels.items():
+            if level is not None:
+                setattr(port, name, level)
+        try:
+            port.open()
+        except GONE as error:
+            with contextlib.suppress(*GONE):
+                port.close()
+            raise self._refused(error) from None
+        return port
+
+    def _refused(self, error: Exception) -> SourceError:
+        """Why the port does not open, and what to type."""
+        number, source = getattr(error, "errno", None), f"serial://{self.label}{named(self._sensor)}"
+        if number == errno.ENOENT or "FileNotFoundError" in str(error):
+            return failure(f"{self.label}: no such port", "lidarspec ports")
+        if number == errno.EACCES:
+            return failure(f"{self.label}: permission denied", f"lidarspec doctor {source}")
+        if number in (errno.EBUSY, errno.EAGAIN) or "exclusively lock" in str(error) or "PermissionError" in str(error):
+            return failure(f"{self.label}: in use by another program", f"lidarspec doctor {source}")
+        if isinstance(error, ValueError) or "baud" in str(error).lower():
+            return failure(f"{self.label}: it cannot run at {self.baud} baud: {error}", f"lidarspec detect {self.label}")
+        return failure(f"{self.label}: {_cause(error)}", "lidarspec ports")
+
+    def _read_posix(self, timeout: float) -> bytes:
+        descriptor = self._port.fileno()
+        if not readable(descriptor, timeout):
+            return b""
+        data = os.read(descriptor, BLOCK)
+        if not data:
+            raise lost(self.label, "it hung up")
+        return data
+
+    def _read_any(self, timeout: float) -> bytes:
+        self._port.timeout = timeout
+        data: bytes = self._port.read(max(1, self._port.in_waiting))
+        return data
+
+
+def connect(address: Address, sensor: Sensor | None = None) -> SerialTransport:
+    """The open port of a serial SOURCE: "serial:///dev/ttyUSB0?baud=230400&dtr=0", "/dev/ttyUSB0" or "COM4".
+
+    Args:
+        sensor: whose baud rate and control lines are taken where the source does not say.
+
+    Raises:
+        UsageError: where nobody says the baud rate, or for an option that a port does not take.
+        SourceError: where it cannot be opened.
+    """
+    address.check(OPTIONS)
+    link = sensor.links.get("data") if sensor is not None else None
+    declared = link if isinstance(link, Serial) else None
+    baud = address.number("baud", 50, 20_000_000) or (declared.baud if declared else None)
+    if not address.place:
+        raise UsageError(f"{address.text}: it names no port, as in serial:///dev/ttyUSB0")
+    if baud is None:
+        raise UsageError(f"{address.text}: how fast is it? Name the sensor with -s, or say {address.text}?baud=115200")
+    levels = {
+        name: level if level is not None else getattr(declared, name, None) for name in ("dtr", "rts") for level in [address.switch(name)]
+    }
+    return SerialTransport(address.place, baud, sensor=sensor, **levels)
+
+
+def _cause(error: BaseException) -> str:
+    """What the system says, where pyserial wraps it in a sentence of its own."""
+    numbers = [one for one in getattr(error, "args", ()) if isinstance(one, int)]
+    return os.strerror(numbers[0]) if numbers else reason(error) if isinstance(error, OSError) else str(error)
+
+
+def _has_no_lines(error: BaseException) -> bool:
+    """Whether the port is of a kind without control lines, such as a pseudo terminal."""
+    numbers = {one for one in getattr(error, "args", ()) if isinstance(one, int)}
+    return bool(numbers & {errno.ENOTTY, errno.EINVAL})

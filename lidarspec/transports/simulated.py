@@ -1,0 +1,136 @@
+"""``sim:ID``: a simulated sensor as a live source, in this process, in real time or any other."""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections.abc import Mapping
+
+from lidarspec.errors import UsageError
+from lidarspec.faults import FAULTS, faults_of
+from lidarspec.files import Chunk, Disconnected
+from lidarspec.links import Serial
+from lidarspec.plugins import sensor as named_sensor
+from lidarspec.scenery import read_scene
+from lidarspec.simulated import SECOND, SimulatedDevice
+from lidarspec.spec import Sensor
+from lidarspec.transports.live import Address, LiveBase, failure
+
+OPTIONS = ("rate", "scene", "seed", *FAULTS)
+#: ns between two reads, in which a fast sensor gathers some packets.
+PAUSE = 2_000_000
+
+
+class SimulatedTransport(LiveBase):
+    """The data link of a simulated device.
+
+    Attributes:
+        sensor, device: which is simulated.
+        baud: of its serial line, None where it has none.
+        overflow: what a reader's queue should do when it is full: a source without a pace of its own waits for its reader.
+    """
+
+    def __init__(self, label: str, device: SimulatedDevice) -> None:
+        super().__init__()
+        self.label, self.device, self.sensor = label, device, device.sensor
+        link = self.sensor.links.get("data")
+        self.datagrams = self.sensor.datagrams
+        self.baud = link.baud if isinstance(link, Serial) else None
+        self.overflow = "block" if math.isinf(device.rate) else "drop_oldest"
+        self._changed = threading.Condition()
+        self._rested = 0
+        device.start(time.monotonic_ns())
+
+    def read(self, timeout: float) -> list[Chunk]:
+        end = time.monotonic_ns() + int(timeout * SECOND)
+        with self._changed:
+            while not self.closed:
+                now = time.monotonic_ns()
+                chunks = self._arrived(now) if now >= self._rested else []
+                if chunks or now >= end:
+                    return chunks
+                due = self.device.deadline
+                wake = end if due is None else min(end, max(due, self._rested))
+                self._changed.wait(max(wake - now, 0) / SECOND)
+        return []
+
+    def write(self, data: bytes) -> None:
+        with self._changed:
+            if not self.device.present:
+                raise Disconnected(f"{self.label}: the simulated sensor is unplugged")
+            self.device.receive(data, time.monotonic_ns())
+            self._changed.notify_all()
+
+    def reopen(self) -> None:
+        with self._changed:
+            self.device.outgoing(time.monotonic_ns())
+            if not self.device.present:
+                raise failure(f"{self.label}: the simulated sensor is unplugged", "wait")
+
+    def lines(self, *, dtr: bool | None = None, rts: bool | None = None) -> None:
+        """Control lines have no effect on a simulated device."""
+
+    def close(self) -> None:
+        with self._changed:
+            self.closed = True
+            self._changed.notify_all()
+
+    def _arrived(self, now: int) -> list[Chunk]:
+        out = [data for link, data in self.device.outgoing(now) if link == "data"]
+        if not self.device.present:
+            raise Disconnected(f"{self.label}: the simulated sensor was unplugged")
+        self._rested = now + PAUSE if out and math.isfinite(self.device.rate) else now
+        at = self.clock.now()
+        return [Chunk(data, at) for data in out]
+
+
+def simulated_device(sensor: Sensor, options: Mapping[str, str]) -> SimulatedDevice:
+    """The device that options name by text: ``{"rate": "2", "scene": "hall.toml", "errors": "0.01"}``.
+
+    Raises:
+        UsageError: for a value that is not of its kind, and where the sensor cannot be simulated.
+        SourceError: where the scene cannot be read.
+    """
+    scene = read_scene(options["scene"]) if "scene" in options else None
+    faults = faults_of({name: text for name, text in options.items() if name in FAULTS})
+    return SimulatedDevice(sensor, scene=scene, seed=_seed(options.get("seed", "0")), rate=rate_of(options.get("rate", "1")), faults=faults)
+
+
+def rate_of(text: str) -> float:
+    """How many times faster than in reality; inf for "max" and 0.
+
+    Raises:
+        UsageError: for anything else but a number above 0.
+    """
+    try:
+        rate = math.inf if text in ("max", "0") else float(text)
+    except ValueError:
+        rate = -1.0
+    if not rate > 0:
+        raise UsageError(f"rate is a number above 0, or max, not {text!r}")
+    return rate
+
+
+def connect(address: Address, sensor: Sensor | None = None) -> SimulatedTransport:
+    """The open transport of ``sim:ID?rate=2&errors=0.01``.
+
+    Args:
+        sensor: who reads it; where it is the same sensor, it is simulated with the same options.
+
+    Raises:
+        UnknownSensor, UnknownOption, UsageError: for what the source says.
+    """
+    address.check(OPTIONS)
+    if not address.place and sensor is None:
+        raise UsageError(f"{address.text}: name the sensor, as in sim:ID; lidarspec sensors lists them")
+    named = named_sensor(address.place) if address.place else sensor
+    assert named is not None
+    simulated = sensor if sensor is not None and sensor.id == named.id else named
+    return SimulatedTransport(address.text, simulated_device(simulated, address.options))
+
+
+def _seed(text: str) -> int:
+    if not text.isdecimal():
+        raise UsageError(f"seed is a whole number, not {text!r}")
+    return int(text)

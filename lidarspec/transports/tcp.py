@@ -1,0 +1,108 @@
+"""TCP: a byte stream from a sensor, connected again when it breaks."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import socket
+import time
+
+from lidarspec.errors import SourceError, UsageError
+from lidarspec.files import Chunk, Disconnected
+from lidarspec.links import Tcp
+from lidarspec.spec import Sensor
+from lidarspec.transports.live import Address, LiveBase, failure, lost, named, readable, reason
+
+#: bytes read at once, and seconds between two reads, in which a fast stream gathers some.
+BLOCK, PAUSE = 1 << 18, 0.002
+#: seconds that a connection may take at first, and when it is tried again.
+PATIENCE, AGAIN = 5.0, 0.5
+
+
+class TcpTransport(LiveBase):
+    """A connection to a sensor.
+
+    Raises:
+        SourceError: where nobody answers.
+    """
+
+    def __init__(self, label: str, host: str, port: int, *, sensor: Sensor | None = None) -> None:
+        super().__init__()
+        self.label, self._address, self._sensor = label, (host, port), sensor
+        self._rested = 0.0
+        self._socket = self._connected(PATIENCE)
+
+    def read(self, timeout: float) -> list[Chunk]:
+        pause = self._rested - time.monotonic()
+        if pause > 0:
+            time.sleep(pause)
+        try:
+            if not readable(self._socket.fileno(), timeout):
+                return []
+            data = self._socket.recv(BLOCK)
+        except (OSError, ValueError) as error:
+            if self.closed:
+                return []
+            raise lost(self.label, error) from None
+        if not data:
+            raise Disconnected(f"{self.label}: the sensor closed the connection")
+        self._rested = time.monotonic() + PAUSE
+        return [Chunk(data, self.clock.now())]
+
+    def write(self, data: bytes) -> None:
+        try:
+            self._socket.sendall(data)
+        except OSError as error:
+            raise lost(self.label, error) from None
+
+    def reopen(self) -> None:
+        self._socket.close()
+        self._socket = self._connected(AGAIN)
+
+    def peer(self) -> str | None:
+        return self._address[0]
+
+    def close(self) -> None:
+        self.closed = True
+        self._socket.close()
+
+    def _connected(self, patience: float) -> socket.socket:
+        try:
+            found = socket.create_connection(self._address, patience)
+        except OSError as error:
+            raise self._refused(error) from None
+        found.settimeout(PATIENCE)
+        found.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        with contextlib.suppress(OSError):
+            found.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+        return found
+
+    def _refused(self, error: OSError) -> SourceError:
+        host, port = self._address
+        doctor = f"lidarspec doctor {self.label}{named(self._sensor)}"
+        if isinstance(error, socket.gaierror):
+            return failure(f"{self.label}: there is no host {host!r}", doctor)
+        if error.errno == errno.ECONNREFUSED:
+            return failure(f"{self.label}: {host} refuses connections to TCP port {port}", doctor)
+        if isinstance(error, TimeoutError) or error.errno in (errno.ETIMEDOUT, errno.EHOSTUNREACH):
+            return failure(f"{self.label}: {host} does not answer on TCP port {port}", f"ping {host}")
+        return failure(f"{self.label}: TCP port {port} of {host}: {reason(error)}", doctor)
+
+
+def connect(address: Address, sensor: Sensor | None = None) -> TcpTransport:
+    """The open connection of a TCP SOURCE: "tcp://192.168.1.200:2111".
+
+    Args:
+        sensor: whose port is taken where the source names none.
+
+    Raises:
+        UsageError: where host or port are missing, or for an option.
+        SourceError: where nobody answers.
+    """
+    address.check(())
+    host, port = address.host_and_port()
+    link = sensor.links.get("data") if sensor is not None else None
+    port = port or (link.port if isinstance(link, Tcp) else None)
+    if not host or port is None:
+        raise UsageError(f"{address.text}: host and port are needed, as in tcp://192.168.1.200:2111")
+    return TcpTransport(address.text, host, port, sensor=sensor)

@@ -1,0 +1,299 @@
+"""UDP: datagrams from a sensor, as many as there are at each wake-up, with what the kernel knows of each.
+
+A sensor sends to this computer's address or to everybody, so that the sockets have to be bound to all interfaces ("udp://"),
+unless one is named ("udp://127.0.0.1:2368"). Nothing is sent, and nobody is answered, before a command is.
+
+Linux says with each datagram when it arrived, however late we fetch it, and how many the socket has dropped before it. The
+receive buffer is what a stalled program lives on; what the kernel really gives is read back.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import ipaddress
+import select
+import socket
+import struct
+import sys
+import time
+from collections.abc import Iterable, Iterator, Sequence
+
+from lidarspec.errors import SourceError, UsageError
+from lidarspec.files import Chunk, Statistics
+from lidarspec.links import Udp, is_datagram
+from lidarspec.spec import Sensor
+from lidarspec.transports._recvmmsg import LARGEST, MANY, Slots
+from lidarspec.transports.live import Address, LiveBase, failure, lost, named, reason
+
+#: bytes of receive buffer that are asked for.
+BUFFER = 8 << 20
+#: datagrams of one socket that are fetched before the others have their turn.
+TOGETHER = 1024
+#: ns that a datagram may have waited in the kernel, at most; more is a clock that was set.
+LATEST = 60_000_000_000
+#: socket options that Python has no names for (Linux, asm-generic/socket.h).
+SO_TIMESTAMPNS, SO_RXQ_OVFL = 35, 40
+OPTIONS = ("port", "group", "src")
+
+
+class UdpTransport(LiveBase):
+    """Datagrams that arrive on some ports.
+
+    Args:
+        label: the SOURCE, for messages.
+        ports: where to listen; 0 takes any that is free.
+        host: address of the interface, "" for all.
+        group: multicast group to join.
+        sender: only datagrams from this address; others are counted as foreign.
+        datagrams: whether each is a whole frame, not a piece of a stream.
+        sensor: for the next command in messages.
+
+    Attributes:
+        ports: those that are open.
+
+    Raises:
+        SourceError: where a port cannot be opened, or the group not joined.
+    """
+
+    def __init__(
+        self,
+        label: str,
+        ports: Sequence[int],
+        *,
+        host: str = "",
+        group: str | None = None,
+        sender: str | None = None,
+        datagrams: bool = True,
+        sensor: Sensor | None = None,
+        remote: tuple[str, int] | None = None,
+    ) -> None:
+        super().__init__()
+        self.label, self.datagrams = label, datagrams
+        self._sender, self._last, self._sensor = sender, remote, sensor
+        self._sockets: dict[int, _Socket] = {}
+        self._poller = select.poll() if hasattr(select, "poll") else None
+        slots = _slots()
+        try:
+            for port in ports:
+                self._add(_Socket(self._bound(host, port, group), slots))
+        except BaseException:
+            self.close()
+            raise
+        self.ports = tuple(one.address[1] for one in self._sockets.values())
+        smallest = min((one.buffer for one in self._sockets.values()), default=BUFFER)
+        self.warnings += shortfall(BUFFER, smallest)
+
+    def read(self, timeout: float) -> list[Chunk]:
+        found: list[Chunk] = []
+        for descriptor in self._ready(timeout):
+            self._fetch(self._sockets[descriptor], found)
+        return found
+
+    def write(self, data: bytes) -> None:
+        if self._last is None:
+            raise failure(f"{self.label}: nothing has arrived yet, so nobody knows the sensor's address", f"lidarspec doctor {self.label}")
+        try:
+            next(iter(self._sockets.values())).socket.sendto(data, self._last)
+        except OSError as error:
+            raise lost(self.label, error) from None
+
+    def reopen(self) -> None:
+        """Sockets stay open, whatever becomes of the sensor."""
+
+    def peer(self) -> str | None:
+        return self._sender or (self._last[0] if self._last else None)
+
+    def close(self) -> None:
+        self.closed = True
+        for one in self._sockets.values():
+            one.socket.close()
+
+    def _ready(self, timeout: float) -> list[int]:
+        if self._poller is not None:
+            return [descriptor for descriptor, _ in self._poller.poll(timeout * 1000)]
+        return select.select(list(self._sockets), [], [], timeout)[0]
+
+    def _fetch(self, one: _Socket, found: list[Chunk]) -> None:
+        """Everything that waits in a socket, up to a limit that is fair to the others."""
+        try:
+            for data, sender, at in one.datagrams(self.clock.now(), self.statistics):
+                if self._sender is not None and sender[0] != self._sender:
+                    self.statistics.foreign += 1
+                    continue
+                self._last = sender
+                found.append(Chunk(data, at, sender, one.address))
+        except ConnectionRefusedError:
+            return  # somebody's answer to what was sent, not to be read as the end
+        except OSError as error:
+            if not self.closed:
+                raise SourceError(f"{self.label}: {reason(error)}") from None
+
+    def _add(self, one: _Socket) -> None:
+        self._sockets[one.socket.fileno()] = one
+        if self._poller is not None:
+            self._poller.register(one.socket, select.POLLIN)
+
+    def _bound(self, host: str, port: int, group: str | None) -> socket.socket:
+        family = socket.AF_INET6 if ":" in host or ":" in (group or "") else socket.AF_INET
+        found = socket.socket(family, socket.SOCK_DGRAM)
+        try:
+            if group is not None:
+                found.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            found.bind(("" if group is not None else host, port))
+            if group is not None:
+                _join(found, group, host)
+        except OSError as error:
+            found.close()
+            raise self._refused(error, host, port, group) from None
+        found.setblocking(False)
+        return found
+
+    def _refused(self, error: OSError, host: str, port: int, group: str | None) -> SourceError:
+        doctor = f"lidarspec doctor '{self.label}'{named(self._sensor)}"
+        if error.errno == errno.EADDRINUSE:
+            return failure(f"{self.label}: UDP port {port} is in use by another program", doctor)
+        if error.errno == errno.EACCES:
+            return failure(f"{self.label}: UDP port {port} needs rights that you do not have", doctor)
+        if error.errno == errno.EADDRNOTAVAIL or isinstance(error, socket.gaierror):
+            return failure(f"{self.label}: {host or group} is no address of this computer", f"lidarspec doctor udp://:{port}")
+        if group is not None and error.errno in (errno.ENODEV, errno.ENETUNREACH):
+            return failure(f"{self.label}: no interface has a route to the group {group}; name one, as in udp://ADDRESS:{port}", doctor)
+        return failure(f"{self.label}: UDP port {port}: {reason(error)}", doctor)
+
+
+class _Socket:
+    """One socket, and what the kernel has said about it.
+
+    Args:
+        slots: where the kernel writes many datagrams at once; None fetches them one by one.
+
+    Attributes:
+        address: of its end here.
+        buffer: bytes of payload and overhead that the kernel holds for it.
+    """
+
+    def __init__(self, found: socket.socket, slots: Slots | None) -> None:
+        self.socket, self._slots, self._drops = found, slots, 0
+        self.address: tuple[str, int] = found.getsockname()[:2]
+        self.buffer = _enlarged(found)
+        for option in (SO_TIMESTAMPNS, SO_RXQ_OVFL) if slots is not None else ():
+            with contextlib.suppress(OSError):
+                found.setsockopt(socket.SOL_SOCKET, option, 1)
+
+    def datagrams(self, now: int, statistics: Statistics) -> Iterator[tuple[bytes, tuple[str, int], int]]:
+        """What waits, with sender and arrival time; counts what the kernel dropped.
+
+        Raises:
+            OSError: what the system says.
+        """
+        if self._slots is None:
+            yield from self._one_by_one(now)
+            return
+        anchor = time.time_ns()
+        for _ in range(TOGETHER // MANY):
+            number = self._slots.fill(self.socket.fileno())
+            for index in range(number):
+                at = self._told(self._slots.said(index), statistics, now, anchor)
+                yield (*self._slots.datagram(index), at)
+            if number < MANY:
+                return
+
+    def _one_by_one(self, now: int) -> Iterator[tuple[bytes, tuple[str, int], int]]:
+        for _ in range(TOGETHER):
+            try:
+                data, sender = self.socket.recvfrom(LARGEST)
+            except BlockingIOError:
+                return
+            yield data, sender[:2], now
+
+    def _told(self, said: Iterable[tuple[int, bytes]], statistics: Statistics, now: int, anchor: int) -> int:
+        """When the datagram arrived; counts what was dropped before it."""
+        at = now
+        for kind, data in said:
+            if kind == SO_TIMESTAMPNS and len(data) == 16:
+                seconds, nanoseconds = struct.unpack("qq", data)
+                at = now - min(max(anchor - seconds * 1_000_000_000 - nanoseconds, 0), LATEST)
+            elif kind == SO_RXQ_OVFL and len(data) == 4:
+                drops = int.from_bytes(data, sys.byteorder)
+                statistics.kernel_drops += (drops - self._drops) & 0xFFFFFFFF
+                self._drops = drops
+        return at
+
+
+def _slots() -> Slots | None:
+    """Room for many datagrams at once, where the system can fetch them so."""
+    try:
+        return Slots() if sys.platform == "linux" else None
+    except OSError:
+        return None
+
+
+def connect(address: Address, sensor: Sensor | None = None) -> UdpTransport:
+    """The open sockets of a UDP SOURCE: "udp://", "udp://:2368", "udp://?port=6699,7788&group=239.255.0.1&src=192.168.1.200".
+
+    Args:
+        sensor: whose ports are taken where the source names none.
+
+    Raises:
+        UsageError: where nobody says the ports, or for an option that UDP does not take.
+        SourceError: where one cannot be opened.
+    """
+    address.check(OPTIONS)
+    host, port = address.host_and_port()
+    link = sensor.links.get("data") if sensor is not None else None
+    ports = _ports(address) or ([port] if port else list(link.ports) if isinstance(link, Udp) else [])
+    if not ports:
+        raise UsageError(f"{address.text}: which port? Name the sensor with -s, or say udp://:2368")
+    group = address.options.get("group")
+    if group is None and host and _is_multicast(host):
+        host, group = "", host
+    if group is not None and not _is_multicast(group):
+        raise UsageError(f"{address.text}: {group} is no multicast group (224.0.0.0 to 239.255.255.255)")
+    whole = link is None or is_datagram(link)
+    return UdpTransport(address.text, ports, host=host, group=group, sender=address.options.get("src"), datagrams=whole, sensor=sensor)
+
+
+def shortfall(asked: int, granted: int) -> list[str]:
+    """A warning where the kernel gave less receive buffer than was asked for, with the command that mends it; else nothing."""
+    if granted >= asked:
+        return []
+    text = f"the system gave a receive buffer of {granted >> 10} KiB of {asked >> 10}: a busy computer will lose packets"
+    return [f"{text}; next: sudo sysctl -w net.core.rmem_max={asked}"]
+
+
+def _enlarged(found: socket.socket) -> int:
+    """Ask for a larger receive buffer; the bytes that there are in the end. Linux says twice what it gives."""
+    if not hasattr(socket, "SO_RCVBUF"):
+        return BUFFER
+    for option in (socket.SO_RCVBUF, getattr(socket, "SO_RCVBUFFORCE", 33 if sys.platform == "linux" else None)):
+        if option is not None and _granted(found) < BUFFER:
+            with contextlib.suppress(OSError):
+                found.setsockopt(socket.SOL_SOCKET, option, BUFFER)
+    return _granted(found)
+
+
+def _granted(found: socket.socket) -> int:
+    return found.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) // (2 if sys.platform == "linux" else 1)
+
+
+def _ports(address: Address) -> list[int]:
+    text = address.options.get("port", "")
+    ports = [part for part in text.split(",") if part]
+    if any(not part.isdecimal() or not 0 < int(part) < 65536 for part in ports):
+        raise UsageError(f"{address.text}: port is one number from 1 to 65535, or several with commas, not {text!r}")
+    return [int(part) for part in ports]
+
+
+def _is_multicast(host: str) -> bool:
+    try:
+        return ipaddress.ip_address(host).is_multicast
+    except ValueError:
+        return False
+
+
+def _join(found: socket.socket, group: str, interface: str) -> None:
+    if found.family == socket.AF_INET6:
+        found.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_JOIN_GROUP, socket.inet_pton(socket.AF_INET6, group) + struct.pack("@I", 0))
+        return
+    found.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, socket.inet_aton(group) + socket.inet_aton(interface or "0.0.0.0"))

@@ -1,0 +1,160 @@
+"""A terminal taken over for a while: the alternate screen, of which only the cells that changed are written.
+
+rich would draw every cell of every picture anew, 50 times what changes; so pictures go out from here, and rich serves
+for what is printed once.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+from types import FrameType, TracebackType
+from typing import Any, TextIO
+
+import numpy as np
+from rich.console import Console
+
+from lidarspec.view.canvas import Cells
+from lidarspec.view.keys import Keys
+from lidarspec.view.palette import Depth, sgr
+
+#: the alternate screen, no cursor, no wrapping at the edge; and all of it back.
+ENTER, LEAVE = "\x1b[?1049h\x1b[?25l\x1b[?7l\x1b[2J", "\x1b[0m\x1b[?7h\x1b[?25h\x1b[?1049l"
+#: the terminal holds a picture back until all of it is there, where it knows how to.
+BEGIN, END = "\x1b[?2026h", "\x1b[?2026l"
+#: unchanged cells between two changed ones that are written along: moving the cursor costs as much.
+BRIDGED = 4
+
+
+class Terminated(BaseException):
+    """A signal asks the process to end; what is open is closed on the way out.
+
+    Attributes:
+        code: the exit code that shells expect, 128 and the signal's number.
+    """
+
+    def __init__(self, number: int) -> None:
+        super().__init__(number)
+        self.code = 128 + number
+
+
+def depth(stream: TextIO) -> Depth:
+    """The colours that a terminal shows, by NO_COLOR, COLORTERM and TERM as rich reads them."""
+    console = Console(file=stream)
+    system = console.color_system
+    if system is None or console.no_color:
+        return "none"
+    return "truecolor" if system == "truecolor" else "256" if system == "256" else "standard"
+
+
+def encodable(stream: TextIO) -> bool:
+    """Whether a stream takes braille characters."""
+    try:
+        "⣿▲│".encode(stream.encoding or "ascii")
+    except (UnicodeEncodeError, LookupError):
+        return False
+    return True
+
+
+class Screen:
+    """A terminal's screen, as a context manager that leaves it as it was, whatever ends it.
+
+    Also when the process is asked to end (SIGTERM, SIGHUP), and while it is suspended (SIGTSTP).
+    """
+
+    def __init__(self, stream: TextIO, keys: Keys) -> None:
+        self._stream, self.keys = stream, keys
+        self._depth, self._plain = depth(stream), not encodable(stream)
+        self._shown: Cells | None = None
+        self._taken = 0  # how often the terminal was taken over: what was shown before is gone, also in the middle of `show`
+        self._handlers: dict[int, Any] = {}
+
+    def size(self) -> tuple[int, int]:
+        """Columns and lines of the window as it is now."""
+        found = os.get_terminal_size(self._stream.fileno())
+        return max(found.columns, 1), max(found.lines, 1)
+
+    def show(self, cells: Cells) -> None:
+        """Put a picture on the screen."""
+        if self._plain:
+            cells = cells.ascii()
+        taken = self._taken
+        before = self._shown if self._shown is not None and self._shown.size == cells.size else None
+        text = changes(before, cells, self._depth)
+        if text:
+            self._write(BEGIN + ("" if before is not None else "\x1b[0m\x1b[2J") + text + END)
+        self._shown = cells if taken == self._taken else None
+
+    def __enter__(self) -> Screen:
+        self.keys.__enter__()
+        if sys.platform == "win32":
+            os.system("")  # switches the console over to escape sequences
+        self._write(ENTER)
+        for name, function in (("SIGTERM", _end), ("SIGHUP", _end), ("SIGTSTP", self._suspend)):
+            number = getattr(signal, name, None)
+            if number is not None:
+                self._handlers[number] = signal.signal(number, function)
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None) -> None:
+        try:
+            self._write(LEAVE)
+        except OSError:
+            pass  # the terminal is gone, and with it what was to be cleaned
+        finally:
+            self.keys.__exit__(kind, error, traceback)
+            for number, handler in self._handlers.items():
+                signal.signal(number, handler)
+            self._handlers.clear()
+
+    def _write(self, text: str) -> None:
+        if sys.platform == "win32":
+            self._stream.write(text)
+            self._stream.flush()
+            return
+        # past the stream's own buffer, which a signal in the middle of a write must not enter again
+        data = text.encode(self._stream.encoding or "utf-8", "replace")
+        while data:
+            data = data[os.write(self._stream.fileno(), data) :]
+
+    def _suspend(self, number: int, frame: FrameType | None) -> None:
+        """Give the terminal back, sleep until the shell wakes us, and take it again."""
+        self._write(LEAVE)
+        self.keys.__exit__(None, None, None)
+        signal.signal(number, signal.SIG_DFL)
+        os.kill(os.getpid(), number)
+        signal.signal(number, self._suspend)
+        self.keys.__enter__()
+        self._write(ENTER)
+        self._shown = None
+        self._taken += 1
+
+
+def changes(before: Cells | None, after: Cells, depth: Depth) -> str:
+    """What to write to a terminal that shows `before` for it to show `after`; None is an empty screen."""
+    old = before if before is not None else Cells.blank(*after.size)
+    changed = (old.codes != after.codes) | (old.inks != after.inks)
+    parts: list[str] = []
+    ink = -1
+    for row in np.flatnonzero(changed.any(axis=1)).tolist():
+        columns = np.flatnonzero(changed[row])
+        starts = np.flatnonzero(np.diff(columns, prepend=-BRIDGED - 2) > BRIDGED)
+        for first, last in zip(columns[starts].tolist(), columns[np.append(starts[1:], len(columns)) - 1].tolist(), strict=True):
+            parts.append(f"\x1b[{row + 1};{first + 1}H")
+            codes, inks = after.codes[row, first : last + 1].tolist(), after.inks[row, first : last + 1].tolist()
+            for code, chosen in zip(codes, inks, strict=True):
+                if chosen != ink:
+                    parts.append(sgr(chosen, depth))
+                    ink = chosen
+                parts.append(chr(code))
+    return "".join(parts)
+
+
+def _end(number: int, frame: FrameType | None) -> None:
+    raise Terminated(number)
+
+
+def interactive() -> bool:
+    """Whether there is a screen to take over."""
+    return sys.stdout.isatty() and os.environ.get("TERM") != "dumb"

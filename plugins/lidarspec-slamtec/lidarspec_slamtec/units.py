@@ -1,0 +1,99 @@
+"""What a simulated unit of each model says of itself: information, scan modes, and the descriptor that announces each mode.
+
+Source: the information and the mode Sensitivity of the A1 are a live A1's answers. The rest is assumed: the times and reaches of the
+other modes are those that the vendor's SDK prints for such models, and only the kinds of capsules of a model are told apart.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from lidarspec import Command
+from lidarspec_slamtec import answers
+
+NODE, EXPRESS, ULTRA, DENSE = 0x81, 0x82, 0x84, 0x85
+DESCRIPTOR = {NODE: "scan_descriptor", EXPRESS: "express_descriptor", ULTRA: "ultra_descriptor", DENSE: "dense_descriptor"}
+
+Answers = Iterable[tuple[str, Mapping[str, Any]]]
+
+
+@dataclass(frozen=True)
+class Mode:
+    """A scan mode: its name, microseconds from point to point, reach in metres, and the type of its descriptor."""
+
+    name: str
+    us_per_sample: float
+    reach: float
+    kind: int
+
+
+@dataclass(frozen=True)
+class Unit:
+    """What a unit says of itself; `model` as in its information, the typical mode is the last."""
+
+    model: int
+    modes: tuple[Mode, ...]
+
+    def config(self, request: Mapping[str, Any]) -> Answers:
+        """The answer to a request for a configuration value; none for a key or mode that it does not have."""
+        key, number = request["key"], request.get("mode", 0)
+        if number >= len(self.modes):
+            return []
+        mode = self.modes[number]
+        known = {
+            answers.MODE_COUNT: (2, "mode_count", len(self.modes)),
+            answers.TYPICAL_MODE: (2, "typical_mode", len(self.modes) - 1),
+            answers.US_PER_SAMPLE: (4, "us_per_sample", mode.us_per_sample),
+            answers.MAX_DISTANCE: (4, "max_distance", mode.reach),
+            answers.ANSWER_TYPE: (1, "answer_type", mode.kind),
+            answers.MODE_NAME: (len(mode.name) + 1, "data", mode.name.encode()),
+        }
+        if key not in known:
+            return []
+        size, field, value = known[key]
+        return [("config", {"descriptor.length": 4 + size, "key": key, f"value.{field}": value})]
+
+    def capsules(self, request: Mapping[str, Any]) -> Answers:
+        """The descriptor of the scan mode that is asked for; mode 0 of an express request is the plain express scan."""
+        number = request["mode"]
+        if number >= len(self.modes):
+            return []
+        return [(DESCRIPTOR[self.modes[number].kind if number else EXPRESS], {})]
+
+    def answering(self, commands: Mapping[str, Command]) -> dict[str, Command]:
+        """The same commands, answered by this unit."""
+        return {name: self._answering(command) for name, command in commands.items()}
+
+    def _answering(self, command: Command) -> Command:
+        information = {"model": self.model, "firmware_minor": 29, "firmware_major": 1, "hardware": 7, "serial": bytes(range(1, 17))}
+        times = {"standard": round(self.modes[0].us_per_sample), "express": round(self.modes[-1].us_per_sample)}
+        fixed: dict[str, Answers] = {
+            "info": (("info", information),),
+            "sample_rate": (("sample_rate", times),),
+            "accessory": (("accessory", {"flags": 1}),),
+        }
+        if command.frame in ("config_request", "mode_config_request"):
+            return dataclasses.replace(command, answers=self.config)
+        if command.frame == "express_request":
+            return dataclasses.replace(command, answers=self.capsules)
+        return dataclasses.replace(command, answers=tuple(fixed.get(command.replies[0], ())) or None if command.replies else None)
+
+
+A1 = Unit(
+    0x18,
+    (
+        Mode("Standard", 508, 12, NODE),
+        Mode("Express", 254, 12, EXPRESS),
+        Mode("Boost", 127, 12, ULTRA),
+        Mode("Sensitivity", 127, 12, ULTRA),
+    ),
+)
+A3 = Unit(
+    0x31,
+    (Mode("Standard", 250, 16, NODE), Mode("Express", 125, 16, EXPRESS), Mode("Boost", 63, 25, ULTRA), Mode("Sensitivity", 63, 25, ULTRA)),
+)
+S2 = Unit(0x71, (Mode("Standard", 125, 30, NODE), Mode("DenseBoost", 31, 30, DENSE)))
+C1 = Unit(0x41, (Mode("Standard", 200, 12, NODE), Mode("DenseBoost", 200, 12, DENSE)))

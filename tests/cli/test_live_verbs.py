@@ -1,0 +1,291 @@
+"""`view`, `stats`, `read` and `plot` on files, simulated sensors and real ports; each kind of failure ends in one line and its code."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import lidarspec as ls
+from lidarspec.simulator import simulate
+from tests.cli.running import process, ran
+
+ID = "ldrobot-stl27l"
+SENSOR = ("-s", ID)
+SIM = f"sim:{ID}"
+VERBS = [("view", "--once", "-t", "1"), ("stats", "-t", "1"), ("read", "-t", "1")]
+posix = pytest.mark.skipif(os.name != "posix", reason="needs pseudo-terminals")
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two seconds of a sensor, of which one frame in fifty is damaged."""
+    path = tmp_path_factory.mktemp("live") / "two.bin"
+    frames = simulate(ls.sensor(ID), 3600)
+    path.write_bytes(b"".join(frame[:-1] + b"\0" if number % 50 == 0 else frame for number, frame in enumerate(frames)))
+    return path
+
+
+@contextlib.contextmanager
+def nothing() -> Iterator[str]:
+    """A source that is not there."""
+    yield "/dev/ttyUSB99"
+
+
+@contextlib.contextmanager
+def silent() -> Iterator[str]:
+    """A port behind which nobody says anything."""
+    master, slave = os.openpty()
+    try:
+        yield os.ttyname(slave)
+    finally:
+        os.close(master)
+        os.close(slave)
+
+
+@contextlib.contextmanager
+def babbling() -> Iterator[str]:
+    """A port that sends bytes which are no frames."""
+    with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as server:
+        server.bind(("127.0.0.1", 0))
+        server.listen()
+        child = subprocess.Popen([sys.executable, "-c", _BABBLE, str(server.fileno())], pass_fds=[server.fileno()])
+        try:
+            yield f"tcp://127.0.0.1:{server.getsockname()[1]}"
+        finally:
+            child.kill()
+            child.wait()
+
+
+_BABBLE = """
+import socket, sys, time
+line, _ = socket.socket(fileno=int(sys.argv[1])).accept()
+while True:
+    line.sendall(b"no lidar was there")
+    time.sleep(0.02)
+"""
+
+
+@contextlib.contextmanager
+def busy() -> Iterator[str]:
+    """A port that somebody else has open."""
+    import serial
+
+    with silent() as path, serial.Serial(path, exclusive=True):
+        yield path
+
+
+@contextlib.contextmanager
+def taken() -> Iterator[str]:
+    """An address that somebody else has bound."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        other.bind(("127.0.0.1", 0))
+        yield f"udp://127.0.0.1:{other.getsockname()[1]}"
+
+
+@contextlib.contextmanager
+def refused() -> Iterator[str]:
+    """An address where nobody listens."""
+    with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as other:
+        other.bind(("127.0.0.1", 0))
+        yield f"tcp://127.0.0.1:{other.getsockname()[1]}"
+
+
+@posix
+@pytest.mark.parametrize("words", VERBS, ids=lambda words: words[0])
+@pytest.mark.parametrize(
+    ("source", "code", "told"),
+    [
+        (nothing, 3, "no such port"),
+        (busy, 3, "in use"),
+        (taken, 3, "in use"),
+        (refused, 3, "refuses"),
+        (silent, 5, "sent nothing within 1 s"),
+        (babbling, 4, "not a scan of data frames"),
+    ],
+    ids=lambda value: getattr(value, "__name__", None),
+)
+def test_failures_end_in_one_line_and_their_code(
+    words: tuple[str, ...], source: contextlib._GeneratorContextManager[str], code: int, told: str
+) -> None:
+    with source() as place:  # type: ignore[operator]
+        done = process(words[0], place, *SENSOR, *words[1:])
+    said = [line for line in done.stderr.decode().splitlines() if not line.startswith("  next: lidarspec ")]
+    assert done.returncode == code, said
+    assert len(said) == 1, said
+    assert told in said[0]
+    assert place in said[0]
+    assert "next: lidarspec " in done.stderr.decode()
+
+
+@posix
+@pytest.mark.parametrize("words", VERBS, ids=lambda words: words[0])
+def test_no_permission_is_said(capture: Path, tmp_path: Path, words: tuple[str, ...]) -> None:
+    path = tmp_path / "secret.bin"
+    path.write_bytes(b"x")
+    path.chmod(0)
+    ran(words[0], capture, *SENSOR, *words[1:])  # what is loaded later may not be readable
+    with nobody():
+        result = ran(words[0], path, *SENSOR, *words[1:], code=3)
+    assert f"{path}: Permission denied" in result.stderr
+
+
+@contextlib.contextmanager
+def nobody() -> Iterator[None]:
+    """Without the rights of root, who may read everything."""
+    user = os.geteuid()
+    if user == 0:
+        os.seteuid(65534)
+    try:
+        yield
+    finally:
+        os.seteuid(user)
+
+
+@posix
+@pytest.mark.parametrize("words", [("stats",), ("read",)])
+def test_an_interrupt_ends_with_130(words: tuple[str, ...]) -> None:
+    restored = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"
+    command = [sys.executable, "-u", "-c", f"{restored}; from lidarspec.cli import main; main()", *words, SIM, *SENSOR]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as running:
+        assert running.stdout is not None
+        assert running.stderr is not None
+        for _ in range(3):
+            assert running.stdout.readline()
+        running.send_signal(signal.SIGINT)
+        rest, said = running.communicate(timeout=60)
+    assert running.returncode == 130
+    assert said == "interrupted\n"
+    assert ("whole scans" in rest) == (words == ("stats",))
+
+
+@pytest.mark.parametrize("words", [("read", SIM), ("stats", SIM, "--json", "--interval", "100ms")])
+def test_a_closed_pipe_ends_quietly(words: tuple[str, ...]) -> None:
+    command = [sys.executable, "-u", "-m", "lidarspec", *words, *SENSOR]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as running:
+        assert running.stdout is not None
+        assert running.stderr is not None
+        assert running.stdout.readline()
+        running.stdout.close()
+        assert running.stderr.read() == ""
+        assert running.wait(60) == 0
+
+
+def test_stats_of_a_simulated_sensor() -> None:
+    done = process("stats", f"sim:{ID}?errors=0.001", *SENSOR, "-t", "1.2", "--interval", "400ms", "--json")
+    *intervals, summary = [json.loads(line) for line in done.stdout.splitlines()]
+    assert done.returncode == 0
+    assert [line["kind"] for line in intervals] == ["interval"] * 3
+    assert summary["kind"] == "summary"
+    assert summary["speed_hz"] == pytest.approx(10, rel=0.05)
+    assert summary["points"] == pytest.approx(2160, rel=0.1)
+    assert summary["packets"] == summary["stats"]["frames"]["data"] == pytest.approx(1800 * 1.2, rel=0.3)
+    assert 0.005 < summary["error_rate"] < 0.15  # of 47 bytes one in a thousand is wrong
+    assert summary["loss_rate"] is None
+    assert summary["jitter_s"] > 0
+    assert sum(line["packets"] for line in intervals) <= summary["packets"]
+
+
+def test_stats_of_a_file(capture: Path) -> None:
+    lines = [json.loads(line) for line in ran("stats", capture, *SENSOR, "--json", "--interval", "500ms").stdout.splitlines()]
+    summary = lines[-1]
+    assert summary["packets"] == 3600 - 72
+    assert summary["error_rate"] == pytest.approx(0.02)
+    assert summary["packet_rate_hz"] == pytest.approx(1800 * 0.98, rel=0.01)
+    assert summary["jitter_s"] is None  # nobody knows when it arrived
+    assert summary["queue"] is None
+    assert summary["skipped_rate"] == pytest.approx(0.02)
+    text = ran("stats", capture, *SENSOR).stdout
+    assert f"{ID}: 3528 packets, " in text
+    assert all(len(line) <= 80 for line in text.splitlines() if not line.startswith(ID))
+
+
+@pytest.mark.parametrize(("limit", "code"), [("1%", 1), ("0.019", 1), ("2.5 %", 0), ("0.5", 0)])
+def test_too_many_errors_are_a_finding(capture: Path, limit: str, code: int) -> None:
+    result = ran("stats", capture, *SENSOR, "--max-errors", limit, code=code)
+    assert ("2.000% of the frames are wrong or lost" in result.stderr) == bool(code)
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (("--max-errors", "many"), "'many' is no share, such as 1% or 0.01"),
+        (("--max-errors", "200%"), "no share"),
+        (("-t", "soon"), "'soon' is no duration above 0"),
+        (("-t", "0"), "no duration above 0"),
+        (("--interval", "3 weeks"), "no duration"),
+    ],
+)
+def test_durations_and_shares_have_units(capture: Path, words: tuple[str, ...], told: str) -> None:
+    assert told in ran("stats", capture, *SENSOR, *words, code=2).stderr
+
+
+def test_read_prints_the_points_that_the_scans_have(capture: Path) -> None:
+    header, *lines = ran("read", capture, *SENSOR, "-n", "5").stdout.splitlines()
+    assert " ".join(header.split()) == "scan x [m] y [m] z [m] range [m] azimuth [rad] elevation [rad] intensity time [s]"
+    assert len({len(line) for line in [header, *lines]}) == 1
+    rows = [json.loads(line) for line in ran("read", capture, *SENSOR, "--json").stdout.splitlines()]
+    with ls.open(capture, ID) as device:
+        clouds = [scan.points[scan.points.valid] for scan in device.scans()]
+    assert [row["scan"] for row in rows] == [number for number, cloud in enumerate(clouds) for _ in range(len(cloud))]
+    np.testing.assert_array_equal(np.array([row["x"] for row in rows], np.float32), np.concatenate([cloud.x for cloud in clouds]))
+    assert [float(value) for value in lines[0].split()[1:3]] == pytest.approx([rows[0]["x"], rows[0]["y"]], abs=1e-3)
+
+
+def test_read_prints_packets_with_units(capture: Path) -> None:
+    header, first, *_ = ran("read", capture, *SENSOR, "--packets", "-n", "2").stdout.splitlines()
+    assert "start_angle [deg]" in header
+    assert "points" not in header
+    row = json.loads(ran("read", capture, *SENSOR, "--packets", "-n", "1", "--json").stdout)
+    with ls.open(capture, ID) as device:
+        packets = next(device.packets())
+    assert row["offset"] == packets.offset[0] == int(first.split()[0])
+    assert row["start_angle"] == pytest.approx(packets["start_angle"][0])
+    assert row["points.distance"] == pytest.approx(packets["points.distance"][0].tolist())
+
+
+def test_read_of_another_frame_type() -> None:
+    assert "unknown frame 'imu'" in ran("read", SIM, *SENSOR, "-f", "imu", code=2).stderr
+
+
+def test_view_prints_one_picture_where_there_is_no_terminal(capture: Path) -> None:
+    result = ran("view", capture, *SENSOR)
+    *picture, told = result.stdout.splitlines()
+    assert told.startswith(f"{ID}: Scan(")
+    assert told.endswith("colours: range 0 to 6 m")
+    assert "0° forward" in picture[0]
+    assert "\x1b" not in result.stdout
+    plain = subprocess.run(
+        [sys.executable, "-m", "lidarspec", "view", str(capture), *SENSOR], capture_output=True, check=True,
+        env={**os.environ, "PYTHONIOENCODING": "ascii"},
+    )  # fmt: skip
+    assert b"^" in plain.stdout
+    assert b"?" not in plain.stdout
+
+
+def test_view_of_a_live_source_waits_for_a_whole_scan() -> None:
+    began = time.monotonic()
+    assert ", complete)" in ran("view", SIM, *SENSOR, "--once").stdout
+    assert time.monotonic() - began < 30
+
+
+def test_plot_writes_a_picture(capture: Path, tmp_path: Path) -> None:
+    import xml.etree.ElementTree as ET
+
+    ran("plot", capture, *SENSOR, "-o", tmp_path / "scan.svg", "-n", "3")
+    root = ET.fromstring((tmp_path / "scan.svg").read_text(encoding="utf-8"))
+    dots = [place for path in root.findall(".//{*}path") if path.get("stroke-linecap") for place in path.get("d", "").split("M")[1:]]
+    assert 500 < len(dots) <= 2160
+    assert "complete" in "".join(text.text or "" for text in root.findall(".//{*}text"))
+    assert ran("plot", capture, *SENSOR, "-o", "-").stdout.startswith("<svg")
+    assert "pictures are written as .svg" in ran("plot", capture, *SENSOR, "-o", tmp_path / "scan.png", code=2).stderr

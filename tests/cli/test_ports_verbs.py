@@ -1,0 +1,234 @@
+"""`ports`, `detect`, `doctor` and `send` at real ports: pseudo-terminals with simulated sensors, sockets, files; and their exit codes."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import lidarspec as ls
+from lidarspec.simulator import simulate
+from lidarspec.testing.ports import virtual_port
+from tests.cli.running import printed, process, ran
+from tests.lines import paced, port, udp, working
+
+
+class TestSend:
+    def test_a_reply_is_printed_with_its_fields(self) -> None:
+        with virtual_port("cspc-m1c1-mini") as made:
+            text = ran("send", made.path, "start", "-s", "cspc-m1c1-mini").stdout
+            assert text.splitlines()[0] == "cspc-m1c1-mini start: answered with ack"
+            assert "firmware  3 " in text
+            assert "reserved  00 00 00 00 00 00" in text
+            time.sleep(0.2)
+            assert made.device.heard == ["start"]  # and not stopped again
+            told = printed("send", made.path, "stop", "-s", "cspc-m1c1-mini")
+        assert (told["confirmed"], told["frame"], told["fields"]["mode"]) == (True, "ack", 0x55)
+        assert told["hex"] == "a5 5a 55 07 00 00 00 00 00 00 00 ad"
+
+    def test_what_is_not_documented_is_said(self) -> None:
+        with virtual_port("cspc-m1c1-mini") as made:
+            assert "no answer is documented" in ran("send", made.path, "low_exposure", "-s", "cspc-m1c1-mini").stdout
+            assert printed("send", made.path, "high_exposure", "-s", "cspc-m1c1-mini")["confirmed"] is False
+
+    def test_arguments_bring_their_units(self) -> None:
+        with virtual_port("slamtec-rplidar-s2") as made:
+            ran("send", made.path, "motor_speed", "speed=10Hz", "-s", "slamtec-rplidar-s2")
+            told = printed("send", made.path, "get_max_distance", "mode=0x1", "-s", "slamtec-rplidar-s2")
+            assert {value["path"]: value.get("unit") for value in told["values"]}["value.max_distance"] == "m"
+            for words in (["motor_speed", "speed=3m"], ["motor_speed", "speed"], ["motor_speed", "speed=fast"], ["motor_speed", "pace=1"]):
+                ran("send", made.path, *words, "-s", "slamtec-rplidar-s2", code=2)
+            assert "did you mean 'motor_speed'" in ran("send", made.path, "motor_sped", "-s", "slamtec-rplidar-s2", code=2).stderr
+            assert "outside" in ran("send", made.path, "motor_speed", "speed=70000", "-s", "slamtec-rplidar-s2", code=2).stderr
+
+    def test_a_dead_device_is_its_own_fault(self, tmp_path: Path) -> None:
+        with port(tmp_path) as made:
+            found = ran("send", made.name, "start", "-s", "cspc-m1c1-mini", "--timeout", "200ms", code=5)
+        assert "no ack frame came within 0.2 s" in found.stderr
+        assert f"next: lidarspec doctor {made.name} -s cspc-m1c1-mini" in found.stderr
+
+    def test_what_cannot_be_sent_to(self, tmp_path: Path) -> None:
+        ran("send", "/dev/ttyNONE7", "start", "-s", "cspc-m1c1-mini", code=3)
+        (tmp_path / "raw.bin").write_bytes(b"".join(simulate(ls.sensor("ldrobot-stl27l"), 9)))
+        ran("send", tmp_path / "raw.bin", "start", "-s", "cspc-m1c1-mini", code=2)
+        with virtual_port("ldrobot-stl27l") as made:
+            assert "it takes no commands" in ran("send", made.path, "start", code=2).stderr
+
+    def test_a_port_in_use(self) -> None:
+        with virtual_port("ldrobot-stl27l") as made, ls.open(made.path, "ldrobot-stl27l"):
+            assert "in use" in ran("send", made.path, "start", "-s", "cspc-m1c1-mini", code=3).stderr
+
+
+class TestDetect:
+    def test_a_port(self) -> None:
+        with virtual_port("ldrobot-stl27l") as made:
+            found = ran("detect", made.path)
+            told = printed("detect", made.path)
+        assert f"next: lidarspec view {made.path} -s ldrobot-stl27l" in found.stderr
+        row = next(line.split() for line in found.stdout.splitlines() if "stl27l" in line)
+        assert row[1:3] == ["ldrobot-stl27l", "yes"]
+        assert told["sources"][0]["sensor"] == "ldrobot-stl27l"
+        assert {fit["sensor"] for fit in told["sources"][0]["fits"]} == {"ldrobot-stl27l", "ldrobot-ld06"}
+
+    def test_a_silent_port_and_starting_it(self) -> None:
+        with virtual_port("cspc-m1c1-mini") as made:
+            found = ran("detect", made.path, "-t", "300ms", code=4)
+            assert "nothing came" in found.stderr
+            assert f"next: lidarspec detect {made.path} --start" in found.stderr
+            assert "info.model says M1C1_Mini" in ran("detect", made.path, "-t", "300ms", "--start").stdout
+
+    def test_unknown_bytes_are_taken_apart(self, tmp_path: Path) -> None:
+        source = random.Random(3)
+        bodies = [b"\x99\x88\x77" + bytes([index]) + source.randbytes(20) for index in range(60)]
+        path = tmp_path / "unknown.bin"
+        path.write_bytes(b"".join(body + ls.Crc(16, 0x8005, 0xFFFF, True, True)(body).to_bytes(2, "little") for body in bodies))
+        found = ran("detect", path, code=4)
+        assert "sync      99 88 77" in found.stdout
+        assert "26 bytes each: 60 of them" in found.stdout
+        assert (
+            "checksum  Crc(width=16, poly=0x8005, init=0xFFFF, refin=True, refout=True) in the last 2 bytes: right in 60 of 60"
+            in found.stdout
+        )
+        told = json.loads(ran("detect", path, "--json", code=4).stdout)
+        assert (told["sources"][0]["sensor"], told["structure"]["period"]) == (None, 26)
+        assert told["structure"]["checksums"][0]["name"] == "CRC-16/MODBUS"
+
+    def test_noise_is_noise(self, tmp_path: Path) -> None:
+        (tmp_path / "noise.bin").write_bytes(random.Random(9).randbytes(9000))
+        assert "nor can frames of one kind be seen" in ran("detect", tmp_path / "noise.bin", code=4).stderr
+        (tmp_path / "empty.bin").write_bytes(b"")
+        ran("detect", tmp_path / "empty.bin", code=4)
+        ran("detect", tmp_path / "none.bin", code=3)
+        ran("detect", "-", code=2)
+
+    def test_sources_with_the_same_frames_are_a_question(self, tmp_path: Path) -> None:
+        sensor = ls.sensor("slamtec-rplidar-s2")
+        (tmp_path / "nodes.bin").write_bytes(sensor.build("scan_descriptor") + b"".join(simulate(sensor, 300)))
+        found = ran("detect", tmp_path / "nodes.bin")
+        assert "slamtec-rplidar-a1, slamtec-rplidar-a3, slamtec-rplidar-c1, slamtec-rplidar-s2 send the same frames" in found.stderr
+        assert found.stdout.count("perhaps") == 4
+
+    def test_all_udp_ports_without_a_source(self) -> None:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+            frames = simulate(ls.sensor("robosense-m1"), 40)
+            with working(lambda stop: paced(lambda data: sender.sendto(data, ("127.0.0.1", 6699)), frames, 200, stop)):
+                found = ran("detect", "-t", "400ms")
+        assert "next: lidarspec view udp://:6699 -s robosense-m1" in found.stderr
+
+    def test_an_interrupt_ends_it_quietly(self, tmp_path: Path) -> None:
+        with port(tmp_path) as made:
+            command = [sys.executable, "-m", "lidarspec", "detect", str(made.name), "-t", "30s"]
+            running = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.PIPE)
+            time.sleep(2.0)
+            running.send_signal(signal.SIGINT)
+            _, errors = running.communicate(timeout=20)
+        assert (running.returncode, b"Traceback" in errors) == (130, False)
+
+
+class TestPorts:
+    def test_udp_ports_of_sensors_and_who_has_them(self) -> None:
+        told = printed("ports")
+        known = {one["port"]: one for one in told["udp"]}
+        assert "robosense-m1" in known[6699]["sensors"]
+        script = (
+            "import socket; s = socket.socket(socket.AF_INET, socket.SOCK_DGRAM); "
+            "s.bind(('127.0.0.1', 7788)); print(1, flush=True); input()"
+        )
+        with subprocess.Popen([sys.executable, "-c", script], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
+            assert other.stdout is not None
+            other.stdout.readline()
+            busy = {one["port"]: one for one in printed("ports")["udp"]}[7788]
+            text = ran("ports").stdout
+            assert f"kill {other.pid}" in ran("doctor", "udp://:7788", code=1).stdout
+            assert other.stdin is not None
+            other.stdin.close()
+        assert (busy["free"], [user["pid"] for user in busy["users"]]) == (False, [other.pid])
+        assert f"(process {other.pid})" in text
+
+    def test_it_leads_on(self) -> None:
+        assert "next: lidarspec detect" in ran("ports").stderr
+
+
+class TestDoctor:
+    def _told(self, *words: object) -> list[dict[str, Any]]:
+        result = process("doctor", *words, "--json")
+        found: list[dict[str, Any]] = json.loads(result.stdout)
+        assert result.returncode == int(not all(finding["ok"] for finding in found))
+        return found
+
+    def test_a_sensor_that_is_well(self) -> None:
+        with virtual_port("ldrobot-stl27l") as made:
+            found = ran("doctor", made.path, "-s", "ldrobot-stl27l", "-t", "500ms")
+        assert "wrong" not in found.stdout
+        assert "ldrobot-stl27l sends: " in found.stdout
+
+    def test_another_sensor_than_thought(self) -> None:
+        with virtual_port("ldrobot-stl27l") as made:
+            found = ran("doctor", made.path, "-s", "cspc-coin-d4", "-t", "300ms", code=1).stdout
+        assert "it sends frames of ldrobot-stl27l, not of cspc-coin-d4" in found
+        assert f"next: lidarspec view {made.path} -s ldrobot-stl27l" in found
+
+    def test_one_that_waits_to_be_started(self) -> None:
+        with virtual_port("cspc-m1c1-mini") as made:
+            found = ran("doctor", made.path, "-s", "cspc-m1c1-mini", "-t", "300ms", code=1).stdout
+            assert f"next: lidarspec send {made.path} start -s cspc-m1c1-mini" in found
+            assert "--start" in ran("doctor", made.path, "-t", "300ms", code=1).stdout
+
+    def test_a_missing_port_and_one_in_use(self) -> None:
+        assert self._told("/dev/ttyNONE7") == [
+            {"ok": False, "text": "/dev/ttyNONE7: no such port; it is not plugged in, or its driver is missing", "mend": "lidarspec ports"}
+        ]
+        with virtual_port("ldrobot-stl27l") as made:
+            script = f"import lidarspec as ls; d = ls.open({made.path!r}, 'ldrobot-stl27l'); print(1, flush=True); input()"
+            with subprocess.Popen([sys.executable, "-c", script], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
+                assert other.stdout is not None
+                assert other.stdin is not None
+                other.stdout.readline()
+                texts = {finding["mend"]: finding["text"] for finding in self._told(made.path)}
+                other.stdin.close()
+        assert f"(process {other.pid})" in texts[f"kill {other.pid}"]
+
+    def test_bytes_of_nobody(self, tmp_path: Path) -> None:
+        source = random.Random(8)
+        with port(tmp_path) as made, working(lambda stop: paced(made.send, [source.randbytes(90) for _ in range(40)], 200, stop)):
+            found = ran("doctor", made.name, "-t", "300ms", code=1).stdout
+        assert "no frame of an installed sensor" in found
+        assert f"next: lidarspec detect {made.name}" in found
+
+    def test_a_port_without_permission(self, tmp_path: Path) -> None:
+        if os.geteuid() == 0:
+            pytest.skip("root may open everything")
+        with port(tmp_path) as made:
+            os.chmod(os.path.realpath(made.name), 0)
+            assert any("may not open it" in finding["text"] for finding in self._told(made.name))
+
+    def test_udp_with_and_without_packets(self) -> None:
+        with udp() as free:
+            number = free.getsockname()[1]
+        silent = self._told(f"udp://127.0.0.1:{number}", "-t", "300ms")
+        assert any("nothing came" in finding["text"] for finding in silent)
+        assert any("only packets to 127.0.0.1 are listened to" in finding["text"] for finding in silent)
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+            frames = simulate(ls.sensor("robosense-m1"), 40)
+            with working(lambda stop: paced(lambda data: sender.sendto(data, ("127.0.0.1", number)), frames, 200, stop)):
+                well = self._told(f"udp://127.0.0.1:{number}", "-t", "500ms")
+        assert any(finding["ok"] and "robosense-m1 sends" in finding["text"] for finding in well)
+
+    def test_files(self, tmp_path: Path) -> None:
+        (tmp_path / "empty.bin").write_bytes(b"")
+        assert not self._told(tmp_path / "empty.bin")[0]["ok"]
+        assert not self._told(tmp_path / "none.bin")[0]["ok"]
+        (tmp_path / "good.bin").write_bytes(b"".join(simulate(ls.sensor("ldrobot-stl27l"), 30)))
+        assert self._told(tmp_path / "good.bin")[0]["ok"]
+
+    def test_the_whole_computer(self) -> None:
+        assert process("doctor").returncode in (0, 1)

@@ -1,0 +1,300 @@
+"""`record` and `replay` as they are typed: real ports, Ctrl-C, full disks, files that exist."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import re
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+import lidarspec as ls
+from lidarspec.files import Chunk
+from lidarspec.recordings import Recorder, Recording
+from tests.cli.running import printed, process, ran
+from tests.lines import SLACK, port
+
+STREAM, DATAGRAMS = "ldrobot-stl27l", "velodyne-vlp16"
+posix = pytest.mark.skipif(not hasattr(os, "openpty"), reason="needs pseudo terminals")
+
+
+def frames(sensor: str, number: int) -> list[bytes]:
+    return [ls.sensor(sensor).example("data", seed=seed) for seed in range(number)]
+
+
+@pytest.fixture
+def stream(tmp_path: Path) -> Path:
+    """A recording of 40 frames in 0.2 s."""
+    path = tmp_path / "stream.lsr"
+    with Recorder(path, STREAM, "serial:///dev/ttyUSB0", baud=921600) as kept:
+        for number, frame in enumerate(frames(STREAM, 40)):
+            kept.write(Chunk(frame, 10**18 + number * 5_000_000))
+    return path
+
+
+@pytest.fixture
+def datagrams(tmp_path: Path) -> Path:
+    """A recording of 30 datagrams in 0.15 s."""
+    path = tmp_path / "datagrams.lsr"
+    some = frames(DATAGRAMS, 3)
+    with Recorder(path, DATAGRAMS, "udp://") as kept:
+        for number in range(30):
+            kept.write(Chunk(some[number % 3], 10**18 + number * 5_000_000, ("10.0.0.1", 2368), ("10.0.0.2", 2368)))
+    return path
+
+
+class Running:
+    """A verb at work in a process of its own."""
+
+    def __init__(self, *words: object, folder: Path) -> None:
+        command = [sys.executable, "-m", "lidarspec", *map(str, words)]
+        self._said, self._lines = "", threading.Condition()
+        self.child = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, cwd=folder, text=True)
+        self._listener = threading.Thread(target=self._listen)
+        self._listener.start()
+
+    def _listen(self) -> None:
+        assert self.child.stderr is not None
+        for line in self.child.stderr:
+            with self._lines:
+                self._said += line
+                self._lines.notify_all()
+
+    def hears(self, pattern: str) -> re.Match[str]:
+        """What it says about something, once it does."""
+        with self._lines:
+            assert self._lines.wait_for(lambda: re.search(pattern, self._said), 60), self._said
+            found = re.search(pattern, self._said)
+        assert found is not None
+        return found
+
+    def ended(self, code: int) -> str:
+        """What it said until its end; it has to end with this code."""
+        self.child.wait(60)
+        self._listener.join()
+        assert self.child.stdout is not None
+        output = self.child.stdout.read()
+        self.child.stdout.close()
+        assert self.child.stderr is not None
+        self.child.stderr.close()
+        assert self.child.returncode == code, self._said
+        assert "Traceback" not in self._said
+        return self._said + output
+
+
+@pytest.fixture
+def started(tmp_path: Path) -> Iterator[Callable[..., Running]]:
+    """Starts verbs; those that are still at work at the end of the test are ended."""
+    made: list[Running] = []
+
+    def start(*words: object) -> Running:
+        made.append(Running(*words, folder=tmp_path))
+        return made[-1]
+
+    yield start
+    for running in made:
+        if running.child.poll() is None:
+            running.child.kill()
+            running.ended(-signal.SIGKILL)
+
+
+def received(path: Path) -> bytes:
+    with Recording(path) as recording:
+        return b"".join(item.data for item in recording if item.direction == "in")
+
+
+@posix
+def test_recorded_replayed_and_recorded_again_it_is_the_same(stream: Path, tmp_path: Path, started: Callable[..., Running]) -> None:
+    player = started("replay", stream, "--json")
+    place = player.hears(r"playing \S+ to (/dev/\S+),")[1]
+    assert player.hears("next: (.*)")[1] == f"lidarspec view {place} -s {STREAM}"
+    again = tmp_path / "again.lsr"
+    ran("record", place, "-s", STREAM, "-o", again, "-n", 40)
+    assert player.ended(0)
+    assert hashlib.sha256(received(again)).hexdigest() == hashlib.sha256(received(stream)).hexdigest()
+    with Recording(again) as recording:
+        assert (recording.header.sensor, recording.header.source, recording.header.baud) == (STREAM, place, 921600)
+        times = [item.at for item in recording if item.direction == "in" and item.at]
+    assert 0.19 < (times[-1] - times[0]) / 1e9 < 0.2 * SLACK
+    with ls.open(stream) as one, ls.open(again) as other:
+        assert [p.raw.tobytes() for p in one.packets()] == [p.raw.tobytes() for p in other.packets()]
+
+
+def test_datagrams_recorded_from_a_socket_as_capture_and_recording(
+    datagrams: Path, tmp_path: Path, started: Callable[..., Running]
+) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
+        free.bind(("127.0.0.1", 0))
+        place = f"udp://127.0.0.1:{free.getsockname()[1]}"
+    for name in ("again.pcap", "again.lsr"):
+        taker = started("record", place, "-s", DATAGRAMS, "-o", name, "-n", 30)
+        taker.hears("nothing has arrived")
+        ran("replay", datagrams, "--to", place)
+        assert "30 packets, 30 records" in taker.ended(0)
+        with ls.open(datagrams) as one, ls.open(tmp_path / name, DATAGRAMS) as other:
+            before, after = (b"".join(p.raw.tobytes() for p in device.packets()) for device in (one, other))
+        assert before == after
+
+
+@posix
+def test_ctrl_c_ends_a_recording_properly(tmp_path: Path, started: Callable[..., Running]) -> None:
+    data = b"".join(frames(STREAM, 20))
+    with port(tmp_path) as line:
+        taker = started("record", line.name, "-s", STREAM, "-o", "it.lsr")
+        deadline = time.monotonic() + 60
+        while not (tmp_path / "it.lsr").exists() and time.monotonic() < deadline:
+            time.sleep(0.02)
+        line.send(data)
+        while received_so_far(tmp_path / "it.lsr") < len(data) and time.monotonic() < deadline:
+            time.sleep(0.02)
+        taker.child.send_signal(signal.SIGINT)
+        said = taker.ended(130)
+    assert "20 packets" in said
+    assert "next: lidarspec view it.lsr" in said
+    assert received(tmp_path / "it.lsr") == data
+
+
+def received_so_far(path: Path) -> int:
+    try:
+        return len(received(path))
+    except ls.LidarSpecError:
+        return 0
+
+
+@posix
+def test_without_a_sensor_bytes_are_recorded_as_they_come(tmp_path: Path, started: Callable[..., Running]) -> None:
+    with port(tmp_path) as line:
+        taker = started("record", f"{line.name}?baud=115200", "-o", "raw.lsr", "-t", "1s")
+        deadline = time.monotonic() + 60
+        while not (tmp_path / "raw.lsr").exists() and time.monotonic() < deadline:
+            time.sleep(0.02)
+        time.sleep(0.2)
+        line.send(b"what nobody knows")
+        assert "next: lidarspec detect raw.lsr" in taker.ended(0)
+    assert received(tmp_path / "raw.lsr") == b"what nobody knows"
+    with Recording(tmp_path / "raw.lsr") as recording:
+        assert (recording.header.sensor, recording.header.baud) == ("", 115200)
+
+
+def test_captures_become_recordings_and_back(datagrams: Path, tmp_path: Path) -> None:
+    capture, back = tmp_path / "it.pcap", tmp_path / "back.lsr"
+    assert printed("record", datagrams, "-o", capture)["packets"] == 30
+    assert printed("record", capture, "-s", DATAGRAMS, "-o", back)["bytes"] == 30 * 1206
+    assert received(back) == received(datagrams)
+    assert printed("record", datagrams, "-o", tmp_path / "part.lsr", "-n", 7)["records"] == 7
+    assert printed("record", datagrams, "-o", tmp_path / "begin.lsr", "-t", "50ms")["records"] == 10
+
+
+def test_the_bytes_of_a_stream_can_be_taken_out(stream: Path, tmp_path: Path) -> None:
+    ran("record", stream, "-o", tmp_path / "it.bin")
+    assert (tmp_path / "it.bin").read_bytes() == received(stream)
+
+
+def test_standard_input_gets_the_times_of_its_arrival(tmp_path: Path) -> None:
+    before = time.time_ns()
+    done = process("record", "-", "-o", "it.lsr", given=b"abc", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    with Recording(tmp_path / "it.lsr") as recording:
+        assert [(item.data, before <= (item.at or 0) <= time.time_ns()) for item in recording] == [(b"abc", True)]
+
+
+def test_damaged_recordings_are_mended(stream: Path, tmp_path: Path) -> None:
+    whole = bytearray(stream.read_bytes())
+    whole[len(whole) // 2] ^= 1
+    stream.write_bytes(whole)
+    said = ran("record", stream, "-o", tmp_path / "stopped.lsr").stderr
+    assert "damaged at byte" in said
+    assert f"next: lidarspec record {stream} --salvage" in said
+    assert "damaged in 1 place" in ran("record", stream, "--salvage", "-o", tmp_path / "mended.lsr").stderr
+    with ls.open(tmp_path / "mended.lsr") as device:
+        assert sum(len(packets) for packets in device.packets()) == 39
+
+
+@pytest.mark.parametrize("verb", [("record", "-o"), ("replay", "--to")])
+def test_nothing_is_overwritten_without_force(stream: Path, tmp_path: Path, verb: tuple[str, str]) -> None:
+    target = tmp_path / "it.lsr"
+    target.write_bytes(b"precious")
+    result = ran(verb[0], stream, verb[1], target, code=2)
+    assert "exists already" in result.stderr
+    assert "--force" in result.stderr
+    assert target.read_bytes() == b"precious"
+    ran(verb[0], stream, verb[1], target, "--force")
+    assert received(target) == received(stream)
+    assert "would be overwritten" in ran(verb[0], target, verb[1], target, "--force", code=2).stderr
+    assert received(target) == received(stream)
+
+
+def test_what_cannot_be_recorded_says_why(stream: Path, datagrams: Path, tmp_path: Path) -> None:
+    assert "byte stream" in ran("record", stream, "-o", tmp_path / "it.pcap", code=2).stderr
+    assert "where a datagram ends" in ran("record", datagrams, "-o", tmp_path / "it.bin", code=2).stderr
+    assert "unknown format '.csv'" in ran("record", stream, "-o", tmp_path / "it.csv", code=2).stderr
+    assert "-n counts packets" in ran("record", stream, "-o", tmp_path / "it.lsr", "-n", 3, code=2).stderr
+    assert "No such file" in ran("record", tmp_path / "nowhere.lsr", "-o", tmp_path / "it.lsr", code=3).stderr
+    assert "next: lidarspec" in ran("record", "/dev/ttyNONE", "-s", STREAM, "-o", tmp_path / "it.lsr", code=3).stderr
+    assert not (tmp_path / "it.lsr").exists()
+    (tmp_path / "empty.bin").touch()
+    assert "holds nothing" in ran("record", tmp_path / "empty.bin", "-o", tmp_path / "it.lsr", code=4).stderr
+    assert not (tmp_path / "it.lsr").exists()
+
+
+def test_a_silent_source_leaves_no_empty_file(tmp_path: Path) -> None:
+    assert "sent nothing" in ran("record", "udp://127.0.0.1:45671", "-t", "0.2", "-o", tmp_path / "it.lsr", code=5).stderr
+    assert not (tmp_path / "it.lsr").exists()
+
+
+@pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() != 0, reason="only root may mount a small disk")
+def test_a_full_disk_ends_it_with_one_line_and_a_whole_file(tmp_path: Path, stream: Path) -> None:
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    made = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=64k", "tmpfs", disk], capture_output=True, check=False)
+    if made.returncode:
+        pytest.skip(f"no disk can be mounted here: {made.stderr.decode().strip()}")
+    try:
+        shutil.copy(stream, tmp_path / "long.bin")
+        with open(tmp_path / "long.bin", "wb") as file:
+            file.write(received(stream) * 100)
+        result = ran("record", tmp_path / "long.bin", "-s", STREAM, "-o", disk / "it.lsr", code=3)
+        assert re.fullmatch(r".*No space left on device; the recording is whole up to byte \d+\n  next: .*\n", result.stderr), result.stderr
+        with Recording(disk / "it.lsr") as recording:
+            list(recording)
+            assert recording.leftover == 0
+    finally:
+        subprocess.run(["umount", "-l", disk], check=True)
+
+
+def test_replays_say_what_they_cannot_do(stream: Path, datagrams: Path, tmp_path: Path) -> None:
+    assert "datagrams were recorded" in ran("replay", datagrams, "--to", "pty", code=2).stderr
+    assert "a byte stream was recorded" in ran("replay", stream, "--to", "udp://127.0.0.1:9", code=2).stderr
+    assert "is live" in ran("replay", "udp://:2368", code=2).stderr
+    assert "no speed" in ran("replay", stream, "--speed", "0", code=2).stderr
+    assert "never ends" in ran("replay", stream, "--to", tmp_path / "it.lsr", "--loop", code=2).stderr
+    raw = tmp_path / "it.bin"
+    raw.write_bytes(received(stream))
+    assert "when its bytes arrived" in ran("replay", raw, "--speed", "1", "--to", tmp_path / "it.lsr", code=2).stderr
+
+
+def test_a_replay_sums_up_with_a_digest(datagrams: Path) -> None:
+    found = json.loads(ran("replay", datagrams, "--to", "udp://127.0.0.1:45672", "--speed", "10x", "--json").stdout)
+    assert (found["chunks"], found["bytes"], found["sha256"]) == (30, 36180, hashlib.sha256(received(datagrams)).hexdigest())
+
+
+@posix
+def test_a_loop_serves_one_reader_after_another_until_ctrl_c(stream: Path, tmp_path: Path, started: Callable[..., Running]) -> None:
+    player = started("replay", stream, "--loop")
+    place = player.hears(r"playing \S+ to (/dev/\S+),")[1]
+    for number, name in enumerate(("one.lsr", "two.lsr"), start=1):
+        ran("record", place, "-s", STREAM, "-o", tmp_path / name, "-n", 60)
+        assert received(tmp_path / name).startswith(received(stream))
+        player.hears(f"(?s)(nobody reads.*){{{number}}}")
+    player.child.send_signal(signal.SIGINT)
+    assert "stream.lsr to /dev/" in player.ended(130)

@@ -1,0 +1,129 @@
+"""`sim`: where the sensor is, what to type next, how it ends."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+import lidarspec as ls
+from tests.cli.running import process, ran
+from tests.lines import SLACK
+
+posix = pytest.mark.skipif(os.name != "posix", reason="pseudo terminals are POSIX")
+STL = "ldrobot-stl27l"
+
+
+def begun(*words: object) -> tuple[subprocess.Popen[str], str]:
+    """``lidarspec sim`` in a process of its own, and the first line that it prints."""
+    command = [sys.executable, "-m", "lidarspec", "sim", *map(str, words)]
+    running = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    assert running.stdout is not None
+    return running, running.stdout.readline().strip()
+
+
+@posix
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_it_is_read_by_another_program_and_ends_cleanly(number: signal.Signals, tmp_path: Path) -> None:
+    link = tmp_path / "ttyLIDAR"
+    running, where = begun("cspc-m1c1-mini", "--link", link, "--rate", "3")
+    try:
+        assert where == str(link)
+        with ls.open(where, "cspc-m1c1-mini") as device:
+            assert device.latest(SLACK).complete
+    finally:
+        running.send_signal(number)
+        _, said = running.communicate(timeout=SLACK)
+    assert running.returncode == 130
+    assert not link.is_symlink()
+    assert "Traceback" not in said
+    lines = said.splitlines()
+    assert lines[0] == "cspc-m1c1-mini, simulated"
+    assert lines[1] == f"  next: lidarspec view {link} -s cspc-m1c1-mini"
+    assert [line.split()[-1] for line in lines[2:4]] == ["start", "stop"]
+    assert "1 info, 1 scan_start" in lines[4]
+    assert lines[-1] == "interrupted"
+
+
+@posix
+def test_a_port_is_the_default_of_a_serial_sensor_and_datagrams_of_the_others() -> None:
+    assert ran("sim", STL, "-t", "100ms").stdout.startswith("/dev/")
+    result = ran("sim", "velodyne-vlp16", "-t", "100ms")
+    assert result.stdout == "udp://127.0.0.1?port=2368,8308\n"
+    assert "next: lidarspec view 'udp://127.0.0.1?port=2368,8308' -s velodyne-vlp16" in result.stderr
+    assert " data" in result.stderr
+
+
+def test_the_place_as_json() -> None:
+    made = json.loads(ran("sim", "hesai-xt32", "-t", "50ms", "--to", "udp://127.0.0.1:2999", "--json").stdout)
+    assert made == {
+        "sensor": "hesai-xt32",
+        "place": "udp://127.0.0.1:2999",
+        "source": "udp://127.0.0.1:2999",
+        "next": "lidarspec view udp://127.0.0.1:2999 -s hesai-xt32",
+    }
+
+
+def test_datagrams_for_another_computer_are_read_there_at_every_interface() -> None:
+    result = ran("sim", "hesai-xt32", "-t", "20ms", "--to", "udp://127.0.0.2:2999")
+    assert result.stdout == "udp://127.0.0.2:2999\n"
+    assert "lidarspec view udp://:2999 -s hesai-xt32" in result.stderr
+
+
+def test_a_file_is_written_at_once_and_can_be_read(tmp_path: Path) -> None:
+    path, began = tmp_path / "made.lsr", time.monotonic()
+    result = ran("sim", STL, "--to", path, "-t", "20s", "--errors", "0.1%", "--seed", "3")
+    assert time.monotonic() - began < 20
+    assert result.stdout == f"{path}\n"
+    assert "36000 data frames sent" in result.stderr or "36001 data frames sent" in result.stderr
+    with ls.open(path) as device:
+        assert len([scan for scan in device.scans() if scan.complete]) in (198, 199, 200)
+        assert device.stats.bad_checksum > 0
+    assert "exists" in ran("sim", STL, "--to", path, code=2).stderr
+    ran("sim", STL, "--to", path, "-t", "1s", "--force")
+
+
+def test_the_plug_is_pulled_and_said_to_be(tmp_path: Path) -> None:
+    result = ran("sim", "velodyne-vlp16", "-t", "1s", "--unplug", "300ms", "--absent", "200ms", "--to", "udp://127.0.0.1:2998")
+    assert [line.partition(" s: ")[2] for line in result.stderr.splitlines() if " s: " in line][:2] == [
+        "unplugged",
+        "plugged in again, udp://127.0.0.1:2998",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "said"),
+    [
+        (("ldrobot-stl27",), 2, "did you mean 'ldrobot-stl27l'"),
+        ((STL, "--to", "udp://"), 2, "lidarspec sim ldrobot-stl27l --to pty"),
+        (("hesai-xt32", "--to", "pty"), 2, "lidarspec sim hesai-xt32 --to udp://127.0.0.1"),
+        ((STL, "--to", "made.csv"), 2, "is no place: pty, udp://HOST:PORT"),
+        ((STL, "--to", "made.pcap"), 2, "byte stream"),
+        ((STL, "--rate", "0.0x"), 2, "rate is a number above 0"),
+        ((STL, "--errors", "3"), 2, "is no share"),
+        ((STL, "--reorder", "3"), 2, "keep their order"),
+        ((STL, "--scene", "no.toml"), 3, "No such file"),
+        ((STL, "--to", "made.bin", "--link", "x"), 2, "goes with --to pty"),
+        ((STL, "--to", "tcp://256.0.0.1:99"), 3, "cannot listen there"),
+        ((), 2, "Missing argument 'SENSOR'"),
+    ],
+)
+def test_what_cannot_be_done_is_said_in_a_line_with_its_code(words: tuple[str, ...], code: int, said: str) -> None:
+    result = ran("sim", *words, code=code)
+    assert said in result.stderr
+    assert result.stdout == ""
+
+
+@posix
+def test_a_link_that_stands_already_is_the_systems_fault(tmp_path: Path) -> None:
+    taken = tmp_path / "taken"
+    taken.write_text("")
+    done = process("sim", STL, "--link", taken)
+    assert done.returncode == 3
+    assert b"File exists" in done.stderr

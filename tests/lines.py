@@ -1,0 +1,125 @@
+"""Real lines for live tests: pseudo terminals behind a name that can be pulled out, and senders that keep a rate."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import socket
+import threading
+import time
+import tty
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from lidarspec import Sensor
+
+#: how much later than promised something may happen while the machine is busy.
+SLACK = 5.0
+
+
+class Port:
+    """A serial port: a pseudo terminal, reached through a name that goes away when it is unplugged."""
+
+    def __init__(self, name: Path) -> None:
+        self.name, self._master, self._slave = name, -1, -1
+        self.plug()
+
+    def plug(self) -> None:
+        self._master, self._slave = os.openpty()
+        tty.setraw(self._slave)
+        self.name.symlink_to(os.ttyname(self._slave))
+
+    def unplug(self) -> None:
+        self.name.unlink()
+        os.close(self._slave)
+        os.close(self._master)
+        self._master = -1
+
+    def send(self, data: bytes) -> None:
+        os.write(self._master, data)
+
+    def received(self, size: int) -> bytes:
+        """The next bytes that the program on the other side wrote."""
+        found = b""
+        while len(found) < size:
+            found += os.read(self._master, size - len(found))
+        return found
+
+    def close(self) -> None:
+        if self._master >= 0:
+            self.unplug()
+
+
+@contextlib.contextmanager
+def port(folder: Path) -> Iterator[Port]:
+    made = Port(folder / "ttyTEST")
+    try:
+        yield made
+    finally:
+        made.close()
+
+
+@contextlib.contextmanager
+def working(function: Callable[[threading.Event], None]) -> Iterator[threading.Event]:
+    """A function in a thread, given the event that asks it to stop."""
+    stop = threading.Event()
+    thread = threading.Thread(target=function, args=(stop,))
+    thread.start()
+    try:
+        yield stop
+    finally:
+        stop.set()
+        thread.join()
+
+
+def paced(send: Callable[[bytes], object], frames: Sequence[bytes], rate: float, stop: threading.Event, tick: float = 0.002) -> int:
+    """Send frames at a rate, again and again until asked to stop, in bunches every `tick` seconds; the number sent."""
+    began, sent = time.monotonic(), 0
+    while not stop.is_set():
+        due = int((time.monotonic() - began) * rate)
+        for index in range(sent, due):
+            send(frames[index % len(frames)])
+        sent = max(sent, due)
+        time.sleep(tick)
+    return sent
+
+
+def until(condition: Callable[[], object], seconds: float = SLACK) -> float:
+    """The seconds until something is so; fails where it does not become so."""
+    began = time.monotonic()
+    while not condition():
+        assert time.monotonic() - began < seconds, "it did not happen in time"
+        time.sleep(0.005)
+    return time.monotonic() - began
+
+
+@contextlib.contextmanager
+def udp(host: str = "127.0.0.1") -> Iterator[socket.socket]:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as made:
+        made.bind((host, 0))
+        yield made
+
+
+def free_port() -> int:
+    """A UDP port that nobody uses."""
+    with udp() as made:
+        number: int = made.getsockname()[1]
+        return number
+
+
+def _values(sensor: str, index: int) -> dict[str, Any]:
+    """What the packet of this number holds."""
+    match sensor:
+        case "shape-clock":  # 40 packets a scan
+            return {"seconds": index // 400 % 60, "ticks": index % 400 * 25, "distances": [1000 + index % 500] * 4}
+        case "shape-commands":  # 18 packets a turn
+            return {"angle": index * 2000 % 36000, "distances": [1000 + index % 500] * 3}
+        case _:
+            block = {"azimuth": index * 100 % 36000, "channels": [{"distance": 400, "intensity": 7}] * 3}
+            return {"number": 1 + index % 200, "reserved": bytes(3), "blocks": [block] * 4}
+
+
+def turning(sensor: Sensor, number: int) -> list[bytes]:
+    """The first data frames of one of the shapes that live tests use, clock, commands or datagrams, as it turns."""
+    return [sensor.build("data", **_values(sensor.id, index)) for index in range(number)]

@@ -1,0 +1,204 @@
+"""Whose bytes: captures, live ports, twins that only their clock or a name tells apart, and bytes of nobody."""
+
+from __future__ import annotations
+
+import random
+import socket
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+import lidarspec as ls
+from lidarspec import CommandError, SourceError, UsageError, WireError
+from lidarspec.detect import detected, scores, verdict, verdicts
+from lidarspec.hearing import Heard, bauds, hear, udp_ports
+from lidarspec.probing import probe, started_first
+from lidarspec.simulator import simulate
+from lidarspec.structure import structure
+from lidarspec.testing.ports import virtual_port
+from tests.lines import Port, paced, port, working
+from tests.sensors.evidence import capture
+
+CAPTURED = {
+    "cspc/coin_d4_ludovatech_issue2_partial.bin": "cspc-coin-d4",
+    "ldrobot/ld06_3_consecutive_frames.bin": "ldrobot-ld06",
+    "hesai/40p/packets.derived.pcap": "hesai-pandar40p",
+    "hesai/40p_20hz/lidar_20Hz.pcapng": "hesai-pandar40p",
+    "hesai/xt32/packets.derived.pcap": "hesai-xt32",
+    "hesai/qt64/packets.derived.pcap": "hesai-qt64",
+    "robosense/helios16p/packets.derived.pcap": "robosense-helios16p",
+    "velodyne/hdl32e/sample_velodyne_hdl32.pcap": "velodyne-hdl32e",
+    "velodyne/vlp16_dual/packets.derived.pcap": "velodyne-vlp16",
+    "velodyne/vlp16_old_firmware/vlp-16-test-90deg-1-50-frames.pcap": "velodyne-vlp16",
+    "velodyne/vlp16_raw/recording.bin": "velodyne-vlp16",
+    "velodyne/vlp16_raw/packet.bin": "velodyne-vlp16",
+}
+FOREIGN = ("ouster/OS-0-32-U1_v2.2.0_1024x10.pcap", "sick/20210113_tim871s_elephant.tcpstream.bin")
+
+
+@pytest.mark.parametrize("name", CAPTURED)
+def test_every_capture_is_its_sensors(name: str) -> None:
+    assert detected(capture(name)).id == CAPTURED[name]
+
+
+@pytest.mark.parametrize("name", FOREIGN)
+def test_captures_of_others_are_nobodys(name: str) -> None:
+    with pytest.raises(WireError, match="no installed sensor's frames"):
+        detected(capture(name))
+
+
+def test_the_same_frames_without_a_difference_are_said_to_be_the_same() -> None:
+    (found,) = verdicts(capture("ydlidar/packets_checksum_ok_concat.bin"))
+    assert found.sensor is None
+    assert {score.sensor.id for score in found.alike} == {"cspc-coin-d4", "cspc-m1c1-mini"}
+    with pytest.raises(UsageError, match="send the same frames"):
+        detected(capture("ydlidar/packets_checksum_ok_concat.bin"))
+
+
+@pytest.mark.parametrize("name", ["ldrobot-stl27l", "ldrobot-ld06", "velodyne-vlp16", "velodyne-hdl32e"])
+def test_clocks_tell_twins_apart(name: str) -> None:
+    sensor = ls.sensor(name)
+    data = simulate(sensor, 60, start=7)
+    found = verdict(Heard("", tuple(data), datagrams=sensor.datagrams))
+    assert found.sensor is sensor
+    assert "its clock advances by" in found.alike[0].why
+
+
+def test_a_baud_rate_decides_where_the_bytes_do_not() -> None:
+    sensor = ls.sensor("slamtec-rplidar-s2")
+    data = (sensor.build("scan_descriptor"), *simulate(sensor, 300))
+    assert len(verdict(Heard("", data)).alike) == 4
+    found = verdict(Heard("", data, baud=1_000_000))
+    assert (found.sensor and found.sensor.id, found.alike[0].why) == ("slamtec-rplidar-s2", "it runs at 1000000 baud")
+
+
+def test_a_scan_that_is_met_in_its_middle_is_known_all_the_same() -> None:
+    sensor = ls.sensor("slamtec-rplidar-a1")
+    assert "slamtec-rplidar-a1" in {score.sensor.id for score in scores([b"".join(simulate(sensor, 300))], datagrams=False)}
+
+
+def test_chance_frames_in_much_noise_are_no_fit() -> None:
+    noise = random.Random(4).randbytes(40_000)
+    data = noise[:20_000] + simulate(ls.sensor("ldrobot-stl27l"), 1)[0] + noise[20_000:]
+    assert scores([data], datagrams=False)
+    assert verdict(Heard("", (data,))).scores == ()
+
+
+def test_damage_does_not_hide_a_sensor() -> None:
+    source, data = random.Random(5), bytearray(b"".join(simulate(ls.sensor("ldrobot-stl27l"), 300)))
+    for _ in range(len(data) // 100):
+        data[source.randrange(len(data))] ^= 0xFF
+    found = verdict(Heard("", (bytes(data),)))
+    assert found.sensor is not None
+    assert found.sensor.id == "ldrobot-stl27l"
+    assert 0.4 < found.scores[0].share < 0.8
+
+
+@pytest.mark.parametrize("name", ["ldrobot-stl27l", "ldrobot-ld06"])
+def test_a_simulated_port_is_its_sensors(name: str) -> None:
+    with virtual_port(name) as made:
+        assert detected(made.path).id == name
+        assert detected(f"serial://{made.path}?baud=230400").id == name
+
+
+def test_a_sensor_that_has_to_be_started_first() -> None:
+    assert {"cspc-m1c1-mini", "slamtec-rplidar-a1"} <= {sensor.id for sensor in started_first()}
+    with virtual_port("cspc-m1c1-mini") as made:
+        with pytest.raises(CommandError, match="nothing comes") as error:
+            detected(made.path)
+        assert error.value.__notes__ == [f"next: lidarspec doctor {made.path}"]
+        assert made.device.heard == []
+        heard = next(heard for heard in probe(made.path) if heard.size)
+        found = verdict(heard)
+        assert (found.sensor and found.sensor.id, found.alike[0].why) == ("cspc-m1c1-mini", "info.model says M1C1_Mini")
+        assert made.device.heard[-1] == "stop"
+
+
+def test_udp_datagrams_of_two_senders_are_told_apart() -> None:
+    vlp, xt = simulate(ls.sensor("velodyne-vlp16"), 40), simulate(ls.sensor("hesai-xt32"), 40)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as first, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as second:
+        first.bind(("127.0.0.1", 0))
+        second.bind(("127.0.0.2", 0))
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe_socket:
+            probe_socket.bind(("127.0.0.1", 0))
+            target = probe_socket.getsockname()[1]
+
+        def send(stop: threading.Event) -> None:
+            while not stop.is_set():
+                for one, other in zip(vlp, xt, strict=True):
+                    first.sendto(one, ("127.0.0.1", target))
+                    second.sendto(other, ("127.0.0.1", target))
+                    time.sleep(0.002)
+
+        with working(send):
+            found = {one.heard.sender: one.sensor and one.sensor.id for one in verdicts(f"udp://127.0.0.1:{target}")}
+            with pytest.raises(UsageError, match="several sensors send"):
+                detected(f"udp://127.0.0.1:{target}")
+            assert detected(f"udp://127.0.0.1:{target}?src=127.0.0.2").id == "hesai-xt32"
+    assert found == {"127.0.0.1": "velodyne-vlp16", "127.0.0.2": "hesai-xt32"}
+
+
+def test_bytes_at_the_wrong_rate_fit_nobody(tmp_path: Path) -> None:
+    source = random.Random(6)
+    with port(tmp_path) as made, working(lambda stop: _noise(made, source, stop)), pytest.raises(WireError, match="no installed sensor"):
+        detected(made.name)
+
+
+def _noise(made: Port, source: random.Random, stop: threading.Event) -> None:
+    paced(made.send, [source.randbytes(100) for _ in range(50)], 200, stop)
+
+
+def test_what_cannot_be_opened_is_the_systems_fault(tmp_path: Path) -> None:
+    with pytest.raises(SourceError, match="no such port"):
+        detected("/dev/ttyNONE7")
+    with pytest.raises(UsageError, match="standard input"):
+        detected("-")
+    (tmp_path / "empty.bin").write_bytes(b"")
+    with pytest.raises(WireError, match="no bytes"):
+        detected(tmp_path / "empty.bin")
+
+
+def test_what_is_listened_to() -> None:
+    assert {115_200, 150_000, 230_400, 921_600} <= set(bauds())
+    assert {2368, 6699, 7788} <= set(udp_ports())
+
+
+def test_a_pseudo_terminal_is_listened_to_once() -> None:
+    with virtual_port("ldrobot-stl27l") as made:
+        (heard,) = hear(made.path, seconds=0.3)
+    assert heard.baud is None
+    assert heard.size > 47
+
+
+class TestStructure:
+    """What unknown bytes are made of."""
+
+    def test_frames_of_one_length(self) -> None:
+        data = b"".join(simulate(ls.sensor("ldrobot-stl27l"), 60))[13:]
+        found = structure([data[:1000], data[1000:]], datagrams=False)
+        assert found is not None
+        assert (found.sync[:2], found.period, len(found.frames)) == (b"\x54\x2c", 47, 59)
+        assert (found.checksums[0].paste, found.checksums[0].right) == ("Crc(width=8, poly=0x4D)", 59)
+
+    def test_frames_that_say_how_long_they_are(self) -> None:
+        found = structure([b"\xfe" + b"".join(simulate(ls.sensor("cspc-m1c1-mini"), 60))], datagrams=False)
+        assert found is not None
+        assert (found.sync, found.period, found.length) == (b"\xaa\x55", None, "10 + 3 x byte at 3")
+        assert found.checksums[0].paste == "WordXor(head=8, groups=(1, 2))"
+
+    def test_long_frames_with_shorter_ones_in_them(self) -> None:
+        found = structure([b"".join(simulate(ls.sensor("robosense-m1"), 60))], datagrams=False, seal=False)
+        assert found is not None
+        assert (found.sync[:4].hex(), found.period) == ("55aa5aa5", 1210)
+
+    def test_datagrams(self) -> None:
+        found = structure(simulate(ls.sensor("robosense-m1"), 20), datagrams=True, seal=False)
+        assert found is not None
+        assert (found.sync[:4].hex(), found.period, found.share) == ("55aa5aa5", 1210, 1.0)
+
+    @pytest.mark.parametrize("data", [b"", b"\x00" * 5000, random.Random(7).randbytes(20_000), b"a line of some text\n" * 3])
+    def test_nothing_is_seen_where_nothing_is(self, data: bytes) -> None:
+        assert structure([data], datagrams=False) is None
+        assert structure([data] if data else [], datagrams=True) is None

@@ -1,0 +1,59 @@
+"""Long captures decoded as a stream: memory does not grow with the file."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import lidarspec as ls
+from lidarspec.pcap import Datagram, PcapWriter
+from lidarspec.simulator import simulate
+
+SENSOR = "robosense-m1"
+ENDS = ("192.168.1.200", 6699), ("192.168.1.102", 6699)
+
+CHILD = r"""
+import re, sys
+from pathlib import Path
+import lidarspec as ls
+def most():
+    # What getrusage tells begins with the memory of the process that started this one.
+    return int(re.search(r"VmHWM:\s+(\d+) kB", Path("/proc/self/status").read_text())[1])
+count = 0
+with ls.open(sys.argv[1], sys.argv[2]) as device:
+    for scan in device.scans():
+        count += len(scan.points.x)
+        if count < 400_000:
+            first = most()
+print(count, first, most())
+"""
+
+
+def written(path: Path, megabytes: int) -> int:
+    """Writes frames of the sensor over and over; the number of packets."""
+    frames = simulate(ls.sensor(SENSOR), 630)
+    with path.open("wb") as file:
+        writer = PcapWriter(file)
+        for index, frame in enumerate(frames):
+            writer.write(Datagram(frame, 10**18 + index * 158_730, *ENDS))
+    data = path.read_bytes()
+    times = max((megabytes << 20) // len(data), 1)
+    with path.open("ab") as file:
+        for _ in range(times - 1):
+            file.write(data[24:])
+    return len(frames) * times
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+@pytest.mark.parametrize("megabytes", [60, pytest.param(1024, marks=pytest.mark.soak)])
+def test_a_capture_of_any_length_is_decoded_below_200_mb(megabytes: int, tmp_path: Path) -> None:
+    path = tmp_path / "long.pcap"
+    packets = written(path, megabytes)
+    done = subprocess.run([sys.executable, "-c", CHILD, str(path), SENSOR], capture_output=True, text=True, check=True, timeout=500)
+    count, first, most = map(int, done.stdout.split())
+    assert count == packets * 125
+    assert most * 1024 < 200_000_000, f"{most} KiB"
+    assert most - first < 40_000, f"from {first} to {most} KiB"

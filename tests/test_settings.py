@@ -1,0 +1,192 @@
+"""`lidarspec.toml`: devices by name, in Python and in every verb; mistakes are named with file, table and key."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import lidarspec as ls
+from lidarspec import settings
+from lidarspec.mounting import Mount
+from lidarspec.scans import Scan
+from lidarspec.simulator import simulate
+from tests.cli.running import ran
+
+SENSOR = "ldrobot-stl27l"
+GOOD = f"""
+[device.front]
+source = "./front.bin"
+sensor = "{SENSOR}"
+mount = {{x = 1, yaw_deg = 90, inverted = true}}
+
+[device.rear]
+source = "udp://:6699"
+"""
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder with a settings file and a capture, which is the working directory; the user has none of his own."""
+    home, here = tmp_path / "home", tmp_path / "project" / "deep"
+    here.mkdir(parents=True)
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(home))
+    monkeypatch.setenv("APPDATA", str(home))
+    monkeypatch.chdir(here)
+    (here.parent / "lidarspec.toml").write_text(GOOD, encoding="utf-8")
+    sensor = ls.sensor(SENSOR)
+    (here.parent / "front.bin").write_bytes(b"".join(simulate(sensor, 600)))
+    return here.parent
+
+
+def whole(source: str | Path, sensor: str | None = None) -> Scan:
+    with ls.open(source, sensor) as device:
+        return next(scan for scan in device.scans() if scan.complete)
+
+
+def test_a_name_opens_its_source_with_its_sensor_and_mount(folder: Path) -> None:
+    plain, mounted = whole(folder / "front.bin", SENSOR), whole("front")
+    assert mounted.sensor.id == SENSOR
+    # turned over y and z change sign, then a quarter turn to the left: (x, y) -> (y, x)
+    np.testing.assert_allclose(mounted.points.x, plain.points.y + 1, atol=1e-5)
+    np.testing.assert_allclose(mounted.points.y, plain.points.x, atol=1e-5)
+    np.testing.assert_array_equal(mounted.points.range, plain.points.range)
+
+
+def test_packets_stay_in_the_sensors_axes(folder: Path) -> None:
+    with ls.open("front") as device:
+        cloud = next(device.packets()).points()
+    with ls.open(folder / "front.bin", SENSOR) as device:
+        np.testing.assert_array_equal(cloud.x, next(device.packets()).points().x)
+
+
+@pytest.mark.parametrize(
+    "words", [("stats", "front", "--json"), ("read", "front", "-n", "2"), ("view", "front", "--once"), ("convert", "front", "out.csv")]
+)
+def test_every_verb_takes_a_name(folder: Path, words: tuple[str, ...]) -> None:
+    assert ran(*words).exit_code == 0
+
+
+def test_the_nearest_file_counts_and_the_users_fills_in(folder: Path) -> None:
+    user = folder.parent / "home" / "lidarspec"
+    user.mkdir(parents=True)
+    (user / "lidarspec.toml").write_text('[device.front]\nsource = "a.bin"\n[device.desk]\nsource = "tcp://desk:2"\n', encoding="utf-8")
+    found = settings.devices()
+    assert list(found) == ["front", "rear", "desk"]
+    assert found["front"].sensor == SENSOR
+    assert found["desk"].file == str(user / "lidarspec.toml")
+    (folder / "deep" / "lidarspec.toml").write_text("", encoding="utf-8")
+    assert list(settings.devices()) == ["front", "desk"]
+
+
+def test_paths_that_begin_with_a_dot_are_from_the_files_folder(folder: Path) -> None:
+    assert settings.devices()["front"].source == str(folder / "front.bin")
+    assert settings.devices()["rear"].source == "udp://:6699"
+
+
+def test_a_path_is_no_name(folder: Path) -> None:
+    assert settings.named("./front") is None
+    assert settings.named(Path("front")) is None
+    assert settings.named("udp://") is None
+    assert settings.named("-") is None
+    (folder / "deep" / "other").write_bytes(b"")
+    assert settings.named("other") is None
+
+
+def test_a_word_that_is_nothing_gets_a_suggestion(folder: Path) -> None:
+    with pytest.raises(ls.UsageError, match=r"'frnt' is no file, and no device of .*lidarspec.toml; did you mean 'front'\?"):
+        ls.open("frnt")
+
+
+def test_without_settings_a_word_is_a_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
+    monkeypatch.setenv("APPDATA", str(tmp_path))
+    with pytest.raises(ls.SourceError, match="front: No such file"):
+        ls.open("front", SENSOR)
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("[devices.front]", r"unknown table 'devices'; did you mean 'device'\?"),
+        ("[device]\nfront = 1", r"devices are tables of their own: \[device.front\]"),
+        ("[device.front]", r"\[device.front\]: source is missing"),
+        ('[device.front]\nsorce = "x.bin"', r"\[device.front\]: unknown key 'sorce'; did you mean 'source'\?"),
+        ("[device.front]\nsource = 3", r"\[device.front\]: source is text, not 3"),
+        ('[device.front]\nsource = "x.bin"\nsensor = ["a"]', r"\[device.front\]: sensor is text, not \['a'\]"),
+        ('[device.front]\nsource = "x.bin"\nmount = 90', r"\[device.front\]: mount is a table, not 90"),
+        ('[device.front]\nsource = "x.bin"\nmount = {yaw = 90}', r"\[device.front\] mount: unknown key 'yaw'; did you mean 'yaw_deg'\?"),
+        ('[device.front]\nsource = "x.bin"\nmount = {yaw_deg = "90"}', r"\[device.front\]: mount.yaw_deg is a number, not '90'"),
+        ('[device.front]\nsource = "x.bin"\nmount = {x = true}', r"mount.x is a number, not True"),
+        ('[device.front]\nsource = "x.bin"\nmount = {x = inf}', r"mount.x is a number, not inf"),
+        ('[device.front]\nsource = "x.bin"\nmount = {inverted = 1}', r"mount.inverted is true or false, not 1"),
+        ('[device.front]\nsource = "x.bin"\noptions = {zero = 1}', r"options are a sensor's: name the sensor as well"),
+        ('[device.front]\nsource = "rear"', r"source 'rear' is a name again"),
+        ('[device.COM4]\nsource = "x.bin"', r"\[device.COM4\]: a name is a letter"),
+        ('[device."a.bin"]\nsource = "x.bin"', r"\[device.a.bin\]: a name is a letter"),
+        ("[device.front", r"not TOML: "),
+    ],
+)
+def test_a_mistake_is_named_with_its_place(folder: Path, text: str, told: str) -> None:
+    (folder / "lidarspec.toml").write_text(text, encoding="utf-8")
+    with pytest.raises(ls.UsageError, match=rf"lidarspec\.toml: .*{told}"):
+        ls.open("front")
+    assert ran("stats", "front", code=2).stderr.startswith(str(folder / "lidarspec.toml"))
+
+
+def test_options_configure_the_sensor(folder: Path) -> None:
+    text = '[device.front]\nsource = "./front.bin"\nsensor = "velodyne-vlp16"\noptions = {frame = "vendor"}'
+    (folder / "lidarspec.toml").write_text(text, encoding="utf-8")
+    with ls.open("front") as device:
+        assert device.sensor.options["frame"] == "vendor"
+    (folder / "lidarspec.toml").write_text(text.replace("frame =", "fram ="), encoding="utf-8")
+    with pytest.raises(ls.UsageError, match="fram"):
+        ls.open("front")
+
+
+@pytest.mark.parametrize(
+    ("mount", "expected"),
+    [
+        (Mount(yaw_deg=90), (-2, 1, 3)),
+        (Mount(pitch_deg=90), (3, 2, -1)),
+        (Mount(roll_deg=90), (1, -3, 2)),
+        (Mount(inverted=True), (1, -2, -3)),
+        (Mount(x=1, y=2, z=3), (2, 4, 6)),
+        (Mount(x=10, yaw_deg=90, inverted=True), (12, 1, -3)),
+        (Mount(yaw_deg=90, pitch_deg=90), (-2, 3, -1)),
+    ],
+)
+def test_a_mount_turns_and_moves(mount: Mount, expected: tuple[float, float, float]) -> None:
+    direction = np.array([1.0, 2.0, 3.0])
+    reach, level = np.linalg.norm(direction), np.hypot(1.0, 2.0)
+    one = {"time": np.zeros(1), "valid": np.ones(1, np.bool_), "stamp_ns": 5}
+    polar = {"range": reach, "azimuth": np.arctan2(2.0, 1.0), "elevation": np.arctan2(3.0, level)}
+    columns = {name: np.array([value], np.float32) for name, value in {"x": 1, "y": 2, "z": 3, **polar}.items()}
+    found = mount.applied(ls.PointCloud(**columns, **one))
+    np.testing.assert_allclose(found.xyz[0], expected, atol=1e-5)
+    beam = np.array(expected) - (mount.x, mount.y, mount.z)
+    assert found.azimuth[0] == pytest.approx(np.arctan2(beam[1], beam[0]), abs=1e-6)
+    assert found.elevation[0] == pytest.approx(np.arcsin(beam[2] / reach), abs=1e-6)
+    assert found.range[0] == np.float32(reach)
+    assert found.stamp_ns == 5
+
+
+def test_no_return_stays_none_and_keeps_its_direction() -> None:
+    nothing = np.full(1, np.nan, np.float32)
+    zero = np.zeros(1, np.float32)
+    cloud = ls.PointCloud(
+        x=nothing, y=nothing, z=nothing, range=np.full(1, np.inf, np.float32), azimuth=zero, elevation=zero,
+        time=np.zeros(1), valid=np.zeros(1, np.bool_),
+    )  # fmt: skip
+    found = Mount(x=3, yaw_deg=180).applied(cloud)
+    assert np.isnan(found.xyz).all()
+    assert np.isinf(found.range[0])
+    assert found.azimuth[0] == pytest.approx(-np.pi)
+    assert not found.valid[0]
+
+
+def test_a_mount_says_what_it_is() -> None:
+    assert str(Mount(x=0.2, yaw_deg=90, inverted=True)) == "x=0.2, yaw_deg=90, inverted"
+    assert str(Mount()) == "as the sensor stands"

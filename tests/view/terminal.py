@@ -1,0 +1,149 @@
+"""A program in a terminal of its own: a real pty, and a screen that is kept as ECMA-48 has it."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import re
+import select
+import signal
+import struct
+import subprocess
+import sys
+import termios
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from types import TracebackType
+
+#: seconds that anything may take; five times what it does on a slow machine.
+DEADLINE = 30.0
+_PIECES = re.compile(r"\x1b\[(\d+);(\d+)H|\x1b\[\??([0-9;]*)([A-Za-z])|([\r\n])|([^\x1b\r\n])")
+
+
+class Terminal:
+    """A program, by default ``lidarspec``, with these words in a window of so many columns and lines; a context manager.
+
+    Attributes:
+        modes: private modes that are set: 1049 (alternate screen), 25 (cursor) and so on.
+    """
+
+    def __init__(
+        self, *words: object, program: Sequence[str] = (), columns: int = 80, lines: int = 24, cwd: Path | None = None, **environment: str
+    ) -> None:
+        self._master, slave = os.openpty()
+        self.resize(columns, lines, notify=False)
+        self.before = termios.tcgetattr(slave)
+        self._slave = slave
+        names = {**os.environ, "TERM": "xterm-256color", "NO_COLOR": "", "COLORTERM": "", **environment}
+        command = [sys.executable, "-c", _MAIN, *(program or [sys.executable, "-m", "lidarspec"]), *map(str, words)]
+        self.process = subprocess.Popen(command, stdin=slave, stdout=slave, stderr=slave, cwd=cwd, env=names, start_new_session=True)
+        self.raw, self.modes = "", {"25", "7"}
+        self._rest = b""
+
+    def resize(self, columns: int, lines: int, *, notify: bool = True) -> None:
+        """Give the window another size; what it shows is forgotten."""
+        fcntl.ioctl(self._master, termios.TIOCSWINSZ, struct.pack("HHHH", lines, columns, 0, 0))
+        self.grid = [[" "] * columns for _ in range(lines)]
+        self._place, self._kept = (0, 0), (0, 0)
+        if notify:
+            self.process.send_signal(signal.SIGWINCH)
+
+    def type(self, keys: str) -> None:
+        """Press keys."""
+        os.write(self._master, keys.encode())
+
+    def text(self) -> str:
+        """What the screen shows now."""
+        while self._read(0.0):
+            pass
+        return "\n".join("".join(row).rstrip() for row in self.grid)
+
+    def wait_for(self, text: str) -> str:
+        """The screen, as soon as it shows a text."""
+        end = time.monotonic() + DEADLINE
+        while text not in (shown := self.text()):
+            assert time.monotonic() < end, f"{text!r} is not shown:\n{shown}"
+            self._read(0.05)
+        return shown
+
+    def ended(self) -> int:
+        """The exit code, as soon as there is one."""
+        end = time.monotonic() + DEADLINE
+        while self.process.poll() is None:
+            assert time.monotonic() < end, "it does not end"
+            self._read(0.02)
+        self.text()
+        return self.process.returncode
+
+    def is_clean(self) -> bool:
+        """Whether the terminal is as it was: main screen, cursor, wrapping, colours, and lines that are echoed."""
+        self.text()
+        now = termios.tcgetattr(self._slave)
+        return (
+            self.modes == {"25", "7"} and now == self.before and self.raw.rpartition("\x1b[?1049l")[0].endswith("\x1b[0m\x1b[?7h\x1b[?25h")
+        )
+
+    def __enter__(self) -> Terminal:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self.process.kill()
+        self.process.wait()
+        os.close(self._master)
+        os.close(self._slave)
+
+    def _read(self, timeout: float) -> bool:
+        ready, _, _ = select.select([self._master], [], [], timeout)
+        if not ready:
+            return False
+        data = self._rest + os.read(self._master, 1 << 16)
+        whole = len(data)
+        begun = data.rfind(b"\x1b")
+        if begun >= 0 and not data[begun:].rstrip(b"0123456789;?[\x1b")[:1]:  # a sequence that goes on in the next piece
+            whole = begun
+        while whole and data[whole - 1] >= 0x80 and not _decodes(data[:whole]):
+            whole -= 1
+        text, self._rest = data[:whole].decode("utf-8", "replace"), data[whole:]
+        self.raw += text
+        for piece in _PIECES.finditer(text):
+            self._take(piece)
+        return True
+
+    def _take(self, piece: re.Match[str]) -> None:
+        at_row, at_column, numbers, letter, control, character = piece.groups()
+        row, column = self._place
+        if at_row:
+            self._place = int(at_row) - 1, int(at_column) - 1
+        elif letter in ("h", "l"):
+            (self.modes.add if letter == "h" else self.modes.discard)(numbers)
+            if numbers == "1049":  # the other screen; the text of the main one is not kept here, its cursor is
+                self.grid = [[" "] * len(line) for line in self.grid]
+                self._place, self._kept = self._kept, self._place
+        elif letter == "J":
+            self.grid = [[" "] * len(line) for line in self.grid]
+        elif control == "\n" and row == len(self.grid) - 1:
+            self.grid = [*self.grid[1:], [" "] * len(self.grid[0])]
+        elif control:
+            self._place = (row + 1, column) if control == "\n" else (row, 0)
+        elif character and row < len(self.grid) and column < len(self.grid[0]):
+            self.grid[row][column] = character
+            self._place = row, column + 1
+
+
+def _decodes(data: bytes) -> bool:
+    try:
+        data.decode("utf-8")
+    except UnicodeDecodeError:
+        return False
+    return True
+
+
+#: makes the pty the terminal of the session, then runs a program in it; a test run in the background of a shell has interrupts
+#: switched off, and its children would inherit that.
+_MAIN = """
+import fcntl, os, signal, sys, termios
+signal.signal(signal.SIGINT, signal.SIG_DFL)
+fcntl.ioctl(0, termios.TIOCSCTTY, 0)
+os.execvp(sys.argv[1], sys.argv[1:])
+"""

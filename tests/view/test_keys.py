@@ -1,0 +1,63 @@
+"""Keys, and the program that draws the screens of the docs."""
+
+from __future__ import annotations
+
+import importlib.util
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lidarspec.view.canvas import Canvas
+from lidarspec.view.keys import decoded
+from lidarspec.view.live import Choice
+from lidarspec.view.palette import STRONG
+
+
+@pytest.mark.parametrize(
+    ("text", "keys"),
+    [
+        ("q", ["q"]),
+        ("+-", ["+", "-"]),
+        ("\x1b[A\x1b[B\x1bOC\x1b[D", ["up", "down", "right", "left"]),
+        ("\x1b", ["escape"]),
+        ("\x1b[5~q", ["q"]),
+        ("\x1b[1;5Cq", ["q"]),
+        ("\x1b[", []),
+        ("", []),
+    ],
+)
+def test_keys_of_a_terminal(text: str, keys: list[str]) -> None:
+    assert decoded(text) == keys
+
+
+def test_keys_change_what_is_shown() -> None:
+    begin = Choice()
+    assert begin.after("c", 6).ramp == "intensity"
+    assert begin.after("c", 6).after("c", 6) == begin
+    assert begin.after("+", 6).after("-", 6) == begin
+    assert begin.after("+", 6).zoom > 1
+    assert begin.after("up", 5).middle == (1.0, 0.0)
+    assert begin.after("left", 5).middle == (0.0, 1.0)
+    assert begin.after("down", 5).after("right", 5).after("+", 5).after("0", 5) == begin
+    assert begin.after(" ", 6).paused
+    assert begin.after("q", 6).done
+    assert begin.after("?", 6).helped
+    assert not begin.after("?", 6).after("escape", 6).helped
+    assert begin.after("x", 6) is begin
+
+
+def test_screens_of_the_docs_hold_every_dot_and_word() -> None:
+    path = Path(__file__).parents[2] / "docs" / "screens.py"
+    spec = importlib.util.spec_from_file_location("screens", path)
+    assert spec is not None
+    assert spec.loader is not None
+    screens = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(screens)
+    canvas = Canvas(12, 4)
+    canvas.plot(np.arange(0.5, 8), np.full(8, 3.5), np.linspace(0, 0.99, 8))
+    canvas.label(2, 3, "a < b", STRONG)
+    root = ET.fromstring(screens.svg(canvas.cells()))
+    assert sum(path.get("d", "").count("M") for path in root.findall(".//{*}path")) == 8
+    assert [text.text for text in root.findall(".//{*}text")] == ["a", "<", "b"]

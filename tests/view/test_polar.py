@@ -1,0 +1,146 @@
+"""Pictures in the terminal: the right way round, to scale, with nothing in the way of a point."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable
+
+import numpy as np
+import pytest
+
+from lidarspec import PointCloud
+from lidarspec.view.canvas import BLANK
+from lidarspec.view.palette import RAMPS, STEPS
+from lidarspec.view.polar import Look, look, picture, ring_step, rounded_up
+
+DOTS = {0x01: (0, 0), 0x02: (1, 0), 0x04: (2, 0), 0x40: (3, 0), 0x08: (0, 1), 0x10: (1, 1), 0x20: (2, 1), 0x80: (3, 1)}
+FLAT = Look("range", 5, 5)
+TALL = Look("range", 5, 5, flat=False)
+
+
+def cloud(*xyz: tuple[float, float, float], intensity: Iterable[float] | None = None) -> PointCloud:
+    x, y, z = np.array(xyz, np.float32).reshape(-1, 3).T
+    zero = np.zeros(len(x), np.float32)
+    strength = None if intensity is None else np.array(list(intensity), np.float32)
+    elevation = np.arctan2(z, np.hypot(x, y))
+    return PointCloud(
+        x=x, y=y, z=z, range=np.hypot(x, y), azimuth=zero, elevation=elevation, time=zero.astype(float), valid=np.isfinite(x),
+        intensity=strength,
+    )  # fmt: skip
+
+
+def drawn(points: PointCloud, look: Look = FLAT, width: int = 60, height: int = 30) -> list[str]:
+    return picture(points, width=width, height=height, look=look).lines()
+
+
+def dots(lines: Iterable[str]) -> set[tuple[int, int]]:
+    """(row, column) of every dot, by the bits of the characters as Unicode numbers them."""
+    found = set()
+    for row, line in enumerate(lines):
+        for column, character in enumerate(line):
+            bits = ord(character) - BLANK
+            if 0 < bits < 256:
+                found |= {(4 * row + down, 2 * column + across) for bit, (down, across) in DOTS.items() if bits & bit}
+    return found
+
+
+def of_points(points: PointCloud) -> set[tuple[int, int]]:
+    """The dots that are not there without the points."""
+    return dots(drawn(points)) - dots(drawn(points[:0]))
+
+
+@pytest.mark.parametrize(
+    ("point", "row", "column"),
+    [((4.1, 0, 0), -1, 0), ((0, 4.1, 0), 0, -1), ((-4.1, 0, 0), 1, 0), ((0, -4.1, 0), 0, 1), ((3, 3, 0), -1, -1)],
+)
+def test_forward_is_up_and_left_is_left(point: tuple[float, float, float], row: int, column: int) -> None:
+    ((down, across),) = of_points(cloud(point))
+    assert np.sign([round((down - 61) / 9), round((across - 61) / 9)]).tolist() == [row, column]
+
+
+def test_a_circle_is_round() -> None:
+    turn = np.linspace(0, 2 * np.pi, 2000)
+    found = np.array(sorted(of_points(cloud(*zip(4.5 * np.cos(turn), 4.5 * np.sin(turn), 0 * turn, strict=True)))))
+    height, width = np.ptp(found, axis=0)
+    assert abs(int(height) - int(width)) <= 1
+    assert height == pytest.approx(2 * 4.5 / 5 * 59.5, abs=2)
+
+
+def test_points_beyond_the_picture_are_left_out_and_it_keeps_its_size() -> None:
+    assert of_points(cloud((7, 0, 0))) == set()
+    for points in (cloud((7, 0, 0)), cloud(), cloud((1, 1, 1))):
+        for chosen in (FLAT, TALL):
+            assert [len(line) for line in drawn(points, chosen, 41, 13)] == [41] * 13
+
+
+@pytest.mark.parametrize("size", [(1, 1), (2, 3), (5, 2), (300, 4)])
+def test_any_window_has_a_picture(size: tuple[int, int]) -> None:
+    for chosen in (FLAT, TALL):
+        assert [len(line) for line in drawn(cloud((1, 1, 1)), chosen, *size)] == [size[0]] * size[1]
+
+
+def test_rings_and_directions_are_named() -> None:
+    lines = drawn(cloud())
+    text = "\n".join(lines)
+    assert "▲" in lines[15]
+    assert all(label in text for label in ("2 m", "4 m", "0° forward", " -90°", "180°"))
+    assert (ring_step(5), ring_step(8.1), ring_step(0.3), ring_step(100)) == (2, 5, 0.1, 50)
+
+
+def test_a_label_hides_no_point() -> None:
+    points = cloud(*((0, -y, 0) for y in np.linspace(0.3, 5, 200)))
+    assert "2 m" in drawn(points[:0])[15]
+    assert "2 m" not in drawn(points)[15]
+    assert "2 m" in "".join(drawn(points))
+
+
+def test_the_middle_can_be_elsewhere() -> None:
+    points = cloud((9, 3, 0))
+    assert len(dots(drawn(points, Look("range", 5, 5, middle=(8.5, 3.0)))) - dots(drawn(points[:0], Look("range", 5, 5, (8.5, 3.0))))) == 1
+
+
+def test_the_reach_takes_in_most_points_and_is_round() -> None:
+    near = [(2.0 * np.cos(a), 2.0 * np.sin(a), 0.0) for a in np.linspace(0, 6.28, 500)]
+    assert look(cloud(*near)).reach == 2.0
+    assert look(cloud(*near, (90, 0, 0))).reach == 2.0
+    assert look(cloud()).reach == 1.0
+    assert [rounded_up(value) for value in (0.011, 1.0, 1.01, 5.3, 99, 101)] == pytest.approx([0.012, 1.0, 1.2, 6.0, 100.0, 120.0])
+
+
+def test_colours_go_from_near_to_far_and_from_weak_to_strong() -> None:
+    points = cloud((0.1, 0.1, 0), (3.4, 3.4, 0), intensity=(200, 1))
+    for ramp, last in (("range", [0, STEPS - 1]), ("intensity", [STEPS - 1, 0])):
+        inks = picture(points, width=60, height=30, look=Look(ramp, 5, 4.8 if ramp == "range" else 200)).inks
+        steps = inks[inks >= RAMPS["range"]] - RAMPS[ramp]
+        assert steps.tolist()[::-1] == last  # the near one is further down
+
+
+def test_without_intensity_colours_show_the_range() -> None:
+    assert look(cloud((1, 0, 0)), ramp="intensity").ramp == "range"
+    assert look(cloud((1, 0, 0), intensity=[7.0]), ramp="intensity") == Look("intensity", 1.0, 8.0)
+
+
+def test_the_side_view_has_the_same_scale_and_up_is_up() -> None:
+    wall = [(4.0, y, z) for y in np.linspace(-2, 2, 100) for z in np.linspace(0, 3, 60)]
+    lines = drawn(cloud(*wall), TALL, 60, 44)
+    title = next(row for row, line in enumerate(lines) if "from the right" in line)
+    above, side = dots(lines[:title]), dots(lines[title + 1 :])
+    column = most(column for _, column in side)
+    line = most(row for row, _ in above)
+    tall = [row for row, at in side if at == column]
+    wide = [at for row, at in above if row == line]
+    assert column > 60
+    assert " x" not in lines[title]
+    assert max(tall) - min(tall) == pytest.approx((max(wide) - min(wide)) * 3 / 4, abs=1)
+    level = next(row for row, line in enumerate(lines[title + 1 :]) if "z 0 m" in line)
+    assert abs(max(tall) // 4 - level) <= 1  # the wall stands on the height of the sensor
+
+
+def test_small_heights_are_drawn_larger_and_that_is_said() -> None:
+    lines = drawn(cloud(*((x, 0, 0.2) for x in np.linspace(-5, 5, 50))), TALL, 60, 30)
+    assert any("heights x10" in line for line in lines)
+
+
+def most(values: Iterable[int]) -> int:
+    """The most frequent value."""
+    return Counter(values).most_common(1)[0][0]
