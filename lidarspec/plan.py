@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
+from functools import cached_property
 from typing import Any
 from weakref import WeakKeyDictionary
 
@@ -15,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.columns import Batch, aligned
-from lidarspec.expressions import is_full, only_field, terms
+from lidarspec.expressions import Term, is_full, only_field, terms
 from lidarspec.geometry import Polar
 from lidarspec.layout import Layout
 from lidarspec.points import columns_of
@@ -58,7 +59,6 @@ class Plan:
         self.shape = np.broadcast_shapes((2,) + (1,) * len(self.axes), *(array.shape for array in arrays))[1:]
         self.parts = {name: value.node if isinstance(value, Traced) else value for name, value in parts.items() if value is not None}
         self._programs: dict[tuple[str, ...], Program] = {}
-        self._known_finite: dict[Node, bool] = {}
         if 0 in self.shape:
             raise Untraceable("packets without points")
         if not isinstance(result.range, Traced) or not is_full(result.range.node, self.width):
@@ -127,7 +127,6 @@ class Plan:
         found |= {"range": shown, "azimuth": result.azimuth}
         if result.intensity is not None:
             found["intensity"] = result.intensity
-        self.directed = [value.node for value in (result.azimuth, result.elevation) if isinstance(value, Traced)]
         return {name: value.node if isinstance(value, Traced) else value for name, value in found.items()}
 
     def _return(self, measured: Traced) -> Any:
@@ -142,22 +141,29 @@ class Plan:
 
     def safe(self, values: Callable[[Node], NDArray[Any]]) -> bool:
         """Whether all directions are numbers where everything that they are made of is: then a nan marks all coordinates alike."""
-        for node in self.directed:
-            for term in terms(node, self.width):
-                if term.full is not None and not self._finite(term.full):
-                    return False
-                if not np.isfinite(term.row).all() or (term.low is not None and not np.isfinite(values(term.low)).all()):
-                    return False
-        return all(isinstance(part, Traced) or np.isfinite(part).all() for part in (self.result.azimuth, self.result.elevation))
+        return self._may_be_safe and all(np.isfinite(values(low)).all() for low in self._low_directions)
+
+    @cached_property
+    def _may_be_safe(self) -> bool:
+        """Whether everything in the directions is a number but for what is known of a batch only."""
+        fixed = all(isinstance(part, Traced) or np.isfinite(part).all() for part in (self.result.azimuth, self.result.elevation))
+        return fixed and all(np.isfinite(term.row).all() and (term.full is None or self._finite(term.full)) for term in self._directions)
+
+    @cached_property
+    def _low_directions(self) -> list[Node]:
+        return [term.low for term in self._directions if term.low is not None]
+
+    @cached_property
+    def _directions(self) -> list[Term]:
+        traced = [part.node for part in (self.result.azimuth, self.result.elevation) if isinstance(part, Traced)]
+        return [term for node in traced for term in terms(node, self.width)]
 
     def _finite(self, node: Node) -> bool:
         """Whether an expression is a number for every value that its field can have."""
-        if node not in self._known_finite:
-            source = only_field(node)
-            leaf = self.layout.leaves.get(source.path) if source is not None else None
-            values = every_value(node, leaf) if leaf is not None else None
-            self._known_finite[node] = values is not None and bool(np.isfinite(values).all())
-        return self._known_finite[node]
+        source = only_field(node)
+        leaf = self.layout.leaves.get(source.path) if source is not None else None
+        values = every_value(node, leaf) if leaf is not None else None
+        return values is not None and bool(np.isfinite(values).all())
 
 
 def _sample(value: Any) -> Any:
