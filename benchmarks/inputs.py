@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 import lidarspec as ls
-from lidarspec.pcap import Datagram, PcapWriter
-from lidarspec.simulator import opening, simulate
+from lidarspec.captures.pcap import Datagram, PcapWriter
+from lidarspec.simulation.simulator import opening, simulate
 
 #: sensor, frames of a full run, the answer it is configured for.
 SENSORS: dict[str, tuple[str, int, str | None]] = {

@@ -16,7 +16,7 @@ from peers import STRUCTS
 from works import FEW, Facts, Others, Work, beside_construct, columns, points_of
 
 import lidarspec as ls
-from lidarspec.pcap import CaptureReader
+from lidarspec.captures.pcap import CaptureReader
 from lidarspec.streams import PacketStream
 
 RATE = 6300  # packets per second of an RS-LiDAR-M1

@@ -18,128 +18,57 @@ from lidarspec import abilities
 from lidarspec._version import __version__ as __version__
 
 if TYPE_CHECKING:
-    from lidarspec.access import Fields as Fields
     from lidarspec.angles import (
         following as following,
-    )
-    from lidarspec.angles import (
         last as last,
-    )
-    from lidarspec.angles import (
         previous as previous,
-    )
-    from lidarspec.angles import (
         spread as spread,
-    )
-    from lidarspec.angles import (
         stack as stack,
-    )
-    from lidarspec.angles import (
         take as take,
-    )
-    from lidarspec.angles import (
         wrap as wrap,
     )
-    from lidarspec.async_device import AsyncDevice as AsyncDevice
-    from lidarspec.async_device import open_async as open_async
-    from lidarspec.checksums import Checksum as Checksum
-    from lidarspec.checksums import Crc as Crc
-    from lidarspec.checksums import Fold15 as Fold15
-    from lidarspec.checksums import Sum as Sum
-    from lidarspec.checksums import WordXor as WordXor
-    from lidarspec.checksums import Xor as Xor
+    from lidarspec.async_device import AsyncDevice as AsyncDevice, open_async as open_async
+    from lidarspec.checksums import Checksum as Checksum, Crc as Crc, Fold15 as Fold15, Sum as Sum, WordXor as WordXor, Xor as Xor
     from lidarspec.clouds import PointCloud as PointCloud
-    from lidarspec.columns import Column as Column
-    from lidarspec.decoder import Counters as Counters
-    from lidarspec.decoder import Decoder as Decoder
-    from lidarspec.decoder import Found as Found
-    from lidarspec.device import Device as Device
-    from lidarspec.device import open as open
+    from lidarspec.decoder import Counters as Counters, Decoder as Decoder, Found as Found
+    from lidarspec.device import Device as Device, open as open
     from lidarspec.errors import (
         CommandError as CommandError,
-    )
-    from lidarspec.errors import (
         LidarSpecError as LidarSpecError,
-    )
-    from lidarspec.errors import (
         MissingField as MissingField,
-    )
-    from lidarspec.errors import (
         OutOfRange as OutOfRange,
-    )
-    from lidarspec.errors import (
         ReplyTimeout as ReplyTimeout,
-    )
-    from lidarspec.errors import (
         SourceError as SourceError,
-    )
-    from lidarspec.errors import (
         SpecError as SpecError,
-    )
-    from lidarspec.errors import (
         UnknownCommand as UnknownCommand,
-    )
-    from lidarspec.errors import (
         UnknownField as UnknownField,
-    )
-    from lidarspec.errors import (
         UnknownFormat as UnknownFormat,
-    )
-    from lidarspec.errors import (
         UnknownFrame as UnknownFrame,
-    )
-    from lidarspec.errors import (
         UnknownOption as UnknownOption,
-    )
-    from lidarspec.errors import (
         UnknownSensor as UnknownSensor,
-    )
-    from lidarspec.errors import (
         UsageError as UsageError,
-    )
-    from lidarspec.errors import (
         WireError as WireError,
     )
-    from lidarspec.fields import Checksummed as Checksummed
-    from lidarspec.fields import Scaled as Scaled
-    from lidarspec.files import Format as Format
-    from lidarspec.files import Transport as Transport
-    from lidarspec.geometry import Cartesian as Cartesian
-    from lidarspec.geometry import Points as Points
-    from lidarspec.geometry import Polar as Polar
+    from lidarspec.fields import Checksummed as Checksummed, Scaled as Scaled
+    from lidarspec.files import Format as Format, Transport as Transport
+    from lidarspec.frames.access import Fields as Fields
+    from lidarspec.frames.columns import Column as Column
+    from lidarspec.geometry import Cartesian as Cartesian, Points as Points, Polar as Polar
     from lidarspec.hookspecs import hookimpl as hookimpl
-    from lidarspec.links import Serial as Serial
-    from lidarspec.links import Tcp as Tcp
-    from lidarspec.links import Udp as Udp
+    from lidarspec.links import Serial as Serial, Tcp as Tcp, Udp as Udp
     from lidarspec.packets import Packets as Packets
-    from lidarspec.plugins import sensor as sensor
-    from lidarspec.plugins import sensors as sensors
+    from lidarspec.plugins import sensor as sensor, sensors as sensors
     from lidarspec.replies import Reply as Reply
-    from lidarspec.scans import LaserScan as LaserScan
-    from lidarspec.scans import Scan as Scan
+    from lidarspec.scans import LaserScan as LaserScan, Scan as Scan
     from lidarspec.session import Session as Session
-    from lidarspec.spec import Command as Command
-    from lidarspec.spec import Frame as Frame
-    from lidarspec.spec import Sensor as Sensor
+    from lidarspec.spec import Command as Command, Frame as Frame, Sensor as Sensor
     from lidarspec.splits import (
         Clock as Clock,
-    )
-    from lidarspec.splits import (
         Every as Every,
-    )
-    from lidarspec.splits import (
         OnChange as OnChange,
-    )
-    from lidarspec.splits import (
         OnFlag as OnFlag,
-    )
-    from lidarspec.splits import (
         OnRewind as OnRewind,
-    )
-    from lidarspec.splits import (
         OnWrap as OnWrap,
-    )
-    from lidarspec.splits import (
         Sequence as Sequence,
     )
 
@@ -152,8 +81,8 @@ _HOMES = {
     "fields": ("Scaled", "Checksummed"),
     "checksums": ("Checksum", "Crc", "Xor", "Sum", "WordXor", "Fold15"),
     "geometry": ("Points", "Polar", "Cartesian"),
-    "access": ("Fields",),
-    "columns": ("Column",),
+    "frames.access": ("Fields",),
+    "frames.columns": ("Column",),
     "angles": ("spread", "wrap", "following", "previous", "last", "stack", "take"),
     "files": ("Format", "Transport"),
     "hookspecs": ("hookimpl",),

@@ -16,8 +16,7 @@ from types import TracebackType
 from typing import Any, Generic, TypeVar
 
 from lidarspec.decoder import Counters
-from lidarspec.device import Device
-from lidarspec.device import open as open_device
+from lidarspec.device import Device, open as open_device
 from lidarspec.errors import UsageError
 from lidarspec.packets import Packets
 from lidarspec.replies import Reply

@@ -13,7 +13,7 @@ from construct import Construct, Container
 from lidarspec.construction import Mismatch, WireNaN, field_path, unwrap
 from lidarspec.errors import LidarSpecError, MissingField, OutOfRange, SpecError, UnknownField, UnknownFrame, UsageError
 from lidarspec.fields import Checksummed
-from lidarspec.schema import FieldInfo, Schema, schema
+from lidarspec.frames.schema import FieldInfo, Schema, schema
 from lidarspec.spec import Sensor
 
 

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.access import Fields
-from lidarspec.columns import Batch
 from lidarspec.errors import SpecError
+from lidarspec.frames.access import Fields
+from lidarspec.frames.columns import Batch
 from lidarspec.spec import Sensor
 from lidarspec.units import exact, factor
 

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.clouds import COLUMNS
-from lidarspec.columns import Column
 from lidarspec.errors import SpecError
+from lidarspec.frames.columns import Column
 from lidarspec.packets import Packets
 from lidarspec.points import Evaluated
 from lidarspec.splits import Every, OnChange, OnFlag, OnRewind, OnWrap, Split

@@ -11,8 +11,8 @@ import bisect
 import numpy as np
 from numpy.typing import NDArray
 
+from lidarspec.frames.judging import VALID
 from lidarspec.framing import COUNTED, Bytes1D, Framing, Mode, Offsets
-from lidarspec.judging import VALID
 
 
 class Datagrams:

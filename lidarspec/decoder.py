@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.codecs import Codec, codec
 from lidarspec.datagrams import Datagrams
 from lidarspec.errors import UsageError
 from lidarspec.found import Counters, Found, Spans, packed
+from lidarspec.frames.codecs import Codec, codec
 from lidarspec.framing import Framing, Mode, Piece
 from lidarspec.runs import cut
 from lidarspec.spec import Sensor

@@ -17,13 +17,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lidarspec.decoder import Counters
-from lidarspec.device import Device
-from lidarspec.device import open as open_device
+from lidarspec.device import Device, open as open_device
 from lidarspec.errors import SourceError
-from lidarspec.faults import Faults
 from lidarspec.replies import Reply
 from lidarspec.scans import Scan
-from lidarspec.simulated import SimulatedDevice
+from lidarspec.simulation.faults import Faults
+from lidarspec.simulation.simulated import SimulatedDevice
 from lidarspec.spec import Sensor
 from lidarspec.transports.doors import HERE
 from lidarspec.transports.serving import Served, door

@@ -10,18 +10,18 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, overload
 
-from lidarspec.arrivals import Arrival
 from lidarspec.decoder import Counters, Spans
-from lidarspec.detect import detected
+from lidarspec.detection.detect import detected
 from lidarspec.errors import SourceError, UsageError
-from lidarspec.file_input import FileInput
 from lidarspec.files import Transport
-from lidarspec.live import PERIOD, LiveInput
+from lidarspec.inputs.arrivals import Arrival
+from lidarspec.inputs.live import PERIOD, LiveInput
+from lidarspec.inputs.reading import PacketReader
+from lidarspec.inputs.stored import FileInput
 from lidarspec.mounting import Mount
 from lidarspec.packets import Packets
 from lidarspec.plugins import sensor as named_sensor
-from lidarspec.reading import PacketReader
-from lidarspec.recorders import AnyRecorder, RecordTo, recorder_for
+from lidarspec.recording.recorders import AnyRecorder, RecordTo, recorder_for
 from lidarspec.replies import Reply
 from lidarspec.scans import Scan, ScanStream
 from lidarspec.settings import named

@@ -8,10 +8,9 @@ from typing import Any
 from lidarspec import examples, parsing
 from lidarspec.building import build, limits
 from lidarspec.clouds import axis_matrix
-from lidarspec.codecs import codec
-from lidarspec.decoder import Decoder, Found, is_stream, spans_of
-from lidarspec.decoder import backend as checked_backend
+from lidarspec.decoder import Decoder, Found, backend as checked_backend, is_stream, spans_of
 from lidarspec.errors import MissingField, OutOfRange, SpecError, UnknownCommand, UnknownField, UnknownOption, UsageError
+from lidarspec.frames.codecs import codec
 from lidarspec.packets import Packets
 from lidarspec.plugins import registry
 from lidarspec.scans import Scan, scans_of

@@ -11,14 +11,14 @@ from construct import Construct
 from numpy.typing import NDArray
 
 from lidarspec.building import build
-from lidarspec.codecs import CompiledCodec, InterpretedCodec, codec
 from lidarspec.construction import clean
 from lidarspec.errors import SpecError, UnknownFrame
-from lidarspec.judging import VALID, plausibility
-from lidarspec.layout import Layout
-from lidarspec.schema import FieldInfo, peeled
+from lidarspec.frames.codecs import CompiledCodec, InterpretedCodec, codec
+from lidarspec.frames.judging import VALID, plausibility
+from lidarspec.frames.layout import Layout
+from lidarspec.frames.schema import FieldInfo, peeled
+from lidarspec.frames.tables import Group, Rows
 from lidarspec.spec import Sensor
-from lidarspec.tables import Group, Rows
 
 #: random frames made at once, and how often, before a sensor's own `sweep` has to help.
 BATCH, TRIES = 64, 40

@@ -15,16 +15,16 @@ import construct
 import numpy as np
 
 from lidarspec.bits import BitField, leaves, probe
-from lidarspec.codecs import codec
 from lidarspec.construction import UNNAMED, Seen, field_path, unwrap
 from lidarspec.decoder import Counters, Found, packed
 from lidarspec.errors import LidarSpecError, WireError
 from lidarspec.fields import Checksummed
-from lidarspec.judging import IMPLAUSIBLE
+from lidarspec.frames.codecs import codec
+from lidarspec.frames.judging import IMPLAUSIBLE
+from lidarspec.frames.schema import FieldInfo, schema
 from lidarspec.parsing import parse_typed
 from lidarspec.points import evaluate
 from lidarspec.rules import children
-from lidarspec.schema import FieldInfo, schema
 from lidarspec.spec import Frame, Sensor
 from lidarspec.streams import PacketStream
 from lidarspec.units import exact

@@ -20,8 +20,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.codecs import Codec
-from lidarspec.judging import CHECKSUM, CONSTANT, IMPLAUSIBLE, LENGTH, PLUGIN, SHORT, VALID, taken
+from lidarspec.frames.codecs import Codec
+from lidarspec.frames.judging import CHECKSUM, CONSTANT, IMPLAUSIBLE, LENGTH, PLUGIN, SHORT, VALID, taken
 
 #: which counter a rejected candidate raises.
 COUNTED = {LENGTH: "bad_length", CHECKSUM: "bad_checksum", IMPLAUSIBLE: "implausible", PLUGIN: "plugin_errors"}

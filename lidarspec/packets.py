@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.access import physical
-from lidarspec.columns import Batch
 from lidarspec.decoder import Counters
 from lidarspec.errors import UnknownField
-from lidarspec.schema import Schema
+from lidarspec.frames.access import physical
+from lidarspec.frames.columns import Batch
+from lidarspec.frames.schema import Schema
+from lidarspec.frames.tables import Table
 from lidarspec.spec import Sensor
-from lidarspec.tables import Table
 
 if TYPE_CHECKING:
     from lidarspec.clouds import PointCloud

@@ -8,13 +8,13 @@ from typing import Any
 
 import construct
 
-from lidarspec.codecs import CompiledCodec, codec
 from lidarspec.construction import Mismatch, clean, field_path
 from lidarspec.errors import SpecError, UnknownFrame, WireError
-from lidarspec.headers import Refused
-from lidarspec.layout import Layout
+from lidarspec.frames.codecs import CompiledCodec, codec
+from lidarspec.frames.headers import Refused
+from lidarspec.frames.layout import Layout
+from lidarspec.frames.unpacking import Unpack
 from lidarspec.spec import Sensor
-from lidarspec.unpacking import Unpack
 
 
 def parse(sensor: Sensor, data: bytes, *, frame: str | None = None, verify: bool = True) -> Any:

@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.access import Fields
 from lidarspec.clouds import PointCloud, axis_matrix, narrowed
-from lidarspec.columns import Batch, Carry, Column, aligned, unpadded
 from lidarspec.errors import SpecError
+from lidarspec.frames.access import Fields
+from lidarspec.frames.columns import Batch, Carry, Column, aligned, unpadded
 from lidarspec.geometry import Cartesian, Points, Polar
 from lidarspec.packets import Packets
 from lidarspec.spec import Sensor

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from lidarspec.errors import CommandError, UnknownField, UsageError
-from lidarspec.schema import FieldInfo
+from lidarspec.frames.schema import FieldInfo
 from lidarspec.spec import Command
 
 #: fields that a reply's repr shows.

@@ -13,9 +13,9 @@ import bisect
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.codecs import Codec
+from lidarspec.frames.codecs import Codec
+from lidarspec.frames.judging import CONSTANT, IMPLAUSIBLE, PLUGIN, SHORT, VALID
 from lidarspec.framing import Bytes1D, Framing, Marks, Mode, Offsets, Piece, count_rejected, fitting, leftmost, merged
-from lidarspec.judging import CONSTANT, IMPLAUSIBLE, PLUGIN, SHORT, VALID
 
 #: strides judged together at first, and at most.
 FIRST, LONGEST = 64, 1 << 14

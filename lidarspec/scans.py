@@ -9,12 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.clouds import PointCloud, joined, restamped
-from lidarspec.columns import Carry
 from lidarspec.cuts import Cutter
-from lidarspec.evaluation import guarded
+from lidarspec.frames.columns import Carry
 from lidarspec.mounting import Mount
-from lidarspec.packets import Packets
-from lidarspec.packets import joined as joined_packets
+from lidarspec.packets import Packets, joined as joined_packets
+from lidarspec.plans.evaluation import guarded
 from lidarspec.points import Evaluated
 from lidarspec.reorder import Reorder
 from lidarspec.spec import Sensor

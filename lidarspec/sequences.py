@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.access import UNKNOWN, Watched
-from lidarspec.columns import Batch
 from lidarspec.decoder import Counters
 from lidarspec.errors import SpecError
+from lidarspec.frames.access import UNKNOWN, Watched
+from lidarspec.frames.columns import Batch
 from lidarspec.splits import Sequence
 
 #: how far back a packet may come and still be a late one; further back the sensor has started again.

@@ -19,8 +19,8 @@ from typing import Any
 
 from lidarspec.decoder import Found
 from lidarspec.errors import CommandError, ReplyTimeout
+from lidarspec.frames.schema import FieldInfo, schema
 from lidarspec.replies import Expected, Outgoing, Pending, Reply
-from lidarspec.schema import FieldInfo, schema
 from lidarspec.spec import Command, Sensor
 
 SECOND = 1_000_000_000

@@ -15,14 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.clocks import Unwrapper, clock_ns
-from lidarspec.codecs import Codec, codec
-from lidarspec.columns import Batch
 from lidarspec.decoder import Counters, Spans
 from lidarspec.errors import UnknownFrame
+from lidarspec.frames.codecs import Codec, codec
+from lidarspec.frames.columns import Batch
+from lidarspec.frames.tables import Table
 from lidarspec.packets import Packets, StateOf, joined_tables
 from lidarspec.sequences import SequenceTracker
 from lidarspec.spec import Sensor
-from lidarspec.tables import Table
 
 
 class PacketStream:

@@ -16,7 +16,7 @@ from construct import Array, Bytes, BytesInteger, Construct, FormatField, Struct
 from lidarspec.bits import BitField, probe
 from lidarspec.construction import UNNAMED, unwrap
 from lidarspec.fields import Checksummed
-from lidarspec.schema import FieldInfo, fields_below, peeled
+from lidarspec.frames.schema import FieldInfo, fields_below, peeled
 from lidarspec.spec import Frame
 
 INDICES = "ijklmn"

@@ -15,16 +15,12 @@ from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 FLOORS = (
-    "_version abilities errors allocation lanes polynomials checksums catalogue angles fields units bits construction",
-    "spec hookspecs geometry links rules splits files samples sumsearch crcsearch checksearch",
-    "schema layout walk headers tables columns access singles unpacking dispatch tracing conditions judging codecs framing runs plan "
-    "installed plugins",
-    "found datagrams decoder packets streams clocks sequences clouds points expressions windows program plan evaluation cuts reorder "
-    "mounting",
-    "session replies identity structure scans scenes sweeps measuring pacing simulator answering faults scenery simulated explain "
-    "parsing building examples engine wiretable wording",
-    "device async_device live watch capture arrivals reading file_input detect hearing probing diagnosis transports recordings pcap "
-    "bulk _pcap_records _pcap_alike _pcap_window _ip sources settings replaying recorders _lsr _lsr_header _appending",
+    "_version abilities errors allocation lanes checksums catalogue angles fields units bits construction",
+    "spec hookspecs geometry links rules splits files searching",
+    "frames framing runs installed plugins",
+    "found datagrams decoder packets streams clocks sequences clouds points plans cuts reorder mounting",
+    "session replies scans simulation explain parsing building examples engine wiretable wording",
+    "device async_device inputs detection transports recording captures sources settings",
     "testing formats export view demo",
     "cli",
     "__main__",
@@ -39,16 +35,16 @@ CONSTRUCT = {
     "construction",
     "fields",
     "rules",
-    "schema",
+    "frames.schema",
     "spec",
-    "walk",
-    "headers",
-    "codecs",
+    "frames.walk",
+    "frames.headers",
+    "frames.codecs",
     "parsing",
     "building",
     "examples",
-    "unpacking",
-    "dispatch",
+    "frames.unpacking",
+    "frames.dispatch",
     "wiretable",
     "explain",
 }

@@ -8,7 +8,7 @@ import os
 import struct
 from pathlib import Path
 
-from lidarspec.pcap import CaptureReader, CaptureStats, Datagram
+from lidarspec.captures.pcap import CaptureReader, CaptureStats, Datagram
 
 CAPTURES = Path(os.environ.get("LIDARSPEC_CAPTURES", Path(__file__).parents[2] / "shared" / "captures"))
 

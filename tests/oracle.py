@@ -13,9 +13,9 @@ import numpy as np
 from construct import ConstructError
 
 from lidarspec import Frame, Sensor
-from lidarspec.access import Fields
-from lidarspec.codecs import InterpretedCodec
-from lidarspec.columns import Batch
+from lidarspec.frames.access import Fields
+from lidarspec.frames.codecs import InterpretedCodec
+from lidarspec.frames.columns import Batch
 
 #: (name, offset, bytes) of a frame.
 Cut = tuple[str, int, bytes]

@@ -13,7 +13,7 @@ import lidarspec as ls
 from lidarspec.decoder import Counters
 from lidarspec.packets import Packets
 from lidarspec.scans import Scan, ScanStream
-from lidarspec.simulator import simulate
+from lidarspec.simulation.simulator import simulate
 from lidarspec.streams import PacketStream
 from tests.shapes import SHAPES
 

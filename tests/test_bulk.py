@@ -17,8 +17,8 @@ import numpy as np
 import pytest
 
 import lidarspec as ls
-from lidarspec.bulk import Batch, CaptureBatches
-from lidarspec.pcap import CaptureReader, Datagram
+from lidarspec.captures.bulk import Batch, CaptureBatches
+from lidarspec.captures.pcap import CaptureReader, Datagram
 from lidarspec.transports.files import CaptureTransport, open_file
 from tests import made_captures as made
 
@@ -326,8 +326,8 @@ def test_one_sender_of_several(tmp_path: Path) -> None:
 
 
 def test_frames_of_two_senders_are_not_mixed(tmp_path: Path) -> None:
-    from lidarspec.pcap import PcapWriter
-    from lidarspec.simulator import simulate
+    from lidarspec.captures.pcap import PcapWriter
+    from lidarspec.simulation.simulator import simulate
 
     path = tmp_path / "two.pcap"
     with path.open("wb") as file:

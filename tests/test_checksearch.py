@@ -11,11 +11,11 @@ import pytest
 import lidarspec
 from lidarspec import Checksum, Crc, Fold15, Sum, WordXor, Xor
 from lidarspec.catalogue import CRCS, name_of
-from lidarspec.checksearch import search
-from lidarspec.polynomials import common_divisor, divisors, quotient, remainder, solve
-from lidarspec.samples import Match, Place
-from lidarspec.simulator import simulate
-from lidarspec.sumsearch import Changed, WordSum
+from lidarspec.searching.checksums import search
+from lidarspec.searching.polynomials import common_divisor, divisors, quotient, remainder, solve
+from lidarspec.searching.samples import Match, Place
+from lidarspec.searching.sums import Changed, WordSum
+from lidarspec.simulation.simulator import simulate
 
 HEAD = b"\xaa\x55"
 

@@ -11,7 +11,7 @@ from itertools import permutations
 
 import pytest
 
-from lidarspec.pcap import CaptureReader, CaptureStats, Datagram
+from lidarspec.captures.pcap import CaptureReader, CaptureStats, Datagram
 from tests import made_captures as made
 
 PACKET = made.ipv4(made.udp(b"one"))

@@ -13,7 +13,7 @@ import pytest
 
 import lidarspec
 from lidarspec import Sensor
-from lidarspec.codecs import CompiledCodec, codec
+from lidarspec.frames.codecs import CompiledCodec, codec
 from lidarspec.testing import material
 from tests.shapes import SHAPES
 

@@ -20,7 +20,7 @@ import pytest
 
 import lidarspec as ls
 from lidarspec.errors import CommandError, OutOfRange, ReplyTimeout, SourceError
-from lidarspec.recordings import Recording
+from lidarspec.recording.recordings import Recording
 from tests.lines import SLACK, Port, free_port, port, turning, udp, until, working
 from tests.shapes import SHAPES
 

@@ -13,8 +13,8 @@ from pathlib import Path
 import pytest
 
 import lidarspec as ls
-from lidarspec.recordings import Recording
-from lidarspec.simulator import simulate
+from lidarspec.recording.recordings import Recording
+from lidarspec.simulation.simulator import simulate
 from lidarspec.transports.udp import BUFFER
 from tests.lines import Port, free_port, port
 

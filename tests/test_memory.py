@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 import lidarspec as ls
-from lidarspec.pcap import Datagram, PcapWriter
-from lidarspec.simulator import simulate
+from lidarspec.captures.pcap import Datagram, PcapWriter
+from lidarspec.simulation.simulator import simulate
 
 SENSOR = "robosense-m1"
 ENDS = ("192.168.1.200", 6699), ("192.168.1.102", 6699)

@@ -13,8 +13,8 @@ from typing import Any, BinaryIO
 
 import pytest
 
+from lidarspec.captures.pcap import CaptureReader, CaptureStats, is_capture
 from lidarspec.errors import SourceError
-from lidarspec.pcap import CaptureReader, CaptureStats, is_capture
 from tests import made_captures as made
 
 FRAME = made.frame(b"one")

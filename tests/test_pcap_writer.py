@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
+from lidarspec.captures.pcap import CaptureReader, CaptureStats, Datagram, PcapWriter
 from lidarspec.errors import SourceError, UsageError
-from lidarspec.pcap import CaptureReader, CaptureStats, Datagram, PcapWriter
 from tests import made_captures as made
 
 DATAGRAM = Datagram(b"\x12\x34\x56", 1_700_000_000_123_456_789, made.SOURCE, made.DESTINATION)

@@ -10,12 +10,12 @@ import pytest
 
 import lidarspec
 from lidarspec import Fields, Polar, Sensor
-from lidarspec.evaluation import evaluated
+from lidarspec.frames.tables import Rows
 from lidarspec.links import is_datagram
 from lidarspec.packets import Packets
-from lidarspec.plan import Plan, plan_for
+from lidarspec.plans.evaluation import evaluated
+from lidarspec.plans.plan import Plan, plan_for
 from lidarspec.points import evaluate, points_function
-from lidarspec.tables import Rows
 from lidarspec.testing import material
 from lidarspec.testing.comparisons import assert_same_points
 from tests.shapes import SHAPES

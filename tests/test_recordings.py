@@ -20,12 +20,12 @@ import numpy as np
 import pytest
 
 import lidarspec as ls
-from lidarspec import _appending
-from lidarspec._lsr import _HEAD, HEADER, packed
-from lidarspec._lsr_header import read_header
 from lidarspec.errors import SourceError, UsageError, WireError
 from lidarspec.files import Chunk
-from lidarspec.recordings import LARGEST, MAGIC, Record, Recorder, Recording
+from lidarspec.recording import appending
+from lidarspec.recording.header import read_header
+from lidarspec.recording.lsr import _HEAD, HEADER, packed
+from lidarspec.recording.recordings import LARGEST, MAGIC, Record, Recorder, Recording
 from lidarspec.sources import transport
 from tests.sensors.evidence import capture
 
@@ -200,7 +200,7 @@ def test_nothing_is_overwritten_unasked(path: Path) -> None:
 def test_records_reach_the_file_by_themselves_and_at_once_when_asked(path: Path) -> None:
     with Recorder(path) as recorder:
         recorder.write(Chunk(b"soon"))
-        deadline = time.monotonic() + 5 * _appending.FLUSH_SECONDS
+        deadline = time.monotonic() + 5 * appending.FLUSH_SECONDS
         while not read(path) and time.monotonic() < deadline:
             time.sleep(0.01)
         assert [item.data for item in read(path)] == [b"soon"]
@@ -222,7 +222,7 @@ def test_several_threads_may_write(path: Path) -> None:
 WRITER = """
 import os, sys
 from lidarspec.files import Chunk
-from lidarspec.recordings import Recorder
+from lidarspec.recording.recordings import Recorder
 
 recorder = Recorder(sys.argv[1])
 for number in range(10**9):
@@ -315,7 +315,7 @@ def test_a_recording_that_cannot_even_begin_says_so() -> None:
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs a named pipe")
 def test_a_disk_that_does_not_keep_up_holds_up_nobody(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(_appending, "BACKLOG", 300_000)
+    monkeypatch.setattr(appending, "BACKLOG", 300_000)
     os.mkfifo(path)
     taken = bytearray()
     with open(os.open(path, os.O_RDONLY | os.O_NONBLOCK), "rb", 0) as slow:

@@ -19,9 +19,9 @@ import pytest
 import lidarspec as ls
 from lidarspec.errors import SourceError, UsageError
 from lidarspec.files import Chunk, Disconnected
-from lidarspec.recorders import recorder
-from lidarspec.recordings import Recorder
-from lidarspec.replaying import Deadlines, Player, replayed
+from lidarspec.recording.recorders import recorder
+from lidarspec.recording.recordings import Recorder
+from lidarspec.recording.replaying import Deadlines, Player, replayed
 from lidarspec.sources import transport
 from lidarspec.transports.players import FilePlayer, PtyPlayer, TcpPlayer, UdpPlayer, player
 from tests.lines import SLACK

@@ -11,7 +11,7 @@ import lidarspec as ls
 from lidarspec import settings
 from lidarspec.mounting import Mount
 from lidarspec.scans import Scan
-from lidarspec.simulator import simulate
+from lidarspec.simulation.simulator import simulate
 from tests.cli.running import ran
 
 SENSOR = "ldrobot-stl27l"

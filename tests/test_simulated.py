@@ -10,8 +10,8 @@ import pytest
 
 import lidarspec as ls
 from lidarspec import OutOfRange, Sensor, UsageError
-from lidarspec.faults import Faults, Line, faults_of
-from lidarspec.simulated import SECOND, SimulatedDevice
+from lidarspec.simulation.faults import Faults, Line, faults_of
+from lidarspec.simulation.simulated import SECOND, SimulatedDevice
 from lidarspec.units import duration
 
 MINI, STL, A1 = ls.sensor("cspc-m1c1-mini"), ls.sensor("ldrobot-stl27l"), ls.sensor("slamtec-rplidar-a1")

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 import lidarspec as ls
 from lidarspec import Cartesian, Frame, Polar, Sensor, SourceError, SpecError, UsageError
-from lidarspec.scenery import read_scene, scene_of
-from lidarspec.scenes import Box, Mover, Room, furnished
-from lidarspec.simulated import SECOND, SimulatedDevice
-from lidarspec.simulator import simulate, simulation
+from lidarspec.simulation.scenery import read_scene, scene_of
+from lidarspec.simulation.scenes import Box, Mover, Room, furnished
+from lidarspec.simulation.simulated import SECOND, SimulatedDevice
+from lidarspec.simulation.simulator import simulate, simulation
 from lidarspec.spec import replaced
 from tests.shapes import count
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import lidarspec as ls
-from lidarspec.simulator import opening, simulate
+from lidarspec.simulation.simulator import opening, simulate
 from tests.shapes import SHAPES
 
 MODES, AHEAD, OUTER = SHAPES["shape-modes"], SHAPES["shape-ahead"], SHAPES["shape-outer"]

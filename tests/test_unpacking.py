@@ -28,10 +28,10 @@ from construct import (
 )
 
 import lidarspec as ls
-from lidarspec import dispatch, unpacking
-from lidarspec.codecs import CompiledCodec, codec
 from lidarspec.construction import clean
-from lidarspec.layout import Layout
+from lidarspec.frames import dispatch, unpacking
+from lidarspec.frames.codecs import CompiledCodec, codec
+from lidarspec.frames.layout import Layout
 from lidarspec.spec import Sensor
 from tests.shapes import SHAPES
 

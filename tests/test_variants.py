@@ -10,7 +10,7 @@ from construct import Array, Const, Int8ul, Struct, this
 
 import lidarspec
 from lidarspec import Frame, Polar, Sensor, SpecError
-from lidarspec.simulator import simulate
+from lidarspec.simulation.simulator import simulate
 from lidarspec.spec import replaced
 from tests.made_captures import frame, pcap
 from tests.shapes import headed, lengths

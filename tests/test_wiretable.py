@@ -8,8 +8,8 @@ import pytest
 from construct import Struct
 
 import lidarspec as ls
-from lidarspec.codecs import CompiledCodec, codec
-from lidarspec.layout import Layout
+from lidarspec.frames.codecs import CompiledCodec, codec
+from lidarspec.frames.layout import Layout
 from lidarspec.wiretable import INDICES, Extent, WireRow, frame_size, wire_table
 from tests.shapes import SHAPES
 

@@ -14,8 +14,8 @@ from lidarspec.building import limits
 from lidarspec.cli.failures import suggest
 from lidarspec.cli.output import emit, emit_json, output_options
 from lidarspec.errors import LidarSpecError, OutOfRange, SourceError, UnknownField, UnknownFrame, UsageError
+from lidarspec.frames.schema import FieldInfo, Schema, schema
 from lidarspec.plugins import sensor as named_sensor
-from lidarspec.schema import FieldInfo, Schema, schema
 from lidarspec.units import exact, factor, split_unit
 
 _STEP = re.compile(r"(\w+)((?:\[(?:\d+|\*)\])*)")

@@ -9,15 +9,15 @@ from typing import Any
 import click
 
 from lidarspec.catalogue import CRCS
-from lidarspec.checksearch import search
 from lidarspec.checksums import Crc
 from lidarspec.cli.failures import FINDINGS, suggest
 from lidarspec.cli.inputs import read
 from lidarspec.cli.output import emit, emit_json, note, output_options
+from lidarspec.detection.hearing import hear
+from lidarspec.detection.structure import cut, structure
 from lidarspec.errors import UsageError
-from lidarspec.hearing import hear
-from lidarspec.samples import Match
-from lidarspec.structure import cut, structure
+from lidarspec.searching.checksums import search
+from lidarspec.searching.samples import Match
 
 #: doubt below which a match may well be chance.
 WEAK = 12

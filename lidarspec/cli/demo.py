@@ -14,8 +14,7 @@ from lidarspec.cli.output import drawn, emit_json, sensor_option
 from lidarspec.cli.progress import size
 from lidarspec.demo import DemoResult, has_terminals, run
 from lidarspec.errors import UsageError
-from lidarspec.plugins import registry
-from lidarspec.plugins import sensor as named_sensor
+from lidarspec.plugins import registry, sensor as named_sensor
 from lidarspec.scans import Scan
 from lidarspec.view.polar import look, picture
 

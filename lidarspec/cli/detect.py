@@ -12,13 +12,13 @@ from lidarspec.cli.crc import told as checksum_told
 from lidarspec.cli.failures import NO_DATA, suggest
 from lidarspec.cli.output import emit, emit_json, note, output_options, table
 from lidarspec.cli.streams import Duration
-from lidarspec.detect import Score, Verdict, verdict, verdicts
+from lidarspec.detection.detect import Score, Verdict, verdict, verdicts
+from lidarspec.detection.hearing import LISTEN, Heard, everywhere, udp_ports
+from lidarspec.detection.probing import probe, started_first
+from lidarspec.detection.structure import Structure, structure
 from lidarspec.errors import SourceError, UsageError
-from lidarspec.hearing import LISTEN, Heard, everywhere, udp_ports
-from lidarspec.probing import probe, started_first
 from lidarspec.settings import named
 from lidarspec.sources import live_address
-from lidarspec.structure import Structure, structure
 from lidarspec.transports.ports import serial_ports
 
 #: checksums that are told of unknown bytes.

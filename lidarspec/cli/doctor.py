@@ -7,8 +7,8 @@ import click
 from lidarspec.cli.failures import FINDINGS
 from lidarspec.cli.output import emit, emit_json, note, output_options, sensor_option
 from lidarspec.cli.streams import Duration
-from lidarspec.diagnosis import Finding, computer, examined
-from lidarspec.hearing import LISTEN
+from lidarspec.detection.diagnosis import Finding, computer, examined
+from lidarspec.detection.hearing import LISTEN
 from lidarspec.plugins import sensor as named_sensor
 
 

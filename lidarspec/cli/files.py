@@ -13,9 +13,8 @@ import click
 from lidarspec.cli.failures import suggest
 from lidarspec.cli.inputs import Input, nearest, no_frame
 from lidarspec.cli.output import emit_json, note, sensor_option
-from lidarspec.detect import detected, scores
-from lidarspec.device import Device
-from lidarspec.device import open as open_device
+from lidarspec.detection.detect import detected, scores
+from lidarspec.device import Device, open as open_device
 from lidarspec.errors import LidarSpecError, UsageError, WireError
 from lidarspec.formats import format_of, write
 from lidarspec.plugins import sensor as named_sensor

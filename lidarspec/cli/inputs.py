@@ -11,10 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from lidarspec.cli.failures import suggest
-from lidarspec.codecs import codec
-from lidarspec.detect import scores
+from lidarspec.detection.detect import scores
 from lidarspec.errors import LidarSpecError, SourceError, UsageError, WireError
-from lidarspec.judging import VALID
+from lidarspec.frames.codecs import codec
+from lidarspec.frames.judging import VALID
 from lidarspec.parsing import parse_typed
 from lidarspec.plugins import sensors
 from lidarspec.sources import transport

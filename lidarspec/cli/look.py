@@ -8,13 +8,12 @@ from typing import Any
 import click
 
 from lidarspec.cli.output import emit, emit_json, note, output_options, table
+from lidarspec.frames.tables import Rows
 from lidarspec.links import Link, Serial, Tcp, Udp
-from lidarspec.plan import Plan, plan_for
-from lidarspec.plugins import registry
-from lidarspec.plugins import sensor as named_sensor
+from lidarspec.plans.plan import Plan, plan_for
+from lidarspec.plugins import registry, sensor as named_sensor
 from lidarspec.points import points_function
 from lidarspec.spec import Command, Frame, Sensor
-from lidarspec.tables import Rows
 from lidarspec.wiretable import frame_size, wire_table
 
 NO_SENSORS = "no sensor is installed: pip install 'lidarspec[all]'"

@@ -7,7 +7,7 @@ from typing import Any
 import click
 
 from lidarspec.cli.output import emit, emit_json, note, output_options, table
-from lidarspec.hearing import udp_ports
+from lidarspec.detection.hearing import udp_ports
 from lidarspec.links import Udp
 from lidarspec.plugins import sensors
 from lidarspec.transports.ports import SerialPort, User, serial_ports, udp_users

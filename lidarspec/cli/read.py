@@ -14,8 +14,7 @@ import numpy as np
 
 from lidarspec.cli.output import note, sensor_option
 from lidarspec.cli.streams import Duration, Patience, nothing_came
-from lidarspec.device import Device
-from lidarspec.device import open as open_device
+from lidarspec.device import Device, open as open_device
 from lidarspec.errors import UnknownFrame
 from lidarspec.scans import Scan
 from lidarspec.view.feed import LOOK, Feed

@@ -11,7 +11,6 @@ from typing import cast
 
 import click
 
-from lidarspec.capture import BoundedQueue, Capture, Mark
 from lidarspec.cli.failures import INTERRUPTED, suggest
 from lidarspec.cli.output import emit_json, note, sensor_option
 from lidarspec.cli.progress import Progress, size
@@ -19,10 +18,11 @@ from lidarspec.cli.streams import Duration, nothing_came
 from lidarspec.device import Device
 from lidarspec.errors import CommandError, LidarSpecError, SourceError, UnknownFormat, UsageError, WireError
 from lidarspec.files import Chunk, LiveTransport, Transport
+from lidarspec.inputs.capture import BoundedQueue, Capture, Mark
 from lidarspec.links import Udp
 from lidarspec.plugins import sensor as named_sensor
-from lidarspec.recorders import AnyRecorder, check_suffix, recorder
-from lidarspec.recordings import Header, Recorder
+from lidarspec.recording.recorders import AnyRecorder, check_suffix, recorder
+from lidarspec.recording.recordings import Header, Recorder
 from lidarspec.settings import named
 from lidarspec.sources import live_address, transport
 from lidarspec.spec import Sensor

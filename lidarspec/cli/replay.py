@@ -21,9 +21,9 @@ from lidarspec.errors import LidarSpecError, UsageError, WireError
 from lidarspec.files import Chunk, Disconnected, Transport
 from lidarspec.links import Udp
 from lidarspec.plugins import sensor as named_sensor
-from lidarspec.recorders import SUFFIXES, recorder
-from lidarspec.recordings import Header
-from lidarspec.replaying import Player, replayed
+from lidarspec.recording.recorders import SUFFIXES, recorder
+from lidarspec.recording.recordings import Header
+from lidarspec.recording.replaying import Player, replayed
 from lidarspec.sources import live_address, transport
 from lidarspec.spec import Sensor
 from lidarspec.transports.players import FilePlayer, player

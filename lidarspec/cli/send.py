@@ -13,12 +13,11 @@ from lidarspec.cli.failures import suggest
 from lidarspec.cli.frames import plain
 from lidarspec.cli.output import emit, emit_json, output_options, sensor_option, table
 from lidarspec.cli.streams import Duration
-from lidarspec.device import Device
-from lidarspec.device import open as open_device
+from lidarspec.device import Device, open as open_device
 from lidarspec.errors import CommandError, UnknownCommand, UnknownField, UsageError
 from lidarspec.explain import explain
+from lidarspec.frames.schema import schema
 from lidarspec.replies import Reply
-from lidarspec.schema import schema
 from lidarspec.spec import Sensor
 from lidarspec.units import factor, split_unit
 

@@ -16,11 +16,11 @@ from lidarspec.cli.output import emit_json, note
 from lidarspec.cli.progress import Progress, size
 from lidarspec.cli.streams import Duration, Share
 from lidarspec.errors import UsageError
-from lidarspec.faults import Faults
 from lidarspec.plugins import sensor as named_sensor
-from lidarspec.recorders import SUFFIXES
-from lidarspec.scenery import read_scene
-from lidarspec.simulated import SimulatedDevice
+from lidarspec.recording.recorders import SUFFIXES
+from lidarspec.simulation.faults import Faults
+from lidarspec.simulation.scenery import read_scene
+from lidarspec.simulation.simulated import SimulatedDevice
 from lidarspec.spec import Sensor
 from lidarspec.transports.doors import HERE, Door, UdpDoor
 from lidarspec.transports.serving import door, is_file, serve, write_file

@@ -15,8 +15,7 @@ import click
 from lidarspec.cli.failures import FINDINGS
 from lidarspec.cli.output import note, sensor_option
 from lidarspec.cli.streams import Duration, Patience, Share, nothing_came
-from lidarspec.device import Device
-from lidarspec.device import open as open_device
+from lidarspec.device import Device, open as open_device
 from lidarspec.packets import Packets
 from lidarspec.view.feed import LOOK, Feed
 from lidarspec.view.meter import Reading

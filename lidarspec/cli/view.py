@@ -11,8 +11,7 @@ import click
 
 from lidarspec.cli.output import drawn, note, sensor_option
 from lidarspec.cli.streams import PATIENCE, Duration, nothing_came
-from lidarspec.device import Device
-from lidarspec.device import open as open_device
+from lidarspec.device import Device, open as open_device
 from lidarspec.settings import named
 from lidarspec.sources import live_address
 from lidarspec.view.canvas import Cells

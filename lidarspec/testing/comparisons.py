@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.clouds import PointCloud
-from lidarspec.codecs import codec
 from lidarspec.construction import member
 from lidarspec.decoder import Decoder, Found, Spans, is_stream, spans_of
+from lidarspec.frames.codecs import codec
 from lidarspec.packets import Packets
 from lidarspec.spec import Sensor
 from lidarspec.streams import PacketStream

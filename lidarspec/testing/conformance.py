@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from lidarspec.codecs import codec
 from lidarspec.decoder import Decoder, packed
 from lidarspec.errors import OutOfRange, WireError
+from lidarspec.frames.codecs import codec
 from lidarspec.packets import joined
 from lidarspec.plugins import sensor as known_sensor
 from lidarspec.scans import Scan, scans_of

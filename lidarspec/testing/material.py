@@ -8,9 +8,9 @@ from collections.abc import Iterable, Iterator
 from typing import Any
 
 from lidarspec.building import limits
-from lidarspec.codecs import codec
 from lidarspec.errors import UsageError, WireError
-from lidarspec.schema import FieldInfo
+from lidarspec.frames.codecs import codec
+from lidarspec.frames.schema import FieldInfo
 from lidarspec.spec import Sensor
 
 #: frames up to this length are cut at every byte, longer ones at so many places.

@@ -5,10 +5,10 @@ from __future__ import annotations
 from contextlib import AbstractContextManager
 from pathlib import Path
 
-from lidarspec.faults import Faults
 from lidarspec.plugins import sensor as named_sensor
-from lidarspec.scenes import Scene
-from lidarspec.simulated import SimulatedDevice
+from lidarspec.simulation.faults import Faults
+from lidarspec.simulation.scenes import Scene
+from lidarspec.simulation.simulated import SimulatedDevice
 from lidarspec.spec import Sensor
 from lidarspec.transports.serving import Served, door
 

@@ -8,10 +8,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO
 
-from lidarspec.bulk import Batch, CaptureBatches
+from lidarspec.captures.bulk import Batch, CaptureBatches
+from lidarspec.captures.pcap import CaptureReader, CaptureStats, is_capture
 from lidarspec.errors import SourceError, WireError
 from lidarspec.files import Chunk
-from lidarspec.pcap import CaptureReader, CaptureStats, is_capture
 from lidarspec.transports.recordings import RecordingTransport, is_recording
 
 #: bytes read at once.

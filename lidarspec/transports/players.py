@@ -12,8 +12,8 @@ from dataclasses import replace
 
 from lidarspec.errors import SourceError, UsageError
 from lidarspec.files import Chunk, Disconnected
-from lidarspec.recorders import AnyRecorder
-from lidarspec.replaying import Player
+from lidarspec.recording.recorders import AnyRecorder
+from lidarspec.recording.replaying import Player
 from lidarspec.transports.live import Address, reason
 
 #: seconds between two looks at whether somebody listens, and what a listener takes to settle: many drop what came while they opened.

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from lidarspec.errors import SourceError
 from lidarspec.files import Chunk
-from lidarspec.recordings import MAGIC, Header, Record, Recording
+from lidarspec.recording.recordings import MAGIC, Header, Record, Recording
 
 #: events behind which a frame begun earlier does not go on.
 INTERRUPTIONS = frozenset({"disconnect", "reconnect", "dropped"})

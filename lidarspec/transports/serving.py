@@ -14,8 +14,8 @@ from types import TracebackType
 from lidarspec.errors import UsageError
 from lidarspec.files import Chunk
 from lidarspec.links import Udp
-from lidarspec.recorders import recorder
-from lidarspec.simulated import SECOND, SimulatedDevice
+from lidarspec.recording.recorders import recorder
+from lidarspec.simulation.simulated import SECOND, SimulatedDevice
 from lidarspec.spec import Sensor
 from lidarspec.transports.doors import HERE, Door, TcpDoor, UdpDoor
 from lidarspec.transports.live import POLL, Address, failure

@@ -8,12 +8,12 @@ import time
 from collections.abc import Mapping
 
 from lidarspec.errors import UsageError
-from lidarspec.faults import FAULTS, faults_of
 from lidarspec.files import Chunk, Disconnected
 from lidarspec.links import Serial
 from lidarspec.plugins import sensor as named_sensor
-from lidarspec.scenery import read_scene
-from lidarspec.simulated import SECOND, SimulatedDevice
+from lidarspec.simulation.faults import FAULTS, faults_of
+from lidarspec.simulation.scenery import read_scene
+from lidarspec.simulation.simulated import SECOND, SimulatedDevice
 from lidarspec.spec import Sensor
 from lidarspec.transports.live import Address, LiveBase, failure
 

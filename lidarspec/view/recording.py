@@ -8,7 +8,7 @@ from typing import Any, Literal, cast
 
 from lidarspec.errors import LidarSpecError
 from lidarspec.files import Chunk, Transport
-from lidarspec.recorders import AnyRecorder, recorder
+from lidarspec.recording.recorders import AnyRecorder, recorder
 
 #: names tried for a file before it is given up.
 TRIES = 100

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 import lidarspec as ls
-from lidarspec.simulator import simulate
+from lidarspec.simulation.simulator import simulate
 from tests.cli.running import EXAMPLE, printed, ran
 
 FRAMES = simulate(ls.sensor("ldrobot-stl27l"), 20)

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 import lidarspec as ls
-from lidarspec.simulator import simulate
+from lidarspec.simulation.simulator import simulate
 from tests.cli.running import process, ran
 
 ID = "ldrobot-stl27l"

@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 
 import lidarspec as ls
-from lidarspec.simulator import simulate
+from lidarspec.simulation.simulator import simulate
 from lidarspec.testing.ports import virtual_port
 from tests.cli.running import printed, process, ran
 from tests.lines import paced, port, udp, working

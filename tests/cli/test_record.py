@@ -20,7 +20,7 @@ import pytest
 
 import lidarspec as ls
 from lidarspec.files import Chunk
-from lidarspec.recordings import Recorder, Recording
+from lidarspec.recording.recordings import Recorder, Recording
 from tests.cli.running import printed, process, ran
 from tests.lines import SLACK, port
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import lidarspec as ls
-from lidarspec.pcap import CaptureReader
+from lidarspec.captures.pcap import CaptureReader
 from lidarspec.streams import PacketStream
 from lidarspec.testing.comparisons import assert_same_points
 from tests.sensors.evidence import assert_points, capture, clockwise, decoded, vector_bytes, vectors

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import lidarspec as ls
-from lidarspec.simulator import simulate
+from lidarspec.simulation.simulator import simulate
 from lidarspec.testing.comparisons import assert_same_points
 from tests.sensors.evidence import PROTOCOLS, assert_points, decoded, vector_bytes, vectors
 

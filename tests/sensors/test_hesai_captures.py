@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 import lidarspec as ls
 from lidarspec import PointCloud, Sensor
-from lidarspec.pcap import CaptureReader
+from lidarspec.captures.pcap import CaptureReader
 from tests.sensors.evidence import capture, decoded
 
 PUBLISHED = {"40p": "hesai-pandar40p", "xt32": "hesai-xt32", "qt64": "hesai-qt64"}

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import lidarspec as ls
-from lidarspec.simulator import simulate
+from lidarspec.simulation.simulator import simulate
 from lidarspec_slamtec.capsules import ultra_codes
 from tests.damage import damaged
 from tests.oracle import Oracle

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import lidarspec as ls
-from lidarspec.simulator import simulate
+from lidarspec.simulation.simulator import simulate
 from tests.sensors.evidence import assert_points, clockwise, decoded, vector_bytes, vectors
 
 FILE = "vectors_udp3d.json"

@@ -12,7 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 import lidarspec as ls
-from lidarspec.pcap import CaptureReader
+from lidarspec.captures.pcap import CaptureReader
 from tests.sensors.evidence import capture, decoded
 
 VLP16, HDL32E = ls.sensor("velodyne-vlp16"), ls.sensor("velodyne-hdl32e")

@@ -12,7 +12,7 @@ import lidarspec as ls
 from lidarspec.decoder import Decoder
 from lidarspec.packets import Packets
 from lidarspec.scans import ScanStream
-from lidarspec.simulator import simulate
+from lidarspec.simulation.simulator import simulate
 from lidarspec.streams import PacketStream
 from lidarspec.view.meter import Meter
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 import lidarspec as ls
-from lidarspec.simulator import simulate
+from lidarspec.simulation.simulator import simulate
 
 if os.name == "posix":
     from tests.view.terminal import Terminal

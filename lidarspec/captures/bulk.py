@@ -1,0 +1,239 @@
+"""Datagrams by the hundred, as arrays: where they stand in one buffer, when they came and from whom.
+
+`CaptureBatches` reads captures so: of each kind of datagram the first is read plainly, and all that look the same are then
+found at once (`alike`). What does not is read plainly, one by one, so that the datagrams, their order and what is
+counted are those of `CaptureReader`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Iterator
+from dataclasses import dataclass
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarspec.captures.alike import Alike, alike, walked
+from lidarspec.captures.ip import headers
+from lidarspec.captures.pcap import CaptureReader, Datagram
+from lidarspec.captures.records import Damaged, Passed, PcapngBlocks, PcapRecords, Truncated, records
+from lidarspec.captures.windows import Window
+from lidarspec.decoder import Decoder, Spans
+
+#: kinds of datagrams that are known at a time, and that become known in one batch: nobody's capture makes this slow.
+MOST_KNOWN = 16
+
+Sender = tuple[str, int]
+
+
+@dataclass(frozen=True, eq=False)
+class Batch:
+    """n datagrams in the order of their arrival.
+
+    Attributes:
+        buffer: the bytes that they stand in. Whoever holds it or a view of it keeps it; otherwise it is used again.
+        starts, sizes: (n,) of each payload in the buffer.
+        at: (n,) int64 arrival times, ns since 1970; -1 where nobody knows.
+        senders: (n,) indices into `names`.
+        names: address and port of each sender.
+    """
+
+    buffer: NDArray[np.uint8]
+    starts: NDArray[np.intp]
+    sizes: NDArray[np.intp]
+    at: NDArray[np.int64]
+    senders: NDArray[np.intp]
+    names: tuple[Sender, ...]
+
+    def __len__(self) -> int:
+        return len(self.starts)
+
+    def data(self, index: int) -> bytes:
+        """The bytes of one datagram."""
+        return self.buffer[self.starts[index] : self.starts[index] + self.sizes[index]].tobytes()
+
+    def of(self, host: str) -> Batch:
+        """Those that come from this address."""
+        if all(name[0] == host for name in self.names):
+            return self
+        wanted = np.array([name[0] == host for name in self.names], np.bool_)[self.senders]
+        return Batch(self.buffer, self.starts[wanted], self.sizes[wanted], self.at[wanted], self.senders[wanted], self.names)
+
+    def by_sender(self) -> dict[Sender, NDArray[np.intp]]:
+        """Which datagrams came from each sender, as indices."""
+        if len(self.names) == 1:
+            return {self.names[0]: np.arange(len(self))}
+        parts = {name: np.flatnonzero(self.senders == index) for index, name in enumerate(self.names)}
+        return {name: part for name, part in parts.items() if len(part)}
+
+    def hosts(self, found: Spans) -> dict[str, list[str]]:
+        """The addresses that frames found in these datagrams came from, by type of frame."""
+        hosts: dict[str, list[str]] = {}
+        if len(self.names) == 1:
+            for kind in np.flatnonzero(np.bincount(found.kinds)).tolist():
+                hosts[found.names[kind]] = [self.names[0][0]]
+            return hosts
+        order = np.argsort(self.starts, kind="stable")
+        senders = self.senders[order[np.searchsorted(self.starts[order], found.starts)]]
+        for kind, sender in dict.fromkeys(zip(found.kinds.tolist(), senders.tolist(), strict=True)):
+            known = hosts.setdefault(found.names[kind], [])
+            known += [self.names[sender][0]] if self.names[sender][0] not in known else []
+        return hosts
+
+
+@runtime_checkable
+class BulkTransport(Protocol):
+    """A transport of datagrams that gives many at a time; see `files.Transport`."""
+
+    def batches(self) -> Iterator[Batch]:
+        """The same datagrams as those of `chunks`.
+
+        Raises:
+            SourceError: where they cannot be read.
+        """
+
+
+def first_frames(decoder: Decoder, batches: Iterable[Batch], wanted: Collection[str]) -> dict[str, bytes]:
+    """The first frame of each type that is wanted, as far as there are some."""
+    first: dict[str, bytes] = {}
+    for batch in batches:
+        found = decoder.placed(batch.buffer, batch.starts, batch.sizes, batch.at)
+        for kind, name in enumerate(found.names):
+            if name in wanted and name not in first and len(where := np.flatnonzero(found.kinds == kind)):
+                first[name] = found.data(int(where[0]))
+        if len(first) == len(wanted):
+            break
+    return first
+
+
+class CaptureBatches(CaptureReader):
+    """The same datagrams as `CaptureReader`'s, in batches; to be read either way, not both."""
+
+    _reading = Window
+    _source: Window
+
+    def batches(self) -> Iterator[Batch]:
+        """The datagrams of the file, as many at once as were read at once."""
+        known: list[Alike] = []
+        with self._to_the_end():
+            form = records(self._source)
+            while self._source.begin_record():
+                walk = walked(self._source.storage, self._source.at, self._source.stop, form)
+                if len(walk.starts) < 2 and not walk.stuck and self._source.more():
+                    continue
+                starts = walk.starts if len(walk.starts) > 1 else np.array([self._source.at])
+                found = _Records(self, self._source, form, starts, known)
+                ended = found.read()
+                if len(batch := found.batch()):
+                    self.stats.datagrams += len(batch)
+                    yield batch
+                if ended is not None:
+                    raise ended
+                known = found.still_known()
+
+
+class _Records:
+    """The records that are whole in the window; where there are none, the one that comes next."""
+
+    def __init__(
+        self, reader: CaptureReader, source: Window, form: PcapRecords | PcapngBlocks, starts: NDArray[np.intp], known: list[Alike]
+    ) -> None:
+        self._reader, self._source, self._form, self._known = reader, source, form, known
+        number = max(len(starts) - 1, 1)
+        self._are_whole = len(starts) > 1
+        self._starts, self._lengths = starts, starts[1:] - starts[:-1] if self._are_whole else np.zeros(1, np.intp)
+        self._kinds = np.full(number, -1, np.intp)  # indices into `_known`
+        self._at = np.zeros(number, np.int64)
+        self._plain: dict[int, Datagram] = {}
+        self._learnt = self._counted = 0  # kinds; packets that were read plainly and are known all the same
+        self._section = _sections(form)
+
+    def read(self) -> Exception | None:
+        """What ended the reading of the file, if it ended here."""
+        if not any(self._match(kind) for kind in range(len(self._known))):
+            for index in np.flatnonzero(self._kinds < 0).tolist():
+                if self._kinds[index] >= 0:
+                    continue  # like one that became known meanwhile
+                self._source.go(int(self._starts[index]))
+                try:
+                    self._read_plainly(index)
+                except (Damaged, Truncated) as ended:
+                    self._kinds = self._kinds[:index]
+                    return ended
+                if _sections(self._form) != self._section:
+                    self._kinds = self._kinds[: index + 1]
+                    return None
+        if self._are_whole:
+            self._source.go(int(self._starts[-1]))
+        return None
+
+    def still_known(self) -> list[Alike]:
+        """What is worth comparing the next records with, most frequent first."""
+        if _sections(self._form) != self._section:
+            return []
+        if len(self._known) == 1:
+            return self._known
+        counts = np.bincount(self._kinds[self._kinds >= 0], minlength=len(self._known))
+        return [self._known[kind] for kind in np.argsort(-counts, kind="stable")[:MOST_KNOWN].tolist()]
+
+    def batch(self) -> Batch:
+        """The datagrams of these records."""
+        known = np.flatnonzero(self._kinds >= 0)
+        self._reader.stats.packets += len(known) - self._counted
+        kinds = self._kinds[known]
+        names: dict[Sender, int] = {}
+        facts = np.array([(one.start, one.size, names.setdefault(one.source, len(names))) for one in self._known], np.intp).reshape(-1, 3)
+        starts, sizes, senders = facts[kinds].T if len(facts) != 1 else (np.full(len(known), fact) for fact in facts.ravel())
+        columns = [self._starts[known] + starts, sizes, self._at[known], senders]
+        buffer = self._source.lent() if len(known) else np.empty(0, np.uint8)
+        if self._plain:
+            buffer = self._with_plain(buffer, columns, known, names)
+        return Batch(buffer, columns[0], columns[1], columns[2], columns[3], tuple(names))
+
+    def _with_plain(
+        self, buffer: NDArray[np.uint8], columns: list[NDArray[Any]], known: NDArray[np.intp], names: dict[Sender, int]
+    ) -> NDArray[np.uint8]:
+        """The buffer with the bytes of datagrams that are not in it as they are, which take their places in the columns."""
+        data = b"".join(datagram.data for datagram in self._plain.values())
+        at = len(buffer)
+        rows = []
+        for datagram in self._plain.values():
+            rows.append((at, len(datagram.data), datagram.at, names.setdefault(datagram.source, len(names))))
+            at += len(datagram.data)
+        order = np.argsort(np.concatenate([known, np.array(list(self._plain), np.intp)]), kind="stable")
+        columns[:] = [np.concatenate(parts)[order] for parts in zip(columns, np.array(rows, np.int64).T, strict=True)]
+        return np.concatenate([buffer, np.frombuffer(data, np.uint8)])
+
+    def _read_plainly(self, index: int) -> None:
+        self._source.begin_record()
+        packet = self._form.read()
+        datagram = self._reader.datagram(packet)
+        if datagram is None or isinstance(packet, Passed):
+            return
+        self._plain[index] = datagram
+        if self._learnt == MOST_KNOWN or not self._are_whole:
+            return
+        places = headers(packet.data, packet.link)
+        record = self._source.storage[self._starts[index] : self._starts[index + 1]].tobytes()
+        found = alike(record, packet, places, datagram.source, self._form) if places else None
+        if found is not None:
+            self._learnt += 1
+            self._known = [*self._known, found]
+            self._match(len(self._known) - 1)
+            if self._kinds[index] >= 0:
+                del self._plain[index]
+                self._counted += 1
+
+    def _match(self, kind: int) -> bool:
+        """Whether all records are now known."""
+        left = np.flatnonzero(self._kinds < 0)
+        found, at = self._known[kind].find(self._source.storage, self._starts[left], self._lengths[left])
+        left = left if found is None else left[found]
+        self._kinds[left] = kind
+        self._at[left] = at
+        return found is None
+
+
+def _sections(form: PcapRecords | PcapngBlocks) -> int:
+    return form.sections if isinstance(form, PcapngBlocks) else 0

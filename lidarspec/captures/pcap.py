@@ -1,0 +1,256 @@
+"""Captures: the UDP datagrams of a pcap or pcapng file, and a writer of pcap files.
+
+Theory of operation: `records` walks the records of the file, `ip` takes the captured frames apart, and this module
+joins the two and counts in `CaptureStats` whatever gives no datagram. Captures are hostile input: past the first four bytes
+nothing in them raises, and memory follows the bytes that are there, never a length that they claim.
+"""
+
+from __future__ import annotations
+
+import ipaddress
+import os
+import struct
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import lru_cache
+from types import TracebackType
+from typing import BinaryIO
+
+from lidarspec.captures.ip import ETHERNET, LARGEST_PAYLOAD, Reassembly, Refused, address, ip_packet, udp, udp_frame
+from lidarspec.captures.records import (
+    LARGEST_PACKET,
+    NANOSECOND_MAGIC,
+    CapturedPacket,
+    Damaged,
+    Passed,
+    Source,
+    Truncated,
+    is_capture,
+    records,
+)
+from lidarspec.errors import SourceError, UsageError
+
+__all__ = ["CaptureReader", "CaptureStats", "Datagram", "PcapWriter", "is_capture"]
+
+_SECOND = 1_000_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class Datagram:
+    """One whole UDP datagram.
+
+    Attributes:
+        data: the payload.
+        at: capture time in ns since 1970, of its last fragment where it came in several; 0 where the file has no times.
+        source, destination: address and port.
+    """
+
+    data: bytes
+    at: int
+    source: tuple[str, int]
+    destination: tuple[str, int]
+
+
+@dataclass(slots=True)
+class CaptureStats:
+    """What a capture held so far.
+
+    Attributes:
+        packets: captured packets, of whatever kind.
+        datagrams: UDP datagrams handed out.
+        other: packets that are not UDP over IP.
+        truncated_tail: whether the file ends in the middle of a record; all before it was read.
+        snapped: UDP packets that the capture's snap length cut short; they are not handed out.
+        fragments: UDP packets that were IP fragments.
+        incomplete_fragments: those whose datagram never became whole.
+        malformed: packets and records that contradict themselves.
+        stopped_at: file offset of the truncated or malformed record that ended the reading, else None.
+    """
+
+    packets: int = 0
+    datagrams: int = 0
+    other: int = 0
+    truncated_tail: bool = False
+    snapped: int = 0
+    fragments: int = 0
+    incomplete_fragments: int = 0
+    malformed: int = 0
+    stopped_at: int | None = None
+
+
+class CaptureReader:
+    """The UDP datagrams of a capture, in file order, each once: an iterator goes on where the last one stopped.
+
+    Args:
+        file: an open binary file, also a pipe, which stays open; or a path, whose file is closed after the last datagram.
+
+    Attributes:
+        stats: what was met so far.
+
+    Raises:
+        SourceError: the file cannot be read, or is no capture at all. Damage further on is counted, never raised.
+    """
+
+    _reading: Callable[[BinaryIO], Source] = Source
+
+    def __init__(self, file: BinaryIO | str | os.PathLike[str]) -> None:
+        self.stats = CaptureStats()
+        self._owned: BinaryIO | None = None
+        if isinstance(file, str | os.PathLike):
+            file = self._owned = _open(file)
+        self._source = self._reading(file)
+        self._fragments = Reassembly()
+        self._datagrams = self._walk()
+        try:
+            magic = self._source.magic()
+            if not is_capture(magic):
+                seen = f"it begins with {magic.hex(' ')}" if magic else "it is empty"
+                raise SourceError(f"{getattr(file, 'name', 'input')}: neither a pcap nor a pcapng capture: {seen}")
+        except SourceError:
+            self.close()
+            raise
+
+    def __iter__(self) -> Iterator[Datagram]:
+        return self._datagrams
+
+    def __enter__(self) -> CaptureReader:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Closes the file, if it was given as a path."""
+        if self._owned is not None:
+            self._owned.close()
+
+    def _walk(self) -> Iterator[Datagram]:
+        with self._to_the_end():
+            found = records(self._source)
+            while self._source.begin_record():
+                datagram = self.datagram(found.read())
+                if datagram is not None:
+                    self.stats.datagrams += 1
+                    yield datagram
+
+    @contextmanager
+    def _to_the_end(self) -> Iterator[None]:
+        """Around the reading of all records: counts what ends it."""
+        try:
+            yield
+        except Truncated:
+            self.stats.truncated_tail = True
+            self.stats.stopped_at = self._source.record
+        except Damaged:
+            self.stats.malformed += 1
+            self.stats.stopped_at = self._source.record
+        finally:
+            self.close()
+        self._fragments.finish()
+        self.stats.incomplete_fragments = self._fragments.dropped
+
+    def datagram(self, packet: CapturedPacket | Passed) -> Datagram | None:
+        """The datagram that this packet is, or makes whole; counts what it is otherwise."""
+        stats = self.stats
+        if isinstance(packet, Passed):
+            stats.malformed += packet is Passed.MALFORMED
+            return None
+        stats.packets += 1
+        try:
+            ip = ip_packet(packet.data, packet.link)
+            if ip.fragment is not None:
+                stats.fragments += 1
+                whole = self._fragments.add(ip, ip.fragment, packet.at)
+                stats.incomplete_fragments = self._fragments.dropped
+                if whole is None:
+                    return None
+                ip = whole
+            part = udp(ip)
+        except Refused as refused:
+            if refused.reason == "other":
+                stats.other += 1
+            elif refused.reason == "short" and len(packet.data) < packet.original:
+                stats.snapped += 1
+            else:
+                stats.malformed += 1
+            return None
+        ends = (address(ip.source), part.source), (address(ip.destination), part.destination)
+        return Datagram(ip.body[part.start : part.stop], packet.at, *ends)
+
+
+class PcapWriter:
+    """Writes datagrams to a pcap file that Wireshark opens: little-endian, nanoseconds, Ethernet, IPv4, UDP.
+
+    Args:
+        file: a file open for binary writing; it stays open, and buffered bytes are its owner's to flush.
+
+    Raises:
+        SourceError: the file does not take all bytes (a full disk). Where it can be cut, it is cut to its last whole record.
+    """
+
+    def __init__(self, file: BinaryIO) -> None:
+        self._file = file
+        self._end = file.tell() if file.seekable() else None  # of the last whole record
+        self._is_broken = False
+        self._append(struct.pack("<4sHHiIII", NANOSECOND_MAGIC, 2, 4, 0, 0, LARGEST_PACKET, ETHERNET))
+
+    def write(self, datagram: Datagram) -> None:
+        """Appends one datagram, unfragmented.
+
+        Raises:
+            UsageError: more than 65,507 bytes, an address that is not IPv4, or a port or time that no record can hold.
+            SourceError: the file does not take all bytes, now or at an earlier call.
+        """
+        if len(datagram.data) > LARGEST_PAYLOAD:
+            raise UsageError(f"a datagram of {len(datagram.data)} bytes: UDP over IPv4 carries at most {LARGEST_PAYLOAD}")
+        seconds, nanoseconds = divmod(datagram.at, _SECOND)
+        if not 0 <= seconds < 1 << 32:
+            raise UsageError(f"a capture time of {datagram.at} ns: pcap holds the years 1970 to 2106")
+        frame = udp_frame(datagram.data, _endpoint(*datagram.source), _endpoint(*datagram.destination))
+        self._append(struct.pack("<IIII", seconds, nanoseconds, len(frame), len(frame)) + frame)
+
+    def _append(self, record: bytes) -> None:
+        if self._is_broken:
+            raise SourceError("the capture file ends in half a record since an earlier write failed")
+        left = memoryview(record)
+        try:
+            while left:
+                written = self._file.write(left)
+                if not written:
+                    raise OSError("the file takes no more bytes")
+                left = left[written:]
+        except OSError as error:
+            self._is_broken = not self._cut()
+            raise SourceError(f"cannot write the capture: {error}") from error
+        if self._end is not None:
+            self._end += len(record)
+
+    def _cut(self) -> bool:
+        """Whether the file could be cut to its last whole record."""
+        if self._end is None:
+            return False
+        try:
+            self._file.seek(self._end)
+            self._file.truncate()
+        except OSError:
+            return False
+        return True
+
+
+def _open(path: str | os.PathLike[str]) -> BinaryIO:
+    try:
+        return open(path, "rb")
+    except OSError as error:
+        raise SourceError(f"{os.fspath(path)}: {error.strerror}") from error
+
+
+@lru_cache(maxsize=256)
+def _endpoint(host: str, port: int) -> tuple[bytes, int]:
+    try:
+        packed = ipaddress.IPv4Address(host).packed
+    except ValueError:
+        raise UsageError(f"{host!r} is not an IPv4 address, which is all that the pcap writer knows") from None
+    if not 0 <= port < 1 << 16:
+        raise UsageError(f"{port} is not a UDP port")
+    return packed, port

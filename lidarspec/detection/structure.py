@@ -1,0 +1,178 @@
+"""What unknown bytes are made of: where frames may begin, how long they are, and which checksum seals them.
+
+Frames of one length show as a distance at which many bytes are equal; their sync bytes are then the longest run of bytes that
+never change. Frames of several lengths show as a pair of bytes that comes again and again, at distances that a length field in
+front of each frame explains.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarspec.searching.checksums import search
+from lidarspec.searching.samples import Match
+
+#: bytes that are looked at, and the shortest and longest period.
+LOOKED_AT, SHORTEST, LONGEST = 1 << 15, 4, 4096
+#: distances that are tried as a length, and the share of frames in which a byte that never changes is the same.
+LAGS, STEADY = 48, 0.9
+#: share of the bytes that has to be in frames, shares that are about the same, and many frames.
+HALF, CLOSE, MANY = 0.5, 0.03, 12
+#: part of the best weight that a shorter period needs.
+ALIKE = 0.75
+#: pairs of bytes that are tried as sync bytes, and frames that a structure needs.
+PAIRS, FRAMES = 32, 3
+#: bytes behind the sync that may hold a length, and the largest size of one unit of it.
+HEADER, UNIT = 8, 16
+
+
+@dataclass(frozen=True)
+class Structure:
+    """Frames that unknown bytes seem to consist of.
+
+    Attributes:
+        sync: bytes that each begins with.
+        period: their length; None where it varies.
+        length: where the length stands, in words, where it varies.
+        share: share of the bytes that are in them.
+        frames: the frames.
+        checksums: what may seal them, the likeliest first.
+    """
+
+    sync: bytes
+    period: int | None
+    length: str
+    share: float
+    frames: tuple[bytes, ...]
+    checksums: tuple[Match, ...]
+
+
+def structure(chunks: Sequence[bytes], *, datagrams: bool, seal: bool = True) -> Structure | None:
+    """The likely structure of unknown bytes, None where there is none to be seen.
+
+    Args:
+        chunks: datagrams, or pieces of a stream.
+        seal: also search for the checksum, which takes seconds.
+    """
+    found = _of_datagrams(chunks) if datagrams else _of_stream(np.frombuffer(b"".join(chunks)[:LOOKED_AT], np.uint8))
+    if found is None or not seal:
+        return found
+    return Structure(found.sync, found.period, found.length, found.share, found.frames, tuple(search(found.frames)))
+
+
+def cut(data: bytes, period: int, start: int = 0) -> list[bytes]:
+    """Whole frames of one length."""
+    return [data[first : first + period] for first in range(start, len(data) - period + 1, period)]
+
+
+def _of_datagrams(chunks: Sequence[bytes]) -> Structure | None:
+    """The datagrams of the commonest length, with the bytes that they begin with."""
+    if len(chunks) < FRAMES:
+        return None
+    lengths, counts = np.unique([len(chunk) for chunk in chunks], return_counts=True)
+    length = int(lengths[(lengths * counts).argmax()])
+    frames = [chunk for chunk in chunks if len(chunk) == length]
+    if len(frames) < FRAMES or length == 0:
+        return None
+    rows = np.frombuffer(b"".join(frames), np.uint8).reshape(len(frames), length)
+    steady = (rows == rows[0]).all(axis=0)
+    sync = frames[0][: int(np.argmin(steady)) if not steady.all() else length][:16]
+    return Structure(sync, length, "", len(frames) * length / sum(map(len, chunks)), tuple(frames), ())
+
+
+def _of_stream(data: NDArray[np.uint8]) -> Structure | None:
+    """The reading that explains more of the bytes; one length for all frames is the simpler one."""
+    periodic, varying = _periodic(data), _by_length(data)
+    if periodic is None or varying is None:
+        return periodic or varying
+    few = len(periodic.frames) < MANY <= len(varying.frames)
+    return varying if varying.share > periodic.share + CLOSE or few else periodic
+
+
+def _periodic(data: NDArray[np.uint8]) -> Structure | None:
+    """Frames of one length: of the distances at which most bytes are equal, the one at which the most stay the same all along."""
+    lags = np.arange(SHORTEST, min(LONGEST, len(data) // FRAMES) + 1)
+    equal = np.array([float((data[lag:] == data[:-lag]).mean()) for lag in lags])
+    likely = lags[np.argsort(equal)[::-1][:LAGS]].tolist()
+    framed = [(weight, found) for lag in likely for weight, found in _framed(data, lag) if found.share > HALF]
+    best = max((weight for weight, _ in framed), default=0.0)
+    return min((found for weight, found in framed if weight > ALIKE * best), key=lambda found: found.period or 0, default=None)
+
+
+def _framed(data: NDArray[np.uint8], period: int) -> Iterator[tuple[float, Structure]]:
+    """Frames of this length, which begin with the longest run of bytes that are always the same, and the share of such bytes."""
+    count = len(data) // period
+    rows = data[: count * period].reshape(count, period)
+    usual = np.array([np.bincount(column, minlength=256).argmax() for column in rows.T], np.uint8)
+    steady = (rows == usual).mean(axis=0) >= STEADY if count >= 2 * FRAMES else (rows == usual).all(axis=0)
+    if not (steady & (usual != 0)).any() or steady.all():
+        return
+    start, length = _longest_run(steady, usual)
+    sync = bytes(np.roll(usual, -start)[:length])
+    frames = [frame for frame in cut(data.tobytes(), period, start) if frame.startswith(sync)]
+    if len(frames) >= FRAMES:
+        share = len(frames) * period / len(data)
+        yield share * float((steady & (usual != 0)).mean()), Structure(sync[:16], period, "", share, tuple(frames), ())
+
+
+def _longest_run(steady: NDArray[np.bool_], usual: NDArray[np.uint8]) -> tuple[int, int]:
+    """Start and length of the longest run of steady bytes, around the end too, without zeros in front: they tell little."""
+    size, best = len(steady), (-1, 0, 0)
+    for start in range(size):
+        if steady[start] and not steady[start - 1]:
+            run = usual[
+                [(start + step) % size for step in range(next(step for step in range(1, size + 1) if not steady[(start + step) % size]))]
+            ]
+            zeros = int(np.argmax(run != 0)) if run.any() else 0
+            best = max(best, (int(np.count_nonzero(run)), -((start + zeros) % size), len(run) - zeros))
+    return -best[1], best[2]
+
+
+def _by_length(data: NDArray[np.uint8]) -> Structure | None:
+    """Frames of several lengths, whose header says how long they are."""
+    pairs = data[:-1].astype(np.int64) << 8 | data[1:]
+    counts = np.bincount(pairs, minlength=1 << 16)
+    best: Structure | None = None
+    for pair in np.argsort(counts)[::-1][:PAIRS].tolist():
+        starts = np.flatnonzero(pairs == pair)
+        if pair in (0, 0xFFFF) or len(starts) < 2 * FRAMES:
+            continue
+        found = _explained(data, starts, bytes([pair >> 8, pair & 0xFF]))
+        if found is not None and (best is None or found.share > best.share):
+            best = found
+    return best if best is not None and best.share > HALF else None
+
+
+def _explained(data: NDArray[np.uint8], starts: NDArray[np.intp], sync: bytes) -> Structure | None:
+    """Frames from one sync to the next, where a byte or a word behind it tells most of their lengths."""
+    starts = starts[starts + HEADER + 2 < len(data)]
+    steps = np.diff(starts)
+    if len(steps) < FRAMES:
+        return None
+    best = (0.0, "", np.zeros(0, np.bool_))
+    for place in range(2, HEADER):
+        low, high = data[starts[:-1] + place].astype(np.int64), data[starts[:-1] + place + 1].astype(np.int64)
+        for kind, values in (("byte", low), ("little-endian word", low | high << 8), ("big-endian word", high | low << 8)):
+            for unit in range(1, UNIT + 1):
+                rest = steps - unit * values
+                usual, number = _commonest(rest)
+                told = rest == usual
+                distinct = len(np.unique(steps[told]))
+                share = float(steps[told].sum() / len(data))
+                if distinct > 1 and number >= FRAMES and usual >= 0 and share > best[0]:
+                    best = (share, f"{usual} + {unit} x {kind} at {place}", told)
+    share, length, told = best
+    if not length:
+        return None
+    whole = data.tobytes()
+    frames = [whole[start : start + step] for start, step in zip(starts[:-1][told].tolist(), steps[told].tolist(), strict=True)]
+    return Structure(sync, None, length, share, tuple(frames), ())
+
+
+def _commonest(values: NDArray[np.int64]) -> tuple[int, int]:
+    found, counts = np.unique(values, return_counts=True)
+    return int(found[counts.argmax()]), int(counts.max())

@@ -1,0 +1,242 @@
+"""Columns: what `points` and `plausible` functions compute with.
+
+A `Column` is an array with one axis for the packets and one for each array level of the struct, each axis named by
+its array, so that arithmetic lines up by itself and sibling arrays cannot be mixed by accident. It also knows the
+batch it comes from: where packets were lost, how long variable arrays are, and how many packets are already certain
+(``ready``) where a value depends on what follows.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.lib.mixins import NDArrayOperatorsMixin
+from numpy.typing import NDArray
+
+from lidarspec.errors import SpecError
+
+if TYPE_CHECKING:  # as in `access`
+    from lidarspec.frames.tables import Table
+
+#: NumPy functions that work element by element, and so keep axes; others see plain arrays.
+ELEMENTWISE = {np.where, np.clip, np.nan_to_num, np.round, np.isclose, np.real_if_close}
+
+Carry = dict[int, NDArray[np.float64]]
+
+
+@dataclass(eq=False)
+class Batch:
+    """The packets that a set of columns belongs to.
+
+    Attributes:
+        table: their raw columns.
+        breaks: (n,) True where something was lost before the packet.
+        state: per frame type, its table and for each packet the index of the frame that was last (-1: none yet).
+        defaults: declared defaults of state columns, per frame type and path.
+        carry: what the previous batch left for `previous` and `last`, by order of call.
+    """
+
+    table: Table
+    breaks: NDArray[np.bool_]
+    state: Mapping[str, tuple[Table | None, NDArray[np.intp]]] = field(default_factory=dict)
+    defaults: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    carry: Carry = field(default_factory=dict)
+    nominal: bool = False
+    left: list[Callable[[int], NDArray[np.float64]]] = field(default_factory=list)
+
+    def __len__(self) -> int:
+        return len(self.table)
+
+    def carried(self, ready: int) -> Carry:
+        """What the next batch has to know, if it starts with packet `ready` of this one."""
+        return {slot: rest(ready) for slot, rest in enumerate(self.left)}
+
+
+class Column(NDArrayOperatorsMixin):
+    """Numbers of a batch of packets: NumPy's ufuncs and functions apply, see the module's text.
+
+    Attributes:
+        array: shape (n or 1, ...), one axis per array level of the struct, length 1 where the value is further out.
+        axes: names of the axes after the first; None where the length is 1.
+        ready: packets from the start whose values depend on nothing that is still to come.
+        source: the field's path, while the column is an unchanged field.
+    """
+
+    def __init__(
+        self, array: NDArray[Any], axes: tuple[str | None, ...], batch: Batch, *, ready: int | None = None, source: str = ""
+    ) -> None:
+        self.array, self.axes, self.batch, self.source = array, axes, batch, source
+        self.ready = len(batch) if ready is None else ready
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """The shape of the array."""
+        return self.array.shape
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
+        return self.array if dtype is None else self.array.astype(dtype)
+
+    def __bool__(self) -> bool:
+        return bool(self.array)
+
+    def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: Any, **kwargs: Any) -> Any:
+        if kwargs.get("out") is not None:
+            raise SpecError("columns cannot be changed in place; write a new expression instead")
+        if method != "__call__":
+            return getattr(ufunc, method)(*(np.asarray(value) for value in inputs), **kwargs)
+        return self.applied(lambda *arrays: ufunc(*arrays, **kwargs), *inputs)
+
+    def __array_function__(self, function: Callable[..., Any], types: Any, args: Any, kwargs: Any) -> Any:
+        if function in ELEMENTWISE:
+            return self.applied(lambda *arrays: function(*arrays, **kwargs), *args)
+        plain = [np.asarray(value) if isinstance(value, Column) else value for value in args]
+        return function(*plain, **kwargs)
+
+    def applied(self, function: Callable[..., Any], *values: Any) -> Column:
+        """`function` of arrays, lined up by axes; columns on the left, arrays by their last axes as in NumPy."""
+        arrays, axes, ready = aligned(values, self.batch)
+        found = np.asarray(function(*arrays))
+        names = (*axes, *(f"<{index}>" for index in range(len(axes), found.ndim - 1)))
+        return Column(found, names, self.batch, ready=ready)
+
+    def on(self, *axes: str) -> Column:
+        """The same values on other axes, by the names of arrays; its own axes go to the last of those named."""
+        chain = self.batch.table.schema.chain()
+        own = [index for index, name in enumerate(self.axes) if name is not None]
+        if len(axes) < len(own):
+            raise SpecError(f"a column with {len(own)} axes cannot be put on {axes}")
+        spots = [_position(name, chain) for name in axes][len(axes) - len(own) :]
+        shape, names = [1] * max(len(chain), len(self.axes)), [None] * max(len(chain), len(self.axes))
+        for index, spot in zip(own, spots, strict=True):
+            shape[spot], names[spot] = self.array.shape[1 + index], chain[spot]  # type: ignore[call-overload]
+        return Column(self.array.reshape(self.array.shape[0], *shape), tuple(names), self.batch, ready=self.ready)
+
+    def steps(self) -> NDArray[np.intp]:
+        """0, 1, 2 ... up to the largest value: the indices of an array of which this is the count."""
+        return np.arange(int(np.nanmax(self.array, initial=0)))
+
+    def shifted(self, step: int) -> Column:
+        """The values `step` places later (earlier if negative) in stream order; see `angles.following`."""
+        rows = Rows1D(self)
+        size = abs(step)
+        slot = len(self.batch.left)
+        carried = self.batch.carry.get(slot, np.empty(0))
+        values = np.concatenate([carried, rows.values])
+        segments = np.concatenate([np.zeros(len(carried), np.intp), rows.segments])
+        found = np.full(len(values), np.nan)
+        if size < len(values):
+            source, target = (slice(size, None), slice(None, -size)) if step > 0 else (slice(None, -size), slice(size, None))
+            if step == 0:
+                source = target = slice(None)
+            found[target] = np.where(segments[source] == segments[target], values[source], np.nan)
+        ready = self.ready
+        if step > 0:
+            certain = rows.starts[ready] - step
+            ready = min(ready, int(np.searchsorted(rows.starts, certain, side="right")) - 1 if certain >= 0 else 0)
+        self.batch.left.append(lambda upto: _tail(values, segments, len(carried) + rows.starts[upto], 0 if step > 0 else size))
+        return Column(rows.spread(found[len(carried) :]), self.axes, self.batch, ready=max(ready, 0))
+
+    def latest(self, where: Any = None) -> Column:
+        """The most recent value at which `where` was true; see `angles.last`."""
+        (values, flags), axes, ready = aligned((self, np.isfinite(self) if where is None else where), self.batch)
+        shape = np.broadcast_shapes(values.shape, flags.shape)
+        both = [Column(np.broadcast_to(array, shape), axes, self.batch, ready=ready) for array in (values, flags)]
+        rows, known = (Rows1D(column) for column in both)
+        slot = len(self.batch.left)
+        carried = self.batch.carry.get(slot, np.empty(0))
+        numbers = np.concatenate([carried, rows.values])
+        spots = np.where(np.concatenate([np.ones(len(carried)), known.values]) > 0, np.arange(len(numbers)), -1)
+        spots = np.maximum.accumulate(spots) if len(spots) else spots
+        found = np.where(spots >= 0, numbers[spots], np.nan)
+        self.batch.left.append(lambda upto: found[: len(carried) + rows.starts[upto]][-1:])
+        return Column(rows.spread(found[len(carried) :]), axes, self.batch, ready=ready)
+
+
+class Rows1D:
+    """A column as one run of values in stream order, without padding.
+
+    Attributes:
+        values, segments: (k,) the values as float64, and a number that changes at each loss.
+        starts: (n + 1,) index of the first value of each packet.
+    """
+
+    def __init__(self, column: Column) -> None:
+        self._shape = (len(column.batch), *column.shape[1:])
+        flat = np.broadcast_to(column.array, self._shape).reshape(self._shape[0], math.prod(self._shape[1:]))
+        self._mask = unpadded(column.axes, self._shape, column.batch)
+        self.values = np.asarray((flat if self._mask is None else flat[self._mask]).reshape(-1), np.float64)
+        per_packet = np.full(len(flat), flat.shape[1]) if self._mask is None else self._mask.sum(axis=1)
+        self.starts = np.concatenate([[0], np.cumsum(per_packet)]).astype(np.intp)
+        self.segments = np.repeat(np.cumsum(column.batch.breaks), per_packet)
+
+    def spread(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Values in stream order back into the column's shape, nan in the padding."""
+        if self._mask is None:
+            return values.reshape(self._shape)
+        full = np.full(self._mask.shape, np.nan)
+        full[self._mask] = values
+        return full.reshape(self._shape)
+
+
+def unpadded(axes: tuple[str | None, ...], shape: tuple[int, ...], batch: Batch) -> NDArray[np.bool_] | None:
+    """Which elements, (n, product of the other lengths), are not padding; None where none is."""
+    mask: NDArray[np.bool_] | None = None
+    for index, name in enumerate(axes):
+        if name is None or name.startswith("<") or isinstance(batch.table.schema.arrays.get(name), int):
+            continue
+        counts = batch.table.counts(name)
+        if len(counts) and int(counts.min()) == shape[1 + index]:
+            continue
+        inside = np.arange(shape[1 + index]) < counts[:, None]
+        inside = inside.reshape(len(counts), *(shape[1 + i] if i == index else 1 for i in range(len(axes))))
+        mask = inside if mask is None else mask & inside
+    return None if mask is None else np.broadcast_to(mask, shape).reshape(shape[0], math.prod(shape[1:]))
+
+
+def aligned(values: tuple[Any, ...], batch: Batch) -> tuple[list[NDArray[Any]], tuple[str | None, ...], int]:
+    """Columns and arrays as arrays that broadcast, the names of the axes they have together, and the smallest `ready`.
+
+    Raises:
+        SpecError: where axes of different arrays meet.
+    """
+    columns = [value for value in values if isinstance(value, Column)]
+    depth = max(len(column.axes) for column in columns)
+    names: list[str | None] = [None] * depth
+    for column in columns:
+        for index, name in enumerate(column.axes):
+            if name is not None and names[index] not in (None, name):
+                raise SpecError(f"axis {names[index]!r} meets axis {name!r}: put one on the other's place with .on(...)")
+            names[index] = name if name is not None else names[index]
+    chain = batch.table.schema.chain()
+    arrays: list[NDArray[Any]] = []
+    for value in values:
+        if isinstance(value, Column):
+            arrays.append(value.array.reshape(*value.shape, *(1,) * (depth - len(value.axes))))
+            continue
+        array = np.asarray(value)
+        arrays.append(array)
+        for index in range(depth):
+            place = array.ndim - depth + index
+            if place >= 0 and array.shape[place] != 1 and names[index] is None:
+                names[index] = chain[index] if index < len(chain) else f"<{index}>"
+    return arrays, tuple(names), min(column.ready for column in columns)
+
+
+def _position(name: str, chain: tuple[str, ...]) -> int:
+    for index, axis in enumerate(chain):
+        if axis == name or axis.rpartition(".")[2] == name:
+            return index
+    raise SpecError(f"there is no array {name!r} around the points; there are {', '.join(chain) or 'none'}")
+
+
+def _tail(values: NDArray[np.float64], segments: NDArray[np.intp], end: int, size: int) -> NDArray[np.float64]:
+    """The last values before `end` that nothing lost separates from it."""
+    start = max(end - size, 0)
+    if end == 0 or size == 0:
+        return np.empty(0)
+    kept = segments[start:end] == segments[end - 1]
+    return np.asarray(values[start:end][kept])

@@ -1,0 +1,206 @@
+"""A frame's test of plausibility, taken apart: tables by the bytes that each part of it looks at.
+
+`plausible` is traced once. What it combines with ``&`` are conditions of their own, and one that depends on no more than
+two bytes beside each other is evaluated for all that these can hold. Frames are then judged by looking these bytes up, with
+the same answers, without making a column of every field. What cannot be traced is evaluated as it stands (`None`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarspec.frames.columns import Batch
+from lidarspec.frames.layout import Bytes2D, Layout, Leaf
+from lidarspec.frames.schema import FieldInfo, Schema
+from lidarspec.frames.tables import Group, Rows
+from lidarspec.frames.tracing import Node, Traced, Untraceable, trace
+
+Check = Callable[[Bytes2D], NDArray[np.bool_]]
+
+
+@dataclass(frozen=True, eq=False)
+class Condition:
+    """A part of the test: a node of the trace, and the fields that it depends on, all in the same arrays."""
+
+    node: Node
+    fields: tuple[FieldInfo, ...]
+
+    def holds(self, columns: Mapping[str, NDArray[np.float64]]) -> NDArray[np.bool_]:
+        """Whether it is true, for columns of the fields in their units, element by element."""
+        with np.errstate(all="ignore"):
+            return np.asarray(_value(self.node, columns, {})).astype(np.bool_)
+
+
+class Conditions:
+    """The test of one frame type.
+
+    Args:
+        plausible: as in `Frame`.
+        schema: of the frame.
+        layout: any of its layouts, to trace it on.
+    """
+
+    def __init__(self, plausible: Callable[[Any], Any], schema: Schema, layout: Layout) -> None:
+        self._parts = _parts(plausible, schema, layout)
+        self._tables: dict[tuple[Any, ...], _Table] = {}
+
+    def checks(self, layout: Layout) -> list[Check] | None:
+        """What frames of a layout, as rows of bytes, have to pass; None where only the function itself can tell."""
+        if self._parts is None:
+            return None
+        leaves = [{info.path: leaf for info in part.fields if (leaf := layout.leaves.get(info.path))} for part in self._parts]
+        if any(
+            part.fields[0].axes and all(0 in leaf.shape for leaf in own.values()) for part, own in zip(self._parts, leaves, strict=True)
+        ):
+            return []  # a test on no elements holds, and what is combined with it is a test on none either
+        return [self._check(part, own) for part, own in zip(self._parts, leaves, strict=True)]
+
+    def _check(self, part: Condition, leaves: Mapping[str, Leaf]) -> Check:
+        places = {(leaf.shape, leaf.strides) for leaf in leaves.values()}
+        first, last = _window(leaves.values())
+        if last - first > 2 or len(places) > 1 or any(len(shape) != len(strides) for shape, strides in places):
+            return _Computed(part, leaves)
+        key = (id(part), *((path, leaf.offset - first, leaf.wire, leaf.elements) for path, leaf in leaves.items()))
+        if key not in self._tables:
+            single = {path: replace(leaf.at(first), shape=(), strides=()) for path, leaf in leaves.items()}
+            self._tables[key] = _table(part, single, last - first)
+        shape, strides = places.pop() if places else ((), ())
+        return _LookedUp(self._tables[key], first, shape, strides)
+
+
+@dataclass(frozen=True, eq=False)
+class _Computed:
+    """A condition on more bytes than a table is made for."""
+
+    part: Condition
+    leaves: Mapping[str, Leaf]
+
+    def __call__(self, rows: Bytes2D) -> NDArray[np.bool_]:
+        held = self.part.holds(_physical(self.part, self.leaves, rows))
+        held = np.broadcast_to(held, (len(rows), *held.shape[1:]))
+        return np.asarray(held.all(axis=tuple(range(1, held.ndim))))
+
+
+@dataclass(frozen=True, eq=False)
+class _Table:
+    """For which values of some bytes, taken as one integer, a condition holds: from one to another, or as listed."""
+
+    dtype: np.dtype[Any]
+    limits: tuple[int, int] | None
+    listed: NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class _LookedUp:
+    """A condition on one or two bytes of a frame, or of each element of an array in it."""
+
+    table: _Table
+    spot: int
+    shape: tuple[int, ...]
+    strides: tuple[int, ...]
+
+    def __call__(self, rows: Bytes2D) -> NDArray[np.bool_]:
+        if not len(rows):
+            return np.empty(0, np.bool_)
+        view: NDArray[Any] = np.ndarray((len(rows), *self.shape), self.table.dtype, rows.data, self.spot, (rows.shape[1], *self.strides))
+        values = view if view.itemsize == 1 else view.astype(self.table.dtype.newbyteorder("="))
+        if self.table.limits is None:
+            held = self.table.listed.take(values)
+        else:
+            low, high = self.table.limits
+            held = values <= high
+            if low:
+                held &= values >= low
+        return np.asarray(held.all(axis=tuple(range(1, held.ndim)))) if self.shape else held
+
+
+def _table(part: Condition, leaves: Mapping[str, Leaf], size: int) -> _Table:
+    """A condition on so many bytes, at most two."""
+    for dtype in map(np.dtype, ("<u2", ">u2") if size == 2 else ("u1",)):
+        blocks = np.split(np.arange(1 << 8 * dtype.itemsize, dtype=dtype), 16)  # so that it takes little memory at a time
+        listed = np.concatenate([_tried(part, leaves, codes) for codes in blocks])
+        true = np.flatnonzero(listed)
+        if len(true) and true[-1] - true[0] == len(true) - 1:
+            return _Table(dtype, (int(true[0]), int(true[-1])), listed)
+    return _Table(dtype, None, listed)
+
+
+def _tried(part: Condition, leaves: Mapping[str, Leaf], codes: NDArray[Any]) -> NDArray[np.bool_]:
+    """Whether a condition holds where the bytes are these integers."""
+    rows = codes.view(np.uint8).reshape(len(codes), -1)
+    return np.broadcast_to(part.holds(_physical(part, leaves, rows)), len(rows))
+
+
+def _physical(part: Condition, leaves: Mapping[str, Leaf], rows: Bytes2D) -> dict[str, NDArray[np.float64]]:
+    """The fields of a condition in their units; nan where the layout lacks one."""
+    found = {}
+    for info in part.fields:
+        leaf = leaves.get(info.path)
+        array = np.full(len(rows), np.nan) if leaf is None else leaf.load(rows).astype(np.float64)
+        found[info.path] = array * info.scale + info.offset if info.scaled else array
+    return found
+
+
+def _window(leaves: Iterable[Leaf]) -> tuple[int, int]:
+    """First byte that the first elements of some fields take, and the one after their last."""
+    spots = []
+    for leaf in leaves:
+        spots += [leaf.offset, leaf.offset + leaf.size - 1] if leaf.wire else []
+        spots += [leaf.offset + segment.byte for element in leaf.elements for segment in element.segments]
+    return (min(spots), max(spots) + 1) if spots else (0, 0)
+
+
+def _parts(plausible: Callable[[Any], Any], schema: Schema, layout: Layout) -> list[Condition] | None:
+    rows = np.zeros((2, layout.size), np.uint8)
+    sample = Batch(Rows(schema, [Group(layout, np.arange(2), rows)]), np.zeros(2, np.bool_))
+    try:
+        answer, _ = trace(plausible, sample)
+        if not isinstance(answer, Traced):
+            return None
+        return [Condition(node, _fields(node, schema)) for node in _conjuncts(answer.node)]
+    except Exception:  # the function itself will say so, frame by frame
+        return None
+
+
+def _conjuncts(node: Node) -> Iterator[Node]:
+    """The conditions that have to hold together."""
+    both = node.kind == "call" and node.function in (np.bitwise_and, np.logical_and)
+    if both and all(isinstance(arg, Node) and arg.sample.array.dtype == np.bool_ for arg in node.args):
+        for arg in node.args:
+            yield from _conjuncts(arg)
+    else:
+        yield node
+
+
+def _fields(node: Node, schema: Schema) -> tuple[FieldInfo, ...]:
+    """The fields that a node depends on.
+
+    Raises:
+        Untraceable: if it depends on more than the frame itself, or on fields that do not stand side by side.
+    """
+    found: dict[str, FieldInfo] = {}
+    pending = [node]
+    while pending:
+        node = pending.pop()
+        if node.kind not in ("field", "call") or any(np.size(arg) != 1 for arg in node.args if not isinstance(arg, Node)):
+            raise Untraceable(f"{node.kind} in a test of plausibility")
+        if node.kind == "field":
+            found[node.path] = schema.fields[node.path]
+        pending += [arg for arg in node.args if isinstance(arg, Node)]
+    if len({info.axes for info in found.values()}) != 1:
+        raise Untraceable("fields of different arrays in a test of plausibility")
+    return tuple(found.values())
+
+
+def _value(node: Node, columns: Mapping[str, NDArray[np.float64]], known: dict[Node, Any]) -> Any:
+    """What a node comes to for columns of the fields."""
+    if node.kind == "field":
+        return columns[node.path]
+    if node not in known:
+        known[node] = node.function(*(_value(arg, columns, known) if isinstance(arg, Node) else arg for arg in node.args))
+    return known[node]

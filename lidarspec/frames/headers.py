@@ -1,0 +1,263 @@
+"""One layout per distinct header, found for a whole batch of candidates at once.
+
+Counts, If and Switch make a frame's layout depend on some of its own header fields. The tree here asks for those
+fields in the order in which the walk of the struct did: each node is one field, each branch one of its values, each
+end a `Layout`, or the reason why there is none. Candidates are sorted through it in bulk, by value.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import random
+import traceback
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import Any
+
+import construct
+import numpy as np
+from construct import Construct
+from numpy.typing import NDArray
+
+from lidarspec.errors import SpecError
+from lidarspec.frames.layout import Layout, Leaf
+from lidarspec.frames.walk import NotCompilable, TooLong, Walk, walk
+from lidarspec.rules import children
+
+#: distinct headers remembered; garbage must not fill the memory with their layouts.
+REMEMBERED = 4096
+
+
+@dataclass(frozen=True, eq=False)
+class Refused:
+    """A header that leads to no frame: too long, or an expression of the plugin failed (`error`: its traceback)."""
+
+    error: str = ""
+
+
+@dataclass(eq=False)
+class _Node:
+    leaf: Leaf | None = None
+    children: dict[int, _Node] = field(default_factory=dict)
+    result: Layout | Refused | None = None
+
+
+class _Short(Exception):
+    """The sample ends before a field that the layout depends on."""
+
+    def __init__(self, leaf: Leaf) -> None:
+        self.leaf = leaf
+
+
+Group = tuple[Layout | Refused, NDArray[np.intp]]
+
+
+def rows_at(buffer: NDArray[np.uint8], offsets: NDArray[np.intp], size: int) -> NDArray[np.uint8]:
+    """As many bytes from each of these offsets, one a row, C-contiguous; no copy where they stand back to back."""
+    count = len(offsets)
+    if not count or not size:
+        return np.zeros((count, size), np.uint8)
+    if size == 1:
+        return buffer.take(offsets).reshape(count, 1)
+    first = int(offsets[0])
+    if int(offsets[-1]) - first == (count - 1) * size and (count < 3 or bool((offsets[1:] - offsets[:-1] == size).all())):
+        return buffer[first : first + count * size].reshape(count, size)
+    windows: NDArray[Any] = np.ndarray((len(buffer) - size + 1,), f"V{size}", buffer.data, 0, (1,))
+    return windows[offsets].view(np.uint8).reshape(count, size)
+
+
+class HeaderTree:
+    """All layouts of one frame type.
+
+    Raises:
+        NotCompilable: where some part of the struct has no computable place, whatever the header.
+    """
+
+    def __init__(self, con: Construct, limit: int) -> None:
+        self._con, self._limit = con, limit
+        self._root, self._size = _Node(), 0
+        check_compilable(con)
+        self.prefix = self._prefix()
+
+    def classify(self, buffer: NDArray[np.uint8], offsets: NDArray[np.intp]) -> tuple[list[Group], NDArray[np.intp]]:
+        """The candidates at `offsets`, sorted by layout.
+
+        Returns:
+            (layout or refusal, indices into `offsets`) for each kind; and the indices of those whose header is not
+            all there.
+        """
+        if self._size > REMEMBERED:
+            self._root, self._size = _Node(), 0
+        groups: list[Group] = []
+        short: list[NDArray[np.intp]] = []
+        stack = [(self._root, np.arange(len(offsets)))] if len(offsets) else []
+        while stack:
+            node, which = stack.pop()
+            if node.result is None and node.leaf is None:
+                self._explore(buffer[offsets[which[0]] : offsets[which[0]] + self._limit])
+            if node.result is not None:
+                groups.append((node.result, which))
+            elif node.leaf is not None:
+                self._branch(node, node.leaf, buffer, offsets, which, stack, short)
+        return groups, np.concatenate(short) if short else np.empty(0, np.intp)
+
+    def layout(self, frame: bytes) -> Layout | Refused | None:
+        """The layout of one frame, or None where its header is not all there."""
+        node: _Node | None = self._root
+        while node is not None and node.leaf is not None and node.leaf.offset + node.leaf.size <= len(frame):
+            node = node.children.get(node.leaf.scalar(frame))
+        if node is not None and node.result is not None:
+            return node.result
+        groups, _ = self.classify(np.frombuffer(frame, np.uint8), np.zeros(1, np.intp))
+        return groups[0][0] if groups else None
+
+    def asked(self, frame: bytes) -> list[Leaf]:
+        """The fields that decided the layout of this frame, in the order in which they were asked for."""
+        found, node = [], self._root
+        while node.leaf is not None:
+            found.append(node.leaf)
+            node = node.children[node.leaf.scalar(frame)]
+        return found
+
+    def choose(self, source: random.Random) -> tuple[Layout, dict[str, int]]:
+        """A layout of a header chosen at random, with the values of the fields it depends on, by path."""
+        keys = sorted(_switch_keys(self._con))
+        for _ in range(400):
+            chosen: dict[str, int] = {}
+
+            def read(leaf: Leaf, chosen: dict[str, int] = chosen) -> int:
+                if leaf.info.path not in chosen:
+                    chosen[leaf.info.path] = _some_value(source, leaf, keys)
+                return chosen[leaf.info.path]
+
+            try:
+                return walk(self._con, read, self._limit).layout(), chosen
+            except (TooLong, ArithmeticError, LookupError, TypeError, ValueError):
+                continue
+        raise SpecError("no header was found that gives a frame within its longest length")
+
+    def _branch(
+        self,
+        node: _Node,
+        leaf: Leaf,
+        buffer: NDArray[np.uint8],
+        offsets: NDArray[np.intp],
+        which: NDArray[np.intp],
+        stack: list[tuple[_Node, NDArray[np.intp]]],
+        short: list[NDArray[np.intp]],
+    ) -> None:
+        there = offsets[which] + leaf.offset + leaf.size <= len(buffer)
+        if not there.all():
+            short.append(which[~there])
+            which = which[there]
+        if not len(which):
+            return
+        values = leaf.at(leaf.offset).load(rows_at(buffer, offsets[which] + leaf.offset, leaf.size))
+        order = np.argsort(values, kind="stable")
+        values = values[order]
+        edges = [0, *(np.flatnonzero(values[1:] != values[:-1]) + 1).tolist(), len(values)]
+        if len(edges) > 2:
+            which = which[order]
+        for start, stop in pairwise(edges):
+            stack.append((node.children.setdefault(int(values[start]), _Node()), which[start:stop]))
+
+    def _explore(self, sample: NDArray[np.uint8]) -> None:
+        """Walk the struct along one sample, and add what the walk asked for and found to the tree."""
+        trail: list[tuple[Leaf, int]] = []
+
+        def read(leaf: Leaf) -> int:
+            _check_control(leaf)
+            if leaf.offset + leaf.size > len(sample):
+                raise _Short(leaf)
+            value = int(leaf.at(leaf.offset).load(sample[None, leaf.offset : leaf.offset + leaf.size].copy())[0])
+            trail.append((leaf, value))
+            return value
+
+        result: Layout | Refused | None = None
+        missing: Leaf | None = None
+        try:
+            result = walk(self._con, read, self._limit).layout()
+        except _Short as short:
+            missing = short.leaf
+        except TooLong:
+            result = Refused()
+        except (NotCompilable, SpecError):
+            raise
+        except Exception:
+            result = Refused(traceback.format_exc())
+        node = self._root
+        for leaf, value in trail:
+            node.leaf = leaf
+            node = node.children.setdefault(value, _Node())
+        node.leaf, node.result = missing, result
+        self._size += 1
+
+    def _prefix(self) -> dict[int, tuple[int, int]]:
+        """The constants whose place depends on no header field."""
+        state = Walk(_stop, self._limit)
+        with contextlib.suppress(_Stop, TooLong):
+            state.run(self._con)
+        return dict(state.constants)
+
+
+class _Stop(Exception):
+    """A field of the header was asked for."""
+
+
+def _stop(leaf: Leaf) -> int:
+    _check_control(leaf)
+    raise _Stop
+
+
+def _check_control(leaf: Leaf) -> None:
+    if leaf.shape or leaf.info.kind != "int":
+        raise NotCompilable(leaf.info.path, "the layout depends on a field that is not one integer")
+
+
+def _some_value(source: random.Random, leaf: Leaf, keys: list[int]) -> int:
+    if leaf.info.const is not None:
+        return int(leaf.info.const)
+    top = (1 << leaf.info.bits) - 1
+    kinds = [source.randint(0, top), source.randint(0, min(top, 8)), source.randint(0, min(top, 40))]
+    return source.choice(kinds + [key for key in keys if key <= top][:16] * (1 if source.random() < 0.7 else 0))
+
+
+def _switch_keys(con: Construct) -> Iterator[int]:
+    if isinstance(con, construct.Switch):
+        yield from (key for key in con.cases if isinstance(key, int))
+    for child in children(con):
+        yield from _switch_keys(child)
+
+
+def check_compilable(con: Construct) -> None:
+    """Raise `NotCompilable` if any branch of a tree holds a construct without a computable place."""
+    _check(con, "")
+
+
+_PLAIN: tuple[Any, ...] = (
+    construct.FormatField,
+    construct.Bytes,
+    construct.BytesInteger,
+    construct.Transformed,
+    construct.Struct,
+    construct.Array,
+    construct.Const,
+    construct.Renamed,
+    construct.Enum,
+    construct.Default,
+    construct.Rebuild,
+    construct.IfThenElse,
+    construct.Switch,
+    type(construct.Pass),
+)
+
+
+def _check(con: Construct, path: str) -> None:
+    if isinstance(con, construct.Renamed):
+        path = f"{path}.{con.name}" if path else str(con.name)
+    if not isinstance(con, _PLAIN) and type(con).__module__ != "lidarspec.fields":
+        raise NotCompilable(path, f"{type(con).__name__} has no fixed place")
+    if not isinstance(con, construct.Transformed):
+        for child in children(con):
+            _check(child, path)

@@ -1,0 +1,214 @@
+"""Where each field of a frame stands, as data: offsets, strides, bits, constants, checksums; and loading by it.
+
+A `Layout` holds for frames of one kind of header; `lidarspec.frames.walk` makes it from the construct tree.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarspec.bits import BitField
+from lidarspec.checksums import Checksum
+from lidarspec.frames.schema import FieldInfo
+
+Bytes2D = NDArray[np.uint8]
+
+
+@dataclass(frozen=True, eq=False)
+class Leaf:
+    """The place of one field.
+
+    Attributes:
+        info: what the field is.
+        offset: of its first element, in bytes from the start of the frame.
+        shape, strides: number of elements and bytes from one to the next along each of its arrays.
+        wire: its type with byte order where it can be read directly, else None.
+        elements: else the bits of each element of the innermost array (one, if that is not inside the bit block).
+        size: bytes of one element, or of the block that it is a part of.
+    """
+
+    info: FieldInfo
+    offset: int
+    shape: tuple[int, ...]
+    strides: tuple[int, ...]
+    size: int
+    wire: np.dtype[Any] | None = None
+    elements: tuple[BitField, ...] = ()
+
+    def load(self, rows: Bytes2D) -> NDArray[Any]:
+        """The raw values of frames given as rows of bytes (C-contiguous), shape (n, *shape), native byte order."""
+        if self.wire is not None:
+            return np.asarray(self._view(rows, self.wire, 0).astype(self.wire.newbyteorder("=")))
+        assert self.info.dtype is not None
+        if not self._packed:
+            return self._bits(rows, self.elements[0])
+        columns = [self._bits(rows, element) for element in self.elements]
+        return np.stack(columns, axis=-1)
+
+    def scalar(self, frame: bytes) -> int:
+        """The raw value of an integer field outside arrays, in the bytes of one frame."""
+        if self.elements:
+            return self.elements[0].value(frame[self.offset : self.offset + self.size])
+        assert self.wire is not None
+        order: Literal["big", "little"] = "big" if self.wire.byteorder == ">" else "little"
+        return int.from_bytes(frame[self.offset : self.offset + self.size], order, signed=self.wire.kind == "i")
+
+    def store(self, rows: Bytes2D, values: Any) -> None:
+        """Write raw values, broadcast to (n, *shape), into frames given as rows of bytes."""
+        full = np.broadcast_to(np.asarray(values), (len(rows), *self.shape))
+        if self.wire is not None:
+            self._view(rows, self.wire, 0)[...] = full.astype(self.wire.newbyteorder("="))
+            return
+        for index, element in enumerate(self.elements):
+            column = (full[..., index] if self._packed else full).astype(np.int64)
+            for part in element.segments:
+                view = self._view(rows, np.dtype("u1"), part.byte)
+                bits = (column >> part.target << part.low).astype(np.uint8) & np.uint8(part.mask)
+                view[...] = (view & np.uint8(~part.mask & 0xFF)) | bits
+
+    @property
+    def _packed(self) -> bool:
+        """Whether the innermost array is inside the bit block, and so has no stride."""
+        return len(self.shape) > len(self.strides)
+
+    def _view(self, rows: Bytes2D, dtype: np.dtype[Any], offset: int) -> NDArray[Any]:
+        shape = self.shape[: len(self.strides)]
+        if 0 in (len(rows), *shape):
+            return np.empty((len(rows), *shape), dtype)
+        return np.ndarray((len(rows), *shape), dtype, rows.data, self.offset + offset, (rows.shape[1], *self.strides))
+
+    def _bits(self, rows: Bytes2D, element: BitField) -> NDArray[Any]:
+        assert self.info.dtype is not None
+        wide = np.dtype(f"u{self.info.dtype.itemsize}")
+        words = element.words if wide.itemsize > 2 else None
+        if words is not None:
+            total = self._view(rows, np.dtype(words[0][0]), words[0][1]).astype(wide) << wide.type(words[0][2])
+            for word, byte, target in words[1:]:
+                total |= self._view(rows, np.dtype(word), byte).astype(wide) << wide.type(target)
+        else:
+            total = np.zeros((len(rows), *self.shape[: len(self.strides)]), wide)
+            for part in element.segments:
+                bits = (self._view(rows, np.dtype("u1"), part.byte) & np.uint8(part.mask)) >> part.low
+                total |= bits.astype(wide) << wide.type(part.target)
+        if element.signed:
+            sign = wide.type(1 << (element.width - 1))
+            return np.asarray(((total ^ sign) - sign).view(self.info.dtype))
+        return np.asarray(total.astype(self.info.dtype))
+
+    def at(self, offset: int) -> Leaf:
+        """The same field with its place counted from `offset`."""
+        return replace(self, offset=self.offset - offset)
+
+
+@dataclass(frozen=True, eq=False)
+class Seal:
+    """A checksum of the frame: the fields that hold it, low bits first, and the byte ranges that it covers."""
+
+    leaves: tuple[Leaf, ...]
+    spans: tuple[tuple[int, int], ...]
+    algorithm: Checksum
+    absent: tuple[int, ...]
+
+    def stored(self, rows: Bytes2D) -> NDArray[np.uint64]:
+        """The values that stand in the frames, (n,)."""
+        if len(self.leaves) == 1 and self.leaves[0].info.kind != "bytes":
+            return self.leaves[0].load(rows).astype(np.uint64)
+        total, shift = np.zeros(len(rows), np.uint64), 0
+        for leaf in self.leaves:
+            if leaf.info.kind == "bytes":
+                values = leaf.load(rows).astype(np.uint64)
+                order = range(values.shape[1]) if self.algorithm.order == "little" else reversed(range(values.shape[1]))
+                for power, column in enumerate(order):
+                    total |= values[:, column] << np.uint64(shift + 8 * power)
+            else:
+                total |= leaf.load(rows).astype(np.uint64) << np.uint64(shift)
+            shift += leaf.info.bits
+        return total
+
+    def computed(self, rows: Bytes2D) -> NDArray[np.uint64]:
+        """The values that should stand there, (n,)."""
+        parts = [rows[:, a:b] for a, b in self.spans]
+        return self.algorithm.batch(parts[0] if len(parts) == 1 else np.concatenate(parts, axis=1))
+
+    def fill(self, rows: Bytes2D) -> None:
+        """Write the right value into each frame."""
+        values, shift = self.computed(rows), 0
+        for leaf in self.leaves:
+            part = (values >> np.uint64(shift)) & np.uint64((1 << leaf.info.bits) - 1)
+            if leaf.info.kind == "bytes":
+                size = leaf.shape[-1]
+                powers = range(size) if self.algorithm.order == "little" else reversed(range(size))
+                part = np.stack([part >> np.uint64(8 * power) & np.uint64(0xFF) for power in powers], axis=1)
+            leaf.store(rows, part)
+            shift += leaf.info.bits
+
+    def sound(self, frame: bytes) -> bool:
+        """Whether one frame carries the right value, or one that means "not filled"."""
+        stored = shift = 0
+        for leaf in self.leaves:
+            if leaf.info.kind == "bytes":
+                stored |= int.from_bytes(frame[leaf.offset : leaf.offset + leaf.size], self.algorithm.order) << shift
+            else:
+                stored |= (leaf.scalar(frame) & ((1 << leaf.info.bits) - 1)) << shift
+            shift += leaf.info.bits
+        parts = [frame[a:b] for a, b in self.spans]
+        return stored == self.algorithm(parts[0] if len(parts) == 1 else b"".join(parts)) or stored in self.absent
+
+    def intact(self, rows: Bytes2D) -> NDArray[np.bool_]:
+        """Which frames carry the right value, or one that means "not filled"."""
+        stored = self.stored(rows)
+        right = np.asarray(stored == self.computed(rows))
+        return right | np.isin(stored, np.array(self.absent, np.uint64)) if self.absent else right
+
+
+@dataclass(frozen=True, eq=False)
+class Layout:
+    """A frame of one kind of header.
+
+    Attributes:
+        size: in bytes.
+        leaves: where each field stands, by path.
+        constants: offset -> (mask, value).
+        seals: its checksums, inner ones first.
+        places: byte range of each named part outside arrays.
+        branches: what If and Switch chose, by path.
+        notes: what is worked out from the layout and kept with it.
+    """
+
+    size: int
+    leaves: Mapping[str, Leaf]
+    constants: Mapping[int, tuple[int, int]]
+    seals: tuple[Seal, ...]
+    places: Mapping[str, tuple[int, int]]
+    branches: Mapping[str, Any] = field(default_factory=dict)
+    notes: dict[Any, Any] = field(default_factory=dict, repr=False)
+
+    def __post_init__(self) -> None:
+        spots = sorted(self.constants)
+        masks, values = ([self.constants[spot][i] for spot in spots] for i in (0, 1))
+        object.__setattr__(self, "_constants", (np.array(spots, np.intp), np.array(masks, np.uint8), np.array(values, np.uint8)))
+
+    def sound(self, frame: bytes) -> bool:
+        """Whether one frame has this size, all constants and the right checksums."""
+        return (
+            len(frame) == self.size
+            and all(frame[spot] & mask == value for spot, (mask, value) in self.constants.items())
+            and all(seal.sound(frame) for seal in self.seals)
+        )
+
+    def seal(self, rows: Bytes2D) -> None:
+        """Write the constants and checksums into frames given as rows of bytes."""
+        spots, masks, values = self._constants  # type: ignore[attr-defined]
+        rows[:, spots] = rows[:, spots] & ~masks | values
+        for seal in self.seals:
+            seal.fill(rows)
+
+    def constant(self, rows: Bytes2D) -> NDArray[np.bool_]:
+        """Which frames have all constants in place."""
+        spots, masks, values = self._constants  # type: ignore[attr-defined]
+        return np.asarray(((rows[:, spots] & masks) == values).all(axis=1))

@@ -1,0 +1,249 @@
+"""Frames of one type as columns of raw values, in stream order.
+
+Two kinds with one behaviour: `Rows` loads fields from bytes by their layout, `Records` collects them from what
+construct parsed. Arrays of variable length are padded to the longest with zeros; `counts` has the lengths.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarspec.bits import leaves
+from lidarspec.errors import SpecError
+from lidarspec.frames.layout import Bytes2D, Layout
+from lidarspec.frames.schema import Schema
+
+
+class Table(Protocol):
+    """The raw columns of n frames of one type."""
+
+    schema: Schema
+
+    def __len__(self) -> int: ...
+    def raw(self, path: str) -> NDArray[Any]:
+        """Raw values, shape (n, *lengths of its axes), native byte order; 0 where a frame lacks the field or element."""
+
+    def present(self, path: str) -> NDArray[np.bool_] | None:
+        """Which frames have the field; None where all have."""
+
+    def counts(self, axis: str) -> NDArray[np.intp]:
+        """The length of an array in each frame, (n,)."""
+
+    def frame(self, index: int) -> bytes:
+        """The bytes of one frame."""
+
+    def take(self, which: NDArray[np.intp]) -> Table:
+        """Some of the frames, in the order given."""
+
+
+@dataclass(frozen=True, eq=False)
+class Group:
+    """Frames of one layout: where they stand in the table, and their bytes, one frame a row."""
+
+    layout: Layout
+    where: NDArray[np.intp]
+    rows: Bytes2D
+
+
+class Rows:
+    """A `Table` of frames whose layout is compiled."""
+
+    def __init__(self, schema: Schema, groups: Sequence[Group]) -> None:
+        self.schema, self.groups = schema, [group for group in groups if len(group.where)]
+        self._length = sum(len(group.where) for group in self.groups)
+        self._order: NDArray[np.intp] | slice | None = None
+
+    def __len__(self) -> int:
+        return self._length
+
+    def raw(self, path: str) -> NDArray[Any]:
+        info = self.schema.fields[path]
+        assert info.dtype is not None
+        if len(self.groups) == 1 and path in self.groups[0].layout.leaves:
+            values = self.groups[0].layout.leaves[path].load(self.groups[0].rows)
+            if self._order is None:
+                self._order = _order(self.groups[0].where)
+            return values[self._order].astype(info.dtype, copy=False)
+        lengths = [self.length(axis) for axis in info.axes]
+        column = np.zeros((len(self), *lengths), info.dtype)
+        for group in self.groups:
+            leaf = group.layout.leaves.get(path)
+            if leaf is not None and 0 not in leaf.shape:
+                corner: Any = (group.where, *(slice(0, length) for length in leaf.shape))
+                column[corner] = leaf.load(group.rows)
+        return column
+
+    def present(self, path: str) -> NDArray[np.bool_] | None:
+        if not self.schema.fields[path].optional:
+            return None
+        there = np.zeros(len(self), np.bool_)
+        for group in self.groups:
+            there[group.where] = path in group.layout.leaves
+        return there
+
+    def counts(self, axis: str) -> NDArray[np.intp]:
+        found = np.zeros(len(self), np.intp)
+        for group in self.groups:
+            found[group.where] = _length(group.layout, axis)
+        return found
+
+    def length(self, axis: str) -> int:
+        """The longest length of an array."""
+        declared = self.schema.arrays.get(axis)
+        if isinstance(declared, int):
+            return declared
+        return max((_length(group.layout, axis) for group in self.groups), default=0)
+
+    def frame(self, index: int) -> bytes:
+        for group in self.groups:
+            spot = np.flatnonzero(group.where == index)
+            if len(spot):
+                return bytes(group.rows[spot[0]].tobytes())
+        raise IndexError(index)
+
+    def take(self, which: NDArray[np.intp]) -> Rows:
+        if len(self.groups) == 1 and len(which) and which[-1] - which[0] == len(which) - 1 and _ascends(which):
+            only = self.groups[0]
+            if _ascends(only.where):
+                return Rows(self.schema, [Group(only.layout, np.arange(len(which)), only.rows[which[0] : which[-1] + 1])])
+        place = np.full(len(self), -1, np.intp)
+        place[which] = np.arange(len(which))
+        groups = []
+        for group in self.groups:
+            there = place[group.where]
+            kept = there >= 0
+            groups.append(Group(group.layout, there[kept], group.rows[kept]))
+        return Rows(self.schema, groups)
+
+    @staticmethod
+    def joined(tables: Sequence[Rows]) -> Rows:
+        """Several tables of one frame type, one after another."""
+        found: dict[int, list[Group]] = {}
+        start = 0
+        for table in tables:
+            for group in table.groups:
+                found.setdefault(id(group.layout), []).append(Group(group.layout, group.where + start, group.rows))
+            start += len(table)
+        return Rows(tables[0].schema, [_merged(groups) for groups in found.values()])
+
+
+def _merged(groups: list[Group]) -> Group:
+    if len(groups) == 1:
+        return groups[0]
+    return Group(groups[0].layout, np.concatenate([g.where for g in groups]), np.concatenate([g.rows for g in groups]))
+
+
+def _order(where: NDArray[np.intp]) -> NDArray[np.intp] | slice:
+    """What puts the rows of the only group into stream order: nothing, where they are in it."""
+    return slice(None) if _ascends(where) else np.argsort(where)
+
+
+def _ascends(where: NDArray[np.intp]) -> bool:
+    return len(where) < 2 or bool((where[1:] > where[:-1]).all())
+
+
+def _length(layout: Layout, axis: str) -> int:
+    """The length of an array in frames of one layout; 0 in an array without elements."""
+    for leaf in layout.leaves.values():
+        if axis in leaf.info.axes:
+            depth = leaf.info.axes.index(axis)
+            return 0 if 0 in leaf.shape[:depth] else leaf.shape[depth]
+    return 0
+
+
+class Records:
+    """A `Table` of frames that construct parsed, for structs that do not compile and as the second engine in tests."""
+
+    def __init__(self, schema: Schema, parsed: Sequence[Any], frames: Sequence[bytes]) -> None:
+        self.schema, self._parsed, self._frames = schema, list(parsed), list(frames)
+
+    def __len__(self) -> int:
+        return len(self._parsed)
+
+    def raw(self, path: str) -> NDArray[Any]:
+        info = self.schema.fields[path]
+        found = [_values(parsed, path.split("."), len(info.axes)) for parsed in self._parsed]
+        lengths = [self.length(axis) for axis in info.axes]
+        dtype = info.dtype if info.dtype is not None else _common_type(found)
+        column = np.zeros((len(self), *lengths), dtype)
+        for index, value in enumerate(found):
+            array = np.asarray([] if value is None else value, dtype)
+            if array.size:
+                corner: Any = (index, *(slice(0, length) for length in array.shape))
+                column[corner] = array
+        return column
+
+    def present(self, path: str) -> NDArray[np.bool_] | None:
+        if not self.schema.fields[path].optional:
+            return None
+        axes = len(self.schema.fields[path].axes)
+        return np.array([_values(parsed, path.split("."), axes) is not None for parsed in self._parsed], np.bool_)
+
+    def counts(self, axis: str) -> NDArray[np.intp]:
+        return np.array([_count(parsed, axis) for parsed in self._parsed], np.intp)
+
+    def length(self, axis: str) -> int:
+        """The longest length of an array."""
+        declared = self.schema.arrays.get(axis)
+        return declared if isinstance(declared, int) else int(self.counts(axis).max(initial=0))
+
+    def frame(self, index: int) -> bytes:
+        return self._frames[index]
+
+    def take(self, which: NDArray[np.intp]) -> Records:
+        return Records(self.schema, [self._parsed[i] for i in which], [self._frames[i] for i in which])
+
+    @staticmethod
+    def joined(tables: Sequence[Records]) -> Records:
+        """Several tables of one frame type, one after another."""
+        parsed = [item for table in tables for item in table._parsed]
+        return Records(tables[0].schema, parsed, [frame for table in tables for frame in table._frames])
+
+
+def _values(parsed: Any, names: list[str], axes: int) -> Any:
+    """The value, or nested lists of values, under a path; None where a branch leaves it out."""
+    if isinstance(parsed, list):
+        return _elements(parsed, names, axes)
+    for index, name in enumerate(names):
+        if not isinstance(parsed, dict) or name not in parsed or parsed[name] is None:
+            return None
+        parsed = parsed[name]
+        if isinstance(parsed, list):
+            return _elements(parsed, names[index + 1 :], axes)
+    if isinstance(parsed, bytes):
+        return list(parsed)
+    return next(iter(leaves(parsed)))[1] if not isinstance(parsed, dict) else None
+
+
+def _elements(parsed: list[Any], names: list[str], axes: int) -> list[Any] | None:
+    found = [_values(element, names, axes) for element in parsed]
+    return None if found and found[0] is None else found
+
+
+def _count(parsed: Any, axis: str) -> int:
+    """The length of an array in one parsed frame; of the first one, where it stands in another array."""
+    value = parsed
+    brackets = axis.count("[]")
+    for name in axis.removesuffix("[]" * brackets).split("."):
+        while isinstance(value, list):
+            if not value:
+                return 0
+            value = value[0]
+        if not isinstance(value, dict) or value.get(name) is None:
+            return 0
+        value = value[name]
+    for _ in range(brackets):
+        value = value[0] if value else []
+    return len(value)
+
+
+def _common_type(found: Iterable[Any]) -> np.dtype[Any]:
+    kinds = {np.asarray(value).dtype.kind for value in found if value is not None}
+    if kinds - set("iufb"):
+        raise SpecError("a column of values that are not numbers")
+    return np.dtype(np.float64 if "f" in kinds else np.int64)

@@ -1,0 +1,348 @@
+"""A traced expression as a list of NumPy calls on a chunk of packets, with scratch arrays that are used again and again.
+
+What depends on one field of two bytes or less is a table by its raw value; sums are one matrix product; sines and
+cosines are taken in float32 of angles that were reduced to half a turn in float64. The rest is ordinary NumPy.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarspec.frames.layout import Bytes2D, Layout, Leaf
+from lidarspec.frames.tracing import Node
+from lidarspec.plans.expressions import Term, is_full, key, only_field, split_level, terms
+from lidarspec.plans.windows import Blocks, Window, raw_values, window
+
+#: points of a chunk, so that its scratch arrays stay in the cache.
+CHUNK = 1 << 16
+TURN = 2 * np.pi
+_TYPES: dict[str, np.dtype[Any]] = {
+    "single": np.dtype(np.float32),
+    "double": np.dtype(np.float64),
+    "index": np.dtype(np.intp),
+    "flag": np.dtype(np.bool_),
+}
+
+Values = Callable[[Node], NDArray[Any]]
+
+
+@dataclass
+class Run:
+    """One execution: the frames, the low values, and the chunk under way."""
+
+    rows: Bytes2D
+    values: Values
+    views: list[NDArray[Any]] = field(default_factory=list)
+    start: int = 0
+    stop: int = 0
+    prepared: dict[int, Any] = field(default_factory=dict)
+
+    def part(self, array: NDArray[Any]) -> NDArray[Any]:
+        """The chunk's packets of values that each packet has, or that all share."""
+        return array[self.start : self.stop] if len(array) > 1 else array
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """One call: `run(execution, output)`, which reads registers by their numbers."""
+
+    text: str
+    run: Callable[[Run, NDArray[Any]], None]
+    output: int
+
+
+class Program:
+    """The calls that make some flat float32 or float64 columns out of frames of one layout.
+
+    Args:
+        layout: of the frames.
+        shape: of the points of a packet.
+        tables: those known already, by what they are of; added to.
+    """
+
+    def __init__(self, layout: Layout, shape: tuple[int, ...], tables: dict[Any, NDArray[Any]]) -> None:
+        self.layout, self.shape, self.width = layout, shape, math.prod(shape)
+        self.chunk = max(CHUNK // max(self.width, 1), 1)
+        self.steps: list[Step] = []
+        self.kinds: list[str] = []
+        self.outputs: dict[str, int] = {}
+        self.risky = False  # whether directions may be nan though ranges are not
+        self.low: list[Node] = []
+        self._tables, self._known = tables, dict[Any, int]()
+        self._blocks: list[Blocks] = []
+        self._tiles: dict[int, NDArray[Any]] = {}
+
+    def want(self, name: str, value: Any, kind: str) -> None:
+        """Make a column of this name; `kind` is "single" or "double"."""
+        self.outputs[name] = self.single(value) if kind == "single" else self.double(value)
+
+    def single(self, value: Any) -> int:
+        """The register of an expression in float32; only products and tables are computed in that precision."""
+        if not is_full(value, self.width):
+            return self._spread(value, "single")
+        return self._once(("single", value), lambda: self._single(value))
+
+    def _single(self, node: Node) -> int:
+        found = self._field(node, "single")
+        if found is not None:
+            return found
+        if node.kind == "call" and node.function is np.multiply:
+            first, second = (self._factor(arg) for arg in node.args)
+            return self._call("multiply", "single", np.multiply, first, second)
+        if node.kind == "call" and node.function in (np.cos, np.sin):
+            angle = self._once(("angle", node.args[0]), lambda: self._angle(node.args[0]))
+            return self._call(node.function.__name__, "single", node.function, self._read(angle))
+        if node.kind == "call" and node.function is np.add and any(not isinstance(arg, Node) for arg in node.args):
+            first, second = (self._factor(arg) for arg in node.args)
+            return self._call("add", "single", np.add, first, second)
+        return self._cast(self.double(node))
+
+    def double(self, value: Any) -> int:
+        """The register of an expression in float64."""
+        if not is_full(value, self.width):
+            return self._spread(value, "double")
+        return self._once(("double", value), lambda: self._double(value))
+
+    def _double(self, node: Node) -> int:
+        kind = "flag" if node.sample.array.dtype.kind == "b" else "double"
+        found = self._field(node, kind)
+        if found is None and node.kind == "call":
+            parts = terms(node, self.width)
+            if len(parts) > 1 or parts[0].full is not node:
+                found = self._sum(node, parts)
+        if found is None and node.kind == "call":
+            found = self._plain(node, kind)
+        return found if found is not None else self._spread(node, kind)
+
+    def _field(self, node: Node, kind: str) -> int | None:
+        """An expression of one field: loaded as it is, or looked up by its window; None where it is neither."""
+        source = only_field(node)
+        leaf = self.layout.leaves.get(source.path) if source is not None and is_full(source, self.width) else None
+        if leaf is None or source is None:
+            return None
+        seen = window(leaf)
+        if seen is None:
+            return None
+        if node is source and not leaf.info.scaled and leaf.wire is not None:
+            return self._load(leaf, seen, leaf.wire, kind)
+        index = self._once(("index", seen), lambda: self._load(leaf, seen, seen.dtype, "index"))
+        table = self._table(node, leaf, seen, kind)
+        text = f"{node.path or source.path}: table of {len(table)} by {8 * seen.size} bits"
+        read = self._read(index)
+        return self._step(text, kind, lambda run, out: table.take(read(run), out=out, mode="clip"))
+
+    def _table(self, node: Node, leaf: Leaf, seen: Window, kind: str) -> NDArray[Any]:
+        name = (kind, seen.offset - leaf.offset, seen.size, leaf.size, key(node))
+        if name not in self._tables:
+            self._tables[name] = np.ascontiguousarray(np.asarray(every_value(node, leaf)), _TYPES[kind])
+        return self._tables[name]
+
+    def _load(self, leaf: Leaf, seen: Window, dtype: np.dtype[Any], kind: str) -> int:
+        """A register with a window of every element as it stands."""
+        blocks = self._of(leaf, seen)
+        place, width = self._blocks.index(blocks), self.width
+
+        def run(execution: Run, out: NDArray[Any]) -> None:
+            source, loaded = execution.prepared[place]
+            if loaded != execution.start:
+                blocks.load(source, execution.start, execution.stop)
+                execution.prepared[place] = (source, execution.start)
+            column = blocks.column(seen, source, execution.start, (execution.stop - execution.start) * width)
+            np.copyto(out, column if column.dtype == dtype else column.view(dtype), casting="unsafe")
+
+        return self._step(f"{leaf.info.path}: {dtype} at byte {seen.offset}", kind, run)
+
+    def _of(self, leaf: Leaf, seen: Window) -> Blocks:
+        for blocks in self._blocks:
+            if blocks.shape == leaf.shape and blocks.holds(seen):
+                return blocks
+        alike = [other for other in self.layout.leaves.values() if other.shape == leaf.shape and other.strides == leaf.strides]
+        self._blocks.append(Blocks(alike, self.layout.size, self.chunk))
+        return self._blocks[-1]
+
+    def _angle(self, value: Node) -> int:
+        """An angle in float32, reduced to half a turn either way before it loses precision."""
+        angle, turns = self.double(value), self._register("double")
+        read = self._read(angle)
+
+        def run(execution: Run, out: NDArray[Any]) -> None:
+            radians, whole = read(execution), execution.views[turns]
+            np.multiply(radians, 1 / TURN, out=whole)
+            np.rint(whole, out=whole)
+            np.multiply(whole, TURN, out=whole)
+            np.subtract(radians, whole, out=whole)
+            np.copyto(out, whole, casting="same_kind")
+
+        return self._step("reduce to half a turn", "single", run)
+
+    def _sum(self, node: Node, parts: list[Term]) -> int | None:
+        """A sum: one matrix product for what is low, and what is full added to it."""
+        flat = [part for part in parts if part.full is None]
+        full = [part for part in parts if part.full is not None]
+        level = split_level(flat, len(self.shape))
+        if level is None or any(part.row.ndim for part in full) or not flat:
+            return None
+        inner = math.prod(self.shape[level:])
+        rows = np.stack([np.broadcast_to(part.row, self.shape[level:] if part.row.ndim else (inner,)).reshape(inner) for part in flat])
+        place, lows, outer = -1 - len(self.steps), [part.low for part in flat], self.shape[:level]
+        self.low += [low for low in lows if low is not None]
+
+        def prepare(run: Run) -> NDArray[np.float64]:
+            number = len(run.rows)
+            found = np.ones((number, *outer, len(lows)))
+            for index, low in enumerate(lows):
+                if low is not None:
+                    values = run.values(low)
+                    found[..., index] = values.reshape(values.shape[: 1 + level])
+            return found.reshape(number, -1, len(lows))
+
+        def run(execution: Run, out: NDArray[Any]) -> None:
+            if place not in execution.prepared:
+                execution.prepared[place] = prepare(execution)
+            left = execution.prepared[place][execution.start : execution.stop].reshape(-1, len(lows))
+            np.matmul(left, rows, out=out.reshape(len(left), inner))
+
+        found = self._step(f"sum of {len(flat)} products", "double", run)
+        for part in full:
+            found = self._call("add", "double", np.add, self._read(found), self._read(self._times(part)))
+        return found
+
+    def _times(self, part: Term) -> int:
+        assert part.full is not None
+        made = self.double(part.full)
+        if part.row == 1:
+            return made
+        factor, read = float(part.row), self._read(made)
+        return self._step(f"times {factor:.6g}", "double", lambda run, out: np.multiply(read(run), factor, out=out))
+
+    def _plain(self, node: Node, kind: str) -> int:
+        """Any other function of arrays, as NumPy evaluates it."""
+        depth = max(len(arg.shape) for arg in node.args if isinstance(arg, Node))
+        reads = [self._argument(arg, depth) for arg in node.args]
+        function, shape = node.function, node.shape
+
+        def run(execution: Run, out: NDArray[Any]) -> None:
+            found = function(*(read(execution) for read in reads))
+            out.reshape(-1, *shape)[...] = found
+
+        return self._step(f"{getattr(function, '__name__', 'function')} as it stands", kind, run)
+
+    def _argument(self, value: Any, depth: int) -> Callable[[Run], Any]:
+        if not isinstance(value, Node):
+            return lambda run: value
+        if is_full(value, self.width):
+            read, shape = self._read(self.double(value)), (*value.shape, *(1,) * (depth - len(value.shape)))
+            return lambda run: read(run).reshape(-1, *shape)
+        self.low.append(value)
+        return lambda run: _deep(run.part(run.values(value)), depth)
+
+    def _factor(self, value: Any) -> Callable[[Run], Any]:
+        """A factor of a float32 product: a register, a number, or a row repeated for the whole chunk."""
+        if is_full(value, self.width):
+            return self._read(self.single(value))
+        if not isinstance(value, Node) and np.size(value) == 1:
+            number = np.float32(np.asarray(value).reshape(()))
+            return lambda run: number
+        return self._read(self._once(("row", id(value)), lambda: self._spread(value, "single")))
+
+    def _spread(self, value: Any, kind: str) -> int:
+        """What is not full, for every point."""
+        if not isinstance(value, Node):
+            row = np.broadcast_to(np.asarray(value, _TYPES[kind]), self.shape).reshape(-1)
+            tile = np.tile(row, self.chunk)
+            found = self._step("the same in every packet", kind, lambda run, out: None)
+            self._tiles[found] = tile
+            return found
+        self.low.append(value)
+        shape, depth = self.shape, len(self.shape)
+
+        def run(execution: Run, out: NDArray[Any]) -> None:
+            out.reshape(-1, *shape)[...] = _deep(execution.part(execution.values(value)), depth)
+
+        return self._step("computed plainly before", kind, run)
+
+    def _cast(self, register: int) -> int:
+        read = self._read(register)
+        return self._step("as float32", "single", lambda run, out: np.copyto(out, read(run), casting="same_kind"))
+
+    def _call(self, text: str, kind: str, function: Any, *reads: Callable[[Run], Any]) -> int:
+        return self._step(text, kind, lambda run, out: function(*(read(run) for read in reads), out=out))
+
+    def _read(self, register: int) -> Callable[[Run], Any]:
+        return lambda run: run.views[register]
+
+    def _step(self, text: str, kind: str, run: Callable[[Run, NDArray[Any]], Any]) -> int:
+        output = self._register(kind)
+        self.steps.append(Step(text, run, output))
+        return output
+
+    def _register(self, kind: str) -> int:
+        self.kinds.append(kind)
+        return len(self.kinds) - 1
+
+    def _once(self, name: Any, make: Callable[[], int]) -> int:
+        if name not in self._known:
+            self._known[name] = make()
+        return self._known[name]
+
+    def run(self, rows: Bytes2D, values: Values) -> dict[str, NDArray[Any]]:
+        """The columns of all frames, flat.
+
+        Args:
+            rows: the frames, C-contiguous.
+            values: the plain result of a node for the whole batch, shape (n or 1, ...).
+        """
+        number = len(rows)
+        found = {name: np.empty(number * self.width, _TYPES[self.kinds[register]]) for name, register in self.outputs.items()}
+        size = min(self.chunk, number) * self.width
+        scratch = [self._tiles[index] if index in self._tiles else np.empty(size, _TYPES[kind]) for index, kind in enumerate(self.kinds)]
+        execution = Run(rows, values)
+        execution.prepared = {place: (blocks.source(rows), -1) for place, blocks in enumerate(self._blocks)}
+        with np.errstate(all="ignore"):
+            for start in range(0, number, self.chunk):
+                self._chunk(execution, scratch, found, start, min(start + self.chunk, number))
+        return found
+
+    def _chunk(self, run: Run, scratch: list[NDArray[Any]], found: dict[str, NDArray[Any]], start: int, stop: int) -> None:
+        count = (stop - start) * self.width
+        run.start, run.stop = start, stop
+        run.views = [array[:count] for array in scratch]
+        for name, register in self.outputs.items():
+            if register not in self._tiles:
+                run.views[register] = found[name][start * self.width : stop * self.width]
+        for step in self.steps:
+            step.run(run, run.views[step.output])
+        for name, register in self.outputs.items():
+            target = found[name][start * self.width : stop * self.width]
+            if run.views[register].base is not target.base:
+                np.copyto(target, run.views[register])
+
+
+def _deep(array: NDArray[Any], depth: int) -> NDArray[Any]:
+    """Values of packets with as many axes as the points have."""
+    return array.reshape(*array.shape, *(1,) * (1 + depth - array.ndim))
+
+
+def every_value(node: Node, leaf: Leaf) -> NDArray[Any] | None:
+    """An expression of one field for every value of the field's window, in its order; None where it has no window."""
+    seen = window(leaf)
+    if seen is None:
+        return None
+    raw = raw_values(leaf, seen).astype(np.float64)
+    physical = raw * leaf.info.scale + leaf.info.offset if leaf.info.scaled else raw
+    with np.errstate(all="ignore"):
+        return np.broadcast_to(_evaluated(node, physical), raw.shape)
+
+
+def _evaluated(node: Node, values: NDArray[np.float64]) -> Any:
+    """An expression of one field for given values of it."""
+    if node.kind == "field":
+        return values
+    args = [_evaluated(arg, values) if isinstance(arg, Node) else np.asarray(arg).reshape(()) for arg in node.args]
+    return node.function(*args)

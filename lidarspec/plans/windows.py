@@ -1,0 +1,101 @@
+"""Fields as long flat arrays: blocks compacted first, then each field loaded through a window of one or two bytes.
+
+A window's raw value indexes a table, so byte order, bits and scale cost nothing while decoding.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarspec.frames.layout import Bytes2D, Leaf
+
+
+@dataclass(frozen=True)
+class Window:
+    """The bytes of a field in its element: from `offset` of the frame, `size` (1 or 2) bytes, little-endian."""
+
+    offset: int
+    size: int
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """The type it is loaded as."""
+        return np.dtype("u1") if self.size == 1 else np.dtype("<u2")
+
+
+def window(leaf: Leaf) -> Window | None:
+    """The window of a field; None where it takes more than two bytes, or stands inside a bit block as an array."""
+    if leaf.wire is not None:
+        return Window(leaf.offset, leaf.wire.itemsize) if leaf.wire.itemsize <= 2 and leaf.wire.kind in "iu" else None
+    if len(leaf.shape) > len(leaf.strides):
+        return None
+    held = [segment.byte for segment in leaf.elements[0].segments]
+    low, high = min(held), max(held)
+    return Window(leaf.offset + low, high - low + 1) if high - low < 2 else None
+
+
+def raw_values(leaf: Leaf, seen: Window) -> NDArray[Any]:
+    """The raw values of a field for every value of its window: (256,) or (65536,)."""
+    codes = np.arange(1 << (8 * seen.size)).astype(seen.dtype)
+    frames = np.zeros((len(codes), leaf.size), np.uint8)
+    start = seen.offset - leaf.offset
+    frames[:, start : start + seen.size] = codes.view(np.uint8).reshape(len(codes), seen.size)
+    single = Leaf(leaf.info, 0, (), (), leaf.size, leaf.wire, leaf.elements)
+    return single.load(frames)
+
+
+class Blocks:
+    """The innermost arrays of frames, without what stands between them, a chunk of packets at a time.
+
+    Args:
+        leaves: the fields wanted; all of the same arrays.
+        size: of a frame in bytes.
+        chunk: packets.
+    """
+
+    def __init__(self, leaves: list[Leaf], size: int, chunk: int) -> None:
+        first = leaves[0]
+        self.shape, strides = first.shape[: len(first.strides)], first.strides
+        self.stride = strides[-1] if strides else size
+        count = self.shape[-1] if self.shape else 1
+        self._flat = self._regular(size, strides)
+        self._length = count * self.stride
+        self._base = 0 if self._flat else max(min(*(leaf.offset for leaf in leaves), size - self._length), 0)
+        self._strides, self._size = (size, *strides[:-1]), size
+        self._compact = None if self._flat else np.empty((chunk, math.prod(self.shape[:-1]) * self._length), np.uint8)
+
+    def _regular(self, size: int, strides: tuple[int, ...]) -> bool:
+        """Whether elements follow each other at one distance from frame to frame too."""
+        expected = size
+        for length, stride in zip(self.shape, strides, strict=True):
+            if stride * length != expected:
+                return False
+            expected = stride
+        return True
+
+    def source(self, rows: Bytes2D) -> NDArray[Any]:
+        """What `load` takes its chunks from."""
+        if self._flat:
+            return rows
+        return np.ndarray((len(rows), *self.shape[:-1]), f"V{self._length}", rows.data, self._base, self._strides)
+
+    def load(self, source: NDArray[Any], start: int, stop: int) -> None:
+        """Compact some packets."""
+        if self._compact is not None:
+            target = self._compact.view(f"V{self._length}").reshape(-1, *self.shape[:-1])
+            np.copyto(target[: stop - start], source[start:stop])
+
+    def column(self, seen: Window, source: NDArray[Any], start: int, count: int) -> NDArray[Any]:
+        """A window of each of `count` elements: of the compacted ones, or of the frames from `start` on."""
+        if self._compact is None:
+            return np.ndarray((count,), seen.dtype, source.data, start * self._size + seen.offset, (self.stride,))
+        return np.ndarray((count,), seen.dtype, self._compact.data, seen.offset - self._base, (self.stride,))
+
+    def holds(self, seen: Window) -> bool:
+        """Whether a window lies in the elements that are kept."""
+        return self._flat or 0 <= seen.offset - self._base <= self.stride - seen.size
