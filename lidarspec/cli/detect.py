@@ -9,7 +9,7 @@ from typing import Any
 import click
 
 from lidarspec.cli.crc import told as checksum_told
-from lidarspec.cli.failures import NO_DATA, suggest
+from lidarspec.cli.failures import DEVICE, NO_DATA, suggest
 from lidarspec.cli.output import emit, emit_json, note, output_options, table
 from lidarspec.cli.streams import Duration
 from lidarspec.detection.detect import Score, Verdict, verdict, verdicts
@@ -51,7 +51,13 @@ def detect(source: str | None, duration: float, start: bool, as_json: bool, outp
     for line in _conclusions(source, found, unknown, start=start):
         note(line)
     if not fitting:
-        raise click.exceptions.Exit(NO_DATA)
+        raise click.exceptions.Exit(_code(source, found))
+
+
+def _code(source: str | None, found: Sequence[Verdict]) -> int:
+    """The exit code where no sensor fits: nothing came from a source, or nothing that is known."""
+    is_silent = source is not None and live_address(source) is not None and not any(one.heard.size for one in found)
+    return DEVICE if is_silent else NO_DATA
 
 
 def _one(source: str, duration: float, *, start: bool) -> list[Verdict]:

@@ -13,6 +13,7 @@ import click
 from lidarspec.cli.failures import suggest
 from lidarspec.cli.inputs import Input, nearest, no_frame
 from lidarspec.cli.output import emit_json, note, sensor_option
+from lidarspec.cli.streams import scans_of
 from lidarspec.detection.detect import detected, scores
 from lidarspec.device import Device, open as open_device
 from lidarspec.errors import LidarSpecError, UsageError, WireError
@@ -61,7 +62,7 @@ def convert(source: str, target: str, sensor_id: str | None, count: int | None, 
     sensor = _detected(source, target) if sensor_id is None else named_sensor(sensor_id)
     written = Written()
     with open_device(source, sensor) as device:
-        scans = itertools.islice(device.scans(), count)
+        scans = itertools.islice(scans_of(device, source), count)
         first = next(scans, None)
         if first is None:
             raise _no_data(device, source, target)

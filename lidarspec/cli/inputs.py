@@ -7,6 +7,7 @@ import re
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
+from shlex import quote
 
 import numpy as np
 
@@ -17,7 +18,7 @@ from lidarspec.frames.codecs import codec
 from lidarspec.frames.judging import VALID
 from lidarspec.parsing import parse_typed
 from lidarspec.plugins import sensors
-from lidarspec.sources import transport
+from lidarspec.sources import is_port, live_address, transport
 from lidarspec.spec import Sensor
 
 #: longest hexadecimal text that is repeated in the next command, and of other text in a message.
@@ -62,11 +63,13 @@ def read(words: Sequence[str]) -> Input:
     if text == "-":
         data = sys.stdin.buffer.read()
         return Input("-", (_unhexed(data) or data,))
-    if len(words) == 1 and os.path.exists(text):
+    if len(words) == 1 and os.path.exists(text) and not is_port(text):
         return _file(text)
     try:
         return Input(text if len(text) <= REPEATED else "-", (_bytes(text),))
     except ValueError as error:
+        if len(words) == 1 and live_address(text) is not None:
+            raise suggest(UsageError(f"{text} is live: this takes bytes or a file"), f"lidarspec read {quote(text)} --packets") from None
         if len(words) == 1 and re.search(r"[/\\.]", text):
             raise SourceError(f"{text}: no such file") from None
         raise UsageError(f"{text[:QUOTED]!r} is no file, and not hexadecimal: {error}") from None

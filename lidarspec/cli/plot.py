@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from lidarspec.cli.output import emit, note, sensor_option
-from lidarspec.cli.streams import nothing_came
+from lidarspec.cli.streams import nothing_came, scans_of
 from lidarspec.device import open as open_device
 from lidarspec.errors import UsageError
 from lidarspec.scans import Scan
@@ -32,7 +32,7 @@ def plot(source: str, output: str, sensor_id: str | None, number: int, ramp: str
     with open_device(source, sensor_id) as device:
         chosen: Scan | None = None
         whole = 0
-        for scan in device.scans():
+        for scan in scans_of(device, source):
             whole += scan.complete
             chosen = scan if scan.complete or chosen is None or not chosen.complete else chosen
             if whole == number:

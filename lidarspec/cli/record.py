@@ -148,7 +148,12 @@ def record(
             if task.recorder is not None and task.recorder.error is error:
                 suggest(error, _following(task))
             raise
-    _sum_up(task, as_json=as_json)
+    try:
+        _sum_up(task, as_json=as_json)
+    except LidarSpecError as error:
+        if not interrupted:
+            raise
+        note(str(error))
     if interrupted:
         raise click.exceptions.Exit(INTERRUPTED)
 

@@ -127,8 +127,9 @@ class _Live:
     def run(self) -> None:
         """Print until the end."""
         edge = last = self._start
-        while edge - self._start < self._end and not self._feed.ended:
-            edge = min(edge + self._interval, self._start + self._end)
+        end = self._start + self._end
+        while edge < end and not self._feed.ended:
+            edge = min(edge + self._interval, end)
             self._feed.pump(edge)
             self._patience.check()
             now = time.monotonic()

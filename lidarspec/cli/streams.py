@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import time
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -11,9 +12,12 @@ import click
 from lidarspec.cli.failures import suggest
 from lidarspec.device import Device
 from lidarspec.errors import CommandError, LidarSpecError, WireError
+from lidarspec.scans import Scan
 
 #: seconds that a device is given for its first frame.
 PATIENCE = 10.0
+#: seconds between two looks at a source that sends nothing.
+LOOK = 0.1
 _UNITS = {"": 1.0, "s": 1.0, "ms": 1e-3, "us": 1e-6, "min": 60.0, "m": 60.0, "h": 3600.0}
 
 
@@ -82,3 +86,16 @@ class Patience:
         waited = time.monotonic() - self._began
         if waited > PATIENCE and self._device.is_live and not self._device.stats.frames:
             raise nothing_came(self._device, self._source, waited)
+
+
+def scans_of(device: Device, source: str) -> Iterator[Scan]:
+    """The scans of a device, which has to send its first frame in time.
+
+    Raises:
+        CommandError, WireError: see `Patience`.
+    """
+    patience = Patience(device, source)
+    for scan in device.scans(wait=LOOK):
+        if scan is not None:
+            yield scan
+        patience.check()

@@ -188,7 +188,7 @@ def _heard(source: str, sensor: Sensor | None, seconds: float) -> Iterator[Findi
     try:
         found = _as_expected(source, sensor, seconds) if sensor is not None else None
         if found is None or not found.scores:
-            tried = verdicts(source, seconds=seconds)
+            tried = [*([found] if found is not None else []), *verdicts(source, seconds=seconds)]
             found = max(tried, key=lambda one: (bool(one.scores), one.heard.size))
     except UsageError as error:
         yield Finding(False, str(error), next((note.removeprefix("next: ") for note in getattr(error, "__notes__", ())), ""))

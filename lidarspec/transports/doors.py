@@ -16,7 +16,7 @@ from typing import Protocol
 from lidarspec.errors import UsageError
 from lidarspec.links import Tcp, Udp
 from lidarspec.spec import Sensor
-from lidarspec.transports.live import POLL, failure, reason
+from lidarspec.transports.live import POLL, failure, listener, reason
 
 #: bytes of commands read at once, and bytes that wait for a slow reader of a connection at most.
 BLOCK, BACKLOG = 1 << 16, 1 << 20
@@ -195,14 +195,9 @@ class TcpDoor:
         self.unplug()
 
     def _listening(self) -> socket.socket:
-        host, port = self._address
-        try:
-            listener = socket.create_server(self._address, family=socket.AF_INET6 if ":" in host else socket.AF_INET)
-        except OSError as error:
-            text = f"tcp://{host}:{port}: cannot listen there: {reason(error)}"
-            raise failure(text, f"ss -ltnp 'sport = :{port}'" if error.errno == errno.EADDRINUSE else "lidarspec sim --help") from None
-        listener.setblocking(False)
-        return listener
+        made = listener(*self._address)
+        made.setblocking(False)
+        return made
 
     def _accept(self) -> None:
         with contextlib.suppress(OSError):

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import re
 import select
+import socket
 import time
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field
@@ -130,6 +132,20 @@ def readable(descriptor: int, timeout: float) -> bool:
     poller = select.poll()
     poller.register(descriptor, select.POLLIN)
     return bool(poller.poll(timeout * 1000))
+
+
+def listener(host: str, port: int) -> socket.socket:
+    """A TCP socket that listens at an address; port 0 takes any that is free.
+
+    Raises:
+        SourceError: where the address cannot be had.
+    """
+    try:
+        return socket.create_server((host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET)
+    except OSError as error:
+        text = f"tcp://{host}:{port}: cannot listen there: {reason(error)}"
+        is_taken = error.errno == errno.EADDRINUSE
+        raise failure(text, f"ss -ltnp 'sport = :{port}'" if is_taken else f"the same with tcp://127.0.0.1:{port}") from None
 
 
 def failure(text: str, following: str) -> SourceError:

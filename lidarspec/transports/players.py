@@ -14,7 +14,7 @@ from lidarspec.errors import SourceError, UsageError
 from lidarspec.files import Chunk, Disconnected
 from lidarspec.recording.recorders import AnyRecorder
 from lidarspec.recording.replaying import Player
-from lidarspec.transports.live import Address, reason
+from lidarspec.transports.live import Address, listener, reason
 
 #: seconds between two looks at whether somebody listens, and what a listener takes to settle: many drop what came while they opened.
 LOOK, SETTLE = 0.02, 0.25
@@ -179,10 +179,7 @@ class TcpPlayer:
         host, port = replace(address, place=address.place[:-2]).host_and_port() if is_free else address.host_and_port()
         if port is None and not is_free:
             raise UsageError(f"{place}: name the port to listen on, as in tcp://127.0.0.1:2111")
-        try:
-            self._server = socket.create_server((host or "127.0.0.1", port or 0), family=socket.AF_INET6 if ":" in host else socket.AF_INET)
-        except OSError as error:
-            raise SourceError(f"{place}: {reason(error)}") from None
+        self._server = listener(host or "127.0.0.1", port or 0)
         self.place = f"tcp://{self._server.getsockname()[0]}:{self._server.getsockname()[1]}"
         self._listener: socket.socket | None = None
 

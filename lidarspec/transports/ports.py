@@ -72,7 +72,8 @@ def lasting(port: str) -> str:
 
 def allowed(port: str) -> bool:
     """Whether this user may open a port; a name that is no file is taken for one that he may."""
-    return not os.path.exists(port) or os.access(port, os.R_OK | os.W_OK)
+    effective = os.access in os.supports_effective_ids
+    return not os.path.exists(port) or os.access(port, os.R_OK | os.W_OK, effective_ids=effective)
 
 
 def group(port: str) -> str:

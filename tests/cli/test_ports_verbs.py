@@ -81,7 +81,7 @@ class TestDetect:
 
     def test_a_silent_port_and_starting_it(self) -> None:
         with virtual_port("cspc-m1c1-mini") as made:
-            found = ran("detect", made.path, "-t", "300ms", code=4)
+            found = ran("detect", made.path, "-t", "300ms", code=5)
             assert "nothing came" in found.stderr
             assert f"next: lidarspec detect {made.path} --start" in found.stderr
             assert "info.model says M1C1_Mini" in ran("detect", made.path, "-t", "300ms", "--start").stdout
