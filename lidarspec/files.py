@@ -39,6 +39,7 @@ class Chunk:
         sender: (address, port) of a datagram, else None.
         receiver: (address, port) that a datagram was sent to, where it is known.
         gap: whether the line was interrupted before it: a frame begun earlier does not go on here.
+        quiet: whether the line had fallen silent before it: what waited there for more bytes was given up.
     """
 
     data: bytes
@@ -46,6 +47,7 @@ class Chunk:
     sender: tuple[str, int] | None = None
     receiver: tuple[str, int] | None = None
     gap: bool = False
+    quiet: bool = False
 
 
 class Transport(Protocol):

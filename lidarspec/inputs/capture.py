@@ -178,7 +178,7 @@ class Capture:
 
     def _run(self) -> None:
         try:
-            quiet, gap = 0.0, False
+            silence, gap, quiet = 0.0, False, False
             while not self._stop.is_set():
                 began = time.monotonic()
                 try:
@@ -186,27 +186,28 @@ class Capture:
                 except Disconnected:
                     if not self._found_again():
                         return
-                    quiet, gap = 0.0, True
+                    silence, gap, quiet = 0.0, True, False
                     continue
                 if chunks:
-                    self.last, quiet = time.monotonic(), 0.0
-                    gap = self._hand_on(chunks, gap=gap)
+                    self.last = time.monotonic()
+                    self._hand_on(chunks, gap=gap, quiet=quiet)
+                    silence, gap, quiet = 0.0, False, False
                     continue
-                before, quiet = quiet, quiet + time.monotonic() - began
-                if before < self._silence <= quiet:
+                silence += time.monotonic() - began
+                if silence >= self._silence and not quiet:
+                    quiet = True
                     self._queue.put(self._link, [Mark.SILENT])
         except BaseException as error:
             self._queue.put(self._link, [error])
 
-    def _hand_on(self, chunks: list[Chunk], *, gap: bool) -> bool:
-        """Record and queue what arrived; False, since no gap is left to be marked."""
-        if gap:
-            chunks[0] = replace(chunks[0], gap=True)
+    def _hand_on(self, chunks: list[Chunk], *, gap: bool, quiet: bool) -> None:
+        """Record and queue what arrived, with what happened before it."""
+        if gap or quiet:
+            chunks[0] = replace(chunks[0], gap=gap, quiet=quiet)
         if self._log is not None:
             for chunk in chunks:
                 self._log.write(chunk)
         self._queue.put(self._link, chunks)
-        return False
 
     def _found_again(self) -> bool:
         """Say that the device is gone, and wait until it is back; False where somebody wants to stop meanwhile."""

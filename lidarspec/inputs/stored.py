@@ -105,9 +105,9 @@ class FileInput:
                 self._senders.see(datagrams.hosts(spans))
                 yield Arrival([spans])
             return
-        for batch, gap in _batches(self._transport.chunks()):
-            if gap:
-                yield Arrival(self.decoder.rest(), interrupted=True)
+        for batch in _batches(self._transport.chunks()):
+            if batch[0].gap or batch[0].quiet:
+                yield Arrival(self.decoder.rest(), interrupted=batch[0].gap)
             found = fed(self.decoder, batch)
             if not self.decoder.stream:
                 self._senders.check(batch, found[0])
@@ -115,17 +115,15 @@ class FileInput:
         yield Arrival(self.decoder.rest())
 
 
-def _batches(chunks: Iterator[Chunk]) -> Iterator[tuple[list[Chunk], bool]]:
-    """The chunks, as many at once as are worth decoding together, and whether the line was interrupted before the first."""
+def _batches(chunks: Iterator[Chunk]) -> Iterator[list[Chunk]]:
+    """The chunks, as many at once as are worth decoding together, up to where the line was interrupted or fell silent."""
     found: list[Chunk] = []
     size = 0
-    gap = False
     for chunk in chunks:
-        if found and (chunk.gap or size >= BATCH_BYTES or len(found) >= BATCH_CHUNKS):
-            yield found, gap
+        if found and (chunk.gap or chunk.quiet or size >= BATCH_BYTES or len(found) >= BATCH_CHUNKS):
+            yield found
             found, size = [], 0
-        gap = chunk.gap if not found else gap
         found.append(chunk)
         size += len(chunk.data)
     if found:
-        yield found, gap
+        yield found

@@ -3,7 +3,7 @@
     offset  size  of a record, little-endian
     0       4     mark b"\\xb5LS\\x1e"
     4       1     kind: 0 header, 1 received, 2 sent, 3 event
-    5       1     flags: 1 a datagram, 2 the line was interrupted before it
+    5       1     flags: 1 a datagram, 2 the line was interrupted before it, 4 it had fallen silent
     6       1     a, bytes of addresses
     7       2     n, bytes of data
     9       8     arrival time, ns since 1970, signed; the least number: nobody knows
@@ -30,7 +30,7 @@ from lidarspec.errors import UsageError
 MAGIC = b"\x89LSR\r\n\x1a\n"
 MARK = b"\xb5LS\x1e"
 HEADER, RECEIVED, SENT, EVENT = range(4)
-DATAGRAM, GAP = 1, 2
+DATAGRAM, GAP, QUIET = 1, 2, 4
 #: most bytes of data in one record.
 LARGEST = 0xFFFF
 _HEAD = struct.Struct("<4sBBBHq")
@@ -55,6 +55,7 @@ class Record:
         sender, receiver: addresses and ports of a datagram, where known.
         datagram: whether `data` is a whole datagram.
         gap: whether the line was interrupted before it.
+        quiet: whether it had fallen silent before it.
     """
 
     direction: Direction
@@ -64,6 +65,7 @@ class Record:
     receiver: Address | None = None
     datagram: bool = False
     gap: bool = False
+    quiet: bool = False
 
 
 def packed(
@@ -192,7 +194,8 @@ def _unpacked(record: bytes) -> tuple[int, Record]:
     sender, receiver = _endpoints(record[_HEAD.size : start]) if addresses else (None, None)
     known = None if at == _UNKNOWN else at
     direction = DIRECTIONS.get(kind, "event")
-    return kind, Record(direction, record[start : start + size], known, sender, receiver, bool(flags & DATAGRAM), bool(flags & GAP))
+    marks = (bool(flags & mark) for mark in (DATAGRAM, GAP, QUIET))
+    return kind, Record(direction, record[start : start + size], known, sender, receiver, *marks)
 
 
 def _addresses_fit(buffer: bytes, start: int) -> bool:

@@ -30,6 +30,7 @@ from lidarspec.recording.lsr import (
     HEADER,
     LARGEST,
     MAGIC,
+    QUIET,
     RECEIVED,
     SENT,
     Record,
@@ -90,7 +91,7 @@ class Recorder(Appender):
         kind = RECEIVED if direction == "in" else SENT
         for start in range(0, len(chunk.data) or 1, LARGEST):
             data = chunk.data[start : start + LARGEST]
-            flags = DATAGRAM * self.header.datagrams | GAP * (chunk.gap and not start)
+            flags = DATAGRAM * self.header.datagrams | (GAP * chunk.gap | QUIET * chunk.quiet) * (not start)
             self._put(packed(kind, data, chunk.at, flags=flags, sender=chunk.sender, receiver=chunk.receiver), len(data))
 
     def event(self, name: str, at: int | None = None, **details: Any) -> None:

@@ -53,7 +53,7 @@ class RecordingTransport:
             if record.direction == "event":
                 interrupted = self._interrupts(record) or interrupted
             elif record.direction == "in" and self._wanted(record):
-                yield Chunk(record.data, record.at, record.sender, record.receiver, interrupted or record.gap)
+                yield Chunk(record.data, record.at, record.sender, record.receiver, interrupted or record.gap, record.quiet)
                 interrupted = False
         if self._recording.damaged:
             self.warnings.append(_damage(self._recording))

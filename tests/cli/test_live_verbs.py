@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import os
 import signal
-import socket
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +15,7 @@ import pytest
 
 import lidarspec as ls
 from lidarspec.simulation.simulator import simulate
+from tests.cli.places import nobody
 from tests.cli.running import process, ran
 
 ID = "ldrobot-stl27l"
@@ -36,98 +34,6 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-@contextlib.contextmanager
-def nothing() -> Iterator[str]:
-    """A source that is not there."""
-    yield "/dev/ttyUSB99"
-
-
-@contextlib.contextmanager
-def silent() -> Iterator[str]:
-    """A port behind which nobody says anything."""
-    master, slave = os.openpty()
-    try:
-        yield os.ttyname(slave)
-    finally:
-        os.close(master)
-        os.close(slave)
-
-
-@contextlib.contextmanager
-def babbling() -> Iterator[str]:
-    """A port that sends bytes which are no frames."""
-    with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as server:
-        server.bind(("127.0.0.1", 0))
-        server.listen()
-        child = subprocess.Popen([sys.executable, "-c", _BABBLE, str(server.fileno())], pass_fds=[server.fileno()])
-        try:
-            yield f"tcp://127.0.0.1:{server.getsockname()[1]}"
-        finally:
-            child.kill()
-            child.wait()
-
-
-_BABBLE = """
-import socket, sys, time
-line, _ = socket.socket(fileno=int(sys.argv[1])).accept()
-while True:
-    line.sendall(b"no lidar was there")
-    time.sleep(0.02)
-"""
-
-
-@contextlib.contextmanager
-def busy() -> Iterator[str]:
-    """A port that somebody else has open."""
-    import serial
-
-    with silent() as path, serial.Serial(path, exclusive=True):
-        yield path
-
-
-@contextlib.contextmanager
-def taken() -> Iterator[str]:
-    """An address that somebody else has bound."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
-        other.bind(("127.0.0.1", 0))
-        yield f"udp://127.0.0.1:{other.getsockname()[1]}"
-
-
-@contextlib.contextmanager
-def refused() -> Iterator[str]:
-    """An address where nobody listens."""
-    with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as other:
-        other.bind(("127.0.0.1", 0))
-        yield f"tcp://127.0.0.1:{other.getsockname()[1]}"
-
-
-@posix
-@pytest.mark.parametrize("words", VERBS, ids=lambda words: words[0])
-@pytest.mark.parametrize(
-    ("source", "code", "told"),
-    [
-        (nothing, 3, "no such port"),
-        (busy, 3, "in use"),
-        (taken, 3, "in use"),
-        (refused, 3, "refuses"),
-        (silent, 5, "sent nothing within 1 s"),
-        (babbling, 4, "not a scan of data frames"),
-    ],
-    ids=lambda value: getattr(value, "__name__", None),
-)
-def test_failures_end_in_one_line_and_their_code(
-    words: tuple[str, ...], source: contextlib._GeneratorContextManager[str], code: int, told: str
-) -> None:
-    with source() as place:  # type: ignore[operator]
-        done = process(words[0], place, *SENSOR, *words[1:])
-    said = [line for line in done.stderr.decode().splitlines() if not line.startswith("  next: lidarspec ")]
-    assert done.returncode == code, said
-    assert len(said) == 1, said
-    assert told in said[0]
-    assert place in said[0]
-    assert "next: lidarspec " in done.stderr.decode()
-
-
 @posix
 @pytest.mark.parametrize("words", VERBS, ids=lambda words: words[0])
 def test_no_permission_is_said(capture: Path, tmp_path: Path, words: tuple[str, ...]) -> None:
@@ -138,18 +44,6 @@ def test_no_permission_is_said(capture: Path, tmp_path: Path, words: tuple[str, 
     with nobody():
         result = ran(words[0], path, *SENSOR, *words[1:], code=3)
     assert f"{path}: Permission denied" in result.stderr
-
-
-@contextlib.contextmanager
-def nobody() -> Iterator[None]:
-    """Without the rights of root, who may read everything."""
-    user = os.geteuid()
-    if user == 0:
-        os.seteuid(65534)
-    try:
-        yield
-    finally:
-        os.seteuid(user)
 
 
 @posix
@@ -167,18 +61,6 @@ def test_an_interrupt_ends_with_130(words: tuple[str, ...]) -> None:
     assert running.returncode == 130
     assert said == "interrupted\n"
     assert ("whole scans" in rest) == (words == ("stats",))
-
-
-@pytest.mark.parametrize("words", [("read", SIM), ("stats", SIM, "--json", "--interval", "100ms")])
-def test_a_closed_pipe_ends_quietly(words: tuple[str, ...]) -> None:
-    command = [sys.executable, "-u", "-m", "lidarspec", *words, *SENSOR]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as running:
-        assert running.stdout is not None
-        assert running.stderr is not None
-        assert running.stdout.readline()
-        running.stdout.close()
-        assert running.stderr.read() == ""
-        assert running.wait(60) == 0
 
 
 def test_stats_of_a_simulated_sensor() -> None:

@@ -76,6 +76,27 @@ class Terminal:
         self.text()
         return self.process.returncode
 
+    def loaded(self) -> None:
+        """Wait until the program has imported what it works with, and then a moment; where that cannot be seen, time has to do."""
+        end = time.monotonic() + DEADLINE
+        while self.process.poll() is None and time.monotonic() < end:
+            try:
+                maps = Path(f"/proc/{self.process.pid}/maps").read_text(encoding="utf-8")
+            except OSError:
+                maps = ""
+                end = min(end, time.monotonic() + 3)
+            if "_multiarray_umath" in maps:
+                break
+            self._read(0.02)
+        end = time.monotonic() + 0.3
+        while time.monotonic() < end:
+            self._read(0.05)
+
+    def is_as_before(self) -> bool:
+        """Whether the terminal's modes are as they were before the program began."""
+        self.text()
+        return self.modes == {"25", "7"} and termios.tcgetattr(self._slave) == self.before
+
     def is_clean(self) -> bool:
         """Whether the terminal is as it was: main screen, cursor, wrapping, colours, and lines that are echoed."""
         self.text()

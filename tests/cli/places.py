@@ -1,0 +1,95 @@
+"""Places where no sensor is: real ports and sockets with something wrong, each a context manager that gives its SOURCE."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import socket
+import threading
+from collections.abc import Iterator
+
+from tests.lines import working
+
+
+@contextlib.contextmanager
+def nothing() -> Iterator[str]:
+    """A source that is not there."""
+    yield "/dev/ttyUSB99"
+
+
+@contextlib.contextmanager
+def silent() -> Iterator[str]:
+    """A port behind which nobody says anything."""
+    master, slave = os.openpty()
+    try:
+        yield os.ttyname(slave)
+    finally:
+        os.close(master)
+        os.close(slave)
+
+
+@contextlib.contextmanager
+def babbling() -> Iterator[str]:
+    """A port that sends bytes which are no frames."""
+    with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as server:
+        server.bind(("127.0.0.1", 0))
+        server.listen()
+        server.settimeout(0.02)
+        with working(lambda stop: _babble(server, stop)):
+            yield f"tcp://127.0.0.1:{server.getsockname()[1]}"
+
+
+def _babble(server: socket.socket, stop: threading.Event) -> None:
+    """Send to whoever comes, one after the other, until he hangs up."""
+    while not stop.is_set():
+        with contextlib.suppress(OSError):
+            line, _ = server.accept()
+            with line:
+                while not stop.wait(0.01):
+                    line.sendall(b"no lidar was there")
+
+
+@contextlib.contextmanager
+def busy() -> Iterator[str]:
+    """A port that somebody else has open."""
+    import serial
+
+    with silent() as path, serial.Serial(path, exclusive=True):
+        yield path
+
+
+@contextlib.contextmanager
+def taken() -> Iterator[str]:
+    """An address that somebody else has bound."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        other.bind(("127.0.0.1", 0))
+        yield f"udp://127.0.0.1:{other.getsockname()[1]}"
+
+
+@contextlib.contextmanager
+def refused() -> Iterator[str]:
+    """An address where nobody listens."""
+    with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as other:
+        other.bind(("127.0.0.1", 0))
+        yield f"tcp://127.0.0.1:{other.getsockname()[1]}"
+
+
+@contextlib.contextmanager
+def nobody() -> Iterator[None]:
+    """Without the rights of root, who may read everything."""
+    user = os.geteuid()
+    if user == 0:
+        os.seteuid(65534)
+    try:
+        yield
+    finally:
+        os.seteuid(user)
+
+
+@contextlib.contextmanager
+def forbidden() -> Iterator[str]:
+    """A port that this user may not open."""
+    with silent() as path:
+        os.chmod(path, 0)
+        with nobody():
+            yield path

@@ -1,0 +1,191 @@
+"""Every verb at every kind of broken source: one clear line, the next command, the documented exit code; Ctrl-C and closed pipes."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from lidarspec.cli import streams
+from tests.cli.places import babbling, busy, forbidden, nothing, refused, silent, taken
+from tests.cli.running import EXAMPLE, ran
+from tests.view.terminal import Terminal
+
+pytestmark = pytest.mark.skipif(os.name != "posix", reason="needs pseudo-terminals")
+
+STL, COMMANDED = ("-s", "ldrobot-stl27l"), ("-s", "cspc-m1c1-mini")
+SIM = "sim:ldrobot-stl27l"
+BRIEF = ("-t", "200ms")
+Place = Callable[[], contextlib.AbstractContextManager[str]]
+
+#: the words of each verb that takes a live SOURCE; what it writes goes to the working directory.
+VERBS: dict[str, tuple[str, ...]] = {
+    "view": ("view", "SOURCE", *STL, *BRIEF),
+    "view --once": ("view", "SOURCE", *STL, *BRIEF, "--once"),
+    "stats": ("stats", "SOURCE", *STL, *BRIEF),
+    "read": ("read", "SOURCE", *STL, *BRIEF),
+    "read --packets": ("read", "SOURCE", *STL, *BRIEF, "--packets"),
+    "plot": ("plot", "SOURCE", *STL, "-o", "scan.svg"),
+    "convert": ("convert", "SOURCE", "points.csv", *STL),
+    "record": ("record", "SOURCE", "-o", "all.lsr", *STL, *BRIEF),
+    "send": ("send", "SOURCE", "start", *COMMANDED, "--timeout", "200ms"),
+    "detect": ("detect", "SOURCE", *BRIEF),
+}
+#: places, the exit code that DESIGN gives them, and a word of what is said.
+BROKEN: tuple[tuple[Place, int, str], ...] = (
+    (nothing, 3, "no such port"),
+    (busy, 3, "in use"),
+    (forbidden, 3, "permission denied"),
+    (taken, 3, "in use"),
+    (refused, 3, "refuses"),
+    (silent, 5, "nothing"),
+    (babbling, 4, "bytes"),
+)
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(streams, "PATIENCE", 0.2)
+    return tmp_path
+
+
+@pytest.mark.parametrize(("place", "code", "told"), BROKEN, ids=lambda value: getattr(value, "__name__", ""))
+@pytest.mark.parametrize("verb", VERBS)
+def test_a_broken_source_ends_in_one_line_and_its_code(folder: Path, verb: str, place: Place, code: int, told: str) -> None:
+    if (verb, place) == ("send", babbling):
+        code, told = 5, "no ack frame came"
+    if (verb, place) == ("send", silent):
+        told = "no ack frame came"
+    with place() as source:
+        result = ran(*(source if word == "SOURCE" else word for word in VERBS[verb]), code=code)
+    lines = result.stderr.splitlines()
+    said = [line for line in lines if not line.lstrip().startswith("next: ")]
+    kept = verb == "record" and place is babbling  # the file that nobody can decode yet is kept, and said
+    assert told in said[-1]
+    assert len(said) == (2 if kept or (verb, place) == ("detect", silent) else 1), said
+    assert lines[-1].lstrip().startswith("next: lidarspec "), lines
+    assert os.listdir(folder) == (["all.lsr"] if kept else [])
+
+
+@pytest.mark.parametrize(("place", "told"), [(place, told) for place, _, told in BROKEN if place is not forbidden])
+def test_doctor_says_the_same_as_a_finding(folder: Path, place: Place, told: str) -> None:
+    with place() as source:
+        result = ran("doctor", source, *STL, *BRIEF, code=1)
+    wrong = [line for line in result.stdout.splitlines() if line.startswith("wrong")]
+    assert any(told in line for line in wrong), result.stdout
+
+
+@pytest.mark.parametrize("verb", ["parse", "explain"])
+@pytest.mark.parametrize("source", ["/dev/ttyUSB99", "udp://:2368", "tcp://127.0.0.1:9", SIM])
+def test_bytes_of_live_sources_are_read_by_another_verb(verb: str, source: str) -> None:
+    result = ran(verb, source, code=2)
+    assert result.stderr == f"{source} is live: this takes bytes or a file\n  next: lidarspec read {source} --packets\n"
+
+
+def test_hexadecimal_digits_with_colons_are_no_address() -> None:
+    assert "ldrobot-stl27l data, 47 bytes" in ran("parse", EXAMPLE.hex(":"), *STL).stdout
+    assert "lsn is cut off" in ran("parse", "aa:55:00", code=4).stderr
+
+
+@pytest.mark.parametrize("words", [("replay", "kept.lsr"), ("sim", "ldrobot-stl27l", *BRIEF)])
+def test_an_address_in_use_cannot_be_played_to(folder: Path, words: tuple[str, ...]) -> None:
+    ran("record", SIM, *STL, *BRIEF, "-o", "kept.lsr")
+    with refused() as source:
+        result = ran(*words, "--to", source, code=3)
+    number = source.rpartition(":")[2]
+    assert result.stderr.splitlines() == [
+        f"{source}: cannot listen there: Address already in use",
+        f"  next: ss -ltnp 'sport = :{number}'",
+    ]
+
+
+#: verbs at work, which Ctrl-C ends; SILENT is a port behind which nobody says anything.
+WORKING: tuple[tuple[str, ...], ...] = (
+    ("view", SIM, *STL),
+    ("view", "SILENT", *STL),
+    ("stats", SIM, *STL),
+    ("read", SIM, *STL),
+    ("read", "SILENT", *STL),
+    ("record", SIM, *STL, "-o", "one.lsr"),
+    ("record", SIM, "-o", "two.lsr"),
+    ("record", "SILENT", *STL, "-o", "three.lsr"),
+    ("replay", "kept.lsr", "--loop"),
+    ("sim", "ldrobot-stl27l"),
+    ("demo", *STL, "-n", "900"),
+    ("convert", SIM, "points.csv", *STL),
+    ("plot", SIM, "-o", "scan.svg", "-n", "900", *STL),
+    ("send", "SILENT", "start", *COMMANDED, "--timeout", "60s"),
+    ("detect", "SILENT", "-t", "60s"),
+    ("doctor", "SILENT", "-t", "60s", *STL),
+    ("parse", "-", *STL),
+    ("explain", "-", *STL),
+)
+
+
+@pytest.fixture
+def worked(tmp_path: Path) -> Iterator[list[tuple[str, Terminal]]]:
+    """All of them at work at the same time, each in a terminal of its own."""
+    ran("record", SIM, *STL, *BRIEF, "-o", tmp_path / "kept.lsr")
+    with contextlib.ExitStack() as stack:
+        found = []
+        for words in WORKING:
+            place = stack.enter_context(silent()) if "SILENT" in words else ""
+            named = [place if word == "SILENT" else word for word in words]
+            found.append((" ".join(words), stack.enter_context(Terminal(*named, cwd=tmp_path))))
+        yield found
+
+
+def test_an_interrupt_ends_every_verb_with_130(worked: list[tuple[str, Terminal]], tmp_path: Path) -> None:
+    for _, terminal in worked:
+        terminal.loaded()
+    for _, terminal in worked:
+        terminal.type("\x03")
+    ends = {words: (terminal.ended(), "Traceback" in terminal.raw, terminal.is_as_before()) for words, terminal in worked}
+    assert ends == dict.fromkeys(ends, (130, False, True))
+    assert {"points.csv", "scan.svg", "three.lsr"}.isdisjoint(os.listdir(tmp_path)), "nothing half made is left"
+
+
+#: verbs that go on printing, and are cut off after their first line as by ``| head -1``.
+PRINTING: tuple[tuple[str, ...], ...] = (
+    ("sensors",),
+    ("show", "ldrobot-stl27l"),
+    ("ports",),
+    ("plugins",),
+    ("view", SIM, *STL),
+    ("stats", SIM, *STL, "--interval", "50ms"),
+    ("stats", SIM, *STL, "--interval", "50ms", "--json"),
+    ("read", SIM, *STL),
+    ("read", SIM, *STL, "--packets", "--json"),
+    ("plot", SIM, *STL, "-o", "-"),
+    ("demo", *STL, "-n", "1"),
+    ("detect", SIM, *BRIEF),
+    ("doctor", SIM, *BRIEF),
+    ("send", "sim:cspc-m1c1-mini", "start", *COMMANDED),
+    ("parse", EXAMPLE.hex(), *STL),
+    ("explain", EXAMPLE.hex(), *STL),
+)
+
+
+def test_a_closed_pipe_ends_every_verb_quietly(tmp_path: Path) -> None:
+    running = {words: _started(words, tmp_path) for words in PRINTING}
+    ends = {}
+    for words, process in running.items():
+        with process:
+            assert process.stdout is not None
+            assert process.stderr is not None
+            assert process.stdout.readline()
+            process.stdout.close()
+            said = process.stderr.read()
+            ends[words] = process.wait(60), [line for line in said.splitlines() if not line.startswith(("next: ", "listening to "))]
+    assert ends == {words: (int(words[0] == "doctor" and ends[words][0] == 1), []) for words in ends}
+
+
+def _started(words: tuple[str, ...], folder: Path) -> subprocess.Popen[str]:
+    command = [sys.executable, "-u", "-m", "lidarspec", *words]
+    return subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=folder)
