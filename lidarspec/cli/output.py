@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
+import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
@@ -29,7 +31,7 @@ def output_options(function: Function) -> Function:
 
 
 def emit(text: str, output: str | None) -> None:
-    """Text to standard output, or into a file.
+    """Text to standard output, or into a file, which keeps what it held until the new text is whole.
 
     Raises:
         SourceError: where the file cannot be written.
@@ -37,10 +39,19 @@ def emit(text: str, output: str | None) -> None:
     if output is None or output == "-":
         click.echo(text)
         return
+    path = Path(output)
+    is_replaced = path.is_file() or not path.exists()  # and not a device or a pipe
+    part = path.with_name(f".{path.name}.{os.getpid()}") if is_replaced else path
     try:
-        Path(output).write_text(text + "\n", encoding="utf-8")
+        part.write_text(text + "\n", encoding="utf-8")
+        if is_replaced:
+            os.replace(part, path)
     except OSError as error:
         raise SourceError(f"{output}: {error.strerror or error}") from None
+    finally:
+        if is_replaced:
+            with contextlib.suppress(OSError):
+                part.unlink()
 
 
 def emit_json(value: Any, output: str | None) -> None:

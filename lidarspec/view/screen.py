@@ -20,7 +20,7 @@ from lidarspec.view.keys import Keys
 from lidarspec.view.palette import Depth, sgr
 
 #: the alternate screen, no cursor, no wrapping at the edge; and all of it back.
-ENTER, LEAVE = "\x1b[?1049h\x1b[?25l\x1b[?7l\x1b[2J", "\x1b[0m\x1b[?7h\x1b[?25h\x1b[?1049l"
+ENTER, LEAVE = "\x1b[?1049h\x1b[?25l\x1b[?7l\x1b[2J", "\x1b[?2026l\x1b[0m\x1b[?7h\x1b[?25h\x1b[?1049l"
 #: the terminal holds a picture back until all of it is there, where it knows how to.
 BEGIN, END = "\x1b[?2026h", "\x1b[?2026l"
 #: unchanged cells between two changed ones that are written along: moving the cursor costs as much.
