@@ -62,10 +62,33 @@ def test_packets_stay_in_the_sensors_axes(folder: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "words", [("stats", "front", "--json"), ("read", "front", "-n", "2"), ("view", "front", "--once"), ("convert", "front", "out.csv")]
+    "words",
+    [
+        ("stats", "front", "--json"),
+        ("read", "front", "-n", "2"),
+        ("view", "front", "--once"),
+        ("convert", "front", "out.csv"),
+        ("plot", "front", "-o", "out.svg"),
+        ("record", "front", "-o", "out.lsr"),
+        ("replay", "front", "--to", "out.bin"),
+        ("detect", "front"),
+        ("doctor", "front"),
+        ("parse", "front"),
+        ("explain", "front"),
+    ],
+    ids=lambda words: words[0],
 )
 def test_every_verb_takes_a_name(folder: Path, words: tuple[str, ...]) -> None:
     assert ran(*words).exit_code == 0
+
+
+def test_a_live_device_by_name_is_live(folder: Path) -> None:
+    assert "rear is live: only what was recorded can be replayed" in ran("replay", "rear", code=2).stderr
+    assert "udp://:6699 is live: this takes bytes or a file" in ran("parse", "rear", code=2).stderr
+
+
+def test_hexadecimal_digits_are_no_name(folder: Path) -> None:
+    assert "is cut off" in ran("parse", "aa5500", code=4).stderr
 
 
 def test_the_nearest_file_counts_and_the_users_fills_in(folder: Path) -> None:

@@ -39,6 +39,8 @@ def detect(source: str | None, duration: float, start: bool, as_json: bool, outp
     """
     if source == "-":
         raise suggest(UsageError("standard input can be read only once: write it to a file first"), "lidarspec detect FILE")
+    device = None if source is None else named(source)
+    source = source if device is None else device.source
     found = list(_everywhere(duration, start=start)) if source is None else _one(source, duration, start=start)
     fitting = [one for one in found if one.scores]
     unknown = None if fitting else _unknown(found)
@@ -61,11 +63,9 @@ def _code(source: str | None, found: Sequence[Verdict]) -> int:
 
 
 def _one(source: str, duration: float, *, start: bool) -> list[Verdict]:
-    device = named(source)
-    place = source if device is None else device.source
-    found = verdicts(place, seconds=duration)
+    found = verdicts(source, seconds=duration)
     if start and not any(one.scores for one in found):
-        for heard in probe(place):
+        for heard in probe(source):
             found = [_best([*found, verdict(heard)])]
             if found[0].is_clear:
                 break

@@ -18,6 +18,7 @@ from lidarspec.frames.codecs import codec
 from lidarspec.frames.judging import VALID
 from lidarspec.parsing import parse_typed
 from lidarspec.plugins import sensors
+from lidarspec.settings import devices
 from lidarspec.sources import is_port, live_address, transport
 from lidarspec.spec import Sensor
 
@@ -68,6 +69,8 @@ def read(words: Sequence[str]) -> Input:
     try:
         return Input(text if len(text) <= REPEATED else "-", (_bytes(text),))
     except ValueError as error:
+        if text in (known := devices()):
+            return read([known[text].source])
         if len(words) == 1 and live_address(text) is not None:
             raise suggest(UsageError(f"{text} is live: this takes bytes or a file"), f"lidarspec read {quote(text)} --packets") from None
         if len(words) == 1 and re.search(r"[/\\.]", text):

@@ -24,6 +24,7 @@ from lidarspec.plugins import sensor as named_sensor
 from lidarspec.recording.recorders import SUFFIXES, recorder
 from lidarspec.recording.recordings import Header
 from lidarspec.recording.replaying import Player, replayed
+from lidarspec.settings import named
 from lidarspec.sources import live_address, transport
 from lidarspec.spec import Sensor
 from lidarspec.transports.players import FilePlayer, player
@@ -100,7 +101,8 @@ def replay(file: str, place: str, speed: float | None, loop: bool, force: bool, 
     To a pty or tcp:// it begins when somebody opens it. udp:// without a port uses those of the recording. A new .lsr or .pcap
     file keeps the times of the recording.
     """
-    if live_address(file) is not None:
+    device = named(file)
+    if live_address(file if device is None else device.source) is not None:
         raise suggest(UsageError(f"{file} is live: only what was recorded can be replayed"), f"lidarspec record {file} -o recording.lsr")
     is_file = place.endswith(SUFFIXES) and "://" not in place
     if is_file and loop:
