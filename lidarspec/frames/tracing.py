@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -43,12 +44,12 @@ class Node:
     number: int
     path: str = ""
 
-    @property
+    @cached_property
     def shape(self) -> tuple[int, ...]:
         """Lengths after the packets' axis."""
         return self.sample.shape[1:]
 
-    @property
+    @cached_property
     def width(self) -> int:
         """Values for each packet; 0 where all packets share them."""
         size = int(np.prod(self.shape, dtype=np.intp))

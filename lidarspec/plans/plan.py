@@ -65,17 +65,17 @@ class Plan:
             raise Untraceable("not every point has a range of its own")
         self._expressions = self._coordinates()
 
-    @property
+    @cached_property
     def width(self) -> int:
         """Points of a packet."""
         return int(np.prod(self.shape, dtype=np.intp))
 
-    @property
+    @cached_property
     def level(self) -> bool:
         """Whether all points lie in the horizontal plane through the sensor."""
         return all(_is_zero(value) for value in (self.result.elevation, self.result.origin[2]))
 
-    @property
+    @cached_property
     def eager(self) -> list[Node]:
         """What has to be computed for every batch: whatever remembers something between batches, and what that needs."""
         wanted = {node.number for node in self.tape.nodes if node.kind in ("shift", "latest", "state")}
