@@ -25,7 +25,6 @@ class Datagrams:
 
     def __init__(self, framing: Framing) -> None:
         self._framing = framing
-        self._marks = [np.array(marks, np.intp).reshape(-1, 3).T for marks in framing.marks]
         self.rejected: dict[str, int] = {}
         self.errors: list[str] = []
 
@@ -47,15 +46,30 @@ class Datagrams:
     def judged(self, buffer: Bytes1D, starts: Offsets, sizes: Offsets, mode: Mode) -> Offsets:
         """The type of each datagram while nothing changes what is looked for."""
         kinds = np.full(len(starts), -1, np.intp)
-        left = np.arange(len(starts)) if len(sizes) and sizes.min() > 0 else np.flatnonzero(sizes)
+        least, most = (int(sizes.min()), int(sizes.max())) if len(sizes) else (0, 0)
+        left = None if least else np.flatnonzero(sizes)
         for kind in self._framing.active(mode):
-            if not len(left):
+            if left is not None and not len(left):
                 break
-            some = left[self._marked(kind, buffer, starts[left], sizes[left])]
-            if len(some):
-                survey = self._framing.codecs[kind].survey(buffer, starts[some])
-                kinds[some[(survey.status == VALID) & (survey.sizes == sizes[some])]] = kind
-                left = left[kinds[left] < 0]
+            size = self._framing.codecs[kind].size
+            if size is not None and not least <= size <= most:
+                continue
+            own, lengths = (starts, sizes) if left is None else (starts[left], sizes[left])
+            marked = self._marked(kind, buffer, own, lengths)
+            if not marked.all():
+                own, lengths = own[marked], lengths[marked]
+                if not len(own):
+                    continue
+            survey = self._framing.codecs[kind].survey(buffer, own)
+            right = survey.sizes == lengths
+            if survey.status.any():
+                right &= survey.status == VALID
+            if left is None and len(own) == len(kinds) and right.all():
+                kinds[:] = kind
+                break
+            found = np.flatnonzero(marked)[right]
+            kinds[found if left is None else left[found]] = kind
+            left = np.flatnonzero((kinds < 0) & (sizes > 0))
         return kinds
 
     def judged_alone(self, datagram: Bytes1D, mode: Mode) -> int:
@@ -75,14 +89,27 @@ class Datagrams:
 
     def _marked(self, kind: int, buffer: Bytes1D, starts: Offsets, sizes: Offsets) -> NDArray[np.bool_]:
         """Which datagrams have the constants of a type."""
-        spots, masks, values = self._marks[kind]
-        last = int(spots.max(initial=-1))
-        marked = sizes > last
-        if marked.all():
-            return np.asarray((buffer.take(starts[:, None] + spots) & masks == values).all(axis=1))
-        where = np.flatnonzero(marked)
-        marked[where] = (buffer.take(starts[where][:, None] + spots) & masks == values).all(axis=1)
+        marks = self._framing.marks[kind]
+        last = max((spot for spot, _, _ in marks), default=-1)
+        whole = sizes > last
+        if not whole.all():
+            marked = whole.copy()
+            marked[whole] = self._marked(kind, buffer, starts[whole], sizes[whole])
+            return marked
+        if not marks:
+            return whole
+        step = _step(starts)
+        marked = whole
+        for spot, mask, value in marks:
+            found = buffer[starts[0] + spot :: step][: len(starts)] if step else buffer.take(starts + spot)
+            marked &= (found if mask == 0xFF else found & np.uint8(mask)) == np.uint8(value)
         return marked
+
+
+def _step(starts: Offsets) -> int:
+    """The bytes from each datagram to the next, where they are the same for all; else 0."""
+    steps = starts[1:] - starts[:-1]
+    return int(steps[0]) if len(steps) and steps[0] > 0 and bool((steps == steps[0]).all()) else 0
 
 
 class _Batch:

@@ -25,8 +25,8 @@ __all__ = ["BACKENDS", "Counters", "Decoder", "Found", "Spans", "backend", "is_s
 #: bytes of a stream looked at in one go, at most and at least.
 PIECE, LEAST = 6 << 16, 1 << 12
 
-#: datagrams judged together.
-TOGETHER = 1024
+#: datagrams judged together; rows of an array, which need not be gathered first, and their bytes.
+TOGETHER, ROWS, ROW_BYTES = 1024, 1 << 16, 1 << 23
 
 Data = bytes | bytearray | memoryview | NDArray[np.uint8]
 
@@ -243,7 +243,7 @@ def spans_of(decoder: Decoder, data: Any) -> list[Spans]:
     if is_stream(data):
         return decoder.spans(data) + decoder.rest()
     if isinstance(data, np.ndarray):
-        everything, step = np.ascontiguousarray(data, np.uint8), max(PIECE // max(data.shape[1], 1), 1)
+        everything, step = np.ascontiguousarray(data, np.uint8), min(max(ROW_BYTES // max(data.shape[1], 1), 1), ROWS)
         return [decoder.datagrams(everything[start : start + step]) for start in range(0, len(everything), step)]
     packets = list(data)
     return [decoder.datagrams(packets[start : start + TOGETHER]) for start in range(0, len(packets), TOGETHER)]

@@ -135,7 +135,22 @@ class Rows:
 def _merged(groups: list[Group]) -> Group:
     if len(groups) == 1:
         return groups[0]
-    return Group(groups[0].layout, np.concatenate([g.where for g in groups]), np.concatenate([g.rows for g in groups]))
+    return Group(groups[0].layout, np.concatenate([g.where for g in groups]), _stacked([g.rows for g in groups]))
+
+
+def _stacked(parts: list[Bytes2D]) -> Bytes2D:
+    """Rows under one another; no copy where they stand so in memory already."""
+    base, width = parts[0].base, parts[0].shape[1]
+    spots = [_address(part) for part in parts]
+    follow = (spot + part.size == after for spot, part, after in zip(spots, parts, spots[1:], strict=False))
+    if not isinstance(base, np.ndarray) or not base.flags.c_contiguous or any(part.base is not base for part in parts) or not all(follow):
+        return np.concatenate(parts)
+    count = sum(map(len, parts))
+    return np.ndarray((count, width), np.uint8, base.data.cast("B") if base.ndim else base, spots[0] - _address(base))
+
+
+def _address(array: NDArray[Any]) -> int:
+    return int(array.__array_interface__["data"][0])
 
 
 def _order(where: NDArray[np.intp]) -> NDArray[np.intp] | slice:
