@@ -37,14 +37,18 @@ class Unwrapper:
             return ns
         raw, time, at = self._last or (int(ns[0]), int(ns[0]), int(host[0]))
         half = self._turn // 2
-        steps = (_steps(ns, raw) + half) % self._turn - half
-        if self._turn >= 10**9:
+        steps = _steps(ns, raw)
+        over = np.flatnonzero((steps < -half) | (steps >= self._turn - half))
+        if len(over):
+            steps[over] = (steps[over] + half) % self._turn - half
+        if self._turn >= 10**9 and host.any():
             before = np.concatenate([[at], host[:-1]])
             passed = np.where((host > 0) & (before > 0), host - before, 0)
             late = passed > self._turn * 3 // 4
             if late.any():
                 steps += np.where(late, (passed - steps + half) // self._turn, 0) * self._turn
-        times = time + np.cumsum(steps)
+        steps[0] += time
+        times = np.cumsum(steps)
         self._last = (int(ns[-1]), int(times[-1]), int(host[-1]))
         return times
 

@@ -22,8 +22,8 @@ from lidarspec.spec import Sensor
 
 __all__ = ["BACKENDS", "Counters", "Decoder", "Found", "Spans", "backend", "is_stream", "packed", "spans_of"]
 
-#: bytes of a stream looked at in one go, at most and at least.
-PIECE, LEAST = 6 << 16, 1 << 12
+#: bytes of a stream looked at in one go: at most, where frames follow one another and where not; and at least.
+LONGEST, PIECE, LEAST = 24 << 16, 6 << 16, 1 << 12
 
 #: datagrams judged together; rows of an array, which need not be gathered first, and their bytes.
 TOGETHER, ROWS, ROW_BYTES = 1024, 1 << 16, 1 << 23
@@ -168,7 +168,8 @@ class Decoder:
             self._need = piece.need if piece.waiting and last else 0
             if piece.waiting and last:
                 break
-            self._size = min(max(4 * piece.end, self._least), PIECE)
+            most = LONGEST if 2 * int(piece.sizes.sum()) > piece.end else PIECE
+            self._size = min(max(4 * piece.end, self._least), max(most, self._least))
         return start
 
     def _entered(self, buffer: NDArray[np.uint8], piece: Piece, at: int | None) -> Spans:

@@ -27,7 +27,7 @@ from lidarspec.frames.judging import CHECKSUM, CONSTANT, IMPLAUSIBLE, LENGTH, PL
 COUNTED = {LENGTH: "bad_length", CHECKSUM: "bad_checksum", IMPLAUSIBLE: "implausible", PLUGIN: "plugin_errors"}
 
 #: candidates of one type in a piece; where there are more, the piece is made shorter, so that memory stays small.
-MOST = 1 << 14
+MOST = 1 << 15
 
 Bytes1D = NDArray[np.uint8]
 Offsets = NDArray[np.intp]
