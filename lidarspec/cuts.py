@@ -158,7 +158,7 @@ def _rows(column: Column, found: Evaluated) -> tuple[NDArray[np.float64], NDArra
     return values[kept], starts[kept]
 
 
-def _sums(counts: NDArray[np.intp], kept: int) -> NDArray[np.intp]:
+def _sums(counts: NDArray[Any], kept: int) -> NDArray[np.intp]:
     """Sums over all axes but the first `kept`; along axes that repeat one number they are products."""
     times = 1
     while counts.ndim > kept:

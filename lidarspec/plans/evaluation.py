@@ -56,7 +56,7 @@ class Values:
 
 @dataclass(eq=False)
 class Share:
-    """The packets of one layout in a batch: their plan, the plain results, and where their points go."""
+    """The packets of one layout in a batch: their plan, the plain results, and where the points of each that is ready begin."""
 
     plan: Plan
     group: Group
@@ -173,8 +173,8 @@ class Points:
         found = np.empty(self.size, dtype)
         for share, part in zip(self._shares, parts, strict=True):
             assert share.spots is not None
-            rows = part.reshape(len(share.group.where), -1)[share.ready]
-            found[share.spots] = rows
+            rows = part.reshape(len(share.group.where), -1)
+            _put(found, share.spots, rows if len(rows) == len(share.spots) else rows[share.ready])
         return found
 
 
@@ -251,7 +251,7 @@ def _laid_out(packets: Packets, shares: list[Share], batch: Batch, fields: Field
     if not one:
         for share in shares:
             share.ready = share.group.where < ready
-            share.spots = starts[share.group.where[share.ready]][:, None] + np.arange(share.plan.width)
+            share.spots = starts[share.group.where[share.ready]]
     same = all(share.plan.shape == plan.shape for share in shares)
     organised = same and len(plan.shape) >= 2 and plan.shape[-1] > 1
     cloud = LazyCloud.of(
@@ -263,12 +263,21 @@ def _laid_out(packets: Packets, shares: list[Share], batch: Batch, fields: Field
     return Evaluated(cloud, ready, batch.carried(ready), _counts(shares, len(packets), same=same)[:ready], fields, plan.axes)
 
 
-def _counts(shares: list[Share], number: int, *, same: bool) -> NDArray[np.intp]:
+def _put(target: NDArray[Any], starts: NDArray[np.intp], rows: NDArray[Any]) -> None:
+    """Write rows into a flat array, each as one piece that begins at its start."""
+    if rows.size:
+        pieces = np.ascontiguousarray(rows, target.dtype)
+        kind = np.dtype((np.void, pieces.shape[1] * pieces.itemsize))
+        windows: NDArray[Any] = np.ndarray((len(target) - pieces.shape[1] + 1,), kind, target.data, 0, target.strides)
+        windows[starts] = pieces.view(kind).reshape(-1)
+
+
+def _counts(shares: list[Share], number: int, *, same: bool) -> NDArray[Any]:
     """1 for each point, with the axes of the arrays, 0 in the padding of shorter ones."""
     if same:
         return np.broadcast_to(np.intp(1), (number, *shares[0].plan.shape))
     shape = tuple(max(lengths) for lengths in zip(*(share.plan.shape for share in shares), strict=True))
-    found = np.zeros((number, *shape), np.intp)
+    found = np.zeros((number, *shape), np.bool_)
     for share in shares:
         corner: Any = (share.group.where, *(slice(0, length) for length in share.plan.shape))
         found[corner] = 1
