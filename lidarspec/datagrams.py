@@ -60,7 +60,7 @@ class Datagrams:
                 own, lengths = own[marked], lengths[marked]
                 if not len(own):
                     continue
-            survey = self._framing.codecs[kind].survey(buffer, own)
+            survey = self._framing.codecs[kind].survey(buffer, own, gathered=False)
             right = survey.sizes == lengths
             if survey.status.any():
                 right &= survey.status == VALID

@@ -16,6 +16,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
+from lidarspec.allocation import keep_freed_memory
 from lidarspec.captures.records import LARGEST_BLOCK, Source
 from lidarspec.errors import SourceError
 
@@ -131,3 +132,6 @@ def _first_size(file: BinaryIO) -> int:
     except (AttributeError, OSError):
         return SMALLEST
     return min(max(status.st_size, SMALLEST), LARGEST) if stat.S_ISREG(status.st_mode) else SMALLEST
+
+
+keep_freed_memory()

@@ -45,8 +45,12 @@ class Codec(Protocol):
     def prefix(self) -> Mapping[int, tuple[int, int]]:
         """The constants at the start: offset -> (mask, value)."""
 
-    def survey(self, buffer: NDArray[np.uint8], offsets: NDArray[np.intp]) -> Survey:
-        """Whether the candidates at these offsets are frames; those whose prefix does not match must be left out."""
+    def survey(self, buffer: NDArray[np.uint8], offsets: NDArray[np.intp], *, gathered: bool = True) -> Survey:
+        """Whether the candidates at these offsets are frames; those whose prefix does not match must be left out.
+
+        Args:
+            gathered: whether their bytes are wanted too, see `Survey.rows`.
+        """
 
     def table(self, frames: Iterable[bytes]) -> Table:
         """Frames known to be of this type, as columns."""
@@ -73,11 +77,11 @@ class CompiledCodec:
         self.parse = frame_parser(frame.prepared, self.tree)
         self._conditions: Conditions | None = None
 
-    def survey(self, buffer: NDArray[np.uint8], offsets: NDArray[np.intp]) -> Survey:
+    def survey(self, buffer: NDArray[np.uint8], offsets: NDArray[np.intp], *, gathered: bool = True) -> Survey:
         errors: list[str] = []
         groups, _ = self.tree.classify(buffer, offsets)
         if len(groups) == 1 and len(groups[0][1]) == len(offsets) and isinstance(groups[0][0], Layout):
-            return self._alike(buffer, offsets, groups[0][0])
+            return self._alike(buffer, offsets, groups[0][0], gathered=gathered)
         status = np.full(len(offsets), SHORT, np.uint8)
         sizes = np.zeros(len(offsets), np.intp)
         for layout, which in groups:
@@ -85,12 +89,12 @@ class CompiledCodec:
                 status[which] = PLUGIN if layout.error else LENGTH
                 errors += [layout.error] * len(which) if layout.error else []
                 continue
-            survey = self._alike(buffer, offsets[which], layout)
+            survey = self._alike(buffer, offsets[which], layout, gathered=gathered)
             status[which], sizes[which] = survey.status, survey.sizes
             errors += survey.errors
         return Survey(status, sizes, tuple(errors))
 
-    def _alike(self, buffer: NDArray[np.uint8], offsets: NDArray[np.intp], layout: Layout) -> Survey:
+    def _alike(self, buffer: NDArray[np.uint8], offsets: NDArray[np.intp], layout: Layout, *, gathered: bool) -> Survey:
         """What candidates of one layout are."""
         whole = offsets <= len(buffer) - layout.size
         count = np.count_nonzero(whole)
@@ -99,7 +103,7 @@ class CompiledCodec:
         else:
             lead, cut = np.flatnonzero(whole), np.flatnonzero(~whole)  # type: ignore[assignment]
         errors: list[str] = []
-        status, rows = self._judged(buffer, offsets[lead], layout, errors)
+        status, rows = self._judged(buffer, offsets[lead], layout, errors, gathered=gathered)
         sizes = np.full(len(offsets), layout.size, np.intp)
         if count < len(offsets):
             short, sizes[cut] = _partial(buffer, offsets[cut], layout)
@@ -111,16 +115,16 @@ class CompiledCodec:
         return Survey(status, sizes, tuple(errors), rows)
 
     def _judged(
-        self, buffer: NDArray[np.uint8], offsets: NDArray[np.intp], layout: Layout, errors: list[str]
+        self, buffer: NDArray[np.uint8], offsets: NDArray[np.intp], layout: Layout, errors: list[str], *, gathered: bool
     ) -> tuple[NDArray[np.uint8], NDArray[np.uint8] | None]:
         """The status of whole candidates of one layout; their bytes, one a row, if they are not too many."""
         judge = self._judge(layout)
         step = max(BLOCK // layout.size, 1)
         if len(offsets) <= step:
-            rows = rows_at(buffer, offsets, layout.size)
-            return judge(rows, errors), rows
-        parts = [judge(rows_at(buffer, offsets[start : start + step], layout.size), errors) for start in range(0, len(offsets), step)]
-        return np.concatenate(parts), None
+            rows = rows_at(buffer, offsets, layout.size, gathered=gathered)
+            return judge(rows, errors), rows if gathered else None
+        blocks = (offsets[start : start + step] for start in range(0, len(offsets), step))
+        return np.concatenate([judge(rows_at(buffer, block, layout.size, gathered=gathered), errors) for block in blocks]), None
 
     def table(self, frames: Iterable[bytes]) -> Rows:
         frames = list(frames)
@@ -157,7 +161,7 @@ class InterpretedCodec:
         self.frame, self.reason, self.schema = frame, reason, schema(frame.prepared)
         self.prefix, self.size = _prefix(frame), _size(frame)
 
-    def survey(self, buffer: NDArray[np.uint8], offsets: NDArray[np.intp]) -> Survey:
+    def survey(self, buffer: NDArray[np.uint8], offsets: NDArray[np.intp], *, gathered: bool = True) -> Survey:
         status = np.zeros(len(offsets), np.uint8)
         sizes = np.zeros(len(offsets), np.intp)
         errors: list[str] = []

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.frames.columns import Batch
-from lidarspec.frames.layout import Bytes2D, Layout, Leaf
+from lidarspec.frames.layout import Bytes2D, Layout, Leaf, elements
 from lidarspec.frames.schema import FieldInfo, Schema
 from lidarspec.frames.tables import Group, Rows
 from lidarspec.frames.tracing import Node, Traced, Untraceable, trace
@@ -107,7 +107,7 @@ class _LookedUp:
     def __call__(self, rows: Bytes2D) -> NDArray[np.bool_]:
         if not len(rows):
             return np.empty(0, np.bool_)
-        view: NDArray[Any] = np.ndarray((len(rows), *self.shape), self.table.dtype, rows.data, self.spot, (rows.shape[1], *self.strides))
+        view = elements(rows, self.table.dtype, self.spot, self.shape, self.strides)
         values = view if view.itemsize == 1 else view.astype(self.table.dtype.newbyteorder("="))
         if self.table.limits is None:
             held = self.table.listed.take(values)

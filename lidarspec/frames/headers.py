@@ -53,16 +53,23 @@ class _Short(Exception):
 Group = tuple[Layout | Refused, NDArray[np.intp]]
 
 
-def rows_at(buffer: NDArray[np.uint8], offsets: NDArray[np.intp], size: int) -> NDArray[np.uint8]:
-    """As many bytes from each of these offsets, one a row, C-contiguous; no copy where they stand back to back."""
+def rows_at(buffer: NDArray[np.uint8], offsets: NDArray[np.intp], size: int, *, gathered: bool = True) -> NDArray[np.uint8]:
+    """As many bytes from each of these offsets, one a row; no copy where they stand back to back.
+
+    Args:
+        gathered: C-contiguous; else no copy either where they stand at one distance, and each row is contiguous by itself.
+    """
     count = len(offsets)
     if not count or not size:
         return np.zeros((count, size), np.uint8)
     if size == 1:
         return buffer.take(offsets).reshape(count, 1)
-    first = int(offsets[0])
-    if int(offsets[-1]) - first == (count - 1) * size and (count < 3 or bool((offsets[1:] - offsets[:-1] == size).all())):
-        return buffer[first : first + count * size].reshape(count, size)
+    first, step = int(offsets[0]), int(offsets[1] - offsets[0]) if count > 1 else size
+    if (step == size or (step > size and not gathered)) and int(offsets[-1]) - first == (count - 1) * step:
+        if count < 3 or bool((offsets[1:] - offsets[:-1] == step).all()):
+            if step == size:
+                return buffer[first : first + count * size].reshape(count, size)
+            return np.ndarray((count, size), np.uint8, buffer.data, first, (step, 1))
     windows: NDArray[Any] = np.ndarray((len(buffer) - size + 1,), f"V{size}", buffer.data, 0, (1,))
     return windows[offsets].view(np.uint8).reshape(count, size)
 

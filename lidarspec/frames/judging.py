@@ -76,9 +76,10 @@ def _among(status: Status, rows: Bytes2D, judge: Callable[[Bytes2D], Status]) ->
 
 
 def taken(rows: Bytes2D, which: NDArray[np.intp] | NDArray[np.bool_]) -> Bytes2D:
-    """Some of the rows (C-contiguous), by index or mask, each copied as one piece."""
-    whole = rows.view(f"V{rows.shape[1]}").reshape(-1)
-    return (whole[which] if which.dtype == np.bool_ else whole.take(which)).view(np.uint8).reshape(-1, rows.shape[1])
+    """Some of the rows, by index or mask, each copied as one piece."""
+    whole = rows.view(f"V{rows.shape[1]}")[:, 0]
+    some = whole.take(which) if which.dtype != np.bool_ and rows.flags.c_contiguous else whole[which]
+    return some.view(np.uint8).reshape(-1, rows.shape[1])
 
 
 def intactness(seal: Seal, errors: list[str], rows: Bytes2D) -> Status:

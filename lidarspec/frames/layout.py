@@ -19,6 +19,14 @@ from lidarspec.frames.schema import FieldInfo
 Bytes2D = NDArray[np.uint8]
 
 
+def elements(rows: Bytes2D, dtype: np.dtype[Any], offset: int, shape: tuple[int, ...], strides: tuple[int, ...]) -> NDArray[Any]:
+    """What stands at an offset of each row (contiguous by itself) and at these strides from there, (n, *shape), not copied."""
+    if rows.flags.c_contiguous:
+        return np.ndarray((len(rows), *shape), dtype, rows.data, offset, (rows.shape[1], *strides))
+    first = rows[:, offset : offset + dtype.itemsize].view(dtype)
+    return np.lib.stride_tricks.as_strided(first, (len(rows), *shape), (rows.strides[0], *strides))
+
+
 @dataclass(frozen=True, eq=False)
 class Leaf:
     """The place of one field.
@@ -41,7 +49,7 @@ class Leaf:
     elements: tuple[BitField, ...] = ()
 
     def load(self, rows: Bytes2D) -> NDArray[Any]:
-        """The raw values of frames given as rows of bytes (C-contiguous), shape (n, *shape), native byte order."""
+        """The raw values of frames given as rows of bytes, shape (n, *shape), native byte order."""
         if self.wire is not None:
             return np.asarray(self._view(rows, self.wire, 0).astype(self.wire.newbyteorder("=")))
         assert self.info.dtype is not None
@@ -80,7 +88,7 @@ class Leaf:
         shape = self.shape[: len(self.strides)]
         if 0 in (len(rows), *shape):
             return np.empty((len(rows), *shape), dtype)
-        return np.ndarray((len(rows), *shape), dtype, rows.data, self.offset + offset, (rows.shape[1], *self.strides))
+        return elements(rows, dtype, self.offset + offset, shape, self.strides)
 
     def _bits(self, rows: Bytes2D, element: BitField) -> NDArray[Any]:
         assert self.info.dtype is not None
