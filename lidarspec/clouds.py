@@ -244,12 +244,9 @@ def joined(clouds: Sequence[PointCloud]) -> PointCloud:
     return LazyCloud.of(source, stamp_ns=source.stamp_ns, shape=shape, nominal=np.bool_(any(cloud.nominal for cloud in clouds)))
 
 
-def restamped(cloud: PointCloud) -> PointCloud:
-    """The same points with times counted from the first one."""
-    if not len(cloud):
-        return cloud
-    shift = round(cloud.time_at(0) * 1e9)
-    return LazyCloud.of(_Restamped(cloud, len(cloud)), stamp_ns=cloud.stamp_ns + shift, shape=cloud.shape, nominal=cloud.nominal)
+def restamped(cloud: PointCloud, stamp_ns: int) -> PointCloud:
+    """The same points with times counted from the first one, which is at `stamp_ns`."""
+    return LazyCloud.of(_Restamped(cloud, len(cloud)), stamp_ns=stamp_ns, shape=cloud.shape, nominal=cloud.nominal)
 
 
 #: directions in REP-103: (axis index, sign).

@@ -121,6 +121,7 @@ class ScanStream:
         self._parts: list[PointCloud] = []
         self._started = False
         self._epoch: int | None = None
+        self._begins: int | None = None  # time of the first point of the scan under way, ns, where it is known
 
     def add(self, packets: Packets) -> list[Scan]:
         """The scans that these packets complete."""
@@ -153,26 +154,34 @@ class ScanStream:
         start = 0
         for cut in self._cutter.cuts(packets, found):
             self._parts.append(found.cloud[start:cut] if cut > start else found.cloud[:0])
-            following = found.cloud[cut : cut + 1]
-            scan = self._close(following, complete=self._started)
+            ends = _time_ns(found.cloud, cut) if cut < len(found.cloud) else None
+            scan = self._close(ends, complete=self._started)
+            self._begins = ends
             if scan is not None:
                 self._started = True
                 yield scan
             start = cut
         self._parts.append(found.cloud[start:] if start else found.cloud)
 
-    def _close(self, following: PointCloud | None, *, complete: bool) -> Scan | None:
+    def _close(self, ends: int | None, *, complete: bool) -> Scan | None:
+        """The scan of the points so far; `ends`: the time of the first point after it, ns."""
         parts = [part for part in self._parts if len(part)]
         self._parts = []
         if not parts:
             return None
-        cloud = restamped(joined(parts))
-        rate = np.nan
-        if following is not None and len(following):
-            period = (following.stamp_ns + round(following.time_at(0) * 1e9) - cloud.stamp_ns) * 1e-9
-            rate = 1 / period if period > 0 else np.nan
+        cloud = joined(parts)
+        begins = self._begins if self._begins is not None else _time_ns(cloud, 0)
+        self._begins = None
+        period = (ends - begins) * 1e-9 if ends is not None else np.nan
+        rate = 1 / period if period > 0 else np.nan
+        cloud = restamped(cloud, begins)
         mounted = cloud if self._mount is None else self._mount.applied(cloud)
         return Scan(mounted, float(rate) if complete else np.nan, complete, self._sensor)
+
+
+def _time_ns(cloud: PointCloud, index: int) -> int:
+    """The time of one point, ns."""
+    return cloud.stamp_ns + round(cloud.time_at(index) * 1e9)
 
 
 def scans_of(sensor: Sensor, batches: Iterable[Packets]) -> Iterator[Scan]:
