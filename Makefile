@@ -1,9 +1,11 @@
 # From a fresh clone, with Python 3.11 or later and a package index: `make demo` and `make test`.
-# PYTHON names the interpreter for a new environment, VENV its folder, DIST the folder for wheels, ARGS goes to pytest or the benchmarks.
+# PYTHON names the interpreter for a new environment, VENV its folder, DIST the folder for wheels, SITE that for the documentation;
+# ARGS goes to pytest or the benchmarks.
 
 PYTHON ?= python3
 VENV ?= .venv
 DIST ?= dist
+SITE ?= site
 ARGS ?=
 
 BIN := $(VENV)/bin
@@ -13,10 +15,11 @@ PROJECTS := pyproject.toml $(PLUGINS:%=%/pyproject.toml)
 PACKAGES := lidarspec $(wildcard plugins/*/lidarspec_*)
 USERS := $(VENV)/.installed
 DEVELOPERS := $(VENV)/.installed-dev
+WRITERS := $(VENV)/.installed-docs
 PEERS := $(VENV)/.installed-bench
 RECENT := import sys; sys.exit(sys.version_info < (3, 11))
 
-.PHONY: demo test soak lint types wheels bench bench-here clean
+.PHONY: demo test soak lint types docs wheels bench bench-here clean
 
 demo: $(USERS)
 	@$(BIN)/lidarspec demo -s ldrobot-stl27l
@@ -34,6 +37,10 @@ lint: $(DEVELOPERS)
 types: $(DEVELOPERS)
 	@$(BIN)/mypy $(PACKAGES) benchmarks
 
+# Without --quiet, which would let broken links pass.
+docs: $(WRITERS)
+	@NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --site-dir $(abspath $(SITE))
+
 wheels: $(DEVELOPERS)
 	@for project in . $(PLUGINS); do $(BIN)/python -m build --wheel --no-isolation --outdir $(DIST) $$project || exit 1; done
 
@@ -45,7 +52,7 @@ bench-here: $(PEERS)
 	@$(BIN)/python benchmarks/run.py $(ARGS)
 
 clean:
-	rm -rf .venv .venv-bench dist .hypothesis .mypy_cache .pytest_cache .ruff_cache
+	rm -rf .venv .venv-bench dist site .hypothesis .mypy_cache .pytest_cache .ruff_cache
 	find lidarspec plugins tests -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # An environment without a working pip, as a failed attempt leaves it behind, is made again.
@@ -60,6 +67,11 @@ $(USERS): $(PROJECTS)
 $(DEVELOPERS): $(USERS)
 	@echo "installing the tools for tests, lint and types into $(VENV), this once"
 	@$(PIP) install --quiet --editable '.[dev]'
+	@touch $@
+
+$(WRITERS): $(USERS)
+	@echo "installing what makes the documentation into $(VENV), this once"
+	@$(PIP) install --quiet --editable '.[docs]'
 	@touch $@
 
 $(PEERS): $(USERS)

@@ -50,7 +50,7 @@ if TYPE_CHECKING:
         WireError as WireError,
     )
     from lidarspec.fields import Checksummed as Checksummed, Scaled as Scaled
-    from lidarspec.files import Format as Format, Transport as Transport
+    from lidarspec.files import Chunk as Chunk, Format as Format, Transport as Transport
     from lidarspec.frames.access import Fields as Fields
     from lidarspec.frames.columns import Column as Column
     from lidarspec.geometry import Cartesian as Cartesian, Points as Points, Polar as Polar
@@ -84,7 +84,7 @@ _HOMES = {
     "frames.access": ("Fields",),
     "frames.columns": ("Column",),
     "angles": ("spread", "wrap", "following", "previous", "last", "stack", "take"),
-    "files": ("Format", "Transport"),
+    "files": ("Format", "Transport", "Chunk"),
     "hookspecs": ("hookimpl",),
     # what can be done with it
     "plugins": ("sensor", "sensors"),

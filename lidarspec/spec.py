@@ -149,7 +149,31 @@ class Configure:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Sensor:
-    """One sensor, described; see DESIGN 3.5 of the documentation for each argument.
+    """One sensor, described.
+
+    Args:
+        id: vendor-model in lower case with hyphens; the same everywhere and for ever.
+        vendor, model: as people write them.
+        frames: every message type by name, in both directions; where several fit at one place, their order decides.
+        points: a function of `Fields` that returns `Polar` or `Cartesian`; None where each data frame has its own.
+        scan: where one scan ends and the next begins.
+        links: by name; the data come over "data", commands over the link that they name.
+        commands: what can be asked of it, by name.
+        clock: its own time, if it has one.
+        sequence: its counter of packets, if it has one.
+        fillers: bytes that it sends between frames; they are counted on their own.
+        state: defaults of other frames' fields for ``f.state``, by frame and path, in units.
+        sweep: the physical values, by path, of data frame number i that are not measured: all that a simulation needs.
+        encode: the measured `Polar` of a batch to the raw values of its fields, where ranges have no field of their own.
+        configure: a function of the sensor and its options, by name, that returns another sensor.
+        on_open, on_close: names of the commands that are sent when it is opened and closed.
+        range_limits: the shortest and the longest range that it can measure, metres.
+        vendor_axes: where the vendor's x, y and z point, of forward, backward, left, right, up and down, for ``frame="vendor"``.
+        status: how far it is proven: "manual", "vectors", "capture" or "hardware".
+        source: the manual with its revision and sections, the captures.
+        aliases: other ids that it is known by.
+        api: the version of this interface that it was written for.
+        options: what it was configured with; not for plugins to set.
 
     Raises:
         SpecError: for an id, status or reference between its parts that cannot be.

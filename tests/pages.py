@@ -23,6 +23,8 @@ from typing import Any
 
 DOCS = Path(__file__).parents[1] / "docs"
 OUTPUT = "Output"
+#: what stands between two blocks of one file.
+SEPARATOR = "\n\n"
 #: pip takes the build backend from what is installed, and needs no package index.
 OFFLINE = {"PIP_NO_INDEX": "1", "PIP_NO_BUILD_ISOLATION": "0", "PIP_DISABLE_PIP_VERSION_CHECK": "1"}
 _FENCE = re.compile(r"^( *)```(\w+)(?: title=\"([^\"]+)\")?\n(.*?)^\1```$", re.MULTILINE | re.DOTALL)
@@ -64,7 +66,7 @@ def follow(page: str, place: Path, environment: Mapping[str, str] | None = None)
             path = place / block.title
             path.parent.mkdir(parents=True, exist_ok=True)
             with path.open("a" if block.title in written else "w", encoding="utf-8") as file:
-                file.write(block.text)
+                file.write(f"{SEPARATOR}{block.text}" if block.title in written else block.text)
             written.add(block.title)
         elif block.language == "sh":
             printed, ran = shell(block, place, environment), ran + 1

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import os
 import re
 from pathlib import Path
@@ -63,8 +64,34 @@ def test_the_plugin_of_the_tutorial_decodes_the_manuals_frame(tmp_path: Path) ->
     assert cloud.y[0] == pytest.approx(0.224 * 0.58384, abs=1e-4)  # 35.73 deg to the left
 
 
+HOOKS = {name: function for name, function in vars(hookspecs).items() if name.startswith("lidarspec_")}
+
+
 def test_every_hook_has_its_heading() -> None:
-    assert {name for name in vars(hookspecs) if name.startswith("lidarspec_")} <= headings("reference/hooks.md")
+    assert set(HOOKS) <= headings("reference/hooks.md")
+
+
+@pytest.mark.parametrize("name", HOOKS)
+def test_every_hook_is_written_with_its_arguments(name: str) -> None:
+    found = re.search(rf"^`{name}\((.*?)\) -> .+?`", (DOCS / "reference/hooks.md").read_text(encoding="utf-8"), flags=re.MULTILINE)
+    assert found
+    assert re.findall(r"(\w+):", found[1]) == list(inspect.signature(HOOKS[name]).parameters)
+
+
+def test_every_public_name_is_on_the_pages_of_the_python_interface() -> None:
+    listed = (DOCS / "reference/python.md").read_text(encoding="utf-8").partition("## Every name")[2]
+    named = re.findall(r"`(\w+)`", listed)
+    assert sorted(named) == sorted(ls.__all__)
+    assert sorted(re.findall(r"^::: lidarspec\.(\w+)$", (DOCS / "reference/api.md").read_text(encoding="utf-8"), re.MULTILINE)) == sorted(
+        named
+    )
+
+
+@pytest.mark.parametrize("value", [ls.Sensor, ls.Frame, ls.Command, ls.Scaled, ls.Checksummed, ls.Clock, ls.Sequence, ls.Polar])
+def test_what_authors_write_says_what_each_argument_is(value: type) -> None:
+    arguments = (inspect.getdoc(value) or "").partition("Args:")[2]
+    named = set(re.findall(r"\w+", " ".join(re.findall(r"^ +([\w, ]+):", arguments, re.MULTILINE))))
+    assert set(inspect.signature(value).parameters) <= named
 
 
 def test_every_public_error_has_its_heading() -> None:
@@ -81,3 +108,9 @@ def test_links_between_pages_lead_somewhere(page: str) -> None:
     path = DOCS / page
     for target in re.findall(r"\]\(([^)#:]+\.md)", path.read_text(encoding="utf-8")):
         assert (path.parent / target).is_file(), target
+
+
+def test_every_page_is_in_the_contents_of_the_site() -> None:
+    contents = (DOCS.parent / "mkdocs.yml").read_text(encoding="utf-8").partition("\nnav:")[2]
+    listed = re.findall(r": (\S+\.md)$", contents, re.MULTILINE)
+    assert sorted(listed) == [page for page in PAGES if not page.startswith("reference/sensors/")]
