@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import doctest
 import inspect
 import os
 import re
@@ -62,6 +63,12 @@ def test_the_plugin_of_the_tutorial_decodes_the_manuals_frame(tmp_path: Path) ->
     cloud = packets.points()
     assert cloud.x[0] == pytest.approx(0.224 * 0.81186, abs=1e-4)  # cos 324.27 deg
     assert cloud.y[0] == pytest.approx(0.224 * 0.58384, abs=1e-4)  # 35.73 deg to the left
+
+
+def test_the_readme_says_what_is_printed() -> None:
+    done = doctest.testfile(str(DOCS.parent / "README.md"), module_relative=False)
+    assert done.attempted
+    assert not done.failed
 
 
 HOOKS = {name: function for name, function in vars(hookspecs).items() if name.startswith("lidarspec_")}
