@@ -20,10 +20,11 @@ class SpecError(LidarSpecError):
     Attributes:
         path: field path or name of the place in the spec, "" where it concerns the whole.
         reason: what is wrong there.
+        rule: the code under which `lidarspec check` explains it, "" where it has none of its own.
     """
 
-    def __init__(self, reason: str, *, path: str = "", sensor: str = "") -> None:
-        self.reason, self.path, self.sensor = reason, path, sensor
+    def __init__(self, reason: str, *, path: str = "", sensor: str = "", rule: str = "") -> None:
+        self.reason, self.path, self.sensor, self.rule = reason, path, sensor, rule
         super().__init__(": ".join(part for part in (sensor, path, reason) if part))
 
 

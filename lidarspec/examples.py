@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import construct
@@ -22,6 +23,9 @@ from lidarspec.spec import Sensor
 
 #: random frames made at once, and how often, before a sensor's own `sweep` has to help.
 BATCH, TRIES = 64, 40
+#: field path -> what draws a raw value of it.
+Drawn = Mapping[str, Callable[[random.Random], Any]]
+NOTHING: Drawn = {}
 
 
 def example(sensor: Sensor, frame: str, *, seed: int = 0) -> bytes:
@@ -31,24 +35,33 @@ def example(sensor: Sensor, frame: str, *, seed: int = 0) -> bytes:
     return examples(sensor, frame, random.Random(f"{sensor.id} {frame} {seed}"))[0]
 
 
-def examples(sensor: Sensor, frame: str, source: random.Random) -> list[bytes]:
-    """Some valid frames of one random header, at least one: what `example` picks from, for tests that need many."""
+def examples(sensor: Sensor, frame: str, source: random.Random, drawn: Drawn = NOTHING) -> list[bytes]:
+    """Some valid frames of one random header, at least one: what `example` picks from, for tests that need many.
+
+    Args:
+        drawn: field path -> what draws its raw value, for what random values never make.
+    """
     engine = codec(sensor.frames[frame])
     if not isinstance(engine, CompiledCodec):
-        return [_interpreted(sensor, frame, engine, source)]
+        return [_interpreted(sensor, frame, engine, source, drawn)]
     for _ in range(TRIES):
-        layout, chosen = engine.tree.choose(source)
+        layout, chosen = engine.tree.choose(source, drawn)
         rows = np.frombuffer(source.randbytes(BATCH * layout.size), np.uint8).reshape(BATCH, layout.size).copy()
+        for path, draw in drawn.items():
+            if path in layout.leaves and path not in chosen:
+                leaf = layout.leaves[path]
+                count = BATCH * int(np.prod(leaf.shape, dtype=np.intp))
+                leaf.store(rows, np.array([draw(source) for _ in range(count)]).reshape(BATCH, *leaf.shape))
         found = _plausible(sensor, frame, layout, _headed(rows, layout, chosen))
         if found:
             return found
     return [_swept(sensor, frame, engine, source)]
 
 
-def _interpreted(sensor: Sensor, frame: str, engine: InterpretedCodec, source: random.Random) -> bytes:
+def _interpreted(sensor: Sensor, frame: str, engine: InterpretedCodec, source: random.Random, drawn: Drawn) -> bytes:
     """A frame that construct alone can read."""
     for _ in range(BATCH * TRIES):
-        data = build(sensor, frame, _random(engine.frame.prepared, source, construct.Container()), {})
+        data = build(sensor, frame, _random(engine.frame.prepared, source, construct.Container(), drawn), {})
         if engine.survey(np.frombuffer(data, np.uint8), np.zeros(1, np.intp)).status[0] == VALID:
             return data
     raise SpecError("no random frame is valid", path=frame, sensor=sensor.id)
@@ -92,8 +105,10 @@ def _swept(sensor: Sensor, frame: str, engine: CompiledCodec, source: random.Ran
     raise SpecError("neither random frames nor those along `sweep` pass `plausible`", path=frame, sensor=sensor.id)
 
 
-def _random(con: Construct, source: random.Random, given: Any) -> Any:
+def _random(con: Construct, source: random.Random, given: Any, drawn: Drawn, path: str = "") -> Any:
     """A random value for a construct that has no compiled layout."""
+    if path in drawn:
+        return drawn[path](source)
     con, info = peeled(con, FieldInfo(""))
     if info.const is not None:
         return info.const
@@ -101,16 +116,16 @@ def _random(con: Construct, source: random.Random, given: Any) -> Any:
         values = construct.Container()
         for child in con.subcons:
             if child.name is not None:
-                values[child.name] = _random(child, source, values)
+                values[child.name] = _random(child, source, values, drawn, f"{path}.{child.name}" if path else child.name)
         return values
     if isinstance(con, construct.Array):
         number = con.count(given) if callable(con.count) else con.count
-        return [_random(con.subcon, source, given) for _ in range(number)]
+        return [_random(con.subcon, source, given, drawn, path) for _ in range(number)]
     if isinstance(con, construct.NullTerminated) or not isinstance(con, construct.Subconstruct):
         return _leaf(con, source)
     if isinstance(con, construct.Adapter):
-        return clean(con.parse(con.subcon.build(_random(con.subcon, source, given))))
-    return _random(con.subcon, source, given)
+        return clean(con.parse(con.subcon.build(_random(con.subcon, source, given, drawn, path))))
+    return _random(con.subcon, source, given, drawn, path)
 
 
 def _leaf(con: Construct, source: random.Random) -> Any:

@@ -6,11 +6,12 @@ distribution and its error, rolled back, and disturbs no other.
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import importlib.util
 import inspect
 import traceback
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
@@ -262,10 +263,26 @@ def _check_hooks(plugin: Any, name: str) -> None:
             raise SpecError(f"{attribute} lacks @hookimpl", path=name)
 
 
-@functools.cache
+#: the registry of this environment, once it is asked for, and those that stand in for it.
+_registries: list[Registry] = []
+
+
 def registry() -> Registry:
     """The registry of this environment."""
-    return Registry(entry_points(GROUP))
+    if not _registries:
+        _registries.append(Registry(entry_points(GROUP)))
+    return _registries[-1]
+
+
+@contextlib.contextmanager
+def standing_in(other: Registry) -> Iterator[Registry]:
+    """As long as this context lasts, `other` is the registry of this environment."""
+    registry()
+    _registries.append(other)
+    try:
+        yield other
+    finally:
+        _registries.remove(other)
 
 
 def sensors() -> dict[str, Sensor]:
@@ -291,7 +308,7 @@ def _from_file(text: str) -> Sensor:
 
     path, colon, wanted = text.partition(".py:")
     file = Path(f"{path}.py" if colon else text)
-    module = _module(file)
+    module = file_module(file)
     local = Registry()
     try:
         ids = local.add(module, name=str(file))
@@ -309,7 +326,12 @@ def _from_file(text: str) -> Sensor:
     return registry().hooked(local.hooked(chosen))
 
 
-def _module(file: Path) -> ModuleType:
+def file_module(file: Path) -> ModuleType:
+    """A file as a module.
+
+    Raises:
+        SourceError, SpecError: for one that is not there, or cannot be imported.
+    """
     if not file.is_file():
         raise SourceError(f"{file}: no such file")
     module_spec = importlib.util.spec_from_file_location(f"lidarspec_file_{file.stem}", file)

@@ -18,17 +18,18 @@ from lidarspec.errors import SpecError
 RESERVED = frozenset({"state", "on"})
 SHADOWED = frozenset(name for name in dir(Container) if not name.startswith("_"))
 
-_REFUSED: dict[type, str] = {
-    type(construct.Pickled): "Pickled runs code from the wire",
-    construct.FlagsEnum: "FlagsEnum loses undeclared bits: declare each bit as a field of a BitStruct",
-    construct.GreedyRange: "GreedyRange has no end of its own on a stream: give a count, or a terminator",
-    type(construct.GreedyBytes): "GreedyBytes has no end of its own on a stream: give a length, or a terminator",
-    construct.RawCopy: "RawCopy ignores edits on rebuild: use Checksummed",
-    construct.Checksum: "construct's Checksum needs RawCopy, which ignores edits on rebuild: use Checksummed",
-    construct.Padded: "padding loses its bytes on a round trip: declare it as a field, such as 'reserved' / Bytes(n)",
-    construct.Pointer: "Pointer reads outside the frame",
-    construct.Seek: "Seek reads outside the frame",
-    construct.Select: "Select and Optional hide errors in the bytes: use If or Switch on a header field",
+#: the rule under which `lidarspec check` explains it, and the reason.
+_REFUSED: dict[type, tuple[str, str]] = {
+    type(construct.Pickled): ("LS110", "Pickled runs code from the wire"),
+    construct.FlagsEnum: ("LS108", "FlagsEnum loses undeclared bits: declare each bit as a field of a BitStruct"),
+    construct.GreedyRange: ("LS111", "GreedyRange has no end of its own on a stream: give a count, or a terminator"),
+    type(construct.GreedyBytes): ("LS111", "GreedyBytes has no end of its own on a stream: give a length, or a terminator"),
+    construct.RawCopy: ("LS109", "RawCopy ignores edits on rebuild: use Checksummed"),
+    construct.Checksum: ("LS109", "construct's Checksum needs RawCopy, which ignores edits on rebuild: use Checksummed"),
+    construct.Padded: ("LS106", "padding loses its bytes on a round trip: declare it as a field, such as 'reserved' / Bytes(n)"),
+    construct.Pointer: ("LS112", "Pointer reads outside the frame"),
+    construct.Seek: ("LS112", "Seek reads outside the frame"),
+    construct.Select: ("LS113", "Select and Optional hide errors in the bytes: use If or Switch on a header field"),
 }
 
 #: what gives a greedy field its end.
@@ -42,11 +43,11 @@ def check_struct(con: Construct) -> None:
         SpecError: for a shadowed, reserved, duplicate or missing name, or a construct that loses bits or never ends.
     """
     for path, part, in_bits in _walk(con, "", in_bits=False):
-        for kind, reason in _REFUSED.items():
+        for kind, (rule, reason) in _REFUSED.items():
             if isinstance(part, kind):
-                raise SpecError(reason, path=path)
+                raise SpecError(reason, path=path, rule=rule)
         if isinstance(part, type(construct.Flag)) and not in_bits:
-            raise SpecError("Flag keeps one bit of its byte only: use a BitStruct, or Int8ul", path=path)
+            raise SpecError("Flag keeps one bit of its byte only: use a BitStruct, or Int8ul", path=path, rule="LS107")
         if isinstance(part, Struct):
             _check_names(part, path, in_bits=in_bits)
 
@@ -58,16 +59,16 @@ def _check_names(struct: Struct, path: str, *, in_bits: bool) -> None:
         place = f"{path}.{name}" if path else str(name)
         if name is None:
             if in_bits or not isinstance(unwrap(child), Const):
-                raise SpecError(f"an unnamed {type(unwrap(child)).__name__} would lose its value: give it a name", path=path)
+                raise SpecError(f"an unnamed {type(unwrap(child)).__name__} would lose its value: give it a name", path=path, rule="LS105")
             continue
         if name in seen:
-            raise SpecError("two fields of this name: the last one would win silently", path=place)
+            raise SpecError("two fields of this name: the last one would win silently", path=place, rule="LS104")
         if name in RESERVED:
-            raise SpecError("no field may be called 'state' or 'on'", path=place)
+            raise SpecError("no field may be called 'state' or 'on'", path=place, rule="LS102")
         if name in SHADOWED:
-            raise SpecError(f"the name {name!r} is shadowed by a method of construct's Container", path=place)
+            raise SpecError(f"the name {name!r} is shadowed by a method of construct's Container", path=place, rule="LS101")
         if name.startswith("_") or not name.isidentifier():
-            raise SpecError("a field name must be a Python identifier without a leading underscore", path=place)
+            raise SpecError("a field name must be a Python identifier without a leading underscore", path=place, rule="LS103")
         seen.add(name)
 
 

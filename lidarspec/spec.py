@@ -54,6 +54,7 @@ class Frame:
         encode: an `encode` function of its own: the measured `Polar` of a batch to the raw values of its fields, by path.
         rate: how many a second are sent; of data, where neither the clock nor the times of the points tell; of other frames, where
             they are sent again and again by themselves.
+        acknowledged: findings of `lidarspec check` that are true and meant, as "LS204" or "LS205 path.of.a.field" -> the reason.
 
     Raises:
         SpecError: if the struct cannot describe a frame (see `lidarspec.rules`).
@@ -70,6 +71,7 @@ class Frame:
     sweep: Callable[[int], Mapping[str, Any]] | None = field(default=None, kw_only=True)
     encode: Callable[..., Mapping[str, Any]] | None = field(default=None, kw_only=True)
     rate: float = field(default=0.0, kw_only=True)
+    acknowledged: Mapping[str, str] = field(default_factory=dict, kw_only=True)
     prepared: Construct = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -77,6 +79,7 @@ class Frame:
             raise SpecError(f"direction is 'in' or 'out', not {self.direction!r}")
         if self.max_length < 1 or self.confirm < 1:
             raise SpecError("max_length and confirm are at least 1")
+        _freeze(self, "acknowledged")
         object.__setattr__(self, "prepared", prepare(self.struct))
         check_struct(self.prepared)
 
@@ -202,10 +205,11 @@ class Sensor:
     source: str = field(kw_only=True)
     aliases: tuple[str, ...] = field(default=(), kw_only=True)
     api: int = field(default=API, kw_only=True)
+    acknowledged: Mapping[str, str] = field(default_factory=dict, kw_only=True)
     options: Mapping[str, Any] = field(default_factory=dict, kw_only=True)
 
     def __post_init__(self) -> None:
-        _freeze(self, "frames", "links", "commands", "state", "options")
+        _freeze(self, "frames", "links", "commands", "state", "acknowledged", "options")
         function = self.configure.function if isinstance(self.configure, Configure) else self.configure
         object.__setattr__(self, "configure", Configure(self, function))
         for name in ("on_open", "on_close", "aliases"):

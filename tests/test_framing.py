@@ -11,8 +11,8 @@ import lidarspec
 from lidarspec import Decoder, Sensor
 from lidarspec.testing import material
 from lidarspec.testing.comparisons import assert_backends_agree, cuts
-from tests.damage import BURSTS, RATES, damaged
-from tests.oracle import Cut, Oracle
+from lidarspec.testing.damage import BURSTS, RATES, damaged
+from lidarspec.testing.oracle import Cut, Oracle
 from tests.shapes import SHAPES
 
 EVERY = {**lidarspec.sensors(), **SHAPES}

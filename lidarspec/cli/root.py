@@ -48,6 +48,9 @@ GROUPS = {
         "build": ("building", "The bytes of one frame from field=value; a unit makes a value physical."),
         "crc": ("crc", "Which checksum seals some sample frames: XOR, sums, or a CRC of 8, 16 or 32 bits."),
     },
+    "authors": {
+        "check": ("check", "What is wrong with a sensor, a file or a distribution: every promise, and mistakes in its spec."),
+    },
 }
 VERBS = {verb: place for verbs in GROUPS.values() for verb, place in verbs.items()}
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import contextlib
 import random
 import traceback
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any
@@ -127,15 +127,22 @@ class HeaderTree:
             node = node.children[node.leaf.scalar(frame)]
         return found
 
-    def choose(self, source: random.Random) -> tuple[Layout, dict[str, int]]:
-        """A layout of a header chosen at random, with the values of the fields it depends on, by path."""
+    def choose(
+        self, source: random.Random, drawn: Mapping[str, Callable[[random.Random], int]] | None = None
+    ) -> tuple[Layout, dict[str, int]]:
+        """A layout of a header chosen at random, with the values of the fields it depends on, by path.
+
+        Args:
+            drawn: field path -> what draws its value in place of chance.
+        """
         keys = sorted(_switch_keys(self._con))
         for _ in range(400):
             chosen: dict[str, int] = {}
 
             def read(leaf: Leaf, chosen: dict[str, int] = chosen) -> int:
                 if leaf.info.path not in chosen:
-                    chosen[leaf.info.path] = _some_value(source, leaf, keys)
+                    own = (drawn or {}).get(leaf.info.path)
+                    chosen[leaf.info.path] = own(source) if own else _some_value(source, leaf, keys)
                 return chosen[leaf.info.path]
 
             try:

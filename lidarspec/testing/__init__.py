@@ -1,4 +1,4 @@
-"""A test kit for sensors: what the engine promises for every sensor, as a class for pytest.
+"""A test kit for sensors: what the engine promises for every sensor, as a class for pytest, and as `lidarspec check`.
 
 from lidarspec.testing import SensorConformance
 
@@ -10,22 +10,21 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-try:
-    import pytest
-except ImportError as error:
-    raise ImportError("the test kit needs pytest: pip install 'lidarspec[testing]'") from error
-
 if TYPE_CHECKING:
     from lidarspec.testing.conformance import SensorConformance as SensorConformance
 
 __all__ = ["SensorConformance"]
 
-pytest.register_assert_rewrite("lidarspec.testing.conformance", "lidarspec.testing.comparisons")
-
 
 def __getattr__(name: str) -> Any:
     if name not in __all__:
         raise AttributeError(f"module 'lidarspec.testing' has no attribute {name!r}")
+    try:
+        import hypothesis  # noqa: F401
+        import pytest
+    except ImportError as error:
+        raise ImportError("the test kit needs pytest and hypothesis: pip install 'lidarspec[testing]'") from error
+    pytest.register_assert_rewrite("lidarspec.testing.comparisons")
     from lidarspec.testing.conformance import SensorConformance
 
     return SensorConformance

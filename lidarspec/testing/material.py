@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import random
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
-from lidarspec.building import limits
-from lidarspec.errors import UsageError, WireError
+from lidarspec.errors import WireError
 from lidarspec.frames.codecs import codec
-from lidarspec.frames.schema import FieldInfo
 from lidarspec.spec import Sensor
 
 #: frames up to this length are cut at every byte, longer ones at so many places.
@@ -22,16 +20,21 @@ def incoming(sensor: Sensor) -> list[str]:
     return [name for name, frame in sensor.frames.items() if frame.direction == "in"]
 
 
-def conversation(sensor: Sensor, *, seed: int = 0, rounds: int = 3) -> list[tuple[str, bytes]]:
-    """Frames of all incoming types as the sensor could send them: (type, bytes), each where it is looked for and believed."""
+def conversation(sensor: Sensor, *, seed: int = 0, rounds: int = 3, example: Callable[..., bytes] | None = None) -> list[tuple[str, bytes]]:
+    """Frames of all incoming types as the sensor could send them: (type, bytes), each where it is looked for and believed.
+
+    Args:
+        example: what makes a valid frame of a type and a seed; by default the sensor's own.
+    """
+    example = example or sensor.example
     found: list[tuple[str, bytes]] = []
     for turn in range(rounds):
         for name in incoming(sensor):
             frame, first = sensor.frames[name], seed * 1000 + turn * 10
             if frame.after is not None:
-                found.append((frame.after, sensor.example(frame.after, seed=first)))
+                found.append((frame.after, example(frame.after, seed=first)))
             number = frame.confirm + 2 if frame.data or frame.confirm > 1 else 1
-            found += [(name, sensor.example(name, seed=first + index)) for index in range(number)]
+            found += [(name, example(name, seed=first + index)) for index in range(number)]
     return found
 
 
@@ -81,25 +84,6 @@ def mutated(data: bytes, source: random.Random) -> bytes:
     return bytes(found)
 
 
-def edited(sensor: Sensor, name: str, data: bytes, source: random.Random) -> tuple[bytes, str, int, int] | None:
-    """A frame with one integer set to a drawn value: (bytes, path, value, what is read back); None where no frame can carry it."""
-    engine = codec(sensor.frames[name])
-    parsed = sensor.parse(data, frame=name)
-    numbers = [spot for spot in integers(parsed) if _free(engine.schema.fields.get(spot[2]))]
-    if not numbers:
-        return None
-    holder, key, path = source.choice(numbers)
-    place = next(index for index, spot in enumerate(integers(parsed)) if spot[0] is holder and spot[1] == key)
-    holder[key] = drawn(engine.schema.fields[path], source)
-    try:
-        built = sensor.build(name, parsed)
-    except UsageError:
-        return None
-    after = list(integers(sensor.parse(built, frame=name)))
-    target, key, _ = after[place]
-    return built, path, holder[key], target[key]
-
-
 def integers(parsed: Any, path: str = "") -> Iterator[tuple[Any, Any, str]]:
     """The integers of a parsed frame: (container, key in it, field path)."""
     entries: Iterable[tuple[Any, Any]] = parsed.items() if isinstance(parsed, dict) else enumerate(parsed)
@@ -124,21 +108,11 @@ def physical(sensor: Sensor, name: str, data: bytes) -> Any:
     return parsed
 
 
-def drawn(info: FieldInfo, source: random.Random) -> int:
-    """A value of a field, often one at an edge of its range."""
-    low, high = limits(info)
-    return source.choice((low, low + 1, high, high - 1, source.randint(low, high), source.randint(low, high)))
-
-
 def seals(sensor: Sensor, name: str, data: bytes) -> set[str]:
     """The fields of a frame that hold a checksum, and so are not the caller's."""
     layout = getattr(codec(sensor.frames[name]), "tree", None)
     found = layout.layout(data) if layout is not None else None
     return {leaf.info.path for seal in getattr(found, "seals", ()) for leaf in seal.leaves}
-
-
-def _free(info: FieldInfo | None) -> bool:
-    return info is not None and info.kind == "int" and info.const is None
 
 
 def fitting(sensor: Sensor, data: bytes) -> list[str]:

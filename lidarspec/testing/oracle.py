@@ -16,6 +16,7 @@ from lidarspec import Frame, Sensor
 from lidarspec.frames.access import Fields
 from lidarspec.frames.codecs import InterpretedCodec
 from lidarspec.frames.columns import Batch
+from lidarspec.spec import Frame, Sensor
 
 #: (name, offset, bytes) of a frame.
 Cut = tuple[str, int, bytes]

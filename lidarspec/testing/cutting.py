@@ -1,0 +1,178 @@
+"""The framing rule, held against the brute-force oracle: damaged streams, any split of them, and what has broken other parsers."""
+
+from __future__ import annotations
+
+import random
+
+from lidarspec.found import Counters
+from lidarspec.spec import Sensor
+from lidarspec.testing import material
+from lidarspec.testing.comparisons import cuts
+from lidarspec.testing.damage import BURSTS, RATES, damaged
+from lidarspec.testing.findings import Violation, require
+from lidarspec.testing.oracle import Cut, Oracle
+from lidarspec.testing.subject import MANY, Subject
+
+#: about so many bytes to a stream: the oracle takes its time.
+LENGTH = 2500
+
+
+class Books:
+    """A decoder whose books are checked after every call: each byte is in a frame, skipped or pending."""
+
+    def __init__(self, sensor: Sensor, *, backend: str = "auto") -> None:
+        self.decoder = sensor.decoder(backend=backend)
+        self.found: list[Cut] = []
+
+    def feed(self, chunk: bytes) -> Books:
+        """Enter what a chunk brings."""
+        return self._entered(cuts(self.decoder.feed(chunk)))
+
+    def finish(self) -> list[Cut]:
+        """All frames, after the end of the input."""
+        return self._entered(cuts(self.decoder.finish())).found
+
+    def _entered(self, found: list[Cut]) -> Books:
+        self.found += found
+        stats: Counters = self.decoder.stats
+        known = sum(len(data) for _, _, data in self.found)
+        require(
+            stats.bytes_in == known + stats.bytes_skipped + stats.pending,
+            "LS412",
+            f"{stats.bytes_in} bytes came in; {known} are in frames, {stats.bytes_skipped} skipped, {stats.pending} pending",
+        )
+        require(
+            sum(stats.frames.values()) == len(self.found), "LS412", f"{len(self.found)} frames came out, and {stats.frames} are counted"
+        )
+        return self
+
+
+def decoded(sensor: Sensor, data: bytes) -> list[Cut]:
+    """The frames of a stream that comes in chunks of random sizes."""
+    books = Books(sensor)
+    for chunk in material.pieces(data, random.Random(len(data))):
+        books.feed(chunk)
+    return books.finish()
+
+
+def hold(subject: Subject, data: bytes, code: str, what: str) -> None:
+    """Raise the violation of a rule unless the decoder finds in a stream what the oracle finds.
+
+    Raises:
+        Violation: with the first frame that differs.
+    """
+    found, wanted = decoded(subject.sensor, data), Oracle(subject.sensor, data).frames()
+    if found == wanted:
+        return
+    missed, extra = [one for one in wanted if one not in found], [one for one in found if one not in wanted]
+    name, offset, frame = (missed or extra or wanted)[0]
+    kind = "is missed" if missed else "is not one"
+    raise Violation(code, f"{what}: the frame at byte {offset} ({len(frame)} bytes) {kind}", name)
+
+
+def long_stream(subject: Subject, *, seed: int = 0, length: int = LENGTH) -> bytes:
+    """A clean conversation of about this length."""
+    rounds = max(length // max(len(subject.stream(rounds=1)), 1), 1)
+    return subject.stream(seed=seed, rounds=rounds)
+
+
+def any_split_of_a_stream_gives_the_same(subject: Subject) -> None:
+    """Every 2-way split, byte by byte, and random splits give the same frames and counters."""
+    sensor, source = subject.sensor, subject.source("splits")
+    data = material.mutated(subject.stream(rounds=1), source) + subject.stream(seed=1, rounds=1)
+    whole = sensor.decoder()
+    expected = cuts(whole.feed(data) + whole.finish())
+    few = len(sensor.frames) > MANY
+    places = material.places(len(data), source)
+    splits = [[data[:spot], data[spot:]] for spot in (places[:: len(places) // 60 + 1] if few else places)]
+    splits += [list(material.pieces(data, source)) for _ in range(6 if few else 20)]
+    for split in [*splits, [data[spot : spot + 1] for spot in range(len(data))]]:
+        decoder = sensor.decoder()
+        found = cuts([item for chunk in split for item in decoder.feed(chunk)] + decoder.finish())
+        if found != expected:
+            lost = next((one for one in expected if one not in found), (found or expected)[0])
+            first = len(split[0]) if len(split) == 2 else 1
+            raise Violation("LS405", f"split at byte {first}, the frame at byte {lost[1]} is not found as in one piece", lost[0])
+        require(decoder.stats == whole.stats, "LS405", "the counters depend on the split")
+
+
+def every_recoverable_frame_is_recovered(subject: Subject) -> None:
+    """At every byte error rate, single and in bursts, the frames are those of the oracle."""
+    for rate in RATES:
+        hold(subject, damaged(long_stream(subject), rate, 1), "LS406", f"of the bytes {rate:g} damaged")
+    for burst in BURSTS:
+        hold(subject, damaged(long_stream(subject, seed=1), 0.05, 2, burst=burst), "LS406", f"bursts of {burst} damaged bytes")
+
+
+def a_claimed_length_is_not_believed(subject: Subject) -> None:
+    """The head of a frame in front of frames, and a frame with a bad end, cost none of those behind."""
+    whole = subject.stream(rounds=1)
+    for frame in dict((name, data) for name, data in subject.conversation(rounds=1)).values():
+        hold(subject, frame[:-1] + bytes([frame[-1] ^ 1]) + whole, "LS407", "behind a frame with a damaged end")
+        for end in range(1, min(len(frame), 50), 1 if len(subject.sensor.frames) <= MANY else 7):
+            hold(subject, frame[:end] + whole, "LS407", f"behind the first {end} bytes of a frame")
+
+
+def the_start_of_a_header_is_looked_for_at_every_byte(subject: Subject) -> None:
+    """Stray bytes and repeated first bytes between frames cost none of them."""
+    frames = subject.conversation()
+    first = frames[0][1][:1]
+    for stray in (b"\xfe", b"\xff", b"\x00", *(first * number for number in range(1, 5))):
+        hold(subject, b"".join(stray + frame for _, frame in frames), "LS408", f"with {stray.hex(' ')} before each frame")
+
+
+def noise_is_cut_as_the_rule_says(subject: Subject) -> None:
+    """Constant lines, and noise made of headers, give the frames of the oracle and no others."""
+    source = subject.source("noise")
+    one = subject.stream(rounds=1)
+    for byte in (b"\x00", b"\xff"):
+        hold(subject, byte * 300 + one + byte * 300, "LS406", f"between 300 bytes {byte.hex()}")
+    for _, frame in subject.conversation(rounds=1):
+        for size in (1, 2, 3, 4):
+            hold(subject, frame[:size] * (400 // size), "LS406", f"headers of {size} bytes alone")
+    heads = [data[: source.randint(1, 6)] for _, data in subject.conversation(rounds=2)] + [b"\x00", b"\xff", b"\xfe"]
+    data = b"".join(source.choices([*heads, one], [*[9] * len(heads), 2 * len(heads)], k=60))[:6000]
+    hold(subject, data, "LS406", "noise made of headers")
+
+
+def the_longest_frame_is_a_frame(subject: Subject) -> None:
+    """The longest of many examples is found in a stream."""
+    for name in material.incoming(subject.sensor):
+        frame = subject.sensor.frames[name]
+        if frame.after is None and frame.confirm == 1:
+            longest = max((subject.example(name, seed=seed) for seed in range(40)), key=len)
+            found = decoded(subject.sensor, longest * 2)
+            wanted = Oracle(subject.sensor, longest * 2).frames()
+            require(found == wanted, "LS409" if len(longest) == frame.max_length else "LS406", f"a frame of {len(longest)} bytes", name)
+
+
+def idle_gives_up_what_waits(subject: Subject) -> None:
+    """What waits when the line falls silent is given up, looked at again, and never joined to what comes later."""
+    frames = subject.conversation(rounds=2)
+    whole = b"".join(data for _, data in frames)
+    name, last = frames[-1]
+    for end in sorted({1, 2, 3, len(last) // 2, len(last) - 1} - {0, len(last)}):
+        books = Books(subject.sensor).feed(whole + last[:end])
+        books.finish()
+        require(books.decoder.stats.pending == 0, "LS411", f"{books.decoder.stats.pending} bytes are still held after idle", name)
+        known = len(books.found)
+        books.feed(last[end:])
+        joined = [one for one in books.finish()[known:] if one[2] == last]
+        require(not joined, "LS411", f"a frame is made of its first {end} bytes before idle and the rest after it", name)
+
+
+def decoders_do_not_know_of_each_other(subject: Subject) -> None:
+    """Two decoders fed in turn give what each gives alone."""
+    inputs = [damaged(long_stream(subject, seed=seed, length=1000), 1e-3, seed) for seed in (3, 4)]
+    alone = []
+    for data in inputs:
+        decoder = subject.sensor.decoder()
+        alone.append(cuts(decoder.feed(data) + decoder.finish()))
+    decoders = [subject.sensor.decoder() for _ in inputs]
+    together: list[list[Cut]] = [[], []]
+    for start in range(0, max(map(len, inputs)), 13):
+        for decoder, data, found in zip(decoders, inputs, together, strict=True):
+            found += cuts(decoder.feed(data[start : start + 13]))
+    for decoder, found in zip(decoders, together, strict=True):
+        found += cuts(decoder.finish())
+    require(together == alone, "LS410", "fed in turn, two decoders give other frames than each alone")

@@ -1,0 +1,231 @@
+"""What can be read off a declaration without any bytes of a sensor: units, sources, lengths, sync, coverage, tests of plausibility."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+from construct import Construct, Struct
+from construct.expr import ExprMixin
+
+from lidarspec.building import limits
+from lidarspec.construction import unwrap
+from lidarspec.errors import LidarSpecError
+from lidarspec.fields import Scaled
+from lidarspec.frames.access import Fields
+from lidarspec.frames.codecs import CompiledCodec, codec
+from lidarspec.frames.columns import Batch
+from lidarspec.frames.layout import Layout
+from lidarspec.frames.tracing import Traced, Untraceable
+from lidarspec.geometry import Polar
+from lidarspec.rules import children
+from lidarspec.spec import Frame, Sensor
+from lidarspec.splits import Clock
+from lidarspec.testing.findings import Finding
+from lidarspec.testing.subject import Subject
+from lidarspec.testing.tracks import data_frames, field_of, traced, used
+from lidarspec.units import factor
+
+#: field names that stand for a measure.
+MEASURES = frozenset(["distance", "range", "radius", "angle", "azimuth", "elevation", "temperature", "voltage", "timestamp"])
+#: share of the places in a payload at which a sync pattern may stand by chance.
+COMMON = 1 / 200
+#: bits of constants and checksums below which noise makes a frame every few megabytes, on a stream and in a datagram.
+WEAK, WEAK_DATAGRAM = 24, 8
+#: seconds after which nobody cares any more that a clock starts again.
+LONG = 7 * 86_400
+PLACEHOLDER = re.compile(r"\s*(\?*|-*|todo.*|tbd.*|n/?a|none|unknown)\s*", re.IGNORECASE)
+
+Findings = Iterator[tuple[str, str, str]]
+
+
+def declared(subject: Subject) -> list[Finding]:
+    """The findings in a declaration, as (code, what, path) made into findings of this sensor."""
+    sensor = subject.sensor
+    checks: list[Callable[[], Findings]] = [lambda: _sensor(sensor), lambda: _clock(sensor)]
+    for name, frame in sensor.frames.items():
+        checks += [lambda n=name, f=frame: _frame(subject, n, f)]  # type: ignore[misc]
+    checks += [lambda n=name: _points(subject, n) for name in data_frames(subject)]  # type: ignore[misc]
+    return [Finding(code, what, path, sensor.id) for check in checks for code, what, path in check()]
+
+
+def _sensor(sensor: Sensor) -> Findings:
+    if PLACEHOLDER.fullmatch(sensor.source):
+        yield "LS202", f"source is {sensor.source!r}", ""
+    for name in ("vendor", "model"):
+        if not getattr(sensor, name).strip():
+            yield "LS211", f"{name} is empty", ""
+    if "data" not in sensor.links:
+        yield "LS211", "there is no link 'data'", "links"
+    if sensor.frames and not any(frame.data for frame in sensor.frames.values()):
+        yield "LS211", "no frame is the data", "frames"
+    low, high = sensor.range_limits
+    if not 0 <= low < high:
+        yield "LS210", f"range_limits are {low:g} .. {high:g}", "range_limits"
+
+
+def _clock(sensor: Sensor) -> Findings:
+    """A clock that starts again within days has to say so."""
+    clock = sensor.clock
+    if not isinstance(clock, Clock) or callable(clock.source) or clock.wraps_at is not None or not sensor.frames:
+        return
+    fields = codec(sensor.frames[sensor.data_frame]).schema.fields
+    infos = [fields.get(path) for path in ((clock.source,) if isinstance(clock.source, str) else clock.source)]
+    spans = [limits(info)[1] * info.scale * float(factor(info.unit, "s") or 0) if info and info.kind == "int" else np.inf for info in infos]
+    if 0 < sum(spans) < LONG:
+        yield (
+            "LS509",
+            f"it can count {sum(spans):g} s, then it starts again, and wraps_at is not given",
+            f"{sensor.data_frame}.{infos[0].path}",
+        )  # type: ignore[union-attr]
+
+
+def _frame(subject: Subject, name: str, frame: Frame) -> Findings:
+    engine = codec(frame)
+    if not isinstance(unwrap(frame.struct, bits=False), Struct):
+        yield "LS114", f"it is a {type(unwrap(frame.struct, bits=False)).__name__}", name
+    if not isinstance(engine, CompiledCodec):
+        yield "LS116", getattr(engine, "reason", "its layout cannot be computed"), name
+    elif engine.size is not None and engine.size != frame.max_length:
+        yield "LS203", f"every frame has {engine.size} bytes, and max_length is {frame.max_length}", name
+    yield from _names(name, frame)
+    if frame.plausible is not None:
+        yield from _plausible(subject, name, frame)
+    if isinstance(engine, CompiledCodec):
+        try:
+            layouts = [(data, engine.tree.layout(data)) for data in (subject.example(name, seed=seed) for seed in range(3))]
+        except LidarSpecError:
+            return
+        yield from _covered(name, [layout for _, layout in layouts if isinstance(layout, Layout)])
+        if frame.direction == "in":
+            yield from _sync(subject, name, frame, engine)
+            yield from _strength(subject, name, frame, [layout for _, layout in layouts if isinstance(layout, Layout)])
+
+
+def _names(name: str, frame: Frame) -> Findings:
+    """Fields whose names stand for a measure, without a unit; `Scaled(..., "")` says that it is a pure number."""
+    pure = set(_explicit(frame.prepared))
+    for path, info in codec(frame).schema.fields.items():
+        if info.name in MEASURES and info.kind in ("int", "float") and not info.unit and not info.labels and path not in pure:
+            yield "LS201", f"{info.name!r} is a measure, and no Scaled says its unit", f"{name}.{path}"
+
+
+def _explicit(con: Construct, path: str = "") -> Iterator[str]:
+    """The paths of fields that are declared with Scaled."""
+    named = getattr(con, "name", None)
+    if named and type(con).__name__ == "Renamed":
+        path = f"{path}.{named}" if path else named
+    if isinstance(con, Scaled):
+        yield path
+    for child in children(con):
+        yield from _explicit(child, path)
+
+
+def _plausible(subject: Subject, name: str, frame: Frame) -> Findings:
+    table = codec(frame).table([subject.example(name)] if _has_example(subject, name) else [])
+    try:
+        with np.errstate(all="ignore"):
+            answer = frame.plausible(Fields(Batch(table, np.zeros(len(table), np.bool_))))  # type: ignore[misc]
+    except Exception as error:
+        yield "LS414", f"plausible: {type(error).__name__}: {error}", f"{name}.plausible"
+        return
+    if isinstance(answer, ExprMixin) or isinstance(answer, Construct):
+        yield "LS207", f"it returns {answer!r}, an expression of construct", f"{name}.plausible"
+    elif isinstance(answer, bool | np.bool_ | str | type(None)):
+        yield "LS207", f"it returns {answer!r} whatever the frame is", f"{name}.plausible"
+
+
+def _has_example(subject: Subject, name: str) -> bool:
+    try:
+        return bool(subject.example(name))
+    except LidarSpecError:
+        return False
+
+
+def _covered(name: str, layouts: list[Layout]) -> Findings:
+    """Fields of a sealed frame that no checksum of it covers."""
+    told: set[str] = set()
+    for layout in layouts:
+        if not layout.seals:
+            continue
+        under = {byte for seal in layout.seals for start, end in seal.spans for byte in range(start, end)}
+        sealing = {leaf.info.path for seal in layout.seals for leaf in seal.leaves}
+        for path, leaf in layout.leaves.items():
+            if path in sealing or leaf.info.const is not None or path in told or 0 in leaf.shape:
+                continue
+            spots = {leaf.offset} if leaf.wire is not None else {leaf.offset + part.byte for part in leaf.elements[0].segments}
+            if not spots <= under:
+                told.add(path)
+                yield "LS205", f"byte {min(spots - under)} is under no checksum of the frame", f"{name}.{path}"
+
+
+def _sync(subject: Subject, name: str, frame: Frame, engine: CompiledCodec) -> Findings:
+    """How often the constants at the start stand within payloads."""
+    if subject.sensor.datagrams or frame.confirm > 1:
+        return
+    if not engine.prefix:
+        yield "LS204", "it has no constant bytes, and every byte is a candidate", name
+        return
+    data = np.frombuffer(b"".join(subject.example(name, seed=seed)[max(engine.prefix) + 1 :] for seed in range(12)), np.uint8)
+    reach = max(engine.prefix) + 1
+    if len(data) < 4 * reach:
+        return
+    places = np.ones(len(data) - reach + 1, np.bool_)
+    for spot, (mask, value) in engine.prefix.items():
+        places &= (data[spot : spot + len(places)] & mask) == value
+    expected = 2.0 ** -sum(mask.bit_count() for mask, _ in engine.prefix.values())
+    share = max(float(places.mean()) if len(data) > 600 else 0.0, expected)
+    if share > COMMON:
+        yield "LS204", f"its constants stand at {share:.1%} of the places in payloads", name
+
+
+def _strength(subject: Subject, name: str, frame: Frame, layouts: list[Layout]) -> Findings:
+    """Whether constants and checksums alone keep noise out."""
+    if frame.plausible is not None or frame.confirm > 1 or not layouts:
+        return
+    weakest = min(sum(mask.bit_count() for mask, _ in layout.constants.values()) + _checked(layout) for layout in layouts)
+    if weakest <= (WEAK_DATAGRAM if subject.sensor.datagrams else WEAK):
+        yield "LS206", f"its constants and checksums have {weakest} bits, and it declares neither plausible nor confirm", name
+
+
+def _checked(layout: Layout) -> int:
+    return sum(sum(leaf.info.bits for leaf in seal.leaves) for seal in layout.seals)
+
+
+def _points(subject: Subject, name: str) -> Findings:
+    """Whether `points` can be traced, and where its columns come from."""
+    try:
+        result = traced(subject, name)
+    except Untraceable as reason:
+        yield "LS208", str(reason), f"{name}.points"
+        return
+    except Exception:  # a property of its own says what fails at work
+        return
+    if not isinstance(result, Polar):
+        return
+    for column, units in (("range", ("m",)), ("azimuth", ("deg", "rad"))):
+        yield from _measured(subject, name, getattr(result, column), column, units)
+    if isinstance(result.range, Traced) and result.range.node.kind == "field":
+        info = field_of(subject, name, result.range.node)
+        metres = factor(info.unit, "m") if info is not None and info.kind == "int" else None
+        if info is not None and metres is not None:
+            furthest = (limits(info)[1] * info.scale + info.offset) * float(metres)
+            if subject.sensor.range_limits[1] > furthest * 1.001:
+                yield "LS210", f"it ends at {furthest:g} m, and range_limits at {subject.sensor.range_limits[1]:g} m", f"{name}.{info.path}"
+
+
+def _measured(subject: Subject, name: str, value: Any, column: str, units: tuple[str, ...]) -> Findings:
+    """A column that no field in a unit of its kind goes into."""
+    infos = [field_of(subject, name, node) for node, looked_up in used(value) if not looked_up]
+    free = [info for info in infos if info is not None and info.const is None and not info.labels]
+    if free and not any(factor(info.unit, unit) is not None for info in infos if info is not None for unit in units):
+        pure = set(_explicit(subject.sensor.frames[name].prepared))
+        bare = [info for info in free if not info.unit and info.path not in pure]
+        if bare:
+            yield (
+                "LS201",
+                f"the {column} of points comes from it, and it has no unit",
+                f"{name}.{max(bare, key=lambda i: len(i.axes)).path}",
+            )

@@ -1,0 +1,104 @@
+"""What holds for single frames: examples repeat, bytes and values survive both ways, types are told apart."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+from lidarspec.errors import SpecError, UsageError
+from lidarspec.frames.codecs import codec
+from lidarspec.testing import material
+from lidarspec.testing.findings import Violation, require
+from lidarspec.testing.subject import Subject
+
+
+def examples_are_valid_and_repeat(subject: Subject, name: str) -> None:
+    """Examples of a frame type are made up, parse, repeat, differ, and are no longer than declared."""
+    frame = subject.sensor.frames[name]
+    try:
+        found = [subject.example(name, seed=seed) for seed in subject.seeds(frame)]
+    except SpecError as error:
+        raise Violation("LS301", error.reason, f"{name}.{error.path}" if error.path not in ("", name) else name) from error
+    again = [subject.sensor.example(name, seed=seed) for seed in range(3)] if not subject.drawers(name) else found[:3]
+    require(found[:3] == again, "LS311", "two examples of one seed differ", name)
+    longest = max(map(len, found))
+    require(longest <= frame.max_length, "LS203", f"an example has {longest} bytes, and max_length is {frame.max_length}", name)
+    fixed = material.seals(subject.sensor, name, found[0])
+    free = [info for info in codec(frame).schema.fields.values() if info.const is None and info.path not in fixed]
+    require(len(set(found)) > 1 or not free or len(found) < 2, "LS301", "all examples are the same", name)
+
+
+def bytes_survive_parsing_and_building(subject: Subject, name: str) -> None:
+    """build(parse(bytes)) == bytes for every example, reserved bits included."""
+    sensor = subject.sensor
+    for seed in subject.seeds(sensor.frames[name]):
+        data = subject.example(name, seed=seed)
+        parsed = sensor.parse(data, frame=name)
+        for built in (sensor.build(name, parsed), sensor.build(name, **parsed)):
+            if built != data:
+                _lost(subject, name, data, built, "LS302")
+            again = sensor.parse(built, frame=name)
+            require(same(parsed, again), "LS302", "what is parsed a second time is something else", name)
+
+
+def values_in_units_build_the_same_bytes(subject: Subject, name: str) -> None:
+    """A frame built from its physical values is the frame that they were read from."""
+    for seed in subject.seeds(subject.sensor.frames[name]):
+        data = subject.example(name, seed=seed)
+        values = material.physical(subject.sensor, name, data)
+        built = data if values is None else subject.sensor.build(name, values, units=True)
+        if built != data:
+            _lost(subject, name, data, built, "LS304")
+
+
+def parse_finds_out_the_type(subject: Subject, name: str) -> None:
+    """Parsing without a type gives what parsing as one of the fitting types gives."""
+    data = subject.example(name, seed=1)
+    fitting = material.fitting(subject.sensor, data)
+    require(name in fitting, "LS306", "its own example is not parsed as such a frame", name)
+    read = [subject.sensor.parse(data, frame=other) for other in fitting]
+    require(any(same(subject.sensor.parse(data), one) for one in read), "LS306", "the type is found out wrongly", name)
+
+
+def same(one: Any, other: Any) -> bool:
+    """Whether two parsed frames are equal; a NaN equals itself bit by bit."""
+    if isinstance(one, dict) and isinstance(other, dict):
+        return one.keys() == other.keys() and all(same(one[key], other[key]) for key in one)
+    if isinstance(one, list) and isinstance(other, list):
+        return len(one) == len(other) and all(map(same, one, other))
+    return bool(one == other) or (one != one and other != other and getattr(one, "raw", 0) == getattr(other, "raw", 0))
+
+
+def _lost(subject: Subject, name: str, data: bytes, built: bytes, code: str) -> None:
+    """Raise the violation for bytes that became others, with the field in which they differ."""
+    spot = next((index for index, pair in enumerate(zip(data, built, strict=False)) if pair[0] != pair[1]), min(len(data), len(built)))
+    one, other = (subject.sensor.parse(part, frame=name, verify=False) for part in (data, built))
+    found = next(((path, a, b) for (path, a), (_, b) in zip(leaves(one), leaves(other), strict=False) if a != b), None)
+    if found is None:
+        raise Violation(
+            code, f"byte {spot} of {len(data)} is {data[spot : spot + 1].hex()} and comes back as {built[spot : spot + 1].hex()}", name
+        )
+    path, before, after = found
+    cut = isinstance(before, int | float) and isinstance(after, int | float) and before - after > 0
+    cut = cut and (after == before - 1 if isinstance(before, int) else before - after < 0.1 * abs(before) + 1)
+    raise Violation("LS303" if cut else code, f"{before!r} comes back as {after!r}", f"{name}.{path}")
+
+
+def leaves(parsed: Any, path: str = "") -> Iterator[tuple[str, Any]]:
+    """The values of a parsed frame: (path with indices, value)."""
+    if isinstance(parsed, dict):
+        for key, value in parsed.items():
+            yield from leaves(value, f"{path}.{key}" if path else key)
+    elif isinstance(parsed, list):
+        for index, value in enumerate(parsed):
+            yield from leaves(value, f"{path}[{index}]")
+    else:
+        yield path, parsed
+
+
+def acceptable(subject: Subject, name: str, values: Any) -> bytes | None:
+    """The frame of these values; None where they cannot go together."""
+    try:
+        return subject.sensor.build(name, values)
+    except UsageError:
+        return None

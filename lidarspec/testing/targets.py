@@ -1,0 +1,182 @@
+"""What can be checked: an installed sensor, a file that describes sensors, a distribution with all of its plugins."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import re
+import traceback
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pluggy
+
+from lidarspec.errors import SourceError, SpecError
+from lidarspec.installed import EntryPoint, entry_points
+from lidarspec.plugins import GROUP, Registry, file_module, registry
+from lidarspec.spec import Sensor
+from lidarspec.testing.findings import Finding
+
+#: what the registry says -> the rule.
+SAID = (
+    ("there is no hook", "LS002"),
+    ("lacks @hookimpl", "LS003"),
+    ("another sensor has this id", "LS005"),
+    ("returns sensors, not", "LS006"),
+    ("returns no sensor", "LS006"),
+    ("definition", "LS004"),
+    ("lidarspec_checksum for", "LS010"),
+)
+
+
+@dataclass(eq=False)
+class Target:
+    """Something to check.
+
+    Attributes:
+        sensors: that were found in it.
+        findings: what kept others from being found.
+        files: the modules that it is written in.
+    """
+
+    sensors: list[Sensor] = field(default_factory=list)
+    findings: list[Finding] = field(default_factory=list)
+    files: list[Path] = field(default_factory=list)
+
+
+def target(text: str | Path) -> Target:
+    """What a name stands for: a file, the id or alias of an installed sensor, or a distribution.
+
+    Raises:
+        SourceError: for a file that is not there.
+        UnknownSensor: for a name that is nothing of all this.
+    """
+    name = str(text)
+    if "/" in name or "\\" in name or name.endswith(".py"):
+        return _file(Path(name))
+    entries = [entry for entry in entry_points(GROUP) if _normal(entry.distribution) == _normal(name)]
+    if entries:
+        return _distribution(entries)
+    sensor = registry().sensor(name)
+    homes = [plugin for plugin in registry().plugins if sensor.id in plugin.sensors]
+    files = [file for plugin in homes for file in module_files(plugin.entry_point.partition(" = ")[2])]
+    return Target([sensor], [], files)
+
+
+def _file(file: Path) -> Target:
+    found = Target(files=[file])
+    try:
+        found.sensors = _added(file_module(file), str(file))
+        if not found.sensors:
+            raise SpecError("lidarspec_sensors returns no sensor")
+    except SourceError:
+        raise
+    except (Exception, SystemExit) as error:
+        found.findings.append(loading(error, [file]))
+        found.files = found.files if _readable(file) else []
+    return found
+
+
+def _distribution(entries: list[EntryPoint]) -> Target:
+    found = Target()
+    known = registry().sensors()
+    for entry in entries:
+        value = entry.value
+        try:
+            sensors = _added(entry.load(), value)
+        except (Exception, SystemExit) as error:
+            found.findings.append(loading(error, module_files(value)))
+            continue
+        found.files += [file for file in module_files(value) if file not in found.files]
+        found.sensors += [known.get(sensor.id, sensor) for sensor in sensors if sensor.id not in {one.id for one in found.sensors}]
+    names = {_normal(entry.distribution) for entry in entries}
+    told = [(plugin, _said(plugin.error)) for plugin in registry().plugins if _normal(plugin.distribution) in names and plugin.error]
+    found.findings += [Finding(code, plugin.error, plugin.entry_point) for plugin, code in told if code in ("LS005", "LS010")]
+    return found
+
+
+def _added(plugin: Any, name: str) -> list[Sensor]:
+    """The sensors of a plugin, loaded on its own, with its own hooks applied.
+
+    Raises:
+        Exception: whatever it fails with.
+    """
+    local = Registry()
+    ids = local.add(plugin, name=name)
+    sensors = [local.sensor(one) for one in ids]
+    hook = getattr(plugin, "lidarspec_checksum", None)
+    for sensor in sensors if callable(hook) else []:
+        for frame in sensor.frames.values():
+            given = {"sensor": sensor, "frame": frame}
+            try:
+                _asked(hook, given)
+            except Exception as error:
+                raise SpecError(f"lidarspec_checksum for {sensor.id}: {type(error).__name__}: {error}", rule="LS010") from error
+    return [registry().hooked(sensor) for sensor in sensors]
+
+
+def _asked(hook: Callable[..., Any], given: dict[str, Any]) -> None:
+    """Call a hook with those of the arguments that it wants."""
+    hook(**{key: given[key] for key in inspect.signature(hook).parameters})
+
+
+def loading(error: BaseException, files: list[Path]) -> Finding:
+    """The finding for what a plugin failed with when it was loaded."""
+    cause = error.__cause__ if isinstance(error, SpecError) and error.__cause__ is not None else error
+    spots = [(spot.filename, spot.lineno or 0) for each in (error, cause) for spot in traceback.extract_tb(each.__traceback__)]
+    own = [spot for spot in spots if any(Path(spot[0]) == file.resolve() or Path(spot[0]) == file for file in files)]
+    if isinstance(cause, SyntaxError) and cause.filename:
+        own = [(cause.filename, cause.lineno or 0)]
+    file, line = own[-1] if own else ("", 0)
+    path = error.path if isinstance(error, SpecError) and error.rule else ""
+    sensor = getattr(error, "sensor", "")
+    text = error.reason if isinstance(error, SpecError) and cause is error else f"{type(cause).__name__}: {cause}"
+    return Finding(_loading_rule(error, cause), " ".join(text.split()), path, sensor, file, line)
+
+
+def _loading_rule(error: BaseException, cause: BaseException) -> str:
+    """The rule of a failure, by its kind and by what was going on."""
+    functions = [spot.name for spot in traceback.extract_tb(cause.__traceback__)]
+    if isinstance(error, SpecError) and error.rule:
+        return error.rule
+    if isinstance(cause, TypeError) and "max_length" in str(cause):
+        return "LS009"
+    if "sizeof" in functions or "_sizeof" in functions:
+        return "LS008"
+    if isinstance(cause, pluggy.PluginValidationError):
+        return "LS004"
+    if isinstance(cause, SpecError):
+        return _said(str(cause)) or "LS007"
+    return "LS006" if "lidarspec_sensors" in functions else "LS001"
+
+
+def _said(text: str) -> str:
+    return next((code for words, code in SAID if words in text), "")
+
+
+def module_files(value: str) -> list[Path]:
+    """The files of the module, or of the package, that an entry point names; none where it cannot be imported."""
+    try:
+        module: ModuleType = importlib.import_module(value.partition("[")[0].partition(":")[0].strip())
+    except (Exception, SystemExit):
+        return []
+    file = Path(str(module.__file__)) if module.__file__ else None
+    if file is None:
+        return []
+    return sorted(file.parent.rglob("*.py")) if file.name == "__init__.py" else [file]
+
+
+def _readable(file: Path) -> bool:
+    """Whether its text is Python."""
+    try:
+        compile(file.read_text(encoding="utf-8"), str(file), "exec")
+    except (SyntaxError, ValueError):
+        return False
+    return True
+
+
+def _normal(name: str) -> str:
+    return re.sub(r"[-_.]+", "-", name).lower()
