@@ -48,6 +48,7 @@ def declared(subject: Subject) -> list[Finding]:
     for name, frame in sensor.frames.items():
         checks += [lambda n=name, f=frame: _frame(subject, n, f)]  # type: ignore[misc]
     checks += [lambda n=name: _points(subject, n) for name in data_frames(subject)]  # type: ignore[misc]
+    checks += [lambda: _reach(subject)]
     return [Finding(code, what, path, sensor.id) for check in checks for code, what, path in check()]
 
 
@@ -75,11 +76,9 @@ def _clock(sensor: Sensor) -> Findings:
     infos = [fields.get(path) for path in ((clock.source,) if isinstance(clock.source, str) else clock.source)]
     spans = [limits(info)[1] * info.scale * float(factor(info.unit, "s") or 0) if info and info.kind == "int" else np.inf for info in infos]
     if 0 < sum(spans) < LONG:
-        yield (
-            "LS509",
-            f"it can count {sum(spans):g} s, then it starts again, and wraps_at is not given",
-            f"{sensor.data_frame}.{infos[0].path}",
-        )  # type: ignore[union-attr]
+        path = clock.source if isinstance(clock.source, str) else clock.source[0]
+        what = f"it can count {sum(spans):g} s, then it starts again, and wraps_at is not given"
+        yield "LS509", what, f"{sensor.data_frame}.{path}"
 
 
 def _frame(subject: Subject, name: str, frame: Frame) -> Findings:
@@ -90,7 +89,7 @@ def _frame(subject: Subject, name: str, frame: Frame) -> Findings:
         yield "LS116", getattr(engine, "reason", "its layout cannot be computed"), name
     elif engine.size is not None and engine.size != frame.max_length:
         yield "LS203", f"every frame has {engine.size} bytes, and max_length is {frame.max_length}", name
-    yield from _names(name, frame)
+    yield from _names(subject, name, frame)
     if frame.plausible is not None:
         yield from _plausible(subject, name, frame)
     if isinstance(engine, CompiledCodec):
@@ -104,12 +103,22 @@ def _frame(subject: Subject, name: str, frame: Frame) -> Findings:
             yield from _strength(subject, name, frame, [layout for _, layout in layouts if isinstance(layout, Layout)])
 
 
-def _names(name: str, frame: Frame) -> Findings:
+def _names(subject: Subject, name: str, frame: Frame) -> Findings:
     """Fields whose names stand for a measure, without a unit; `Scaled(..., "")` says that it is a pure number."""
-    pure = set(_explicit(frame.prepared))
+    pure = set(_explicit(frame.prepared)) | (_multiplied(subject, name) if frame.data else set())
     for path, info in codec(frame).schema.fields.items():
         if info.name in MEASURES and info.kind in ("int", "float") and not info.unit and not info.labels and path not in pure:
             yield "LS201", f"{info.name!r} is a measure, and no Scaled says its unit", f"{name}.{path}"
+
+
+def _multiplied(subject: Subject, name: str) -> set[str]:
+    """The fields that make ranges together with another one, which has the unit."""
+    try:
+        infos = [field_of(subject, name, node) for node, _ in used(getattr(traced(subject, name), "range", None))]
+    except Exception:  # said elsewhere
+        return set()
+    known = any(info is not None and factor(info.unit, "m") is not None for info in infos)
+    return {info.path for info in infos if info is not None} if known else set()
 
 
 def _explicit(con: Construct, path: str = "") -> Iterator[str]:
@@ -131,7 +140,7 @@ def _plausible(subject: Subject, name: str, frame: Frame) -> Findings:
     except Exception as error:
         yield "LS414", f"plausible: {type(error).__name__}: {error}", f"{name}.plausible"
         return
-    if isinstance(answer, ExprMixin) or isinstance(answer, Construct):
+    if isinstance(answer, ExprMixin | Construct):
         yield "LS207", f"it returns {answer!r}, an expression of construct", f"{name}.plausible"
     elif isinstance(answer, bool | np.bool_ | str | type(None)):
         yield "LS207", f"it returns {answer!r} whatever the frame is", f"{name}.plausible"
@@ -176,8 +185,9 @@ def _sync(subject: Subject, name: str, frame: Frame, engine: CompiledCodec) -> F
     for spot, (mask, value) in engine.prefix.items():
         places &= (data[spot : spot + len(places)] & mask) == value
     expected = 2.0 ** -sum(mask.bit_count() for mask, _ in engine.prefix.values())
-    share = max(float(places.mean()) if len(data) > 600 else 0.0, expected)
-    if share > COMMON:
+    share, chance = float(places.mean()), COMMON + 4 * (COMMON / len(places)) ** 0.5  # beyond what chance makes of so few bytes
+    share = expected if expected > COMMON else share
+    if expected > COMMON or share > chance:
         yield "LS204", f"its constants stand at {share:.1%} of the places in payloads", name
 
 
@@ -207,13 +217,25 @@ def _points(subject: Subject, name: str) -> Findings:
         return
     for column, units in (("range", ("m",)), ("azimuth", ("deg", "rad"))):
         yield from _measured(subject, name, getattr(result, column), column, units)
-    if isinstance(result.range, Traced) and result.range.node.kind == "field":
-        info = field_of(subject, name, result.range.node)
+
+
+def _reach(subject: Subject) -> Findings:
+    """A range limit that no data frame can hold in the field that its ranges are."""
+    reach: list[tuple[float, str]] = []
+    for name in data_frames(subject):
+        try:
+            result = traced(subject, name)
+        except Exception:  # said elsewhere
+            return
+        value = getattr(result, "range", None)
+        info = field_of(subject, name, value.node) if isinstance(value, Traced) and value.node.kind == "field" else None
         metres = factor(info.unit, "m") if info is not None and info.kind == "int" else None
-        if info is not None and metres is not None:
-            furthest = (limits(info)[1] * info.scale + info.offset) * float(metres)
-            if subject.sensor.range_limits[1] > furthest * 1.001:
-                yield "LS210", f"it ends at {furthest:g} m, and range_limits at {subject.sensor.range_limits[1]:g} m", f"{name}.{info.path}"
+        if info is None or metres is None:
+            return
+        reach.append(((limits(info)[1] * info.scale + info.offset) * float(metres), f"{name}.{info.path}"))
+    furthest, path = max(reach, default=(np.inf, ""))
+    if subject.sensor.range_limits[1] > furthest * 1.001:
+        yield "LS210", f"it ends at {furthest:g} m, and range_limits at {subject.sensor.range_limits[1]:g} m", path
 
 
 def _measured(subject: Subject, name: str, value: Any, column: str, units: tuple[str, ...]) -> Findings:

@@ -101,8 +101,9 @@ def _indexed(subject: Subject, name: str, error: WireError) -> None:
     frame = error.frame or name
     if frame not in subject.sensor.frames or not error.path:
         return
-    info = codec(subject.sensor.frames[frame]).schema.fields.get(re.sub(r"\[\d+\]", "", error.path))
-    arrays = len(info.axes) - (info.kind == "bytes") if info is not None else 0
+    schema, path = codec(subject.sensor.frames[frame]).schema, re.sub(r"\[\d+\]", "", error.path)
+    info = schema.fields.get(path)
+    arrays = len(info.axes) - (info.kind == "bytes") if info is not None and path not in schema.arrays else 0
     require(
         not arrays or "[" in error.path, "LS309", f"the fault is told at {error.path!r}, an element of an array", f"{frame}.{error.path}"
     )

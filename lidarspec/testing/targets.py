@@ -107,7 +107,7 @@ def _added(plugin: Any, name: str) -> list[Sensor]:
     local = Registry()
     ids = local.add(plugin, name=name)
     sensors = [local.sensor(one) for one in ids]
-    hook = getattr(plugin, "lidarspec_checksum", None)
+    hook: Any = getattr(plugin, "lidarspec_checksum", None)
     for sensor in sensors if callable(hook) else []:
         for frame in sensor.frames.values():
             given = {"sensor": sensor, "frame": frame}

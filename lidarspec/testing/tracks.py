@@ -87,11 +87,10 @@ def field_of(subject: Subject, name: str, node: Node) -> FieldInfo | None:
 
 @dataclass(frozen=True, eq=False)
 class Beams:
-    """Directions of points as `points` gives them, before they are folded; (n, ...) each, nan where they are padding."""
+    """Directions of points as `points` gives them, before they are folded; (n, ...) each, padding included."""
 
     azimuth: Floats
     elevation: Floats
-    ring: Floats
 
 
 def beams(subject: Subject, name: str, packets: Packets) -> Beams | None:
@@ -101,10 +100,5 @@ def beams(subject: Subject, name: str, packets: Packets) -> Beams | None:
         polar = points_function(subject.sensor, name)(Fields(batch))
         if not isinstance(polar, Polar):
             return None
-        ring = 0 if polar.ring is None else polar.ring
-        azimuth, elevation, number, shape = (
-            np.asarray(array, np.float64) for array in aligned((polar.azimuth, polar.elevation, ring, polar.range), batch)[0]
-        )
-    full = np.broadcast_shapes(azimuth.shape, elevation.shape, number.shape, shape.shape)
-    azimuth, elevation, number = (np.broadcast_to(array, full) for array in (azimuth, elevation, number))
-    return Beams(azimuth, elevation, number)
+        azimuth, elevation, _ = (np.asarray(part, np.float64) for part in aligned((polar.azimuth, polar.elevation, polar.range), batch)[0])
+    return Beams(azimuth, elevation)

@@ -124,7 +124,7 @@ def _points(subject: Subject, name: str, data: bytes, wanted: Mapping[str, Mappi
         spot = int(index)
         require(-len(cloud) <= spot < len(cloud), "LS708", f"there is no point {spot} among {len(cloud)}", f"{place} {name}")
         got = {}
-        for column, value in columns.items():
+        for column in columns:
             require(column in COLUMNS and getattr(cloud, column) is not None, "LS702", f"points have no {column!r}", f"{place} {name}")
             got[column] = float(getattr(cloud, column)[spot])
         wrong = [column for column, value in columns.items() if not np.isclose(got[column], value, rtol=NEAR, atol=NEAR)]

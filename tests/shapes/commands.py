@@ -44,7 +44,7 @@ SENSOR = Sensor(
     model="Commands",
     frames={
         "data": Frame(DATA, data=True, max_length=11, plausible=lambda f: f.angle < 360),
-        "ack": Frame(ACK, max_length=5),
+        "ack": Frame(ACK, max_length=5, acknowledged={"LS206": "no line is noisy enough for a shape"}),
         "order": Frame(ORDER, direction="out", max_length=6),
     },
     points=points,

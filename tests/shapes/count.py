@@ -35,8 +35,8 @@ def points(f: Fields) -> Polar:
 
 
 def sweep(i: int) -> dict[str, float]:
-    """Nine packets a turn; the count stays the caller's."""
-    return dict(first=i * 40.0 % 360, last=(i * 40 + 39.0) % 360)
+    """Nine packets a turn."""
+    return dict(count=LONGEST, first=i * 40.0 % 360, last=(i * 40 + 39.0) % 360)
 
 
 SENSOR = Sensor(

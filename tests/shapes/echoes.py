@@ -39,7 +39,7 @@ SENSOR = Sensor(
     "shape-echoes",
     vendor="Shapes",
     model="Echoes",
-    frames={"data": Frame(DATA, data=True, max_length=36)},
+    frames={"data": Frame(DATA, data=True, max_length=36, acknowledged={"LS206": "no line is noisy enough for a shape"})},
     points=points,
     scan=OnChange("turn"),
     links={"data": Serial(115_200)},

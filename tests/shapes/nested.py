@@ -36,7 +36,7 @@ SENSOR = Sensor(
     "shape-nested",
     vendor="Shapes",
     model="Nested",
-    frames={"data": Frame(DATA, data=True, max_length=20)},
+    frames={"data": Frame(DATA, data=True, max_length=20, acknowledged={"LS205 serial": "`over` is what the shape is about"})},
     points=points,
     scan=OnWrap("header.angle"),
     links={"data": Serial(230_400)},

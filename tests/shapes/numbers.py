@@ -16,7 +16,7 @@ DATA = Checksummed(
         "stamp" / Scaled(Int64ul, 1e-9, "s"),
         "serial" / Int64sb,
         "offset" / Int32sb,
-        "azimuth" / Float64l,
+        "azimuth" / Scaled(Float64l, 1, "rad"),
         "samples"
         / Array(SAMPLES, Struct("range" / Scaled(Float32b, 1, "m"), "elevation" / Scaled(Int16sl, 0.01, "deg"), "spare" / Int8ul)),
         "crc" / Int16ul,

@@ -18,7 +18,7 @@ DATA = Checksummed(
         "extension" / If(this.options.extended == 1, Struct("serial" / Int32ub, "trim" / Scaled(Int8ub, 0.1, "deg"))),
         "extra" / Switch(this.options.kind, {1: Struct("rpm" / Int16ub), 2: Struct("rpm" / Int16ub, "volts" / Int8ub)}),
         "angle" / Scaled(Int16ub, 0.01, "deg"),
-        "distances" / Array(this.rows * this.columns, Int16ul),
+        "distances" / Array(this.rows * this.columns, Scaled(Int16ul, 1, "") * "in steps that the options say"),
         "crc" / Int16ub,
     ),
     field="crc",

@@ -33,7 +33,15 @@ SENSOR = Sensor(
     "shape-outer",
     vendor="Shapes",
     model="Outer",
-    frames={"data": Frame(DATA, data=True, max_length=5 + 2 * MOST, plausible=lambda f: f.header.size > 0)},
+    frames={
+        "data": Frame(
+            DATA,
+            data=True,
+            max_length=5 + 2 * MOST,
+            plausible=lambda f: f.header.size > 0,
+            acknowledged={"LS208 points": "the number of points is asked of a column"},
+        )
+    },
     points=points,
     scan=OnWrap("azimuth"),
     links={"data": Serial(115_200)},

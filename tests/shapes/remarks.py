@@ -42,7 +42,7 @@ SENSOR = Sensor(
     vendor="Shapes",
     model="Remarks",
     frames={
-        "data": Frame(DATA, data=True, max_length=13),
+        "data": Frame(DATA, data=True, max_length=13, acknowledged={"LS206": "no line is noisy enough for a shape"}),
         "remark": Frame(REMARK, max_length=27, plausible=plausible_remark, sweep=sweep_remark),
     },
     points=points,

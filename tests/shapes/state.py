@@ -53,7 +53,10 @@ SENSOR = Sensor(
     "shape-state",
     vendor="Shapes",
     model="State",
-    frames={"data": Frame(DATA, data=True, max_length=40), "info": Frame(INFO, max_length=13, plausible=lambda f: f.zero < 360)},
+    frames={
+        "data": Frame(DATA, data=True, max_length=40, acknowledged={"LS206": "no line is noisy enough for a shape"}),
+        "info": Frame(INFO, max_length=13, plausible=lambda f: f.zero < 360),
+    },
     points=points,
     scan=OnWrap("blocks.azimuth"),
     links={"data": Serial(921_600)},

@@ -43,7 +43,15 @@ SENSOR = Sensor(
     "shape-text",
     vendor="Shapes",
     model="Text",
-    frames={"data": Frame(DATA, data=True, max_length=24, plausible=lambda f: f.angle < 360)},
+    frames={
+        "data": Frame(
+            DATA,
+            data=True,
+            max_length=24,
+            plausible=lambda f: f.angle < 360,
+            acknowledged={"LS116": "numbers in text have no place that a header tells"},
+        )
+    },
     points=points,
     scan=OnWrap("azimuth"),
     links={"data": Serial(9_600)},

@@ -21,7 +21,9 @@ DATA = Checksummed(
     algorithm=Crc(16, 0x8005, refin=True, refout=True),
 )
 INFO = Checksummed(
-    Struct("magic" / Const(MAGIC), "temperature" / Scaled(Int8ul, 1, "degC", offset=-40), "voltage" / Int8ul, "check" / Int8ul),
+    Struct(
+        "magic" / Const(MAGIC), "temperature" / Scaled(Int8ul, 1, "degC", offset=-40), "voltage" / Scaled(Int8ul, 1, "V"), "check" / Int8ul
+    ),
     field="check",
     algorithm=Xor(),
 )

@@ -18,7 +18,7 @@ DATA = Struct(
     "distance" / Scaled(Int16ul, 0.00025, "m"),
 )
 INFO = Checksummed(
-    Struct("header" / Const(b"\x3e\x01"), "revision" / Int8ul, "temperature" / Int8ul, "sum" / Int8ul),
+    Struct("header" / Const(b"\x3e\x01"), "revision" / Int8ul, "temperature" / Scaled(Int8ul, 1, "degC"), "sum" / Int8ul),
     field="sum",
     algorithm=Sum(8),
 )
@@ -37,7 +37,7 @@ SENSOR = Sensor(
     vendor="Shapes",
     model="Weak",
     frames={
-        "info": Frame(INFO, max_length=5),
+        "info": Frame(INFO, max_length=5, acknowledged={"LS206": "no line is noisy enough for a shape"}),
         "data": Frame(DATA, data=True, max_length=5, plausible=plausible, confirm=3),
     },
     points=points,

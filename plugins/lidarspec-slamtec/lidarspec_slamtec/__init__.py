@@ -30,6 +30,8 @@ from lidarspec_slamtec.answers import ANSWERS, DESCRIPTORS
 from lidarspec_slamtec.commands import BY_DTR, BY_PWM, BY_SPEED, COMMANDS, express
 from lidarspec_slamtec.requests import REQUESTS
 
+#: why no field of a capsule is in metres.
+CODED = "a code word says itself how many millimetres one of its steps is (SDK, sl_lidar_driver.cpp)"
 DTHETA = ("unsigned", "signed")
 
 EXPRESS = Frame(
@@ -52,6 +54,7 @@ ULTRA = Frame(
     max_length=132,
     plausible=capsules.plausible,
     after="ultra_descriptor",
+    acknowledged={"LS201 cabins.predict2": CODED},
 )
 DENSE = Frame(
     capsules.DENSE,
@@ -73,6 +76,7 @@ ULTRA_DENSE = Frame(
     max_length=170,
     plausible=capsules.plausible,
     after="ultra_dense_descriptor",
+    acknowledged={"LS201 cabins.second_scale": CODED},
 )
 HQ = Frame(
     nodes.HQ,

@@ -88,5 +88,12 @@ def sweep_position(i: int) -> dict[str, Any]:
 
 FRAMES = {
     "data": Frame(DATA, data=True, max_length=1206, plausible=plausible),
-    "position": Frame(POSITION, max_length=512, plausible=plausible_position, sweep=sweep_position, rate=POSITIONS),
+    "position": Frame(
+        POSITION,
+        max_length=512,
+        plausible=plausible_position,
+        sweep=sweep_position,
+        rate=POSITIONS,
+        acknowledged={"LS201 inertial.temperature": "signed in the low 12 bits from an HDL-32E, and no number at all from a VLP-16"},
+    ),
 }
