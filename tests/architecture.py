@@ -47,6 +47,8 @@ CONSTRUCT = {
     "frames.dispatch",
     "wiretable",
     "explain",
+    "export.messages",
+    "export.formulas",
 }
 CONFINED = {"construct": CONSTRUCT, "pluggy": {"hookspecs", "plugins"}, "serial": {"transports.serial", "transports.ports"}}
 
