@@ -28,7 +28,15 @@ if TYPE_CHECKING:
         wrap as wrap,
     )
     from lidarspec.async_device import AsyncDevice as AsyncDevice, open_async as open_async
-    from lidarspec.checksums import Checksum as Checksum, Crc as Crc, Fold15 as Fold15, Sum as Sum, WordXor as WordXor, Xor as Xor
+    from lidarspec.checksums import (
+        Checksum as Checksum,
+        Crc as Crc,
+        Fold15 as Fold15,
+        Sum as Sum,
+        WordXor as WordXor,
+        Xor as Xor,
+        ZeroPadded as ZeroPadded,
+    )
     from lidarspec.clouds import PointCloud as PointCloud
     from lidarspec.decoder import Counters as Counters, Decoder as Decoder, Found as Found
     from lidarspec.device import Device as Device, open as open
@@ -79,7 +87,7 @@ _HOMES = {
     "links": ("Serial", "Udp", "Tcp"),
     "splits": ("Clock", "Sequence", "OnWrap", "OnFlag", "OnChange", "OnRewind", "Every"),
     "fields": ("Scaled", "Checksummed"),
-    "checksums": ("Checksum", "Crc", "Xor", "Sum", "WordXor", "Fold15"),
+    "checksums": ("Checksum", "Crc", "Xor", "Sum", "WordXor", "Fold15", "ZeroPadded"),
     "geometry": ("Points", "Polar", "Cartesian"),
     "frames.access": ("Fields",),
     "frames.columns": ("Column",),

@@ -226,6 +226,36 @@ class Fold15(Checksum):
         return (total & np.uint64(0x7FFF)) + (total >> np.uint64(15)) & np.uint64(0x7FFF)
 
 
+@dataclass(frozen=True)
+class ZeroPadded(Checksum):
+    """Another algorithm over the data and as many zero bytes as make its length a multiple of `to`, as hardware that takes words has it."""
+
+    algorithm: Checksum
+    to: int
+
+    def __post_init__(self) -> None:
+        _require(self, to=range(1, 1 << 31))
+
+    @property
+    def width(self) -> int:  # type: ignore[override]
+        """That of the other algorithm, in bits."""
+        return self.algorithm.width
+
+    @property
+    def order(self) -> ByteOrder:  # type: ignore[override]
+        """That of the other algorithm."""
+        return self.algorithm.order
+
+    def __call__(self, data: Bytes) -> int:
+        return self.algorithm(bytes(data) + bytes(-len(data) % self.to))
+
+    def describe(self) -> str:
+        return f"{self.algorithm.describe()} of the bytes padded with zeros to a multiple of {self.to}"
+
+    def batch(self, rows: NDArray[np.uint8]) -> Values:
+        return self.algorithm.batch(np.pad(rows, ((0, 0), (0, -rows.shape[1] % self.to))))
+
+
 @lru_cache(maxsize=512)
 def _word_masks(algorithm: WordXor, length: int) -> tuple[NDArray[np.uint64], ...]:
     """Where the low and the high bytes of the words stand among so many bytes, as masks of `lanes.words`, (words, 1)."""

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from lidarspec.checksums import Checksum, Crc, Fold15, Sum, WordXor, Xor
+from lidarspec.checksums import Checksum, Crc, Fold15, Sum, WordXor, Xor, ZeroPadded
 
 VECTORS = Path(__file__).parents[2] / "shared" / "protocols" / "vectors_serial2d.json"
 
@@ -50,6 +50,7 @@ ALGORITHMS: list[Checksum] = [
     *(Sum(width) for width in (1, 7, 8, 16, 20, 64)),
     *(WordXor(head, groups) for head, groups in [(0, (2,)), (0, (1,)), (8, (1, 2)), (3, (2, 1)), (5, (1, 2, 2, 1))]),
     Fold15(),
+    *(ZeroPadded(inner, to) for inner, to in [(CRC32, 4), (Crc(16, 0x1021, order="big"), 3), (Fold15(), 8)]),
 ]
 name_of = methodcaller("describe")
 
@@ -256,11 +257,19 @@ def test_takes_every_kind_of_bytes_and_pickles(algorithm: Checksum) -> None:
         assert (copy, hash(copy), copy(data)) == (algorithm, hash(algorithm), algorithm(data))
 
 
+def test_padding_with_zeros_to_whole_words() -> None:
+    for data in (b"", b"1", b"1234", b"123456789"):
+        assert ZeroPadded(CRC32, 4)(data) == CRC32(data.ljust(-(-len(data) // 4) * 4, b"\0"))
+    padded = ZeroPadded(Crc(16, 0x1021, order="big"), 4)
+    assert (padded.width, padded.order) == (16, "big")
+
+
 def test_describe() -> None:
     assert CRC8_LDROBOT.describe() == "CRC-8 poly 0x4d"
     assert CRC16_MODBUS.describe() == "CRC-16 poly 0x8005 init 0xffff reflected"
     assert Crc(12, 0x80F, refout=True, xorout=1).describe() == "CRC-12 poly 0x80f xorout 0x001 refout"
     assert (Xor().describe(), Sum(16).describe(), Fold15().describe()) == ("XOR-8", "16-bit sum", "15-bit folded sum")
+    assert ZeroPadded(Xor(), 4).describe() == "XOR-8 of the bytes padded with zeros to a multiple of 4"
     assert M1C1.describe() == "XOR-16 of 1+2-byte words after a head of 8 bytes"
 
 

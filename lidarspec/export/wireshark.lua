@@ -191,8 +191,8 @@ end
 
 function Walk:decorate(node, tree, range, item, value, label, right)
   if label ~= node.name then item:set_text(label .. ": " .. (node.labels and node.labels[value] or tostring(value))) end
-  if node.unit or node.scale then
-    item:append_text(" (" .. physical(node, value) .. ")")
+  if node.unit or node.physical then
+    item:append_text(node.physical and " (" .. physical(node, value) .. ")" or " " .. node.unit)
     if node.physical then tree:add(node.physical, range, plain(value) * (node.scale or 1) + (node.offset or 0)):set_hidden(true) end
   end
   if not right then item:add_proto_expert_info(marks.constant) end
@@ -315,7 +315,9 @@ function step.sealed(self, node, tree, label)
   local from = self.at
   self:visit(node.body, tree, label)
   local seal = node.seal
-  local stored, computed = self:stored(seal), checksum[seal.algorithm](seal, self:covered(seal, from))
+  local data = self:covered(seal, from)
+  if seal.pad then data = data .. string.rep("\0", -#data % seal.pad) end
+  local stored, computed = self:stored(seal), checksum[seal.algorithm](seal, data)
   local is_absent = seal.absent[stored]
   local is_right = stored == plain(computed) or is_absent
   if seal.is_wide then is_right = tostring(self.exact[seal.fields[1].path]) == tostring(computed) or is_absent end

@@ -73,7 +73,11 @@ def dissector(sensor: Sensor) -> str:
         "frames": [_frame(message, name) for message in found],
     }
     head = _HEAD.format(
-        title=_title(sensor), version=__version__, source=sensor.source, name=quoted(name), title_quoted=quoted(_title(sensor))
+        title=_title(sensor),
+        version=__version__,
+        source=" ".join(sensor.source.split()),
+        name=quoted(name),
+        title_quoted=quoted(_title(sensor)),
     )
     return "\n".join([head, f"local sensor = {lua(about)}", _REGISTERED, _walker()])
 

@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from lidarspec.bits import BitField
-from lidarspec.checksums import Checksum, Crc, Fold15, Sum, WordXor, Xor
+from lidarspec.checksums import Checksum, Crc, Fold15, Sum, WordXor, Xor, ZeroPadded
 from lidarspec.export import Refused
-from lidarspec.export.formulas import Formula, Op, Ref, refs
+from lidarspec.export.formulas import Formula, refs
 from lidarspec.export.messages import Message
 from lidarspec.export.tree import Blob, Block, Empty, Node, Number, Part, Repeat, Sealed, Select, Struct, When, nodes
 from lidarspec.export.wireshark_text import Code, formula, quoted
@@ -200,6 +200,10 @@ def _algorithm(algorithm: Checksum) -> Table:
             return {"algorithm": "word_xor", "head": algorithm.head, "halves": halves}
         case Fold15():
             return {"algorithm": "fold15"}
+        case ZeroPadded():
+            if isinstance(algorithm.algorithm, ZeroPadded):
+                raise Refused("a checksum padded twice")
+            return {**_algorithm(algorithm.algorithm), "pad": algorithm.to}
     raise Refused(f"the checksum {type(algorithm).__name__} is Python code, which Wireshark does not run")
 
 
@@ -254,6 +258,3 @@ def _run(bits: BitField, size: int, order: str) -> int | None:
 
 def _mask(bits: BitField, size: int, order: str) -> int:
     return ((1 << bits.width) - 1) << (_run(bits, size, order) or 0)
-
-
-__all__ = ["tables", "Op", "Ref"]

@@ -23,14 +23,12 @@ Source: RPLIDAR interface protocol, "SCAN"; HQ capsules: the vendor's SDK (sl_li
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from construct import Array, BitsInteger, BitStruct, ByteSwapped, Const, Int8ul, Int16ul, Int32ul, Int64ul, Struct
-from numpy.typing import NDArray
 
-from lidarspec import Checksum, Checksummed, Crc, Fields, Polar, Scaled
+from lidarspec import Checksummed, Crc, Fields, Polar, Scaled, ZeroPadded
 
 CONFIRM = 10  # nodes in an unbroken run; see the measurement above
 HQ_NODES = 96
@@ -49,29 +47,6 @@ NODE = Struct(
     "beam" / ByteSwapped(BitStruct("angle" / Scaled(BitsInteger(15), 1 / 64, "deg"), "check" / Const(1, BitsInteger(1)))),
     "distance" / Scaled(Int16ul, 0.00025, "m") * "0: no return",
 )
-
-
-@dataclass(frozen=True)
-class ZeroPadded(Checksum):
-    """Another algorithm over the data and as many zero bytes as make its length a multiple of `to`."""
-
-    algorithm: Checksum
-    to: int
-
-    @property
-    def width(self) -> int:  # type: ignore[override]
-        """That of the other algorithm, in bits."""
-        return self.algorithm.width
-
-    def __call__(self, data: bytes | bytearray | memoryview) -> int:
-        return self.algorithm(bytes(data) + bytes(-len(data) % self.to))
-
-    def describe(self) -> str:
-        return f"{self.algorithm.describe()} of the bytes padded with zeros to a multiple of {self.to}"
-
-    def batch(self, rows: NDArray[np.uint8]) -> NDArray[np.uint64]:
-        return self.algorithm.batch(np.pad(rows, ((0, 0), (0, -rows.shape[1] % self.to))))
-
 
 CRC32 = Crc(32, 0x04C11DB7, init=0xFFFFFFFF, refin=True, refout=True, xorout=0xFFFFFFFF)
 
