@@ -117,7 +117,7 @@ def _sealed(con: Checksummed, place: _Place) -> Sealed:
 
 
 def _leaf(con: Construct, place: _Place) -> Node:
-    info = fields_below(con, place.info)[place.info.path] if place.info.path and place.name else place.info
+    info = _plain(fields_below(con, place.info)[place.info.path] if place.info.path and place.name else place.info)
     if isinstance(con, FormatField) and con.fmtstr[-1] != "?":
         code, order = con.fmtstr[-1], "big" if con.fmtstr[0] in ">!" else "little"
         kind = "float" if code in "efd" else "uint" if code.isupper() else "int"
@@ -154,11 +154,17 @@ def _block(con: Construct, place: _Place) -> Block:
     for bits in found:
         names = tuple(key for key in bits.keys if isinstance(key, str))
         info = infos[".".join(part for part in (place.info.path, *names) if part)]
+        info = _plain(info)
         parts.append(Part(info, bits, names, tuple(key for key in bits.keys if isinstance(key, int))))
         _known(scope, names, info)
     if place.name:
         place.scope.add(place.name, parts[0].info if not parts[0].names else scope)
     return Block(place.name, place.info, size, tuple(parts))
+
+
+def _plain(info: FieldInfo) -> FieldInfo:
+    """The same field with the number that a constant's name stands for."""
+    return replace(info, const=labelled(Ref(info.path, info), info.const)) if isinstance(info.const, str) else info
 
 
 def _known(scope: Scope, names: tuple[str, ...], info: FieldInfo) -> None:

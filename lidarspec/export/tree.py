@@ -180,3 +180,17 @@ def nodes(node: Node) -> Iterator[Node]:
     yield node
     for child in children(node):
         yield from nodes(child)
+
+
+def formulas(node: Node) -> tuple[Formula, ...]:
+    """The formulas of a node, those of its parts left out."""
+    match node:
+        case Blob():
+            return (node.size,)
+        case Repeat():
+            return (node.count,)
+        case When():
+            return (node.condition,)
+        case Select():
+            return (node.key,)
+    return ()

@@ -19,7 +19,8 @@ end
 function int.band(a, b) return int.bits(a, b, {[2] = true}) end
 function int.bor(a, b) return int.bits(a, b, {[1] = true, [2] = true}) end
 function int.bxor(a, b) return int.bits(a, b, {[1] = true}) end
-function int.div(a, b) return math.floor(a / b) end
+function int.div(a, b) return b ~= 0 and math.floor(a / b) or error("division by zero") end
+function int.mod(a, b) return b ~= 0 and a - math.floor(a / b) * b or error("division by zero") end
 function int.truth(condition) return condition and 1 or 0 end
 
 -- Checksums: each takes its parameters and the covered bytes as a string.

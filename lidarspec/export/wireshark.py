@@ -40,7 +40,8 @@ local function new(abbreviation, name, type, shown, labels, mask, text)
 end
 
 local kind = new({name} .. ".frame", "frame type", ftypes.STRING, base.NONE)
-local status = new({name} .. ".checksum.status", "checksum status", ftypes.UINT8, base.NONE, {{[0] = "Bad", [1] = "Good", [2] = "Not filled"}})
+local verdicts = {{[0] = "Bad", [1] = "Good", [2] = "Not filled"}}
+local status = new({name} .. ".checksum.status", "checksum status", ftypes.UINT8, base.NONE, verdicts)
 local marks = {{
   checksum = ProtoExpert.new({name} .. ".checksum.bad", "checksum wrong", expert.group.CHECKSUM, expert.severity.ERROR),
   constant = ProtoExpert.new({name} .. ".constant.bad", "not the constant that stands here", expert.group.MALFORMED, expert.severity.ERROR),

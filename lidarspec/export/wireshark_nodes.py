@@ -11,7 +11,7 @@ from lidarspec.checksums import Checksum, Crc, Fold15, Sum, WordXor, Xor, ZeroPa
 from lidarspec.export import Refused
 from lidarspec.export.formulas import Formula, refs
 from lidarspec.export.messages import Message
-from lidarspec.export.tree import Blob, Block, Empty, Node, Number, Part, Repeat, Sealed, Select, Struct, When, nodes
+from lidarspec.export.tree import Blob, Block, Empty, Node, Number, Part, Repeat, Sealed, Select, Struct, When, formulas, nodes
 from lidarspec.export.wireshark_text import Code, formula, quoted
 from lidarspec.frames.schema import FieldInfo
 
@@ -38,7 +38,7 @@ class _Writer:
 
     def __post_init__(self) -> None:
         for node in nodes(self.message.root):
-            self.kept |= {ref.path for value in _formulas(node) for ref in refs(value)}
+            self.kept |= {ref.path for value in formulas(node) for ref in refs(value)}
             if isinstance(node, Sealed):
                 self.seals |= set(node.fields)
                 self.marked |= set(node.over or ())
@@ -74,7 +74,7 @@ class _Writer:
         if node.kind == "float" and node.size == 8:
             kind = "DOUBLE"
         table: Table = {"kind": "number", "name": node.name, "type": node.kind, "size": node.size}
-        table |= {"le": node.order == "little" and node.size > 1 or None, **self._described(node.info, kind)}
+        table |= {"le": (node.order == "little" and node.size > 1) or None, **self._described(node.info, kind)}
         return table | {"skip": self._skip(node.info, node.size)}
 
     def _blob(self, node: Blob) -> Table:
@@ -163,7 +163,7 @@ class _Writer:
         return None if info.path in self.kept or info.const is not None else size
 
     def _seal(self, node: Sealed) -> Table:
-        widths = {path: width for path, width in _widths(node)}
+        widths = dict(_widths(node))
         return {
             **_algorithm(node.algorithm),
             "fields": [{"path": path, "width": widths[path]} for path in node.fields],
@@ -171,7 +171,7 @@ class _Writer:
             "last": node.over[1] if node.over else None,
             "big": node.algorithm.order == "big" or None,
             "is_wide": (len(node.fields) == 1 and widths[node.fields[0]] > 32) or None,
-            "absent": {value: True for value in node.absent},
+            "absent": dict.fromkeys(node.absent, True),
         }
 
 
@@ -180,10 +180,8 @@ def _widths(node: Sealed) -> Iterator[tuple[str, int]]:
     for below in nodes(node):
         if isinstance(below, Block):
             yield from ((part.info.path, part.bits.width) for part in below.parts)
-        elif isinstance(below, Number):
-            yield below.info.path, 8 * below.size
-        elif isinstance(below, Blob) and below.name and isinstance(below.size, int):
-            yield below.info.path, 8 * below.size
+        elif isinstance(below, Number | Blob):
+            yield below.info.path, below.info.bits
 
 
 def _algorithm(algorithm: Checksum) -> Table:
@@ -205,19 +203,6 @@ def _algorithm(algorithm: Checksum) -> Table:
                 raise Refused("a checksum padded twice")
             return {**_algorithm(algorithm.algorithm), "pad": algorithm.to}
     raise Refused(f"the checksum {type(algorithm).__name__} is Python code, which Wireshark does not run")
-
-
-def _formulas(node: Node) -> tuple[Formula, ...]:
-    match node:
-        case Blob():
-            return (node.size,)
-        case Repeat():
-            return (node.count,)
-        case When():
-            return (node.condition,)
-        case Select():
-            return (node.key,)
-    return ()
 
 
 def _function(value: Formula) -> Code:

@@ -15,9 +15,9 @@ class Code(str):
     """Lua as it stands, not to be quoted."""
 
 
-_BARE = {"+": "({} + {})", "-": "({} - {})", "*": "({} * {})", "%": "({} % {})", "<<": "({} * 2 ^ {})"}
+_BARE = {"+": "({} + {})", "-": "({} - {})", "*": "({} * {})", "<<": "({} * 2 ^ {})"}
 _COMPARED = {"==": "==", "!=": "~=", "<": "<", "<=": "<=", ">": ">", ">=": ">="}
-_CALLED = {"//": "int.div", "&": "int.band", "|": "int.bor", "^": "int.bxor"}
+_CALLED = {"//": "int.div", "%": "int.mod", "&": "int.band", "|": "int.bor", "^": "int.bxor"}
 
 
 def formula(value: Formula) -> Code:
