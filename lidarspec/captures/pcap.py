@@ -31,9 +31,13 @@ from lidarspec.captures.records import (
 )
 from lidarspec.errors import SourceError, UsageError
 
-__all__ = ["CaptureReader", "CaptureStats", "Datagram", "PcapWriter", "is_capture"]
+__all__ = ["CaptureReader", "CaptureStats", "Datagram", "PcapWriter", "StreamReader", "is_capture", "is_stream_capture"]
 
 _SECOND = 1_000_000_000
+#: the link types kept for private use: captures of byte streams have the first.
+USER_LINKS = range(147, 163)
+#: who sent a datagram, and to whom, where nobody knows.
+NOBODY = ("0.0.0.0", 0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -179,21 +183,35 @@ class CaptureReader:
         return Datagram(ip.body[part.start : part.stop], packet.at, *ends)
 
 
+class StreamReader(CaptureReader):
+    """The packets of a capture of a byte stream, link type USER0 to USER15, as datagrams that nobody sent."""
+
+    def datagram(self, packet: CapturedPacket | Passed) -> Datagram | None:
+        """What the packet holds; counts it where it is of another link type."""
+        if isinstance(packet, Passed) or packet.link not in USER_LINKS:
+            self.stats.other += 1
+            return None
+        self.stats.packets += 1
+        self.stats.snapped += len(packet.data) < packet.original
+        return Datagram(packet.data, packet.at, NOBODY, NOBODY)
+
+
 class PcapWriter:
-    """Writes datagrams to a pcap file that Wireshark opens: little-endian, nanoseconds, Ethernet, IPv4, UDP.
+    """Writes a pcap file that Wireshark opens, little-endian, with nanoseconds: datagrams as Ethernet, IPv4 and UDP, or bare packets.
 
     Args:
         file: a file open for binary writing; it stays open, and buffered bytes are its owner's to flush.
+        link: the link type: Ethernet for `write`; USER0 for `packet`, when no protocol is around the bytes.
 
     Raises:
         SourceError: the file does not take all bytes (a full disk). Where it can be cut, it is cut to its last whole record.
     """
 
-    def __init__(self, file: BinaryIO) -> None:
+    def __init__(self, file: BinaryIO, link: int = ETHERNET) -> None:
         self._file = file
         self._end = file.tell() if file.seekable() else None  # of the last whole record
         self._is_broken = False
-        self._append(struct.pack("<4sHHiIII", NANOSECOND_MAGIC, 2, 4, 0, 0, LARGEST_PACKET, ETHERNET))
+        self._append(struct.pack("<4sHHiIII", NANOSECOND_MAGIC, 2, 4, 0, 0, LARGEST_PACKET, link))
 
     def write(self, datagram: Datagram) -> None:
         """Appends one datagram, unfragmented.
@@ -204,11 +222,21 @@ class PcapWriter:
         """
         if len(datagram.data) > LARGEST_PAYLOAD:
             raise UsageError(f"a datagram of {len(datagram.data)} bytes: UDP over IPv4 carries at most {LARGEST_PAYLOAD}")
-        seconds, nanoseconds = divmod(datagram.at, _SECOND)
+        self.packet(udp_frame(datagram.data, _endpoint(*datagram.source), _endpoint(*datagram.destination)), datagram.at)
+
+    def packet(self, data: bytes, at: int) -> None:
+        """Appends one packet as it is, of the writer's link type, with its time in ns since 1970.
+
+        Raises:
+            UsageError: for a packet or time that no record can hold.
+            SourceError: as `write`.
+        """
+        seconds, nanoseconds = divmod(at, _SECOND)
         if not 0 <= seconds < 1 << 32:
-            raise UsageError(f"a capture time of {datagram.at} ns: pcap holds the years 1970 to 2106")
-        frame = udp_frame(datagram.data, _endpoint(*datagram.source), _endpoint(*datagram.destination))
-        self._append(struct.pack("<IIII", seconds, nanoseconds, len(frame), len(frame)) + frame)
+            raise UsageError(f"a capture time of {at} ns: pcap holds the years 1970 to 2106")
+        if len(data) > LARGEST_PACKET:
+            raise UsageError(f"a packet of {len(data)} bytes: a record holds at most {LARGEST_PACKET}")
+        self._append(struct.pack("<IIII", seconds, nanoseconds, len(data), len(data)) + data)
 
     def _append(self, record: bytes) -> None:
         if self._is_broken:
@@ -236,6 +264,11 @@ class PcapWriter:
         except OSError:
             return False
         return True
+
+
+def is_stream_capture(head: bytes) -> bool:
+    """Whether the first 24 bytes of a file are those of a pcap capture of a byte stream."""
+    return is_capture(head) and len(head) >= 24 and int.from_bytes(head[20:22], "little") in USER_LINKS and head[0] in b"\x4d\xd4"
 
 
 def _open(path: str | os.PathLike[str]) -> BinaryIO:

@@ -101,7 +101,7 @@ class Task:
 
 @click.command()
 @click.argument("source", metavar="SOURCE")
-@click.option("-o", "--output", "target", metavar="FILE", required=True, help="The file: .lsr, .pcap for datagrams, .bin for bytes alone.")
+@click.option("-o", "--output", "target", metavar="FILE", required=True, help="The file: .lsr, .pcap for Wireshark, .bin for bytes alone.")
 @sensor_option
 @click.option("-t", "--duration", "seconds", type=Duration(), help="How long, such as 10s; until Ctrl-C by default.")
 @click.option("-n", "--count", type=click.IntRange(min=1), help="So many packets at least: the sensor's data packets, or datagrams.")

@@ -1,4 +1,4 @@
-"""What a source is recorded in, by the suffix of the file: .lsr holds everything, .pcap datagrams, .bin the bytes alone."""
+"""What a source is recorded in, by the suffix of the file: .lsr holds everything, .pcap packets for Wireshark, .bin the bytes alone."""
 
 from __future__ import annotations
 
@@ -8,16 +8,18 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
 
-from lidarspec.captures.pcap import Datagram, PcapWriter, is_capture
+from lidarspec.captures.pcap import NOBODY, USER_LINKS, Datagram, PcapWriter, is_capture
 from lidarspec.errors import UnknownFormat, UsageError
 from lidarspec.files import Chunk, Transport
+from lidarspec.found import Found
+from lidarspec.plugins import sensor as named_sensor
 from lidarspec.recording.appending import Appender
 from lidarspec.recording.recordings import Recorder
 from lidarspec.spec import Sensor
 
 SUFFIXES = (".lsr", ".pcap", ".bin")
-#: who sent a datagram, and to whom, where nobody knows.
-NOBODY = ("0.0.0.0", 0)
+#: bytes between frames that make one packet at most.
+LARGEST_GAP = 1 << 16
 _HEAD, _RECORD = 24, 16
 
 
@@ -33,7 +35,7 @@ class PcapRecorder(Appender):
         self._made, self._receiver = io.BytesIO(), (NOBODY[0], port)
         self._writer = PcapWriter(self._made)
         super().__init__(path, _whole_packets, overwrite=overwrite)
-        self._put(self._taken_out())
+        self._put(_taken_out(self._made))
 
     def write(self, chunk: Chunk, direction: Literal["in", "out"] = "in") -> None:
         """Take a datagram that was received; one that was sent is none of the sensor's, and is left out.
@@ -43,16 +45,64 @@ class PcapRecorder(Appender):
         """
         if direction == "in":
             self._writer.write(Datagram(chunk.data, chunk.at or 0, chunk.sender or NOBODY, chunk.receiver or self._receiver))
-            self._put(self._taken_out(), len(chunk.data))
+            self._put(_taken_out(self._made), len(chunk.data))
 
     def event(self, name: str, at: int | None = None, **details: Any) -> None:
         """A capture has no place for events."""
 
-    def _taken_out(self) -> bytes:
-        data = self._made.getvalue()
-        self._made.seek(0)
-        self._made.truncate()
-        return data
+
+class FrameRecorder(Appender):
+    """Writes a byte stream as a capture with one packet for each frame, link type USER0; otherwise as a `Recorder`.
+
+    What is no frame becomes packets too, so that they hold every byte that was received, in order.
+
+    Args:
+        path: the file, new unless `overwrite`.
+        sensor: whose frames they are.
+    """
+
+    def __init__(self, path: str | Path, sensor: Sensor, *, overwrite: bool = False) -> None:
+        self._made, self._decoder = io.BytesIO(), sensor.decoder(stream=True)
+        self._held, self._base, self._at = bytearray(), 0, 0
+        self._writer = PcapWriter(self._made, USER_LINKS[0])
+        super().__init__(path, _whole_packets, overwrite=overwrite)
+        self._put(_taken_out(self._made))
+
+    def write(self, chunk: Chunk, direction: Literal["in", "out"] = "in") -> None:
+        """Take bytes that were received; those that were sent are left out."""
+        if direction == "in":
+            self._at = chunk.at or self._at
+            if chunk.gap:
+                self._cut(self._decoder.idle())
+            self._held += chunk.data
+            self._cut(self._decoder.feed(chunk.data, self._at))
+
+    def event(self, name: str, at: int | None = None, **details: Any) -> None:
+        """A capture has no place for events."""
+
+    def _cut(self, found: list[Found]) -> None:
+        """Write the frames found, and what lies before them and is none; keep what waits for more."""
+        for item in found:
+            self._skip(item.offset - self._base)
+            self._packet(len(item.data), item.at or self._at)
+        self._skip(len(self._held) - self._decoder.stats.pending)
+
+    def _skip(self, size: int) -> None:
+        while size > 0:
+            part = min(size, LARGEST_GAP)
+            self._packet(part, self._at)
+            size -= part
+
+    def _packet(self, size: int, at: int) -> None:
+        self._writer.packet(bytes(self._held[:size]), at)
+        del self._held[:size]
+        self._base += size
+        self._put(_taken_out(self._made), size)
+
+    def _finish(self) -> None:
+        if not self._closing:
+            self._cut(self._decoder.finish())
+        super()._finish()
 
 
 class RawRecorder(Appender):
@@ -70,7 +120,7 @@ class RawRecorder(Appender):
         """Bytes alone have no place for events."""
 
 
-AnyRecorder = Recorder | PcapRecorder | RawRecorder
+AnyRecorder = Recorder | PcapRecorder | FrameRecorder | RawRecorder
 #: a file, a recorder, or what makes one when the source is open.
 RecordTo = str | Path | AnyRecorder | Callable[[Transport], AnyRecorder]
 
@@ -97,7 +147,7 @@ def recorder(
     port: int = 0,
     overwrite: bool = False,
 ) -> AnyRecorder:
-    """The recorder for a file, by its suffix; arguments as of `Recorder` and `PcapRecorder`.
+    """The recorder for a file, by its suffix; arguments as of `Recorder`, `PcapRecorder` and `FrameRecorder`.
 
     Raises:
         UnknownFormat: for a suffix that is none of them.
@@ -106,7 +156,9 @@ def recorder(
     """
     suffix = check_suffix(path)
     if suffix == ".pcap" and not datagrams:
-        raise UsageError(f"{path}: a capture holds datagrams, and a byte stream has none: record it in an .lsr or .bin file")
+        if not sensor:
+            raise UsageError(f"{path}: a capture of a byte stream has a packet for each frame: name the sensor with -s, or record an .lsr")
+        return FrameRecorder(path, sensor if isinstance(sensor, Sensor) else named_sensor(sensor), overwrite=overwrite)
     if suffix == ".bin" and datagrams:
         raise UsageError(f"{path}: bytes alone do not say where a datagram ends: record datagrams in an .lsr or .pcap file")
     if suffix == ".lsr":
@@ -119,6 +171,14 @@ def recorder_for(target: RecordTo, sensor: Sensor | str | None, source: str | Pa
     if isinstance(target, str | Path):
         return recorder(target, sensor, source, datagrams=opened.datagrams, baud=getattr(opened, "baud", None)), True
     return (target, False) if isinstance(target, AnyRecorder) else (target(opened), True)
+
+
+def _taken_out(made: io.BytesIO) -> bytes:
+    """What a writer has made since it was last asked."""
+    data = made.getvalue()
+    made.seek(0)
+    made.truncate()
+    return data
 
 
 def _whole_packets(data: bytes | bytearray, limit: int) -> int:

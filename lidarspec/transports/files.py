@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from lidarspec.captures.bulk import Batch, CaptureBatches
-from lidarspec.captures.pcap import CaptureReader, CaptureStats, is_capture
+from lidarspec.captures.pcap import CaptureReader, CaptureStats, StreamReader, is_capture, is_stream_capture
 from lidarspec.errors import SourceError, WireError
 from lidarspec.files import Chunk
 from lidarspec.transports.recordings import RecordingTransport, is_recording
@@ -95,6 +95,17 @@ class CaptureTransport(FileTransport):
             self.warnings.append(f"{self._path}: {stats.snapped} packets were cut by the capture's snap length")
 
 
+class StreamCaptureTransport(FileTransport):
+    """The bytes of a capture of a byte stream, packet by packet."""
+
+    def chunks(self) -> Iterator[Chunk]:
+        reader = StreamReader(self._file)
+        for packet in reader:
+            yield Chunk(packet.data, packet.at or None)
+        if reader.stats.truncated_tail:
+            self.warnings.append(f"{self._path} is cut off in its last record; everything before it was read")
+
+
 def open_file(path: str, *, sender: str | None = None) -> FileTransport | RecordingTransport:
     """The transport for a file, by what it holds; "-" is standard input.
 
@@ -107,13 +118,15 @@ def open_file(path: str, *, sender: str | None = None) -> FileTransport | Record
         try:
             file = open(path, "rb")  # noqa: SIM115  the transport closes it
             undo.callback(file.close)
-            head = file.peek(8)[:8]
+            head = file.peek(24)[:24]
         except OSError as error:
             raise SourceError(f"{path}: {error.strerror or error}") from None
         undo.pop_all()
     if is_recording(head):
         file.close()
         return RecordingTransport(path, sender=sender)
+    if is_stream_capture(head):
+        return StreamCaptureTransport(path, file)
     if is_capture(head):
         return CaptureTransport(path, file, sender=sender)
     return HexTransport(path, file) if Path(path).suffix in (".hex", ".txt") else FileTransport(path, file)
