@@ -381,9 +381,11 @@ local function likely(tvb, at, stop, last)
   end
 end
 
-local function show(frame, tvb, at, size, root, told)
+-- What is sound and asked for by nobody, neither a tree on the screen nor a filter, is not taken apart.
+local function show(frame, tvb, at, size, root, told, is_sound)
   local item = root:add(proto, tvb(at, size), string.format("%s, %s, %d bytes", sensor.title, frame.name, size))
   item:add(kind, tvb(at, size), frame.name):set_generated(true)
+  if is_sound and not root:referenced(Dissector.get(proto.name:lower())) then return table.insert(told, frame.name) end
   local begun = walk(frame, tvb, at, at + size)
   local done, problem = pcall(begun.visit, begun, frame.root, item)
   if not done and type(problem) ~= "table" then error(problem, 0) end
@@ -424,7 +426,7 @@ local function dissected(tvb, pinfo, root, is_datagram)
       pinfo.desegment_offset, pinfo.desegment_len = at, DESEGMENT_ONE_MORE_SEGMENT
     end
     if frame then
-      show(frame, tvb, place, size, root, told)
+      show(frame, tvb, place, size, root, told, true)
       if sensor.announcing[frame.name] then last = frame.name end
     end
     at = frame and place + size or stop
@@ -453,4 +455,12 @@ for place, patterns in pairs(sensor.places) do
     before[place][pattern] = known:get_dissector(pattern)
     known:add(pattern, proto)
   end
+end
+
+-- Ports are hints: on others, datagrams that are as a whole a frame with constants are taken too.
+if not sensor.is_stream and sensor.places["udp.port"] then
+  proto:register_heuristic("udp", function(tvb, pinfo, root)
+    local frame = exact(tvb, 0, tvb:len(), last_before[pinfo.number])
+    return frame ~= nil and #frame.magic > 1 and dissected(tvb, pinfo, root, true) > 0
+  end)
 end

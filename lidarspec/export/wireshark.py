@@ -26,7 +26,8 @@ _HEAD = """\
 --     wireshark -X lua_script:THIS_FILE CAPTURE
 --
 -- or put it into the personal Lua plugins folder (Help, About Wireshark, Folders).
--- Found by UDP and TCP port, by "Decode As", and in captures of link type USER0 to USER15, which hold what came over a serial line.
+-- It takes UDP and TCP by port, UDP on other ports by its constants, and captures of link type USER0 to USER15, which hold what came
+-- over a serial line ("lidarspec record SOURCE -s SENSOR -o FILE.pcap" writes them).
 -- A field is the raw number of the wire; where it has a unit, FIELD.physical can be filtered by as well.
 
 local proto = Proto({name}, {title_quoted})

@@ -235,7 +235,8 @@ def test_nothing_is_overwritten_without_force(stream: Path, tmp_path: Path, verb
 
 
 def test_what_cannot_be_recorded_says_why(stream: Path, datagrams: Path, tmp_path: Path) -> None:
-    assert "byte stream" in ran("record", stream, "-o", tmp_path / "it.pcap", code=2).stderr
+    ran("record", stream, "-o", tmp_path / "raw.bin")
+    assert "byte stream" in ran("record", tmp_path / "raw.bin", "-o", tmp_path / "it.pcap", code=2).stderr
     assert "where a datagram ends" in ran("record", datagrams, "-o", tmp_path / "it.bin", code=2).stderr
     assert "unknown format '.csv'" in ran("record", stream, "-o", tmp_path / "it.csv", code=2).stderr
     assert "-n counts packets" in ran("record", stream, "-o", tmp_path / "it.lsr", "-n", 3, code=2).stderr
