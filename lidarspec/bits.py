@@ -66,6 +66,13 @@ class BitField:
         total = sum((block[s.byte] & s.mask) >> s.low << s.target for s in self.segments)
         return total - (1 << self.width) if self.signed and total >> (self.width - 1) else total
 
+    def masks(self, size: int) -> bytes:
+        """Which bits of each byte of a block of `size` bytes are the value's."""
+        found = bytearray(size)
+        for segment in self.segments:
+            found[segment.byte] |= segment.mask
+        return bytes(found)
+
 
 def leaves(parsed: Any, keys: tuple[str | int, ...] = ()) -> Iterator[tuple[tuple[str | int, ...], Any]]:
     """The values of a parsed object with where they stand in it, private entries left out."""

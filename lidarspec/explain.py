@@ -19,9 +19,11 @@ from lidarspec.construction import UNNAMED, Seen, field_path, unwrap
 from lidarspec.decoder import Counters, Found, packed
 from lidarspec.errors import LidarSpecError, WireError
 from lidarspec.fields import Checksummed
+from lidarspec.flips import flips
 from lidarspec.frames.codecs import codec
 from lidarspec.frames.judging import IMPLAUSIBLE
 from lidarspec.frames.schema import FieldInfo, schema
+from lidarspec.listing import Explanation
 from lidarspec.parsing import parse_typed
 from lidarspec.points import evaluate
 from lidarspec.rules import children
@@ -29,14 +31,14 @@ from lidarspec.spec import Frame, Sensor
 from lidarspec.streams import PacketStream
 from lidarspec.units import exact
 from lidarspec.wiretable import bit_text, hexed
-from lidarspec.wording import Explanation, Point, Row, Value, hexdump
+from lidarspec.wording import Point, Row, Value, hexdump
 
 __all__ = ["Explanation", "explain", "hexdump"]
 
 #: most points of a frame without arrays that are told.
 TOLD = 4
-#: most decimals of a value.
-DIGITS = 6
+#: most decimals of a value, and most flipped bits that are told one by one.
+DIGITS, FLIPS = 6, 3
 
 Keys = tuple[str | int, ...]
 
@@ -58,7 +60,7 @@ def explain(sensor: Sensor, data: bytes, frame: str | None = None) -> Explanatio
     reading = _Reading(sensor.frames[name], data)
     rows = (*reading.rows(), *reading.rest(fault))
     if not _valid(sensor, name, data[: reading.end], fault):
-        return Explanation(sensor.id, name, data, rows, fault)
+        return Explanation(sensor.id, name, data, rows, fault, tuple(_flipped(sensor, name, data, reading)))
     points, notes = _points(sensor, name, data[: reading.end], rows)
     return Explanation(sensor.id, name, data, rows, fault, notes).with_points(points)
 
@@ -72,6 +74,21 @@ def _valid(sensor: Sensor, name: str, data: bytes, fault: WireError | None) -> b
     except WireError:
         return False
     return True
+
+
+def _flipped(sensor: Sensor, name: str, data: bytes, reading: _Reading) -> Iterator[str]:
+    """Which single flipped bit would explain the damage, with what its field would have said."""
+    found = flips(sensor, name, data)
+    if len(found) > FLIPS:
+        yield f"one flipped bit would explain it, but in any of {len(found)} places, so that nothing can be said of where"
+        return
+    before = reading.values()
+    for flip in found:
+        after = _Reading(sensor.frames[name], flip.mended(data)).values()
+        path = next((path for path, value in after.items() if value.holds(flip.offset, flip.bit)), "")
+        values = [str(part[path]) for part in (before, after) if path in part]
+        said = f", {path} {', sent as '.join(values)}" if path and all(values) else f", {path}" if path else ""
+        yield f"{'one' if len(found) == 1 else 'a'} flipped bit would explain it: byte {flip.offset} bit {flip.bit}{said}"
 
 
 class _Reading:
@@ -104,6 +121,10 @@ class _Reading:
             last = element
         if group:
             yield self._row(last, group)
+
+    def values(self) -> dict[str, Value]:
+        """Every value by its path."""
+        return {value.path: value for row in self.rows() for value in row.values}
 
     def rest(self, fault: WireError | None) -> Iterator[Row]:
         """The bytes that no part took: those of the part that is cut off, or more than the frame has."""
@@ -141,7 +162,7 @@ class _Reading:
         right = True
         for part, seen in group:
             for keys, raw in leaves(seen.value):
-                value, info = self._value(part, keys, raw)
+                value, info = self._value(part, seen, keys, raw)
                 values.append(value)
                 if info.const is not None and value.raw != info.const:
                     remarks.append(f"wrong: {hexed(value.raw, info.bits)}, expected {hexed(info.const, info.bits)}")
@@ -152,7 +173,7 @@ class _Reading:
                     right = right and good
         return Row(start, self._data[start:end], path, tuple(values), tuple(remarks), right)
 
-    def _value(self, part: str, keys: Keys, raw: Any) -> tuple[Value, FieldInfo]:
+    def _value(self, part: str, seen: Seen, keys: Keys, raw: Any) -> tuple[Value, FieldInfo]:
         path = part + "".join(f"[{key}]" if isinstance(key, int) else f".{key}" for key in keys)
         unknown = FieldInfo(plain(path), docs="constant" if path.endswith(UNNAMED) else "")
         info = self._schema.fields.get(plain(path), unknown)
@@ -160,7 +181,8 @@ class _Reading:
         physical = float(raw * info.scale + info.offset) if isinstance(raw, int | float) else None
         label = info.labels.get(raw, "") if isinstance(raw, int) else ""
         digits = None if info.kind == "float" else _digits(info)
-        return Value(path, raw, physical, info.unit, digits, label, bit_text(bits) if bits else "", info.docs), info
+        masks = bits.masks(seen.end - seen.start) if bits else b"\xff" * (seen.end - seen.start)
+        return Value(path, raw, physical, info.unit, digits, label, bit_text(bits) if bits else "", info.docs, seen.start, masks), info
 
 
 def plain(path: str) -> str:

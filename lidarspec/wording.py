@@ -1,21 +1,25 @@
-"""The rows of an explained frame, and the words for them: numbers, bits, points and places as people read them."""
+"""The words for a frame's parts: numbers, bits, points and places as people read them."""
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from lidarspec.clouds import PointCloud
 from lidarspec.errors import WireError
 
-#: bytes in a line of a hexdump, lines before the marked one, and bytes in a line of an explanation.
-DUMPED, BEFORE, LINED = 16, 2, 8
-#: the widest column of paths.
-PATHS = 36
+#: bytes in a line of a hexdump, and lines before the marked one.
+DUMPED, BEFORE = 16, 2
 DEGREES_PER_TURN = 360
+
+
+class Span(NamedTuple):
+    """A piece of a line and its role: "" or "offset", "hex", "name", "bits", "docs", "good", "bad", "point", "note", "title"."""
+
+    text: str
+    role: str = ""
 
 
 class Point(NamedTuple):
@@ -57,6 +61,7 @@ class Value:
         label: the name of the raw value, where it has one.
         bits: which bits of the row's bytes it is; "" for whole bytes.
         docs: the author's text.
+        start, masks: where in the frame its bytes begin, and which bits of each are its own.
     """
 
     path: str
@@ -67,11 +72,18 @@ class Value:
     label: str = ""
     bits: str = ""
     docs: str = ""
+    start: int = 0
+    masks: bytes = b""
 
     @property
     def name(self) -> str:
         """The last part of the path."""
         return self.path.rpartition(".")[2]
+
+    def holds(self, offset: int, bit: int) -> bool:
+        """Whether a bit of the frame is one of its own."""
+        place = offset - self.start
+        return 0 <= place < len(self.masks) and bool(self.masks[place] >> bit & 1)
 
     def __str__(self) -> str:
         if self.physical is None:
@@ -115,20 +127,36 @@ class Row:
     @property
     def meaning(self) -> str:
         """Values in their units, the author's text, remarks and points, in one line."""
-        alone = len(self.values) == 1 and not self.values[0].bits
-        first = set(re.findall(r"\[(\d+)\]", self.path)) <= {"0"}
-        units = [value.unit for value in self.values if value.unit and "[" in self.path]
-        words = [_named(value, plain=alone or units.count(value.unit) == 1, bits=first) for value in self.values]
-        docs = self.values[0].docs if alone and first else ""
-        told = ", ".join([word for word in words if word and not (alone and self.remarks)] + [str(point) for point in self.points[:1]])
-        return "; ".join(part for part in (told, *self.remarks, docs, *(str(point) for point in self.points[1:])) if part)
+        return "".join(text for text, _ in self.spans())
 
-    def lines(self, paths: int, width: int) -> Iterator[str]:
-        """The row as text: one line, and further ones where its bytes are many."""
-        parts = [self.data[start : start + width] for start in range(0, len(self.data), width)] or [b""]
-        for index, part in enumerate(parts):
-            rest = f"{self.path:<{paths}}  {self.meaning}" if index == 0 else ""
-            yield f"{self.offset + index * width:04x}  {part.hex(' '):<{3 * width - 1}}  {rest}".rstrip()
+    def spans(self, *, drawn: bool = False) -> list[Span]:
+        """The same in parts with their roles; with `drawn`, without the values, which stand bit by bit below the row."""
+        alone = len(self.values) == 1 and not self.values[0].bits
+        values = [] if drawn else self._values(alone=alone)
+        verdict = "good" if self.right else "bad"
+        docs = self.values[0].docs if alone and self.first else ""
+        points = list(dict.fromkeys(str(point) for point in self.points))
+        parts = [(", ", text, "") for text in values] + [(", ", text, "point") for text in points[:1]]
+        parts += [("; ", text, verdict) for text in self.remarks] + [("; ", docs, "docs")] + [("; ", text, "point") for text in points[1:]]
+        parts = [part for part in parts if part[1]]
+        return [Span(separator * (index > 0) + text, role) for index, (separator, text, role) in enumerate(parts)]
+
+    @property
+    def first(self) -> bool:
+        """Whether it stands in the first element of every array around it; the others are the same again."""
+        return set(re.findall(r"\[(\d+)\]", self.path)) <= {"0"}
+
+    def _values(self, *, alone: bool) -> list[str]:
+        """Each value in words, with its name where there are several."""
+        if alone and self.remarks:
+            return []
+        units = [value.unit for value in self.values if value.unit and "[" in self.path]
+        names = [value.name for value in self.values]
+        words = []
+        for value in self.values:
+            name = value.name if names.count(value.name) == 1 else value.path.removeprefix(f"{self.path}.")
+            words.append(_named(value, name, plain=alone or units.count(value.unit) == 1, bits=self.first))
+        return words
 
     def to_dict(self) -> dict[str, Any]:
         """The row for JSON."""
@@ -137,46 +165,20 @@ class Row:
         return {**found, "values": [value.to_dict() for value in self.values]} | ({"points": points} if points else {})
 
 
-@dataclass(frozen=True)
-class Explanation:
-    """A frame explained: rows that name every byte exactly once, in order.
-
-    Attributes:
-        sensor, frame: ids.
-        data: the bytes.
-        rows: one for each field, bit block or array element.
-        fault: what is wrong with the frame as a whole; None if it is valid.
-        notes: what concerns the whole frame.
-    """
-
-    sensor: str
-    frame: str
-    data: bytes
-    rows: tuple[Row, ...]
-    fault: WireError | None = None
-    notes: tuple[str, ...] = ()
-
-    def __str__(self) -> str:
-        paths = min(max((len(row.path) for row in self.rows), default=0), PATHS)
-        width = min(max((len(row.data) for row in self.rows), default=1), LINED)
-        return "\n".join([text for row in self.rows for text in row.lines(paths, width)] + [f"note: {note}" for note in self.notes])
-
-    def to_dict(self) -> dict[str, Any]:
-        """The explanation for JSON."""
-        fault = None if self.fault is None else {"reason": self.fault.reason, "offset": self.fault.offset, "path": self.fault.path}
-        head = {"sensor": self.sensor, "frame": self.frame, "size": len(self.data), "fault": fault, "notes": list(self.notes)}
-        return {**head, "rows": [row.to_dict() for row in self.rows]}
-
-    def with_points(self, points: Sequence[tuple[Point, ...]]) -> Explanation:
-        """The same with points for each row."""
-        return replace(self, rows=tuple(replace(row, points=found) for row, found in zip(self.rows, points, strict=True)))
-
-
-def _named(value: Value, *, plain: bool, bits: bool) -> str:
+def _named(value: Value, name: str, *, plain: bool, bits: bool) -> str:
     """A value with its name, unless the unit says enough, and with its bits; those of an array's elements are told once."""
     text = str(value)
     where = f" ({value.bits})" if value.bits and bits else ""
-    return f"{text}{where}" if plain else f"{value.name} {text or value.raw.hex(' ')}{where}"
+    return f"{text}{where}" if plain else f"{name} {text or value.raw.hex(' ')}{where}"
+
+
+def bit_picture(data: bytes, masks: bytes) -> str:
+    """The bits of one value in some bytes, the highest of each byte first: ".. 000001.. 00011000"; dots are bits of other values."""
+    parts = []
+    for byte, mask in zip(data, masks, strict=True):
+        bits = "".join(str(byte >> bit & 1) if mask >> bit & 1 else "." for bit in range(7, -1, -1))
+        parts.append(bits if mask else "..")
+    return " ".join(parts)
 
 
 def number(value: Any) -> Any:

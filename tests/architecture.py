@@ -19,7 +19,7 @@ FLOORS = (
     "spec hookspecs geometry links rules splits files searching",
     "frames framing runs installed plugins",
     "found datagrams decoder packets streams clocks sequences clouds points plans cuts reorder mounting",
-    "session replies scans simulation explain parsing building examples engine wiretable wording",
+    "session replies scans simulation explain parsing building examples engine wiretable wording listing flips differences",
     "device async_device inputs detection transports recording captures sources settings",
     "testing formats export view demo",
     "cli",

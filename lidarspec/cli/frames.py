@@ -8,13 +8,18 @@ from typing import Any
 import click
 
 from lidarspec.cli.failures import suggest
-from lidarspec.cli.inputs import Input, Piece, fitting, nearest, no_frame, pieces, read
-from lidarspec.cli.output import emit, emit_json, note, output_options, sensor_option, table
-from lidarspec.errors import WireError
+from lidarspec.cli.inputs import Input, Piece, fitting, likely_starts, nearest, no_frame, pieces, read
+from lidarspec.cli.output import emit, emit_json, emit_lines, note, output_options, sensor_option, table
+from lidarspec.differences import differences, told as told_differences
+from lidarspec.errors import UsageError, WireError
 from lidarspec.explain import explain as explained
+from lidarspec.listing import LINED, Explanation, Line
 from lidarspec.plugins import sensor as named_sensor
 from lidarspec.spec import Sensor
-from lidarspec.wording import LINED, Explanation, Row, number
+from lidarspec.wording import Row, Span, number
+
+#: places in bytes between frames that are explained as damaged frames, at most.
+DAMAGED = 64
 
 count_option = click.option("-n", "--count", type=click.IntRange(min=1), help="Frames at most.")
 words_argument = click.argument("words", metavar="HEX|FILE|-", nargs=-1, required=True)
@@ -50,21 +55,59 @@ def parse(words: Sequence[str], sensor_id: str | None, count: int | None, as_jso
 @sensor_option
 @click.option("-f", "--frame", metavar="NAME", help="The frame type, where the bytes do not tell.")
 @count_option
+@click.option("--bits", is_flag=True, help="Draw the bits of every element of an array, not of the first alone.")
+@click.option(
+    "--diff", metavar="HEX|FILE|next", help="What differs from this frame, to the bit; 'next': from the second frame of the input."
+)
 @output_options
-def explain(words: Sequence[str], sensor_id: str | None, frame: str | None, count: int | None, as_json: bool, output: str | None) -> None:
+def explain(
+    words: Sequence[str],
+    sensor_id: str | None,
+    frame: str | None,
+    count: int | None,
+    bits: bool,
+    diff: str | None,
+    as_json: bool,
+    output: str | None,
+) -> None:
     """Every byte of each frame: offset, hex, field, value, unit, meaning."""
     given, sensor, fits, found = _found(words, sensor_id, count, frame, damaged=True)
     if not given.data:
         raise no_frame(sensor, given)
-    parts = [(piece, _explained(sensor, piece)) for piece in found or [Piece(0, given.data, "?")]]
+    if diff is not None:
+        _compare(sensor, given, found, diff, frame, as_json=as_json, output=output)
+        return
+    parts = [part for piece in found or [Piece(0, given.data, "?")] for part in _parts(sensor, piece)]
     if as_json:
         told = [{"offset": piece.offset, **part.to_dict()} for piece, part in parts]
         emit_json({"sensor": sensor.id, "fits": fits, "frames": told}, output)
     else:
-        emit("\n\n".join(f"{_title(sensor, piece, part)}\n{part}" for piece, part in parts), output)
-    fault = parts[0][1].fault
-    if fault is not None:
-        raise suggest(fault, f"lidarspec show {sensor.id}")
+        lines: list[Line] = []
+        for piece, part in parts:
+            lines += [()] * bool(lines) + [(Span(_title(sensor, piece, part), "title"),), *part.lines(every=bits)]
+        emit_lines(lines, output)
+    if not any(part.frame and part.fault is None for _, part in parts):
+        raise suggest(next(part.fault for _, part in parts if part.fault), f"lidarspec show {sensor.id}")
+
+
+def _compare(sensor: Sensor, given: Input, found: list[Piece], diff: str, frame: str | None, *, as_json: bool, output: str | None) -> None:
+    """Print what differs between the first frame of the input and another one."""
+    frames = [piece for piece in found if piece.frame] or [Piece(0, given.data, "?")]
+    if diff == "next":
+        same = [piece for piece in frames[1:] if piece.frame == frames[0].frame]
+        if not same:
+            raise UsageError(f"the input has no second {frames[0].frame} frame to compare with")
+        other = same[0]
+    else:
+        data = read([diff])
+        rest = [Piece(0, data.data, frame)] if frame else [piece for piece in pieces(sensor, data) if piece.frame]
+        other = next((piece for piece in rest if piece.frame == frames[0].frame), Piece(0, data.data, frames[0].frame))
+    first, second = _explained(sensor, frames[0]), _explained(sensor, other)
+    differing = differences(first, second)
+    if as_json:
+        emit_json({"sensor": sensor.id, "frame": first.frame, "differences": [part.to_dict() for part in differing]}, output)
+    else:
+        emit_lines([(Span(f"{sensor.id} {first.frame}", "title"),), *told_differences(first, second, differing)], output)
 
 
 def _found(
@@ -101,13 +144,38 @@ def _sensor(given: Input, sensor_id: str | None, *, damaged: bool) -> tuple[Sens
 
 
 def _explained(sensor: Sensor, piece: Piece) -> Explanation:
-    """A frame explained; bytes between frames as one row; "?" for bytes that may begin like a frame."""
-    if not piece.frame:
-        return Explanation(sensor.id, "", piece.data, (Row(0, piece.data, "", (), ("in no frame",), right=False),))
+    """A frame explained; "?" for bytes that may begin like one."""
     try:
         return explained(sensor, piece.data, None if piece.frame == "?" else piece.frame)
     except WireError as fault:
         raise suggest(fault, f"lidarspec show {sensor.id}") from None
+
+
+def _parts(sensor: Sensor, piece: Piece) -> Iterator[tuple[Piece, Explanation]]:
+    """A piece of the input explained; of bytes that are in no frame, those that begin like one as far as they go."""
+    if piece.frame:
+        yield piece, _explained(sensor, piece)
+        return
+    data, end = piece.data, 0
+    for start in likely_starts(sensor, data)[:DAMAGED]:
+        if start < end:
+            continue
+        try:
+            found = explained(sensor, data[start:])
+            left = found.rows[-1].data if found.rows and not found.rows[-1].path else b""
+            found = explained(sensor, data[start : len(data) - len(left)], found.frame)
+        except WireError:
+            continue
+        if start > end:
+            yield _skipped(sensor, Piece(piece.offset + end, data[end:start], ""))
+        end = start + len(found.data)
+        yield Piece(piece.offset + start, found.data, found.frame), found
+    if end < len(data):
+        yield _skipped(sensor, Piece(piece.offset + end, data[end:], ""))
+
+
+def _skipped(sensor: Sensor, piece: Piece) -> tuple[Piece, Explanation]:
+    return piece, Explanation(sensor.id, "", piece.data, (Row(0, piece.data, "", (), ("in no frame",), right=False),))
 
 
 def _title(sensor: Sensor, piece: Piece, part: Explanation | None = None) -> str:

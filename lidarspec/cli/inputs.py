@@ -26,8 +26,8 @@ from lidarspec.spec import Sensor
 REPEATED, QUOTED = 400, 64
 #: sensors whose share of the bytes is this close to the best fit as well.
 AS_GOOD = 0.01
-#: constant bits that make bytes look like a frame.
-ALIKE = 8
+#: constant bits that make bytes look like a frame, and constant bytes that do so in the midst of others.
+ALIKE, SYNC = 8, 2
 
 
 @dataclass(frozen=True)
@@ -105,6 +105,18 @@ def pieces(sensor: Sensor, given: Input) -> list[Piece]:
         found.append(Piece(frame.offset, frame.data, frame.frame))
         end = frame.offset + len(frame.data)
     return found + ([Piece(end, data[end:], "")] if end < len(data) else [])
+
+
+def likely_starts(sensor: Sensor, data: bytes) -> list[int]:
+    """Where bytes begin like an incoming frame: with two constant bytes or more, and any other; in ascending order."""
+    starts: set[int] = set()
+    for frame in sensor.frames.values():
+        prefix = codec(frame).prefix
+        size = next((spot for spot in range(len(prefix) + 1) if prefix.get(spot, (0, 0))[0] != 0xFF), 0)
+        if frame.direction == "in" and size >= SYNC:
+            magic = bytes(prefix[spot][1] for spot in range(size))
+            starts |= {found.start() for found in re.finditer(re.escape(magic) + b"(?=.)", data, re.DOTALL)}
+    return sorted(starts)
 
 
 def no_frame(sensor: Sensor, given: Input) -> WireError:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -15,6 +15,20 @@ from rich.table import Table
 from rich.text import Text
 
 from lidarspec.errors import SourceError
+from lidarspec.listing import Line, folded, text as plain_text
+
+#: the colours of what stands in a line, by its role.
+STYLES = {
+    "title": "bold",
+    "offset": "dim",
+    "hex": "cyan",
+    "bits": "yellow",
+    "docs": "dim",
+    "good": "green",
+    "bad": "bold red",
+    "point": "magenta",
+    "note": "bold yellow",
+}
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -52,6 +66,19 @@ def emit(text: str, output: str | None) -> None:
         if is_replaced:
             with contextlib.suppress(OSError):
                 part.unlink()
+
+
+def emit_lines(lines: Iterable[Line], output: str | None) -> None:
+    """Lines with roles: in colours, and folded to its width, on a terminal (NO_COLOR is obeyed); as plain text anywhere else."""
+    if output is None and (console := Console()).is_terminal:
+        found = Text()
+        for line in lines:
+            for span in folded(line, console.width):
+                found.append(span.text, STYLES.get(span.role))
+            found.append("\n")
+        click.echo(drawn(found))
+        return
+    emit("\n".join(plain_text(line) for line in lines), output)
 
 
 def emit_json(value: Any, output: str | None) -> None:

@@ -117,7 +117,7 @@ def test_the_next_command_can_be_typed() -> None:
 
 def test_a_truncated_frame_is_explained_before_it_fails() -> None:
     result = ran("explain", EXAMPLE[:12].hex(), code=4)
-    assert "0009  dc 00 e2  points[1]           0.220 m, intensity 226" in result.stdout
+    assert "0009  dc 00 e2  points[1]    0.220 m, intensity 226" in result.stdout
     assert "frame ends at byte 12 of 47: points[2].distance needs 2 bytes, 0 left" in result.stderr
 
 

@@ -109,7 +109,8 @@ def test_explain_takes_the_frame_type_where_bytes_do_not_tell() -> None:
 def test_captures_are_explained() -> None:
     frames = printed("explain", capture(COIN_D4), "-s", "cspc-coin-d4")["frames"]
     assert b"".join(bytes.fromhex(row["hex"]) for frame in frames for row in frame["rows"]) == capture(COIN_D4).read_bytes()
-    assert [frame["frame"] for frame in frames] == ["", "info", "scan_start", "data", "data", "data", "data", ""]
+    assert [frame["frame"] for frame in frames] == ["", "info", "scan_start", "data", "data", "data", "data", "data"]
+    assert [frame["fault"] is None for frame in frames[1:]] == [True] * 6 + [False]
     assert "3 data" not in ran("parse", capture(LD06), *SENSOR).stderr
 
 

@@ -1,0 +1,140 @@
+"""An explained frame, and how it is listed: a line for each part, indented as the struct is nested, bit fields drawn below.
+
+Lines are pieces with roles, so that who has a terminal can colour them; their texts alone say the same.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from lidarspec.errors import WireError
+from lidarspec.wording import Point, Row, Span, bit_picture
+
+#: bytes in a line, spaces of a level of nesting, and the widest columns of bits and of names.
+LINED, LEVEL, PICTURES, NAMES = 8, 2, 35, 36
+
+#: pieces of a line that are columns, and how much room there has to be beside them for folding.
+FIXED, FOLDED = 3, 24
+
+Line = tuple[Span, ...]
+
+
+@dataclass(frozen=True)
+class Explanation:
+    """A frame explained: rows that name every byte exactly once, in order.
+
+    Attributes:
+        sensor, frame: ids.
+        data: the bytes.
+        rows: one for each field, bit block or array element.
+        fault: what is wrong with the frame as a whole; None if it is valid.
+        notes: what concerns the whole frame.
+    """
+
+    sensor: str
+    frame: str
+    data: bytes
+    rows: tuple[Row, ...]
+    fault: WireError | None = None
+    notes: tuple[str, ...] = ()
+
+    def __str__(self) -> str:
+        return "\n".join(text(line) for line in self.lines())
+
+    def lines(self, *, every: bool = False) -> list[Line]:
+        """The listing in pieces; `every` draws the bits of all elements of an array, and not of the first alone."""
+        return [*_Listing(self.rows, every=every).lines(), *((Span("note: ", "note"), Span(note)) for note in self.notes)]
+
+    def to_dict(self) -> dict[str, Any]:
+        """The explanation for JSON."""
+        fault = None if self.fault is None else {"reason": self.fault.reason, "offset": self.fault.offset, "path": self.fault.path}
+        head = {"sensor": self.sensor, "frame": self.frame, "size": len(self.data), "fault": fault, "notes": list(self.notes)}
+        return {**head, "rows": [row.to_dict() for row in self.rows]}
+
+    def with_points(self, points: Sequence[tuple[Point, ...]]) -> Explanation:
+        """The same with points for each row."""
+        return replace(self, rows=tuple(replace(row, points=found) for row, found in zip(self.rows, points, strict=True)))
+
+
+def text(line: Line) -> str:
+    """A line without its roles."""
+    return "".join(span.text for span in line).rstrip()
+
+
+def folded(line: Line, width: int) -> Line:
+    """The same line with line breaks where it is wider than `width`; what goes on stands below the first piece of its text."""
+    indent = sum(len(span.text) for span in line[:FIXED])
+    if len(text(line)) <= width or indent + FOLDED > width:
+        return line
+    found, column = list(line[:FIXED]), indent
+    for span in line[FIXED:]:
+        for word in re.findall(r"\s*\S+", span.text):
+            breaks = column + len(word) > width and column > indent
+            part = f"\n{' ' * indent}{word.lstrip()}" if breaks else word
+            found.append(Span(part, span.role))
+            column = len(part) - 1 if breaks else column + len(part)
+    return tuple(found)
+
+
+def parents(path: str) -> list[str]:
+    """The structs and elements that a path goes through, outermost first: "a[0].b.c" is in "a[0]" and "a[0].b"."""
+    parts = path.split(".")
+    return [".".join(parts[:depth]) for depth in range(1, len(parts))]
+
+
+class _Listing:
+    """The lines of some rows, in columns of one width."""
+
+    def __init__(self, rows: Sequence[Row], *, every: bool) -> None:
+        self._rows = rows
+        self._drawn = [any(value.bits for value in row.values) and (every or row.first) for row in rows]
+        self._bytes = min(max((len(row.data) for row in rows), default=1), LINED)
+        pictures = [bit_picture(*part) for row, drawn in zip(rows, self._drawn, strict=True) if drawn for part in _bits(row)]
+        self._left = max([3 * self._bytes - 1, *(len(picture) for picture in pictures if len(picture) <= PICTURES)])
+        self._paths = min(max((len(name) for index in range(len(rows)) for name in self._names(index)), default=0), NAMES)
+
+    def lines(self) -> Iterator[Line]:
+        above: list[str] = []
+        for index, row in enumerate(self._rows):
+            around = parents(row.path)
+            for depth, path in enumerate(around):
+                if path not in above[depth : depth + 1]:
+                    yield self._line(row.offset, Span(""), _indented(path, depth), [])
+            above = around
+            yield from self._row(row, len(around), drawn=self._drawn[index])
+
+    def _row(self, row: Row, depth: int, *, drawn: bool) -> Iterator[Line]:
+        parts = [row.data[start : start + self._bytes] for start in range(0, len(row.data), self._bytes)] or [b""]
+        role = "hex" if row.right else "bad"
+        yield self._line(row.offset, Span(parts[0].hex(" "), role), _indented(row.path, depth), row.spans(drawn=drawn))
+        for number, part in enumerate(parts[1:], 1):
+            yield (Span(f"{row.offset + number * self._bytes:04x}  ", "offset"), Span(part.hex(" "), role))
+        for value, picture in zip(row.values, _bits(row), strict=True) if drawn else ():
+            words = [Span(str(value) or value.raw.hex(" "))]
+            words += [Span(f" ({value.bits})", "docs")] * (len(value.masks) - value.masks.count(0) > 1 and bool(value.bits))
+            words += [Span(f"; {value.docs}", "docs")] if value.docs else []
+            drawing = Span(bit_picture(*picture), "bits") if value.bits else Span(picture[0].hex(" "), role)
+            yield self._line(value.start, drawing, " " * LEVEL * (depth + 1) + value.path.removeprefix(f"{row.path}."), words)
+
+    def _line(self, offset: int, left: Span, name: str, words: Sequence[Span]) -> Line:
+        padded = Span(f"{left.text:<{self._left}}  ", left.role)
+        return (Span(f"{offset:04x}  ", "offset"), padded, Span(f"{name:<{self._paths}}  ", "name"), *words)
+
+    def _names(self, index: int) -> Iterator[str]:
+        row = self._rows[index]
+        around = parents(row.path)
+        yield from (_indented(path, depth) for depth, path in enumerate([*around, row.path]))
+        if self._drawn[index]:
+            yield from (" " * LEVEL * (len(around) + 1) + value.path.removeprefix(f"{row.path}.") for value in row.values)
+
+
+def _bits(row: Row) -> list[tuple[bytes, bytes]]:
+    """The bytes and the bits in them of each value."""
+    return [(row.data[value.start - row.offset :][: len(value.masks)], value.masks) for value in row.values]
+
+
+def _indented(path: str, depth: int) -> str:
+    return " " * LEVEL * depth + path.rpartition(".")[2]
