@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from fractions import Fraction
 
 from lidarspec.errors import UsageError
@@ -37,6 +38,11 @@ def split_unit(text: str) -> tuple[str, str]:
         if text.endswith(unit) and _is_number(text[: -len(unit)]):
             return text[: -len(unit)].strip(), unit
     return text, ""
+
+
+def slug(unit: str) -> str:
+    """A unit as part of a name: "deg/s" is "deg_s"."""
+    return re.sub(r"\W+", "_", unit).strip("_").lower()
 
 
 def _is_number(text: str) -> bool:

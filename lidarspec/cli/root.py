@@ -50,6 +50,7 @@ GROUPS = {
     },
     "authors": {
         "check": ("check", "What is wrong with a sensor, a file or a distribution: every promise, and mistakes in its spec."),
+        "export": ("export", "A sensor's spec for another tool: wireshark, c, ksy (Kaitai), md, svg, json, pyi."),
     },
 }
 VERBS = {verb: place for verbs in GROUPS.values() for verb, place in verbs.items()}

@@ -7,9 +7,10 @@ the reason, where its target cannot say what the spec says.
 from __future__ import annotations
 
 import importlib
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from lidarspec.errors import UnknownName, UsageError
+from lidarspec.errors import UnknownFrame, UnknownName, UsageError
 
 if TYPE_CHECKING:
     from lidarspec.spec import Sensor
@@ -18,6 +19,11 @@ if TYPE_CHECKING:
 EXPORTS: dict[str, str] = {
     "wireshark": "lidarspec.export.wireshark:dissector",
     "c": "lidarspec.export.c:header",
+    "ksy": "lidarspec.export.ksy:ksy",
+    "md": "lidarspec.export.reference:page",
+    "svg": "lidarspec.export.diagram:svg",
+    "json": "lidarspec.export.data:text",
+    "pyi": "lidarspec.export.stubs:pyi",
 }
 
 
@@ -29,6 +35,18 @@ class UnknownExport(UnknownName):
     """There is no export of this kind."""
 
     what = "export"
+
+
+def narrowed(sensor: Sensor, frame: str) -> Sensor:
+    """The sensor with one frame type alone, and no commands: what exports of a single message are made from.
+
+    Raises:
+        UnknownFrame: if it has no frame type of this name.
+    """
+    if frame not in sensor.frames:
+        raise UnknownFrame(frame, sensor.frames, place=sensor.id)
+    alone = {frame: replace(sensor.frames[frame], after=None)}
+    return replace(sensor, frames=alone, commands={}, state={}, on_open=(), on_close=())
 
 
 def export(kind: str, sensor: Sensor) -> str:
