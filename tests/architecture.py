@@ -21,7 +21,7 @@ FLOORS = (
     "found datagrams decoder packets streams clocks sequences clouds points plans cuts reorder mounting",
     "session replies scans simulation explain parsing building examples engine wiretable wording listing flips differences",
     "device async_device inputs detection transports recording captures sources settings",
-    "testing formats export view demo",
+    "testing formats export view demo scaffold",
     "cli",
     "__main__",
 )

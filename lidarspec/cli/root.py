@@ -49,6 +49,7 @@ GROUPS = {
         "crc": ("crc", "Which checksum seals some sample frames: XOR, sums, or a CRC of 8, 16 or 32 bits."),
     },
     "authors": {
+        "new": ("new", "A distribution for a sensor of your own, which works before anything in it is changed."),
         "check": ("check", "What is wrong with a sensor, a file or a distribution: every promise, and mistakes in its spec."),
         "export": ("export", "A sensor's spec for another tool: wireshark, c, ksy (Kaitai), md, svg, json, pyi."),
     },

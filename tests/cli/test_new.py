@@ -1,0 +1,134 @@
+"""`new`: the distribution that it writes works before anything in it is changed."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import lidarspec as ls
+from lidarspec.scaffold import Names
+from tests.architecture import Module, private_imports
+from tests.cli.running import ran
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def installed(folder: Path) -> dict[str, str]:
+    """The environment of a process in which the distribution in this folder is installed, as pip leaves it behind."""
+    project = tomllib.loads((folder / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    about = folder / f"{project['name'].replace('-', '_')}-{project['version']}.dist-info"
+    about.mkdir(exist_ok=True)
+    entries = "".join(f"{name} = {value}\n" for name, value in project["entry-points"]["lidarspec"].items())
+    (about / "entry_points.txt").write_text(f"[lidarspec]\n{entries}", encoding="utf-8")
+    header = f"Metadata-Version: 2.1\nName: {project['name']}\nVersion: {project['version']}\n"
+    (about / "METADATA").write_text(header, encoding="utf-8")
+    paths = [str(folder), *filter(None, [os.environ.get("PYTHONPATH")])]
+    return {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}
+
+
+def run(folder: Path, *words: object, code: int = 0) -> str:
+    """What ``python -m WORDS`` prints in the folder of an installed distribution."""
+    command = [sys.executable, "-m", *map(str, words)]
+    done = subprocess.run(command, cwd=folder, env=installed(folder), capture_output=True, text=True, check=False, timeout=120)
+    assert done.returncode == code, done.stdout + done.stderr
+    return done.stdout
+
+
+@pytest.fixture(scope="module", params=["serial", "udp"])
+def made(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The distribution of an invented sensor with either link."""
+    place = tmp_path_factory.mktemp("new")
+    told = ran("new", "acme-x1", "--into", place, "--link", request.param)
+    folder = place / "lidarspec-acme-x1"
+    assert [Path(line) for line in told.stdout.splitlines()] == [path for path in map(Path, told.stdout.splitlines()) if path.is_file()]
+    assert f"pip install -e '{folder}[test]'" in told.stderr
+    return folder
+
+
+def test_its_own_tests_pass(made: Path) -> None:
+    assert " passed" in run(made, "pytest", "-q", "-p", "no:cacheprovider")
+
+
+def test_it_is_found_shown_simulated_and_converted(made: Path) -> None:
+    assert "acme- = lidarspec_acme_x1" in run(made, "lidarspec", "plugins")
+    shown = run(made, "lidarspec", "show", "acme-x1")
+    assert "command speed speed=5..15, answered by ack" in shown
+    assert "CRC-16 poly 0x1021 init 0xffff over all other bytes" in shown
+    suffix = "pcap" if "udp 2370" in shown else "bin"
+    run(made, "lidarspec", "sim", "acme-x1", "--to", made / f"sent.{suffix}", "-t", "0.5s")
+    run(made, "lidarspec", "convert", made / f"sent.{suffix}", made / "points.csv")
+    lines = (made / "points.csv").read_text(encoding="utf-8").splitlines()
+    assert lines[0].split(",")[:4] == ["x", "y", "z", "range"]
+    assert len(lines) > 3000
+
+
+def test_its_simulation_can_be_viewed_and_recorded(made: Path) -> None:
+    assert "acme-x1: Scan(720 points, 10.0 Hz" in run(made, "lidarspec", "view", "sim:acme-x1", "--once")
+    run(made, "lidarspec", "record", "sim:acme-x1", "-s", "acme-x1", "-o", made / "some.lsr", "-t", "0.3s")
+    assert len(run(made, "lidarspec", "read", made / "some.lsr").splitlines()) > 100
+
+
+def test_the_points_are_compiled(made: Path) -> None:
+    assert "plain evaluation" not in run(made, "lidarspec", "show", "acme-x1", "--plan")
+
+
+def test_its_vectors_are_true(made: Path) -> None:
+    sensor = ls.sensor(made / "lidarspec_acme_x1" / "__init__.py")
+    listed = json.loads((made / "vectors.json").read_text(encoding="utf-8"))
+    assert {vector["frame"] for vector in listed} == set(sensor.frames)
+    for vector in listed:
+        parsed = sensor.parse(bytes.fromhex(vector["hex"]), vector["frame"])
+        assert {path: read(parsed, path) for path in vector["values"]} == vector["values"]
+        assert "Acme X1 manual, section" in vector["source"]
+
+
+def read(parsed: Any, path: str) -> Any:
+    for part in path.replace("[", ".").replace("]", "").split("."):
+        parsed = parsed[int(part)] if part.isdigit() else parsed[part]
+    return parsed
+
+
+def test_it_is_written_as_the_projects_own_sensors_are(made: Path) -> None:
+    module = Module("lidarspec_acme_x1", (made / "lidarspec_acme_x1" / "__init__.py").read_text(encoding="utf-8"), True)
+    assert not private_imports({module.name: module}, ls.__all__)
+    config = ["--config", str(ROOT / "pyproject.toml")]
+    for words in (["check"], ["format", "--check"]):
+        done = subprocess.run([sys.executable, "-m", "ruff", *words, *config, str(made)], capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stdout
+    assert len(module.text.splitlines()) < 160
+
+
+def test_what_is_there_is_not_overwritten(tmp_path: Path) -> None:
+    (tmp_path / "lidarspec-acme-x1").mkdir()
+    assert "exists already" in ran("new", "acme-x1", "--into", tmp_path, code=2).stderr
+    assert not list((tmp_path / "lidarspec-acme-x1").iterdir())
+
+
+@pytest.mark.parametrize("name", ["acme", "Acme-X1", "acme_x1", "acme-", "-x1", "acme x1", "../acme-x1", "acme--x1", "äcme-x1", ""])
+def test_what_is_no_id_is_refused(tmp_path: Path, name: str) -> None:
+    assert "is no id" in ran("new", "--into", tmp_path, "--", name, code=2).stderr
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_id_that_is_taken_is_refused(tmp_path: Path) -> None:
+    assert "is installed already" in ran("new", "ldrobot-ld06", "--into", tmp_path, code=2).stderr
+
+
+@pytest.mark.parametrize("name", ["3d-360", "acme-data", "acme-x-1b", "a-1"])
+def test_odd_ids_make_working_modules(tmp_path: Path, name: str) -> None:
+    ran("new", name, "--into", tmp_path)
+    names = Names(name)
+    assert ls.sensor(tmp_path / names.distribution / names.module / "__init__.py").id == name
+    assert names.constant.isidentifier()
+
+
+def test_a_place_that_cannot_be_written_is_named(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    assert "file" in ran("new", "acme-x1", "--into", tmp_path / "file", code=3).stderr
