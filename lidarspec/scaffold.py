@@ -5,6 +5,7 @@ A line of a template that ends in ``#if serial`` or ``#if udp`` is for sensors w
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -13,11 +14,15 @@ from pathlib import Path
 from string import Template
 from typing import Literal
 
+from lidarspec.draft import Draft
+from lidarspec.drafting import drafted
 from lidarspec.errors import SourceError, UsageError
 
 Link = Literal["serial", "udp"]
 #: what the modules of the templates call something else.
 TAKEN = {"ACK", "COMMAND", "DATA", "RATE", "SAMPLES", "TURNS"}
+#: frames of a capture that are kept as vectors.
+VECTORS = 3
 _ID = re.compile(r"([a-z0-9]+)-([a-z0-9]+(?:-[a-z0-9]+)*)")
 _CONDITION = re.compile(r"^(.*?) *#if (\w+)\n", re.MULTILINE)
 
@@ -89,6 +94,29 @@ def invented(names: Names, link: Link) -> dict[str, str]:
         f"{names.module}/__init__.py": filled("module.py", values, link),
         f"{names.module}/py.typed": "",
         f"tests/test_{names.id.replace('-', '_')}.py": filled("test_module.py", values, link),
+    }
+
+
+def captured(names: Names, link: Link, draft: Draft, *, origin: str, port: int | None) -> dict[str, str]:
+    """The files of a distribution with the sensor that a capture was drafted to, by path.
+
+    Args:
+        origin: the capture in words.
+        port: the UDP port that the datagrams were sent to, where that is known.
+    """
+    serial = "Serial(115_200)},  # the baud rate: a capture does not tell it"
+    udp = f"Udp({port})}},  # where the capture's datagrams went" if port else "Udp(2368)},  # the port: this capture does not tell it"
+    values = {**names.values(), **drafted(draft, origin=origin, link=serial if link == "serial" else udp)}
+    frames = [
+        {"frame": "data", "hex": data.hex(" "), "values": {}, "source": f"{origin}, at byte {at}"} for at, data in draft.frames[:VECTORS]
+    ]
+    return {
+        "pyproject.toml": filled("pyproject.toml", values, link),
+        "README.md": filled("README_draft.md", values, link),
+        "vectors.json": json.dumps(frames, indent=2) + "\n",
+        f"{names.module}/__init__.py": filled("draft.py", values, link),
+        f"{names.module}/py.typed": "",
+        f"tests/test_{names.id.replace('-', '_')}.py": filled("test_draft.py", values, link),
     }
 
 

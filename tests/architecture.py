@@ -19,7 +19,8 @@ FLOORS = (
     "spec hookspecs geometry links rules splits files searching",
     "frames framing runs installed plugins",
     "found datagrams decoder packets streams clocks sequences clouds points plans cuts reorder mounting",
-    "session replies scans simulation explain parsing building examples engine wiretable wording listing flips differences",
+    "session replies scans simulation explain parsing building examples engine wiretable wording listing flips differences candidates "
+    "draft drafting",
     "device async_device inputs detection transports recording captures sources settings",
     "testing formats export view demo scaffold",
     "cli",

@@ -185,7 +185,7 @@ class TestStructure:
     def test_frames_that_say_how_long_they_are(self) -> None:
         found = structure([b"\xfe" + b"".join(simulate(ls.sensor("cspc-m1c1-mini"), 60))], datagrams=False)
         assert found is not None
-        assert (found.sync, found.period, found.length) == (b"\xaa\x55", None, "10 + 3 x byte at 3")
+        assert (found.sync, found.period, str(found.length)) == (b"\xaa\x55", None, "10 + 3 x byte at 3")
         assert found.checksums[0].paste == "WordXor(head=8, groups=(1, 2))"
 
     def test_long_frames_with_shorter_ones_in_them(self) -> None:

@@ -101,7 +101,7 @@ def told(match: Match) -> dict[str, Any]:
 def _text(match: Match, length: int) -> str:
     order = f", {match.order}-endian" if match.place.size > 1 else ""
     name = f" ({match.name})" if match.name else ""
-    chance = f"one wrong guess in {2**match.doubt:.0e} would be" if match.doubt >= WEAK else "which may be chance"
+    chance = f"one wrong guess in {match.odds} would be" if match.doubt >= WEAK else "which may be chance"
     lines = [
         f"{match.algorithm.describe()}{name}: right in {match.right} of {match.total} frames; {chance}",
         f"  field: {match.place}{order}",

@@ -185,7 +185,7 @@ def _structure_told(found: Structure | None) -> dict[str, Any] | None:
     return {
         "sync": found.sync.hex(" "),
         "period": found.period,
-        "length": found.length or None,
+        "length": str(found.length) if found.length else None,
         "share": round(found.share, 4),
         "frames": len(found.frames),
         "checksums": checksums,

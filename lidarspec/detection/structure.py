@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from lidarspec.checksums import ByteOrder
 from lidarspec.searching.checksums import search
 from lidarspec.searching.samples import Match
 
@@ -31,13 +32,37 @@ HEADER, UNIT = 8, 16
 
 
 @dataclass(frozen=True)
+class Length:
+    """What a header says of the length of its frame: `rest` + `unit` times the number of `size` bytes at `place`."""
+
+    place: int
+    size: int
+    order: ByteOrder
+    unit: int
+    rest: int
+
+    @property
+    def end(self) -> int:
+        """The first byte behind the number."""
+        return self.place + self.size
+
+    def of(self, frame: bytes) -> int:
+        """The length that a frame says it has."""
+        return self.rest + self.unit * int.from_bytes(frame[self.place : self.end], self.order)
+
+    def __str__(self) -> str:
+        kind = "byte" if self.size == 1 else f"{self.order}-endian word"
+        return f"{self.rest} + {self.unit} x {kind} at {self.place}"
+
+
+@dataclass(frozen=True)
 class Structure:
     """Frames that unknown bytes seem to consist of.
 
     Attributes:
         sync: bytes that each begins with.
         period: their length; None where it varies.
-        length: where the length stands, in words, where it varies.
+        length: how they say it, where it varies.
         share: share of the bytes that are in them.
         frames: the frames.
         checksums: what may seal them, the likeliest first.
@@ -45,7 +70,7 @@ class Structure:
 
     sync: bytes
     period: int | None
-    length: str
+    length: Length | None
     share: float
     frames: tuple[bytes, ...]
     checksums: tuple[Match, ...]
@@ -81,7 +106,7 @@ def _of_datagrams(chunks: Sequence[bytes]) -> Structure | None:
     rows = np.frombuffer(b"".join(frames), np.uint8).reshape(len(frames), length)
     steady = (rows == rows[0]).all(axis=0)
     sync = frames[0][: int(np.argmin(steady)) if not steady.all() else length][:16]
-    return Structure(sync, length, "", len(frames) * length / sum(map(len, chunks)), tuple(frames), ())
+    return Structure(sync, length, None, len(frames) * length / sum(map(len, chunks)), tuple(frames), ())
 
 
 def _of_stream(data: NDArray[np.uint8]) -> Structure | None:
@@ -116,7 +141,7 @@ def _framed(data: NDArray[np.uint8], period: int) -> Iterator[tuple[float, Struc
     frames = [frame for frame in cut(data.tobytes(), period, start) if frame.startswith(sync)]
     if len(frames) >= FRAMES:
         share = len(frames) * period / len(data)
-        yield share * float((steady & (usual != 0)).mean()), Structure(sync[:16], period, "", share, tuple(frames), ())
+        yield share * float((steady & (usual != 0)).mean()), Structure(sync[:16], period, None, share, tuple(frames), ())
 
 
 def _longest_run(steady: NDArray[np.bool_], usual: NDArray[np.uint8]) -> tuple[int, int]:
@@ -153,10 +178,11 @@ def _explained(data: NDArray[np.uint8], starts: NDArray[np.intp], sync: bytes) -
     steps = np.diff(starts)
     if len(steps) < FRAMES:
         return None
-    best = (0.0, "", np.zeros(0, np.bool_))
+    best: tuple[float, Length | None, NDArray[np.bool_]] = (0.0, None, np.zeros(0, np.bool_))
+    kinds: tuple[tuple[int, ByteOrder], ...] = ((1, "little"), (2, "little"), (2, "big"))
     for place in range(2, HEADER):
         low, high = data[starts[:-1] + place].astype(np.int64), data[starts[:-1] + place + 1].astype(np.int64)
-        for kind, values in (("byte", low), ("little-endian word", low | high << 8), ("big-endian word", high | low << 8)):
+        for (size, order), values in zip(kinds, (low, low | high << 8, high | low << 8), strict=True):
             for unit in range(1, UNIT + 1):
                 rest = steps - unit * values
                 usual, number = _commonest(rest)
@@ -164,9 +190,9 @@ def _explained(data: NDArray[np.uint8], starts: NDArray[np.intp], sync: bytes) -
                 distinct = len(np.unique(steps[told]))
                 share = float(steps[told].sum() / len(data))
                 if distinct > 1 and number >= FRAMES and usual >= 0 and share > best[0]:
-                    best = (share, f"{usual} + {unit} x {kind} at {place}", told)
+                    best = (share, Length(place, size, order, unit, usual), told)
     share, length, told = best
-    if not length:
+    if length is None:
         return None
     whole = data.tobytes()
     frames = [whole[start : start + step] for start, step in zip(starts[:-1][told].tolist(), steps[told].tolist(), strict=True)]

@@ -17,6 +17,8 @@ Part = Literal["all", "before", "behind"]
 SHORT, NEAR = 64, 12
 #: bytes in front that a checksum at the end may leave out, and how far from the end that is.
 HEAD, TAIL = 6, 4
+#: how far apart the values of each byte of a checksum lie, and how much more likely the usual place is.
+APART, USUAL = 96, 1.1
 #: share of the frames that a checksum has to be right for: some may be damaged.
 ENOUGH = 0.6
 #: doubt at which a match is sure enough for the search to end: one wrong guess in a million looks like that.
@@ -81,7 +83,7 @@ class Match:
         remarks: what else is to be said.
         name: what a catalogue calls it.
         open: whether other parameters fit these frames as well.
-        varied: distinct values of the byte of its place that varies least.
+        varied: how much that byte of its place varies that varies least, see `Samples.varied`.
     """
 
     algorithm: Checksum
@@ -95,7 +97,12 @@ class Match:
     remarks: tuple[str, ...] = ()
     name: str = ""
     open: bool = False
-    varied: int = 0
+    varied: float = 0.0
+
+    @property
+    def odds(self) -> str:
+        """The number of wrong checksums of which one would fit as well by chance, as a power of ten."""
+        return f"1e+{int(self.doubt * np.log10(2)):02}"
 
     @property
     def sure(self) -> bool:
@@ -182,9 +189,15 @@ class Samples:
         """Whether there is one frame: too little to look anywhere but at the usual places."""
         return len(self) == 1
 
-    def varied(self, place: Place) -> int:
-        """How many values the byte of a place has that varies least."""
-        return min(len(np.unique(self.fields(Place(place.offset + spot, 1), "little"))) for spot in range(place.size))
+    def varied(self, place: Place) -> float:
+        """How much that byte of a place varies that varies least: whether its values lie far apart, and how many are distinct.
+
+        The usual place, at the end, needs a little less.
+        """
+        columns = [self.fields(Place(place.offset + spot, 1), "little") for spot in range(place.size)]
+        distinct = min(len(np.unique(values)) for values in columns) / min(len(self), 256)
+        apart = min(int(np.ptp(values)) for values in columns) >= APART
+        return 2 * apart + min(1.0, distinct * (USUAL if place.offset == -place.size else 1))
 
     def _varies(self, place: Place) -> bool:
         values = self.fields(place, "little")

@@ -91,7 +91,7 @@ def pasted(algorithm: Checksum) -> str:
 def plain_matches(samples: Samples) -> Iterator[Match]:
     """Every plain checksum that fits, in no special order."""
     few = samples.few(SCREENED)
-    tried, sure, match = 0, False, None
+    tried, sure, certain = 0, False, False
     for size, algorithms in ((4, (Sum(32),)), (2, _WIDE), (1, (Xor(), Sum(8)))):
         for place in few.places(size):
             for span in spans(place, few):
@@ -103,8 +103,9 @@ def plain_matches(samples: Samples) -> Iterator[Match]:
                     tried += 1
                     for match in _fitting(samples, few, algorithm, place, span, tried):
                         sure = sure or match.sure
+                        certain = certain or (match.sure and not isinstance(match.algorithm, Xor | WordXor))
                         yield match
-            if sure and match is not None and not isinstance(match.algorithm, Xor | WordXor):
+            if certain:
                 return
         if sure:
             return
@@ -138,7 +139,7 @@ def _fitting(samples: Samples, few: Samples, algorithm: Checksum, place: Place, 
             proven = enough(right, len(samples)) if not fitted else right >= CERTAIN * len(samples)
             if proven and doubtful > 0 and not (few.alone and fitted):
                 remarks: tuple[str, ...] = ("a constant is in it: fields left out of what it covers, or a start value",) if fitted else ()
-                varied = 0
+                varied = 0.0
                 if isinstance(algorithm, Xor | WordXor) and span == Span():
                     remarks, varied = (*remarks, ANYWHERE), samples.varied(place)
                 yield Match(one, place, span, order, right, len(samples), doubtful, pasted(one), remarks, "", bool(fitted), varied)

@@ -63,3 +63,8 @@ def test_none_is_found_and_nothing_is_no_input(tmp_path: Path) -> None:
     (tmp_path / "noise.bin").write_bytes(source.randbytes(5000))
     found = ran("crc", tmp_path / "noise.bin", code=2)
     assert "--period BYTES" in found.stderr
+
+
+def test_many_frames_prove_more_than_a_float_can_hold() -> None:
+    frames = simulate(ls.sensor("ldrobot-stl27l"), 250)
+    assert "one wrong guess in 1e+" in ran("crc", *(frame.hex() for frame in frames)).stdout

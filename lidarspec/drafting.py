@@ -1,0 +1,309 @@
+"""The text of a first spec out of a draft: each field with the evidence for it, and honest names for what nobody knows yet."""
+
+from __future__ import annotations
+
+import itertools
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarspec.candidates import CIRCLES, FEW, Candidate, follows, values
+from lidarspec.checksums import ByteOrder
+from lidarspec.draft import Blocks, Draft
+from lidarspec.searching.samples import Match
+
+#: bytes of a constant that are told, and how many have to be constant together to be a field.
+TOLD, RUN = 8, 2
+#: unknown bytes in a row in which no constant ones are looked for: there the scene decides what changes.
+LONG = 64
+#: doubt below which a checksum may be chance, as one in so many powers of two.
+WEAK = 12
+
+
+@dataclass(frozen=True)
+class Field:
+    """A line of a struct: where it begins, how long it is, its name, what follows the name, and the evidence."""
+
+    start: int
+    size: int
+    name: str
+    code: str
+    why: tuple[str, ...] = ()
+
+    def lines(self, indent: str) -> Iterator[str]:
+        """Its text."""
+        yield from (f"{indent}# {line}" for line in self.why)
+        gap = f"\n{indent}" if "\n" in self.code else " "
+        yield f'{indent}"{self.name}"{gap}/ {self.code},'
+
+
+def drafted(draft: Draft, *, origin: str, link: str) -> dict[str, str]:
+    """What a template of a module needs: imports, the struct, functions and arguments, as text.
+
+    Args:
+        origin: what the draft was made from, in words.
+        link: the data link as it stands in the module.
+    """
+    fields = list(_fields(draft))
+    seal = _seal(draft, fields)
+    angles = _angles(draft)
+    lines = [line for field in fields for line in field.lines(" " * (8 if seal else 4))]
+    body = "\n".join(lines)
+    struct = f"Checksummed(\n    Struct(\n{body}\n    ),\n{seal[0]})" if seal else f"Struct(\n{body}\n)"
+    below = [f"f.{path} < 360" for path, _, _ in angles]
+    plausible = below[0] if len(below) == 1 else " & ".join(f"({one})" for one in below)
+    counters = [one for one in draft.candidates if one.kind == "counter" and one.offset < draft.head]
+    text = {
+        "frames_told": f"{len(draft.frames)} frame{'s' * (len(draft.frames) != 1)}, {draft.share:.1%} of its {draft.bytes_in} bytes",
+        "origin": origin,
+        "checksum_class": f"{seal[1]}\n\n\n" if seal and seal[1] else "",
+        "sealed": "" if seal else "# No checksum was found: XORs, sums and CRCs of 8, 16 and 32 bits were tried.\n",
+        "struct": struct,
+        "plausible": f'def plausible(f: Fields) -> Any:\n    """Angles below 360 degrees."""\n    return {plausible}\n\n\n'
+        if angles
+        else "",
+        "azimuth": f"np.deg2rad(f.{angles[0][0]})" if angles else "np.zeros(1)",
+        "distance": f"0 * f.{angles[0][0]}" if angles else "np.zeros(1)",
+        "sweep": _sweep(draft, angles),
+        "arguments": "".join(f"    {line}\n" for line in _arguments(angles, counters)),
+        "frame_arguments": f"max_length={_longest(draft)}" + (", plausible=plausible" if angles else ""),
+        "link_code": link,
+    }
+    return {**text, **_imports(text)}
+
+
+def _fields(draft: Draft) -> Iterator[Field]:
+    """The fields of a frame in their order."""
+    rows, known = draft.rows, _known(draft)
+    cuts = sorted({0, draft.head, *_span_cuts(draft), *(edge for one in known for edge in (one.start, one.start + one.size))})
+    at = 0
+    for field in [*known, Field(draft.head, 0, "", "")]:
+        yield from _gap(rows, at, field.start, cuts)
+        if field.name:
+            yield field
+        at = field.start + field.size
+    if draft.size is None and draft.length is not None:
+        yield from _varying(draft)
+
+
+def _known(draft: Draft) -> list[Field]:
+    """Those that something is known of, without overlaps."""
+    found = list(_header(draft))
+    if draft.length is not None:
+        told = sorted({len(frame) for _, frame in draft.frames})
+        seen = (
+            f"frames of {told[0]} to {told[-1]} bytes"
+            if len(told) > 1
+            else f"whole frames of {told[0]} bytes, and the beginning of another"
+        )
+        why = f"frames are as long as {draft.length} says: {seen}"
+        found.append(
+            Field(draft.length.place, draft.length.size, _counter_name(draft), _integer(draft.length.size, draft.length.order), (why,))
+        )
+    if draft.seal is not None and not draft.tail:
+        found.append(_check(draft, draft.seal, draft.seal.place.start(draft.head)))
+    if draft.blocks is not None:
+        found.append(_block_field(draft, draft.blocks))
+    found += [_rising(draft, one) for one in draft.candidates]
+    chosen: list[Field] = []
+    for field in found:
+        if all(field.start + field.size <= other.start or other.start + other.size <= field.start for other in chosen):
+            chosen.append(field)
+    return sorted(chosen, key=lambda field: field.start)
+
+
+def _header(draft: Draft) -> Iterator[Field]:
+    """The sync bytes, in pieces where the checksum's span begins among them; those of blocks that begin with them are theirs."""
+    end = len(draft.sync) if draft.blocks is None else min(len(draft.sync), draft.blocks.start)
+    edges = [0, *(cut for cut in _span_cuts(draft) if 0 < cut < end), end]
+    for a, b in itertools.pairwise(edges):
+        if b > a:
+            why = (f"{len(draft.frames)} frames begin so",) if a == 0 else ()
+            yield Field(a, b - a, f"header_{a}" if a else "header", f"Const({_bytes(draft.sync[a:b])})", why)
+
+
+def _gap(rows: NDArray[np.uint8], start: int, end: int, cuts: Sequence[int]) -> Iterator[Field]:
+    """What lies between known fields, in pieces that the checksum's span and constant bytes make."""
+    edges = {start, end, *(cut for cut in cuts if start < cut < end)}
+    if len(rows) >= FEW and end - start <= LONG:
+        edges |= _constant_edges(rows, start, end)
+    for a, b in itertools.pairwise(sorted(edges)):
+        yield Field(a, b - a, f"unknown_{a}", f"Bytes({b - a})", _constant(rows[:, a:b]))
+
+
+def _constant_edges(rows: NDArray[np.uint8], start: int, end: int) -> set[int]:
+    """Where runs of bytes that never change begin and end."""
+    steady = np.concatenate([[False], (rows[:, start:end] == rows[0, start:end]).all(axis=0), [False]])
+    begins, ends = (np.flatnonzero(np.diff(steady.astype(np.int8)) == step) for step in (1, -1))
+    runs = [(int(a), int(b)) for a, b in zip(begins, ends, strict=True) if b - a >= RUN]
+    return {start + edge for run in runs for edge in run}
+
+
+def _constant(columns: NDArray[np.uint8]) -> tuple[str, ...]:
+    if not columns.size or not (columns == columns[0]).all():
+        return ()
+    told = columns[0, :TOLD].tobytes().hex(" ") + (" ..." if columns.shape[1] > TOLD else "")
+    alike = bool((columns[0] == columns[0, 0]).all()) and columns.shape[1] > TOLD
+    return (f"always {f'{columns[0, 0]:02x}' if alike else told} in {len(columns)} frames",)
+
+
+def _rising(draft: Draft, one: Candidate, what: str = "frame") -> Field:
+    """A counter, an angle, or something else that rises."""
+    code = _integer(one.size, one.order)
+    why: tuple[str, ...] = (one.why(what),)
+    if one.kind == "angle":
+        code = f'Scaled({code}, {CIRCLES[one.circle][0]:g}, "deg")'
+    if what == "frame":
+        for other in draft.candidates:
+            same = other.circle == one.circle and other.kind == one.kind != "counter" and other.offset < one.offset
+            first, last = (values(draft.rows, each.offset, each.size, each.order) for each in (other, one))
+            if same and follows(first, last, one.circle) > 1 - 1 / FEW:
+                why = (*why, f"lies between this frame's {other.name} and the next one's: the angle of the last sample?")
+    return Field(one.offset, one.size, one.name, code, why)
+
+
+def _block_field(draft: Draft, blocks: Blocks) -> Field:
+    rows = draft.rows[:, blocks.start : blocks.end].reshape(-1, blocks.size)
+    fields, at = [Field(0, len(blocks.flag), "flag", f"Const({_bytes(blocks.flag)})")], len(blocks.flag)
+    for one in [*(_rising(draft, each, "block") for each in blocks.candidates), Field(blocks.size, 0, "", "")]:
+        fields += _gap(rows, at, one.start, ())
+        fields += [one] if one.name else []
+        at = one.start + one.size
+    indent = " " * (16 if draft.seal else 12)
+    body = "\n".join(line for field in fields for line in field.lines(indent))
+    code = f"Array(\n{indent[8:]}    {blocks.count},\n{indent[8:]}    Struct(\n{body}\n{indent[8:]}    ),\n{indent[8:]})"
+    why = f"{blocks.count} blocks of {blocks.size} bytes that begin with {blocks.flag.hex(' ')}"
+    return Field(blocks.start, blocks.end - blocks.start, "blocks", code, (why,))
+
+
+def _varying(draft: Draft) -> Iterator[Field]:
+    """What varies in number, and the checksum behind it."""
+    assert draft.length is not None
+    rest, name = draft.head + draft.tail - draft.length.rest, _counter_name(draft)
+    if draft.length.unit > 1 and rest == 0:
+        yield Field(draft.head, 0, "samples", f'Array(this.{name}, Struct("unknown_0" / Bytes({draft.length.unit})))')
+    else:
+        number = f"this.{name}" if draft.length.unit == 1 else f"{draft.length.unit} * this.{name}"
+        lengths = {len(frame) for _, frame in draft.frames}
+        step = int(np.gcd.reduce([length - min(lengths) for length in lengths]))
+        why = (f"their lengths differ by multiples of {step}: samples of {step} bytes?",) if step > 1 else ()
+        yield Field(draft.head, 0, f"unknown_{draft.head}", f"Bytes({number} - {rest})" if rest else f"Bytes({number})", why)
+    if draft.tail and draft.seal is not None:
+        yield _check(draft, draft.seal, -draft.tail)
+
+
+def _counter_name(draft: Draft) -> str:
+    return "count" if draft.length is not None and draft.length.unit > 1 else "length"
+
+
+def _check(draft: Draft, seal: Match, start: int) -> Field:
+    chance = "which may be chance: hold more frames against it" if seal.doubt < WEAK else f"a wrong one would be so once in {seal.odds}"
+    elsewhere = tuple(remark for remark in seal.remarks if "constant" not in remark)
+    return Field(
+        start,
+        seal.place.size,
+        "check",
+        _integer(seal.place.size, seal.order),
+        (f"right in {seal.right} of {seal.total} frames, {chance}", *elsewhere),
+    )
+
+
+def _seal(draft: Draft, fields: Sequence[Field]) -> tuple[str, str] | None:
+    """The arguments of `Checksummed` behind its struct, and a class where the checksum needs one of its own."""
+    if draft.seal is None:
+        return None
+    own = draft.seal.paste.startswith("class ")
+    algorithm = "Check()" if own else draft.seal.paste.splitlines()[0]
+    over = ""
+    shortest = min(len(frame) for _, frame in draft.frames)
+    ranges = draft.seal.span.ranges(draft.seal.place, shortest)
+    if sum(b - a for a, b in ranges) < shortest - draft.seal.place.size:
+        (first, last), place = (ranges[0][0], ranges[-1][1]), draft.seal.place.start(shortest)
+        inside = [field.name for field in fields if first <= (field.start if field.start >= 0 else place) < last and field.name != "check"]
+        over = f"    over={tuple(inside)!r},\n".replace("'", '"')
+    return f'    field="check",\n    algorithm={algorithm},\n{over}', _typed(draft.seal.paste) if own else ""
+
+
+def _typed(text: str) -> str:
+    return text.replace("def __call__(self, data):", "def __call__(self, data: Any) -> int:").replace(
+        "def describe(self):", "def describe(self) -> str:"
+    )
+
+
+def _span_cuts(draft: Draft) -> list[int]:
+    """Where the checksum's span begins and ends inside of the head."""
+    if draft.seal is None or not draft.frames:
+        return []
+    shortest = min(len(frame) for _, frame in draft.frames)
+    edges = {edge for span in draft.seal.span.ranges(draft.seal.place, shortest) for edge in span}
+    return sorted(edge for edge in edges if edge < draft.head)
+
+
+def _angles(draft: Draft) -> list[tuple[str, Candidate, int]]:
+    """(path, field, how many there are in a frame) of the angles that wrap, those of blocks first."""
+    inside = [(f"blocks.{one.name}", one, draft.blocks.count) for one in draft.blocks.candidates] if draft.blocks else []
+    return [each for each in [*inside, *((one.name, one, 1) for one in draft.candidates)] if each[1].kind == "angle"]
+
+
+def _sweep(draft: Draft, angles: Sequence[tuple[str, Candidate, int]]) -> str:
+    if not angles:
+        return ""
+    entries = []
+    for path, one, count in angles:
+        step = one.steps[1] * CIRCLES[one.circle][0]
+        number = f"({count} * i + np.arange({count}))" if count > 1 else "i"
+        entries.append(f'        "{path}": {number} * {step:g} % 360,\n')
+    return (
+        "\n\n\ndef sweep(i: int) -> dict[str, Any]:\n"
+        f'    """The angles of packet i, at the pace of the capture."""\n    return {{\n{"".join(entries)}    }}'
+    )
+
+
+def _arguments(angles: Sequence[tuple[str, Candidate, int]], counters: Sequence[Candidate]) -> Iterator[str]:
+    yield f'scan=OnWrap("{angles[0][0]}"),' if angles else "scan=Every(0.1),  # seconds: no angle is known that a turn could be told by"
+    if counters:
+        one = counters[0]
+        limits = f", first={one.first}, last={one.circle - 1}" if one.wraps else ""
+        yield f'sequence=Sequence("{one.name}"{limits}),  # a jump in it is a loss'
+    if angles:
+        yield "sweep=sweep,"
+
+
+def _longest(draft: Draft) -> str:
+    if draft.size is not None or draft.length is None:
+        return str(draft.size)
+    longest = max(len(frame) for _, frame in draft.frames)
+    return str(draft.length.rest + 255 * draft.length.unit if draft.length.size == 1 else 2 * longest)
+
+
+def _imports(text: dict[str, str]) -> dict[str, str]:
+    """The names that the text uses, by the library that they are from."""
+    code = "\n".join(text.values())
+    construct = sorted(set(re.findall(r"\b(Array|Bytes|Const|Int\d+u[lb]|this(?=\.))\b", code)) | {"Struct"})
+    own = {
+        "Fields",
+        "Frame",
+        "Polar",
+        "Sensor",
+        "hookimpl",
+        *re.findall(r"\b(Check(?:sum|summed)|Crc|Every|Fold15|OnWrap|Scaled|Sequence|Serial|Sum|Udp|WordXor|Xor)\b", code),
+    }
+    typing = "from typing import Any\n" if "Any" in code else ""
+    return {"construct_names": ", ".join(sorted(construct, key=_case)), "own_names": ", ".join(sorted(own, key=_case)), "typing": typing}
+
+
+def _case(name: str) -> tuple[bool, str, int]:
+    """Classes before functions, and numbers by their size."""
+    number = re.search(r"\d+", name)
+    return name[0].islower(), name[: number.start()] if number else name, int(number[0]) if number else 0
+
+
+def _integer(size: int, order: ByteOrder) -> str:
+    return f"Int{8 * size}u{order[0]}" if size > 1 else "Int8ul"
+
+
+def _bytes(data: bytes) -> str:
+    return 'b"' + "".join(f"\\x{byte:02x}" for byte in data) + '"'
