@@ -70,19 +70,29 @@ def last(a: Array, where: Array | None = None) -> Array:
 
 def stack(*columns: Array) -> Array:
     """Several columns side by side as a new innermost axis: (n, b) each gives (n, b, k)."""
-    return _applied(lambda *arrays: np.stack(np.broadcast_arrays(*arrays), axis=-1), *columns)
+    return _applied(side_by_side, *columns)
+
+
+def side_by_side(*arrays: Any) -> Any:
+    """Arrays that broadcast, as a new innermost axis."""
+    return np.stack(np.broadcast_arrays(*arrays), axis=-1)
 
 
 def take(table: Array, index: Array) -> Array:
     """The entries of a table, shape (m,), at `index`; nan where the index is not in it."""
-    entries = np.asarray(table, np.float64)
+    return _applied(LookUp(np.asarray(table, np.float64)), index)
 
-    def look_up(spots: Any) -> Any:
-        inside = (spots >= 0) & (spots < len(entries))
-        found = entries[np.where(inside, spots, 0).astype(np.intp)] if len(entries) else np.zeros(np.shape(spots))
+
+class LookUp:
+    """The function of an index that gives the entries of a table, (m,); nan where there is none."""
+
+    def __init__(self, entries: Any) -> None:
+        self.entries, self.__name__ = entries, "take"
+
+    def __call__(self, spots: Any) -> Any:
+        inside = (spots >= 0) & (spots < len(self.entries))
+        found = self.entries[np.where(inside, spots, 0).astype(np.intp)] if len(self.entries) else np.zeros(np.shape(spots))
         return np.where(inside, found, np.nan)
-
-    return _applied(look_up, index)
 
 
 def _shifted(a: Array, step: int) -> Array:

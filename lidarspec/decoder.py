@@ -6,6 +6,8 @@ with the next. Datagram links frame by datagram. However the input is cut, the f
 
 from __future__ import annotations
 
+import importlib.util
+import os
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -31,6 +33,8 @@ TOGETHER, ROWS, ROW_BYTES = 1024, 1 << 16, 1 << 23
 Data = bytes | bytearray | memoryview | NDArray[np.uint8]
 
 BACKENDS = ("auto", "numpy", "jit", "construct")
+#: the variable of the environment that names the default.
+BACKEND = "LIDARSPEC_BACKEND"
 
 
 class Decoder:
@@ -40,13 +44,14 @@ class Decoder:
         sensor: the sensor; only its incoming frames are looked for.
         stream: a byte stream, or datagrams one for each `feed`.
         interpreted: let construct judge every candidate.
+        backend: what makes points of its packets, "auto", "numpy" or "jit".
     """
 
-    def __init__(self, sensor: Sensor, *, stream: bool, interpreted: bool = False) -> None:
+    def __init__(self, sensor: Sensor, *, stream: bool, interpreted: bool = False, backend: str = "auto") -> None:
         incoming = {name: frame for name, frame in sensor.frames.items() if frame.direction == "in"}
         if not incoming:
             raise UsageError(f"{sensor.id} has no frames yet: configure it with its file first")
-        self.sensor, self.stream, self.interpreted = sensor, stream, interpreted
+        self.sensor, self.stream, self.interpreted, self.backend = sensor, stream, interpreted, backend
         self.stats = Counters()
         self._codecs: dict[str, Codec] = {name: codec(frame, interpreted=interpreted) for name, frame in incoming.items()}
         self._framing = Framing(self._codecs)
@@ -229,13 +234,18 @@ def _first_mode(sensor: Sensor) -> str | None:
 
 
 def backend(name: str) -> str:
-    """The back end that a name stands for.
+    """The back end that a name stands for; "auto" is what LIDARSPEC_BACKEND says, if it says anything.
 
     Raises:
-        UsageError: for a name that is none.
+        UsageError: for a name that is none, and for "jit" where Numba is not installed.
     """
+    place = "backend"
+    if name == "auto" and os.environ.get(BACKEND):
+        place, name = BACKEND, os.environ[BACKEND]
     if name not in BACKENDS:
-        raise UsageError(f"backend is one of {', '.join(BACKENDS)}, not {name!r}")
+        raise UsageError(f"{place} is one of {', '.join(BACKENDS)}, not {name!r}")
+    if name == "jit" and importlib.util.find_spec("numba") is None:
+        raise UsageError(f"{place} 'jit' needs Numba: pip install 'lidarspec[jit]'")
     return name
 
 

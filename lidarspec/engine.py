@@ -57,8 +57,9 @@ class StandardEngine:
         return build(sensor, command.frame, None, values)
 
     def decoder(self, sensor: Sensor, *, stream: bool | None, backend: str) -> Decoder:
-        interpreted = checked_backend(backend) == "construct"
-        return Decoder(sensor, stream=not sensor.datagrams if stream is None else stream, interpreted=interpreted)
+        chosen = checked_backend(backend)
+        stream = not sensor.datagrams if stream is None else stream
+        return Decoder(sensor, stream=stream, interpreted=chosen == "construct", backend=chosen)
 
     def split(self, sensor: Sensor, data: Any, *, backend: str) -> list[Found]:
         found = spans_of(self.decoder(sensor, stream=is_stream(data), backend=backend), data)
@@ -68,7 +69,7 @@ class StandardEngine:
         decoder = self.decoder(sensor, stream=is_stream(data), backend=backend)
         found = spans_of(decoder, data)
         name = frame or data_frame(sensor, found) or sensor.data_frame
-        return PacketStream(sensor, name, decoder.stats, interpreted=decoder.interpreted).add(found, whole=True)
+        return PacketStream(sensor, name, decoder.stats, interpreted=decoder.interpreted, backend=decoder.backend).add(found, whole=True)
 
     def scans(self, sensor: Sensor, data: Any, *, backend: str) -> Iterator[Scan]:
         return scans_of(sensor, [self.decode(sensor, data, frame=None, backend=backend)])

@@ -35,6 +35,7 @@ class Packets:
         breaks: (n,) True where something was lost before the packet.
         state: for each other frame type, its frames and which of them was last before each packet.
         stats: the counters of the decoder.
+        backend: what makes points of them, "auto", "numpy" or "jit".
     """
 
     def __init__(
@@ -50,10 +51,11 @@ class Packets:
         breaks: NDArray[np.bool_],
         state: Mapping[str, StateOf],
         stats: Counters,
+        backend: str = "auto",
     ) -> None:
         self.sensor, self.frame, self.table = sensor, frame, table
         self.offset, self.time_ns, self.host_ns, self.index, self.breaks = offset, time_ns, host_ns, index, breaks
-        self.state, self.stats = state, stats
+        self.state, self.stats, self.backend = state, stats, backend
 
     def __len__(self) -> int:
         return len(self.table)
@@ -112,6 +114,7 @@ class Packets:
             breaks=self.breaks[indices],
             state={name: (table, chosen[indices]) for name, (table, chosen) in self.state.items()},
             stats=self.stats,
+            backend=self.backend,
         )
 
     def batch(self, carry: dict[int, NDArray[np.float64]] | None = None) -> Batch:
@@ -140,7 +143,8 @@ def joined(parts: Sequence[Packets]) -> Packets:
         which = [np.where(part.state[name][1] < 0, -1, part.state[name][1] + start) for part, start in zip(parts, starts[:-1], strict=True)]
         state[name] = (joined_tables(known) if known else None, np.concatenate(which))
     columns = {key: np.concatenate([getattr(part, key) for part in parts]) for key in ("offset", "time_ns", "host_ns", "index", "breaks")}
-    return Packets(head.sensor, head.frame, joined_tables([part.table for part in parts]), **columns, state=state, stats=parts[-1].stats)
+    table = joined_tables([part.table for part in parts])
+    return Packets(head.sensor, head.frame, table, **columns, state=state, stats=parts[-1].stats, backend=head.backend)
 
 
 def joined_tables(tables: Sequence[Any]) -> Table:

@@ -32,15 +32,24 @@ class PacketStream:
         sensor, frame: whose, and of which type.
         stats: the decoder's counters; lost, duplicate and late packets are added to them.
         interpreted: parse with construct.
+        backend: see `Decoder`.
         state: frames of other types, by name, that count as seen before the first packet.
     """
 
     def __init__(
-        self, sensor: Sensor, frame: str, stats: Counters, *, interpreted: bool = False, state: Mapping[str, bytes] | None = None
+        self,
+        sensor: Sensor,
+        frame: str,
+        stats: Counters,
+        *,
+        interpreted: bool = False,
+        backend: str = "auto",
+        state: Mapping[str, bytes] | None = None,
     ) -> None:
         if frame not in sensor.frames:
             raise UnknownFrame(frame, sensor.frames, place=sensor.id)
         self.sensor, self.frame, self.stats, self._interpreted = sensor, frame, stats, interpreted
+        self._backend = backend
         self._codec: Codec = codec(sensor.frames[frame], interpreted=interpreted)
         self._others = [name for name, other in sensor.frames.items() if other.direction == "in" and not other.data and name != frame]
         self._state: dict[str, bytes] = dict(state or {})
@@ -83,6 +92,7 @@ class PacketStream:
             breaks=breaks,
             state=state,
             stats=self.stats,
+            backend=self._backend,
         )
 
     def interrupt(self) -> None:

@@ -18,7 +18,8 @@ FLOORS = (
     "_version abilities errors allocation lanes checksums catalogue angles fields units bits construction",
     "spec hookspecs geometry links rules splits files searching",
     "frames framing runs installed plugins",
-    "found datagrams decoder packets streams clocks sequences clouds points plans cuts reorder mounting",
+    "found datagrams decoder packets streams clocks sequences clouds points plans cuts reorder mounting kernelmath kernelparts "
+    "kernelwriter kernelsource kerneltext kernels",
     "session replies scans simulation explain parsing building examples engine wiretable wording listing flips differences candidates "
     "draft drafting",
     "device async_device inputs detection transports recording captures sources settings",
@@ -51,7 +52,13 @@ CONSTRUCT = {
     "export.messages",
     "export.formulas",
 }
-CONFINED = {"construct": CONSTRUCT, "pluggy": {"hookspecs", "plugins"}, "serial": {"transports.serial", "transports.ports"}}
+CONFINED = {
+    "numba": {"kernelmath"},
+    "llvmlite": {"kernelmath"},
+    "construct": CONSTRUCT,
+    "pluggy": {"hookspecs", "plugins"},
+    "serial": {"transports.serial", "transports.ports"},
+}
 
 TYPE_CHECKING = {"TYPE_CHECKING", "typing.TYPE_CHECKING"}
 PLUGINS_MAY_IMPORT = {"construct", "numpy"} | sys.stdlib_module_names

@@ -14,7 +14,7 @@ from collections import deque
 from pathlib import Path
 from typing import Any
 
-from lidarspec.decoder import Counters, Decoder, Spans
+from lidarspec.decoder import Counters, Decoder, Spans, backend as backend_named
 from lidarspec.errors import CommandError, LidarSpecError, ReplyTimeout
 from lidarspec.files import Chunk, LiveTransport
 from lidarspec.inputs.arrivals import Arrival, Senders, answers, fed
@@ -63,9 +63,10 @@ class LiveInput:
         recorder: AnyRecorder | None = None,
         period: float = PERIOD,
     ) -> None:
-        self._source, self.sensor, self._backend, self._recorder, self._period = source, sensor, backend, recorder, period
+        self._source, self.sensor, self._recorder, self._period = source, sensor, recorder, period
+        self._backend = calm(backend)
         self.queue, self._session = BoundedQueue(policy), Session(sensor)
-        self.decoder: Decoder = sensor.decoder(stream=not opened.datagrams, backend=backend)
+        self.decoder: Decoder = sensor.decoder(stream=not opened.datagrams, backend=self._backend)
         self._decoders, self._captures = {"data": self.decoder}, {}
         self._senders, self._ready = Senders(source, sensor), deque[Arrival]()
         self._offset = time.time_ns() - time.monotonic_ns()
@@ -310,6 +311,12 @@ def _runs(events: list[Event]) -> list[tuple[str, list[Chunk] | Mark | BaseExcep
         else:
             found.append((link, [item]))
     return found
+
+
+def calm(name: str) -> str:
+    """The back end of a live stream: none by itself that stops to compile, since nothing would be decoded meanwhile."""
+    chosen = backend_named(name)
+    return "numpy" if chosen == "auto" else chosen
 
 
 def _silence(sensor: Sensor, opened: LiveTransport) -> float:

@@ -58,4 +58,5 @@ class PacketReader:
             yield from stream.finish()
 
     def _made(self, name: str) -> PacketStream:
-        return PacketStream(self._sensor, name, self._decoder.stats, interpreted=self._decoder.interpreted, state=self._state)
+        decoder = self._decoder
+        return PacketStream(self._sensor, name, decoder.stats, interpreted=decoder.interpreted, backend=decoder.backend, state=self._state)

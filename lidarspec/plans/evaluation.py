@@ -22,7 +22,7 @@ from lidarspec.frames.columns import Batch, Carry, Column
 from lidarspec.frames.tables import Group, Rows
 from lidarspec.frames.tracing import Node
 from lidarspec.packets import Packets, install_points
-from lidarspec.plans.plan import Plan, plan_for, tables_of
+from lidarspec.plans.plan import Plan, plan_for, tables_of, worth_compiling
 from lidarspec.points import Evaluated, evaluate, points_function
 
 _MAIN = ("x", "y", "z", "intensity")
@@ -65,9 +65,12 @@ class Share:
     ready: NDArray[np.bool_]
     spots: NDArray[np.intp] | None
 
-    def program(self, names: tuple[str, ...], function: Any) -> dict[str, NDArray[Any]]:
-        """Columns made by a program, for every packet of the group."""
-        found = self.plan.program(names, tables_of(function)).run(np.ascontiguousarray(self.group.rows), self.values.array)
+    def program(self, names: tuple[str, ...], function: Any, backend: str) -> dict[str, NDArray[Any]]:
+        """Columns made by a kernel or a program, for every packet of the group."""
+        rows, tables = np.ascontiguousarray(self.group.rows), tables_of(function)
+        if backend == "jit" or (backend == "auto" and worth_compiling(function, names, self.plan, len(rows))):
+            return self.plan.kernel(names, tables).run(rows, self.values.array)
+        found = self.plan.program(names, tables).run(rows, self.values.array)
         if "x" in found and not self.plan.safe(self.values.array):
             made = [found[name] for name in "xyz" if name in found]
             bad = np.isnan(made).any(axis=0)
@@ -112,6 +115,8 @@ class Points:
             return self._programmed(("range",))
         if name == "azimuth":
             azimuth = self._programmed(("azimuth",))["azimuth"]
+            if self._turn is None and azimuth.dtype == np.float32:
+                return {"azimuth": azimuth}  # a kernel has narrowed it
             if self._turn is not None:
                 direction = self._turn[:2, :2] @ np.stack([np.cos(azimuth), np.sin(azimuth)])
                 azimuth = np.arctan2(direction[1], direction[0])
@@ -162,7 +167,7 @@ class Points:
         return float(share.plain(share.plan.parts["time"])[row].flat[spot] + offset)
 
     def _programmed(self, names: tuple[str, ...]) -> dict[str, NDArray[Any]]:
-        found = [share.program(names, self._function) for share in self._shares]
+        found = [share.program(names, self._function, self._packets.backend) for share in self._shares]
         return {name: self._joined([part[name] for part in found], found[0][name].dtype) for name in names}
 
     def _joined(self, parts: list[NDArray[Any]], dtype: Any) -> NDArray[Any]:

@@ -20,11 +20,19 @@ from lidarspec.frames.layout import Layout
 from lidarspec.frames.tables import Group, Rows
 from lidarspec.frames.tracing import Node, Traced, Untraceable, trace
 from lidarspec.geometry import Polar
+from lidarspec.kernelparts import is_number
+from lidarspec.kernels import Kernel, available
+from lidarspec.kerneltext import written
 from lidarspec.plans.expressions import Term, is_full, only_field, terms
 from lidarspec.plans.program import Program, every_value
 from lidarspec.points import columns_of
 
 PointsFunction = Callable[[Any], Any]
+
+#: points of a job that earn loading Numba with a kernel compiled before, and with one to be compiled; about a second's worth each.
+WARM, COLD = 1 << 26, 1 << 28
+#: a count that nothing brings up to them.
+NEVER = -(1 << 62)
 
 
 class Plan:
@@ -59,6 +67,8 @@ class Plan:
         self.shape = np.broadcast_shapes((2,) + (1,) * len(self.axes), *(array.shape for array in arrays))[1:]
         self.parts = {name: value.node if isinstance(value, Traced) else value for name, value in parts.items() if value is not None}
         self._programs: dict[tuple[str, ...], Program] = {}
+        self._kernels: dict[tuple[str, ...], Kernel] = {}
+        self._fixed = is_fixed(sample)
         if 0 in self.shape:
             raise Untraceable("packets without points")
         if not isinstance(result.range, Traced) or not is_full(result.range.node, self.width):
@@ -93,6 +103,16 @@ class Plan:
                 made.want(name, self._expressions[name], "double" if name == "azimuth" else "single")
             self._programs[names] = made
         return self._programs[names]
+
+    def kernel(self, names: tuple[str, ...], tables: dict[Any, NDArray[Any]]) -> Kernel:
+        """The kernel for these columns."""
+        if names not in self._kernels:
+            origin = [self.parts[f"o{axis}"] for axis in "xyz"]
+            known = all(is_number(value, self.layout.leaves) for value in (*self.directed, *origin))
+            wanted = {name: self._expressions[name] for name in names}
+            text = written(self.layout, self.shape, wanted, tables, fixed=self._fixed, together=not known)
+            self._kernels[names] = Kernel(text, self.layout.size, self.width)
+        return self._kernels[names]
 
     def describe(self) -> list[str]:
         """The plan in lines: the shape, what is computed for each packet, and the calls for each chunk."""
@@ -166,6 +186,12 @@ class Plan:
         return values is not None and bool(np.isfinite(values).all())
 
 
+def is_fixed(sample: Batch) -> bool:
+    """Whether all frames of a type have one layout."""
+    schema = sample.table.schema
+    return all(isinstance(count, int) for count in schema.arrays.values()) and not any(f.optional for f in schema.fields.values())
+
+
 def _sample(value: Any) -> Any:
     return value.node.sample if isinstance(value, Traced) else value
 
@@ -184,6 +210,8 @@ def _is_zero(value: Any) -> bool:
 
 #: tables by what they are of, shared by the plans of a `points` function.
 _TABLES: WeakKeyDictionary[PointsFunction, dict[Any, NDArray[Any]]] = WeakKeyDictionary()
+#: points made so far, by the names of their columns.
+_MADE: WeakKeyDictionary[PointsFunction, dict[tuple[str, ...], int]] = WeakKeyDictionary()
 
 
 def plan_for(function: PointsFunction, batch: Batch, group: Group) -> Plan | Untraceable:
@@ -203,6 +231,23 @@ def _planned(function: PointsFunction, batch: Batch, group: Group) -> Plan | Unt
         return Plan(function, Batch(table, np.zeros(2, np.bool_), state, batch.defaults), group.layout)
     except Untraceable as reason:
         return reason
+
+
+def worth_compiling(function: PointsFunction, names: tuple[str, ...], plan: Plan, frames: int) -> bool:
+    """Whether so many points of a `points` function were asked for, these frames included, that its kernel pays."""
+    made = _MADE.setdefault(function, {})
+    made[names] = made.get(names, 0) + frames * plan.width
+    if made[names] < WARM or not available():
+        return False
+    try:
+        kernel = plan.kernel(names, tables_of(function))
+        if made[names] < COLD and not kernel.is_compiled:
+            return False
+        kernel.compile()
+    except Exception:  # whatever is wrong with Numba or its cache here, NumPy does without
+        made[names] = NEVER
+        return False
+    return True
 
 
 def tables_of(function: PointsFunction) -> dict[Any, NDArray[Any]]:

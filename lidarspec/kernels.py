@@ -1,0 +1,191 @@
+"""Kernels at work: compiled by Numba, kept on disk between runs, called by one or several threads.
+
+Nothing here imports Numba before a kernel is wanted. The text of a kernel is a file in the cache folder, since Numba keeps
+compiled code only for functions that come from files; its name is a hash of all that the code depends on.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import importlib.util
+import math
+import os
+import sys
+import types
+from collections.abc import Callable
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarspec._version import __version__
+from lidarspec.errors import UsageError
+from lidarspec.frames.layout import Bytes2D
+from lidarspec.frames.tracing import Node
+from lidarspec.kerneltext import Text
+
+Values = Callable[[Node], NDArray[Any]]
+
+CACHE, THREADS = "LIDARSPEC_CACHE", "LIDARSPEC_THREADS"
+
+#: points below which a second thread costs more than it saves.
+SHARE = 1 << 16
+
+
+class Kernel:
+    """The columns that a text describes, for frames of one layout.
+
+    Args:
+        text: of the kernel.
+        size: of a frame in bytes.
+        width: points of a frame.
+    """
+
+    def __init__(self, text: Text, size: int, width: int) -> None:
+        self._text, self._size, self._width = text, size, width
+        wanted = text.wanted
+        self._numbers = np.array(wanted.numbers, np.int64)
+        self._function: Any = None
+
+    @property
+    def is_compiled(self) -> bool:
+        """Whether the compiled code is at hand or on disk."""
+        return self._function is not None or compiled_before(self._text.source)
+
+    def compile(self) -> None:
+        """Have the code at hand.
+
+        Raises:
+            UsageError: where Numba is not installed, or does not work here.
+        """
+        if self._function is None:
+            try:
+                self._function = function_of(self._text.source)
+            except ImportError as error:
+                raise UsageError(f"backend 'jit' needs Numba (pip install 'lidarspec[jit]'): {error}") from error
+
+    def run(self, rows: Bytes2D, values: Values) -> dict[str, NDArray[np.float32]]:
+        """The columns of all frames, flat; arguments as of `Program.run`."""
+        self.compile()
+        count = len(rows)
+        found = {name: np.empty(count * self._width, np.float32) for name in self._text.names}
+        given: list[Any] = []
+        for node in self._text.wanted.nodes:
+            array = values(node)
+            step = math.prod(node.shape) if len(array) > 1 else 0
+            flat = np.ascontiguousarray(np.broadcast_to(array.reshape(len(array), *array.shape[1:]), (len(array), *node.shape)), np.float64)
+            given += [flat.reshape(-1), step]
+        rest = (self._numbers, *self._text.wanted.arrays, *given, *found.values())
+        flat_rows = rows.reshape(-1)
+        self._shared(count, lambda first, number: self._function(flat_rows, first, number, *rest))
+        return found
+
+    def _shared(self, count: int, run: Callable[[int, int], Any]) -> None:
+        """Call for all frames, by parts where there are threads and enough for them."""
+        number = min(threads(), max(count * self._width // SHARE, 1), count)
+        if number < 2:
+            if count:
+                run(0, count)
+            return
+        edges = [count * index // number for index in range(number + 1)]
+        parts = [_pool(number - 1).submit(run, first, last - first) for first, last in pairwise(edges[1:])]
+        run(0, edges[1])
+        for part in parts:
+            part.result()
+
+
+def threads() -> int:
+    """How many threads a kernel is given: LIDARSPEC_THREADS, by default 1.
+
+    Raises:
+        UsageError: where that is no number of at least 1.
+    """
+    text = os.environ.get(THREADS, "1")
+    if not text.isdecimal() or not int(text):
+        raise UsageError(f"{THREADS} is a number of threads, 1 or more, not {text!r}")
+    return int(text)
+
+
+@functools.cache
+def _pool(number: int) -> Any:
+    from concurrent.futures import ThreadPoolExecutor
+
+    return ThreadPoolExecutor(number, "lidarspec")
+
+
+def available() -> bool:
+    """Whether Numba is installed; it is not imported for that."""
+    return importlib.util.find_spec("numba") is not None
+
+
+def cache_folder() -> Path:
+    """Where kernels are kept: LIDARSPEC_CACHE, or what the system calls the user's cache."""
+    named = os.environ.get(CACHE)
+    if named:
+        return Path(named)
+    if sys.platform == "win32":
+        base = Path(os.environ.get("LOCALAPPDATA") or Path.home() / "AppData" / "Local")
+    elif sys.platform == "darwin":
+        base = Path.home() / "Library" / "Caches"
+    else:
+        base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    return base / "lidarspec"
+
+
+@functools.cache
+def _module_name(source: str) -> str:
+    """A name by all that the compiled code depends on, but for the processor, which Numba looks after."""
+    from importlib.metadata import version
+
+    vocabulary = Path(__file__).with_name("kernelmath.py").read_bytes()
+    parts = (source, __version__, version("numba"), np.__version__, sys.version)
+    digest = hashlib.sha256("\0".join(parts).encode() + vocabulary)
+    return f"lidarspec_kernel_{digest.hexdigest()[:24]}"
+
+
+def compiled_before(source: str) -> bool:
+    """Whether compiled code of a kernel is in the cache folder."""
+    name = _module_name(source)
+    if name in sys.modules:
+        return True
+    try:
+        return any((cache_folder() / "__pycache__").glob(f"{name}.kernel-*.nbi"))
+    except OSError:
+        return False
+
+
+@functools.lru_cache(maxsize=256)
+def function_of(source: str) -> Any:
+    """The compiled function of a kernel's text; where the cache folder cannot be written, compiled for this run only."""
+    name = _module_name(source)
+    path = _kept(name, source)
+    module = types.ModuleType(name)
+    if path is not None:
+        module.__file__ = str(path)
+    sys.modules[name] = module  # Numba looks it up by its name as it loads compiled code
+    text = source if path is not None else source.replace("cache=True, ", "")
+    try:
+        exec(compile(text, str(path or name), "exec"), module.__dict__)
+    except BaseException:
+        del sys.modules[name]
+        raise
+    return module.kernel
+
+
+def _kept(name: str, source: str) -> Path | None:
+    """The file of a kernel's text, written if it is not there; None where that cannot be done."""
+    folder = cache_folder()
+    path = folder / f"{name}.py"
+    try:
+        if path.is_file() and path.read_text(encoding="utf-8") == source:
+            return path if os.access(folder, os.W_OK) or (folder / "__pycache__").is_dir() else None
+        folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+        unfinished = folder / f"{name}.{os.getpid()}.tmp"
+        unfinished.write_text(source, encoding="utf-8")
+        os.replace(unfinished, path)
+        return path
+    except OSError:
+        return None

@@ -1,0 +1,167 @@
+"""What a kernel's source is written with: variables in the loops, arguments, the bytes of fields, tables by them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarspec.frames.layout import Layout, Leaf
+from lidarspec.frames.tracing import Node
+from lidarspec.kernelparts import integer
+from lidarspec.plans.expressions import key, last_axis
+from lidarspec.plans.program import every_value
+from lidarspec.plans.windows import window
+
+
+@dataclass(frozen=True)
+class Value:
+    """An expression in a kernel, and the loop at which it varies: 0 never, 1 with the packet, 2 with its first array, and so on."""
+
+    text: str
+    level: int
+
+
+@dataclass
+class Wanted:
+    """What a kernel is called with besides the bytes: arrays and numbers that are known, results of nodes that are not."""
+
+    arrays: list[NDArray[Any]] = field(default_factory=list)
+    numbers: list[int] = field(default_factory=list)
+    nodes: list[Node] = field(default_factory=list)
+
+
+class Writer:
+    """Writes values into the loops.
+
+    Args:
+        layout, shape: of the frames, and of the points of a packet.
+        fixed: whether all frames have this layout.
+        tables: those known already, by what they are of; added to.
+    """
+
+    def __init__(self, layout: Layout, shape: tuple[int, ...], tables: dict[Any, NDArray[Any]], *, fixed: bool) -> None:
+        self.layout, self.shape, self.width, self.fixed = layout, shape, math.prod(shape), fixed
+        self.inner = 1 + last_axis(shape)
+        self.wanted = Wanted()
+        self.lines: list[list[str]] = [[] for _ in range(self.inner + 1)]
+        self.angles: list[Value] = []
+        self.both: set[Node] = set()
+        self._tables = tables
+        self._known: dict[Any, Any] = {}
+        self._made = 0
+
+    def number(self, value: int) -> str:
+        """A length or place in the text."""
+        if self.fixed or value in (0, 1):
+            return str(value)
+        self.wanted.numbers.append(value)
+        return f"n{len(self.wanted.numbers) - 1}"
+
+    def once(self, name: Any, make: Callable[[], Any]) -> Any:
+        """What was made under this name."""
+        if name not in self._known:
+            self._known[name] = make()
+        return self._known[name]
+
+    def let(self, level: int, text: str) -> Value:
+        """A variable in a loop."""
+        self._made += 1
+        self.lines[level].append(f"v{self._made} = {text}")
+        return Value(f"v{self._made}", level)
+
+    def place(self, shape: tuple[int, ...]) -> str:
+        """The index of an element of an array of this shape in the loops."""
+        return self.strided(shape, tuple(math.prod(shape[axis + 1 :]) for axis in range(len(shape))))
+
+    def strided(self, shape: tuple[int, ...], strides: tuple[int, ...]) -> str:
+        """The same with steps along each axis."""
+        parts = [
+            f"i{axis}" if stride == 1 else f"i{axis} * {self.number(stride)}"
+            for axis, (length, stride) in enumerate(zip(shape, strides, strict=True))
+            if length > 1
+        ]
+        return " + ".join(parts) or "0"
+
+    def array(self, values: NDArray[Any]) -> str:
+        """An array that is known, as an argument; flat."""
+        flat = np.ascontiguousarray(values).reshape(-1)
+        return str(self.once(("array", id(values)), lambda: (self._keep(flat), values))[0])
+
+    def _keep(self, flat: NDArray[Any]) -> str:
+        self.wanted.arrays.append(flat)
+        return f"c{len(self.wanted.arrays) - 1}"
+
+    def constant(self, value: Any, depth: int, kind: str = "float64") -> Value:
+        """A number, or an element of an array that all packets share."""
+        array = np.asarray(value)
+        if array.size == 1:
+            number = array.reshape(()).astype(np.float64 if array.dtype.kind != "b" else np.bool_).item()
+            return Value(f"np.float32({number!r})" if kind == "float32" else repr(number), 0)
+        shape = (1,) * (depth - array.ndim) + array.shape[max(array.ndim - depth, 0) :]
+        name = self.array(self.once(("cast", id(value), kind), lambda: (array.astype(kind), value))[0])
+        return self.once(("element", name, shape), lambda: self.let(1 + last_axis(shape), f"at({name}, {self.place(shape)})"))  # type: ignore[no-any-return]
+
+    def given(self, node: Node) -> Value:
+        """What NumPy has computed before."""
+        if node not in self.wanted.nodes:
+            self.wanted.nodes.append(node)
+        name = self.wanted.nodes.index(node)
+        found = self.once(
+            ("given", node), lambda: self.let(1 + last_axis(node.shape), f"at(g{name}, p * s{name} + {self.place(node.shape)})")
+        )
+        if node.sample.array.dtype.kind != "b":
+            return found  # type: ignore[no-any-return]
+        return self.once(("given flag", node), lambda: self.let(found.level, f"{found.text} != 0"))  # type: ignore[no-any-return]
+
+    def raw(self, leaf: Leaf) -> Value | None:
+        """The integer of a field."""
+        if leaf.info.path not in self._known:
+            text = integer(leaf, lambda offset: self.byte(leaf, offset).text)
+            self._known[leaf.info.path] = None if text is None else self.let(1 + last_axis(leaf.shape), text)
+        return self._known[leaf.info.path]  # type: ignore[no-any-return]
+
+    def byte(self, leaf: Leaf, offset: int) -> Value:
+        """A byte of the element of an array, or of the frame."""
+        shape, level = leaf.shape[: len(leaf.strides)], 1 + last_axis(leaf.shape[: len(leaf.strides)])
+        steps = self.once(("element", shape, leaf.strides), lambda: self.let(level, f"base + {self.strided(shape, leaf.strides)}"))
+        return self.once(  # type: ignore[no-any-return]
+            ("byte", shape, leaf.strides, offset), lambda: self.let(level, f"byte_at(rows, {steps.text} + {self.number(offset)})")
+        )
+
+    def looked_up(self, node: Node, source: Node, kind: Any, factor: float) -> Value | None:
+        """An expression of one field from a table; None where the field has too many values."""
+        leaf = self.layout.leaves.get(source.path)
+        seen = window(leaf) if leaf is not None else None
+        if leaf is None or seen is None:
+            return None
+        table = self._table(node, leaf, kind, factor)
+        return self.let(self.inner, f"at({self.array(table)}, {self._code(leaf)})")
+
+    def _table(self, node: Node, leaf: Leaf, kind: Any, factor: float) -> NDArray[Any]:
+        seen = window(leaf)
+        assert seen is not None
+        name = ("kernel", np.dtype(kind).name, factor, seen.offset - leaf.offset, seen.size, leaf.size, leaf.info.path, key(node))
+        if name not in self._tables:
+            self._tables[name] = np.ascontiguousarray(np.asarray(every_value(node, leaf)) * factor, kind)
+        return self._tables[name]
+
+    def _code(self, leaf: Leaf) -> str:
+        seen = window(leaf)
+        assert seen is not None
+        first = self.byte(leaf, seen.offset).text
+        return first if seen.size == 1 else f"({first} | {self.byte(leaf, seen.offset + 1).text} << 8)"
+
+    def beside(self, node: Node, leaf: Leaf) -> Value:
+        """A cosine or sine from a table that has both side by side, so that they are fetched together."""
+        name = ("kernel", "both", leaf.info.path, leaf.size, key(node.args[0]))
+        if name not in self._tables:
+            angles = np.asarray(every_value(node.args[0], leaf))
+            self._tables[name] = np.stack([np.cos(angles), np.sin(angles)], axis=1).astype(np.float32)
+        table = self.array(self._tables[name])
+        index = self.once(("spot", name), lambda: self.let(self.inner, f"{self._code(leaf)} << 1"))
+        return self.let(self.inner, f"at({table}, {index.text}{' + 1' if node.function is np.sin else ''})")
