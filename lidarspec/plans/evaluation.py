@@ -111,16 +111,9 @@ class Points:
             x = self.column("x")
             assert x is not None
             return {"valid": ~np.isnan(x)}
-        if name == "range":
-            return self._programmed(("range",))
-        if name == "azimuth":
-            azimuth = self._programmed(("azimuth",))["azimuth"]
-            if self._turn is None and azimuth.dtype == np.float32:
-                return {"azimuth": azimuth}  # a kernel has narrowed it
-            if self._turn is not None:
-                direction = self._turn[:2, :2] @ np.stack([np.cos(azimuth), np.sin(azimuth)])
-                azimuth = np.arctan2(direction[1], direction[0])
-            return {"azimuth": narrowed(azimuth)}
+        if name in ("range", "azimuth"):
+            found = self._programmed(("range", "azimuth") if self._packets.backend == "jit" else (name,))
+            return found | {"azimuth": self._azimuth(found["azimuth"])} if "azimuth" in found else found
         if name == "time":
             return {"time": self._joined([self._times(share) for share in self._shares], np.float64)}
         if name == "elevation":
@@ -140,6 +133,15 @@ class Points:
             assert x is not None
             return {"z": np.where(np.isnan(x), x, np.float32(0))}
         return self._turned(self._programmed(tuple(n for n in _MAIN if n in parts or (n in "xyz" and not (level and n == "z")))))
+
+    def _azimuth(self, angles: NDArray[Any]) -> NDArray[np.float32]:
+        """Azimuths in the axes that are asked for, narrowed where a kernel has not done so."""
+        if self._turn is None and angles.dtype == np.float32:
+            return angles
+        if self._turn is not None:
+            direction = self._turn[:2, :2] @ np.stack([np.cos(angles), np.sin(angles)])
+            angles = np.arctan2(direction[1], direction[0])
+        return narrowed(angles)
 
     def _turned(self, found: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
         """Coordinates in the vendor's axes, where those are asked for; each is one of REP-103's, or its opposite."""
