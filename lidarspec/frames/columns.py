@@ -125,19 +125,19 @@ class Column(NDArrayOperatorsMixin):
         size = abs(step)
         slot = len(self.batch.left)
         carried = self.batch.carry.get(slot, np.empty(0))
-        values = np.concatenate([carried, rows.values])
-        segments = np.concatenate([np.zeros(len(carried), np.intp), rows.segments])
-        found = np.full(len(values), np.nan)
-        if size < len(values):
-            source, target = (slice(size, None), slice(None, -size)) if step > 0 else (slice(None, -size), slice(size, None))
-            if step == 0:
-                source = target = slice(None)
-            found[target] = np.where(segments[source] == segments[target], values[source], np.nan)
+        values = np.concatenate([carried, rows.values]) if len(carried) else rows.values
+        edges = rows.edges + len(carried)
+        found = np.empty(len(values))
+        ahead, behind, inside = max(step, 0), max(-step, 0), max(len(values) - size, 0)
+        found[behind : behind + inside] = values[ahead : ahead + inside]
+        found[:behind] = found[behind + inside :] = np.nan
+        for edge in edges.tolist() if size else ():
+            found[max(edge - ahead, 0) : edge + behind] = np.nan
         ready = self.ready
         if step > 0:
             certain = rows.starts[ready] - step
             ready = min(ready, int(np.searchsorted(rows.starts, certain, side="right")) - 1 if certain >= 0 else 0)
-        self.batch.left.append(lambda upto: _tail(values, segments, len(carried) + rows.starts[upto], 0 if step > 0 else size))
+        self.batch.left.append(lambda upto: _tail(values, edges, len(carried) + rows.starts[upto], 0 if step > 0 else size))
         return Column(rows.spread(found[len(carried) :]), self.axes, self.batch, ready=max(ready, 0))
 
     def latest(self, where: Any = None) -> Column:
@@ -160,8 +160,9 @@ class Rows1D:
     """A column as one run of values in stream order, without padding.
 
     Attributes:
-        values, segments: (k,) the values as float64, and a number that changes at each loss.
+        values: (k,) as float64.
         starts: (n + 1,) index of the first value of each packet.
+        edges: indices of the values before which something was lost, ascending.
     """
 
     def __init__(self, column: Column) -> None:
@@ -169,9 +170,11 @@ class Rows1D:
         flat = np.broadcast_to(column.array, self._shape).reshape(self._shape[0], math.prod(self._shape[1:]))
         self._mask = unpadded(column.axes, self._shape, column.batch)
         self.values = np.asarray((flat if self._mask is None else flat[self._mask]).reshape(-1), np.float64)
-        per_packet = np.full(len(flat), flat.shape[1]) if self._mask is None else self._mask.sum(axis=1)
-        self.starts = np.concatenate([[0], np.cumsum(per_packet)]).astype(np.intp)
-        self.segments = np.repeat(np.cumsum(column.batch.breaks), per_packet)
+        if self._mask is None:
+            self.starts = np.arange(len(flat) + 1, dtype=np.intp) * flat.shape[1]
+        else:
+            self.starts = np.concatenate([[0], np.cumsum(self._mask.sum(axis=1))]).astype(np.intp)
+        self.edges = self.starts[np.flatnonzero(column.batch.breaks)]
 
     def spread(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Values in stream order back into the column's shape, nan in the padding."""
@@ -233,10 +236,9 @@ def _position(name: str, chain: tuple[str, ...]) -> int:
     raise SpecError(f"there is no array {name!r} around the points; there are {', '.join(chain) or 'none'}")
 
 
-def _tail(values: NDArray[np.float64], segments: NDArray[np.intp], end: int, size: int) -> NDArray[np.float64]:
+def _tail(values: NDArray[np.float64], edges: NDArray[np.intp], end: int, size: int) -> NDArray[np.float64]:
     """The last values before `end` that nothing lost separates from it."""
-    start = max(end - size, 0)
     if end == 0 or size == 0:
         return np.empty(0)
-    kept = segments[start:end] == segments[end - 1]
-    return np.asarray(values[start:end][kept])
+    lost = edges[edges < end]
+    return values[max(end - size, int(lost[-1]) if len(lost) else 0, 0) : end].copy()

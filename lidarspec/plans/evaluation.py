@@ -250,12 +250,13 @@ def _laid_out(packets: Packets, shares: list[Share], batch: Batch, fields: Field
     """The cloud and the counts of the first `ready` packets."""
     one = len(shares) == 1 and _in_order(shares[0].group.where)
     plan = shares[0].plan
-    widths = np.zeros(len(packets), np.intp)
-    for share in shares:
-        widths[share.group.where] = share.plan.width
-    starts = np.cumsum(widths) - widths
-    size = int(widths[:ready].sum())
+    size = ready * plan.width
     if not one:
+        widths = np.zeros(len(packets), np.intp)
+        for share in shares:
+            widths[share.group.where] = share.plan.width
+        starts = np.cumsum(widths) - widths
+        size = int(widths[:ready].sum())
         for share in shares:
             share.ready = share.group.where < ready
             share.spots = starts[share.group.where[share.ready]]
@@ -292,7 +293,7 @@ def _counts(shares: list[Share], number: int, *, same: bool) -> NDArray[Any]:
 
 
 def _in_order(where: NDArray[np.intp]) -> bool:
-    return len(where) < 2 or bool((np.diff(where) > 0).all())
+    return bool((where[1:] > where[:-1]).all())
 
 
 def guarded(packets: Packets, carry: Carry | None = None, *, final: bool, epoch: int) -> Evaluated | None:
