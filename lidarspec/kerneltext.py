@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Set
 from dataclasses import dataclass
 from typing import Any
 
@@ -103,18 +103,18 @@ def written(
     shape: tuple[int, ...],
     expressions: Mapping[str, Any],
     tables: dict[Any, NDArray[Any]],
+    varying: Set[str],
     *,
-    fixed: bool,
     together: bool,
 ) -> Text:
     """The kernel of some columns.
 
     Args:
-        layout, shape, tables, fixed: see `Writer`.
+        layout, shape, tables, varying: see `Writer`.
         expressions: of the columns, by name.
         together: where one coordinate is nan, all are.
     """
-    writer = Expressions(layout, shape, tables, fixed=fixed)
+    writer = Expressions(layout, shape, tables, varying)
     assembly = Assembly(writer)
     writer.both = _both(expressions.values())
     made = {name: _made(writer, name, value) for name, value in expressions.items()}

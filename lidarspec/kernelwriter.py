@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Set
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -40,12 +40,12 @@ class Writer:
 
     Args:
         layout, shape: of the frames, and of the points of a packet.
-        fixed: whether all frames have this layout.
+        varying: the arrays whose lengths differ from frame to frame.
         tables: those known already, by what they are of; added to.
     """
 
-    def __init__(self, layout: Layout, shape: tuple[int, ...], tables: dict[Any, NDArray[Any]], *, fixed: bool) -> None:
-        self.layout, self.shape, self.width, self.fixed = layout, shape, math.prod(shape), fixed
+    def __init__(self, layout: Layout, shape: tuple[int, ...], tables: dict[Any, NDArray[Any]], varying: Set[str]) -> None:
+        self.layout, self.shape, self.width, self.varying = layout, shape, math.prod(shape), varying
         self.inner = 1 + last_axis(shape)
         self.wanted = Wanted()
         self.lines: list[list[str]] = [[] for _ in range(self.inner + 1)]
@@ -57,7 +57,7 @@ class Writer:
 
     def number(self, value: int) -> str:
         """A length or place in the text."""
-        if self.fixed or value in (0, 1):
+        if not self.varying or value in (0, 1):
             return str(value)
         self.wanted.numbers.append(value)
         return f"n{len(self.wanted.numbers) - 1}"
@@ -76,12 +76,12 @@ class Writer:
 
     def place(self, shape: tuple[int, ...]) -> str:
         """The index of an element of an array of this shape in the loops."""
-        return self.strided(shape, tuple(math.prod(shape[axis + 1 :]) for axis in range(len(shape))))
+        return self.strided(shape, tuple(self.number(math.prod(shape[axis + 1 :])) for axis in range(len(shape))))
 
-    def strided(self, shape: tuple[int, ...], strides: tuple[int, ...]) -> str:
+    def strided(self, shape: tuple[int, ...], strides: tuple[str, ...]) -> str:
         """The same with steps along each axis."""
         parts = [
-            f"i{axis}" if stride == 1 else f"i{axis} * {self.number(stride)}"
+            f"i{axis}" if stride == "1" else f"i{axis} * {stride}"
             for axis, (length, stride) in enumerate(zip(shape, strides, strict=True))
             if length > 1
         ]
@@ -128,10 +128,26 @@ class Writer:
     def byte(self, leaf: Leaf, offset: int) -> Value:
         """A byte of the element of an array, or of the frame."""
         shape, level = leaf.shape[: len(leaf.strides)], 1 + last_axis(leaf.shape[: len(leaf.strides)])
-        steps = self.once(("element", shape, leaf.strides), lambda: self.let(level, f"base + {self.strided(shape, leaf.strides)}"))
+        steps = self.once(("element", shape, leaf.strides), lambda: self.let(level, f"base + {self.strided(shape, self._strides(leaf))}"))
+        place = str(offset) if self._stays(leaf) else self.number(offset)
         return self.once(  # type: ignore[no-any-return]
-            ("byte", shape, leaf.strides, offset), lambda: self.let(level, f"byte_at(rows, {steps.text} + {self.number(offset)})")
+            ("byte", shape, leaf.strides, offset), lambda: self.let(level, f"byte_at(rows, {steps.text} + {place})")
         )
+
+    def _strides(self, leaf: Leaf) -> tuple[str, ...]:
+        """The steps of a field's arrays; that of the innermost arrays of all, on which most depends, is the same in all frames."""
+        strides = [self.number(stride) for stride in leaf.strides]
+        if leaf.strides and len(leaf.info.axes) == max(len(other.info.axes) for other in self.layout.leaves.values()):
+            strides[-1] = str(leaf.strides[-1])
+        return tuple(strides)
+
+    def _stays(self, leaf: Leaf) -> bool:
+        """Whether a field has the same place in all frames: it stands before what varies, or in the first element of it."""
+        leaves = self.layout.leaves.values()
+        found = [(other.offset, other.strides) for other in leaves if any(axis in self.varying for axis in other.info.axes)]
+        first, strides = min(found, default=(self.layout.size, ()))
+        inside = bool(strides) and leaf.strides == strides and leaf.offset - first < strides[-1]
+        return leaf.offset <= first or inside
 
     def looked_up(self, node: Node, source: Node, kind: Any, factor: float) -> Value | None:
         """An expression of one field from a table; None where the field has too many values."""

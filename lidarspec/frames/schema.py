@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import construct
@@ -66,6 +67,10 @@ class Schema:
 
     def chain(self) -> tuple[str, ...]:
         """The axes of the deepest nesting of arrays; the first one of equally deep ones."""
+        return self._chain
+
+    @cached_property
+    def _chain(self) -> tuple[str, ...]:
         return max((info.axes for info in self.fields.values() if info.kind != "bytes"), key=len, default=())
 
     def depth(self) -> int:

@@ -34,15 +34,20 @@ class Values:
     def __init__(self, plan: Plan, batch: Batch) -> None:
         self._fields = Fields(batch)
         self._columns: list[Any] = [None] * len(plan.tape.nodes)
+        self._by_path: dict[str, Any] = {}
 
     def column(self, node: Node) -> Column:
         """The result of a node."""
+        if self._columns[node.number] is None and node.path in self._by_path:
+            self._columns[node.number] = self._by_path[node.path]
         if self._columns[node.number] is None:
             for arg in node.args:
                 if isinstance(arg, Node):
                     self.column(arg)
             with np.errstate(all="ignore"):
                 self._columns[node.number] = node.column(self._columns, self._fields)
+            if node.path:
+                self._by_path[node.path] = self._columns[node.number]
         return self._columns[node.number]  # type: ignore[no-any-return]
 
     def array(self, node: Node) -> NDArray[Any]:
@@ -67,10 +72,10 @@ class Share:
 
     def program(self, names: tuple[str, ...], function: Any, backend: str) -> dict[str, NDArray[Any]]:
         """Columns made by a kernel or a program, for every packet of the group."""
-        rows, tables = np.ascontiguousarray(self.group.rows), tables_of(function)
+        rows = np.ascontiguousarray(self.group.rows)
         if backend == "jit" or (backend == "auto" and worth_compiling(function, names, self.plan, len(rows))):
-            return self.plan.kernel(names, tables).run(rows, self.values.array)
-        found = self.plan.program(names, tables).run(rows, self.values.array)
+            return self.plan.kernel(names, function).run(rows, self.values.array)
+        found = self.plan.program(names, tables_of(function)).run(rows, self.values.array)
         if "x" in found and not self.plan.safe(self.values.array):
             made = [found[name] for name in "xyz" if name in found]
             bad = np.isnan(made).any(axis=0)
@@ -191,8 +196,8 @@ def evaluated(packets: Packets, carry: Carry | None = None, *, final: bool = Tru
     return found if found is not None else evaluate(packets, carry, final=final, epoch=epoch)
 
 
-def _planned(packets: Packets, carry: Carry | None, *, final: bool, epoch: int | None) -> Evaluated | None:
-    """The same by plans; None where there is none for these packets."""
+def _planned(packets: Packets, carry: Carry | None, *, final: bool, epoch: int | None, alone: bool = False) -> Evaluated | None:
+    """The same by plans; None where there is none for these packets; `alone`: no batch follows that needs `Evaluated.carry`."""
     table = packets.table
     if not isinstance(table, Rows) or not table.groups:
         return None
@@ -207,7 +212,7 @@ def _planned(packets: Packets, carry: Carry | None, *, final: bool, epoch: int |
     known: list[Plan] = [plan for plan in plans if isinstance(plan, Plan)]
     first, fields = Values(known[0], batch), Fields(batch)
     try:
-        remembering = _remembered(known[0], first, several=len(known) > 1)
+        remembering = _remembered(known[0], first, ("state",) if alone and len(known) == 1 else ("shift", "latest", "state"))
         shares = [_share(packets, batch, plan, group, first, remembering) for plan, group in zip(known, table.groups, strict=True)]
     except (SpecError, ValueError):
         return None
@@ -218,9 +223,9 @@ def _planned(packets: Packets, carry: Carry | None, *, final: bool, epoch: int |
     return _laid_out(packets, [share for share in shares if share is not None], batch, fields, ready, base)
 
 
-def _remembered(plan: Plan, values: Values, *, several: bool) -> dict[int, Column]:
+def _remembered(plan: Plan, values: Values, kinds: tuple[str, ...]) -> dict[int, Column]:
     """The results that depend on other packets, of the whole batch, in the order in which `points` asks for them."""
-    return {node.number: values.column(node) for node in plan.eager if node.kind in ("shift", "latest", "state")}
+    return {node.number: values.column(node) for node in plan.eager if node.kind in kinds}
 
 
 def _share(packets: Packets, batch: Batch, plan: Plan, group: Group, whole: Values, remembered: dict[int, Column]) -> Share | None:
@@ -306,7 +311,8 @@ def guarded(packets: Packets, carry: Carry | None = None, *, final: bool, epoch:
 
 
 def _cloud(packets: Packets) -> PointCloud:
-    return evaluated(packets).cloud
+    found = _planned(packets, None, final=True, epoch=None, alone=True)
+    return (found if found is not None else evaluate(packets)).cloud
 
 
 keep_freed_memory()

@@ -68,7 +68,8 @@ class Plan:
         self.parts = {name: value.node if isinstance(value, Traced) else value for name, value in parts.items() if value is not None}
         self._programs: dict[tuple[str, ...], Program] = {}
         self._kernels: dict[tuple[str, ...], Kernel] = {}
-        self._fixed = is_fixed(sample)
+        self._own: bool | None = None
+        self._varying = {name for name, count in sample.table.schema.arrays.items() if not isinstance(count, int)}
         if 0 in self.shape:
             raise Untraceable("packets without points")
         if not isinstance(result.range, Traced) or not is_full(result.range.node, self.width):
@@ -104,13 +105,16 @@ class Plan:
             self._programs[names] = made
         return self._programs[names]
 
-    def kernel(self, names: tuple[str, ...], tables: dict[Any, NDArray[Any]]) -> Kernel:
-        """The kernel for these columns."""
+    def kernel(self, names: tuple[str, ...], function: PointsFunction) -> Kernel:
+        """The kernel for these columns; one for this layout alone, or one that serves all where there have been several."""
         if names not in self._kernels:
+            if self._own is None:
+                self._own = not self._varying or _OWN.setdefault(function, self.layout.size) == self.layout.size
+            tables, varying = tables_of(function), set[str]() if self._own else self._varying
             origin = [self.parts[f"o{axis}"] for axis in "xyz"]
             known = all(is_number(value, self.layout.leaves) for value in (*self.directed, *origin))
             wanted = {name: self._expressions[name] for name in names}
-            text = written(self.layout, self.shape, wanted, tables, fixed=self._fixed, together=not known)
+            text = written(self.layout, self.shape, wanted, tables, varying, together=not known)
             self._kernels[names] = Kernel(text, self.layout.size, self.width)
         return self._kernels[names]
 
@@ -186,12 +190,6 @@ class Plan:
         return values is not None and bool(np.isfinite(values).all())
 
 
-def is_fixed(sample: Batch) -> bool:
-    """Whether all frames of a type have one layout."""
-    schema = sample.table.schema
-    return all(isinstance(count, int) for count in schema.arrays.values()) and not any(f.optional for f in schema.fields.values())
-
-
 def _sample(value: Any) -> Any:
     return value.node.sample if isinstance(value, Traced) else value
 
@@ -210,6 +208,8 @@ def _is_zero(value: Any) -> bool:
 
 #: tables by what they are of, shared by the plans of a `points` function.
 _TABLES: WeakKeyDictionary[PointsFunction, dict[Any, NDArray[Any]]] = WeakKeyDictionary()
+#: the size of the frames that were the first to get a kernel.
+_OWN: WeakKeyDictionary[PointsFunction, int] = WeakKeyDictionary()
 #: points made so far, by the names of their columns.
 _MADE: WeakKeyDictionary[PointsFunction, dict[tuple[str, ...], int]] = WeakKeyDictionary()
 
@@ -240,7 +240,7 @@ def worth_compiling(function: PointsFunction, names: tuple[str, ...], plan: Plan
     if made[names] < WARM or not available():
         return False
     try:
-        kernel = plan.kernel(names, tables_of(function))
+        kernel = plan.kernel(names, function)
         if made[names] < COLD and not kernel.is_compiled:
             return False
         kernel.compile()
