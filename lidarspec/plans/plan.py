@@ -112,7 +112,7 @@ class Plan:
                 self._own = not self._varying or _OWN.setdefault(function, self.layout.size) == self.layout.size
             tables, varying = tables_of(function), set[str]() if self._own else self._varying
             origin = [self.parts[f"o{axis}"] for axis in "xyz"]
-            known = all(is_number(value, self.layout.leaves) for value in (*self.directed, *origin))
+            known = all(is_number(value, self.layout.leaves) for value in (*self._directed, *origin))
             wanted = {name: self._expressions[name] for name in names}
             text = written(self.layout, self.shape, wanted, tables, varying, together=not known)
             self._kernels[names] = Kernel(text, self.layout.size, self.width)
@@ -179,8 +179,11 @@ class Plan:
 
     @cached_property
     def _directions(self) -> list[Term]:
-        traced = [part.node for part in (self.result.azimuth, self.result.elevation) if isinstance(part, Traced)]
-        return [term for node in traced for term in terms(node, self.width)]
+        return [term for node in self._directed for term in terms(node, self.width)]
+
+    @property
+    def _directed(self) -> list[Node]:
+        return [part.node for part in (self.result.azimuth, self.result.elevation) if isinstance(part, Traced)]
 
     def _finite(self, node: Node) -> bool:
         """Whether an expression is a number for every value that its field can have."""

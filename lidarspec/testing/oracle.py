@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 from construct import ConstructError
 
-from lidarspec import Frame, Sensor
 from lidarspec.frames.access import Fields
 from lidarspec.frames.codecs import InterpretedCodec
 from lidarspec.frames.columns import Batch
