@@ -20,9 +20,8 @@ FLOORS = (
     "frames framing runs installed plugins",
     "found datagrams decoder packets streams clocks sequences clouds points plans cuts reorder mounting kernelmath kernelparts "
     "kernelwriter kernelsource kerneltext kernels",
-    "session replies scans simulation explain parsing building examples engine wiretable wording listing flips differences candidates "
-    "draft drafting",
-    "device async_device inputs detection transports recording captures sources settings",
+    "session replies scans simulation explain parsing building examples engine wiretable wording listing flips differences",
+    "device async_device inputs detection transports recording captures sources settings candidates draft drafting",
     "testing formats export view demo scaffold",
     "cli",
     "__main__",
