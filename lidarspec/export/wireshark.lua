@@ -134,8 +134,9 @@ local function gathered(part, range)
     local bits = math.floor(range(byte, 1):uint() / 2 ^ low) % 2 ^ count
     if wide then total = total + UInt64(bits):lshift(target) else total = total + bits * 2 ^ target end
   end
+  if not wide and part.signed and total >= 2 ^ (part.width - 1) then total = total - 2 ^ part.width end
+  if not wide then return math.floor(total) end -- an integer also where Lua tells them from floats
   if not part.signed then return total end
-  if not wide then return total >= 2 ^ (part.width - 1) and total - 2 ^ part.width or total end
   return Int64(0) + Int64.fromhex(total:lshift(64 - part.width):tohex()):arshift(64 - part.width)
 end
 
@@ -312,6 +313,8 @@ function Walk:covered(seal, from)
   return table.concat(parts)
 end
 
+local function hex(value) return type(value) == "number" and string.format("0x%x", value) or "0x" .. value:tohex() end
+
 function step.sealed(self, node, tree, label)
   local from = self.at
   self:visit(node.body, tree, label)
@@ -321,14 +324,19 @@ function step.sealed(self, node, tree, label)
   local stored, computed = self:stored(seal), checksum[seal.algorithm](seal, data)
   local is_absent = seal.absent[stored]
   local is_right = stored == plain(computed) or is_absent
-  if seal.is_wide then is_right = tostring(self.exact[seal.fields[1].path]) == tostring(computed) or is_absent end
+  if seal.is_wide and type(computed) ~= "number" then
+    stored = self.exact[seal.fields[1].path]
+    is_right = stored == computed or is_absent
+  end
   if not is_right then self.wrong = self.wrong or "checksum" end
   local item = tree and self.items[seal.fields[1].path]
   if item then
-    item:append_text(is_absent and " [not filled]" or is_right and " [correct]" or string.format(" [wrong, should be 0x%x]", plain(computed)))
-    if not is_right then item:add_proto_expert_info(marks.checksum, string.format("checksum is 0x%x, should be 0x%x", stored, plain(computed))) end
+    item:append_text(is_absent and " [not filled]" or is_right and " [correct]" or " [wrong, should be " .. hex(computed) .. "]")
+    if not is_right then
+      item:add_proto_expert_info(marks.checksum, string.format("checksum is %s, should be %s", hex(stored), hex(computed)))
+    end
     local place = self.places[seal.fields[1].path]
-    tree:add(status, self.tvb(place[1], place[2] - place[1]), is_absent and 2 or is_right and 1 or 0):set_generated(true)
+    item:add(status, self.tvb(place[1], place[2] - place[1]), is_absent and 2 or is_right and 1 or 0):set_generated(true)
   end
 end
 
