@@ -80,7 +80,7 @@ NUMBERS = Struct(
 def sealed(number: int, algorithm: Any, field: Any) -> Checksummed:
     """A frame with a checksum in the middle."""
     body = Struct(
-        "magic" / Const(bytes([0xF1, number])), "count" / Int8ub, "data" / Bytes(this.count % 40), "sum" / field, "rest" / Bytes(3)
+        "magic" / Const(bytes([0xF1, number])), "count" / Int8ub, "data" / Bytes(this.count % 90), "sum" / field, "rest" / Bytes(3)
     )
     return Checksummed(body, field="sum", algorithm=algorithm)
 
@@ -120,7 +120,7 @@ SENSOR = Sensor(
         "formulas": Frame(FORMULAS, max_length=80),
         "kinds": Frame(KINDS, max_length=20),
         "numbers": Frame(NUMBERS, max_length=70),
-        **{f"sealed{number}": Frame(sealed(number, *pair), max_length=60) for number, pair in enumerate(ALGORITHMS)},
+        **{f"sealed{number}": Frame(sealed(number, *pair), max_length=110) for number, pair in enumerate(ALGORITHMS)},
     },
     points=points,
     scan=OnWrap("angle"),

@@ -124,6 +124,7 @@ def test_damaged_frames_are_none_of_either_s(reader: Path) -> None:
     verdicts = [_is_frame(sensor, name, data) for sensor, name, data in frames]
     assert {True, False} <= set(verdicts)
     for (sensor, name, data), wanted, (is_frame, length, _) in zip(frames, verdicts, _read(reader, frames), strict=True):
+        assert not is_frame or length <= len(data)
         assert (is_frame == 1 and length == len(data)) == wanted, f"{sensor.id} {name} {data.hex()}"
 
 
