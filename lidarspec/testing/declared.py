@@ -245,7 +245,7 @@ def _measured(subject: Subject, name: str, value: Any, column: str, units: tuple
     if free and not any(factor(info.unit, unit) is not None for info in infos if info is not None for unit in units):
         pure = set(_explicit(subject.sensor.frames[name].prepared))
         bare = [info for info in free if not info.unit and info.path not in pure]
-        if bare:
+        if bare and len(bare) == len([info for info in free if not info.unit]):
             yield (
                 "LS201",
                 f"the {column} of points comes from it, and it has no unit",

@@ -102,8 +102,9 @@ def the_full_circle_is_the_same_as_none(subject: Subject, name: str) -> None:
             continue
         nought, turned, circle = clouds
         moved = np.abs((turned.azimuth - nought.azimuth + np.pi) % (2 * np.pi) - np.pi)
-        if np.nanmax(moved, initial=0) > 1.5 * SMALL * abs(info.scale) * 2 * np.pi / FULL[info.unit]:
-            continue  # it is multiplied: a rate, or a step
+        along = float(np.nanmax(moved, initial=0)) / (SMALL * abs(info.scale) * 2 * np.pi / FULL[info.unit])
+        if not 0.5 < along < 1.5:
+            continue  # points do not move with it: a rate, a step, or another angle than the azimuth
         apart = np.nanmax(np.abs(nought.xyz - circle.xyz) / (1 + np.abs(nought.range))[:, None], initial=0)
         same = np.array_equal(nought.valid, circle.valid) and apart < 1e-3
         require(same, "LS505", f"{path} of exactly {FULL[info.unit]:g} {info.unit} gives other points than 0", f"{name}.{path}")

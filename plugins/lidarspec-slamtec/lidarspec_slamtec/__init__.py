@@ -32,6 +32,8 @@ from lidarspec_slamtec.requests import REQUESTS
 
 #: why no field of a capsule is in metres.
 CODED = "a code word says itself how many millimetres one of its steps is (SDK, sl_lidar_driver.cpp)"
+#: why asking for any key is not always answered.
+KEYS = "a unit answers for the keys that it knows (answers.py)"
 DTHETA = ("unsigned", "signed")
 
 EXPRESS = Frame(
@@ -152,6 +154,7 @@ def rplidar(
         configure=configure,
         on_open=("stop", "start_motor", "scan"),
         on_close=("stop", "stop_motor"),
+        acknowledged=dict.fromkeys(("LS604 commands.get_config", "LS604 commands.get_mode_config"), KEYS),
         range_limits=range_limits,
         vendor_axes=("forward", "right", "up"),
         status=status,

@@ -1,0 +1,11 @@
+"""An acknowledgement of what is not found."""
+
+from __future__ import annotations
+
+from lidarspec import hookimpl
+from tests.broken.sound import sensor
+
+
+@hookimpl
+def lidarspec_sensors():
+    return [sensor(acknowledged={"LS202": "the manual is secret"})]

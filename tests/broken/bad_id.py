@@ -1,0 +1,13 @@
+"""An id that is none."""
+
+from __future__ import annotations
+
+import dataclasses
+
+from lidarspec import hookimpl
+from tests.broken.sound import sensor
+
+
+@hookimpl
+def lidarspec_sensors():
+    return [dataclasses.replace(sensor(), id="Broken One")]

@@ -1,0 +1,24 @@
+"""A checksum of one's own that does not look at every byte."""
+
+from __future__ import annotations
+
+from lidarspec import Checksum, Checksummed, hookimpl
+from tests.broken.sound import frame, sensor, struct
+
+
+class EveryOther(Checksum):
+    width = 16
+
+    def __call__(self, data):
+        return sum(bytes(data)[::2]) & 0xFFFF
+
+    def describe(self):
+        return "sum of every other byte"
+
+
+DATA = Checksummed(struct(), field="sum", algorithm=EveryOther())
+
+
+@hookimpl
+def lidarspec_sensors():
+    return [sensor(frame(DATA))]

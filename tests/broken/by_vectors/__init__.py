@@ -1,0 +1,1 @@
+"""Mistakes that only the manual's own frames show: vectors.json has them."""

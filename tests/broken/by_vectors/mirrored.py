@@ -1,0 +1,15 @@
+"""A clockwise sensor read counter-clockwise, or the other way round."""
+
+from __future__ import annotations
+
+from lidarspec import Polar, hookimpl
+from tests.broken import sound
+
+
+def points(f):
+    return Polar(f.samples.distance, -sound.points(f).azimuth, intensity=f.samples.quality)
+
+
+@hookimpl
+def lidarspec_sensors():
+    return [sound.sensor(points=points)]

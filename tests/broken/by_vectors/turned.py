@@ -1,0 +1,17 @@
+"""A zero direction that is not the manual's."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lidarspec import Polar, hookimpl
+from tests.broken import sound
+
+
+def points(f):
+    return Polar(f.samples.distance, sound.points(f).azimuth + np.pi / 2, intensity=f.samples.quality)
+
+
+@hookimpl
+def lidarspec_sensors():
+    return [sound.sensor(points=points)]

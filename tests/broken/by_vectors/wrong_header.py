@@ -1,0 +1,13 @@
+"""Another header than the manual's."""
+
+from __future__ import annotations
+
+from construct import Const
+
+from lidarspec import hookimpl
+from tests.broken.sound import frame, sealed, sensor
+
+
+@hookimpl
+def lidarspec_sensors():
+    return [sensor(frame(sealed(header=Const(b"\xaa\x55\xc4"))))]

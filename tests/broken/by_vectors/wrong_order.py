@@ -1,0 +1,13 @@
+"""Big-endian where the wire is little-endian."""
+
+from __future__ import annotations
+
+from construct import Int16sb
+
+from lidarspec import Scaled, hookimpl
+from tests.broken.sound import frame, sealed, sensor
+
+
+@hookimpl
+def lidarspec_sensors():
+    return [sensor(frame(sealed(tilt=Scaled(Int16sb, 0.01, "deg"))))]

@@ -1,0 +1,11 @@
+"""A clock that starts again after 65 s, compared as if it never did."""
+
+from __future__ import annotations
+
+from lidarspec import Clock, hookimpl
+from tests.broken.sound import sensor
+
+
+@hookimpl
+def lidarspec_sensors():
+    return [sensor(clock=Clock("time"))]

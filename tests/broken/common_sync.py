@@ -1,0 +1,13 @@
+"""A sync pattern of one bit, which is everywhere in a payload."""
+
+from __future__ import annotations
+
+from construct import BitsInteger, BitStruct, Const
+
+from lidarspec import hookimpl
+from tests.broken.sound import SIZE, frame, sealed, sensor
+
+
+@hookimpl
+def lidarspec_sensors():
+    return [sensor(frame(sealed(header=BitStruct("sync" / Const(1, BitsInteger(1)), "kind" / BitsInteger(7))), max_length=SIZE - 2))]

@@ -1,0 +1,11 @@
+"""Two sensors of one id."""
+
+from __future__ import annotations
+
+from lidarspec import hookimpl
+from tests.broken.sound import sensor
+
+
+@hookimpl
+def lidarspec_sensors():
+    return [sensor(), sensor()]

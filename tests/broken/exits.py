@@ -1,0 +1,5 @@
+"""It ends the interpreter when it is imported."""
+
+import sys
+
+sys.exit("leaving")

@@ -1,0 +1,13 @@
+"""A Flag on a whole byte, which keeps one bit of it."""
+
+from __future__ import annotations
+
+from construct import Flag
+
+from lidarspec import hookimpl
+from tests.broken.sound import SIZE, frame, sealed, sensor
+
+
+@hookimpl
+def lidarspec_sensors():
+    return [sensor(frame(sealed(dirty=Flag), max_length=SIZE + 8))]

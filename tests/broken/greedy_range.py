@@ -1,0 +1,13 @@
+"""GreedyRange, which has no end on a stream."""
+
+from __future__ import annotations
+
+from construct import GreedyRange, Struct
+
+from lidarspec import hookimpl
+from tests.broken.sound import SIZE, frame, sealed, sensor
+
+
+@hookimpl
+def lidarspec_sensors():
+    return [sensor(frame(sealed(extra=GreedyRange(Struct())), max_length=SIZE + 8))]

@@ -1,0 +1,15 @@
+"""hasattr(this, ...), which is always true."""
+
+from __future__ import annotations
+
+from construct import Int8ul, Int16ul, this
+
+from lidarspec import hookimpl
+from tests.broken.sound import SIZE, frame, sealed, sensor
+
+EXTRA = Int8ul if hasattr(this, "extended") else Int16ul
+
+
+@hookimpl
+def lidarspec_sensors():
+    return [sensor(frame(sealed(extra=EXTRA), max_length=SIZE + 1))]

@@ -1,0 +1,15 @@
+"""A lambda that raises a KeyError for some headers."""
+
+from __future__ import annotations
+
+from construct import Bytes, Int8ul
+
+from lidarspec import hookimpl
+from tests.broken.sound import SIZE, frame, sealed, sensor
+
+LENGTHS = {1: 1, 2: 2, 3: 3}
+
+
+@hookimpl
+def lidarspec_sensors():
+    return [sensor(frame(sealed(kind=Int8ul, extra=Bytes(lambda this: LENGTHS[this.kind])), max_length=SIZE + 4))]

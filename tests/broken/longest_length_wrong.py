@@ -1,0 +1,13 @@
+"""A longest length that is not the frame's."""
+
+from __future__ import annotations
+
+from lidarspec import Frame, hookimpl
+from tests.broken.sound import ACK, sensor
+
+PLAIN = sensor()
+
+
+@hookimpl
+def lidarspec_sensors():
+    return [sensor(frames={**PLAIN.frames, "ack": Frame(ACK, max_length=8, plausible=lambda f: f.code < 8)})]

@@ -1,0 +1,11 @@
+"""A sensor that names no source."""
+
+from __future__ import annotations
+
+from lidarspec import hookimpl
+from tests.broken.sound import sensor
+
+
+@hookimpl
+def lidarspec_sensors():
+    return [sensor(source="TODO")]

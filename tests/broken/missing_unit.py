@@ -1,0 +1,15 @@
+"""A distance without a unit."""
+
+from __future__ import annotations
+
+from construct import Array, Int8ul, Int16ul, Struct, this
+
+from lidarspec import hookimpl
+from tests.broken.sound import frame, sealed, sensor
+
+SAMPLE = Struct("distance" / Int16ul, "quality" / Int8ul)
+
+
+@hookimpl
+def lidarspec_sensors():
+    return [sensor(frame(sealed(samples=Array(this.count, SAMPLE))))]

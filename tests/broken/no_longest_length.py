@@ -1,0 +1,13 @@
+"""A frame that does not say how long it can be."""
+
+from __future__ import annotations
+
+from lidarspec import Frame, hookimpl
+from tests.broken.sound import sealed, sensor
+
+DATA = Frame(sealed(), data=True)
+
+
+@hookimpl
+def lidarspec_sensors():
+    return [sensor(DATA)]

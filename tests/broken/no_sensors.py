@@ -1,0 +1,8 @@
+"""A plugin that lists something else than sensors."""
+
+from lidarspec import hookimpl
+
+
+@hookimpl
+def lidarspec_sensors():
+    return ["broken-one"]

@@ -1,0 +1,17 @@
+"""`plausible` with construct's `this`, which is an expression and always true."""
+
+from __future__ import annotations
+
+from construct import this
+
+from lidarspec import hookimpl
+from tests.broken.sound import frame, sensor
+
+
+def plausible(f):
+    return this.first == this.last
+
+
+@hookimpl
+def lidarspec_sensors():
+    return [sensor(frame(plausible=plausible))]

@@ -1,0 +1,13 @@
+"""Pointer, which reads outside the frame."""
+
+from __future__ import annotations
+
+from construct import Int8ul, Pointer
+
+from lidarspec import hookimpl
+from tests.broken.sound import SIZE, frame, sealed, sensor
+
+
+@hookimpl
+def lidarspec_sensors():
+    return [sensor(frame(sealed(extra=Pointer(200, Int8ul)), max_length=SIZE + 8))]

@@ -1,0 +1,15 @@
+"""A `points` function with a misspelt field."""
+
+from __future__ import annotations
+
+from lidarspec import Polar, hookimpl
+from tests.broken.sound import sensor
+
+
+def points(f):
+    return Polar(f.samples.distnace, 0)
+
+
+@hookimpl
+def lidarspec_sensors():
+    return [sensor(points=points)]

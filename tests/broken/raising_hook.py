@@ -1,0 +1,9 @@
+"""A hook that fails while it lists its sensors."""
+
+from lidarspec import hookimpl
+from tests.broken.sound import sensor
+
+
+@hookimpl
+def lidarspec_sensors():
+    return [sensor(), sensor(range_limits=(0, 1 / 0))]

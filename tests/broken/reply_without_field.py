@@ -1,0 +1,11 @@
+"""A reply that is told by a field that it does not have."""
+
+from __future__ import annotations
+
+from lidarspec import Command, hookimpl
+from tests.broken.sound import sensor
+
+
+@hookimpl
+def lidarspec_sensors():
+    return [sensor(commands={"start": Command("order", {"code": 1}, reply="ack", matches={"mode": 1}, starts=True)})]

@@ -1,0 +1,13 @@
+"""A field called `state`, which means other packets in `points`."""
+
+from __future__ import annotations
+
+from construct import Int8ul
+
+from lidarspec import hookimpl
+from tests.broken.sound import SIZE, frame, sealed, sensor
+
+
+@hookimpl
+def lidarspec_sensors():
+    return [sensor(frame(sealed(state=Int8ul), max_length=SIZE + 8))]

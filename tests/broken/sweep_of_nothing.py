@@ -1,0 +1,15 @@
+"""A sweep that gives a value to a field that the frame does not have."""
+
+from __future__ import annotations
+
+from lidarspec import hookimpl
+from tests.broken import sound
+
+
+def sweep(i):
+    return {**sound.sweep(i), "speed": 10}
+
+
+@hookimpl
+def lidarspec_sensors():
+    return [sound.sensor(sweep=sweep)]

@@ -1,0 +1,15 @@
+"""Python asks whether `this.count == 1` is true, and an expression always is."""
+
+from __future__ import annotations
+
+from construct import Int8ul, Int16ul, this
+
+from lidarspec import hookimpl
+from tests.broken.sound import SIZE, frame, sealed, sensor
+
+QUALITY = Int8ul if this.count == 1 else Int16ul
+
+
+@hookimpl
+def lidarspec_sensors():
+    return [sensor(frame(sealed(quality=QUALITY), max_length=SIZE + 1))]

@@ -1,0 +1,7 @@
+"""A hook without its mark."""
+
+from tests.broken.sound import sensor
+
+
+def lidarspec_sensors():
+    return [sensor()]

@@ -1,0 +1,19 @@
+"""`points` that remembers the batch before."""
+
+from __future__ import annotations
+
+from lidarspec import Polar, hookimpl
+from tests.broken import sound
+
+SEEN = []
+
+
+def points(f):
+    SEEN.append(1)
+    found = sound.points(f)
+    return Polar(found.range, found.azimuth, time=0.001 * len(SEEN))
+
+
+@hookimpl
+def lidarspec_sensors():
+    return [sound.sensor(points=points)]
