@@ -176,6 +176,7 @@ class Sensor:
         source: the manual with its revision and sections, the captures.
         aliases: other ids that it is known by.
         api: the version of this interface that it was written for.
+        acknowledged: findings of `lidarspec check` about the sensor as a whole that are true and meant, as "LS401" -> the reason.
         options: what it was configured with; not for plugins to set.
 
     Raises:
