@@ -124,12 +124,22 @@ class SerialTransport(LiveBase):
 
     def _read_posix(self, timeout: float) -> bytes:
         descriptor = self._port.fileno()
-        if not readable(descriptor, timeout):
-            return b""
-        data = os.read(descriptor, BLOCK)
+        data = self._waiting(descriptor)  # after the pause there is something, as a rule
+        if not data:
+            if not readable(descriptor, timeout):
+                return b""
+            data = os.read(descriptor, BLOCK)
         if not data:
             raise lost(self.label, "it hung up")
         return data
+
+    @staticmethod
+    def _waiting(descriptor: int) -> bytes:
+        """What has arrived; nothing as well where the line has hung up, which the system tells only who waits."""
+        try:
+            return os.read(descriptor, BLOCK)
+        except BlockingIOError:
+            return b""
 
     def _read_any(self, timeout: float) -> bytes:
         self._port.timeout = timeout
