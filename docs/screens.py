@@ -1,4 +1,4 @@
-"""Makes the pictures of docs/how-to/view.md: screens of `view` as SVG, from a simulated sensor and from a capture.
+"""Makes the screens of the how-to pages: `view` as SVG, from a simulated sensor and from a capture, and what other verbs print.
 
     python docs/screens.py CAPTURES
 
@@ -7,9 +7,11 @@ CAPTURES is the folder with velodyne/vlp16_old_firmware in it; without it the 3D
 
 from __future__ import annotations
 
+import random
 import re
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Iterator
 from itertools import groupby
@@ -20,6 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 import lidarspec as ls
+from lidarspec.simulation.faults import Faults
+from lidarspec.testing.ports import virtual_port
 from lidarspec.view.canvas import BLANK, Cells
 from lidarspec.view.feed import Feed
 from lidarspec.view.live import Window
@@ -29,6 +33,8 @@ HERE = Path(__file__).parent / "how-to" / "screens"
 #: pixels of a cell, of the margin, and of a dot.
 ACROSS, DOWN, MARGIN, DOT = 8, 16, 12, 2.3
 GROUND, PLAIN = "#101218", "#d8dae0"
+#: what the pages call the port of the sensor.
+PORT = "/dev/ttyUSB0"
 CAPTURE = "velodyne/vlp16_old_firmware/vlp-16-test-90deg-1-50-frames.pcap"
 
 
@@ -104,18 +110,34 @@ def main() -> None:
     source = str(captures / CAPTURE) if captures else "sim:velodyne-vlp16"
     tall = screen(source, "velodyne-vlp16", columns=110, lines=36, seconds=2.2, called="corridor.pcap")
     (HERE / "view-3d.svg").write_text(svg(tall), encoding="utf-8")
-    page = HERE.parent / "view.md"
-    page.write_text(
-        re.sub(r"(\$ lidarspec stats .*?\n).*?```", _shown, page.read_text(encoding="utf-8"), flags=re.DOTALL), encoding="utf-8"
-    )
+    for name in ("view.md", "find.md"):
+        page = HERE.parent / name
+        page.write_text(printed(page.read_text(encoding="utf-8")), encoding="utf-8")
 
 
-def _shown(command: re.Match[str]) -> str:
-    """A command as the page has it, and what it prints; a simulated sensor stands in for the port."""
-    words = command[1].split()[2:]
-    words[1] = "sim:ldrobot-stl27l?errors=0.0001"
-    done = subprocess.run([sys.executable, "-m", "lidarspec", *words], capture_output=True, text=True, check=True)
-    return f"{command[1]}{done.stdout}```"
+def printed(page: str) -> str:
+    """A page with what its commands print now; a simulated sensor stands in for its port, made bytes for its file."""
+    with tempfile.TemporaryDirectory() as folder:
+        link = Path(folder, "port")
+        Path(folder, "unknown.bin").write_bytes(b"".join(sealed(index) for index in range(60)))
+        with virtual_port("ldrobot-stl27l", link=link, faults=Faults(errors=0.0001)):
+            return re.sub(r"(?<=```text\n)\$ lidarspec (.*)\n(?:.*\n)*?(?=```)", lambda found: shown(found[1], link), page)
+
+
+def shown(command: str, link: Path) -> str:
+    """A command as the page has it, and what it prints."""
+    words = [str(link) if word == PORT else word for word in command.split()]
+    program = [sys.executable, "-m", "lidarspec", *words]
+    done = subprocess.run(program, cwd=link.parent, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=False)
+    wider = " " * (len(str(link)) - len(PORT))
+    text = done.stdout.replace("source" + wider, "source").replace(str(link), PORT)
+    return f"$ lidarspec {command}\n{text}"
+
+
+def sealed(index: int) -> bytes:
+    """A frame of nobody's: two bytes of sync, a counter, noise, and a CRC."""
+    body = b"\x9a\x51" + index.to_bytes(2, "little") + random.Random(index).randbytes(20)
+    return body + ls.Crc(16, 0x1021, 0xFFFF)(body).to_bytes(2, "little")
 
 
 if __name__ == "__main__":
