@@ -1,12 +1,13 @@
-"""Decoders of two formats as one would write them by hand in NumPy: what the engine is to match from the spec alone.
+"""Decoders of packets as one would write them by hand in NumPy: what the engine is to match from the spec alone.
 
 They know offsets, strides and scales; blocks are compacted before anything is computed, what depends on one 16-bit field
-is a table by its raw value, and chunks stay in the cache.
+is a table by its raw value, and chunks stay in the cache. Those of serial lines are in `by_hand_serial`.
 """
 
 from __future__ import annotations
 
 import functools
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,8 +17,8 @@ Bytes = NDArray[np.uint8]
 Floats = NDArray[np.float32]
 
 M1_CHUNK = 512  # packets: 64,000 points
-STL_CHUNK = 4096  # frames: 49,152 points
-STL_FRAME, STL_POINTS = 47, 12
+VLP_CHUNK = 160  # packets: 61,440 points
+XT_CHUNK = 240  # packets: 61,440 points
 CODES = np.arange(1 << 16)
 
 
@@ -46,7 +47,7 @@ def m1_points(packets: Bytes) -> Floats:
         np.copyto(compact[:rows], channels[start : start + rows].reshape(rows, 1, 25))
         distance, level, rise, east, north = (row[:count] for row in scratch)
         for offset, wanted in ((0, (("range", distance),)), (2, (("cos", level), ("sin", rise))), (4, (("cos", east), ("sin", north)))):
-            np.copyto(index[:count], _column(compact, offset, "<u2", 9, count))
+            np.copyto(index[:count], column(compact, offset, "<u2", 9, count))
             for name, target in wanted:
                 tables[name].take(index[:count], out=target, mode="clip")
         x, y, z, intensity = found[:, start * 125 : start * 125 + count]
@@ -54,92 +55,118 @@ def m1_points(packets: Bytes) -> Floats:
         np.multiply(distance, level, out=level)
         np.multiply(level, east, out=x)
         np.multiply(level, north, out=y)
-        np.copyto(intensity, _column(compact, 6, "u1", 9, count))
+        np.copyto(intensity, column(compact, 6, "u1", 9, count))
     return found
 
 
-def _column(buffer: NDArray[Any], offset: int, kind: str, stride: int, count: int) -> NDArray[Any]:
+def vlp16_points(packets: Bytes) -> Floats:
+    """x y z intensity of VLP-16 packets (n, 1206) with single return: float32, (4, n * 384); nan where there is no return.
+
+    Each firing lies on the way to the next block; where that is further than the sensor turns, the step before counts.
+    """
+    slot = np.arange(32)
+    elevation = np.deg2rad(np.tile([-15.0, 1, -13, 3, -11, 5, -9, 7, -7, 9, -5, 11, -3, 13, -1, 15], 2))
+    shares = np.stack([np.ones(32), (slot // 16 * 55.296 + slot % 16 * 2.304) / 110.592])
+    level, rise = (np.tile(row.astype(np.float32), VLP_CHUNK * 12) for row in (np.cos(elevation), np.sin(elevation)))
+    height = np.tile((-0.04191 * np.tan(elevation)).astype(np.float32), VLP_CHUNK * 12)
+    blocks = np.ndarray((len(packets), 12), np.dtype("<u2"), packets.data, 2, (1206, 100)).astype(np.float64) * 0.01
+    ahead = (np.append(blocks.ravel()[1:], np.nan) - blocks.ravel() + 180) % 360 - 180
+    before = np.concatenate([[np.nan], ahead[:-1]])
+    lows = np.stack([blocks.ravel(), np.where(np.abs(ahead) < 0.995, ahead, before)], axis=1)
+    channels = np.ndarray((len(packets), 12), "V96", packets.data, 4, (1206, 100))
+    found = np.empty((4, len(packets) * 384), np.float32)
+    compact, scratch = np.empty((VLP_CHUNK, 12), "V96"), Scratch(VLP_CHUNK * 384)
+    for start in range(0, len(packets), VLP_CHUNK):
+        rows = min(VLP_CHUNK, len(packets) - start)
+        count = rows * 384
+        np.copyto(compact[:rows], channels[start : start + rows])
+        distance, flat = scratch.single[0][:count], scratch.single[1][:count]
+        lookup(_metres(0.002), column(compact, 0, "<u2", 3, count), scratch, distance)
+        east, north = scratch.directions(np.matmul(lows[start * 12 : (start + rows) * 12], shares), count)
+        x, y, z, intensity = found[:, start * 384 : start * 384 + count]
+        np.multiply(distance, rise[:count], out=z)
+        np.add(z, height[:count], out=z)
+        np.multiply(distance, level[:count], out=flat)
+        np.multiply(flat, east, out=x)
+        np.multiply(flat, north, out=y)
+        np.copyto(intensity, column(compact, 2, "u1", 3, count))
+    return found
+
+
+def xt32_points(packets: Bytes) -> Floats:
+    """x y z intensity of PandarXT-32 packets (n, 1080) in steps of 4 mm: float32, (4, n * 256); nan where there is no return."""
+    elevation, offset = np.deg2rad(15.0 - np.arange(32)), np.zeros(32)
+    level, rise = (np.tile(row.astype(np.float32), XT_CHUNK * 8) for row in (np.cos(elevation), np.sin(elevation)))
+    azimuth = np.ndarray((len(packets), 8), np.dtype("<u2"), packets.data, 12, (1080, 130)).astype(np.float64) * 0.01
+    channels = np.ndarray((len(packets), 8), "V128", packets.data, 14, (1080, 130))
+    found = np.empty((4, len(packets) * 256), np.float32)
+    compact, scratch = np.empty((XT_CHUNK, 8), "V128"), Scratch(XT_CHUNK * 256)
+    for start in range(0, len(packets), XT_CHUNK):
+        rows = min(XT_CHUNK, len(packets) - start)
+        count = rows * 256
+        np.copyto(compact[:rows], channels[start : start + rows])
+        distance, flat = scratch.single[0][:count], scratch.single[1][:count]
+        lookup(_metres(0.004), column(compact, 0, "<u2", 4, count), scratch, distance)
+        east, north = scratch.directions(azimuth[start : start + rows].reshape(-1, 1) + offset, count)
+        x, y, z, intensity = found[:, start * 256 : start * 256 + count]
+        np.multiply(distance, rise[:count], out=z)
+        np.multiply(distance, level[:count], out=flat)
+        np.multiply(flat, east, out=x)
+        np.multiply(flat, north, out=y)
+        np.copyto(intensity, column(compact, 2, "u1", 4, count))
+    return found
+
+
+def payloads(path: Path) -> Bytes:
+    """The UDP payloads of a little-endian pcap file with Ethernet and IPv4 whose records are all alike: uint8, (n, size), not copied.
+
+    Raises:
+        ValueError: if they are not.
+    """
+    data = np.fromfile(path, np.uint8)
+    length = 16 + int(data[32:36].view("<u4")[0])
+    records = data[24 : 24 + (len(data) - 24) // length * length].reshape(-1, length)
+    heads = np.ascontiguousarray(records[:, 8:58])  # the length, and all headers
+    heads[:, 26:28] = heads[:, 32:34] = heads[:, 48:50] = 0  # identification and checksums
+    if bool((heads != heads[0]).any()) or heads[0, 20:22].tolist() != [8, 0] or heads[0, 31] != 17:
+        raise ValueError("not all records are alike")
+    return records[:, 58:]
+
+
+def m1_scans(path: Path) -> list[Floats]:
+    """x y z intensity of each frame of an RS-LiDAR-M1 in a pcap file, which begins where the packet number falls."""
+    packets = np.ascontiguousarray(payloads(path))
+    number = packets[:, 4].astype(np.intp) << 8 | packets[:, 5]
+    cuts = (np.flatnonzero(number[1:] < number[:-1]) + 1) * 125
+    return np.split(m1_points(packets), cuts, axis=1)
+
+
+class Scratch:
+    """Arrays for a chunk of so many points, used again for the next one."""
+
+    def __init__(self, points: int) -> None:
+        self.index = np.empty(points, np.intp)
+        self.single = np.empty((5, points), np.float32)
+
+    def directions(self, clockwise: NDArray[np.float64], count: int) -> tuple[Floats, Floats]:
+        """The cosine and the sine of angles in degrees, turned counter-clockwise."""
+        angle, east, north = (row[:count] for row in self.single[2:])
+        np.multiply(clockwise.reshape(-1), -np.pi / 180, out=angle, casting="same_kind")
+        return np.cos(angle, out=east), np.sin(angle, out=north)
+
+
+def lookup(table: Floats, codes: NDArray[Any], scratch: Scratch, out: Floats) -> None:
+    """The table's values for these codes."""
+    index = scratch.index[: len(out)]
+    np.copyto(index, codes)
+    table.take(index, out=out, mode="clip")
+
+
+@functools.cache
+def _metres(step: float) -> Floats:
+    return np.where(CODES > 0, CODES * step, np.nan).astype(np.float32)
+
+
+def column(buffer: NDArray[Any], offset: int, kind: str, stride: int, count: int) -> NDArray[Any]:
+    """A field of each of so many elements that stand at one distance."""
     return np.ndarray((count,), kind, buffer.view(np.uint8).data, offset, (stride,))
-
-
-@functools.cache
-def _crc_tables() -> list[NDArray[np.uint8]]:
-    """What each pair of bytes adds to the CRC-8 (0x4d) of the 46 bytes before it, by the pair loaded little-endian."""
-    single = np.arange(256)
-    for _ in range(8):
-        single = np.where(single & 0x80, single << 1 ^ 0x4D, single << 1) & 0xFF
-    tables = [single.astype(np.uint8)]
-    while len(tables) < STL_FRAME - 1:
-        tables.insert(0, single[tables[0]].astype(np.uint8))
-    return [tables[spot][CODES & 0xFF] ^ tables[spot + 1][CODES >> 8] for spot in range(0, STL_FRAME - 1, 2)]
-
-
-def _good(frames: Bytes) -> NDArray[np.bool_]:
-    """Which STL-27L frames (n, 47) have their checksum, angles below 360 degrees and a time of at most 30 s."""
-    pairs = np.ascontiguousarray(frames[:, : STL_FRAME - 1]).view("<u2")
-    crc = np.zeros(len(frames), np.uint8)
-    for spot, table in enumerate(_crc_tables()):
-        crc ^= table.take(pairs[:, spot], mode="clip")
-    start, end, time = pairs[:, 2], pairs[:, 21], pairs[:, 22]
-    good: NDArray[np.bool_] = (crc == frames[:, 46]) & (start < 36000) & (end < 36000) & (time <= 30_000)
-    return good
-
-
-def stl27l_points(frames: Bytes) -> Floats:
-    """x y intensity of STL-27L frames (n, 47), those with a wrong checksum left out: float32, (3, points)."""
-    found = np.empty((3, len(frames) * STL_POINTS), np.float32)
-    end = 0
-    for start in range(0, len(frames), STL_CHUNK):
-        rows = frames[start : start + STL_CHUNK]
-        good = _good(rows)
-        end = _stl27l_chunk(rows if good.all() else rows[good], found, end)
-    return found[:, :end]
-
-
-def _stl27l_chunk(frames: Bytes, found: Floats, start: int) -> int:
-    """Write the points of good frames from column `start` on; the column after them."""
-    first, final = (np.ascontiguousarray(frames[:, at : at + 2]).view("<u2").astype(np.float64) for at in (4, 42))
-    steps = np.arange(STL_POINTS) / (STL_POINTS - 1)
-    angle = np.deg2rad((first + (final - first) % 36000 * steps) * -0.01).astype(np.float32).ravel()
-    samples = np.ascontiguousarray(frames[:, 6:42])
-    end = start + angle.size
-    x, y, intensity = found[:, start:end]
-    distance = _stl27l_ranges().take(_column(samples, 0, "<u2", 3, angle.size), mode="clip")
-    np.multiply(distance, np.cos(angle), out=x)
-    np.multiply(distance, np.sin(angle), out=y)
-    np.copyto(intensity, _column(samples, 2, "u1", 3, angle.size))
-    return end
-
-
-@functools.cache
-def _stl27l_ranges() -> Floats:
-    return np.where(CODES > 0, CODES * 0.001, np.nan).astype(np.float32)
-
-
-def stl27l_stream(data: bytes) -> Floats:
-    """x y intensity of the STL-27L frames in a stream of bytes with noise, the leftmost of frames that overlap."""
-    stream = np.frombuffer(data, np.uint8)
-    here = np.flatnonzero(stream[: len(stream) - STL_FRAME + 1] == 0x54)
-    here = here[stream[here + 1] == 0x2C]
-    windows = np.lib.stride_tricks.sliding_window_view(stream, STL_FRAME)
-    found = np.empty((3, len(here) * STL_POINTS), np.float32)
-    free, end = 0, 0
-    for start in range(0, len(here), STL_CHUNK):
-        spots = here[start : start + STL_CHUNK]
-        rows = windows[spots]
-        good = np.flatnonzero(_good(rows))
-        chosen = good[_leftmost(spots[good], free)]
-        if len(chosen):
-            free = int(spots[chosen[-1]]) + STL_FRAME
-            end = _stl27l_chunk(rows[chosen], found, end)
-    return found[:, :end]
-
-
-def _leftmost(spots: NDArray[np.intp], free: int) -> NDArray[np.bool_]:
-    """Which frames at these offsets do not overlap one that was chosen before, the first byte left being at `free`."""
-    chosen = np.ones(len(spots), np.bool_)
-    if bool((np.diff(spots, prepend=free - STL_FRAME) < STL_FRAME).any()):
-        for index, offset in enumerate(spots.tolist()):
-            chosen[index] = offset >= free
-            free = offset + STL_FRAME if chosen[index] else free
-    return chosen

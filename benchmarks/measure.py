@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import resource
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -29,33 +30,43 @@ class Contender:
 
 
 Rates = dict[str, list[float]]
+Clock = Callable[[], float]
+
+#: seconds; no clock steps by less.
+LEAST_STEP = 1e-6
 
 
-def raced(contenders: Mapping[str, Contender], runs: int, least: float) -> Rates:
+def raced(contenders: Mapping[str, Contender], runs: int, least: float, clock: Clock = time.perf_counter) -> Rates:
     """Seconds for each of the amount, by contender, one figure for each run; each has run twice before.
 
     Args:
         least: seconds; what takes less is repeated within a run until it takes that long.
     """
-    repeats = {name: _repeats(contender, least) for name, contender in contenders.items()}
+    repeats = {name: _repeats(contender, least, clock) for name, contender in contenders.items()}
     found: Rates = {name: [] for name in contenders}
     for _ in range(runs):
         for name, contender in contenders.items():
-            found[name].append(_seconds(contender, repeats[name]) / contender.amount)
+            found[name].append(_seconds(contender, repeats[name], clock) / contender.amount)
     return found
 
 
-def _repeats(contender: Contender, least: float) -> int:
+def _repeats(contender: Contender, least: float, clock: Clock) -> int:
     contender.run()
-    return max(1, math.ceil(least / _seconds(contender, 1)))
+    return max(1, math.ceil(least / _seconds(contender, 1, clock)))
 
 
-def _seconds(contender: Contender, repeats: int) -> float:
+def _seconds(contender: Contender, repeats: int, clock: Clock) -> float:
     """The mean time of one of several runs in a row."""
-    start = time.perf_counter()
+    start = clock()
     for _ in range(repeats):
         contender.run()
-    return (time.perf_counter() - start) / repeats
+    return max(clock() - start, LEAST_STEP) / repeats
+
+
+def cpu_seconds() -> float:
+    """What this process, all its threads and the processes that it waited for have taken of the processors."""
+    times = [resource.getrusage(which) for which in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+    return sum(part.ru_utime + part.ru_stime for part in times)
 
 
 def times(rates: Rates, fast: str, slow: str) -> float:

@@ -6,9 +6,11 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from statistics import median
 from typing import Any
 
+import by_hand
 import libraries
 from inputs import Inputs
 from measure import Contender, Rates, times
@@ -16,6 +18,7 @@ from peers import STRUCTS
 from works import FEW, Facts, Others, Work, beside_construct, columns, points_of
 
 import lidarspec as ls
+from lidarspec.captures.bulk import CaptureBatches
 from lidarspec.captures.pcap import CaptureReader
 from lidarspec.streams import PacketStream
 
@@ -47,6 +50,13 @@ def from_capture(inputs: Inputs, key: str, title: str, more: Others | None = Non
     )
 
 
+def m1_pcap(inputs: Inputs) -> Work:
+    path, points = inputs.capture("m1"), 125 * len(inputs.frames("m1"))
+    return from_capture(
+        inputs, "m1", "RS-LiDAR-M1 capture to scans", {"by hand": lambda: Contender(lambda: by_hand.m1_scans(path), points)}
+    )
+
+
 def vlp16_pcap(inputs: Inputs) -> Work:
     path, points = inputs.capture("vlp16"), 384 * len(inputs.frames("vlp16"))
     return from_capture(inputs, "vlp16", "VLP-16 capture to scans", {"velodyne-decoder": lambda: libraries.velodyne_pcap(path, points)})
@@ -57,13 +67,21 @@ def payloads(inputs: Inputs) -> Work:
     others: Others = {
         "dpkt": lambda: libraries.dpkt_payloads(path, packets),
         "ouster-sdk": lambda: libraries.ouster_payloads(path, packets),
+        "our own objects": lambda: Contender(lambda: one_by_one_of(path), packets),
+        "by hand": lambda: Contender(lambda: by_hand.payloads(path).size, packets),
     }
 
     def run() -> int:
-        with CaptureReader(path) as reader:
-            return sum(len(datagram.data) for datagram in reader)
+        with CaptureBatches(path) as reader:
+            return sum(int(batch.sizes.sum()) for batch in reader.batches())
 
     return Work("capture payloads, 1210 bytes", "packets", packets, path.stat().st_size, lambda _: run, others, has_backends=False)
+
+
+def one_by_one_of(path: Path) -> int:
+    """The same payloads as an object each."""
+    with CaptureReader(path) as reader:
+        return sum(len(datagram.data) for datagram in reader)
 
 
 def live(inputs: Inputs) -> Work:
@@ -146,7 +164,7 @@ def importing(inputs: Inputs) -> Work:
 
 
 ELSEWHERE: Mapping[str, Callable[[Inputs], Work]] = {
-    "m1-pcap": lambda inputs: from_capture(inputs, "m1", "RS-LiDAR-M1 capture to scans"),
+    "m1-pcap": m1_pcap,
     "vlp16-pcap": vlp16_pcap,
     "pcap": payloads,
     "live": live,

@@ -9,25 +9,27 @@ from rich.console import Console
 from rich.table import Table
 
 #: ratios that have a column of their own; the others stand in the last one.
-COLUMNS = {"construct": "construct", "compiled": "compiled construct", "plain": "plain points", "by hand": "by hand"}
+COLUMNS = {"construct": "construct", "compiled": "compiled\nconstruct", "plain": "plain\npoints", "by hand": "by\nhand"}
 #: contenders that only a fact is made of.
 INNER = ("libraries",)
 #: characters; what is piped to a file is not folded to a terminal.
 WIDE = 180
+#: shares of memcpy below this say nothing.
+LEAST_SHARE = 1e-4
 
 
-def shown(rows: Sequence[Mapping[str, Any]], versions: Mapping[str, str], *, quick: bool) -> None:
-    """Print the rows."""
+def shown(rows: Sequence[Mapping[str, Any]], versions: Mapping[str, str], *, title: str, best: bool) -> None:
+    """Print the rows: medians, or the best run of each contender."""
     console = Console()
     if not console.is_terminal:
         console = Console(width=WIDE)
-    table = Table(title="quick: these figures mean nothing" if quick else None, caption=_caption(versions))
+    table = Table(title=title, caption=_caption(versions))
     table.add_column("work")
-    for title in ("back end", "million/s", "MB/s", "of memcpy", *(f"x {title}" for title in COLUMNS.values())):
-        table.add_column(title, justify="right")
+    for heading in ("back\nend", "a second", "MB/s", "of memcpy", *(f"x {name}" for name in COLUMNS.values())):
+        table.add_column(heading, justify="right")
     table.add_column("x others; more")
     for row in rows:
-        table.add_row(*_cells(row))
+        table.add_row(*_cells({**row, **row["best"]} if best else row))
     console.print(table)
 
 
@@ -36,13 +38,13 @@ def _caption(versions: Mapping[str, str]) -> str:
 
 
 def _cells(row: Mapping[str, Any]) -> list[str]:
-    ratios = row["times"]
+    ratios, share = row["times"], row["share_of_memcpy"]
     return [
         row["title"],
         row["backend"],
-        f"{_figure(row['million_per_s'])} {row['unit']}",
+        _number(row["million_per_s"], row["unit"]),
         _figure(row["mb_per_s"]) if row["bytes"] else "",
-        f"{100 * row['share_of_memcpy']:.2f} %" if row["bytes"] else "",
+        f"{100 * share:.2f} %" if row["bytes"] and share > LEAST_SHARE else "",
         *(_figure(ratios[name]) if name in ratios else "" for name in COLUMNS),
         "; ".join(_more(row)),
     ]
@@ -52,6 +54,11 @@ def _more(row: Mapping[str, Any]) -> list[str]:
     others = [f"{name} {_figure(ratio)}" for name, ratio in row["times"].items() if name not in COLUMNS and name not in INNER]
     missing = [f"{name} not installed" for name in row["not_installed"]]
     return [*others, *missing, *(f"{_figure(value)} {name}" for name, value in row["facts"].items())]
+
+
+def _number(millions: float, unit: str) -> str:
+    """Millions, or where they are few the number itself."""
+    return f"{_figure(millions)} M {unit}" if millions >= 0.01 else f"{_figure(millions * 1e6)} {unit}"
 
 
 def _figure(value: float) -> str:

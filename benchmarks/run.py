@@ -9,6 +9,7 @@ import os
 import platform
 import sys
 import tempfile
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from statistics import median
@@ -17,7 +18,7 @@ from typing import Any
 from inputs import Inputs
 from libraries import versions
 from live_works import ON_LINES
-from measure import Contender, Rates, memcpy, raced, times
+from measure import Clock, Contender, Rates, cpu_seconds, memcpy, raced, times
 from more_works import ELSEWHERE
 from report import shown
 from works import ON_BYTES, Work
@@ -46,16 +47,15 @@ def working() -> list[str]:
     return found
 
 
-def rows(name: str, work: Work, backends: list[str], copy: Contender, *, runs: int, least: float) -> Iterator[dict[str, Any]]:
+def rows(name: str, work: Work, backends: list[str], copy: Contender, *, runs: int, least: float, clock: Clock) -> Iterator[dict[str, Any]]:
     """The lines of a work, one for each back end, all measured in turn."""
     chosen = backends if work.has_backends else [""]
     others, missing = work.present()
     ours = {backend: {"ours": Contender(work.ours(backend), work.amount), **work.own(backend)} for backend in chosen}
     by_backend = {f"{own} {backend}": contender for backend, owns in ours.items() for own, contender in owns.items()}
-    rates = raced({"memcpy": copy, **by_backend, **others}, runs, least)
+    rates = raced({"memcpy": copy, **by_backend, **others}, runs, least, clock)
     for backend in chosen:
         mine: Rates = {**rates, **{own: rates[f"{own} {backend}"] for own in ours[backend]}}
-        seconds = median(mine["ours"]) * work.amount
         yield {
             "work": name,
             "title": work.title,
@@ -64,20 +64,29 @@ def rows(name: str, work: Work, backends: list[str], copy: Contender, *, runs: i
             "amount": work.amount,
             "bytes": work.size,
             "runs": runs,
-            "seconds": seconds,
-            "million_per_s": work.amount / seconds / 1e6,
-            "mb_per_s": work.size / seconds / 1e6,
-            "share_of_memcpy": times(mine, "ours", "memcpy") * work.size / work.amount,
-            "times": {other: times(mine, "ours", other) for other in others},
+            **figures(work, mine, list(others), backend),
+            "best": figures(work, {contender: [min(seconds)] for contender, seconds in mine.items()}, list(others), backend),
             "not_installed": missing,
-            "facts": work.facts(backend or "numpy", mine),
         }
 
 
-def record(found: list[dict[str, Any]], *, quick: bool) -> dict[str, Any]:
+def figures(work: Work, rates: Rates, others: list[str], backend: str) -> dict[str, Any]:
+    """What is measured of a work, by the rates of all contenders."""
+    seconds = median(rates["ours"]) * work.amount
+    return {
+        "seconds": seconds,
+        "million_per_s": work.amount / seconds / 1e6,
+        "mb_per_s": work.size / seconds / 1e6,
+        "share_of_memcpy": times(rates, "ours", "memcpy") * work.size / work.amount,
+        "times": {other: times(rates, "ours", other) for other in others},
+        "facts": work.facts(backend or "numpy", rates),
+    }
+
+
+def record(found: list[dict[str, Any]], *, quick: bool, cpu: bool) -> dict[str, Any]:
     """What `--json` writes."""
     machine = {"python": platform.python_version(), "machine": platform.machine(), "system": platform.system(), "cores": os.cpu_count()}
-    return {"lidarspec": ls.__version__, "quick": quick, **machine, "libraries": versions(), "rows": found}
+    return {"lidarspec": ls.__version__, "quick": quick, "cpu_time": cpu, **machine, "libraries": versions(), "rows": found}
 
 
 def arguments() -> argparse.Namespace:
@@ -89,6 +98,8 @@ def arguments() -> argparse.Namespace:
         "--runs", metavar="N", type=int, default=RUNS, help=f"runs of each contender, {LEAST_RUNS} or more; default: {RUNS}"
     )
     parser.add_argument("--backend", metavar="NAME", action="append", choices=BACKENDS, help="back ends; default: all that work here")
+    parser.add_argument("--cpu", action="store_true", help="count processor time, not the time that passes: for a busy machine")
+    parser.add_argument("--best", action="store_true", help="show the best run of each contender, not the median")
     parser.add_argument("--quick", action="store_true", help="tiny inputs: shows that everything runs, the figures mean nothing")
     given = parser.parse_args()
     if given.runs < LEAST_RUNS:
@@ -105,14 +116,16 @@ def main() -> int:
     backends = given.backend or working()
     found: list[dict[str, Any]] = []
     copy = memcpy(quick=given.quick)
+    least, clock = (0.0 if given.quick else LEAST_SECONDS), (cpu_seconds if given.cpu else time.perf_counter)
     with tempfile.TemporaryDirectory() as folder:
         for name in given.works:
             print(f"{name} ...", file=sys.stderr)
-            inputs = Inputs(Path(folder), quick=given.quick)
-            found += rows(name, WORKS[name](inputs), backends, copy, runs=given.runs, least=0 if given.quick else LEAST_SECONDS)
-    shown(found, versions(), quick=given.quick)
+            work = WORKS[name](Inputs(Path(folder), quick=given.quick))
+            found += rows(name, work, backends, copy, runs=given.runs, least=least, clock=clock)
+    what = f"{'best runs' if given.best else 'medians'}{', processor time' if given.cpu else ''}"
+    shown(found, versions(), title="quick: these figures mean nothing" if given.quick else what, best=given.best)
     if given.json:
-        given.json.write_text(json.dumps(record(found, quick=given.quick), indent=2) + "\n", encoding="utf-8")
+        given.json.write_text(json.dumps(record(found, quick=given.quick, cpu=given.cpu), indent=2) + "\n", encoding="utf-8")
     return int(any(row["facts"].get("intact frames lost") for row in found))
 
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import by_hand
+import by_hand_serial
 import libraries
 import numpy as np
 from inputs import Inputs
@@ -17,6 +18,7 @@ from peers import construct_on
 import lidarspec as ls
 from lidarspec.packets import Packets
 from lidarspec.points import evaluate
+from lidarspec.simulation.simulator import opening
 
 Others = dict[str, Callable[[], Contender]]
 Facts = dict[str, float]
@@ -107,6 +109,7 @@ def in_memory(inputs: Inputs, key: str, title: str, more: Others | None = None) 
     others: Others = {
         **beside_construct(inputs, key),
         "plain": lambda: Contender(plainly(sensor, rows), points),
+        "by hand": lambda: Contender(lambda: BY_HAND[key](rows), points),
     }
     return Work(
         title,
@@ -120,25 +123,30 @@ def in_memory(inputs: Inputs, key: str, title: str, more: Others | None = None) 
     )
 
 
-def in_stream(inputs: Inputs, key: str, title: str, data: bytes, more: Others | None = None, facts: Any = no_facts) -> Work:
+def in_stream(
+    inputs: Inputs, key: str, title: str, data: bytes, by_us: Callable[[bytes], Any], more: Others, facts: Any = no_facts
+) -> Work:
     """A byte stream to points: framing and checksums included."""
     sensor = inputs.sensor(key)
     points = len(sensor.decode(data).points())
-    others: Others = {**beside_construct(inputs, key), "plain": lambda: Contender(plainly(sensor, data), points)}
+    others: Others = {
+        **beside_construct(inputs, key),
+        "plain": lambda: Contender(plainly(sensor, data), points),
+        "by hand": lambda: Contender(lambda: by_us(data), points),
+    }
     ours: Callable[[str], Any] = lambda backend: points_of(sensor, data, backend)  # noqa: E731
-    return Work(title, "points", points, len(data), ours, {**others, **(more or {})}, facts=facts)
+    return Work(title, "points", points, len(data), ours, {**others, **more}, facts=facts)
 
 
-def m1(inputs: Inputs) -> Work:
-    rows = inputs.array("m1")
-    by_us: Others = {"by hand": lambda: Contender(lambda: by_hand.m1_points(rows), len(rows) * 125)}
-    return in_memory(inputs, "m1", "RS-LiDAR-M1 packets", by_us)
-
-
-def stl27l(inputs: Inputs) -> Work:
-    rows = inputs.array("stl27l")
-    by_us: Others = {"by hand": lambda: Contender(lambda: by_hand.stl27l_points(rows), len(rows) * 12)}
-    return in_memory(inputs, "stl27l", "STL-27L frames", by_us)
+#: hand-written decoders of packets in an array.
+BY_HAND: Mapping[str, Callable[[Any], Any]] = {
+    "m1": by_hand.m1_points,
+    "stl27l": by_hand_serial.stl27l_points,
+    "m1c1": by_hand_serial.m1c1_points,
+    "vlp16": by_hand.vlp16_points,
+    "xt32": by_hand.xt32_points,
+    "rplidar": by_hand_serial.rplidar_points,
+}
 
 
 def vlp16(inputs: Inputs) -> Work:
@@ -149,44 +157,48 @@ def vlp16(inputs: Inputs) -> Work:
     )
 
 
+def rplidar(inputs: Inputs) -> Work:
+    some = inputs.frames("rplidar")[: 10 * FEW]
+    return in_memory(inputs, "rplidar", "RPLIDAR nodes", {"rplidar": lambda: libraries.rplidar_nodes(some)})
+
+
 def stl27l_stream(inputs: Inputs) -> Work:
     """The stream in which frames are damaged and noise stands between them; intact frames that are not found are counted."""
     noisy, sensor = inputs.noisy("stl27l"), inputs.sensor("stl27l")
-    points = len(sensor.decode(noisy.data).points())
     frames = inputs.frames("stl27l")[:FEW]
-    more: Others = {
-        "by hand": lambda: Contender(lambda: by_hand.stl27l_stream(noisy.data), points),
-        "lds2d": lambda: libraries.lds2d_stream("LD14P", b"".join(frames), 12 * len(frames)),
-    }
+    more: Others = {"lds2d": lambda: libraries.lds2d_stream("LD14P", b"".join(frames), 12 * len(frames))}
 
     def facts(backend: str, rates: Rates) -> Facts:
         found = np.isin(noisy.intact, sensor.decode(noisy.data, backend=backend).offset)
         return {"intact frames": len(noisy.intact), "intact frames lost": int((~found).sum())}
 
-    return in_stream(inputs, "stl27l", "STL-27L stream, 2 % noise", noisy.data, more, facts)
+    by_us = by_hand_serial.stl27l_stream
+    return in_stream(inputs, "stl27l", "STL-27L stream, 2 % noise", noisy.data, by_us, more, facts)
 
 
 def m1c1_stream(inputs: Inputs) -> Work:
     frames = inputs.frames("m1c1")[:FEW]
     points = sum(frame[3] for frame in frames)
     more: Others = {"lds2d": lambda: libraries.lds2d_stream("COIN-D4", b"".join(frames), points)}
-    return in_stream(inputs, "m1c1", "M1C1_Mini stream", inputs.stream("m1c1"), more)
+    return in_stream(inputs, "m1c1", "M1C1_Mini stream", inputs.stream("m1c1"), by_hand_serial.m1c1_stream, more)
 
 
-def rplidar(inputs: Inputs) -> Work:
+def rplidar_stream(inputs: Inputs) -> Work:
     some = inputs.frames("rplidar")[: 10 * FEW]
-    return in_stream(
-        inputs, "rplidar", "RPLIDAR nodes (stream)", inputs.stream("rplidar"), {"rplidar": lambda: libraries.rplidar_nodes(some)}
-    )
+    first = len(opening(inputs.sensor("rplidar")))
+    more: Others = {"rplidar": lambda: libraries.rplidar_nodes(some)}
+    by_us: Callable[[bytes], Any] = lambda data: by_hand_serial.rplidar_stream(data, first)  # noqa: E731
+    return in_stream(inputs, "rplidar", "RPLIDAR nodes (stream)", inputs.stream("rplidar"), by_us, more)
 
 
 ON_BYTES: Mapping[str, Callable[[Inputs], Work]] = {
-    "m1": m1,
-    "stl27l": stl27l,
+    "m1": lambda inputs: in_memory(inputs, "m1", "RS-LiDAR-M1 packets"),
+    "stl27l": lambda inputs: in_memory(inputs, "stl27l", "STL-27L frames"),
     "m1c1": lambda inputs: in_memory(inputs, "m1c1", "M1C1_Mini packets of 25 samples, corrected"),
     "vlp16": vlp16,
     "xt32": lambda inputs: in_memory(inputs, "xt32", "Pandar XT32 packets"),
     "rplidar": rplidar,
     "stl27l-stream": stl27l_stream,
     "m1c1-stream": m1c1_stream,
+    "rplidar-stream": rplidar_stream,
 }

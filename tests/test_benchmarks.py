@@ -12,6 +12,38 @@ import pytest
 
 RUN = Path(__file__).parents[1] / "benchmarks" / "run.py"
 
+BY_HAND = """
+import sys
+from pathlib import Path
+sys.path.insert(0, sys.argv[1])
+import by_hand, by_hand_serial
+import numpy as np
+from inputs import Inputs
+from works import BY_HAND
+from lidarspec.simulation.simulator import opening
+
+inputs = Inputs(Path(sys.argv[2]), quick=True)
+
+def alike(key, data, found):
+    cloud = inputs.sensor(key).decode(data).points()
+    wanted = [cloud.x, cloud.y, cloud.intensity] if len(found) == 3 else [cloud.x, cloud.y, cloud.z, cloud.intensity]
+    for column, own in zip(wanted, found, strict=True):
+        np.testing.assert_allclose(own, column, rtol=0, atol=1e-5)
+    print(key)
+
+for key, function in BY_HAND.items():
+    alike(key, inputs.array(key), function(inputs.array(key)))
+alike("stl27l", inputs.noisy("stl27l").data, by_hand_serial.stl27l_stream(inputs.noisy("stl27l").data))
+alike("m1c1", inputs.stream("m1c1"), by_hand_serial.m1c1_stream(inputs.stream("m1c1")))
+first = len(opening(inputs.sensor("rplidar")))
+alike("rplidar", inputs.stream("rplidar"), by_hand_serial.rplidar_stream(inputs.stream("rplidar"), first))
+assert by_hand.payloads(inputs.capture("m1")).tobytes() == b"".join(inputs.frames("m1"))
+print("payloads")
+scans = [scan.points for scan in inputs.sensor("m1").scans(inputs.array("m1"))]
+np.testing.assert_array_equal(np.hstack(by_hand.m1_scans(inputs.capture("m1")))[0], np.concatenate([cloud.x for cloud in scans]))
+print("scans")
+"""
+
 
 def measured(folder: Path, *options: str) -> list[dict[str, Any]]:
     record = folder / "record.json"
@@ -45,3 +77,10 @@ def test_an_unknown_work_is_refused_with_the_names_there_are() -> None:
     done = subprocess.run([sys.executable, str(RUN), "--only", "fastest"], capture_output=True, text=True, check=False)
     assert done.returncode == 2
     assert "stl27l-stream" in done.stderr
+
+
+def test_what_is_written_by_hand_gives_the_same_points(tmp_path: Path) -> None:
+    """The decoders that the engine is measured beside do the same work: in a process of its own, where they can be imported."""
+    done = subprocess.run([sys.executable, "-c", BY_HAND, str(RUN.parent), str(tmp_path)], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.split() == ["m1", "stl27l", "m1c1", "vlp16", "xt32", "rplidar", "stl27l", "m1c1", "rplidar", "payloads", "scans"]

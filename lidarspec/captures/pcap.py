@@ -15,7 +15,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
 from types import TracebackType
-from typing import BinaryIO
+from typing import BinaryIO, Self
 
 from lidarspec.captures.ip import ETHERNET, LARGEST_PAYLOAD, Reassembly, Refused, address, ip_packet, udp, udp_frame
 from lidarspec.captures.records import (
@@ -118,7 +118,7 @@ class CaptureReader:
     def __iter__(self) -> Iterator[Datagram]:
         return self._datagrams
 
-    def __enter__(self) -> CaptureReader:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:

@@ -65,10 +65,10 @@ def rows_at(buffer: NDArray[np.uint8], offsets: NDArray[np.intp], size: int, *, 
     if size == 1:
         return buffer.take(offsets).reshape(count, 1)
     first, step = int(offsets[0]), int(offsets[1] - offsets[0]) if count > 1 else size
-    is_even = (step == size or (step > size and not gathered)) and int(offsets[-1]) - first == (count - 1) * step
-    if is_even and (count < 3 or bool((offsets[1:] - offsets[:-1] == step).all())):
-        if step == size:
-            return buffer[first : first + count * size].reshape(count, size)
+    even = int(offsets[-1]) - first == (count - 1) * step and (count < 3 or bool((offsets[1:] - offsets[:-1] == step).all()))
+    if even and step == size:
+        return buffer[first : first + count * size].reshape(count, size)
+    if even and step > size and not gathered:
         return np.ndarray((count, size), np.uint8, buffer.data, first, (step, 1))
     windows: NDArray[Any] = np.ndarray((len(buffer) - size + 1,), f"V{size}", buffer.data, 0, (1,))
     return windows[offsets].view(np.uint8).reshape(count, size)
