@@ -65,8 +65,7 @@ class Datagrams:
             if survey.status.any():
                 right &= survey.status == VALID
             if left is None and len(own) == len(kinds) and right.all():
-                kinds[:] = kind
-                break
+                return np.broadcast_to(np.intp(kind), len(kinds))
             found = np.flatnonzero(marked)[right]
             kinds[found if left is None else left[found]] = kind
             left = np.flatnonzero((kinds < 0) & (sizes > 0))

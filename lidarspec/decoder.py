@@ -112,11 +112,11 @@ class Decoder:
     def datagrams(self, data: Sequence[Any] | NDArray[np.uint8], at: Sequence[int | None] | None = None) -> Spans:
         """Datagrams, each one frame, whole, or none; a list, or the rows of an array."""
         if isinstance(data, np.ndarray):
-            buffer, sizes = data.reshape(-1), np.full(len(data), data.shape[1], np.intp)
+            buffer, sizes = data.reshape(-1), np.broadcast_to(np.intp(data.shape[1]), len(data))
         else:
             buffer, sizes = np.frombuffer(b"".join(data), np.uint8), np.array([len(one) for one in data], np.intp)
-        times = np.full(len(data), -1, np.int64) if at is None else np.array([-1 if one is None else one for one in at], np.int64)
-        return self.placed(buffer, np.cumsum(sizes) - sizes, sizes, times)
+        times = _UNKNOWN if at is None else np.array([-1 if one is None else one for one in at], np.int64)
+        return self.placed(buffer, _starts(sizes), sizes, np.broadcast_to(times, len(data)))
 
     def placed(self, buffer: NDArray[np.uint8], starts: NDArray[np.intp], sizes: NDArray[np.intp], at: NDArray[np.int64]) -> Spans:
         """Datagrams that stand in one buffer already; the same as `datagrams`, and nothing is copied.
@@ -126,13 +126,13 @@ class Decoder:
             starts, sizes: of each datagram, in the order of their arrival.
             at: their arrival times in ns, -1 where nobody knows.
         """
-        ends = np.cumsum(sizes)
-        total = int(ends[-1]) if len(ends) else 0
+        offsets = _starts(sizes, self._base)
+        total = int(offsets[-1] + sizes[-1]) - self._base if len(offsets) else 0
         self.stats.bytes_in += total
         kinds = self._datagrams.kinds(buffer, starts, sizes, self._mode)
         self._rejected(self._datagrams.rejected, self._datagrams.errors)
-        offsets, self._base = self._base + (ends - sizes), self._base + total
-        gaps = np.zeros(len(starts), np.int64)
+        self._base += total
+        gaps = np.broadcast_to(np.int64(0), len(starts))
         if self._gap or bool((kinds < 0).any()):
             good = kinds >= 0
             gaps = self._lost(buffer, starts, sizes, good)
@@ -225,6 +225,20 @@ class Decoder:
             for name in self._names:  # in their order, however the input was cut
                 if name in frames:
                     frames[name] = frames.pop(name)
+
+
+#: the arrival time of what nobody knows it of.
+_UNKNOWN = np.array(-1, np.int64)
+
+
+def _starts(sizes: NDArray[np.intp], first: int = 0) -> NDArray[np.intp]:
+    """Where pieces of these sizes begin that stand back to back from `first` on."""
+    if len(sizes) and sizes.strides == (0,) and sizes[0]:
+        return np.arange(first, first + len(sizes) * int(sizes[0]), int(sizes[0]))
+    starts = np.cumsum(sizes)
+    starts -= sizes
+    starts += first
+    return starts
 
 
 def _first_mode(sensor: Sensor) -> str | None:

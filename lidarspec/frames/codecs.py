@@ -104,8 +104,9 @@ class CompiledCodec:
             lead, cut = np.flatnonzero(whole), np.flatnonzero(~whole)  # type: ignore[assignment]
         errors: list[str] = []
         status, rows = self._judged(buffer, offsets[lead], layout, errors, gathered=gathered)
-        sizes = np.full(len(offsets), layout.size, np.intp)
+        sizes: NDArray[np.intp] = np.broadcast_to(np.intp(layout.size), len(offsets))
         if count < len(offsets):
+            sizes = sizes.copy()
             short, sizes[cut] = _partial(buffer, offsets[cut], layout)
             if isinstance(lead, slice):
                 status = np.concatenate([status, short])
