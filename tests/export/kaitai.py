@@ -74,6 +74,7 @@ def differences(parsed: Any, read: Any, path: str = "") -> list[str]:
     if isinstance(parsed, Mapping):
         return [place for name, value in parsed.items() for place in differences(value, _member(read, name), f"{path}.{name}")]
     if isinstance(parsed, list):
+        read = getattr(read, "value", read)
         if len(parsed) != len(read):
             return [f"{path}: {len(parsed)} elements, and {len(read)} in Kaitai"]
         return [place for index, value in enumerate(parsed) for place in differences(value, read[index], f"{path}[{index}]")]

@@ -21,11 +21,40 @@ REFUSED = {"shape-text": "Decimal is Python code"}
 SPOKEN = [name for name, sensor in SENSORS.items() if name not in REFUSED and sensor.frames]
 
 
+def made(*fields: Any, case: str = "odd") -> Sensor:
+    """A sensor of this one frame."""
+    frame = Frame(Struct("sync" / Const(b"\x01\x02"), *fields), data=True, max_length=64)
+    return Sensor(
+        f"acme-{case.replace('_', '-')}",
+        vendor="Acme",
+        model="Odd",
+        frames={"data": frame},
+        points=lambda f: ls.Polar(range=0, azimuth=0),
+        scan=ls.Every(1.0),
+        links={"data": ls.Serial(9600)},
+        range_limits=(0, 1),
+        status="manual",
+        source="the tests",
+    )
+
+
+ODD = {
+    "alternatives": ("kind" / Int8ul, "value" / IfThenElse(this.kind > 128, Int16ul, Struct("low" / Int8ul, "high" / Int8ul))),
+    "arrays_of_arrays": ("count" / Int8ul, "grid" / Array(2, Array(3, Int16ul))),
+    "odd_integers": ("wide" / BytesInteger(5, swapped=True), "many" / Array(2, Int24sb), "plain" / Array(2, BytesInteger(3))),
+    "parts_of_arrays": ("flags" / Array(3, Struct("on_" / Int8ul, "more" / If(this.on_ > 100, Bytes(2)))), "end" / Int8ul),
+}
+
+
+PARTS = bytes([1, 2, 200, 11, 12, 3, 150, 13, 14, 9])
+UNUSUAL = {case: made(*fields, case=case) for case, fields in ODD.items()}
+
+
 @pytest.fixture(scope="module")
 def compiled(tmp_path_factory: pytest.TempPathFactory) -> Path:
     pytest.importorskip("kaitaistruct", reason="Kaitai's runtime is not installed: pip install kaitaistruct")
     folder = tmp_path_factory.mktemp("ksy")
-    kaitai.compile_all([SENSORS[name] for name in SPOKEN], folder)
+    kaitai.compile_all([*(SENSORS[name] for name in SPOKEN), *UNUSUAL.values()], folder)
     return folder
 
 
@@ -56,41 +85,10 @@ def test_wrong_constants_are_noticed(compiled: Path) -> None:
         kaitai.reader(kaitai.module(sensor, compiled), sensor, "data").from_bytes(b"\x00" + data[1:])
 
 
-def made(*fields: Any) -> Sensor:
-    """A sensor of this one frame."""
-    frame = Frame(Struct("sync" / Const(b"\x01\x02"), *fields), data=True, max_length=64)
-    return Sensor(
-        "acme-odd",
-        vendor="Acme",
-        model="Odd",
-        frames={"data": frame},
-        points=lambda f: ls.Polar(range=0, azimuth=0),
-        scan=ls.Every(1.0),
-        links={"data": ls.Serial(9600)},
-        range_limits=(0, 1),
-        status="manual",
-        source="the tests",
-    )
-
-
-ODD = {
-    "alternatives": ("kind" / Int8ul, "value" / IfThenElse(this.kind > 128, Int16ul, Struct("low" / Int8ul, "high" / Int8ul))),
-    "arrays_of_arrays": ("count" / Int8ul, "grid" / Array(2, Array(3, Int16ul))),
-    "odd_integers": ("wide" / BytesInteger(5, swapped=True), "many" / Array(2, Int24sb), "plain" / Array(2, BytesInteger(3))),
-    "parts_of_arrays": ("flags" / Array(3, Struct("on_" / Int8ul, "more" / If(this.on_ > 100, Bytes(2))))),
-}
-
-
-PARTS = bytes([1, 2, 200, 11, 12, 3, 150, 13, 14])
-
-
-@pytest.mark.parametrize("case", list(ODD))
-def test_unusual_structs_are_read_alike(tmp_path: Path, case: str) -> None:
-    pytest.importorskip("kaitaistruct", reason="Kaitai's runtime is not installed: pip install kaitaistruct")
-    fields = ODD[case] if isinstance(ODD[case], tuple) else (ODD[case],)
-    sensor = made(*fields)
-    kaitai.compile_all([sensor], tmp_path)
-    found = kaitai.module(sensor, tmp_path)
+@pytest.mark.parametrize("case", list(UNUSUAL))
+def test_unusual_structs_are_read_alike(compiled: Path, case: str) -> None:
+    sensor = UNUSUAL[case]
+    found = kaitai.module(sensor, compiled)
     for seed in range(6):
         data = PARTS if case == "parts_of_arrays" else sensor.example("data", seed=seed)
         assert kaitai.differences(sensor.parse(data), kaitai.reader(found, sensor, "data").from_bytes(data)) == []
