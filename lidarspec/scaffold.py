@@ -14,8 +14,8 @@ from pathlib import Path
 from string import Template
 from typing import Literal
 
-from lidarspec.draft import Draft
-from lidarspec.drafting import drafted
+from lidarspec.drafts.draft import Draft
+from lidarspec.drafts.drafting import drafted
 from lidarspec.errors import SourceError, UsageError
 
 Link = Literal["serial", "udp"]

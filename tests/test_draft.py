@@ -10,8 +10,8 @@ import pytest
 
 import lidarspec as ls
 from lidarspec import Checksum, Crc, Sum, UsageError, WireError, WordXor, Xor
-from lidarspec.candidates import candidates
-from lidarspec.draft import Draft, draft
+from lidarspec.drafts.candidates import candidates
+from lidarspec.drafts.draft import Draft, draft
 from lidarspec.scaffold import Names
 from lidarspec.searching.samples import Place
 from lidarspec.searching.sums import Changed

@@ -7,11 +7,11 @@ import re
 import pytest
 
 import lidarspec as ls
-from lidarspec.differences import differences, told as told_differences
-from lidarspec.explain import explain
-from lidarspec.flips import Flip, flips
-from lidarspec.listing import folded, parents, text
-from lidarspec.wording import Span, bit_picture
+from lidarspec.explaining.differences import differences, told as told_differences
+from lidarspec.explaining.explain import explain
+from lidarspec.explaining.flips import Flip, flips
+from lidarspec.explaining.listing import folded, parents, text
+from lidarspec.explaining.wording import Span, bit_picture
 from tests.cli.running import EXAMPLE, printed, process, ran
 from tests.shapes import SHAPES
 

@@ -64,7 +64,7 @@ def _message(error: Exception) -> str:
     if isinstance(error, OSError) and error.filename is not None:
         return f"{error.filename}: {error.strerror}"
     if isinstance(error, errors.WireError) and error.data:
-        from lidarspec.wording import hexdump
+        from lidarspec.explaining.wording import hexdump
 
         return f"{error}\n{hexdump(error)}"
     return str(error)

@@ -9,7 +9,7 @@ import click
 
 from lidarspec.cli.failures import suggest
 from lidarspec.cli.output import note
-from lidarspec.draft import draft
+from lidarspec.drafts.draft import draft
 from lidarspec.errors import UsageError, WireError
 from lidarspec.files import Chunk
 from lidarspec.plugins import sensors

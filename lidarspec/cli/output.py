@@ -15,7 +15,7 @@ from rich.table import Table
 from rich.text import Text
 
 from lidarspec.errors import SourceError
-from lidarspec.listing import Line, folded, text as plain_text
+from lidarspec.explaining.listing import Line, folded, text as plain_text
 
 #: the colours of what stands in a line, by its role.
 STYLES = {

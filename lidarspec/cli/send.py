@@ -15,7 +15,7 @@ from lidarspec.cli.output import emit, emit_json, output_options, sensor_option,
 from lidarspec.cli.streams import Duration
 from lidarspec.device import Device, open as open_device
 from lidarspec.errors import CommandError, UnknownCommand, UnknownField, UsageError
-from lidarspec.explain import explain
+from lidarspec.explaining.explain import explain
 from lidarspec.frames.schema import schema
 from lidarspec.replies import Reply
 from lidarspec.spec import Sensor

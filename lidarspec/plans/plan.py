@@ -20,10 +20,10 @@ from lidarspec.frames.layout import Layout
 from lidarspec.frames.tables import Group, Rows
 from lidarspec.frames.tracing import Node, Traced, Untraceable, trace
 from lidarspec.geometry import Polar
-from lidarspec.kernelparts import is_number
-from lidarspec.kernels import Kernel, available
-from lidarspec.kerneltext import written
 from lidarspec.plans.expressions import Term, is_full, only_field, terms
+from lidarspec.plans.kernelparts import is_number
+from lidarspec.plans.kernels import Kernel, available
+from lidarspec.plans.kerneltext import written
 from lidarspec.plans.program import Program, every_value
 from lidarspec.points import columns_of
 

@@ -15,9 +15,9 @@ import numpy as np
 
 from lidarspec.angles import LookUp, side_by_side
 from lidarspec.frames.tracing import Node
-from lidarspec.kernelparts import TEMPLATES, is_cheap, line
-from lidarspec.kernelwriter import Value, Writer
 from lidarspec.plans.expressions import is_full, only_field
+from lidarspec.plans.kernelparts import TEMPLATES, is_cheap, line
+from lidarspec.plans.kernelwriter import Value, Writer
 from lidarspec.plans.program import every_value
 from lidarspec.plans.windows import window
 

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.candidates import CIRCLES, FEW, Candidate, follows, values
 from lidarspec.checksums import ByteOrder
-from lidarspec.draft import Blocks, Draft
+from lidarspec.drafts.candidates import CIRCLES, FEW, Candidate, follows, values
+from lidarspec.drafts.draft import Blocks, Draft
 from lidarspec.searching.samples import Match
 
 #: bytes of a constant that are told, and how many have to be constant together to be a field.

@@ -18,12 +18,13 @@ from lidarspec.bits import BitField, leaves, probe
 from lidarspec.construction import UNNAMED, Seen, field_path, unwrap
 from lidarspec.decoder import Counters, Found, packed
 from lidarspec.errors import LidarSpecError, WireError
+from lidarspec.explaining.flips import flips
+from lidarspec.explaining.listing import Explanation
+from lidarspec.explaining.wording import Point, Row, Value, hexdump
 from lidarspec.fields import Checksummed
-from lidarspec.flips import flips
 from lidarspec.frames.codecs import codec
 from lidarspec.frames.judging import IMPLAUSIBLE
 from lidarspec.frames.schema import FieldInfo, schema
-from lidarspec.listing import Explanation
 from lidarspec.parsing import parse_typed
 from lidarspec.points import evaluate
 from lidarspec.rules import children
@@ -31,7 +32,6 @@ from lidarspec.spec import Frame, Sensor
 from lidarspec.streams import PacketStream
 from lidarspec.units import exact
 from lidarspec.wiretable import bit_text, hexed
-from lidarspec.wording import Point, Row, Value, hexdump
 
 __all__ = ["Explanation", "explain", "hexdump"]
 

@@ -25,7 +25,7 @@ from lidarspec._version import __version__
 from lidarspec.errors import UsageError
 from lidarspec.frames.layout import Bytes2D
 from lidarspec.frames.tracing import Node
-from lidarspec.kerneltext import Text
+from lidarspec.plans.kerneltext import Text
 
 Values = Callable[[Node], NDArray[Any]]
 

@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.candidates import FEW, Candidate, candidates
 from lidarspec.detection.structure import STEADY, Length, structure
+from lidarspec.drafts.candidates import FEW, Candidate, candidates
 from lidarspec.errors import WireError
 from lidarspec.searching.checksums import search
 from lidarspec.searching.samples import Match, Place

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from lidarspec.frames.layout import Layout, Leaf
 from lidarspec.frames.tracing import Node
-from lidarspec.kernelparts import integer
 from lidarspec.plans.expressions import key, last_axis
+from lidarspec.plans.kernelparts import integer
 from lidarspec.plans.program import every_value
 from lidarspec.plans.windows import window
 

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from itertools import groupby
 from typing import Any
 
-from lidarspec.listing import Explanation, Line
+from lidarspec.explaining.listing import Explanation, Line
+from lidarspec.explaining.wording import Span, Value, bit_picture, fixed, number
 from lidarspec.wiretable import hexed
-from lidarspec.wording import Span, Value, bit_picture, fixed, number
 
 #: bytes of a field in a line.
 LINED = 4

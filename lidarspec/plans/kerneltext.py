@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from lidarspec.frames.layout import Layout
 from lidarspec.frames.tracing import Node
-from lidarspec.kernelsource import CHUNK, Expressions, Later, Trig
-from lidarspec.kernelwriter import Value, Wanted, Writer
+from lidarspec.plans.kernelsource import CHUNK, Expressions, Later, Trig
+from lidarspec.plans.kernelwriter import Value, Wanted, Writer
 
 HEAD = """\
 # Made by lidarspec; kept so that it is compiled only once.
@@ -21,7 +21,7 @@ import math
 import numpy as np
 from numba import njit
 
-from lidarspec.kernelmath import (
+from lidarspec.plans.kernelmath import (
     BYTES, DOUBLES, INTEGER, MADE_SINGLES, PLACES, SINGLES,
     at, byte_at, cos_sin, larger, looked_up, modulo, narrowed, number, put, smaller,
 )

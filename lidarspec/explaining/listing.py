@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from lidarspec.errors import WireError
-from lidarspec.wording import Point, Row, Span, bit_picture
+from lidarspec.explaining.wording import Point, Row, Span, bit_picture
 
 #: bytes in a line, spaces of a level of nesting, and the widest columns of bits and of names.
 LINED, LEVEL, PICTURES, NAMES = 8, 2, 35, 36
