@@ -2,19 +2,27 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import os
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 import lidarspec
+from lidarspec import Fields, Polar, UsageError
+from lidarspec.frames.tables import Rows
 from lidarspec.links import is_datagram
 from lidarspec.packets import Packets
 from lidarspec.plans.evaluation import evaluated
-from lidarspec.points import evaluate
+from lidarspec.plans.plan import Plan, plan_for
+from lidarspec.points import evaluate, points_function
+from lidarspec.simulation.simulator import opening, simulate
 from lidarspec.testing import material
 from lidarspec.testing.comparisons import assert_same_points
 from tests.shapes import SHAPES
@@ -28,7 +36,8 @@ MANY = 16
 
 @pytest.fixture(autouse=True, scope="module")
 def cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    folder = Path(os.environ.get("LIDARSPEC_CACHE") or tmp_path_factory.mktemp("kernels"))
+    base = tmp_path_factory.getbasetemp()
+    folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "kernels"  # one for all workers
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("LIDARSPEC_CACHE", str(folder))
         yield folder
@@ -62,3 +71,99 @@ def test_every_column_of_damaged_and_mixed_streams(name: str) -> None:
     packets = sensor.decode(material.stream(sensor), backend="jit")
     if len(packets):
         assert_same_points(evaluated(packets).cloud, evaluate(packets).cloud, ulps=ULPS)
+
+
+ANSWERS = [(name, answer) for name, sensor in lidarspec.sensors().items() for answer in sensor.frames if sensor.frames[answer].data]
+
+
+@pytest.mark.parametrize(("name", "answer"), ANSWERS)
+def test_all_sensors_of_this_repository_have_a_kernel(name: str, answer: str) -> None:
+    sensor = SENSORS[name] if answer == SENSORS[name].data_frame else SENSORS[name].configure(answer=answer)
+    frames = simulate(sensor, 2 * MANY)
+    packets = sensor.decode(frames if is_datagram(sensor.links.get("data")) else opening(sensor) + b"".join(frames), backend="jit")
+    cloud = packets.points()
+    assert_same_points(cloud, evaluate(packets).cloud, ulps=ULPS)
+    assert cloud.valid.any()
+    assert plan(packets).kernels
+
+
+def plan(packets: Packets) -> Plan:
+    assert isinstance(packets.table, Rows)
+    found = plan_for(points_function(packets.sensor, packets.frame), packets.batch(), packets.table.groups[0])
+    assert isinstance(found, Plan), str(found)
+    return found
+
+
+def test_any_number_of_threads_gives_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    sensor = SENSORS["velodyne-vlp16"]
+    rows = np.tile(np.frombuffer(b"".join(frames_of("velodyne-vlp16")), np.uint8).reshape(MANY, -1), (40, 1))
+    alone = sensor.decode(rows, backend="jit").points()
+    for number in ("2", "3"):
+        monkeypatch.setenv("LIDARSPEC_THREADS", number)
+        cloud = sensor.decode(rows, backend="jit").points()
+        for name, column in alone.columns.items():
+            np.testing.assert_array_equal(cloud.columns[name], column)
+    monkeypatch.setenv("LIDARSPEC_THREADS", "many")
+    with pytest.raises(UsageError, match="LIDARSPEC_THREADS is a number"):
+        len(sensor.decode(rows, backend="jit").points().x)
+
+
+@pytest.mark.parametrize("compiled", [False, True])
+def test_it_is_chosen_by_itself_once_enough_points_were_made(compiled: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    sensor = dataclasses.replace(SENSORS["ldrobot-stl27l"], points=functools.partial(points_of_another_kind))
+    packets = sensor.decode(b"".join(frames_of("ldrobot-stl27l")))
+    enough = 3 * 12 * len(packets)
+    monkeypatch.setattr("lidarspec.plans.plan.WARM", enough if compiled else 0)
+    monkeypatch.setattr("lidarspec.plans.plan.COLD", 10 * enough if compiled else enough)
+    monkeypatch.setattr("lidarspec.plans.kernels.compiled_before", lambda source: compiled)
+    used = []
+    for _ in range(4):
+        cloud = packets.points()
+        assert_same_points(cloud, evaluate(packets).cloud, ulps=ULPS)
+        used.append(any(kernel.is_ready for kernel in plan(packets).kernels.values()))
+    assert used == [False, False, True, True]
+
+
+def points_of_another_kind(f: Fields) -> Polar:
+    return Polar(range=f.points.distance, azimuth=np.deg2rad(f.start_angle + 2 * np.arange(12)), intensity=f.points.intensity)
+
+
+def run(code: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env={**os.environ, **environment}, check=False)
+
+
+DECODING = """
+import sys, lidarspec as ls
+sensor = ls.sensor("ldrobot-stl27l")
+x = sensor.decode(sensor.example("data") * 3).points().x
+print("numba" in sys.modules, len(x))
+"""
+
+
+def test_the_environment_names_the_default_and_nothing_else_imports_numba(cache: Path) -> None:
+    assert run(DECODING).stdout.split() == ["False", "36"]
+    assert run(DECODING, LIDARSPEC_BACKEND="jit").stdout.split() == ["True", "36"]
+    wrong = run(DECODING, LIDARSPEC_BACKEND="fast")
+    assert "LIDARSPEC_BACKEND is one of auto, numpy, jit, construct, not 'fast'" in wrong.stderr
+
+
+def test_kernels_are_kept_between_runs_and_done_without_where_they_cannot_be(tmp_path: Path) -> None:
+    code = DECODING + "from lidarspec.plans.kernels import function_of; print(function_of.cache_info().misses)"
+    for _ in range(2):
+        done = run(code, LIDARSPEC_BACKEND="jit", LIDARSPEC_CACHE=str(tmp_path / "kept"), NUMBA_DEBUG_CACHE="1")
+        assert done.stdout.splitlines()[-2:] == ["True 36", "1"], done.stderr
+    assert "index loaded" in done.stdout
+    assert "data loaded" in done.stdout
+    occupied = tmp_path / "file"
+    occupied.write_text("not a folder")
+    done = run(DECODING, LIDARSPEC_BACKEND="jit", LIDARSPEC_CACHE=str(occupied))
+    assert done.stdout.split() == ["True", "36"], done.stderr
+
+
+def test_without_numba_asking_for_it_is_an_error_and_nothing_else_is(tmp_path: Path) -> None:
+    hidden = (
+        "import importlib.util as u\nfind = u.find_spec\nu.find_spec = lambda name, *rest: None if name == 'numba' else find(name, *rest)\n"
+    )
+    assert run(hidden + DECODING).stdout.split() == ["False", "36"]
+    asked = run(hidden + DECODING.replace("* 3)", "* 3, backend='jit')"))
+    assert "UsageError: backend 'jit' needs Numba: pip install 'lidarspec[jit]'" in asked.stderr

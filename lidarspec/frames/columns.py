@@ -167,7 +167,8 @@ class Rows1D:
 
     def __init__(self, column: Column) -> None:
         self._shape = (len(column.batch), *column.shape[1:])
-        flat = np.broadcast_to(column.array, self._shape).reshape(self._shape[0], math.prod(self._shape[1:]))
+        full = column.array if column.array.shape == self._shape else np.broadcast_to(column.array, self._shape)
+        flat = full.reshape(self._shape[0], math.prod(self._shape[1:]))
         self._mask = unpadded(column.axes, self._shape, column.batch)
         self.values = np.asarray((flat if self._mask is None else flat[self._mask]).reshape(-1), np.float64)
         if self._mask is None:

@@ -51,6 +51,11 @@ class Kernel:
         self._function: Any = None
 
     @property
+    def is_ready(self) -> bool:
+        """Whether the compiled code is at hand."""
+        return self._function is not None
+
+    @property
     def is_compiled(self) -> bool:
         """Whether the compiled code is at hand or on disk."""
         return self._function is not None or compiled_before(self._text.source)
@@ -74,10 +79,7 @@ class Kernel:
         found = {name: np.empty(count * self._width, np.float32) for name in self._text.names}
         given: list[Any] = []
         for node in self._text.wanted.nodes:
-            array = values(node)
-            step = math.prod(node.shape) if len(array) > 1 else 0
-            flat = np.ascontiguousarray(np.broadcast_to(array.reshape(len(array), *array.shape[1:]), (len(array), *node.shape)), np.float64)
-            given += [flat.reshape(-1), step]
+            given += _flat(values(node), node.shape)
         rest = (self._numbers, *self._text.wanted.arrays, *given, *found.values())
         flat_rows = rows.reshape(-1)
         self._shared(count, lambda first, number: self._function(flat_rows, first, number, *rest))
@@ -95,6 +97,13 @@ class Kernel:
         run(0, edges[1])
         for part in parts:
             part.result()
+
+
+def _flat(array: NDArray[Any], shape: tuple[int, ...]) -> tuple[NDArray[np.float64], int]:
+    """A result for every packet, or one for all, (n or 1, *shape), as one run of numbers; and how many each packet has of its own."""
+    full = (len(array), *shape)
+    array = array if array.shape == full else np.broadcast_to(array, full)
+    return np.ascontiguousarray(array, np.float64).reshape(-1), math.prod(shape) if len(array) > 1 else 0
 
 
 def threads() -> int:

@@ -42,7 +42,7 @@ class Plan:
         tape: what `points` computes.
         shape: of the points of a packet, one length for each axis in `axes`.
         result: what `points` returned, traced.
-        organised: whether clouds are organised in columns and rows.
+        kernels: those that were asked for, by the names of their columns.
 
     Raises:
         Untraceable: where only plain evaluation can do it; the text says why.
@@ -67,7 +67,7 @@ class Plan:
         self.shape = np.broadcast_shapes((2,) + (1,) * len(self.axes), *(array.shape for array in arrays))[1:]
         self.parts = {name: value.node if isinstance(value, Traced) else value for name, value in parts.items() if value is not None}
         self._programs: dict[tuple[str, ...], Program] = {}
-        self._kernels: dict[tuple[str, ...], Kernel] = {}
+        self.kernels: dict[tuple[str, ...], Kernel] = {}
         self._own: bool | None = None
         self._varying = {name for name, count in sample.table.schema.arrays.items() if not isinstance(count, int)}
         if 0 in self.shape:
@@ -107,7 +107,7 @@ class Plan:
 
     def kernel(self, names: tuple[str, ...], function: PointsFunction) -> Kernel:
         """The kernel for these columns; one for this layout alone, or one that serves all where there have been several."""
-        if names not in self._kernels:
+        if names not in self.kernels:
             if self._own is None:
                 self._own = not self._varying or _OWN.setdefault(function, self.layout.size) == self.layout.size
             tables, varying = tables_of(function), set[str]() if self._own else self._varying
@@ -115,8 +115,8 @@ class Plan:
             known = all(is_number(value, self.layout.leaves) for value in (*self._directed, *origin))
             wanted = {name: self._expressions[name] for name in names}
             text = written(self.layout, self.shape, wanted, tables, varying, together=not known)
-            self._kernels[names] = Kernel(text, self.layout.size, self.width)
-        return self._kernels[names]
+            self.kernels[names] = Kernel(text, self.layout.size, self.width)
+        return self.kernels[names]
 
     def describe(self) -> list[str]:
         """The plan in lines: the shape, what is computed for each packet, and the calls for each chunk."""
