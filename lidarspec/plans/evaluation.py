@@ -22,6 +22,7 @@ from lidarspec.frames.columns import Batch, Carry, Column
 from lidarspec.frames.tables import Group, Rows
 from lidarspec.frames.tracing import Node
 from lidarspec.packets import Packets, install_points
+from lidarspec.plans.kernels import spread_out
 from lidarspec.plans.plan import Plan, plan_for, tables_of, worth_compiling
 from lidarspec.points import Evaluated, evaluate, points_function
 
@@ -61,14 +62,13 @@ class Values:
 
 @dataclass(eq=False)
 class Share:
-    """The packets of one layout in a batch: their plan, the plain results, and where the points of each that is ready begin."""
+    """The packets of one layout in a batch: their plan, the plain results, and where the first point of each goes, -1 for nowhere."""
 
     plan: Plan
     group: Group
     values: Values
     batch: Batch
-    ready: NDArray[np.bool_]
-    spots: NDArray[np.intp] | None
+    first: NDArray[np.intp] | None = None
 
     def program(self, names: tuple[str, ...], function: Any, backend: str) -> dict[str, NDArray[Any]]:
         """Columns made by a kernel or a program, for every packet of the group."""
@@ -165,7 +165,7 @@ class Points:
     def time_at(self, index: int) -> float:
         """One value of the column "time"."""
         share = self._shares[0]
-        if len(self._shares) > 1 or share.spots is not None:
+        if len(self._shares) > 1 or share.first is not None:
             found = self.column("time")
             assert found is not None
             return float(found[index])
@@ -179,14 +179,13 @@ class Points:
 
     def _joined(self, parts: list[NDArray[Any]], dtype: Any) -> NDArray[Any]:
         """The points of all layouts in stream order, those of packets that wait left out."""
-        if len(parts) == 1 and self._shares[0].spots is None:
+        if len(parts) == 1 and self._shares[0].first is None:
             flat = parts[0].reshape(-1)[: self.size]
             return flat.astype(dtype, copy=False)
         found = np.empty(self.size, dtype)
         for share, part in zip(self._shares, parts, strict=True):
-            assert share.spots is not None
-            rows = part.reshape(len(share.group.where), -1)
-            _put(found, share.spots, rows if len(rows) == len(share.spots) else rows[share.ready])
+            assert share.first is not None
+            spread_out(part.reshape(-1), share.first, share.plan.width, found, compiled=self._packets.backend == "jit")
         return found
 
 
@@ -212,7 +211,8 @@ def _planned(packets: Packets, carry: Carry | None, *, final: bool, epoch: int |
     known: list[Plan] = [plan for plan in plans if isinstance(plan, Plan)]
     first, fields = Values(known[0], batch), Fields(batch)
     try:
-        remembering = _remembered(known[0], first, ("state",) if alone and len(known) == 1 else ("shift", "latest", "state"))
+        simple = alone and len(known) == 1 and _in_order(table.groups[0].where)
+        remembering = _remembered(known[0], first, ("state",) if simple else ("shift", "latest", "state"))
         shares = [_share(packets, batch, plan, group, first, remembering) for plan, group in zip(known, table.groups, strict=True)]
     except (SpecError, ValueError):
         return None
@@ -220,7 +220,9 @@ def _planned(packets: Packets, carry: Carry | None, *, final: bool, epoch: int |
         return None
     ready = len(packets) if final else min((column.ready for column in remembering.values()), default=len(packets))
     base = epoch if epoch is not None else int(packets.time_ns[0]) if len(packets) else 0
-    return _laid_out(packets, [share for share in shares if share is not None], batch, fields, ready, base)
+    cloud, axes = _laid_out(packets, [share for share in shares if share is not None], batch, ready, base)
+    counts = np.empty(0, np.intp) if alone else _counts([share for share in shares if share is not None], len(packets))[:ready]
+    return Evaluated(cloud, ready, batch.carried(ready), counts, fields, axes)
 
 
 def _remembered(plan: Plan, values: Values, kinds: tuple[str, ...]) -> dict[int, Column]:
@@ -248,11 +250,11 @@ def _share(packets: Packets, batch: Batch, plan: Plan, group: Group, whole: Valu
         low = values.array(node)
         if not ((low > 0) & np.isfinite(low)).all():
             return None
-    return Share(plan, group, values, batch, np.empty(0, np.bool_), None)
+    return Share(plan, group, values, batch)
 
 
-def _laid_out(packets: Packets, shares: list[Share], batch: Batch, fields: Fields, ready: int, base: int) -> Evaluated:
-    """The cloud and the counts of the first `ready` packets."""
+def _laid_out(packets: Packets, shares: list[Share], batch: Batch, ready: int, base: int) -> tuple[LazyCloud, tuple[str | None, ...]]:
+    """The cloud of the first `ready` packets, and the axes of its points."""
     one = len(shares) == 1 and _in_order(shares[0].group.where)
     plan = shares[0].plan
     size = ready * plan.width
@@ -263,8 +265,7 @@ def _laid_out(packets: Packets, shares: list[Share], batch: Batch, fields: Field
         starts = np.cumsum(widths) - widths
         size = int(widths[:ready].sum())
         for share in shares:
-            share.ready = share.group.where < ready
-            share.spots = starts[share.group.where[share.ready]]
+            share.first = np.where(share.group.where < ready, starts[share.group.where], -1)
     same = all(share.plan.shape == plan.shape for share in shares)
     organised = same and len(plan.shape) >= 2 and plan.shape[-1] > 1
     cloud = LazyCloud.of(
@@ -273,21 +274,12 @@ def _laid_out(packets: Packets, shares: list[Share], batch: Batch, fields: Field
         shape=(ready * math.prod(plan.shape[:-1]), plan.shape[-1]) if organised else None,
         nominal=np.bool_(batch.nominal or plan.result.nominal),
     )
-    return Evaluated(cloud, ready, batch.carried(ready), _counts(shares, len(packets), same=same)[:ready], fields, plan.axes)
+    return cloud, plan.axes
 
 
-def _put(target: NDArray[Any], starts: NDArray[np.intp], rows: NDArray[Any]) -> None:
-    """Write rows into a flat array, each as one piece that begins at its start."""
-    if rows.size:
-        pieces = np.ascontiguousarray(rows, target.dtype)
-        kind = np.dtype((np.void, pieces.shape[1] * pieces.itemsize))
-        windows: NDArray[Any] = np.ndarray((len(target) - pieces.shape[1] + 1,), kind, target.data, 0, target.strides)
-        windows[starts] = pieces.view(kind).reshape(-1)
-
-
-def _counts(shares: list[Share], number: int, *, same: bool) -> NDArray[Any]:
+def _counts(shares: list[Share], number: int) -> NDArray[Any]:
     """1 for each point, with the axes of the arrays, 0 in the padding of shorter ones."""
-    if same:
+    if all(share.plan.shape == shares[0].plan.shape for share in shares):
         return np.broadcast_to(np.intp(1), (number, *shares[0].plan.shape))
     shape = tuple(max(lengths) for lengths in zip(*(share.plan.shape for share in shares), strict=True))
     found = np.zeros((number, *shape), np.bool_)

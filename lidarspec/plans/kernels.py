@@ -25,7 +25,7 @@ from lidarspec._version import __version__
 from lidarspec.errors import UsageError
 from lidarspec.frames.layout import Bytes2D
 from lidarspec.frames.tracing import Node
-from lidarspec.plans.kerneltext import Text
+from lidarspec.plans.kerneltext import SPREAD, Text
 
 Values = Callable[[Node], NDArray[Any]]
 
@@ -104,6 +104,21 @@ def _flat(array: NDArray[Any], shape: tuple[int, ...]) -> tuple[NDArray[np.float
     full = (len(array), *shape)
     array = array if array.shape == full else np.broadcast_to(array, full)
     return np.ascontiguousarray(array, np.float64).reshape(-1), math.prod(shape) if len(array) > 1 else 0
+
+
+def spread_out(values: NDArray[Any], first: NDArray[np.intp], width: int, found: NDArray[Any], *, compiled: bool) -> None:
+    """Write the points of packets, `width` each, to where the first of each packet goes; -1 leaves a packet out."""
+    if compiled and values.dtype == np.float32:
+        function_of(SPREAD)(values, first.astype(np.int64, copy=False), width, found)
+        return
+    kept = first >= 0
+    rows, starts = np.ascontiguousarray(values.reshape(len(first), width), found.dtype), first
+    if not kept.all():
+        rows, starts = rows[kept], first[kept]
+    if rows.size:
+        piece = np.dtype((np.void, rows.shape[1] * rows.itemsize))
+        windows: NDArray[Any] = np.ndarray((len(found) - width + 1,), piece, found.data, 0, found.strides)
+        windows[starts] = rows.view(piece).reshape(-1)
 
 
 def threads() -> int:

@@ -31,6 +31,20 @@ nan, inf = np.nan, np.inf
 
 """
 
+#: a kernel that puts the points of packets to where they belong.
+SPREAD = (
+    HEAD
+    + """\
+@njit([(SINGLES, PLACES, INTEGER, MADE_SINGLES)], cache=True, nogil=True)
+def kernel(values, first, width, found):
+    for p in range(len(first)):
+        start = at(first, p)
+        if start >= 0:
+            for i in range(width):
+                put(found, start + i, at(values, p * width + i))
+"""
+)
+
 _TYPES = {"float32": "SINGLES", "float64": "DOUBLES", "int64": "PLACES"}
 
 
