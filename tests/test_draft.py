@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import random
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +14,7 @@ import lidarspec as ls
 from lidarspec import Checksum, Crc, Sum, UsageError, WireError, WordXor, Xor
 from lidarspec.drafts.candidates import candidates
 from lidarspec.drafts.draft import Draft, draft
+from lidarspec.frames.columns import aligned
 from lidarspec.scaffold import Names
 from lidarspec.searching.samples import Place
 from lidarspec.searching.sums import Changed
@@ -19,6 +22,7 @@ from lidarspec.simulation.simulator import simulate
 from lidarspec.sources import transport
 from tests.cli.running import ran
 from tests.sensors.evidence import capture
+from tests.shapes import SHAPES
 
 LD06, COIN_D4 = "ldrobot/ld06_3_consecutive_frames.bin", "cspc/coin_d4_ludovatech_issue2_partial.bin"
 VLP16, VLP16_RAW, HELIOS = (
@@ -119,6 +123,27 @@ def test_the_evidence_stands_beside_each_field(tmp_path: Path) -> None:
     assert len(list(sensor.scans((tmp_path / "some.bin").read_bytes()))) == 3
 
 
+def test_a_draft_is_written_as_the_projects_own_sensors_are(tmp_path: Path) -> None:
+    """With everything that a draft can have: blocks, a count, a class for the checksum, angles, a counter."""
+    sources = {
+        "blocks": b"".join(simulate(ls.sensor("velodyne-vlp16"), 60)),
+        "count": b"".join(simulate(ls.sensor("cspc-coin-d4"), 60)),
+        "class": made(b"\x5a\xc3", Changed(Sum(8), 0x55), skip=1),
+        "over": made(b"\x5a\xc3", Crc(16, 0x1021), skip=3),
+        "angles": b"".join(simulate(ls.sensor("ldrobot-ld06"), 300)),
+    }
+    for name, data in sources.items():
+        (tmp_path / f"{name}.bin").write_bytes(data)
+        ran("new", f"acme-{name}", "--into", tmp_path, "--from-capture", tmp_path / f"{name}.bin")
+    text = "".join(path.read_text(encoding="utf-8") for path in tmp_path.glob("*/lidarspec_acme_*/__init__.py"))
+    for mark in ("/ Array(\n        12,", "this.count", "class Check(Checksum):", "deg2rad(f.angle_4)", "Sequence(", "confirm=2", "over=("):
+        assert mark in text
+    config = ["--config", str(Path(__file__).parents[1] / "pyproject.toml")]
+    for words in (["check"], ["format", "--check"]):
+        done = subprocess.run([sys.executable, "-m", "ruff", *words, *config, str(tmp_path)], capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stdout
+
+
 def made(body: bytes, checksum: Checksum, *, number: int = 60, skip: int = 0, order: str = "little", vary: int = 0) -> bytes:
     """Frames with a counter and random content behind a header, sealed at the end."""
     source = random.Random(number)
@@ -146,9 +171,9 @@ def test_made_frames_are_drafted_to_a_module_that_reads_them(tmp_path: Path, che
     data = (tmp_path / "some.bin").read_bytes()
     found = sensor.split(data)
     assert len(found) == 60
-    damaged = bytearray(found[5].data)
-    damaged[-8] ^= 0x10
-    assert not sensor.split(bytes(damaged))
+    damaged = bytearray(data)
+    damaged[found[5].offset + len(found[5].data) - 8] ^= 0x10
+    assert [one.offset for one in sensor.split(bytes(damaged))] == [one.offset for one in found if one is not found[5]]
     assert sensor.build("data", sensor.parse(found[5].data)) == found[5].data
 
 
@@ -193,3 +218,11 @@ def test_a_capture_that_is_not_there_is_named(tmp_path: Path) -> None:
 def test_names_are_refused_before_a_capture_is_read() -> None:
     with pytest.raises(UsageError):
         Names("X9")
+
+
+def test_points_may_depend_on_no_field() -> None:
+    """As those of a draft without an angle do."""
+    shape = SHAPES["shape-count"]
+    batch = shape.decode(shape.example("data") * 3).batch()
+    arrays, axes, ready = aligned((np.zeros(1), 0.0), batch)
+    assert ([array.tolist() for array in arrays], axes, ready) == ([[0.0], 0.0], (), 3)

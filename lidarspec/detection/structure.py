@@ -125,7 +125,18 @@ def _periodic(data: NDArray[np.uint8]) -> Structure | None:
     likely = lags[np.argsort(equal)[::-1][:LAGS]].tolist()
     framed = [(weight, found) for lag in likely for weight, found in _framed(data, lag) if found.share > HALF]
     best = max((weight for weight, _ in framed), default=0.0)
-    return min((found for weight, found in framed if weight > ALIKE * best), key=lambda found: found.period or 0, default=None)
+    shortest = min((found for weight, found in framed if weight > ALIKE * best), key=lambda found: found.period or 0, default=None)
+    return None if shortest is None else _divided(data, shortest)
+
+
+def _divided(data: NDArray[np.uint8], whole: Structure) -> Structure:
+    """The frames of which a whole number repeats together, as in a simulation, where these have sync bytes of their own; else the same."""
+    period = whole.period or 0
+    for part in (part for part in range(SHORTEST, period // 2 + 1) if period % part == 0):
+        for _, found in _framed(data, part):
+            if found.share > whole.share - CLOSE and len(set(found.sync)) > 1:
+                return found
+    return whole
 
 
 def _framed(data: NDArray[np.uint8], period: int) -> Iterator[tuple[float, Structure]]:

@@ -21,6 +21,8 @@ TOLD, RUN = 8, 2
 LONG = 64
 #: doubt below which a checksum may be chance, as one in so many powers of two.
 WEAK = 12
+#: bits of constants and checksum that let noise through: two frames in a row are asked for then.
+FEW_BITS = 24
 
 
 @dataclass(frozen=True)
@@ -53,8 +55,9 @@ def drafted(draft: Draft, *, origin: str, link: str) -> dict[str, str]:
     lines = [line for field in fields for line in field.lines(" " * (8 if seal else 4))]
     body = "\n".join(lines)
     struct = f"Checksummed(\n    Struct(\n{body}\n    ),\n{seal[0]})" if seal else f"Struct(\n{body}\n)"
-    below = [f"f.{path} < 360" for path, _, _ in angles]
+    below = [f"f.{path} < 360" for path in angles if "." not in path]
     plausible = below[0] if len(below) == 1 else " & ".join(f"({one})" for one in below)
+    is_weak = not draft.datagrams and not below and _strength(draft) <= FEW_BITS
     counters = [one for one in draft.candidates if one.kind == "counter" and one.offset < draft.head]
     text = {
         "frames_told": f"{len(draft.frames)} frame{'s' * (len(draft.frames) != 1)}, {draft.share:.1%} of its {draft.bytes_in} bytes",
@@ -63,13 +66,12 @@ def drafted(draft: Draft, *, origin: str, link: str) -> dict[str, str]:
         "sealed": "" if seal else "# No checksum was found: XORs, sums and CRCs of 8, 16 and 32 bits were tried.\n",
         "struct": struct,
         "plausible": f'def plausible(f: Fields) -> Any:\n    """Angles below 360 degrees."""\n    return {plausible}\n\n\n'
-        if angles
+        if below
         else "",
-        "azimuth": f"np.deg2rad(f.{angles[0][0]})" if angles else "np.zeros(1)",
-        "distance": f"0 * f.{angles[0][0]}" if angles else "np.zeros(1)",
-        "sweep": _sweep(draft, angles),
+        "azimuth": f"np.deg2rad(f.{angles[0]})" if angles else "np.zeros(1)",
+        "distance": f"0 * f.{angles[0]}" if angles else "np.zeros(1)",
         "arguments": "".join(f"    {line}\n" for line in _arguments(angles, counters)),
-        "frame_arguments": f"max_length={_longest(draft)}" + (", plausible=plausible" if angles else ""),
+        "frame_arguments": ", ".join([f"max_length={_longest(draft)}", *["plausible=plausible"] * bool(below), *["confirm=2"] * is_weak]),
         "link_code": link,
     }
     return {**text, **_imports(text)}
@@ -242,34 +244,24 @@ def _span_cuts(draft: Draft) -> list[int]:
     return sorted(edge for edge in edges if edge < draft.head)
 
 
-def _angles(draft: Draft) -> list[tuple[str, Candidate, int]]:
-    """(path, field, how many there are in a frame) of the angles that wrap, those of blocks first."""
-    inside = [(f"blocks.{one.name}", one, draft.blocks.count) for one in draft.blocks.candidates] if draft.blocks else []
-    return [each for each in [*inside, *((one.name, one, 1) for one in draft.candidates)] if each[1].kind == "angle"]
+def _angles(draft: Draft) -> list[str]:
+    """The paths of the angles that wrap, those of blocks first."""
+    inside = [f"blocks.{one.name}" for one in draft.blocks.candidates if one.kind == "angle"] if draft.blocks else []
+    return inside + [one.name for one in draft.candidates if one.kind == "angle"]
 
 
-def _sweep(draft: Draft, angles: Sequence[tuple[str, Candidate, int]]) -> str:
-    if not angles:
-        return ""
-    entries = []
-    for path, one, count in angles:
-        step = one.steps[1] * CIRCLES[one.circle][0]
-        number = f"({count} * i + np.arange({count}))" if count > 1 else "i"
-        entries.append(f'        "{path}": {number} * {step:g} % 360,\n')
-    return (
-        "\n\n\ndef sweep(i: int) -> dict[str, Any]:\n"
-        f'    """The angles of packet i, at the pace of the capture."""\n    return {{\n{"".join(entries)}    }}'
-    )
+def _strength(draft: Draft) -> int:
+    """Bits of the constants and the checksum."""
+    flags = len(draft.blocks.flag) * draft.blocks.count if draft.blocks else 0
+    return 8 * (len(draft.sync) + flags + (draft.seal.place.size if draft.seal else 0))
 
 
-def _arguments(angles: Sequence[tuple[str, Candidate, int]], counters: Sequence[Candidate]) -> Iterator[str]:
-    yield f'scan=OnWrap("{angles[0][0]}"),' if angles else "scan=Every(0.1),  # seconds: no angle is known that a turn could be told by"
+def _arguments(angles: Sequence[str], counters: Sequence[Candidate]) -> Iterator[str]:
+    yield f'scan=OnWrap("{angles[0]}"),' if angles else "scan=Every(0.1),  # seconds: no angle is known that a turn could be told by"
     if counters:
         one = counters[0]
         limits = f", first={one.first}, last={one.circle - 1}" if one.wraps else ""
         yield f'sequence=Sequence("{one.name}"{limits}),  # a jump in it is a loss'
-    if angles:
-        yield "sweep=sweep,"
 
 
 def _longest(draft: Draft) -> str:
@@ -291,8 +283,11 @@ def _imports(text: dict[str, str]) -> dict[str, str]:
         "hookimpl",
         *re.findall(r"\b(Check(?:sum|summed)|Crc|Every|Fold15|OnWrap|Scaled|Sequence|Serial|Sum|Udp|WordXor|Xor)\b", code),
     }
-    typing = "from typing import Any\n" if "Any" in code else ""
-    return {"construct_names": ", ".join(sorted(construct, key=_case)), "own_names": ", ".join(sorted(own, key=_case)), "typing": typing}
+    return {
+        "construct_names": ", ".join(sorted(construct, key=_case)),
+        "own_names": ", ".join(sorted(own, key=_case)),
+        "typing": "from typing import Any\n" if "Any" in code else "",
+    }
 
 
 def _case(name: str) -> tuple[bool, str, int]:

@@ -208,7 +208,7 @@ def aligned(values: tuple[Any, ...], batch: Batch) -> tuple[list[NDArray[Any]], 
         SpecError: where axes of different arrays meet.
     """
     columns = [value for value in values if isinstance(value, Column)]
-    depth = max(len(column.axes) for column in columns)
+    depth = max((len(column.axes) for column in columns), default=0)
     names: list[str | None] = [None] * depth
     for column in columns:
         for index, name in enumerate(column.axes):
@@ -227,7 +227,7 @@ def aligned(values: tuple[Any, ...], batch: Batch) -> tuple[list[NDArray[Any]], 
             place = array.ndim - depth + index
             if place >= 0 and array.shape[place] != 1 and names[index] is None:
                 names[index] = chain[index] if index < len(chain) else f"<{index}>"
-    return arrays, tuple(names), min(column.ready for column in columns)
+    return arrays, tuple(names), min((column.ready for column in columns), default=len(batch))
 
 
 def _position(name: str, chain: tuple[str, ...]) -> int:

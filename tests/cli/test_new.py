@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import subprocess
 import sys
 import tomllib
@@ -14,6 +15,7 @@ import pytest
 
 import lidarspec as ls
 from lidarspec.scaffold import Names
+from lidarspec.simulation.simulator import simulate
 from tests.architecture import Module, private_imports
 from tests.cli.running import ran
 
@@ -39,6 +41,30 @@ def run(folder: Path, *words: object, code: int = 0) -> str:
     done = subprocess.run(command, cwd=folder, env=installed(folder), capture_output=True, text=True, check=False, timeout=120)
     assert done.returncode == code, done.stdout + done.stderr
     return done.stdout
+
+
+def test_the_tests_of_a_draft_pass(tmp_path: Path) -> None:
+    (tmp_path / "some.bin").write_bytes(b"".join(simulate(ls.sensor("ldrobot-ld06"), 200)))
+    ran("new", "acme-x1", "--into", tmp_path, "--from-capture", tmp_path / "some.bin")
+    folder = tmp_path / "lidarspec-acme-x1"
+    assert len(json.loads((folder / "vectors.json").read_text(encoding="utf-8"))) == 3
+    assert " passed" in run(folder, "pytest", "-q", "-p", "no:cacheprovider")
+    assert "angle_4" in run(folder, "lidarspec", "explain", tmp_path / "some.bin", "-s", "acme-x1")
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("drafted", [False, True])
+def test_the_readme_holds_in_a_clean_environment(tmp_path: Path, *, drafted: bool) -> None:
+    (tmp_path / "some.bin").write_bytes(b"".join(simulate(ls.sensor("ldrobot-ld06"), 200)))
+    ran("new", "acme-x1", "--into", tmp_path, *(["--from-capture", tmp_path / "some.bin"] if drafted else []))
+    folder = tmp_path / "lidarspec-acme-x1"
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    lines = re.findall(r"^    (.+)$", (folder / "README.md").read_text(encoding="utf-8"), flags=re.MULTILINE)
+    for line in lines:
+        command = line.replace("CAPTURE", str(tmp_path / "some.bin")).replace("install -e", f"install -q {ROOT} -e")
+        done = subprocess.run(command, shell=True, cwd=folder, env=environment, capture_output=True, text=True, check=False, timeout=900)
+        assert done.returncode == 0, command + done.stdout + done.stderr
+    assert len(lines) >= 5
 
 
 @pytest.fixture(scope="module", params=["serial", "udp"])
