@@ -62,7 +62,7 @@ def drafted(draft: Draft, *, origin: str, link: str) -> dict[str, str]:
     text = {
         "frames_told": f"{len(draft.frames)} frame{'s' * (len(draft.frames) != 1)}, {draft.share:.1%} of its {draft.bytes_in} bytes",
         "origin": origin,
-        "checksum_class": f"{seal[1]}\n\n\n" if seal and seal[1] else "",
+        "checksum_class": f"\n{seal[1]}\n\n\n" if seal and seal[1] else "",
         "sealed": "" if seal else "# No checksum was found: XORs, sums and CRCs of 8, 16 and 32 bits were tried.\n",
         "struct": struct,
         "plausible": f'def plausible(f: Fields) -> Any:\n    """Angles below 360 degrees."""\n    return {plausible}\n\n\n'
