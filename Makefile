@@ -19,7 +19,7 @@ WRITERS := $(VENV)/.installed-docs
 PEERS := $(VENV)/.installed-bench
 RECENT := import sys; sys.exit(sys.version_info < (3, 11))
 
-.PHONY: demo test soak lint types docs wheels bench bench-here clean
+.PHONY: demo test soak lint types docs wheels reference bench bench-here clean
 
 demo: $(USERS)
 	@$(BIN)/lidarspec demo -s ldrobot-stl27l
@@ -43,6 +43,10 @@ docs: $(WRITERS)
 
 wheels: $(DEVELOPERS)
 	@for project in . $(PLUGINS); do $(BIN)/python -m build --wheel --no-isolation --outdir $(DIST) $$project || exit 1; done
+
+# The pages of the sensors in docs/reference/sensors, from their specs.
+reference: $(USERS)
+	@$(BIN)/python docs/reference_pages.py
 
 # The libraries to compare with bring old versions of others along, so they have an environment of their own.
 bench:

@@ -22,16 +22,15 @@ class Cell:
 
     name: str
     bits: int
-    detail: str = ""
-    said: str = ""
-    role: str = ""
-    offset: str = ""
-    size: str = ""
+    detail: str
+    said: str
+    role: str
+    offset: Extent
 
 
 @dataclass(frozen=True)
 class Group:
-    """Boxes that stand together: repeated `label` times, or there under a condition; `box` has a dashed frame."""
+    """Boxes that stand together: repeated, or with `optional` there under a condition, as the label says."""
 
     label: str
     items: tuple[Item, ...]
@@ -44,7 +43,13 @@ Item = Cell | Group
 def cells(message: Message) -> tuple[Item, ...]:
     """The items of a frame type."""
     seals = {path: node for node in nodes(message.root) if isinstance(node, Sealed) for path in node.fields}
-    return _Cells(seals).visit(message.root, Extent(), 0)[0]
+    return _Cells(seals, mixed=not byte_order(message)).visit(message.root, Extent(), 0)[0]
+
+
+def byte_order(message: Message) -> str:
+    """The byte order of all numbers of a frame type, "" where they differ or there are none of several bytes."""
+    orders = {node.order for node in nodes(message.root) if isinstance(node, Number) and node.size > 1}
+    return orders.pop() if len(orders) == 1 else ""
 
 
 def phrase(formula: Formula) -> str:
@@ -64,6 +69,7 @@ def phrase(formula: Formula) -> str:
 @dataclass
 class _Cells:
     seals: dict[str, Sealed]
+    mixed: bool
 
     def visit(self, node: Node, start: Extent, depth: int) -> tuple[tuple[Item, ...], Extent]:
         """The items of a part that begins at `start`, and its size."""
@@ -90,7 +96,7 @@ class _Cells:
         size = Extent()
         for member in node.members:
             found, more = self.visit(member, start + size, depth)
-            named = isinstance(member, Struct | Sealed) and len(found) > 1
+            named = isinstance(member, Struct | Sealed) or (isinstance(member, Block) and member.parts[0].names)
             items += [replace(item, name=f"{member.name}.{item.name}") if named and isinstance(item, Cell) else item for item in found]
             size = size + more
         return tuple(items), size
@@ -99,37 +105,38 @@ class _Cells:
         kind = {"uint": "u", "int": "s", "float": "float "}[node.kind] + str(8 * node.size)
         order = f" {node.order}" if node.size > 1 else ""
         said = f"{node.kind}{8 * node.size}{order}"
-        detail = " ".join(part for part in (kind, unit_text(node.info)) if part)
+        short = f" {node.order[0]}e" if self.mixed and node.size > 1 else ""
+        detail = " ".join(part for part in (kind + short, unit_text(node.info)) if part)
         return self._cell(node, 8 * node.size, detail, said, start)
 
     def _blob(self, node: Blob, start: Extent) -> tuple[tuple[Item, ...], Extent]:
         size = Extent(node.size) if isinstance(node.size, int) else Extent(0, (phrase(node.size),))
         if node.size == 0:
             return (), size
-        detail = node.const.hex(" ") if node.const is not None and len(node.const) <= 8 else f"{size} bytes"
+        detail = node.const.hex(" ") if node.const is not None and len(node.const) <= 8 else f"{size} byte{'s' * (str(size) != '1')}"
         bits = 8 * node.size if isinstance(node.size, int) else 0
-        return (self._cell(node, bits, detail, "bytes", start, str(size)),), size
+        return (self._cell(node, bits, detail, "bytes", start),), size
 
-    def _cell(self, node: Number | Blob, bits: int, detail: str, kind: str, start: Extent, size: str = "") -> Cell:
+    def _cell(self, node: Number | Blob, bits: int, detail: str, kind: str, start: Extent) -> Cell:
         path, seal = node.info.path, self.seals.get(node.info.path)
         if isinstance(node, Number) and node.info.const is not None:
             detail = f"{node.info.const:#0{2 * node.size + 2}x}" if isinstance(node.info.const, int) else str(node.info.const)
         sealed = "" if seal is None else seal.algorithm.describe()
         said = "; ".join(part for part in (path, kind, unit_text(node.info), meaning(node.info), sealed) if part)
         role = "sum" if seal else "const" if node.info.const is not None else "spare" if _is_spare(node.name) else ""
-        return Cell(node.name or "(constant)", bits, detail, said, role, str(start), size or str(bits // 8))
+        return Cell(node.name or "(constant)", bits, detail, said, role, start)
 
     def _block(self, node: Block, start: Extent) -> list[Cell]:
         """A box for each run of bits of one value, in the order of the wire, the highest bit of each byte first."""
         runs = [(run.byte, run.low + run.mask.bit_count() - 1, run, part) for part in node.parts for run in part.bits.segments]
-        found: list[tuple[Part, int, int]] = []
-        for _, _, run, part in sorted(runs, key=lambda entry: (entry[0], -entry[1])):
+        found: list[tuple[Part, int, int, int]] = []
+        for byte, _, run, part in sorted(runs, key=lambda entry: (entry[0], -entry[1])):
             low, high = run.target, run.target + run.mask.bit_count() - 1
             if found and found[-1][0] is part and found[-1][1] == high + 1:
-                found[-1] = (part, low, found[-1][2])
+                found[-1] = (part, low, *found[-1][2:])
             else:
-                found.append((part, low, high))
-        return [self._run(node, part, low, high, start) for part, low, high in found]
+                found.append((part, low, high, byte))
+        return [self._run(node, part, low, high, start + Extent(byte)) for part, low, high, byte in found]
 
     def _run(self, node: Block, part: Part, low: int, high: int, start: Extent) -> Cell:
         whole = high - low + 1 == part.bits.width
@@ -139,14 +146,14 @@ class _Cells:
         texts = (part.info.path, bit_text(part.bits), unit_text(part.info), meaning(part.info), seal.algorithm.describe() if seal else "")
         role = "sum" if seal else "const" if part.info.const is not None else "spare" if _is_spare(name) else ""
         unit = unit_text(part.info) if whole else ""
-        return Cell(name, high - low + 1, detail or unit, "; ".join(text for text in texts if text), role, str(start), str(node.size))
+        return Cell(name, high - low + 1, detail or unit, "; ".join(text for text in texts if text), role, start)
 
     def _repeat(self, node: Repeat, start: Extent, depth: int) -> tuple[tuple[Item, ...], Extent]:
         index = INDICES[depth % len(INDICES)]
         count = node.count if isinstance(node.count, int) else phrase(node.count)
         _, element = self.visit(node.element, Extent(), depth + 1)
         items, _ = self.visit(node.element, start + element.times(index), depth + 1)
-        return (Group(f"{node.name} \u00d7 {count}", items),), element.times(count)
+        return (Group(f"{node.name} \u00d7\u00a0{count}", items),), element.times(count)
 
     def _choice(self, node: When | Select, start: Extent, depth: int) -> tuple[tuple[Item, ...], Extent]:
         if isinstance(node, When):

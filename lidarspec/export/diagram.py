@@ -3,22 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from xml.sax.saxutils import escape, quoteattr
 
-from lidarspec.export.cells import Cell, Group, Item, cells
+from lidarspec.export.cells import Cell, Group, Item, byte_order, cells
 from lidarspec.export.messages import messages
 from lidarspec.spec import Sensor
-from lidarspec.wiretable import frame_size
+from lidarspec.wiretable import Extent, frame_size
 
 #: bits in a row, pixels of a bit and of a row, of the offsets at the left, of a level of brackets, and around everything.
-BITS, BIT, ROW, LEFT, LEVEL, EDGE = 32, 22, 46, 104, 172, 16
+BITS, BIT, ROW, LEFT, LEVEL, EDGE = 32, 22, 46, 104, 136, 16
 #: bits that are drawn in full; a longer field is a torn row.
 LONGEST = 128
+#: letters of an offset in one line.
+FORMULA = 13
 FILLS = {"": "#ffffff", "const": "#e4e8ee", "sum": "#fde7b8", "spare": "#f4f4f2"}
 INK, FAINT, LINE = "#1c2430", "#64707f", "#4a5565"
 #: width of a letter in its size, and the sizes of names and of what stands below them.
-LETTER, NAMED, DETAILED, SMALLEST = 0.56, 13, 10.5, 8
+LETTER, NAMED, DETAILED, SMALLEST = 0.61, 13, 10.5, 8
 
 
 def svg(sensor: Sensor) -> str:
@@ -30,11 +32,17 @@ def svg(sensor: Sensor) -> str:
     sheet = _Sheet()
     for message in messages(sensor):
         size = frame_size(message.frame)
-        sheet.title(f"{sensor.vendor} {sensor.model}: {message.name}", f"{size} bytes" if size != "1" else "1 byte")
+        order = byte_order(message)
+        detail = f"{size} byte{'s' * (size != '1')}" + (f", integers {order}-endian" if order else "")
+        sheet.title(f"{sensor.vendor} {sensor.model}: {message.name}", detail)
         sheet.ruler()
         sheet.items(cells(message), 0)
         sheet.close()
     return sheet.document(f"{sensor.id}: packet diagrams")
+
+
+#: left edge, upper edge and bits of what a field has of a row.
+Piece = tuple[float, float, int]
 
 
 @dataclass
@@ -105,28 +113,30 @@ class _Sheet:
 
     def _box(self, cell: Cell) -> None:
         """A field in as many pieces as it takes rows; the name stands in the widest."""
-        pieces = []
-        left = cell.bits
+        pieces: list[Piece] = []
+        left, lead = cell.bits, self.used % 8
         while left:
             if self.used == 0:
-                self._offset(cell, cell.bits - left)
+                self._offset(cell, (lead + cell.bits - left) // 8)
             taken = min(left, BITS - self.used)
             pieces.append((LEFT + self.used * BIT, self.top, taken))
             self.used, left = self.used + taken, left - taken
             if self.used == BITS:
                 self._row_ends()
         widest = max(range(len(pieces)), key=lambda index: pieces[index][2])
+        self.parts += _outlined(pieces, cell)
         for index, (x, y, bits) in enumerate(pieces):
-            self.parts.append(_rect(x, y, bits * BIT, ROW, cell))
             if index == widest:
                 self.parts += _label(x, y, bits * BIT, cell)
+            elif len(pieces) == 2 and not _below(*pieces):
+                self.parts += _label(x, y, bits * BIT, replace(cell, name=f"({cell.name})", detail=""), fill=FAINT)
 
     def _torn(self, cell: Cell) -> None:
         """A field too long to draw, or of no known length: a row with a wavy cut."""
         self._row_ends()
         self._offset(cell, 0)
         width = BITS * BIT
-        self.parts.append(_rect(LEFT, self.top, width, ROW, cell))
+        self.parts += _outlined([(LEFT, self.top, BITS)], cell)
         for share in (0.12, 0.88):
             x = LEFT + share * width
             self.parts.append(
@@ -135,11 +145,15 @@ class _Sheet:
         self.parts += _label(LEFT, self.top, width, cell)
         self.top, self.used = self.top + ROW, 0
 
-    def _offset(self, cell: Cell, bits: int) -> None:
-        """The offset of a row, left of it."""
-        text = cell.offset if not bits else str(int(cell.offset) + bits // 8) if cell.offset.isdigit() else f"{cell.offset} + {bits // 8}"
-        size = max(min(11, (LEFT - EDGE - 10) / (LETTER * len(text))), SMALLEST - 1)
-        self.parts.append(_text(LEFT - 8, self.top + ROW / 2 + 4, text, size, fill=FAINT, anchor="end"))
+    def _offset(self, cell: Cell, more: int) -> None:
+        """The offset of a row, so many bytes after the field's, left of it; a long formula in two lines."""
+        text = str(cell.offset + Extent(more))
+        middle = text.find(" + ", len(text) // 2 - 4)
+        lines = [text] if len(text) <= FORMULA or middle < 0 else [text[: middle + 2], text[middle + 3 :]]
+        for index, line in enumerate(lines):
+            y = self.top + ROW / 2 + 4 + 13 * (index - (len(lines) - 1) / 2)
+            size = min(11, (LEFT - 12) / (LETTER * len(line)))
+            self.parts.append(_text(LEFT - 8, y, line, size, fill=FAINT, anchor="end"))
 
 
 def _depth(group: Group) -> int:
@@ -147,14 +161,37 @@ def _depth(group: Group) -> int:
     return max((1 + _depth(item) for item in group.items if isinstance(item, Group)), default=0)
 
 
-def _rect(x: float, y: float, width: float, height: float, cell: Cell) -> str:
-    place = f'x="{x:g}" y="{y:g}" width="{width:g}" height="{height:g}"'
-    return f'<rect {place} fill="{FILLS[cell.role]}" stroke="{LINE}"><title>{escape(cell.said)}</title></rect>'
+def _outlined(pieces: Sequence[Piece], cell: Cell) -> Iterator[str]:
+    """The box of a field: its pieces filled, and lines around them but not between two of them."""
+    rects = "".join(f'<rect x="{x:g}" y="{y:g}" width="{bits * BIT}" height="{ROW}"/>' for x, y, bits in pieces)
+    yield f'<g fill="{FILLS[cell.role]}"><title>{escape(cell.said)}</title>{rects}</g>'
+    path = ""
+    for index, piece in enumerate(pieces):
+        x, y, bits = piece
+        end = x + bits * BIT
+        path += f"M{x:g} {y:g}v{ROW}M{end:g} {y:g}v{ROW}"
+        before, after = pieces[index - 1] if index else None, pieces[index + 1] if index + 1 < len(pieces) else None
+        path += f"M{max(x, _end(before)):g} {y:g}H{end:g}" if before is None or _end(before) < end else ""
+        path += f"M{x:g} {y + ROW:g}H{end:g}" if after is None or not _below(piece, after) else ""
+        path += f"M{x:g} {y:g}H{before[0]:g}" if before and before[0] > x else ""
+        path += f"M{_end(after):g} {y + ROW:g}H{end:g}" if after and _below(piece, after) and _end(after) < end else ""
+    yield f'<path d="{path}" fill="none" stroke="{LINE}"/>'
 
 
-def _label(x: float, y: float, width: float, cell: Cell) -> Iterator[str]:
+def _end(piece: Piece | None) -> float:
+    return 0 if piece is None else piece[0] + piece[2] * BIT
+
+
+def _below(one: Piece, other: Piece) -> bool:
+    """Whether two pieces of a field touch, one above the other."""
+    return abs(one[1] - other[1]) == ROW and max(one[0], other[0]) < min(_end(one), _end(other))
+
+
+def _label(x: float, y: float, width: float, cell: Cell, fill: str = INK) -> Iterator[str]:
     """The name of a field and what it is, as large as there is room; a name that fits nowhere is written upright."""
     room = width - 5
+    if LETTER * SMALLEST * len(cell.name) > room:
+        cell = replace(cell, name=cell.name.rpartition(".")[2])
     size = min(NAMED, room / (LETTER * len(cell.name)))
     middle = x + width / 2
     if size < SMALLEST and len(cell.name) > 1:
@@ -162,10 +199,10 @@ def _label(x: float, y: float, width: float, cell: Cell) -> Iterator[str]:
         text = cell.name if tall >= SMALLEST - 1 else cell.name[: int((ROW - 4) / (LETTER * (SMALLEST - 1)))]
         tall = max(tall, SMALLEST - 1)
         turned = f' transform="rotate(-90 {middle:g} {y + ROW / 2:g})"'
-        yield _text(middle, y + ROW / 2 + tall * 0.35, text, tall, anchor="middle", more=turned)
+        yield _text(middle, y + ROW / 2 + tall * 0.35, text, tall, fill=fill, anchor="middle", more=turned)
         return
     fits = cell.detail and LETTER * DETAILED * len(cell.detail) <= room
-    yield _text(middle, y + ROW / 2 + (-1 if fits else size * 0.35), cell.name, size, anchor="middle")
+    yield _text(middle, y + ROW / 2 + (-1 if fits else size * 0.35), cell.name, size, fill=fill, anchor="middle")
     if fits:
         yield _text(middle, y + ROW / 2 + 13, cell.detail, DETAILED, fill=FAINT, anchor="middle")
 

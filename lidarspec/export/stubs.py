@@ -134,7 +134,7 @@ class {camel(sensor.id)}(Sensor):
     def parse(self, data: bytes, frame: str | None = None, *, verify: bool = True) -> Any: ...
 {builds}
     @overload
-    def build(self, frame: str, value: Any = None, /, *, units: bool = False, **values: Any) -> bytes: ...
+    def build(self, _frame: str, _value: Any = None, /, *, units: bool = False, **values: Any) -> bytes: ...
 {commands}
 {rest}'''
 
@@ -145,10 +145,12 @@ def _build(message: Message) -> str:
     fields = "".join(
         f", {member.name}: {'float' if isinstance(member, Number) else 'Any'} = ..."
         for member in body.members
-        if member.name and not keyword.iskeyword(member.name) and not (isinstance(member, Number | Blob) and member.info.const is not None)
+        if member.name not in ("", "self", "units")
+        and not keyword.iskeyword(member.name)
+        and not (isinstance(member, Number | Blob) and member.info.const is not None)
     )
     more = f", units: bool = False{fields}, **values: Any"
-    return f'    @overload\n    def build(self, frame: Literal["{message.name}"], value: Any = None, /, *{more}) -> bytes: ...'
+    return f'    @overload\n    def build(self, _frame: Literal["{message.name}"], _value: Any = None, /, *{more}) -> bytes: ...'
 
 
 def _command(name: str, command: Command) -> str:

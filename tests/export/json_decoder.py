@@ -1,0 +1,98 @@
+"""Frames decoded by nothing but the JSON of a spec, to show that it says enough; written from docs/reference/spec-json.md."""
+
+from __future__ import annotations
+
+import struct
+from typing import Any
+
+FLOATS = {2: "e", 4: "f", 8: "d"}
+OPERATIONS = {
+    "+": lambda a, b: a + b,
+    "-": lambda a, b=None: -a if b is None else a - b,
+    "*": lambda a, b: a * b,
+    "//": lambda a, b: a // b,
+    "%": lambda a, b: a % b,
+    "&": lambda a, b: a & b,
+    "|": lambda a, b: a | b,
+    "^": lambda a, b: a ^ b,
+    "<<": lambda a, b: a << b,
+    ">>": lambda a, b: a >> b,
+    "==": lambda a, b: a == b,
+    "!=": lambda a, b: a != b,
+    "<": lambda a, b: a < b,
+    "<=": lambda a, b: a <= b,
+    ">": lambda a, b: a > b,
+    ">=": lambda a, b: a >= b,
+    "not": lambda a: not a,
+}
+
+
+class Decoder:
+    """One frame: its bytes, how far they are read, and the values so far by path."""
+
+    def __init__(self, data: bytes) -> None:
+        self.data, self.at, self.known = data, 0, {}
+
+    def read(self, part: dict[str, Any]) -> Any:
+        """The value of a part that begins here."""
+        return getattr(self, "read_" + part["kind"])(part)
+
+    def taken(self, size: int) -> bytes:
+        self.at += size
+        assert self.at <= len(self.data)
+        return self.data[self.at - size : self.at]
+
+    def value(self, formula: Any) -> int:
+        if isinstance(formula, int):
+            return formula
+        if "field" in formula:
+            return self.known[formula["field"]]
+        return OPERATIONS[formula["op"]](*(self.value(arg) for arg in formula["args"]))
+
+    def read_struct(self, part: dict[str, Any]) -> Any:
+        found = {}
+        for member in part["members"]:
+            value = self.read(member)
+            if member["name"]:
+                found[member["name"]] = value
+        return found
+
+    def read_uint(self, part: dict[str, Any], *, signed: bool = False) -> int:
+        self.known[part["path"]] = int.from_bytes(self.taken(part["bytes"]), part["order"], signed=signed)
+        return self.known[part["path"]]
+
+    def read_int(self, part: dict[str, Any]) -> int:
+        return self.read_uint(part, signed=True)
+
+    def read_float(self, part: dict[str, Any]) -> float:
+        (value,) = struct.unpack(("<" if part["order"] == "little" else ">") + FLOATS[part["bytes"]], self.taken(part["bytes"]))
+        return value
+
+    def read_bytes(self, part: dict[str, Any]) -> bytes:
+        return self.taken(self.value(part["bytes"]))
+
+    def read_block(self, part: dict[str, Any]) -> Any:
+        block = self.taken(part["bytes"])
+        found: Any = {}
+        for bits in part["parts"]:
+            value = sum((block[run["byte"]] >> run["low"]) % (1 << run["width"]) << run["target"] for run in bits["runs"])
+            if bits["signed"] and value >> bits["width"] - 1:
+                value -= 1 << bits["width"]
+            self.known[bits["path"]] = value
+            if not bits["name"]:
+                return value
+            found[bits["name"]] = value
+        return found
+
+    def read_array(self, part: dict[str, Any]) -> Any:
+        return [self.read(part["element"]) for _ in range(self.value(part["count"]))]
+
+    def read_if(self, part: dict[str, Any]) -> Any:
+        return self.read(part["then"] if self.value(part["condition"]) else part["else"])
+
+    def read_switch(self, part: dict[str, Any]) -> Any:
+        key = self.value(part["key"])
+        return self.read(next((case["part"] for case in part["cases"] if case["value"] == key), part["default"]))
+
+    def read_nothing(self, part: dict[str, Any]) -> None:
+        return None
