@@ -32,7 +32,7 @@ def flips(sensor: Sensor, name: str, data: bytes) -> list[Flip]:
     engine = codec(frame)
     if not 0 < len(data) <= frame.max_length or (not isinstance(engine, CompiledCodec) and len(data) > INTERPRETED):
         return []
-    if any(spot >= len(data) for spot in engine.prefix):
+    if engine.size not in (None, len(data)) or any(spot >= len(data) for spot in engine.prefix):
         return []
     wrong = {spot for spot, (mask, value) in engine.prefix.items() if data[spot] & mask != value}
     if len(wrong) > 1:
