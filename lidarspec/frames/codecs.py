@@ -121,11 +121,11 @@ class CompiledCodec:
         """The status of whole candidates of one layout; their bytes, one a row, if they are not too many."""
         judge = self._judge(layout)
         step = max(BLOCK // layout.size, 1)
-        if len(offsets) <= step:
+        if len(offsets) <= step or not gathered:
             rows = rows_at(buffer, offsets, layout.size, gathered=gathered)
             return judge(rows, errors), rows if gathered else None
-        blocks = (offsets[start : start + step] for start in range(0, len(offsets), step))
-        return np.concatenate([judge(rows_at(buffer, block, layout.size, gathered=gathered), errors) for block in blocks]), None
+        parts = [judge(rows_at(buffer, offsets[start : start + step], layout.size), errors) for start in range(0, len(offsets), step)]
+        return np.concatenate(parts), None
 
     def table(self, frames: Iterable[bytes]) -> Rows:
         frames = list(frames)
