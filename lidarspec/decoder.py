@@ -6,7 +6,6 @@ with the next. Datagram links frame by datagram. However the input is cut, the f
 
 from __future__ import annotations
 
-import importlib.util
 import os
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -251,15 +250,13 @@ def backend(name: str) -> str:
     """The back end that a name stands for; "auto" is what LIDARSPEC_BACKEND says, if it says anything.
 
     Raises:
-        UsageError: for a name that is none, and for "jit" where Numba is not installed.
+        UsageError: for a name that is none.
     """
     place = "backend"
     if name == "auto" and os.environ.get(BACKEND):
         place, name = BACKEND, os.environ[BACKEND]
     if name not in BACKENDS:
         raise UsageError(f"{place} is one of {', '.join(BACKENDS)}, not {name!r}")
-    if name == "jit" and importlib.util.find_spec("numba") is None:
-        raise UsageError(f"{place} 'jit' needs Numba: pip install 'lidarspec[jit]'")
     return name
 
 

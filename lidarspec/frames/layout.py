@@ -5,7 +5,7 @@ A `Layout` holds for frames of one kind of header; `lidarspec.frames.walk` makes
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
@@ -140,6 +140,10 @@ class Seal:
 
     def computed(self, rows: Bytes2D) -> NDArray[np.uint64]:
         """The values that should stand there, (n,)."""
+        for function in _faster:
+            found = function(self, rows)
+            if found is not None:
+                return found
         parts = [rows[:, a:b] for a, b in self.spans]
         return self.algorithm.batch(parts[0] if len(parts) == 1 else np.concatenate(parts, axis=1))
 
@@ -172,6 +176,14 @@ class Seal:
         stored = self.stored(rows)
         right = np.asarray(stored == self.computed(rows))
         return right | np.isin(stored, np.array(self.absent, np.uint64)) if self.absent else right
+
+
+_faster: list[Callable[[Seal, Bytes2D], NDArray[np.uint64] | None]] = []
+
+
+def install_faster(function: Callable[[Seal, Bytes2D], NDArray[np.uint64] | None]) -> None:
+    """Have checksums computed by another function first; what it gives None for is computed here."""
+    _faster[:] = [function]
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,8 +19,9 @@ BYTES = types.Array(types.uint8, 1, "C", readonly=True)
 SINGLES = types.Array(types.float32, 1, "C", readonly=True)
 DOUBLES = types.Array(types.float64, 1, "C", readonly=True)
 PLACES = types.Array(types.int64, 1, "C", readonly=True)
+WORDS = types.Array(types.uint16, 1, "C", readonly=True)
 MADE_SINGLES = types.Array(types.float32, 1, "C")
-MADE_DOUBLES = types.Array(types.float64, 1, "C")
+MADE_PLACES = types.Array(types.int64, 1, "C")
 INTEGER = types.int64
 
 #: added to a float64 and taken off again, it leaves a whole number, whose lowest bit is the sum's.

@@ -61,16 +61,8 @@ class Kernel:
         return self._function is not None or compiled_before(self._text.source)
 
     def compile(self) -> None:
-        """Have the code at hand.
-
-        Raises:
-            UsageError: where Numba is not installed, or does not work here.
-        """
-        if self._function is None:
-            try:
-                self._function = function_of(self._text.source)
-            except ImportError as error:
-                raise UsageError(f"backend 'jit' needs Numba (pip install 'lidarspec[jit]'): {error}") from error
+        """Have the code at hand."""
+        self._function = self._function or function_of(self._text.source)
 
     def run(self, rows: Bytes2D, values: Values) -> dict[str, NDArray[np.float32]]:
         """The columns of all frames, flat; arguments as of `Program.run`."""
@@ -143,6 +135,18 @@ def _pool(number: int) -> Any:
 def available() -> bool:
     """Whether Numba is installed; it is not imported for that."""
     return importlib.util.find_spec("numba") is not None
+
+
+def require() -> None:
+    """Import Numba.
+
+    Raises:
+        UsageError: where it is not installed, or does not work here.
+    """
+    try:
+        import lidarspec.plans.kernelmath  # noqa: F401
+    except ImportError as error:
+        raise UsageError(f"backend 'jit' needs Numba: pip install 'lidarspec[jit]' ({error})") from error
 
 
 def cache_folder() -> Path:

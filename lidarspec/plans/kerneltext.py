@@ -22,7 +22,7 @@ import numpy as np
 from numba import njit
 
 from lidarspec.plans.kernelmath import (
-    BYTES, DOUBLES, INTEGER, MADE_SINGLES, PLACES, SINGLES,
+    BYTES, DOUBLES, INTEGER, MADE_PLACES, MADE_SINGLES, PLACES, SINGLES, WORDS,
     at, byte_at, cos_sin, larger, looked_up, modulo, narrowed, number, put, smaller,
 )
 
