@@ -57,6 +57,8 @@ def _check_names(struct: Struct, path: str, *, in_bits: bool) -> None:
     for child in struct.subcons:
         name = child.name
         place = f"{path}.{name}" if path else str(name)
+        if isinstance(child, construct.Padded):
+            continue  # refused on its own, and with a better reason
         if name is None:
             if in_bits or not isinstance(unwrap(child), Const):
                 raise SpecError(f"an unnamed {type(unwrap(child)).__name__} would lose its value: give it a name", path=path, rule="LS105")

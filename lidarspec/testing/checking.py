@@ -18,6 +18,8 @@ from lidarspec.testing.written import written
 
 #: where golden vectors are looked for beside a file that is checked.
 VECTORS = "vectors.json"
+#: rules without which there is nothing to try, and what is skipped then.
+FATAL, ELSE = frozenset({"LS114", "LS115", "LS301"}), "everything else"
 
 
 @dataclass(eq=False)
@@ -82,11 +84,11 @@ def _report(subject: Subject, places: Places, mistakes: list[Finding], watch: Ca
         found = one.findings(subject)
         report.held += not found
         report.findings += found
-        if any(finding.code == "LS301" for finding in found):
-            report.skipped["what needs examples"] = "no example can be made up"
+        if any(finding.code in FATAL for finding in report.findings):
+            report.skipped[ELSE] = "nothing can be tried before what is found is mended"
             break
-    distinct = list(dict.fromkeys(report.findings))
-    left = left_over(distinct, sensor, whole="what needs examples" not in report.skipped)
+    distinct = list({(finding.code, finding.path): finding for finding in reversed(report.findings)}.values())[::-1]
+    left = left_over(distinct, sensor, whole=ELSE not in report.skipped)
     report.findings = [places.placed(finding, sensor) for finding in left]
     report.measured = subject.measured
     return report

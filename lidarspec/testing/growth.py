@@ -11,7 +11,7 @@ from lidarspec.testing.findings import require
 from lidarspec.testing.subject import Subject
 
 #: bytes of the whole input, and of that of a sensor that is not compiled.
-LENGTH, SHORT = 120_000, 12_000
+LENGTH, SHORT = 240_000, 12_000
 #: how many times as long twice the input may take, and how often it is tried.
 RATIO, TRIES = 3.0, 12
 #: CPU seconds below which a difference says nothing.

@@ -8,7 +8,9 @@ from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
 from lidarspec.errors import WireError
+from lidarspec.fields import Checksummed
 from lidarspec.frames.codecs import codec
+from lidarspec.rules import children
 from lidarspec.spec import Sensor
 
 #: frames up to this length are cut at every byte, longer ones at so many places.
@@ -111,8 +113,20 @@ def physical(sensor: Sensor, name: str, data: bytes) -> Any:
 def seals(sensor: Sensor, name: str, data: bytes) -> set[str]:
     """The fields of a frame that hold a checksum, and so are not the caller's."""
     layout = getattr(codec(sensor.frames[name]), "tree", None)
-    found = layout.layout(data) if layout is not None else None
+    if layout is None:
+        return set(_sealing(sensor.frames[name].prepared))
+    found = layout.layout(data)
     return {leaf.info.path for seal in getattr(found, "seals", ()) for leaf in seal.leaves}
+
+
+def _sealing(con: Any, path: str = "") -> Iterator[str]:
+    """The paths of the fields that hold checksums, read off a construct tree."""
+    if type(con).__name__ == "Renamed":
+        path = f"{path}.{con.name}" if path else con.name
+    if isinstance(con, Checksummed):
+        yield from (f"{path}.{field}" if path else field for field in con.fields)
+    for child in children(con):
+        yield from _sealing(child, path)
 
 
 def fitting(sensor: Sensor, data: bytes) -> list[str]:

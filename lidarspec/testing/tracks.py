@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from lidarspec.errors import LidarSpecError
 from lidarspec.frames.access import Fields
-from lidarspec.frames.columns import Batch, aligned
+from lidarspec.frames.columns import Batch, aligned, unpadded
 from lidarspec.frames.schema import FieldInfo
 from lidarspec.frames.tables import Group, Rows
 from lidarspec.frames.tracing import Node, Traced, trace
@@ -87,7 +87,7 @@ def field_of(subject: Subject, name: str, node: Node) -> FieldInfo | None:
 
 @dataclass(frozen=True, eq=False)
 class Beams:
-    """Directions of points as `points` gives them, before they are folded; (n, ...) each, padding included."""
+    """Directions of points as `points` gives them, before they are folded, padding left out."""
 
     azimuth: Floats
     elevation: Floats
@@ -100,5 +100,8 @@ def beams(subject: Subject, name: str, packets: Packets) -> Beams | None:
         polar = points_function(subject.sensor, name)(Fields(batch))
         if not isinstance(polar, Polar):
             return None
-        azimuth, elevation, _ = (np.asarray(part, np.float64) for part in aligned((polar.azimuth, polar.elevation, polar.range), batch)[0])
-    return Beams(azimuth, elevation)
+        arrays, axes, _ = aligned((polar.azimuth, polar.elevation, polar.range), batch)
+    shape = np.broadcast_shapes((len(packets), *(1,) * len(axes)), *(array.shape for array in arrays))
+    mask = unpadded(axes, shape, batch)
+    azimuth, elevation = (np.broadcast_to(np.asarray(array, np.float64), shape).reshape(shape[0], -1) for array in arrays[:2])
+    return Beams(azimuth[mask], elevation[mask]) if mask is not None else Beams(azimuth, elevation)

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from construct import GreedyBytes, NullTerminated
+from construct import ExprAdapter, Int8ul
 
 from lidarspec import hookimpl
 from tests.broken.sound import SIZE, frame, sealed, sensor
 
-TEXT = NullTerminated(GreedyBytes)
+WHITENED = ExprAdapter(Int8ul, lambda value, context: value ^ 0x55, lambda value, context: value ^ 0x55)
 
 
 @hookimpl
 def lidarspec_sensors():
-    return [sensor(frame(sealed(name=TEXT), max_length=SIZE + 16))]
+    return [sensor(frame(sealed(name=WHITENED), max_length=SIZE + 1))]

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from construct import If, Int8ul, this
+from construct import Const, If, Int8ul, Struct, this
 
 from lidarspec import hookimpl
-from tests.broken.sound import frame, sensor, struct
+from tests.broken.sound import frame, sensor
 
-EXTENDED = struct(extra=If(this.number == 1, Int8ul))
+EXTENDED = Struct("header" / Const(b"\xaa\x55"), "kind" / Int8ul, "extra" / If(this.kind == 1, Int8ul))
 
 
 @hookimpl

@@ -69,7 +69,7 @@ def points(f: Fields) -> Polar:
 
 def sweep(i: int) -> dict[str, float]:
     """Packets of 24 samples, 10 a turn."""
-    first = i * LONGEST * STEP % 360
+    first = (10 + i * LONGEST * STEP) % 360
     last = (first + (LONGEST - 1) * STEP) % 360
     return dict(number=i % 256, time=i * PERIOD % WRAP, tilt=0, first=first, last=last, count=LONGEST)
 

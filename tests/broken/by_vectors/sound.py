@@ -1,0 +1,9 @@
+"""The sound sensor beside the vectors."""
+
+from lidarspec import hookimpl
+from tests.broken.sound import sensor
+
+
+@hookimpl
+def lidarspec_sensors():
+    return [sensor()]
