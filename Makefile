@@ -19,13 +19,17 @@ WRITERS := $(VENV)/.installed-docs
 PEERS := $(VENV)/.installed-bench
 RECENT := import sys; sys.exit(sys.version_info < (3, 11))
 
-.PHONY: demo test soak lint types docs wheels reference bench bench-here clean
+.PHONY: demo test test-long soak lint types docs wheels reference bench bench-here clean
 
 demo: $(USERS)
 	@$(BIN)/lidarspec demo -s ldrobot-stl27l
 
 test: $(DEVELOPERS)
 	@$(BIN)/python -m pytest -n auto $(ARGS)
+
+# The conformance suite with a hundred times the examples: hours.
+test-long: $(DEVELOPERS)
+	@LIDARSPEC_EXAMPLES=4000 $(BIN)/python -m pytest -n auto tests/test_conformance.py $(ARGS)
 
 soak: $(DEVELOPERS)
 	@$(BIN)/python -m pytest -m soak $(ARGS)

@@ -1,18 +1,18 @@
-"""Framing, against the brute-force oracle: damaged streams, any split of them, and inputs that have broken other parsers."""
+"""Framing: inputs that have broken other parsers, and single mechanisms; what holds for every sensor is in the test kit."""
 
 from __future__ import annotations
 
-import random
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
 import lidarspec
-from lidarspec import Decoder, Sensor
+from lidarspec import Sensor
 from lidarspec.testing import material
-from lidarspec.testing.comparisons import assert_backends_agree, cuts
-from lidarspec.testing.damage import BURSTS, RATES, damaged
-from lidarspec.testing.oracle import Cut, Oracle
+from lidarspec.testing.comparisons import assert_backends_agree
+from lidarspec.testing.cutting import Books, decoded
+from lidarspec.testing.damage import damaged
+from lidarspec.testing.oracle import Oracle
 from tests.shapes import SHAPES
 
 EVERY = {**lidarspec.sensors(), **SHAPES}
@@ -27,93 +27,9 @@ LENGTH = 2500
 each_stream = pytest.mark.parametrize("sensor", STREAMS.values(), ids=STREAMS)
 
 
-class Books:
-    """A decoder whose books are checked after every call: each byte is in a frame, skipped or pending."""
-
-    def __init__(self, sensor: Sensor, *, backend: str = "auto") -> None:
-        self.decoder: Decoder = sensor.decoder(backend=backend)
-        self.found: list[Cut] = []
-
-    def feed(self, chunk: bytes) -> Books:
-        return self._entered(cuts(self.decoder.feed(chunk)))
-
-    def finish(self) -> list[Cut]:
-        return self._entered(cuts(self.decoder.finish())).found
-
-    def _entered(self, found: list[Cut]) -> Books:
-        self.found += found
-        stats = self.decoder.stats
-        assert stats.bytes_in == sum(len(data) for _, _, data in self.found) + stats.bytes_skipped + stats.pending
-        assert sum(stats.frames.values()) == len(self.found)
-        return self
-
-
-def decoded(sensor: Sensor, data: bytes) -> list[Cut]:
-    """The frames of a stream that comes in chunks of random sizes."""
-    books = Books(sensor)
-    for chunk in material.pieces(data, random.Random(len(data))):
-        books.feed(chunk)
-    return books.finish()
-
-
 def conversation(sensor: Sensor, *, seed: int = 0, length: int = LENGTH) -> bytes:
     rounds = max(length // len(material.stream(sensor, rounds=1)), 1)
     return material.stream(sensor, seed=seed, rounds=rounds)
-
-
-@each_stream
-@pytest.mark.parametrize("rate", RATES)
-def test_every_recoverable_frame_is_recovered(sensor: Sensor, rate: float) -> None:
-    data = damaged(conversation(sensor), rate, 1)
-    assert decoded(sensor, data) == Oracle(sensor, data).frames()
-
-
-@each_stream
-@pytest.mark.parametrize("burst", BURSTS)
-def test_every_recoverable_frame_is_recovered_after_bursts(sensor: Sensor, burst: int) -> None:
-    data = damaged(conversation(sensor, seed=1), 0.05, 2, burst=burst)
-    assert decoded(sensor, data) == Oracle(sensor, data).frames()
-
-
-@each_stream
-def test_noise_made_of_headers_is_cut_as_the_rule_says(sensor: Sensor) -> None:
-    source = random.Random(sensor.id)
-    heads = [data[: source.randint(1, 6)] for _, data in material.conversation(sensor, rounds=2)] + [b"\x00", b"\xff", b"\xfe"]
-    data = b"".join(source.choices([*heads, material.stream(sensor, rounds=1)], [*[9] * len(heads), 2 * len(heads)], k=60))[:6000]
-    assert decoded(sensor, data) == Oracle(sensor, data).frames()
-
-
-@each_stream
-def test_stray_bytes_between_frames_cost_none(sensor: Sensor) -> None:
-    frames = material.conversation(sensor)
-    first = frames[0][1][:1]
-    for stray in (b"\xfe", b"\xff", b"\x00", first, first * 3):
-        data = b"".join(stray + frame for _, frame in frames)
-        assert decoded(sensor, data) == Oracle(sensor, data).frames()
-
-
-@each_stream
-def test_the_head_of_a_frame_before_frames_costs_none(sensor: Sensor) -> None:
-    whole = material.stream(sensor, rounds=1)
-    frame = material.conversation(sensor, rounds=1)[-1][1]
-    for end in range(min(len(frame), 50)):
-        data = frame[:end] + whole
-        assert decoded(sensor, data) == Oracle(sensor, data).frames()
-
-
-@each_stream
-@pytest.mark.parametrize("byte", [b"\x00", b"\xff"], ids=["zeros", "ones"])
-def test_constant_lines_are_cut_as_the_rule_says(sensor: Sensor, byte: bytes) -> None:
-    data = byte * 300 + material.stream(sensor, rounds=1) + byte * 300
-    assert decoded(sensor, data) == Oracle(sensor, data).frames()
-
-
-@each_stream
-def test_headers_alone_never_make_a_frame_that_the_oracle_does_not_see(sensor: Sensor) -> None:
-    for _, frame in material.conversation(sensor, rounds=1):
-        for size in (1, 2, 3, 4):
-            data = frame[:size] * (400 // size)
-            assert decoded(sensor, data) == Oracle(sensor, data).frames()
 
 
 @pytest.mark.parametrize("sensor", EVERY.values(), ids=EVERY)
@@ -130,21 +46,6 @@ def test_datagrams_of_any_size_raise_on_nothing(sensor: Sensor) -> None:
 
 
 @each_stream
-def test_idle_gives_up_what_waits_and_looks_at_it_again(sensor: Sensor) -> None:
-    frames = material.conversation(sensor, rounds=2)
-    whole = b"".join(data for _, data in frames)
-    for end in (1, 2, 3, len(frames[-1][1]) - 1):
-        data = frames[-1][1][:end] + whole[: -end or None]
-        books = Books(sensor).feed(data)
-        books.finish()
-        assert books.decoder.stats.pending == 0
-        assert books.found == Oracle(sensor, data).frames()
-        books.feed(whole)
-        books.finish()
-        assert len(books.found) >= len(Oracle(sensor, data).frames())
-
-
-@each_stream
 def test_idle_between_chunks_is_the_rule_on_each_part(sensor: Sensor) -> None:
     """Between two calls of `idle` the rule holds, and nothing that was given up comes back."""
     if any(frame.confirm > 1 or frame.after for frame in sensor.frames.values()):
@@ -157,17 +58,6 @@ def test_idle_between_chunks_is_the_rule_on_each_part(sensor: Sensor) -> None:
         expected += [(name, base + offset, frame) for name, offset, frame in Oracle(sensor, part).frames()]
         base += len(part)
     assert books.found == expected
-
-
-@each_stream
-def test_decoders_fed_in_turn_do_not_know_of_each_other(sensor: Sensor) -> None:
-    inputs = [damaged(conversation(sensor, seed=seed), 1e-3, seed) for seed in (3, 4)]
-    alone = [decoded(sensor, data) for data in inputs]
-    together = [Books(sensor), Books(sensor)]
-    for start in range(0, max(map(len, inputs)), 13):
-        for books, data in zip(together, inputs, strict=True):
-            books.feed(data[start : start + 13])
-    assert [books.finish() for books in together] == alone
 
 
 def test_decoders_in_threads_do_not_know_of_each_other() -> None:

@@ -1,10 +1,9 @@
-"""Bounds that hold on any input: memory, time, and how long a frame is kept back."""
+"""Bounds that hold on any input: memory, and how long a frame is kept back."""
 
 from __future__ import annotations
 
 import gc
 import random
-import time
 import tracemalloc
 from collections.abc import Callable
 
@@ -15,6 +14,8 @@ import lidarspec
 from lidarspec import Sensor
 from lidarspec.frames.codecs import CompiledCodec, codec
 from lidarspec.testing import material
+from lidarspec.testing.growth import worst
+from lidarspec.testing.subject import Subject
 from tests.shapes import SHAPES
 
 EVERY = {**lidarspec.sensors(), **SHAPES}
@@ -33,15 +34,6 @@ def garbage(length: int, seed: int = 0) -> bytes:
     return np.random.default_rng(seed).bytes(length)
 
 
-def worst(sensor: Sensor, length: int) -> bytes:
-    """Headers that claim the longest frame, and two random bytes: candidates without end, as long as they can be."""
-    source = random.Random(sensor.id)
-    longest = max((sensor.example(sensor.data_frame, seed=seed) for seed in range(40)), key=len)
-    heads = [longest[: source.randint(3, 8)] + source.randbytes(2) for _ in range(64)]
-    unit = b"".join(heads)
-    return (unit * (length // len(unit) + 1))[:length]
-
-
 def peak(task: Callable[[], object]) -> int:
     """Bytes that a task holds at most beyond those held before."""
     gc.collect()
@@ -55,23 +47,6 @@ def peak(task: Callable[[], object]) -> int:
         tracemalloc.stop()
 
 
-def seconds(task: Callable[[], object]) -> float:
-    """CPU seconds of one run."""
-    start = time.process_time()
-    task()
-    return time.process_time() - start
-
-
-def growth(half: Callable[[], object], whole: Callable[[], object]) -> float:
-    """How many times as long the whole takes as the half, by the quickest of up to twelve runs of each, in turn."""
-    shortest = longest = float("inf")
-    for _ in range(12):
-        shortest, longest = min(shortest, seconds(half)), min(longest, seconds(whole))
-        if longest <= 2.2 * shortest:
-            break
-    return longest / shortest
-
-
 def fed(sensor: Sensor, data: bytes, times: int = 1, chunk: int = 4096) -> None:
     decoder = sensor.decoder()
     for _ in range(times):
@@ -83,7 +58,7 @@ def fed(sensor: Sensor, data: bytes, times: int = 1, chunk: int = 4096) -> None:
 @each_stream
 def test_a_decoder_holds_less_than_its_longest_frame(sensor: Sensor) -> None:
     bound = max(frame.max_length * frame.confirm for frame in sensor.frames.values() if frame.direction == "in")
-    for data in (garbage(20_000), worst(sensor, 20_000), material.stream(sensor)):
+    for data in (garbage(20_000), worst(Subject(sensor), 20_000), material.stream(sensor)):
         decoder, source = sensor.decoder(), random.Random(1)
         for chunk in material.pieces(data, source):
             decoder.feed(chunk)
@@ -105,18 +80,9 @@ def test_fifty_megabytes_of_garbage_take_no_memory(sensor: Sensor) -> None:
 
 @pytest.mark.parametrize("sensor", COMPILED.values(), ids=COMPILED)
 def test_the_worst_stream_takes_little_memory(sensor: Sensor) -> None:
-    data = worst(sensor, MEGABYTE // 8)
+    data = worst(Subject(sensor), MEGABYTE // 8)
     fed(sensor, data[:8192])
     assert peak(lambda: fed(sensor, data)) < 2 * MEGABYTE
-
-
-@each_stream
-@pytest.mark.parametrize("kind", ["garbage", "worst"])
-def test_time_grows_with_the_input_and_no_faster(sensor: Sensor, kind: str) -> None:
-    share = 1 if sensor.id in COMPILED else 10
-    data = (garbage(400_000) if kind == "garbage" else worst(sensor, 400_000))[: 400_000 // share]
-    fed(sensor, data[:8192])
-    assert growth(lambda: fed(sensor, data[: len(data) // 2]), lambda: fed(sensor, data)) <= 2.5
 
 
 @each_stream

@@ -15,6 +15,7 @@ from lidarspec.simulation.scenes import Box, Mover, Room, furnished
 from lidarspec.simulation.simulated import SECOND, SimulatedDevice
 from lidarspec.simulation.simulator import simulate, simulation
 from lidarspec.spec import replaced
+from lidarspec.testing.scene import off
 from tests.shapes import count
 
 #: metres by which a point may be off its surface: half a step of the range, and float32.
@@ -27,20 +28,7 @@ EVERY = [(name, frame) for name, sensor in ls.sensors().items() for frame in sen
 
 
 #: 40 samples a packet, and nothing that says when they are sent.
-SHAPE = replaced(count.SENSOR, sweep=lambda i: {"count": 40, **count.sweep(i)})
-
-
-def off(room: Room, xyz: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Metres from points to the nearest surface of a room: nothing of the simulator's own geometry is used."""
-    found = np.full(len(xyz), np.inf)
-    for body in (room.walls, *room.boxes):
-        if body is None:
-            continue
-        middle = (np.array(body.low) + body.high) / 2
-        beyond = np.abs(xyz - middle) - (np.array(body.high) - body.low) / 2
-        outside = np.linalg.norm(np.maximum(beyond, 0), axis=1)
-        found = np.minimum(found, np.abs(outside + np.minimum(beyond.max(axis=1), 0)))
-    return found
+SHAPE = count.SENSOR
 
 
 def placed(cloud: ls.PointCloud, packets: int) -> NDArray[np.float64]:

@@ -13,7 +13,7 @@ from lidarspec.testing.subject import Subject
 #: bytes of the whole input, and of that of a sensor that is not compiled.
 LENGTH, SHORT = 240_000, 12_000
 #: how many times as long twice the input may take, and how often it is tried.
-RATIO, TRIES = 3.0, 12
+RATIO, TRIES = 3.0, 5
 #: CPU seconds below which a difference says nothing.
 LEAST = 0.05
 

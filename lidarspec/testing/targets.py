@@ -12,8 +12,6 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-import pluggy
-
 from lidarspec.errors import SourceError, SpecError
 from lidarspec.installed import EntryPoint, entry_points
 from lidarspec.plugins import GROUP, Registry, file_module, registry
@@ -146,8 +144,6 @@ def _loading_rule(error: BaseException, cause: BaseException) -> str:
         return "LS009"
     if "sizeof" in functions or "_sizeof" in functions:
         return "LS008"
-    if isinstance(cause, pluggy.PluginValidationError):
-        return "LS004"
     if isinstance(cause, SpecError):
         return _said(str(cause)) or "LS007"
     return "LS006" if "lidarspec_sensors" in functions else "LS001"
