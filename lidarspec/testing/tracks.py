@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -103,5 +104,7 @@ def beams(subject: Subject, name: str, packets: Packets) -> Beams | None:
         arrays, axes, _ = aligned((polar.azimuth, polar.elevation, polar.range), batch)
     shape = np.broadcast_shapes((len(packets), *(1,) * len(axes)), *(array.shape for array in arrays))
     mask = unpadded(axes, shape, batch)
-    azimuth, elevation = (np.broadcast_to(np.asarray(array, np.float64), shape).reshape(shape[0], -1) for array in arrays[:2])
+    azimuth, elevation = (
+        np.broadcast_to(np.asarray(array, np.float64), shape).reshape(shape[0], math.prod(shape[1:])) for array in arrays[:2]
+    )
     return Beams(azimuth[mask], elevation[mask]) if mask is not None else Beams(azimuth, elevation)

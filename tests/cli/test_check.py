@@ -9,54 +9,49 @@ from pathlib import Path
 import pytest
 
 from lidarspec.testing.rules import RULES
-from tests.cli.running import run
+from tests.cli.running import ran
 
 ROOT = Path(__file__).resolve().parents[2]
 STRANGER = ROOT / "tests" / "shapes" / "stranger" / "acme_lidars.py"
 
 
-def test_a_clean_file_says_so(tmp_path: Path) -> None:
-    done = run("check", str(STRANGER), "--max-examples", "8", "-v")
-    assert done.code == 0, done.out
-    assert "acme-x1: clean" in done.out
-    assert re.search(r"measured  data, under a checksum: single-bit errors that pass: 0 %", done.out)
-    assert "skipped   vectors_hold: there is no file of golden vectors" in done.out
+def test_a_clean_file_says_so() -> None:
+    done = ran("check", STRANGER, "--max-examples", "8", "-v")
+    assert "acme-x1: clean" in done.output
+    assert re.search(r"measured  data, under a checksum: single-bit errors that pass: 0 %", done.output)
+    assert "skipped   vectors_hold: there is no file of golden vectors" in done.output
 
 
 def test_a_finding_says_what_where_why_and_what_to_write(tmp_path: Path) -> None:
     file = tmp_path / "mine.py"
     text = STRANGER.read_text(encoding="utf-8")
-    assert '"rate" / ' in text
-    file.write_text(re.sub(r'"(start|rate)" / Scaled\((\w+), [^)]*\)', r'"\1" / \2', text), encoding="utf-8")
-    done = run("check", str(file), "--max-examples", "8")
-    assert done.code == 1
-    line = next(number for number, row in enumerate(file.read_text(encoding="utf-8").splitlines(), 1) if '"start" /' in row)
-    assert f"LS201 {RULES['LS201'].title}\n  where  acme-x1 data.start ({file}:{line})\n  what   " in done.out
-    assert f"  why    {RULES['LS201'].why}\n  write  {RULES['LS201'].write}" in done.out
+    bare = text.replace('"distance" / Scaled(BitsInteger(16), 0.001, "m")', '"distance" / BitsInteger(16)')
+    assert bare != text
+    file.write_text(bare, encoding="utf-8")
+    done = ran("check", file, "--max-examples", "8", code=1)
+    line = next(number for number, row in enumerate(bare.splitlines(), 1) if '"distance" /' in row)
+    assert f"LS201 {RULES['LS201'].title}\n  where  acme-x1 data.samples.distance ({file}:{line})\n  what   " in done.output
+    assert f"  why    {RULES['LS201'].why}\n  write  {RULES['LS201'].write}" in done.output
+    assert done.output.rstrip().splitlines()[-1].startswith("acme-x1: 1 finding, ")
 
 
 def test_json_has_the_same(tmp_path: Path) -> None:
     file = tmp_path / "broken.py"
     file.write_text("import a_library_that_nobody_has\n", encoding="utf-8")
-    done = run("check", str(file), "--json")
-    assert done.code == 1
-    (report,) = json.loads(done.out)
+    (report,) = json.loads(ran("check", file, "--json", code=1).stdout)
     (finding,) = report["findings"]
     assert (finding["code"], finding["file"], finding["line"]) == ("LS001", str(file), 1)
     assert finding["why"] == RULES["LS001"].why
 
 
 def test_a_distribution_is_checked_with_all_of_its_sensors() -> None:
-    done = run("check", "lidarspec-ldrobot", "--max-examples", "3", "--json")
-    assert done.code == 0, done.out
-    assert [report["name"] for report in json.loads(done.out)] == ["ldrobot-stl27l", "ldrobot-ld06"]
+    found = json.loads(ran("check", "lidarspec-ldrobot", "--max-examples", "3", "--json").stdout)
+    assert [report["name"] for report in found] == ["ldrobot-stl27l", "ldrobot-ld06"]
 
 
 @pytest.mark.parametrize(("name", "code", "said"), [("nobody-has", 2, "unknown sensor"), ("./none.py", 3, "no such file")])
 def test_what_is_not_there_is_no_finding(name: str, code: int, said: str) -> None:
-    done = run("check", name)
-    assert done.code == code
-    assert said in done.err
+    assert said in ran("check", name, code=code).output
 
 
 def test_every_rule_has_its_heading() -> None:

@@ -88,7 +88,7 @@ def configure(sensor: Sensor, *, calibration: str | Path) -> Sensor:
 
 def sweep(i: int) -> dict[str, float]:
     """Thirty-six packets a turn."""
-    return dict(start=i * 10.0 % 360)
+    return dict(count=4, start=i * 10.0 % 360)
 
 
 X1 = Sensor(
