@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import lidarspec as ls
-from lidarspec import Checksum, Crc, Sum, UsageError, WireError, WordXor, Xor
+from lidarspec import Checksum, Crc, Fold15, Sum, UsageError, WireError, WordXor, Xor
 from lidarspec.drafts.candidates import candidates
 from lidarspec.drafts.draft import Draft, draft
 from lidarspec.frames.columns import aligned
@@ -185,6 +185,38 @@ def test_an_index_that_starts_again_is_a_counter_with_its_limits(tmp_path: Path)
     sensor = module(tmp_path, tmp_path / "some.bin")
     assert (sensor.sequence, share(sensor, tmp_path / "some.bin")) == (ls.Sequence("counter_1", first=0xA0, last=0xF9), 1.0)
     assert sensor.decode(data[: 22 * 50] + data[22 * 53 :]).stats.lost == 3
+
+
+def test_turns_of_an_index_are_not_taken_for_one_frame(tmp_path: Path) -> None:
+    """Ninety packets a turn that begin with one constant byte, over a scene that stands still: the format of old vacuum cleaners."""
+    rows = [np.array([1500 + 40 * (i % 90) + j for j in range(8)], "<u2").tobytes() for i in range(900)]
+    frames = [bytes([0xFA, 0xA0 + i % 90, 0x00, 0x4B]) + row for i, row in enumerate(rows)]
+    data = b"".join(frame + Fold15()(frame).to_bytes(2, "little") for frame in frames)
+    found = draft([data[9:]], datagrams=False)
+    assert (found.sync[:1], found.size, len(found.frames)) == (b"\xfa", 22, 899)
+    assert found.seal is not None
+    assert (found.seal.algorithm, found.seal.place) == (Fold15(), Place(-2, 2))
+    assert [(one.name, one.first, one.circle) for one in found.candidates if one.kind == "counter"] == [("counter_1", 0xA0, 0xFA)]
+
+
+def test_a_length_in_bytes_with_short_frames_of_another_kind_between(tmp_path: Path) -> None:
+    """A header of fields, then samples of three bytes, and a big-endian sum; now and then a frame of eleven bytes."""
+    source = random.Random(7)
+
+    def frame(i: int) -> bytes:
+        samples = source.randbytes(3 * source.randrange(40, 44))
+        data = bytes([130]) if i % 50 == 49 else bytes([130, 0, 0]) + (i % 16 * 2250).to_bytes(2, "big") + samples
+        head = b"\xaa" + (8 + len(data)).to_bytes(2, "big") + b"\x01\x61" + (b"\xae" if len(data) == 1 else b"\xad")
+        whole = head + len(data).to_bytes(2, "big") + data
+        return whole + Sum(16)(whole).to_bytes(2, "big")
+
+    (tmp_path / "some.bin").write_bytes(b"".join(map(frame, range(300))))
+    found = draft([(tmp_path / "some.bin").read_bytes()], datagrams=False)
+    assert (found.sync, str(found.length), len(found.frames)) == (b"\xaa\x00", "2 + 1 x byte at 2", 294)
+    assert found.seal is not None
+    assert (found.seal.algorithm, found.seal.place, found.seal.order) == (Sum(16), Place(-2, 2), "big")
+    assert rising(found) == {"angle_11": (2, "big", 36_000)}
+    assert share(module(tmp_path, tmp_path / "some.bin"), tmp_path / "some.bin") > 0.99
 
 
 @pytest.mark.parametrize("order", ["little", "big"])

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.checksums import ByteOrder
+from lidarspec.drafts.candidates import candidates
 from lidarspec.searching.checksums import search
 from lidarspec.searching.samples import Match
 
@@ -130,13 +131,21 @@ def _periodic(data: NDArray[np.uint8]) -> Structure | None:
 
 
 def _divided(data: NDArray[np.uint8], whole: Structure) -> Structure:
-    """The frames of which a whole number repeats together, as in a simulation, where these have sync bytes of their own; else the same."""
+    """The frames of which a whole number repeats together, as turns of an index or in a simulation do; else the same.
+
+    They are frames of their own where more than one byte begins them, or one and a counter.
+    """
     period = whole.period or 0
     for part in (part for part in range(SHORTEST, period // 2 + 1) if period % part == 0):
         for _, found in _framed(data, part):
-            if found.share > whole.share - CLOSE and len(set(found.sync)) > 1:
+            if found.share > whole.share - CLOSE and (len(set(found.sync)) > 1 or _is_counted(found)):
                 return found
     return whole
+
+
+def _is_counted(found: Structure) -> bool:
+    rows = np.frombuffer(b"".join(found.frames), np.uint8).reshape(len(found.frames), -1)
+    return any(one.kind == "counter" for one in candidates(rows))
 
 
 def _framed(data: NDArray[np.uint8], period: int) -> Iterator[tuple[float, Structure]]:
@@ -172,15 +181,18 @@ def _by_length(data: NDArray[np.uint8]) -> Structure | None:
     """Frames of several lengths, whose header says how long they are."""
     pairs = data[:-1].astype(np.int64) << 8 | data[1:]
     counts = np.bincount(pairs, minlength=1 << 16)
-    best: Structure | None = None
+    best: tuple[float, int, Structure] | None = None
     for pair in np.argsort(counts)[::-1][:PAIRS].tolist():
         starts = np.flatnonzero(pairs == pair)
         if pair in (0, 0xFFFF) or len(starts) < 2 * FRAMES:
             continue
         found = _explained(data, starts, bytes([pair >> 8, pair & 0xFF]))
-        if found is not None and (best is None or found.share > best.share):
-            best = found
-    return best if best is not None and best.share > HALF else None
+        if found is None:
+            continue
+        begins = int(starts[0])  # of pairs in a header that do as well, the one in front: captures often begin with a frame
+        if best is None or found.share > best[0] + CLOSE or (found.share > best[0] - CLOSE and begins < best[1]):
+            best = (found.share, begins, found)
+    return best[2] if best is not None and best[0] > HALF else None
 
 
 def _explained(data: NDArray[np.uint8], starts: NDArray[np.intp], sync: bytes) -> Structure | None:

@@ -82,7 +82,9 @@ class Candidate:
             return f"{text}, wraps at {self.circle}: {CIRCLES[self.circle][1]}?"
         if not self.wraps:
             return f"{text}; not seen to start again"
-        return f"{text}, starts again at {'about ' if self.kind == 'rising' else ''}{self.circle}"
+        if self.kind == "counter":
+            return f"{text}, from {self.circle - 1} back to {self.first}"
+        return f"{text}, starts again at about {self.circle}"
 
 
 def candidates(rows: NDArray[np.uint8]) -> list[Candidate]:

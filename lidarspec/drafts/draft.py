@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.detection.structure import STEADY, Length, structure
-from lidarspec.drafts.candidates import FEW, Candidate, candidates
+from lidarspec.drafts.candidates import FEW, FRONT, Candidate, candidates
 from lidarspec.errors import WireError
 from lidarspec.searching.checksums import search
 from lidarspec.searching.samples import Match, Place
@@ -24,6 +24,8 @@ SOUGHT, SYNC, SHORT_SYNC, MANY = 256, 4, 2, 12
 BLOCKS, FILLED = 3, 0.5
 #: bytes behind which no count is looked for, and longest and shortest element of what is counted.
 HEADER, LARGEST, SMALLEST = 8, 16, 2
+#: widest checksum, in bytes.
+LONGEST_SEAL = 4
 
 
 @dataclass(frozen=True)
@@ -56,6 +58,7 @@ class Draft:
         candidates: fields that rise, outside the blocks.
         blocks: parts of the frame that begin alike.
         seal: the checksum, None where none was found.
+        front: bytes that nearly all frames have at least, where a length counts bytes: as many are looked into.
     """
 
     datagrams: bool
@@ -67,6 +70,7 @@ class Draft:
     candidates: tuple[Candidate, ...] = ()
     blocks: Blocks | None = None
     seal: Match | None = None
+    front: int = 0
 
     @property
     def share(self) -> float:
@@ -83,7 +87,7 @@ class Draft:
         """Bytes in front that every frame has: all of them where there is one length."""
         if self.size is not None or self.length is None:
             return self.size or 0
-        return max(self.length.rest - self.tail, self.length.end, 0)
+        return max(self.length.rest - self.tail, self.length.end, self.front)
 
     @property
     def rows(self) -> NDArray[np.uint8]:
@@ -109,6 +113,7 @@ def draft(chunks: Sequence[bytes], *, datagrams: bool) -> Draft:
     first = Draft(datagrams, b"", found.period, found.length, (), size)
     first = _begun(first, parts, start) or _begun(first, parts, max(parts[0].find(found.sync), 0)) or replace(first, sync=found.sync)
     known = _counted(replace(first, frames=tuple(_walk(first, parts))), parts[-1])
+    known = _fronted(known, parts)
     known = replace(known, candidates=tuple(candidates(known.rows)))
     known = replace(known, seal=_seal(known))
     return _detailed(replace(known, frames=tuple(_walk(known, parts))))
@@ -179,6 +184,15 @@ def _counted(known: Draft, data: bytes) -> Draft:
     return known
 
 
+def _fronted(known: Draft, parts: Sequence[bytes]) -> Draft:
+    """Where the length counts bytes, with a head of the fields in front of what varies: short frames are of another kind then."""
+    if known.length is None or known.length.unit > 1 or not known.frames:
+        return known
+    lengths = sorted(len(frame) for _, frame in known.frames)
+    known = replace(known, front=min(FRONT, lengths[int(len(lengths) * (1 - STEADY))] - LONGEST_SEAL))
+    return replace(known, frames=tuple(_walk(known, parts)))
+
+
 def _seal(known: Draft) -> Match | None:
     """The checksum that fits, the first of those that do not stand where something rises."""
     frames = [frame for _, frame in known.frames]
@@ -202,8 +216,8 @@ def _can_stand(known: Draft, match: Match) -> bool:
     place, span = match.place, match.span
     whole = (span.part, span.head, span.tail) == ("all", 0, 0) or (span.part, span.tail) == ("before", 0)
     at_end = place.offset == -place.size
-    if known.size is None and place.offset < 0:
-        return at_end
+    if known.size is None and not at_end:
+        return 0 <= place.offset <= known.head - place.size and whole
     return whole or at_end or span.part == "behind"
 
 

@@ -92,10 +92,11 @@ def plain_matches(samples: Samples) -> Iterator[Match]:
     """Every plain checksum that fits, in no special order."""
     few = samples.few(SCREENED)
     tried, sure, certain = 0, False, False
+    longest = len(few.frames[-1])
     for size, algorithms in ((4, (Sum(32),)), (2, _WIDE), (1, (Xor(), Sum(8)))):
         for place in few.places(size):
             for span in spans(place, few):
-                if 2 * sum(b - a for a, b in span.ranges(place, few.shortest)) < few.shortest - size:
+                if 2 * sum(b - a for a, b in span.ranges(place, longest)) < longest - size:
                     continue
                 for algorithm in algorithms:
                     if isinstance(algorithm, WordXor) and (span.head or span.tail):
