@@ -147,6 +147,7 @@ class _Records:
         self._at = np.zeros(number, np.int64)
         self._plain: dict[int, Datagram] = {}
         self._learnt = self._counted = 0  # kinds; packets that were read plainly and are known all the same
+        self._only: Alike | None = None  # what all records are like
         self._section = _sections(form)
 
     def read(self) -> Exception | None:
@@ -179,6 +180,8 @@ class _Records:
 
     def batch(self) -> Batch:
         """The datagrams of these records."""
+        if self._only is not None and not self._plain:
+            return self._uniform(self._only)
         known = np.flatnonzero(self._kinds >= 0)
         self._reader.stats.packets += len(known) - self._counted
         kinds = self._kinds[known]
@@ -190,6 +193,13 @@ class _Records:
         if self._plain:
             buffer = self._with_plain(buffer, columns, known, names)
         return Batch(buffer, columns[0], columns[1], columns[2], columns[3], tuple(names))
+
+    def _uniform(self, kind: Alike) -> Batch:
+        """The same where all records are of one kind."""
+        number = len(self._at)
+        self._reader.stats.packets += number - self._counted
+        sizes, senders = (np.broadcast_to(np.intp(fact), number) for fact in (kind.size, 0))
+        return Batch(self._source.lent(), self._starts[:number] + kind.start, sizes, self._at, senders, (kind.source,))
 
     def _with_plain(
         self, buffer: NDArray[np.uint8], columns: list[NDArray[Any]], known: NDArray[np.intp], names: dict[Sender, int]
@@ -227,9 +237,18 @@ class _Records:
 
     def _match(self, kind: int) -> bool:
         """Whether all records are now known."""
-        left = np.flatnonzero(self._kinds < 0)
-        found, at = self._known[kind].find(self._source.storage, self._starts[left], self._lengths[left])
-        left = left if found is None else left[found]
+        alike, number = self._known[kind], len(self._kinds)
+        if kind == 0 and self._are_whole:
+            found, at = alike.find(self._source.storage, self._starts[:number], self._lengths)
+            if found is None:
+                self._only, self._at = alike, at
+                self._kinds = np.broadcast_to(np.intp(0), number)
+                return True
+            left = np.flatnonzero(found)
+        else:
+            left = np.flatnonzero(self._kinds < 0)
+            found, at = alike.find(self._source.storage, self._starts[left], self._lengths[left])
+            left = left if found is None else left[found]
         self._kinds[left] = kind
         self._at[left] = at
         return found is None
