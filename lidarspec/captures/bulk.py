@@ -165,6 +165,8 @@ class _Records:
                 if _sections(self._form) != self._section:
                     self._kinds = self._kinds[: index + 1]
                     return None
+                if self._only is not None:
+                    break
         if self._are_whole:
             self._source.go(int(self._starts[-1]))
         return None
