@@ -25,7 +25,10 @@ from lidarspec.testing.targets import target
 @click.option("-o", "--output", metavar="FILE", help="Write to a file instead of standard output.")
 @click.pass_context
 def check(ctx: click.Context, name: str, max_examples: int, vectors: str | None, verbose: bool, as_json: bool, output: str | None) -> None:
-    """Everything that the test kit asks of a sensor, and mistakes in its declaration; exit code 1 where there are findings."""
+    """What is wrong with a sensor, a file or a distribution: every promise, and mistakes in its spec.
+
+    Everything that the test kit asks, without a test file. Exit code 1 where there are findings.
+    """
     if importlib.util.find_spec("hypothesis") is None:
         raise UsageError("check needs hypothesis: pip install 'lidarspec[testing]'")
     file = Path(vectors) if vectors else None
