@@ -48,6 +48,7 @@ CONSTRUCT = {
     "wiretable",
     "explaining.explain",
     "export.messages",
+    "testing.declared",
     "export.formulas",
 }
 CONFINED = {
