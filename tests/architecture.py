@@ -49,6 +49,7 @@ CONSTRUCT = {
     "explaining.explain",
     "export.messages",
     "testing.declared",
+    "testing.oracle",
     "export.formulas",
 }
 CONFINED = {
