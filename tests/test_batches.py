@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import random
 from collections.abc import Sequence
@@ -115,3 +116,16 @@ def test_a_period_that_depends_on_the_frame_is_looked_up_again_when_it_changes()
     batches, _, stats = run(sensor, datagrams, [0, 300, 640, 1500, len(datagrams)])
     assert (stats.lost, stats.late, stats.duplicates) == (0, 0, 0)
     assert int(column(batches, "breaks").sum()) == 2, "where the period changes the counter starts again"
+
+
+@pytest.mark.parametrize("backend", ["numpy", "construct"])
+@pytest.mark.parametrize("counts", [(1, 0), (0, 1, 1), (0, 0), (3, 0, 1)])
+def test_packets_without_samples_give_no_points_whatever_packets_are_beside_them(counts: tuple[int, ...], backend: str) -> None:
+    shape = SHAPES["shape-count"]
+    sensor = dataclasses.replace(shape, frames={"data": dataclasses.replace(shape.frames["data"], plausible=None)})
+    samples = [[dict(distance=1000 + index, quality=index)] * count for index, count in enumerate(counts)]
+    packets = sensor.decode(b"".join(sensor.build("data", first=0, last=100, samples=each) for each in samples), backend=backend)
+    cloud = packets.points()
+    assert (len(packets), len(cloud)) == (len(counts), sum(counts))
+    assert cloud.intensity is not None
+    assert cloud.intensity.tolist() == [index for index, count in enumerate(counts) for _ in range(count)]

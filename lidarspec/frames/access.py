@@ -23,10 +23,16 @@ def field_column(info: FieldInfo, table: Table, depth: int, batch: Batch, which:
     array = physical(info, table)
     if which is not None:
         array = array[which]
-    lengths = array.shape[1:]
-    axes: list[str | None] = [name if length != 1 else None for name, length in zip(info.axes, lengths, strict=True)]
+    axes = [_axis(name, length, table, known=which is None) for name, length in zip(info.axes, array.shape[1:], strict=True)]
     spare = max(depth - len(axes), 0)
     return Column(array.reshape(*array.shape, *(1,) * spare), (*axes, *(None,) * spare), batch, source=info.path)
+
+
+def _axis(name: str, length: int, table: Table, *, known: bool) -> str | None:
+    """The name of an axis; of length 1 it needs none, unless packets of the batch have no element at all."""
+    if length != 1 or (known and not isinstance(table.schema.arrays.get(name), int) and not table.counts(name).all()):
+        return name
+    return None
 
 
 def physical(info: FieldInfo, table: Table) -> NDArray[np.float64]:
