@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import random
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -93,7 +94,7 @@ def _swept(sensor: Sensor, frame: str, engine: CompiledCodec, source: random.Ran
         raise SpecError("no random frame passes `plausible`, and there is no `sweep` to start from", path=frame, sensor=sensor.id)
     for _ in range(TRIES):
         values = sweep(source.randrange(10_000))
-        layout, chosen = engine.tree.choose(source)
+        layout, chosen = engine.tree.choose(source, _stated(engine, values))
         rows = np.frombuffer(source.randbytes(layout.size), np.uint8).reshape(1, layout.size).copy()
         for path, value in values.items():
             leaf = layout.leaves.get(path)
@@ -103,6 +104,21 @@ def _swept(sensor: Sensor, frame: str, engine: CompiledCodec, source: random.Ran
         if found:
             return found[0]
     raise SpecError("neither random frames nor those along `sweep` pass `plausible`", path=frame, sensor=sensor.id)
+
+
+def _stated(engine: CompiledCodec, values: Mapping[str, Any]) -> Drawn:
+    """What gives the numbers of a sweep, raw, where a header asks for them."""
+    fields = engine.schema.fields
+    found: dict[str, Callable[[random.Random], Any]] = {}
+    for path, value in values.items():
+        if path in fields and np.ndim(value) == 0 and not isinstance(value, bytes):
+            raw = round((float(value) - fields[path].offset) / fields[path].scale)
+            found[path] = functools.partial(_always, raw)
+    return found
+
+
+def _always(raw: int, _: random.Random) -> int:
+    return raw
 
 
 def _random(con: Construct, source: random.Random, given: Any, drawn: Drawn, path: str = "") -> Any:

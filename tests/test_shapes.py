@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import numpy as np
 import pytest
-from construct import Int16ul
+from construct import Int16ub, Int16ul, Struct
 
-from lidarspec import OutOfRange, PointCloud, Sensor, UsageError, Xor, spread, wrap
+from lidarspec import Checksummed, OutOfRange, PointCloud, Sensor, Sum, UsageError, Xor, spread, wrap
+from lidarspec.simulation.simulator import simulate
+from lidarspec.spec import replaced
 from tests.shapes import SHAPES, calibration
 
 both = pytest.mark.parametrize("backend", ["auto", "construct"])
@@ -46,6 +49,28 @@ def test_a_sweep_of_one_beam_starts_and_ends_at_its_start() -> None:
         np.testing.assert_array_equal(spread(np.array([[350.0]]), np.array([[10.0]]), 3, full=360.0), [[350, 360, 370]])
         np.testing.assert_array_equal(spread(np.array([[5.0]]), np.array([[5.0]]), 2, full=360.0), [[5, 5]])
     assert wrap(np.array([360.0, -1e-20, 725.0]), 360.0).tolist() == [0, 0, 5]
+
+
+def test_a_length_that_follows_from_another_is_filled_in_wherever_a_frame_is_made() -> None:
+    sensor = SHAPES["shape-sized"]
+    built = sensor.build("data", angle=0, samples=[dict(quality=1, distance=2000)] * 4)
+    examples = [sensor.example("data", seed=seed) for seed in range(20)]
+    for frame in (built, *examples, *simulate(sensor, 4)):
+        parsed = sensor.parse(frame)
+        assert (parsed.length, parsed.size) == (len(frame) - 2, len(frame) - 7)
+        assert sensor.build("data", parsed) == frame
+    assert len({len(frame) for frame in examples}) > 3
+    wrong = Sum(16)(built[:1] + b"\0\0" + built[3:-2]).to_bytes(2, "big")
+    assert len(sensor.decode(built[:1] + b"\0\0" + built[3:-2] + wrong)) == 0
+
+
+def test_plausible_frames_are_found_around_the_lengths_of_the_sweep() -> None:
+    """Nothing says here that one length follows from the other, and chance would never make both."""
+    shape = SHAPES["shape-sized"]
+    children = [child if child.name != "length" else "length" / Int16ub for child in shape.frames["data"].struct.subcon.subcons]
+    plain = dataclasses.replace(shape.frames["data"], struct=Checksummed(Struct(*children), "sum", Sum(16)))
+    sensor = replaced(shape, frames={"data": plain}, sweep=lambda i: dict(length=7 + 3 * (i % 9), size=2 + 3 * (i % 9), angle=7.0))
+    assert len({len(sensor.example("data", seed=seed)) for seed in range(20)}) > 3
 
 
 @both

@@ -16,7 +16,7 @@ from lidarspec.simulation.simulated import SECOND, SimulatedDevice
 from lidarspec.simulation.simulator import simulate, simulation
 from lidarspec.spec import replaced
 from lidarspec.testing.scene import off
-from tests.shapes import count
+from tests.shapes import count, sized
 
 #: metres by which a point may be off its surface: half a step of the range, and float32.
 EXACT = 2e-6
@@ -167,6 +167,10 @@ def test_what_cannot_be_simulated_says_why() -> None:
         simulate(replaced(sensor, points=lambda f: Polar(f.samples.distance * 0 + 1, 0)), 1)
     with pytest.raises(SpecError, match="only polar points"):
         simulate(replaced(sensor, points=lambda f: Cartesian(f.samples.distance, 0, 0)), 1)
+    with pytest.raises(SpecError, match="sweep has to give 'size', which the length"):
+        simulate(replaced(sized.SENSOR, sweep=lambda i: {"angle": 0}), 1)
+    with pytest.raises(SpecError, match="with size = 500 there is no frame of at most 99 bytes"):
+        simulate(replaced(sized.SENSOR, sweep=lambda i: {"angle": 0, "size": 500}), 1)
 
 
 def test_a_frame_may_encode_its_ranges_itself() -> None:

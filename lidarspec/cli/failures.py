@@ -24,7 +24,7 @@ CODES: tuple[tuple[type[Exception], int, str], ...] = (
     (errors.SourceError, SOURCE, "lidarspec {verb} --help"),
     (errors.WireError, NO_DATA, "lidarspec show {sensor}"),
     (errors.CommandError, DEVICE, "lidarspec show {sensor}"),
-    (errors.SpecError, FINDINGS, "lidarspec plugins"),
+    (errors.SpecError, FINDINGS, "lidarspec check {sensor}"),
     (errors.LidarSpecError, FINDINGS, "lidarspec plugins"),
     (click.UsageError, USAGE, "lidarspec {verb} --help"),
     (click.ClickException, USAGE, "lidarspec {verb} --help"),
@@ -77,7 +77,9 @@ def _following(error: Exception, command: str, verb: str) -> str:
 
         return "lidarspec plugins" if any(plugin.error for plugin in registry().plugins) else command
     sensor = _sensor(error)
-    return "lidarspec sensors" if "{sensor}" in command and not sensor else command.format(sensor=sensor, verb=verb).replace("  ", " ")
+    if "{sensor}" in command and not sensor:
+        return "lidarspec plugins" if isinstance(error, errors.SpecError) else "lidarspec sensors"
+    return command.format(sensor=sensor, verb=verb).replace("  ", " ")
 
 
 def _sensor(error: Exception) -> str:

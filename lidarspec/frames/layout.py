@@ -197,6 +197,7 @@ class Layout:
         seals: its checksums, inner ones first.
         places: byte range of each named part outside arrays.
         branches: what If and Switch chose, by path.
+        following: fields whose values follow from this header in a frame that is made, and those; they are not asked of one that comes.
         notes: what is worked out from the layout and kept with it.
     """
 
@@ -206,6 +207,7 @@ class Layout:
     seals: tuple[Seal, ...]
     places: Mapping[str, tuple[int, int]]
     branches: Mapping[str, Any] = field(default_factory=dict)
+    following: tuple[tuple[Leaf, int], ...] = ()
     notes: dict[Any, Any] = field(default_factory=dict, repr=False)
 
     def __post_init__(self) -> None:
@@ -222,7 +224,9 @@ class Layout:
         )
 
     def seal(self, rows: Bytes2D) -> None:
-        """Write the constants and checksums into frames given as rows of bytes."""
+        """Write what follows from the header, the constants and the checksums into frames given as rows of bytes."""
+        for leaf, value in self.following:
+            leaf.store(rows, value)
         spots, masks, values = self._constants  # type: ignore[attr-defined]
         rows[:, spots] = rows[:, spots] & ~masks | values
         for seal in self.seals:

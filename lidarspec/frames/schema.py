@@ -30,6 +30,7 @@ class FieldInfo:
         scale, offset, unit: ``physical = raw * scale + offset``.
         bits: width in bits; 0 where not fixed.
         const: the value it must have, None where free.
+        rebuilt: the function of the fields around it that gives its value in a frame that is made (construct's Rebuild).
         labels: meanings of raw values (construct's Enum).
         optional: whether some headers leave it out.
     """
@@ -44,6 +45,7 @@ class FieldInfo:
     docs: str = ""
     bits: int = 0
     const: Any = None
+    rebuilt: Any = None
     labels: Mapping[int, str] = field(default_factory=dict)
     optional: bool = False
 
@@ -135,7 +137,9 @@ def peeled(con: Construct, info: FieldInfo) -> tuple[Construct, FieldInfo]:
             info = replace(info, labels={int(value): str(name) for value, name in con.ksymapping.items()})
         elif isinstance(con, Const):
             info = replace(info, const=con.value)
-        elif not isinstance(con, construct.Default | construct.Rebuild):
+        elif isinstance(con, construct.Rebuild):
+            info = replace(info, rebuilt=con.func)
+        elif not isinstance(con, construct.Default):
             return con, info
         con = con.subcon
 

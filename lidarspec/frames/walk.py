@@ -8,7 +8,9 @@ path and a reason (`NotCompilable`), and is then interpreted by construct.
 
 from __future__ import annotations
 
+import contextlib
 import functools
+import operator
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -41,7 +43,7 @@ Read = Callable[[Leaf], int]
 
 @dataclass
 class Walk:
-    """The state of one walk through a struct: how far it came and what it found."""
+    """The state of one walk through a struct: how far it came, what it found, and the values that it asked for."""
 
     read: Read
     limit: int
@@ -51,6 +53,8 @@ class Walk:
     seals: list[Seal] = field(default_factory=list)
     places: dict[str, tuple[int, int]] = field(default_factory=dict)
     branches: dict[str, Construct] = field(default_factory=dict)
+    asked: dict[str, int] = field(default_factory=dict)
+    rebuilt: list[tuple[Leaf, Scope]] = field(default_factory=list)
 
     def run(self, con: Construct) -> Walk:
         """Go through a prepared struct from here."""
@@ -59,7 +63,22 @@ class Walk:
 
     def layout(self) -> Layout:
         """What was found, as a value."""
-        return Layout(self.cursor, self.leaves, self.constants, tuple(self.seals), self.places, self.branches)
+        return Layout(self.cursor, self.leaves, self.constants, tuple(self.seals), self.places, self.branches, self._following())
+
+    def value(self, leaf: Leaf) -> int:
+        """The value of a field that the layout depends on."""
+        if leaf.info.path not in self.asked:
+            self.asked[leaf.info.path] = self.read(leaf)
+        return self.asked[leaf.info.path]
+
+    def _following(self) -> tuple[tuple[Leaf, int], ...]:
+        """The values of `Rebuild` fields that follow from those that the layout depends on, and from no other."""
+        found: list[tuple[Leaf, int]] = []
+        self.read = _unasked
+        for leaf, scope in self.rebuilt:
+            with contextlib.suppress(Exception):  # of the others: construct evaluates them when a frame is built
+                found.append((leaf, operator.index(leaf.info.rebuilt(scope))))
+        return tuple(found)
 
 
 @dataclass(frozen=True)
@@ -90,7 +109,7 @@ class Scope:
         if isinstance(found, Leaf):
             if self._element:
                 raise NotCompilable(found.info.path, "elements of one array differ in layout")
-            return self._walk.read(found)
+            return self._walk.value(found)
         return found
 
     def __getattr__(self, name: str) -> Any:
@@ -230,6 +249,8 @@ def _bit_constant(state: Walk, elements: list[BitField], value: int) -> None:
 
 def _add(state: Walk, leaf: Leaf, place: _Place) -> None:
     state.leaves[leaf.info.path] = leaf
+    if leaf.info.rebuilt is not None and not leaf.shape:
+        state.rebuilt.append((leaf, place.scope))
     place.scope._names[leaf.info.name] = leaf
 
 
@@ -255,6 +276,10 @@ def _held(leaf: Leaf) -> list[tuple[int, int]]:
         return [(leaf.offset, leaf.offset + leaf.size)]
     spots = [part.byte for element in leaf.elements for part in element.segments]
     return [(leaf.offset + min(spots), leaf.offset + max(spots) + 1)]
+
+
+def _unasked(leaf: Leaf) -> int:
+    raise NotCompilable(leaf.info.path, "the layout does not depend on it")
 
 
 def _value(expression: Any, place: _Place) -> Any:

@@ -17,7 +17,7 @@ from lidarspec.errors import SpecError
 from lidarspec.frames.codecs import CompiledCodec, codec
 from lidarspec.frames.layout import Layout, Leaf
 from lidarspec.frames.tables import Group, Rows
-from lidarspec.frames.walk import walk
+from lidarspec.frames.walk import TooLong, walk
 from lidarspec.spec import Sensor
 
 Values = Mapping[str, Any]
@@ -65,11 +65,23 @@ class FrameMaker:
         known = self._layouts.get(tuple(self._raw(values, path) for path in self._asked))
         if known is None:
             asked: list[str] = []
-            known = walk(self.engine.frame.prepared, functools.partial(self._read, values, asked), self.engine.frame.max_length).layout()
+            known = self._walked(values, asked)
             self._layouts = self._layouts if asked == self._asked else {}
             self._asked = asked
             self._layouts[tuple(self._raw(values, path) for path in asked)] = known
         return known
+
+    def _walked(self, values: Values, asked: list[str]) -> Layout:
+        frame, fields = self.engine.frame, self.engine.schema.fields
+        try:
+            return walk(frame.prepared, functools.partial(self._read, values, asked), frame.max_length).layout()
+        except TooLong as error:
+            left_out = [path for path in asked if path not in values and fields[path].const is None]
+            given = ", ".join(f"{path} = {values[path]}" for path in asked if path in values)
+            reason = f"with {given} there is no frame of at most {frame.max_length} bytes (max_length)"
+            if left_out:
+                reason = f"sweep has to give {left_out[0]!r}, which the length of the frame depends on"
+            raise SpecError(reason, path=str(error), sensor=self.sensor.id) from None
 
     def _rows(self, layout: Layout, frames: Sequence[Values]) -> NDArray[np.uint8]:
         rows = np.zeros((len(frames), layout.size), np.uint8)

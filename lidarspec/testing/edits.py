@@ -92,4 +92,4 @@ def _values(info: FieldInfo, own: Any, st: Any) -> Any:
 
 
 def free(info: FieldInfo | None) -> bool:
-    return info is not None and info.kind == "int" and info.const is None
+    return info is not None and info.kind == "int" and info.const is None and info.rebuilt is None

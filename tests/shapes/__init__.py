@@ -23,6 +23,7 @@ from tests.shapes import (
     options,
     outer,
     remarks,
+    sized,
     state,
     text,
     twins,
@@ -52,6 +53,7 @@ _MODULES = (
     lengths,
     headed,
     remarks,
+    sized,
     outer,
 )
 
