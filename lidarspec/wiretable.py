@@ -6,6 +6,7 @@ that only some headers have is marked with the condition.
 
 from __future__ import annotations
 
+import itertools
 import re
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -171,7 +172,13 @@ def formula(expression: Any, path: str = "") -> str:
     if " at 0x" in text:
         return "?"
     text = _FIELD.sub(lambda found: _resolved(found[0], path), _ITEM.sub(r".\1", text))
-    return text[1:-1] if text.startswith("(") and text.endswith(")") and text.count("(") == 1 else text
+    return text[1:-1] if _enclosed(text) else text
+
+
+def _enclosed(text: str) -> bool:
+    """Whether the first bracket of a text closes at its end."""
+    depths = list(itertools.accumulate((part == "(") - (part == ")") for part in text))
+    return text.startswith("(") and depths.index(0) == len(text) - 1
 
 
 def _resolved(text: str, path: str) -> str:
@@ -200,10 +207,11 @@ def unit_text(info: FieldInfo) -> str:
 
 
 def meaning(info: FieldInfo) -> str:
-    """What is said of a field: its constant, its text, the names of its values."""
+    """What is said of a field: its constant, what it follows from, its text, the names of its values."""
     const = hexed(info.const, info.bits) if info.const is not None else ""
     labels = ", ".join(f"{value} {name}" for value, name in info.labels.items())
-    return "; ".join(part for part in (const and f"always {const}", info.docs, labels) if part)
+    follows = formula(info.rebuilt, info.path) if info.rebuilt is not None else "?"
+    return "; ".join(part for part in (const and f"always {const}", follows != "?" and f"= {follows}", info.docs, labels) if part)
 
 
 def hexed(value: object, bits: int) -> str:

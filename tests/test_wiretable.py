@@ -79,6 +79,14 @@ def test_what_some_headers_leave_out_is_marked() -> None:
     assert frame_size(SHAPES["shape-options"].frames["data"]) == "9 + size(extension) + size(extra) + 2*(rows * columns)"
 
 
+def test_a_length_that_follows_from_another_says_from_which() -> None:
+    frame = SHAPES["shape-sized"].frames["data"]
+    rows = {row.field: row for row in wire_table(frame)}
+    assert rows["length"].meaning == "= size + 5; all bytes before the sum"
+    assert rows["samples"].meaning == "(size - 2) // 3 elements of 3"
+    assert frame_size(frame) == "9 + 3*((size - 2) // 3)"
+
+
 def test_text_has_no_size_of_its_own() -> None:
     rows = {row.field: row for row in wire_table(SHAPES["shape-text"].frames["data"])}
     assert (rows["angle"].offset, rows["angle"].size, rows["angle"].type) == ("2", "varies", "text up to ','")
