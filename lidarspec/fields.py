@@ -12,7 +12,7 @@ from typing import Any
 from construct import Construct, Container, Subconstruct
 
 from lidarspec.checksums import Checksum
-from lidarspec.construction import Mismatch, bit_width, member, note, unwrap, verifying
+from lidarspec.construction import MarkedStruct, Mismatch, bit_width, member, note, prepare, unwrap, verifying
 
 
 class Scaled(Subconstruct):  # type: ignore[misc]
@@ -66,7 +66,7 @@ class Checksummed(Subconstruct):  # type: ignore[misc]
 
     def _parse(self, stream: Any, context: Any, path: str) -> Any:
         start = stream.tell()
-        obj = self.subcon._parsereport(stream, context, path)
+        obj = self._marked._parsereport(stream, context, path)
         end = stream.tell()
         note(context, path, start, end, obj, self)
         if not verifying(context, checksums=True):
@@ -87,14 +87,18 @@ class Checksummed(Subconstruct):  # type: ignore[misc]
         blank = obj
         for name, value in zip(self.fields, given, strict=True):
             blank = _replaced(blank, name, self._zero(name) if value is None else value)
-        trial = io.BytesIO()
-        self.subcon._build(blank, trial, context, path)
+        con, trial = self._marked, io.BytesIO()
+        con._build(blank, trial, context, path)
         data = trial.getvalue()
-        parsed = self.subcon._parsereport(io.BytesIO(data), _unverified(context), path)
+        parsed = con._parsereport(io.BytesIO(data), _unverified(context), path)
         if None not in given and self._stored(parsed) in self.absent:
-            return self.subcon._build(blank, stream, context, path)
-        sealed = self._filled(blank, self._computed(data, parsed, 0))
-        return self.subcon._build(sealed, stream, context, path)
+            return con._build(blank, stream, context, path)
+        return con._build(self._filled(blank, self._computed(data, parsed, 0)), stream, context, path)
+
+    @property
+    def _marked(self) -> Construct:
+        """The struct as a frame has it, which notes where its members stand; an author may also parse with it alone."""
+        return self.subcon if isinstance(unwrap(self.subcon), MarkedStruct) else prepare(self.subcon)
 
     def verdict(self, data: bytes, obj: Any, base: int = 0) -> tuple[int, int]:
         """The checksum that stands in one parsed struct and the one that should, for its bytes, which began at `base`."""
@@ -150,7 +154,7 @@ class Checksummed(Subconstruct):  # type: ignore[misc]
 
     def _span(self, obj: Any, name: str) -> tuple[int, int]:
         """Where a dotted field stands, in bytes of the stream that was parsed; a bit field by the bytes that hold it."""
-        con, parts = self.subcon, name.split(".")
+        con, parts = self._marked, name.split(".")
         for depth, part in enumerate(parts):
             start, end = obj["_marks"][part]
             con, obj = unwrap(con, bits=False)._subcons[part], obj[part]

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from construct import Int16ub, Int16ul, Struct
+from construct import ConstructError, Int16ub, Int16ul, Struct
 
 from lidarspec import Checksummed, OutOfRange, PointCloud, Sensor, Sum, UsageError, Xor, spread, wrap
 from lidarspec.simulation.simulator import simulate
@@ -108,6 +108,18 @@ def test_checksums_stand_where_they_are_declared() -> None:
     assert frame[4] == sum(frame[:4]) & 0xFF
     other = nested.build("data", header=dict(angle=0x1234), distances=[1, 2, 3], serial=b"abd")
     assert frame[14:18] == other[14:18]
+
+
+@pytest.mark.parametrize("name", ["shape-middle", "shape-nibbles", "shape-nested", "shape-sized"])
+def test_a_sealed_struct_parses_and_builds_without_a_sensor(name: str) -> None:
+    """As an author tries it first."""
+    sensor = SHAPES[name]
+    struct, frame = sensor.frames["data"].struct, sensor.example("data")
+    parsed = struct.parse(frame)
+    assert parsed == sensor.parse(frame)
+    assert struct.build(parsed) == frame
+    with pytest.raises(ConstructError, match=r"expected .*, got"):
+        struct.parse(frame[:-1] + bytes([frame[-1] ^ 1]))
 
 
 @both
