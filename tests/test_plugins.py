@@ -159,6 +159,35 @@ def test_the_command_line_lists_what_is_broken(site: Path) -> None:
     assert python(site, "-m", "lidarspec", "show", "acme-x1").returncode == 0
 
 
+#: what `check` names each broken entry point with.
+RULES = {
+    "absent-module = lidarspec_broken.absent": "LS001",
+    "absent-import = lidarspec_broken.absent_import": "LS001",
+    "syntax = lidarspec_broken.syntax": "LS001",
+    "exits = lidarspec_broken.exits": "LS001",
+    "wrong-signature = lidarspec_broken.wrong_signature": "LS004",
+    "misspelt = lidarspec_broken.misspelt": "LS002",
+    "unmarked = lidarspec_broken.unmarked": "LS003",
+    "duplicate = lidarspec_broken.duplicate": "LS005",
+    "raises = lidarspec_broken.raises": "LS006",
+    "no-sensor = lidarspec_broken.no_sensor": "LS006",
+    "hook = lidarspec_broken.hook": "LS010",
+}
+
+
+def test_a_broken_distribution_is_checked_to_its_end(site: Path) -> None:
+    done = python(site, "-m", "lidarspec", "check", "lidarspec-broken", "--max-examples", "3", "--json")
+    assert (done.returncode, done.stderr) == (1, "")
+    loading, *sensors = json.loads(done.stdout)
+    named = {finding["path"]: finding["code"] for finding in loading["findings"]}
+    assert RULES.items() <= named.items()
+    assert named.get("on") == "LS102"
+    assert {"broken-checksum", "broken-plausible", "broken-points"} <= {report["name"] for report in sensors if report["findings"]}
+    assert {finding["path"] for finding in loading["findings"] if finding["code"] == "LS001" and not finding["line"]} == {
+        "absent-module = lidarspec_broken.absent"
+    }
+
+
 class TestStranger(SensorConformance):
     """The stranger's sensor straight from its file."""
 

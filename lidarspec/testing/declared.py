@@ -49,7 +49,13 @@ def declared(subject: Subject) -> list[Finding]:
         checks += [lambda n=name, f=frame: _frame(subject, n, f)]  # type: ignore[misc]
     checks += [lambda n=name: _points(subject, n) for name in data_frames(subject)]  # type: ignore[misc]
     checks += [lambda: _reach(subject)]
-    return [Finding(code, what, path, sensor.id) for check in checks for code, what, path in check()]
+    found: list[Finding] = []
+    for check in checks:
+        try:
+            found += [Finding(code, what, path, sensor.id) for code, what, path in check()]
+        except Exception as error:  # out of the plugin's own functions
+            found.append(Finding("LS414", f"{type(error).__name__}: {error}", "", sensor.id))
+    return found
 
 
 def _sensor(sensor: Sensor) -> Findings:

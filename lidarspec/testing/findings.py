@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any
 
 from lidarspec.spec import Sensor
@@ -39,7 +40,9 @@ class Finding:
 
     def __str__(self) -> str:
         place = " ".join(part for part in (self.sensor, self.path) if part)
-        where = f" ({self.file}:{self.line})" if self.file else ""
+        file = Path(self.file)
+        file = file.relative_to(Path.cwd()) if file.is_relative_to(Path.cwd()) else file
+        where = f" ({file}:{self.line})" if self.file else ""
         rule = self.rule
         return f"{self.code} {rule.title}\n  where  {place}{where}\n  what   {self.what}\n  why    {rule.why}\n  write  {rule.write}"
 

@@ -21,7 +21,9 @@ def examples_are_valid_and_repeat(subject: Subject, name: str) -> None:
     try:
         found = [subject.example(name, seed=seed) for seed in subject.seeds(frame)]
     except SpecError as error:
-        raise Violation("LS301", error.reason, f"{name}.{error.path}" if error.path not in ("", name) else name) from error
+        raise Violation(
+            "LS301", error.reason, error.path if error.path.startswith(name) else f"{name}.{error.path}" if error.path else name
+        ) from error
     again = [subject.sensor.example(name, seed=seed) for seed in range(3)] if not subject.drawers(name) else found[:3]
     require(found[:3] == again, "LS311", "two examples of one seed differ", name)
     longest = max(map(len, found))

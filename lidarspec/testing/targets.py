@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import importlib
+import importlib.util
 import inspect
 import re
 import traceback
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 from lidarspec.errors import SourceError, SpecError
@@ -86,7 +85,8 @@ def _distribution(entries: list[EntryPoint]) -> Target:
         try:
             sensors = _added(entry.load(), value)
         except (Exception, SystemExit) as error:
-            found.findings.append(loading(error, module_files(value)))
+            finding = loading(error, module_files(value))
+            found.findings.append(replace(finding, path=finding.path or f"{entry.name} = {value}"))
             continue
         found.files += [file for file in module_files(value) if file not in found.files]
         found.sensors += [known.get(sensor.id, sensor) for sensor in sensors if sensor.id not in {one.id for one in found.sensors}]
@@ -154,14 +154,14 @@ def _said(text: str) -> str:
 
 
 def module_files(value: str) -> list[Path]:
-    """The files of the module, or of the package, that an entry point names; none where it cannot be imported."""
+    """The files of the module, or of the package, that an entry point names; none where there is none."""
     try:
-        module: ModuleType = importlib.import_module(value.partition("[")[0].partition(":")[0].strip())
+        found = importlib.util.find_spec(value.partition("[")[0].partition(":")[0].strip())
     except (Exception, SystemExit):
         return []
-    file = Path(str(module.__file__)) if module.__file__ else None
-    if file is None:
+    if found is None or not found.origin or not found.origin.endswith(".py"):
         return []
+    file = Path(found.origin)
     return sorted(file.parent.rglob("*.py")) if file.name == "__init__.py" else [file]
 
 
