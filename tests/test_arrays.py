@@ -1,0 +1,91 @@
+"""Frames in arrays and in one buffer: found where they stand, with the result of one datagram after another."""
+
+from __future__ import annotations
+
+import functools
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+import lidarspec
+from lidarspec import Sensor
+from lidarspec.clocks import Unwrapper
+from lidarspec.decoder import Spans
+from lidarspec.frames.tables import Rows
+from tests.shapes import SHAPES
+
+#: one of each family: relatives that share their frames are cut alike.
+EVERY = {
+    sensor.id: sensor
+    for sensor in {tuple(map(id, sensor.frames.values())): sensor for sensor in {**lidarspec.sensors(), **SHAPES}.values()}.values()
+}
+each_sensor = pytest.mark.parametrize("sensor", EVERY.values(), ids=EVERY)
+EXAMPLES = 40
+
+
+@functools.cache
+def damaged(sensor: Sensor) -> NDArray[np.uint8]:
+    """Frames of one length, (n, size), with a byte changed in every fifth, at places all over the frame."""
+    frames = [sensor.example(sensor.data_frame, seed=seed) for seed in range(EXAMPLES)]
+    size = max(map(len, frames), key=[len(frame) for frame in frames].count)
+    rows = np.frombuffer(b"".join(frame for frame in frames if len(frame) == size), np.uint8).reshape(-1, size).copy()
+    for row in range(0, len(rows), 5):
+        rows[row, row * size // len(rows)] ^= 0x41
+    return rows
+
+
+def facts(spans: Spans) -> list[tuple[str, int, bytes, int]]:
+    return [(found.frame, found.offset, found.data, found.gap) for found in spans.found()]
+
+
+@each_sensor
+@pytest.mark.parametrize("distance", ["none", "even", "uneven"])
+def test_datagrams_in_one_buffer_are_those_one_after_another(sensor: Sensor, distance: str) -> None:
+    rows = damaged(sensor)
+    count, size = rows.shape
+    one_by_one, together = sensor.decoder(stream=False), sensor.decoder(stream=False)
+    wanted = [(f.frame, f.offset, f.data, f.gap) for row in rows for f in one_by_one.feed(row.tobytes())]
+    spare = {"none": 0, "even": 58, "uneven": np.random.default_rng(1).integers(0, 30, count)}[distance]
+    starts = np.cumsum(np.full(count, size) + spare) - size
+    buffer = np.random.default_rng(2).integers(0, 256, int(starts[-1]) + size, np.uint8)
+    for start, row in zip(starts, rows, strict=True):
+        buffer[start : start + size] = row
+    found = together.placed(buffer, starts.astype(np.intp), np.full(count, size, np.intp), np.full(count, -1, np.int64))
+    assert facts(found) == wanted
+    assert together.stats == one_by_one.stats
+
+
+@each_sensor
+def test_the_rows_of_an_array_are_those_datagrams(sensor: Sensor) -> None:
+    rows = damaged(sensor)
+    array, listed = sensor.decode(rows), sensor.decode([row.tobytes() for row in rows])
+    assert array.stats == listed.stats
+    assert array.raw.tobytes() == listed.raw.tobytes()
+    for name in ("offset", "time_ns", "host_ns", "index", "breaks"):
+        np.testing.assert_array_equal(getattr(array, name), getattr(listed, name))
+
+
+def test_a_large_array_is_not_copied() -> None:
+    sensor = lidarspec.sensor("robosense-m1")
+    rows = np.tile(np.frombuffer(sensor.example("data"), np.uint8), (15_000, 1))
+    table = sensor.decode(rows, frame="data").table
+    assert isinstance(table, Rows)
+    assert len(table) == len(rows)
+    assert np.shares_memory(table.groups[0].rows, rows)
+    assert (table.groups[0].rows == rows).all()
+
+
+@pytest.mark.parametrize("wraps_at", [0.065536, 30.0, 3600.0])
+def test_clocks_run_on_over_wraps_and_steps_back(wraps_at: float) -> None:
+    turn = round(wraps_at * 1e9)
+    source = np.random.default_rng(3)
+    true = 5 * turn + np.cumsum(source.integers(-turn // 20, turn // 4, 5000))
+    whole, parts = Unwrapper(wraps_at), Unwrapper(wraps_at)
+    nobody = np.zeros(len(true), np.int64)
+    found = whole.push(true % turn, nobody)
+    np.testing.assert_array_equal(found - found[0], true - true[0])
+    cuts = [0, 1, 2, 77, 4000, 5000]
+    pieces = [parts.push(true[a:b] % turn, nobody[a:b]) for a, b in pairwise(cuts)]
+    np.testing.assert_array_equal(np.concatenate(pieces), found)
