@@ -15,11 +15,12 @@ import numpy as np
 import pytest
 
 import lidarspec
-from lidarspec import Checksum, Crc, Fields, Polar, UsageError, WordXor, Xor, kernelsums
+from lidarspec import Checksum, Crc, Fields, Polar, UsageError, WordXor, Xor
 from lidarspec.frames.layout import Seal
 from lidarspec.frames.tables import Rows
 from lidarspec.links import is_datagram
 from lidarspec.packets import Packets
+from lidarspec.plans import kernelsums
 from lidarspec.plans.evaluation import evaluated
 from lidarspec.plans.plan import Plan, plan_for
 from lidarspec.points import evaluate, points_function
