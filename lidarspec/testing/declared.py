@@ -252,8 +252,6 @@ def _measured(subject: Subject, name: str, value: Any, column: str, units: tuple
         pure = set(_explicit(subject.sensor.frames[name].prepared))
         bare = [info for info in free if not info.unit and info.path not in pure]
         if bare and len(bare) == len([info for info in free if not info.unit]):
-            yield (
-                "LS201",
-                f"the {column} of points comes from it, and it has no unit",
-                f"{name}.{max(bare, key=lambda i: len(i.axes)).path}",
-            )
+            order = list(codec(subject.sensor.frames[name]).schema.fields)
+            first = min(bare, key=lambda info: (-len(info.axes), order.index(info.path) if info.path in order else len(order)))
+            yield "LS201", f"the {column} of points comes from it, and it has no unit", f"{name}.{first.path}"

@@ -78,7 +78,7 @@ ULTRA_DENSE = Frame(
     max_length=170,
     plausible=capsules.plausible,
     after="ultra_dense_descriptor",
-    acknowledged={"LS201 cabins.second_scale": CODED},
+    acknowledged={"LS201 cabins.second_high": CODED},
 )
 HQ = Frame(
     nodes.HQ,
