@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
-from lidarspec import Sensor, hookimpl
-from tests.broken.sound import ACK, sensor
+from construct import StreamError
+
+from lidarspec import Sensor, WireError, hookimpl
+from tests.broken.sound import sensor
 
 
 class Mine(Sensor):
     def parse(self, data, frame=None, *, verify=True):
-        if frame == "ack":
-            return ACK.parse(data)
-        return super().parse(data, frame, verify=verify)
+        try:
+            return super().parse(data, frame, verify=verify)
+        except WireError as error:
+            if frame == "ack":
+                raise StreamError(str(error)) from None
+            raise
 
 
 @hookimpl
