@@ -17,7 +17,7 @@ from lidarspec.testing.targets import target
 
 
 @click.command()
-@click.argument("name", metavar="NAME|FILE|DISTRIBUTION")
+@click.argument("name", metavar="ID|FILE|DISTRIBUTION|FOLDER")
 @click.option("--max-examples", type=click.IntRange(1), default=EXAMPLES, show_default=True, help="Examples of each frame type.")
 @click.option("--vectors", metavar="FILE", help="Golden vectors; by default vectors.json beside a file.")
 @click.option("-v", "--verbose", is_flag=True, help="Also what was skipped and why, and what was measured.")

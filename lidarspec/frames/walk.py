@@ -72,7 +72,7 @@ class Walk:
         return self.asked[leaf.info.path]
 
     def _following(self) -> tuple[tuple[Leaf, int], ...]:
-        """The values of `Rebuild` fields that follow from those that the layout depends on, and from no other."""
+        """The values of `Rebuild` fields that follow from constants and from those that the layout depends on, and from no other."""
         found: list[tuple[Leaf, int]] = []
         self.read = _unasked
         for leaf, scope in self.rebuilt:
@@ -279,6 +279,8 @@ def _held(leaf: Leaf) -> list[tuple[int, int]]:
 
 
 def _unasked(leaf: Leaf) -> int:
+    if isinstance(leaf.info.const, int):
+        return leaf.info.const
     raise NotCompilable(leaf.info.path, "the layout does not depend on it")
 
 

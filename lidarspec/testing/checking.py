@@ -16,8 +16,6 @@ from lidarspec.testing.subject import EXAMPLES, Subject
 from lidarspec.testing.targets import Target
 from lidarspec.testing.written import written
 
-#: where golden vectors are looked for beside a file that is checked.
-VECTORS = "vectors.json"
 #: rules without which there is nothing to try, and what is skipped then.
 FATAL, ELSE = frozenset({"LS114", "LS115", "LS301"}), "everything else"
 
@@ -53,7 +51,7 @@ def reports(
     Args:
         name: what was asked for.
         examples: of each frame type, for each property.
-        vectors: golden vectors; by default those in "vectors.json" beside a single file.
+        vectors: golden vectors; by default those that the target has.
         watch: is told what is looked at.
     """
     places = Places(target.files)
@@ -61,9 +59,8 @@ def reports(
     single = [sensor for sensor in target.sensors if len(target.sensors) == 1]
     if mistakes and not single:
         yield Report(name, mistakes)
-    beside = [file.parent / VECTORS for file in target.files[:1] if (file.parent / VECTORS).is_file()] if len(target.files) == 1 else []
     for sensor in target.sensors:
-        subject = Subject(sensor, examples, vectors=vectors or next(iter(beside), None))
+        subject = Subject(sensor, examples, vectors=vectors or target.vectors)
         yield _report(subject, places, mistakes if single else [], watch or (lambda text: None))
 
 

@@ -97,7 +97,7 @@ _FRAMES = (
         "LS301",
         "no example can be made up",
         "nothing can be tried on it",
-        'strategies = {"frame.field": ...} in the test class, or a `sweep`',
+        'a `sweep`, on another frame than data Frame(sweep=), or strategies = {"frame.field": ...} in the test class',
     ),
     Rule("LS302", "bytes do not survive parsing and building", "a replayed or edited frame is another one", "fields that keep every bit"),
     Rule("LS303", "a value is cut, not rounded", "int() loses a step whenever a float falls short", "Scaled, or round() in place of int()"),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import inspect
 import re
+import tomllib
 import traceback
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -17,6 +18,8 @@ from lidarspec.plugins import GROUP, Registry, file_module, registry
 from lidarspec.spec import Sensor
 from lidarspec.testing.findings import Finding
 
+#: the name of a file of golden vectors.
+VECTORS = "vectors.json"
 #: what the registry says -> the rule.
 SAID = (
     ("there is no hook", "LS002"),
@@ -37,21 +40,25 @@ class Target:
         sensors: that were found in it.
         findings: what kept others from being found.
         files: the modules that it is written in.
+        vectors: its golden vectors: beside a file; of a distribution with one sensor, in its folder or its tests.
     """
 
     sensors: list[Sensor] = field(default_factory=list)
     findings: list[Finding] = field(default_factory=list)
     files: list[Path] = field(default_factory=list)
+    vectors: Path | None = None
 
 
 def target(text: str | Path) -> Target:
-    """What a name stands for: a file, the id or alias of an installed sensor, or a distribution.
+    """What a name stands for: a file, the id or alias of an installed sensor, or a distribution, by its name or its folder.
 
     Raises:
-        SourceError: for a file that is not there.
+        SourceError: for a file that is not there, and for the folder of a distribution that is not installed.
         UnknownSensor: for a name that is nothing of all this.
     """
     name = str(text)
+    if (Path(name) / "pyproject.toml").is_file():
+        return _folder(Path(name))
     if "/" in name or "\\" in name or name.endswith(".py"):
         return _file(Path(name))
     entries = [entry for entry in entry_points(GROUP) if _normal(entry.distribution) == _normal(name)]
@@ -60,11 +67,12 @@ def target(text: str | Path) -> Target:
     sensor = registry().sensor(name)
     homes = [plugin for plugin in registry().plugins if sensor.id in plugin.sensors]
     files = [file for plugin in homes for file in module_files(plugin.entry_point.partition(" = ")[2])]
-    return Target([sensor], [], files)
+    alone = [file.parent for file in files if [plugin.sensors for plugin in homes] == [(sensor.id,)]]
+    return Target([sensor], [], files, _vectors(*alone, *(folder.parent for folder in alone)))
 
 
 def _file(file: Path) -> Target:
-    found = Target(files=[file])
+    found = Target(files=[file], vectors=_vectors(file.parent))
     try:
         found.sensors = _added(file_module(file), str(file))
         if not found.sensors:
@@ -75,6 +83,24 @@ def _file(file: Path) -> Target:
         found.findings.append(loading(error, [file]))
         found.files = found.files if _readable(file) else []
     return found
+
+
+def _folder(folder: Path) -> Target:
+    """The distribution whose source is in a folder."""
+    try:
+        name = str(tomllib.loads((folder / "pyproject.toml").read_text(encoding="utf-8"))["project"]["name"])
+    except (ValueError, KeyError) as error:
+        raise SourceError(f"{folder / 'pyproject.toml'} names no project: {error}") from None
+    entries = [entry for entry in entry_points(GROUP) if _normal(entry.distribution) == _normal(name)]
+    if not entries:
+        raise SourceError(f"{name} is not installed, or has no sensors: pip install -e {folder}")
+    found = _distribution(entries)
+    found.vectors = _vectors(folder, folder / "tests") if len(found.sensors) == 1 else None
+    return found
+
+
+def _vectors(*folders: Path) -> Path | None:
+    return next((folder / VECTORS for folder in folders if (folder / VECTORS).is_file()), None)
 
 
 def _distribution(entries: list[EntryPoint]) -> Target:
