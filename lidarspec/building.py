@@ -116,9 +116,11 @@ def limits(info: FieldInfo) -> tuple[int, int]:
 
 
 def _openings(con: Construct, given: Container) -> Container:
-    """The values with a place for each checksum, which fills it in itself."""
+    """The values with the constants, and with a place for each checksum, which fills it in itself."""
     for name, child in _members(con):
         inner = unwrap(child, bits=False)
+        if isinstance(inner, construct.Const):
+            given.setdefault(name, inner.value)
         if isinstance(inner, construct.Struct) and isinstance(given.get(name), dict):
             _openings(child, given[name])
     for seal in _seals(con):

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from construct import ConstructError, Int16ub, Int16ul, Struct
+from construct import Const, ConstructError, Int16ub, Int16ul, Rebuild, Struct, this
 
-from lidarspec import Checksummed, OutOfRange, PointCloud, Sensor, Sum, UsageError, Xor, spread, wrap
+from lidarspec import Checksummed, Frame, OutOfRange, PointCloud, Sensor, Sum, UsageError, Xor, spread, wrap
 from lidarspec.simulation.simulator import simulate
 from lidarspec.spec import replaced
 from tests.shapes import SHAPES, calibration
@@ -62,6 +62,14 @@ def test_a_length_that_follows_from_another_is_filled_in_wherever_a_frame_is_mad
     assert len({len(frame) for frame in examples}) > 3
     wrong = Sum(16)(built[:1] + b"\0\0" + built[3:-2]).to_bytes(2, "big")
     assert len(sensor.decode(built[:1] + b"\0\0" + built[3:-2] + wrong)) == 0
+
+
+def test_a_length_may_follow_from_a_constant() -> None:
+    struct = Struct("magic" / Const(b"SZ"), "length" / Rebuild(Int16ub, this.size + 5), "size" / Const(1, Int16ub), "speed" / Int16ub)
+    shape = SHAPES["shape-sized"]
+    sensor = replaced(shape, frames={**shape.frames, "speed": Frame(struct, max_length=8, plausible=lambda f: f.length == 6)})
+    assert sensor.build("speed", speed=7) == b"SZ\0\6\0\1\0\7"
+    assert sensor.parse(sensor.example("speed"), "speed").length == 6
 
 
 def test_plausible_frames_are_found_around_the_lengths_of_the_sweep() -> None:

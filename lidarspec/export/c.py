@@ -120,7 +120,7 @@ def header(sensor: Sensor) -> str:
     Raises:
         Refused: where only Python code can decide what a frame is made of, or its places cannot be computed in C.
     """
-    prefix = identifier(sensor.id)
+    prefix = identifier(sensor.id if sensor.id[0].isalpha() else f"lidar_{sensor.id}")
     title, source = f"{sensor.vendor} {sensor.model}", " ".join(sensor.source.split()).replace("*/", "* /")
     names, algorithms = _Names(prefix), _Algorithms(prefix)
     frames = ["\n".join(_frame(message, names, algorithms)) for message in messages(sensor)]

@@ -18,6 +18,7 @@ from lidarspec import Sensor, WireError
 from lidarspec.export import Refused, export
 from lidarspec.frames.codecs import codec
 from lidarspec.frames.schema import Schema
+from lidarspec.spec import replaced
 from lidarspec.testing import material
 from tests.export.trees import DISTINCT, EVERY, values
 
@@ -72,6 +73,14 @@ def test_every_header_compiles_without_a_warning(tmp_path: Path) -> None:
     source = tmp_path / "all.c"
     source.write_text(_included(tmp_path) + "int main(void) { return 0; }\n")
     _compile(source, tmp_path / "all", *STRICT, "-fsyntax-only")
+
+
+@needs_gcc
+def test_an_id_that_begins_with_a_digit_makes_names_all_the_same(tmp_path: Path) -> None:
+    (tmp_path / "it.h").write_text(export("c", replaced(SENSORS["shape-count"], id="3acme-x1")))
+    (tmp_path / "it.c").write_text('#include "it.h"\nint main(void) { return lidar_3acme_x1_data_count((const uint8_t *)"abc") != 99; }\n')
+    subprocess.run([str(GCC), *STRICT, "-o", "it", "it.c"], cwd=tmp_path, check=True)
+    subprocess.run([tmp_path / "it"], check=True)
 
 
 @pytest.mark.skipif(shutil.which("g++") is None, reason="g++ is not installed")
