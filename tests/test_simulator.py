@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -171,6 +172,23 @@ def test_what_cannot_be_simulated_says_why() -> None:
         simulate(replaced(sized.SENSOR, sweep=lambda i: {"angle": 0}), 1)
     with pytest.raises(SpecError, match="with size = 500 there is no frame of at most 99 bytes"):
         simulate(replaced(sized.SENSOR, sweep=lambda i: {"angle": 0, "size": 500}), 1)
+
+
+@pytest.mark.parametrize(("stretch", "shift"), [(1, 0.1), (1, -0.02), (1.01, 0.05), (0.98, 0)])
+def test_corrected_ranges_go_back_through_the_correction(stretch: float, shift: float) -> None:
+    """As a site's calibration makes them, in a hook."""
+
+    def corrected(f: Any) -> Polar:
+        polar = count.points(f)
+        return Polar(np.where(polar.range > 0, polar.range * stretch + shift, 0), polar.azimuth, intensity=polar.intensity)
+
+    room = Room()
+    frames = simulate(replaced(SHAPE, points=corrected), 9, scene=room)
+    cloud = replaced(SHAPE, points=corrected).decode(b"".join(frames)).points()
+    assert cloud.valid.all()
+    assert off(room, cloud.xyz.astype(np.float64)).max() < 0.0005 * stretch + EXACT
+    raw = SHAPE.decode(b"".join(frames)).points()
+    np.testing.assert_allclose(cloud.range, raw.range * stretch + shift, atol=1e-5)
 
 
 def test_a_frame_may_encode_its_ranges_itself() -> None:

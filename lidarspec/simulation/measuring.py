@@ -38,7 +38,7 @@ class Target:
     Attributes:
         path: of the field.
         inner: index of the innermost axes of the points that belongs to it.
-        step, zero: metres of one raw step and of raw 0; no step where the header gives it.
+        step, zero: metres of one raw step and of raw 0; no step where packets have their own, such as the header's or a calibration's.
     """
 
     path: str
@@ -139,11 +139,11 @@ class Measurement:
             polar = Polar(ranges, np.broadcast_to(beams.azimuth, ranges.shape), np.broadcast_to(beams.elevation, ranges.shape))
             return {path: np.asarray(values) for path, values in self._encode(polar).items()}
         found: dict[str, NDArray[Any]] = {}
-        for target, step in zip(self._targets, steps, strict=True):
+        for target, (step, zero) in zip(self._targets, steps, strict=True):
             info = table.schema.fields[target.path]
             part = _part(ranges, target.inner)
             with np.errstate(all="ignore"):
-                raw = np.rint((part - target.zero) / step)
+                raw = np.rint((part - zero) / step)
             top = float((1 << info.bits) - 1) if info.kind == "int" else np.inf
             found[target.path] = np.where((part > 0) & (raw > 0) & (raw <= top), raw, 0)
         return found
@@ -158,22 +158,25 @@ class Measurement:
             expected = PROBE * info.scale + info.offset
             inner = [spot for spot in self._inner(table, answer) if np.isclose(_part(answer, spot), expected).any()]
             found += [Target(path, spot, info.scale, info.offset) for spot in inner]
-        found = found or self._proportional(table)
+        found = found or self._linear(table)
         if not found:
             reason = "no field in metres makes the range of a point: the sensor has to give `encode`"
             raise SpecError(reason, path="points", sensor=self._sensor.id)
         return tuple(found)
 
-    def _proportional(self, table: Rows) -> list[Target]:
-        """The elements of arrays without a unit of their own to which the ranges are in proportion: the header has the unit."""
+    def _linear(self, table: Rows) -> list[Target]:
+        """The fields that ranges are linear in, not by their own scale: those in metres, shifted or stretched by a correction; and
+        the elements of arrays without a unit to which ranges are in proportion, since the header has the unit."""
         found = []
         for path, info in table.schema.fields.items():
-            if info.unit or info.kind != "int" or not info.axes:
+            metres = factor(info.unit, "m") is not None
+            if not metres and (info.unit or info.kind != "int" or not info.axes):
                 continue
-            once, twice = self._answers(table, path, PROBE, 2 * PROBE)
-            for spot in self._inner(table, once):
-                single, double = _part(once, spot), _part(twice, spot)
-                if ((single > 0) & np.isclose(double, 2 * single)).any():
+            answers = self._answers(table, path, PROBE, 2 * PROBE, 3 * PROBE)
+            for spot in self._inner(table, answers[0]):
+                once, twice, thrice = (_part(answer, spot) for answer in answers)
+                even = np.isclose(thrice - twice, twice - once) & (twice > once) & (once > 0)
+                if (even & (metres | np.isclose(twice, 2 * once))).any():
                     found.append(Target(path, spot, None))
         return found
 
@@ -186,9 +189,12 @@ class Measurement:
         store(table, path, before)
         return answers
 
-    def _step(self, table: Rows, target: Target) -> Any:
-        """Metres of one raw step, a number or for each packet."""
-        return _part(self._answers(table, target.path, PROBE)[0], target.inner) / PROBE if target.step is None else target.step
+    def _step(self, table: Rows, target: Target) -> tuple[Any, Any]:
+        """Metres of one raw step and of raw 0, numbers or for each point."""
+        if target.step is not None:
+            return target.step, target.zero
+        once, twice = (_part(answer, target.inner) for answer in self._answers(table, target.path, PROBE, 2 * PROBE))
+        return (twice - once) / PROBE, 2 * once - twice
 
     def _inner(self, table: Rows, answer: Floats) -> list[tuple[int, ...]]:
         """The indices of the axes of the points that are further in than those of the fields."""
