@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.datagrams import Datagrams
-from lidarspec.errors import UsageError
+from lidarspec.errors import UsageError, refuse_text
 from lidarspec.found import Counters, Found, Spans, packed
 from lidarspec.frames.codecs import Codec, codec
 from lidarspec.framing import Framing, Mode, Piece
@@ -272,5 +272,10 @@ def spans_of(decoder: Decoder, data: Any) -> list[Spans]:
 
 
 def is_stream(data: Any) -> bool:
-    """Whether an input is one run of bytes, not datagrams."""
+    """Whether an input is one run of bytes, not datagrams.
+
+    Raises:
+        UsageError: for a text or a path.
+    """
+    refuse_text(data)
     return isinstance(data, bytes | bytearray | memoryview)

@@ -7,6 +7,7 @@ own text from typed arguments, so that the place of a fault can be read from the
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable
 
 
@@ -60,24 +61,33 @@ class UsageError(LidarSpecError):
     """A call that cannot be carried out as it was made: the caller's fault."""
 
 
-def did_you_mean(name: str, known: Iterable[str]) -> str:
+def did_you_mean(name: str, known: Iterable[str], *, alike: float = 0.5) -> str:
     """A closing clause such as ``; did you mean 'speed'?``, or an empty text where nothing is close."""
     import difflib  # for the one call in many thousands that has to suggest something
 
     by_letters = {other.lower(): other for other in known}
-    close = difflib.get_close_matches(name.lower(), list(by_letters), n=1, cutoff=0.5)
+    close = difflib.get_close_matches(name.lower(), list(by_letters), n=1, cutoff=alike)
     return f"; did you mean {by_letters[close[0]]!r}?" if close else ""
+
+
+def refuse_text(data: object) -> None:
+    """Raise `UsageError` for a text or a path where the bytes themselves are taken."""
+    if isinstance(data, str | os.PathLike):
+        raise UsageError(
+            f"bytes are taken, not {type(data).__name__}: bytes.fromhex(...) of hexadecimal text, lidarspec.open(...) of a file"
+        )
 
 
 class UnknownName(UsageError):
     """A name that is not among those known; the message suggests the closest one."""
 
     what = "name"
+    alike = 0.5
 
     def __init__(self, name: str, known: Iterable[str] = (), *, place: str = "", hint: str = "") -> None:
         known = sorted(known)
         self.name, self.known, self.place = name, tuple(known), place
-        suggestion = did_you_mean(name, known)
+        suggestion = did_you_mean(name, known, alike=self.alike)
         listed = f" (known: {', '.join(known)})" if known and not suggestion and len(known) <= 12 else ""
         where = f"{place}: " if place else ""
         super().__init__(f"{where}unknown {self.what} {name!r}{suggestion}{listed}{hint}")
@@ -117,6 +127,7 @@ class UnknownFormat(UnknownName):
     """No file format is known by this suffix."""
 
     what = "format"
+    alike = 0.6  # suffixes are short, and half of their letters say nothing
 
 
 class MissingField(UsageError):

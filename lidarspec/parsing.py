@@ -9,7 +9,7 @@ from typing import Any
 import construct
 
 from lidarspec.construction import Mismatch, clean, field_path
-from lidarspec.errors import SpecError, UnknownFrame, WireError
+from lidarspec.errors import SpecError, UnknownFrame, WireError, refuse_text
 from lidarspec.frames.codecs import CompiledCodec, codec
 from lidarspec.frames.headers import Refused
 from lidarspec.frames.layout import Layout
@@ -19,7 +19,9 @@ from lidarspec.spec import Sensor
 
 def parse(sensor: Sensor, data: bytes, *, frame: str | None = None, verify: bool = True) -> Any:
     """See `Sensor.parse`."""
-    data = bytes(data)
+    if not isinstance(data, bytes):
+        refuse_text(data)
+        data = bytes(data)
     try:
         for parser in _parsers(sensor, frame, len(data)):
             found = parser(data)
@@ -47,7 +49,9 @@ def _parsers(sensor: Sensor, frame: str | None, size: int) -> list[Unpack]:
 
 def parse_typed(sensor: Sensor, data: bytes, *, frame: str | None = None, verify: bool = True) -> tuple[str, Any]:
     """The name of the frame type, and the parsed frame."""
-    data = bytes(data)
+    if not isinstance(data, bytes):
+        refuse_text(data)
+        data = bytes(data)
     if frame is not None:
         if frame not in sensor.frames:
             raise UnknownFrame(frame, sensor.frames, place=sensor.id)

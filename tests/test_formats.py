@@ -114,7 +114,15 @@ def test_a_folder_that_is_not_there_is_a_source_error(tmp_path: Path) -> None:
         write(tmp_path / "none" / "a.csv", [scan(0)])
 
 
-@pytest.mark.parametrize(("name", "told"), [("a.cvs", "did you mean '.csv'"), ("a", "unknown format 'a'"), ("a.np", "did you mean '.npz'")])
+@pytest.mark.parametrize(
+    ("name", "told"),
+    [
+        ("a.cvs", "did you mean '.csv'"),
+        ("a", "unknown format 'a'"),
+        ("a.np", "did you mean '.npz'"),
+        ("a.pcd", r"unknown format '.pcd' \(known: "),
+    ],
+)
 def test_an_unknown_suffix_gets_a_suggestion(name: str, told: str) -> None:
     with pytest.raises(UnknownFormat, match=told):
         format_of(name)

@@ -177,3 +177,11 @@ class TestClocks:
             if isinstance(node, ast.Call) and (name := ast.unparse(node.func)) in WALL
         }
         assert found == STAMPED
+
+
+@pytest.mark.parametrize("text", ["54 2c", Path("drive.pcap")], ids=["text", "path"])
+@pytest.mark.parametrize("method", ["parse", "decode", "split", "scans"])
+def test_text_where_bytes_are_taken_is_the_callers_fault(method: str, text: object) -> None:
+    sensor = SHAPES["shape-count"]
+    with pytest.raises(ls.UsageError, match=r"bytes are taken, not .*: bytes.fromhex"):
+        list(getattr(sensor, method)(text))
