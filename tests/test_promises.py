@@ -31,9 +31,9 @@ TURNING = SHAPES["shape-commands"]
 WALL = {"time.time", "time.time_ns", "datetime.now", "datetime.utcnow"}
 STAMPED = {
     ("cli/record.py", "time.time_ns"),
-    ("live.py", "time.time_ns"),
-    ("recordings.py", "datetime.now"),
-    ("recordings.py", "time.time_ns"),
+    ("inputs/live.py", "time.time_ns"),
+    ("recording/recordings.py", "datetime.now"),
+    ("recording/recordings.py", "time.time_ns"),
     ("transports/live.py", "time.time_ns"),
     ("transports/serving.py", "time.time_ns"),
     ("transports/udp.py", "time.time_ns"),

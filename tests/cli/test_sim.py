@@ -104,7 +104,6 @@ def test_the_plug_is_pulled_and_said_to_be(tmp_path: Path) -> None:
         ((STL, "--to", "udp://"), 2, "lidarspec sim ldrobot-stl27l --to pty"),
         (("hesai-xt32", "--to", "pty"), 2, "lidarspec sim hesai-xt32 --to udp://127.0.0.1"),
         ((STL, "--to", "made.csv"), 2, "is no place: pty, udp://HOST:PORT"),
-        ((STL, "--to", "made.pcap"), 2, "byte stream"),
         ((STL, "--rate", "0.0x"), 2, "rate is a number above 0"),
         ((STL, "--errors", "3"), 2, "is no share"),
         ((STL, "--reorder", "3"), 2, "keep their order"),
