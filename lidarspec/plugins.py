@@ -317,7 +317,7 @@ def _from_file(text: str) -> Sensor:
     except (Exception, SystemExit) as error:
         raise SpecError(f"{type(error).__name__}: {error}", path=str(file)) from error
     if not ids:
-        raise SpecError("lidarspec_sensors returns no sensor", path=str(file))
+        raise SpecError("there is no function lidarspec_sensors, marked @hookimpl, that returns a sensor", path=str(file))
     if len(ids) > 1 and not wanted:
         raise UsageError(f"{file} describes several sensors, name one: {', '.join(f'{file}:{name}' for name in ids)}")
     chosen = local._loaded.get(wanted or ids[0])

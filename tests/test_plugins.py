@@ -234,7 +234,7 @@ def test_a_file_that_is_no_sensor_is_a_clear_error(tmp_path: Path) -> None:
         "import a_library_that_nobody_has": "a_library_that_nobody_has",
         "def broken(:": "SyntaxError",
         "raise SystemExit(3)": "SystemExit",
-        "": "no sensor",
+        "": "no function lidarspec_sensors",
         "from lidarspec import hookimpl\n@hookimpl\ndef lidarspec_sensors():\n    return [1 / 0]": "ZeroDivisionError",
     }.items():
         file.write_text(text, encoding="utf-8")

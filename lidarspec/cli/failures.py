@@ -77,6 +77,8 @@ def _following(error: Exception, command: str, verb: str) -> str:
 
         return "lidarspec plugins" if any(plugin.error for plugin in registry().plugins) else command
     sensor = _sensor(error)
+    if isinstance(error, errors.SpecError) and error.path.endswith(".py"):
+        return f"lidarspec check {error.path}"
     if "{sensor}" in command and not sensor:
         return "lidarspec plugins" if isinstance(error, errors.SpecError) else "lidarspec sensors"
     return command.format(sensor=sensor, verb=verb).replace("  ", " ")

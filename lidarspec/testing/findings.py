@@ -42,9 +42,10 @@ class Finding:
         place = " ".join(part for part in (self.sensor, self.path) if part)
         file = Path(self.file)
         file = file.relative_to(Path.cwd()) if file.is_relative_to(Path.cwd()) else file
-        where = f" ({file}:{self.line})" if self.file else ""
+        where = f"{file}:{self.line}" if self.line else str(file) if self.file else ""
+        where = f"{place} ({where})" if place and where else place or where
         rule = self.rule
-        return f"{self.code} {rule.title}\n  where  {place}{where}\n  what   {self.what}\n  why    {rule.why}\n  write  {rule.write}"
+        return f"{self.code} {rule.title}\n  where  {where}\n  what   {self.what}\n  why    {rule.why}\n  write  {rule.write}"
 
 
 class Violation(AssertionError):

@@ -26,7 +26,7 @@ SAID = (
     ("lacks @hookimpl", "LS003"),
     ("another sensor has this id", "LS005"),
     ("returns sensors, not", "LS006"),
-    ("returns no sensor", "LS006"),
+    ("that returns a sensor", "LS006"),
     ("definition", "LS004"),
     ("lidarspec_checksum for", "LS010"),
 )
@@ -76,7 +76,7 @@ def _file(file: Path) -> Target:
     try:
         found.sensors = _added(file_module(file), str(file))
         if not found.sensors:
-            raise SpecError("lidarspec_sensors returns no sensor")
+            raise SpecError("there is no function lidarspec_sensors, marked @hookimpl, that returns a sensor")
     except SourceError:
         raise
     except (Exception, SystemExit) as error:
@@ -154,7 +154,7 @@ def loading(error: BaseException, files: list[Path]) -> Finding:
     own = [spot for spot in spots if any(Path(spot[0]) == file.resolve() or Path(spot[0]) == file for file in files)]
     if isinstance(cause, SyntaxError) and cause.filename:
         own = [(cause.filename, cause.lineno or 0)]
-    file, line = own[-1] if own else ("", 0)
+    file, line = own[-1] if own else (str(files[0]) if len(files) == 1 else "", 0)
     path = error.path if isinstance(error, SpecError) and error.rule else ""
     sensor = getattr(error, "sensor", "")
     text = error.reason if isinstance(error, SpecError) and cause is error else f"{type(cause).__name__}: {cause}"

@@ -67,3 +67,11 @@ def test_every_rule_has_its_heading() -> None:
     for rule in RULES.values():
         assert rule.why in page
         assert rule.write in page
+
+
+def test_what_keeps_a_file_from_being_a_sensor_is_said_with_its_place(tmp_path: Path) -> None:
+    file = tmp_path / "empty.py"
+    file.write_text("import lidarspec\n", encoding="utf-8")
+    said = "there is no function lidarspec_sensors, marked @hookimpl, that returns a sensor"
+    assert f"  where  {file}\n  what   {said}\n" in ran("check", file, code=1).stdout
+    assert ran("show", file, code=1).stderr.splitlines() == [f"{file}: {said}", f"  next: lidarspec check {file}"]
