@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from contextlib import AbstractContextManager
+import contextlib
+import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 
 from lidarspec.plugins import sensor as named_sensor
@@ -13,6 +15,7 @@ from lidarspec.spec import Sensor
 from lidarspec.transports.serving import Served, door
 
 
+@contextlib.contextmanager
 def virtual_port(
     sensor: str | Sensor,
     *,
@@ -22,16 +25,17 @@ def virtual_port(
     seed: int = 0,
     rate: float = 1.0,
     faults: Faults | None = None,
-) -> AbstractContextManager[Served]:
+) -> Iterator[Served]:
     """A simulated sensor on a real port, as a context: a pseudo-terminal, or a socket.
 
     Args:
         sensor: an id or a Sensor.
         to: "pty", "udp://127.0.0.1:PORT" or "tcp://127.0.0.1:PORT"; TCP port 0 takes one that is free.
-        link: a symbolic link that leads to the pseudo-terminal, also after it was unplugged and came back.
+        link: a symbolic link that leads to the pseudo-terminal, also after it was unplugged and came back; by default one in a folder
+            of its own.
         scene, seed, rate, faults: as of `SimulatedDevice`.
 
-    Returns:
+    Yields:
         What has a `path` to open, the `device` with the names of the commands that it `heard`, `unplug` and `plug`.
 
     Raises:
@@ -39,4 +43,8 @@ def virtual_port(
     """
     known = sensor if isinstance(sensor, Sensor) else named_sensor(sensor)
     device = SimulatedDevice(known, scene=scene, seed=seed, rate=rate, faults=faults)
-    return Served(device, door(known, to, link))
+    with contextlib.ExitStack() as stack:
+        if to == "pty" and link is None:
+            # The system names each pseudo-terminal anew, and may give the old name to somebody else's meanwhile.
+            link = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="lidarspec-port-"))) / "port"
+        yield stack.enter_context(Served(device, door(known, to, link)))
