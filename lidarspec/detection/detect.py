@@ -112,12 +112,6 @@ def verdict(heard: Heard) -> Verdict:
     return Verdict(heard, (*alike, *others), tuple(alike))
 
 
-def best_verdict(heard: Sequence[Heard]) -> Verdict:
-    """The verdict on the one of several that says most: that with the largest share of bytes in frames."""
-    verdicts = [verdict(one) for one in heard] or [Verdict(Heard(""), (), ())]
-    return max(verdicts, key=lambda one: (one.scores[0].share if one.scores else 0.0, one.heard.size))
-
-
 def verdicts(source: str | Path, *, seconds: float | None = None) -> list[Verdict]:
     """Whose bytes come from a source, one verdict for each sender; of a serial port, at the baud rate that fits best.
 

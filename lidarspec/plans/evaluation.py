@@ -95,8 +95,8 @@ class Share:
 class Points:
     """The columns of the points of a batch, made when they are asked for; what a `LazyCloud` reads from."""
 
-    def __init__(self, packets: Packets, shares: list[Share], ready: int, size: int, base: int) -> None:
-        self._packets, self._shares, self._ready, self.size, self._base = packets, shares, ready, size, base
+    def __init__(self, packets: Packets, shares: list[Share], size: int, base: int) -> None:
+        self._packets, self._shares, self.size, self._base = packets, shares, size, base
         self._function = points_function(packets.sensor, packets.frame)
         self._made: dict[str, NDArray[Any]] = {}
         axes = packets.sensor.vendor_axes if packets.sensor.options.get("frame") == "vendor" else None
@@ -269,7 +269,7 @@ def _laid_out(packets: Packets, shares: list[Share], batch: Batch, ready: int, b
     same = all(share.plan.shape == plan.shape for share in shares)
     organised = same and len(plan.shape) >= 2 and plan.shape[-1] > 1
     cloud = LazyCloud.of(
-        Points(packets, shares, ready, size, base),
+        Points(packets, shares, size, base),
         stamp_ns=base,
         shape=(ready * math.prod(plan.shape[:-1]), plan.shape[-1]) if organised else None,
         nominal=np.bool_(batch.nominal or plan.result.nominal),
