@@ -29,6 +29,8 @@ from lidarspec.transports.serving import Served, door
 
 #: seconds that the scans may take beyond those that they last.
 PATIENCE = 15.0
+#: seconds without a scan after which nothing is on the way any more.
+QUIET = 0.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,23 +103,26 @@ def _live(simulated: SimulatedDevice, path: Path, turns: int) -> tuple[str, tupl
     if sensor.datagrams:
         port = _free_port()
         at = f"udp://{HERE}:{port}"
-        with open_device(at, sensor, start=False, record=path) as device, Served(simulated, door(sensor, at)):
-            return at, *_read(device, turns)
+        with open_device(at, sensor, start=False, record=path) as device, Served(simulated, door(sensor, at)) as served:
+            return at, *_read(device, served, turns)
     to = "pty" if has_terminals() else f"tcp://{HERE}:0"
     with (
         Served(simulated, door(sensor, to), patient=True) as served,
         open_device(served.path, sensor, start=False, record=path) as device,
     ):
-        return served.path, *_read(device, turns)
+        return served.path, *_read(device, served, turns)
 
 
-def _read(device: Device, turns: int) -> tuple[tuple[Reply, ...], tuple[Scan, ...], Counters]:
+def _read(device: Device, served: Served, turns: int) -> tuple[tuple[Reply, ...], tuple[Scan, ...], Counters]:
     replies = tuple(device.send(name) for name in device.sensor.on_open)
     limit = time.monotonic() + PATIENCE + turns
     scans: list[Scan] = []
     for scan in device.scans(wait=0.1):
         scans += [scan] if scan is not None else []
         if sum(one.complete for one in scans) >= turns:
+            served.rest()
+            while device.newest(QUIET) is not None:
+                pass  # what is still on the way counts as sent, so it is read too
             return replies, tuple(scans), device.stats
         if time.monotonic() > limit:
             break

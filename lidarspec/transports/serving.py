@@ -104,14 +104,18 @@ class Served:
         """Put it in again: the port is back, and the sensor as after power-up."""
         self._order(lambda: self.device.start(time.monotonic_ns()))
 
+    def rest(self) -> None:
+        """Send nothing more; what was sent can still be read."""
+        self._stop.set()
+        self._thread.join()
+
     def close(self) -> None:
         """End it.
 
         Raises:
             Exception: what went wrong in its thread.
         """
-        self._stop.set()
-        self._thread.join()
+        self.rest()
         self.door.close()
         if self._failure:
             raise self._failure[0]
