@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from lidarspec.frames.layout import Leaf
 from lidarspec.frames.tracing import Node
 from lidarspec.plans.expressions import only_field
-from lidarspec.plans.program import every_value
-from lidarspec.plans.windows import raw_values, window
+from lidarspec.plans.windows import every_value, raw_values, window
 
 #: how a kernel writes NumPy's functions of numbers; what is not here is computed by NumPy itself.
 TEMPLATES: dict[Any, str] = {

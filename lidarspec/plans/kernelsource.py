@@ -18,8 +18,7 @@ from lidarspec.frames.tracing import Node
 from lidarspec.plans.expressions import is_full, only_field
 from lidarspec.plans.kernelparts import TEMPLATES, is_cheap, line
 from lidarspec.plans.kernelwriter import Value, Writer
-from lidarspec.plans.program import every_value
-from lidarspec.plans.windows import window
+from lidarspec.plans.windows import every_value, window
 
 #: points of which the scratch arrays stay in the fastest cache.
 CHUNK = 2048

@@ -14,8 +14,7 @@ from lidarspec.frames.layout import Layout, Leaf
 from lidarspec.frames.tracing import Node
 from lidarspec.plans.expressions import key, last_axis
 from lidarspec.plans.kernelparts import integer
-from lidarspec.plans.program import every_value
-from lidarspec.plans.windows import window
+from lidarspec.plans.windows import every_value, window
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,8 @@ from lidarspec.plans.expressions import Term, is_full, only_field, terms
 from lidarspec.plans.kernelparts import is_number
 from lidarspec.plans.kernels import Kernel, available
 from lidarspec.plans.kerneltext import written
-from lidarspec.plans.program import Program, every_value
+from lidarspec.plans.program import Program
+from lidarspec.plans.windows import every_value
 from lidarspec.points import columns_of
 
 PointsFunction = Callable[[Any], Any]

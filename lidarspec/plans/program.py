@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -17,44 +17,13 @@ from numpy.typing import NDArray
 from lidarspec.frames.layout import Bytes2D, Layout, Leaf
 from lidarspec.frames.tracing import Node
 from lidarspec.plans.expressions import Term, is_full, key, only_field, split_level, terms
-from lidarspec.plans.windows import Blocks, Window, raw_values, window
+from lidarspec.plans.registers import TYPES, Read, Run, Step, Values, shared
+from lidarspec.plans.windows import Blocks, Window, every_value, window
 
 #: points of a chunk, so that its scratch arrays stay in the cache.
 CHUNK = 1 << 16
 TURN = 2 * np.pi
-_TYPES: dict[str, np.dtype[Any]] = {
-    "single": np.dtype(np.float32),
-    "double": np.dtype(np.float64),
-    "index": np.dtype(np.intp),
-    "flag": np.dtype(np.bool_),
-}
-
-Values = Callable[[Node], NDArray[Any]]
-
-
-@dataclass
-class Run:
-    """One execution: the frames, the low values, and the chunk under way."""
-
-    rows: Bytes2D
-    values: Values
-    views: list[NDArray[Any]] = field(default_factory=list)
-    start: int = 0
-    stop: int = 0
-    prepared: dict[int, Any] = field(default_factory=dict)
-
-    def part(self, array: NDArray[Any]) -> NDArray[Any]:
-        """The chunk's packets of values that each packet has, or that all share."""
-        return array[self.start : self.stop] if len(array) > 1 else array
-
-
-@dataclass(frozen=True, eq=False)
-class Step:
-    """One call: `run(execution, output)`, which reads registers by their numbers."""
-
-    text: str
-    run: Callable[[Run, NDArray[Any]], None]
-    output: int
+_NOTHING = np.empty(0)
 
 
 class Program:
@@ -97,7 +66,7 @@ class Program:
             return self._call("multiply", "single", np.multiply, first, second)
         if node.kind == "call" and node.function in (np.cos, np.sin):
             angle = self._once(("angle", node.args[0]), lambda: self._angle(node.args[0]))
-            return self._call(node.function.__name__, "single", node.function, self._read(angle))
+            return self._call(node.function.__name__, "single", node.function, Read(angle))
         if node.kind == "call" and node.function is np.add and any(not isinstance(arg, Node) for arg in node.args):
             first, second = (self._factor(arg) for arg in node.args)
             return self._call("add", "single", np.add, first, second)
@@ -134,13 +103,13 @@ class Program:
         index = self._once(("index", seen), lambda: self._load(leaf, seen, seen.dtype, "index"))
         table = self._table(node, leaf, seen, kind)
         text = f"{node.path or source.path}: table of {len(table)} by {8 * seen.size} bits"
-        read = self._read(index)
-        return self._step(text, kind, lambda run, out: table.take(read(run), out=out, mode="clip"))
+        read = Read(index)
+        return self._step(text, kind, lambda run, out: table.take(read(run), out=out, mode="clip"), read)
 
     def _table(self, node: Node, leaf: Leaf, seen: Window, kind: str) -> NDArray[Any]:
         name = (kind, seen.offset - leaf.offset, seen.size, leaf.size, key(node))
         if name not in self._tables:
-            self._tables[name] = np.ascontiguousarray(np.asarray(every_value(node, leaf)), _TYPES[kind])
+            self._tables[name] = np.ascontiguousarray(np.asarray(every_value(node, leaf)), TYPES[kind])
         return self._tables[name]
 
     def _load(self, leaf: Leaf, seen: Window, dtype: np.dtype[Any], kind: str) -> int:
@@ -169,7 +138,7 @@ class Program:
     def _angle(self, value: Node) -> int:
         """An angle in float32, reduced to half a turn either way before it loses precision."""
         angle, turns = self.double(value), self._register("double")
-        read = self._read(angle)
+        read = Read(angle)
 
         def run(execution: Run, out: NDArray[Any]) -> None:
             radians, whole = read(execution), execution.views[turns]
@@ -179,7 +148,7 @@ class Program:
             np.subtract(radians, whole, out=whole)
             np.copyto(out, whole, casting="same_kind")
 
-        return self._step("reduce to half a turn", "single", run)
+        return self._step("reduce to half a turn", "single", run, read, Read(turns))
 
     def _sum(self, node: Node, parts: list[Term]) -> int | None:
         """A sum: one matrix product for what is low, and what is full added to it."""
@@ -210,7 +179,7 @@ class Program:
 
         found = self._step(f"sum of {len(flat)} products", "double", run)
         for part in full:
-            found = self._call("add", "double", np.add, self._read(found), self._read(self._times(part)))
+            found = self._call("add", "double", np.add, Read(found), Read(self._times(part)))
         return found
 
     def _times(self, part: Term) -> int:
@@ -218,26 +187,27 @@ class Program:
         made = self.double(part.full)
         if part.row == 1:
             return made
-        factor, read = float(part.row), self._read(made)
-        return self._step(f"times {factor:.6g}", "double", lambda run, out: np.multiply(read(run), factor, out=out))
+        factor, read = float(part.row), Read(made)
+        return self._step(f"times {factor:.6g}", "double", lambda run, out: np.multiply(read(run), factor, out=out), read)
 
     def _plain(self, node: Node, kind: str) -> int:
         """Any other function of arrays, as NumPy evaluates it."""
         depth = max(len(arg.shape) for arg in node.args if isinstance(arg, Node))
         reads = [self._argument(arg, depth) for arg in node.args]
+        used = [Read(self.double(arg)) for arg in node.args if is_full(arg, self.width)]
         function, shape = node.function, node.shape
 
         def run(execution: Run, out: NDArray[Any]) -> None:
             found = function(*(read(execution) for read in reads))
             out.reshape(-1, *shape)[...] = found
 
-        return self._step(f"{getattr(function, '__name__', 'function')} as it stands", kind, run)
+        return self._step(f"{getattr(function, '__name__', 'function')} as it stands", kind, run, *used)
 
     def _argument(self, value: Any, depth: int) -> Callable[[Run], Any]:
         if not isinstance(value, Node):
             return lambda run: value
         if is_full(value, self.width):
-            read, shape = self._read(self.double(value)), (*value.shape, *(1,) * (depth - len(value.shape)))
+            read, shape = Read(self.double(value)), (*value.shape, *(1,) * (depth - len(value.shape)))
             return lambda run: read(run).reshape(-1, *shape)
         self.low.append(value)
         return lambda run: _deep(run.part(run.values(value)), depth)
@@ -245,16 +215,16 @@ class Program:
     def _factor(self, value: Any) -> Callable[[Run], Any]:
         """A factor of a float32 product: a register, a number, or a row repeated for the whole chunk."""
         if is_full(value, self.width):
-            return self._read(self.single(value))
+            return Read(self.single(value))
         if not isinstance(value, Node) and np.size(value) == 1:
             number = np.float32(np.asarray(value).reshape(()))
             return lambda run: number
-        return self._read(self._once(("row", id(value)), lambda: self._spread(value, "single")))
+        return Read(self._once(("row", id(value)), lambda: self._spread(value, "single")))
 
     def _spread(self, value: Any, kind: str) -> int:
         """What is not full, for every point."""
         if not isinstance(value, Node):
-            row = np.broadcast_to(np.asarray(value, _TYPES[kind]), self.shape).reshape(-1)
+            row = np.broadcast_to(np.asarray(value, TYPES[kind]), self.shape).reshape(-1)
             tile = np.tile(row, self.chunk)
             found = self._step("the same in every packet", kind, lambda run, out: None)
             self._tiles[found] = tile
@@ -268,18 +238,15 @@ class Program:
         return self._step("computed plainly before", kind, run)
 
     def _cast(self, register: int) -> int:
-        read = self._read(register)
-        return self._step("as float32", "single", lambda run, out: np.copyto(out, read(run), casting="same_kind"))
+        read = Read(register)
+        return self._step("as float32", "single", lambda run, out: np.copyto(out, read(run), casting="same_kind"), read)
 
     def _call(self, text: str, kind: str, function: Any, *reads: Callable[[Run], Any]) -> int:
-        return self._step(text, kind, lambda run, out: function(*(read(run) for read in reads), out=out))
+        return self._step(text, kind, lambda run, out: function(*(read(run) for read in reads), out=out), *reads)
 
-    def _read(self, register: int) -> Callable[[Run], Any]:
-        return lambda run: run.views[register]
-
-    def _step(self, text: str, kind: str, run: Callable[[Run, NDArray[Any]], Any]) -> int:
+    def _step(self, text: str, kind: str, run: Callable[[Run, NDArray[Any]], Any], *reads: Callable[[Run], Any]) -> int:
         output = self._register(kind)
-        self.steps.append(Step(text, run, output))
+        self.steps.append(Step(text, run, output, tuple(read.register for read in reads if isinstance(read, Read))))
         return output
 
     def _register(self, kind: str) -> int:
@@ -299,14 +266,31 @@ class Program:
             values: the plain result of a node for the whole batch, shape (n or 1, ...).
         """
         number = len(rows)
-        found = {name: np.empty(number * self.width, _TYPES[self.kinds[register]]) for name, register in self.outputs.items()}
+        found = {name: np.empty(number * self.width, TYPES[self.kinds[register]]) for name, register in self.outputs.items()}
         size = min(self.chunk, number) * self.width
-        scratch = [self._tiles[index] if index in self._tiles else np.empty(size, _TYPES[kind]) for index, kind in enumerate(self.kinds)]
+        scratch = self._scratch(size)
         execution = Run(rows, values)
         execution.prepared = {place: (blocks.source(rows), -1) for place, blocks in enumerate(self._blocks)}
         with np.errstate(all="ignore"):
             for start in range(0, number, self.chunk):
                 self._chunk(execution, scratch, found, start, min(start + self.chunk, number))
+        return found
+
+    @cached_property
+    def _slots(self) -> list[int]:
+        """Which registers share memory; asked for when no column is added any more."""
+        return shared(self.steps, self.kinds, {*self.outputs.values(), *self._tiles})
+
+    def _scratch(self, size: int) -> list[NDArray[Any]]:
+        """An array for each register; those that are not needed at the same time share one."""
+        made, found = dict[int, NDArray[Any]](), list[NDArray[Any]]()
+        for register, (slot, kind) in enumerate(zip(self._slots, self.kinds, strict=True)):
+            if slot < 0:
+                found.append(self._tiles.get(register, _NOTHING))
+                continue
+            if slot not in made:
+                made[slot] = np.empty(size, TYPES[kind])
+            found.append(made[slot])
         return found
 
     def _chunk(self, run: Run, scratch: list[NDArray[Any]], found: dict[str, NDArray[Any]], start: int, stop: int) -> None:
@@ -327,22 +311,3 @@ class Program:
 def _deep(array: NDArray[Any], depth: int) -> NDArray[Any]:
     """Values of packets with as many axes as the points have."""
     return array.reshape(*array.shape, *(1,) * (1 + depth - array.ndim))
-
-
-def every_value(node: Node, leaf: Leaf) -> NDArray[Any] | None:
-    """An expression of one field for every value of the field's window, in its order; None where it has no window."""
-    seen = window(leaf)
-    if seen is None:
-        return None
-    raw = raw_values(leaf, seen).astype(np.float64)
-    physical = raw * leaf.info.scale + leaf.info.offset if leaf.info.scaled else raw
-    with np.errstate(all="ignore"):
-        return np.broadcast_to(_evaluated(node, physical), raw.shape)
-
-
-def _evaluated(node: Node, values: NDArray[np.float64]) -> Any:
-    """An expression of one field for given values of it."""
-    if node.kind == "field":
-        return values
-    args = [_evaluated(arg, values) if isinstance(arg, Node) else np.asarray(arg).reshape(()) for arg in node.args]
-    return node.function(*args)

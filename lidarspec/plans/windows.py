@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.frames.layout import Bytes2D, Leaf
+from lidarspec.frames.tracing import Node
 
 
 @dataclass(frozen=True)
@@ -47,6 +48,25 @@ def raw_values(leaf: Leaf, seen: Window) -> NDArray[Any]:
     frames[:, start : start + seen.size] = codes.view(np.uint8).reshape(len(codes), seen.size)
     single = Leaf(leaf.info, 0, (), (), leaf.size, leaf.wire, leaf.elements)
     return single.load(frames)
+
+
+def every_value(node: Node, leaf: Leaf) -> NDArray[Any] | None:
+    """An expression of one field for every value of the field's window, in its order; None where it has no window."""
+    seen = window(leaf)
+    if seen is None:
+        return None
+    raw = raw_values(leaf, seen).astype(np.float64)
+    physical = raw * leaf.info.scale + leaf.info.offset if leaf.info.scaled else raw
+    with np.errstate(all="ignore"):
+        return np.broadcast_to(_evaluated(node, physical), raw.shape)
+
+
+def _evaluated(node: Node, values: NDArray[np.float64]) -> Any:
+    """An expression of one field for given values of it."""
+    if node.kind == "field":
+        return values
+    args = [_evaluated(arg, values) if isinstance(arg, Node) else np.asarray(arg).reshape(()) for arg in node.args]
+    return node.function(*args)
 
 
 class Blocks:
