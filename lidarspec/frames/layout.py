@@ -181,9 +181,9 @@ class Seal:
 _faster: list[Callable[[Seal, Bytes2D], NDArray[np.uint64] | None]] = []
 
 
-def install_faster(function: Callable[[Seal, Bytes2D], NDArray[np.uint64] | None]) -> None:
-    """Have checksums computed by another function first; what it gives None for is computed here."""
-    _faster[:] = [function]
+def install_faster(function: Callable[[Seal, Bytes2D], NDArray[np.uint64] | None] | None) -> None:
+    """Have checksums computed by another function first; what it gives None for is computed here. None ends it."""
+    _faster[:] = [function] if function is not None else []
 
 
 @dataclass(frozen=True, eq=False)
