@@ -51,9 +51,14 @@ class Kernel:
         self._function: Any = None
 
     @property
+    def is_ready(self) -> bool:
+        """Whether the compiled code is at hand."""
+        return self._function is not None
+
+    @property
     def is_compiled(self) -> bool:
         """Whether the compiled code is at hand or on disk."""
-        return self._function is not None or compiled_before(self._text.source)
+        return self.is_ready or compiled_before(self._text.source)
 
     def compile(self) -> None:
         """Have the code at hand."""
