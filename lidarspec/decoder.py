@@ -17,6 +17,7 @@ from lidarspec.datagrams import Datagrams
 from lidarspec.errors import UsageError, refuse_text
 from lidarspec.found import Counters, Found, Spans, packed
 from lidarspec.frames.codecs import Codec, codec
+from lidarspec.frames.layout import Sums, summed_by
 from lidarspec.framing import Framing, Mode, Piece
 from lidarspec.runs import cut
 from lidarspec.spec import Sensor
@@ -44,14 +45,15 @@ class Decoder:
         stream: a byte stream, or datagrams one for each `feed`.
         interpreted: let construct judge every candidate.
         backend: what makes points of its packets, "auto", "numpy" or "jit".
+        sums: what computes checksums; by default their algorithms.
     """
 
-    def __init__(self, sensor: Sensor, *, stream: bool, interpreted: bool = False, backend: str = "auto") -> None:
+    def __init__(self, sensor: Sensor, *, stream: bool, interpreted: bool = False, backend: str = "auto", sums: Sums | None = None) -> None:
         incoming = {name: frame for name, frame in sensor.frames.items() if frame.direction == "in"}
         if not incoming:
             raise UsageError(f"{sensor.id} has no frames yet: configure it with its file first")
         self.sensor, self.stream, self.interpreted, self.backend = sensor, stream, interpreted, backend
-        self.stats = Counters()
+        self.stats, self._sums = Counters(), sums
         self._codecs: dict[str, Codec] = {name: codec(frame, interpreted=interpreted) for name, frame in incoming.items()}
         self._framing = Framing(self._codecs)
         self._mode = Mode(after=_first_mode(sensor))
@@ -128,7 +130,8 @@ class Decoder:
         offsets = _starts(sizes, self._base)
         total = int(offsets[-1] + sizes[-1]) - self._base if len(offsets) else 0
         self.stats.bytes_in += total
-        kinds = self._datagrams.kinds(buffer, starts, sizes, self._mode)
+        with summed_by(self._sums):
+            kinds = self._datagrams.kinds(buffer, starts, sizes, self._mode)
         self._rejected(self._datagrams.rejected, self._datagrams.errors)
         self._base += total
         gaps = np.broadcast_to(np.int64(0), len(starts))
@@ -165,7 +168,8 @@ class Decoder:
             part = buffer[start : start + self._size]
             last = start + len(part) == len(buffer)
             part = part if lasting else part.copy()
-            piece = cut(self._framing, part, self._mode, base=self._base, final=final and last)
+            with summed_by(self._sums):
+                piece = cut(self._framing, part, self._mode, base=self._base, final=final and last)
             spans = self._entered(part, piece, at)
             found += [spans] if len(spans.kinds) else []  # one without frames would keep its bytes
             start, self._base = start + piece.end, self._base + piece.end

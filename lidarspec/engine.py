@@ -12,7 +12,7 @@ from lidarspec.decoder import Decoder, Found, backend as checked_backend, is_str
 from lidarspec.errors import MissingField, OutOfRange, SpecError, UnknownCommand, UnknownField, UnknownOption, UsageError
 from lidarspec.frames.codecs import codec
 from lidarspec.packets import Packets
-from lidarspec.plans.kernelsums import take_over
+from lidarspec.plans import kernelsums
 from lidarspec.plugins import registry
 from lidarspec.scans import Scan, scans_of
 from lidarspec.spec import Configure, Sensor, replaced
@@ -59,10 +59,9 @@ class StandardEngine:
 
     def decoder(self, sensor: Sensor, *, stream: bool | None, backend: str) -> Decoder:
         chosen = checked_backend(backend)
-        if chosen == "jit":
-            take_over()
+        sums = kernelsums.compiled() if chosen == "jit" else None
         stream = not sensor.datagrams if stream is None else stream
-        return Decoder(sensor, stream=stream, interpreted=chosen == "construct", backend=chosen)
+        return Decoder(sensor, stream=stream, interpreted=chosen == "construct", backend=chosen, sums=sums)
 
     def split(self, sensor: Sensor, data: Any, *, backend: str) -> list[Found]:
         found = spans_of(self.decoder(sensor, stream=is_stream(data), backend=backend), data)

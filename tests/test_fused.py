@@ -182,6 +182,20 @@ def test_compiled_checksums_are_those_of_the_algorithm(algorithm: Checksum, span
     np.testing.assert_array_equal(found, algorithm.batch(covered), strict=True)
 
 
+def test_checksums_are_compiled_for_the_decoder_that_asks_and_no_other(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[int] = []
+    monkeypatch.setattr(kernelsums, "checksums", lambda seal, rows: asked.append(len(rows)))
+    for name in ("ldrobot-stl27l", "shape-count"):
+        data = b"".join(frames_of(name))
+        compiled, plain = (SENSORS[name].decoder(backend=backend) for backend in ("jit", "numpy"))
+        before = len(asked)
+        assert compiled.feed(data)
+        assert len(asked) > before
+        before = len(asked)
+        assert plain.feed(data)
+        assert len(asked) == before
+
+
 def test_streams_are_cut_alike() -> None:
     sensor = SENSORS["ldrobot-stl27l"]
     data = b"".join(b"".join(frames_of("ldrobot-stl27l")) + b"T,T" for _ in range(400))

@@ -5,7 +5,9 @@ A `Layout` holds for frames of one kind of header; `lidarspec.frames.walk` makes
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import contextlib
+from collections.abc import Callable, Iterator, Mapping
+from contextvars import ContextVar
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
@@ -140,10 +142,10 @@ class Seal:
 
     def computed(self, rows: Bytes2D) -> NDArray[np.uint64]:
         """The values that should stand there, (n,)."""
-        for function in _faster:
-            found = function(self, rows)
-            if found is not None:
-                return found
+        sums = _SUMS.get()
+        found = sums(self, rows) if sums is not None else None
+        if found is not None:
+            return found
         parts = [rows[:, a:b] for a, b in self.spans]
         return self.algorithm.batch(parts[0] if len(parts) == 1 else np.concatenate(parts, axis=1))
 
@@ -178,12 +180,19 @@ class Seal:
         return right | np.isin(stored, np.array(self.absent, np.uint64)) if self.absent else right
 
 
-_faster: list[Callable[[Seal, Bytes2D], NDArray[np.uint64] | None]] = []
+#: the checksums of frames, (n,); None where the algorithm is to compute them itself.
+Sums = Callable[[Seal, Bytes2D], NDArray[np.uint64] | None]
+_SUMS: ContextVar[Sums | None] = ContextVar("sums", default=None)
 
 
-def install_faster(function: Callable[[Seal, Bytes2D], NDArray[np.uint64] | None] | None) -> None:
-    """Have checksums computed by another function first; what it gives None for is computed here. None ends it."""
-    _faster[:] = [function] if function is not None else []
+@contextlib.contextmanager
+def summed_by(sums: Sums | None) -> Iterator[None]:
+    """As long as it lasts, checksums are computed by this function first."""
+    token = _SUMS.set(sums)
+    try:
+        yield
+    finally:
+        _SUMS.reset(token)
 
 
 @dataclass(frozen=True, eq=False)
