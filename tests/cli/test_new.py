@@ -14,6 +14,7 @@ from typing import Any
 import pytest
 
 import lidarspec as ls
+from lidarspec.export import EXPORTS, export
 from lidarspec.scaffold import Names
 from lidarspec.simulation.simulator import simulate
 from tests.architecture import Module, private_imports
@@ -99,6 +100,14 @@ def test_its_simulation_can_be_viewed_and_recorded(made: Path) -> None:
     assert "acme-x1: Scan(720 points, 10.0 Hz" in run(made, "lidarspec", "view", "sim:acme-x1", "--once")
     run(made, "lidarspec", "record", "sim:acme-x1", "-s", "acme-x1", "-o", made / "some.lsr", "-t", "0.3s")
     assert len(run(made, "lidarspec", "read", made / "some.lsr").splitlines()) > 100
+
+
+def test_it_is_exported_to_every_other_tool(made: Path) -> None:
+    sensor = ls.sensor(made / "lidarspec_acme_x1" / "__init__.py")
+    for kind in EXPORTS:
+        text = export(kind, sensor)
+        assert "checksum" in text.lower() or "crc" in text.lower() or kind == "pyi", kind
+        assert "distance" in text, kind
 
 
 def test_the_points_are_compiled(made: Path) -> None:
