@@ -99,7 +99,7 @@ class Column(NDArrayOperatorsMixin):
     def applied(self, function: Callable[..., Any], *values: Any) -> Column:
         """`function` of arrays, lined up by axes; columns on the left, arrays by their last axes as in NumPy."""
         arrays, axes, ready = aligned(values, self.batch)
-        found = np.asarray(function(*arrays))
+        found = np.asarray(remainder(*arrays) if function is np.remainder else function(*arrays))
         names = (*axes, *(f"<{index}>" for index in range(len(axes), found.ndim - 1)))
         return Column(found, names, self.batch, ready=ready)
 
@@ -228,6 +228,17 @@ def aligned(values: tuple[Any, ...], batch: Batch) -> tuple[list[NDArray[Any]], 
             if place >= 0 and array.shape[place] != 1 and names[index] is None:
                 names[index] = chain[index] if index < len(chain) else f"<{index}>"
     return arrays, tuple(names), min((column.ready for column in columns), default=len(batch))
+
+
+def remainder(values: NDArray[Any], full: NDArray[Any]) -> NDArray[Any]:
+    """``np.remainder``, bit by bit; a quarter of the time for what is a turn away at most, as nearly all angles are."""
+    if full.ndim or not full > 0 or values.dtype != np.float64:
+        return np.remainder(values, full)
+    found: NDArray[Any] = values - full * (values >= full) + full * (values < 0)
+    far = (values < -full) | (values >= 2 * full)
+    if far.any():
+        found[far] = np.remainder(values[far], full)
+    return found
 
 
 def _position(name: str, chain: tuple[str, ...]) -> int:

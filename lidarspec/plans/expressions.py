@@ -58,6 +58,17 @@ def only_field(node: Node) -> Node | None:
     return next(iter(found.values()), None)
 
 
+def chosen(node: Node, width: int) -> tuple[Node, Any, Any] | None:
+    """The condition of a ``np.where`` that packets or blocks decide, and what it chooses from, each a number or full of one field."""
+    if node.kind != "call" or node.function is not np.where or len(node.args) != 3:
+        return None
+    condition, *options = node.args
+    fits = [only_field(o) is not None and is_full(o, width) if isinstance(o, Node) else np.size(o) == 1 for o in options]
+    if not isinstance(condition, Node) or is_full(condition, width) or not all(fits):
+        return None
+    return condition, *(o if isinstance(o, Node) else float(np.asarray(o).reshape(())) for o in options)  # type: ignore[return-value]
+
+
 def key(node: Node) -> tuple[Any, ...]:
     """What makes two expressions of one field the same."""
     if node.kind == "field":

@@ -20,7 +20,7 @@ from lidarspec.frames.layout import Layout
 from lidarspec.frames.tables import Group, Rows
 from lidarspec.frames.tracing import Node, Traced, Untraceable, trace
 from lidarspec.geometry import Polar
-from lidarspec.plans.expressions import Term, is_full, only_field, terms
+from lidarspec.plans.expressions import Term, chosen, is_full, only_field, terms
 from lidarspec.plans.kernelparts import is_number
 from lidarspec.plans.kernels import Kernel, available
 from lidarspec.plans.kerneltext import written
@@ -188,6 +188,9 @@ class Plan:
 
     def _finite(self, node: Node) -> bool:
         """Whether an expression is a number for every value that its field can have."""
+        options = chosen(node, self.width)
+        if options is not None:
+            return all(self._finite(option) if isinstance(option, Node) else bool(np.isfinite(option)) for option in options[1:])
         source = only_field(node)
         leaf = self.layout.leaves.get(source.path) if source is not None else None
         values = every_value(node, leaf) if leaf is not None else None

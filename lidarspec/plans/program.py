@@ -16,13 +16,13 @@ from numpy.typing import NDArray
 
 from lidarspec.frames.layout import Bytes2D, Layout, Leaf
 from lidarspec.frames.tracing import Node
-from lidarspec.plans.expressions import Term, is_full, key, only_field, split_level, terms
-from lidarspec.plans.registers import TYPES, Read, Run, Step, Values, shared
+from lidarspec.plans.expressions import is_full, key, last_axis, only_field
+from lidarspec.plans.registers import TYPES, Read, Run, Step, Values, deep, shared
+from lidarspec.plans.sums import Sums
 from lidarspec.plans.windows import Blocks, Window, every_value, window
 
 #: points of a chunk, so that its scratch arrays stay in the cache.
 CHUNK = 1 << 16
-TURN = 2 * np.pi
 _NOTHING = np.empty(0)
 
 
@@ -45,6 +45,7 @@ class Program:
         self.low: list[Node] = []
         self._tables, self._known = tables, dict[Any, int]()
         self._blocks: list[Blocks] = []
+        self._sums = Sums(self)
         self._tiles: dict[int, NDArray[Any]] = {}
 
     def want(self, name: str, value: Any, kind: str) -> None:
@@ -55,42 +56,39 @@ class Program:
         """The register of an expression in float32; only products and tables are computed in that precision."""
         if not is_full(value, self.width):
             return self._spread(value, "single")
-        return self._once(("single", value), lambda: self._single(value))
+        return self.once(("single", value), lambda: self._single(value))
 
     def _single(self, node: Node) -> int:
-        found = self._field(node, "single")
+        found = self.field(node, "single")
         if found is not None:
             return found
         if node.kind == "call" and node.function is np.multiply:
             first, second = (self._factor(arg) for arg in node.args)
-            return self._call("multiply", "single", np.multiply, first, second)
+            return self.call("multiply", "single", np.multiply, first, second)
         if node.kind == "call" and node.function in (np.cos, np.sin):
-            angle = self._once(("angle", node.args[0]), lambda: self._angle(node.args[0]))
-            return self._call(node.function.__name__, "single", node.function, Read(angle))
+            return self._sums.direction(node)
         if node.kind == "call" and node.function is np.add and any(not isinstance(arg, Node) for arg in node.args):
             first, second = (self._factor(arg) for arg in node.args)
-            return self._call("add", "single", np.add, first, second)
+            return self.call("add", "single", np.add, first, second)
         return self._cast(self.double(node))
 
     def double(self, value: Any) -> int:
         """The register of an expression in float64."""
         if not is_full(value, self.width):
             return self._spread(value, "double")
-        return self._once(("double", value), lambda: self._double(value))
+        return self.once(("double", value), lambda: self._double(value))
 
     def _double(self, node: Node) -> int:
         kind = "flag" if node.sample.array.dtype.kind == "b" else "double"
-        found = self._field(node, kind)
+        found = self.field(node, kind)
         if found is None and node.kind == "call":
-            parts = terms(node, self.width)
-            if len(parts) > 1 or parts[0].full is not node:
-                found = self._sum(node, parts)
+            found = self._sums.sum(node)
         if found is None and node.kind == "call":
             found = self._plain(node, kind)
         return found if found is not None else self._spread(node, kind)
 
-    def _field(self, node: Node, kind: str) -> int | None:
-        """An expression of one field: loaded as it is, or looked up by its window; None where it is neither."""
+    def field(self, node: Node, kind: str, factor: float = 1.0) -> int | None:
+        """An expression of one field, times a number: loaded as it is, or looked up by its window; None where it is neither."""
         source = only_field(node)
         leaf = self.layout.leaves.get(source.path) if source is not None and is_full(source, self.width) else None
         if leaf is None or source is None:
@@ -98,18 +96,19 @@ class Program:
         seen = window(leaf)
         if seen is None:
             return None
-        if node is source and not leaf.info.scaled and leaf.wire is not None:
+        if node is source and factor == 1 and not leaf.info.scaled and leaf.wire is not None:
             return self._load(leaf, seen, leaf.wire, kind)
-        index = self._once(("index", seen), lambda: self._load(leaf, seen, seen.dtype, "index"))
-        table = self._table(node, leaf, seen, kind)
+        index = self.once(("index", seen), lambda: self._load(leaf, seen, seen.dtype, "index"))
+        table = self._table(node, leaf, seen, kind, factor)
         text = f"{node.path or source.path}: table of {len(table)} by {8 * seen.size} bits"
         read = Read(index)
-        return self._step(text, kind, lambda run, out: table.take(read(run), out=out, mode="clip"), read)
+        return self.step(text, kind, lambda run, out: table.take(read(run), out=out, mode="wrap"), read)
 
-    def _table(self, node: Node, leaf: Leaf, seen: Window, kind: str) -> NDArray[Any]:
-        name = (kind, seen.offset - leaf.offset, seen.size, leaf.size, key(node))
+    def _table(self, node: Node, leaf: Leaf, seen: Window, kind: str, factor: float) -> NDArray[Any]:
+        name = (kind, seen.offset - leaf.offset, seen.size, leaf.size, factor, key(node))
         if name not in self._tables:
-            self._tables[name] = np.ascontiguousarray(np.asarray(every_value(node, leaf)), TYPES[kind])
+            values = np.asarray(every_value(node, leaf))
+            self._tables[name] = np.ascontiguousarray(values if factor == 1 else values * factor, TYPES[kind])
         return self._tables[name]
 
     def _load(self, leaf: Leaf, seen: Window, dtype: np.dtype[Any], kind: str) -> int:
@@ -125,7 +124,7 @@ class Program:
             column = blocks.column(seen, source, execution.start, (execution.stop - execution.start) * width)
             np.copyto(out, column if column.dtype == dtype else column.view(dtype), casting="unsafe")
 
-        return self._step(f"{leaf.info.path}: {dtype} at byte {seen.offset}", kind, run)
+        return self.step(f"{leaf.info.path}: {dtype} at byte {seen.offset}", kind, run)
 
     def _of(self, leaf: Leaf, seen: Window) -> Blocks:
         for blocks in self._blocks:
@@ -135,60 +134,17 @@ class Program:
         self._blocks.append(Blocks(alike, self.layout.size, self.chunk))
         return self._blocks[-1]
 
-    def _angle(self, value: Node) -> int:
-        """An angle in float32, reduced to half a turn either way before it loses precision."""
-        angle, turns = self.double(value), self._register("double")
-        read = Read(angle)
-
-        def run(execution: Run, out: NDArray[Any]) -> None:
-            radians, whole = read(execution), execution.views[turns]
-            np.multiply(radians, 1 / TURN, out=whole)
-            np.rint(whole, out=whole)
-            np.multiply(whole, TURN, out=whole)
-            np.subtract(radians, whole, out=whole)
-            np.copyto(out, whole, casting="same_kind")
-
-        return self._step("reduce to half a turn", "single", run, read, Read(turns))
-
-    def _sum(self, node: Node, parts: list[Term]) -> int | None:
-        """A sum: one matrix product for what is low, and what is full added to it."""
-        flat = [part for part in parts if part.full is None]
-        full = [part for part in parts if part.full is not None]
-        level = split_level(flat, len(self.shape))
-        if level is None or any(part.row.ndim for part in full) or not flat:
-            return None
-        inner = math.prod(self.shape[level:])
-        rows = np.stack([np.broadcast_to(part.row, self.shape[level:] if part.row.ndim else (inner,)).reshape(inner) for part in flat])
-        place, lows, outer = -1 - len(self.steps), [part.low for part in flat], self.shape[:level]
-        self.low += [low for low in lows if low is not None]
-
-        def prepare(run: Run) -> NDArray[np.float64]:
-            number = len(run.rows)
-            found = np.ones((number, *outer, len(lows)))
-            for index, low in enumerate(lows):
-                if low is not None:
-                    values = run.values(low)
-                    found[..., index] = values.reshape(values.shape[: 1 + level])
-            return found.reshape(number, -1, len(lows))
+    def repeated(self, text: str, kind: str, make: Callable[[Run], NDArray[Any]]) -> int:
+        """Numbers of packets or blocks, made for the batch at its first chunk, for each point of theirs."""
+        place = -1 - len(self.steps)
 
         def run(execution: Run, out: NDArray[Any]) -> None:
             if place not in execution.prepared:
-                execution.prepared[place] = prepare(execution)
-            left = execution.prepared[place][execution.start : execution.stop].reshape(-1, len(lows))
-            np.matmul(left, rows, out=out.reshape(len(left), inner))
+                execution.prepared[place] = np.asarray(make(execution), TYPES[kind]).reshape(len(execution.rows), -1)
+            numbers = execution.prepared[place][execution.start : execution.stop].reshape(-1, 1)
+            out.reshape(len(numbers), -1)[...] = numbers
 
-        found = self._step(f"sum of {len(flat)} products", "double", run)
-        for part in full:
-            found = self._call("add", "double", np.add, Read(found), Read(self._times(part)))
-        return found
-
-    def _times(self, part: Term) -> int:
-        assert part.full is not None
-        made = self.double(part.full)
-        if part.row == 1:
-            return made
-        factor, read = float(part.row), Read(made)
-        return self._step(f"times {factor:.6g}", "double", lambda run, out: np.multiply(read(run), factor, out=out), read)
+        return self.step(text, kind, run)
 
     def _plain(self, node: Node, kind: str) -> int:
         """Any other function of arrays, as NumPy evaluates it."""
@@ -201,7 +157,7 @@ class Program:
             found = function(*(read(execution) for read in reads))
             out.reshape(-1, *shape)[...] = found
 
-        return self._step(f"{getattr(function, '__name__', 'function')} as it stands", kind, run, *used)
+        return self.step(f"{getattr(function, '__name__', 'function')} as it stands", kind, run, *used)
 
     def _argument(self, value: Any, depth: int) -> Callable[[Run], Any]:
         if not isinstance(value, Node):
@@ -210,7 +166,7 @@ class Program:
             read, shape = Read(self.double(value)), (*value.shape, *(1,) * (depth - len(value.shape)))
             return lambda run: read(run).reshape(-1, *shape)
         self.low.append(value)
-        return lambda run: _deep(run.part(run.values(value)), depth)
+        return lambda run: deep(run.part(run.values(value)), depth)
 
     def _factor(self, value: Any) -> Callable[[Run], Any]:
         """A factor of a float32 product: a register, a number, or a row repeated for the whole chunk."""
@@ -219,41 +175,44 @@ class Program:
         if not isinstance(value, Node) and np.size(value) == 1:
             number = np.float32(np.asarray(value).reshape(()))
             return lambda run: number
-        return Read(self._once(("row", id(value)), lambda: self._spread(value, "single")))
+        return Read(self.once(("row", id(value)), lambda: self._spread(value, "single")))
 
     def _spread(self, value: Any, kind: str) -> int:
         """What is not full, for every point."""
         if not isinstance(value, Node):
             row = np.broadcast_to(np.asarray(value, TYPES[kind]), self.shape).reshape(-1)
             tile = np.tile(row, self.chunk)
-            found = self._step("the same in every packet", kind, lambda run, out: None)
+            found = self.step("the same in every packet", kind, lambda run, out: None)
             self._tiles[found] = tile
             return found
         self.low.append(value)
+        level = last_axis(value.shape)
+        if value.width == math.prod(self.shape[:level]):
+            return self.repeated("computed plainly before", kind, lambda run: run.values(value))
         shape, depth = self.shape, len(self.shape)
 
         def run(execution: Run, out: NDArray[Any]) -> None:
-            out.reshape(-1, *shape)[...] = _deep(execution.part(execution.values(value)), depth)
+            out.reshape(-1, *shape)[...] = deep(execution.part(execution.values(value)), depth)
 
-        return self._step("computed plainly before", kind, run)
+        return self.step("computed plainly before", kind, run)
 
     def _cast(self, register: int) -> int:
         read = Read(register)
-        return self._step("as float32", "single", lambda run, out: np.copyto(out, read(run), casting="same_kind"), read)
+        return self.step("as float32", "single", lambda run, out: np.copyto(out, read(run), casting="same_kind"), read)
 
-    def _call(self, text: str, kind: str, function: Any, *reads: Callable[[Run], Any]) -> int:
-        return self._step(text, kind, lambda run, out: function(*(read(run) for read in reads), out=out), *reads)
+    def call(self, text: str, kind: str, function: Any, *reads: Callable[[Run], Any]) -> int:
+        return self.step(text, kind, lambda run, out: function(*(read(run) for read in reads), out=out), *reads)
 
-    def _step(self, text: str, kind: str, run: Callable[[Run, NDArray[Any]], Any], *reads: Callable[[Run], Any]) -> int:
-        output = self._register(kind)
+    def step(self, text: str, kind: str, run: Callable[[Run, NDArray[Any]], Any], *reads: Callable[[Run], Any]) -> int:
+        output = self.register(kind)
         self.steps.append(Step(text, run, output, tuple(read.register for read in reads if isinstance(read, Read))))
         return output
 
-    def _register(self, kind: str) -> int:
+    def register(self, kind: str) -> int:
         self.kinds.append(kind)
         return len(self.kinds) - 1
 
-    def _once(self, name: Any, make: Callable[[], int]) -> int:
+    def once(self, name: Any, make: Callable[[], int]) -> int:
         if name not in self._known:
             self._known[name] = make()
         return self._known[name]
@@ -306,8 +265,3 @@ class Program:
             target = found[name][start * self.width : stop * self.width]
             if run.views[register].base is not target.base:
                 np.copyto(target, run.views[register])
-
-
-def _deep(array: NDArray[Any], depth: int) -> NDArray[Any]:
-    """Values of packets with as many axes as the points have."""
-    return array.reshape(*array.shape, *(1,) * (1 + depth - array.ndim))

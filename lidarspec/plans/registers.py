@@ -58,6 +58,21 @@ class Read:
         return run.views[self.register]
 
 
+@dataclass(frozen=True)
+class Number:
+    """A number as an argument of a step."""
+
+    value: float
+
+    def __call__(self, run: Run) -> float:
+        return self.value
+
+
+def deep(array: NDArray[Any], depth: int) -> NDArray[Any]:
+    """Values of packets with as many axes as the points have."""
+    return array.reshape(*array.shape, *(1,) * (1 + depth - array.ndim))
+
+
 def shared(steps: Sequence[Step], kinds: Sequence[str], own: Collection[int]) -> list[int]:
     """A slot for each register, so that registers of one kind that are never needed at the same time have the same one.
 

@@ -1,0 +1,112 @@
+"""Sums of what packets or blocks have once, times rows that all of them share: matrix products, and angles that are near half a turn."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarspec.frames.tracing import Node
+from lidarspec.plans.expressions import Term
+from lidarspec.plans.registers import Run
+
+Floats = NDArray[np.float64]
+
+TURN = 2 * np.pi
+#: radians from which on float32 is too coarse for an angle.
+NEAR = 4.0
+
+
+@dataclass(frozen=True, eq=False)
+class Product:
+    """Numbers of packets or blocks times rows, summed.
+
+    Attributes:
+        lows: the numbers, None for 1.
+        rows: (k, inner), of each the row that it is multiplied by.
+        outer: the axes after the packets' that the numbers have.
+    """
+
+    lows: Sequence[Node | None]
+    rows: Floats
+    outer: tuple[int, ...]
+
+    @classmethod
+    def of(cls, parts: Sequence[Term], shape: tuple[int, ...], level: int) -> Product:
+        """The product of the parts of a sum that are low, for points of this shape; `level`: axes that the numbers may have."""
+        inner = math.prod(shape[level:])
+        rows = [np.broadcast_to(part.row, shape[level:] if part.row.ndim else (inner,)).reshape(inner) for part in parts]
+        return cls([part.low for part in parts], np.stack(rows), shape[:level])
+
+    @property
+    def inner(self) -> int:
+        """The length of a row."""
+        return self.rows.shape[1]
+
+    @property
+    def nodes(self) -> list[Node]:
+        """What has to be known of a batch."""
+        return [low for low in self.lows if low is not None]
+
+    def left(self, run: Run) -> Floats:
+        """The numbers, (n, *outer, k)."""
+        found = np.empty((len(run.rows), *self.outer, len(self.lows)))
+        for index, low in enumerate(self.lows):
+            found[..., index] = 1.0 if low is None else self.values(run, low)
+        return found
+
+    def values(self, run: Run, low: Node) -> Floats:
+        """The numbers of one column, (n or 1, *outer)."""
+        values = run.values(low)
+        return values.reshape(values.shape[: 1 + len(self.outer)])
+
+
+@dataclass(frozen=True, eq=False)
+class Angles:
+    """Angles that lie around one of their packet or block, which alone is reduced to half a turn.
+
+    Attributes:
+        start: what makes that one: numbers of packets or blocks, each with its factor.
+        around: the others; the first column of its product is for the start.
+        more: radians that other parts of the angles add, at least and at most.
+    """
+
+    start: Sequence[tuple[Node | None, float]]
+    around: Product
+    more: tuple[float, float]
+
+    @classmethod
+    def of(cls, product: Product, more: tuple[float, float]) -> Angles | None:
+        """The angles that a product makes; None where nothing is the same for all points of a packet or block."""
+        level = [bool((row == row[0]).all()) for row in product.rows]
+        start = [(low, float(row[0])) for low, row, is_level in zip(product.lows, product.rows, level, strict=True) if is_level]
+        if not any(low is not None for low, _ in start) or not np.isfinite((*product.rows.flat, *more)).all():
+            return None
+        others = [index for index, is_level in enumerate(level) if not is_level]
+        rows = np.vstack([np.ones(product.inner), product.rows[others]])
+        return cls(start, Product([None, *(product.lows[index] for index in others)], rows, product.outer), more)
+
+    @property
+    def nodes(self) -> list[Node]:
+        """What has to be known of a batch."""
+        return [*self.around.nodes, *(low for low, _ in self.start if low is not None)]
+
+    @property
+    def all_alike(self) -> bool:
+        """Whether all points of a packet or block have the same angle."""
+        return len(self.around.rows) == 1 and self.more == (0.0, 0.0)
+
+    def left(self, run: Run) -> tuple[Floats, NDArray[np.bool_]]:
+        """The numbers, (n, *outer, k), and where points may be so far from half a turn that they have to be reduced, (n, *outer)."""
+        found = self.around.left(run)
+        start, rows = found[..., 0], self.around.rows
+        start[...] = sum(factor if low is None else self.around.values(run, low) * factor for low, factor in self.start)
+        (low, high), least, most = self.more, rows.min(axis=1), rows.max(axis=1)
+        middle = found @ ((most + least) / 2) + (high + low) / 2
+        whole = np.rint(middle / TURN) * TURN
+        start -= whole
+        aside = np.abs(found[..., 1:]) @ ((most - least)[1:] / 2) + (high - low) / 2
+        return found, ~(np.abs(middle - whole) + aside <= NEAR)

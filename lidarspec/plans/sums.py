@@ -1,0 +1,162 @@
+"""Sums and angles as steps of a program: what is low as one matrix product, angles reduced to half a turn before they become float32."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarspec.frames.tracing import Node
+from lidarspec.plans.expressions import Term, chosen, only_field, split_level, terms
+from lidarspec.plans.products import TURN, Angles, Product
+from lidarspec.plans.registers import Number, Read, Run, deep
+from lidarspec.plans.windows import every_value
+
+if TYPE_CHECKING:
+    from lidarspec.plans.program import Program
+
+
+class Sums:
+    """The sums and angles of a program; each method adds steps to it and gives the register of their result."""
+
+    def __init__(self, program: Program) -> None:
+        self._program = program
+        self._around: dict[Node, Angles | None] = {}
+
+    def direction(self, node: Node) -> int:
+        """A cosine or sine; where all points of a packet or block have the same, it is computed once for them."""
+        angles, function = self._angles(node.args[0]), node.function
+        if angles is None or not angles.all_alike:
+            angle = self._program.once(("angle", node.args[0]), lambda: self._angle(node.args[0]))
+            return self._program.call(function.__name__, "single", function, Read(angle))
+        return self._program.repeated(f"{function.__name__} of each block", "single", lambda run: function(angles.left(run)[0][..., 0]))
+
+    def _angle(self, value: Node) -> int:
+        """An angle in float32, reduced to half a turn either way before it loses precision."""
+        near = self._near(value)
+        if near is not None:
+            return near
+        angle, turns = self._program.double(value), self._program.register("double")
+        read = Read(angle)
+
+        def run(execution: Run, out: NDArray[Any]) -> None:
+            radians, whole = read(execution), execution.views[turns]
+            np.multiply(radians, 1 / TURN, out=whole)
+            np.rint(whole, out=whole)
+            np.multiply(whole, TURN, out=whole)
+            np.subtract(radians, whole, out=whole)
+            np.copyto(out, whole, casting="same_kind")
+
+        return self._program.step("reduce to half a turn", "single", run, read, Read(turns))
+
+    def _near(self, value: Node) -> int | None:
+        """The same for angles that lie around one of their packet or block: most of them need no reduction; None for others."""
+        angles = self._angles(value)
+        if angles is None:
+            return None
+        read = Read(self._added(angles.around.rows, place := -1 - len(self._program.steps), angles.left, self._parts(value)[1]))
+
+        def run(execution: Run, out: NDArray[Any]) -> None:
+            radians, far = read(execution), execution.prepared[place][1]
+            spots = np.flatnonzero(far[execution.start : execution.stop])
+            if len(spots):
+                rows = radians.reshape(-1, angles.around.inner)
+                rows[spots] -= np.rint(rows[spots] / TURN) * TURN
+            np.copyto(out, radians, casting="same_kind")
+
+        return self._program.step("reduce what is far from half a turn", "single", run, read)
+
+    def _angles(self, value: Node) -> Angles | None:
+        """Angles that lie around one of their packet or block; None where they do not, or nobody knows."""
+        if value not in self._around:
+            flat, full = self._parts(value)
+            product, ranges = self._product(flat, full), [self._range(part) for part in full]
+            more = float(sum(low for low, _ in ranges)), float(sum(high for _, high in ranges))
+            found = self._around[value] = None if product is None else Angles.of(product, more)
+            self._program.low += [] if found is None else found.nodes
+        return self._around[value]
+
+    def sum(self, node: Node) -> int | None:
+        """A sum: one matrix product for what is low, and what is full added to it."""
+        flat, full = self._parts(node)
+        product = self._product(flat, full)
+        if product is None:
+            return None
+        self._program.low += product.nodes
+        return self._added(product.rows, -1 - len(self._program.steps), lambda run: (product.left(run),), full)
+
+    def _parts(self, node: Node) -> tuple[list[Term], list[Term]]:
+        parts = terms(node, self._program.width)
+        return [part for part in parts if part.full is None], [part for part in parts if part.full is not None]
+
+    def _product(self, flat: list[Term], full: list[Term]) -> Product | None:
+        """What is low in a sum; None where its axes cross, or there is nothing."""
+        level = split_level(flat, len(self._program.shape))
+        return None if level is None or not flat or any(part.row.ndim for part in full) else Product.of(flat, self._program.shape, level)
+
+    def _added(self, rows: NDArray[Any], place: int, left: Callable[[Run], tuple[Any, ...]], full: list[Term]) -> int:
+        """A matrix product of numbers, made for the batch at its first chunk, and rows; what is full is added to it."""
+        many, inner = rows.shape
+
+        def run(execution: Run, out: NDArray[Any]) -> None:
+            if place not in execution.prepared:
+                execution.prepared[place] = left(execution)
+            numbers = execution.prepared[place][0][execution.start : execution.stop].reshape(-1, many)
+            np.matmul(numbers, rows, out=out.reshape(len(numbers), inner))
+
+        found = self._program.step(f"sum of {many} products", "double", run)
+        for part in full:
+            found = self._plus(found, part)
+        return found
+
+    def _plus(self, sum_: int, part: Term) -> int:
+        """A sum and what is full."""
+        assert part.full is not None
+        factor, options = float(part.row), chosen(part.full, self._program.width)
+        if options is None:
+            return self._program.call("add", "double", np.add, Read(sum_), Read(self._scaled(part.full, factor)))
+        condition, *values = options
+        first, second = (Read(self._scaled(value, factor)) if isinstance(value, Node) else Number(value * factor) for value in values)
+        self._program.low.append(condition)
+        shape, depth = self._program.shape, len(self._program.shape)
+
+        def run(execution: Run, out: NDArray[Any]) -> None:
+            flags = execution.part(execution.values(condition)).astype(np.bool_)
+            if flags.all() or not flags.any():
+                np.add(sum_read(execution), (first if flags.any() else second)(execution), out=out)
+                return
+            either = (np.asarray(read(execution)) for read in (first, second))
+            added = np.where(deep(flags, depth), *(array.reshape(-1, *shape) if array.ndim else array for array in either))
+            np.add(sum_read(execution), added.reshape(-1), out=out)
+
+        sum_read = Read(sum_)
+        return self._program.step("add one of two", "double", run, sum_read, first, second)
+
+    def _scaled(self, node: Node, factor: float) -> int:
+        """What is full times a number, in float64; the number is part of the table where there is one."""
+        found = self._program.field(node, "double", factor)
+        if found is not None:
+            return found
+        read = Read(self._program.double(node))
+        if factor == 1:
+            return read.register
+        return self._program.step(f"times {factor:.6g}", "double", lambda run, out: np.multiply(read(run), factor, out=out), read)
+
+    def _range(self, part: Term) -> tuple[float, float]:
+        """The least and the most of what is full in a sum; infinite where it is not known."""
+        assert part.full is not None
+        options = chosen(part.full, self._program.width)
+        values = np.concatenate([self._every(value) for value in ((part.full,) if options is None else options[1:])])
+        found = np.outer(values, part.row.reshape(-1))
+        return float(found.min()), float(found.max())
+
+    def _every(self, value: Any) -> NDArray[Any]:
+        """All values that an expression of one field can have."""
+        if not isinstance(value, Node):
+            return np.array([value])
+        source = only_field(value)
+        leaf = self._program.layout.leaves.get(source.path) if source is not None else None
+        values = every_value(value, leaf) if leaf is not None else None
+        return np.array([np.inf]) if values is None else values
