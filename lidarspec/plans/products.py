@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,7 +45,7 @@ class Product:
     @property
     def inner(self) -> int:
         """The length of a row."""
-        return self.rows.shape[1]
+        return int(self.rows.shape[1])
 
     @property
     def nodes(self) -> list[Node]:
@@ -99,8 +100,8 @@ class Angles:
         """Whether all points of a packet or block have the same angle."""
         return len(self.around.rows) == 1 and self.more == (0.0, 0.0)
 
-    def left(self, run: Run) -> tuple[Floats, NDArray[np.bool_]]:
-        """The numbers, (n, *outer, k), and where points may be so far from half a turn that they have to be reduced, (n, *outer)."""
+    def left(self, run: Run) -> tuple[Floats, Floats, Floats]:
+        """The numbers, (n, *outer, k), the angles in the middle of each, (n, *outer), within half a turn, and how far others may be."""
         found = self.around.left(run)
         start, rows = found[..., 0], self.around.rows
         start[...] = sum(factor if low is None else self.around.values(run, low) * factor for low, factor in self.start)
@@ -108,5 +109,18 @@ class Angles:
         middle = found @ ((most + least) / 2) + (high + low) / 2
         whole = np.rint(middle / TURN) * TURN
         start -= whole
-        aside = np.abs(found[..., 1:]) @ ((most - least)[1:] / 2) + (high - low) / 2
-        return found, ~(np.abs(middle - whole) + aside <= NEAR)
+        middle -= whole
+        return found, middle, np.abs(found[..., 1:]) @ ((most - least)[1:] / 2) + (high - low) / 2
+
+
+def reduced(angles: Floats) -> Floats:
+    """Radians without whole turns: within half a turn either way."""
+    return angles - np.rint(angles / TURN) * TURN
+
+
+def multiplied(left: NDArray[Any], right: NDArray[Any], out: NDArray[Any]) -> None:
+    """A matrix product; rows come out the same in any company, for which a lone one needs another: it would be summed in another order."""
+    if len(left) == 1:
+        out[...] = (left[[0, 0]] @ right)[:1]
+    else:
+        np.matmul(left, right, out=out)

@@ -31,7 +31,7 @@ class Run:
     views: list[NDArray[Any]] = field(default_factory=list)
     start: int = 0
     stop: int = 0
-    prepared: dict[int, Any] = field(default_factory=dict)
+    prepared: dict[Any, Any] = field(default_factory=dict)
 
     def part(self, array: NDArray[Any]) -> NDArray[Any]:
         """The chunk's packets of values that each packet has, or that all share."""

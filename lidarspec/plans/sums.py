@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from lidarspec.frames.tracing import Node
 from lidarspec.plans.expressions import Term, chosen, only_field, split_level, terms
-from lidarspec.plans.products import TURN, Angles, Product
+from lidarspec.plans.products import NEAR, TURN, Angles, Product, multiplied, reduced
 from lidarspec.plans.registers import Number, Read, Run, deep
+from lidarspec.plans.rotations import Rotation, Turns
 from lidarspec.plans.windows import every_value
 
 if TYPE_CHECKING:
@@ -24,14 +25,53 @@ class Sums:
     def __init__(self, program: Program) -> None:
         self._program = program
         self._around: dict[Node, Angles | None] = {}
+        self._rotations: dict[Node, Rotation | None] = {}
 
     def direction(self, node: Node) -> int:
-        """A cosine or sine; where all points of a packet or block have the same, it is computed once for them."""
-        angles, function = self._angles(node.args[0]), node.function
-        if angles is None or not angles.all_alike:
-            angle = self._program.once(("angle", node.args[0]), lambda: self._angle(node.args[0]))
-            return self._program.call(function.__name__, "single", function, Read(angle))
-        return self._program.repeated(f"{function.__name__} of each block", "single", lambda run: function(angles.left(run)[0][..., 0]))
+        """A cosine or sine; where all points of a packet or block have the same or nearly so, it is computed once for them."""
+        value, function = node.args[0], node.function
+        angles = self._angles(value)
+        if angles is not None and angles.all_alike:
+            name = f"{function.__name__} of each block"
+            return self._program.repeated(name, "single", lambda run: function(angles.left(run)[1].astype(np.float32)))
+        rotation = self._rotation(value)
+        if rotation is not None:
+            return self._turned(function, rotation, self._program.once(("wide", value), lambda: self._wide(rotation)))
+        angle = self._program.once(("angle", value), lambda: self._angle(value))
+        return self._program.call(function.__name__, "single", function, Read(angle))
+
+    def _rotation(self, value: Node) -> Rotation | None:
+        if value not in self._rotations:
+            angles = self._angles(value)
+            self._rotations[value] = None if angles is None else Rotation.of(angles)
+        return self._rotations[value]
+
+    def _wide(self, rotation: Rotation) -> int:
+        """The angles of those packets or blocks whose points are too far apart for one rotation, within half a turn."""
+
+        def run(execution: Run, out: NDArray[Any]) -> None:
+            if rotation not in execution.prepared:
+                execution.prepared[rotation] = rotation.turns(execution)
+            turns: Turns = execution.prepared[rotation]
+            turns.move(execution.start, execution.stop)
+            if turns.some_wide:
+                out.reshape(-1, rotation.inner)[turns.wide] = turns.angles()
+
+        return self._program.step("angles of what is wide", "single", run)
+
+    def _turned(self, function: Any, rotation: Rotation, wide: int) -> int:
+        """Cosines or sines of angles that are turned a little from the one in their middle: a matrix product of series."""
+        read = Read(wide)
+
+        def run(execution: Run, out: NDArray[Any]) -> None:
+            turns: Turns = execution.prepared[rotation]
+            rows = out.reshape(-1, rotation.inner)
+            if not turns.all_wide:
+                multiplied((turns.cos if function is np.cos else turns.sin).T, rotation.rows, rows)
+            if turns.some_wide:
+                rows[turns.wide] = function(read(execution).reshape(-1, rotation.inner)[turns.wide])
+
+        return self._program.step(f"{function.__name__} by {len(rotation.rows)} products", "single", run, read)
 
     def _angle(self, value: Node) -> int:
         """An angle in float32, reduced to half a turn either way before it loses precision."""
@@ -59,11 +99,12 @@ class Sums:
         read = Read(self._added(angles.around.rows, place := -1 - len(self._program.steps), angles.left, self._parts(value)[1]))
 
         def run(execution: Run, out: NDArray[Any]) -> None:
-            radians, far = read(execution), execution.prepared[place][1]
-            spots = np.flatnonzero(far[execution.start : execution.stop])
+            radians, (_, middle, aside) = read(execution), execution.prepared[place]
+            chunk = slice(execution.start, execution.stop)
+            spots = np.flatnonzero(~(np.abs(middle[chunk]) + aside[chunk] <= NEAR))
             if len(spots):
                 rows = radians.reshape(-1, angles.around.inner)
-                rows[spots] -= np.rint(rows[spots] / TURN) * TURN
+                rows[spots] = reduced(rows[spots])
             np.copyto(out, radians, casting="same_kind")
 
         return self._program.step("reduce what is far from half a turn", "single", run, read)
@@ -104,7 +145,7 @@ class Sums:
             if place not in execution.prepared:
                 execution.prepared[place] = left(execution)
             numbers = execution.prepared[place][0][execution.start : execution.stop].reshape(-1, many)
-            np.matmul(numbers, rows, out=out.reshape(len(numbers), inner))
+            multiplied(numbers, rows, out.reshape(len(numbers), inner))
 
         found = self._program.step(f"sum of {many} products", "double", run)
         for part in full:
