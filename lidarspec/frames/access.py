@@ -39,7 +39,8 @@ def physical(info: FieldInfo, table: Table) -> NDArray[np.float64]:
     """A field in its unit: float64, shape (n, *lengths); nan where a frame lacks the field."""
     array = table.raw(info.path).astype(np.float64)
     if info.scaled:
-        array = array * info.scale + info.offset
+        array *= info.scale
+        array += info.offset
     there = table.present(info.path)
     if there is not None:
         array = np.where(there.reshape(-1, *(1,) * (array.ndim - 1)), array, np.nan)

@@ -12,7 +12,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.plans.products import NEAR, Angles, Floats, multiplied, reduced
+from lidarspec.plans.products import Angles, Floats, reduced
 from lidarspec.plans.registers import Run
 
 Singles = NDArray[np.float32]
@@ -47,7 +47,7 @@ class Rotation:
         return self.angles.around.inner
 
     @cached_property
-    def _span(self) -> tuple[float, float]:
+    def span(self) -> tuple[float, float]:
         """What is in the middle of the row, and half of its width."""
         row = self.angles.around.rows[-1]
         return (float(row.max()) + float(row.min())) / 2, (float(row.max()) - float(row.min())) / 2
@@ -55,19 +55,27 @@ class Rotation:
     @cached_property
     def rows(self) -> Singles:
         """The right side of the products, (k, inner)."""
-        middle, half = self._span
+        middle, half = self.span
         row = self.angles.around.rows[-1] - middle
         series = (row / half) ** np.arange(TERMS)[:, None] if self.moving else np.stack([np.cos(row), np.sin(row)])
         return series.astype(np.float32)
 
     def turns(self, run: Run) -> Turns:
         """The left sides of the products, for a batch."""
-        numbers, middle, _ = self.angles.left(run)
-        return Turns(self, numbers, middle, numbers[..., -1] * self._span[1] if self.moving else np.zeros_like(middle))
+        around, (middle, half) = self.angles.around, self.span
+        terms = [(low, factor) for low, factor in self.angles.start]
+        terms.append((around.lows[-1], middle))
+        values = [(np.ones((1, *around.outer)) if low is None else around.values(run, low), factor) for low, factor in terms]
+        return Turns(self, values, half)
 
 
 class Turns:
     """The left sides of the products of a batch, chunk by chunk.
+
+    Args:
+        rotation: whose.
+        terms: what makes the angle in the middle: numbers, (n or 1, *outer), and their factors; the last are those that move.
+        half: the factor of those that makes the distance of the farthest points from the middle.
 
     Attributes:
         cos, sin: (k, rows of the chunk).
@@ -75,19 +83,25 @@ class Turns:
         some_wide, all_wide: whether there are such, and no others.
     """
 
-    def __init__(self, rotation: Rotation, numbers: Floats, middle: Floats, aside: Floats) -> None:
-        self._rotation, self._numbers, self._middle, self._aside = rotation, numbers, middle, aside
+    def __init__(self, rotation: Rotation, terms: list[tuple[Floats, float]], half: float) -> None:
+        self._rotation, self._terms, self._half = rotation, terms, half
 
     def move(self, start: int, stop: int) -> None:
         """Go to the packets from `start` to `stop`."""
-        middle, aside = self._middle[start:stop].reshape(-1), self._aside[start:stop].reshape(-1)
-        close = (np.abs(aside) <= NARROW) & (np.abs(middle) <= NEAR)
-        self.all_wide = not close.any()
-        self.some_wide = self.all_wide or not close.all()
+        parts = [(values[start:stop] if len(values) > 1 else values, factor) for values, factor in self._terms]
+        middle = np.zeros((stop - start, *self._rotation.angles.around.outer))
+        for values, factor in parts:
+            middle += values * factor
+        middle = reduced(middle.reshape(-1))
+        moved = np.broadcast_to(parts[-1][0], (stop - start, *self._rotation.angles.around.outer)).reshape(-1)
+        aside = (moved * self._half).astype(np.float32)
+        close = np.abs(aside) <= NARROW
+        self.some_wide = self._rotation.moving and not close.all()
+        self.all_wide = self.some_wide and not close.any()
         self.wide: slice | NDArray[np.intp] = slice(None) if self.all_wide else np.flatnonzero(~close)
-        self._chunk = slice(start, stop)
+        self._found = middle, moved
         if not self.all_wide:
-            self._expand(middle, aside.astype(np.float32))
+            self._expand(middle, aside)
 
     def _expand(self, middle: Floats, aside: Singles) -> None:
         """The coefficients of both: of the series, each term is the one before the last, times a number for its packet or block."""
@@ -106,8 +120,6 @@ class Turns:
 
     def angles(self) -> Floats:
         """The angles of the rows that are wide, (rows, inner) radians."""
-        around = self._rotation.angles.around
-        numbers = self._numbers[self._chunk].reshape(-1, len(around.rows))[self.wide]
-        found = np.empty((len(numbers), around.inner))
-        multiplied(numbers, around.rows, found)
-        return reduced(found)
+        middle, moved = (values[self.wide] for values in self._found)
+        row, (at, _) = self._rotation.angles.around.rows[-1], self._rotation.span
+        return reduced(middle[:, None] + moved[:, None] * (row - at))
