@@ -6,21 +6,25 @@ row of a matrix product in float32, and no trigonometry.
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.plans.products import Angles, Floats, reduced
+from lidarspec.plans.products import TURN, Angles, Floats, reduced
 from lidarspec.plans.registers import Run
 
 Singles = NDArray[np.float32]
 
 #: terms of the series, and radians from the middle up to which what follows them is below 1e-8.
 TERMS, NARROW = 5, 1 / 16
-#: of each term from the third on: what it is of the one before the last, besides the square of the distance.
-_FACTORS = np.array([[-1 / (term * (term - 1))] for term in range(2, TERMS)], np.float32)
+#: of the derivatives of a cosine and of a sine, where cosine and sine take turns.
+_SIGNS = (1, -1, -1, 1, 1), (1, 1, -1, -1, 1)
+#: packets or blocks whose coefficients are made together.
+_WINDOW = 1 << 14
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,20 +57,22 @@ class Rotation:
         return (float(row.max()) + float(row.min())) / 2, (float(row.max()) - float(row.min())) / 2
 
     @cached_property
-    def rows(self) -> Singles:
-        """The right side of the products, (k, inner)."""
+    def rows(self) -> tuple[Singles, Singles]:
+        """The right sides of the products, for cosines and for sines, (k, inner)."""
         middle, half = self.span
         row = self.angles.around.rows[-1] - middle
-        series = (row / half) ** np.arange(TERMS)[:, None] if self.moving else np.stack([np.cos(row), np.sin(row)])
-        return series.astype(np.float32)
+        if not self.moving:
+            return _single([np.cos(row), -np.sin(row)]), _single([np.cos(row), np.sin(row)])
+        series = [(row / half) ** term / math.factorial(term) for term in range(TERMS)]
+        return tuple(_single([s * t for s, t in zip(signs, series, strict=True)]) for signs in _SIGNS)  # type: ignore[return-value]
 
     def turns(self, run: Run) -> Turns:
         """The left sides of the products, for a batch."""
         around, (middle, half) = self.angles.around, self.span
-        terms = [(low, factor) for low, factor in self.angles.start]
-        terms.append((around.lows[-1], middle))
-        values = [(np.ones((1, *around.outer)) if low is None else around.values(run, low), factor) for low, factor in terms]
-        return Turns(self, values, half)
+        ones = np.ones((1, *around.outer))
+        terms = [*self.angles.start, (around.lows[-1], middle)]
+        values = [(ones if low is None else around.values(run, low), factor / TURN) for low, factor in terms]
+        return Turns(self, len(run.rows), values, half)
 
 
 class Turns:
@@ -74,52 +80,74 @@ class Turns:
 
     Args:
         rotation: whose.
-        terms: what makes the angle in the middle: numbers, (n or 1, *outer), and their factors; the last are those that move.
+        number: of packets.
+        terms: what makes the angle in the middle: numbers, (n or 1, *outer), and their factors in turns; the last are those that move.
         half: the factor of those that makes the distance of the farthest points from the middle.
 
     Attributes:
-        cos, sin: (k, rows of the chunk).
+        left: for cosines and for sines, (rows of the chunk, k).
         wide: which rows are not close enough together.
         some_wide, all_wide: whether there are such, and no others.
     """
 
-    def __init__(self, rotation: Rotation, terms: list[tuple[Floats, float]], half: float) -> None:
-        self._rotation, self._terms, self._half = rotation, terms, half
+    def __init__(self, rotation: Rotation, number: int, terms: list[tuple[Floats, float]], half: float) -> None:
+        self._rotation, self._number, self._terms, self._half = rotation, number, terms, half
+        self._outer = math.prod(rotation.angles.around.outer)
+        self._first = self._last = 0
 
     def move(self, start: int, stop: int) -> None:
         """Go to the packets from `start` to `stop`."""
-        parts = [(values[start:stop] if len(values) > 1 else values, factor) for values, factor in self._terms]
-        middle = np.zeros((stop - start, *self._rotation.angles.around.outer))
-        for values, factor in parts:
-            middle += values * factor
-        middle = reduced(middle.reshape(-1))
-        moved = np.broadcast_to(parts[-1][0], (stop - start, *self._rotation.angles.around.outer)).reshape(-1)
-        aside = (moved * self._half).astype(np.float32)
-        close = np.abs(aside) <= NARROW
-        self.some_wide = self._rotation.moving and not close.all()
-        self.all_wide = self.some_wide and not close.any()
-        self.wide: slice | NDArray[np.intp] = slice(None) if self.all_wide else np.flatnonzero(~close)
-        self._found = middle, moved
-        if not self.all_wide:
-            self._expand(middle, aside)
+        if not self._first <= start < stop <= self._last:
+            self._first, self._last = start, min(max(stop, start + _WINDOW // self._outer), self._number)
+            self._expand()
+        rows = slice((start - self._first) * self._outer, (stop - self._first) * self._outer)
+        self.left = self._series[:, 0, rows].T, self._series[:, 1, rows].T
+        self.some_wide = self.all_wide = False
+        if self._any_wide:
+            wide = self._wide[rows]
+            self.some_wide, self.all_wide = bool(wide.any()), bool(wide.all())
+            self.wide: slice | NDArray[np.intp] = slice(None) if self.all_wide else np.flatnonzero(wide)
+            self._chunk = self._middle[rows][self.wide], self._moved[rows][self.wide]
 
-    def _expand(self, middle: Floats, aside: Singles) -> None:
-        """The coefficients of both: of the series, each term is the one before the last, times a number for its packet or block."""
+    def _expand(self) -> None:
+        """The coefficients of the packets that come next: of each, its cosine and sine times powers of how far its points go."""
+        chosen = [self._rows(values) for values, _ in self._terms]
+        middle = np.zeros((self._last - self._first) * self._outer)
+        for values, (_, factor) in zip(chosen, self._terms, strict=True):
+            middle += values * factor
+        middle -= np.rint(middle)
+        middle *= TURN
         single = middle.astype(np.float32)
         rest = (middle - single).astype(np.float32)
         cos, sin = np.cos(single), np.sin(single)
-        terms = np.empty((len(self._rotation.rows), 2, len(aside)), np.float32)
-        np.subtract(cos, rest * sin, out=terms[0, 0])
-        np.add(sin, rest * cos, out=terms[0, 1])
-        np.multiply(terms[0, 1], -aside if self._rotation.moving else -1, out=terms[1, 0])
-        np.multiply(terms[0, 0], aside if self._rotation.moving else 1, out=terms[1, 1])
+        series = self._series = np.empty((len(self._rotation.rows[0]), 2, len(middle)), np.float32)
+        np.subtract(cos, rest * sin, out=series[0, 0])
+        np.add(sin, rest * cos, out=series[0, 1])
+        self._any_wide = False
         if self._rotation.moving:
-            for index, factor in enumerate(aside * aside * _FACTORS, 2):
-                np.multiply(terms[index - 2], factor, out=terms[index])
-        self.cos, self.sin = terms[:, 0], terms[:, 1]
+            self._moved, self._middle = chosen[-1], middle
+            aside = (chosen[-1] * self._half).astype(np.float32)
+            self._wide = ~(np.abs(aside) <= NARROW)
+            self._any_wide = bool(self._wide.any())
+            np.multiply(series[0, ::-1], aside, out=series[1])
+            aside *= aside
+            np.multiply(series[:2], aside, out=series[2:4])
+            np.multiply(series[2], aside, out=series[4])
+        else:
+            series[1] = series[0, ::-1]
+
+    def _rows(self, values: Floats) -> Floats:
+        """Numbers of the packets that come next, one for each of their rows."""
+        if len(values) == 1:
+            return np.broadcast_to(values.reshape(-1), (self._last - self._first, self._outer)).reshape(-1)
+        return values[self._first : self._last].reshape(-1)
 
     def angles(self) -> Floats:
         """The angles of the rows that are wide, (rows, inner) radians."""
-        middle, moved = (values[self.wide] for values in self._found)
+        middle, moved = self._chunk
         row, (at, _) = self._rotation.angles.around.rows[-1], self._rotation.span
         return reduced(middle[:, None] + moved[:, None] * (row - at))
+
+
+def _single(rows: Sequence[Floats]) -> Singles:
+    return np.stack(rows).astype(np.float32)

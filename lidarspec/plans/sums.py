@@ -61,17 +61,17 @@ class Sums:
 
     def _turned(self, function: Any, rotation: Rotation, wide: int) -> int:
         """Cosines or sines of angles that are turned a little from the one in their middle: a matrix product of series."""
-        read = Read(wide)
+        read, which = Read(wide), 0 if function is np.cos else 1
 
         def run(execution: Run, out: NDArray[Any]) -> None:
             turns: Turns = execution.prepared[rotation]
             rows = out.reshape(-1, rotation.inner)
             if not turns.all_wide:
-                multiplied((turns.cos if function is np.cos else turns.sin).T, rotation.rows, rows)
+                multiplied(turns.left[which], rotation.rows[which], rows)
             if turns.some_wide:
                 rows[turns.wide] = function(read(execution).reshape(-1, rotation.inner)[turns.wide])
 
-        return self._program.step(f"{function.__name__} by {len(rotation.rows)} products", "single", run, read)
+        return self._program.step(f"{function.__name__} by {len(rotation.rows[0])} products", "single", run, read)
 
     def _angle(self, value: Node) -> int:
         """An angle in float32, reduced to half a turn either way before it loses precision."""
