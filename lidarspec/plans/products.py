@@ -53,11 +53,11 @@ class Product:
         return [low for low in self.lows if low is not None]
 
     def left(self, run: Run) -> Floats:
-        """The numbers, (n, *outer, k)."""
-        found = np.empty((len(run.rows), *self.outer, len(self.lows)))
-        for index, low in enumerate(self.lows):
-            found[..., index] = 1.0 if low is None else self.values(run, low)
-        return found
+        """The numbers, (k, n times what `outer` holds)."""
+        found = np.empty((len(self.lows), len(run.rows), *self.outer))
+        for column, low in zip(found, self.lows, strict=True):
+            column[...] = 1.0 if low is None else self.values(run, low)
+        return found.reshape(len(self.lows), -1)
 
     def values(self, run: Run, low: Node) -> Floats:
         """The numbers of one column, (n or 1, *outer)."""
@@ -100,17 +100,25 @@ class Angles:
         """Whether all points of a packet or block have the same angle."""
         return len(self.around.rows) == 1 and self.more == (0.0, 0.0)
 
-    def left(self, run: Run) -> tuple[Floats, Floats, Floats]:
-        """The numbers, (n, *outer, k), the angles in the middle of each, (n, *outer), within half a turn, and how far others may be."""
-        found = self.around.left(run)
-        start, rows = found[..., 0], self.around.rows
-        start[...] = sum(factor if low is None else self.around.values(run, low) * factor for low, factor in self.start)
-        (low, high), least, most = self.more, rows.min(axis=1), rows.max(axis=1)
-        middle = found @ ((most + least) / 2) + (high + low) / 2
-        whole = np.rint(middle / TURN) * TURN
-        start -= whole
+    def left(self, run: Run) -> tuple[Floats, NDArray[np.bool_]]:
+        """The numbers, (k, rows), the first of each within half a turn; and where angles may be that have to be reduced all the same."""
+        found, rows = self.around.left(run), self.around.rows
+        start = found[0].reshape(len(run.rows), *self.around.outer)
+        start[...] = 0
+        for low, factor in self.start:
+            start += factor if low is None else self.around.values(run, low) * factor
+        (lowest, highest), least, most = self.more, rows.min(axis=1), rows.max(axis=1)
+        middle = found[0] + (highest + lowest) / 2
+        for numbers, at in zip(found[1:], (least + most)[1:] / 2, strict=True):
+            middle += numbers * at
+        whole = np.rint(middle * (1 / TURN))
+        whole *= TURN
+        found[0] -= whole
         middle -= whole
-        return found, middle, np.abs(found[..., 1:]) @ ((most - least)[1:] / 2) + (high - low) / 2
+        reach = np.abs(middle, out=middle)
+        for numbers, half in zip(found[1:], (most - least)[1:] / 2, strict=True):
+            reach += np.abs(numbers * half)
+        return found, ~(reach <= NEAR - (highest - lowest) / 2)
 
 
 def reduced(angles: Floats) -> Floats:

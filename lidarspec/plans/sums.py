@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from lidarspec.frames.tracing import Node
 from lidarspec.plans.expressions import Term, chosen, only_field, split_level, terms
-from lidarspec.plans.products import NEAR, TURN, Angles, Product, multiplied, reduced
+from lidarspec.plans.products import TURN, Angles, Product, multiplied, reduced
 from lidarspec.plans.registers import Number, Read, Run, deep
 from lidarspec.plans.rotations import Rotation, Turns
 from lidarspec.plans.windows import every_value
@@ -33,7 +33,7 @@ class Sums:
         angles = self._angles(value)
         if angles is not None and angles.all_alike:
             name = f"{function.__name__} of each block"
-            return self._program.repeated(name, "single", lambda run: function(angles.left(run)[1].astype(np.float32)))
+            return self._program.repeated(name, "single", lambda run: function(_shared_by(angles, run)))
         rotation = self._rotation(value)
         if rotation is not None:
             return self._turned(function, rotation, self._program.once(("wide", value), lambda: self._wide(rotation)))
@@ -99,9 +99,8 @@ class Sums:
         read = Read(self._added(angles.around.rows, place := -1 - len(self._program.steps), angles.left, self._parts(value)[1]))
 
         def run(execution: Run, out: NDArray[Any]) -> None:
-            radians, (_, middle, aside) = read(execution), execution.prepared[place]
-            chunk = slice(execution.start, execution.stop)
-            spots = np.flatnonzero(~(np.abs(middle[chunk]) + aside[chunk] <= NEAR))
+            radians, (numbers, far) = read(execution), execution.prepared[place]
+            spots = np.flatnonzero(far[_rows(execution, numbers)])
             if len(spots):
                 rows = radians.reshape(-1, angles.around.inner)
                 rows[spots] = reduced(rows[spots])
@@ -139,15 +138,15 @@ class Sums:
 
     def _added(self, rows: NDArray[Any], place: int, left: Callable[[Run], tuple[Any, ...]], full: list[Term]) -> int:
         """A matrix product of numbers, made for the batch at its first chunk, and rows; what is full is added to it."""
-        many, inner = rows.shape
+        inner = rows.shape[1]
 
         def run(execution: Run, out: NDArray[Any]) -> None:
             if place not in execution.prepared:
                 execution.prepared[place] = left(execution)
-            numbers = execution.prepared[place][0][execution.start : execution.stop].reshape(-1, many)
-            multiplied(numbers, rows, out.reshape(len(numbers), inner))
+            numbers = execution.prepared[place][0]
+            multiplied(numbers[:, _rows(execution, numbers)].T, rows, out.reshape(-1, inner))
 
-        found = self._program.step(f"sum of {many} products", "double", run)
+        found = self._program.step(f"sum of {len(rows)} products", "double", run)
         for part in full:
             found = self._plus(found, part)
         return found
@@ -201,3 +200,17 @@ class Sums:
         leaf = self._program.layout.leaves.get(source.path) if source is not None else None
         values = every_value(value, leaf) if leaf is not None else None
         return np.array([np.inf]) if values is None else values
+
+
+def _rows(run: Run, numbers: NDArray[Any]) -> slice:
+    """The columns of a left side that belong to the chunk: one for each packet, or several."""
+    each = numbers.shape[1] // len(run.rows)
+    return slice(run.start * each, run.stop * each)
+
+
+def _shared_by(angles: Angles, run: Run) -> NDArray[np.float32]:
+    """The angle that all points of each packet or block have."""
+    if angles not in run.prepared:
+        run.prepared[angles] = angles.left(run)[0][0].astype(np.float32)
+    found: NDArray[np.float32] = run.prepared[angles]
+    return found
