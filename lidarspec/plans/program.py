@@ -22,7 +22,7 @@ from lidarspec.plans.sums import Sums
 from lidarspec.plans.windows import Blocks, Window, every_value, window
 
 #: points of a chunk, so that its scratch arrays stay in the cache.
-CHUNK = 1 << 16
+CHUNK = 1 << 17
 _NOTHING = np.empty(0)
 
 
