@@ -49,7 +49,7 @@ def m1_points(packets: Bytes) -> Floats:
         for offset, wanted in ((0, (("range", distance),)), (2, (("cos", level), ("sin", rise))), (4, (("cos", east), ("sin", north)))):
             np.copyto(index[:count], column(compact, offset, "<u2", 9, count))
             for name, target in wanted:
-                tables[name].take(index[:count], out=target, mode="clip")
+                tables[name].take(index[:count], out=target, mode="wrap")
         x, y, z, intensity = found[:, start * 125 : start * 125 + count]
         np.multiply(distance, rise, out=z)
         np.multiply(distance, level, out=level)
@@ -159,7 +159,7 @@ def lookup(table: Floats, codes: NDArray[Any], scratch: Scratch, out: Floats) ->
     """The table's values for these codes."""
     index = scratch.index[: len(out)]
     np.copyto(index, codes)
-    table.take(index, out=out, mode="clip")
+    table.take(index, out=out, mode="wrap")
 
 
 @functools.cache

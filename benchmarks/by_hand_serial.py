@@ -32,7 +32,7 @@ def _good(frames: Bytes) -> NDArray[np.bool_]:
     pairs = np.ascontiguousarray(frames[:, : STL_FRAME - 1]).view("<u2")
     crc = np.zeros(len(frames), np.uint8)
     for spot, table in enumerate(_crc_tables()):
-        crc ^= table.take(pairs[:, spot], mode="clip")
+        crc ^= table.take(pairs[:, spot], mode="wrap")
     start, end, time = pairs[:, 2], pairs[:, 21], pairs[:, 22]
     good: NDArray[np.bool_] = (crc == frames[:, 46]) & (start < 36000) & (end < 36000) & (time <= 30_000)
     return good
@@ -57,7 +57,7 @@ def _stl27l_chunk(frames: Bytes, found: Floats, start: int) -> int:
     samples = np.ascontiguousarray(frames[:, 6:42])
     end = start + angle.size
     x, y, intensity = found[:, start:end]
-    distance = _stl27l_ranges().take(column(samples, 0, "<u2", 3, angle.size), mode="clip")
+    distance = _stl27l_ranges().take(column(samples, 0, "<u2", 3, angle.size), mode="wrap")
     np.multiply(distance, np.cos(angle), out=x)
     np.multiply(distance, np.sin(angle), out=y)
     np.copyto(intensity, column(samples, 2, "u1", 3, angle.size))
@@ -134,7 +134,7 @@ def _m1c1_chunk(packets: Bytes, found: Floats, start: int, scratch: Scratch) -> 
     distance, correction = scratch.single[0][:size], scratch.single[1][:size]
     metres, corrections, levels = _m1c1_tables()
     lookup(metres, column(samples, 1, "<u2", 3, size), scratch, distance)
-    corrections.take(scratch.index[:size], out=correction, mode="clip")
+    corrections.take(scratch.index[:size], out=correction, mode="wrap")
     np.subtract(angle, correction, out=angle)
     east, north = scratch.directions(angle, size)
     np.multiply(distance, east, out=x)
@@ -194,7 +194,7 @@ def rplidar_points(nodes: Bytes) -> Floats:
         x, y, intensity = found[:, start : start + len(rows)]
         lookup(metres, column(rows, 3, "<u2", 5, len(rows)), scratch, distance)
         lookup(cosine, column(rows, 1, "<u2", 5, len(rows)), scratch, x)
-        sine.take(scratch.index[: len(rows)], out=y, mode="clip")
+        sine.take(scratch.index[: len(rows)], out=y, mode="wrap")
         np.multiply(distance, x, out=x)
         np.multiply(distance, y, out=y)
         lookup(quality, rows[:, 0], scratch, intensity)

@@ -6,16 +6,21 @@ from collections.abc import Mapping
 from typing import Any
 
 import click
+import numpy as np
 
 from lidarspec.cli.output import emit, emit_json, note, output_options, table
-from lidarspec.frames.tables import Rows
+from lidarspec.errors import SpecError
+from lidarspec.frames.columns import Batch
 from lidarspec.links import Link, Serial, Tcp, Udp
 from lidarspec.plans.plan import Plan, plan_for
 from lidarspec.plugins import registry, sensor as named_sensor
 from lidarspec.points import points_function
+from lidarspec.simulation.sweeps import FrameMaker
 from lidarspec.spec import Command, Frame, Sensor
 from lidarspec.wiretable import frame_size, wire_table
 
+#: packets that a plan is shown for: as many as a turn may take, since some of them are shorter.
+PACKETS = 32
 NO_SENSORS = "no sensor is installed: pip install 'lidarspec[all]'"
 
 
@@ -70,10 +75,14 @@ def show(sensor_id: str, as_plan: bool, as_json: bool, output: str | None) -> No
 
 def _plan(sensor: Sensor, frame: str) -> list[str]:
     """The plan of a data frame in lines, or why there is none."""
-    packets = sensor.decode([sensor.example(frame)], frame)
-    if not isinstance(packets.table, Rows) or not packets.table.groups:
-        return ["plain evaluation: the frame is not compiled"]
-    found = plan_for(points_function(sensor, frame), packets.batch(), packets.table.groups[0])
+    try:
+        made, sweep = FrameMaker(sensor, frame), sensor.frames[frame].sweep or sensor.sweep
+    except SpecError as error:
+        return [f"plain evaluation: {error}"]
+    table = made.table([sweep(index) for index in range(PACKETS)]) if sweep else made.engine.table([sensor.example(frame)])
+    state = {name: (None, np.full(len(table), -1, np.intp)) for name in sensor.state}
+    largest = max(table.groups, key=lambda group: group.layout.size)
+    found = plan_for(points_function(sensor, frame), Batch(table, np.zeros(len(table), np.bool_), state, sensor.state), largest)
     return found.describe() if isinstance(found, Plan) else [f"plain evaluation: {found}"]
 
 

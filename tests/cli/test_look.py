@@ -64,6 +64,9 @@ def test_show_tells_commands_and_their_bytes() -> None:
 @pytest.mark.parametrize("sensor", list(ls.sensors()))
 def test_show_works_for_every_sensor(sensor: str) -> None:
     assert set(printed("show", sensor)["frames"]) == set(ls.sensor(sensor).frames)
+    plans = printed("show", sensor, "--plan")
+    assert set(plans) == {name for name, frame in ls.sensor(sensor).frames.items() if frame.data}
+    assert all("points a packet" in lines[0] for lines in plans.values()), plans
 
 
 def test_plugins_names_distributions() -> None:
