@@ -41,8 +41,8 @@ def _days(year: Any, month: Any, day: Any) -> Any:
     """Days from 1970-01-01 in the Gregorian calendar; years begin in March, so that the leap day is the last."""
     years = np.where(month <= 2, year - 1, year)
     months = np.where(month <= 2, month + 9, month - 3)
-    leap_days = years // 4 - years // 100 + years // 400
-    return 365 * years + leap_days + (153 * months + 2) // 5 + day - 719_469
+    leap_days = np.floor(years / 4) - np.floor(years / 100) + np.floor(years / 400)
+    return 365 * years + leap_days + np.floor((153 * months + 2) / 5) + day - 719_469
 
 
 def beams(f: Fields, channels: Calibration, *, distance: Any, block: Any, returns: Any, fired: Any) -> Polar:
