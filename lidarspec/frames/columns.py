@@ -88,7 +88,7 @@ class Column(NDArrayOperatorsMixin):
             raise SpecError("columns cannot be changed in place; write a new expression instead")
         if method != "__call__":
             return getattr(ufunc, method)(*(np.asarray(value) for value in inputs), **kwargs)
-        return self.applied(lambda *arrays: ufunc(*arrays, **kwargs), *inputs)
+        return self.applied((lambda *arrays: ufunc(*arrays, **kwargs)) if kwargs else ufunc, *inputs)
 
     def __array_function__(self, function: Callable[..., Any], types: Any, args: Any, kwargs: Any) -> Any:
         if function in ELEMENTWISE:
@@ -208,6 +208,9 @@ def aligned(values: tuple[Any, ...], batch: Batch) -> tuple[list[NDArray[Any]], 
         SpecError: where axes of different arrays meet.
     """
     columns = [value for value in values if isinstance(value, Column)]
+    if columns and all(column.axes == columns[0].axes for column in columns) and _only_numbers_beside(values):
+        arrays = [value.array if isinstance(value, Column) else np.asarray(value) for value in values]
+        return arrays, columns[0].axes, min([column.ready for column in columns])
     depth = max((len(column.axes) for column in columns), default=0)
     names: list[str | None] = [None] * depth
     for column in columns:
@@ -216,7 +219,7 @@ def aligned(values: tuple[Any, ...], batch: Batch) -> tuple[list[NDArray[Any]], 
                 raise SpecError(f"axis {names[index]!r} meets axis {name!r}: put one on the other's place with .on(...)")
             names[index] = name if name is not None else names[index]
     chain = batch.table.schema.chain()
-    arrays: list[NDArray[Any]] = []
+    arrays = []
     for value in values:
         if isinstance(value, Column):
             arrays.append(value.array.reshape(*value.shape, *(1,) * (depth - len(value.axes))))
@@ -228,6 +231,11 @@ def aligned(values: tuple[Any, ...], batch: Batch) -> tuple[list[NDArray[Any]], 
             if place >= 0 and array.shape[place] != 1 and names[index] is None:
                 names[index] = chain[index] if index < len(chain) else f"<{index}>"
     return arrays, tuple(names), min((column.ready for column in columns), default=len(batch))
+
+
+def _only_numbers_beside(values: tuple[Any, ...]) -> bool:
+    """Whether what is no column is a plain number, so that nothing has to be lined up."""
+    return all(isinstance(value, Column | int | float) for value in values)
 
 
 def remainder(values: NDArray[Any], full: NDArray[Any]) -> NDArray[Any]:
