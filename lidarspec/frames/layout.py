@@ -29,6 +29,13 @@ def elements(rows: Bytes2D, dtype: np.dtype[Any], offset: int, shape: tuple[int,
     return np.lib.stride_tricks.as_strided(first, (len(rows), *shape), (rows.strides[0], *strides))
 
 
+def span(rows: Bytes2D) -> NDArray[np.uint8]:
+    """All bytes from the first of the first row to the last of the last one, those between the rows included, (k,), not copied."""
+    if rows.flags.c_contiguous:
+        return rows.reshape(-1)
+    return np.lib.stride_tricks.as_strided(rows, ((len(rows) - 1) * rows.strides[0] + rows.shape[1],), (1,))
+
+
 @dataclass(frozen=True, eq=False)
 class Leaf:
     """The place of one field.

@@ -22,8 +22,9 @@ from lidarspec.frames.columns import Batch, Carry, Column
 from lidarspec.frames.tables import Group, Rows
 from lidarspec.frames.tracing import Node
 from lidarspec.packets import Packets, install_points
-from lidarspec.plans.kernels import spread_out
+from lidarspec.plans.kernels import Kernel, spread_out
 from lidarspec.plans.plan import Plan, plan_for, tables_of, worth_compiling
+from lidarspec.plans.program import Program
 from lidarspec.points import Evaluated, evaluate, points_function
 
 _MAIN = ("x", "y", "z", "intensity")
@@ -72,16 +73,30 @@ class Share:
 
     def program(self, names: tuple[str, ...], function: Any, backend: str) -> dict[str, NDArray[Any]]:
         """Columns made by a kernel or a program, for every packet of the group."""
-        rows = np.ascontiguousarray(self.group.rows)
-        if backend == "jit" or (backend == "auto" and worth_compiling(function, names, self.plan, len(rows))):
-            return self.plan.kernel(names, function).run(rows, self.values.array)
-        found = self.plan.program(names, tables_of(function)).run(rows, self.values.array)
-        if "x" in found and not self.plan.safe(self.values.array):
+        made = self.maker(names, function, backend, len(self.group.where))
+        found = made.columns(len(self.group.where))
+        self.fill(made, found, 0, len(self.group.where))
+        return found
+
+    def maker(self, names: tuple[str, ...], function: Any, backend: str, number: int) -> Program | Kernel:
+        """What makes columns of so many packets: a kernel or a program."""
+        if backend == "jit" or (backend == "auto" and worth_compiling(function, names, self.plan, number)):
+            return self.plan.kernel(names, function)
+        return self.plan.program(names, tables_of(function))
+
+    def fill(self, maker: Program | Kernel, found: Mapping[str, NDArray[Any]], first: int, stop: int) -> None:
+        """Fill the columns of some of the packets."""
+
+        def values(node: Node) -> NDArray[Any]:
+            array = self.values.array(node)
+            return array[first:stop] if len(array) > 1 else array
+
+        maker.run(self.group.rows[first:stop], values, found)
+        if "x" in found and isinstance(maker, Program) and not self.plan.safe(values):
             made = [found[name] for name in "xyz" if name in found]
             bad = np.isnan(made).any(axis=0)
             for column in made:
                 column[bad] = np.nan
-        return found
 
     def plain(self, value: Any) -> NDArray[Any]:
         """A part of the result for every point of the group, evaluated plainly."""

@@ -13,7 +13,7 @@ import math
 import os
 import sys
 import types
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from lidarspec._version import __version__
 from lidarspec.errors import UsageError
-from lidarspec.frames.layout import Bytes2D
+from lidarspec.frames.layout import Bytes2D, span
 from lidarspec.frames.tracing import Node
 from lidarspec.plans.kerneltext import SPREAD, Text
 
@@ -40,12 +40,11 @@ class Kernel:
 
     Args:
         text: of the kernel.
-        size: of a frame in bytes.
         width: points of a frame.
     """
 
-    def __init__(self, text: Text, size: int, width: int) -> None:
-        self._text, self._size, self._width = text, size, width
+    def __init__(self, text: Text, width: int) -> None:
+        self._text, self._width = text, width
         wanted = text.wanted
         self._numbers = np.array(wanted.numbers, np.int64)
         self._function: Any = None
@@ -64,18 +63,20 @@ class Kernel:
         """Have the code at hand."""
         self._function = self._function or function_of(self._text.source)
 
-    def run(self, rows: Bytes2D, values: Values) -> dict[str, NDArray[np.float32]]:
-        """The columns of all frames, flat; arguments as of `Program.run`."""
+    def columns(self, number: int) -> dict[str, NDArray[Any]]:
+        """The columns of so many frames, to be filled."""
+        return {name: np.empty(number * self._width, np.float32) for name in self._text.names}
+
+    def run(self, rows: Bytes2D, values: Values, found: Mapping[str, NDArray[Any]]) -> None:
+        """Fill the columns of all frames; arguments as of `Program.run`."""
         self.compile()
-        count = len(rows)
-        found = {name: np.empty(count * self._width, np.float32) for name in self._text.names}
+        count, stride = rows.shape[0], rows.strides[0]
         given: list[Any] = []
         for node in self._text.wanted.nodes:
             given += _flat(values(node), node.shape)
-        rest = (self._numbers, *self._text.wanted.arrays, *given, *found.values())
-        flat_rows = rows.reshape(-1)
-        self._shared(count, lambda first, number: self._function(flat_rows, first, number, *rest))
-        return found
+        rest = (self._numbers, *self._text.wanted.arrays, *given, *(found[name] for name in self._text.names))
+        data = span(rows)
+        self._shared(count, lambda first, number: self._function(data, stride, first, number, *rest))
 
     def _shared(self, count: int, run: Callable[[int, int], Any]) -> None:
         """Call for all frames, by parts where there are threads and enough for them."""

@@ -163,11 +163,11 @@ def _made(writer: Expressions, name: str, value: Any) -> Any:
 
 def _function(writer: Writer, assembly: Assembly, turns: list[str], names: tuple[str, ...]) -> str:
     """The signature and the loops."""
-    size, width = writer.number(writer.layout.size), writer.number(writer.width)
+    width = writer.number(writer.width)
     held = writer.number(max(CHUNK // writer.width, 1)) if turns else "count"
     loops = _loops(writer, width)
     wanted = writer.wanted
-    parameters = [("rows", "BYTES"), ("first", "INTEGER"), ("count", "INTEGER"), ("numbers", "PLACES")]
+    parameters = [("rows", "BYTES"), ("stride", "INTEGER"), ("first", "INTEGER"), ("count", "INTEGER"), ("numbers", "PLACES")]
     parameters += [(f"c{index}", _TYPES[array.dtype.name]) for index, array in enumerate(wanted.arrays)]
     for index in range(len(wanted.nodes)):
         parameters += [(f"g{index}", "DOUBLES"), (f"s{index}", "INTEGER")]
@@ -180,7 +180,7 @@ def _function(writer: Writer, assembly: Assembly, turns: list[str], names: tuple
         "    end = min(begin + step, first + count)",
         "    start = begin * " + width,
     ]
-    body += ["    for p in range(begin, end):", f"        base = p * {size}", *(f"        {text}" for text in loops)]
+    body += ["    for p in range(begin, end):", "        base = p * stride", *(f"        {text}" for text in loops)]
     if turns:
         body += [f"    for k in range((end - begin) * {width}):", "        o = start + k"]
         body += [f"        {text}" for text in (*turns, *assembly.flat)]

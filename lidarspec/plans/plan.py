@@ -116,7 +116,7 @@ class Plan:
             known = all(is_number(value, self.layout.leaves) for value in (*self._directed, *origin))
             wanted = {name: self._expressions[name] for name in names}
             text = written(self.layout, self.shape, wanted, tables, varying, together=not known)
-            self.kernels[names] = Kernel(text, self.layout.size, self.width)
+            self.kernels[names] = Kernel(text, self.width)
         return self.kernels[names]
 
     def describe(self) -> list[str]:

@@ -7,7 +7,7 @@ cosines are taken in float32 of angles that were reduced to half a turn in float
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import cached_property
 from typing import Any
 
@@ -217,15 +217,21 @@ class Program:
             self._known[name] = make()
         return self._known[name]
 
-    def run(self, rows: Bytes2D, values: Values) -> dict[str, NDArray[Any]]:
-        """The columns of all frames, flat.
+    def columns(self, number: int) -> dict[str, NDArray[Any]]:
+        """The columns of so many frames, to be filled."""
+        return {name: np.empty(number * self.width, TYPES[self.kinds[register]]) for name, register in self.outputs.items()}
+
+    def run(self, rows: Bytes2D, values: Values, found: Mapping[str, NDArray[Any]]) -> None:
+        """Fill the columns of all frames.
 
         Args:
-            rows: the frames, C-contiguous.
-            values: the plain result of a node for the whole batch, shape (n or 1, ...).
+            rows: the frames, at one distance from each other.
+            values: the plain result of a node for these frames, shape (n or 1, ...).
+            found: flat, contiguous and as long as `columns` makes them.
         """
         number = len(rows)
-        found = {name: np.empty(number * self.width, TYPES[self.kinds[register]]) for name, register in self.outputs.items()}
+        if any(blocks.is_flat for blocks in self._blocks):
+            rows = np.ascontiguousarray(rows)
         size = min(self.chunk, number) * self.width
         scratch = self._scratch(size)
         execution = Run(rows, values)
@@ -233,7 +239,6 @@ class Program:
         with np.errstate(all="ignore"):
             for start in range(0, number, self.chunk):
                 self._chunk(execution, scratch, found, start, min(start + self.chunk, number))
-        return found
 
     @cached_property
     def _slots(self) -> list[int]:
@@ -252,7 +257,7 @@ class Program:
             found.append(made[slot])
         return found
 
-    def _chunk(self, run: Run, scratch: list[NDArray[Any]], found: dict[str, NDArray[Any]], start: int, stop: int) -> None:
+    def _chunk(self, run: Run, scratch: list[NDArray[Any]], found: Mapping[str, NDArray[Any]], start: int, stop: int) -> None:
         count = (stop - start) * self.width
         run.start, run.stop = start, stop
         run.views = [array[:count] for array in scratch]

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.frames.layout import Bytes2D, Leaf
+from lidarspec.frames.layout import Bytes2D, Leaf, elements
 from lidarspec.frames.tracing import Node
 
 
@@ -76,6 +76,9 @@ class Blocks:
         leaves: the fields wanted; all of the same arrays.
         size: of a frame in bytes.
         chunk: packets.
+
+    Attributes:
+        is_flat: whether nothing stands between them, if the frames stand back to back, as they then have to.
     """
 
     def __init__(self, leaves: list[Leaf], size: int, chunk: int) -> None:
@@ -83,11 +86,11 @@ class Blocks:
         self.shape, strides = first.shape[: len(first.strides)], first.strides
         self.stride = strides[-1] if strides else size
         count = self.shape[-1] if self.shape else 1
-        self._flat = self._regular(size, strides)
+        self.is_flat = self._regular(size, strides)
         self._length = count * self.stride
-        self._base = 0 if self._flat else max(min(*(leaf.offset for leaf in leaves), size - self._length), 0)
-        self._strides, self._size = (size, *strides[:-1]), size
-        self._compact = None if self._flat else np.empty((chunk, math.prod(self.shape[:-1]) * self._length), np.uint8)
+        self._base = 0 if self.is_flat else max(min(*(leaf.offset for leaf in leaves), size - self._length), 0)
+        self._strides, self._size = strides[:-1], size
+        self._compact = None if self.is_flat else np.empty((chunk, math.prod(self.shape[:-1]) * self._length), np.uint8)
 
     def _regular(self, size: int, strides: tuple[int, ...]) -> bool:
         """Whether elements follow each other at one distance from frame to frame too."""
@@ -100,9 +103,9 @@ class Blocks:
 
     def source(self, rows: Bytes2D) -> NDArray[Any]:
         """What `load` takes its chunks from."""
-        if self._flat:
+        if self.is_flat:
             return rows
-        return np.ndarray((len(rows), *self.shape[:-1]), f"V{self._length}", rows.data, self._base, self._strides)
+        return elements(rows, np.dtype(f"V{self._length}"), self._base, self.shape[:-1], self._strides)
 
     def load(self, source: NDArray[Any], start: int, stop: int) -> None:
         """Compact some packets."""
@@ -118,4 +121,4 @@ class Blocks:
 
     def holds(self, seen: Window) -> bool:
         """Whether a window lies in the elements that are kept."""
-        return self._flat or 0 <= seen.offset - self._base <= self.stride - seen.size
+        return self.is_flat or 0 <= seen.offset - self._base <= self.stride - seen.size
