@@ -105,7 +105,7 @@ class CaptureReader:
             file = self._owned = _open(file)
         self._source = self._reading(file)
         self._fragments = Reassembly()
-        self._datagrams = self._walk()
+        self._datagrams: Iterator[Datagram] | None = None
         try:
             magic = self._source.magic()
             if not is_capture(magic):
@@ -116,6 +116,8 @@ class CaptureReader:
             raise
 
     def __iter__(self) -> Iterator[Datagram]:
+        if self._datagrams is None:  # and not before: it holds the reader, which would live on until the garbage is collected
+            self._datagrams = self._walk()
         return self._datagrams
 
     def __enter__(self) -> Self:
