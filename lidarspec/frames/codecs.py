@@ -139,7 +139,7 @@ class CompiledCodec:
         return Rows(
             self.schema,
             [
-                Group(layout, which, rows_at(buffer, offsets if len(which) == len(offsets) else offsets[which], layout.size))
+                Group(layout, which, _rows(buffer, offsets if len(which) == len(offsets) else offsets[which], layout.size))
                 for layout, which in known
             ],
         )
@@ -210,6 +210,11 @@ def _partial(buffer: NDArray[np.uint8], offsets: NDArray[np.intp], layout: Layou
         status[there] = np.where(buffer[offsets[there] + spot] & mask == value, status[there], CONSTANT)
         sizes[~there] = spot + 1
     return status, sizes
+
+
+def _rows(buffer: NDArray[np.uint8], offsets: NDArray[np.intp], size: int) -> NDArray[np.uint8]:
+    """Frames, one a row, where they stand, if they are at least half of what stands there and would be kept for them; else copied."""
+    return rows_at(buffer, offsets, size, gathered=2 * len(offsets) * size < len(buffer))
 
 
 def _size(frame: Frame) -> int | None:

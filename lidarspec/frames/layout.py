@@ -26,6 +26,8 @@ def elements(rows: Bytes2D, dtype: np.dtype[Any], offset: int, shape: tuple[int,
     if rows.flags.c_contiguous:
         return np.ndarray((len(rows), *shape), dtype, rows.data, offset, (rows.shape[1], *strides))
     first = rows[:, offset : offset + dtype.itemsize].view(dtype)
+    if not shape:
+        return first[:, 0]
     return np.lib.stride_tricks.as_strided(first, (len(rows), *shape), (rows.strides[0], *strides))
 
 
