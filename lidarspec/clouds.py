@@ -93,9 +93,13 @@ class PointCloud:
             shape = (number // rows, rows) if first % rows == 0 and number % rows == 0 else None
         return PointCloud(**{**picked, "shape": shape})
 
-    def time_at(self, index: int) -> float:
-        """The time of one point, without making the column where it is not made yet."""
-        return float(self.time[index])
+    def times_at(self, indices: NDArray[np.intp]) -> NDArray[np.float64]:
+        """The times of some points, without making the column where it is not made yet."""
+        return self.time[indices]
+
+    def stretch(self, start: int, stop: int) -> PointCloud:
+        """Consecutive points."""
+        return self[start:stop]
 
     def to_structured(self) -> NDArray[Any]:
         """A structured array (N,) with PCL's layout: x y z intensity ring time, itemsize 32; what is missing is 0."""
@@ -112,17 +116,27 @@ def _pick(value: Any, which: Any) -> Any:
 
 
 class Columns(Protocol):
-    """Where a `LazyCloud` takes its columns from."""
+    """Where a `LazyCloud` takes its columns from.
 
-    @property
-    def size(self) -> int:
-        """The number of points."""
+    Attributes:
+        size: the number of points.
+    """
+
+    size: int
 
     def column(self, name: str) -> NDArray[Any] | None:
         """A column of `PointCloud`; None where the sensor has none."""
 
-    def time_at(self, index: int) -> float:
-        """One value of the column "time"; the others need not be made for it."""
+    def times_at(self, indices: NDArray[np.intp]) -> NDArray[np.float64]:
+        """Some values of the column "time"; the others need not be made for them."""
+
+    def stretch(self, start: int, stop: int) -> Columns | None:
+        """Those of consecutive points, which may be made for these alone; None where that is not known."""
+        return None
+
+    def followed(self, others: Sequence[Columns]) -> Columns | None:
+        """These points and others after them as one, made together; None where that is not known."""
+        return None
 
 
 class _Unread:
@@ -156,15 +170,23 @@ class LazyCloud(PointCloud):
     def __getitem__(self, which: Any) -> PointCloud:
         if isinstance(which, slice) and which.step in (None, 1):
             first, end, _ = which.indices(len(self))
-            number, rows = max(end - first, 0), self.shape[1] if self.shape else 0
-            shape = (number // rows, rows) if rows and first % rows == 0 and number % rows == 0 else None
-            return LazyCloud.of(
-                _Sliced(self, slice(first, first + number), number), stamp_ns=self.stamp_ns, shape=shape, nominal=self.nominal
-            )
+            number = max(end - first, 0)
+            return self._part(_Sliced(self, slice(first, first + number), number), first)
         return super().__getitem__(which)
 
-    def time_at(self, index: int) -> float:
-        return float(self.time[index]) if "time" in self.__dict__ else self.source.time_at(index)
+    def stretch(self, start: int, stop: int) -> PointCloud:
+        """Consecutive points; where they are many their columns are made for them alone."""
+        source = self.source.stretch(start, stop) if stop > start else None
+        return self[start:stop] if source is None else self._part(source, start)
+
+    def _part(self, source: Columns, first: int) -> LazyCloud:
+        """The points of a source, of which the first is one of ours."""
+        number, rows = source.size, self.shape[1] if self.shape else 0
+        shape = (number // rows, rows) if rows and first % rows == 0 and number % rows == 0 else None
+        return LazyCloud.of(source, stamp_ns=self.stamp_ns, shape=shape, nominal=self.nominal)
+
+    def times_at(self, indices: NDArray[np.intp]) -> NDArray[np.float64]:
+        return self.time[indices] if "time" in self.__dict__ else self.source.times_at(indices)
 
     def __reduce__(self) -> Any:
         return _cloud, ({f.name: getattr(self, f.name) for f in fields(self)},)
@@ -178,8 +200,8 @@ def _cloud(values: dict[str, Any]) -> PointCloud:
     return PointCloud(**values)
 
 
-@dataclass(frozen=True, eq=False)
-class _Sliced:
+@dataclass(eq=False)
+class _Sliced(Columns):
     """Some points of another cloud, one after another."""
 
     cloud: PointCloud
@@ -190,12 +212,12 @@ class _Sliced:
         found = getattr(self.cloud, name)
         return None if found is None else found[self.which]
 
-    def time_at(self, index: int) -> float:
-        return self.cloud.time_at(self.which.start + index)
+    def times_at(self, indices: NDArray[np.intp]) -> NDArray[np.float64]:
+        return self.cloud.times_at(indices + self.which.start)
 
 
-@dataclass(frozen=True, eq=False)
-class _Joined:
+@dataclass(eq=False)
+class _Joined(Columns):
     """Several clouds one after another, with times from one stamp."""
 
     clouds: Sequence[PointCloud]
@@ -208,16 +230,17 @@ class _Joined:
         parts = [getattr(cloud, name) for cloud in self.clouds]
         return None if any(part is None for part in parts) else np.concatenate(parts)
 
-    def time_at(self, index: int) -> float:
+    def times_at(self, indices: NDArray[np.intp]) -> NDArray[np.float64]:
+        found, start = np.empty(len(indices)), 0
         for cloud in self.clouds:
-            if index < len(cloud):
-                return cloud.time_at(index) + (cloud.stamp_ns - self.stamp_ns) * 1e-9
-            index -= len(cloud)
-        raise IndexError(index)
+            inside = (indices >= start) & (indices < start + len(cloud))
+            found[inside] = cloud.times_at(indices[inside] - start) + (cloud.stamp_ns - self.stamp_ns) * 1e-9
+            start += len(cloud)
+        return found
 
 
-@dataclass(frozen=True, eq=False)
-class _Restamped:
+@dataclass(eq=False)
+class _Restamped(Columns):
     """Another cloud with times counted from its first point."""
 
     cloud: PointCloud
@@ -227,8 +250,8 @@ class _Restamped:
         found: NDArray[Any] | None = getattr(self.cloud, name)
         return found - found[0] if name == "time" and found is not None else found
 
-    def time_at(self, index: int) -> float:
-        return self.cloud.time_at(index) - self.cloud.time_at(0)
+    def times_at(self, indices: NDArray[np.intp]) -> NDArray[np.float64]:
+        return self.cloud.times_at(indices) - self.cloud.times_at(np.zeros(1, np.intp))
 
 
 def joined(clouds: Sequence[PointCloud]) -> PointCloud:
@@ -240,8 +263,11 @@ def joined(clouds: Sequence[PointCloud]) -> PointCloud:
     shape = (
         (sum(cloud.shape[0] for cloud in clouds if cloud.shape), rows.pop()) if len(rows) == 1 and all(c.shape for c in clouds) else None
     )
-    source = _Joined(clouds, clouds[0].stamp_ns, sum(map(len, clouds)))
-    return LazyCloud.of(source, stamp_ns=source.stamp_ns, shape=shape, nominal=np.bool_(any(cloud.nominal for cloud in clouds)))
+    sources = [cloud.source for cloud in clouds if isinstance(cloud, LazyCloud)]
+    source = sources[0].followed(sources[1:]) if len(sources) == len(clouds) else None
+    if source is None:
+        source = _Joined(clouds, clouds[0].stamp_ns, sum(map(len, clouds)))
+    return LazyCloud.of(source, stamp_ns=clouds[0].stamp_ns, shape=shape, nominal=np.bool_(any(cloud.nominal for cloud in clouds)))
 
 
 def restamped(cloud: PointCloud, stamp_ns: int) -> PointCloud:

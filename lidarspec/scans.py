@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -151,17 +151,16 @@ class ScanStream:
         return list(self._cut(packets, found))
 
     def _cut(self, packets: Packets, found: Evaluated) -> Iterator[Scan]:
-        start = 0
-        for cut in self._cutter.cuts(packets, found):
-            self._parts.append(found.cloud[start:cut] if cut > start else found.cloud[:0])
-            ends = _time_ns(found.cloud, cut) if cut < len(found.cloud) else None
+        start, cuts = 0, self._cutter.cuts(packets, found)
+        for cut, ends in zip(cuts, _times_ns(found.cloud, cuts), strict=True):
+            self._parts.append(found.cloud.stretch(start, cut))
             scan = self._close(ends, complete=self._started)
             self._begins = ends
             if scan is not None:
                 self._started = True
                 yield scan
             start = cut
-        self._parts.append(found.cloud[start:] if start else found.cloud)
+        self._parts.append(found.cloud.stretch(start, len(found.cloud)))
 
     def _close(self, ends: int | None, *, complete: bool) -> Scan | None:
         """The scan of the points so far; `ends`: the time of the first point after it, ns."""
@@ -170,7 +169,8 @@ class ScanStream:
         if not parts:
             return None
         cloud = joined(parts)
-        begins = self._begins if self._begins is not None else _time_ns(cloud, 0)
+        begins = self._begins if self._begins is not None else _times_ns(cloud, [0])[0]
+        assert begins is not None
         self._begins = None
         period = (ends - begins) * 1e-9 if ends is not None else np.nan
         rate = 1 / period if period > 0 else np.nan
@@ -179,9 +179,11 @@ class ScanStream:
         return Scan(mounted, float(rate) if complete else np.nan, complete, self._sensor)
 
 
-def _time_ns(cloud: PointCloud, index: int) -> int:
-    """The time of one point, ns."""
-    return cloud.stamp_ns + round(cloud.time_at(index) * 1e9)
+def _times_ns(cloud: PointCloud, indices: Sequence[int]) -> list[int | None]:
+    """The times of some points in order, ns; None for those past the end."""
+    known = [index for index in indices if index < len(cloud)]
+    times = cloud.times_at(np.array(known, np.intp)).tolist() if known else []
+    return [cloud.stamp_ns + round(time * 1e9) for time in times] + [None] * (len(indices) - len(known))
 
 
 def scans_of(sensor: Sensor, batches: Iterable[Packets]) -> Iterator[Scan]:

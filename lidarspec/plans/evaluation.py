@@ -15,19 +15,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.allocation import keep_freed_memory
-from lidarspec.clouds import LazyCloud, PointCloud, axis_matrix, narrowed
+from lidarspec.clouds import LazyCloud, PointCloud
 from lidarspec.errors import SpecError
 from lidarspec.frames.access import Fields
 from lidarspec.frames.columns import Batch, Carry, Column
 from lidarspec.frames.tables import Group, Rows
 from lidarspec.frames.tracing import Node
 from lidarspec.packets import Packets, install_points
-from lidarspec.plans.kernels import Kernel, spread_out
+from lidarspec.plans.kernels import Kernel
 from lidarspec.plans.plan import Plan, plan_for, tables_of, worth_compiling
 from lidarspec.plans.program import Program
+from lidarspec.plans.stretches import Points
 from lidarspec.points import Evaluated, evaluate, points_function
-
-_MAIN = ("x", "y", "z", "intensity")
 
 
 class Values:
@@ -106,102 +105,22 @@ class Share:
             array = array.reshape(*array.shape, *(1,) * (len(shape) - array.ndim))
         return np.broadcast_to(array, shape)
 
+    def some(self, which: NDArray[np.intp]) -> Share:
+        """The same for some of the packets, by index."""
+        batch = _picked(self.batch, Group(self.group.layout, which, self.group.rows[which]))
+        values = Values(self.plan, batch)
+        for node in self.plan.eager:
+            if node.kind in ("shift", "latest", "state"):
+                column = self.values.column(node)
+                values.know(node, Column(column.array[which] if len(column.array) > 1 else column.array, column.axes, batch))
+        return Share(self.plan, Group(self.group.layout, np.arange(len(which)), self.group.rows[:0]), values, batch)
 
-class Points:
-    """The columns of the points of a batch, made when they are asked for; what a `LazyCloud` reads from."""
 
-    def __init__(self, packets: Packets, shares: list[Share], size: int, base: int) -> None:
-        self._packets, self._shares, self.size, self._base = packets, shares, size, base
-        self._function = points_function(packets.sensor, packets.frame)
-        self._made: dict[str, NDArray[Any]] = {}
-        axes = packets.sensor.vendor_axes if packets.sensor.options.get("frame") == "vendor" else None
-        self._turn = None if axes is None else axis_matrix(axes)
-
-    def column(self, name: str) -> NDArray[Any] | None:
-        """A column of `PointCloud`; None where the sensor has none."""
-        if name not in self._made:
-            self._made |= self._columns(name)
-        return self._made.get(name)
-
-    def _columns(self, name: str) -> dict[str, NDArray[Any]]:
-        parts = self._shares[0].plan.parts
-        if name in _MAIN:
-            return self._coordinates(name, parts)
-        if name == "valid":
-            x = self.column("x")
-            assert x is not None
-            return {"valid": ~np.isnan(x)}
-        if name in ("range", "azimuth"):
-            found = self._programmed(("range", "azimuth") if self._packets.backend == "jit" else (name,))
-            return found | {"azimuth": self._azimuth(found["azimuth"])} if "azimuth" in found else found
-        if name == "time":
-            return {"time": self._joined([self._times(share) for share in self._shares], np.float64)}
-        if name == "elevation":
-            return {name: self._joined([share.plain(share.plan.parts[name]) for share in self._shares], np.float32)}
-        types: dict[str, Any] = {"ring": np.uint16, "return_index": np.uint8}
-        return (
-            {name: self._joined([np.nan_to_num(share.plain(share.plan.parts[name])) for share in self._shares], types[name])}
-            if name in parts
-            else {}
-        )
-
-    def _coordinates(self, name: str, parts: Mapping[str, Any]) -> dict[str, NDArray[Any]]:
-        """The columns that are made together; where all points are level, the height only when it is asked for."""
-        level = self._turn is None and all(share.plan.level for share in self._shares)
-        if level and name == "z":
-            x = self.column("x")
-            assert x is not None
-            return {"z": np.where(np.isnan(x), x, np.float32(0))}
-        return self._turned(self._programmed(tuple(n for n in _MAIN if n in parts or (n in "xyz" and not (level and n == "z")))))
-
-    def _azimuth(self, angles: NDArray[Any]) -> NDArray[np.float32]:
-        """Azimuths in the axes that are asked for, narrowed where a kernel has not done so."""
-        if self._turn is None and angles.dtype == np.float32:
-            return angles
-        if self._turn is not None:
-            direction = self._turn[:2, :2] @ np.stack([np.cos(angles), np.sin(angles)])
-            angles = np.arctan2(direction[1], direction[0])
-        return narrowed(angles)
-
-    def _turned(self, found: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
-        """Coordinates in the vendor's axes, where those are asked for; each is one of REP-103's, or its opposite."""
-        if self._turn is None:
-            return found
-        made = dict(found)
-        for name, row in zip("xyz", self._turn, strict=True):
-            source = int(np.flatnonzero(row)[0])
-            made[name] = found["xyz"[source]] * np.float32(row[source])
-        return made
-
-    def _times(self, share: Share) -> NDArray[np.float64]:
-        offsets = (self._packets.time_ns[share.group.where] - self._base) * 1e-9
-        return np.asarray(share.plain(share.plan.parts["time"]) + offsets.reshape(-1, *(1,) * len(share.plan.shape)))
-
-    def time_at(self, index: int) -> float:
-        """One value of the column "time"."""
-        share = self._shares[0]
-        if len(self._shares) > 1 or share.first is not None:
-            found = self.column("time")
-            assert found is not None
-            return float(found[index])
-        row, spot = divmod(index, share.plan.width)
-        offset = (self._packets.time_ns[share.group.where[row]] - self._base) * 1e-9
-        return float(share.plain(share.plan.parts["time"])[row].flat[spot] + offset)
-
-    def _programmed(self, names: tuple[str, ...]) -> dict[str, NDArray[Any]]:
-        found = [share.program(names, self._function, self._packets.backend) for share in self._shares]
-        return {name: self._joined([part[name] for part in found], found[0][name].dtype) for name in names}
-
-    def _joined(self, parts: list[NDArray[Any]], dtype: Any) -> NDArray[Any]:
-        """The points of all layouts in stream order, those of packets that wait left out."""
-        if len(parts) == 1 and self._shares[0].first is None:
-            flat = parts[0].reshape(-1)[: self.size]
-            return flat.astype(dtype, copy=False)
-        found = np.empty(self.size, dtype)
-        for share, part in zip(self._shares, parts, strict=True):
-            assert share.first is not None
-            spread_out(part.reshape(-1), share.first, share.plan.width, found, compiled=self._packets.backend == "jit")
-        return found
+def _picked(batch: Batch, group: Group) -> Batch:
+    """The packets of a group, in its order, as a batch of their own."""
+    state = {name: (frames, which[group.where]) for name, (frames, which) in batch.state.items()}
+    table = Rows(batch.table.schema, [Group(group.layout, np.arange(len(group.where)), group.rows)])
+    return Batch(table, batch.breaks[group.where], state, batch.defaults, nominal=batch.nominal)
 
 
 def evaluated(packets: Packets, carry: Carry | None = None, *, final: bool = True, epoch: int | None = None) -> Evaluated:
@@ -249,9 +168,7 @@ def _share(packets: Packets, batch: Batch, plan: Plan, group: Group, whole: Valu
     """A group with its plain results; None where the plan was made for other counts, or a factor is not positive."""
     values = whole
     if len(group.where) != len(packets) or not _in_order(group.where):
-        state = {name: (frames, which[group.where]) for name, (frames, which) in batch.state.items()}
-        table = Rows(batch.table.schema, [Group(group.layout, np.arange(len(group.where)), group.rows)])
-        batch = Batch(table, batch.breaks[group.where], state, batch.defaults, nominal=batch.nominal)
+        batch = _picked(batch, group)
         values = Values(plan, batch)
         for number, column in remembered.items():
             node = plan.tape.nodes[number]
