@@ -7,12 +7,17 @@ with `after` only counts while it is announced, and a frame has to be as long as
 from __future__ import annotations
 
 import bisect
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lidarspec.allocation import alike, repeated
 from lidarspec.frames.judging import VALID
-from lidarspec.framing import COUNTED, Bytes1D, Framing, Mode, Offsets
+from lidarspec.framing import COUNTED, Bytes1D, Framing, Marks, Mode, Offsets
+
+#: constants that stand side by side: offset, type, mask (None: all bits), value.
+Word = tuple[int, np.dtype[Any], Any, Any]
 
 
 class Datagrams:
@@ -25,6 +30,7 @@ class Datagrams:
 
     def __init__(self, framing: Framing) -> None:
         self._framing = framing
+        self._words = [_words(marks) for marks in framing.marks]
         self.rejected: dict[str, int] = {}
         self.errors: list[str] = []
 
@@ -45,9 +51,9 @@ class Datagrams:
 
     def judged(self, buffer: Bytes1D, starts: Offsets, sizes: Offsets, mode: Mode) -> Offsets:
         """The type of each datagram while nothing changes what is looked for."""
-        kinds = np.full(len(starts), -1, np.intp)
-        least, most = (int(sizes.min()), int(sizes.max())) if len(sizes) else (0, 0)
-        left = None if least else np.flatnonzero(sizes)
+        number, known = len(starts), alike(sizes)
+        least, most = (known, known) if known is not None else (int(sizes.min()), int(sizes.max())) if number else (0, 0)
+        kinds, left = None, None if least else np.flatnonzero(sizes)
         for kind in self._framing.active(mode):
             if left is not None and not len(left):
                 break
@@ -56,20 +62,22 @@ class Datagrams:
                 continue
             own, lengths = (starts, sizes) if left is None else (starts[left], sizes[left])
             marked = self._marked(kind, buffer, own, lengths)
-            if not marked.all():
+            if np.count_nonzero(marked) < len(marked):
                 own, lengths = own[marked], lengths[marked]
                 if not len(own):
                     continue
             survey = self._framing.codecs[kind].survey(buffer, own, gathered=False)
+            valid = not np.count_nonzero(survey.status)
+            if valid and left is None and len(own) == number and _same(survey.sizes, lengths):
+                return repeated(kind, number)
             right = survey.sizes == lengths
-            if survey.status.any():
+            if not valid:
                 right &= survey.status == VALID
-            if left is None and len(own) == len(kinds) and right.all():
-                return np.broadcast_to(np.intp(kind), len(kinds))
             found = np.flatnonzero(marked)[right]
+            kinds = np.full(number, -1, np.intp) if kinds is None else kinds
             kinds[found if left is None else left[found]] = kind
             left = np.flatnonzero((kinds < 0) & (sizes > 0))
-        return kinds
+        return np.full(number, -1, np.intp) if kinds is None else kinds
 
     def judged_alone(self, datagram: Bytes1D, mode: Mode) -> int:
         """The type of one datagram, -1 where it is none; counts why."""
@@ -88,27 +96,50 @@ class Datagrams:
 
     def _marked(self, kind: int, buffer: Bytes1D, starts: Offsets, sizes: Offsets) -> NDArray[np.bool_]:
         """Which datagrams have the constants of a type."""
-        marks = self._framing.marks[kind]
-        last = max((spot for spot, _, _ in marks), default=-1)
-        whole = sizes > last
-        if not whole.all():
-            marked = whole.copy()
-            marked[whole] = self._marked(kind, buffer, starts[whole], sizes[whole])
-            return marked
-        if not marks:
-            return whole
+        words = self._words[kind]
+        end = max((spot + dtype.itemsize for spot, dtype, _, _ in words), default=0)
+        size = alike(sizes)
+        if size is None or size < end:
+            whole = sizes >= end
+            if not whole.all():
+                marked = whole.copy()
+                marked[whole] = self._marked(kind, buffer, starts[whole], sizes[whole])
+                return marked
+        marked = np.ones(len(starts), np.bool_)
         step = _step(starts)
-        marked = whole
-        for spot, mask, value in marks:
-            found = buffer[starts[0] + spot :: step][: len(starts)] if step else buffer.take(starts + spot)
-            marked &= (found if mask == 0xFF else found & np.uint8(mask)) == np.uint8(value)
+        for spot, dtype, mask, value in words if len(starts) else ():
+            found = (
+                np.ndarray((len(starts),), dtype, buffer, starts.item(0) + spot, (step,))
+                if step
+                else np.ndarray((len(buffer) - spot - dtype.itemsize + 1,), dtype, buffer, spot, (1,))[starts]
+            )
+            marked &= (found if mask is None else found & mask) == value
         return marked
 
 
 def _step(starts: Offsets) -> int:
     """The bytes from each datagram to the next, where they are the same for all; else 0."""
     steps = starts[1:] - starts[:-1]
-    return int(steps[0]) if len(steps) and steps[0] > 0 and bool((steps == steps[0]).all()) else 0
+    step = steps.item(0) if len(steps) else 0
+    return step if step > 0 and np.count_nonzero(steps == step) == len(steps) else 0
+
+
+def _same(first: Offsets, second: Offsets) -> bool:
+    one, other = alike(first), alike(second)
+    return bool((first == second).all()) if one is None or other is None else one == other
+
+
+def _words(marks: Marks) -> list[Word]:
+    """Constants as few words of 1, 2, 4 or 8 bytes, each of bytes that all have constants."""
+    left, found = {spot: (mask, value) for spot, mask, value in marks}, list[Word]()
+    while left:
+        first = min(left)
+        size = next(size for size in (8, 4, 2, 1) if all(spot in left for spot in range(first, first + size)))
+        parts = [left.pop(first + index) for index in range(size)]
+        dtype = np.dtype(f"<u{size}")
+        mask, value = (np.frombuffer(bytes(part), dtype)[0] for part in zip(*parts, strict=True))
+        found.append((first, dtype, None if all(part[0] == 0xFF for part in parts) else mask, value))
+    return found
 
 
 class _Batch:
@@ -123,14 +154,16 @@ class _Batch:
         """The types from here up to the datagram that changes what is looked for."""
         if mode.after not in self._known:
             kinds = self._types.judged(self._buffer, self._starts[position:], self._sizes[position:], mode)
-            switching = [kind for kind in range(len(self._framing.names)) if self._framing.switches(kind, mode)]
+            switching = (
+                [kind for kind in range(len(self._framing.names)) if self._framing.switches(kind, mode)] if self._framing.named else []
+            )
             spots = (np.flatnonzero(np.isin(kinds, switching)) + position).tolist() if switching else []
             self._known[mode.after] = position, kinds, spots
         first, kinds, spots = self._known[mode.after]
         index = bisect.bisect_left(spots, position)
         stop = spots[index] + 1 if index < len(spots) else len(self._starts)
         found = kinds[position - first : stop - first]
-        for lost in np.flatnonzero(found < 0).tolist():
+        for lost in np.flatnonzero(found < 0).tolist() if alike(found) is None else ():
             start = int(self._starts[position + lost])
             found[lost] = self._types.judged_alone(self._buffer[start : start + int(self._sizes[position + lost])], mode)
             if found[lost] >= 0 and self._framing.switches(int(found[lost]), mode):

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lidarspec.allocation import alike, repeated
 from lidarspec.datagrams import Datagrams
 from lidarspec.errors import UsageError, refuse_text
 from lidarspec.found import Counters, Found, Spans, packed
@@ -113,11 +114,11 @@ class Decoder:
     def datagrams(self, data: Sequence[Any] | NDArray[np.uint8], at: Sequence[int | None] | None = None) -> Spans:
         """Datagrams, each one frame, whole, or none; a list, or the rows of an array."""
         if isinstance(data, np.ndarray):
-            buffer, sizes = data.reshape(-1), np.broadcast_to(np.intp(data.shape[1]), len(data))
+            buffer, sizes = data.reshape(-1), repeated(data.shape[1], len(data))
         else:
-            buffer, sizes = np.frombuffer(b"".join(data), np.uint8), np.array([len(one) for one in data], np.intp)
-        times = _UNKNOWN if at is None else np.array([-1 if one is None else one for one in at], np.int64)
-        return self.placed(buffer, _starts(sizes), sizes, np.broadcast_to(times, len(data)))
+            buffer, sizes = np.frombuffer(b"".join(data), np.uint8), _sizes(list(map(len, data)))
+        times = repeated(-1, len(data)) if at is None else np.array([-1 if one is None else one for one in at], np.int64)
+        return self.placed(buffer, _starts(sizes), sizes, times)
 
     def placed(self, buffer: NDArray[np.uint8], starts: NDArray[np.intp], sizes: NDArray[np.intp], at: NDArray[np.int64]) -> Spans:
         """Datagrams that stand in one buffer already; the same as `datagrams`, and nothing is copied.
@@ -128,14 +129,14 @@ class Decoder:
             at: their arrival times in ns, -1 where nobody knows.
         """
         offsets = _starts(sizes, self._base)
-        total = int(offsets[-1] + sizes[-1]) - self._base if len(offsets) else 0
+        total = offsets.item(-1) + sizes.item(-1) - self._base if len(offsets) else 0
         self.stats.bytes_in += total
         with summed_by(self._sums):
             kinds = self._datagrams.kinds(buffer, starts, sizes, self._mode)
         self._rejected(self._datagrams.rejected, self._datagrams.errors)
         self._base += total
-        gaps = np.broadcast_to(np.int64(0), len(starts))
-        if self._gap or bool((kinds < 0).any()):
+        gaps, kind = repeated(0, len(starts)), alike(kinds)
+        if self._gap or bool((kinds < 0).any() if kind is None else kind < 0):
             good = kinds >= 0
             gaps = self._lost(buffer, starts, sizes, good)
             kinds, starts, sizes, offsets, at = (array[good] for array in (kinds, starts, sizes, offsets, at))
@@ -221,7 +222,8 @@ class Decoder:
     def _count(self, kinds: NDArray[np.intp]) -> None:
         frames = self.stats.frames
         known = len(frames)
-        for kind, number in enumerate(np.bincount(kinds).tolist() if len(kinds) else ()):
+        only = alike(kinds)
+        for kind, number in [(only, len(kinds))] if only is not None else enumerate(np.bincount(kinds).tolist() if len(kinds) else ()):
             if number:
                 frames[self._names[kind]] = frames.get(self._names[kind], 0) + number
         if len(frames) > known > 0:
@@ -230,18 +232,21 @@ class Decoder:
                     frames[name] = frames.pop(name)
 
 
-#: the arrival time of what nobody knows it of.
-_UNKNOWN = np.array(-1, np.int64)
-
-
 def _starts(sizes: NDArray[np.intp], first: int = 0) -> NDArray[np.intp]:
     """Where pieces of these sizes begin that stand back to back from `first` on."""
-    if len(sizes) and sizes.strides == (0,) and sizes[0]:
-        return np.arange(first, first + len(sizes) * int(sizes[0]), int(sizes[0]))
+    if size := alike(sizes):
+        return np.arange(first, first + len(sizes) * size, size)
     starts = np.cumsum(sizes)
     starts -= sizes
     starts += first
     return starts
+
+
+def _sizes(lengths: list[int]) -> NDArray[np.intp]:
+    """Sizes as an array."""
+    if lengths and lengths.count(lengths[0]) == len(lengths):
+        return repeated(lengths[0], len(lengths))
+    return np.array(lengths, np.intp)
 
 
 def _first_mode(sensor: Sensor) -> str | None:

@@ -18,6 +18,7 @@ import construct
 import numpy as np
 from numpy.typing import NDArray
 
+from lidarspec.allocation import repeated
 from lidarspec.construction import Mismatch
 from lidarspec.errors import SpecError
 from lidarspec.frames.conditions import Check, Conditions
@@ -104,7 +105,7 @@ class CompiledCodec:
             lead, cut = np.flatnonzero(whole), np.flatnonzero(~whole)  # type: ignore[assignment]
         errors: list[str] = []
         status, rows = self._judged(buffer, offsets[lead], layout, errors, gathered=gathered)
-        sizes: NDArray[np.intp] = np.broadcast_to(np.intp(layout.size), len(offsets))
+        sizes: NDArray[np.intp] = repeated(layout.size, len(offsets))
         if count < len(offsets):
             sizes = sizes.copy()
             short, sizes[cut] = _partial(buffer, offsets[cut], layout)

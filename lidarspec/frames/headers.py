@@ -50,6 +50,7 @@ class _Short(Exception):
         self.leaf = leaf
 
 
+_NONE = np.empty(0, np.intp)
 Group = tuple[Layout | Refused, NDArray[np.intp]]
 
 
@@ -64,8 +65,10 @@ def rows_at(buffer: NDArray[np.uint8], offsets: NDArray[np.intp], size: int, *, 
         return np.zeros((count, size), np.uint8)
     if size == 1:
         return buffer.take(offsets).reshape(count, 1)
-    first, step = int(offsets[0]), int(offsets[1] - offsets[0]) if count > 1 else size
-    even = int(offsets[-1]) - first == (count - 1) * step and (count < 3 or bool((offsets[1:] - offsets[:-1] == step).all()))
+    first, step = offsets.item(0), offsets.item(1) - offsets.item(0) if count > 1 else size
+    even = offsets.item(-1) - first == (count - 1) * step
+    if even and count > 2:
+        even = np.count_nonzero(offsets[1:] - offsets[:-1] == step) == count - 1
     if even and step == size:
         return buffer[first : first + count * size].reshape(count, size)
     if even and step > size and not gathered:
@@ -96,6 +99,8 @@ class HeaderTree:
         """
         if self._size > REMEMBERED:
             self._root, self._size = _Node(), 0
+        if isinstance(self._root.result, Layout) and len(offsets):
+            return [(self._root.result, np.arange(len(offsets)))], _NONE
         groups: list[Group] = []
         short: list[NDArray[np.intp]] = []
         stack = [(self._root, np.arange(len(offsets)))] if len(offsets) else []
@@ -107,7 +112,7 @@ class HeaderTree:
                 groups.append((node.result, which))
             elif node.leaf is not None:
                 self._branch(node, node.leaf, buffer, offsets, which, stack, short)
-        return groups, np.concatenate(short) if short else np.empty(0, np.intp)
+        return groups, np.concatenate(short) if short else _NONE
 
     def layout(self, frame: bytes) -> Layout | Refused | None:
         """The layout of one frame, or None where its header is not all there."""
