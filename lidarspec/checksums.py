@@ -22,7 +22,7 @@ Values: TypeAlias = NDArray[np.uint64]
 _LOOP_BYTES = 2048  # below this, a Python loop over bytes is done before NumPy's calls have started
 _NARROW_LOOP_BYTES = 256  # the same where the register is a byte
 _FEW = 4  # rows that are done one by one sooner than together
-_BLOCK_BYTES = 1 << 18  # rows of a batch taken at a time; with what is computed of them they fit the second-level cache
+_BLOCK_BYTES = 1 << 19  # rows of a batch taken at a time; with what is computed of them they fit the second-level cache
 
 
 class Checksum(ABC):

@@ -3,9 +3,12 @@
 `words` turns rows into columns of eight bytes, so that one step of NumPy takes the same eight bytes of every row.
 
 A CRC is linear. A register of one byte is computed by halves: the bytes of a row in front are each advanced as far as the
-bytes behind them are away, by a table of 256, and XORed onto them, until one byte is left. A wider register runs along all
-rows at once, two bytes a step, by a table of 65,536; long rows are cut into segments that run side by side and are joined in
-pairs. Tables depend on the polynomial and the distance alone.
+bytes behind them are away, by a table of 256, and XORed onto them, until one byte is left. Where rows are many, their words
+become one word before, without tables: eight bytes on, a byte counts as the sum of itself at fewer bytes on, which ones is
+what the polynomial says (its eighth power has the same terms, eight times as far apart). So each word is XORed onto sums for
+0 to 7 bytes on, and these are moved and added up. A wider register runs along all rows at once, two bytes a step, by a table
+of 65,536; long rows are cut into segments that run side by side and are joined in pairs. Tables depend on the polynomial and
+the distance alone.
 
 Registers are kept in wire order, where the low byte is the one that meets the next data byte: for `refin` the usual
 reflected register, otherwise the usual register aligned left with its bytes swapped. One formula serves both.
@@ -18,26 +21,28 @@ import numpy as np
 from numpy.typing import NDArray
 
 REGISTER_BYTES = [2] * 17 + [4] * 16 + [8] * 32  # that a register is kept in, by its width
+MANY = 1024  # rows whose words are summed in less time than tables take
 MIRROR = bytes(int(f"{byte:08b}"[::-1], 2) for byte in range(256))
+
+_BYTE, _BYTE_BITS = np.uint64(0xFF), np.uint64(8)
 
 
 def words(rows: NDArray[np.uint8], *, zeros_first: bool = False) -> NDArray[np.uint64]:
     """The rows, filled up with zeros, as columns of little-endian words of eight bytes; shape (words, n), contiguous."""
     (count, length), width = rows.shape, -(-rows.shape[1] // 8) * 8
-    spare = 8 * (width - length)
+    spare = np.uint64(8 * (width - length))
     if length < 8 or rows.strides[1] != 1:
         padded = np.zeros((count, width), np.uint8)
         padded[:, width - length if zeros_first else 0 :][:, :length] = rows
         return np.ascontiguousarray(padded.view("<u8").T)
     found = np.empty((width // 8, count), "<u8")
-    shift = (length - width) if zeros_first else 0
-    for index, column in enumerate(found):
-        start = min(max(8 * index + shift, 0), length - 8)
-        column[:] = rows[:, start : start + 8].view("<u8")[:, 0]
-    if spare and zeros_first:
-        found[0] <<= np.uint64(spare)
+    whole, lead = length // 8, length % 8 if zeros_first else 0
+    first = rows[:, lead : lead + 8].view("<u8")[:, 0]
+    found[1 if lead else 0 :][:whole] = np.lib.stride_tricks.as_strided(first, (whole, count), (8, rows.strides[0]))
+    if lead:
+        np.left_shift(rows[:, :8].view("<u8")[:, 0], spare, out=found[0])
     elif spare:
-        found[-1] >>= np.uint64(spare)
+        np.right_shift(rows[:, -8:].view("<u8")[:, 0], spare, out=found[-1])
     return found
 
 
@@ -73,6 +78,8 @@ def _narrow(rows: NDArray[np.uint8], start: int, width: int, poly: int, refin: b
     left = words(rows, zeros_first=True)
     if start:
         left[0] ^= np.uint64(start << 8 * (-rows.shape[1] % 8))
+    if len(rows) >= MANY and len(left) > 1:
+        left = _summed(left, poly << 8 - width)[None]
     while len(left) > 1:
         half, distance = len(left) // 2, (len(left) + 1) // 2
         moved = left[:half].tobytes().translate(_advance(8 * distance, width, poly, refin))
@@ -84,6 +91,35 @@ def _narrow(rows: NDArray[np.uint8], start: int, width: int, poly: int, refin: b
         moved = parts[::2].tobytes().translate(_advance(size, width, poly, refin))
         lanes = np.frombuffer(moved, f"<u{size}") ^ parts[1::2]
     return np.frombuffer(lanes.tobytes().translate(_advance(1, width, poly, refin)), np.uint8)
+
+
+def _summed(columns: NDArray[np.uint64], poly: int) -> NDArray[np.uint64]:
+    """One word of each row, (n,), that its bytes would give the same register with; `poly` has eight bits."""
+    shares = _shares(len(columns), poly)
+    onto = np.uint64(sum(1 << 8 * (7 - power) for power in range(8) if poly >> power & 1))
+    total, first = np.zeros(columns.shape[1], np.uint64), np.empty(columns.shape[1], np.uint64)
+    highest = max(shares).bit_length() - 1
+    for power in range(highest, -1, -1):
+        if power < highest:
+            np.multiply(np.bitwise_and(total, _BYTE, out=first), onto, out=first)
+            np.right_shift(total, _BYTE_BITS, out=total)
+            np.bitwise_xor(total, first, out=total)
+        for share, column in zip(shares, columns, strict=True):
+            if share >> power & 1:
+                np.bitwise_xor(total, column, out=total)
+    return total
+
+
+@lru_cache(maxsize=256)
+def _shares(number: int, poly: int) -> tuple[int, ...]:
+    """How many bytes further on each of so many words counts, relative to the last one: a bit for each number from 0 to 7."""
+    found = [1]
+    while len(found) < number:
+        share = found[-1]
+        for _ in range(8):
+            share = share << 1 ^ (0x100 | poly if share & 0x80 else 0)
+        found.append(share)
+    return tuple(reversed(found))
 
 
 def _wide(rows: NDArray[np.uint8], start: int, width: int, poly: int, refin: bool) -> NDArray[Any]:
