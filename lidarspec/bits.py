@@ -47,19 +47,24 @@ class BitField:
     @cached_property
     def words(self) -> tuple[tuple[str, int, int], ...] | None:
         """The value as words, if it is whole bytes in a row: type, first byte and lowest bit of each; else None."""
-        parts = sorted(self.segments, key=lambda part: part.byte)
-        first, count = parts[0].byte, len(parts)
-        places = [(part.byte - first, part.target) for part in parts]
-        orders = {"<": [(at, 8 * at) for at in range(count)], ">": [(at, 8 * (count - 1 - at)) for at in range(count)]}
-        order = next((name for name, expected in orders.items() if places == expected), None)
-        if order is None or any(part.mask != 0xFF or part.low for part in parts):
+        if self.run is None:
             return None
-        words, at = [], 0
+        (order, first, count), words, at = self.run, list[tuple[str, int, int]](), 0
         while at < count:
             size = 1 << min((count - at).bit_length() - 1, 3)
             words.append((f"{order}u{size}", first + at, 8 * (at if order == "<" else count - at - size)))
             at += size
         return tuple(words)
+
+    @cached_property
+    def run(self) -> tuple[str, int, int] | None:
+        """The value as whole bytes in a row, if it is: "<" or ">", the first byte, and how many; else None."""
+        parts = sorted(self.segments, key=lambda part: part.byte)
+        first, count = parts[0].byte, len(parts)
+        places = [(part.byte - first, part.target) for part in parts]
+        orders = {"<": [(at, 8 * at) for at in range(count)], ">": [(at, 8 * (count - 1 - at)) for at in range(count)]}
+        order = next((name for name, expected in orders.items() if places == expected), None)
+        return None if order is None or any(part.mask != 0xFF or part.low for part in parts) else (order, first, count)
 
     def value(self, block: bytes) -> int:
         """The value in one block of bytes."""

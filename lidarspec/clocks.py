@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from lidarspec.errors import SpecError
 from lidarspec.frames.access import Fields
 from lidarspec.frames.columns import Batch
+from lidarspec.frames.schema import Schema
 from lidarspec.spec import Sensor
 from lidarspec.units import exact, factor
 
@@ -61,23 +62,35 @@ def clock_ns(sensor: Sensor, batch: Batch) -> Times:
         terms = source(Fields(batch))
         columns = terms if isinstance(terms, tuple | list) else (terms,)
         return sum((_nanoseconds(np.asarray(column), len(batch)) for column in columns), np.zeros(len(batch), np.int64))
-    total = np.zeros(len(batch), np.int64)
-    paths = (source,) if isinstance(source, str) else source
-    for path in paths:
-        info = batch.table.schema.fields.get(path)
-        scaling = _scaling(info.unit, info.scale, info.offset) if info else None
-        if info is None or scaling is None or info.axes:
-            raise SpecError("a clock is a field of the header with a unit of time", path=path, sensor=sensor.id)
+    total: Times | None = None
+    for path, step, zero, furthest in _terms((source,) if isinstance(source, str) else tuple(source), batch.table.schema, sensor.id):
         raw = batch.table.raw(path)
-        step, zero = scaling
-        if raw.dtype.kind in "ui" and isinstance(step, int) and isinstance(zero, int):
-            total += _within(raw, _FURTHEST // len(paths) // max(step, 1)) * step + zero
+        if furthest and raw.dtype.kind in "ui":
+            part = _within(raw, furthest)
+            part *= step
+            if zero:
+                part += zero
         else:
-            total += _nanoseconds(raw.astype(np.float64) * float(step / 10**9) + float(zero / 10**9), len(batch))
-    return total
+            part = _nanoseconds(raw.astype(np.float64) * float(step / 10**9) + float(zero / 10**9), len(batch))
+        total = part if total is None else np.add(total, part, out=total)
+    return np.zeros(len(batch), np.int64) if total is None else total
 
 
 @lru_cache(maxsize=256)
+def _terms(paths: tuple[str, ...], schema: Schema, sensor: str) -> list[tuple[str, Any, Any, int]]:
+    """The fields that add up to a clock: path, nanoseconds in one step and at zero, furthest reading (0 where these are fractions)."""
+    found = []
+    for path in paths:
+        info = schema.fields.get(path)
+        scaling = _scaling(info.unit, info.scale, info.offset) if info else None
+        if info is None or scaling is None or info.axes:
+            raise SpecError("a clock is a field of the header with a unit of time", path=path, sensor=sensor)
+        step, zero = scaling
+        whole = isinstance(step, int) and isinstance(zero, int)
+        found.append((path, step, zero, _FURTHEST // len(paths) // max(step, 1) if whole else 0))
+    return found
+
+
 def _scaling(unit: str, scale: float, offset: float) -> tuple[Any, Any] | None:
     """Nanoseconds in one step of a field and at its zero: integers where both are whole, else fractions; None if it is no time."""
     per_unit = factor(unit, "s")
@@ -100,7 +113,7 @@ def _steps(values: NDArray[np.int64], before: int) -> NDArray[np.int64]:
 def _within(raw: NDArray[Any], furthest: int) -> Times:
     if raw.dtype.itemsize * 8 - (raw.dtype.kind == "i") < furthest.bit_length():
         return raw.astype(np.int64)
-    if len(raw) and int(raw.max()) <= furthest and int(raw.min()) >= -furthest:
+    if len(raw) and int(raw.max()) <= furthest and (raw.dtype.kind == "u" or int(raw.min()) >= -furthest):
         return raw.astype(np.int64)
     edges = np.iinfo(raw.dtype)
     return np.asarray(np.clip(raw, max(int(edges.min), -furthest), min(int(edges.max), furthest)), np.int64)

@@ -35,40 +35,40 @@ class Remembered:
     """
 
     def __init__(self) -> None:
-        self._paths: frozenset[str] | None = None
-        self._known: dict[tuple[int, ...], NDArray[np.int64]] = {}
+        self._paths: tuple[str, ...] | None = None
+        self._known: dict[tuple[int, ...], int] = {}
 
-    def __call__(self, function: Callable[[Any], Any], batch: Batch) -> NDArray[np.int64]:
-        """What the function says, (n,), or without an axis where it is the same for all packets."""
-        key = self._key(batch, self._paths)
+    def __call__(self, function: Callable[[Any], Any], batch: Batch) -> int | NDArray[np.int64]:
+        """What the function says, (n,), or one number where it is the same for all packets."""
+        key = self._key(batch)
         if key is not None and key in self._known:
             return self._known[key]
         seen: set[str] = set()
-        values = np.asarray(function(Watched(batch, seen)), np.float64)
-        values = (values.reshape(-1) if values.ndim else values).astype(np.int64)
-        self._paths = frozenset(seen) if UNKNOWN not in seen and self._paths in (None, seen) else frozenset()
-        key = self._key(batch, self._paths)
-        if key is not None and len(self._known) < REMEMBERED:
-            found = values if values.ndim == 0 else values[0]
-            if bool((values == found).all()):
-                self._known[key] = np.array(found)
-        return np.asarray(np.broadcast_to(values, (len(batch),)) if values.ndim else values, np.int64)
+        values = np.asarray(function(Watched(batch, seen)), np.float64).reshape(-1).astype(np.int64)
+        self._paths = _header(batch, seen) if self._paths is None or set(self._paths) == seen else ()
+        key = self._key(batch)
+        if len(values) == 1 or (len(values) and bool((values == values[0]).all())):
+            if key is not None and len(self._known) < REMEMBERED:
+                self._known[key] = values.item(0)
+            return values.item(0)
+        return np.asarray(np.broadcast_to(values, (len(batch),)))
 
-    @staticmethod
-    def _key(batch: Batch, paths: frozenset[str] | None) -> tuple[int, ...] | None:
-        """The values of the fields, if they are integers of the header and the same in all packets."""
-        if not paths:
-            return None
+    def _key(self, batch: Batch) -> tuple[int, ...] | None:
+        """The values of the fields, if they are the same in all packets."""
         key = []
-        for path in sorted(paths):
-            info = batch.table.schema.fields[path]
-            if info.axes or info.optional or info.dtype is None or info.dtype.kind not in "ui":
-                return None
+        for path in self._paths or ():
             raw = batch.table.raw(path)
-            if not len(raw) or bool((raw != raw[0]).any()):
+            if not len(raw) or np.count_nonzero(raw == raw[0]) < len(raw):
                 return None
-            key.append(int(raw[0]))
-        return tuple(key)
+            key.append(raw.item(0))
+        return tuple(key) or None
+
+
+def _header(batch: Batch, seen: set[str]) -> tuple[str, ...]:
+    """The fields that were looked at, if all are integers of the header that no frame lacks; else none."""
+    infos = [batch.table.schema.fields[path] for path in sorted(seen - {UNKNOWN})]
+    plain = all(not info.axes and not info.optional and info.dtype is not None and info.dtype.kind in "ui" for info in infos)
+    return tuple(info.path for info in infos) if plain and UNKNOWN not in seen else ()
 
 
 class SequenceTracker:
@@ -90,8 +90,7 @@ class SequenceTracker:
             raise SpecError("a sequence is a field of the header", path=self._rule.field)
         numbers = batch.table.raw(self._rule.field).astype(np.int64)
         there = batch.table.present(self._rule.field)
-        last = self._last(batch, (1 << info.bits) - 1)
-        periods = last - self._rule.first + 1
+        periods = self._last(batch, (1 << info.bits) - 1) - self._rule.first + 1
         if there is None or bool(there.all()):
             return self._runs(numbers, periods)
         each = np.broadcast_to(periods, numbers.shape)
@@ -99,21 +98,24 @@ class SequenceTracker:
         found = [self._step(number, period) if known else self._unnumbered() for number, period, known in steps]
         return np.array([index for index, _ in found], np.int64), np.array([jump for _, jump in found], np.bool_)
 
-    def _runs(self, numbers: NDArray[np.int64], periods: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.bool_] | None]:
+    def _runs(self, numbers: NDArray[np.int64], periods: int | NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.bool_] | None]:
         """The same for packets that are all numbered; those that follow one another are counted together."""
-        each = periods if periods.ndim else None
+        one, each = (periods, None) if isinstance(periods, int) else (0, periods)
         steady = numbers[1:] - numbers[:-1]
         ones = steady == 1
-        if not ones.all():
-            ones |= (steady - 1) % np.maximum(periods if each is None else periods[1:], 1) == 0
+        if np.count_nonzero(ones) < len(ones):
+            ones |= (steady - 1) % np.maximum(one if each is None else each[1:], 1) == 0
         steady = ones if each is None else ones & (each[1:] == each[:-1])
-        odd = [*(np.flatnonzero(~steady) + 1).tolist(), len(numbers)] if not steady.all() else [len(numbers)]
+        if np.count_nonzero(steady) == len(steady) and self._follows(numbers.item(0), one if each is None else each.item(0)):
+            self._number, self._index = numbers.item(-1), self._index + len(numbers)
+            return np.arange(self._index + 1 - len(numbers), self._index + 1), None
+        odd = [*(np.flatnonzero(~steady) + 1).tolist(), len(numbers)]
         index, jumps = np.empty(len(numbers), np.int64), None
         spot = turn = 0
         while spot < len(numbers):
             while odd[turn] <= spot:
                 turn += 1
-            number, period = int(numbers[spot]), int(periods if each is None else each[spot])
+            number, period = numbers.item(spot), one if each is None else each.item(spot)
             follows = self._follows(number, period)
             end = odd[turn] if follows else spot + 1
             if follows:
@@ -130,12 +132,12 @@ class SequenceTracker:
     def _follows(self, number: int, period: int) -> bool:
         return self._number is not None and period == self._period and (number - self._number - 1) % period == 0
 
-    def _last(self, batch: Batch, widest: int) -> NDArray[np.int64]:
-        """The highest number of the counter, for each packet or, without an axis, for all."""
+    def _last(self, batch: Batch, widest: int) -> int | NDArray[np.int64]:
+        """The highest number of the counter, for each packet or for all."""
         last = self._rule.last
         if callable(last):
             return self._highest(last, batch)
-        return np.array(widest if last is None else last, np.int64)
+        return widest if last is None else int(last)
 
     def _step(self, number: int, period: int) -> tuple[int, bool]:
         period = max(period, 1)

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lidarspec.allocation import alike, repeated
 from lidarspec.clocks import Unwrapper, clock_ns
 from lidarspec.decoder import Counters, Spans
 from lidarspec.errors import UnknownFrame
@@ -70,17 +71,26 @@ class PacketStream:
         table = self._table(parts)
         state = self._states(parts, len(table), whole=whole)
         offset, host = (_joined([part.column(name) for part in parts], np.int64) for name in ("offsets", "at"))
-        host = host if not len(host) or int(host.min()) >= 0 else np.maximum(host, 0)
+        if len(host):
+            known = alike(host)
+            host = (
+                np.maximum(host, 0)
+                if known is None and int(host.min()) < 0
+                else host
+                if known is None or known >= 0
+                else repeated(0, len(host))
+            )
         index = np.arange(self._number, self._number + len(table), dtype=np.int64)
         time = host
         self._number += len(table)
         if len(table) and (self._sequence is not None or self._clock is not None):
             batch = Batch(table, breaks, state, self.sensor.state)
-            if self._sequence is not None:
-                index, jumps = self._guarded(self._sequence.push, (index, None), batch)
-                breaks = breaks if jumps is None else breaks | jumps
-            if self._clock is not None:
-                time = self._guarded(self._times, host, batch, host)
+            with np.errstate(all="ignore"):
+                if self._sequence is not None:
+                    index, jumps = self._guarded(self._sequence.push, (index, None), batch)
+                    breaks = breaks if jumps is None else breaks | jumps
+                if self._clock is not None:
+                    time = self._guarded(self._times, host, batch, host)
         return Packets(
             self.sensor,
             self.frame,
@@ -101,8 +111,7 @@ class PacketStream:
 
     def _guarded(self, function: Callable[..., Any], otherwise: Any, *args: Any) -> Any:
         try:
-            with np.errstate(all="ignore"):
-                return function(*args)
+            return function(*args)
         except Exception:
             self.stats.error(traceback.format_exc())
             return otherwise
@@ -114,7 +123,7 @@ class PacketStream:
     def _breaks(self, part: _Part) -> NDArray[np.bool_]:
         """Whether something was lost before each of our frames, since ours before it."""
         breaks = np.zeros(part.number, np.bool_)
-        if part.spans.gaps.any():
+        if alike(part.spans.gaps) != 0 and part.spans.gaps.any():
             losses = np.cumsum(part.spans.gaps > 0)
             marks = losses if part.where is None else losses[part.where]
             breaks[:1] = marks[:1] > 0
@@ -160,8 +169,8 @@ class PacketStream:
     def _unchanged(self, name: str, number: int) -> StateOf:
         """The state of packets during which no frame of this other type came."""
         if name not in self._state:
-            return None, np.full(number, -1, np.intp)
-        return self._last(name), np.zeros(number, np.intp)
+            return None, repeated(-1, number)
+        return self._last(name), repeated(0, number)
 
     def _last(self, name: str) -> Table:
         """The last frame of another type, as a table."""
@@ -195,7 +204,10 @@ class _Part:
     @classmethod
     def of(cls, spans: Spans, frame: str) -> _Part:
         """The frames of one type in a piece."""
-        mine = spans.kinds == spans.names.index(frame) if frame in spans.names else np.zeros(len(spans.kinds), np.bool_)
+        own, kind = spans.names.index(frame) if frame in spans.names else -1, alike(spans.kinds)
+        if kind is not None and kind == own:
+            return cls(spans, None, len(spans.kinds))
+        mine = spans.kinds == own
         if mine.all():
             return cls(spans, None, len(mine))
         where = np.flatnonzero(mine)

@@ -9,6 +9,7 @@ import contextlib
 from collections.abc import Callable, Iterator, Mapping
 from contextvars import ContextVar
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
@@ -24,7 +25,7 @@ Bytes2D = NDArray[np.uint8]
 def elements(rows: Bytes2D, dtype: np.dtype[Any], offset: int, shape: tuple[int, ...], strides: tuple[int, ...]) -> NDArray[Any]:
     """What stands at an offset of each row (contiguous by itself) and at these strides from there, (n, *shape), not copied."""
     if rows.flags.c_contiguous:
-        return np.ndarray((len(rows), *shape), dtype, rows.data, offset, (rows.shape[1], *strides))
+        return np.ndarray((len(rows), *shape), dtype, rows, offset, (rows.shape[1], *strides))
     first = rows[:, offset : offset + dtype.itemsize].view(dtype)
     if not shape:
         return first[:, 0]
@@ -62,7 +63,7 @@ class Leaf:
     def load(self, rows: Bytes2D) -> NDArray[Any]:
         """The raw values of frames given as rows of bytes, shape (n, *shape), native byte order."""
         if self.wire is not None:
-            return np.asarray(self._view(rows, self.wire, 0).astype(self.wire.newbyteorder("=")))
+            return self._view(rows, self.wire, 0).astype(self._native)
         assert self.info.dtype is not None
         if not self._packed:
             return self._bits(rows, self.elements[0])
@@ -90,6 +91,11 @@ class Leaf:
                 bits = (column >> part.target << part.low).astype(np.uint8) & np.uint8(part.mask)
                 view[...] = (view & np.uint8(~part.mask & 0xFF)) | bits
 
+    @cached_property
+    def _native(self) -> np.dtype[Any]:
+        assert self.wire is not None
+        return self.wire.newbyteorder("=")
+
     @property
     def _packed(self) -> bool:
         """Whether the innermost array is inside the bit block, and so has no stride."""
@@ -97,15 +103,18 @@ class Leaf:
 
     def _view(self, rows: Bytes2D, dtype: np.dtype[Any], offset: int) -> NDArray[Any]:
         shape = self.shape[: len(self.strides)]
-        if 0 in (len(rows), *shape):
+        if not len(rows) or 0 in shape:
             return np.empty((len(rows), *shape), dtype)
         return elements(rows, dtype, self.offset + offset, shape, self.strides)
 
     def _bits(self, rows: Bytes2D, element: BitField) -> NDArray[Any]:
         assert self.info.dtype is not None
         wide = np.dtype(f"u{self.info.dtype.itemsize}")
-        words = element.words if wide.itemsize > 2 else None
-        if words is not None:
+        whole = self._whole(rows, element, wide)
+        words = element.words if wide.itemsize > 2 and whole is None else None
+        if whole is not None:
+            total = whole
+        elif words is not None:
             total = self._view(rows, np.dtype(words[0][0]), words[0][1]).astype(wide) << wide.type(words[0][2])
             for word, byte, target in words[1:]:
                 total |= self._view(rows, np.dtype(word), byte).astype(wide) << wide.type(target)
@@ -117,7 +126,22 @@ class Leaf:
         if element.signed:
             sign = wide.type(1 << (element.width - 1))
             return np.asarray(((total ^ sign) - sign).view(self.info.dtype))
-        return np.asarray(total.astype(self.info.dtype))
+        return total.astype(self.info.dtype, copy=False)
+
+    def _whole(self, rows: Bytes2D, element: BitField, wide: np.dtype[Any]) -> NDArray[Any] | None:
+        """Values of whole bytes in a row, cut out of the words that end with them; None where there is not so much before."""
+        if element.run is None or wide.itemsize < 4:
+            return None
+        order, first, count = element.run
+        spare = wide.itemsize - count
+        if self.offset + first < spare:
+            return None
+        total = self._view(rows, np.dtype(f"{order}u{wide.itemsize}"), first - spare).astype(wide)
+        if spare and order == "<":
+            total >>= wide.type(8 * spare)
+        elif spare:
+            total &= wide.type((1 << 8 * count) - 1)
+        return total
 
     def at(self, offset: int) -> Leaf:
         """The same field with its place counted from `offset`."""

@@ -64,11 +64,12 @@ class Rows:
     def raw(self, path: str) -> NDArray[Any]:
         info = self.schema.fields[path]
         assert info.dtype is not None
-        if len(self.groups) == 1 and path in self.groups[0].layout.leaves:
-            values = self.groups[0].layout.leaves[path].load(self.groups[0].rows)
+        if len(self.groups) == 1 and (only := self.groups[0].layout.leaves.get(path)) is not None:
+            values = only.load(self.groups[0].rows)
             if self._order is None:
                 self._order = _order(self.groups[0].where)
-            return values[self._order].astype(info.dtype, copy=False)
+            values = values if isinstance(self._order, slice) else values[self._order]
+            return values.astype(info.dtype, copy=False)
         lengths = [self.length(axis) for axis in info.axes]
         column = np.zeros((len(self), *lengths), info.dtype)
         for group in self.groups:
@@ -159,7 +160,7 @@ def _order(where: NDArray[np.intp]) -> NDArray[np.intp] | slice:
 
 
 def _ascends(where: NDArray[np.intp]) -> bool:
-    return len(where) < 2 or bool((where[1:] > where[:-1]).all())
+    return bool(np.count_nonzero(where[1:] > where[:-1]) == max(len(where) - 1, 0))
 
 
 def _length(layout: Layout, axis: str) -> int:
