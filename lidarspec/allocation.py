@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import sys
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 #: bytes; what is freed at the end of the heap is kept up to twice as much.
 KEPT = 1 << 24
+#: numbers that `counted` keeps.
+COUNTED = 1 << 17
 
 
 def keep_freed_memory() -> None:
@@ -27,6 +30,23 @@ def keep_freed_memory() -> None:
 def repeated(value: int, count: int) -> NDArray[np.int64]:
     """The same value so many times, (count,), read-only; as `np.broadcast_to`, at a tenth of its cost."""
     return np.ndarray((count,), np.int64, value.to_bytes(8, sys.byteorder, signed=True), 0, (0,))
+
+
+def counted(count: int) -> NDArray[np.int64]:
+    """0, 1, 2 ... as many numbers as asked for, (count,), read-only; in the same memory each time, unless they are very many."""
+    return _numbers()[:count] if count <= COUNTED else np.arange(count)
+
+
+def is_counted(numbers: NDArray[np.int64]) -> bool:
+    """Whether numbers are known to ascend, because they are from `counted`."""
+    return numbers.base is _numbers() and numbers.strides[0] > 0
+
+
+@lru_cache(maxsize=1)
+def _numbers() -> NDArray[np.int64]:
+    found = np.arange(COUNTED)
+    found.setflags(write=False)
+    return found
 
 
 def alike(values: NDArray[np.int64]) -> int | None:

@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.allocation import alike, repeated
-from lidarspec.frames.judging import VALID
+from lidarspec.frames.judging import VALID, Survey
+from lidarspec.frames.layout import Bytes2D, Layout, elements
 from lidarspec.framing import COUNTED, Bytes1D, Framing, Marks, Mode, Offsets
 
 #: constants that stand side by side: offset, type, mask (None: all bits), value.
@@ -33,6 +34,42 @@ class Datagrams:
         self._words = [_words(marks) for marks in framing.marks]
         self.rejected: dict[str, int] = {}
         self.errors: list[str] = []
+        self._surveyed: tuple[int, Survey] | None = None
+
+    def alike(self, rows: Bytes2D, mode: Mode) -> tuple[int, Layout] | None:
+        """The type and layout of datagrams of one size, one a row; None where they are to be told apart by `kinds`.
+
+        So they are where not all are frames of one type and layout, and where they change what is looked for.
+        """
+        self._surveyed = None
+        for kind in self._framing.active(mode):
+            codec = self._framing.codecs[kind]
+            if codec.size not in (None, rows.shape[1]):
+                continue
+            marked = self._marks(kind, rows)
+            if not marked:
+                continue
+            survey = codec.alike(rows) if marked == len(rows) and not self._framing.switches(kind, mode) else None
+            if survey is None or survey.layout is None:
+                return None
+            if np.count_nonzero(survey.status):
+                self._surveyed = kind, survey
+                return None
+            return kind, survey.layout
+        return None
+
+    def _marks(self, kind: int, rows: Bytes2D) -> int:
+        """How many rows have the constants of a type."""
+        marked = None
+        for spot, dtype, mask, value in self._words[kind]:
+            if spot + dtype.itemsize > rows.shape[1]:
+                return 0
+            found = elements(rows, dtype, spot, (), ())
+            right = (found if mask is None else found & mask) == value
+            marked = right if marked is None else np.bitwise_and(marked, right, out=marked)
+            if not np.count_nonzero(marked):
+                return 0
+        return len(rows) if marked is None else int(np.count_nonzero(marked))
 
     def kinds(self, buffer: Bytes1D, starts: Offsets, sizes: Offsets, mode: Mode) -> Offsets:
         """The type of each datagram, as its index, -1 where it is none.
@@ -47,6 +84,7 @@ class Datagrams:
             part = batch.kinds_from(position, mode)
             parts.append(part)
             position += len(part)
+        self._surveyed = None
         return parts[0] if len(parts) == 1 else np.concatenate([np.empty(0, np.intp), *parts])
 
     def judged(self, buffer: Bytes1D, starts: Offsets, sizes: Offsets, mode: Mode) -> Offsets:
@@ -66,7 +104,7 @@ class Datagrams:
                 own, lengths = own[marked], lengths[marked]
                 if not len(own):
                     continue
-            survey = self._framing.codecs[kind].survey(buffer, own, gathered=False)
+            survey = self._survey(kind, buffer, own, whole=left is None and len(own) == number)
             valid = not np.count_nonzero(survey.status)
             if valid and left is None and len(own) == number and _same(survey.sizes, lengths):
                 return repeated(kind, number)
@@ -78,6 +116,13 @@ class Datagrams:
             kinds[found if left is None else left[found]] = kind
             left = np.flatnonzero((kinds < 0) & (sizes > 0))
         return np.full(number, -1, np.intp) if kinds is None else kinds
+
+    def _survey(self, kind: int, buffer: Bytes1D, starts: Offsets, *, whole: bool) -> Survey:
+        """What datagrams are, if they are of a type; `whole`: all of the batch, which `alike` may have looked at already."""
+        known, self._surveyed = self._surveyed, None
+        if whole and known is not None and known[0] == kind:
+            return known[1]
+        return self._framing.codecs[kind].survey(buffer, starts, gathered=False)
 
     def judged_alone(self, datagram: Bytes1D, mode: Mode) -> int:
         """The type of one datagram, -1 where it is none; counts why."""
@@ -115,6 +160,16 @@ class Datagrams:
             )
             marked &= (found if mask is None else found & mask) == value
         return marked
+
+
+def evenly(buffer: Bytes1D, starts: Offsets, sizes: Offsets) -> Bytes2D | None:
+    """Datagrams as the rows of an array, where they have one size and stand at one distance, one after another; else None."""
+    count = len(starts)
+    size = sizes.item(0) if count else 0
+    if not size or (alike(sizes) is None and np.count_nonzero(sizes == size) < count):
+        return None
+    step = size if count == 1 else _step(starts)
+    return np.ndarray((count, size), np.uint8, buffer, starts.item(0), (step, 1)) if step >= size else None
 
 
 def _step(starts: Offsets) -> int:

@@ -14,11 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.allocation import alike, repeated
-from lidarspec.datagrams import Datagrams
+from lidarspec.datagrams import Datagrams, evenly
 from lidarspec.errors import UsageError, refuse_text
-from lidarspec.found import Counters, Found, Spans, packed
+from lidarspec.found import Alike, Counters, Found, Spans, packed
 from lidarspec.frames.codecs import Codec, codec
-from lidarspec.frames.layout import Sums, summed_by
+from lidarspec.frames.layout import Bytes2D, Sums, summed_by
 from lidarspec.framing import Framing, Mode, Piece
 from lidarspec.runs import cut
 from lidarspec.spec import Sensor
@@ -29,7 +29,7 @@ __all__ = ["BACKENDS", "Counters", "Decoder", "Found", "Spans", "backend", "is_s
 LONGEST, PIECE, LEAST = 24 << 16, 6 << 16, 1 << 12
 
 #: datagrams judged together; rows of an array, which need not be gathered first, and their bytes.
-TOGETHER, ROWS, ROW_BYTES = 1024, 1 << 16, 1 << 23
+TOGETHER, ROWS, ROW_BYTES = 1024, 1 << 17, 1 << 23
 
 Data = bytes | bytearray | memoryview | NDArray[np.uint8]
 
@@ -118,7 +118,9 @@ class Decoder:
         else:
             buffer, sizes = np.frombuffer(b"".join(data), np.uint8), _sizes(list(map(len, data)))
         times = repeated(-1, len(data)) if at is None else np.array([-1 if one is None else one for one in at], np.int64)
-        return self.placed(buffer, _starts(sizes), sizes, times)
+        rows = buffer.reshape(len(data), -1) if alike(sizes) else None
+        found = None if rows is None else self._alike(buffer, 0, rows, times)
+        return self._sorted(buffer, _starts(sizes), sizes, times) if found is None else found
 
     def placed(self, buffer: NDArray[np.uint8], starts: NDArray[np.intp], sizes: NDArray[np.intp], at: NDArray[np.int64]) -> Spans:
         """Datagrams that stand in one buffer already; the same as `datagrams`, and nothing is copied.
@@ -128,6 +130,24 @@ class Decoder:
             starts, sizes: of each datagram, in the order of their arrival.
             at: their arrival times in ns, -1 where nobody knows.
         """
+        rows = evenly(buffer, starts, sizes)
+        found = None if rows is None else self._alike(buffer, starts.item(0), rows, at)
+        return self._sorted(buffer, starts, sizes, at) if found is None else found
+
+    def _alike(self, buffer: NDArray[np.uint8], first: int, rows: Bytes2D, at: NDArray[np.int64]) -> Spans | None:
+        """Datagrams of one size and distance, if all are frames of one layout that change nothing."""
+        with summed_by(self._sums):
+            known = self._datagrams.alike(rows, self._mode)
+        if known is None:
+            return None
+        found = Alike(self._names, buffer, *known, rows, first, self._base, self._gap, at)
+        self.stats.bytes_in += rows.size
+        self._base, self._gap = self._base + rows.size, 0
+        self._count(found.kinds)
+        return found
+
+    def _sorted(self, buffer: NDArray[np.uint8], starts: NDArray[np.intp], sizes: NDArray[np.intp], at: NDArray[np.int64]) -> Spans:
+        """Datagrams of any kinds."""
         offsets = _starts(sizes, self._base)
         total = offsets.item(-1) + sizes.item(-1) - self._base if len(offsets) else 0
         self.stats.bytes_in += total

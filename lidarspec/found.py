@@ -1,13 +1,21 @@
-"""What a decoder found and counted: frames as arrays or one by one, and the counters."""
+"""What a decoder found and counted: frames as arrays or one by one, and the counters.
+
+Frames of one layout that stand at one distance, with nothing lost between them, are `Alike`: arrays that follow from a few
+numbers cost more than finding such frames does, and are made only when they are read.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from lidarspec.allocation import repeated
+from lidarspec.frames.layout import Bytes2D, Layout
 
 
 @dataclass
@@ -84,6 +92,7 @@ class Spans:
         names: the types; `kinds` are indices into them.
         buffer: the bytes that the frames stand in, at `starts`, `sizes` long.
         offsets, gaps, at: as in `Found`; `at` is -1 where nobody knows it.
+        layout: that all have; None where they have not, or nobody knows.
     """
 
     names: tuple[str, ...]
@@ -94,6 +103,10 @@ class Spans:
     offsets: NDArray[np.int64]
     gaps: NDArray[np.int64]
     at: NDArray[np.int64]
+    layout: Layout | None = None
+
+    def __len__(self) -> int:
+        return len(self.kinds)
 
     def data(self, index: int) -> bytes:
         """The bytes of one frame."""
@@ -106,6 +119,78 @@ class Spans:
             Found(self.names[kind], offset, self.data(index), None if at < 0 else at, gap)
             for index, (kind, offset, gap, at) in enumerate(rows)
         ]
+
+
+class Alike(Spans):
+    """Frames of one layout at one distance, one after another in the input: a `Spans` whose arrays are made when they are read.
+
+    Args:
+        kind: index of their type.
+        rows: their bytes, one a row, each contiguous by itself.
+        first: where the first one begins in the buffer.
+        offset: of the first one in the input.
+        gap: bytes skipped before it.
+    """
+
+    def __init__(
+        self,
+        names: tuple[str, ...],
+        buffer: NDArray[np.uint8],
+        kind: int,
+        layout: Layout,
+        rows: Bytes2D,
+        first: int,
+        offset: int,
+        gap: int,
+        at: NDArray[np.int64],
+    ) -> None:
+        vars(self).update(names=names, buffer=buffer, at=at, layout=layout)
+        vars(self).update(kind=kind, rows=rows, first=first, offset=offset, gap=gap)
+
+    kind: int
+    layout: Layout
+    rows: Bytes2D
+    first: int
+    offset: int
+    gap: int
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    @cached_property
+    def kinds(self) -> NDArray[np.intp]:
+        """The type of each."""
+        return repeated(self.kind, len(self))
+
+    @cached_property
+    def starts(self) -> NDArray[np.intp]:
+        """Where each begins in the buffer."""
+        return self.first + np.arange(len(self)) * self.rows.strides[0]
+
+    @cached_property
+    def sizes(self) -> NDArray[np.intp]:
+        """The bytes of each."""
+        return repeated(self.rows.shape[1], len(self))
+
+    @cached_property
+    def offsets(self) -> NDArray[np.int64]:
+        """Where each begins in the input."""
+        return np.arange(self.run.start, self.run.stop, self.run.step)
+
+    @property
+    def run(self) -> range:
+        """The same as a range."""
+        size = self.rows.shape[1]
+        return range(self.offset, self.offset + size * len(self), size)
+
+    @cached_property
+    def gaps(self) -> NDArray[np.int64]:
+        """The bytes skipped before each."""
+        if not self.gap:
+            return repeated(0, len(self))
+        gaps = np.zeros(len(self), np.int64)
+        gaps[0] = self.gap
+        return gaps
 
 
 def packed(found: Sequence[Found]) -> Spans:

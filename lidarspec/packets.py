@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -20,6 +21,8 @@ if TYPE_CHECKING:
     from lidarspec.clouds import PointCloud
 
 StateOf = tuple[Table | None, NDArray[np.intp]]
+#: a column, or the numbers of a range, which become one when it is read.
+Numbers = NDArray[np.int64] | range
 
 
 class Packets:
@@ -28,10 +31,8 @@ class Packets:
     Attributes:
         sensor, frame: whose, and of which type.
         table: their raw columns.
-        offset: (n,) int64, of the first byte of each in the input.
         time_ns: (n,) int64, by the sensor's clock, unwrapped; else the host's.
         host_ns: (n,) int64 arrival times; 0 where the caller gave none.
-        index: (n,) int64, the unwrapped sequence number; 0, 1, 2 ... where the sensor has none.
         breaks: (n,) True where something was lost before the packet.
         state: for each other frame type, its frames and which of them was last before each packet.
         stats: the counters of the decoder.
@@ -44,18 +45,28 @@ class Packets:
         frame: str,
         table: Table,
         *,
-        offset: NDArray[np.int64],
+        offset: Numbers,
         time_ns: NDArray[np.int64],
         host_ns: NDArray[np.int64],
-        index: NDArray[np.int64],
+        index: Numbers,
         breaks: NDArray[np.bool_],
         state: Mapping[str, StateOf],
         stats: Counters,
         backend: str = "auto",
     ) -> None:
         self.sensor, self.frame, self.table = sensor, frame, table
-        self.offset, self.time_ns, self.host_ns, self.index, self.breaks = offset, time_ns, host_ns, index, breaks
+        self._offset, self.time_ns, self.host_ns, self._index, self.breaks = offset, time_ns, host_ns, index, breaks
         self.state, self.stats, self.backend = state, stats, backend
+
+    @cached_property
+    def offset(self) -> NDArray[np.int64]:
+        """The first byte of each in the input, (n,)."""
+        return _column(self._offset)
+
+    @cached_property
+    def index(self) -> NDArray[np.int64]:
+        """The unwrapped sequence number of each, (n,); 0, 1, 2 ... where the sensor has none."""
+        return _column(self._index)
 
     def __len__(self) -> int:
         return len(self.table)
@@ -150,6 +161,10 @@ def joined(parts: Sequence[Packets]) -> Packets:
 def joined_tables(tables: Sequence[Any]) -> Table:
     """Several tables of one frame type, one after another."""
     return type(tables[0]).joined(tables)  # type: ignore[no-any-return]
+
+
+def _column(numbers: Numbers) -> NDArray[np.int64]:
+    return np.arange(numbers.start, numbers.stop, numbers.step) if isinstance(numbers, range) else numbers
 
 
 def _nested(schema: Schema, columns: Mapping[str, NDArray[Any]], prefix: str) -> np.dtype[Any]:

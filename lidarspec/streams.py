@@ -9,19 +9,21 @@ from __future__ import annotations
 import traceback
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.allocation import alike, repeated
+from lidarspec.allocation import alike, counted, repeated
 from lidarspec.clocks import Unwrapper, clock_ns
 from lidarspec.decoder import Counters, Spans
 from lidarspec.errors import UnknownFrame
-from lidarspec.frames.codecs import Codec, codec
+from lidarspec.found import Alike
+from lidarspec.frames.codecs import Codec, CompiledCodec, codec
 from lidarspec.frames.columns import Batch
-from lidarspec.frames.tables import Table
-from lidarspec.packets import Packets, StateOf, joined_tables
+from lidarspec.frames.tables import Group, Rows, Table
+from lidarspec.packets import Numbers, Packets, StateOf, joined_tables
 from lidarspec.sequences import SequenceTracker
 from lidarspec.spec import Sensor
 
@@ -66,21 +68,12 @@ class PacketStream:
         Args:
             whole: the frames are a whole input: packets before the first frame of another type see that one as state.
         """
-        parts = [_Part.of(spans, self.frame) for spans in found if len(spans.kinds)]
+        parts = [_Part.of(spans, self.frame) for spans in found if len(spans)]
         breaks = _joined([self._breaks(part) for part in parts], np.bool_)
         table = self._table(parts)
         state = self._states(parts, len(table), whole=whole)
-        offset, host = (_joined([part.column(name) for part in parts], np.int64) for name in ("offsets", "at"))
-        if len(host):
-            known = alike(host)
-            host = (
-                np.maximum(host, 0)
-                if known is None and int(host.min()) < 0
-                else host
-                if known is None or known >= 0
-                else repeated(0, len(host))
-            )
-        index = np.arange(self._number, self._number + len(table), dtype=np.int64)
+        offset, host = _offsets(parts), _times([part.column("at") for part in parts])
+        index: Numbers = range(self._number, self._number + len(table))
         time = host
         self._number += len(table)
         if len(table) and (self._sequence is not None or self._clock is not None):
@@ -137,7 +130,7 @@ class PacketStream:
         return breaks
 
     def _table(self, parts: Sequence[_Part]) -> Table:
-        tables = [self._codec.gather(part.spans.buffer, part.column("starts"), part.column("sizes")) for part in parts if part.number]
+        tables = [part.table(self._codec) for part in parts if part.number]
         if not tables:
             return self._codec.table([])
         return tables[0] if len(tables) == 1 else joined_tables(tables)
@@ -204,6 +197,8 @@ class _Part:
     @classmethod
     def of(cls, spans: Spans, frame: str) -> _Part:
         """The frames of one type in a piece."""
+        if isinstance(spans, Alike) and spans.names[spans.kind] == frame:
+            return cls(spans, None, len(spans))
         own, kind = spans.names.index(frame) if frame in spans.names else -1, alike(spans.kinds)
         if kind is not None and kind == own:
             return cls(spans, None, len(spans.kinds))
@@ -217,6 +212,13 @@ class _Part:
         """An array of the spans, for our frames."""
         array: NDArray[Any] = getattr(self.spans, name)
         return array if self.where is None else array[self.where]
+
+    def table(self, codec: Codec) -> Table:
+        """Our frames as columns."""
+        spans = self.spans
+        if isinstance(spans, Alike) and self.where is None and isinstance(codec, CompiledCodec):
+            return Rows(codec.schema, [Group(spans.layout, counted(len(spans)), np.ascontiguousarray(spans.rows))])
+        return codec.gather(spans.buffer, self.column("starts"), self.column("sizes"))
 
 
 def data_frame(sensor: Sensor, found: Sequence[Spans]) -> str | None:
@@ -241,6 +243,24 @@ def _counted(sensor: Sensor, frame: str) -> bool:
 
 def _kinds(spans: Spans, names: Sequence[str]) -> list[int]:
     return [index for index, name in enumerate(spans.names) if name in names]
+
+
+def _offsets(parts: Sequence[_Part]) -> Numbers:
+    """Where our frames begin in the input; as a range, where all have one size and follow one another."""
+    runs = [part.spans.run for part in parts if part.where is None and isinstance(part.spans, Alike)]
+    follow = all(before.stop == after.start and before.step == after.step for before, after in pairwise(runs))
+    if runs and len(runs) == len(parts) and follow:
+        return range(runs[0].start, runs[-1].stop, runs[0].step)
+    return _joined([part.column("offsets") for part in parts], np.int64)
+
+
+def _times(parts: Sequence[NDArray[np.int64]]) -> NDArray[np.int64]:
+    """Arrival times, 0 where nobody knows them."""
+    known = {alike(part) for part in parts if len(part)}
+    if len(known) == 1 and (only := known.pop()) is not None:
+        return repeated(max(only, 0), sum(map(len, parts)))
+    found = _joined(parts, np.int64)
+    return np.maximum(found, 0) if len(found) and int(found.min()) < 0 else found
 
 
 def _joined(parts: Sequence[NDArray[Any]], dtype: Any) -> NDArray[Any]:

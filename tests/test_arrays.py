@@ -12,8 +12,12 @@ from numpy.typing import NDArray
 import lidarspec
 from lidarspec import Sensor
 from lidarspec.clocks import Unwrapper
-from lidarspec.decoder import Spans
+from lidarspec.decoder import Counters, Spans
+from lidarspec.found import Alike
+from lidarspec.frames.codecs import CompiledCodec, codec
 from lidarspec.frames.tables import Rows
+from lidarspec.packets import joined
+from lidarspec.streams import PacketStream
 from tests.shapes import SHAPES
 
 #: one of each family: relatives that share their frames are cut alike.
@@ -65,6 +69,28 @@ def test_the_rows_of_an_array_are_those_datagrams(sensor: Sensor) -> None:
     assert array.raw.tobytes() == listed.raw.tobytes()
     for name in ("offset", "time_ns", "host_ns", "index", "breaks"):
         np.testing.assert_array_equal(getattr(array, name), getattr(listed, name))
+
+
+@each_sensor
+def test_arrays_of_sound_frames_alone_and_with_damaged_ones_in_turn(sensor: Sensor) -> None:
+    mixed = damaged(sensor)
+    judge = sensor.decoder(stream=False)
+    sound = np.array([row for row in mixed if judge.feed(row.tobytes())]).reshape(-1, mixed.shape[1])
+    arrays = [sound, mixed, sound, sound, mixed[:1], sound[:1], mixed[-1:], sound[::-1], mixed[:0]]
+    together, one_by_one = sensor.decoder(stream=False), sensor.decoder(stream=False)
+    found = [together.datagrams(array) for array in arrays]
+    listed = [one_by_one.datagrams([row.tobytes()]) for array in arrays for row in array]
+    assert [fact for spans in found for fact in facts(spans)] == [fact for spans in listed for fact in facts(spans)]
+    assert together.stats == one_by_one.stats
+    assert not len(sound) or isinstance(found[5], Alike) == isinstance(codec(sensor.frames[sensor.data_frame]), CompiledCodec)
+    streams = [PacketStream(sensor, sensor.data_frame, Counters()) for _ in range(3)]
+    whole, wanted = streams[0].add(found, whole=True), streams[1].add(listed, whole=True)
+    parts = joined([streams[2].add([spans], whole=True) for spans in found])
+    for packets in (whole, parts):
+        assert packets.raw.tobytes() == wanted.raw.tobytes()
+        for name in ("offset", "time_ns", "host_ns", "index", "breaks"):
+            assert getattr(packets, name).dtype == getattr(wanted, name).dtype
+            np.testing.assert_array_equal(getattr(packets, name), getattr(wanted, name))
 
 
 def test_a_large_array_is_not_copied() -> None:

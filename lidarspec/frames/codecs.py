@@ -53,6 +53,9 @@ class Codec(Protocol):
             gathered: whether their bytes are wanted too, see `Survey.rows`.
         """
 
+    def alike(self, rows: NDArray[np.uint8]) -> Survey | None:
+        """The same of candidates of one size and one layout, one a row; None where they are to be surveyed."""
+
     def table(self, frames: Iterable[bytes]) -> Table:
         """Frames known to be of this type, as columns."""
 
@@ -94,6 +97,14 @@ class CompiledCodec:
             status[which], sizes[which] = survey.status, survey.sizes
             errors += survey.errors
         return Survey(status, sizes, tuple(errors))
+
+    def alike(self, rows: NDArray[np.uint8]) -> Survey | None:
+        layout = self.tree.common(rows)
+        if layout is None or layout.size != rows.shape[1]:
+            return None
+        errors: list[str] = []
+        status = self._judge(layout)(rows, errors)
+        return Survey(status, repeated(layout.size, len(rows)), tuple(errors), layout=layout)
 
     def _alike(self, buffer: NDArray[np.uint8], offsets: NDArray[np.intp], layout: Layout, *, gathered: bool) -> Survey:
         """What candidates of one layout are."""
@@ -171,6 +182,9 @@ class InterpretedCodec:
             data = buffer[offset : offset + self.frame.max_length].tobytes()
             status[index], sizes[index] = self._judge(data, errors)
         return Survey(status, sizes, tuple(errors))
+
+    def alike(self, rows: NDArray[np.uint8]) -> Survey | None:
+        return None
 
     def table(self, frames: Iterable[bytes]) -> Records:
         frames = list(frames)

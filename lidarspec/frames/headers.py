@@ -114,6 +114,15 @@ class HeaderTree:
                 self._branch(node, node.leaf, buffer, offsets, which, stack, short)
         return groups, np.concatenate(short) if short else _NONE
 
+    def common(self, rows: NDArray[np.uint8]) -> Layout | None:
+        """The layout of candidates, one a row, if they have one and the fields that decide it are the same in all; else None."""
+        first = rows[0].tobytes()
+        layout = self.layout(first)
+        if not isinstance(layout, Layout):
+            return None
+        same = (np.count_nonzero(leaf.load(rows) == leaf.scalar(first)) == len(rows) for leaf in self.asked(first))
+        return layout if all(same) else None
+
     def layout(self, frame: bytes) -> Layout | Refused | None:
         """The layout of one frame, or None where its header is not all there."""
         node: _Node | None = self._root
@@ -173,11 +182,13 @@ class HeaderTree:
         if not len(which):
             return
         values = leaf.at(leaf.offset).load(rows_at(buffer, offsets[which] + leaf.offset, leaf.size))
+        if np.count_nonzero(values == values[0]) == len(values):
+            stack.append((node.children.setdefault(values.item(0), _Node()), which))
+            return
         order = np.argsort(values, kind="stable")
         values = values[order]
         edges = [0, *(np.flatnonzero(values[1:] != values[:-1]) + 1).tolist(), len(values)]
-        if len(edges) > 2:
-            which = which[order]
+        which = which[order]
         for start, stop in pairwise(edges):
             stack.append((node.children.setdefault(int(values[start]), _Node()), which[start:stop]))
 

@@ -121,9 +121,11 @@ class Survey:
         sizes: of those that are valid; for those short of bytes how many tell more (0: any).
         errors: tracebacks out of plugins.
         rows: the bytes of all candidates, one a row, where all have one layout and are whole.
+        layout: that all have, where that is known.
     """
 
     status: Status
     sizes: NDArray[np.intp]
     errors: tuple[str, ...] = ()
     rows: Bytes2D | None = None
+    layout: Layout | None = None

@@ -13,6 +13,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from lidarspec.allocation import counted, is_counted
 from lidarspec.bits import leaves
 from lidarspec.errors import SpecError
 from lidarspec.frames.layout import Bytes2D, Layout
@@ -111,7 +112,7 @@ class Rows:
         if len(self.groups) == 1 and len(which) and which[-1] - which[0] == len(which) - 1 and _ascends(which):
             only = self.groups[0]
             if _ascends(only.where):
-                return Rows(self.schema, [Group(only.layout, np.arange(len(which)), only.rows[which[0] : which[-1] + 1])])
+                return Rows(self.schema, [Group(only.layout, counted(len(which)), only.rows[which[0] : which[-1] + 1])])
         place = np.full(len(self), -1, np.intp)
         place[which] = np.arange(len(which))
         groups = []
@@ -124,6 +125,10 @@ class Rows:
     @staticmethod
     def joined(tables: Sequence[Rows]) -> Rows:
         """Several tables of one frame type, one after another."""
+        alone = [table.groups[0] for table in tables if len(table.groups) == 1]
+        if len(alone) == len(tables) and len({id(group.layout) for group in alone}) == 1 and all(_ascends(group.where) for group in alone):
+            rows = _stacked([group.rows for group in alone])
+            return Rows(tables[0].schema, [Group(alone[0].layout, counted(len(rows)), rows)])
         found: dict[int, list[Group]] = {}
         start = 0
         for table in tables:
@@ -160,7 +165,7 @@ def _order(where: NDArray[np.intp]) -> NDArray[np.intp] | slice:
 
 
 def _ascends(where: NDArray[np.intp]) -> bool:
-    return bool(np.count_nonzero(where[1:] > where[:-1]) == max(len(where) - 1, 0))
+    return is_counted(where) or bool(np.count_nonzero(where[1:] > where[:-1]) == max(len(where) - 1, 0))
 
 
 def _length(layout: Layout, axis: str) -> int:
