@@ -22,7 +22,7 @@ Values: TypeAlias = NDArray[np.uint64]
 _LOOP_BYTES = 2048  # below this, a Python loop over bytes is done before NumPy's calls have started
 _NARROW_LOOP_BYTES = 256  # the same where the register is a byte
 _FEW = 4  # rows that are done one by one sooner than together
-_BLOCK_BYTES = 1 << 19  # rows of a batch taken at a time; with what is computed of them they fit the second-level cache
+_BLOCK_BYTES = 1 << 20  # rows of a batch taken at a time: few enough for the caches, and many enough to hide NumPy's cost per call
 
 
 class Checksum(ABC):
@@ -46,9 +46,33 @@ class Checksum(ABC):
         """The checksum of each row, shape (n,), for frames of one length, shape (n, m), contiguous or not."""
         return np.fromiter((self(row.tobytes()) for row in rows), np.uint64, len(rows))
 
+    def over(self, rows: NDArray[np.uint8], spans: lanes.Spans) -> Values:
+        """The checksum of some bytes of each row, shape (n,): from one place to another, one span after another."""
+        return self.batch(lanes.cut(rows, spans))
+
+
+class _Worded(Checksum):
+    """An algorithm that works on words of many rows side by side, wherever in the rows the bytes stand."""
+
+    def batch(self, rows: NDArray[np.uint8]) -> Values:
+        return self.over(rows, ((0, rows.shape[1]),))
+
+    def over(self, rows: NDArray[np.uint8], spans: lanes.Spans) -> Values:
+        if self._are_few(rows, spans):
+            return super().batch(lanes.cut(rows, spans))
+        return _in_blocks(lambda block: self._values(block, spans), rows)
+
+    def _are_few(self, rows: NDArray[np.uint8], spans: lanes.Spans) -> bool:
+        """Whether the rows are done one by one sooner than together."""
+        return len(rows) < _FEW
+
+    @abstractmethod
+    def _values(self, rows: NDArray[np.uint8], spans: lanes.Spans) -> Values:
+        """The checksums of a block of rows."""
+
 
 @dataclass(frozen=True)
-class Crc(Checksum):
+class Crc(_Worded):
     """A cyclic redundancy check, its parameters as CRC catalogues print them; a wrong one raises ValueError.
 
     Args:
@@ -91,10 +115,12 @@ class Crc(Checksum):
         values = (f" {name} 0x{getattr(self, name):0{digits}x}" for name in ("poly", "init", "xorout") if getattr(self, name))
         return f"CRC-{self.width}{''.join(values)}{order}"
 
-    def batch(self, rows: NDArray[np.uint8]) -> Values:
-        if rows.size < (_NARROW_LOOP_BYTES if self.width <= 8 else _LOOP_BYTES):
-            return super().batch(rows)
-        registers = _in_blocks(lambda block: lanes.registers(block, self._loop[1], self.width, self.poly, self.refin), rows)
+    def _are_few(self, rows: NDArray[np.uint8], spans: lanes.Spans) -> bool:
+        length = sum(stop - start for start, stop in spans)
+        return len(rows) * length < (_NARROW_LOOP_BYTES if self.width <= 8 else _LOOP_BYTES)
+
+    def _values(self, rows: NDArray[np.uint8], spans: lanes.Spans) -> Values:
+        registers = lanes.registers(rows, spans, self._loop[1], self.width, self.poly, self.refin)
         if not self.refin:
             registers = registers.byteswap() >> 8 * registers.itemsize - self.width
         values = registers.astype(np.uint64)
@@ -111,7 +137,7 @@ class Crc(Checksum):
 
 
 @dataclass(frozen=True)
-class Xor(Checksum):
+class Xor(_Worded):
     """The XOR of all bytes."""
 
     width = 8
@@ -122,14 +148,13 @@ class Xor(Checksum):
     def describe(self) -> str:
         return "XOR-8"
 
-    def batch(self, rows: NDArray[np.uint8]) -> Values:
-        if len(rows) < _FEW:
-            return super().batch(rows)
-        return _in_blocks(lambda block: lanes.folded_xor(lanes.words(block)), rows)
+    def _values(self, rows: NDArray[np.uint8], spans: lanes.Spans) -> Values:
+        columns = lanes.words(rows, spans=spans)
+        return lanes.folded_xor(lanes.xor(columns, range(len(columns))))
 
 
 @dataclass(frozen=True)
-class Sum(Checksum):
+class Sum(_Worded):
     """The sum of all bytes modulo 2**width; a width outside 1 to 64 raises ValueError."""
 
     width: int = 8
@@ -144,14 +169,12 @@ class Sum(Checksum):
     def describe(self) -> str:
         return f"{self.width}-bit sum"
 
-    def batch(self, rows: NDArray[np.uint8]) -> Values:
-        if len(rows) < _FEW:
-            return super().batch(rows)
-        return _in_blocks(lambda block: lanes.byte_sums(lanes.words(block)), rows) & np.uint64((1 << self.width) - 1)
+    def _values(self, rows: NDArray[np.uint8], spans: lanes.Spans) -> Values:
+        return lanes.byte_sums(lanes.words(rows, spans=spans)) & np.uint64((1 << self.width) - 1)
 
 
 @dataclass(frozen=True)
-class WordXor(Checksum):
+class WordXor(_Worded):
     """The XOR of words of one or two bytes, low byte first, extended to 16 bits by zeros; wrong sizes raise ValueError.
 
     Args:
@@ -176,16 +199,14 @@ class WordXor(Checksum):
     def describe(self) -> str:
         return f"XOR-16 of {'+'.join(map(str, self.groups))}-byte words" + (f" after a head of {self.head} bytes" if self.head else "")
 
-    def batch(self, rows: NDArray[np.uint8]) -> Values:
-        if len(rows) < _FEW:
-            return super().batch(rows)
-        low, high = _word_masks(self, rows.shape[1])
-
-        def values(block: NDArray[np.uint8]) -> Values:
-            columns = lanes.words(block)
-            return lanes.folded_xor(columns & low) | lanes.folded_xor(columns & high) << np.uint64(8)
-
-        return _in_blocks(values, rows)
+    def _values(self, rows: NDArray[np.uint8], spans: lanes.Spans) -> Values:
+        columns = lanes.words(rows, spans=spans)
+        low, high, part = np.zeros((3, len(rows)), np.uint64)
+        for which, masks in _word_masks(self, len(columns)):
+            alike = lanes.xor(columns, which)
+            np.bitwise_xor(low, np.bitwise_and(alike, masks[0], out=part), out=low)
+            np.bitwise_xor(high, np.bitwise_and(alike, masks[1], out=part), out=high)
+        return lanes.folded_xor(low) | lanes.folded_xor(high) << np.uint64(8)
 
     @cached_property
     def halves(self) -> tuple[list[slice], list[slice]]:
@@ -257,15 +278,16 @@ class ZeroPadded(Checksum):
 
 
 @lru_cache(maxsize=512)
-def _word_masks(algorithm: WordXor, length: int) -> tuple[NDArray[np.uint64], ...]:
-    """Where the low and the high bytes of the words stand among so many bytes, as masks of `lanes.words`, (words, 1)."""
-    found = []
-    for half in algorithm.halves:
-        mask = np.zeros((1, length), np.uint8)
+def _word_masks(algorithm: WordXor, number: int) -> list[tuple[list[int], tuple[np.uint64, np.uint64]]]:
+    """Where the low and the high bytes stand in so many words of `lanes.words`, as masks; with the words that have the same."""
+    masks = np.zeros((2, 8 * number), np.uint8)
+    for mask, half in zip(masks, algorithm.halves, strict=True):
         for part in half:
-            mask[:, part] = 0xFF
-        found.append(lanes.words(mask))
-    return tuple(found)
+            mask[part] = 0xFF
+    found: dict[tuple[np.uint64, np.uint64], list[int]] = {}
+    for word, (low, high) in enumerate(masks.view("<u8").T):
+        found.setdefault((low, high), []).append(word)
+    return [(which, both) for both, which in found.items()]
 
 
 def _in_blocks(values: Callable[[NDArray[np.uint8]], NDArray[Any]], rows: NDArray[np.uint8]) -> NDArray[Any]:

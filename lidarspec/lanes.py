@@ -14,6 +14,7 @@ Registers are kept in wire order, where the low byte is the one that meets the n
 reflected register, otherwise the usual register aligned left with its bytes swapped. One formula serves both.
 """
 
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import Any
 
@@ -24,34 +25,82 @@ REGISTER_BYTES = [2] * 17 + [4] * 16 + [8] * 32  # that a register is kept in, b
 MANY = 1024  # rows whose words are summed in less time than tables take
 MIRROR = bytes(int(f"{byte:08b}"[::-1], 2) for byte in range(256))
 
+#: which bytes of a row: from one to another, one span after another.
+Spans = tuple[tuple[int, int], ...]
+
 _BYTE, _BYTE_BITS = np.uint64(0xFF), np.uint64(8)
 
 
-def words(rows: NDArray[np.uint8], *, zeros_first: bool = False) -> NDArray[np.uint64]:
-    """The rows, filled up with zeros, as columns of little-endian words of eight bytes; shape (words, n), contiguous."""
-    (count, length), width = rows.shape, -(-rows.shape[1] // 8) * 8
-    spare = np.uint64(8 * (width - length))
-    if length < 8 or rows.strides[1] != 1:
-        padded = np.zeros((count, width), np.uint8)
-        padded[:, width - length if zeros_first else 0 :][:, :length] = rows
-        return np.ascontiguousarray(padded.view("<u8").T)
-    found = np.empty((width // 8, count), "<u8")
-    whole, lead = length // 8, length % 8 if zeros_first else 0
-    first = rows[:, lead : lead + 8].view("<u8")[:, 0]
-    found[1 if lead else 0 :][:whole] = np.lib.stride_tricks.as_strided(first, (whole, count), (8, rows.strides[0]))
-    if lead:
-        np.left_shift(rows[:, :8].view("<u8")[:, 0], spare, out=found[0])
-    elif spare:
-        np.right_shift(rows[:, -8:].view("<u8")[:, 0], spare, out=found[-1])
+def words(rows: NDArray[np.uint8], *, spans: Spans | None = None, zeros_first: bool = False) -> NDArray[np.uint64]:
+    """The rows, filled up with zeros, as columns of little-endian words of eight bytes; shape (words, n), contiguous.
+
+    Args:
+        spans: which bytes of each row, one span after another; by default all.
+    """
+    spans = spans or ((0, rows.shape[1]),)
+    if rows.shape[1] < 8 or rows.strides[1] != 1:
+        rows = np.ascontiguousarray(np.pad(rows, ((0, 0), (0, 8))))
+    count, size = rows.shape
+    number, runs, parts = _pieces(spans, size, zeros_first)
+    found, begun = np.empty((number, count), "<u8"), -1
+    for first, length, start in runs:
+        words = rows[:, start : start + 8].view("<u8")[:, 0]
+        found[first : first + length] = np.lib.stride_tricks.as_strided(words, (length, count), (8, rows.strides[0]))
+    for word, start, right, mask, left in parts:
+        part = rows[:, start : start + 8].view("<u8")[:, 0] >> right
+        if mask is not None:
+            part &= mask
+        if word == begun:
+            found[word] |= np.left_shift(part, left, out=part)
+        else:
+            np.left_shift(part, left, out=found[word])
+        begun = word
     return found
 
 
-def folded_xor(columns: NDArray[np.uint64]) -> NDArray[np.uint64]:
-    """The XOR of the eight bytes of the words of each row, over all its words; (n,)."""
-    total = np.bitwise_xor.reduce(columns, axis=0)
+@lru_cache(maxsize=1024)
+def _pieces(spans: Spans, size: int, zeros_first: bool) -> tuple[int, list[tuple[int, int, int]], list[tuple[Any, ...]]]:
+    """What `words` of rows of a size are made of.
+
+    Returns:
+        How many there are; runs of whole ones: first word, number, place in the row; and parts of words: word, place of eight
+        bytes in the row that hold the part, and how it comes to its place: shifted right, masked (None: needless), shifted left.
+    """
+    total = sum(stop - start for start, stop in spans)
+    number = -(-total // 8)
+    runs, parts, spot = list[tuple[int, int, int]](), list[tuple[Any, ...]](), 8 * number - total if zeros_first else 0
+    for first, stop in spans:
+        start = first
+        while start < stop:
+            word, byte = divmod(spot, 8)
+            length = min(8 - byte, stop - start)
+            if length == 8:
+                whole = (stop - start) // 8
+                runs.append((word, whole, start))
+                length = 8 * whole
+            else:
+                place = min(start, size - 8)
+                mask = None if start - place + length == 8 or byte + length == 8 else np.uint64((1 << 8 * length) - 1)
+                parts.append((word, place, np.uint64(8 * (start - place)), mask, np.uint64(8 * byte)))
+            spot += length
+            start += length
+    return number, runs, parts
+
+
+def xor(columns: NDArray[np.uint64], which: Sequence[int]) -> NDArray[np.uint64]:
+    """The XOR of some words of each row, (n,)."""
+    total = columns[which[0]].copy() if len(which) else np.zeros(columns.shape[1], np.uint64)
+    for index in which[1:]:
+        np.bitwise_xor(total, columns[index], out=total)
+    return total
+
+
+def folded_xor(total: NDArray[np.uint64]) -> NDArray[np.uint64]:
+    """The XOR of the eight bytes of each word, (n,); `total` is used up."""
+    part = np.empty_like(total)
     for bits in (32, 16, 8):
-        total ^= total >> np.uint64(bits)
-    return np.asarray(total & np.uint64(0xFF))
+        np.bitwise_xor(total, np.right_shift(total, np.uint64(bits), out=part), out=total)
+    return np.bitwise_and(total, _BYTE, out=total)
 
 
 def byte_sums(columns: NDArray[np.uint64]) -> NDArray[np.uint64]:
@@ -66,18 +115,25 @@ def byte_sums(columns: NDArray[np.uint64]) -> NDArray[np.uint64]:
     return total
 
 
-def registers(rows: NDArray[np.uint8], start: int, width: int, poly: int, refin: bool) -> NDArray[Any]:
-    """The register after each row, shape (n,), in an integer of the bytes that it takes."""
-    return (_narrow if width <= 8 else _wide)(rows, start, width, poly, refin)
+def registers(rows: NDArray[np.uint8], spans: Spans, start: int, width: int, poly: int, refin: bool) -> NDArray[Any]:
+    """The register after some bytes of each row, shape (n,), in an integer of the bytes that it takes."""
+    return (_narrow if width <= 8 else _wide)(rows, spans, start, width, poly, refin)
 
 
-def _narrow(rows: NDArray[np.uint8], start: int, width: int, poly: int, refin: bool) -> NDArray[np.uint8]:
+def cut(rows: NDArray[np.uint8], spans: Spans) -> NDArray[np.uint8]:
+    """The bytes of each row that some spans cover, one span after another."""
+    parts = [rows[:, start:stop] for start, stop in spans]
+    return parts[0] if len(parts) == 1 else np.concatenate(parts, axis=1)
+
+
+def _narrow(rows: NDArray[np.uint8], spans: Spans, start: int, width: int, poly: int, refin: bool) -> NDArray[np.uint8]:
     """`registers` of at most one byte, in one byte."""
-    if not rows.shape[1]:
+    length = sum(stop - first for first, stop in spans)
+    if not length:
         return np.full(len(rows), start, np.uint8)
-    left = words(rows, zeros_first=True)
+    left = words(rows, spans=spans, zeros_first=True)
     if start:
-        left[0] ^= np.uint64(start << 8 * (-rows.shape[1] % 8))
+        left[0] ^= np.uint64(start << 8 * (-length % 8))
     if len(rows) >= MANY and len(left) > 1:
         left = _summed(left, poly << 8 - width)[None]
     while len(left) > 1:
@@ -122,8 +178,9 @@ def _shares(number: int, poly: int) -> tuple[int, ...]:
     return tuple(reversed(found))
 
 
-def _wide(rows: NDArray[np.uint8], start: int, width: int, poly: int, refin: bool) -> NDArray[Any]:
+def _wide(rows: NDArray[np.uint8], spans: Spans, start: int, width: int, poly: int, refin: bool) -> NDArray[Any]:
     """`registers` of any width."""
+    rows = cut(rows, spans)
     (count, length), table = rows.shape, _word_table(width, poly, refin)
     segment = min(max(64, 1 << (rows.size // 2048).bit_length()), length + length % 2)  # enough of them to hide NumPy's cost per call
     # Zero bytes in front change nothing while the register is 0; so `start` is met in the row's first bytes.

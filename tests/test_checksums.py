@@ -140,6 +140,15 @@ class TestBatch:
             data = rows[row].tobytes()  # of this length, a single CRC is a batch of one: the oracle has to judge
             assert values[row] == (bitwise_crc(algorithm, data) if isinstance(algorithm, Crc) and length > 2000 else algorithm(data))
 
+    def test_bytes_anywhere_in_the_rows(self, algorithm: Checksum) -> None:
+        for spans in [((0, 8), (10, 85)), ((3, 5),), ((1, 2), (4, 9), (9, 30)), ((5, 5), (7, 7)), ((80, 88), (0, 3)), ((2, 3), (85, 88))]:
+            for count in (3, 300 if spans[0] == (0, 8) else 60):
+                rows = random_rows(count, 88)
+                joined = np.concatenate([rows[:, start:stop] for start, stop in spans], axis=1)
+                assert algorithm.over(rows, spans).tolist() == singly(algorithm, joined), (spans, count)
+        short = random_rows(400, 5)
+        assert algorithm.over(short, ((0, 1), (3, 5))).tolist() == singly(algorithm, short[:, [0, 3, 4]])
+
     def test_any_strides(self, algorithm: Checksum) -> None:
         for length in (13, 46):
             buffer = random_rows(400, 3 * length)
