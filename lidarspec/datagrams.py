@@ -7,6 +7,7 @@ with `after` only counts while it is announced, and a frame has to be as long as
 from __future__ import annotations
 
 import bisect
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -184,6 +185,7 @@ def _same(first: Offsets, second: Offsets) -> bool:
     return bool((first == second).all()) if one is None or other is None else one == other
 
 
+@lru_cache(maxsize=2048)
 def _words(marks: Marks) -> list[Word]:
     """Constants as few words of 1, 2, 4 or 8 bytes, each of bytes that all have constants."""
     left, found = {spot: (mask, value) for spot, mask, value in marks}, list[Word]()

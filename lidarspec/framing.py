@@ -15,7 +15,7 @@ from __future__ import annotations
 import bisect
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -162,8 +162,12 @@ class Framing:
 
 def marks(codec: Codec) -> Marks:
     """The constants at the start of a type's frames, whole bytes first, which tell the most."""
-    found = [(spot, mask, value) for spot, (mask, value) in codec.prefix.items()]
-    return tuple(sorted(found, key=lambda mark: (mark[1] != 0xFF, mark[0])))
+    return _sorted(tuple((spot, mask, value) for spot, (mask, value) in codec.prefix.items()))
+
+
+@lru_cache(maxsize=2048)
+def _sorted(constants: Marks) -> Marks:
+    return tuple(sorted(constants, key=lambda mark: (mark[1] != 0xFF, mark[0])))
 
 
 def matches(buffer: Bytes1D, constants: Marks) -> Offsets:

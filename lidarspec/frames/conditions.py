@@ -110,13 +110,20 @@ class _LookedUp:
         view = elements(rows, self.table.dtype, self.spot, self.shape, self.strides)
         values = view if view.itemsize == 1 else view.astype(self.table.dtype.newbyteorder("="))
         if self.table.limits is None:
-            held = self.table.listed.take(values)
+            held = _listed(self.table.listed, values)
         else:
             low, high = self.table.limits
             held = values <= high
             if low:
                 held &= values >= low
         return np.asarray(held.all(axis=tuple(range(1, held.ndim)))) if self.shape else held
+
+
+def _listed(listed: NDArray[np.bool_], values: NDArray[Any]) -> NDArray[np.bool_]:
+    """What a table says of each value; of bytes it says so sooner as a translation."""
+    if values.itemsize > 1:
+        return listed.take(values)
+    return np.frombuffer(values.tobytes().translate(listed.tobytes()), np.bool_).reshape(values.shape)
 
 
 def _table(part: Condition, leaves: Mapping[str, Leaf], size: int) -> _Table:
