@@ -156,6 +156,15 @@ class ExactFloat(FormatField):  # type: ignore[misc]
         return super()._build(obj, stream, context, path)
 
 
+class NamedEnum(construct.Enum):  # type: ignore[misc]
+    """An Enum that shows expressions the same name of a number in building as in parsing."""
+
+    def _build(self, obj: Any, stream: Any, context: Any, path: str) -> Any:
+        raw = self._encode(obj, context, path)
+        self.subcon._build(raw, stream, context, path)
+        return self._decode(raw, context, path)
+
+
 def verifying(context: Any, *, checksums: bool = False) -> bool:
     """Whether constants, or checksums too, are checked in this parse (``_verify``: True, "constants" or False)."""
     wanted = context._params.get("_verify", True)
@@ -174,6 +183,10 @@ def prepare(con: Construct) -> Construct:
         return IndexedArray(con.count, prepare(con.subcon))
     if isinstance(con, Const):
         return CheckedConst(con.value, prepare(con.subcon))
+    if isinstance(con, construct.Enum):
+        named = NamedEnum(prepare(con.subcon))
+        named.encmapping, named.decmapping, named.ksymapping = con.encmapping, con.decmapping, con.ksymapping
+        return named
     if isinstance(con, construct.IfThenElse):
         return construct.IfThenElse(con.condfunc, prepare(con.thensubcon), prepare(con.elsesubcon))
     if isinstance(con, construct.Switch):

@@ -88,6 +88,8 @@ def _select(con: construct.Switch, place: _Place) -> Select:
     cases = []
     for value, case in con.cases.items():
         number = labelled(key, value) if isinstance(value, str) and isinstance(key, Ref) else value
+        if number is value and isinstance(key, Ref) and value in key.info.labels:
+            continue  # construct looks a value that has a name up by that name alone
         if not isinstance(number, int):
             raise Refused(f"{place.info.path}: a case for {value!r}, which is no integer")
         cases.append((int(number), _branch(case, place)))
@@ -117,7 +119,7 @@ def _sealed(con: Checksummed, place: _Place) -> Sealed:
 
 
 def _leaf(con: Construct, place: _Place) -> Node:
-    info = _plain(fields_below(con, place.info)[place.info.path] if place.info.path and place.name else place.info)
+    info = fields_below(con, place.info)[place.info.path] if place.info.path and place.name else place.info
     if isinstance(con, FormatField) and con.fmtstr[-1] != "?":
         code, order = con.fmtstr[-1], "big" if con.fmtstr[0] in ">!" else "little"
         kind = "float" if code in "efd" else "uint" if code.isupper() else "int"
@@ -154,17 +156,11 @@ def _block(con: Construct, place: _Place) -> Block:
     for bits in found:
         names = tuple(key for key in bits.keys if isinstance(key, str))
         info = infos[".".join(part for part in (place.info.path, *names) if part)]
-        info = _plain(info)
         parts.append(Part(info, bits, names, tuple(key for key in bits.keys if isinstance(key, int))))
         _known(scope, names, info)
     if place.name:
         place.scope.add(place.name, parts[0].info if not parts[0].names else scope)
     return Block(place.name, place.info, size, tuple(parts))
-
-
-def _plain(info: FieldInfo) -> FieldInfo:
-    """The same field with the number that a constant's name stands for."""
-    return replace(info, const=labelled(Ref(info.path, info), info.const)) if isinstance(info.const, str) else info
 
 
 def _known(scope: Scope, names: tuple[str, ...], info: FieldInfo) -> None:

@@ -250,7 +250,8 @@ def _some_value(source: random.Random, leaf: Leaf, keys: list[int]) -> int:
         return int(leaf.info.const)
     top = (1 << leaf.info.bits) - 1
     kinds = [source.randint(0, top), source.randint(0, min(top, 8)), source.randint(0, min(top, 40))]
-    value = source.choice(kinds + [key for key in keys if key <= top][:16] * (1 if source.random() < 0.7 else 0))
+    named = [key for key in (*leaf.info.labels, *keys) if key <= top]
+    value = source.choice(kinds + named[:16] * (1 if source.random() < 0.7 else 0))
     is_negative = leaf.info.dtype is not None and leaf.info.dtype.kind == "i" and value >> (leaf.info.bits - 1)
     return value - (1 << leaf.info.bits) if is_negative else value
 

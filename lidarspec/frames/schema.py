@@ -15,6 +15,7 @@ import construct
 import numpy as np
 from construct import Array, BitsInteger, Bytes, BytesInteger, Const, Construct, FormatField, Struct
 
+from lidarspec.errors import SpecError
 from lidarspec.fields import Checksummed, Scaled
 
 
@@ -58,6 +59,10 @@ class FieldInfo:
     def scaled(self) -> bool:
         """Whether the physical value is another number than the raw one."""
         return self.scale != 1 or self.offset != 0
+
+    def seen(self, raw: int) -> Any:
+        """A raw value as the expressions of a struct see it: where construct's Enum has a name for it, that name."""
+        return construct.EnumIntegerString.new(raw, self.labels[raw]) if raw in self.labels else raw
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,12 +141,24 @@ def peeled(con: Construct, info: FieldInfo) -> tuple[Construct, FieldInfo]:
         elif isinstance(con, construct.Enum):
             info = replace(info, labels={int(value): str(name) for value, name in con.ksymapping.items()})
         elif isinstance(con, Const):
-            info = replace(info, const=con.value)
+            info = replace(info, const=_constant(con))
         elif isinstance(con, construct.Rebuild):
             info = replace(info, rebuilt=con.func)
         elif not isinstance(con, construct.Default):
             return con, info
         con = con.subcon
+
+
+def _constant(con: Const) -> Any:
+    """The raw value of a constant, also where it is given by the name that construct's Enum has for it."""
+    below = con.subcon
+    while isinstance(con.value, str) and isinstance(below, construct.Subconstruct):
+        if isinstance(below, construct.Enum):
+            if con.value not in below.encmapping:
+                raise SpecError(f"the constant {str(con.value)!r} is none of {', '.join(map(str, below.encmapping))}")
+            return int(below.encmapping[con.value])
+        below = below.subcon
+    return con.value
 
 
 def fields_below(con: Construct, info: FieldInfo) -> dict[str, FieldInfo]:
@@ -179,5 +196,7 @@ def _merged(known: FieldInfo, other: FieldInfo) -> FieldInfo:
     if known.axes != other.axes or "other" in (known.kind, other.kind) or known.dtype is None or other.dtype is None:
         return replace(known, dtype=None, kind="other")
     dtype = np.promote_types(known.dtype, other.dtype)
+    bits = known.bits if (known.bits, known.dtype) == (other.bits, other.dtype) else 0 if known.kind == "bytes" else 8 * dtype.itemsize
     const = known.const if known.const == other.const else None
-    return replace(known, dtype=dtype, kind="float" if dtype.kind == "f" else known.kind, const=const)
+    labels = known.labels if known.labels == other.labels else {}
+    return replace(known, dtype=dtype, kind="float" if dtype.kind == "f" else known.kind, bits=bits, const=const, labels=labels)

@@ -122,7 +122,7 @@ class _Writer:
         inner, info = peeled(con, info)
         if info.const is not None and not isinstance(inner, Struct | Array):
             scope.take(f"{inner.sizeof()}x", 0)
-            return self._named(info.const)
+            return self._labelled(labels, self._named(info.const))
         if isinstance(inner, construct.IfThenElse | construct.Switch):
             return self._value(self._layout.branches[info.path], FieldInfo(info.path, info.axes), scope)
         if isinstance(inner, Checksummed):
@@ -208,7 +208,7 @@ class _Writer:
         if isinstance(inner, Array) and isinstance(inner.count, int):
             return _list(self._bits(inner.subcon, (*keys, index), bits, scope, block) for index in range(inner.count))
         if info.const is not None:
-            return self._named(info.const)
+            return self._labelled(labels, self._named(info.const))
         if keys not in bits or inner is construct.Flag:
             raise Unsupported
         return self._labelled(labels, self._joined(bits[keys], block))

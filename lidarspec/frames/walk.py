@@ -109,7 +109,7 @@ class Scope:
         if isinstance(found, Leaf):
             if self._element:
                 raise NotCompilable(found.info.path, "elements of one array differ in layout")
-            return self._walk.value(found)
+            return found.info.seen(self._walk.value(found))
         return found
 
     def __getattr__(self, name: str) -> Any:
