@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
-from construct import Construct, EnumIntegerString
+from construct import Adapter, BitsInteger, Bytes, BytesInteger, Construct, Enum, EnumIntegerString, Flag, FormatField, Struct, Subconstruct
 
 #: random blocks that have to agree before a probed block is believed.
 CONFIRMATIONS = 24
@@ -97,6 +97,8 @@ def probe(con: Construct, size: int) -> list[BitField] | None:
 
     The block must accept every pattern: constants in it have to be unchecked (``_verify=False`` is passed).
     """
+    if not _even(con):
+        return None
     base = _parse(con, bytes(size))
     if any(not isinstance(value, int) or value != 0 for value in base.values()):
         return None
@@ -110,6 +112,15 @@ def probe(con: Construct, size: int) -> list[BitField] | None:
         return None
     known = [field for field in fields if field is not None]
     return known if _confirmed(con, size, known) else None
+
+
+def _even(con: Construct) -> bool:
+    """Whether every block is read in the same way: what a value decides on shows with few blocks only, and probing could miss it."""
+    if isinstance(con, Struct):
+        return all(map(_even, con.subcons))
+    if isinstance(con, Subconstruct):
+        return (isinstance(con, Enum) or not isinstance(con, Adapter)) and _even(con.subcon)
+    return isinstance(con, BitsInteger | Bytes | BytesInteger | FormatField | type(Flag))
 
 
 def bytes_of(con: Construct, names: Iterable[str]) -> list[int]:

@@ -74,7 +74,7 @@ class _Values:
             value = value.tolist()
         if isinstance(value, list | tuple):
             found = [self.checked(element, path, f"{shown}[{index}]") for index, element in enumerate(value)]
-            return bytes(found) if info is not None and info.kind == "bytes" else found
+            return self._bytes(found, shown) if info is not None and info.kind == "bytes" else found
         return value if info is None or value is None else self._number(info, value, shown)
 
     def _mapping(self, value: Mapping[str, Any], path: str, shown: str) -> Container:
@@ -87,6 +87,15 @@ class _Values:
                 raise UnknownField(below, [known for known in self._known if known], place=self._place)
             found[name] = self.checked(element, below, f"{shown}.{name}" if shown else name)
         return found
+
+    def _bytes(self, found: list[Any], shown: str) -> bytes | list[Any]:
+        """Numbers as a byte string; byte strings stay an array of them."""
+        if all(isinstance(part, bytes | list) for part in found):
+            return found
+        try:
+            return bytes(found)
+        except (TypeError, ValueError):
+            raise UsageError(f"{self._place}: {shown} takes bytes, or numbers from 0 to 255, not {found!r:.60}") from None
 
     def _number(self, info: FieldInfo, value: Any, shown: str) -> Any:
         if isinstance(value, np.generic):
@@ -101,18 +110,12 @@ class _Values:
             if not np.isfinite(value) or (not self._units and value != int(value)):
                 raise UsageError(f"{self._place}: {shown} = {value} is not a raw integer; pass units=True for physical values")
             value = round(value)
-        low, high = limits(info)
+        low, high = info.limits
         if not low <= value <= high:
             edges = (low * info.scale + info.offset, high * info.scale + info.offset) if self._units else (low, high)
             shown_value = value * info.scale + info.offset if self._units else value
             raise OutOfRange(shown, shown_value, *edges, unit=info.unit if self._units else "", place=self._place)
         return int(value)
-
-
-def limits(info: FieldInfo) -> tuple[int, int]:
-    """The lowest and highest raw value of an integer field."""
-    signed = info.dtype is not None and info.dtype.kind == "i"
-    return (-(1 << (info.bits - 1)), (1 << (info.bits - 1)) - 1) if signed else (0, (1 << info.bits) - 1)
 
 
 def _openings(con: Construct, given: Container) -> Container:
@@ -243,7 +246,7 @@ def _solved(
     expression: Any, context: Callable[[], Container], holder: Container, field: str, length: int, info: FieldInfo | None, axis: str
 ) -> int:
     """The value of the count field that gives this length."""
-    top = limits(info)[1] if info is not None and info.kind == "int" else 65535
+    top = info.limits[1] if info is not None and info.kind == "int" else 65535
 
     def gives(value: int) -> bool:
         holder[field] = value

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import copy
 import math
+import operator
 import re
 import struct
 from typing import Any, NamedTuple
@@ -141,6 +142,16 @@ class CheckedConst(Const):  # type: ignore[misc]
         return obj
 
 
+class CountedBytes(Bytes):  # type: ignore[misc]
+    """Bytes of a computed length, of which a wrong one is told from an end of the stream."""
+
+    def _parse(self, stream: Any, context: Any, path: str) -> Any:
+        length = operator.index(self.length(context))
+        if length < 0:
+            raise construct.RangeError(f"invalid length {length}", path=path)
+        return construct.stream_read(stream, length, path)
+
+
 class ExactFloat(FormatField):  # type: ignore[misc]
     """A float field that carries the payload of a NaN through parsing and building."""
 
@@ -179,6 +190,8 @@ def prepare(con: Construct) -> Construct:
         if con.fmtstr[-1] not in "efd":
             return con
         return ExactFloat(con.fmtstr[0], con.fmtstr[-1])
+    if isinstance(con, Bytes):
+        return CountedBytes(con.length) if callable(con.length) else con
     if isinstance(con, Array):
         return IndexedArray(con.count, prepare(con.subcon))
     if isinstance(con, Const):

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from lidarspec import examples, parsing
-from lidarspec.building import build, limits
+from lidarspec.building import build
 from lidarspec.clouds import axis_matrix
 from lidarspec.decoder import Decoder, Found, backend as checked_backend, is_stream, spans_of
 from lidarspec.errors import MissingField, OutOfRange, SpecError, UnknownCommand, UnknownField, UnknownOption, UsageError
@@ -53,7 +53,7 @@ class StandardEngine:
             if not low <= value <= high:
                 raise OutOfRange(argument, value, low, high, unit=fields[path].unit, place=place)
             raw = round((value - fields[path].offset) / fields[path].scale)
-            bottom, top = limits(fields[path])
+            bottom, top = fields[path].limits
             _put(values, path, min(max(raw, bottom), top))
         return build(sensor, command.frame, None, values)
 

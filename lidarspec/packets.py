@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.decoder import Counters
-from lidarspec.errors import UnknownField
+from lidarspec.errors import SpecError, UnknownField
 from lidarspec.frames.access import physical
 from lidarspec.frames.columns import Batch
 from lidarspec.frames.schema import Schema
@@ -168,7 +168,7 @@ def _column(numbers: Numbers) -> NDArray[np.int64]:
 
 
 def _nested(schema: Schema, columns: Mapping[str, NDArray[Any]], prefix: str) -> np.dtype[Any]:
-    """The structured dtype of one level of the struct."""
+    """The structured dtype of one level of the struct; SpecError where one name is both a value and a struct."""
     members: list[Any] = []
     seen: set[str] = set()
     for path, info in schema.fields.items():
@@ -179,6 +179,8 @@ def _nested(schema: Schema, columns: Mapping[str, NDArray[Any]], prefix: str) ->
             continue
         seen.add(name)
         here = prefix + name
+        if below == "" and any(other.startswith(f"{here}.") for other in schema.fields):
+            raise SpecError("a value in one branch and a struct in another: ask for its columns one by one", path=here)
         own = [index for index, axis in enumerate(info.axes) if axis.rstrip("[]") == here]
         shape = tuple(columns[path].shape[1 + index] for index in own)
         kind = _nested(schema, columns, f"{here}.") if below else columns[path].dtype

@@ -10,7 +10,6 @@ from typing import Any
 
 import click
 
-from lidarspec.building import limits
 from lidarspec.cli.failures import suggest
 from lidarspec.cli.output import emit, emit_json, output_options
 from lidarspec.errors import LidarSpecError, OutOfRange, SourceError, UnknownField, UnknownFrame, UsageError
@@ -121,7 +120,7 @@ def _steps(info: FieldInfo, number: Fraction, unit: str, path: str, place: str) 
     raw = (number * per_unit - exact(info.offset)) / exact(info.scale)
     if info.kind != "int":
         return float(raw)
-    low, high = limits(info)
+    low, high = info.limits
     if not low <= round(raw) <= high:
         edges = [float(edge * exact(info.scale) + exact(info.offset)) for edge in (low, high)]
         raise OutOfRange(path, float(number * per_unit), *edges, unit=info.unit, place=place)

@@ -43,7 +43,7 @@ def physical(info: FieldInfo, table: Table) -> NDArray[np.float64]:
         array += info.offset
     there = table.present(info.path)
     if there is not None:
-        array = np.where(there.reshape(-1, *(1,) * (array.ndim - 1)), array, np.nan)
+        array = np.where(there.reshape(*there.shape, *(1,) * (array.ndim - there.ndim)), array, np.nan)
     return array
 
 

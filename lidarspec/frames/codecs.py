@@ -23,7 +23,7 @@ from lidarspec.construction import Mismatch
 from lidarspec.errors import SpecError
 from lidarspec.frames.conditions import Check, Conditions
 from lidarspec.frames.dispatch import frame_parser
-from lidarspec.frames.headers import HeaderTree, Refused, rows_at
+from lidarspec.frames.headers import HeaderTree, Refused, check_compilable, rows_at
 from lidarspec.frames.judging import CHECKSUM, CONSTANT, LENGTH, PLUGIN, SHORT, VALID, Judge, Survey, plausibility
 from lidarspec.frames.layout import Layout
 from lidarspec.frames.schema import Schema, schema
@@ -71,10 +71,12 @@ class CompiledCodec:
     """
 
     def __init__(self, frame: Frame) -> None:
+        check_compilable(frame.prepared)
         self.frame, self.schema = frame, schema(frame.prepared)
         for info in self.schema.fields.values():
             if info.dtype is None:
-                raise NotCompilable(info.path, "its branches have different types")
+                wide = f"its {info.bits} bits are more than a column holds"
+                raise NotCompilable(info.path, wide if info.bits > 64 else "its values are not all plain numbers of one kind")
         self.tree = HeaderTree(frame.prepared, frame.max_length)
         self.prefix, self.size = self.tree.prefix, _size(frame)
         #: the Container of one whole, sound frame; None where construct has to look at it
@@ -246,7 +248,7 @@ def _prefix(frame: Frame) -> dict[int, tuple[int, int]]:
         raise TooLong
 
     state = Walk(stop, frame.max_length)
-    with contextlib.suppress(NotCompilable, TooLong, SpecError):
+    with contextlib.suppress(Exception):  # what comes before counts; the rest is construct's to judge
         state.run(frame.prepared)
     return dict(state.constants)
 

@@ -7,7 +7,6 @@ end a `Layout`, or the reason why there is none. Candidates are sorted through i
 
 from __future__ import annotations
 
-import contextlib
 import random
 import traceback
 from collections.abc import Callable, Iterator, Mapping
@@ -18,6 +17,7 @@ from typing import Any
 import construct
 import numpy as np
 from construct import Construct
+from construct.expr import BinExpr, UniExpr
 from numpy.typing import NDArray
 
 from lidarspec.errors import SpecError
@@ -25,6 +25,8 @@ from lidarspec.frames.layout import Layout, Leaf
 from lidarspec.frames.walk import NotCompilable, TooLong, Walk, walk
 from lidarspec.rules import children
 
+#: headers tried before any arrives.
+TRIED = 64
 #: distinct headers remembered; garbage must not fill the memory with their layouts.
 REMEMBERED = 4096
 
@@ -87,8 +89,8 @@ class HeaderTree:
     def __init__(self, con: Construct, limit: int) -> None:
         self._con, self._limit = con, limit
         self._root, self._size = _Node(), 0
-        check_compilable(con)
         self.prefix = self._prefix()
+        self._try_headers()
 
     def classify(self, buffer: NDArray[np.uint8], offsets: NDArray[np.intp]) -> tuple[list[Group], NDArray[np.intp]]:
         """The candidates at `offsets`, sorted by layout.
@@ -212,7 +214,7 @@ class HeaderTree:
             missing = short.leaf
         except TooLong:
             result = Refused()
-        except (NotCompilable, SpecError):
+        except SpecError:
             raise
         except Exception:
             result = Refused(traceback.format_exc())
@@ -226,9 +228,36 @@ class HeaderTree:
     def _prefix(self) -> dict[int, tuple[int, int]]:
         """The constants whose place depends on no header field."""
         state = Walk(_stop, self._limit)
-        with contextlib.suppress(_Stop, TooLong):
+        try:
             state.run(self._con)
+        except (NotCompilable, SpecError):
+            raise
+        except Exception:
+            pass  # a field of the header was asked for, or it leads to no frame, which `classify` says
         return dict(state.constants)
+
+    def _try_headers(self) -> None:
+        """Walk the struct for values at which its expressions may decide otherwise, so that what does not compile is known by now."""
+        keys = sorted({*_switch_keys(self._con), *_compared(self._con)})
+        pending: list[dict[str, int]] = [{}]
+        for given in pending:
+            asked: dict[str, list[int]] = {}
+
+            def read(leaf: Leaf, given: dict[str, int] = given, asked: dict[str, list[int]] = asked) -> int:
+                _check_control(leaf)
+                values = asked[leaf.info.path] = _edges(leaf, keys)
+                return given.get(leaf.info.path, values[0])
+
+            try:
+                walk(self._con, read, self._limit)
+            except (NotCompilable, SpecError):
+                raise
+            except Exception:
+                pass  # a header that leads to no frame; the next one may
+            for path, values in asked.items():
+                if path not in given:
+                    further = [{**given, path: value} for value in values[1:]]
+                    pending += [one for one in further if one not in pending][: max(TRIED - len(pending), 0)]
 
 
 class _Stop(Exception):
@@ -261,6 +290,29 @@ def _switch_keys(con: Construct) -> Iterator[int]:
         yield from (key for key in con.cases if isinstance(key, int))
     for child in children(con):
         yield from _switch_keys(child)
+
+
+def _edges(leaf: Leaf, keys: list[int]) -> list[int]:
+    """Values of a field at which a layout may change: a usual one first."""
+    if leaf.info.const is not None:
+        return [int(leaf.info.const)]
+    low, high = leaf.info.limits
+    return [value for value in dict.fromkeys((1, 0, *leaf.info.labels, *keys, 2, high, low)) if low <= value <= high]
+
+
+def _compared(con: Construct) -> Iterator[int]:
+    """The numbers in the expressions of a tree, and those beside them."""
+    pending = [vars(con).get(name) for name in ("count", "length", "condfunc", "keyfunc")]
+    while pending:
+        part = pending.pop()
+        if isinstance(part, BinExpr):
+            pending += [part.lhs, part.rhs]
+        elif isinstance(part, UniExpr):
+            pending.append(part.operand)
+        elif isinstance(part, int):
+            yield from (part - 1, part, part + 1)
+    for child in children(con):
+        yield from _compared(child)
 
 
 def check_compilable(con: Construct) -> None:

@@ -60,6 +60,12 @@ class FieldInfo:
         """Whether the physical value is another number than the raw one."""
         return self.scale != 1 or self.offset != 0
 
+    @property
+    def limits(self) -> tuple[int, int]:
+        """The lowest and highest raw value of an integer field."""
+        signed = self.dtype is not None and self.dtype.kind == "i"
+        return (-(1 << (self.bits - 1)), (1 << (self.bits - 1)) - 1) if signed else (0, (1 << self.bits) - 1)
+
     def seen(self, raw: int) -> Any:
         """A raw value as the expressions of a struct see it: where construct's Enum has a name for it, that name."""
         return construct.EnumIntegerString.new(raw, self.labels[raw]) if raw in self.labels else raw
@@ -111,7 +117,7 @@ def _walk(con: Construct, info: FieldInfo, fields: dict[str, FieldInfo], arrays:
     elif con is not construct.Pass and info.path:
         leaf = _leaf(con, info)
         if leaf.kind == "bytes":
-            arrays[leaf.axes[-1]] = con.length
+            arrays[leaf.axes[-1]] = getattr(con, "length", None)
         known = fields.get(leaf.path)
         fields[leaf.path] = leaf if known is None else _merged(known, leaf)
 
@@ -182,7 +188,16 @@ def _leaf(con: Construct, info: FieldInfo) -> FieldInfo:
     if isinstance(con, Bytes):
         bits = 8 * con.length if isinstance(con.length, int) else 0
         return replace(info, dtype=np.dtype("u1"), kind="bytes", bits=bits, axes=(*info.axes, axis_path(info)))
+    if _is_text(con):
+        return replace(info, dtype=np.dtype("u1"), kind="bytes", axes=(*info.axes, axis_path(info)))
     return info
+
+
+def _is_text(con: Construct) -> bool:
+    """Whether it gives the bytes up to a terminator, or as many as are said in front of them."""
+    while isinstance(con, construct.NullTerminated | construct.NullStripped | construct.FixedSized | construct.Prefixed):
+        con = con.subcon
+    return con is construct.GreedyBytes
 
 
 def integer_type(bits: int, *, signed: bool = False) -> np.dtype[Any]:

@@ -6,7 +6,7 @@ construct parsed. Arrays of variable length are padded to the longest with zeros
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -30,7 +30,7 @@ class Table(Protocol):
         """Raw values, shape (n, *lengths of its axes), native byte order; 0 where a frame lacks the field or element."""
 
     def present(self, path: str) -> NDArray[np.bool_] | None:
-        """Which frames have the field; None where all have."""
+        """Which frames have the field, (n,), or which elements, where not all elements of a frame have it; None where all have."""
 
     def counts(self, axis: str) -> NDArray[np.intp]:
         """The length of an array in each frame, (n,)."""
@@ -190,28 +190,42 @@ class Records:
         info = self.schema.fields[path]
         found = [_values(parsed, path.split("."), len(info.axes)) for parsed in self._parsed]
         lengths = [self.length(axis) for axis in info.axes]
-        dtype = info.dtype if info.dtype is not None else _common_type(found)
+        dtype = info.dtype if info.dtype is not None else _common_type(found, path)
         column = np.zeros((len(self), *lengths), dtype)
-        for index, value in enumerate(found):
-            array = np.asarray([] if value is None else value, dtype)
-            if array.size:
-                corner: Any = (index, *(slice(0, length) for length in array.shape))
-                column[corner] = array
+        try:
+            for index, value in enumerate(found):
+                _put(column, index, value)
+        except (IndexError, TypeError, ValueError):
+            raise SpecError("its branches give values of different shapes, and a column has one", path=path) from None
         return column
 
     def present(self, path: str) -> NDArray[np.bool_] | None:
         if not self.schema.fields[path].optional:
             return None
-        axes = len(self.schema.fields[path].axes)
-        return np.array([_values(parsed, path.split("."), axes) is not None for parsed in self._parsed], np.bool_)
+        axes = self.schema.fields[path].axes
+        there = [_there(_values(parsed, path.split("."), len(axes))) for parsed in self._parsed]
+        if not any(isinstance(one, list) for one in there):
+            return np.array(there, np.bool_)
+        column = np.zeros((len(self), *map(self.length, axes)), np.bool_)
+        for index, one in enumerate(there):
+            _put(column, index, one)
+        return column
 
     def counts(self, axis: str) -> NDArray[np.intp]:
-        return np.array([_count(parsed, axis) for parsed in self._parsed], np.intp)
+        lengths = self._lengths(axis)
+        if any(len(found) > 1 for found in lengths):
+            raise SpecError("its length differs within one frame, and a column has one for each frame", path=axis)
+        return np.array([max(found, default=0) for found in lengths], np.intp)
 
     def length(self, axis: str) -> int:
         """The longest length of an array."""
         declared = self.schema.arrays.get(axis)
-        return declared if isinstance(declared, int) else int(self.counts(axis).max(initial=0))
+        return declared if isinstance(declared, int) else max((max(found, default=0) for found in self._lengths(axis)), default=0)
+
+    def _lengths(self, axis: str) -> list[set[int]]:
+        brackets = axis.count("[]")
+        names = axis.removesuffix("[]" * brackets).split(".")
+        return [_counts(parsed, names, brackets) for parsed in self._parsed]
 
     def frame(self, index: int) -> bytes:
         return self._frames[index]
@@ -243,28 +257,50 @@ def _values(parsed: Any, names: list[str], axes: int) -> Any:
 
 def _elements(parsed: list[Any], names: list[str], axes: int) -> list[Any] | None:
     found = [_values(element, names, axes) for element in parsed]
-    return None if found and found[0] is None else found
+    return None if found and all(part is None for part in found) else found
 
 
-def _count(parsed: Any, axis: str) -> int:
-    """The length of an array in one parsed frame; of the first one, where it stands in another array."""
-    value = parsed
-    brackets = axis.count("[]")
-    for name in axis.removesuffix("[]" * brackets).split("."):
-        while isinstance(value, list):
-            if not value:
-                return 0
-            value = value[0]
-        if not isinstance(value, dict) or value.get(name) is None:
-            return 0
-        value = value[name]
-    for _ in range(brackets):
-        value = value[0] if value else []
-    return len(value)
+def _there(value: Any) -> Any:
+    """Whether there is a value; lists of that where some elements have one and others not."""
+    if not isinstance(value, list):
+        return value is not None
+    found = [_there(part) for part in value]
+    return True if all(part is True for part in found) else found
 
 
-def _common_type(found: Iterable[Any]) -> np.dtype[Any]:
-    kinds = {np.asarray(value).dtype.kind for value in found if value is not None}
+def _put(column: NDArray[Any], index: int, value: Any) -> None:
+    """Copy a value, or lists of them, into its place in a padded array; lists may differ in length."""
+    if isinstance(value, list) and column.ndim > 2:
+        for place, part in enumerate(value):
+            _put(column[index], place, part)
+    elif isinstance(value, list):
+        column[index, : len(value)] = [0 if part is None else part for part in value]
+    elif value is not None:
+        column[index] = value
+
+
+def _counts(value: Any, names: list[str], brackets: int) -> set[int]:
+    """The lengths of an array under a path in one parsed frame, of all of them where it stands in another array."""
+    if isinstance(value, list) and (names or brackets):
+        below = brackets if names else brackets - 1
+        return {length for part in value for length in _counts(part, names, below)}
+    if names:
+        found = value.get(names[0]) if isinstance(value, dict) else None
+        return set() if found is None else _counts(found, names[1:], brackets)
+    return {len(value)} if isinstance(value, list | bytes) else set()
+
+
+def _numbers(value: Any) -> Iterator[Any]:
+    """The values in lists of them."""
+    if isinstance(value, list):
+        for part in value:
+            yield from _numbers(part)
+    elif value is not None:
+        yield value
+
+
+def _common_type(found: list[Any], path: str) -> np.dtype[Any]:
+    kinds = {np.asarray(value).dtype.kind for value in _numbers(found)}
     if kinds - set("iufb"):
-        raise SpecError("a column of values that are not numbers")
+        raise SpecError("its values are no numbers, and a column holds numbers: declare a text as bytes", path=path)
     return np.dtype(np.float64 if "f" in kinds else np.int64)

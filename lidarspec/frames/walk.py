@@ -96,7 +96,7 @@ class Scope:
 
     def __init__(self, walk: Walk, parent: Scope | None, path: str, *, element: bool) -> None:
         self._walk, self._parent, self._path, self._element = walk, parent, path, element
-        self._names: dict[str, Leaf | Scope] = {}
+        self._names: dict[str | None, Leaf | Scope | None] = {}
 
     def __getitem__(self, name: str) -> Any:
         if name == "_":
@@ -115,6 +115,9 @@ class Scope:
     def __getattr__(self, name: str) -> Any:
         return self[name]
 
+    def __len__(self) -> int:
+        raise NotCompilable(self._path, "an expression asks for the length of an array")
+
 
 def walk(con: Construct, read: Read, limit: int) -> Walk:
     """Go through a prepared struct; `read` gives the value of each field that its layout depends on.
@@ -130,7 +133,7 @@ def _visit(state: Walk, con: Construct, place: _Place) -> None:
     start = state.cursor
     inner, info = peeled(con, place.info)
     place = replace(place, info=info)
-    if isinstance(inner, construct.Transformed | BytesInteger):
+    if isinstance(inner, construct.Transformed | construct.Restreamed | BytesInteger):
         _block(state, inner, place)
     elif isinstance(inner, Checksummed):
         _visit(state, inner.subcon, place)
@@ -161,6 +164,7 @@ def _struct(state: Walk, con: Struct, place: _Place) -> None:
         if child.name is not None:
             path = f"{path}.{child.name}" if path else child.name
         _visit(state, child, _Place(FieldInfo(path, place.info.axes), scope, place.shape, place.strides))
+        scope._names.setdefault(child.name, None)
 
 
 def _array(state: Walk, con: Array, place: _Place) -> None:
@@ -170,9 +174,7 @@ def _array(state: Walk, con: Array, place: _Place) -> None:
     element = replace(place, info=replace(place.info, axes=axes), shape=(*place.shape, count), strides=(*place.strides, 0))
     _visit(state, con.subcon, element)
     size = state.cursor - start
-    if size == 0 and count:
-        raise NotCompilable(place.info.path, "an array of elements without size")
-    if start + size * count > state.limit:
+    if start + max(size, 1) * count > state.limit:
         raise TooLong(place.info.path)
     for path, leaf in state.leaves.items():
         if leaf.info.axes[: len(axes)] == axes:
@@ -211,7 +213,7 @@ def _block(state: Walk, con: Construct, place: _Place) -> None:
     try:
         size = int(con.sizeof())
         found = _probed(con, size)
-    except construct.SizeofError:
+    except (construct.ConstructError, LookupError):
         found = None
     if found is None:
         raise NotCompilable(place.info.path, "a bit block whose values are not plain bits of it")
@@ -289,7 +291,7 @@ def _value(expression: Any, place: _Place) -> Any:
 
 
 def _count(expression: Any, place: _Place) -> int:
-    count = _value(expression, place)
-    if not isinstance(count, int) or count < 0:
+    count = operator.index(_value(expression, place))
+    if count < 0:
         raise TooLong(place.info.path)
     return count

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from lidarspec.building import limits
 from lidarspec.decoder import Decoder, packed
 from lidarspec.frames.codecs import codec
 from lidarspec.packets import joined
@@ -52,7 +51,7 @@ def values_at_the_edges_read_alike(subject: Subject, name: str) -> None:
         parsed = subject.sensor.parse(subject.example(name, seed=seed), frame=name)
         for holder, key, path in list(material.integers(parsed)):
             if free(fields.get(path)) and path not in subject.drawers(name) and source.random() < 0.3:
-                holder[key] = source.choice(limits(fields[path]))
+                holder[key] = source.choice(fields[path].limits)
         made = acceptable(subject, name, parsed)
         built += [(name, made)] if made is not None else []
     assert_backends_agree(subject.sensor, material.delivery(subject.sensor, built))

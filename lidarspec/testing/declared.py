@@ -10,7 +10,6 @@ import numpy as np
 from construct import Construct, Struct
 from construct.expr import ExprMixin
 
-from lidarspec.building import limits
 from lidarspec.construction import unwrap
 from lidarspec.errors import LidarSpecError
 from lidarspec.fields import Scaled
@@ -80,7 +79,7 @@ def _clock(sensor: Sensor) -> Findings:
         return
     fields = codec(sensor.frames[sensor.data_frame]).schema.fields
     infos = [fields.get(path) for path in ((clock.source,) if isinstance(clock.source, str) else clock.source)]
-    spans = [limits(info)[1] * info.scale * float(factor(info.unit, "s") or 0) if info and info.kind == "int" else np.inf for info in infos]
+    spans = [info.limits[1] * info.scale * float(factor(info.unit, "s") or 0) if info and info.kind == "int" else np.inf for info in infos]
     if 0 < sum(spans) < LONG:
         path = clock.source if isinstance(clock.source, str) else clock.source[0]
         what = f"it can count {sum(spans):g} s, then it starts again, and wraps_at is not given"
@@ -238,7 +237,7 @@ def _reach(subject: Subject) -> Findings:
         metres = factor(info.unit, "m") if info is not None and info.kind == "int" else None
         if info is None or metres is None:
             return
-        reach.append(((limits(info)[1] * info.scale + info.offset) * float(metres), f"{name}.{info.path}"))
+        reach.append(((info.limits[1] * info.scale + info.offset) * float(metres), f"{name}.{info.path}"))
     furthest, path = max(reach, default=(np.inf, ""))
     if subject.sensor.range_limits[1] > furthest * 1.001:
         yield "LS210", f"it ends at {furthest:g} m, and range_limits at {subject.sensor.range_limits[1]:g} m", path

@@ -162,12 +162,11 @@ def counters_run_on(subject: Subject, name: str) -> None:
 
 def _full_circle(info: FieldInfo) -> tuple[int, int] | None:
     """The raw values of no angle and of the full circle; None where the field cannot hold both."""
-    from lidarspec.building import limits
 
     if info.kind != "int" or info.const is not None or info.unit not in FULL or not info.scale:
         return None
     raw = [(value - info.offset) / info.scale for value in (0.0, FULL[info.unit])]
-    low, high = limits(info)
+    low, high = info.limits
     whole = all(abs(value - round(value)) < 1e-6 and low <= round(value) <= high for value in raw)
     return (round(raw[0]), round(raw[1])) if whole else None
 

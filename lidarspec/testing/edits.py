@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 from typing import Any
 
-from lidarspec.building import limits
 from lidarspec.frames.codecs import codec
 from lidarspec.frames.schema import FieldInfo
 from lidarspec.testing import material
@@ -85,7 +84,7 @@ def _values(info: FieldInfo, own: Any, st: Any) -> Any:
     """What a field's raw value is drawn from: the author's strategy, or its range and the edges of it."""
     if own is not None and hasattr(own, "example"):
         return own
-    low, high = limits(info)
+    low, high = info.limits
     if own is not None:
         return st.randoms(use_true_random=False).map(own)
     return st.one_of(st.integers(low, high), st.sampled_from(sorted({low, min(low + 1, high), max(high - 1, low), high})))
