@@ -88,6 +88,7 @@ DECLARED = {
     "out_of_reach": {"LS210"},
     "interpreted": {"LS116"},
     "no_example": {"LS301"},
+    "not_held": {"LS312"},
     "blind_checksum": {"LS310"},
     "points_fail": {"LS414"},
     "with_memory": {"LS415"},

@@ -6,13 +6,29 @@ import random
 from typing import Any
 
 import pytest
-from construct import Array, BitsInteger, BitStruct, Const, Enum, If, IfThenElse, Int8ub, Int16ub, Int24ub, Int32ub, Struct, Switch, this
+from construct import (
+    Array,
+    BitsInteger,
+    BitStruct,
+    Const,
+    Enum,
+    If,
+    IfThenElse,
+    Int8ub,
+    Int16ub,
+    Int24ub,
+    Int32ub,
+    Rebuild,
+    Struct,
+    Switch,
+    this,
+)
 
 from lidarspec import SpecError
 from lidarspec.export.messages import messages
 from lidarspec.export.tree import Select, nodes
 from lidarspec.frames.codecs import CompiledCodec, codec
-from tests.alike import agree, sensor
+from tests.alike import BACKENDS, agree, sensor
 
 KIND = Enum(Int8ub, idle=1, busy=2, lost=7)
 FLAGS = BitStruct("low" / BitsInteger(5), "kind" / Enum(BitsInteger(3), idle=1, busy=2))
@@ -50,6 +66,20 @@ def test_named_values_choose_as_in_construct(name: str) -> None:
 def test_a_number_is_built_as_its_name_is() -> None:
     ours = sensor(CHOICES["names"])
     assert [ours.build("data", kind=kind, body=3) for kind in (1, "idle", 2, 4)] == [b"\1\3", b"\1\3", b"\2\0\3", b"\4\0\0\0\3"]
+
+
+@pytest.mark.parametrize("inside", [False, True])
+def test_what_build_fills_in_is_not_asked_of_a_frame_that_comes(inside: bool) -> None:
+    """`Rebuild` says what is written; single parse and both decoders take any value, and keep it."""
+    length = "length" / Rebuild(Int8ub, this._.size + 1 if inside else this.size + 1)
+    head = "head" / Struct(length) if inside else length
+    ours = sensor(Struct("size" / Int8ub, head, "data" / Array(this.size, Int8ub)))
+    right, wrong = b"\2\3\7\7", b"\2\x09\7\7"
+    assert ours.build("data", ours.parse(right)) == ours.build("data", ours.parse(wrong)) == right
+    for backend in BACKENDS:
+        found = ours.decode([right, wrong], backend=backend)
+        assert found["head.length" if inside else "length"].tolist() == [3, 9]
+    assert [ours.parse(data).head.length if inside else ours.parse(data).length for data in (right, wrong)] == [3, 9]
 
 
 def test_examples_are_of_every_name() -> None:

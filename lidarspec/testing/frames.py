@@ -5,8 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
+import numpy as np
+
 from lidarspec.errors import SpecError, UsageError, WireError
 from lidarspec.frames.codecs import CompiledCodec, codec
+from lidarspec.frames.judging import VALID
+from lidarspec.frames.layout import Layout
 from lidarspec.testing import material
 from lidarspec.testing.findings import Violation, require
 from lidarspec.testing.subject import Subject
@@ -52,6 +56,7 @@ def every_raw_value_survives(subject: Subject, name: str) -> None:
     if isinstance(codec(sensor.frames[name]), CompiledCodec):
         return
     sealed = material.seals(sensor, name, b"")
+    follows = {info.path for info in codec(sensor.frames[name]).schema.fields.values() if info.rebuilt is not None}
     plain = [subject.example(name, seed=seed) for seed in range(3)]
     for example, spot in ((one, spot) for one in plain for spot in material.places(len(one), source) for _ in range(CHANGES)):
         data = bytearray(example)
@@ -61,13 +66,33 @@ def every_raw_value_survives(subject: Subject, name: str) -> None:
             again = sensor.parse(sensor.build(name, parsed), frame=name)
         except (WireError, UsageError):
             continue
-        _same_leaves(parsed, again, sealed, name)
+        _same_leaves(parsed, again, sealed | follows, name)
 
 
 def _same_leaves(parsed: Any, again: Any, sealed: set[str], name: str) -> None:
     for (path, before), (other, after) in zip(leaves(parsed), leaves(again), strict=False):
         if path == other and path not in sealed and isinstance(before, int | float) and before != after:
             raise Violation("LS303" if is_cut(before, after) else "LS302", f"{before!r} comes back as {after!r}", f"{name}.{path}")
+
+
+def what_follows_is_held(subject: Subject, name: str) -> None:
+    """A frame in which a field is not what its `Rebuild` says is refused: it would be built as another."""
+    sensor, engine = subject.sensor, codec(subject.sensor.frames[name])
+    if not isinstance(engine, CompiledCodec):
+        return
+    for data in (subject.example(name, seed=seed) for seed in range(3)):
+        layout = engine.tree.layout(data)
+        assert isinstance(layout, Layout)
+        leaves = [leaf for leaf in layout.leaves.values() if leaf.info.rebuilt is not None and not leaf.shape and leaf.info.kind == "int"]
+        for leaf, step in ((leaf, step) for leaf in leaves for step in (1, -1)):
+            rows = np.frombuffer(data, np.uint8).reshape(1, -1).copy()
+            leaf.store(rows, leaf.scalar(data) + step)
+            for seal in layout.seals:
+                seal.fill(rows)
+            other, place = rows.tobytes(), f"{name}.{leaf.info.path}"
+            if other != data and engine.survey(rows[0], np.zeros(1, np.intp)).status[0] == VALID:
+                built = sensor.build(name, sensor.parse(other, frame=name))
+                require(built == other, "LS312", f"{leaf.scalar(other)} passes, and {leaf.scalar(built)} is built", place)
 
 
 def is_cut(before: Any, after: Any) -> bool:

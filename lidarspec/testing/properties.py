@@ -109,6 +109,7 @@ PROPERTIES = (
     Property(frames.examples_are_valid_and_repeat, "frame", "LS301"),
     Property(frames.bytes_survive_parsing_and_building, "frame", "LS302"),
     Property(frames.every_raw_value_survives, "frame", "LS302", unless=("LS302", "LS303")),
+    Property(frames.what_follows_is_held, "frame", "LS312", unless=("LS302", "LS303")),
     Property(frames.values_in_units_build_the_same_bytes, "frame", "LS304", unless=("LS302", "LS303")),
     Property(edits.values_survive_building_and_parsing, "frame", "LS305", unless=("LS302", "LS303")),
     Property(frames.parse_finds_out_the_type, "frame", "LS306"),

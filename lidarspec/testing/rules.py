@@ -136,6 +136,12 @@ _FRAMES = (
         "what fails once cannot be looked at again",
         "structs without chance or clock in them",
     ),
+    Rule(
+        "LS312",
+        "a field that `Rebuild` fills in, and nothing holds",
+        "a frame that says otherwise is taken, and built as another",
+        "the same in `plausible`: f.length == f.size + 5",
+    ),
 )
 
 _STREAMS = (

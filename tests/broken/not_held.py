@@ -1,0 +1,13 @@
+"""A length that follows from another, which no frame that comes is held to."""
+
+from __future__ import annotations
+
+from construct import Int16ul, Rebuild, this
+
+from lidarspec import hookimpl
+from tests.broken.sound import FIELDS, SIZE, frame, sealed, sensor
+
+
+@hookimpl
+def lidarspec_sensors():
+    return [sensor(frame(sealed(count=FIELDS["count"], length=Rebuild(Int16ul, this.count * 3 + 17)), max_length=SIZE + 2))]
