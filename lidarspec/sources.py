@@ -69,6 +69,12 @@ def is_port(text: str) -> bool:
     return _PORT.fullmatch(name) is not None and not path.is_file()
 
 
+def has_control(source: str | Path) -> bool:
+    """Whether a source says by itself where commands go: ``control=HOST[:PORT]``."""
+    address = live_address(source)
+    return address is not None and bool(address.options.get("control"))
+
+
 def control_link(source: str | Path, name: str, link: Link, host: str | None) -> Transport:
     """The open transport of a link that commands go over apart from the data.
 

@@ -257,6 +257,48 @@ def test_commands_over_a_link_of_their_own(server: socket.socket, named: str) ->
         until(lambda: heard == [START, SPEED, STOP])
 
 
+@contextlib.contextmanager
+def silent_at_first(number: int, seconds: float, heard: list[str]) -> Iterator[None]:
+    """A device that sends datagrams to a port, the first one after some seconds, and answers whoever sends it an order."""
+
+    def work(stop: threading.Event) -> None:
+        with udp() as own:
+            own.settimeout(0.02)
+            stop.wait(seconds)
+            for frame in turning(SENSOR, 10_000):
+                if stop.is_set():
+                    return
+                own.sendto(frame, ("127.0.0.1", number))
+                with contextlib.suppress(TimeoutError):
+                    order, sender = own.recvfrom(100)
+                    heard.append("order")
+                    own.sendto(SENSOR.build("ack", code=SENSOR.parse(order, "order").code, result=0), sender)
+
+    with working(work):
+        yield
+
+
+def datagram_sensor(number: int) -> ls.Sensor:
+    return dataclasses.replace(SENSOR, links={"data": ls.Udp(number)}, on_open=(), on_close=())
+
+
+def test_a_command_waits_for_the_first_datagram_that_says_where_the_sensor_is() -> None:
+    number, heard = free_port(), list[str]()
+    with silent_at_first(number, 0.3, heard), ls.open(f"udp://127.0.0.1:{number}", datagram_sensor(number), start=False) as opened:
+        assert opened.send("speed", rate=10.0, trim=0.0, timeout=SLACK).confirmed
+        assert heard
+        assert sum(len(batch) for batch, _ in zip(opened.packets(wait=0.3), range(3), strict=False)) > 0
+
+
+def test_a_sensor_that_nothing_was_heard_of_cannot_be_sent_to() -> None:
+    number = free_port()
+    with ls.open(f"udp://127.0.0.1:{number}", datagram_sensor(number), start=False) as opened:
+        began = time.monotonic()
+        with pytest.raises(CommandError, match="nothing has arrived yet, so nobody knows the sensor's address"):
+            opened.send("speed", rate=10.0, trim=0.0, timeout=0.2)
+        assert 0.2 <= time.monotonic() - began < 0.2 + SLACK
+
+
 def test_an_unknown_control_address_is_asked_for() -> None:
     commands = {"start": dataclasses.replace(SENSOR.commands["start"], link="control")}
     links: dict[str, ls.Udp | ls.Tcp] = {"data": ls.Udp(7009), "control": ls.Tcp(7010)}

@@ -15,6 +15,7 @@ from lidarspec.cli.failures import INTERRUPTED, suggest
 from lidarspec.cli.output import emit_json, note, sensor_option
 from lidarspec.cli.progress import Progress, size
 from lidarspec.cli.streams import Duration, nothing_came
+from lidarspec.detection.detect import declared
 from lidarspec.device import Device
 from lidarspec.errors import CommandError, LidarSpecError, SourceError, UnknownFormat, UsageError, WireError
 from lidarspec.files import Chunk, LiveTransport, Transport
@@ -122,15 +123,16 @@ def record(
 ) -> None:
     """Everything that a source sends, with the time of its arrival, in one file that survives a crash.
 
-    With -s the sensor is started, and what it is stands in the file; without, bytes are recorded as they come.
+    A sensor that is named, with -s or by the source (sim:ID), is started, and what it is stands in the file; without, bytes are
+    recorded as they come.
     """
     _check_target(target)
     path = source.partition("?")[0]
     if os.path.exists(path) and os.path.exists(target) and os.path.samefile(path, target):
         raise UsageError(f"{target} is the source: it would be overwritten")
     known = named(source)
-    sensor = named_sensor(sensor_id) if sensor_id else known.configured() if known else None
     is_live = live_address(known.source if known else source) is not None
+    sensor = named_sensor(sensor_id) if sensor_id else declared(source) if is_live else known.configured() if known else None
     interrupted = False
     with Progress() as progress:
         task = Task(source, target, sensor, seconds, count, not no_start, force, salvage, progress)

@@ -137,7 +137,7 @@ def detected(source: str | Path) -> Sensor:
         UsageError: where several fit equally well: they are listed.
         SourceError: where it cannot be opened.
     """
-    told = _declared(source)
+    told = declared(source)
     if told is not None:
         return told
     device = named(source)
@@ -155,8 +155,8 @@ def detected(source: str | Path) -> Sensor:
     return alike[0].sensor
 
 
-def _declared(source: str | Path) -> Sensor | None:
-    """The sensor that a source names itself."""
+def declared(source: str | Path) -> Sensor | None:
+    """The sensor that a source names itself: a device of `lidarspec.toml`, a recording, a simulated sensor; None for any other."""
     device = named(source)
     configured = device.configured() if device is not None else None
     if configured is not None:

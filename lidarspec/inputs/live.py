@@ -23,8 +23,8 @@ from lidarspec.inputs.watch import Watch
 from lidarspec.recording.recorders import AnyRecorder
 from lidarspec.replies import Outgoing, Pending, Reply
 from lidarspec.session import Session
-from lidarspec.sources import control_link
-from lidarspec.spec import Sensor
+from lidarspec.sources import control_link, has_control
+from lidarspec.spec import Command, Sensor
 
 #: seconds between two decodings of what has come, and the longest that a wait goes on before others have their turn.
 PERIOD, TURN = 0.02, 0.05
@@ -153,6 +153,8 @@ class LiveInput:
 
     def send(self, name: str, *, timeout: float | None = None, **arguments: Any) -> Reply:
         """The reply to a command; see `Device.send`."""
+        if name in self.sensor.commands:
+            self._await_sender(self.sensor.commands[name], timeout)
         with self._talk:
             pending = self._session.request(name, time.monotonic_ns(), timeout=timeout, **arguments)
             self._speak()
@@ -161,6 +163,15 @@ class LiveInput:
                 raise self._failure
             self._help(pending)
         return pending.result()
+
+    def _await_sender(self, command: Command, timeout: float | None) -> None:
+        """Wait for a first datagram where it alone says where the sensor is, as long as for a reply."""
+        data = self._captures["data"].transport
+        if command.link not in self._captures and (data.peer() or has_control(self._source)):
+            return
+        limit = time.monotonic() + (command.timeout * (1 + command.retries) if timeout is None else timeout)
+        while not getattr(data, "addressed", True) and self._failure is None and time.monotonic() < limit:
+            self._help()
 
     def close(self) -> None:
         """Stop the sensor where it was started, and give everything back; a second call does nothing."""
@@ -194,12 +205,12 @@ class LiveInput:
             with contextlib.suppress(LidarSpecError):
                 pending.result()
 
-    def _help(self, pending: Pending) -> None:
+    def _help(self, pending: Pending | None = None) -> None:
         """Do a turn of the work, unless another thread is at it."""
         if not self._turn.acquire(timeout=TURN / 5):
             return
         try:
-            if not pending.done:
+            if pending is None or not pending.done:
                 self._pump(TURN)
         finally:
             self._turn.release()

@@ -108,6 +108,11 @@ class UdpTransport(LiveBase):
         except OSError as error:
             raise lost(self.label, error) from None
 
+    @property
+    def addressed(self) -> bool:
+        """Whether what is written has somewhere to go: to whom the last datagram came from."""
+        return self._last is not None
+
     def reopen(self) -> None:
         """Sockets stay open, whatever becomes of the sensor."""
 

@@ -113,6 +113,19 @@ def received(path: Path) -> bytes:
         return b"".join(item.data for item in recording if item.direction == "in")
 
 
+def test_a_simulated_sensor_is_known_and_started(tmp_path: Path) -> None:
+    """One that sends nothing before it is asked to."""
+    target = tmp_path / "a.lsr"
+    result = printed("record", "sim:slamtec-rplidar-a1?rate=4", "-o", target, "-n", 20)
+    assert result["sensor"] == "slamtec-rplidar-a1"
+    assert result["packets"] >= 20
+    assert printed("stats", target)["packets"] >= 20
+
+
+def test_nothing_is_sent_to_a_simulated_sensor_where_that_is_asked_for(tmp_path: Path) -> None:
+    ran("record", "sim:slamtec-rplidar-a1", "-o", tmp_path / "a.lsr", "-t", "0.2", "--no-start", code=5)
+
+
 @posix
 def test_recorded_replayed_and_recorded_again_it_is_the_same(stream: Path, tmp_path: Path, started: Callable[..., Running]) -> None:
     player = started("replay", stream, "--json")
