@@ -19,7 +19,7 @@ from lidarspec.frames.tracing import Node
 from lidarspec.plans.expressions import is_full, key, last_axis, only_field
 from lidarspec.plans.registers import TYPES, Read, Run, Step, Values, deep, shared
 from lidarspec.plans.sums import Sums
-from lidarspec.plans.windows import Blocks, Window, every_value, window
+from lidarspec.plans.windows import Blocks, Window, every_value, shift_of, window
 
 #: points of a chunk, so that its scratch arrays stay in the cache.
 CHUNK = 1 << 17
@@ -96,8 +96,12 @@ class Program:
         seen = window(leaf)
         if seen is None:
             return None
-        if node is source and factor == 1 and not leaf.info.scaled and leaf.wire is not None:
-            return self._load(leaf, seen, leaf.wire, kind)
+        if node is source and factor == 1 and not leaf.info.scaled:
+            shift = None if leaf.wire is not None else shift_of(leaf, seen)
+            if shift is not None:
+                return self._shifted(leaf, seen, *shift, kind)
+            if leaf.wire is not None:
+                return self._load(leaf, seen, leaf.wire, kind)
         index = self.once(("index", seen), lambda: self._load(leaf, seen, seen.dtype, "index"))
         table = self._table(node, leaf, seen, kind, factor)
         text = f"{node.path or source.path}: table of {len(table)} by {8 * seen.size} bits"
@@ -125,6 +129,21 @@ class Program:
             np.copyto(out, column if column.dtype == dtype else column.view(dtype), casting="unsafe")
 
         return self.step(f"{leaf.info.path}: {dtype} at byte {seen.offset}", kind, run)
+
+    def _shifted(self, leaf: Leaf, seen: Window, shift: int, mask: int, kind: str) -> int:
+        """A register with some bits of a window of every element."""
+        words = f"u{seen.size}"
+        word, bits = self.once((words, seen), lambda: self._load(leaf, seen, seen.dtype, words)), self.register(words)
+        read = Read(word)
+
+        def run(execution: Run, out: NDArray[Any]) -> None:
+            part = execution.views[bits]
+            np.right_shift(read(execution), shift, out=part)
+            if mask << shift < (1 << 8 * seen.size) - (1 << shift):
+                np.bitwise_and(part, mask, out=part)
+            np.copyto(out, part, casting="unsafe")
+
+        return self.step(f"{leaf.info.path}: {mask.bit_length()} bits from bit {shift} on", kind, run, read, Read(bits))
 
     def _of(self, leaf: Leaf, seen: Window) -> Blocks:
         for blocks in self._blocks:

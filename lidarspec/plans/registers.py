@@ -17,6 +17,8 @@ TYPES: dict[str, np.dtype[Any]] = {
     "double": np.dtype(np.float64),
     "index": np.dtype(np.intp),
     "flag": np.dtype(np.bool_),
+    "u1": np.dtype("u1"),
+    "u2": np.dtype("u2"),
 }
 
 Values = Callable[[Node], NDArray[Any]]

@@ -50,6 +50,16 @@ def raw_values(leaf: Leaf, seen: Window) -> NDArray[Any]:
     return single.load(frames)
 
 
+def shift_of(leaf: Leaf, seen: Window) -> tuple[int, int] | None:
+    """By how much a window is shifted right, and what is masked then, to give the raw value of a field; None where that is not all."""
+    raw = raw_values(leaf, seen).astype(np.int64)
+    ones = np.flatnonzero(raw[1 << np.arange(8 * seen.size)] == 1)
+    if not len(ones):
+        return None
+    shift, mask = int(ones[0]), int(raw[-1])
+    return (shift, mask) if np.array_equal(np.arange(len(raw)) >> shift & mask, raw) else None
+
+
 def every_value(node: Node, leaf: Leaf) -> NDArray[Any] | None:
     """An expression of one field for every value of the field's window, in its order; None where it has no window."""
     seen = window(leaf)
