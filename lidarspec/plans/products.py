@@ -19,6 +19,8 @@ Floats = NDArray[np.float64]
 TURN = 2 * np.pi
 #: radians from which on float32 is too coarse for an angle.
 NEAR = 4.0
+#: multiplications up to which OpenBLAS stays in one thread (`SMP_THRESHOLD_MIN` times `GEMM_MULTITHREAD_THRESHOLD`).
+_ALONE = 1 << 18
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,8 +129,14 @@ def reduced(angles: Floats) -> Floats:
 
 
 def multiplied(left: NDArray[Any], right: NDArray[Any], out: NDArray[Any]) -> None:
-    """A matrix product; rows come out the same in any company, for which a lone one needs another: it would be summed in another order."""
-    if len(left) == 1:
-        out[...] = (left[[0, 0]] @ right)[:1]
-    else:
-        np.matmul(left, right, out=out)
+    """A matrix product in pieces that a BLAS does in one thread; with two, a chunk would wait for the one that is busy elsewhere.
+
+    Rows come out the same in any company: for that a lone one needs another, as it would be summed in another order.
+    """
+    step = max(_ALONE // right.size, 2)
+    for start in range(0, len(left), step):
+        part, target = left[start : start + step], out[start : start + step]
+        if len(part) > 1:
+            np.matmul(part, right, out=target)
+        else:
+            target[...] = (part.repeat(2, axis=0) @ right)[:1]
