@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.allocation import keep_freed_memory
+from lidarspec.allocation import is_counted, keep_freed_memory
 from lidarspec.clouds import LazyCloud, PointCloud
 from lidarspec.errors import SpecError
 from lidarspec.frames.access import Fields
@@ -222,7 +222,7 @@ def _counts(shares: list[Share], number: int) -> NDArray[Any]:
 
 
 def _in_order(where: NDArray[np.intp]) -> bool:
-    return bool((where[1:] > where[:-1]).all())
+    return is_counted(where) or bool((where[1:] > where[:-1]).all())
 
 
 def guarded(packets: Packets, carry: Carry | None = None, *, final: bool, epoch: int) -> Evaluated | None:
