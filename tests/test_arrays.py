@@ -11,10 +11,12 @@ from numpy.typing import NDArray
 
 import lidarspec
 from lidarspec import Sensor
-from lidarspec.clocks import Unwrapper
+from lidarspec.clocks import Unwrapper, clock_ns
 from lidarspec.decoder import Counters, Spans
 from lidarspec.found import Alike
+from lidarspec.frames.access import Fields
 from lidarspec.frames.codecs import CompiledCodec, codec
+from lidarspec.frames.columns import Batch
 from lidarspec.frames.tables import Rows
 from lidarspec.packets import joined
 from lidarspec.streams import PacketStream
@@ -115,3 +117,20 @@ def test_clocks_run_on_over_wraps_and_steps_back(wraps_at: float) -> None:
     cuts = [0, 1, 2, 77, 4000, 5000]
     pieces = [parts.push(true[a:b] % turn, nobody[a:b]) for a, b in pairwise(cuts)]
     np.testing.assert_array_equal(np.concatenate(pieces), found)
+
+
+@pytest.mark.parametrize("spread", [1, 3, 40, 400])
+def test_a_clock_that_is_a_function_is_read_as_the_function_says(spread: int) -> None:
+    sensor = lidarspec.sensor("hesai-xt32")
+    assert sensor.clock is not None
+    assert callable(sensor.clock.source)
+    random = np.random.default_rng(spread)
+    rows = np.tile(np.frombuffer(sensor.example("data"), np.uint8), (400, 1))
+    start, _ = codec(sensor.frames["data"]).tree.layout(rows[0].tobytes()).places["utc"]
+    dates = random.integers(1, 60, (spread, 6), np.uint8)
+    rows[:, start : start + 6] = dates[np.sort(random.integers(0, spread, len(rows)))]
+    table = codec(sensor.frames["data"]).table([row.tobytes() for row in rows])
+    for some in (np.arange(400), np.arange(1), np.arange(150, 250)):
+        batch = Batch(table.take(some), np.zeros(len(some), np.bool_))
+        seconds = [np.broadcast_to(np.asarray(term).reshape(-1), len(some)) for term in sensor.clock.source(Fields(batch))]
+        assert clock_ns(sensor, batch).tolist() == sum(np.rint(term * 1e9).astype(np.int64) for term in seconds).tolist()

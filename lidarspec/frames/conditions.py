@@ -33,7 +33,7 @@ class Condition:
     def holds(self, columns: Mapping[str, NDArray[np.float64]]) -> NDArray[np.bool_]:
         """Whether it is true, for columns of the fields in their units, element by element."""
         with np.errstate(all="ignore"):
-            return np.asarray(_value(self.node, columns, {})).astype(np.bool_)
+            return np.asarray(value_of(self.node, columns, {})).astype(np.bool_)
 
 
 class Conditions:
@@ -169,7 +169,7 @@ def _parts(plausible: Callable[[Any], Any], schema: Schema, layout: Layout) -> l
         answer, _ = trace(plausible, sample)
         if not isinstance(answer, Traced):
             return None
-        return [Condition(node, _fields(node, schema)) for node in _conjuncts(answer.node)]
+        return [Condition(node, fields_of(node, schema)) for node in _conjuncts(answer.node)]
     except Exception:  # the function itself will say so, frame by frame
         return None
 
@@ -184,8 +184,8 @@ def _conjuncts(node: Node) -> Iterator[Node]:
         yield node
 
 
-def _fields(node: Node, schema: Schema) -> tuple[FieldInfo, ...]:
-    """The fields that a node depends on.
+def fields_of(node: Node, schema: Schema) -> tuple[FieldInfo, ...]:
+    """The fields that a node depends on, each once.
 
     Raises:
         Untraceable: if it depends on more than the frame itself, or on fields that do not stand side by side.
@@ -204,10 +204,10 @@ def _fields(node: Node, schema: Schema) -> tuple[FieldInfo, ...]:
     return tuple(found.values())
 
 
-def _value(node: Node, columns: Mapping[str, NDArray[np.float64]], known: dict[Node, Any]) -> Any:
+def value_of(node: Node, columns: Mapping[str, NDArray[np.float64]], known: dict[Node, Any]) -> Any:
     """What a node comes to for columns of the fields."""
     if node.kind == "field":
         return columns[node.path]
     if node not in known:
-        known[node] = node.function(*(_value(arg, columns, known) if isinstance(arg, Node) else arg for arg in node.args))
+        known[node] = node.function(*(value_of(arg, columns, known) if isinstance(arg, Node) else arg for arg in node.args))
     return known[node]
