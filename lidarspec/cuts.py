@@ -29,12 +29,20 @@ class Turning:
 
     def push(self, steps: NDArray[np.float64]) -> NDArray[np.float64]:
         """1 or -1 for each of the next steps, (k,), given in turns; of length 1 where it is the same for all."""
-        totals = np.cumsum(np.concatenate([[self._total], steps]))[1:]
+        totals = steps.copy()
+        totals[:1] += self._total
+        np.cumsum(totals, out=totals)
+        first = self._direction
         self._total = float(totals[-1]) if len(totals) else self._total
         found: NDArray[np.float64] | None = None
-        start, size = 0, 64
-        first = self._direction
+        start, size, is_new = 0, 64, True
         while start < len(totals):
+            if self._direction and is_new:
+                is_new = False
+                if self._only_ahead(float(totals[start]), steps[start + 1 :]):
+                    if found is not None:
+                        found[start:] = self._direction
+                    break
             part = totals[start : start + size]
             if self._direction == 0:
                 found = np.ones(len(totals)) if found is None else found
@@ -55,6 +63,13 @@ class Turning:
                 self._direction = -self._direction or (1 if part[spot] > 0 else -1)
                 self._furthest = self._direction * float(part[spot])
         return np.array([float(first or 1)]) if found is None else found
+
+    def _only_ahead(self, total: float, steps: NDArray[np.float64]) -> bool:
+        """Whether the angle has come further than ever with this total, and all steps after it go on the same way."""
+        if self._direction * total < self._furthest or float((self._direction * steps).min(initial=0.0)) < 0:
+            return False
+        self._furthest = self._direction * self._total
+        return True
 
 
 class Cutter:
@@ -151,8 +166,11 @@ def _rows(column: Column, found: Evaluated) -> tuple[NDArray[np.float64], NDArra
     if not levels and len(array) == len(counts):
         return array.reshape(-1), _starts(_sums(counts, 1))
     shape = np.broadcast_shapes((found.ready, *array.shape[1 : 1 + levels]), counts.shape[: 1 + levels])
-    points = _sums(np.broadcast_to(counts, (*shape, *counts.shape[1 + levels :])), 1 + levels).reshape(-1)
+    numbers = _sums(np.broadcast_to(counts, (*shape, *counts.shape[1 + levels :])), 1 + levels)
     values = np.broadcast_to(array.reshape(len(array), *array.shape[1 : 1 + levels]), shape).reshape(-1)
+    if numbers.size and not any(numbers.strides) and (each := int(numbers.flat[0])):
+        return values, np.arange(len(values)) * each
+    points = numbers.reshape(-1)
     starts = _starts(points)
     kept = points > 0 if levels else np.ones(len(points), np.bool_)
     return values[kept], starts[kept]
@@ -165,12 +183,15 @@ def _sums(counts: NDArray[Any], kept: int) -> NDArray[np.intp]:
         repeats = counts.strides[-1] == 0 and counts.shape[-1] > 0
         times *= counts.shape[-1] if repeats else 1
         counts = counts[..., 0] if repeats else counts.sum(axis=-1)
-    return counts * times
+    return np.broadcast_to(counts.flat[0] * times, counts.shape) if counts.size and not any(counts.strides) else counts * times
 
 
 def _folded(angles: NDArray[np.float64], full: float) -> NDArray[np.float64]:
     """Angles in [0, full); the same as `np.mod`, and several times as fast."""
-    return angles - np.floor(angles / full) * full
+    turns = angles / full
+    np.floor(turns, out=turns)
+    turns *= full
+    return np.subtract(angles, turns, out=turns)
 
 
 def _before(values: NDArray[np.float64], first: float | None) -> NDArray[np.float64]:

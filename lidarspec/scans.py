@@ -151,27 +151,31 @@ class ScanStream:
         return list(self._cut(packets, found))
 
     def _cut(self, packets: Packets, found: Evaluated) -> Iterator[Scan]:
-        start, cuts = 0, self._cutter.cuts(packets, found)
-        for cut, ends in zip(cuts, _times_ns(found.cloud, cuts), strict=True):
-            self._parts.append(found.cloud.stretch(start, cut))
+        start, cloud, cuts = 0, found.cloud, self._cutter.cuts(packets, found)
+        first, *times = _times_ns(cloud, [0, *cuts])
+        self._begins = first if self._begins is None else self._begins
+        for cut, ends in zip(cuts, times, strict=True):
+            self._take(cloud, start, cut)
             scan = self._close(ends, complete=self._started)
             self._begins = ends
             if scan is not None:
                 self._started = True
                 yield scan
             start = cut
-        self._parts.append(found.cloud.stretch(start, len(found.cloud)))
+        self._take(cloud, start, len(cloud))
+
+    def _take(self, cloud: PointCloud, start: int, stop: int) -> None:
+        if start < stop:
+            self._parts.append(cloud.stretch(start, stop))
 
     def _close(self, ends: int | None, *, complete: bool) -> Scan | None:
         """The scan of the points so far; `ends`: the time of the first point after it, ns."""
-        parts = [part for part in self._parts if len(part)]
-        self._parts = []
+        parts, self._parts = self._parts, []
         if not parts:
             return None
         cloud = joined(parts)
-        begins = self._begins if self._begins is not None else _times_ns(cloud, [0])[0]
-        assert begins is not None
-        self._begins = None
+        begins = self._begins
+        assert begins is not None  # since there are points
         period = (ends - begins) * 1e-9 if ends is not None else np.nan
         rate = 1 / period if period > 0 else np.nan
         cloud = restamped(cloud, begins)

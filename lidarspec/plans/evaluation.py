@@ -9,6 +9,7 @@ import math
 import traceback
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -91,11 +92,16 @@ class Share:
             return array[first:stop] if len(array) > 1 else array
 
         maker.run(self.group.rows[first:stop], values, found)
-        if "x" in found and isinstance(maker, Program) and not self.plan.safe(values):
+        if "x" in found and isinstance(maker, Program) and not self.is_safe and not self.plan.safe(values):
             made = [found[name] for name in "xyz" if name in found]
             bad = np.isnan(made).any(axis=0)
             for column in made:
                 column[bad] = np.nan
+
+    @cached_property
+    def is_safe(self) -> bool:
+        """Whether a nan marks all coordinates of a point alike; see `Plan.safe`."""
+        return self.plan.safe(self.values.array)
 
     def plain(self, value: Any) -> NDArray[Any]:
         """A part of the result for every point of the group, evaluated plainly."""

@@ -9,12 +9,14 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.clouds import Columns, axis_matrix, narrowed
+from lidarspec.frames.tracing import Node
 from lidarspec.packets import Packets
 from lidarspec.plans.kernels import spread_out
 from lidarspec.points import points_function
@@ -148,9 +150,10 @@ class Points(Made):
         if share is None or self.has("time"):
             return cast("NDArray[np.float64]", self.column("time"))[indices]
         packets, spots = np.divmod(indices, share.plan.width)
-        few = share.some(packets)
+        after = share.plan.parts["time"]
+        few = share.some(packets).plain(after) if isinstance(after, Node) else share.plain(after)[packets]
         offsets = (self._packets.time_ns[packets] - self.base) * 1e-9
-        return np.asarray(few.plain(few.plan.parts["time"]).reshape(len(packets), -1)[np.arange(len(packets)), spots] + offsets)
+        return np.asarray(few.reshape(len(packets), -1)[np.arange(len(packets)), spots] + offsets)
 
     def times_of(self, share: Share, first: int, stop: int) -> NDArray[np.float64]:
         """The times of all points of some packets of a share, as many axes as those have."""
@@ -199,12 +202,14 @@ class Stretches(Made):
     def __init__(self, parts: Sequence[Stretch], made: dict[str, NDArray[Any]] | None = None) -> None:
         first = parts[0].points
         super().__init__(first._packets, first._shares, sum(part.stop - part.start for part in parts))
-        self._parts = parts
-        self._stands_alone = (self.size >= LEAST or made is not None) and self._is_even()
+        self._parts, self._is_large = parts, self.size >= LEAST or made is not None
         self._made = self._made if made is None else made
 
-    def _is_even(self) -> bool:
-        """Whether the packets all have one layout, and are whole but for the first and the last one."""
+    @cached_property
+    def _stands_alone(self) -> bool:
+        """Whether the points are many, and their packets all have one layout and are whole but for the first and the last one."""
+        if not self._is_large:
+            return False
         shares = [part.points.even for part in self._parts]
         width = self._shares[0].plan.width
         inner = [*(part.stop for part in self._parts[:-1]), *(part.start for part in self._parts[1:])]
