@@ -12,7 +12,6 @@ import os
 import socket
 import struct
 import sys
-from collections.abc import Iterator
 
 #: datagrams in one call, and the room for each: memory that is not written to costs nothing.
 MANY, LARGEST = 256, 1 << 16
@@ -41,6 +40,11 @@ class _Datagram(ctypes.Structure):
     _fields_ = (("message", _Message), ("size", ctypes.c_uint))
 
 
+#: where the size of the first datagram, and of what is told with it, stand in the headers, and how far on the next ones do, in words.
+_SIZE, _SIZE_STEP = (part // ctypes.sizeof(ctypes.c_uint) for part in (_Datagram.size.offset, ctypes.sizeof(_Datagram)))
+_TOLD, _TOLD_STEP = (part // ctypes.sizeof(ctypes.c_size_t) for part in (_Message.control_size.offset, ctypes.sizeof(_Datagram)))
+
+
 class Slots:
     """Room for many datagrams, used again and again.
 
@@ -57,14 +61,17 @@ class Slots:
         self._payload, self._names, self._control = (ctypes.create_string_buffer(MANY * size) for size in (LARGEST, NAME, CONTROL))
         self._data, self._senders, self._said = (memoryview(part).cast("B") for part in (self._payload, self._names, self._control))
         self._vectors = (_Vector * MANY)()
-        self._datagrams = (_Datagram * MANY)()
+        self._headers = ctypes.create_string_buffer(MANY * ctypes.sizeof(_Datagram))
+        self._datagrams = (_Datagram * MANY).from_buffer(self._headers)
+        # An access to a field by its name costs more than a datagram should.
+        self._sizes, self._told = (memoryview(self._headers).cast("B").cast(kind) for kind in "IN")
         for index in range(MANY):
             self._vectors[index] = _Vector(ctypes.addressof(self._payload) + index * LARGEST, LARGEST)
             message = self._datagrams[index].message
             message.name, message.name_size = ctypes.addressof(self._names) + index * NAME, NAME
             message.vectors, message.vectors_number = ctypes.pointer(self._vectors[index]), 1
             message.control, message.control_size = ctypes.addressof(self._control) + index * CONTROL, CONTROL
-        self._fresh = bytes(self._datagrams)
+        self._fresh = self._headers.raw
         self._known: dict[bytes, tuple[str, int]] = {}
 
     def fill(self, descriptor: int) -> int:
@@ -73,7 +80,7 @@ class Slots:
         Raises:
             OSError: what the system says.
         """
-        ctypes.memmove(self._datagrams, self._fresh, len(self._fresh))  # the kernel wrote over the sizes
+        ctypes.memmove(self._headers, self._fresh, len(self._fresh))  # the kernel wrote over the sizes
         number: int = self._call(descriptor, self._datagrams, MANY, socket.MSG_DONTWAIT, None)
         if number < 0:
             code = ctypes.get_errno()
@@ -85,8 +92,8 @@ class Slots:
     def datagram(self, index: int) -> tuple[bytes, tuple[str, int]]:
         """A datagram that was fetched, and its sender."""
         start = index * LARGEST
-        data = bytes(self._data[start : start + self._datagrams[index].size])
-        name = bytes(self._senders[index * NAME : index * NAME + NAME])
+        data = self._data[start : start + self._sizes[_SIZE + index * _SIZE_STEP]].tobytes()
+        name = self._senders[index * NAME : index * NAME + NAME].tobytes()
         sender = self._known.get(name)
         if sender is None:
             if len(self._known) >= MANY:
@@ -94,17 +101,18 @@ class Slots:
             sender = self._known[name] = _address(name)
         return data, sender
 
-    def said(self, index: int) -> Iterator[tuple[int, bytes]]:
+    def said(self, index: int) -> list[tuple[int, memoryview]]:
         """What the socket layer said with a datagram: type and value."""
-        start = index * CONTROL
-        end = start + self._datagrams[index].message.control_size
+        start, found = index * CONTROL, list[tuple[int, memoryview]]()
+        end = start + self._told[_TOLD + index * _TOLD_STEP]
         while start + _HEADER.size <= end:
             size, level, kind = _HEADER.unpack_from(self._said, start)
             if size < _HEADER.size:
-                return
+                break
             if level == socket.SOL_SOCKET:
-                yield kind, bytes(self._said[start + _HEADER.size : start + size])
+                found.append((kind, self._said[start + _HEADER.size : start + size]))
             start += -(-size // _ALIGN) * _ALIGN
+        return found
 
 
 def _address(name: bytes) -> tuple[str, int]:

@@ -37,6 +37,7 @@ PAUSE = 0.002
 LATEST = 60_000_000_000
 #: socket options that Python has no names for (Linux, asm-generic/socket.h).
 SO_TIMESTAMPNS, SO_RXQ_OVFL = 35, 40
+TIME = struct.Struct("qq")
 OPTIONS = ("port", "group", "src")
 
 
@@ -225,12 +226,12 @@ class _Socket:
                 return
             yield data, sender[:2], now
 
-    def _told(self, said: Iterable[tuple[int, bytes]], statistics: Statistics, now: int, anchor: int) -> int:
+    def _told(self, said: Iterable[tuple[int, memoryview]], statistics: Statistics, now: int, anchor: int) -> int:
         """When the datagram arrived; counts what was dropped before it."""
         at = now
         for kind, data in said:
             if kind == SO_TIMESTAMPNS and len(data) == 16:
-                seconds, nanoseconds = struct.unpack("qq", data)
+                seconds, nanoseconds = TIME.unpack(data)
                 at = now - min(max(anchor - seconds * 1_000_000_000 - nanoseconds, 0), LATEST)
             elif kind == SO_RXQ_OVFL and len(data) == 4:
                 drops = int.from_bytes(data, sys.byteorder)
