@@ -64,7 +64,7 @@ class Slots:
         self._headers = ctypes.create_string_buffer(MANY * ctypes.sizeof(_Datagram))
         self._datagrams = (_Datagram * MANY).from_buffer(self._headers)
         # An access to a field by its name costs more than a datagram should.
-        self._sizes, self._told = (memoryview(self._headers).cast("B").cast(kind) for kind in "IN")
+        self._sizes, self._told = memoryview(self._headers).cast("B").cast("I"), memoryview(self._headers).cast("B").cast("P")
         for index in range(MANY):
             self._vectors[index] = _Vector(ctypes.addressof(self._payload) + index * LARGEST, LARGEST)
             message = self._datagrams[index].message
