@@ -168,7 +168,7 @@ def test_bit_fields_show_their_bits() -> None:
         "intensity": (0x0A5738 >> 2 & 0xFF, "byte 1 bits 1-0, byte 0 bits 7-2"),
         "exposure": (0x0A5738 & 3, "byte 0 bits 1-0"),
     }
-    assert "angle 10.000000 deg (byte 1 bits 7-0, byte 0 bits 7-1), check 1 (byte 0 bit 0)" in rows["fsa"].meaning
+    assert "angle 10.00 deg (byte 1 bits 7-0, byte 0 bits 7-1), check 1 (byte 0 bit 0)" in rows["fsa"].meaning
 
 
 def variant(*fields: object) -> Sensor:
@@ -271,3 +271,36 @@ def test_numbers_are_shown_with_the_steps_of_their_scale() -> None:
     serial = next(value for row in found.rows for value in row.values if value.name == "serial")
     assert str(serial) == str(serial.raw)
     assert not any(math.isinf(value.physical) for row in found.rows for value in row.values if value.name == "serial")
+
+
+@pytest.mark.parametrize(
+    ("scale", "offset", "shown"),
+    [
+        (1 / 64, 0, "300.02"),
+        (1 / 16, 0, "1200.0625"),
+        (0.25, 0, "4800.25"),
+        (0.01, 0, "192.01"),
+        (0.01, -327.68, "-135.67"),
+        (0.001, 0, "19.201"),
+        (0.00025, 0, "4.80025"),
+        (360 / 65536, 0, "105.474"),
+        (1 / 3, 0, "6400.3"),
+        (1, 273.15, "19474.15"),
+        (100, 0, "1920100"),
+        (1e-9, 0, "0.000019201"),
+        (2**-32, 0, "0.0000044706"),
+    ],
+)
+def test_a_value_has_the_decimals_that_its_steps_need(scale: float, offset: float, shown: str) -> None:
+    """One raw step more shows another number, and what is shown is built as it was read."""
+    shape = SHAPES["shape-numbers"]
+    frame = Frame(Struct("magic" / Const(b"\xf0\x0d"), "x" / Scaled(Int16ul, scale, "u", offset)), data=True, max_length=4)
+    sensor = dataclasses.replace(shape, frames={"data": frame}, points=lambda f: ls.Polar(f.x, 0), sequence=None, clock=None, sweep=None)
+
+    def said(raw: int) -> str:
+        row = explain(sensor, sensor.build("data", x=raw)).rows[-1]
+        return str(row.values[0]).split()[0]
+
+    assert said(19_201) == shown
+    assert said(19_202) != shown
+    assert sensor.parse(sensor.build("data", x=float(shown), units=True)).x == 19_201

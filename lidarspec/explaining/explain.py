@@ -37,8 +37,8 @@ __all__ = ["Explanation", "explain", "hexdump"]
 
 #: most points of a frame without arrays that are told.
 TOLD = 4
-#: most decimals of a value, and most flipped bits that are told one by one.
-DIGITS, FLIPS = 6, 3
+#: most decimals that steps are told apart by, those that may be added to show one in full, and most flipped bits that are told one by one.
+DIGITS, SPARE, FLIPS = 12, 2, 3
 
 Keys = tuple[str | int, ...]
 
@@ -196,9 +196,10 @@ def kind(path: str) -> str:
 
 
 def _digits(info: FieldInfo) -> int:
-    """Decimals that show every step of a field."""
+    """Decimals that tell every step of a field from the next; a few more where these show it in full."""
     steps = (exact(info.scale), exact(info.offset))
-    return next((digits for digits in range(DIGITS) if all(step * 10**digits % 1 == 0 for step in steps)), DIGITS)
+    apart = next((digits for digits in range(DIGITS) if abs(steps[0]) * 10**digits >= 1), DIGITS)
+    return next((digits for digits in range(apart, apart + SPARE + 1) if all(step * 10**digits % 1 == 0 for step in steps)), apart)
 
 
 def _blocks(con: Any, path: str) -> Iterator[tuple[str, Mapping[Keys, BitField]]]:
