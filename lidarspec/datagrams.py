@@ -7,19 +7,15 @@ with `after` only counts while it is announced, and a frame has to be as long as
 from __future__ import annotations
 
 import bisect
-from functools import lru_cache
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.allocation import alike, repeated
 from lidarspec.frames.judging import VALID, Survey
-from lidarspec.frames.layout import Bytes2D, Layout, elements
-from lidarspec.framing import COUNTED, Bytes1D, Framing, Marks, Mode, Offsets
-
-#: constants that stand side by side: offset, type, mask (None: all bits), value.
-Word = tuple[int, np.dtype[Any], Any, Any]
+from lidarspec.frames.layout import Bytes2D, Layout
+from lidarspec.framing import COUNTED, Bytes1D, Framing, Mode, Offsets
+from lidarspec.straight import fitting, words
 
 
 class Datagrams:
@@ -32,7 +28,8 @@ class Datagrams:
 
     def __init__(self, framing: Framing) -> None:
         self._framing = framing
-        self._words = [_words(marks) for marks in framing.marks]
+        self._words = [words(marks) for marks in framing.marks]
+        self._ends = [max((spot + dtype.itemsize for spot, dtype, _, _ in found), default=0) for found in self._words]
         self.rejected: dict[str, int] = {}
         self.errors: list[str] = []
         self._surveyed: tuple[int, Survey] | None = None
@@ -45,9 +42,9 @@ class Datagrams:
         self._surveyed = None
         for kind in self._framing.active(mode):
             codec = self._framing.codecs[kind]
-            if codec.size not in (None, rows.shape[1]):
+            if codec.size not in (None, rows.shape[1]) or self._ends[kind] > rows.shape[1]:
                 continue
-            marked = self._marks(kind, rows)
+            marked = fitting(self._words[kind], rows)
             if not marked:
                 continue
             survey = codec.alike(rows) if marked == len(rows) and not self._framing.switches(kind, mode) else None
@@ -58,19 +55,6 @@ class Datagrams:
                 return None
             return kind, survey.layout
         return None
-
-    def _marks(self, kind: int, rows: Bytes2D) -> int:
-        """How many rows have the constants of a type."""
-        marked = None
-        for spot, dtype, mask, value in self._words[kind]:
-            if spot + dtype.itemsize > rows.shape[1]:
-                return 0
-            found = elements(rows, dtype, spot, (), ())
-            right = (found if mask is None else found & mask) == value
-            marked = right if marked is None else np.bitwise_and(marked, right, out=marked)
-            if not np.count_nonzero(marked):
-                return 0
-        return len(rows) if marked is None else int(np.count_nonzero(marked))
 
     def kinds(self, buffer: Bytes1D, starts: Offsets, sizes: Offsets, mode: Mode) -> Offsets:
         """The type of each datagram, as its index, -1 where it is none.
@@ -142,8 +126,7 @@ class Datagrams:
 
     def _marked(self, kind: int, buffer: Bytes1D, starts: Offsets, sizes: Offsets) -> NDArray[np.bool_]:
         """Which datagrams have the constants of a type."""
-        words = self._words[kind]
-        end = max((spot + dtype.itemsize for spot, dtype, _, _ in words), default=0)
+        end = self._ends[kind]
         size = alike(sizes)
         if size is None or size < end:
             whole = sizes >= end
@@ -153,7 +136,7 @@ class Datagrams:
                 return marked
         marked = np.ones(len(starts), np.bool_)
         step = _step(starts)
-        for spot, dtype, mask, value in words if len(starts) else ():
+        for spot, dtype, mask, value in self._words[kind] if len(starts) else ():
             found = (
                 np.ndarray((len(starts),), dtype, buffer, starts.item(0) + spot, (step,))
                 if step
@@ -183,20 +166,6 @@ def _step(starts: Offsets) -> int:
 def _same(first: Offsets, second: Offsets) -> bool:
     one, other = alike(first), alike(second)
     return bool((first == second).all()) if one is None or other is None else one == other
-
-
-@lru_cache(maxsize=2048)
-def _words(marks: Marks) -> list[Word]:
-    """Constants as few words of 1, 2, 4 or 8 bytes, each of bytes that all have constants."""
-    left, found = {spot: (mask, value) for spot, mask, value in marks}, list[Word]()
-    while left:
-        first = min(left)
-        size = next(size for size in (8, 4, 2, 1) if all(spot in left for spot in range(first, first + size)))
-        parts = [left.pop(first + index) for index in range(size)]
-        dtype = np.dtype(f"<u{size}")
-        mask, value = (np.frombuffer(bytes(part), dtype)[0] for part in zip(*parts, strict=True))
-        found.append((first, dtype, None if all(part[0] == 0xFF for part in parts) else mask, value))
-    return found
 
 
 class _Batch:

@@ -192,17 +192,23 @@ class Decoder:
             with summed_by(self._sums):
                 piece = cut(self._framing, part, self._mode, base=self._base, final=final and last)
             spans = self._entered(part, piece, at)
-            found += [spans] if len(spans.kinds) else []  # one without frames would keep its bytes
+            found += [spans] if len(spans) else []  # one without frames would keep its bytes
             start, self._base = start + piece.end, self._base + piece.end
             self._need = piece.need if piece.waiting and last else 0
             if piece.waiting and last:
                 break
-            most = LONGEST if 2 * int(piece.sizes.sum()) > piece.end else PIECE
+            most = LONGEST if 2 * (piece.sizes.sum() if piece.rows is None else piece.rows.size) > piece.end else PIECE
             self._size = min(max(4 * piece.end, self._least), max(most, self._least))
         return start
 
     def _entered(self, buffer: NDArray[np.uint8], piece: Piece, at: int | None) -> Spans:
         """The frames of a piece, with all that was found in it counted."""
+        if piece.layout is not None and piece.rows is not None:
+            times = repeated(-1 if at is None else at, len(piece.rows))
+            found = Alike(self._names, buffer, piece.kinds.item(0), piece.layout, piece.rows, 0, self._base, self._gap, times)
+            self._gap = 0
+            self._count(found.kinds)
+            return found
         gaps = self._gaps(buffer, piece)
         self._rejected(piece.rejected, piece.errors)
         self._count(piece.kinds)

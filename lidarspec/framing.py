@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from lidarspec.frames.codecs import Codec
 from lidarspec.frames.judging import CHECKSUM, CONSTANT, IMPLAUSIBLE, LENGTH, PLUGIN, SHORT, VALID, taken
+from lidarspec.frames.layout import Layout
 
 #: which counter a rejected candidate raises.
 COUNTED = {LENGTH: "bad_length", CHECKSUM: "bad_checksum", IMPLAUSIBLE: "implausible", PLUGIN: "plugin_errors"}
@@ -74,11 +75,12 @@ class Candidates:
 
 @dataclass
 class Mode:
-    """What is remembered between pieces: the last frame named by any `after`, and a run of weak frames under way."""
+    """What is remembered between pieces: the last frame named by any `after`, a run of weak frames under way, the last frame's size."""
 
     after: str | None = None
     run: str | None = None
     run_end: int = -1
+    size: int = 0
 
 
 @dataclass
@@ -93,6 +95,7 @@ class Piece:
         rows: the bytes of the frames, one a row, where all have one layout; None where nobody gathered them.
         rejected: number of rejected candidates by counter.
         errors: tracebacks out of plugins.
+        layout: that all frames have, one after another from the first byte on; None where they have not, or nobody knows.
     """
 
     kinds: Offsets = field(default_factory=lambda: np.empty(0, np.intp))
@@ -104,6 +107,7 @@ class Piece:
     rows: NDArray[np.uint8] | None = None
     rejected: dict[str, int] = field(default_factory=dict)
     errors: list[str] = field(default_factory=list)
+    layout: Layout | None = None
 
     def reject(self, numbers: Sequence[int], errors: Sequence[str]) -> None:
         """Count candidates as rejected: how many of each status."""
@@ -228,6 +232,7 @@ def leftmost(framing: Framing, buffer: Bytes1D, mode: Mode, *, final: bool) -> P
     if framing.named:
         live = _until_switched(framing, live, mode, piece)
     piece.kinds, piece.offsets, piece.sizes, piece.rows = live.kinds, live.offsets, live.sizes, live.rows
+    mode.size = live.sizes.item(-1) if len(live.sizes) else mode.size
     count_rejected(piece, found, final=final)
     return piece
 

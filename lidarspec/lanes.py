@@ -6,9 +6,9 @@ A CRC is linear. A register of one byte is computed by halves: the bytes of a ro
 bytes behind them are away, by a table of 256, and XORed onto them, until one byte is left. Where rows are many, their words
 become one word before, without tables: eight bytes on, a byte counts as the sum of itself at fewer bytes on, which ones is
 what the polynomial says (its eighth power has the same terms, eight times as far apart). So each word is XORed onto sums for
-0 to 7 bytes on, and these are moved and added up. A wider register runs along all rows at once, two bytes a step, by a table
-of 65,536; long rows are cut into segments that run side by side and are joined in pairs. Tables depend on the polynomial and
-the distance alone.
+0 to 7 bytes on, and these are moved and added up. Where rows are few and short, each byte is looked up by its place. A wider
+register runs along all rows at once, two bytes a step, by a table of 65,536; long rows are cut into segments that run side by
+side and are joined in pairs. Tables depend on the polynomial and the distance alone.
 
 Registers are kept in wire order, where the low byte is the one that meets the next data byte: for `refin` the usual
 reflected register, otherwise the usual register aligned left with its bytes swapped. One formula serves both.
@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 REGISTER_BYTES = [2] * 17 + [4] * 16 + [8] * 32  # that a register is kept in, by its width
+FEW, SHORT = 1 << 13, 1 << 7  # bytes of all rows, and of one, for which a table for each place pays
 MANY = 1024  # rows whose words are summed in less time than tables take
 MIRROR = bytes(int(f"{byte:08b}"[::-1], 2) for byte in range(256))
 
@@ -117,6 +118,9 @@ def byte_sums(columns: NDArray[np.uint64]) -> NDArray[np.uint64]:
 
 def registers(rows: NDArray[np.uint8], spans: Spans, start: int, width: int, poly: int, refin: bool) -> NDArray[Any]:
     """The register after some bytes of each row, shape (n,), in an integer of the bytes that it takes."""
+    length = sum(stop - first for first, stop in spans)
+    if 0 < length <= SHORT and len(rows) * length <= FEW:
+        return _by_place(rows, spans, length, start, width, poly, refin)
     return (_narrow if width <= 8 else _wide)(rows, spans, start, width, poly, refin)
 
 
@@ -124,6 +128,30 @@ def cut(rows: NDArray[np.uint8], spans: Spans) -> NDArray[np.uint8]:
     """The bytes of each row that some spans cover, one span after another."""
     parts = [rows[:, start:stop] for start, stop in spans]
     return parts[0] if len(parts) == 1 else np.concatenate(parts, axis=1)
+
+
+def _by_place(rows: NDArray[np.uint8], spans: Spans, length: int, start: int, width: int, poly: int, refin: bool) -> NDArray[Any]:
+    """`registers` of a few short rows: what each byte comes to at the end is looked up, and the sum is taken."""
+    table, firsts, begun = _places(length, start, width, poly, refin)
+    found: NDArray[Any] = np.bitwise_xor.reduce(table.take(cut(rows, spans) + firsts), axis=1)
+    return np.bitwise_xor(found, begun, out=found) if begun else found
+
+
+@lru_cache(maxsize=64)
+def _places(length: int, start: int, width: int, poly: int, refin: bool) -> tuple[NDArray[Any], NDArray[np.intp], Any]:
+    """The register after the bytes from each place of a row to its end, by the first of them, the others being 0.
+
+    Returns:
+        All of them, (256 * length,); where those of each place begin; and the register after `start` and as many zeros.
+    """
+    table = np.array(byte_table(width, poly, refin), f"<u{REGISTER_BYTES[width] if width > 8 else 1}")
+    found = [table]
+    while len(found) < length:
+        found.append(table[found[-1] & 0xFF] ^ (found[-1] >> 8 if width > 8 else 0))
+    begun = table.dtype.type(start >> 8 * length)
+    for place, byte in enumerate(start.to_bytes(8, "little")[:length]):
+        begun ^= found[length - 1 - place][byte]
+    return np.concatenate(found[::-1]), np.arange(length) * 256, begun
 
 
 def _narrow(rows: NDArray[np.uint8], spans: Spans, start: int, width: int, poly: int, refin: bool) -> NDArray[np.uint8]:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from lidarspec.frames.codecs import Codec
 from lidarspec.frames.judging import CONSTANT, IMPLAUSIBLE, PLUGIN, SHORT, VALID
 from lidarspec.framing import Bytes1D, Framing, Marks, Mode, Offsets, Piece, count_rejected, fitting, leftmost, merged
+from lidarspec.straight import straight
 
 #: strides judged together at first, and at most.
 FIRST, LONGEST = 64, 1 << 14
@@ -43,7 +44,8 @@ def cut(framing: Framing, buffer: Bytes1D, mode: Mode, *, base: int, final: bool
     """
     if any(framing.weak(kind) for kind in framing.active(mode)):
         return _Runs(framing, buffer, mode, base, final=final).cut()
-    return leftmost(framing, buffer, mode, final=final)
+    found = None if final else straight(framing, buffer, mode)
+    return leftmost(framing, buffer, mode, final=final) if found is None else found
 
 
 class Lane:

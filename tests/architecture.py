@@ -17,7 +17,7 @@ from pathlib import Path
 FLOORS = (
     "_version abilities errors allocation lanes checksums catalogue angles fields units bits construction",
     "spec hookspecs geometry links rules splits files searching",
-    "frames framing runs installed plugins",
+    "frames framing straight runs installed plugins",
     "found datagrams decoder packets streams clocks sequences clouds points plans cuts reorder mounting",
     "session replies scans simulation explaining parsing building examples engine wiretable",
     "device async_device inputs detection transports recording captures sources settings drafts",
