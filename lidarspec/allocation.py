@@ -32,6 +32,14 @@ def repeated(value: int, count: int) -> NDArray[np.int64]:
     return np.ndarray((count,), np.int64, value.to_bytes(8, sys.byteorder, signed=True), 0, (0,))
 
 
+def some(values: NDArray[np.int64], which: NDArray[np.bool_] | NDArray[np.intp] | slice) -> NDArray[np.int64]:
+    """Some of the values, by mask, indices or slice; of equal ones as `repeated` has them."""
+    value = alike(values)
+    if value is None or isinstance(which, slice):
+        return values[which]
+    return repeated(value, int(np.count_nonzero(which)) if which.dtype == np.bool_ else len(which))
+
+
 def counted(count: int) -> NDArray[np.int64]:
     """0, 1, 2 ... as many numbers as asked for, (count,), read-only; in the same memory each time, unless they are very many."""
     return _numbers()[:count] if count <= COUNTED else np.arange(count)

@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.allocation import alike, repeated
+from lidarspec.frames.constants import equal, right, words
 from lidarspec.frames.judging import VALID, Survey
 from lidarspec.frames.layout import Bytes2D, Layout
 from lidarspec.framing import COUNTED, Bytes1D, Framing, Mode, Offsets
-from lidarspec.straight import fitting, words
 
 
 class Datagrams:
@@ -42,12 +42,12 @@ class Datagrams:
         self._surveyed = None
         for kind in self._framing.active(mode):
             codec = self._framing.codecs[kind]
-            if codec.size not in (None, rows.shape[1]) or self._ends[kind] > rows.shape[1]:
+            if codec.size not in (None, rows.shape[1]):
                 continue
-            marked = fitting(self._words[kind], rows)
-            if not marked:
+            marked = right(self._words[kind], rows)
+            if marked is not None and not np.count_nonzero(marked):
                 continue
-            survey = codec.alike(rows) if marked == len(rows) and not self._framing.switches(kind, mode) else None
+            survey = codec.alike(rows) if marked is None and not self._framing.switches(kind, mode) else None
             if survey is None or survey.layout is None:
                 return None
             if np.count_nonzero(survey.status):
@@ -126,6 +126,7 @@ class Datagrams:
 
     def _marked(self, kind: int, buffer: Bytes1D, starts: Offsets, sizes: Offsets) -> NDArray[np.bool_]:
         """Which datagrams have the constants of a type."""
+        constants = self._words[kind]
         end = self._ends[kind]
         size = alike(sizes)
         if size is None or size < end:
@@ -136,13 +137,14 @@ class Datagrams:
                 return marked
         marked = np.ones(len(starts), np.bool_)
         step = _step(starts)
-        for spot, dtype, mask, value in self._words[kind] if len(starts) else ():
+        for word in constants if len(starts) else ():
+            spot, dtype, _, _ = word
             found = (
                 np.ndarray((len(starts),), dtype, buffer, starts.item(0) + spot, (step,))
                 if step
                 else np.ndarray((len(buffer) - spot - dtype.itemsize + 1,), dtype, buffer, spot, (1,))[starts]
             )
-            marked &= (found if mask is None else found & mask) == value
+            marked &= equal(found, word)
         return marked
 
 

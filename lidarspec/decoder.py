@@ -212,10 +212,10 @@ class Decoder:
         gaps = self._gaps(buffer, piece)
         self._rejected(piece.rejected, piece.errors)
         self._count(piece.kinds)
-        starts, offsets = piece.offsets, self._base + piece.offsets.astype(np.int64)
+        starts, offsets = piece.offsets, np.add(piece.offsets, self._base)
         if piece.rows is not None:
             buffer, starts = piece.rows.reshape(-1), np.arange(len(piece.rows)) * piece.rows.shape[1]
-        times = np.full(len(gaps), -1 if at is None else at, np.int64)
+        times = repeated(-1 if at is None else at, len(gaps))
         return Spans(self._names, buffer, piece.kinds, starts, piece.sizes, offsets, gaps, times)
 
     def _gaps(self, buffer: NDArray[np.uint8], piece: Piece) -> NDArray[np.int64]:

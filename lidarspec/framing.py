@@ -15,12 +15,14 @@ from __future__ import annotations
 import bisect
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property, lru_cache
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lidarspec.allocation import repeated, some
 from lidarspec.frames.codecs import Codec
+from lidarspec.frames.constants import Marks
 from lidarspec.frames.judging import CHECKSUM, CONSTANT, IMPLAUSIBLE, LENGTH, PLUGIN, SHORT, VALID, taken
 from lidarspec.frames.layout import Layout
 
@@ -32,9 +34,6 @@ MOST = 1 << 15
 
 Bytes1D = NDArray[np.uint8]
 Offsets = NDArray[np.intp]
-
-#: constants: offset, mask, value.
-Marks = tuple[tuple[int, int, int], ...]
 
 
 @dataclass(eq=False)
@@ -70,7 +69,7 @@ class Candidates:
     def only(self, which: NDArray[np.bool_]) -> Candidates:
         """Some of them."""
         rows = None if self.rows is None else taken(self.rows, which[: len(self.rows)])
-        return Candidates(self.kind, self.offsets[which], self.status[which], self.sizes[which], self.errors, rows)
+        return Candidates(self.kind, self.offsets[which], self.status[which], some(self.sizes, which), self.errors, rows)
 
 
 @dataclass
@@ -129,7 +128,7 @@ class Framing:
     def __init__(self, codecs: Mapping[str, Codec]) -> None:
         self.names, self.codecs = list(codecs), list(codecs.values())
         self.named = {codec.frame.after for codec in self.codecs} - {None}
-        self.marks = [marks(codec) for codec in self.codecs]
+        self.marks = [codec.marks for codec in self.codecs]
         lengths = [codec.frame.max_length for codec in self.codecs]
         #: no candidate waits for more bytes than these.
         self.reach = max(lengths) + max(codec.frame.max_length * codec.frame.confirm for codec in self.codecs)
@@ -162,16 +161,6 @@ class Framing:
             spots = {kind: offsets[: int(np.searchsorted(offsets, len(buffer)))] for kind, offsets in spots.items()}
         found = [Candidates.judged(kind, self.codecs[kind], buffer, offsets) for kind, offsets in spots.items() if len(offsets)]
         return buffer, found
-
-
-def marks(codec: Codec) -> Marks:
-    """The constants at the start of a type's frames, whole bytes first, which tell the most."""
-    return _sorted(tuple((spot, mask, value) for spot, (mask, value) in codec.prefix.items()))
-
-
-@lru_cache(maxsize=2048)
-def _sorted(constants: Marks) -> Marks:
-    return tuple(sorted(constants, key=lambda mark: (mark[1] != 0xFF, mark[0])))
 
 
 def matches(buffer: Bytes1D, constants: Marks) -> Offsets:
@@ -256,7 +245,7 @@ class Live:
         rows = self.rows
         if rows is not None and (not isinstance(which, slice) or which.stop < len(rows)):
             rows = rows[which] if isinstance(which, slice) else taken(rows, which)
-        return Live(self.kinds[which], self.offsets[which], self.sizes[which], self.status[which], rows)
+        return Live(some(self.kinds, which), self.offsets[which], some(self.sizes, which), self.status[which], rows)
 
 
 def merged(found: Sequence[Candidates], *, final: bool) -> Live:
@@ -265,7 +254,7 @@ def merged(found: Sequence[Candidates], *, final: bool) -> Live:
     live = [one if one.valid or bool((one.status <= worst).all()) else one.only(one.status <= worst) for one in found]
     if len(live) == 1:
         one = live[0]
-        return Live(np.full(len(one.offsets), one.kind), one.offsets, one.sizes, one.status, one.rows)
+        return Live(repeated(one.kind, len(one.offsets)), one.offsets, one.sizes, one.status, one.rows)
     kinds = np.repeat([one.kind for one in live], [len(one.offsets) for one in live])
     offsets = np.concatenate([one.offsets for one in live])
     order = np.lexsort((kinds, offsets))

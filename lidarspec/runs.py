@@ -13,13 +13,15 @@ import bisect
 import numpy as np
 from numpy.typing import NDArray
 
+from lidarspec.allocation import repeated
 from lidarspec.frames.codecs import Codec
+from lidarspec.frames.constants import Marks, right, words
 from lidarspec.frames.judging import CONSTANT, IMPLAUSIBLE, PLUGIN, SHORT, VALID
-from lidarspec.framing import Bytes1D, Framing, Marks, Mode, Offsets, Piece, count_rejected, fitting, leftmost, merged
+from lidarspec.framing import Bytes1D, Framing, Mode, Offsets, Piece, count_rejected, fitting, leftmost, merged
 from lidarspec.straight import straight
 
-#: strides judged together at first, and at most.
-FIRST, LONGEST = 64, 1 << 14
+#: strides judged together at first, and at most; and how many are judged sooner as the rows of an array.
+FIRST, LONGEST, FEW = 64, 1 << 14, 8
 
 #: offsets of a stretch at first, and at most.
 NARROW, WIDE = 1 << 8, 1 << 12
@@ -165,9 +167,29 @@ class Lane:
         assert self._size
         if self._start <= spot < self._end:
             return self.status[spot : min(spot + number * self._size, self._end) : self._size]
-        offsets = spot + self._size * np.arange(number)
-        self._judge(offsets)
+        known = self._judged_rows(spot, min(number, (len(self._buffer) - spot) // self._size))
+        if known and self.status[spot + (known - 1) * self._size] != VALID:
+            number = known  # the run breaks there, or before
+        self._judge(spot + self._size * np.arange(known, number))
         return self.status[spot : spot + number * self._size : self._size]
+
+    def _judged_rows(self, spot: int, number: int) -> int:
+        """How many in a row are judged as the rows of an array: up to the first without the right constants, 0 where that cannot be."""
+        if number < FEW:
+            return 0
+        assert self._size
+        rows = np.ndarray((number, self._size), np.uint8, self._buffer, spot, (self._size, 1))
+        marked = right(words(self._marks), rows)
+        count = number if marked is None else int(marked.argmin())
+        survey = self._codec.alike(rows[:count]) if count else None
+        if survey is not None:
+            self.status[spot : spot + count * self._size : self._size] = survey.status
+            self.errors = survey.errors or self.errors
+        elif count:
+            return 0
+        if count < number:
+            self.status[spot + count * self._size] = CONSTANT
+        return min(count + 1, number)
 
     def _live(self, spot: int) -> bool:
         if self.status[spot] == _UNKNOWN:
@@ -314,6 +336,11 @@ class _Runs:
 def _filled(piece: Piece, taken: list[tuple[int, int, int, int]]) -> None:
     """Enter the runs that were taken: type, first offset, number and size of their frames."""
     if not taken:
+        return
+    if len(taken) == 1:
+        kind, spot, number, size = taken[0]
+        piece.kinds, piece.sizes = repeated(kind, number), repeated(size, number)
+        piece.offsets = np.arange(spot, spot + number * size, size)
         return
     kinds, spots, numbers, sizes = np.array(taken, np.intp).T
     within = np.arange(int(numbers.sum())) - np.repeat(np.cumsum(numbers) - numbers, numbers)

@@ -6,21 +6,16 @@ would take the same. So they are judged as rows, which takes a few calls; on any
 
 from __future__ import annotations
 
-from functools import lru_cache
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.allocation import counted, repeated
-from lidarspec.frames.layout import Bytes2D, Layout, elements
-from lidarspec.framing import Framing, Marks, Mode, Piece
+from lidarspec.frames.constants import Marks, right, words
+from lidarspec.frames.layout import Layout
+from lidarspec.framing import Framing, Mode, Piece
 
 #: bytes of a piece that is looked at so, at most: where the frames turn out to be damaged, it is looked at twice.
 SMALL = 1 << 16
-
-#: constants that stand side by side: offset, type, mask (None: all bits), value.
-Word = tuple[int, np.dtype[Any], Any, Any]
 
 
 def straight(framing: Framing, buffer: NDArray[np.uint8], mode: Mode) -> Piece | None:
@@ -35,10 +30,11 @@ def straight(framing: Framing, buffer: NDArray[np.uint8], mode: Mode) -> Piece |
         return None
     rows = buffer[: number * mode.size].reshape(number, mode.size)
     for kind in framing.active(mode):
-        marked = fitting(words(framing.marks[kind]), rows)
-        if not marked:
+        told = tuple(word for word in words(framing.marks[kind]) if word[0] + word[1].itemsize <= mode.size)
+        marked = right(told, rows)
+        if marked is not None and not np.count_nonzero(marked):
             continue
-        survey = framing.codecs[kind].alike(rows) if marked == number and not framing.switches(kind, mode) else None
+        survey = framing.codecs[kind].alike(rows) if marked is None and not framing.switches(kind, mode) else None
         if survey is None or survey.layout is None or np.count_nonzero(survey.status):
             return None
         need = _awaited(framing, mode, kind, survey.layout, buffer[rows.size :].tobytes()) if rows.size < len(buffer) else 0
@@ -71,31 +67,3 @@ def _awaited(framing: Framing, mode: Mode, kind: int, layout: Layout, rest: byte
 
 def _begins(marks: Marks, data: bytes) -> bool:
     return all(spot >= len(data) or data[spot] & mask == value for spot, mask, value in marks)
-
-
-def fitting(constants: list[Word], rows: Bytes2D) -> int:
-    """How many rows have these constants, as far as the rows go."""
-    marked = None
-    for spot, dtype, mask, value in constants:
-        if spot + dtype.itemsize > rows.shape[1]:
-            continue
-        found = elements(rows, dtype, spot, (), ())
-        right = (found if mask is None else found & mask) == value
-        marked = right if marked is None else np.bitwise_and(marked, right, out=marked)
-        if not np.count_nonzero(marked):
-            return 0
-    return len(rows) if marked is None else int(np.count_nonzero(marked))
-
-
-@lru_cache(maxsize=2048)
-def words(marks: Marks) -> list[Word]:
-    """Constants as few words of 1, 2, 4 or 8 bytes, each of bytes that all have constants."""
-    left, found = {spot: (mask, value) for spot, mask, value in marks}, list[Word]()
-    while left:
-        first = min(left)
-        size = next(size for size in (8, 4, 2, 1) if all(spot in left for spot in range(first, first + size)))
-        parts = [left.pop(first + index) for index in range(size)]
-        dtype = np.dtype(f"<u{size}")
-        mask, value = (np.frombuffer(bytes(part), dtype)[0] for part in zip(*parts, strict=True))
-        found.append((first, dtype, None if all(part[0] == 0xFF for part in parts) else mask, value))
-    return found

@@ -9,13 +9,14 @@ from __future__ import annotations
 import traceback
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.allocation import alike, counted, repeated
+from lidarspec.allocation import alike, counted, repeated, some
 from lidarspec.clocks import Unwrapper, clock_ns
 from lidarspec.decoder import Counters, Spans
 from lidarspec.errors import UnknownFrame
@@ -118,7 +119,7 @@ class PacketStream:
         breaks = np.zeros(part.number, np.bool_)
         if alike(part.spans.gaps) != 0 and part.spans.gaps.any():
             losses = np.cumsum(part.spans.gaps > 0)
-            marks = losses if part.where is None else losses[part.where]
+            marks = losses[part.own]
             breaks[:1] = marks[:1] > 0
             breaks[1:] = marks[1:] > marks[:-1]
             left = int(losses[-1]) > (int(marks[-1]) if part.number else 0)
@@ -138,6 +139,8 @@ class PacketStream:
     def _states(self, parts: Sequence[_Part], number: int, *, whole: bool) -> dict[str, StateOf]:
         """The frames of each other type, and which of them was the last before each packet."""
         if all(part.where is None for part in parts):
+            if not self._state:
+                return dict.fromkeys(self._others, (None, repeated(-1, number)))
             return {name: self._unchanged(name, number) for name in self._others}
         seen = self._others_in(parts)
         return {name: self._state_of(name, *seen[name], number=number, whole=whole) for name in self._others}
@@ -148,14 +151,13 @@ class PacketStream:
         number = 0
         for part in parts:
             if part.where is not None:
-                mine = np.zeros(len(part.spans.kinds), np.bool_)
-                mine[part.where] = True
-                before = np.cumsum(mine)
-                for index in np.flatnonzero(~mine).tolist():
+                others = np.ones(len(part.spans), np.bool_)
+                others[part.own] = False
+                for rank, index in enumerate(np.flatnonzero(others).tolist()):
                     name = part.spans.names[part.spans.kinds[index]]
                     if name in seen:
                         seen[name][0].append(part.spans.data(index))
-                        seen[name][1].append(number + int(before[index]))
+                        seen[name][1].append(number + index - rank)
             number += part.number
         return seen
 
@@ -180,7 +182,7 @@ class PacketStream:
             frames, before = [self._state[name], *frames], [0, *before]
         elif whole:
             before = [0, *before[1:]]
-        which = np.searchsorted(np.array(before, np.intp), np.arange(number), side="right").astype(np.intp) - 1
+        which = np.repeat(np.arange(-1, len(before)), np.diff([0, *before, number])) if any(before) else repeated(len(before) - 1, number)
         self._state[name] = frames[-1]
         table: Table = codec(self.sensor.frames[name], interpreted=self._interpreted).table(frames)
         return table, which
@@ -208,10 +210,19 @@ class _Part:
         where = np.flatnonzero(mine)
         return cls(spans, where, len(where))
 
+    @cached_property
+    def own(self) -> NDArray[np.intp] | slice:
+        """Which frames are ours, as a slice where they follow one another."""
+        where = self.where
+        if where is None or not len(where):
+            return slice(0, self.number)
+        first, last = where.item(0), where.item(-1)
+        return slice(first, last + 1) if last - first == len(where) - 1 else where
+
     def column(self, name: str) -> NDArray[Any]:
         """An array of the spans, for our frames."""
         array: NDArray[Any] = getattr(self.spans, name)
-        return array if self.where is None else array[self.where]
+        return array if self.where is None else some(array, self.own)
 
     def table(self, codec: Codec) -> Table:
         """Our frames as columns."""

@@ -22,6 +22,7 @@ from lidarspec.allocation import repeated
 from lidarspec.construction import Mismatch
 from lidarspec.errors import SpecError
 from lidarspec.frames.conditions import Check, Conditions
+from lidarspec.frames.constants import Marks, marks
 from lidarspec.frames.dispatch import frame_parser
 from lidarspec.frames.headers import HeaderTree, Refused, check_compilable, rows_at
 from lidarspec.frames.judging import CHECKSUM, CONSTANT, LENGTH, PLUGIN, SHORT, VALID, Judge, Survey, plausibility
@@ -36,11 +37,17 @@ BLOCK = 1 << 19
 
 
 class Codec(Protocol):
-    """The engine of one frame type; `size` is that of all its frames, None where they differ."""
+    """The engine of one frame type.
+
+    Attributes:
+        size: that of all its frames, None where they differ.
+        marks: the constants of `prefix`, whole bytes first, which tell the most.
+    """
 
     frame: Frame
     schema: Schema
     size: int | None
+    marks: Marks
 
     @property
     def prefix(self) -> Mapping[int, tuple[int, int]]:
@@ -79,6 +86,7 @@ class CompiledCodec:
                 raise NotCompilable(info.path, wide if info.bits > 64 else "its values are not all plain numbers of one kind")
         self.tree = HeaderTree(frame.prepared, frame.max_length)
         self.prefix, self.size = self.tree.prefix, _size(frame)
+        self.marks = marks(self.prefix)
         #: the Container of one whole, sound frame; None where construct has to look at it
         self.parse = frame_parser(frame.prepared, self.tree)
         self._conditions: Conditions | None = None
@@ -175,6 +183,7 @@ class InterpretedCodec:
     def __init__(self, frame: Frame, reason: str = "") -> None:
         self.frame, self.reason, self.schema = frame, reason, schema(frame.prepared)
         self.prefix, self.size = _prefix(frame), _size(frame)
+        self.marks = marks(self.prefix)
 
     def survey(self, buffer: NDArray[np.uint8], offsets: NDArray[np.intp], *, gathered: bool = True) -> Survey:
         status = np.zeros(len(offsets), np.uint8)

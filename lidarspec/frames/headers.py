@@ -30,6 +30,9 @@ TRIED = 64
 #: distinct headers remembered; garbage must not fill the memory with their layouts.
 REMEMBERED = 4096
 
+#: different values of a header field that are looked for one by one.
+FEW = 4
+
 
 @dataclass(frozen=True, eq=False)
 class Refused:
@@ -187,6 +190,10 @@ class HeaderTree:
         if np.count_nonzero(values == values[0]) == len(values):
             stack.append((node.children.setdefault(values.item(0), _Node()), which))
             return
+        few = _few(values)
+        if few is not None:
+            stack.extend((node.children.setdefault(value, _Node()), which[values == value]) for value in few)
+            return
         order = np.argsort(values, kind="stable")
         values = values[order]
         edges = [0, *(np.flatnonzero(values[1:] != values[:-1]) + 1).tolist(), len(values)]
@@ -258,6 +265,15 @@ class HeaderTree:
                 if path not in given:
                     further = [{**given, path: value} for value in values[1:]]
                     pending += [one for one in further if one not in pending][: max(TRIED - len(pending), 0)]
+
+
+def _few(values: NDArray[Any]) -> list[int] | None:
+    """The values in ascending order, if they are few different ones, which are found one by one sooner than sorted."""
+    found, left = list[int](), values
+    while len(left) and len(found) < FEW:
+        found.append(left.item(0))
+        left = left[left != left[0]]
+    return None if len(left) else sorted(found)
 
 
 class _Stop(Exception):

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from lidarspec.frames.access import Fields
 from lidarspec.frames.columns import Batch, Column, unpadded
 from lidarspec.frames.conditions import Check
+from lidarspec.frames.constants import marks, right, words
 from lidarspec.frames.layout import Bytes2D, Layout, Seal
 from lidarspec.frames.schema import Schema
 from lidarspec.frames.tables import Group, Rows, Table
@@ -40,13 +41,14 @@ class Judge:
         self, frame: Frame, schema: Schema, layout: Layout, prefix: Mapping[int, tuple[int, int]], checks: list[Check] | None
     ) -> None:
         self._frame, self._schema, self._layout, self._checks = frame, schema, layout, checks
-        self._constants = [(spot, mask, value) for spot, (mask, value) in layout.constants.items() if prefix.get(spot) != (mask, value)]
+        self._constants = words(marks({spot: known for spot, known in layout.constants.items() if prefix.get(spot) != known}))
 
     def __call__(self, rows: Bytes2D, errors: list[str]) -> Status:
         """The status of each candidate, (n,); tracebacks out of plugins go to `errors`."""
         status = np.zeros(len(rows), np.uint8)
-        for spot, mask, value in self._constants:
-            status[(rows[:, spot] & mask) != value] = CONSTANT
+        held = right(self._constants, rows) if len(rows) else None
+        if held is not None:
+            status[~held] = CONSTANT
         for seal in self._layout.seals:
             _among(status, rows, functools.partial(intactness, seal, errors))
         if self._checks is not None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -115,7 +115,7 @@ def fed(decoder: Decoder, chunks: Sequence[Chunk]) -> list[Spans]:
     ends = decoder.stats.bytes_in + np.cumsum([len(chunk.data) for chunk in chunks])
     times = np.array([-1 if chunk.at is None else chunk.at for chunk in chunks], np.int64)
     found = decoder.spans(b"".join([chunk.data for chunk in chunks]), chunks[-1].at)
-    return [replace(spans, at=times[np.searchsorted(ends, spans.offsets + spans.sizes)]) for spans in found]
+    return [spans.arrived(times[np.searchsorted(ends, spans.offsets + spans.sizes)]) for spans in found]
 
 
 def answers(found: Sequence[Spans], awaited: frozenset[str]) -> list[Found]:
