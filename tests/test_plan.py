@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -115,3 +116,16 @@ def test_columns_are_made_once_and_slices_share_them() -> None:
     assert part.x.base is cloud.x or part.x.base is cloud.x.base
     assert part.shape == (25, 5)
     assert isinstance(packets.batch().table, Rows)
+
+
+def test_threads_that_decode_with_one_sensor_do_not_meet() -> None:
+    sensor = lidarspec.sensor("robosense-m1")
+    some = np.stack([np.frombuffer(sensor.example("data", seed=seed), np.uint8) for seed in range(40)])
+    inputs = [np.tile(some[:20], (50, 1)), np.tile(some[20:], (50, 1))]
+    wanted = [sensor.decode(rows).points().x for rows in inputs]
+
+    def same(index: int) -> bool:
+        return all(np.array_equal(sensor.decode(inputs[index]).points().x, wanted[index], equal_nan=True) for _ in range(15))
+
+    with ThreadPoolExecutor(2) as pool:
+        assert all(pool.map(same, [0, 1]))

@@ -18,6 +18,7 @@ from lidarspec.frames.layout import Bytes2D, Layout, Leaf
 from lidarspec.frames.tracing import Node
 from lidarspec.plans.expressions import is_full, key, last_axis, only_field
 from lidarspec.plans.registers import TYPES, Read, Run, Step, Values, deep, shared
+from lidarspec.plans.scratch import Scratch, scratch
 from lidarspec.plans.sums import Sums
 from lidarspec.plans.windows import Blocks, Window, every_value, shift_of, window
 
@@ -121,11 +122,7 @@ class Program:
         place, width = self._blocks.index(blocks), self.width
 
         def run(execution: Run, out: NDArray[Any]) -> None:
-            source, loaded = execution.prepared[place]
-            if loaded != execution.start:
-                blocks.load(source, execution.start, execution.stop)
-                execution.prepared[place] = (source, execution.start)
-            column = blocks.column(seen, source, execution.start, (execution.stop - execution.start) * width)
+            column = execution.prepared[place].column(seen, execution.start, execution.stop, width)
             np.copyto(out, column if column.dtype == dtype else column.view(dtype), casting="unsafe")
 
         return self.step(f"{leaf.info.path}: {dtype} at byte {seen.offset}", kind, run)
@@ -150,7 +147,7 @@ class Program:
             if blocks.shape == leaf.shape and blocks.holds(seen):
                 return blocks
         alike = [other for other in self.layout.leaves.values() if other.shape == leaf.shape and other.strides == leaf.strides]
-        self._blocks.append(Blocks(alike, self.layout.size, self.chunk))
+        self._blocks.append(Blocks(alike, self.layout.size))
         return self._blocks[-1]
 
     def repeated(self, text: str, kind: str, make: Callable[[Run], NDArray[Any]]) -> int:
@@ -251,20 +248,22 @@ class Program:
         number = len(rows)
         if any(blocks.is_flat for blocks in self._blocks):
             rows = np.ascontiguousarray(rows)
-        size = min(self.chunk, number) * self.width
-        scratch = self._scratch(size)
-        execution = Run(rows, values)
-        execution.prepared = {place: (blocks.source(rows), -1) for place, blocks in enumerate(self._blocks)}
-        with np.errstate(all="ignore"):
-            for start in range(0, number, self.chunk):
-                self._chunk(execution, scratch, found, start, min(start + self.chunk, number))
+        packets = min(self.chunk, number)
+        with scratch() as memory:
+            execution = Run(rows, values)
+            rooms = [memory.take(blocks.room(packets)) for blocks in self._blocks]
+            execution.prepared = {place: self._blocks[place].loading(rows, room) for place, room in enumerate(rooms)}
+            registers = self._registers(memory, packets * self.width)
+            with np.errstate(all="ignore"):
+                for start in range(0, number, self.chunk):
+                    self._chunk(execution, registers, found, start, min(start + self.chunk, number))
 
     @cached_property
     def _slots(self) -> list[int]:
         """Which registers share memory; asked for when no column is added any more."""
         return shared(self.steps, self.kinds, {*self.outputs.values(), *self._tiles})
 
-    def _scratch(self, size: int) -> list[NDArray[Any]]:
+    def _registers(self, memory: Scratch, size: int) -> list[NDArray[Any]]:
         """An array for each register; those that are not needed at the same time share one."""
         made, found = dict[int, NDArray[Any]](), list[NDArray[Any]]()
         for register, (slot, kind) in enumerate(zip(self._slots, self.kinds, strict=True)):
@@ -272,14 +271,14 @@ class Program:
                 found.append(self._tiles.get(register, _NOTHING))
                 continue
             if slot not in made:
-                made[slot] = np.empty(size, TYPES[kind])
+                made[slot] = memory.take(size * TYPES[kind].itemsize).view(TYPES[kind])
             found.append(made[slot])
         return found
 
-    def _chunk(self, run: Run, scratch: list[NDArray[Any]], found: Mapping[str, NDArray[Any]], start: int, stop: int) -> None:
+    def _chunk(self, run: Run, registers: list[NDArray[Any]], found: Mapping[str, NDArray[Any]], start: int, stop: int) -> None:
         count = (stop - start) * self.width
         run.start, run.stop = start, stop
-        run.views = [array[:count] for array in scratch]
+        run.views = [array[:count] for array in registers]
         for name, register in self.outputs.items():
             if register not in self._tiles:
                 run.views[register] = found[name][start * self.width : stop * self.width]

@@ -85,13 +85,12 @@ class Blocks:
     Args:
         leaves: the fields wanted; all of the same arrays.
         size: of a frame in bytes.
-        chunk: packets.
 
     Attributes:
         is_flat: whether nothing stands between them, if the frames stand back to back, as they then have to.
     """
 
-    def __init__(self, leaves: list[Leaf], size: int, chunk: int) -> None:
+    def __init__(self, leaves: list[Leaf], size: int) -> None:
         first = leaves[0]
         self.shape, strides = first.shape[: len(first.strides)], first.strides
         self.stride = strides[-1] if strides else size
@@ -100,7 +99,6 @@ class Blocks:
         self._length = count * self.stride
         self._base = 0 if self.is_flat else max(min(*(leaf.offset for leaf in leaves), size - self._length), 0)
         self._strides, self._size = strides[:-1], size
-        self._compact = None if self.is_flat else np.empty((chunk, math.prod(self.shape[:-1]) * self._length), np.uint8)
 
     def _regular(self, size: int, strides: tuple[int, ...]) -> bool:
         """Whether elements follow each other at one distance from frame to frame too."""
@@ -111,24 +109,43 @@ class Blocks:
             expected = stride
         return True
 
-    def source(self, rows: Bytes2D) -> NDArray[Any]:
-        """What `load` takes its chunks from."""
+    def room(self, packets: int) -> int:
+        """Bytes that a chunk of so many packets takes."""
+        return 0 if self.is_flat else packets * math.prod(self.shape[:-1]) * self._length
+
+    def loading(self, rows: Bytes2D, room: NDArray[np.uint8]) -> Loading:
+        """Their fields, compacted in this room."""
         if self.is_flat:
-            return rows
-        return elements(rows, np.dtype(f"V{self._length}"), self._base, self.shape[:-1], self._strides)
-
-    def load(self, source: NDArray[Any], start: int, stop: int) -> None:
-        """Compact some packets."""
-        if self._compact is not None:
-            target = self._compact.view(f"V{self._length}").reshape(-1, *self.shape[:-1])
-            np.copyto(target[: stop - start], source[start:stop])
-
-    def column(self, seen: Window, source: NDArray[Any], start: int, count: int) -> NDArray[Any]:
-        """A window of each of `count` elements: of the compacted ones, or of the frames from `start` on."""
-        if self._compact is None:
-            return np.ndarray((count,), seen.dtype, source.data, start * self._size + seen.offset, (self.stride,))
-        return np.ndarray((count,), seen.dtype, self._compact.data, seen.offset - self._base, (self.stride,))
+            return Loading(rows, None, 0, self._size, self.stride)
+        block = np.dtype(f"V{self._length}")
+        source = elements(rows, block, self._base, self.shape[:-1], self._strides)
+        return Loading(source, room.view(block).reshape(-1, *self.shape[:-1]), self._base, 0, self.stride)
 
     def holds(self, seen: Window) -> bool:
         """Whether a window lies in the elements that are kept."""
         return self.is_flat or 0 <= seen.offset - self._base <= self.stride - seen.size
+
+
+class Loading:
+    """The fields of some frames, a chunk of packets at a time.
+
+    Args:
+        source: the frames, or their blocks.
+        compact: what the blocks of a chunk are copied to; None where the frames are looked at themselves.
+        base: where a block begins in its frame.
+        size: bytes from packet to packet in the source, where that is looked at.
+        stride: bytes from element to element.
+    """
+
+    def __init__(self, source: NDArray[Any], compact: NDArray[Any] | None, base: int, size: int, stride: int) -> None:
+        self._source, self._compact, self._base, self._size, self._stride = source, compact, base, size, stride
+        self._start = -1
+
+    def column(self, seen: Window, start: int, stop: int, width: int) -> NDArray[Any]:
+        """A window of each of `width` elements of the packets from `start` to `stop`."""
+        if self._compact is None:
+            return np.ndarray(((stop - start) * width,), seen.dtype, self._source.data, start * self._size + seen.offset, (self._stride,))
+        if self._start != start:
+            np.copyto(self._compact[: stop - start], self._source[start:stop])
+            self._start = start
+        return np.ndarray(((stop - start) * width,), seen.dtype, self._compact.data, seen.offset - self._base, (self._stride,))
