@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -241,17 +241,17 @@ class _Joined(Columns):
 
 @dataclass(eq=False)
 class _Restamped(Columns):
-    """Another cloud with times counted from its first point."""
+    """Other columns with times counted from the first point."""
 
-    cloud: PointCloud
+    source: Columns
     size: int
 
     def column(self, name: str) -> NDArray[Any] | None:
-        found: NDArray[Any] | None = getattr(self.cloud, name)
+        found = self.source.column(name)
         return found - found[0] if name == "time" and found is not None else found
 
     def times_at(self, indices: NDArray[np.intp]) -> NDArray[np.float64]:
-        return self.cloud.times_at(indices) - self.cloud.times_at(np.zeros(1, np.intp))
+        return self.source.times_at(indices) - self.source.times_at(np.zeros(1, np.intp))
 
 
 def joined(clouds: Sequence[PointCloud]) -> PointCloud:
@@ -272,7 +272,9 @@ def joined(clouds: Sequence[PointCloud]) -> PointCloud:
 
 def restamped(cloud: PointCloud, stamp_ns: int) -> PointCloud:
     """The same points with times counted from the first one, which is at `stamp_ns`."""
-    return LazyCloud.of(_Restamped(cloud, len(cloud)), stamp_ns=stamp_ns, shape=cloud.shape, nominal=cloud.nominal)
+    if not isinstance(cloud, LazyCloud):
+        return replace(cloud, time=cloud.time - cloud.time[0], stamp_ns=stamp_ns)
+    return LazyCloud.of(_Restamped(cloud.source, len(cloud)), stamp_ns=stamp_ns, shape=cloud.shape, nominal=cloud.nominal)
 
 
 #: directions in REP-103: (axis index, sign).
