@@ -10,7 +10,7 @@ import copy
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
 from functools import cached_property
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -118,6 +118,12 @@ class Spans:
     def data(self, index: int) -> bytes:
         """The bytes of one frame."""
         return self.buffer[self.starts[index] : self.starts[index] + self.sizes[index]].tobytes()
+
+    def arrived(self, at: NDArray[np.int64]) -> Self:
+        """The same frames with other times of arrival."""
+        found = object.__new__(type(self))
+        vars(found).update(vars(self), at=at)
+        return found
 
     def found(self) -> list[Found]:
         """The frames one by one."""

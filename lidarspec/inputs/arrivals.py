@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import accumulate
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ import numpy as np
 from lidarspec.decoder import Decoder, Found, Spans
 from lidarspec.errors import UsageError
 from lidarspec.files import Chunk
+from lidarspec.found import Alike
 from lidarspec.spec import Sensor
 
 #: other senders of a stream that are looked at; datagrams of further ones are foreign unseen.
@@ -49,14 +51,15 @@ class Senders:
         Raises:
             UsageError: where two addresses send frames of one type.
         """
-        ends = np.cumsum([len(chunk.data) for chunk in chunks])
-        hosts = [chunk.sender[0] if chunk.sender else None for chunk in chunks]
-        if len(set(hosts)) == 1 and hosts[0] is not None and self._first == dict.fromkeys(self._first, hosts[0]):
-            for kind in np.unique(found.kinds).tolist():
-                self._first.setdefault(found.names[kind], hosts[0])
+        senders = {chunk.sender for chunk in chunks}
+        sender = senders.pop() if len(senders) == 1 else None
+        if sender is not None and all(host == sender[0] for host in self._first.values()):
+            for kind in [found.kind] if isinstance(found, Alike) else np.unique(found.kinds).tolist():
+                self._first.setdefault(found.names[kind], sender[0])
             return
+        hosts = [chunk.sender[0] if chunk.sender else None for chunk in chunks]
         sizes = np.array([len(chunk.data) for chunk in chunks])
-        places = np.searchsorted(ends - sizes, found.starts, side="right") - 1
+        places = np.searchsorted(np.cumsum(sizes) - sizes, found.starts, side="right") - 1
         for kind, place in zip(found.kinds.tolist(), places.tolist(), strict=True):
             host = hosts[place]
             if host is not None and self._first.setdefault(found.names[kind], host) != host:
@@ -112,10 +115,11 @@ def fed(decoder: Decoder, chunks: Sequence[Chunk]) -> list[Spans]:
         return [decoder.datagrams([chunk.data for chunk in chunks], [chunk.at for chunk in chunks])]
     if len(chunks) == 1:
         return decoder.spans(chunks[0].data, chunks[0].at)
-    ends = decoder.stats.bytes_in + np.cumsum([len(chunk.data) for chunk in chunks])
+    data = [chunk.data for chunk in chunks]
+    ends = np.array([*accumulate(map(len, data), initial=decoder.stats.bytes_in)])[1:]
+    found = decoder.spans(b"".join(data), chunks[-1].at)
     times = np.array([-1 if chunk.at is None else chunk.at for chunk in chunks], np.int64)
-    found = decoder.spans(b"".join([chunk.data for chunk in chunks]), chunks[-1].at)
-    return [spans.arrived(times[np.searchsorted(ends, spans.offsets + spans.sizes)]) for spans in found]
+    return [spans.arrived(times[ends.searchsorted(spans.offsets + spans.sizes)]) for spans in found]
 
 
 def answers(found: Sequence[Spans], awaited: frozenset[str]) -> list[Found]:

@@ -80,12 +80,14 @@ class BoundedQueue:
         with self._changed:
             for item in items:
                 if isinstance(item, Chunk):
-                    self._make_room(len(item.data))
+                    size = len(item.data)
+                    if self._waiting >= self._most or self._size + size > self._largest:
+                        self._make_room(size)
                     if self.closed:
                         return
                     self.produced += 1
                     self._waiting += 1
-                    self._size += len(item.data)
+                    self._size += size
                 self._events.append((link, item))
             self._changed.notify_all()
 
@@ -103,6 +105,11 @@ class BoundedQueue:
             self._changed.wait_for(lambda: self._events or self._kept or self.closed, timeout - max(pause, 0.0))
             found = list(self._kept)
             self._kept.clear()
+            if len(found) + len(self._events) <= chunks and not self._cut:
+                found += self._events
+                self._events.clear()
+                self.consumed += self._waiting
+                self._waiting = self._size = 0
             while self._events and len(found) < chunks:
                 found.append(self._left())
             self._changed.notify_all()

@@ -270,7 +270,7 @@ class LiveInput:
                 self._speak()
         if link == "data":
             self._watch.saw(found)
-            if interrupted or any(len(spans.kinds) for spans in found):
+            if interrupted or any(map(len, found)):
                 self._ready.append(Arrival(found, interrupted=interrupted))
 
     def _start_again(self) -> None:
@@ -314,13 +314,16 @@ class LiveInput:
 def _runs(events: list[Event]) -> list[tuple[str, list[Chunk] | Mark | BaseException]]:
     """Events with consecutive chunks of one link joined, up to where the line was interrupted."""
     found: list[tuple[str, list[Chunk] | Mark | BaseException]] = []
+    run, of = list[Chunk](), ""
     for link, item in events:
         if not isinstance(item, Chunk):
             found.append((link, item))
-        elif found and found[-1][0] == link and isinstance(found[-1][1], list) and not item.gap:
-            found[-1][1].append(item)
+            of = ""
+        elif link == of and not item.gap:
+            run.append(item)
         else:
-            found.append((link, [item]))
+            run, of = [item], link
+            found.append((link, run))
     return found
 
 

@@ -30,10 +30,10 @@ class Watch:
 
     def saw(self, found: Sequence[Spans]) -> None:
         """Take note of what was decoded."""
-        if any(len(spans.kinds) for spans in found):
+        if any(map(len, found)):
             self._framed, self._bytes, self._unframed_since = time.monotonic(), self._decoder.stats.bytes_in, None
-            data = [name for name, frame in self._sensor.frames.items() if frame.data]
-            self.streams = self.streams or any(name in self._decoder.stats.frames for name in data)
+            if not self.streams:
+                self.streams = any(frame.data and name in self._decoder.stats.frames for name, frame in self._sensor.frames.items())
         elif self._unframed_since is None and self._decoder.stats.bytes_in > self._bytes:
             self._unframed_since = time.monotonic()
 
