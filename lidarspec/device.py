@@ -55,6 +55,7 @@ class Device:
         self.sensor, self._source, self.mount = sensor, source, mount
         self._streams: dict[str | None, PacketReader] = {}
         self._latest, self._unseen = ScanStream(sensor, mount), deque[Scan]()
+        self._ahead: Arrival | None = None
         self._own_recorder: AnyRecorder | None = None
         self._input = self._opened(backend, record, overflow, period)
         self._finalizer = weakref.finalize(self, _close, self._input, self._own_recorder)
@@ -100,13 +101,18 @@ class Device:
     def packets(self, frame: str | None = None, *, wait: float | None = None) -> Iterator[Packets]:
         """The packets of the data frame, or of another type, in batches, until the input ends or the device is closed.
 
+        A file is read once, whoever reads it. After `latest` they begin with the batch in which its scan was found.
+
         Args:
             frame: the name of a frame type.
             wait: yield a batch of no packets where nothing has come for so many seconds, so that the caller has a turn.
+
+        Raises:
+            SourceError: where a file has been read to its end before.
         """
-        reader = self._reader(frame)
-        for arrival in self._arrivals(wait):
-            packets = reader.add(arrival) if arrival is not None else reader.none()
+        reader, ahead = self._reader(frame), self._taken_back()
+        for arrival in self._arrivals(wait, ahead):
+            packets = reader.none() if arrival is None else reader.last if arrival is ahead and frame is None else reader.add(arrival)
             if packets is not None and (len(packets) or arrival is None):
                 yield packets
 
@@ -119,15 +125,20 @@ class Device:
     def scans(self, *, wait: float | None = None) -> Iterator[Any]:
         """Every scan; the first and last piece, and those before and after an interruption, are marked ``complete=False``.
 
+        A file is read once, whoever reads it. After `latest` they begin with the batch in which its scan was found.
+
         Args:
             wait: yield None where nothing has come for so many seconds, so that the caller has a turn.
+
+        Raises:
+            SourceError: where a file has been read to its end before.
         """
-        stream, reader = ScanStream(self.sensor, self.mount), self._reader(None)
-        for arrival in self._arrivals(wait):
+        stream, reader, ahead = ScanStream(self.sensor, self.mount), self._reader(None), self._taken_back()
+        for arrival in self._arrivals(wait, ahead):
             if arrival is None:
                 yield None
                 continue
-            yield from reader.scans(stream, arrival)
+            yield from reader.scans(stream, arrival, read=arrival is ahead)
             stream = ScanStream(self.sensor, self.mount) if arrival.interrupted else stream
         yield from stream.finish()
 
@@ -158,13 +169,15 @@ class Device:
             if arrival is None and time.monotonic() >= deadline:
                 return None
             if arrival is not None:
-                self._unseen += [scan for scan in reader.scans(self._latest, arrival) if scan.complete]
+                found = [scan for scan in reader.scans(self._latest, arrival) if scan.complete]
+                self._ahead = arrival if found and not self.is_live else None
+                self._unseen += found
                 self._latest = ScanStream(self.sensor, self.mount) if arrival.interrupted else self._latest
         if not self.is_live:
             return self._unseen.popleft()
-        found = self._unseen[-1]
+        newest = self._unseen[-1]
         self._unseen.clear()
-        return found
+        return newest
 
     def overdue(self) -> SourceError:
         """What to say when a scan did not come in time."""
@@ -225,8 +238,20 @@ class Device:
             self._streams[frame] = PacketReader(self.sensor, frame, self._input.decoder, first)
         return self._streams[frame]
 
-    def _arrivals(self, wait: float | None) -> Iterator[Arrival | None]:
+    def _taken_back(self) -> Arrival | None:
+        """What of a file `latest` found its last scan in, for another to begin with; its further scans are then no longer waited for."""
+        ahead, self._ahead = self._ahead, None
+        if ahead is not None:
+            self._latest = ScanStream(self.sensor, self.mount)
+            self._unseen.clear()
+        elif self._input.state == "ended":
+            raise SourceError(f"{self._source} has been read to its end: open it again to read it once more")
+        return ahead
+
+    def _arrivals(self, wait: float | None, ahead: Arrival | None = None) -> Iterator[Arrival | None]:
         """What arrives, until the end; None where nothing has for `wait` seconds."""
+        if ahead is not None:
+            yield ahead
         while not self._input.ended:
             arrival = self._input.next(LONG if wait is None else wait)
             if arrival is not None or not self._input.ended:

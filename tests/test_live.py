@@ -327,6 +327,47 @@ def test_a_file_gives_one_scan_after_another(tmp_path: Path) -> None:
             device.latest()
 
 
+def test_packets_and_scans_of_a_file_go_on_where_its_scan_was_found(tmp_path: Path) -> None:
+    path = tmp_path / "raw.bin"
+    frames = turning(TURNING, 200)
+    path.write_bytes(b"".join(frames))
+    with ls.open(path, TURNING) as device:
+        times = [scan.stamp_ns for scan in device.scans()]
+    with ls.open(path, TURNING) as device:
+        first, second = device.latest(), device.latest()
+        assert times[1:3] == [first.stamp_ns, second.stamp_ns]
+        (packets,) = device.packets()
+        assert len(packets) == len(frames)
+        assert device.stats.frames["data"] == len(frames)
+        assert (device.stats.duplicates, device.stats.lost) == (0, 0)
+        for read_again in (device.packets, device.scans):
+            with pytest.raises(SourceError, match="has been read to its end: open it again"):
+                next(read_again())
+    with ls.open(path, TURNING) as device:
+        device.latest()
+        assert [scan.stamp_ns for scan in device.scans()] == times
+    with ls.open(path, TURNING) as device:
+        device.latest()
+        assert sum(len(packets) for packets in device.packets("data")) == len(frames)
+
+
+def test_a_long_file_goes_on_behind_what_was_read_before(tmp_path: Path) -> None:
+    path = tmp_path / "raw.bin"
+    frames = turning(TURNING, 40_000)
+    path.write_bytes(b"".join(frames))
+    with ls.open(path, TURNING) as device:
+        whole = [len(packets) for packets in device.packets()]
+    assert len(whole) > 2
+    with ls.open(path, TURNING) as device:
+        device.latest()
+        assert [len(packets) for packets in device.packets()] == whole
+    with ls.open(path, TURNING) as device:
+        iterator = device.packets()
+        assert len(next(iterator)) == whole[0]
+        device.latest()
+        assert [len(packets) for packets in device.packets()] == whole[1:]
+
+
 def test_closing_from_another_thread_ends_the_iteration(line: Port) -> None:
     with ls.open(f"serial://{line.name}", TURNING) as device:
         timer = threading.Timer(0.2, device.close)

@@ -23,12 +23,16 @@ class PacketReader:
         frame: the type; where the sensor has several data frames and none is named, the first that arrives decides.
         decoder: where the frames come from.
         state: frames of other types, by name, that count as seen before the first packet.
+
+    Attributes:
+        last: the packets of the last arrival.
     """
 
     def __init__(self, sensor: Sensor, frame: str | None, decoder: Decoder, state: Mapping[str, bytes]) -> None:
         self._sensor, self._decoder, self._state = sensor, decoder, state
         self._waiting: deque[Spans] = deque(maxlen=UNDECIDED)
         self._stream = self._made(frame) if frame is not None else None
+        self.last: Packets | None = None
 
     def add(self, arrival: Arrival) -> Packets | None:
         """The packets among these frames; None while nobody knows of which type."""
@@ -40,18 +44,22 @@ class PacketReader:
         if self._stream is None:
             return None
         self._waiting.clear()
-        packets = self._stream.add(found)
+        self.last = self._stream.add(found)
         if arrival.interrupted:
             self._stream.interrupt()
-        return packets
+        return self.last
 
     def none(self) -> Packets:
         """A batch of no packets."""
         return (self._stream or self._made(self._sensor.data_frame)).add([])
 
-    def scans(self, stream: ScanStream, arrival: Arrival) -> Iterator[Scan]:
-        """The scans that an arrival completes; an interruption ends the one under way, and the stream with it."""
-        packets = self.add(arrival)
+    def scans(self, stream: ScanStream, arrival: Arrival, *, read: bool = False) -> Iterator[Scan]:
+        """The scans that an arrival completes; an interruption ends the one under way, and the stream with it.
+
+        Args:
+            read: it is the last one, of which packets were made before.
+        """
+        packets = self.last if read else self.add(arrival)
         if packets is not None and len(packets):
             yield from stream.add(packets)
         if arrival.interrupted:
