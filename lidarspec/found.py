@@ -6,7 +6,6 @@ numbers cost more than finding such frames does, and are made only when they are
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
 from functools import cached_property
@@ -108,12 +107,6 @@ class Spans:
 
     def __len__(self) -> int:
         return len(self.kinds)
-
-    def arrived(self, at: NDArray[np.int64]) -> Spans:
-        """The same frames with other arrival times."""
-        other = copy.copy(self)
-        vars(other)["at"] = at
-        return other
 
     def data(self, index: int) -> bytes:
         """The bytes of one frame."""
