@@ -38,6 +38,7 @@ CONSTRUCT = {
     "frames.schema",
     "spec",
     "frames.walk",
+    "frames.choices",
     "frames.headers",
     "frames.codecs",
     "parsing",
