@@ -8,6 +8,7 @@ The only module that imports Numba as it is imported; nothing imports it but a k
 from __future__ import annotations
 
 import math
+import sys
 
 import numpy as np
 from llvmlite import ir
@@ -30,6 +31,7 @@ _PI = math.pi
 #: largest float32 below pi.
 _BELOW_PI = np.nextafter(np.float32(_PI), np.float32(0))
 _FAR = 1e6
+_IS_BIG = sys.byteorder == "big"
 
 
 @intrinsic
@@ -39,6 +41,19 @@ def byte_at(context, array, index):
     def make(target, builder, signature, args):
         held = target.make_array(signature.args[0])(target, builder, args[0])
         return builder.zext(builder.load(cgutils.gep_inbounds(builder, held.data, args[1])), ir.IntType(64))
+
+    return types.int64(array, types.int64), make
+
+
+@intrinsic
+def word_at(context, array, index):
+    """Eight bytes from an index on, the first one lowest."""
+
+    def make(target, builder, signature, args):
+        held = target.make_array(signature.args[0])(target, builder, args[0])
+        place = cgutils.gep_inbounds(builder, held.data, args[1])
+        word = builder.load(builder.bitcast(place, ir.IntType(64).as_pointer()), align=1)
+        return builder.call(builder.module.declare_intrinsic("llvm.bswap", [ir.IntType(64)]), [word]) if _IS_BIG else word
 
     return types.int64(array, types.int64), make
 

@@ -23,7 +23,7 @@ from numba import njit
 
 from lidarspec.plans.kernelmath import (
     BYTES, DOUBLES, INTEGER, MADE_PLACES, MADE_SINGLES, PLACES, SINGLES, WORDS,
-    at, byte_at, cos_sin, larger, looked_up, modulo, narrowed, number, put, smaller,
+    at, byte_at, cos_sin, larger, looked_up, modulo, narrowed, number, put, smaller, word_at,
 )
 
 nan, inf = np.nan, np.inf
