@@ -91,7 +91,10 @@ class Share:
             array = self.values.array(node)
             return array[first:stop] if len(array) > 1 else array
 
-        maker.run(self.group.rows[first:stop], values, found)
+        if stop - first == len(self.group.where):
+            maker.run(self.group.rows, self.values.array, found)
+        else:
+            maker.run(self.group.rows[first:stop], values, found)
         if "x" in found and isinstance(maker, Program) and not self.is_safe and not self.plan.safe(values):
             made = [found[name] for name in "xyz" if name in found]
             bad = np.isnan(made).any(axis=0)

@@ -18,7 +18,7 @@ from lidarspec.frames.layout import Bytes2D, Layout, Leaf
 from lidarspec.frames.tracing import Node
 from lidarspec.plans.expressions import is_full, key, last_axis, only_field
 from lidarspec.plans.registers import TYPES, Read, Run, Step, Values, deep, shared
-from lidarspec.plans.scratch import Scratch, scratch
+from lidarspec.plans.scratch import borrowed, given_back
 from lidarspec.plans.sums import Sums
 from lidarspec.plans.windows import Blocks, Window, every_value, shift_of, window
 
@@ -249,31 +249,25 @@ class Program:
         if any(blocks.is_flat for blocks in self._blocks):
             rows = np.ascontiguousarray(rows)
         packets = min(self.chunk, number)
-        with scratch() as memory:
-            execution = Run(rows, values)
-            rooms = [memory.take(blocks.room(packets)) for blocks in self._blocks]
-            execution.prepared = {place: self._blocks[place].loading(rows, room) for place, room in enumerate(rooms)}
-            registers = self._registers(memory, packets * self.width)
-            with np.errstate(all="ignore"):
-                for start in range(0, number, self.chunk):
-                    self._chunk(execution, registers, found, start, min(start + self.chunk, number))
+        memory, execution = borrowed(), Run(rows, values)
+        made = memory.arrays(self._slots, packets, self._wanted)
+        execution.prepared = {place: blocks.loading(rows, made[place]) for place, blocks in enumerate(self._blocks)}
+        registers = [made[slot + len(self._blocks)] if slot >= 0 else self._tiles.get(at, _NOTHING) for at, slot in enumerate(self._slots)]
+        with np.errstate(all="ignore"):
+            for start in range(0, number, self.chunk):
+                self._chunk(execution, registers, found, start, min(start + self.chunk, number))
+        given_back(memory)
 
     @cached_property
     def _slots(self) -> list[int]:
         """Which registers share memory; asked for when no column is added any more."""
         return shared(self.steps, self.kinds, {*self.outputs.values(), *self._tiles})
 
-    def _registers(self, memory: Scratch, size: int) -> list[NDArray[Any]]:
-        """An array for each register; those that are not needed at the same time share one."""
-        made, found = dict[int, NDArray[Any]](), list[NDArray[Any]]()
-        for register, (slot, kind) in enumerate(zip(self._slots, self.kinds, strict=True)):
-            if slot < 0:
-                found.append(self._tiles.get(register, _NOTHING))
-                continue
-            if slot not in made:
-                made[slot] = memory.take(size * TYPES[kind].itemsize).view(TYPES[kind])
-            found.append(made[slot])
-        return found
+    @cached_property
+    def _wanted(self) -> list[tuple[int, np.dtype[Any]]]:
+        """The arrays that a chunk needs, of so many elements a packet: for the blocks, then for the slots."""
+        kinds = dict(sorted((slot, kind) for slot, kind in zip(self._slots, self.kinds, strict=True) if slot >= 0))
+        return [(blocks.room, np.dtype(np.uint8)) for blocks in self._blocks] + [(self.width, TYPES[kind]) for kind in kinds.values()]
 
     def _chunk(self, run: Run, registers: list[NDArray[Any]], found: Mapping[str, NDArray[Any]], start: int, stop: int) -> None:
         count = (stop - start) * self.width

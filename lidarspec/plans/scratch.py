@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,25 +14,40 @@ MOST_KEPT, LARGEST = 2, 1 << 23
 #: bytes; where arrays begin, and what is left between them, so that they do not all fall on the same places of a cache.
 ALIGNED, APART = 64, 320
 
-_KEPT: list[NDArray[np.uint8]] = []
-
 
 class Scratch:
     """A piece of memory from which arrays are taken one after another."""
 
-    def __init__(self, memory: NDArray[np.uint8]) -> None:
-        self.memory, self._wanted = memory, 0
+    def __init__(self) -> None:
+        self._memory, self._wanted = _aligned(0), 0
+        self._arranged: tuple[object, int, list[NDArray[Any]]] | None = None
 
-    def take(self, size: int) -> NDArray[np.uint8]:
-        """So many bytes, whatever they hold, for as long as the scratch is used."""
-        start = self._wanted
+    def arrays(self, owner: object, number: int, kinds: Sequence[tuple[int, np.dtype[Any]]]) -> list[NDArray[Any]]:
+        """Arrays that hold anything.
+
+        Args:
+            owner, number: who asks for how much; the same two get the same arrays the next time.
+            kinds: elements of each array for each of `number`, and their type.
+        """
+        if self._arranged is None or self._arranged[0] is not owner or self._arranged[1] != number:
+            self._wanted = 0
+            self._arranged = owner, number, [self._taken(number * count, dtype) for count, dtype in kinds]
+        return self._arranged[2]
+
+    def _taken(self, count: int, dtype: np.dtype[Any]) -> NDArray[Any]:
+        start, size = self._wanted, count * dtype.itemsize
         self._wanted = start + size + -size % ALIGNED + APART
-        return self.memory[start : start + size] if start + size <= len(self.memory) else np.empty(size, np.uint8)
+        memory = self._memory[start : start + size] if start + size <= len(self._memory) else np.empty(size, np.uint8)
+        return memory.view(dtype)
 
-    def grown(self) -> NDArray[np.uint8]:
-        """The memory for the next one: as much as this one would have needed."""
+    def grow(self) -> None:
+        """See to it that the next arrays have room, if as much is wanted."""
         wanted = min(self._wanted, LARGEST)
-        return self.memory if wanted <= len(self.memory) else _aligned(wanted)
+        if wanted > len(self._memory):
+            self._memory, self._arranged = _aligned(wanted), None
+
+
+_KEPT: list[Scratch] = []
 
 
 def _aligned(size: int) -> NDArray[np.uint8]:
@@ -41,14 +56,16 @@ def _aligned(size: int) -> NDArray[np.uint8]:
     return memory[start : start + size]
 
 
-@contextmanager
-def scratch() -> Iterator[Scratch]:
-    """Memory that nobody else uses as long as it lasts."""
+def borrowed() -> Scratch:
+    """Memory that nobody else uses until it is given back."""
     try:
-        memory = _KEPT.pop()  # at once, whatever other threads do
+        return _KEPT.pop()  # at once, whatever other threads do
     except IndexError:
-        memory = np.empty(0, np.uint8)
-    taken = Scratch(memory)
-    yield taken
+        return Scratch()
+
+
+def given_back(scratch: Scratch) -> None:
+    """Its arrays are not used any more; where this is never said, it is just freed."""
+    scratch.grow()
     if len(_KEPT) < MOST_KEPT:
-        _KEPT.append(taken.grown())
+        _KEPT.append(scratch)

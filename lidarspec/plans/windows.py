@@ -88,6 +88,7 @@ class Blocks:
 
     Attributes:
         is_flat: whether nothing stands between them, if the frames stand back to back, as they then have to.
+        room: bytes that they take for each packet when they are compacted.
     """
 
     def __init__(self, leaves: list[Leaf], size: int) -> None:
@@ -99,6 +100,7 @@ class Blocks:
         self._length = count * self.stride
         self._base = 0 if self.is_flat else max(min(*(leaf.offset for leaf in leaves), size - self._length), 0)
         self._strides, self._size = strides[:-1], size
+        self.room = 0 if self.is_flat else math.prod(self.shape[:-1]) * self._length
 
     def _regular(self, size: int, strides: tuple[int, ...]) -> bool:
         """Whether elements follow each other at one distance from frame to frame too."""
@@ -108,10 +110,6 @@ class Blocks:
                 return False
             expected = stride
         return True
-
-    def room(self, packets: int) -> int:
-        """Bytes that a chunk of so many packets takes."""
-        return 0 if self.is_flat else packets * math.prod(self.shape[:-1]) * self._length
 
     def loading(self, rows: Bytes2D, room: NDArray[np.uint8]) -> Loading:
         """Their fields, compacted in this room."""
