@@ -21,13 +21,13 @@ from lidarspec.captures.records import LARGEST_BLOCK, Source
 from lidarspec.errors import SourceError
 
 #: bytes of a buffer: of the first as many as the file has; each that is filled makes the next one longer.
-SMALLEST, LARGEST = 1 << 16, 4 * LARGEST_BLOCK
+SMALLEST, LARGEST = 1 << 16, 8 * LARGEST_BLOCK
 
 #: bytes behind what was read that may be looked at, whatever they are, so that records can be compared in words.
 SLACK = 256
 
 #: buffers kept for use again.
-MOST_KEPT = 3
+MOST_KEPT = 2
 
 
 class Window(Source):
