@@ -20,12 +20,17 @@ def field_column(info: FieldInfo, table: Table, depth: int, batch: Batch, which:
     """A field in its unit as a column of `depth` array axes; `which`: the frame of the table for each packet."""
     from lidarspec.frames.columns import Column
 
-    array = physical(info, table)
+    array = field_array(info, table, depth)
     if which is not None:
         array = array[which]
-    axes = [_axis(name, length, table, known=which is None) for name, length in zip(info.axes, array.shape[1:], strict=True)]
-    spare = max(depth - len(axes), 0)
-    return Column(array.reshape(*array.shape, *(1,) * spare), (*axes, *(None,) * spare), batch, source=info.path)
+    axes = [_axis(name, length, table, known=which is None) for name, length in zip(info.axes, array.shape[1:], strict=False)]
+    return Column(array, (*axes, *(None,) * (array.ndim - 1 - len(axes))), batch, source=info.path)
+
+
+def field_array(info: FieldInfo, table: Table, depth: int) -> NDArray[np.float64]:
+    """A field in its unit, with `depth` array axes at least."""
+    array = physical(info, table)
+    return array.reshape(*array.shape, *(1,) * (depth + 1 - array.ndim))
 
 
 def _axis(name: str, length: int, table: Table, *, known: bool) -> str | None:

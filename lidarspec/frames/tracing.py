@@ -55,6 +55,12 @@ class Node:
         size = int(np.prod(self.shape, dtype=np.intp))
         return size if self.sample.shape[0] > 1 else 0
 
+    @cached_property
+    def operands(self) -> list[tuple[Node | None, Any]]:
+        """What is called with: nodes, each with the axes that it lacks of the deepest; None with what is no node, as an array."""
+        depth = max(len(arg.sample.axes) for arg in self.args if isinstance(arg, Node))
+        return [(arg, (1,) * (depth - len(arg.sample.axes))) if isinstance(arg, Node) else (None, np.asarray(arg)) for arg in self.args]
+
     def column(self, values: list[Any], fields: Fields) -> Column:
         """The plain result for a batch, from the results of the nodes before."""
         args = [values[arg.number] if isinstance(arg, Node) else arg for arg in self.args]

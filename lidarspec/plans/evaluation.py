@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from lidarspec.allocation import is_counted, keep_freed_memory
 from lidarspec.clouds import LazyCloud, PointCloud
 from lidarspec.errors import SpecError
-from lidarspec.frames.access import Fields
+from lidarspec.frames.access import Fields, field_array
 from lidarspec.frames.columns import Batch, Carry, Column
 from lidarspec.frames.tables import Group, Rows
 from lidarspec.frames.tracing import Node
@@ -37,6 +37,7 @@ class Values:
         self._fields = Fields(batch)
         self._columns: list[Any] = [None] * len(plan.tape.nodes)
         self._by_path: dict[str, Any] = {}
+        self._table, self._arrays = batch.table, dict[Node | str, NDArray[Any]]()
 
     def column(self, node: Node) -> Column:
         """The result of a node."""
@@ -54,11 +55,38 @@ class Values:
 
     def array(self, node: Node) -> NDArray[Any]:
         """The array of a node's result, (n or 1, ...)."""
-        return self.column(node).array
+        column = self._columns[node.number]
+        if column is not None:
+            return column.array  # type: ignore[no-any-return]
+        if node not in self._arrays:
+            with np.errstate(all="ignore"):
+                self._arrays[node] = self._array(node)
+        return self._arrays[node]
+
+    def _array(self, node: Node) -> NDArray[Any]:
+        """The same as of its column, where no axes have to be named."""
+        column = self._columns[node.number]
+        column = self._by_path.get(node.path) if column is None else column
+        if column is not None or node.kind not in ("field", "call"):
+            return self.column(node).array
+        known = self._arrays.get(node.path or node)
+        if known is not None:
+            return known
+        if node.kind == "field":
+            found = field_array(self._table.schema.fields[node.path], self._table, self._table.schema.depth())
+        else:
+            args = [value if arg is None else _deeper(self._array(arg), value) for arg, value in node.operands]
+            found = np.asarray(node.function(*args))
+        self._arrays[node.path or node] = found
+        return found
 
     def know(self, node: Node, column: Column) -> None:
         """Take a result as given."""
         self._columns[node.number] = column
+
+
+def _deeper(array: NDArray[Any], axes: tuple[int, ...]) -> NDArray[Any]:
+    return array.reshape(*array.shape, *axes) if axes else array
 
 
 @dataclass(eq=False)
