@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import itertools
 import os
 import select
 import signal
@@ -265,7 +266,7 @@ def silent_at_first(number: int, seconds: float, heard: list[str]) -> Iterator[N
         with udp() as own:
             own.settimeout(0.02)
             stop.wait(seconds)
-            for frame in turning(SENSOR, 10_000):
+            for frame in itertools.cycle(turning(SENSOR, 30)):
                 if stop.is_set():
                     return
                 own.sendto(frame, ("127.0.0.1", number))

@@ -6,7 +6,6 @@ import io
 import os
 import struct
 import threading
-import time
 from collections import Counter
 from itertools import pairwise
 from pathlib import Path
@@ -149,13 +148,6 @@ def test_paths(tmp_path: Path) -> None:
 def test_failing_reads_are_source_errors() -> None:
     with pytest.raises(SourceError, match="cannot read"):
         CaptureReader("/proc/self/mem")
-
-
-def test_speed() -> None:
-    capture = io.BytesIO(made.pcap_head() + made.record(made.frame(bytes(1248))) * 20_000)
-    start = time.perf_counter()
-    assert sum(1 for _ in CaptureReader(capture)) == 20_000
-    assert time.perf_counter() - start < 1.0, "five times slower than 100,000 packets/s"
 
 
 REAL = {
