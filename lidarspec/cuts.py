@@ -62,7 +62,9 @@ class Turning:
                 found = np.full(len(totals), float(first)) if found is None else found
                 self._direction = -self._direction or (1 if part[spot] > 0 else -1)
                 self._furthest = self._direction * float(part[spot])
-        return np.array([float(first or 1)]) if found is None else found
+        if found is not None and not (found == found[0]).all():
+            return found
+        return np.array([float(first or 1)]) if found is None else found[:1]
 
     def _only_ahead(self, total: float, steps: NDArray[np.float64]) -> bool:
         """Whether the angle has come further than ever with this total, and all steps after it go on the same way."""

@@ -83,10 +83,22 @@ def test_large_scans_are_computed_without_the_rest_of_their_batch() -> None:
 
 def test_small_scans_share_what_is_computed() -> None:
     sensor = small_scans()
-    scans = list(scans_of(sensor, [sensor.decode(simulate(ls.sensor("velodyne-vlp16"), 700))]))
+    packets = sensor.decode(simulate(ls.sensor("velodyne-vlp16"), 700))
+    scans = list(scans_of(sensor, [packets]))
     bases = {id(scan.points.x.base) for scan in scans}
     assert len(scans) > 300
     assert len(bases) < 20
+    assert_cut_from(scans, packets.points())
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_small_scans_may_be_read_in_any_order(seed: int) -> None:
+    sensor = small_scans()
+    packets = sensor.decode(simulate(ls.sensor("velodyne-vlp16"), 400))
+    scans = list(scans_of(sensor, batches(packets, 190)))
+    for index in np.random.default_rng(seed).permutation(len(scans))[:100]:
+        assert scans[index].points.x is not None
+    assert_cut_from(scans, packets.points())
 
 
 def small_scans() -> Sensor:

@@ -6,11 +6,12 @@ columns are made for the packets that it is of and no others, straight into arra
 
 from __future__ import annotations
 
+import bisect
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -105,6 +106,14 @@ class Made(Columns):
         return made
 
 
+class Block(NamedTuple):
+    """Points of a batch, from `start` to `stop`, and the columns made of them so far."""
+
+    start: int
+    stop: int
+    made: dict[str, NDArray[Any]]
+
+
 class Points(Made):
     """The points of a batch; what a `LazyCloud` reads from.
 
@@ -115,7 +124,7 @@ class Points(Made):
     def __init__(self, packets: Packets, shares: Sequence[Share], size: int, base: int) -> None:
         super().__init__(packets, shares, size)
         self.base = base
-        self._blocks: dict[int, dict[str, NDArray[Any]]] = {}
+        self._blocks: list[Block] = []
 
     @property
     def even(self) -> Share | None:
@@ -130,20 +139,31 @@ class Points(Made):
         return Stretches([Stretch(self, start, stop)])
 
     def part(self, name: str, start: int, stop: int) -> NDArray[Any] | None:
-        """A column of some points; those around them have it made too, for whoever asks for them next."""
+        """A column of some points; those behind them have it made too, for whoever asks for them next."""
         if self.even is None or self.has(name) or self.size <= SHARED:
             column = self.column(name)
             return None if column is None else column[start:stop]
-        width = self._shares[0].plan.width
-        step = max(SHARED // width, 1) * width
-        found = []
-        for first in range(start // step * step, stop, step):
-            block = Stretches([Stretch(self, first, min(first + step, self.size))], self._blocks.setdefault(first, {}))
-            column = block.column(name)
+        found, at = [], start
+        while at < stop:
+            first, end, made = self._block(at)
+            column = Stretches([Stretch(self, first, end)], made).column(name)
             if column is None:
                 return None
-            found.append(column[max(start - first, 0) : stop - first])
+            found.append(column[at - first : stop - first])
+            at = end
         return found[0] if len(found) == 1 else np.concatenate(found)
+
+    def _block(self, at: int) -> Block:
+        """The points around one that have their columns made together; they are in no other block."""
+        index = bisect.bisect(self._blocks, at, key=lambda block: block.start)
+        if index and at < self._blocks[index - 1].stop:
+            return self._blocks[index - 1]
+        width = self._shares[0].plan.width
+        after = self._blocks[index].start if index < len(self._blocks) else self.size
+        start = at // width * width
+        block = Block(start, min(start + max(SHARED // width, 1) * width, after), {})
+        self._blocks.insert(index, block)
+        return block
 
     def times_at(self, indices: NDArray[np.intp]) -> NDArray[np.float64]:
         share = self.even
