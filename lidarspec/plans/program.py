@@ -248,9 +248,9 @@ class Program:
         number = len(rows)
         if any(blocks.is_flat for blocks in self._blocks):
             rows = np.ascontiguousarray(rows)
-        packets = min(self.chunk, number)
+        room = min(self.chunk, 1 << number.bit_length())  # the same for scans that are nearly as long
         memory, execution = borrowed(), Run(rows, values)
-        made = memory.arrays(self._slots, packets, self._wanted)
+        made = memory.arrays(self._slots, room, self._wanted)
         execution.prepared = {place: blocks.loading(rows, made[place]) for place, blocks in enumerate(self._blocks)}
         registers = [made[slot + len(self._blocks)] if slot >= 0 else self._tiles.get(at, _NOTHING) for at, slot in enumerate(self._slots)]
         with np.errstate(all="ignore"):

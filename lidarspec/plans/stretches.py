@@ -10,7 +10,6 @@ import bisect
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import numpy as np
@@ -222,14 +221,12 @@ class Stretches(Made):
     def __init__(self, parts: Sequence[Stretch], made: dict[str, NDArray[Any]] | None = None) -> None:
         first = parts[0].points
         super().__init__(first._packets, first._shares, sum(part.stop - part.start for part in parts))
-        self._parts, self._is_large = parts, self.size >= LEAST or made is not None
+        self._parts = parts
+        self._stands_alone = (self.size >= LEAST or made is not None) and self._is_even()
         self._made = self._made if made is None else made
 
-    @cached_property
-    def _stands_alone(self) -> bool:
-        """Whether the points are many, and their packets all have one layout and are whole but for the first and the last one."""
-        if not self._is_large:
-            return False
+    def _is_even(self) -> bool:
+        """Whether the packets all have one layout, and are whole but for the first and the last one."""
         shares = [part.points.even for part in self._parts]
         width = self._shares[0].plan.width
         inner = [*(part.stop for part in self._parts[:-1]), *(part.start for part in self._parts[1:])]
