@@ -39,6 +39,7 @@ class Program:
     def __init__(self, layout: Layout, shape: tuple[int, ...], tables: dict[Any, NDArray[Any]]) -> None:
         self.layout, self.shape, self.width = layout, shape, math.prod(shape)
         self.chunk = max(CHUNK // max(self.width, 1), 1)
+        self._most = self.chunk + self.chunk // 4  # packets at a time, so that no few are left over
         self.steps: list[Step] = []
         self.kinds: list[str] = []
         self.outputs: dict[str, int] = {}
@@ -197,7 +198,7 @@ class Program:
         """What is not full, for every point."""
         if not isinstance(value, Node):
             row = np.broadcast_to(np.asarray(value, TYPES[kind]), self.shape).reshape(-1)
-            tile = np.tile(row, self.chunk)
+            tile = np.tile(row, self._most)
             found = self.step("the same in every packet", kind, lambda run, out: None)
             self._tiles[found] = tile
             return found
@@ -248,14 +249,15 @@ class Program:
         number = len(rows)
         if any(blocks.is_flat for blocks in self._blocks):
             rows = np.ascontiguousarray(rows)
-        room = min(self.chunk, 1 << number.bit_length())  # the same for scans that are nearly as long
+        step = -(-number // max(-(-number // self._most), 1))
+        room = min(self._most, 1 << step.bit_length())  # the same for scans that are nearly as long
         memory, execution = borrowed(), Run(rows, values)
         made = memory.arrays(self._slots, room, self._wanted)
         execution.prepared = {place: blocks.loading(rows, made[place]) for place, blocks in enumerate(self._blocks)}
         registers = [made[slot + len(self._blocks)] if slot >= 0 else self._tiles.get(at, _NOTHING) for at, slot in enumerate(self._slots)]
         with np.errstate(all="ignore"):
-            for start in range(0, number, self.chunk):
-                self._chunk(execution, registers, found, start, min(start + self.chunk, number))
+            for start in range(0, number, step or 1):
+                self._chunk(execution, registers, found, start, min(start + step, number))
         given_back(memory)
 
     @cached_property
