@@ -132,10 +132,14 @@ class Framing:
         lengths = [codec.frame.max_length for codec in self.codecs]
         #: no candidate waits for more bytes than these.
         self.reach = max(lengths) + max(codec.frame.max_length * codec.frame.confirm for codec in self.codecs)
+        self._active: dict[str | None, list[int]] = {}
 
     def active(self, mode: Mode) -> list[int]:
         """The types that are looked for now, in order."""
-        return [index for index, codec in enumerate(self.codecs) if codec.frame.after in (None, mode.after)]
+        known = self._active.get(mode.after)
+        if known is None:
+            known = self._active[mode.after] = [i for i, codec in enumerate(self.codecs) if codec.frame.after in (None, mode.after)]
+        return known
 
     def weak(self, kind: int) -> bool:
         """Whether frames of a type are believed in runs alone."""

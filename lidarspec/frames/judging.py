@@ -60,7 +60,7 @@ class Judge:
     def _check(self, status: Status, rows: Bytes2D, checks: list[Check]) -> None:
         for check in checks:
             held = check(rows)
-            if not held.all():
+            if np.count_nonzero(held) < len(held):
                 status[~held & (status == VALID)] = IMPLAUSIBLE
 
     def _asked(self, rows: Bytes2D, errors: list[str]) -> Status:
@@ -69,7 +69,7 @@ class Judge:
 
 def _among(status: Status, rows: Bytes2D, judge: Callable[[Bytes2D], Status]) -> None:
     """Judge those that are valid so far."""
-    if not status.any():
+    if not np.count_nonzero(status):
         status[:] = judge(rows)
         return
     left = np.flatnonzero(status == VALID)
@@ -87,7 +87,8 @@ def taken(rows: Bytes2D, which: NDArray[np.intp] | NDArray[np.bool_]) -> Bytes2D
 def intactness(seal: Seal, errors: list[str], rows: Bytes2D) -> Status:
     """`VALID`, `CHECKSUM` or `PLUGIN` for each frame, by one of its checksums."""
     try:
-        return np.where(seal.intact(rows), np.uint8(VALID), np.uint8(CHECKSUM))
+        wrong = ~seal.intact(rows)
+        return np.multiply(wrong.view(np.uint8), np.uint8(CHECKSUM))
     except Exception:
         errors += [traceback.format_exc()] * len(rows)
         return np.full(len(rows), PLUGIN, np.uint8)

@@ -5,8 +5,7 @@ A `Layout` holds for frames of one kind of header; `lidarspec.frames.walk` makes
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from contextvars import ContextVar
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -217,14 +216,17 @@ Sums = Callable[[Seal, Bytes2D], NDArray[np.uint64] | None]
 _SUMS: ContextVar[Sums | None] = ContextVar("sums", default=None)
 
 
-@contextlib.contextmanager
-def summed_by(sums: Sums | None) -> Iterator[None]:
+class summed_by:
     """As long as it lasts, checksums are computed by this function first."""
-    token = _SUMS.set(sums)
-    try:
-        yield
-    finally:
-        _SUMS.reset(token)
+
+    def __init__(self, sums: Sums | None) -> None:
+        self._sums = sums
+
+    def __enter__(self) -> None:
+        self._token = _SUMS.set(self._sums)
+
+    def __exit__(self, *_: object) -> None:
+        _SUMS.reset(self._token)
 
 
 @dataclass(frozen=True, eq=False)

@@ -314,7 +314,8 @@ class LiveInput:
 def _runs(events: list[Event]) -> list[tuple[str, list[Chunk] | Mark | BaseException]]:
     """Events with consecutive chunks of one link joined, up to where the line was interrupted."""
     found: list[tuple[str, list[Chunk] | Mark | BaseException]] = []
-    run, of = list[Chunk](), ""
+    of = ""
+    run: list[Chunk] = []
     for link, item in events:
         if not isinstance(item, Chunk):
             found.append((link, item))

@@ -37,7 +37,8 @@ class Values:
         self._fields = Fields(batch)
         self._columns: list[Any] = [None] * len(plan.tape.nodes)
         self._by_path: dict[str, Any] = {}
-        self._table, self._arrays = batch.table, dict[Node | str, NDArray[Any]]()
+        self._table = batch.table
+        self._arrays: dict[Node | str, NDArray[Any]] = {}
 
     def column(self, node: Node) -> Column:
         """The result of a node."""

@@ -103,7 +103,7 @@ class Slots:
 
     def said(self, index: int) -> list[tuple[int, memoryview]]:
         """What the socket layer said with a datagram: type and value."""
-        start, found = index * CONTROL, list[tuple[int, memoryview]]()
+        start, found = index * CONTROL, []
         end = start + self._told[_TOLD + index * _TOLD_STEP]
         while start + _HEADER.size <= end:
             size, level, kind = _HEADER.unpack_from(self._said, start)
