@@ -16,7 +16,7 @@ import sys
 #: datagrams in one call, and the room for each: memory that is not written to costs nothing.
 MANY, LARGEST = 256, 1 << 16
 NAME, CONTROL = 32, 128
-_HEADER = struct.Struct("@Nii")
+_HEADER, _TWO = struct.Struct("@Nii"), struct.Struct("@Niiqq")
 _ALIGN = struct.calcsize("@N")
 
 
@@ -100,6 +100,13 @@ class Slots:
                 self._known.clear()
             sender = self._known[name] = _address(name)
         return data, sender
+
+    def numbers(self, index: int) -> tuple[int, int, int] | None:
+        """What the socket layer said with a datagram, if it is one value of two numbers: its type, and these; else None."""
+        if self._told[_TOLD + index * _TOLD_STEP] != _TWO.size:
+            return None
+        size, level, kind, first, second = _TWO.unpack_from(self._said, index * CONTROL)
+        return (kind, first, second) if size == _TWO.size and level == socket.SOL_SOCKET else None
 
     def said(self, index: int) -> list[tuple[int, memoryview]]:
         """What the socket layer said with a datagram: type and value."""

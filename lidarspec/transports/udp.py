@@ -133,8 +133,9 @@ class UdpTransport(LiveBase):
     def _fetch(self, one: _Socket, found: list[Chunk]) -> None:
         """Everything that waits in a socket, up to a limit that is fair to the others."""
         try:
+            own = self._sender
             for data, sender, at in one.datagrams(self.clock.now(), self.statistics):
-                if self._sender is not None and sender[0] != self._sender:
+                if own is not None and sender[0] != own:
                     self.statistics.foreign += 1
                     continue
                 self._last = sender
@@ -213,8 +214,12 @@ class _Socket:
         for _ in range(TOGETHER // MANY):
             number = self._slots.fill(self.socket.fileno())
             for index in range(number):
-                at = self._told(self._slots.said(index), statistics, now, anchor)
-                yield (*self._slots.datagram(index), at)
+                data, sender = self._slots.datagram(index)
+                told = self._slots.numbers(index)
+                if told is not None and told[0] == SO_TIMESTAMPNS:
+                    yield data, sender, _carried(told[1], told[2], now, anchor)
+                else:
+                    yield data, sender, self._told(self._slots.said(index), statistics, now, anchor)
             if number < MANY:
                 return
 
@@ -232,12 +237,17 @@ class _Socket:
         for kind, data in said:
             if kind == SO_TIMESTAMPNS and len(data) == 16:
                 seconds, nanoseconds = TIME.unpack(data)
-                at = now - min(max(anchor - seconds * 1_000_000_000 - nanoseconds, 0), LATEST)
+                at = _carried(seconds, nanoseconds, now, anchor)
             elif kind == SO_RXQ_OVFL and len(data) == 4:
                 drops = int.from_bytes(data, sys.byteorder)
                 statistics.kernel_drops += (drops - self._drops) & 0xFFFFFFFF
                 self._drops = drops
         return at
+
+
+def _carried(seconds: int, nanoseconds: int, now: int, anchor: int) -> int:
+    """A time of the wall clock, which reads `anchor` now, as one of a clock that reads `now`; of the last minute, whatever it says."""
+    return now - min(max(anchor - seconds * 1_000_000_000 - nanoseconds, 0), LATEST)
 
 
 def _slots() -> Slots | None:
