@@ -12,8 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.allocation import alike, repeated
+from lidarspec.frames.codecs import CompiledCodec
 from lidarspec.frames.constants import equal, right, words
-from lidarspec.frames.judging import VALID, Survey
+from lidarspec.frames.judging import PLUGIN, SHORT, VALID, Status, Survey
 from lidarspec.frames.layout import Bytes2D, Layout
 from lidarspec.framing import COUNTED, Bytes1D, Framing, Mode, Offsets
 
@@ -109,6 +110,28 @@ class Datagrams:
             return known[1]
         return self._framing.codecs[kind].survey(buffer, starts, gathered=False)
 
+    def refused(self, buffer: Bytes1D, starts: Offsets, sizes: Offsets, mode: Mode) -> Status:
+        """Why datagrams that are no frames are none, (n,), 0 where they resemble none; `PLUGIN` where each is to be judged alone."""
+        reasons = np.zeros(len(starts), np.uint8)
+        for kind in self._framing.active(mode):
+            codec = self._framing.codecs[kind]
+            if not isinstance(codec, CompiledCodec):
+                return np.full(len(starts), PLUGIN, np.uint8)
+            marked = np.flatnonzero(self._marked(kind, buffer, starts, sizes))
+            if len(marked):
+                survey, own = codec.survey(buffer, starts[marked], gathered=False), sizes[marked]
+                status = np.where(survey.sizes > own, np.uint8(SHORT), survey.status)
+                status[(status == VALID) & (survey.sizes == own)] = PLUGIN
+                reasons[marked] = np.maximum(reasons[marked], status)
+        return reasons
+
+    def count(self, reasons: Status) -> None:
+        """Count datagrams as rejected."""
+        for reason, number in enumerate(np.bincount(reasons).tolist()):
+            if number:
+                counter = COUNTED.get(reason, "bad_length")
+                self.rejected[counter] = self.rejected.get(counter, 0) + number
+
     def judged_alone(self, datagram: Bytes1D, mode: Mode) -> int:
         """The type of one datagram, -1 where it is none; counts why."""
         rejected, size = 0, np.array([len(datagram)])
@@ -120,8 +143,7 @@ class Datagrams:
                 return kind
             rejected = max(rejected, int(survey.status[0]))
             self.errors += survey.errors
-        counter = COUNTED.get(rejected, "bad_length")
-        self.rejected[counter] = self.rejected.get(counter, 0) + 1
+        self.count(np.array([rejected], np.uint8))
         return -1
 
     def _marked(self, kind: int, buffer: Bytes1D, starts: Offsets, sizes: Offsets) -> NDArray[np.bool_]:
@@ -191,12 +213,20 @@ class _Batch:
         index = bisect.bisect_left(spots, position)
         stop = spots[index] + 1 if index < len(spots) else len(self._starts)
         found = kinds[position - first : stop - first]
-        for lost in np.flatnonzero(found < 0).tolist() if alike(found) is None else ():
-            start = int(self._starts[position + lost])
-            found[lost] = self._types.judged_alone(self._buffer[start : start + int(self._sizes[position + lost])], mode)
-            if found[lost] >= 0 and self._framing.switches(int(found[lost]), mode):
-                found = found[: lost + 1]
-                break
+        if alike(found) is None and len(lost := np.flatnonzero(found < 0)):
+            found = self._rejected(found, lost, position, mode)
         if len(found) and found[-1] >= 0 and self._framing.switches(int(found[-1]), mode):
             mode.after = self._framing.names[int(found[-1])]
+        return found
+
+    def _rejected(self, found: Offsets, lost: Offsets, position: int, mode: Mode) -> Offsets:
+        """Count those that are no frames; the types again, up to one that turns out to be a frame that changes what is looked for."""
+        reasons = self._types.refused(self._buffer, self._starts[position + lost], self._sizes[position + lost], mode)
+        for index in lost[reasons == PLUGIN].tolist():
+            start = int(self._starts[position + index])
+            found[index] = self._types.judged_alone(self._buffer[start : start + int(self._sizes[position + index])], mode)
+            if found[index] >= 0 and self._framing.switches(int(found[index]), mode):
+                found = found[: index + 1]
+                break
+        self._types.count(reasons[(reasons != PLUGIN) & (lost < len(found))])
         return found

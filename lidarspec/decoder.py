@@ -168,8 +168,11 @@ class Decoder:
     ) -> NDArray[np.int64]:
         """The bytes in datagrams that are no frames before each one that is, fillers left out; counts them."""
         lost = np.where(good, 0, sizes)
-        for index in np.flatnonzero(lost).tolist():
-            lost[index] -= self._skip(buffer[starts[index] : starts[index] + sizes[index]])
+        if self._fillers:
+            for index in np.flatnonzero(lost).tolist():
+                lost[index] -= self._skip(buffer[starts[index] : starts[index] + sizes[index]])
+        else:
+            self.stats.bytes_skipped += int(lost.sum())
         before = np.concatenate([[-self._gap], np.cumsum(lost)[good]])
         self._gap = int(lost.sum() - before[-1])
         return np.diff(before)
