@@ -14,6 +14,7 @@ from lidarspec.construction import Mismatch, WireNaN, field_path, unwrap
 from lidarspec.errors import LidarSpecError, MissingField, OutOfRange, SpecError, UnknownField, UnknownFrame, UsageError
 from lidarspec.fields import Checksummed
 from lidarspec.frames.schema import FieldInfo, Schema, schema
+from lidarspec.rules import children
 from lidarspec.spec import Sensor
 
 
@@ -53,9 +54,18 @@ def _usage(fault: Mismatch, place: str) -> UsageError:
 def _fields(con: Construct) -> tuple[Schema, frozenset[str]]:
     """The fields of a frame type, and the paths of these and of all that holds them."""
     table = schema(con)
-    known = set(table.fields) | set(table.arrays)
+    known = set(table.fields) | set(table.arrays) | set(_named(con, ""))
     parts = [path.split(".") for path in known]
     return table, frozenset(known | {".".join(names[:depth]) for names in parts for depth in range(len(names))})
+
+
+def _named(con: Construct, path: str) -> Iterator[str]:
+    """The paths of all parts with a name, those without a field too."""
+    if isinstance(con, construct.Renamed):
+        path = f"{path}.{con.name}" if path else str(con.name)
+        yield path
+    for child in children(con):
+        yield from _named(child, path)
 
 
 class _Values:
@@ -89,8 +99,8 @@ class _Values:
         return found
 
     def _bytes(self, found: list[Any], shown: str) -> bytes | list[Any]:
-        """Numbers as a byte string; byte strings stay an array of them."""
-        if all(isinstance(part, bytes | list) for part in found):
+        """Numbers as a byte string; an array of byte strings, or of what another branch has there, stays one."""
+        if not any(isinstance(part, int | str) for part in found):
             return found
         try:
             return bytes(found)
@@ -105,7 +115,7 @@ class _Values:
         if self._units and info.scaled:
             value = (value - info.offset) / info.scale
         if info.kind == "float":
-            return float(value)
+            return value if isinstance(value, int) else float(value)
         if isinstance(value, float):
             if not np.isfinite(value) or (not self._units and value != int(value)):
                 raise UsageError(f"{self._place}: {shown} = {value} is not a raw integer; pass units=True for physical values")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import random
 from collections.abc import Callable, Mapping
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 
 from lidarspec.building import build
 from lidarspec.construction import clean
-from lidarspec.errors import SpecError, UnknownFrame
+from lidarspec.errors import SpecError, UnknownFrame, UsageError
 from lidarspec.frames.codecs import CompiledCodec, InterpretedCodec, codec
 from lidarspec.frames.judging import VALID, plausibility
 from lidarspec.frames.layout import Layout
@@ -62,7 +63,10 @@ def examples(sensor: Sensor, frame: str, source: random.Random, drawn: Drawn = N
 def _interpreted(sensor: Sensor, frame: str, engine: InterpretedCodec, source: random.Random, drawn: Drawn) -> bytes:
     """A frame that construct alone can read."""
     for _ in range(BATCH * TRIES):
-        data = build(sensor, frame, _random(engine.frame.prepared, source, construct.Container(), drawn), {})
+        try:
+            data = build(sensor, frame, _random(engine.frame.prepared, source, construct.Container(), drawn), {})
+        except (UsageError, construct.ConstructError):  # what was drawn goes not together; something else may
+            continue
         if engine.survey(np.frombuffer(data, np.uint8), np.zeros(1, np.intp)).status[0] == VALID:
             return data
     raise SpecError("no random frame is valid", path=frame, sensor=sensor.id)
@@ -121,32 +125,54 @@ def _always(raw: int, _: random.Random) -> int:
     return raw
 
 
-def _random(con: Construct, source: random.Random, given: Any, drawn: Drawn, path: str = "") -> Any:
-    """A random value for a construct that has no compiled layout."""
+def _random(con: Construct, source: random.Random, scope: Any, drawn: Drawn, path: str = "") -> Any:
+    """A random value for a construct that has no compiled layout; `scope`: what its expressions see."""
     if path in drawn:
         return drawn[path](source)
     con, info = peeled(con, FieldInfo(""))
     if info.const is not None:
-        return info.const
+        return info.seen(info.const)
+    if info.rebuilt is not None:
+        with contextlib.suppress(Exception):  # it may ask for what comes after it, and is evaluated again when the frame is built
+            return info.rebuilt(scope)
     if isinstance(con, construct.Struct):
-        values = construct.Container()
+        values = construct.Container(_=scope)
         for child in con.subcons:
             if child.name is not None:
                 values[child.name] = _random(child, source, values, drawn, f"{path}.{child.name}" if path else child.name)
         return values
     if isinstance(con, construct.Array):
-        number = con.count(given) if callable(con.count) else con.count
-        return [_random(con.subcon, source, given, drawn, path) for _ in range(number)]
+        return [_random(con.subcon, source, scope, drawn, path) for _ in range(construct.evaluate(con.count, scope))]
+    if isinstance(con, construct.IfThenElse | construct.Switch):
+        return _random(_chosen(con, scope), source, scope, drawn, path)
     if isinstance(con, construct.NullTerminated) or not isinstance(con, construct.Subconstruct):
-        return _leaf(con, source)
+        return info.seen(_leaf(con, source, scope, info)) if info.labels else _leaf(con, source, scope, info)
     if isinstance(con, construct.Adapter):
-        return clean(con.parse(con.subcon.build(_random(con.subcon, source, given, drawn, path))))
-    return _random(con.subcon, source, given, drawn, path)
+        return clean(con.parse(con.subcon.build(_random(con.subcon, source, scope, drawn, path))))
+    return _random(con.subcon, source, scope, drawn, path)
 
 
-def _leaf(con: Construct, source: random.Random) -> Any:
+def _chosen(con: Any, scope: Any) -> Construct:
+    """The part of an If or Switch that its fields choose."""
+    if isinstance(con, construct.Switch):
+        return con.cases.get(construct.evaluate(con.keyfunc, scope), con.default)
+    return con.thensubcon if construct.evaluate(con.condfunc, scope) else con.elsesubcon
+
+
+def _leaf(con: Construct, source: random.Random, scope: Any, info: FieldInfo) -> Any:
+    if con is construct.Pass:
+        return None
     if isinstance(con, construct.NullTerminated):
         return str(source.randrange(10 ** source.randint(1, 4))).encode()
-    if isinstance(con, construct.IfThenElse | construct.Switch) or con is construct.Pass:
-        return None
+    if isinstance(con, construct.Computed):
+        return construct.evaluate(con.func, scope)
+    if con is construct.GreedyBytes:
+        return source.randbytes(source.randint(0, 4))
+    if isinstance(con, construct.Bytes):
+        return source.randbytes(construct.evaluate(con.length, scope))
+    if info.labels and source.random() < 0.5:
+        return source.choice(list(info.labels))
+    if isinstance(con, construct.BitsInteger):
+        value = source.getrandbits(con.length)
+        return value - (1 << con.length) if con.signed and value >> (con.length - 1) else value
     return con.parse(source.randbytes(con.sizeof()))

@@ -60,6 +60,18 @@ INTERPRETED: dict[str, Any] = {
 }
 
 
+#: the promises that are about reading and building single frames, and frames in bulk.
+HELD = {
+    "examples_are_valid_and_repeat",
+    "bytes_survive_parsing_and_building",
+    "values_in_units_build_the_same_bytes",
+    "a_truncated_frame_is_a_wire_error",
+    "single_packets_equal_a_batch",
+    "values_at_the_edges_read_alike",
+    "compiled_and_interpreted_agree",
+}
+
+
 def frames() -> list[bytes]:
     """Counts with numbers after them, and with terminated texts."""
     return [
@@ -89,8 +101,8 @@ def test_such_a_frame_keeps_every_promise(name: str) -> None:
     fields: Any = {**COMPILED, **INTERPRETED}[name]
     inner = Struct("magic" / Const(b"\xf1\x5a"), "k" / Int8ub, "y" / If(this.k > 2, Int8ub), "v" / fields, "end" / Const(b"\xe1\x77"))
     subject = Subject(sensor(inner))
-    found = [finding for one in PROPERTIES if not one.lacks(subject) for finding in one.findings(subject)]
-    assert not [finding for finding in found if finding.rule == "LS308"], found
+    found = [finding for one in PROPERTIES if one.name in HELD and not one.lacks(subject) for finding in one.findings(subject)]
+    assert not found, found
 
 
 def test_numbers_are_taken_for_a_byte_string_and_nothing_else() -> None:

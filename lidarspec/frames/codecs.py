@@ -29,7 +29,7 @@ from lidarspec.frames.judging import CHECKSUM, CONSTANT, LENGTH, PLUGIN, SHORT, 
 from lidarspec.frames.layout import Layout
 from lidarspec.frames.schema import Schema, schema
 from lidarspec.frames.tables import Group, Records, Rows, Table
-from lidarspec.frames.walk import NotCompilable, TooLong, Walk
+from lidarspec.frames.walk import NotCompilable, Unread, Walk
 from lidarspec.spec import Frame
 
 #: bytes of candidates looked at in one go, so that memory stays small on hostile streams.
@@ -209,6 +209,8 @@ class InterpretedCodec:
         try:
             self.frame.prepared.parse_stream(stream, _verify="constants")
             size = stream.tell()
+            if not size:
+                return LENGTH, 0
             parsed = self.frame.prepared.parse(data[:size])
         except Mismatch as mismatch:
             return (CHECKSUM if mismatch.reason == "checksum" else CONSTANT), 0
@@ -254,7 +256,7 @@ def _prefix(frame: Frame) -> dict[int, tuple[int, int]]:
     """The constants at the start of a frame that cannot be compiled as a whole."""
 
     def stop(leaf: Any) -> int:
-        raise TooLong
+        raise Unread
 
     state = Walk(stop, frame.max_length)
     with contextlib.suppress(Exception):  # what comes before counts; the rest is construct's to judge

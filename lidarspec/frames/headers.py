@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from lidarspec.errors import SpecError
 from lidarspec.frames import choices
 from lidarspec.frames.layout import Layout, Leaf
-from lidarspec.frames.walk import NotCompilable, TooLong, Walk, walk
+from lidarspec.frames.walk import NotCompilable, TooLong, Unread, Walk, walk
 from lidarspec.rules import children
 
 #: distinct headers remembered; garbage must not fill the memory with their layouts.
@@ -46,7 +46,7 @@ class _Node:
     result: Layout | Refused | None = None
 
 
-class _Short(Exception):
+class _Short(Unread):
     """The sample ends before a field that the layout depends on."""
 
     def __init__(self, leaf: Leaf) -> None:
@@ -233,7 +233,7 @@ def _few(values: NDArray[Any]) -> list[int] | None:
     return None if len(left) else sorted(found)
 
 
-class _Stop(Exception):
+class _Stop(Unread):
     """A field of the header was asked for."""
 
 

@@ -178,7 +178,7 @@ class Seal:
         found = sums(self, rows) if sums is not None else None
         if found is not None:
             return found
-        return self.algorithm.over(rows, self.spans)
+        return self.algorithm.over(rows, self.spans or ((0, 0),))
 
     def fill(self, rows: Bytes2D) -> None:
         """Write the right value into each frame."""
@@ -239,8 +239,9 @@ class Layout:
         constants: offset -> (mask, value).
         seals: its checksums, inner ones first.
         places: byte range of each named part outside arrays.
-        branches: what If and Switch chose, by path.
+        branches: what each If and Switch chose.
         following: fields whose values follow from this header in a frame that is made, and those; they are not asked of one that comes.
+        lengths: of each array, by its axis; 0 in an array without elements.
         notes: what is worked out from the layout and kept with it.
     """
 
@@ -251,6 +252,7 @@ class Layout:
     places: Mapping[str, tuple[int, int]]
     branches: Mapping[str, Any] = field(default_factory=dict)
     following: tuple[tuple[Leaf, int], ...] = ()
+    lengths: Mapping[str, int] = field(default_factory=dict)
     notes: dict[Any, Any] = field(default_factory=dict, repr=False)
 
     def __post_init__(self) -> None:

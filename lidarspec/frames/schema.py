@@ -73,7 +73,10 @@ class FieldInfo:
 
 @dataclass(frozen=True, eq=False)
 class Schema:
-    """All fields of a frame type, in the order of the wire, and the arrays they are in (path -> declared count)."""
+    """All fields of a frame type, in the order of the wire, and the arrays they are in.
+
+    `arrays`: path -> declared count; a number where every frame has so many elements, else a function of the fields around it, or None.
+    """
 
     fields: Mapping[str, FieldInfo]
     arrays: Mapping[str, Any]
@@ -108,8 +111,8 @@ def _walk(con: Construct, info: FieldInfo, fields: dict[str, FieldInfo], arrays:
             if child.name is not None:
                 _walk(child, replace(info, path=f"{info.path}.{child.name}" if info.path else child.name), fields, arrays)
     elif isinstance(con, Array):
-        axis = axis_path(info)
-        arrays[axis] = con.count
+        axis, count = axis_path(info), _sometimes(con.count) if info.optional else con.count
+        arrays[axis] = _common_count(arrays[axis], count) if axis in arrays else count
         _walk(con.subcon, replace(info, axes=(*info.axes, axis)), fields, arrays)
     elif isinstance(con, construct.IfThenElse | construct.Switch):
         for branch in branches(con):
@@ -117,9 +120,23 @@ def _walk(con: Construct, info: FieldInfo, fields: dict[str, FieldInfo], arrays:
     elif con is not construct.Pass and info.path:
         leaf = _leaf(con, info)
         if leaf.kind == "bytes":
-            arrays[leaf.axes[-1]] = getattr(con, "length", None)
+            axis, length = leaf.axes[-1], getattr(con, "length", None)
+            length = _sometimes(length) if info.optional else length
+            arrays[axis] = _common_count(arrays[axis], length) if axis in arrays else length
         known = fields.get(leaf.path)
         fields[leaf.path] = leaf if known is None else _merged(known, leaf)
+
+
+def _sometimes(count: Any) -> Any:
+    """A count that holds where there is the array at all: no number, since the length is then another."""
+    return (lambda context: count) if isinstance(count, int) else count
+
+
+def _common_count(known: Any, other: Any) -> Any:
+    """The declared count of an array that several branches declare: a number where all say it."""
+    if not isinstance(known, int) or known == other:
+        return known
+    return other if callable(other) else None
 
 
 def axis_path(info: FieldInfo) -> str:
@@ -208,7 +225,8 @@ def integer_type(bits: int, *, signed: bool = False) -> np.dtype[Any]:
 
 def _merged(known: FieldInfo, other: FieldInfo) -> FieldInfo:
     """One column for a field that several branches declare."""
-    if known.axes != other.axes or "other" in (known.kind, other.kind) or known.dtype is None or other.dtype is None:
+    kinds = {known.kind, other.kind}
+    if known.axes != other.axes or "other" in kinds or kinds > {"bytes"} or known.dtype is None or other.dtype is None:
         return replace(known, dtype=None, kind="other")
     dtype = np.promote_types(known.dtype, other.dtype)
     bits = known.bits if (known.bits, known.dtype) == (other.bits, other.dtype) else 0 if known.kind == "bytes" else 8 * dtype.itemsize

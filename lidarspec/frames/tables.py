@@ -91,7 +91,7 @@ class Rows:
     def counts(self, axis: str) -> NDArray[np.intp]:
         found = np.zeros(len(self), np.intp)
         for group in self.groups:
-            found[group.where] = _length(group.layout, axis)
+            found[group.where] = group.layout.lengths.get(axis, 0)
         return found
 
     def length(self, axis: str) -> int:
@@ -99,7 +99,7 @@ class Rows:
         declared = self.schema.arrays.get(axis)
         if isinstance(declared, int):
             return declared
-        return max((_length(group.layout, axis) for group in self.groups), default=0)
+        return max((group.layout.lengths.get(axis, 0) for group in self.groups), default=0)
 
     def frame(self, index: int) -> bytes:
         for group in self.groups:
@@ -166,15 +166,6 @@ def _order(where: NDArray[np.intp]) -> NDArray[np.intp] | slice:
 
 def _ascends(where: NDArray[np.intp]) -> bool:
     return is_counted(where) or bool(np.count_nonzero(where[1:] > where[:-1]) == max(len(where) - 1, 0))
-
-
-def _length(layout: Layout, axis: str) -> int:
-    """The length of an array in frames of one layout; 0 in an array without elements."""
-    for leaf in layout.leaves.values():
-        if axis in leaf.info.axes:
-            depth = leaf.info.axes.index(axis)
-            return 0 if 0 in leaf.shape[:depth] else leaf.shape[depth]
-    return 0
 
 
 class Records:
@@ -275,8 +266,10 @@ def _put(column: NDArray[Any], index: int, value: Any) -> None:
             _put(column[index], place, part)
     elif isinstance(value, list):
         column[index, : len(value)] = [0 if part is None else part for part in value]
+    elif column.ndim == 1 or isinstance(value, bool):
+        column[index] = 0 if value is None else value
     elif value is not None:
-        column[index] = value
+        raise ValueError("a value where another frame has an array")
 
 
 def _counts(value: Any, names: list[str], brackets: int) -> set[int]:
@@ -300,7 +293,13 @@ def _numbers(value: Any) -> Iterator[Any]:
 
 
 def _common_type(found: list[Any], path: str) -> np.dtype[Any]:
-    kinds = {np.asarray(value).dtype.kind for value in _numbers(found)}
-    if kinds - set("iufb"):
+    """The type of a column of which the spec does not say one."""
+    values = list(_numbers(found))
+    if not all(isinstance(value, int | float) for value in values):
         raise SpecError("its values are no numbers, and a column holds numbers: declare a text as bytes", path=path)
-    return np.dtype(np.float64 if "f" in kinds else np.int64)
+    if any(isinstance(value, float) for value in values):
+        return np.dtype(np.float64)
+    for kind in (np.int64, np.uint64):
+        if np.iinfo(kind).min <= min(values, default=0) and max(values, default=0) <= np.iinfo(kind).max:
+            return np.dtype(kind)
+    raise SpecError("its numbers are wider than the 64 bits that a column holds", path=path)

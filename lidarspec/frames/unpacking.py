@@ -124,7 +124,7 @@ class _Writer:
             scope.take(f"{inner.sizeof()}x", 0)
             return self._labelled(labels, self._named(info.const))
         if isinstance(inner, construct.IfThenElse | construct.Switch):
-            return self._value(self._layout.branches[info.path], FieldInfo(info.path, info.axes), scope)
+            return self._value(self._layout.branches[inner], FieldInfo(info.path, info.axes), scope)
         if isinstance(inner, Checksummed):
             return self._value(inner.subcon, FieldInfo(info.path, info.axes), scope)
         if isinstance(inner, Struct):
@@ -148,7 +148,9 @@ class _Writer:
 
     def _array(self, con: Array, info: FieldInfo, scope: _Scope) -> str:
         axis = axis_path(info)
-        number = con.count if isinstance(con.count, int) else self._length(axis)
+        number = con.count if isinstance(con.count, int) else self._layout.lengths[axis]
+        if number == 0:
+            return "L()"
         info = FieldInfo(info.path, (*info.axes, axis))
         self._variables += 1
         element = _Scope(f"e{self._variables}")
@@ -165,12 +167,6 @@ class _Writer:
         scope.lines += [loop, *(f"    {line}" for line in element.lines), f"    {found}.append({text})"]
         return found
 
-    def _length(self, axis: str) -> int:
-        for leaf in self._layout.leaves.values():
-            if axis in leaf.info.axes:
-                return leaf.shape[leaf.info.axes.index(axis)]
-        raise Unsupported
-
     def _scalar(self, con: Construct, info: FieldInfo, scope: _Scope) -> str:
         if isinstance(con, FormatField):
             order, code = con.fmtstr[0], con.fmtstr[-1]
@@ -183,7 +179,7 @@ class _Writer:
         if isinstance(con, BytesInteger) and isinstance(con.length, int) and isinstance(con.swapped, bool):
             return self._integer(scope.one(f"{con.length}s"), big=not con.swapped, signed=bool(con.signed))
         if isinstance(con, Bytes):
-            return scope.one(f"{con.length if isinstance(con.length, int) else self._length(axis_path(info))}s")
+            return scope.one(f"{con.length if isinstance(con.length, int) else self._layout.lengths[axis_path(info)]}s")
         raise Unsupported
 
     def _integer(self, raw: str, *, big: bool, signed: bool) -> str:

@@ -34,8 +34,12 @@ class NotCompilable(Exception):
         super().__init__(f"{path}: {reason}" if path else reason)
 
 
+class Unread(Exception):
+    """The value of a field that the layout depends on is not there."""
+
+
 class TooLong(Exception):
-    """The header claims more than the longest length that the frame declares."""
+    """The header claims more than the longest length that the frame declares, or no byte at all."""
 
 
 Read = Callable[[Leaf], int]
@@ -52,7 +56,8 @@ class Walk:
     constants: dict[int, tuple[int, int]] = field(default_factory=dict)
     seals: list[Seal] = field(default_factory=list)
     places: dict[str, tuple[int, int]] = field(default_factory=dict)
-    branches: dict[str, Construct] = field(default_factory=dict)
+    branches: dict[Construct, Construct] = field(default_factory=dict)
+    lengths: dict[str, int] = field(default_factory=dict)
     asked: dict[str, int] = field(default_factory=dict)
     rebuilt: list[tuple[Leaf, Scope]] = field(default_factory=list)
 
@@ -63,7 +68,8 @@ class Walk:
 
     def layout(self) -> Layout:
         """What was found, as a value."""
-        return Layout(self.cursor, self.leaves, self.constants, tuple(self.seals), self.places, self.branches, self._following())
+        seals, following = tuple(self.seals), self._following()
+        return Layout(self.cursor, self.leaves, self.constants, seals, self.places, self.branches, following, self.lengths)
 
     def value(self, leaf: Leaf) -> int:
         """The value of a field that the layout depends on."""
@@ -124,9 +130,12 @@ def walk(con: Construct, read: Read, limit: int) -> Walk:
 
     Raises:
         NotCompilable: where construct alone can tell what comes next.
-        TooLong: where the frame would be longer than `limit`.
+        TooLong: where the frame would be longer than `limit`, or without a byte.
     """
-    return Walk(read, limit).run(con)
+    state = Walk(read, limit).run(con)
+    if not state.cursor:
+        raise TooLong("")
+    return state
 
 
 def _visit(state: Walk, con: Construct, place: _Place) -> None:
@@ -143,11 +152,11 @@ def _visit(state: Walk, con: Construct, place: _Place) -> None:
     elif isinstance(inner, Array):
         _array(state, inner, place)
     elif isinstance(inner, construct.IfThenElse):
-        state.branches[info.path] = inner.thensubcon if _value(inner.condfunc, place) else inner.elsesubcon
-        _visit(state, state.branches[info.path], place)
+        state.branches[inner] = inner.thensubcon if _value(inner.condfunc, place) else inner.elsesubcon
+        _visit(state, state.branches[inner], place)
     elif isinstance(inner, construct.Switch):
-        state.branches[info.path] = inner.cases.get(_value(inner.keyfunc, place), inner.default)
-        _visit(state, state.branches[info.path], place)
+        state.branches[inner] = inner.cases.get(_value(inner.keyfunc, place), inner.default)
+        _visit(state, state.branches[inner], place)
     elif inner is not construct.Pass:
         _field(state, inner, place)
     if state.cursor > state.limit:
@@ -160,9 +169,7 @@ def _struct(state: Walk, con: Struct, place: _Place) -> None:
     scope = Scope(state, place.scope, place.info.path, element=bool(place.shape))
     place.scope._names.setdefault(place.info.name, scope)
     for child in con.subcons:
-        path = place.info.path
-        if child.name is not None:
-            path = f"{path}.{child.name}" if path else child.name
+        path = "" if child.name is None else f"{place.info.path}.{child.name}" if place.info.path else child.name
         _visit(state, child, _Place(FieldInfo(path, place.info.axes), scope, place.shape, place.strides))
         scope._names.setdefault(child.name, None)
 
@@ -170,9 +177,13 @@ def _struct(state: Walk, con: Struct, place: _Place) -> None:
 def _array(state: Walk, con: Array, place: _Place) -> None:
     count = _count(con.count, place)
     axes = (*place.info.axes, axis_path(place.info))
+    state.lengths[axes[-1]] = 0 if 0 in place.shape else count
     start = state.cursor
     element = replace(place, info=replace(place.info, axes=axes), shape=(*place.shape, count), strides=(*place.strides, 0))
-    _visit(state, con.subcon, element)
+    if count:
+        _visit(state, con.subcon, element)
+    else:
+        _visit_none(state, con.subcon, element)
     size = state.cursor - start
     if start + max(size, 1) * count > state.limit:
         raise TooLong(place.info.path)
@@ -186,6 +197,18 @@ def _array(state: Walk, con: Array, place: _Place) -> None:
         del state.constants[spot]
         state.constants.update({spot + size * index: what for index in range(count)})
     state.cursor = start + size * count
+
+
+def _visit_none(state: Walk, con: Construct, place: _Place) -> None:
+    """Go through an element that the array has none of, for its fields alone: nothing is asked of it."""
+    start, constants = state.cursor, dict(state.constants)
+    try:
+        _visit(state, con, place)
+    except Unread:
+        raise
+    except Exception:
+        pass  # what construct never looks at cannot fail
+    state.cursor, state.constants = start, constants
 
 
 def _field(state: Walk, con: Construct, place: _Place) -> None:
@@ -227,10 +250,13 @@ def _block(state: Walk, con: Construct, place: _Place) -> None:
         place.scope._names[place.info.name] = scope
         place = replace(place, scope=scope)
     for path, elements in groups.items():
-        info = infos[path]
+        info = infos[path] if path else place.info
         inside = len(info.axes) > len(place.shape)
+        if len(info.axes) > len(place.shape) + 1:
+            raise NotCompilable(path, "an array of arrays of bits")
         shape = (*place.shape, len(elements)) if inside else place.shape
-        _add(state, Leaf(info, state.cursor, shape, place.strides, size, elements=tuple(elements)), place)
+        if path:
+            _add(state, Leaf(info, state.cursor, shape, place.strides, size, elements=tuple(elements)), place)
         if info.const is not None:
             _bit_constant(state, elements, int(info.const))
     state.cursor += size
@@ -251,6 +277,8 @@ def _bit_constant(state: Walk, elements: list[BitField], value: int) -> None:
 
 def _add(state: Walk, leaf: Leaf, place: _Place) -> None:
     state.leaves[leaf.info.path] = leaf
+    if len(leaf.shape) > len(place.shape):  # bytes, or an array within a bit block
+        state.lengths[leaf.info.axes[-1]] = 0 if 0 in place.shape else leaf.shape[-1]
     if leaf.info.rebuilt is not None and not leaf.shape:
         state.rebuilt.append((leaf, place.scope))
     place.scope._names[leaf.info.name] = leaf
