@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import itertools
 import weakref
+from collections import Counter
 
 import numpy as np
 import pytest
@@ -12,12 +13,17 @@ import pytest
 import lidarspec as ls
 from lidarspec import OnChange, OnWrap, Sensor
 from lidarspec.clouds import COLUMNS, PointCloud
+from lidarspec.decoder import Decoder
+from lidarspec.frames.tables import Rows
 from lidarspec.packets import Packets
 from lidarspec.plans import stretches
 from lidarspec.scans import Scan, scans_of
 from lidarspec.simulation.simulator import simulate
+from lidarspec.streams import PacketStream
+from tests.shapes import SHAPES
 
 BACKENDS = ["numpy", "jit"]
+SENSORS = {**ls.sensors(), **{name: sensor for name, sensor in SHAPES.items() if sensor.frames}}
 
 
 def packets_of(name: str, number: int, backend: str) -> Packets:
@@ -38,7 +44,7 @@ def assert_cut_from(scans: list[Scan], whole: PointCloud, names: tuple[str, ...]
         for name in names:
             found, wanted = getattr(scan.points, name), getattr(whole, name)
             if name == "time":
-                assert abs(found + (scan.stamp_ns - whole.stamp_ns) * 1e-9 - wanted[start:stop]).max() < 2e-9
+                assert abs(found + (scan.stamp_ns - whole.stamp_ns) * 1e-9 - wanted[start:stop]).max(initial=0) < 2e-9
             elif wanted is None:
                 assert found is None
             else:
@@ -143,3 +149,28 @@ def test_a_sensor_that_turns_back_and_forth_is_cut_alike_in_any_batches() -> Non
     assert len(whole) > 8
     for sizes in ((1, 7, 250), (310, 280), tuple([20] * 44)):
         assert [len(scan) for scan in scans_of(sensor, batches(packets, *sizes))] == whole
+
+
+@pytest.mark.parametrize(("name", "backend"), [*((name, "numpy") for name in SENSORS), ("robosense-m1", "jit"), ("velodyne-vlp16", "jit")])
+def test_packets_that_stay_where_they_were_read_give_the_same_points(name: str, backend: str) -> None:
+    if backend == "jit":
+        pytest.importorskip("numba")
+    sensor = SENSORS[name]
+    frames = [sensor.example(sensor.data_frame, seed=seed) for seed in range(8)]
+    size = Counter(map(len, frames)).most_common(1)[0][0]
+    rows = np.stack([np.frombuffer(frame, np.uint8) for frame in frames if len(frame) == size])
+    apart = np.full((len(rows), size + 1), 0xFF, np.uint8)
+    apart[:, :size] = rows
+    starts, sizes = np.arange(len(rows)) * (size + 1), np.full(len(rows), size)
+    unknown = np.full(len(rows), -1)
+    found = []
+    for buffer, places in ((rows.reshape(-1), np.arange(len(rows)) * size), (apart.reshape(-1), starts)):
+        decoder = Decoder(sensor, stream=False, backend=backend)
+        stream = PacketStream(sensor, sensor.data_frame, decoder.stats, backend=backend)
+        found.append(stream.add([decoder.placed(buffer, places, sizes, unknown)]))
+    together, separate = found
+    assert len(together) == len(separate)
+    if isinstance(separate.table, Rows) and len(separate):
+        if len(separate.table.groups[0].where) == len(rows) > 1:
+            assert separate.table.groups[0].rows.strides[0] == size + (size > 1)
+        assert_cut_from([Scan(separate.points(), 0.0, True, sensor)], together.points())
