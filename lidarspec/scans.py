@@ -194,5 +194,12 @@ def scans_of(sensor: Sensor, batches: Iterable[Packets]) -> Iterator[Scan]:
     """Every scan of batches of one stream."""
     stream = ScanStream(sensor)
     for batch in batches:
-        yield from stream.add(batch)
+        yield from handed_out(stream.add(batch))
     yield from stream.finish()
+
+
+def handed_out(scans: list[Scan]) -> Iterator[Scan]:
+    """Scans one by one, each of which is forgotten then, and with it the columns that are made of it."""
+    scans.reverse()
+    while scans:
+        yield scans.pop()

@@ -6,12 +6,14 @@ import gc
 import itertools
 import weakref
 from collections import Counter
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 import lidarspec as ls
 from lidarspec import OnChange, OnWrap, Sensor
+from lidarspec.captures.pcap import Datagram, PcapWriter
 from lidarspec.clouds import COLUMNS, PointCloud
 from lidarspec.decoder import Decoder
 from lidarspec.frames.tables import Rows
@@ -138,6 +140,23 @@ def test_packets_go_with_the_last_scan_that_is_made_of_them(sensor: Sensor) -> N
         assert not any(packets() for packets in known)
     finally:
         gc.enable()
+
+
+@pytest.mark.parametrize("opened", [False, True], ids=["packets", "capture"])
+def test_a_scan_is_forgotten_once_it_was_given(opened: bool, tmp_path: Path) -> None:
+    sensor, path = ls.sensor("velodyne-vlp16"), tmp_path / "some.pcap"
+    frames = simulate(sensor, 700)
+    with path.open("wb") as file:
+        writer = PcapWriter(file)
+        for frame in frames:
+            writer.write(Datagram(frame, 10**18, ("192.168.1.200", 2368), ("192.168.1.102", 2368)))
+    given = list[weakref.ref[Scan]]()
+    with ls.open(path, sensor) as device:
+        for scan in device.scans() if opened else scans_of(sensor, [sensor.decode(frames)]):
+            given.append(weakref.ref(scan))
+            assert len(scan.points.x) == len(scan)
+            assert sum(known() is not None for known in given) <= 2
+    assert len(given) > 5
 
 
 def test_a_sensor_that_turns_back_and_forth_is_cut_alike_in_any_batches() -> None:

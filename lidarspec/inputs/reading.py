@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping
 from lidarspec.decoder import Decoder, Spans
 from lidarspec.inputs.arrivals import Arrival
 from lidarspec.packets import Packets
-from lidarspec.scans import Scan, ScanStream
+from lidarspec.scans import Scan, ScanStream, handed_out
 from lidarspec.spec import Sensor
 from lidarspec.streams import PacketStream, data_frame
 
@@ -61,7 +61,7 @@ class PacketReader:
         """
         packets = self.last if read else self.add(arrival)
         if packets is not None and len(packets):
-            yield from stream.add(packets)
+            yield from handed_out(stream.add(packets))
         if arrival.interrupted:
             yield from stream.finish()
 
