@@ -48,7 +48,7 @@ class Unwrapper:
         over = np.flatnonzero((steps < -half) | (steps >= self._turn - half))
         if len(over):
             steps[over] = (steps[over] + half) % self._turn - half
-        if self._turn >= 10**9 and host.any():
+        if self._turn >= 10**9 and int(host.max()) - min(int(host.min()), at or int(host.max())) > self._turn * 3 // 4:
             before = np.concatenate([[at], host[:-1]])
             passed = np.where((host > 0) & (before > 0), host - before, 0)
             late = passed > self._turn * 3 // 4
