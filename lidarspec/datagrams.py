@@ -13,10 +13,13 @@ from numpy.typing import NDArray
 
 from lidarspec.allocation import alike, repeated
 from lidarspec.frames.codecs import CompiledCodec
-from lidarspec.frames.constants import equal, right, words
+from lidarspec.frames.constants import equal, exclude, right
 from lidarspec.frames.judging import PLUGIN, SHORT, VALID, Status, Survey
 from lidarspec.frames.layout import Bytes2D, Layout
 from lidarspec.framing import COUNTED, Bytes1D, Framing, Mode, Offsets
+
+#: constants that tell the types of most datagrams.
+TOLD = 4
 
 
 class Datagrams:
@@ -29,8 +32,6 @@ class Datagrams:
 
     def __init__(self, framing: Framing) -> None:
         self._framing = framing
-        self._words = [words(marks) for marks in framing.marks]
-        self._ends = [max((spot + dtype.itemsize for spot, dtype, _, _ in found), default=0) for found in self._words]
         self.rejected: dict[str, int] = {}
         self.errors: list[str] = []
         self._surveyed: tuple[int, Survey] | None = None
@@ -41,21 +42,34 @@ class Datagrams:
         So they are where not all are frames of one type and layout, and where they change what is looked for.
         """
         self._surveyed = None
+        kind = self._likely(rows, mode)
+        if kind is None or right(self._framing.words[kind], rows) is not None or self._framing.switches(kind, mode):
+            return None
+        survey = self._framing.codecs[kind].alike(rows)
+        if survey is None or survey.layout is None:
+            return None
+        if np.count_nonzero(survey.status):
+            self._surveyed = kind, survey
+            return None
+        return kind, survey.layout
+
+    def _likely(self, rows: Bytes2D, mode: Mode) -> int | None:
+        """The type that the first datagram resembles, if none of those with its constants resembles one that comes first; else None."""
+        first, before = rows[0].tobytes(), list[int]()
         for kind in self._framing.active(mode):
-            codec = self._framing.codecs[kind]
-            if codec.size not in (None, rows.shape[1]):
+            if self._framing.codecs[kind].size not in (None, len(first)) or self._framing.ends[kind] > len(first):
                 continue
-            marked = right(self._words[kind], rows)
-            if marked is not None and not np.count_nonzero(marked):
-                continue
-            survey = codec.alike(rows) if marked is None and not self._framing.switches(kind, mode) else None
-            if survey is None or survey.layout is None:
-                return None
-            if np.count_nonzero(survey.status):
-                self._surveyed = kind, survey
-                return None
-            return kind, survey.layout
+            if all(first[spot] & mask == value for spot, mask, value in self._framing.marks[kind][:TOLD]):
+                return None if any(self._resembled(other, kind, rows) for other in before) else kind
+            before.append(kind)
         return None
+
+    def _resembled(self, kind: int, other: int, rows: Bytes2D) -> bool:
+        """Whether any row with the constants of the other type has those of this type as well."""
+        if exclude(self._framing.marks[kind], self._framing.marks[other]):
+            return False
+        marked = right(self._framing.words[kind], rows)
+        return marked is None or bool(np.count_nonzero(marked))
 
     def kinds(self, buffer: Bytes1D, starts: Offsets, sizes: Offsets, mode: Mode) -> Offsets:
         """The type of each datagram, as its index, -1 where it is none.
@@ -148,8 +162,7 @@ class Datagrams:
 
     def _marked(self, kind: int, buffer: Bytes1D, starts: Offsets, sizes: Offsets) -> NDArray[np.bool_]:
         """Which datagrams have the constants of a type."""
-        constants = self._words[kind]
-        end = self._ends[kind]
+        constants, end = self._framing.words[kind], self._framing.ends[kind]
         size = alike(sizes)
         if size is None or size < end:
             whole = sizes >= end

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -17,11 +18,11 @@ from lidarspec.allocation import alike, repeated
 from lidarspec.datagrams import Datagrams, evenly
 from lidarspec.errors import UsageError, refuse_text
 from lidarspec.found import Alike, Counters, Found, Spans, packed
-from lidarspec.frames.codecs import Codec, codec
+from lidarspec.frames.codecs import codec
 from lidarspec.frames.layout import Bytes2D, Sums, summed_by
 from lidarspec.framing import Framing, Mode, Piece
 from lidarspec.runs import cut
-from lidarspec.spec import Sensor
+from lidarspec.spec import Frame, Sensor
 
 __all__ = ["BACKENDS", "Counters", "Decoder", "Found", "Spans", "backend", "is_stream", "packed", "spans_of"]
 
@@ -55,12 +56,11 @@ class Decoder:
             raise UsageError(f"{sensor.id} has no frames yet: configure it with its file first")
         self.sensor, self.stream, self.interpreted, self.backend = sensor, stream, interpreted, backend
         self.stats, self._sums = Counters(), sums
-        self._codecs: dict[str, Codec] = {name: codec(frame, interpreted=interpreted) for name, frame in incoming.items()}
-        self._framing = Framing(self._codecs)
+        self._framing = _framing(tuple(incoming), tuple(incoming.values()), interpreted)
         self._mode = Mode(after=_first_mode(sensor))
         self._pending, self._base, self._need = b"", 0, 0
         self._gap = 0
-        self._fillers, self._names = bytes(sensor.fillers), tuple(self._codecs)
+        self._fillers, self._names = bytes(sensor.fillers), tuple(incoming)
         self._least = max(LEAST, 2 * self._framing.reach)
         self._size = max(PIECE, self._least)
         self._datagrams = Datagrams(self._framing)
@@ -259,6 +259,11 @@ class Decoder:
             for name in self._names:  # in their order, however the input was cut
                 if name in frames:
                     frames[name] = frames.pop(name)
+
+
+@lru_cache(maxsize=256)
+def _framing(names: tuple[str, ...], frames: tuple[Frame, ...], interpreted: bool) -> Framing:
+    return Framing({name: codec(frame, interpreted=interpreted) for name, frame in zip(names, frames, strict=True)})
 
 
 def _starts(sizes: NDArray[np.intp], first: int = 0) -> NDArray[np.intp]:

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from lidarspec.allocation import repeated, some
 from lidarspec.frames.codecs import Codec
-from lidarspec.frames.constants import Marks
+from lidarspec.frames.constants import Marks, words
 from lidarspec.frames.judging import CHECKSUM, CONSTANT, IMPLAUSIBLE, LENGTH, PLUGIN, SHORT, VALID, taken
 from lidarspec.frames.layout import Layout
 
@@ -129,6 +129,9 @@ class Framing:
         self.names, self.codecs = list(codecs), list(codecs.values())
         self.named = {codec.frame.after for codec in self.codecs} - {None}
         self.marks = [codec.marks for codec in self.codecs]
+        self.words = [words(marks) for marks in self.marks]
+        #: bytes up to the end of the last of those.
+        self.ends = [max((spot + dtype.itemsize for spot, dtype, _, _ in found), default=0) for found in self.words]
         lengths = [codec.frame.max_length for codec in self.codecs]
         #: no candidate waits for more bytes than these.
         self.reach = max(lengths) + max(codec.frame.max_length * codec.frame.confirm for codec in self.codecs)

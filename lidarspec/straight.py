@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.allocation import counted, repeated
-from lidarspec.frames.constants import Marks, right, words
+from lidarspec.frames.constants import Marks, right
 from lidarspec.frames.layout import Layout
 from lidarspec.framing import Framing, Mode, Piece
 
@@ -30,7 +30,7 @@ def straight(framing: Framing, buffer: NDArray[np.uint8], mode: Mode) -> Piece |
         return None
     rows = buffer[: number * mode.size].reshape(number, mode.size)
     for kind in framing.active(mode):
-        told = tuple(word for word in words(framing.marks[kind]) if word[0] + word[1].itemsize <= mode.size)
+        told = tuple(word for word in framing.words[kind] if word[0] + word[1].itemsize <= mode.size)
         marked = right(told, rows)
         if marked is not None and not np.count_nonzero(marked):
             continue

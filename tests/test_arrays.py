@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
+from collections.abc import Callable
 from itertools import pairwise
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
+from construct import Const, Int8ul, Int16ub, Struct
 from numpy.typing import NDArray
 
 import lidarspec
-from lidarspec import Sensor
+from lidarspec import Frame, Sensor
 from lidarspec.clocks import Unwrapper, clock_ns
 from lidarspec.decoder import Counters, Spans
 from lidarspec.found import Alike
@@ -134,3 +139,30 @@ def test_a_clock_that_is_a_function_is_read_as_the_function_says(spread: int) ->
         batch = Batch(table.take(some), np.zeros(len(some), np.bool_))
         seconds = [np.broadcast_to(np.asarray(term).reshape(-1), len(some)) for term in sensor.clock.source(Fields(batch))]
         assert clock_ns(sensor, batch).tolist() == sum(np.rint(term * 1e9).astype(np.int64) for term in seconds).tolist()
+
+
+@pytest.mark.parametrize(
+    "plausible",
+    [
+        lambda f: f.mode < 17,
+        lambda f: (f.mode >= 3) & (f.mode <= 9) & (f.angle < 36_000),
+        lambda f: f.mode % 2 == 1,
+        lambda f: f.mode % 4 != f.mode // 64,
+        lambda f: (f.mode % 4 == 1) | (f.mode % 4 == 2),
+        lambda f: (f.mode == 0) | (f.mode == 255),
+        lambda f: (f.mode == 7) & ((f.angle == 5) | (f.angle == 1029)),
+        lambda f: f.angle % 1024 == 3,
+        lambda f: f.angle * 0 + f.mode * 0 < -1,
+        lambda f: (f.angle > 7) | (f.mode == 1),
+    ],
+)
+def test_plausible_frames_of_an_array_are_those_that_the_function_says(plausible: Callable[[Any], Any]) -> None:
+    frame = Frame(Struct("sync" / Const(b"\xa5"), "mode" / Int8ul, "angle" / Int16ub), data=True, max_length=4, plausible=plausible)
+    sensor = dataclasses.replace(SHAPES["shape-bits"], frames={"data": frame})
+    rows = np.random.default_rng(5).integers(0, 256, (70_000, 4), np.uint8)
+    rows[:, 0] = 0xA5
+    rows[:65536, 2:] = np.arange(65536, dtype=">u2").view(np.uint8).reshape(-1, 2)
+    rows[::9, 1] = np.arange(len(rows[::9])) % 256
+    columns = SimpleNamespace(mode=rows[:, 1].astype(float), angle=rows[:, 2] * 256.0 + rows[:, 3])
+    wanted = np.flatnonzero(np.broadcast_to(plausible(columns), len(rows)))
+    assert sensor.decode(rows).offset.tolist() == (4 * wanted).tolist()

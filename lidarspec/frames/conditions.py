@@ -20,6 +20,9 @@ from lidarspec.frames.schema import FieldInfo, Schema
 from lidarspec.frames.tables import Group, Rows
 from lidarspec.frames.tracing import Node, Traced, Untraceable, trace
 
+#: values of a few bits that are compared one by one.
+ALLOWED = 2
+
 Check = Callable[[Bytes2D], NDArray[np.bool_]]
 
 
@@ -88,11 +91,35 @@ class _Computed:
 
 @dataclass(frozen=True, eq=False)
 class _Table:
-    """For which values of some bytes, taken as one integer, a condition holds: from one to another, or as listed."""
+    """For which values of some bytes, taken as one integer, a condition holds.
+
+    Attributes:
+        limits: from one to another; None where they are no such range.
+        bits: else the bits that it depends on, and what they may be, if that is little; None where it is not.
+        listed: for each value.
+    """
 
     dtype: np.dtype[Any]
     limits: tuple[int, int] | None
     listed: NDArray[np.bool_]
+    bits: tuple[int, tuple[int, ...]] | None = None
+
+    def holds(self, values: NDArray[Any]) -> NDArray[np.bool_]:
+        """Whether it holds for each of the values."""
+        if self.limits is not None:
+            low, high = self.limits
+            held = values <= high
+            return np.asarray(held & (values >= low) if low else held)
+        if self.bits is not None:
+            mask, allowed = self.bits
+            left = values & values.dtype.type(mask)
+            held = left == allowed[0]
+            for value in allowed[1:]:
+                held |= left == value
+            return np.asarray(held)
+        if values.itemsize > 1:
+            return self.listed.take(values)
+        return np.frombuffer(values.tobytes().translate(self.listed.tobytes()), np.bool_).reshape(values.shape)
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,21 +136,8 @@ class _LookedUp:
             return np.empty(0, np.bool_)
         view = elements(rows, self.table.dtype, self.spot, self.shape, self.strides)
         values = view if view.itemsize == 1 else view.astype(self.table.dtype.newbyteorder("="))
-        if self.table.limits is None:
-            held = _listed(self.table.listed, values)
-        else:
-            low, high = self.table.limits
-            held = values <= high
-            if low:
-                held &= values >= low
+        held = self.table.holds(values)
         return np.asarray(held.all(axis=tuple(range(1, held.ndim)))) if self.shape else held
-
-
-def _listed(listed: NDArray[np.bool_], values: NDArray[Any]) -> NDArray[np.bool_]:
-    """What a table says of each value; of bytes it says so sooner as a translation."""
-    if values.itemsize > 1:
-        return listed.take(values)
-    return np.frombuffer(values.tobytes().translate(listed.tobytes()), np.bool_).reshape(values.shape)
 
 
 def _table(part: Condition, leaves: Mapping[str, Leaf], size: int) -> _Table:
@@ -134,7 +148,15 @@ def _table(part: Condition, leaves: Mapping[str, Leaf], size: int) -> _Table:
         true = np.flatnonzero(listed)
         if len(true) and true[-1] - true[0] == len(true) - 1:
             return _Table(dtype, (int(true[0]), int(true[-1])), listed)
-    return _Table(dtype, None, listed)
+    return _Table(dtype, None, listed, _bits(listed))
+
+
+def _bits(listed: NDArray[np.bool_]) -> tuple[int, tuple[int, ...]] | None:
+    """The bits on which a list depends, and with which values of these it holds, if they are one or two; else None."""
+    values = np.arange(len(listed))
+    mask = sum(bit for bit in map(int, 1 << np.arange(16)) if bit < len(listed) and (listed != listed[values ^ bit]).any())
+    allowed = np.unique(values[listed] & mask).tolist()
+    return (mask, tuple(allowed)) if 0 < len(allowed) <= ALLOWED else None
 
 
 def _tried(part: Condition, leaves: Mapping[str, Leaf], codes: NDArray[Any]) -> NDArray[np.bool_]:

@@ -38,6 +38,13 @@ def words(constants: Marks) -> tuple[Word, ...]:
     return tuple(found)
 
 
+def exclude(some: Marks, others: Marks) -> bool:
+    """Whether no frame has some constants and the others as well."""
+    known = {spot: (mask, value) for spot, mask, value in others}
+    both = [(mask & known[spot][0], value ^ known[spot][1]) for spot, mask, value in some if spot in known]
+    return any(mask & differing for mask, differing in both)
+
+
 def equal(found: NDArray[Any], word: Word) -> NDArray[np.bool_]:
     """Where the right constants stand, of what stands at their place."""
     _, _, mask, value = word
