@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lidarspec.allocation import alike
 from lidarspec.errors import SpecError
 from lidarspec.frames.access import Fields
 from lidarspec.frames.columns import Batch
@@ -46,6 +47,10 @@ class Unwrapper:
         half = self._turn // 2
         steps = _steps(ns, raw)
         over = np.flatnonzero((steps < -half) | (steps >= self._turn - half))
+        if not len(over) and alike(host) == 0:
+            times = ns if time == raw else ns + (time - raw)
+            self._last = (ns.item(-1), times.item(-1), 0)
+            return times
         if len(over):
             steps[over] = (steps[over] + half) % self._turn - half
         if self._turn >= 10**9 and int(host.max()) - min(int(host.min()), at or int(host.max())) > self._turn * 3 // 4:

@@ -16,14 +16,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.allocation import alike, counted, repeated, some
+from lidarspec.allocation import alike, repeated, some
 from lidarspec.clocks import Unwrapper, clock_ns
 from lidarspec.decoder import Counters, Spans
 from lidarspec.errors import UnknownFrame
 from lidarspec.found import Alike
 from lidarspec.frames.codecs import Codec, CompiledCodec, codec
 from lidarspec.frames.columns import Batch
-from lidarspec.frames.tables import Group, Rows, Table
+from lidarspec.frames.tables import Table
 from lidarspec.packets import Numbers, Packets, StateOf, joined_tables
 from lidarspec.sequences import SequenceTracker
 from lidarspec.spec import Sensor
@@ -228,7 +228,7 @@ class _Part:
         """Our frames as columns."""
         spans = self.spans
         if isinstance(spans, Alike) and self.where is None and isinstance(codec, CompiledCodec):
-            return Rows(codec.schema, [Group(spans.layout, counted(len(spans)), np.ascontiguousarray(spans.rows))])
+            return codec.lined(spans.layout, spans.rows, room=len(spans.buffer))
         return codec.gather(spans.buffer, self.column("starts"), self.column("sizes"))
 
 

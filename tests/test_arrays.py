@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 import lidarspec
 from lidarspec import Frame, Sensor
+from lidarspec.allocation import repeated
 from lidarspec.clocks import Unwrapper, clock_ns
 from lidarspec.decoder import Counters, Spans
 from lidarspec.found import Alike
@@ -121,6 +122,9 @@ def test_clocks_run_on_over_wraps_and_steps_back(wraps_at: float) -> None:
     np.testing.assert_array_equal(found - found[0], true - true[0])
     cuts = [0, 1, 2, 77, 4000, 5000]
     pieces = [parts.push(true[a:b] % turn, nobody[a:b]) for a, b in pairwise(cuts)]
+    np.testing.assert_array_equal(np.concatenate(pieces), found)
+    silent = Unwrapper(wraps_at)
+    pieces = [silent.push(true[a:b] % turn, repeated(0, b - a)) for a, b in pairwise([*range(0, 5000, 3), 5000])]
     np.testing.assert_array_equal(np.concatenate(pieces), found)
 
 

@@ -18,7 +18,7 @@ import construct
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.allocation import repeated
+from lidarspec.allocation import counted, repeated
 from lidarspec.construction import Mismatch
 from lidarspec.errors import SpecError
 from lidarspec.frames.conditions import Check, Conditions
@@ -165,6 +165,15 @@ class CompiledCodec:
                 for layout, which in known
             ],
         )
+
+    def lined(self, layout: Layout, rows: NDArray[np.uint8], *, room: int) -> Rows:
+        """Valid frames of one layout, one a row, as columns.
+
+        Args:
+            room: bytes that would be kept for the rows, if they stayed where they stand.
+        """
+        kept = rows if 2 * rows.size >= room else np.ascontiguousarray(rows)
+        return Rows(self.schema, [Group(layout, counted(len(rows)), kept)])
 
     def _judge(self, layout: Layout) -> Judge:
         judge = layout.notes.get(Judge)
