@@ -36,7 +36,7 @@ class Unwrapper:
     """
 
     def __init__(self, wraps_at: float | None) -> None:
-        self._turn = int(exact(wraps_at) * 10**9) if wraps_at else 0
+        self._turn = _turn(wraps_at) if wraps_at else 0
         self._last: tuple[int, int, int] | None = None
 
     def push(self, ns: Times, host: Times) -> Times:
@@ -88,6 +88,12 @@ def clock_ns(sensor: Sensor, batch: Batch) -> Times:
             part = _nanoseconds(raw.astype(np.float64) * float(step / 10**9) + float(zero / 10**9), len(batch))
         total = part if total is None else np.add(total, part, out=total)
     return np.zeros(len(batch), np.int64) if total is None else total
+
+
+@lru_cache(maxsize=256)
+def _turn(seconds: float) -> int:
+    """So many seconds in nanoseconds, as the number is written."""
+    return int(exact(seconds) * 10**9)
 
 
 class _Reading:
