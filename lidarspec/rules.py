@@ -13,6 +13,7 @@ from construct import Const, Construct, Container, Struct
 
 from lidarspec.construction import unwrap
 from lidarspec.errors import SpecError
+from lidarspec.fields import Scaled
 
 #: names that `points` and the engine need for themselves.
 RESERVED = frozenset({"state", "on"})
@@ -50,6 +51,7 @@ def check_struct(con: Construct) -> None:
             raise SpecError("Flag keeps one bit of its byte only: use a BitStruct, or Int8ul", path=path, rule="LS107")
         if isinstance(part, Struct):
             _check_names(part, path, in_bits=in_bits)
+    _check_measures(con, "", (1, 0, ""), {})
 
 
 def _check_names(struct: Struct, path: str, *, in_bits: bool) -> None:
@@ -72,6 +74,21 @@ def _check_names(struct: Struct, path: str, *, in_bits: bool) -> None:
         if name.startswith("_") or not name.isidentifier():
             raise SpecError("a field name must be a Python identifier without a leading underscore", path=place, rule="LS103")
         seen.add(name)
+
+
+def _check_measures(con: Construct, path: str, measure: tuple[float, float, str], found: dict[str, tuple[float, float, str]]) -> None:
+    """Refuse a field that branches measure in different steps or units: it is one column, and has one of each."""
+    if isinstance(con, construct.Renamed):
+        path = f"{path}.{con.name}" if path else str(con.name)
+        measure = (1, 0, "")
+    if isinstance(con, Scaled):
+        measure = (con.scale, con.offset, con.unit)
+    is_number = isinstance(con, construct.FormatField | construct.BytesInteger | construct.BitsInteger)
+    if is_number and found.setdefault(path, measure) != measure:
+        raise SpecError("its branches have different scales or units: give each a name of its own", path=path)
+    for child in children(con):
+        if not isinstance(con, Struct) or child.name is not None:
+            _check_measures(child, path, measure, found)
 
 
 def _walk(con: Construct, path: str, *, in_bits: bool) -> Iterator[tuple[str, Construct, bool]]:

@@ -24,7 +24,7 @@ from construct import (
     this,
 )
 
-from lidarspec import SpecError
+from lidarspec import Scaled, SpecError
 from lidarspec.export.messages import messages
 from lidarspec.export.tree import Select, nodes
 from lidarspec.frames.codecs import CompiledCodec, codec
@@ -90,6 +90,17 @@ def test_examples_are_of_every_name() -> None:
 def test_a_constant_is_one_of_the_names() -> None:
     with pytest.raises(SpecError, match="'bsuy' is none of idle, busy"):
         codec(sensor(Struct("kind" / Const("bsuy", KIND))).frames["data"])
+
+
+def test_one_field_has_one_unit() -> None:
+    """Else the column would have that of the branch that stands first."""
+    fine, coarse = Scaled(Int16ub, 0.001, "m"), Scaled(Int16ub, 0.002, "m")
+    for other in (coarse, Scaled(Int16ub, 0.001, "deg"), Scaled(Int16ub, 0.001, "m", offset=1), Int16ub):
+        rows = [Array(2, Struct("far" / part)) for part in (fine, other)]
+        with pytest.raises(SpecError, match=r"rows\.far: its branches have different scales or units"):
+            sensor(Struct("kind" / KIND, "rows" / Switch(this.kind, {"idle": rows[0], "busy": rows[1]})))
+    kept = sensor(Struct("kind" / KIND, "far" / Switch(this.kind, {"idle": fine, "busy": Scaled(Int32ub, 0.001, "m")})))
+    assert kept.decode([b"\1\0\5", b"\2\0\1\0\0"])["far"].tolist() == [0.005, 65.536]
 
 
 def test_exports_leave_out_what_is_never_chosen() -> None:
