@@ -26,12 +26,8 @@ def headings(page: str) -> set[str]:
     return set(re.findall(r"^## (\S+)$", (DOCS / page).read_text(encoding="utf-8"), flags=re.MULTILINE))
 
 
-#: pages with something to run; what an explanation shows is taken out of its surroundings.
-FOLLOWED = [
-    page
-    for page in PAGES
-    if not page.startswith("explanation/") and any(block.language in ("sh", "python") for block in pages.blocks(page))
-]
+#: pages with something to run.
+FOLLOWED = [page for page in PAGES if any(block.language in ("sh", "python") for block in pages.blocks(page))]
 
 
 @pytest.mark.skipif(os.name == "nt", reason="shell blocks are for bash, and some use a pseudo-terminal")
