@@ -69,10 +69,9 @@ class Rotation:
     def turns(self, run: Run) -> Turns:
         """The left sides of the products, for a batch."""
         around, (middle, half) = self.angles.around, self.span
-        ones = np.ones((1, *around.outer))
         terms = [*self.angles.start, (around.lows[-1], middle)]
-        values = [(ones if low is None else around.values(run, low), factor / TURN) for low, factor in terms]
-        return Turns(self, len(run.rows), values, half)
+        values = [(around.values(run, low), factor / TURN) for low, factor in terms if low is not None]
+        return Turns(self, len(run.rows), values, sum(factor for low, factor in terms if low is None) / TURN, half)
 
 
 class Turns:
@@ -82,6 +81,7 @@ class Turns:
         rotation: whose.
         number: of packets.
         terms: what makes the angle in the middle: numbers, (n or 1, *outer), and their factors in turns; the last are those that move.
+        fixed: turns that are added to it.
         half: the factor of those that makes the distance of the farthest points from the middle.
 
     Attributes:
@@ -90,8 +90,8 @@ class Turns:
         some_wide, all_wide: whether there are such, and no others.
     """
 
-    def __init__(self, rotation: Rotation, number: int, terms: list[tuple[Floats, float]], half: float) -> None:
-        self._rotation, self._number, self._terms, self._half = rotation, number, terms, half
+    def __init__(self, rotation: Rotation, number: int, terms: list[tuple[Floats, float]], fixed: float, half: float) -> None:
+        self._rotation, self._number, self._terms, self._fixed, self._half = rotation, number, terms, fixed, half
         self._outer = math.prod(rotation.angles.around.outer)
         self._first = self._last = 0
 
@@ -112,9 +112,10 @@ class Turns:
     def _expand(self) -> None:
         """The coefficients of the packets that come next: of each, its cosine and sine times powers of how far its points go."""
         chosen = [self._rows(values) for values, _ in self._terms]
-        middle = np.zeros((self._last - self._first) * self._outer)
-        for values, (_, factor) in zip(chosen, self._terms, strict=True):
+        middle = chosen[0] * self._terms[0][1]
+        for values, (_, factor) in zip(chosen[1:], self._terms[1:], strict=True):
             middle += values * factor
+        middle += self._fixed
         middle -= np.rint(middle)
         middle *= TURN
         single = middle.astype(np.float32)
