@@ -29,8 +29,8 @@ __all__ = ["BACKENDS", "Counters", "Decoder", "Found", "Spans", "backend", "is_s
 #: bytes of a stream looked at in one go: at most, where frames follow one another and where not; and at least.
 LONGEST, PIECE, LEAST = 24 << 16, 6 << 16, 1 << 12
 
-#: datagrams judged together; rows of an array, which need not be gathered first, and their bytes.
-TOGETHER, ROWS, ROW_BYTES = 1024, 1 << 17, 1 << 23
+#: datagrams of a list judged together; rows of an array, which need not be gathered first; and bytes of either, about.
+TOGETHER, ROWS, ROW_BYTES = 1 << 14, 1 << 17, 1 << 23
 
 Data = bytes | bytearray | memoryview | NDArray[np.uint8]
 
@@ -311,7 +311,8 @@ def spans_of(decoder: Decoder, data: Any) -> list[Spans]:
         everything, step = np.ascontiguousarray(data, np.uint8), min(max(ROW_BYTES // max(data.shape[1], 1), 1), ROWS)
         return [decoder.datagrams(everything[start : start + step]) for start in range(0, len(everything), step)]
     packets = list(data)
-    return [decoder.datagrams(packets[start : start + TOGETHER]) for start in range(0, len(packets), TOGETHER)]
+    step = max(1, min(TOGETHER, ROW_BYTES // max(len(packets[0]), 1))) if packets else 1
+    return [decoder.datagrams(packets[start : start + step]) for start in range(0, len(packets), step)]
 
 
 def is_stream(data: Any) -> bool:

@@ -74,12 +74,17 @@ class Candidates:
 
 @dataclass
 class Mode:
-    """What is remembered between pieces: the last frame named by any `after`, a run of weak frames under way, the last frame's size."""
+    """What is remembered between pieces: the last frame named by any `after`, a run of weak frames under way, the last frame's size.
+
+    Attributes:
+        steady: frames of that size seem to follow one another without a byte between.
+    """
 
     after: str | None = None
     run: str | None = None
     run_end: int = -1
     size: int = 0
+    steady: bool = True
 
 
 @dataclass
@@ -228,7 +233,9 @@ def leftmost(framing: Framing, buffer: Bytes1D, mode: Mode, *, final: bool) -> P
     if framing.named:
         live = _until_switched(framing, live, mode, piece)
     piece.kinds, piece.offsets, piece.sizes, piece.rows = live.kinds, live.offsets, live.sizes, live.rows
-    mode.size = live.sizes.item(-1) if len(live.sizes) else mode.size
+    if len(live.sizes):
+        mode.size = live.sizes.item(-1)
+        mode.steady = live.offsets.item(-1) - live.offsets.item(0) == mode.size * (len(live.sizes) - 1)
     count_rejected(piece, found, final=final)
     return piece
 

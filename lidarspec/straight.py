@@ -1,7 +1,7 @@
-"""Frames that follow one another without a byte between, as in a stream that is received as it comes: found without a search.
+"""Frames that follow one another without a byte between, as in a stream that nothing disturbs: found without a search.
 
 Where all of them are frames of one layout, and nothing that comes first in the order stands at their first bytes, the search
-would take the same. So they are judged as rows, which takes a few calls; on anything else the search goes on.
+would take the same. So they are judged as rows, which takes a few calls, up to the first that is none; there the search goes on.
 """
 
 from __future__ import annotations
@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 
 from lidarspec.allocation import counted, repeated
 from lidarspec.frames.constants import Marks, right
-from lidarspec.frames.layout import Layout
+from lidarspec.frames.layout import Bytes2D, Layout
 from lidarspec.framing import Framing, Mode, Piece
 
-#: bytes of a piece that is looked at so, at most: where the frames turn out to be damaged, it is looked at twice.
-SMALL = 1 << 16
+#: rows that are looked at before all are; bytes of a piece that is looked at so even after a piece with damaged frames.
+FEW, SMALL = 64, 1 << 16
 
 
 def straight(framing: Framing, buffer: NDArray[np.uint8], mode: Mode) -> Piece | None:
@@ -23,32 +23,42 @@ def straight(framing: Framing, buffer: NDArray[np.uint8], mode: Mode) -> Piece |
 
     Args:
         buffer: the bytes not yet decided and those after them.
-        mode: as after the piece before.
+        mode: as after the piece before; remembered in it is whether this was worth its time.
     """
-    number = len(buffer) // mode.size if mode.size and len(buffer) <= SMALL else 0
+    number = len(buffer) // mode.size if mode.size and (mode.steady or len(buffer) <= SMALL) else 0
     if not number:
         return None
     rows = buffer[: number * mode.size].reshape(number, mode.size)
     for kind in framing.active(mode):
-        told = tuple(word for word in framing.words[kind] if word[0] + word[1].itemsize <= mode.size)
-        marked = right(told, rows)
-        if marked is not None and not np.count_nonzero(marked):
+        lead = _leading(framing, kind, rows)
+        if lead is None:
             continue
-        survey = framing.codecs[kind].alike(rows) if marked is None and not framing.switches(kind, mode) else None
-        if survey is None or survey.layout is None or np.count_nonzero(survey.status):
+        survey = framing.codecs[kind].alike(rows[:lead]) if 2 * lead > number and not framing.switches(kind, mode) else None
+        if survey is None or survey.layout is None:
             return None
-        need = _awaited(framing, mode, kind, survey.layout, buffer[rows.size :].tobytes()) if rows.size < len(buffer) else 0
-        return Piece(
-            repeated(kind, number),
-            counted(number) * mode.size,
-            repeated(mode.size, number),
-            rows.size,
-            need > 0,
-            need,
-            rows,
-            layout=survey.layout,
-        )
+        valid = int((survey.status != 0).argmax()) if np.count_nonzero(survey.status) else lead
+        mode.steady = 2 * valid > number
+        return _piece(framing, mode, kind, survey.layout, rows[:valid], buffer) if mode.steady else None
     return None
+
+
+def _leading(framing: Framing, kind: int, rows: Bytes2D) -> int | None:
+    """How many rows from the first on have the constants of a type, as far as the rows go; None where no row has them."""
+    told = tuple(word for word in framing.words[kind] if word[0] + word[1].itemsize <= rows.shape[1])
+    for some in (rows[:FEW], rows):
+        marked = right(told, some)
+        if marked is not None and np.count_nonzero(marked):
+            return int(marked.argmin())
+    return len(rows) if marked is None else None
+
+
+def _piece(framing: Framing, mode: Mode, kind: int, layout: Layout, rows: Bytes2D, buffer: NDArray[np.uint8]) -> Piece:
+    """A piece that ends with these frames, and waits for a next one where that is there in part."""
+    number, size = rows.shape
+    rest = buffer[rows.size :]
+    need = _awaited(framing, mode, kind, layout, rest.tobytes()) if 0 < len(rest) < size else 0
+    spots = counted(number) * size
+    return Piece(repeated(kind, number), spots, repeated(size, number), rows.size, need > 0, need, rows, layout=layout)
 
 
 def _awaited(framing: Framing, mode: Mode, kind: int, layout: Layout, rest: bytes) -> int:

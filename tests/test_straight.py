@@ -13,6 +13,7 @@ import lidarspec
 from lidarspec import Checksummed, Frame, Sensor, Xor
 from lidarspec.found import Alike
 from lidarspec.lanes import FEW, SHORT, registers
+from lidarspec.straight import SMALL
 from lidarspec.testing import material
 from lidarspec.testing.cutting import Books
 from lidarspec.testing.damage import damaged
@@ -63,6 +64,28 @@ def test_clean_frames_are_found_so() -> None:
     found = [spans for piece in as_it_comes(data, 18, 1) for spans in decoder.spans(piece)]
     assert sum(isinstance(spans, Alike) for spans in found) > 5
     assert sum(map(len, found)) == 40
+
+
+@pytest.mark.parametrize("faults", [0, 2, 40])
+def test_long_pieces_are_taken_up_to_the_first_damage(faults: int) -> None:
+    source = random.Random(faults)
+    frames = [TWINS.example("data", seed=seed) for seed in range(40)]
+    data = bytearray(b"".join(source.choice(frames) for _ in range(60_000)))
+    for _ in range(faults):
+        spot = source.randrange(len(data))
+        data[spot : spot + source.randrange(2)] = source.randbytes(source.randint(0, 30))
+    whole, parts = TWINS.decoder(), TWINS.decoder()
+    found = [*whole.spans(bytes(data)), *whole.rest()]
+    pieces = [spans for start in range(0, len(data), 5000) for spans in parts.spans(bytes(data[start : start + 5000]))]
+    pieces += parts.rest()
+    for name in ("offsets", "gaps", "kinds"):
+        assert (
+            np.concatenate([getattr(one, name) for one in found]).tolist()
+            == np.concatenate([getattr(one, name) for one in pieces]).tolist()
+        )
+    assert whole.stats == parts.stats
+    longest = max(len(spans) * len(frames[0]) for spans in found if isinstance(spans, Alike) or faults > 2)
+    assert longest > SMALL
 
 
 def test_a_type_that_comes_first_is_looked_for_at_each_frame() -> None:
