@@ -125,19 +125,19 @@ class Cutter:
         else:
             turned, earlier = (_folded(direction * (some - at), full) for some in (values, before))
         passed = np.flatnonzero(earlier - turned > full / 2)
-        found, away = self._armed_at(passed, (turned > full * AWAY) & (turned < full * (1 - AWAY)))
-        self._armed = self._armed or away
+        found = self._armed_at(passed, turned, full)
         return np.array(found, np.intp) if known is None else known[np.array(found, np.intp)]
 
-    def _armed_at(self, passed: NDArray[np.intp], far: NDArray[np.bool_]) -> tuple[list[int], bool]:
-        """Those of the places where an angle passes that come after it was far away; and whether it was since the last one."""
+    def _armed_at(self, passed: NDArray[np.intp], turned: NDArray[np.float64], full: float) -> list[int]:
+        """Those of the places where an angle passes that come after it was far away."""
         found: list[int] = []
         since = 0
         for spot in passed.tolist():
-            if self._armed or far[since:spot].any():
+            if self._armed or _was_far(turned[since:spot], full):
                 found.append(spot)
                 self._armed, since = False, spot
-        return found, bool(far[since:].any())
+        self._armed = self._armed or _was_far(turned[since:], full)
+        return found
 
     def _periods(self, rule: Every, packets: Packets, found: Evaluated) -> list[int]:
         times = packets.time_ns[: found.ready]
@@ -188,8 +188,23 @@ def _sums(counts: NDArray[Any], kept: int) -> NDArray[np.intp]:
     return np.broadcast_to(counts.flat[0] * times, counts.shape) if counts.size and not any(counts.strides) else counts * times
 
 
+def _was_far(angles: NDArray[np.float64], full: float) -> bool:
+    """Whether any of these angles is far from the cut at 0."""
+    least, most = full * AWAY, full * (1 - AWAY)
+    if len(angles) and least < angles[len(angles) // 2] < most:
+        return True
+    return bool(((angles > least) & (angles < most)).any())
+
+
 def _folded(angles: NDArray[np.float64], full: float) -> NDArray[np.float64]:
-    """Angles in [0, full); the same as `np.mod`, and several times as fast."""
+    """Angles in [0, full), which are not to be written to; the same as `np.mod`, and several times as fast."""
+    outside = np.flatnonzero((angles < 0) | (angles >= full))
+    if not len(outside):
+        return angles
+    if 8 * len(outside) < len(angles):
+        found = angles.copy()
+        found[outside] = _folded(angles[outside], full)
+        return found
     turns = angles / full
     np.floor(turns, out=turns)
     turns *= full
