@@ -54,9 +54,9 @@ class Kernel:
         """Whether the compiled code is at hand."""
         return self._function is not None
 
-    @property
+    @functools.cached_property
     def is_compiled(self) -> bool:
-        """Whether the compiled code is at hand or on disk."""
+        """Whether the compiled code was at hand or on disk when this was first asked."""
         return self.is_ready or compiled_before(self._text.source)
 
     def compile(self) -> None:

@@ -244,7 +244,10 @@ def worth_compiling(function: PointsFunction, names: tuple[str, ...], plan: Plan
     """Whether so many points of a `points` function were asked for, these frames included, that its kernel pays."""
     made = _MADE.setdefault(function, {})
     made[names] = made.get(names, 0) + frames * plan.width
-    if made[names] < WARM or not available():
+    if made[names] < WARM:
+        return False
+    if not available():
+        made[names] = NEVER
         return False
     try:
         kernel = plan.kernel(names, function)
