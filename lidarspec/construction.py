@@ -122,6 +122,8 @@ class IndexedArray(Array):  # type: ignore[misc]
 
     def _build(self, obj: Any, stream: Any, context: Any, path: str) -> Any:
         count = construct.evaluate(self.count, context)
+        if not isinstance(obj, list | tuple | bytes):
+            raise Mismatch(path, 0, "a list of its elements", repr(obj), "value")
         if len(obj) != count:
             raise construct.RangeError(f"expected {count} elements, found {len(obj)}", path=path)
         built = construct.ListContainer()
@@ -143,13 +145,18 @@ class CheckedConst(Const):  # type: ignore[misc]
 
 
 class CountedBytes(Bytes):  # type: ignore[misc]
-    """Bytes of a computed length, of which a wrong one is told from an end of the stream."""
+    """Bytes, of which a wrong length is told from an end of the stream, and what are none from an expression that fails."""
 
     def _parse(self, stream: Any, context: Any, path: str) -> Any:
-        length = operator.index(self.length(context))
+        length = operator.index(construct.evaluate(self.length, context))
         if length < 0:
             raise construct.RangeError(f"invalid length {length}", path=path)
         return construct.stream_read(stream, length, path)
+
+    def _build(self, obj: Any, stream: Any, context: Any, path: str) -> Any:
+        if not isinstance(obj, bytes | bytearray | int):
+            raise Mismatch(path, 0, "bytes", repr(obj), "value")
+        return super()._build(obj, stream, context, path)
 
 
 class ExactFloat(FormatField):  # type: ignore[misc]
@@ -191,7 +198,7 @@ def prepare(con: Construct) -> Construct:
             return con
         return ExactFloat(con.fmtstr[0], con.fmtstr[-1])
     if isinstance(con, Bytes):
-        return CountedBytes(con.length) if callable(con.length) else con
+        return CountedBytes(con.length)
     if isinstance(con, Array):
         return IndexedArray(con.count, prepare(con.subcon))
     if isinstance(con, Const):

@@ -168,7 +168,7 @@ def _column(numbers: Numbers) -> NDArray[np.int64]:
 
 
 def _nested(schema: Schema, columns: Mapping[str, NDArray[Any]], prefix: str) -> np.dtype[Any]:
-    """The structured dtype of one level of the struct; SpecError where one name is both a value and a struct."""
+    """The structured dtype of one level of the struct; SpecError where one name is a value, a struct or an array by turns."""
     members: list[Any] = []
     seen: set[str] = set()
     for path, info in schema.fields.items():
@@ -179,10 +179,16 @@ def _nested(schema: Schema, columns: Mapping[str, NDArray[Any]], prefix: str) ->
             continue
         seen.add(name)
         here = prefix + name
-        if below == "" and any(other.startswith(f"{here}.") for other in schema.fields):
-            raise SpecError("a value in one branch and a struct in another: ask for its columns one by one", path=here)
+        if len(_forms(schema, here)) > 1:
+            raise SpecError("a value, a struct or an array by turns in its branches: ask for its columns one by one", path=here)
         own = [index for index, axis in enumerate(info.axes) if axis.rstrip("[]") == here]
         shape = tuple(columns[path].shape[1 + index] for index in own)
         kind = _nested(schema, columns, f"{here}.") if below else columns[path].dtype
         members.append((name, kind, shape) if shape else (name, kind))
     return np.dtype(members)
+
+
+def _forms(schema: Schema, here: str) -> set[tuple[bool, int]]:
+    """What a name is in the branches that have it: whether a value, and in how many arrays of its own."""
+    parts = [(path, info) for path, info in schema.fields.items() if path == here or path.startswith(f"{here}.")]
+    return {(path == here, sum(axis.rstrip("[]") == here for axis in info.axes)) for path, info in parts}

@@ -116,6 +116,22 @@ def test_numbers_are_taken_for_a_byte_string_and_nothing_else() -> None:
             ours.build("data", v=wrong)
 
 
+@pytest.mark.parametrize("value", [None, 1.5])
+def test_what_is_no_list_and_no_bytes_is_the_callers_fault(value: Any) -> None:
+    for part in (Array(this.k, Int8ub), Bytes(this.k), Bytes(2)):
+        with pytest.raises(UsageError, match="v"):
+            sensor(Struct("k" / Int8ub, "v" / part)).build("data", k=2, v=value)
+
+
+def test_a_name_that_is_an_array_in_one_branch_alone_has_no_raw_form_and_its_columns_do() -> None:
+    forms = {1: Struct("x" / Int8ub), 2: Array(2, Struct("y" / Int8ub))}
+    packets = sensor(Struct("k" / Int8ub, "v" / Switch(this.k, forms))).decode([b"\1\5", b"\2\6\7"])
+    np.testing.assert_array_equal(packets["v.x"], [5, np.nan])
+    np.testing.assert_array_equal(packets["v.y"], [[np.nan, np.nan], [6, 7]])
+    with pytest.raises(SpecError, match="v: a value, a struct or an array by turns"):
+        _ = packets.raw
+
+
 def test_an_element_without_a_field_has_no_number_in_its_unit() -> None:
     ours = sensor(Struct("v" / Array(3, Struct("n" / Int8ub, "x" / If(this.n == 1, Int8ub)))))
     packets = ours.decode([b"\0\1\5\0", b"\1\7\1\7\1\7", b"\0\0\0"])
@@ -148,7 +164,7 @@ def test_branches_that_no_column_can_hold_are_told() -> None:
         packets["v"]
     packets = sensor(Struct("k" / Int8ub, "w" / struct.w)).decode([b"\1\3", b"\2\6"])
     np.testing.assert_array_equal(packets["w.x"], [np.nan, 6])
-    with pytest.raises(SpecError, match="w: a value in one branch and a struct in another"):
+    with pytest.raises(SpecError, match="w: a value, a struct or an array by turns"):
         _ = packets.raw
 
 

@@ -42,7 +42,8 @@ def _axis(name: str, length: int, table: Table, *, known: bool) -> str | None:
 
 def physical(info: FieldInfo, table: Table) -> NDArray[np.float64]:
     """A field in its unit: float64, shape (n, *lengths); nan where a frame lacks the field."""
-    array = table.raw(info.path).astype(np.float64)
+    with np.errstate(invalid="ignore"):  # a signalling nan is a nan
+        array = table.raw(info.path).astype(np.float64)
     if info.scaled:
         array *= info.scale
         array += info.offset

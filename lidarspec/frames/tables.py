@@ -85,7 +85,8 @@ class Rows:
             return None
         there = np.zeros(len(self), np.bool_)
         for group in self.groups:
-            there[group.where] = path in group.layout.leaves
+            is_empty = any(group.layout.lengths.get(axis) == 0 for axis in self.schema.fields[path].axes)
+            there[group.where] = is_empty or path in group.layout.leaves
         return there
 
     def counts(self, axis: str) -> NDArray[np.intp]:
