@@ -22,6 +22,8 @@ SENSORS: dict[str, tuple[str, int, str | None]] = {
     "vlp16": ("velodyne-vlp16", 2000, None),
     "xt32": ("hesai-xt32", 3000, None),
     "rplidar": ("slamtec-rplidar-a1", 100_000, "node"),
+    "m1-long": ("robosense-m1", 63_000, None),
+    "vlp16-long": ("velodyne-vlp16", 20_000, None),
 }
 QUICKER = 50  # times fewer frames in a quick run
 NOISE = 0.02  # share of the frames that is damaged, and share of noise among the bytes

@@ -44,7 +44,7 @@ def from_capture(inputs: Inputs, key: str, title: str, more: Others | None = Non
         points,
         path.stat().st_size,
         lambda backend: lambda: scans(backend),
-        {**beside_construct(inputs, key), **(more or {})},
+        {**beside_construct(inputs, key.removesuffix("-long")), **(more or {})},
         lambda backend: {"in memory": Contender(points_of(sensor, rows, backend), points)},
         facts,
     )
@@ -60,6 +60,14 @@ def m1_pcap(inputs: Inputs) -> Work:
 def vlp16_pcap(inputs: Inputs) -> Work:
     path, points = inputs.capture("vlp16"), 384 * len(inputs.frames("vlp16"))
     return from_capture(inputs, "vlp16", "VLP-16 capture to scans", {"velodyne-decoder": lambda: libraries.velodyne_pcap(path, points)})
+
+
+def m1_long(inputs: Inputs) -> Work:
+    return from_capture(inputs, "m1-long", "RS-LiDAR-M1 capture of 10 s to scans")
+
+
+def vlp16_long(inputs: Inputs) -> Work:
+    return from_capture(inputs, "vlp16-long", "VLP-16 capture of 26 s to scans")
 
 
 def payloads(inputs: Inputs) -> Work:
@@ -165,7 +173,9 @@ def importing(inputs: Inputs) -> Work:
 
 ELSEWHERE: Mapping[str, Callable[[Inputs], Work]] = {
     "m1-pcap": m1_pcap,
+    "m1-long": m1_long,
     "vlp16-pcap": vlp16_pcap,
+    "vlp16-long": vlp16_long,
     "pcap": payloads,
     "live": live,
     "parse-stl27l": lambda inputs: parse(inputs, "stl27l", "parse one STL-27L frame"),
