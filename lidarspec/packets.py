@@ -26,7 +26,7 @@ Numbers = NDArray[np.int64] | range
 
 
 class Packets:
-    """n frames of one type.
+    """n frames of one type. Their arrays are to be read only: some share memory.
 
     Attributes:
         sensor, frame: whose, and of which type.
