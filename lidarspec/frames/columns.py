@@ -9,7 +9,7 @@ batch it comes from: where packets were lost, how long variable arrays are, and 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -99,7 +99,7 @@ class Column(NDArrayOperatorsMixin):
     def applied(self, function: Callable[..., Any], *values: Any) -> Column:
         """`function` of arrays, lined up by axes; columns on the left, arrays by their last axes as in NumPy."""
         arrays, axes, ready = aligned(values, self.batch)
-        found = np.asarray(remainder(*arrays) if function is np.remainder else function(*arrays))
+        found = called(function, arrays)
         names = (*axes, *(f"<{index}>" for index in range(len(axes), found.ndim - 1)))
         return Column(found, names, self.batch, ready=ready)
 
@@ -238,9 +238,14 @@ def _only_numbers_beside(values: tuple[Any, ...]) -> bool:
     return all(isinstance(value, Column | int | float) for value in values)
 
 
-def remainder(values: NDArray[Any], full: NDArray[Any]) -> NDArray[Any]:
+def called(function: Callable[..., Any], arrays: Sequence[Any]) -> NDArray[Any]:
+    """What a function makes of arrays that are lined up."""
+    return np.asarray(remainder(*arrays) if function is np.remainder else function(*arrays))
+
+
+def remainder(values: Any, full: Any) -> NDArray[Any]:
     """``np.remainder``, bit by bit; a quarter of the time for what is a turn away at most, as nearly all angles are."""
-    if full.ndim or not full > 0 or values.dtype != np.float64:
+    if np.ndim(full) or not full > 0 or np.ndim(values) == 0 or values.dtype != np.float64:
         return np.asarray(np.remainder(values, full))
     turns = np.subtract(values < 0, values >= full, dtype=np.int8)
     found: NDArray[np.float64] = values + full * turns

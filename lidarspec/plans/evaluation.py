@@ -19,7 +19,7 @@ from lidarspec.allocation import is_counted, keep_freed_memory
 from lidarspec.clouds import LazyCloud, PointCloud
 from lidarspec.errors import SpecError
 from lidarspec.frames.access import Fields, field_array
-from lidarspec.frames.columns import Batch, Carry, Column
+from lidarspec.frames.columns import Batch, Carry, Column, called
 from lidarspec.frames.tables import Group, Rows
 from lidarspec.frames.tracing import Node
 from lidarspec.packets import Packets, install_points
@@ -77,7 +77,7 @@ class Values:
             found = field_array(self._table.schema.fields[node.path], self._table, self._table.schema.depth())
         else:
             args = [value if arg is None else _deeper(self._array(arg), value) for arg, value in node.operands]
-            found = np.asarray(node.function(*args))
+            found = called(node.function, args)
         self._arrays[node.path or node] = found
         return found
 
