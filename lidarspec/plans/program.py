@@ -47,6 +47,7 @@ class Program:
         self.low: list[Node] = []
         self._tables, self._known = tables, dict[Any, int]()
         self._blocks: list[Blocks] = []
+        self._shifts: dict[tuple[str, Window], tuple[int, int] | None] = {}
         self._sums = Sums(self)
         self._tiles: dict[int, NDArray[Any]] = {}
 
@@ -98,22 +99,36 @@ class Program:
         seen = window(leaf)
         if seen is None:
             return None
+        shift = self._shift(leaf, seen)
         if node is source and factor == 1 and not leaf.info.scaled:
-            shift = None if leaf.wire is not None else shift_of(leaf, seen)
             if shift is not None:
                 return self._shifted(leaf, seen, *shift, kind)
             if leaf.wire is not None:
                 return self._load(leaf, seen, leaf.wire, kind)
         index = self.once(("index", seen), lambda: self._load(leaf, seen, seen.dtype, "index"))
+        if shift is not None and seen.size > 1:  # a smaller table stays nearer
+            whole = Read(index)
+            index = self.once(("index", seen, shift), lambda: self._cut(leaf, seen, *shift, whole))
         table = self._table(node, leaf, seen, kind, factor)
-        text = f"{node.path or source.path}: table of {len(table)} by {8 * seen.size} bits"
+        text = f"{node.path or source.path}: table of {len(table)} by {(len(table) - 1).bit_length()} bits"
         read = Read(index)
         return self.step(text, kind, lambda run, out: table.take(read(run), out=out, mode="wrap"), read)
 
+    def _shift(self, leaf: Leaf, seen: Window) -> tuple[int, int] | None:
+        """How a field that shares its window with others is cut out of it; see `shift_of`."""
+        if leaf.wire is not None:
+            return None
+        if (leaf.info.path, seen) not in self._shifts:
+            self._shifts[leaf.info.path, seen] = shift_of(leaf, seen)
+        return self._shifts[leaf.info.path, seen]
+
     def _table(self, node: Node, leaf: Leaf, seen: Window, kind: str, factor: float) -> NDArray[Any]:
-        name = (kind, seen.offset - leaf.offset, seen.size, leaf.size, factor, key(node))
+        shift = self._shift(leaf, seen)
+        name = (kind, seen.offset - leaf.offset, seen.size, leaf.size, shift, factor, key(node))
         if name not in self._tables:
             values = np.asarray(every_value(node, leaf))
+            if shift is not None and seen.size > 1:
+                values = values[np.arange(shift[1] + 1) << shift[0]]
             self._tables[name] = np.ascontiguousarray(values if factor == 1 else values * factor, TYPES[kind])
         return self._tables[name]
 
@@ -131,17 +146,20 @@ class Program:
     def _shifted(self, leaf: Leaf, seen: Window, shift: int, mask: int, kind: str) -> int:
         """A register with some bits of a window of every element."""
         words = f"u{seen.size}"
-        word, bits = self.once((words, seen), lambda: self._load(leaf, seen, seen.dtype, words)), self.register(words)
-        read = Read(word)
+        word = Read(self.once((words, seen), lambda: self._load(leaf, seen, seen.dtype, words)))
+        read = Read(self._cut(leaf, seen, shift, mask, word))
+        return self.step(f"{leaf.info.path} as it stands", kind, lambda run, out: np.copyto(out, read(run), casting="unsafe"), read)
+
+    def _cut(self, leaf: Leaf, seen: Window, shift: int, mask: int, word: Read) -> int:
+        """A register of the same kind with some bits of the words of another."""
+        is_masked = mask < (1 << 8 * seen.size) - 1 >> shift
 
         def run(execution: Run, out: NDArray[Any]) -> None:
-            part = execution.views[bits]
-            np.right_shift(read(execution), shift, out=part)
-            if mask << shift < (1 << 8 * seen.size) - (1 << shift):
-                np.bitwise_and(part, mask, out=part)
-            np.copyto(out, part, casting="unsafe")
+            np.right_shift(word(execution), shift, out=out)
+            if is_masked:
+                np.bitwise_and(out, mask, out=out)
 
-        return self.step(f"{leaf.info.path}: {mask.bit_length()} bits from bit {shift} on", kind, run, read, Read(bits))
+        return self.step(f"{leaf.info.path}: {mask.bit_length()} bits from bit {shift} on", self.kinds[word.register], run, word)
 
     def _of(self, leaf: Leaf, seen: Window) -> Blocks:
         for blocks in self._blocks:
