@@ -73,6 +73,7 @@ class Maker:
             lambda f: np.arctan(full(f) * 0.01) * 20,
             lambda f: np.where(low(f) > 180, full(f) * 0.1, number),
             lambda f: np.where(low(f) > 90, 0, np.sqrt(full(f))),
+            lambda f: np.where(low(f) > 270, np.nan, full(f)),
             lambda f: np.where(full(f) > 30, low(f), number),
             lambda f: take(row, full(f)),
             lambda f: np.clip(full(f), 1, 40) * 3 - low(f),
