@@ -170,6 +170,7 @@ class LiveInput:
         if command.link not in self._captures and (data.peer() or has_control(self._source)):
             return
         limit = time.monotonic() + (command.timeout * (1 + command.retries) if timeout is None else timeout)
+        # only a transport that answers to whoever sent last has to say so
         while not getattr(data, "addressed", True) and self._failure is None and time.monotonic() < limit:
             self._help()
 

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from lidarspec.frames.layout import Leaf
 from lidarspec.frames.tracing import Node
-from lidarspec.plans.expressions import only_field
-from lidarspec.plans.windows import every_value, raw_values, window
+from lidarspec.plans.windows import possible, raw_values, window
 
 #: how a kernel writes NumPy's functions of numbers; what is not here is computed by NumPy itself.
 TEMPLATES: dict[Any, str] = {
@@ -80,10 +79,9 @@ def is_number(value: Any, leaves: Any) -> bool:
         return value.path in leaves and leaves[value.path].info.kind != "float"
     if value.kind != "call":
         return False
-    source = only_field(value)
-    if source is not None and source.path in leaves and window(leaves[source.path]) is not None:
-        found = every_value(value, leaves[source.path])
-        return found is not None and bool(np.isfinite(found).all())
+    found = possible(value, leaves)
+    if found is not None:
+        return bool(np.isfinite(found).all())
     if value.function in _DIVISIONS:
         divisor = value.args[1]
         return not isinstance(divisor, Node) and bool(np.all(divisor)) and is_number(value.args[0], leaves)

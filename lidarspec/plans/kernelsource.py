@@ -18,7 +18,7 @@ from lidarspec.frames.tracing import Node
 from lidarspec.plans.expressions import is_full, only_field
 from lidarspec.plans.kernelparts import TEMPLATES, is_cheap, line
 from lidarspec.plans.kernelwriter import Value, Writer
-from lidarspec.plans.windows import every_value, window
+from lidarspec.plans.windows import every_value, possible, window
 
 #: points of which the scratch arrays stay in the fastest cache.
 CHUNK = 2048
@@ -208,8 +208,7 @@ class Expressions(Writer):
 
     def _small_angle(self, node: Node, source: Node, factor: float) -> Value | None:
         """An angle by one field: a table in float32 where that is exact enough."""
-        leaf = self.layout.leaves.get(source.path)
-        values = every_value(node, leaf) if leaf is not None else None
+        values = possible(node, self.layout.leaves)
         if values is None:
             return None
         with np.errstate(all="ignore"):

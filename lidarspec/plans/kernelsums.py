@@ -63,6 +63,7 @@ class _Shares:
     Attributes:
         words: where eight bytes are loaded at a time.
         tables: of each of these bytes, its share by its value; 0 for those that are not covered, or were before.
+        is_plain: whether all shares are the bytes as they stand, in the low byte of the checksum or the high one.
         lows, highs: where shares are the bytes themselves, which of them go into the low byte of the checksum, and the high one.
     """
 

@@ -25,7 +25,7 @@ from lidarspec.plans.kernelparts import is_number
 from lidarspec.plans.kernels import Kernel, available
 from lidarspec.plans.kerneltext import written
 from lidarspec.plans.program import Program
-from lidarspec.plans.windows import every_value
+from lidarspec.plans.windows import possible
 from lidarspec.points import columns_of
 
 PointsFunction = Callable[[Any], Any]
@@ -191,9 +191,7 @@ class Plan:
         options = chosen(node, self.width)
         if options is not None:
             return all(self._finite(option) if isinstance(option, Node) else bool(np.isfinite(option)) for option in options[1:])
-        source = only_field(node)
-        leaf = self.layout.leaves.get(source.path) if source is not None else None
-        values = every_value(node, leaf) if leaf is not None else None
+        values = possible(node, self.layout.leaves)
         return values is not None and bool(np.isfinite(values).all())
 
 

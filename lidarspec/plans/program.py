@@ -1,7 +1,7 @@
 """A traced expression as a list of NumPy calls on a chunk of packets, with scratch arrays that are used again and again.
 
-What depends on one field of two bytes or less is a table by its raw value; sums are one matrix product; sines and
-cosines are taken in float32 of angles that were reduced to half a turn in float64. The rest is ordinary NumPy.
+What depends on one field of two bytes or less is a table by its raw value, or its bits as they stand; sums, sines and cosines
+are matrix products where they can be (`sums`). The rest is ordinary NumPy.
 """
 
 from __future__ import annotations
@@ -43,7 +43,6 @@ class Program:
         self.steps: list[Step] = []
         self.kinds: list[str] = []
         self.outputs: dict[str, int] = {}
-        self.risky = False  # whether directions may be nan though ranges are not
         self.low: list[Node] = []
         self._tables, self._known = tables, dict[Any, int]()
         self._blocks: list[Blocks] = []

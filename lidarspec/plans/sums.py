@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.frames.tracing import Node
-from lidarspec.plans.expressions import Term, chosen, only_field, split_level, terms
+from lidarspec.plans.expressions import Term, chosen, split_level, terms
 from lidarspec.plans.products import TURN, Angles, Product, multiplied, reduced
 from lidarspec.plans.registers import Number, Read, Run, deep
 from lidarspec.plans.rotations import Rotation, Turns
-from lidarspec.plans.windows import every_value
+from lidarspec.plans.windows import possible
 
 if TYPE_CHECKING:
     from lidarspec.plans.program import Program
@@ -196,9 +196,7 @@ class Sums:
         """All values that an expression of one field can have."""
         if not isinstance(value, Node):
             return np.array([value])
-        source = only_field(value)
-        leaf = self._program.layout.leaves.get(source.path) if source is not None else None
-        values = every_value(value, leaf) if leaf is not None else None
+        values = possible(value, self._program.layout.leaves)
         return np.array([np.inf]) if values is None else values
 
 

@@ -6,6 +6,7 @@ A window's raw value indexes a table, so byte order, bits and scale cost nothing
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 
 from lidarspec.frames.layout import Bytes2D, Leaf, elements
 from lidarspec.frames.tracing import Node
+from lidarspec.plans.expressions import only_field
 
 
 @dataclass(frozen=True)
@@ -69,6 +71,13 @@ def every_value(node: Node, leaf: Leaf) -> NDArray[Any] | None:
     physical = raw * leaf.info.scale + leaf.info.offset if leaf.info.scaled else raw
     with np.errstate(all="ignore"):
         return np.broadcast_to(_evaluated(node, physical), raw.shape)
+
+
+def possible(node: Node, leaves: Mapping[str, Leaf]) -> NDArray[Any] | None:
+    """All values that an expression can have, whatever the bytes are; None where it is not of one field, or nobody knows."""
+    source = only_field(node)
+    leaf = leaves.get(source.path) if source is not None else None
+    return every_value(node, leaf) if leaf is not None else None
 
 
 def _evaluated(node: Node, values: NDArray[np.float64]) -> Any:
