@@ -110,9 +110,9 @@ class Rows:
         raise IndexError(index)
 
     def take(self, which: NDArray[np.intp]) -> Rows:
-        if len(self.groups) == 1 and len(which) and which[-1] - which[0] == len(which) - 1 and _ascends(which):
+        if len(self.groups) == 1 and len(which) and which[-1] - which[0] == len(which) - 1 and ascends(which):
             only = self.groups[0]
-            if _ascends(only.where):
+            if ascends(only.where):
                 return Rows(self.schema, [Group(only.layout, counted(len(which)), only.rows[which[0] : which[-1] + 1])])
         place = np.full(len(self), -1, np.intp)
         place[which] = np.arange(len(which))
@@ -127,7 +127,7 @@ class Rows:
     def joined(tables: Sequence[Rows]) -> Rows:
         """Several tables of one frame type, one after another."""
         alone = [table.groups[0] for table in tables if len(table.groups) == 1]
-        if len(alone) == len(tables) and len({id(group.layout) for group in alone}) == 1 and all(_ascends(group.where) for group in alone):
+        if len(alone) == len(tables) and len({id(group.layout) for group in alone}) == 1 and all(ascends(group.where) for group in alone):
             rows = _stacked([group.rows for group in alone])
             return Rows(tables[0].schema, [Group(alone[0].layout, counted(len(rows)), rows)])
         found: dict[int, list[Group]] = {}
@@ -162,10 +162,11 @@ def _address(array: NDArray[Any]) -> int:
 
 def _order(where: NDArray[np.intp]) -> NDArray[np.intp] | slice:
     """What puts the rows of the only group into stream order: nothing, where they are in it."""
-    return slice(None) if _ascends(where) else np.argsort(where)
+    return slice(None) if ascends(where) else np.argsort(where)
 
 
-def _ascends(where: NDArray[np.intp]) -> bool:
+def ascends(where: NDArray[np.intp]) -> bool:
+    """Whether frames stand in the table in the order of their rows."""
     return is_counted(where) or bool(np.count_nonzero(where[1:] > where[:-1]) == max(len(where) - 1, 0))
 
 

@@ -15,12 +15,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.allocation import is_counted, keep_freed_memory
+from lidarspec.allocation import keep_freed_memory
 from lidarspec.clouds import LazyCloud, PointCloud
 from lidarspec.errors import SpecError
 from lidarspec.frames.access import Fields, field_array
 from lidarspec.frames.columns import Batch, Carry, Column, called
-from lidarspec.frames.tables import Group, Rows
+from lidarspec.frames.tables import Group, Rows, ascends
 from lidarspec.frames.tracing import Node
 from lidarspec.packets import Packets, install_points
 from lidarspec.plans.kernels import Kernel
@@ -183,7 +183,7 @@ def _planned(packets: Packets, carry: Carry | None, *, final: bool, epoch: int |
     known: list[Plan] = [plan for plan in plans if isinstance(plan, Plan)]
     first, fields = Values(known[0], batch), Fields(batch)
     try:
-        simple = alone and len(known) == 1 and _in_order(table.groups[0].where)
+        simple = alone and len(known) == 1 and ascends(table.groups[0].where)
         remembering = _remembered(known[0], first, ("state",) if simple else ("shift", "latest", "state"))
         shares = [_share(packets, batch, plan, group, first, remembering) for plan, group in zip(known, table.groups, strict=True)]
     except (SpecError, ValueError):
@@ -205,7 +205,7 @@ def _remembered(plan: Plan, values: Values, kinds: tuple[str, ...]) -> dict[int,
 def _share(packets: Packets, batch: Batch, plan: Plan, group: Group, whole: Values, remembered: dict[int, Column]) -> Share | None:
     """A group with its plain results; None where the plan was made for other counts, or a factor is not positive."""
     values = whole
-    if len(group.where) != len(packets) or not _in_order(group.where):
+    if len(group.where) != len(packets) or not ascends(group.where):
         batch = _picked(batch, group)
         values = Values(plan, batch)
         for number, column in remembered.items():
@@ -225,7 +225,7 @@ def _share(packets: Packets, batch: Batch, plan: Plan, group: Group, whole: Valu
 
 def _laid_out(packets: Packets, shares: list[Share], batch: Batch, ready: int, base: int) -> tuple[LazyCloud, tuple[str | None, ...]]:
     """The cloud of the first `ready` packets, and the axes of its points."""
-    one = len(shares) == 1 and _in_order(shares[0].group.where)
+    one = len(shares) == 1 and ascends(shares[0].group.where)
     plan = shares[0].plan
     size = ready * plan.width
     if not one:
@@ -257,10 +257,6 @@ def _counts(shares: list[Share], number: int) -> NDArray[Any]:
         corner: Any = (share.group.where, *(slice(0, length) for length in share.plan.shape))
         found[corner] = 1
     return found
-
-
-def _in_order(where: NDArray[np.intp]) -> bool:
-    return is_counted(where) or bool((where[1:] > where[:-1]).all())
 
 
 def guarded(packets: Packets, carry: Carry | None = None, *, final: bool, epoch: int) -> Evaluated | None:
