@@ -8,6 +8,7 @@ import re
 import socket
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -264,11 +265,15 @@ def test_a_destination_that_cannot_carry_the_sensor_is_refused(tmp_path: Path) -
 
 @posix
 def test_what_goes_wrong_in_the_thread_of_a_port_is_raised_at_its_end() -> None:
+    tried = threading.Event()
+
     class Broken(SimulatedDevice):
         def sendings(self, now: int) -> list[tuple[str, str, bytes]]:
+            tried.set()
             raise ZeroDivisionError
 
     port = Served(Broken(STL, faults=Faults()), door(STL, "pty"))
+    assert tried.wait(10)
     with pytest.raises(ZeroDivisionError):
         port.close()
 
