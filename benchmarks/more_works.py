@@ -20,7 +20,7 @@ from works import FEW, Facts, Others, Work, beside_construct, columns, points_of
 import lidarspec as ls
 from lidarspec.captures.bulk import CaptureBatches
 from lidarspec.captures.pcap import CaptureReader
-from lidarspec.streams import PacketStream
+from lidarspec.packets.stream import PacketStream
 
 RATE = 6300  # packets per second of an RS-LiDAR-M1
 TOGETHER = 63  # of them in 10 ms

@@ -24,7 +24,7 @@ from report import shown
 from works import ON_BYTES, Work
 
 import lidarspec as ls
-from lidarspec.decoder import BACKENDS
+from lidarspec.framing.decoder import BACKENDS
 
 WORKS = {**ON_BYTES, **ELSEWHERE, **ON_LINES}
 LEAST_RUNS = 5

@@ -16,8 +16,8 @@ from measure import Contender, Rates, times
 from peers import construct_on
 
 import lidarspec as ls
-from lidarspec.packets import Packets
-from lidarspec.points import evaluate
+from lidarspec.packets.packets import Packets
+from lidarspec.points.plain import evaluate
 from lidarspec.simulation.simulator import opening
 
 Others = dict[str, Callable[[], Contender]]

@@ -11,8 +11,8 @@ import sys
 from pathlib import Path
 
 import lidarspec as ls
-from lidarspec.export import export, narrowed
-from lidarspec.export.reference import page
+from lidarspec.exports import export, narrowed
+from lidarspec.exports.reference import page
 
 HERE = Path(__file__).parent / "reference" / "sensors"
 

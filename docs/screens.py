@@ -23,11 +23,10 @@ from numpy.typing import NDArray
 
 import lidarspec as ls
 from lidarspec.simulation.faults import Faults
-from lidarspec.testing.ports import virtual_port
-from lidarspec.view.canvas import BLANK, Cells
+from lidarspec.testing.fixtures import virtual_port
+from lidarspec.view.canvas import BLANK, INKS, Cells
 from lidarspec.view.feed import Feed
 from lidarspec.view.live import Window
-from lidarspec.view.palette import INKS
 
 HERE = Path(__file__).parent / "how-to" / "screens"
 #: pixels of a cell, of the margin, and of a dot.

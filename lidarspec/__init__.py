@@ -14,32 +14,14 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from lidarspec import abilities
 from lidarspec._version import __version__ as __version__
+from lidarspec.spec import description as abilities
 
 if TYPE_CHECKING:
-    from lidarspec.angles import (
-        following as following,
-        last as last,
-        previous as previous,
-        spread as spread,
-        stack as stack,
-        take as take,
-        wrap as wrap,
-    )
-    from lidarspec.async_device import AsyncDevice as AsyncDevice, open_async as open_async
-    from lidarspec.checksums import (
-        Checksum as Checksum,
-        Crc as Crc,
-        Fold15 as Fold15,
-        Sum as Sum,
-        WordXor as WordXor,
-        Xor as Xor,
-        ZeroPadded as ZeroPadded,
-    )
-    from lidarspec.clouds import PointCloud as PointCloud
-    from lidarspec.decoder import Counters as Counters, Decoder as Decoder, Found as Found
-    from lidarspec.device import Device as Device, open as open
+    from lidarspec.columns.columns import Column as Column, Fields as Fields
+    from lidarspec.device.async_device import AsyncDevice as AsyncDevice, open_async as open_async
+    from lidarspec.device.device import Device as Device, open as open
+    from lidarspec.device.session import Reply as Reply, Session as Session
     from lidarspec.errors import (
         CommandError as CommandError,
         LidarSpecError as LidarSpecError,
@@ -57,20 +39,25 @@ if TYPE_CHECKING:
         UsageError as UsageError,
         WireError as WireError,
     )
-    from lidarspec.fields import Checksummed as Checksummed, Scaled as Scaled
-    from lidarspec.files import Chunk as Chunk, Format as Format, Transport as Transport
-    from lidarspec.frames.access import Fields as Fields
-    from lidarspec.frames.columns import Column as Column
-    from lidarspec.geometry import Cartesian as Cartesian, Points as Points, Polar as Polar
-    from lidarspec.hookspecs import hookimpl as hookimpl
-    from lidarspec.links import Serial as Serial, Tcp as Tcp, Udp as Udp
-    from lidarspec.packets import Packets as Packets
-    from lidarspec.plugins import sensor as sensor, sensors as sensors
-    from lidarspec.replies import Reply as Reply
-    from lidarspec.scans import LaserScan as LaserScan, Scan as Scan
-    from lidarspec.session import Session as Session
-    from lidarspec.spec import Command as Command, Frame as Frame, Sensor as Sensor
-    from lidarspec.splits import (
+    from lidarspec.framing.decoder import Counters as Counters, Decoder as Decoder, Found as Found
+    from lidarspec.packets.packets import Packets as Packets
+    from lidarspec.plugins import hookimpl as hookimpl, sensor as sensor, sensors as sensors
+    from lidarspec.points.cloud import PointCloud as PointCloud
+    from lidarspec.scans.scans import LaserScan as LaserScan, Scan as Scan
+    from lidarspec.spec.checksums import (
+        Checksum as Checksum,
+        Crc as Crc,
+        Fold15 as Fold15,
+        Sum as Sum,
+        WordXor as WordXor,
+        Xor as Xor,
+        ZeroPadded as ZeroPadded,
+    )
+    from lidarspec.spec.description import Command as Command, Frame as Frame, Sensor as Sensor
+    from lidarspec.spec.fields import Checksummed as Checksummed, Scaled as Scaled
+    from lidarspec.spec.links import Serial as Serial, Tcp as Tcp, Udp as Udp
+    from lidarspec.spec.results import Cartesian as Cartesian, Points as Points, Polar as Polar
+    from lidarspec.spec.timing import (
         Clock as Clock,
         Every as Every,
         OnChange as OnChange,
@@ -79,32 +66,36 @@ if TYPE_CHECKING:
         OnWrap as OnWrap,
         Sequence as Sequence,
     )
+    from lidarspec.spec.vocabulary import (
+        following as following,
+        last as last,
+        previous as previous,
+        spread as spread,
+        stack as stack,
+        take as take,
+        wrap as wrap,
+    )
+    from lidarspec.transports.protocol import Chunk as Chunk, Format as Format, Transport as Transport
 
 
-_HOMES = {
-    # what a sensor is
-    "spec": ("Sensor", "Frame", "Command"),
-    "links": ("Serial", "Udp", "Tcp"),
-    "splits": ("Clock", "Sequence", "OnWrap", "OnFlag", "OnChange", "OnRewind", "Every"),
-    "fields": ("Scaled", "Checksummed"),
-    "checksums": ("Checksum", "Crc", "Xor", "Sum", "WordXor", "Fold15", "ZeroPadded"),
-    "geometry": ("Points", "Polar", "Cartesian"),
-    "frames.access": ("Fields",),
-    "frames.columns": ("Column",),
-    "angles": ("spread", "wrap", "following", "previous", "last", "stack", "take"),
-    "files": ("Format", "Transport", "Chunk"),
-    "hookspecs": ("hookimpl",),
-    # what can be done with it
-    "plugins": ("sensor", "sensors"),
-    "device": ("open", "Device"),
-    "async_device": ("open_async", "AsyncDevice"),
-    "decoder": ("Decoder", "Found", "Counters"),
-    "packets": ("Packets",),
-    "clouds": ("PointCloud",),
-    "scans": ("Scan", "LaserScan"),
-    "session": ("Session",),
-    "replies": ("Reply",),
-    # what can go wrong
+_HOMES: dict[str, tuple[str, ...]] = {
+    "spec.description": ("Sensor", "Frame", "Command"),
+    "spec.links": ("Serial", "Udp", "Tcp"),
+    "spec.timing": ("Clock", "Sequence", "OnWrap", "OnFlag", "OnChange", "OnRewind", "Every"),
+    "spec.fields": ("Scaled", "Checksummed"),
+    "spec.checksums": ("Checksum", "Crc", "Xor", "Sum", "WordXor", "Fold15", "ZeroPadded"),
+    "spec.results": ("Points", "Polar", "Cartesian"),
+    "columns.columns": ("Fields", "Column"),
+    "spec.vocabulary": ("spread", "wrap", "following", "previous", "last", "stack", "take"),
+    "transports.protocol": ("Format", "Transport", "Chunk"),
+    "plugins": ("hookimpl", "sensor", "sensors"),
+    "device.device": ("open", "Device"),
+    "device.async_device": ("open_async", "AsyncDevice"),
+    "framing.decoder": ("Decoder", "Found", "Counters"),
+    "packets.packets": ("Packets",),
+    "points.cloud": ("PointCloud",),
+    "scans.scans": ("Scan", "LaserScan"),
+    "device.session": ("Session", "Reply"),
     "errors": (
         "LidarSpecError",
         "SpecError",
@@ -127,7 +118,7 @@ _HOME = {name: module for module, names in _HOMES.items() for name in names}
 
 __all__ = list(_HOME)
 
-abilities.install(lambda: importlib.import_module("lidarspec.engine").StandardEngine())
+abilities.install(lambda: importlib.import_module("lidarspec.spec.sensor").StandardEngine())
 
 
 def __getattr__(name: str) -> Any:

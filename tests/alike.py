@@ -17,7 +17,7 @@ import pytest
 from construct import Construct
 
 from lidarspec import Every, Fields, Frame, Packets, Polar, Sensor, SpecError, Udp, WireError
-from lidarspec.frames.schema import schema
+from lidarspec.wire.schema import schema
 
 BACKENDS = ("auto", "construct")
 #: what puts every 16-bit number among the ranges that are returns.

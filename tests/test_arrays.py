@@ -16,16 +16,15 @@ from numpy.typing import NDArray
 
 import lidarspec
 from lidarspec import Frame, Sensor
-from lidarspec.allocation import repeated
-from lidarspec.clocks import Unwrapper, clock_ns
-from lidarspec.decoder import Counters, Spans
-from lidarspec.found import Alike
-from lidarspec.frames.access import Fields
-from lidarspec.frames.codecs import CompiledCodec, codec
-from lidarspec.frames.columns import Batch
-from lidarspec.frames.tables import Rows
-from lidarspec.packets import joined
-from lidarspec.streams import PacketStream
+from lidarspec.columns.columns import Batch, Fields
+from lidarspec.framing.decoder import Counters, Spans
+from lidarspec.framing.frame_engine import CompiledCodec, codec
+from lidarspec.framing.results import Alike
+from lidarspec.packets.clocks import Unwrapper, clock_ns
+from lidarspec.packets.packets import joined
+from lidarspec.packets.stream import PacketStream
+from lidarspec.wire.arrays import repeated
+from lidarspec.wire.frame_table import Rows
 from tests.shapes import SHAPES
 
 #: one of each family: relatives that share their frames are cut alike.

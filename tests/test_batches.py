@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 import lidarspec as ls
-from lidarspec.decoder import Counters
-from lidarspec.packets import Packets
-from lidarspec.scans import Scan, ScanStream
+from lidarspec.framing.decoder import Counters
+from lidarspec.packets.packets import Packets
+from lidarspec.packets.stream import PacketStream
+from lidarspec.scans.scans import Scan, ScanStream
 from lidarspec.simulation.simulator import simulate
-from lidarspec.streams import PacketStream
 from tests.shapes import SHAPES
 
 COLUMNS = ("time_ns", "host_ns", "index", "breaks", "offset")

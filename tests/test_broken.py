@@ -6,9 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from lidarspec.testing.checking import reports
+from lidarspec.testing.check import reports, target
 from lidarspec.testing.findings import Finding
-from lidarspec.testing.targets import target
 
 HERE = Path(__file__).resolve().parent / "broken"
 

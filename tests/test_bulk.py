@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 
 import lidarspec as ls
-from lidarspec.captures import windows
+from lidarspec.captures import bulk as windows
 from lidarspec.captures.bulk import Batch, CaptureBatches
 from lidarspec.captures.pcap import CaptureReader, Datagram
 from lidarspec.transports.files import CaptureTransport, open_file

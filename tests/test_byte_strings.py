@@ -29,8 +29,8 @@ from construct import (
 )
 
 from lidarspec import SpecError, UsageError, WireError
-from lidarspec.frames.codecs import CompiledCodec, InterpretedCodec, codec
-from lidarspec.testing.properties import PROPERTIES
+from lidarspec.framing.frame_engine import CompiledCodec, InterpretedCodec, codec
+from lidarspec.testing.conformance import PROPERTIES
 from lidarspec.testing.subject import Subject
 from tests.alike import BACKENDS, agree, sensor
 

@@ -10,12 +10,12 @@ import pytest
 
 import lidarspec
 from lidarspec import Checksum, Crc, Fold15, Sum, WordXor, Xor
-from lidarspec.catalogue import CRCS, name_of
-from lidarspec.searching.checksums import search
-from lidarspec.searching.polynomials import common_divisor, divisors, quotient, remainder, solve
-from lidarspec.searching.samples import Match, Place
-from lidarspec.searching.sums import Changed, WordSum
+from lidarspec.discovery.checksum_search import search
+from lidarspec.discovery.crc_search import common_divisor, divisors, quotient, remainder, solve
+from lidarspec.discovery.samples import Match, Place
+from lidarspec.discovery.sum_search import Changed, WordSum
 from lidarspec.simulation.simulator import simulate
+from lidarspec.spec.checksums import CRCS, name_of
 
 HEAD = b"\xaa\x55"
 

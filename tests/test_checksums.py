@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from lidarspec.checksums import Checksum, Crc, Fold15, Sum, WordXor, Xor, ZeroPadded
+from lidarspec.spec.checksums import Checksum, Crc, Fold15, Sum, WordXor, Xor, ZeroPadded
 
 VECTORS = Path(__file__).parents[2] / "shared" / "protocols" / "vectors_serial2d.json"
 

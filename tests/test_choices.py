@@ -25,9 +25,9 @@ from construct import (
 )
 
 from lidarspec import Scaled, SpecError
-from lidarspec.export.messages import messages
-from lidarspec.export.tree import Select, nodes
-from lidarspec.frames.codecs import CompiledCodec, codec
+from lidarspec.exports.messages import messages
+from lidarspec.exports.tree import Select, nodes
+from lidarspec.framing.frame_engine import CompiledCodec, codec
 from tests.alike import BACKENDS, agree, sensor
 
 KIND = Enum(Int8ub, idle=1, busy=2, lost=7)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import lidarspec
 from lidarspec import Sensor
-from lidarspec.frames.codecs import InterpretedCodec, codec
+from lidarspec.framing.frame_engine import InterpretedCodec, codec
 from lidarspec.testing import SensorConformance
 from tests.shapes import SHAPES
 

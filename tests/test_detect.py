@@ -12,12 +12,11 @@ import pytest
 
 import lidarspec as ls
 from lidarspec import CommandError, SourceError, UsageError, WireError
-from lidarspec.detection.detect import detected, scores, verdict, verdicts
-from lidarspec.detection.hearing import Heard, bauds, hear, udp_ports
-from lidarspec.detection.probing import probe, started_first
-from lidarspec.detection.structure import structure
+from lidarspec.discovery.detect import detected, scores, verdict, verdicts
+from lidarspec.discovery.listen import Heard, bauds, hear, probe, started_first, udp_ports
+from lidarspec.discovery.periods import structure
 from lidarspec.simulation.simulator import simulate
-from lidarspec.testing.ports import virtual_port
+from lidarspec.testing.fixtures import virtual_port
 from tests.lines import Port, paced, port, working
 from tests.sensors.evidence import capture
 

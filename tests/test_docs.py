@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 import lidarspec as ls
-from lidarspec import errors, hookspecs
+from lidarspec import errors, plugins as hookspecs
 from lidarspec.cli.root import VERBS
 from tests import pages
 from tests.pages import DOCS

@@ -12,14 +12,14 @@ import pytest
 
 import lidarspec as ls
 from lidarspec import Checksum, Crc, Fold15, Sum, UsageError, WireError, WordXor, Xor
-from lidarspec.drafts.candidates import candidates
-from lidarspec.drafts.draft import Draft, draft
-from lidarspec.frames.columns import aligned
-from lidarspec.scaffold import Names
-from lidarspec.searching.samples import Place
-from lidarspec.searching.sums import Changed
+from lidarspec.columns.columns import aligned
+from lidarspec.discovery.draft import Draft, draft
+from lidarspec.discovery.periods import candidates
+from lidarspec.discovery.samples import Place
+from lidarspec.discovery.scaffold import Names
+from lidarspec.discovery.sum_search import Changed
 from lidarspec.simulation.simulator import simulate
-from lidarspec.sources import transport
+from lidarspec.transports.open_url import transport
 from tests.cli.running import ran
 from tests.sensors.evidence import capture
 from tests.shapes import SHAPES

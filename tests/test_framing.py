@@ -8,11 +8,9 @@ import pytest
 
 import lidarspec
 from lidarspec import Sensor
-from lidarspec.testing import material
+from lidarspec.testing import subject as material
 from lidarspec.testing.comparisons import assert_backends_agree
-from lidarspec.testing.cutting import Books, decoded
-from lidarspec.testing.damage import damaged
-from lidarspec.testing.oracle import Oracle
+from lidarspec.testing.framing import Books, Oracle, damaged, decoded
 from tests.shapes import SHAPES
 
 EVERY = {**lidarspec.sensors(), **SHAPES}

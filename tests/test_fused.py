@@ -16,17 +16,17 @@ import pytest
 
 import lidarspec
 from lidarspec import Checksum, Crc, Fields, Polar, UsageError, WordXor, Xor
-from lidarspec.frames.layout import Seal
-from lidarspec.frames.tables import Rows
-from lidarspec.links import is_datagram
-from lidarspec.packets import Packets
-from lidarspec.plans import kernelsums
-from lidarspec.plans.evaluation import evaluated
-from lidarspec.plans.plan import Plan, plan_for
-from lidarspec.points import evaluate, points_function
+from lidarspec.packets.packets import Packets
+from lidarspec.points.evaluate import evaluated
+from lidarspec.points.numba_kernels import checksums as kernelsums
+from lidarspec.points.plain import evaluate, points_function
+from lidarspec.points.plan import Plan, plan_for
 from lidarspec.simulation.simulator import opening, simulate
-from lidarspec.testing import material
+from lidarspec.spec.links import is_datagram
+from lidarspec.testing import subject as material
 from lidarspec.testing.comparisons import assert_same_points
+from lidarspec.wire.frame_table import Rows
+from lidarspec.wire.layout import Seal
 from tests.shapes import SHAPES
 
 pytest.importorskip("numba", reason="the fused back end needs Numba: pip install 'lidarspec[jit]'")
@@ -115,9 +115,9 @@ def test_it_is_chosen_by_itself_once_enough_points_were_made(compiled: bool, mon
     sensor = dataclasses.replace(SENSORS["ldrobot-stl27l"], points=functools.partial(points_of_another_kind))
     packets = sensor.decode(b"".join(frames_of("ldrobot-stl27l")))
     enough = 3 * 12 * len(packets)
-    monkeypatch.setattr("lidarspec.plans.plan.WARM", enough if compiled else 0)
-    monkeypatch.setattr("lidarspec.plans.plan.COLD", 10 * enough if compiled else enough)
-    monkeypatch.setattr("lidarspec.plans.kernels.compiled_before", lambda source: compiled)
+    monkeypatch.setattr("lidarspec.points.plan.WARM", enough if compiled else 0)
+    monkeypatch.setattr("lidarspec.points.plan.COLD", 10 * enough if compiled else enough)
+    monkeypatch.setattr("lidarspec.points.numba_kernels.kernels.compiled_before", lambda source: compiled)
     used = []
     for _ in range(4):
         cloud = packets.points()
@@ -150,7 +150,7 @@ def test_the_environment_names_the_default_and_nothing_else_imports_numba(cache:
 
 
 def test_kernels_are_kept_between_runs_and_done_without_where_they_cannot_be(tmp_path: Path) -> None:
-    code = DECODING + "from lidarspec.plans.kernels import function_of; print(function_of.cache_info().misses)"
+    code = DECODING + "from lidarspec.points.numba_kernels.kernels import function_of; print(function_of.cache_info().misses)"
     for _ in range(2):
         done = run(code, LIDARSPEC_BACKEND="jit", LIDARSPEC_CACHE=str(tmp_path / "kept"), NUMBA_DEBUG_CACHE="1")
         assert done.stdout.splitlines()[-2:] == ["True 36", "1"], done.stderr

@@ -12,7 +12,7 @@ from construct import Const, Int8ul, Struct
 import lidarspec
 from lidarspec import Checksummed, Frame, OnWrap, Polar, Sensor, Serial, SpecError, Sum, Xor, hookimpl
 from lidarspec.plugins import Registry
-from lidarspec.scans import scans_of
+from lidarspec.scans.scans import scans_of
 from tests.shapes import SHAPES
 from tests.test_plugins import STRANGER
 
@@ -133,7 +133,7 @@ def test_a_misspelt_hook_is_refused_by_name(registry: Registry) -> None:
 
 
 def test_every_hook_has_its_documentation() -> None:
-    from lidarspec import hookspecs
+    from lidarspec import plugins as hookspecs
 
     manager = pluggy.PluginManager(hookspecs.NAMESPACE)
     manager.add_hookspecs(hookspecs)

@@ -43,7 +43,7 @@ def test_finding_a_sensor_imports_neither_the_engine_nor_other_plugins() -> None
 
 
 def test_a_method_brings_the_engine() -> None:
-    assert "lidarspec.decoder" in loaded("ls.sensor('ldrobot-stl27l').decoder()")
+    assert "lidarspec.framing.decoder" in loaded("ls.sensor('ldrobot-stl27l').decoder()")
 
 
 def test_importing_the_package_imports_no_library() -> None:

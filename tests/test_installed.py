@@ -15,9 +15,8 @@ from typing import Any
 import pytest
 
 from lidarspec import Sensor, SpecError, UnknownSensor, hookimpl
-from lidarspec.installed import EntryPoint, entry_points
-from lidarspec.plugins import Registry
-from lidarspec.spec import replaced
+from lidarspec.plugins import EntryPoint, Registry, entry_points
+from lidarspec.spec.description import replaced
 from tests.shapes import SHAPES
 
 

@@ -11,13 +11,12 @@ from construct import Const, Int8ul, Int16ul, Struct
 from hypothesis import strategies as st
 
 from lidarspec import Checksummed, Frame, Sensor, Sum
-from lidarspec.spec import replaced
-from lidarspec.testing.checking import reports
+from lidarspec.spec.description import replaced
+from lidarspec.testing.check import Target, reports
 from lidarspec.testing.declared import declared
-from lidarspec.testing.edits import values_survive_building_and_parsing
 from lidarspec.testing.findings import Violation, left_over
+from lidarspec.testing.frames import values_survive_building_and_parsing
 from lidarspec.testing.subject import Subject
-from lidarspec.testing.targets import Target
 from lidarspec.testing.vectors import vectors_hold
 from tests.broken import sound
 
@@ -75,7 +74,7 @@ def test_the_plugin_loads_nothing_of_the_engine(tmp_path: Path) -> None:
     (tmp_path / "test_other.py").write_text(
         "import sys\n\ndef test_light():\n"
         "    assert 'lidarspec.testing.plugin' in sys.modules\n"
-        "    heavy = {'numpy', 'construct', 'hypothesis', 'lidarspec.spec', 'lidarspec.plugins'}\n"
+        "    heavy = {'numpy', 'construct', 'hypothesis', 'lidarspec.spec.description', 'lidarspec.plugins'}\n"
         "    assert not heavy & sys.modules.keys()\n",
         encoding="utf-8",
     )

@@ -12,9 +12,9 @@ import pytest
 
 import lidarspec
 from lidarspec import Sensor
-from lidarspec.frames.codecs import CompiledCodec, codec
-from lidarspec.testing import material
-from lidarspec.testing.growth import worst
+from lidarspec.framing.frame_engine import CompiledCodec, codec
+from lidarspec.testing import subject as material
+from lidarspec.testing.framing import worst
 from lidarspec.testing.subject import Subject
 from tests.shapes import SHAPES
 

@@ -7,10 +7,8 @@ import re
 import pytest
 
 import lidarspec as ls
-from lidarspec.explaining.differences import differences, told as told_differences
-from lidarspec.explaining.explain import explain
-from lidarspec.explaining.flips import Flip, flips
-from lidarspec.explaining.listing import folded, parents, text
+from lidarspec.explaining.explanation import Flip, explain, flips
+from lidarspec.explaining.listing import differences, folded, parents, text, told as told_differences
 from lidarspec.explaining.wording import Span, bit_picture
 from tests.cli.running import EXAMPLE, printed, process, ran
 from tests.shapes import SHAPES

@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 
 import lidarspec as ls
+from lidarspec.device.arrivals import fed
 from lidarspec.errors import SourceError, UsageError
-from lidarspec.files import Chunk
-from lidarspec.inputs.arrivals import fed
 from lidarspec.recording.recordings import Recording
+from lidarspec.transports.protocol import Chunk
 from tests.lines import SLACK, Port, free_port, paced, port, turning, udp, until, working
 from tests.shapes import SHAPES
 

@@ -11,14 +11,14 @@ import pytest
 
 import lidarspec
 from lidarspec import Fields, Polar, Sensor
-from lidarspec.frames.tables import Rows
-from lidarspec.links import is_datagram
-from lidarspec.packets import Packets
-from lidarspec.plans.evaluation import evaluated
-from lidarspec.plans.plan import Plan, plan_for
-from lidarspec.points import evaluate, points_function
-from lidarspec.testing import material
+from lidarspec.packets.packets import Packets
+from lidarspec.points.evaluate import evaluated
+from lidarspec.points.plain import evaluate, points_function
+from lidarspec.points.plan import Plan, plan_for
+from lidarspec.spec.links import is_datagram
+from lidarspec.testing import subject as material
 from lidarspec.testing.comparisons import assert_same_points
+from lidarspec.wire.frame_table import Rows
 from tests.shapes import SHAPES
 
 SENSORS = {**lidarspec.sensors(), **{name: sensor for name, sensor in SHAPES.items() if sensor.frames}}

@@ -14,12 +14,7 @@ import numpy as np
 import pytest
 
 import lidarspec
-from lidarspec import (
-    SourceError,
-    SpecError,
-    UnknownSensor,
-    UsageError,
-)
+from lidarspec import SourceError, SpecError, UnknownSensor, UsageError
 from lidarspec.testing import SensorConformance
 
 HERE = Path(__file__).resolve().parent / "shapes"

@@ -15,12 +15,12 @@ import numpy as np
 import pytest
 
 import lidarspec as ls
-from lidarspec.files import Chunk
+from lidarspec.device.capture_thread import BoundedQueue
 from lidarspec.formats import write
-from lidarspec.inputs.capture import BoundedQueue
-from lidarspec.scans import Scan
+from lidarspec.packets.stream import Unwrapper
+from lidarspec.scans.scans import Scan
 from lidarspec.simulation.simulator import simulate
-from lidarspec.streams import Unwrapper
+from lidarspec.transports.protocol import Chunk
 from tests.cli.running import ran
 from tests.lines import Port, port, turning
 from tests.shapes import SHAPES

@@ -12,12 +12,12 @@ import pytest
 
 import lidarspec
 from lidarspec import Fields, Polar, Sensor
-from lidarspec.angles import following, previous, spread, take, wrap
-from lidarspec.packets import Packets
-from lidarspec.plans.evaluation import evaluated
-from lidarspec.plans.plan import Plan, plan_for
-from lidarspec.points import evaluate, points_function
+from lidarspec.packets.packets import Packets
+from lidarspec.points.evaluate import evaluated
+from lidarspec.points.plain import evaluate, points_function
+from lidarspec.points.plan import Plan, plan_for
 from lidarspec.simulation.simulator import simulate
+from lidarspec.spec.vocabulary import following, previous, spread, take, wrap
 from lidarspec.testing.comparisons import assert_same_points
 
 Expression = Callable[[Fields], Any]

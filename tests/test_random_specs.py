@@ -13,7 +13,7 @@ import pytest
 from construct import Construct
 
 from lidarspec import Sensor, SpecError
-from lidarspec.frames.codecs import CompiledCodec, codec
+from lidarspec.framing.frame_engine import CompiledCodec, codec
 from tests.alike import BACKENDS, agree, clouds_agree, expected, sensor
 from tests.random_specs import made, spec
 

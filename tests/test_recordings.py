@@ -21,12 +21,11 @@ import pytest
 
 import lidarspec as ls
 from lidarspec.errors import SourceError, UsageError, WireError
-from lidarspec.files import Chunk
 from lidarspec.recording import appending
-from lidarspec.recording.header import read_header
-from lidarspec.recording.lsr import _HEAD, HEADER, packed
+from lidarspec.recording.format import _HEAD, HEADER, packed, read_header
 from lidarspec.recording.recordings import LARGEST, MAGIC, Record, Recorder, Recording
-from lidarspec.sources import transport
+from lidarspec.transports.open_url import transport
+from lidarspec.transports.protocol import Chunk
 from tests.sensors.evidence import capture
 
 STREAM, DATAGRAMS = "ldrobot-stl27l", "velodyne-hdl32e"
@@ -221,7 +220,7 @@ def test_several_threads_may_write(path: Path) -> None:
 
 WRITER = """
 import os, sys
-from lidarspec.files import Chunk
+from lidarspec.transports.protocol import Chunk
 from lidarspec.recording.recordings import Recorder
 
 recorder = Recorder(sys.argv[1])

@@ -18,12 +18,12 @@ import pytest
 
 import lidarspec as ls
 from lidarspec.errors import SourceError, UsageError
-from lidarspec.files import Chunk, Disconnected
 from lidarspec.recording.recorders import recorder
 from lidarspec.recording.recordings import Recorder
 from lidarspec.recording.replaying import Deadlines, Player, replayed
-from lidarspec.sources import transport
-from lidarspec.transports.players import FilePlayer, PtyPlayer, TcpPlayer, UdpPlayer, player
+from lidarspec.transports.open_url import transport
+from lidarspec.transports.outlets import FilePlayer, PtyPlayer, TcpPlayer, UdpPlayer, player
+from lidarspec.transports.protocol import Chunk, Disconnected
 from tests.lines import SLACK
 
 STREAM, DATAGRAMS = "ldrobot-stl27l", "velodyne-vlp16"

@@ -11,12 +11,12 @@ import pytest
 
 import lidarspec
 from lidarspec import Fields, Polar, Sensor
-from lidarspec.angles import spread
-from lidarspec.frames.columns import remainder
-from lidarspec.plans.evaluation import evaluated
-from lidarspec.plans.plan import Plan, plan_for
-from lidarspec.points import evaluate, points_function
+from lidarspec.columns.columns import remainder
+from lidarspec.points.evaluate import evaluated
+from lidarspec.points.plain import evaluate, points_function
+from lidarspec.points.plan import Plan, plan_for
 from lidarspec.simulation.simulator import simulate
+from lidarspec.spec.vocabulary import spread
 from lidarspec.testing.comparisons import assert_same_points
 
 STL27L = lidarspec.sensor("ldrobot-stl27l")

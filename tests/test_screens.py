@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from lidarspec.testing.ports import virtual_port
+from lidarspec.testing.fixtures import virtual_port
 from tests.cli.running import ran
 
 PAGES = Path(__file__).parents[1] / "docs" / "how-to"

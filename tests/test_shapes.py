@@ -11,7 +11,7 @@ from construct import Const, ConstructError, Int16ub, Int16ul, Rebuild, Struct, 
 
 from lidarspec import Checksummed, Frame, OutOfRange, PointCloud, Sensor, Sum, UsageError, Xor, spread, wrap
 from lidarspec.simulation.simulator import simulate
-from lidarspec.spec import replaced
+from lidarspec.spec.description import replaced
 from tests.shapes import SHAPES, calibration
 
 both = pytest.mark.parametrize("backend", ["auto", "construct"])

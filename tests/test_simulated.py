@@ -10,9 +10,9 @@ import pytest
 
 import lidarspec as ls
 from lidarspec import OutOfRange, Sensor, UsageError
+from lidarspec.simulation.device import SECOND, SimulatedDevice
 from lidarspec.simulation.faults import Faults, Line, faults_of
-from lidarspec.simulation.simulated import SECOND, SimulatedDevice
-from lidarspec.units import duration
+from lidarspec.spec.fields import duration
 
 MINI, STL, A1 = ls.sensor("cspc-m1c1-mini"), ls.sensor("ldrobot-stl27l"), ls.sensor("slamtec-rplidar-a1")
 MS = SECOND // 1000

@@ -18,11 +18,10 @@ import pytest
 import lidarspec as ls
 from lidarspec import SourceError, UsageError
 from lidarspec.errors import UnknownFormat
+from lidarspec.simulation.device import SimulatedDevice
 from lidarspec.simulation.faults import Faults
-from lidarspec.simulation.scenery import read_scene
-from lidarspec.simulation.scenes import Room
-from lidarspec.simulation.simulated import SimulatedDevice
-from lidarspec.testing.ports import virtual_port
+from lidarspec.simulation.scenes import Room, read_scene
+from lidarspec.testing.fixtures import virtual_port
 from lidarspec.transports.serving import Served, door, write_file
 from tests.lines import SLACK, free_port
 from tests.test_simulator import off

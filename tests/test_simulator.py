@@ -11,12 +11,11 @@ from numpy.typing import NDArray
 
 import lidarspec as ls
 from lidarspec import Cartesian, Frame, Polar, Sensor, SourceError, SpecError, UsageError
-from lidarspec.simulation.scenery import read_scene, scene_of
-from lidarspec.simulation.scenes import Box, Mover, Room, furnished
-from lidarspec.simulation.simulated import SECOND, SimulatedDevice
+from lidarspec.simulation.device import SECOND, SimulatedDevice
+from lidarspec.simulation.scenes import Box, Mover, Room, furnished, read_scene, scene_of
 from lidarspec.simulation.simulator import simulate, simulation
-from lidarspec.spec import replaced
-from lidarspec.testing.scene import off
+from lidarspec.spec.description import replaced
+from lidarspec.testing.geometry import off
 from tests.shapes import count, sized
 
 #: metres by which a point may be off its surface: half a step of the range, and float32.

@@ -11,12 +11,11 @@ from construct import Bytes, Const, Struct
 
 import lidarspec
 from lidarspec import Checksummed, Frame, Sensor, Xor
-from lidarspec.found import Alike
-from lidarspec.lanes import FEW, SHORT, registers
-from lidarspec.straight import SMALL
-from lidarspec.testing import material
-from lidarspec.testing.cutting import Books
-from lidarspec.testing.damage import damaged
+from lidarspec.framing.results import Alike
+from lidarspec.framing.steady import SMALL
+from lidarspec.spec.row_checksums import FEW, SHORT, registers
+from lidarspec.testing import subject as material
+from lidarspec.testing.framing import Books, damaged
 from tests.shapes import SHAPES
 
 TWINS = SHAPES["shape-twins"]

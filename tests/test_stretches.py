@@ -14,14 +14,14 @@ import pytest
 import lidarspec as ls
 from lidarspec import OnChange, OnWrap, Sensor
 from lidarspec.captures.pcap import Datagram, PcapWriter
-from lidarspec.clouds import COLUMNS, PointCloud
-from lidarspec.decoder import Decoder
-from lidarspec.frames.tables import Rows
-from lidarspec.packets import Packets
-from lidarspec.plans import stretches
-from lidarspec.scans import Scan, scans_of
+from lidarspec.framing.decoder import Decoder
+from lidarspec.packets.packets import Packets
+from lidarspec.packets.stream import PacketStream
+from lidarspec.points import lazy_columns as stretches
+from lidarspec.points.cloud import COLUMNS, PointCloud
+from lidarspec.scans.scans import Scan, scans_of
 from lidarspec.simulation.simulator import simulate
-from lidarspec.streams import PacketStream
+from lidarspec.wire.frame_table import Rows
 from tests.shapes import SHAPES
 
 BACKENDS = ["numpy", "jit"]

@@ -8,8 +8,8 @@ from collections.abc import Iterator
 import pytest
 
 from lidarspec.errors import SourceError, UsageError
-from lidarspec.files import Disconnected
-from lidarspec.sources import transport
+from lidarspec.transports.open_url import transport
+from lidarspec.transports.protocol import Disconnected
 from lidarspec.transports.tcp import TcpTransport
 from tests.lines import until
 

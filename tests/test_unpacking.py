@@ -28,11 +28,11 @@ from construct import (
 )
 
 import lidarspec as ls
-from lidarspec.construction import clean
-from lidarspec.frames import dispatch, unpacking
-from lidarspec.frames.codecs import CompiledCodec, codec
-from lidarspec.frames.layout import Layout
-from lidarspec.spec import Sensor
+from lidarspec.framing.frame_engine import CompiledCodec, codec
+from lidarspec.spec.construct_layer import clean
+from lidarspec.spec.description import Sensor
+from lidarspec.wire import single_frames as dispatch, single_frames as unpacking
+from lidarspec.wire.layout import Layout
 from tests.shapes import SHAPES
 
 EVERY = {**ls.sensors(), **SHAPES}

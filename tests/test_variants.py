@@ -11,7 +11,7 @@ from construct import Array, Const, Int8ul, Struct, this
 import lidarspec
 from lidarspec import Frame, Polar, Sensor, SpecError
 from lidarspec.simulation.simulator import simulate
-from lidarspec.spec import replaced
+from lidarspec.spec.description import replaced
 from tests.made_captures import frame, pcap
 from tests.shapes import headed, lengths
 

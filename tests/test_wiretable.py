@@ -8,9 +8,9 @@ import pytest
 from construct import Struct
 
 import lidarspec as ls
-from lidarspec.frames.codecs import CompiledCodec, codec
-from lidarspec.frames.layout import Layout
-from lidarspec.wiretable import INDICES, Extent, WireRow, frame_size, wire_table
+from lidarspec.framing.frame_engine import CompiledCodec, codec
+from lidarspec.wire.layout import Layout
+from lidarspec.wire.wire_table import INDICES, Extent, WireRow, frame_size, wire_table
 from tests.shapes import SHAPES
 
 SENSORS = {**ls.sensors(), **SHAPES}

@@ -1,4 +1,7 @@
-"""The verbs from file to file."""
+"""The verbs from file to file.
+
+`plot`: a scan as a picture in a file.
+"""
 
 from __future__ import annotations
 
@@ -12,16 +15,18 @@ import click
 
 from lidarspec.cli.failures import suggest
 from lidarspec.cli.inputs import Input, nearest, no_frame
-from lidarspec.cli.output import emit_json, note, sensor_option
-from lidarspec.cli.streams import scans_of
-from lidarspec.detection.detect import detected, scores
-from lidarspec.device import Device, open as open_device
+from lidarspec.cli.output import emit, emit_json, note, sensor_option
+from lidarspec.cli.streams import nothing_came, scans_of
+from lidarspec.device.device import Device, open as open_device
+from lidarspec.discovery.detect import detected, scores
 from lidarspec.errors import LidarSpecError, UsageError, WireError
 from lidarspec.formats import format_of, write
 from lidarspec.plugins import sensor as named_sensor
-from lidarspec.scans import Scan
-from lidarspec.sources import transport
-from lidarspec.spec import Sensor
+from lidarspec.scans.scans import Scan
+from lidarspec.spec.description import Sensor
+from lidarspec.transports.open_url import transport
+from lidarspec.view.polar import look
+from lidarspec.view.svg import svg
 
 #: datagrams and bytes looked at again to say why there is no data in a file.
 LOOKED_AT = 1 << 16
@@ -125,3 +130,33 @@ def _again(source: str) -> Input | None:
     finally:
         opened.close()
     return Input(source, tuple(chunks), opened.datagrams)
+
+
+@click.command()
+@click.argument("source", metavar="IN")
+@click.option("-o", "--output", metavar="FILE.svg", required=True, help="Where to; - is standard output.")
+@sensor_option
+@click.option("-n", "--number", type=click.IntRange(min=1), default=1, show_default=True, help="Which of the whole scans.")
+@click.option("--colour", "ramp", type=click.Choice(["range", "intensity"]), default="range", show_default=True, help="What colours show.")
+@click.option("--max-range", type=click.FloatRange(min=0, min_open=True), metavar="METRES", help="From the middle to the edge.")
+def plot(source: str, output: str, sensor_id: str | None, number: int, ramp: str, max_range: float | None) -> None:
+    """A scan as an SVG picture.
+
+    From above, and from the side where the points are not in one plane.
+    """
+    if output != "-" and Path(output).suffix.lower() != ".svg":
+        raise UsageError(f"{output}: pictures are written as .svg; browsers show them, Inkscape and rsvg-convert turn them into others")
+    with open_device(source, sensor_id) as device:
+        chosen: Scan | None = None
+        whole = 0
+        for scan in scans_of(device, source):
+            whole += scan.complete
+            chosen = scan if scan.complete or chosen is None or not chosen.complete else chosen
+            if whole == number:
+                break
+        if chosen is None:
+            raise nothing_came(device, source)
+        if whole < number:
+            note(f"{source} has {whole} whole scan{'s' * (whole != 1)}; drawn is the last piece of it that could be")
+        title = f"{device.sensor.id}: {chosen}"
+        emit(svg(chosen.points, look(chosen.points, ramp=ramp, reach=max_range), title), output)

@@ -11,12 +11,11 @@ from lidarspec.cli.failures import suggest
 from lidarspec.cli.inputs import Input, Piece, fitting, likely_starts, nearest, no_frame, pieces, read
 from lidarspec.cli.output import emit, emit_json, emit_lines, note, output_options, sensor_option, table
 from lidarspec.errors import UsageError, WireError
-from lidarspec.explaining.differences import differences, told as told_differences
-from lidarspec.explaining.explain import explain as explained
-from lidarspec.explaining.listing import LINED, Explanation, Line
+from lidarspec.explaining.explanation import explain as explained
+from lidarspec.explaining.listing import LINED, Explanation, Line, differences, told as told_differences
 from lidarspec.explaining.wording import Row, Span, number
 from lidarspec.plugins import sensor as named_sensor
-from lidarspec.spec import Sensor
+from lidarspec.spec.description import Sensor
 
 #: places in bytes between frames that are explained as damaged frames, at most.
 DAMAGED = 64

@@ -12,15 +12,15 @@ from shlex import quote
 import numpy as np
 
 from lidarspec.cli.failures import suggest
-from lidarspec.detection.detect import scores
+from lidarspec.device.settings import devices
+from lidarspec.discovery.detect import scores
 from lidarspec.errors import LidarSpecError, SourceError, UsageError, WireError
-from lidarspec.frames.codecs import codec
-from lidarspec.frames.judging import VALID
-from lidarspec.parsing import parse_typed
+from lidarspec.framing.frame_engine import codec
+from lidarspec.framing.plausibility import VALID
 from lidarspec.plugins import sensors
-from lidarspec.settings import devices
-from lidarspec.sources import is_port, live_address, transport
-from lidarspec.spec import Sensor
+from lidarspec.spec.description import Sensor
+from lidarspec.transports.open_url import is_port, live_address, transport
+from lidarspec.wire.parse import parse_typed
 
 #: longest hexadecimal text that is repeated in the next command, and of other text in a message.
 REPEATED, QUOTED = 400, 64

@@ -1,10 +1,16 @@
-"""What verbs print: text or JSON, on standard output or into a file."""
+"""One line on a terminal that says how far a verb is; elsewhere nothing.
+
+What verbs print: text or JSON, on standard output or into a file.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import json
 import os
+import shutil
+import sys
+import time
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
@@ -16,6 +22,49 @@ from rich.text import Text
 
 from lidarspec.errors import SourceError
 from lidarspec.explaining.listing import Line, folded, text as plain_text
+
+#: seconds between two lines.
+PERIOD = 0.2
+
+
+class Progress:
+    """The line, on standard error; a context manager that takes it away at the end."""
+
+    def __init__(self) -> None:
+        self._is_shown = sys.stderr.isatty()
+        self._due, self._width = 0.0, 0
+
+    def __call__(self, text: Callable[[], str]) -> None:
+        """Show a text, made only where it is time for one."""
+        if not self._is_shown or time.monotonic() < self._due:
+            return
+        self._due = time.monotonic() + PERIOD
+        line = text()[: shutil.get_terminal_size().columns - 1]
+        self._write(f"\r{line.ljust(self._width)}")
+        self._width = len(line)
+
+    def clear(self) -> None:
+        """Take the line away, so that something else can be said."""
+        if self._width:
+            self._write(f"\r{' ' * self._width}\r")
+            self._width, self._due = 0, 0.0
+
+    def __enter__(self) -> Progress:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.clear()
+
+    def _write(self, text: str) -> None:
+        sys.stderr.write(text)
+        sys.stderr.flush()
+
+
+def size(number: float) -> str:
+    """Bytes in words: "1.5 MB"."""
+    power = 0 if number < 1000 else 1 if number < 1e6 else 2 if number < 1e9 else 3
+    return f"{number:.0f} bytes" if not power else f"{number / 1000**power:.1f} {'?kMG'[power]}B"
+
 
 #: the colours of what stands in a line, by its role.
 STYLES = {

@@ -12,22 +12,21 @@ from typing import cast
 import click
 
 from lidarspec.cli.failures import INTERRUPTED, suggest
-from lidarspec.cli.output import emit_json, note, sensor_option
-from lidarspec.cli.progress import Progress, size
+from lidarspec.cli.output import Progress, emit_json, note, sensor_option, size
 from lidarspec.cli.streams import Duration, nothing_came
-from lidarspec.detection.detect import declared
-from lidarspec.device import Device
+from lidarspec.device.capture_thread import BoundedQueue, Capture, Mark
+from lidarspec.device.device import Device
+from lidarspec.device.settings import named
+from lidarspec.discovery.detect import declared
 from lidarspec.errors import CommandError, LidarSpecError, SourceError, UnknownFormat, UsageError, WireError
-from lidarspec.files import Chunk, LiveTransport, Transport
-from lidarspec.inputs.capture import BoundedQueue, Capture, Mark
-from lidarspec.links import Udp
 from lidarspec.plugins import sensor as named_sensor
 from lidarspec.recording.recorders import AnyRecorder, check_suffix, recorder
 from lidarspec.recording.recordings import Header, Recorder
-from lidarspec.settings import named
-from lidarspec.sources import live_address, transport
-from lidarspec.spec import Sensor
-from lidarspec.transports.recordings import RecordingTransport
+from lidarspec.spec.description import Sensor
+from lidarspec.spec.links import Udp
+from lidarspec.transports.files import RecordingTransport
+from lidarspec.transports.open_url import live_address, transport
+from lidarspec.transports.protocol import Chunk, LiveTransport, Transport
 
 #: seconds between two looks at the time and at the disk.
 TURN = 0.1

@@ -14,21 +14,20 @@ from typing import Any
 import click
 
 from lidarspec.cli.failures import INTERRUPTED, suggest
-from lidarspec.cli.output import emit_json, note, sensor_option
-from lidarspec.cli.progress import Progress, size
+from lidarspec.cli.output import Progress, emit_json, note, sensor_option, size
 from lidarspec.cli.streams import Parameter
+from lidarspec.device.settings import named
 from lidarspec.errors import LidarSpecError, UsageError, WireError
-from lidarspec.files import Chunk, Disconnected, Transport
-from lidarspec.links import Udp
 from lidarspec.plugins import sensor as named_sensor
 from lidarspec.recording.recorders import SUFFIXES, recorder
 from lidarspec.recording.recordings import Header
 from lidarspec.recording.replaying import Player, replayed
-from lidarspec.settings import named
-from lidarspec.sources import live_address, transport
-from lidarspec.spec import Sensor
-from lidarspec.transports.players import FilePlayer, player
-from lidarspec.transports.recordings import RecordingTransport
+from lidarspec.spec.description import Sensor
+from lidarspec.spec.links import Udp
+from lidarspec.transports.files import RecordingTransport
+from lidarspec.transports.open_url import live_address, transport
+from lidarspec.transports.outlets import FilePlayer, player
+from lidarspec.transports.protocol import Chunk, Disconnected, Transport
 
 #: ns; a chunk that goes out later than this is worth a word.
 LATE = 20_000_000

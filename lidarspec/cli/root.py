@@ -21,12 +21,12 @@ from lidarspec.errors import did_you_mean
 #: group -> verb -> (module, what it does); the texts are those of the verbs' own help.
 GROUPS = {
     "look": {
-        "sensors": ("look", "The installed sensors, and how far each is proven."),
-        "show": ("look", "What a sensor is, and the wire table of each of its frames."),
-        "ports": ("ports", "The serial ports of this computer, and the UDP ports that installed sensors send to."),
-        "detect": ("detect", "Which installed sensor sends, and at which port and baud rate."),
-        "doctor": ("doctor", "What keeps a sensor's bytes from coming, and the command that mends it."),
-        "plugins": ("look", "The plugins that were found, and what is wrong with those that do not load."),
+        "sensors": ("sensors", "The installed sensors, and how far each is proven."),
+        "show": ("sensors", "What a sensor is, and the wire table of each of its frames."),
+        "ports": ("finding", "The serial ports of this computer, and the UDP ports that installed sensors send to."),
+        "detect": ("finding", "Which installed sensor sends, and at which port and baud rate."),
+        "doctor": ("finding", "What keeps a sensor's bytes from coming, and the command that mends it."),
+        "plugins": ("sensors", "The plugins that were found, and what is wrong with those that do not load."),
         "demo": ("demo", "A simulated sensor on a port: started, read through a bad line, recorded, read again, drawn."),
     },
     "stream": {
@@ -36,22 +36,22 @@ GROUPS = {
         "replay": ("replay", "A recording or capture, sent again as it came: bit for bit, and by the clock."),
         "sim": ("sim", "A simulated sensor on a serial port, UDP, TCP or in a file."),
         "send": ("send", "Send a command to a sensor, and print its reply."),
-        "stats": ("stats", "How a sensor is doing: speed, rates, errors, loss, jitter, queue."),
+        "stats": ("read", "How a sensor is doing: speed, rates, errors, loss, jitter, queue."),
     },
     "files": {
         "convert": ("files", "Write the points of a capture or raw file to a file, in the format of its suffix."),
-        "plot": ("plot", "A scan as an SVG picture."),
+        "plot": ("files", "A scan as an SVG picture."),
     },
     "bytes": {
         "parse": ("frames", "The fields of each frame in some bytes."),
         "explain": ("frames", "Every byte of each frame: offset, hex, field, value, unit, meaning."),
-        "build": ("building", "The bytes of one frame from field=value; a unit makes a value physical."),
-        "crc": ("crc", "Which checksum seals some sample frames: XOR, sums, or a CRC of 8, 16 or 32 bits."),
+        "build": ("build", "The bytes of one frame from field=value; a unit makes a value physical."),
+        "crc": ("finding", "Which checksum seals some sample frames: XOR, sums, or a CRC of 8, 16 or 32 bits."),
     },
     "authors": {
-        "new": ("new", "A distribution for a sensor of your own, which works before anything in it is changed."),
-        "check": ("check", "What is wrong with a sensor, a file or a distribution: every promise, and mistakes in its spec."),
-        "export": ("export", "A sensor's spec for another tool: wireshark, c, ksy (Kaitai), md, svg, json, pyi."),
+        "new": ("authors", "A distribution for a sensor of your own, which works before anything in it is changed."),
+        "check": ("authors", "What is wrong with a sensor, a file or a distribution: every promise, and mistakes in its spec."),
+        "export": ("authors", "A sensor's spec for another tool: wireshark, c, ksy (Kaitai), md, svg, json, pyi."),
     },
 }
 VERBS = {verb: place for verbs in GROUPS.values() for verb, place in verbs.items()}

@@ -13,13 +13,13 @@ from lidarspec.cli.failures import suggest
 from lidarspec.cli.frames import plain
 from lidarspec.cli.output import emit, emit_json, output_options, sensor_option, table
 from lidarspec.cli.streams import Duration
-from lidarspec.device import Device, open as open_device
+from lidarspec.device.device import Device, open as open_device
+from lidarspec.device.session import Reply
 from lidarspec.errors import CommandError, UnknownCommand, UnknownField, UsageError
-from lidarspec.explaining.explain import explain
-from lidarspec.frames.schema import schema
-from lidarspec.replies import Reply
-from lidarspec.spec import Sensor
-from lidarspec.units import factor, split_unit
+from lidarspec.explaining.explanation import explain
+from lidarspec.spec.description import Sensor
+from lidarspec.spec.fields import factor, split_unit
+from lidarspec.wire.schema import schema
 
 
 @click.command()

@@ -12,17 +12,16 @@ from pathlib import Path
 import click
 
 from lidarspec.cli.failures import suggest
-from lidarspec.cli.output import emit_json, note
-from lidarspec.cli.progress import Progress, size
+from lidarspec.cli.output import Progress, emit_json, note, size
 from lidarspec.cli.streams import Duration, Share
 from lidarspec.errors import UsageError
 from lidarspec.plugins import sensor as named_sensor
 from lidarspec.recording.recorders import SUFFIXES
+from lidarspec.simulation.device import SimulatedDevice
 from lidarspec.simulation.faults import Faults
-from lidarspec.simulation.scenery import read_scene
-from lidarspec.simulation.simulated import SimulatedDevice
-from lidarspec.spec import Sensor
-from lidarspec.transports.doors import HERE, Door, UdpDoor
+from lidarspec.simulation.scenes import read_scene
+from lidarspec.spec.description import Sensor
+from lidarspec.transports.outlets import HERE, Door, UdpDoor
 from lidarspec.transports.serving import door, is_file, serve, write_file
 from lidarspec.transports.simulated import rate_of
 

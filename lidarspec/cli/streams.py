@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from lidarspec.cli.failures import suggest
-from lidarspec.device import Device
+from lidarspec.device.device import Device
 from lidarspec.errors import CommandError, LidarSpecError, WireError
-from lidarspec.scans import Scan
+from lidarspec.scans.scans import Scan
 
 #: seconds that a device is given for its first frame.
 PATIENCE = 10.0

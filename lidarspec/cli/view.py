@@ -11,16 +11,15 @@ import click
 
 from lidarspec.cli.output import drawn, note, sensor_option
 from lidarspec.cli.streams import PATIENCE, Duration, nothing_came
-from lidarspec.device import Device, open as open_device
-from lidarspec.settings import named
-from lidarspec.sources import live_address
+from lidarspec.device.device import Device, open as open_device
+from lidarspec.device.settings import named
+from lidarspec.transports.open_url import live_address
 from lidarspec.view.canvas import Cells
 from lidarspec.view.feed import LOOK, Feed
-from lidarspec.view.keys import keyboard
 from lidarspec.view.live import Window
 from lidarspec.view.polar import look, picture
 from lidarspec.view.recording import Switch
-from lidarspec.view.screen import Screen, Terminated, encodable, interactive
+from lidarspec.view.screen import Screen, Terminated, encodable, interactive, keyboard
 
 
 @click.command()

@@ -1,1 +1,1 @@
-"""Frames explained byte by byte, for people: rows and words, bits, flipped bits, differences."""
+"""explaining"""

@@ -7,8 +7,8 @@ import re
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-from lidarspec.clouds import PointCloud
 from lidarspec.errors import WireError
+from lidarspec.points.cloud import PointCloud
 
 #: bytes in a line of a hexdump, and lines before the marked one.
 DUMPED, BEFORE = 16, 2

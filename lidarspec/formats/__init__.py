@@ -8,11 +8,11 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from lidarspec.errors import LidarSpecError, SourceError, SpecError, UnknownFormat
-from lidarspec.files import Format
 from lidarspec.formats.arrays import NPZ
 from lidarspec.formats.text import CSV
 from lidarspec.plugins import registry
-from lidarspec.scans import Scan
+from lidarspec.scans.scans import Scan
+from lidarspec.transports.protocol import Format
 
 BUILT_IN = {known.suffix: known for known in (CSV, NPZ)}
 

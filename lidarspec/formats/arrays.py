@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarspec.clouds import COLUMNS, PointCloud
-from lidarspec.files import Format
-from lidarspec.scans import Scan
+from lidarspec.points.cloud import COLUMNS, PointCloud
+from lidarspec.scans.scans import Scan
+from lidarspec.transports.protocol import Format
 
 
 def write(path: Path, scans: Iterable[Scan], *, every_point: bool) -> None:

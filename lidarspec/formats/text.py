@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.clouds import COLUMNS
-from lidarspec.files import Format
-from lidarspec.scans import Scan
+from lidarspec.points.cloud import COLUMNS
+from lidarspec.scans.scans import Scan
+from lidarspec.transports.protocol import Format
 
 #: how a number of each type is written: seven figures are half a micrometre at a metre; times keep their nanoseconds.
 _WRITTEN = {"f4": "%.7g", "f8": "%.9f"}

@@ -10,12 +10,12 @@ from typing import Any, Literal
 
 from lidarspec.captures.pcap import NOBODY, USER_LINKS, Datagram, PcapWriter, is_capture
 from lidarspec.errors import UnknownFormat, UsageError
-from lidarspec.files import Chunk, Transport
-from lidarspec.found import Found
+from lidarspec.framing.results import Found
 from lidarspec.plugins import sensor as named_sensor
 from lidarspec.recording.appending import Appender
 from lidarspec.recording.recordings import Recorder
-from lidarspec.spec import Sensor
+from lidarspec.spec.description import Sensor
+from lidarspec.transports.protocol import Chunk, Transport
 
 SUFFIXES = (".lsr", ".pcap", ".bin")
 #: bytes between frames that make one packet at most.

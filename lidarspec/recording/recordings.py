@@ -18,11 +18,9 @@ from typing import Any, BinaryIO, Literal
 
 from lidarspec._version import __version__
 from lidarspec.errors import SourceError, WireError
-from lidarspec.files import Chunk
 from lidarspec.plugins import registry, sensor as named_sensor
 from lidarspec.recording.appending import Appender
-from lidarspec.recording.header import VERSION, Header, read_header
-from lidarspec.recording.lsr import (
+from lidarspec.recording.format import (
     DATAGRAM,
     DIRECTIONS,
     EVENT,
@@ -33,12 +31,16 @@ from lidarspec.recording.lsr import (
     QUIET,
     RECEIVED,
     SENT,
+    VERSION,
+    Header,
     Record,
     RecordReader,
     packed,
+    read_header,
     whole_records,
 )
-from lidarspec.spec import Sensor
+from lidarspec.spec.description import Sensor
+from lidarspec.transports.protocol import Chunk
 
 __all__ = ["LARGEST", "MAGIC", "Header", "Record", "Recorder", "Recording"]
 

@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from typing import Protocol
 
-from lidarspec.files import Chunk
+from lidarspec.transports.protocol import Chunk
 
 _SECOND = 1_000_000_000
 

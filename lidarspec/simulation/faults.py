@@ -13,7 +13,7 @@ from dataclasses import dataclass, fields
 from typing import Any
 
 from lidarspec.errors import OutOfRange, UsageError
-from lidarspec.units import duration
+from lidarspec.spec.fields import duration
 
 #: share of the datagrams that come late where any are reordered.
 LATE = 0.1

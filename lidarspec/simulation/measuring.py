@@ -14,15 +14,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lidarspec.columns.columns import Batch, Column, Fields, aligned
 from lidarspec.errors import SpecError
-from lidarspec.frames.access import Fields
-from lidarspec.frames.columns import Batch, Column, aligned
-from lidarspec.frames.tables import Rows
-from lidarspec.geometry import Polar
-from lidarspec.points import points_function
+from lidarspec.points.plain import points_function
 from lidarspec.simulation.scenes import Scene
-from lidarspec.spec import Sensor
-from lidarspec.units import factor
+from lidarspec.spec.description import Sensor
+from lidarspec.spec.fields import factor
+from lidarspec.spec.results import Polar
+from lidarspec.wire.frame_table import Rows
 
 Floats = NDArray[np.float64]
 #: how often ranges are measured again while directions still move.

@@ -11,7 +11,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from lidarspec.testing.conformance import SensorConformance as SensorConformance
+    from lidarspec.testing.conformance import SensorConformance
 
 __all__ = ["SensorConformance"]
 

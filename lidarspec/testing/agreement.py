@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from lidarspec.decoder import Decoder, packed
-from lidarspec.frames.codecs import codec
-from lidarspec.packets import joined
-from lidarspec.scans import Scan, scans_of
-from lidarspec.streams import PacketStream
-from lidarspec.testing import material
+from lidarspec.framing.decoder import Decoder, packed
+from lidarspec.framing.frame_engine import codec
+from lidarspec.packets.packets import joined
+from lidarspec.packets.stream import PacketStream
+from lidarspec.scans.scans import Scan, scans_of
+from lidarspec.testing import subject as material
 from lidarspec.testing.comparisons import assert_backends_agree, assert_same_packets, assert_same_places, assert_well_formed
-from lidarspec.testing.edits import free
 from lidarspec.testing.findings import Violation, require
-from lidarspec.testing.frames import acceptable
+from lidarspec.testing.frames import acceptable, free
 from lidarspec.testing.subject import MANY, Subject
 
 

@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.clouds import PointCloud
-from lidarspec.construction import member
-from lidarspec.decoder import Decoder, Found, Spans, is_stream, spans_of
 from lidarspec.errors import SpecError
-from lidarspec.frames.codecs import codec
-from lidarspec.packets import Packets
-from lidarspec.spec import Sensor
-from lidarspec.streams import PacketStream
+from lidarspec.framing.decoder import Decoder, Found, Spans, is_stream, spans_of
+from lidarspec.framing.frame_engine import codec
+from lidarspec.packets.packets import Packets
+from lidarspec.packets.stream import PacketStream
+from lidarspec.points.cloud import PointCloud
+from lidarspec.spec.construct_layer import member
+from lidarspec.spec.description import Sensor
 
 #: units in the last place by which coordinates of two evaluations may differ, at the size of the range.
 ULPS = 4

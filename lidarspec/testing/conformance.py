@@ -1,24 +1,198 @@
-"""The tests that every sensor has to pass; derive a class from `SensorConformance`, name the sensor, and let pytest collect it."""
+"""Every property that a sensor is held to, in one table: for the test class, and for `lidarspec check`.
+
+The tests that every sensor has to pass; derive a class from `SensorConformance`, name the sensor, and let pytest collect it.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import traceback
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
 import pytest
 
-from lidarspec.spec import Sensor
+from lidarspec.errors import SpecError
+from lidarspec.framing.frame_engine import CompiledCodec, codec
+from lidarspec.spec.description import Sensor
+from lidarspec.testing import (
+    agreement,
+    commands as talking,
+    frames,
+    frames as edits,
+    framing as cutting,
+    framing as growth,
+    geometry as directions,
+    geometry as scene,
+    hostile,
+    vectors,
+)
 from lidarspec.testing.declared import declared
-from lidarspec.testing.findings import left_over
-from lidarspec.testing.properties import PROPERTIES, Property
-from lidarspec.testing.subject import EXAMPLES, Subject
+from lidarspec.testing.findings import Finding, Violation, left_over
+from lidarspec.testing.geometry import data_frames
+from lidarspec.testing.subject import EXAMPLES, Subject, incoming
+
+Lack = Callable[[Subject], str]
+
+
+def _nothing(subject: Subject) -> str:
+    return ""
+
+
+def _no_stream(subject: Subject) -> str:
+    return "it sends datagrams, not a stream of bytes" if subject.sensor.datagrams else ""
+
+
+def _no_sweep(subject: Subject) -> str:
+    names = data_frames(subject)
+    if not (subject.sensor.sweep or any(subject.sensor.frames[name].sweep for name in names)):
+        return "it declares no `sweep`, and cannot be simulated"
+    alone = [name for name in names if not isinstance(codec(subject.sensor.frames[name]), CompiledCodec)]
+    return f"{', '.join(alone)} is not compiled, and cannot be simulated" if alone else ""
+
+
+def _no_commands(subject: Subject) -> str:
+    return "" if subject.sensor.commands else "it has no commands"
+
+
+def _no_device(subject: Subject) -> str:
+    if _no_commands(subject) or not any(command.replies for command in subject.sensor.commands.values()):
+        return "it has no commands with a documented reply"
+    return _no_sweep(subject)
+
+
+def _no_vectors(subject: Subject) -> str:
+    return "" if subject.vectors else "there is no file of golden vectors"
+
+
+def _not_compiled(subject: Subject) -> str:
+    alone = [name for name in incoming(subject.sensor) if not isinstance(codec(subject.sensor.frames[name]), CompiledCodec)]
+    return f"{', '.join(alone)} is read by construct alone" if alone else ""
+
+
+@dataclass(frozen=True)
+class Property:
+    """Something that has to hold.
+
+    Attributes:
+        function: of the subject, and of a name where it holds for each frame, data frame or command.
+        each: "sensor", "frame", "data" or "command".
+        rule: that a plain assertion in it falls under.
+        lacks: why it does not apply to a sensor, "" where it does.
+        unless: rules that say it better; where one of them is broken, this is not looked at.
+    """
+
+    function: Callable[..., None]
+    each: str
+    rule: str
+    lacks: Lack = _nothing
+    unless: tuple[str, ...] = ()
+
+    @property
+    def name(self) -> str:
+        """Its name: that of the function."""
+        return self.function.__name__
+
+    def cases(self, subject: Subject) -> Iterable[tuple[str, ...]]:
+        """What it is asked of."""
+        names = {
+            "frame": list(subject.sensor.frames),
+            "data": data_frames(subject),
+            "command": list(subject.sensor.commands),
+        }
+        return [()] if self.each == "sensor" else [(name,) for name in names[self.each]]
+
+    def findings(self, subject: Subject) -> list[Finding]:
+        """What does not hold."""
+        found = []
+        for case in self.cases(subject):
+            try:
+                self.function(subject, *case)
+            except Violation as error:
+                found.append(Finding(error.code, error.what, error.path, subject.sensor.id))
+            except AssertionError as error:
+                code = "LS414" if "Traceback" in str(error) else self.rule
+                found.append(Finding(code, _gist(error), ".".join(case), subject.sensor.id))
+            except SpecError as error:
+                found.append(Finding(error.rule or _rule_of(error), error.reason, ".".join(case) or error.path, subject.sensor.id))
+            except Exception as error:
+                found.append(_unexpected(error, ".".join(case), subject))
+        return found
+
+
+SPECIAL_CUTS = ("LS401", "LS405", "LS407", "LS408", "LS409", "LS410", "LS411", "LS412", "LS306")
+
+PROPERTIES = (
+    Property(frames.examples_are_valid_and_repeat, "frame", "LS301"),
+    Property(frames.bytes_survive_parsing_and_building, "frame", "LS302"),
+    Property(frames.every_raw_value_survives, "frame", "LS302", unless=("LS302", "LS303")),
+    Property(frames.what_follows_is_held, "frame", "LS312", unless=("LS302", "LS303")),
+    Property(frames.values_in_units_build_the_same_bytes, "frame", "LS304", unless=("LS302", "LS303")),
+    Property(edits.values_survive_building_and_parsing, "frame", "LS305", unless=("LS302", "LS303")),
+    Property(frames.parse_finds_out_the_type, "frame", "LS306"),
+    Property(hostile.a_truncated_frame_is_a_wire_error, "frame", "LS307"),
+    Property(hostile.a_damaged_frame_is_at_worst_a_wire_error, "frame", "LS308"),
+    Property(hostile.every_single_bit_error_is_seen, "frame", "LS310"),
+    Property(vectors.vectors_hold, "sensor", "LS706", lacks=_no_vectors),
+    Property(directions.clouds_keep_the_conventions, "data", "LS501"),
+    Property(directions.directions_are_radians, "data", "LS502", unless=("LS414",)),
+    Property(directions.a_single_point_has_a_direction, "data", "LS503", unless=("LS414",)),
+    Property(directions.the_full_circle_is_the_same_as_none, "data", "LS505", unless=("LS414", "LS503")),
+    Property(directions.angles_are_in_order, "data", "LS506", lacks=_no_sweep, unless=("LS414", "LS502")),
+    Property(directions.counters_run_on, "data", "LS509", lacks=_no_sweep, unless=("LS414",)),
+    Property(agreement.the_same_bytes_give_the_same_points, "sensor", "LS415", unless=("LS414",)),
+    Property(agreement.a_clean_input_loses_nothing, "sensor", "LS401"),
+    Property(cutting.any_split_of_a_stream_gives_the_same, "sensor", "LS405", lacks=_no_stream),
+    Property(cutting.decoders_do_not_know_of_each_other, "sensor", "LS410", lacks=_no_stream, unless=("LS405", "LS412")),
+    Property(cutting.idle_gives_up_what_waits, "sensor", "LS411", lacks=_no_stream),
+    Property(cutting.the_longest_frame_is_a_frame, "sensor", "LS409", lacks=_no_stream, unless=("LS401", "LS405", "LS410", "LS412")),
+    Property(cutting.the_start_of_a_header_is_looked_for_at_every_byte, "sensor", "LS408", lacks=_no_stream, unless=SPECIAL_CUTS),
+    Property(cutting.a_claimed_length_is_not_believed, "sensor", "LS407", lacks=_no_stream, unless=SPECIAL_CUTS),
+    Property(cutting.every_recoverable_frame_is_recovered, "sensor", "LS406", lacks=_no_stream, unless=SPECIAL_CUTS),
+    Property(cutting.noise_is_cut_as_the_rule_says, "sensor", "LS406", lacks=_no_stream, unless=SPECIAL_CUTS),
+    Property(agreement.values_at_the_edges_read_alike, "frame", "LS402", lacks=_not_compiled, unless=("LS414", "LS415")),
+    Property(agreement.compiled_and_interpreted_agree, "sensor", "LS402", lacks=_not_compiled, unless=("LS414", "LS415", *SPECIAL_CUTS)),
+    Property(agreement.single_packets_equal_a_batch, "sensor", "LS403", unless=("LS415",)),
+    Property(agreement.scans_do_not_depend_on_batches, "sensor", "LS404", unless=("LS414", "LS415")),
+    Property(growth.time_grows_with_the_input_and_no_faster, "sensor", "LS413", lacks=_no_stream, unless=("LS412",)),
+    Property(scene.a_simulated_scene_comes_back, "data", "LS507", lacks=_no_sweep, unless=("LS201", "LS414", "LS502", "LS415", "LS503")),
+    Property(talking.a_command_parses_back, "command", "LS601", lacks=_no_commands),
+    Property(talking.arguments_are_held_to_their_ranges, "command", "LS602", lacks=_no_commands),
+    Property(talking.replies_can_match, "command", "LS603", lacks=_no_commands),
+    Property(talking.the_simulated_sensor_answers, "command", "LS604", lacks=_no_device, unless=("LS414", "LS508", "LS601", "LS603")),
+)
+
+
+def _gist(error: BaseException) -> str:
+    """The last line that says something."""
+    lines = [line for line in str(error).splitlines() if line.strip()]
+    return (lines[-1] if "Traceback" in str(error) else lines[0]) if lines else type(error).__name__
+
+
+def _rule_of(error: SpecError) -> str:
+    return "LS115" if "expression of the struct" in error.reason else "LS301" if "random frame" in error.reason else "LS414"
+
+
+def _unexpected(error: Exception, path: str, subject: Subject) -> Finding:
+    """The finding for an exception that nobody documented, at the plugin's own line where it comes from one."""
+    spots = [spot for spot in traceback.extract_tb(error.__traceback__) if not _ours(spot.filename)]
+    spot = spots[-1] if spots else None
+    text = f"{type(error).__name__}: {str(error).splitlines()[0] if str(error) else ''}"
+    return Finding("LS308", text, path, subject.sensor.id, spot.filename if spot else "", (spot.lineno or 0) if spot else 0)
+
+
+def _ours(file: str) -> bool:
+    """Whether a file is the engine's, or a library's that it stands on."""
+    package = Path(__file__).resolve().parents[1]
+    return package in Path(file).parents or any(part in Path(file).parts for part in ("construct", "numpy", "hypothesis", "_pytest"))
+
 
 _SUBJECTS: dict[type, Subject] = {}
 
 
 class SensorConformance:
-    """What holds for every sensor: a test for each property in `lidarspec.testing.properties`.
+    """What holds for every sensor: a test for each property in `lidarspec.testing.conformance`.
 
     Attributes:
         sensor: an id, a `Sensor`, or a file that describes one.

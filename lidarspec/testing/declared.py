@@ -10,22 +10,20 @@ import numpy as np
 from construct import Construct, Struct
 from construct.expr import ExprMixin
 
-from lidarspec.construction import unwrap
+from lidarspec.columns.columns import Batch, Fields
+from lidarspec.columns.graph import Traced, Untraceable
 from lidarspec.errors import LidarSpecError
-from lidarspec.fields import Scaled
-from lidarspec.frames.access import Fields
-from lidarspec.frames.codecs import CompiledCodec, codec
-from lidarspec.frames.columns import Batch
-from lidarspec.frames.layout import Layout
-from lidarspec.frames.tracing import Traced, Untraceable
-from lidarspec.geometry import Polar
-from lidarspec.rules import children
-from lidarspec.spec import Frame, Sensor
-from lidarspec.splits import Clock
+from lidarspec.framing.frame_engine import CompiledCodec, codec
+from lidarspec.spec.construct_layer import unwrap
+from lidarspec.spec.description import Frame, Sensor
+from lidarspec.spec.fields import Scaled, factor
+from lidarspec.spec.results import Polar
+from lidarspec.spec.rules import children
+from lidarspec.spec.timing import Clock
 from lidarspec.testing.findings import Finding
+from lidarspec.testing.geometry import data_frames, field_of, traced, used
 from lidarspec.testing.subject import Subject
-from lidarspec.testing.tracks import data_frames, field_of, traced, used
-from lidarspec.units import factor
+from lidarspec.wire.layout import Layout
 
 #: field names that stand for a measure.
 MEASURES = frozenset(["distance", "range", "radius", "angle", "azimuth", "elevation", "temperature", "voltage", "timestamp"])

@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.errors import SpecError, WireError
-from lidarspec.frames.codecs import CompiledCodec, codec
-from lidarspec.frames.judging import VALID
-from lidarspec.frames.layout import Layout
-from lidarspec.testing import material
+from lidarspec.framing.frame_engine import CompiledCodec, codec
+from lidarspec.framing.plausibility import VALID
+from lidarspec.testing import subject as material
 from lidarspec.testing.findings import Violation, require
 from lidarspec.testing.subject import MANY, Subject
+from lidarspec.wire.layout import Layout
 
 #: frames of which every bit is flipped.
 SAMPLES = 3

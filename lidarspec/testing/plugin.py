@@ -10,7 +10,7 @@ import pytest
 
 if TYPE_CHECKING:
     from lidarspec.plugins import Registry
-    from lidarspec.spec import Sensor
+    from lidarspec.spec.description import Sensor
     from lidarspec.transports.serving import Served
 
 
@@ -23,7 +23,7 @@ def pytest_configure(config: pytest.Config) -> None:
 def sensor(request: pytest.FixtureRequest) -> Sensor:
     """The sensor under test: that of ``@pytest.mark.lidarspec("acme-x1")``, or of the test class."""
     from lidarspec.plugins import sensor as named
-    from lidarspec.spec import Sensor
+    from lidarspec.spec.description import Sensor
 
     marker = request.node.get_closest_marker("lidarspec")
     wanted = marker.args[0] if marker else getattr(request.cls, "sensor", None)
@@ -34,11 +34,11 @@ def sensor(request: pytest.FixtureRequest) -> Sensor:
 
 @pytest.fixture
 def virtual_port(request: pytest.FixtureRequest) -> Iterator[Callable[..., Served]]:
-    """A function that puts a simulated sensor on a real port until the test ends: `lidarspec.testing.ports.virtual_port`.
+    """A function that puts a simulated sensor on a real port until the test ends: `lidarspec.testing.fixtures.virtual_port`.
 
     Its first argument is an id or a Sensor; without one it is the test's own `sensor`. What comes back has a `path` to open.
     """
-    from lidarspec.testing import ports
+    from lidarspec.testing import fixtures as ports
 
     with ExitStack() as stack:
 

@@ -1,18 +1,151 @@
-"""A sensor under test: its examples, with the author's own strategies in them, and what was measured along the way."""
+"""What the conformance tests are fed: conversations out of a sensor's own examples, their edits, cuts and noise.
+
+A sensor under test: its examples, with the author's own strategies in them, and what was measured along the way.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import os
 import random
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from lidarspec.examples import examples
+from lidarspec.errors import WireError
+from lidarspec.framing.frame_engine import codec
 from lidarspec.plugins import sensor as named_sensor
-from lidarspec.spec import Frame, Sensor
-from lidarspec.testing import material
+from lidarspec.simulation.frame_maker import examples
+from lidarspec.spec.description import Frame, Sensor
+from lidarspec.spec.fields import Checksummed
+from lidarspec.spec.rules import children
+
+#: frames up to this length are cut at every byte, longer ones at so many places.
+SHORT = 300
+
+
+def incoming(sensor: Sensor) -> list[str]:
+    """The names of the frame types that the sensor sends."""
+    return [name for name, frame in sensor.frames.items() if frame.direction == "in"]
+
+
+def conversation(sensor: Sensor, *, seed: int = 0, rounds: int = 3, example: Callable[..., bytes] | None = None) -> list[tuple[str, bytes]]:
+    """Frames of all incoming types as the sensor could send them: (type, bytes), each where it is looked for and believed.
+
+    Args:
+        example: what makes a valid frame of a type and a seed; by default the sensor's own.
+    """
+    example = example or sensor.example
+    found: list[tuple[str, bytes]] = []
+    for turn in range(rounds):
+        for name in incoming(sensor):
+            frame, first = sensor.frames[name], seed * 1000 + turn * 10
+            if frame.after is not None:
+                found.append((frame.after, example(frame.after, seed=first)))
+            number = frame.confirm + 2 if frame.data or frame.confirm > 1 else 1
+            found += [(name, example(name, seed=first + index)) for index in range(number)]
+    return found
+
+
+def stream(sensor: Sensor, *, seed: int = 0, rounds: int = 3) -> bytes:
+    """The bytes of a conversation."""
+    return b"".join(data for _, data in conversation(sensor, seed=seed, rounds=rounds))
+
+
+def delivery(sensor: Sensor, frames: list[tuple[str, bytes]]) -> Any:
+    """Frames as the data link delivers them: datagrams, or one run of bytes."""
+    parts = [data for _, data in frames]
+    return parts if sensor.datagrams else b"".join(parts)
+
+
+def places(length: int, source: random.Random) -> list[int]:
+    """Where to cut so many bytes: everywhere if they are few, else at the ends and at random."""
+    if length <= SHORT:
+        return list(range(length))
+    return sorted({0, 1, 2, 3, length - 2, length - 1, *source.sample(range(length), SHORT // 2)})
+
+
+def pieces(data: bytes, source: random.Random) -> Iterator[bytes]:
+    """The bytes in chunks of random sizes, empty ones among them."""
+    start = 0
+    while start < len(data):
+        size = source.choice((0, 1, 1, 2, 3, 7, 20, 100, 1000))
+        yield data[start : start + size]
+        start += size
+
+
+def mutated(data: bytes, source: random.Random) -> bytes:
+    """The bytes with a few of them changed, dropped, doubled or put in, or cut short."""
+    found = bytearray(data)
+    for _ in range(source.choice((1, 1, 2, 4))):
+        spot = source.randrange(len(found) + 1)
+        kind = source.randrange(5)
+        if kind == 0:
+            found[spot : spot + 1] = source.randbytes(1)
+        elif kind == 1:
+            del found[spot : spot + source.randint(1, 3)]
+        elif kind == 2:
+            found[spot:spot] = source.randbytes(source.randint(1, 3))
+        elif kind == 3:
+            found[spot : spot + 1] = source.choice((b"\x00", b"\xff", b"\x7f", b"\x80"))
+        else:
+            found[spot:spot] = found[max(spot - 4, 0) : spot]
+    return bytes(found)
+
+
+def integers(parsed: Any, path: str = "") -> Iterator[tuple[Any, Any, str]]:
+    """The integers of a parsed frame: (container, key in it, field path)."""
+    entries: Iterable[tuple[Any, Any]] = parsed.items() if isinstance(parsed, dict) else enumerate(parsed)
+    for key, value in entries:
+        below = path if isinstance(parsed, list) else f"{path}.{key}" if path else key
+        if isinstance(value, dict | list):
+            yield from integers(value, below)
+        elif type(value) is int:
+            yield parsed, key, below
+
+
+def physical(sensor: Sensor, name: str, data: bytes) -> Any:
+    """A parsed frame with its scaled integers in units; None where one is too wide for a float to hold exactly."""
+    fields = codec(sensor.frames[name]).schema.fields
+    parsed = sensor.parse(data, frame=name)
+    for holder, key, path in list(integers(parsed)):
+        info = fields.get(path)
+        if info is not None and info.scaled and info.kind == "int":
+            if info.bits > 48:
+                return None
+            holder[key] = holder[key] * info.scale + info.offset
+    return parsed
+
+
+def seals(sensor: Sensor, name: str, data: bytes) -> set[str]:
+    """The fields of a frame that hold a checksum, and so are not the caller's."""
+    layout = getattr(codec(sensor.frames[name]), "tree", None)
+    if layout is None:
+        return set(_sealing(sensor.frames[name].prepared))
+    found = layout.layout(data)
+    return {leaf.info.path for seal in getattr(found, "seals", ()) for leaf in seal.leaves}
+
+
+def _sealing(con: Any, path: str = "") -> Iterator[str]:
+    """The paths of the fields that hold checksums, read off a construct tree."""
+    if type(con).__name__ == "Renamed":
+        path = f"{path}.{con.name}" if path else con.name
+    if isinstance(con, Checksummed):
+        yield from (f"{path}.{field}" if path else field for field in con.fields)
+    for child in children(con):
+        yield from _sealing(child, path)
+
+
+def fitting(sensor: Sensor, data: bytes) -> list[str]:
+    """The frame types that these bytes can be."""
+    found = []
+    for name in sensor.frames:
+        with contextlib.suppress(WireError):
+            sensor.parse(data, frame=name)
+            found.append(name)
+    return found
+
 
 #: examples of each frame type that a property tries.
 EXAMPLES = int(os.environ.get("LIDARSPEC_EXAMPLES", "40"))
@@ -53,7 +186,7 @@ class Subject:
 
     def seeds(self, frame: Frame, share: float = 1.0) -> range:
         """Seeds of examples: fewer for long frames, since construct takes its time for each field, and where there are many types."""
-        few = 8 if frame.max_length > material.SHORT else 1
+        few = 8 if frame.max_length > SHORT else 1
         few *= 2 if len(self.sensor.frames) > MANY else 1
         return range(max(int(self.examples * share) // few, 3))
 
@@ -75,7 +208,7 @@ class Subject:
 
     def conversation(self, *, seed: int = 0, rounds: int = 3) -> list[tuple[str, bytes]]:
         """Frames of all incoming types as the sensor could send them: (type, bytes), each where it is looked for and believed."""
-        return material.conversation(self.sensor, seed=seed, rounds=rounds, example=self.example)
+        return conversation(self.sensor, seed=seed, rounds=rounds, example=self.example)
 
     def stream(self, *, seed: int = 0, rounds: int = 3) -> bytes:
         """The bytes of a conversation."""

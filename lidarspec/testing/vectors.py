@@ -19,14 +19,14 @@ from typing import Any
 
 import numpy as np
 
+from lidarspec.discovery.checksum_search import search
 from lidarspec.errors import LidarSpecError, WireError
-from lidarspec.frames.codecs import codec
-from lidarspec.frames.schema import FieldInfo
-from lidarspec.searching.checksums import search
+from lidarspec.framing.frame_engine import codec
 from lidarspec.testing.findings import Violation, require
 from lidarspec.testing.frames import leaves
+from lidarspec.testing.geometry import read
 from lidarspec.testing.subject import Subject
-from lidarspec.testing.tracks import read
+from lidarspec.wire.schema import FieldInfo
 
 #: what a point may differ by: metres and radians as manuals print them.
 NEAR = 2e-4

@@ -15,10 +15,10 @@ import time
 import serial
 
 from lidarspec.errors import SourceError, UsageError
-from lidarspec.files import Chunk
-from lidarspec.links import Serial
-from lidarspec.spec import Sensor
-from lidarspec.transports.live import Address, LiveBase, failure, lost, named, readable, reason
+from lidarspec.spec.description import Sensor
+from lidarspec.spec.links import Serial
+from lidarspec.transports.live_transport import Address, LiveBase, failure, lost, named, readable, reason
+from lidarspec.transports.protocol import Chunk
 
 try:
     from termios import error as TermiosError

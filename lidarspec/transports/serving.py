@@ -12,13 +12,13 @@ from pathlib import Path
 from types import TracebackType
 
 from lidarspec.errors import UsageError
-from lidarspec.files import Chunk
-from lidarspec.links import Udp
 from lidarspec.recording.recorders import recorder
-from lidarspec.simulation.simulated import SECOND, SimulatedDevice
-from lidarspec.spec import Sensor
-from lidarspec.transports.doors import HERE, Door, TcpDoor, UdpDoor
-from lidarspec.transports.live import POLL, Address, failure
+from lidarspec.simulation.device import SECOND, SimulatedDevice
+from lidarspec.spec.description import Sensor
+from lidarspec.spec.links import Udp
+from lidarspec.transports.live_transport import POLL, Address, failure
+from lidarspec.transports.outlets import HERE, Door, TcpDoor, UdpDoor
+from lidarspec.transports.protocol import Chunk
 
 #: seconds at least between two sendings.
 PAUSE = 0.001
@@ -196,7 +196,7 @@ def door(sensor: Sensor, text: str, link: str | Path | None = None) -> Door:
     """
     if text == "pty":
         try:
-            from lidarspec.transports.pty import PtyDoor
+            from lidarspec.transports.outlets import PtyDoor
         except ImportError:
             raise failure("this system has no pseudo-terminals", "lidarspec sim SENSOR --to tcp://127.0.0.1:2111") from None
         return PtyDoor(sensor, link)

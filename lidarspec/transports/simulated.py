@@ -8,14 +8,14 @@ import time
 from collections.abc import Mapping
 
 from lidarspec.errors import UsageError
-from lidarspec.files import Chunk, Disconnected
-from lidarspec.links import Serial
 from lidarspec.plugins import sensor as named_sensor
+from lidarspec.simulation.device import SECOND, SimulatedDevice
 from lidarspec.simulation.faults import FAULTS, faults_of
-from lidarspec.simulation.scenery import read_scene
-from lidarspec.simulation.simulated import SECOND, SimulatedDevice
-from lidarspec.spec import Sensor
-from lidarspec.transports.live import Address, LiveBase, failure
+from lidarspec.simulation.scenes import read_scene
+from lidarspec.spec.description import Sensor
+from lidarspec.spec.links import Serial
+from lidarspec.transports.live_transport import Address, LiveBase, failure
+from lidarspec.transports.protocol import Chunk, Disconnected
 
 OPTIONS = ("rate", "scene", "seed", *FAULTS)
 #: ns between two reads, in which a fast sensor gathers some packets.

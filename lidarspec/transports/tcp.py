@@ -8,10 +8,10 @@ import socket
 import time
 
 from lidarspec.errors import SourceError, UsageError
-from lidarspec.files import Chunk, Disconnected
-from lidarspec.links import Tcp
-from lidarspec.spec import Sensor
-from lidarspec.transports.live import Address, LiveBase, failure, lost, named, readable, reason
+from lidarspec.spec.description import Sensor
+from lidarspec.spec.links import Tcp
+from lidarspec.transports.live_transport import Address, LiveBase, failure, lost, named, readable, reason
+from lidarspec.transports.protocol import Chunk, Disconnected
 
 #: bytes read at once, and seconds between two reads, in which a fast stream gathers some.
 BLOCK, PAUSE = 1 << 18, 0.002

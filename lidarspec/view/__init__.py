@@ -1,1 +1,1 @@
-"""Pictures of clouds: for the terminal, and whatever else can show points."""
+"""view"""

@@ -1,15 +1,181 @@
-"""What a device delivers, taken in between two pictures or two lines of figures: counted, and the newest scan kept."""
+"""How a sensor is doing: speed, rates, losses and jitter over the last moments, and over everything.
+
+What a device delivers, taken in between two pictures or two lines of figures: counted, and the newest scan kept.
+"""
 
 from __future__ import annotations
 
+import math
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
 
-from lidarspec.device import Device
-from lidarspec.packets import Packets
-from lidarspec.scans import Scan, ScanStream
-from lidarspec.view.meter import Meter
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarspec.device.device import Device
+from lidarspec.framing.decoder import Counters
+from lidarspec.packets.packets import Packets
+from lidarspec.scans.scans import Scan, ScanStream
+
+#: scans kept for means and medians.
+KEPT = 1 << 12
+Seconds = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Reading:
+    """Figures over some time; None where they are not known.
+
+    Attributes:
+        seconds: how long that was.
+        speed_hz: scans a second, by their own times.
+        scans, packets: how many there were; scans are whole ones.
+        packet_rate_hz: packets a second.
+        points, valid: points per scan, and those with a return among them.
+        error_rate: frames whose checksum, length or values were wrong, of all, from 0 to 1.
+        skipped_rate: bytes that are in no frame and no declared filler, of all.
+        loss_rate: packets that are missing by the sensor's sequence, of all; None where it has none.
+        jitter_s: standard deviation of the time between packets' arrivals.
+        longest_gap_s: the longest time between two arrivals.
+        bytes_per_s: of input.
+    """
+
+    seconds: float | None
+    speed_hz: float | None
+    scans: int
+    packets: int
+    packet_rate_hz: float | None
+    points: float | None
+    valid: float | None
+    error_rate: float
+    skipped_rate: float
+    loss_rate: float | None
+    jitter_s: float | None
+    longest_gap_s: float | None
+    bytes_per_s: float | None
+
+    def to_dict(self) -> dict[str, Any]:
+        """The figures by name."""
+        return asdict(self)
+
+
+NOTHING = Reading(None, None, 0, 0, None, None, None, 0.0, 0.0, None, None, None, None)
+
+
+class Tally:
+    """What came since some moment."""
+
+    def __init__(self, counters: Counters) -> None:
+        self._before = totals(counters)
+        self.scans = self.packets = 0
+        self._rates: deque[float] = deque(maxlen=KEPT)
+        self._sizes: deque[tuple[int, int]] = deque(maxlen=KEPT)
+        self._gaps, self._spanned, self._squares, self._longest = 0, 0.0, 0.0, 0.0
+        self._by_host = True
+
+    def arrived(self, number: int, gaps: Seconds, *, by_host: bool) -> None:
+        """Count packets, and the seconds from each to the next, (n,), by their arrival or else by the sensor's clock."""
+        self.packets += number
+        self._by_host = by_host
+        if len(gaps):
+            self._gaps += len(gaps)
+            self._spanned += float(gaps.sum())
+            self._squares += float(np.square(gaps).sum())
+            self._longest = max(self._longest, float(gaps.max()))
+
+    def turned(self, points: int, valid: int, rate_hz: float) -> None:
+        """Count a whole scan."""
+        self.scans += 1
+        self._sizes.append((points, valid))
+        if np.isfinite(rate_hz):
+            self._rates.append(rate_hz)
+
+    def reading(self, counters: Counters, *, seconds: float | None, sequenced: bool) -> Reading:
+        """The figures up to now.
+
+        Args:
+            counters: now.
+            seconds: how long it was by the caller's clock; taken from the arrivals where it is left out.
+            sequenced: whether the sensor numbers its packets.
+        """
+        spanned = self._spanned or None
+        lasted = seconds or spanned
+        change = {name: value - self._before[name] for name, value in totals(counters).items()}
+        mean = self._spanned / self._gaps if self._gaps else 0.0
+        return Reading(
+            seconds=lasted,
+            speed_hz=float(np.median(self._rates)) if self._rates else None,
+            scans=self.scans,
+            packets=self.packets,
+            packet_rate_hz=self._gaps / spanned if spanned else self.packets / lasted if lasted else None,
+            points=_mean([size for size, _ in self._sizes]),
+            valid=_mean([valid for _, valid in self._sizes]),
+            error_rate=_share(change["rejected"], change["frames"]),
+            skipped_rate=_share(change["skipped"], change["bytes_in"] - change["skipped"]),
+            loss_rate=_share(change["lost"], self.packets) if sequenced else None,
+            jitter_s=math.sqrt(max(self._squares / self._gaps - mean * mean, 0.0)) if spanned and self._by_host else None,
+            longest_gap_s=self._longest if spanned and self._by_host else None,
+            bytes_per_s=change["bytes_in"] / lasted if lasted else None,
+        )
+
+
+class Meter:
+    """Counts packets and scans as they come: since the last reading, and all of them."""
+
+    def __init__(self, counters: Counters, *, sequenced: bool) -> None:
+        self._sequenced = sequenced
+        self._last: int | None = None
+        self._recent, self._all = Tally(counters), Tally(counters)
+
+    def packets(self, packets: Packets) -> None:
+        """Count a batch."""
+        known = packets.host_ns[packets.host_ns > 0]
+        times = known if len(known) else packets.time_ns
+        edge = [] if self._last is None else [self._last]
+        gaps = np.diff(np.concatenate([np.array(edge, np.int64), times])) * 1e-9
+        self._last = int(times[-1]) if len(times) else self._last
+        for tally in (self._recent, self._all):
+            tally.arrived(len(packets), gaps, by_host=len(known) > 0)
+
+    def scan(self, scan: Scan) -> None:
+        """Count a whole scan; a piece of one says nothing of speed and points."""
+        if scan.complete:
+            valid = int(scan.points.valid.sum())
+            for tally in (self._recent, self._all):
+                tally.turned(len(scan), valid, scan.rate_hz)
+
+    def reading(self, counters: Counters, seconds: float | None = None) -> Reading:
+        """The figures since the reading before this; then it starts anew."""
+        found = self._recent.reading(counters, seconds=seconds, sequenced=self._sequenced)
+        self._recent = Tally(counters)
+        return found
+
+    def summary(self, counters: Counters, seconds: float | None = None) -> Reading:
+        """The figures of everything."""
+        return self._all.reading(counters, seconds=seconds, sequenced=self._sequenced)
+
+
+def totals(counters: Counters) -> dict[str, int]:
+    """What the rates of a reading are made of."""
+    return {
+        "bytes_in": counters.bytes_in,
+        "frames": sum(counters.frames.values()),
+        "rejected": counters.bad_checksum + counters.bad_length + counters.implausible,
+        "skipped": counters.bytes_skipped - counters.bytes_filler,
+        "lost": counters.lost,
+    }
+
+
+def _share(some: int, others: int) -> float:
+    return some / (some + others) if some + others > 0 else 0.0
+
+
+def _mean(values: Sequence[int]) -> float | None:
+    return float(np.mean(values)) if values else None
+
 
 #: seconds from scan to scan of a file where their times do not say it, and the longest pause that is kept.
 STEP, LONGEST = 0.1, 2.0

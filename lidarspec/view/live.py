@@ -8,11 +8,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lidarspec.scans import Scan
-from lidarspec.view.canvas import Cells
-from lidarspec.view.feed import Feed
-from lidarspec.view.meter import Reading
-from lidarspec.view.palette import ALARM, GOOD, STRONG
+from lidarspec.scans.scans import Scan
+from lidarspec.view.canvas import ALARM, GOOD, STRONG, Cells
+from lidarspec.view.feed import Feed, Reading
 from lidarspec.view.panel import Figure, Layout, Title, composed, figures_of, help_page, message
 from lidarspec.view.polar import Look, look, picture
 from lidarspec.view.recording import Switch

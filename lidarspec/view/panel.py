@@ -6,9 +6,8 @@ import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from lidarspec.view.canvas import Cells
-from lidarspec.view.meter import NOTHING, Reading
-from lidarspec.view.palette import ALARM, FAINT, GOOD, LABEL, PLAIN, RAMPS, STEPS, STRONG
+from lidarspec.view.canvas import ALARM, FAINT, GOOD, LABEL, PLAIN, RAMPS, STEPS, STRONG, Cells
+from lidarspec.view.feed import NOTHING, Reading
 from lidarspec.view.polar import Look
 
 #: cells of the figures beside the picture, and of the narrowest picture that has them there.

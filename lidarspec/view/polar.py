@@ -8,9 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.clouds import PointCloud
-from lidarspec.view.canvas import ACROSS, DOWN, Canvas, Cells
-from lidarspec.view.palette import FAINT, LABEL, STRONG
+from lidarspec.points.cloud import PointCloud
+from lidarspec.view.canvas import ACROSS, DOWN, FAINT, LABEL, STRONG, Canvas, Cells
 
 #: share of the points that the picture's reach takes in, where a few are far beyond all others.
 MOST, FAR_BEYOND = 99.0, 1.5

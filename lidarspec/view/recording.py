@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any, Literal, cast
 
 from lidarspec.errors import LidarSpecError
-from lidarspec.files import Chunk, Transport
 from lidarspec.recording.recorders import AnyRecorder, recorder
+from lidarspec.transports.protocol import Chunk, Transport
 
 #: names tried for a file before it is given up.
 TRIES = 100

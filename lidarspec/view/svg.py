@@ -9,8 +9,8 @@ from xml.sax.saxutils import escape
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.clouds import PointCloud
-from lidarspec.view.palette import STEPS, Rgb
+from lidarspec.points.cloud import PointCloud
+from lidarspec.view.canvas import STEPS, Rgb
 from lidarspec.view.polar import Look, ring_step, shade
 
 #: pixels: of each side of the view from above, of the margins, of a dot, and of the highest view from the side.

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from lidarspec import Counters, Found, Sensor
-from lidarspec.decoder import packed
+from lidarspec.framing.decoder import packed
 from tests.broken import sound
 
 HEADERS = {b"\xaa\x55\xc3": "data", b"\x17\x71\x44": "ack"}

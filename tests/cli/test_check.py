@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from lidarspec.testing.rules import RULES
+from lidarspec.testing.findings import RULES
 from tests.cli.running import ran
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -14,8 +14,8 @@ from typing import Any
 import pytest
 
 import lidarspec as ls
-from lidarspec.export import EXPORTS, export
-from lidarspec.scaffold import Names
+from lidarspec.discovery.scaffold import Names
+from lidarspec.exports import EXPORTS, export
 from lidarspec.simulation.simulator import simulate
 from tests.architecture import Module, private_imports
 from tests.cli.running import ran

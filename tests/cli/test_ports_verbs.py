@@ -17,7 +17,7 @@ import pytest
 
 import lidarspec as ls
 from lidarspec.simulation.simulator import simulate
-from lidarspec.testing.ports import virtual_port
+from lidarspec.testing.fixtures import virtual_port
 from tests.cli.running import printed, process, ran
 from tests.lines import paced, port, udp, working
 

@@ -19,8 +19,8 @@ from pathlib import Path
 import pytest
 
 import lidarspec as ls
-from lidarspec.files import Chunk
 from lidarspec.recording.recordings import Recorder, Recording
+from lidarspec.transports.protocol import Chunk
 from tests.cli.running import printed, process, ran
 from tests.lines import SLACK, port
 

@@ -16,8 +16,8 @@ from typing import Any
 import pytest
 
 from lidarspec import Sensor
-from lidarspec.export import export
-from lidarspec.export.expressions import identifier
+from lidarspec.exports import export
+from lidarspec.exports.ksy import identifier
 
 HERE = Path(__file__).parent
 #: the compiler of Kaitai's own packages, by path or on PATH; without it the npm package is looked for, as node does (NODE_PATH).

@@ -12,7 +12,7 @@ import pytest
 
 from lidarspec import Sensor, Udp
 from lidarspec.captures.pcap import USER_LINKS, Datagram, PcapWriter
-from lidarspec.export import export
+from lidarspec.exports import export
 
 TSHARK = shutil.which("tshark")
 needs_tshark = pytest.mark.skipif(TSHARK is None, reason="tshark is not installed")

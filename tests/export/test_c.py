@@ -15,11 +15,11 @@ from typing import Any
 import pytest
 
 from lidarspec import Sensor, WireError
-from lidarspec.export import Refused, export
-from lidarspec.frames.codecs import codec
-from lidarspec.frames.schema import Schema
-from lidarspec.spec import replaced
-from lidarspec.testing import material
+from lidarspec.exports import Refused, export
+from lidarspec.framing.frame_engine import codec
+from lidarspec.spec.description import replaced
+from lidarspec.testing import subject as material
+from lidarspec.wire.schema import Schema
 from tests.export.trees import DISTINCT, EVERY, values
 
 GCC = shutil.which("gcc")

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 import lidarspec
-from lidarspec.export import export
+from lidarspec.exports import export
 from tests.cli.running import EXAMPLE
 from tests.export.sharks import captured, needs_tshark, tshark, written
 from tests.pages import blocks

@@ -14,9 +14,9 @@ from xml.etree import ElementTree
 import pytest
 
 import lidarspec as ls
-from lidarspec.export import EXPORTS, Refused, UnknownExport, export, narrowed
-from lidarspec.export.diagram import BIT, BITS, LEFT
-from lidarspec.frames.schema import schema
+from lidarspec.exports import EXPORTS, Refused, UnknownExport, export, narrowed
+from lidarspec.exports.diagram import BIT, BITS, LEFT
+from lidarspec.wire.schema import schema
 from tests.cli.running import ran
 from tests.export.json_decoder import Decoder
 from tests.shapes import SHAPES

@@ -10,8 +10,8 @@ from construct import Array, Bytes, BytesInteger, Const, Float16b, If, IfThenEls
 
 import lidarspec as ls
 from lidarspec import Frame, Sensor
-from lidarspec.export import Refused, export
-from lidarspec.export.yaml import yaml
+from lidarspec.exports import Refused, export
+from lidarspec.exports.ksy import yaml
 from tests.export import kaitai
 from tests.shapes import SHAPES
 

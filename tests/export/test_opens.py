@@ -9,9 +9,9 @@ import pytest
 
 import lidarspec
 from lidarspec.captures.pcap import CaptureStats, Datagram, PcapWriter, StreamReader
-from lidarspec.files import Chunk
 from lidarspec.recording.recorders import FrameRecorder, recorder
-from lidarspec.sources import transport
+from lidarspec.transports.open_url import transport
+from lidarspec.transports.protocol import Chunk
 from tests.cli.running import ran
 from tests.export.sharks import columns, needs_tshark, tshark, written
 

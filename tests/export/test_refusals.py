@@ -9,10 +9,10 @@ import pytest
 from construct import Array, Bytes, Const, Int8ub, Int16ub, Struct, Switch, this
 
 from lidarspec import Checksum, Checksummed, Frame, Sensor, UsageError
-from lidarspec.export import Refused, UnknownExport, export
-from lidarspec.export.formulas import Op, Ref
-from lidarspec.export.messages import messages
-from lidarspec.export.tree import Repeat, nodes
+from lidarspec.exports import Refused, UnknownExport, export
+from lidarspec.exports.formulas import Op, Ref
+from lidarspec.exports.messages import messages
+from lidarspec.exports.tree import Repeat, nodes
 from tests.export.oddities import SENSOR
 from tests.shapes.calibration import BARE
 

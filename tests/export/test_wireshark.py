@@ -12,9 +12,9 @@ import pytest
 import lidarspec
 from lidarspec import Sensor
 from lidarspec.captures.pcap import CaptureReader
-from lidarspec.export import Refused, export
-from lidarspec.frames.codecs import codec
-from lidarspec.testing import material
+from lidarspec.exports import Refused, export
+from lidarspec.framing.frame_engine import codec
+from lidarspec.testing import subject as material
 from tests import made_captures as made
 from tests.export.sharks import captured, columns, dissector, needs_tshark, tshark, written
 from tests.export.trees import DISTINCT, EVERY, values

@@ -11,7 +11,7 @@ import pytest
 
 import lidarspec as ls
 from lidarspec.captures.pcap import CaptureReader
-from lidarspec.streams import PacketStream
+from lidarspec.packets.stream import PacketStream
 from lidarspec.testing.comparisons import assert_same_points
 from tests.sensors.evidence import assert_points, capture, clockwise, decoded, vector_bytes, vectors
 

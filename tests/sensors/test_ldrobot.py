@@ -12,7 +12,7 @@ import pytest
 from construct import Array, Const, Int8ul, Int16ul, Struct
 
 import lidarspec as ls
-from lidarspec.streams import PacketStream
+from lidarspec.packets.stream import PacketStream
 from tests.sensors.evidence import assert_points, capture, clockwise, decoded, vector_bytes, vectors
 
 FILE = "vectors_serial2d.json"

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 import lidarspec as ls
-from lidarspec.scans import ScanStream
-from lidarspec.streams import PacketStream
+from lidarspec.packets.stream import PacketStream
+from lidarspec.scans.scans import ScanStream
 from lidarspec.testing.comparisons import assert_same_points
 from tests.sensors.evidence import decoded, vector_bytes, vectors
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import lidarspec as ls
-from lidarspec.frames.codecs import codec
+from lidarspec.framing.frame_engine import codec
 from tests.sensors.evidence import assert_points, clockwise, decoded, vector_bytes, vectors
 from tests.sensors.rplidar import believing
 

@@ -9,8 +9,7 @@ import pytest
 
 import lidarspec as ls
 from lidarspec.simulation.simulator import simulate
-from lidarspec.testing.damage import damaged
-from lidarspec.testing.oracle import Oracle
+from lidarspec.testing.framing import Oracle, damaged
 from lidarspec_slamtec.capsules import ultra_codes
 from tests.sensors.evidence import clockwise, decoded
 from tests.sensors.rplidar import A1, ANSWERS, believing, capsule, capsules, nodes_in, turns

@@ -7,8 +7,7 @@ import re
 import numpy as np
 import pytest
 
-from lidarspec.view.canvas import BLANK, Canvas, Cells
-from lidarspec.view.palette import ALARM, FAINT, INKS, PLAIN, RAMPS, STEPS, sgr, style
+from lidarspec.view.canvas import ALARM, BLANK, FAINT, INKS, PLAIN, RAMPS, STEPS, Canvas, Cells, sgr, style
 from lidarspec.view.screen import changes
 from tests.view.test_polar import DOTS
 

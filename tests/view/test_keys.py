@@ -9,10 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lidarspec.view.canvas import Canvas
-from lidarspec.view.keys import decoded
+from lidarspec.view.canvas import STRONG, Canvas
 from lidarspec.view.live import Choice
-from lidarspec.view.palette import STRONG
+from lidarspec.view.screen import decoded
 
 
 @pytest.mark.parametrize(

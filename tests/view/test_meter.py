@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 import lidarspec as ls
-from lidarspec.decoder import Decoder
-from lidarspec.packets import Packets
-from lidarspec.scans import ScanStream
+from lidarspec.framing.decoder import Decoder
+from lidarspec.packets.packets import Packets
+from lidarspec.packets.stream import PacketStream
+from lidarspec.scans.scans import ScanStream
 from lidarspec.simulation.simulator import simulate
-from lidarspec.streams import PacketStream
-from lidarspec.view.meter import Meter
+from lidarspec.view.feed import Meter
 
 ID = "ldrobot-stl27l"
 FRAMES = 900

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from lidarspec import PointCloud
-from lidarspec.view.canvas import BLANK
-from lidarspec.view.palette import RAMPS, STEPS
+from lidarspec.view.canvas import BLANK, RAMPS, STEPS
 from lidarspec.view.polar import Look, look, picture, ring_step, rounded_up
 
 DOTS = {0x01: (0, 0), 0x02: (1, 0), 0x04: (2, 0), 0x40: (3, 0), 0x08: (0, 1), 0x10: (1, 1), 0x20: (2, 1), 0x80: (3, 1)}

@@ -1,0 +1,137 @@
+"""The verb that makes a new sensor's distribution.
+
+The verb that checks a plugin.
+
+`export`: a spec in the language of another tool.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+from pathlib import Path
+from shlex import quote
+
+import click
+
+from lidarspec.cli.failures import FINDINGS, suggest
+from lidarspec.cli.output import Progress, emit, emit_json, note
+from lidarspec.discovery.draft import draft
+from lidarspec.discovery.scaffold import Link, Names, captured, invented, write
+from lidarspec.errors import UsageError, WireError
+from lidarspec.exports import EXPORTS, Refused, export as exported, narrowed
+from lidarspec.plugins import sensor as named_sensor, sensors
+from lidarspec.testing.check import Report, reports, target
+from lidarspec.testing.subject import EXAMPLES
+from lidarspec.transports.open_url import transport
+from lidarspec.transports.protocol import Chunk
+
+#: bytes of a capture that are looked at.
+MOST = 1 << 22
+
+
+@click.command()
+@click.argument("sensor_id", metavar="ID")
+@click.option("--into", metavar="DIR", default=".", help="Where the distribution's folder goes; by default into this one.")
+@click.option("--link", type=click.Choice(["serial", "udp"]), help="What the sensor sends over; serial by default.")
+@click.option("--from-capture", "capture", metavar="FILE", help="Draft the frames from their bytes: raw, .pcap, .lsr, .hex.")
+def new(sensor_id: str, into: str, link: str | None, capture: str | None) -> None:
+    """A distribution for a sensor of your own, which works before anything in it is changed.
+
+    It has an invented sensor with frames, checksum, points, commands and simulation, its tests, and the entry point by which it is
+    found once it is installed. With --from-capture it has what the bytes of a capture can be told to consist of: sync bytes, length,
+    checksum, counters, angles, each with the evidence for it; what cannot be told is called unknown.
+    """
+    names = Names(sensor_id)
+    if sensor_id in sensors():
+        raise suggest(UsageError(f"{sensor_id} is installed already: choose another id"), f"lidarspec show {sensor_id}")
+    folder = Path(into) / names.distribution
+    if folder.exists():
+        raise UsageError(f"{folder} exists already: nothing was written")
+    texts = invented(names, "udp" if link == "udp" else "serial") if capture is None else _drafted(names, link, capture)
+    write(folder, texts)
+    for name in texts:
+        click.echo(folder / name)
+    look = f"demo -s {sensor_id}" if capture is None else f"explain {quote(capture)} -s {sensor_id}"
+    note(f"next: pip install -e {quote(f'{folder}[test]')} && pytest {quote(str(folder))} && lidarspec {look}")
+
+
+def _drafted(names: Names, link: str | None, capture: str) -> dict[str, str]:
+    """The files with a draft of the capture's frames: of several senders and ports, those that the most bytes come from and go to."""
+    opened = transport(capture)
+    groups: dict[object, list[Chunk]] = {}
+    size = 0
+    try:
+        for chunk in opened.chunks():
+            groups.setdefault((chunk.sender and chunk.sender[0], chunk.receiver and chunk.receiver[1]), []).append(chunk)
+            size += len(chunk.data)
+            if size >= MOST:
+                break
+    finally:
+        opened.close()
+    chunks = max(groups.values(), key=lambda group: sum(len(chunk.data) for chunk in group), default=[])
+    if not size:
+        raise WireError(f"{capture} holds no bytes")
+    found = draft([chunk.data for chunk in chunks], datagrams=opened.datagrams)
+    note(f"{capture}: {len(found.frames)} frames, {found.share:.1%} of {found.bytes_in} bytes")
+    receiver = chunks[0].receiver
+    chosen: Link = "udp" if (link or ("udp" if opened.datagrams else "serial")) == "udp" else "serial"
+    return captured(names, chosen, found, origin=f"a capture, {Path(capture).name}", port=receiver[1] if receiver else None)
+
+
+@click.command()
+@click.argument("name", metavar="ID|FILE|DISTRIBUTION|FOLDER")
+@click.option("--max-examples", type=click.IntRange(1), default=EXAMPLES, show_default=True, help="Examples of each frame type.")
+@click.option("--vectors", metavar="FILE", help="Golden vectors; by default vectors.json beside a file.")
+@click.option("-v", "--verbose", is_flag=True, help="Also what was skipped and why, and what was measured.")
+@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+@click.option("-o", "--output", metavar="FILE", help="Write to a file instead of standard output.")
+@click.pass_context
+def check(ctx: click.Context, name: str, max_examples: int, vectors: str | None, verbose: bool, as_json: bool, output: str | None) -> None:
+    """What is wrong with a sensor, a file or a distribution: every promise, and mistakes in its spec.
+
+    Everything that the test kit asks, without a test file. Exit code 1 where there are findings.
+    """
+    if importlib.util.find_spec("hypothesis") is None:
+        raise UsageError("check needs hypothesis: pip install 'lidarspec[testing]'")
+    file = Path(vectors) if vectors else None
+    with Progress() as line:
+        found = list(reports(target(name), name, examples=max_examples, vectors=file, watch=lambda text: line(lambda: text)))
+    if as_json:
+        emit_json([report.to_dict() for report in found], output)
+    else:
+        emit("\n\n".join(text for report in found for text in _told(report, verbose=verbose)), output)
+    if any(report.findings for report in found):
+        ctx.exit(FINDINGS)
+
+
+def _told(report: Report, *, verbose: bool) -> list[str]:
+    """A report in paragraphs."""
+    paragraphs = [str(finding) for finding in report.findings]
+    number = len(report.findings)
+    verdict = f"{number} finding{'s' * (number != 1)}" if number else "clean"
+    more = f", {report.held} properties hold" if report.held else ""
+    more += f", {len(report.skipped)} skipped" if report.skipped else ""
+    lines = [f"{report.name}: {verdict}{more}"]
+    if verbose:
+        lines += [f"  skipped   {name}: {reason}" for name, reason in report.skipped.items()]
+        lines += [f"  measured  {name}: {value}" for name, value in report.measured.items()]
+    return [*paragraphs, "\n".join(lines)]
+
+
+@click.command()
+@click.argument("kind", metavar="KIND", type=click.Choice(list(EXPORTS)))
+@click.argument("sensor_id", metavar="SENSOR")
+@click.option("-o", "--output", metavar="FILE", help="Write to a file instead of standard output.")
+@click.option("-f", "--frame", metavar="NAME", help="One frame type alone; by default all, or the one that carries the points.")
+def export(kind: str, sensor_id: str, output: str | None, frame: str | None) -> None:
+    """A sensor's spec for another tool: wireshark, c, ksy (Kaitai), md, svg, json, pyi.
+
+    SENSOR is an id or a file ./mysensor.py. What the target cannot say is refused, with the reason.
+    """
+    sensor = named_sensor(sensor_id)
+    chosen = sensor if frame is None else narrowed(sensor, frame)
+    try:
+        text = exported(kind, chosen)
+    except Refused as refused:
+        raise suggest(refused, f"lidarspec show {sensor.id}") from None
+    emit(text.removesuffix("\n"), output)

@@ -1,0 +1,182 @@
+"""`build`: one frame out of field=value."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import click
+
+from lidarspec.cli.failures import suggest
+from lidarspec.cli.output import emit, emit_json, output_options
+from lidarspec.errors import LidarSpecError, OutOfRange, SourceError, UnknownField, UnknownFrame, UsageError
+from lidarspec.plugins import sensor as named_sensor
+from lidarspec.spec.fields import exact, factor, split_unit
+from lidarspec.wire.schema import FieldInfo, Schema, schema
+
+_STEP = re.compile(r"(\w+)((?:\[(?:\d+|\*)\])*)")
+_PATH = re.compile(rf"{_STEP.pattern}(?:\.{_STEP.pattern})*")
+
+Index = int | str
+Steps = list[tuple[str, list[Index]]]
+
+
+@click.command()
+@click.argument("sensor_id", metavar="ID")
+@click.argument("frame")
+@click.argument("assignments", metavar="FIELD=VALUE", nargs=-1)
+@output_options
+def build(sensor_id: str, frame: str, assignments: Sequence[str], as_json: bool, output: str | None) -> None:
+    """The bytes of one frame from field=value; a unit makes a value physical.
+
+    A bare number is the wire's integer. points[*].distance=1m sets every element, points[3].intensity=7 one; later ones win.
+    Constants, counts and checksums are filled in. -o writes the bytes themselves, or text where FILE ends in .hex.
+    """
+    sensor = named_sensor(sensor_id)
+    if frame not in sensor.frames:
+        raise suggest(UnknownFrame(frame, sensor.frames, place=sensor.id), f"lidarspec show {sensor_id}")
+    try:
+        data = sensor.build(frame, values(schema(sensor.frames[frame].prepared), assignments, f"{sensor.id} {frame}"))
+    except LidarSpecError as error:
+        raise suggest(error, f"lidarspec show {sensor_id}") from None
+    if as_json:
+        emit_json({"sensor": sensor.id, "frame": frame, "size": len(data), "hex": data.hex(" ")}, output)
+    elif output is None or output.endswith(".hex"):
+        emit(data.hex(" "), output)
+    else:
+        _write(output, data)
+
+
+def _write(output: str, data: bytes) -> None:
+    try:
+        Path(output).write_bytes(data)
+    except OSError as error:
+        raise SourceError(f"{output}: {error.strerror or error}") from None
+
+
+def values(table: Schema, assignments: Sequence[str], place: str) -> dict[str, Any]:
+    """Raw values, nested as in the struct.
+
+    Raises:
+        UsageError: for an assignment that is none, an unknown field, or a value that its field cannot take.
+    """
+    parsed = [_assignment(table, text, place) for text in assignments]
+    found: dict[str, Any] = {}
+    for steps, value in sorted(parsed, key=lambda item: any(indices for _, indices in item[0])):
+        _put(found, steps, value, lambda path: _length(table, found, path, place), "")
+    return found
+
+
+def _assignment(table: Schema, text: str, place: str) -> tuple[Steps, Any]:
+    path, equals, value = text.partition("=")
+    if not equals or not _PATH.fullmatch(path):
+        raise UsageError(f"{place}: {text!r} is not field=value")
+    steps: Steps = [
+        (name, [part if part == "*" else int(part) for part in re.findall(r"[\d*]+", indices)]) for name, indices in _STEP.findall(path)
+    ]
+    plain = ".".join(name for name, _ in steps)
+    info = table.fields.get(plain)
+    if info is None:
+        raise UnknownField(path, table.fields, place=place)
+    arrays = len(info.axes) - (info.kind == "bytes")
+    given = sum(len(indices) for _, indices in steps)
+    if given != arrays:
+        raise UsageError(f"{place}: {plain} is in {arrays} array{'s' * (arrays != 1)}, and {path!r} has {given} indices")
+    return steps, _raw(info, value.strip(), path, place)
+
+
+def _raw(info: FieldInfo, text: str, path: str, place: str) -> Any:
+    """The raw value that a text stands for: hexadecimal for bytes, a label, a number, or a number with a unit."""
+    if info.kind == "bytes":
+        try:
+            return bytes.fromhex(text)
+        except ValueError:
+            raise UsageError(f"{place}: {path} takes bytes in hexadecimal, not {text!r}") from None
+    for raw, label in info.labels.items():
+        if text == label:
+            return raw
+    digits, unit = split_unit(text)
+    try:
+        number = Fraction(int(digits, 0)) if re.fullmatch(r"0[xXbBoO]\w+", digits) else Fraction(digits)
+    except ValueError:
+        raise UsageError(f"{place}: {path} takes a number, not {text!r}") from None
+    if unit:
+        return _steps(info, number, unit, path, place)
+    if number.denominator == 1 and info.kind != "float":
+        return int(number)
+    if info.kind == "int":
+        raise UsageError(f"{place}: {path} = {text} is not a raw integer{f'; give it a unit: {text}{info.unit}' if info.unit else ''}")
+    return float(number)
+
+
+def _steps(info: FieldInfo, number: Fraction, unit: str, path: str, place: str) -> int | float:
+    """The raw value nearest to a physical one."""
+    per_unit = factor(unit, info.unit)
+    if per_unit is None:
+        raise UsageError(f"{place}: {path} is in {info.unit or 'no unit'}, and {unit!r} cannot be turned into that")
+    raw = (number * per_unit - exact(info.offset)) / exact(info.scale)
+    if info.kind != "int":
+        return float(raw)
+    low, high = info.limits
+    if not low <= round(raw) <= high:
+        edges = [float(edge * exact(info.scale) + exact(info.offset)) for edge in (low, high)]
+        raise OutOfRange(path, float(number * per_unit), *edges, unit=info.unit, place=place)
+    return round(raw)
+
+
+def _put(target: dict[str, Any], steps: Steps, value: Any, length: Callable[[str], int], above: str) -> None:
+    """Set a value; "*" stands for every element of an array of known length."""
+    (name, indices), *rest = steps
+    path = f"{above}.{name}" if above else name
+    if not indices:
+        if rest:
+            _put(target.setdefault(name, {}), rest, value, length, path)
+        else:
+            target[name] = value
+        return
+    _elements(target.setdefault(name, []), indices, rest, value, length, path)
+
+
+def _elements(array: list[Any], indices: list[Index], rest: Steps, value: Any, length: Callable[[str], int], path: str) -> None:
+    index, *more = indices
+    places = range(length(path) or len(array)) if index == "*" else [int(index)]
+    for place in places:
+        array.extend([None] * (place + 1 - len(array)))
+        if more:
+            array[place] = array[place] or []
+            _elements(array[place], more, rest, value, length, f"{path}[]")
+        elif rest:
+            array[place] = array[place] or {}
+            _put(array[place], rest, value, length, path)
+        else:
+            array[place] = value
+
+
+class _Scope(dict[str, Any]):
+    """What the length of an array is computed from: the values given so far, by item and by attribute."""
+
+    def __getattr__(self, name: str) -> Any:
+        return self[name]
+
+
+def _scope(value: Any) -> Any:
+    return _Scope({name: _scope(element) for name, element in value.items()}) if isinstance(value, Mapping) else value
+
+
+def _length(table: Schema, given: Mapping[str, Any], path: str, place: str) -> int:
+    """The length of an array: declared, or from the count fields given; 0 where it follows from single elements given."""
+    declared = table.arrays[path]
+    if isinstance(declared, int):
+        return declared
+    try:
+        return int(declared(_scope(given)))
+    except Exception:
+        target: Any = given
+        for name in path.removesuffix("[]").split("."):
+            target = target.get(name, {}) if isinstance(target, Mapping) else {}
+        if isinstance(target, list) and target:
+            return 0
+        raise UsageError(f"{place}: how many elements {path}[*] has is not known: give the count field, or {path}[0]=...") from None

@@ -1,0 +1,390 @@
+"""The verb that lists the ports of this computer.
+
+The verb that finds out which checksum it is.
+
+The verb that finds out which sensor it is.
+
+The verb that finds out why nothing comes.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Sequence
+from shlex import quote
+from typing import Any
+
+import click
+
+from lidarspec.cli.failures import DEVICE, FINDINGS, NO_DATA, suggest
+from lidarspec.cli.inputs import read
+from lidarspec.cli.output import emit, emit_json, note, output_options, sensor_option, table
+from lidarspec.cli.streams import Duration
+from lidarspec.device.settings import named
+from lidarspec.discovery.checksum_search import search
+from lidarspec.discovery.detect import Score, Verdict, verdict, verdicts
+from lidarspec.discovery.doctor import Finding, computer, examined
+from lidarspec.discovery.listen import LISTEN, Heard, everywhere, hear, probe, started_first, udp_ports
+from lidarspec.discovery.periods import Structure, cut, structure
+from lidarspec.discovery.samples import Match
+from lidarspec.errors import SourceError, UsageError
+from lidarspec.plugins import sensor as named_sensor, sensors
+from lidarspec.spec.checksums import CRCS, Crc
+from lidarspec.spec.links import Udp
+from lidarspec.transports.open_url import live_address
+from lidarspec.transports.ports import SerialPort, User, serial_ports, udp_users
+
+
+@click.command()
+@output_options
+def ports(as_json: bool, output: str | None) -> None:
+    """The serial ports of this computer, and the UDP ports that installed sensors send to."""
+    serial, udp = serial_ports(), {port: udp_users(port) for port in udp_ports()}
+    if as_json:
+        emit_json({"serial": [_serial(port) for port in serial], "udp": [_udp(port, users) for port, users in udp.items()]}, output)
+        return
+    rows = [[port.path, port.description or "serial port", _state(port), port.lasting] for port in serial]
+    rows += [[f"udp://:{port}", ", ".join(_senders(port)), _udp_state(users), ""] for port, users in udp.items()]
+    emit(table(["port", "what it is", "state", "lasting name"], rows, output), output)
+    if not serial:
+        note("there is no serial port; one that should be here: is it plugged in?")
+    note(f"next: lidarspec detect{f' {serial[0].path}' if len(serial) == 1 else ''}")
+
+
+def _senders(port: int) -> list[str]:
+    """The installed sensors whose data come to a UDP port."""
+    found = []
+    for sensor in sensors().values():
+        link = sensor.links.get("data")
+        if isinstance(link, Udp) and port in link.ports:
+            found.append(sensor.id)
+    return found
+
+
+def _state(port: SerialPort) -> str:
+    if not port.allowed:
+        return "no permission: lidarspec doctor"
+    return f"in use by {', '.join(map(str, port.users))}" if port.users else "free"
+
+
+def _udp_state(users: tuple[User, ...] | None) -> str:
+    if users is None:
+        return "free"
+    return f"in use by {', '.join(map(str, users)) or 'another user'}"
+
+
+def _serial(port: SerialPort) -> dict[str, Any]:
+    return {**vars(port), "users": [vars(user) for user in port.users]}
+
+
+def _udp(port: int, users: tuple[User, ...] | None) -> dict[str, Any]:
+    return {"port": port, "sensors": _senders(port), "free": users is None, "users": [vars(user) for user in users or ()]}
+
+
+#: doubt below which a match may well be chance.
+WEAK = 12
+#: matches that are printed, and the texts that read as hexadecimal.
+PRINTED = 4
+HEX = (".hex", ".txt")
+
+
+@click.command()
+@click.argument("words", metavar="HEX...|FILE|-", nargs=-1, required=True)
+@click.option("--period", type=click.IntRange(min=3), help="The length of the frames, for a file in which they follow each other.")
+@click.option("--offset", type=click.IntRange(min=0), default=0, help="Where the first of them begins.")
+@output_options
+def crc(words: Sequence[str], period: int | None, offset: int, as_json: bool, output: str | None) -> None:
+    """Which checksum seals some sample frames: XOR, sums, or a CRC of 8, 16 or 32 bits.
+
+    Frames are words of hexadecimal digits, one each; a text file with a frame in each line (.hex, .txt); or a capture. Of raw
+    bytes the frames are found out, or --period says how long they are. The more frames, the surer the answer: a dozen is plenty.
+    """
+    frames = _frames(words, period, offset)
+    found = search(frames)
+    if as_json:
+        emit_json({"frames": len(frames), "matches": [checksum_told(match) for match in found]}, output)
+    elif found:
+        shown = [match for match in found if match.open == found[0].open][:PRINTED]
+        emit("\n\n".join(_text(match, len(frames[0])) for match in shown), output)
+    if not found:
+        note(
+            f"no checksum of {len(frames)} frame{'s' * (len(frames) != 1)} was found: are they whole, and do they begin where they should?"
+        )
+        raise click.exceptions.Exit(FINDINGS)
+    if found[0].doubt < WEAK:
+        note("this may be chance: give more frames")
+
+
+def _frames(words: Sequence[str], period: int | None, offset: int) -> list[bytes]:
+    """The sample frames."""
+    if len(words) == 1 and (words[0] == "-" or os.path.exists(words[0])):
+        return _of_file(words[0], period, offset)
+    whole = read(words).data
+    if period is not None:
+        return cut(whole, period, offset)
+    each = [read([word]).data for word in words]
+    return each if min(map(len, each)) > 2 else [whole]
+
+
+def _of_file(path: str, period: int | None, offset: int) -> list[bytes]:
+    if path != "-" and not path.endswith(HEX):
+        heard = max(hear(path), key=lambda one: one.size)
+        chunks, datagrams = heard.chunks, heard.datagrams
+    else:
+        given = read([path])
+        chunks, datagrams = tuple(chunk for chunk in given.chunks if chunk), len(given.chunks) > 1
+    if period is not None:
+        return cut(b"".join(chunks), period, offset)
+    if datagrams and path.endswith(HEX):
+        return list(chunks)
+    found = structure(chunks, datagrams=datagrams, seal=False)
+    if found is None:
+        raise suggest(UsageError(f"{path}: where its frames begin cannot be seen"), f"lidarspec crc {path} --period BYTES --offset BYTES")
+    length = f"{found.period} bytes" if found.period else f"{found.length} bytes"
+    note(f"{len(found.frames)} frames that begin with {found.sync.hex(' ')}, {length} long")
+    return list(found.frames)
+
+
+def checksum_told(match: Match) -> dict[str, Any]:
+    """A match for JSON."""
+    return {
+        "checksum": match.algorithm.describe(),
+        "name": match.name,
+        "paste": match.paste,
+        "field": {"offset": match.place.offset, "size": match.place.size, "order": match.order},
+        "over": {"part": match.span.part, "head": match.span.head, "tail": match.span.tail},
+        "right": match.right,
+        "frames": match.total,
+        "evidence_bits": round(match.doubt, 1),
+        "remarks": list(match.remarks),
+    }
+
+
+def _text(match: Match, length: int) -> str:
+    order = f", {match.order}-endian" if match.place.size > 1 else ""
+    name = f" ({match.name})" if match.name else ""
+    chance = f"one wrong guess in {match.odds} would be" if match.doubt >= WEAK else "which may be chance"
+    lines = [
+        f"{match.algorithm.describe()}{name}: right in {match.right} of {match.total} frames; {chance}",
+        f"  field: {match.place}{order}",
+        f"  over:  {match.span.told(match.place, length)}",
+        *(f"  note:  {remark}" for remark in match.remarks),
+    ]
+    known = isinstance(match.algorithm, Crc) and match.algorithm in CRCS.values()
+    lines += (
+        [f"  paste: {match.paste}"]
+        if "\n" not in match.paste or known
+        else ["  paste:", *("    " + line for line in match.paste.splitlines())]
+    )
+    return "\n".join(lines)
+
+
+#: checksums that are told of unknown bytes.
+TOLD = 2
+
+
+@click.command()
+@click.argument("source", required=False)
+@click.option("-t", "--duration", type=Duration(), default=LISTEN, metavar="TIME", help="How long to listen for, each time.")
+@click.option("--start", is_flag=True, help="Also send the start commands of sensors that keep silent until they are started.")
+@output_options
+def detect(source: str | None, duration: float, start: bool, as_json: bool, output: str | None) -> None:
+    """Which installed sensor sends, and at which port and baud rate.
+
+    SOURCE is a port, a file or a capture; without it every serial port is listened to at every baud rate that installed sensors
+    declare, and every UDP port. A sensor fits by the share of the bytes in frames that pass checksum and plausibility. Sensors
+    with the same frames are told apart by their clocks, names in their frames and baud rates, as far as that goes.
+    """
+    if source == "-":
+        raise suggest(UsageError("standard input can be read only once: write it to a file first"), "lidarspec detect FILE")
+    device = None if source is None else named(source)
+    source = source if device is None else device.source
+    found = list(_everywhere(duration, start=start)) if source is None else _one(source, duration, start=start)
+    fitting = [one for one in found if one.scores]
+    unknown = None if fitting else _unknown(found)
+    if as_json:
+        emit_json({"sources": [_told(one) for one in found], "structure": _structure_told(unknown)}, output)
+    elif fitting:
+        emit(_detected_text(found, output), output)
+    elif unknown is not None:
+        emit(_structure_text(unknown), output)
+    for line in _conclusions(source, found, unknown, start=start):
+        note(line)
+    if not fitting:
+        raise click.exceptions.Exit(_code(source, found))
+
+
+def _code(source: str | None, found: Sequence[Verdict]) -> int:
+    """The exit code where no sensor fits: nothing came from a source, or nothing that is known."""
+    is_silent = source is not None and live_address(source) is not None and not any(one.heard.size for one in found)
+    return DEVICE if is_silent else NO_DATA
+
+
+def _one(source: str, duration: float, *, start: bool) -> list[Verdict]:
+    found = verdicts(source, seconds=duration)
+    if start and not any(one.scores for one in found):
+        for heard in probe(source):
+            found = [_best([*found, verdict(heard)])]
+            if found[0].is_clear:
+                break
+    return found
+
+
+def _everywhere(duration: float, *, start: bool) -> Iterator[Verdict]:
+    ports = [port.path for port in serial_ports()]
+    note(f"listening to {len(ports)} serial port{'s' * (len(ports) != 1)} and UDP {', '.join(map(str, udp_ports()))}")
+    for port in ports:
+        try:
+            yield from _one(port, duration, start=start)
+        except SourceError as error:
+            yield Verdict(Heard(port, failure=error), (), ())
+    for heard in everywhere([], seconds=duration):
+        yield verdict(heard)
+
+
+def _best(found: Sequence[Verdict]) -> Verdict:
+    return max(found, key=lambda one: (one.scores[0].share if one.scores else 0.0, one.heard.size))
+
+
+def _unknown(found: Sequence[Verdict]) -> Structure | None:
+    """What the bytes are made of that fit no sensor."""
+    heard = max((one.heard for one in found), key=lambda heard: heard.size, default=None)
+    return structure(heard.chunks, datagrams=heard.datagrams) if heard is not None and heard.size else None
+
+
+def _detected_text(found: Sequence[Verdict], output: str | None) -> str:
+    rows = []
+    for one in found:
+        alike = {score.sensor.id for score in one.alike}
+        for score in one.scores:
+            verdict_of = "no" if score.sensor.id not in alike else "yes" if len(alike) == 1 else "perhaps"
+            rows.append([_place(one.heard), score.sensor.id, verdict_of, f"{score.share:.1%}", str(score.data_frames), score.why])
+    return table(["source", "sensor", "is it", "in frames", "data frames", "told by"], rows, output)
+
+
+def _place(heard: Heard) -> str:
+    where = heard.source + (f" from {heard.sender}" if heard.sender else "")
+    return f"{where} at {heard.baud} baud" if heard.baud is not None else where
+
+
+def _conclusions(source: str | None, found: Sequence[Verdict], unknown: Structure | None, *, start: bool) -> Iterator[str]:
+    for one in found:
+        if one.heard.failure is not None:
+            yield f"{one.heard.failure}"
+        elif one.sensor is not None:
+            yield f"next: lidarspec {_verb(one)} {_again(one)} -s {one.sensor.id}"
+        elif one.alike:
+            ids = [score.sensor.id for score in one.alike]
+            yield f"{_place(one.heard)}: {', '.join(ids)} send the same frames, and nothing in these tells them apart: choose one"
+            yield f"next: lidarspec {_verb(one)} {_again(one)} -s {ids[0]}"
+    if any(one.scores for one in found):
+        return
+    size = sum(one.heard.size for one in found)
+    if size:
+        yield f"{size} bytes, and no frame of an installed sensor" + ("" if unknown else "; nor can frames of one kind be seen in them")
+        yield f"next: {_following(source, unknown)}"
+        return
+    yield "nothing came"
+    is_serial = source is None or ((address := live_address(source)) is not None and address.scheme == "serial")
+    if is_serial and not start and started_first():
+        yield f"{', '.join(sensor.id for sensor in started_first())} send nothing before they are started"
+        yield f"next: lidarspec detect {source or ''}".rstrip() + " --start"
+    else:
+        yield f"next: lidarspec doctor {quote(source) if source else ''}".rstrip()
+
+
+def _verb(one: Verdict) -> str:
+    return "read" if live_address(one.heard.source) is None else "view"
+
+
+def _following(source: str | None, unknown: Structure | None) -> str:
+    """What to type where bytes come that no sensor fits."""
+    if source is None or live_address(source) is not None:
+        return f"lidarspec doctor {quote(source) if source else ''}".rstrip()
+    if unknown is not None and unknown.period and not unknown.checksums:
+        return f"lidarspec crc {source} --period {unknown.period}"
+    return "lidarspec sensors"
+
+
+def _again(one: Verdict) -> str:
+    """The source as it has to be opened for the sensor that was found."""
+    source, heard = one.heard.source, one.heard
+    link = one.sensor.links.get("data") if one.sensor is not None else None
+    if heard.baud is not None and "baud=" not in source and heard.baud != getattr(link, "baud", None):
+        source += f"{'&' if '?' in source else '?'}baud={heard.baud}"
+    if heard.sender and "src=" not in source:
+        source += f"{'&' if '?' in source else '?'}src={heard.sender}"
+    return quote(source)
+
+
+def _told(one: Verdict) -> dict[str, Any]:
+    """A verdict for JSON."""
+    heard = one.heard
+    return {
+        "source": heard.source,
+        "baud": heard.baud,
+        "sender": heard.sender or None,
+        "bytes": heard.size,
+        "failure": str(heard.failure) if heard.failure else None,
+        "sensor": one.sensor.id if one.sensor is not None else None,
+        "alike": [score.sensor.id for score in one.alike],
+        "fits": [_score(score) for score in one.scores],
+    }
+
+
+def _score(score: Score) -> dict[str, Any]:
+    return {"sensor": score.sensor.id, "share": round(score.share, 4), "data_frames": score.data_frames, "told_by": score.why}
+
+
+def _structure_told(found: Structure | None) -> dict[str, Any] | None:
+    if found is None:
+        return None
+    checksums = [checksum_told(match) for match in found.checksums]
+    return {
+        "sync": found.sync.hex(" "),
+        "period": found.period,
+        "length": str(found.length) if found.length else None,
+        "share": round(found.share, 4),
+        "frames": len(found.frames),
+        "checksums": checksums,
+    }
+
+
+def _structure_text(found: Structure) -> str:
+    length = f"{found.period} bytes each" if found.period else f"of {found.length} bytes"
+    lines = [
+        "unknown frames:",
+        f"  sync      {found.sync.hex(' ') or 'not known'}",
+        f"  length    {length}: {len(found.frames)} of them, {found.share:.0%} of the bytes",
+    ]
+    for match in found.checksums[:TOLD]:
+        told = match.paste if "\n" not in match.paste else match.algorithm.describe()
+        lines.append(f"  checksum  {told} in {match.place}: right in {match.right} of {match.total}")
+    return "\n".join(lines if found.checksums else [*lines, "  checksum  none was found"])
+
+
+@click.command()
+@click.argument("source", required=False)
+@sensor_option
+@click.option("-t", "--duration", type=Duration(), default=LISTEN, metavar="TIME", help="How long to listen for, each time.")
+@output_options
+def doctor(source: str | None, sensor_id: str | None, duration: float, as_json: bool, output: str | None) -> None:
+    """What keeps a sensor's bytes from coming, and the command that mends it.
+
+    Looks for missing ports and rights, ports in use, small buffers, silence, a wrong baud rate, a wrong interface. Without SOURCE
+    all ports of this computer. Ends with 1 where something is wrong.
+    """
+    sensor = None if sensor_id is None else named_sensor(sensor_id)
+    if source is not None and not as_json:
+        note(f"listening to {source}")
+    found = list(computer()) if source is None else list(examined(source, sensor, seconds=duration))
+    if as_json:
+        emit_json([vars(finding) for finding in found], output)
+    else:
+        emit("\n".join(line for finding in found for line in _lines(finding)) or "nothing is wrong with the ports of this computer", output)
+    if any(not finding.ok for finding in found):
+        raise click.exceptions.Exit(FINDINGS)
+
+
+def _lines(finding: Finding) -> list[str]:
+    return [f"{'ok   ' if finding.ok else 'wrong'}  {finding.text}"] + ([f"       next: {finding.mend}"] if finding.mend else [])

@@ -1,0 +1,155 @@
+"""The verbs that look at what is installed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import click
+import numpy as np
+
+from lidarspec.cli.output import emit, emit_json, note, output_options, table
+from lidarspec.columns.columns import Batch
+from lidarspec.errors import SpecError
+from lidarspec.plugins import registry, sensor as named_sensor
+from lidarspec.points.plain import points_function
+from lidarspec.points.plan import Plan, plan_for
+from lidarspec.simulation.frame_maker import FrameMaker
+from lidarspec.spec.description import Command, Frame, Sensor
+from lidarspec.spec.links import Link, Serial, Tcp, Udp
+from lidarspec.wire.wire_table import frame_size, wire_table
+
+#: packets that a plan is shown for: as many as a turn may take, since some of them are shorter.
+PACKETS = 32
+NO_SENSORS = "no sensor is installed: pip install 'lidarspec[all]'"
+
+
+@click.command()
+@output_options
+def sensors(as_json: bool, output: str | None) -> None:
+    """The installed sensors, and how far each is proven."""
+    known = registry().sensors()
+    homes = {name: plugin.distribution for plugin in registry().plugins for name in plugin.sensors}
+    if as_json:
+        emit_json([_facts(sensor) | {"distribution": homes.get(name, "")} for name, sensor in known.items()], output)
+    elif known:
+        rows = [[s.id, f"{s.vendor} {s.model}", _links(s), s.status, homes.get(name, "")] for name, s in known.items()]
+        emit(table(["id", "device", "link", "status", "distribution"], rows, output), output)
+    if not known:
+        note(NO_SENSORS)
+    broken = [plugin for plugin in registry().plugins if plugin.error]
+    if broken:
+        note(f"{len(broken)} plugin{'s' * (len(broken) > 1)} could not be loaded; next: lidarspec plugins")
+
+
+@click.command()
+@click.argument("sensor_id", metavar="SENSOR")
+@click.option("--plan", "as_plan", is_flag=True, help="How its points are computed, and what falls back to plain evaluation.")
+@output_options
+def show(sensor_id: str, as_plan: bool, as_json: bool, output: str | None) -> None:
+    """What a sensor is, and the wire table of each of its frames."""
+    sensor = named_sensor(sensor_id)
+    if as_plan:
+        plans = {name: _plan(sensor, name) for name, frame in sensor.frames.items() if frame.data}
+        emit_json(plans, output) if as_json else emit("\n".join(line for name in plans for line in (f"{name}:", *plans[name])), output)
+        return
+    if as_json:
+        frames = {name: _frame(frame) | {"rows": [vars(row) for row in wire_table(frame)]} for name, frame in sensor.frames.items()}
+        commands = {name: _command(sensor, command) for name, command in sensor.commands.items()}
+        emit_json({**_facts(sensor), "frames": frames, "commands": commands}, output)
+        return
+    low, high = sensor.range_limits
+    parts = [
+        f"{sensor.id}: {sensor.vendor} {sensor.model}",
+        f"  link    {_links(sensor)}\n  range   {low:g} .. {high:g} m\n  status  {sensor.status}\n  source  {sensor.source}",
+    ]
+    for name, command in sensor.commands.items():
+        parts.append(f"  command {name}{_command_text(_command(sensor, command))}")
+    for name, frame in sensor.frames.items():
+        rows = [[row.offset, row.size, row.type, row.field, row.unit, row.meaning] for row in wire_table(frame)]
+        kind = " (to the sensor)" if frame.direction == "out" else " (points)" if frame.data else ""
+        headers = ["offset", "size", "type", "field", "unit", "meaning"]
+        parts.append(f"\n{name}{kind}: {frame_size(frame)} bytes\n{table(headers, rows, output)}")
+    emit("\n".join(parts), output)
+
+
+def _plan(sensor: Sensor, frame: str) -> list[str]:
+    """The plan of a data frame in lines, or why there is none."""
+    try:
+        made, sweep = FrameMaker(sensor, frame), sensor.frames[frame].sweep or sensor.sweep
+    except SpecError as error:
+        return [f"plain evaluation: {error}"]
+    table = made.table([sweep(index) for index in range(PACKETS)]) if sweep else made.engine.table([sensor.example(frame)])
+    state = {name: (None, np.full(len(table), -1, np.intp)) for name in sensor.state}
+    largest = max(table.groups, key=lambda group: group.layout.size)
+    found = plan_for(points_function(sensor, frame), Batch(table, np.zeros(len(table), np.bool_), state, sensor.state), largest)
+    return found.describe() if isinstance(found, Plan) else [f"plain evaluation: {found}"]
+
+
+@click.command()
+@output_options
+def plugins(as_json: bool, output: str | None) -> None:
+    """The plugins that were found, and what is wrong with those that do not load."""
+    found = registry().plugins
+    if as_json:
+        emit_json([{**vars(plugin), "sensors": list(plugin.sensors)} for plugin in found], output)
+        return
+    rows = [[p.distribution, p.version, p.entry_point, f"not loaded: {p.error}" if p.error else ", ".join(p.sensors)] for p in found]
+    emit(table(["distribution", "version", "entry point", "sensors"], rows, output) if rows else NO_SENSORS, output)
+
+
+def _facts(sensor: Sensor) -> dict[str, Any]:
+    """What is known of a sensor, for JSON."""
+    return {
+        "id": sensor.id,
+        "vendor": sensor.vendor,
+        "model": sensor.model,
+        "status": sensor.status,
+        "source": sensor.source,
+        "aliases": list(sensor.aliases),
+        "links": {name: _link(link) for name, link in sensor.links.items()},
+        "frames": list(sensor.frames),
+        "commands": list(sensor.commands),
+        "range_limits": list(sensor.range_limits),
+    }
+
+
+def _frame(frame: Frame) -> dict[str, Any]:
+    return {"direction": frame.direction, "data": frame.data, "size": frame_size(frame), "max_length": frame.max_length}
+
+
+def _command(sensor: Sensor, command: Command) -> Mapping[str, Any]:
+    args = {name: {"field": path, "low": low, "high": high} for name, (path, low, high) in command.args.items()}
+    frame = "" if command.frame is None or args else sensor.build(command.frame, _nested(command.values)).hex(" ")
+    return {"frame": command.frame, "arguments": args, "hex": frame, "reply": " or ".join(command.replies) or None}
+
+
+def _command_text(command: Mapping[str, Any]) -> str:
+    args = "".join(f" {name}={limits['low']:g}..{limits['high']:g}" for name, limits in command["arguments"].items())
+    return f"{args}{': ' if command['hex'] else ''}{command['hex']}{', answered by ' + command['reply'] if command['reply'] else ''}"
+
+
+def _nested(values: Mapping[str, Any]) -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    for path, value in values.items():
+        *parents, last = path.split(".")
+        place = found
+        for parent in parents:
+            place = place.setdefault(parent, {})
+        place[last] = value
+    return found
+
+
+def _links(sensor: Sensor) -> str:
+    return ", ".join(_link_text(link) for link in sensor.links.values())
+
+
+def _link_text(link: Link) -> str:
+    if isinstance(link, Serial):
+        return f"serial {'/'.join(str(baud) for baud in link.bauds)} baud"
+    return f"udp {'/'.join(str(port) for port in link.ports)}" if isinstance(link, Udp) else f"tcp {link.port}"
+
+
+def _link(link: Link) -> dict[str, Any]:
+    kind = {Serial: "serial", Udp: "udp", Tcp: "tcp"}[type(link)]
+    return {"kind": kind, **{name: list(value) if isinstance(value, tuple) else value for name, value in vars(link).items()}}

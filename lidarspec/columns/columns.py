@@ -1,0 +1,402 @@
+"""Columns: what `points` and `plausible` functions compute with.
+
+A `Column` is an array with one axis for the packets and one for each array level of the struct, each axis named by
+its array, so that arithmetic lines up by itself and sibling arrays cannot be mixed by accident. It also knows the
+batch it comes from: where packets were lost, how long variable arrays are, and how many packets are already certain
+(``ready``) where a value depends on what follows.
+
+The fields of a batch by attribute: what a `points` or `plausible` function is given as ``f``.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.lib.mixins import NDArrayOperatorsMixin
+from numpy.typing import NDArray
+
+from lidarspec.errors import SpecError, UnknownField
+
+if TYPE_CHECKING:
+    from lidarspec.wire.frame_table import Table
+    from lidarspec.wire.schema import FieldInfo, Schema
+
+#: NumPy functions that work element by element, and so keep axes; others see plain arrays.
+ELEMENTWISE = {np.where, np.clip, np.nan_to_num, np.round, np.isclose, np.real_if_close}
+
+Carry = dict[int, NDArray[np.float64]]
+
+
+@dataclass(eq=False)
+class Batch:
+    """The packets that a set of columns belongs to.
+
+    Attributes:
+        table: their raw columns.
+        breaks: (n,) True where something was lost before the packet.
+        state: per frame type, its table and for each packet the index of the frame that was last (-1: none yet).
+        defaults: declared defaults of state columns, per frame type and path.
+        carry: what the previous batch left for `previous` and `last`, by order of call.
+    """
+
+    table: Table
+    breaks: NDArray[np.bool_]
+    state: Mapping[str, tuple[Table | None, NDArray[np.intp]]] = field(default_factory=dict)
+    defaults: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    carry: Carry = field(default_factory=dict)
+    nominal: bool = False
+    left: list[Callable[[int], NDArray[np.float64]]] = field(default_factory=list)
+
+    def __len__(self) -> int:
+        return len(self.table)
+
+    def carried(self, ready: int) -> Carry:
+        """What the next batch has to know, if it starts with packet `ready` of this one."""
+        return {slot: rest(ready) for slot, rest in enumerate(self.left)}
+
+
+class Column(NDArrayOperatorsMixin):
+    """Numbers of a batch of packets: NumPy's ufuncs and functions apply, see the module's text.
+
+    Attributes:
+        array: shape (n or 1, ...), one axis per array level of the struct, length 1 where the value is further out.
+        axes: names of the axes after the first; None where the length is 1.
+        ready: packets from the start whose values depend on nothing that is still to come.
+        source: the field's path, while the column is an unchanged field.
+    """
+
+    def __init__(
+        self, array: NDArray[Any], axes: tuple[str | None, ...], batch: Batch, *, ready: int | None = None, source: str = ""
+    ) -> None:
+        self.array, self.axes, self.batch, self.source = array, axes, batch, source
+        self.ready = len(batch) if ready is None else ready
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """The shape of the array."""
+        return self.array.shape
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
+        return self.array if dtype is None else self.array.astype(dtype)
+
+    def __bool__(self) -> bool:
+        return bool(self.array)
+
+    def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: Any, **kwargs: Any) -> Any:
+        if kwargs.get("out") is not None:
+            raise SpecError("columns cannot be changed in place; write a new expression instead")
+        if method != "__call__":
+            return getattr(ufunc, method)(*(np.asarray(value) for value in inputs), **kwargs)
+        return self.applied((lambda *arrays: ufunc(*arrays, **kwargs)) if kwargs else ufunc, *inputs)
+
+    def __array_function__(self, function: Callable[..., Any], types: Any, args: Any, kwargs: Any) -> Any:
+        if function in ELEMENTWISE:
+            return self.applied(lambda *arrays: function(*arrays, **kwargs), *args)
+        plain = [np.asarray(value) if isinstance(value, Column) else value for value in args]
+        return function(*plain, **kwargs)
+
+    def applied(self, function: Callable[..., Any], *values: Any) -> Column:
+        """`function` of arrays, lined up by axes; columns on the left, arrays by their last axes as in NumPy."""
+        arrays, axes, ready = aligned(values, self.batch)
+        found = called(function, arrays)
+        names = (*axes, *(f"<{index}>" for index in range(len(axes), found.ndim - 1)))
+        return Column(found, names, self.batch, ready=ready)
+
+    def on(self, *axes: str) -> Column:
+        """The same values on other axes, by the names of arrays; its own axes go to the last of those named."""
+        chain = self.batch.table.schema.chain()
+        own = [index for index, name in enumerate(self.axes) if name is not None]
+        if len(axes) < len(own):
+            raise SpecError(f"a column with {len(own)} axes cannot be put on {axes}")
+        spots = [_position(name, chain) for name in axes][len(axes) - len(own) :]
+        shape, names = [1] * max(len(chain), len(self.axes)), [None] * max(len(chain), len(self.axes))
+        for index, spot in zip(own, spots, strict=True):
+            shape[spot], names[spot] = self.array.shape[1 + index], chain[spot]  # type: ignore[call-overload]
+        return Column(self.array.reshape(self.array.shape[0], *shape), tuple(names), self.batch, ready=self.ready)
+
+    def steps(self) -> NDArray[np.intp]:
+        """0, 1, 2 ... up to the largest value: the indices of an array of which this is the count."""
+        return np.arange(int(np.nanmax(self.array, initial=0)))
+
+    def shifted(self, step: int) -> Column:
+        """The values `step` places later (earlier if negative) in stream order; see `angles.following`."""
+        rows = Rows1D(self)
+        size = abs(step)
+        slot = len(self.batch.left)
+        carried = self.batch.carry.get(slot, np.empty(0))
+        values = np.concatenate([carried, rows.values]) if len(carried) else rows.values
+        edges = rows.edges + len(carried)
+        found = np.empty(len(values))
+        ahead, behind, inside = max(step, 0), max(-step, 0), max(len(values) - size, 0)
+        found[behind : behind + inside] = values[ahead : ahead + inside]
+        found[:behind] = found[behind + inside :] = np.nan
+        for edge in edges.tolist() if size else ():
+            found[max(edge - ahead, 0) : edge + behind] = np.nan
+        ready = self.ready
+        if step > 0:
+            certain = rows.starts[ready] - step
+            ready = min(ready, int(np.searchsorted(rows.starts, certain, side="right")) - 1 if certain >= 0 else 0)
+        self.batch.left.append(lambda upto: _tail(values, edges, len(carried) + rows.starts[upto], 0 if step > 0 else size))
+        return Column(rows.spread(found[len(carried) :]), self.axes, self.batch, ready=max(ready, 0))
+
+    def latest(self, where: Any = None) -> Column:
+        """The most recent value at which `where` was true; see `angles.last`."""
+        (values, flags), axes, ready = aligned((self, np.isfinite(self) if where is None else where), self.batch)
+        shape = np.broadcast_shapes(values.shape, flags.shape)
+        both = [Column(np.broadcast_to(array, shape), axes, self.batch, ready=ready) for array in (values, flags)]
+        rows, known = (Rows1D(column) for column in both)
+        slot = len(self.batch.left)
+        carried = self.batch.carry.get(slot, np.empty(0))
+        numbers = np.concatenate([carried, rows.values])
+        spots = np.where(np.concatenate([np.ones(len(carried)), known.values]) > 0, np.arange(len(numbers)), -1)
+        spots = np.maximum.accumulate(spots) if len(spots) else spots
+        found = np.where(spots >= 0, numbers[spots], np.nan)
+        self.batch.left.append(lambda upto: found[: len(carried) + rows.starts[upto]][-1:])
+        return Column(rows.spread(found[len(carried) :]), axes, self.batch, ready=ready)
+
+
+class Rows1D:
+    """A column as one run of values in stream order, without padding.
+
+    Attributes:
+        values: (k,) as float64.
+        starts: (n + 1,) index of the first value of each packet.
+        edges: indices of the values before which something was lost, ascending.
+    """
+
+    def __init__(self, column: Column) -> None:
+        self._shape = (len(column.batch), *column.shape[1:])
+        full = column.array if column.array.shape == self._shape else np.broadcast_to(column.array, self._shape)
+        flat = full.reshape(self._shape[0], math.prod(self._shape[1:]))
+        self._mask = unpadded(column.axes, self._shape, column.batch)
+        self.values = np.asarray((flat if self._mask is None else flat[self._mask]).reshape(-1), np.float64)
+        if self._mask is None:
+            self.starts = np.arange(len(flat) + 1, dtype=np.intp) * flat.shape[1]
+        else:
+            self.starts = np.concatenate([[0], np.cumsum(self._mask.sum(axis=1))]).astype(np.intp)
+        self.edges = self.starts[np.flatnonzero(column.batch.breaks)]
+
+    def spread(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Values in stream order back into the column's shape, nan in the padding."""
+        if self._mask is None:
+            return values.reshape(self._shape)
+        full = np.full(self._mask.shape, np.nan)
+        full[self._mask] = values
+        return full.reshape(self._shape)
+
+
+def unpadded(axes: tuple[str | None, ...], shape: tuple[int, ...], batch: Batch) -> NDArray[np.bool_] | None:
+    """Which elements, (n, product of the other lengths), are not padding; None where none is."""
+    mask: NDArray[np.bool_] | None = None
+    for index, name in enumerate(axes):
+        if name is None or name.startswith("<") or isinstance(batch.table.schema.arrays.get(name), int):
+            continue
+        counts = batch.table.counts(name)
+        if len(counts) and int(counts.min()) == shape[1 + index]:
+            continue
+        inside = np.arange(shape[1 + index]) < counts[:, None]
+        inside = inside.reshape(len(counts), *(shape[1 + i] if i == index else 1 for i in range(len(axes))))
+        mask = inside if mask is None else mask & inside
+    return None if mask is None else np.broadcast_to(mask, shape).reshape(shape[0], math.prod(shape[1:]))
+
+
+def aligned(values: tuple[Any, ...], batch: Batch) -> tuple[list[NDArray[Any]], tuple[str | None, ...], int]:
+    """Columns and arrays as arrays that broadcast, the names of the axes they have together, and the smallest `ready`.
+
+    Raises:
+        SpecError: where axes of different arrays meet.
+    """
+    columns = [value for value in values if isinstance(value, Column)]
+    if columns and all(column.axes == columns[0].axes for column in columns) and _only_numbers_beside(values):
+        arrays = [value.array if isinstance(value, Column) else np.asarray(value) for value in values]
+        return arrays, columns[0].axes, min([column.ready for column in columns])
+    depth = max((len(column.axes) for column in columns), default=0)
+    names: list[str | None] = [None] * depth
+    for column in columns:
+        for index, name in enumerate(column.axes):
+            if name is not None and names[index] not in (None, name):
+                raise SpecError(f"axis {names[index]!r} meets axis {name!r}: put one on the other's place with .on(...)")
+            names[index] = name if name is not None else names[index]
+    chain = batch.table.schema.chain()
+    arrays = []
+    for value in values:
+        if isinstance(value, Column):
+            arrays.append(value.array.reshape(*value.shape, *(1,) * (depth - len(value.axes))))
+            continue
+        array = np.asarray(value)
+        arrays.append(array)
+        for index in range(depth):
+            place = array.ndim - depth + index
+            if place >= 0 and array.shape[place] != 1 and names[index] is None:
+                names[index] = chain[index] if index < len(chain) else f"<{index}>"
+    return arrays, tuple(names), min((column.ready for column in columns), default=len(batch))
+
+
+def _only_numbers_beside(values: tuple[Any, ...]) -> bool:
+    """Whether what is no column is a plain number, so that nothing has to be lined up."""
+    return all(isinstance(value, Column | int | float) for value in values)
+
+
+def called(function: Callable[..., Any], arrays: Sequence[Any]) -> NDArray[Any]:
+    """What a function makes of arrays that are lined up."""
+    return np.asarray(remainder(*arrays) if function is np.remainder else function(*arrays))
+
+
+def remainder(values: Any, full: Any) -> NDArray[Any]:
+    """``np.remainder``, bit by bit; a quarter of the time for what is a turn away at most, as nearly all angles are."""
+    if np.ndim(full) or not full > 0 or np.ndim(values) == 0 or values.dtype != np.float64:
+        return np.asarray(np.remainder(values, full))
+    turns = np.subtract(values < 0, values >= full, dtype=np.int8)
+    found: NDArray[np.float64] = values + full * turns
+    inside = (found >= 0) & (found < full)
+    if not inside.all():
+        found[~inside] = np.remainder(values[~inside], full)
+    return found
+
+
+def _position(name: str, chain: tuple[str, ...]) -> int:
+    for index, axis in enumerate(chain):
+        if axis == name or axis.rpartition(".")[2] == name:
+            return index
+    raise SpecError(f"there is no array {name!r} around the points; there are {', '.join(chain) or 'none'}")
+
+
+def _tail(values: NDArray[np.float64], edges: NDArray[np.intp], end: int, size: int) -> NDArray[np.float64]:
+    """The last values before `end` that nothing lost separates from it."""
+    if end == 0 or size == 0:
+        return np.empty(0)
+    lost = edges[edges < end]
+    return values[max(end - size, int(lost[-1]) if len(lost) else 0, 0) : end].copy()
+
+
+def field_column(info: FieldInfo, table: Table, depth: int, batch: Batch, which: NDArray[np.intp] | None = None) -> Column:
+    """A field in its unit as a column of `depth` array axes; `which`: the frame of the table for each packet."""
+
+    array = field_array(info, table, depth)
+    if which is not None:
+        array = array[which]
+    axes = [_axis(name, length, table, known=which is None) for name, length in zip(info.axes, array.shape[1:], strict=False)]
+    return Column(array, (*axes, *(None,) * (array.ndim - 1 - len(axes))), batch, source=info.path)
+
+
+def field_array(info: FieldInfo, table: Table, depth: int) -> NDArray[np.float64]:
+    """A field in its unit, with `depth` array axes at least."""
+    array = physical(info, table)
+    return array.reshape(*array.shape, *(1,) * (depth + 1 - array.ndim))
+
+
+def _axis(name: str, length: int, table: Table, *, known: bool) -> str | None:
+    """The name of an axis; of length 1 it needs none, unless packets of the batch have no element at all."""
+    if length != 1 or (known and not isinstance(table.schema.arrays.get(name), int) and not table.counts(name).all()):
+        return name
+    return None
+
+
+def physical(info: FieldInfo, table: Table) -> NDArray[np.float64]:
+    """A field in its unit: float64, shape (n, *lengths); nan where a frame lacks the field."""
+    with np.errstate(invalid="ignore"):  # a signalling nan is a nan
+        array = table.raw(info.path).astype(np.float64)
+    if info.scaled:
+        array *= info.scale
+        array += info.offset
+    there = table.present(info.path)
+    if there is not None:
+        array = np.where(there.reshape(*there.shape, *(1,) * (array.ndim - there.ndim)), array, np.nan)
+    return array
+
+
+class Fields:
+    """The fields of a batch of packets by attribute, as `Column`s: ``f.points.distance``, ``f.state.difop.vertical``."""
+
+    def __init__(self, batch: Batch, schema: Schema | None = None, prefix: str = "") -> None:
+        self._batch, self._schema, self._prefix = batch, schema or batch.table.schema, prefix
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__"):
+            raise AttributeError(name)
+        if name == "state" and not self._prefix:
+            return _States(self._batch)
+        path = f"{self._prefix}{name}"
+        info = self._schema.fields.get(path)
+        if info is not None:
+            return field_column(info, self._batch.table, self._schema.depth(), self._batch)
+        if any(known.startswith(f"{path}.") for known in self._schema.fields):
+            return Fields(self._batch, self._schema, f"{path}.")
+        raise UnknownField(path, self._schema.fields)
+
+
+#: among the paths of `Watched`: something else than fields was looked at.
+UNKNOWN = ""
+
+
+class Watched(Fields):
+    """`Fields` that keep the paths of the fields that were looked at in `seen`."""
+
+    def __init__(self, batch: Batch, seen: set[str], schema: Schema | None = None, prefix: str = "") -> None:
+        super().__init__(batch, schema, prefix)
+        self._seen = seen
+
+    def __getattr__(self, name: str) -> Any:
+        found = super().__getattr__(name)
+        if isinstance(found, Fields):
+            return Watched(self._batch, self._seen, self._schema, f"{self._prefix}{name}.")
+        path = f"{self._prefix}{name}"
+        self._seen.add(path if path in self._schema.fields else UNKNOWN)
+        return found
+
+
+class _States:
+    """``f.state``: the frames of other types that were last before each packet."""
+
+    def __init__(self, batch: Batch) -> None:
+        self._batch = batch
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__"):
+            raise AttributeError(name)
+        if name not in self._batch.state:
+            raise UnknownField(name, self._batch.state, place="state")
+        return _State(self._batch, name, "")
+
+
+class _State:
+    """``f.state.difop``: the fields of one other frame type, or their declared defaults."""
+
+    def __init__(self, batch: Batch, frame: str, prefix: str) -> None:
+        self._batch, self._frame, self._prefix = batch, frame, prefix
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__"):
+            raise AttributeError(name)
+        path = f"{self._prefix}{name}"
+        table, which = self._batch.state[self._frame]
+        defaults = self._batch.defaults.get(self._frame, {})
+        known = set(defaults) | (set(table.schema.fields) if table is not None else set())
+        if path in known:
+            return self._column(path, table, which, defaults)
+        if any(other.startswith(f"{path}.") for other in known):
+            return _State(self._batch, self._frame, f"{path}.")
+        raise UnknownField(path, known, place=f"state.{self._frame}")
+
+    def _column(self, path: str, table: Table | None, which: NDArray[np.intp], defaults: Mapping[str, Any]) -> Column:
+
+        batch, depth = self._batch, self._batch.table.schema.depth()
+        missing = which < 0
+        if not missing.any() and table is not None:
+            same = len(which) == 0 or int(which.min()) == int(which.max())
+            return field_column(table.schema.fields[path], table, depth, batch, which[:1] if same else which)
+        if path not in defaults:
+            raise SpecError(f"no {self._frame} frame has arrived yet, and no default is declared", path=f"state.{self._frame}.{path}")
+        batch.nominal = True
+        default = np.asarray(defaults[path], np.float64)
+        names = tuple(path if length != 1 else None for length in default.shape)
+        spare = (1,) * max(depth - default.ndim, 0)
+        array = default.reshape(1, *default.shape, *spare)
+        if table is not None and not missing.all():
+            known = field_column(table.schema.fields[path], table, depth, batch, np.maximum(which, 0)).array
+            array = np.where(missing.reshape(-1, *(1,) * (known.ndim - 1)), array, known)
+        return Column(array, (*names, *(None,) * len(spare)), batch)

@@ -1,0 +1,239 @@
+"""Capture apart from decoding: a thread fetches what arrives and hands it on through a bounded queue.
+
+The thread does nothing but read, keep the time, record and queue, so that a consumer which is slow, or busy in Python, costs
+no byte. A recording gets everything; the queue is bounded by its policy: with "drop_oldest" the oldest chunks give way, with
+"block" the thread waits. What was produced is always what was consumed, dropped or still waits.
+
+When the device goes away the thread says so, tries to find it again with growing pauses, and marks the first chunk after the
+gap. Silence is what the system has confirmed, not what a thread that got no time believes: reads that came back empty.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from collections.abc import Iterable
+from dataclasses import replace
+from enum import Enum
+from typing import Protocol
+
+from lidarspec.errors import SourceError, UsageError
+from lidarspec.transports.live_transport import POLL
+from lidarspec.transports.protocol import Chunk, Disconnected, LiveTransport
+
+#: what waits in a queue at most: chunks, and bytes in them; several seconds of the fastest sensors.
+CHUNKS, BYTES = 1 << 16, 1 << 25
+#: seconds between attempts to find a device again, at first and at most.
+SOON, LATER = 0.02, 0.25
+POLICIES = ("drop_oldest", "block")
+
+
+class Mark(Enum):
+    """What happens on a link besides data."""
+
+    SILENT = "silent"
+    LOST = "lost"
+    BACK = "back"
+
+
+Item = Chunk | Mark | BaseException
+Event = tuple[str, Item]
+
+
+class Log(Protocol):
+    """Where everything that arrives is recorded."""
+
+    def write(self, chunk: Chunk) -> None: ...
+
+    def event(self, name: str, at: int | None = None) -> None: ...
+
+
+class BoundedQueue:
+    """What arrived on the links of a device and was not taken yet.
+
+    Args:
+        policy: what to do when it is full: "drop_oldest" or "block".
+        chunks, size: what it holds at most: chunks, and bytes in them.
+
+    Attributes:
+        produced, consumed, dropped: chunks; ``produced == consumed + dropped + len(queue)`` always holds.
+    """
+
+    def __init__(self, policy: str = "drop_oldest", *, chunks: int = CHUNKS, size: int = BYTES) -> None:
+        if policy not in POLICIES:
+            raise UsageError(f"a full queue can {' or '.join(POLICIES)}, not {policy!r}")
+        self._blocks, self._most, self._largest = policy == "block", chunks, size
+        self._events: deque[Event] = deque()
+        self._kept: dict[Event, None] = {}
+        self._cut: set[str] = set()
+        self._waiting = self._size = 0
+        self._changed = threading.Condition()
+        self.produced = self.consumed = self.dropped = 0
+        self.closed = False
+
+    def __len__(self) -> int:
+        return self._waiting
+
+    def put(self, link: str, items: Iterable[Item]) -> None:
+        """Add what happened on a link, in order."""
+        with self._changed:
+            for item in items:
+                if isinstance(item, Chunk):
+                    size = len(item.data)
+                    if self._waiting >= self._most or self._size + size > self._largest:
+                        self._make_room(size)
+                    if self.closed:
+                        return
+                    self.produced += 1
+                    self._waiting += 1
+                    self._size += size
+                self._events.append((link, item))
+            self._changed.notify_all()
+
+    def take(self, timeout: float, *, until: float = 0.0, chunks: int = CHUNKS) -> list[Event]:
+        """What has arrived, in order; empty where nothing does within `timeout` seconds, or the queue is closed and empty.
+
+        Args:
+            until: a time of the monotonic clock up to which everything is gathered before any of it is given.
+            chunks: how many events at most.
+        """
+        pause = min(until - time.monotonic(), timeout)
+        if pause > 0 and not self.closed:
+            time.sleep(pause)  # what arrives meanwhile wakes nobody
+        with self._changed:
+            self._changed.wait_for(lambda: self._events or self._kept or self.closed, timeout - max(pause, 0.0))
+            found = list(self._kept)
+            self._kept.clear()
+            if len(found) + len(self._events) <= chunks and not self._cut:
+                found += self._events
+                self._events.clear()
+                self.consumed += self._waiting
+                self._waiting = self._size = 0
+            while self._events and len(found) < chunks:
+                found.append(self._left())
+            self._changed.notify_all()
+            return found
+
+    def close(self) -> None:
+        """Nobody is going to take anything any more: whoever waits is let go."""
+        with self._changed:
+            self.closed = True
+            self._changed.notify_all()
+
+    def _left(self) -> Event:
+        """The oldest event, which somebody takes."""
+        link, item = self._events.popleft()
+        if isinstance(item, Chunk):
+            self.consumed += 1
+            self._waiting -= 1
+            self._size -= len(item.data)
+            if link in self._cut:
+                self._cut.discard(link)
+                item = replace(item, gap=True)
+        return link, item
+
+    def _make_room(self, size: int) -> None:
+        while self._waiting and not self.closed and (self._waiting >= self._most or self._size + size > self._largest):
+            if self._blocks:
+                self._changed.notify_all()
+                self._changed.wait(POLL)
+                continue
+            link, item = self._events.popleft()
+            if isinstance(item, Chunk):
+                self.dropped += 1
+                self._waiting -= 1
+                self._size -= len(item.data)
+                self._cut.add(link)
+            else:
+                self._kept.pop((link, item), None)
+                self._kept[(link, item)] = None
+
+
+class Capture:
+    """The thread that reads a live transport.
+
+    Args:
+        transport: the open transport; closed with the capture.
+        queue: where it goes to.
+        link: the name of the link.
+        log: the recording, if there is one.
+        silence: seconds without a byte after which the line counts as silent.
+
+    Attributes:
+        transport: the transport.
+        connected: whether the device is there.
+        disconnects: how often it went away.
+        last: when something last arrived, by `time.monotonic`; the time of opening before that.
+    """
+
+    def __init__(
+        self, transport: LiveTransport, queue: BoundedQueue, *, link: str = "data", log: Log | None = None, silence: float = 0.1
+    ) -> None:
+        self.transport, self.connected, self.disconnects, self.last = transport, True, 0, time.monotonic()
+        self._queue, self._link, self._log, self._silence = queue, link, log, silence
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name=f"capture of {link}", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Stop reading and give the port or socket back; a second call does nothing."""
+        self._stop.set()
+        if threading.current_thread() is not self._thread:
+            self._thread.join(5.0)
+        self.transport.close()
+
+    def _run(self) -> None:
+        try:
+            silence, gap, quiet = 0.0, False, False
+            while not self._stop.is_set():
+                began = time.monotonic()
+                try:
+                    chunks = self.transport.read(POLL)
+                except Disconnected:
+                    if not self._found_again():
+                        return
+                    silence, gap, quiet = 0.0, True, False
+                    continue
+                if chunks:
+                    self.last = time.monotonic()
+                    self._hand_on(chunks, gap=gap, quiet=quiet)
+                    silence, gap, quiet = 0.0, False, False
+                    continue
+                silence += time.monotonic() - began
+                if silence >= self._silence and not quiet:
+                    quiet = True
+                    self._queue.put(self._link, [Mark.SILENT])
+        except BaseException as error:
+            self._queue.put(self._link, [error])
+
+    def _hand_on(self, chunks: list[Chunk], *, gap: bool, quiet: bool) -> None:
+        """Record and queue what arrived, with what happened before it."""
+        if gap or quiet:
+            chunks[0] = replace(chunks[0], gap=gap, quiet=quiet)
+        if self._log is not None:
+            for chunk in chunks:
+                self._log.write(chunk)
+        self._queue.put(self._link, chunks)
+
+    def _found_again(self) -> bool:
+        """Say that the device is gone, and wait until it is back; False where somebody wants to stop meanwhile."""
+        self.connected = False
+        self.disconnects += 1
+        self._tell(Mark.LOST, "disconnect")
+        pause = SOON
+        while not self._stop.wait(pause):
+            pause = min(pause * 2, LATER)
+            try:
+                self.transport.reopen()
+            except SourceError:
+                continue
+            self.connected, self.last = True, time.monotonic()
+            self._tell(Mark.BACK, "reconnect")
+            return True
+        return False
+
+    def _tell(self, mark: Mark, event: str) -> None:
+        if self._log is not None:
+            self._log.event(event)
+        self._queue.put(self._link, [mark])

@@ -1,0 +1,372 @@
+"""Packets and scans out of what arrives, with what one batch has to know of the one before.
+
+A sensor on a source: packets and scans as they come, commands, counters.
+"""
+
+from __future__ import annotations
+
+import time
+import weakref
+from collections import deque
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Any, overload
+
+from lidarspec.device.arrivals import Arrival
+from lidarspec.device.file_input import FileInput
+from lidarspec.device.live_input import PERIOD, LiveInput
+from lidarspec.device.session import Reply
+from lidarspec.device.settings import named
+from lidarspec.discovery.detect import detected
+from lidarspec.errors import SourceError, UsageError
+from lidarspec.framing.decoder import Counters, Decoder, Spans
+from lidarspec.packets.packets import Packets
+from lidarspec.packets.stream import PacketStream, data_frame
+from lidarspec.plugins import sensor as named_sensor
+from lidarspec.points.cloud import Mount
+from lidarspec.recording.recorders import AnyRecorder, RecordTo, recorder_for
+from lidarspec.scans.scans import Scan, ScanStream, handed_out
+from lidarspec.spec.description import Sensor
+from lidarspec.transports.open_url import transport
+from lidarspec.transports.protocol import Transport
+
+#: batches kept while nobody knows yet which data frame the sensor answers in.
+UNDECIDED = 256
+
+
+class PacketReader:
+    """The packets of one type out of what arrives.
+
+    Args:
+        frame: the type; where the sensor has several data frames and none is named, the first that arrives decides.
+        decoder: where the frames come from.
+        state: frames of other types, by name, that count as seen before the first packet.
+
+    Attributes:
+        last: the packets of the last arrival.
+    """
+
+    def __init__(self, sensor: Sensor, frame: str | None, decoder: Decoder, state: Mapping[str, bytes]) -> None:
+        self._sensor, self._decoder, self._state = sensor, decoder, state
+        self._waiting: deque[Spans] = deque(maxlen=UNDECIDED)
+        self._stream = self._made(frame) if frame is not None else None
+        self.last: Packets | None = None
+
+    def add(self, arrival: Arrival) -> Packets | None:
+        """The packets among these frames; None while nobody knows of which type."""
+        self._waiting += arrival.found
+        found = list(self._waiting)
+        if self._stream is None:
+            name = data_frame(self._sensor, found)
+            self._stream = self._made(name) if name is not None else None
+        if self._stream is None:
+            return None
+        self._waiting.clear()
+        self.last = self._stream.add(found)
+        if arrival.interrupted:
+            self._stream.interrupt()
+        return self.last
+
+    def none(self) -> Packets:
+        """A batch of no packets."""
+        return (self._stream or self._made(self._sensor.data_frame)).add([])
+
+    def scans(self, stream: ScanStream, arrival: Arrival, *, read: bool = False) -> Iterator[Scan]:
+        """The scans that an arrival completes; an interruption ends the one under way, and the stream with it.
+
+        Args:
+            read: it is the last one, of which packets were made before.
+        """
+        packets = self.last if read else self.add(arrival)
+        if packets is not None and len(packets):
+            yield from handed_out(stream.add(packets))
+        if arrival.interrupted:
+            yield from stream.finish()
+
+    def _made(self, name: str) -> PacketStream:
+        decoder = self._decoder
+        return PacketStream(self._sensor, name, decoder.stats, interpreted=decoder.interpreted, backend=decoder.backend, state=self._state)
+
+
+#: seconds that one wait for data takes where there is no end to waiting.
+LONG = 3600.0
+
+
+class Device:
+    """A sensor read from a source; a context manager.
+
+    Attributes:
+        sensor: the sensor, given or detected.
+        mount: how it is mounted, where `lidarspec.toml` says so: scans come in the carrier's axes, packets in the sensor's.
+    """
+
+    def __init__(
+        self,
+        source: str | Path,
+        sensor: Sensor,
+        *,
+        backend: str = "auto",
+        start: bool = True,
+        record: RecordTo | None = None,
+        overflow: str | None = None,
+        period: float = PERIOD,
+        mount: Mount | None = None,
+    ) -> None:
+        self.sensor, self._source, self.mount = sensor, source, mount
+        self._streams: dict[str | None, PacketReader] = {}
+        self._latest, self._unseen = ScanStream(sensor, mount), deque[Scan]()
+        self._ahead: Arrival | None = None
+        self._own_recorder: AnyRecorder | None = None
+        self._input = self._opened(backend, record, overflow, period)
+        self._finalizer = weakref.finalize(self, _close, self._input, self._own_recorder)
+        if start and isinstance(self._input, LiveInput):
+            try:
+                self._input.begin()
+            except BaseException:
+                self.close()
+                raise
+
+    @property
+    def stats(self) -> Counters:
+        """The counters of everything read so far."""
+        return self._input.stats
+
+    @property
+    def warnings(self) -> list[str]:
+        """What is to be said about the source now: a file that is cut off, silence, a likely wrong baud rate, a small buffer."""
+        return self._input.warnings
+
+    @property
+    def state(self) -> str:
+        """How the source is doing: "streaming", "waiting" (for a first frame), "silent" (for a second), "no frames" (bytes only),
+        "disconnected", "ended" (a file) or "closed"."""
+        return self._input.state
+
+    @property
+    def queued(self) -> int | None:
+        """Chunks that have arrived and wait to be decoded; None for a file."""
+        return len(self._input.queue) if isinstance(self._input, LiveInput) else None
+
+    @property
+    def is_live(self) -> bool:
+        """Whether data come at their own pace, and not from a file."""
+        return self._input.is_live
+
+    def spans(self) -> Iterator[list[Spans]]:
+        """Every incoming frame of all types, in batches."""
+        for arrival in self._arrivals(None):
+            if arrival is not None and arrival.found:
+                yield arrival.found
+
+    def packets(self, frame: str | None = None, *, wait: float | None = None) -> Iterator[Packets]:
+        """The packets of the data frame, or of another type, in batches, until the input ends or the device is closed.
+
+        A file is read once, whoever reads it. After `latest` they begin with the batch in which its scan was found.
+
+        Args:
+            frame: the name of a frame type.
+            wait: yield a batch of no packets where nothing has come for so many seconds, so that the caller has a turn.
+
+        Raises:
+            SourceError: where a file has been read to its end before.
+        """
+        reader, ahead = self._reader(frame), self._taken_back()
+        for arrival in self._arrivals(wait, ahead):
+            packets = reader.none() if arrival is None else reader.last if arrival is ahead and frame is None else reader.add(arrival)
+            if packets is not None and (len(packets) or arrival is None):
+                yield packets
+
+    @overload
+    def scans(self) -> Iterator[Scan]: ...
+
+    @overload
+    def scans(self, *, wait: float) -> Iterator[Scan | None]: ...
+
+    def scans(self, *, wait: float | None = None) -> Iterator[Any]:
+        """Every scan; the first and last piece, and those before and after an interruption, are marked ``complete=False``.
+
+        A file is read once, whoever reads it. After `latest` they begin with the batch in which its scan was found.
+
+        Args:
+            wait: yield None where nothing has come for so many seconds, so that the caller has a turn.
+
+        Raises:
+            SourceError: where a file has been read to its end before.
+        """
+        stream, reader, ahead = ScanStream(self.sensor, self.mount), self._reader(None), self._taken_back()
+        for arrival in self._arrivals(wait, ahead):
+            if arrival is None:
+                yield None
+                continue
+            yield from reader.scans(stream, arrival, read=arrival is ahead)
+            stream = ScanStream(self.sensor, self.mount) if arrival.interrupted else stream
+        yield from stream.finish()
+
+    def latest(self, timeout: float | None = None) -> Scan:
+        """The newest complete scan, newer than the one that the last call gave; waits for it. Older ones are passed over.
+
+        A file has no newest scan: it gives one after another.
+
+        Args:
+            timeout: seconds to wait.
+
+        Raises:
+            SourceError: where none comes in time, the input has ended or the device was closed.
+        """
+        deadline = None if timeout is None else time.monotonic() + timeout
+        while (found := self.newest(LONG if deadline is None else max(deadline - time.monotonic(), 0.0))) is None:
+            if deadline is not None and time.monotonic() >= deadline:
+                raise self.overdue()
+        return found
+
+    def newest(self, wait: float) -> Scan | None:
+        """The same as `latest`, but None where no scan comes within `wait` seconds."""
+        deadline, mark, reader = time.monotonic() + wait, self._input.mark(), self._reader(None)
+        while not (self._unseen and self._input.caught_up(mark)):
+            if self._input.ended:
+                raise SourceError(f"{self._source}: no further scan, since the input is {self._input.state}")
+            arrival = self._input.next(max(deadline - time.monotonic(), 0.0))
+            if arrival is None and time.monotonic() >= deadline:
+                return None
+            if arrival is not None:
+                found = [scan for scan in reader.scans(self._latest, arrival) if scan.complete]
+                self._ahead = arrival if found and not self.is_live else None
+                self._unseen += found
+                self._latest = ScanStream(self.sensor, self.mount) if arrival.interrupted else self._latest
+        if not self.is_live:
+            return self._unseen.popleft()
+        newest = self._unseen[-1]
+        self._unseen.clear()
+        return newest
+
+    def overdue(self) -> SourceError:
+        """What to say when a scan did not come in time."""
+        error = SourceError(f"{self._source}: no scan in time; the source is {self.state}")
+        error.add_note(f"next: lidarspec doctor '{self._source}' -s {self.sensor.id}")
+        return error
+
+    def send(self, name: str, *, timeout: float | None = None, **arguments: Any) -> Reply:
+        """The reply to a command; at once with ``confirmed=False`` where none is documented.
+
+        Args:
+            name: of the command.
+            timeout: seconds to wait for the reply; by default what the sensor declares.
+            arguments: by name, in units.
+
+        Raises:
+            UnknownCommand, UnknownField, MissingField, OutOfRange: for what the sensor does not take; nothing is sent.
+            CommandError: where the device refuses, or the connection is lost; ReplyTimeout where it keeps silent.
+        """
+        return self._input.send(name, timeout=timeout, **arguments)
+
+    def leave_on(self) -> None:
+        """Let the sensor go on as it is when the device is closed."""
+        if isinstance(self._input, LiveInput):
+            self._input.stays_on = True
+
+    def close(self) -> None:
+        """Stop the sensor where it was started, and give the source back; a second call does nothing."""
+        self._finalizer()
+
+    def __enter__(self) -> Device:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None) -> None:
+        self.close()
+
+    def __repr__(self) -> str:
+        return f"Device({self.sensor.id} on {self._source}, {self.state}: {self.stats})"
+
+    def _opened(self, backend: str, record: RecordTo | None, overflow: str | None, period: float) -> FileInput | LiveInput:
+        opened: Any = transport(self._source, self.sensor)
+        try:
+            if not hasattr(opened, "read"):
+                if record is not None:
+                    raise UsageError(f"{self._source} is a file already: there is nothing to record")
+                return FileInput(self._source, self.sensor, opened, backend=backend)
+            kept, is_own = (None, False) if record is None else recorder_for(record, self.sensor, self._source, opened)
+            self._own_recorder = kept if is_own else None
+            policy: str = getattr(opened, "overflow", "drop_oldest") if overflow is None else overflow
+            return LiveInput(self._source, self.sensor, opened, backend=backend, policy=policy, recorder=kept, period=period)
+        except BaseException:
+            _close(opened, self._own_recorder)
+            raise
+
+    def _reader(self, frame: str | None) -> PacketReader:
+        if frame not in self._streams:
+            first = self._input.first_state() if isinstance(self._input, FileInput) else {}
+            self._streams[frame] = PacketReader(self.sensor, frame, self._input.decoder, first)
+        return self._streams[frame]
+
+    def _taken_back(self) -> Arrival | None:
+        """What of a file `latest` found its last scan in, for another to begin with; its further scans are then no longer waited for."""
+        ahead, self._ahead = self._ahead, None
+        if ahead is not None:
+            self._latest = ScanStream(self.sensor, self.mount)
+            self._unseen.clear()
+        elif self._input.state == "ended":
+            raise SourceError(f"{self._source} has been read to its end: open it again to read it once more")
+        return ahead
+
+    def _arrivals(self, wait: float | None, ahead: Arrival | None = None) -> Iterator[Arrival | None]:
+        """What arrives, until the end; None where nothing has for `wait` seconds."""
+        if ahead is not None:
+            yield ahead
+        while not self._input.ended:
+            arrival = self._input.next(LONG if wait is None else wait)
+            if arrival is not None or not self._input.ended:
+                yield arrival
+
+
+def _close(source: FileInput | LiveInput | Transport, recorder: AnyRecorder | None) -> None:
+    """Give everything back; the recording is closed even where the source fails."""
+    try:
+        source.close()
+    finally:
+        if recorder is not None:
+            recorder.close()
+
+
+def open(
+    source: str | Path,
+    sensor: str | Sensor | None = None,
+    *,
+    backend: str = "auto",
+    start: bool = True,
+    record: RecordTo | None = None,
+    overflow: str | None = None,
+    period: float = PERIOD,
+) -> Device:
+    """A sensor on any SOURCE: a port, a socket, a simulated device, a file, or "-" for standard input.
+
+    Args:
+        source: "/dev/ttyUSB0", "serial:///dev/ttyUSB0?baud=230400", "udp://", "tcp://host:port", "capture.pcap", or a name
+            of `lidarspec.toml` ...
+        sensor: an id, a path to a sensor's module, or a Sensor; found out where left out.
+        backend: what evaluates `points`: "auto", "numpy", "jit" or "construct".
+        start: False leaves out the commands that the sensor declares for its start, and for its end.
+        record: a new file, or a `Recorder`, for everything that arrives and is sent; or what makes one of the open transport.
+        overflow: what a live source does when the consumer is too slow: "drop_oldest", or "block"; by default the first, but
+            a simulated sensor without a pace of its own waits.
+        period: seconds between two decodings of what has come.
+
+    Raises:
+        SourceError: where the source cannot be opened.
+        UsageError, WireError: where several sensors fit, or none, and `sensor` was left out.
+        CommandError: where the device does not start.
+    """
+    device = named(source)
+    if sensor is None:
+        sensor = detected(source)
+    known = sensor if isinstance(sensor, Sensor) else named_sensor(sensor)
+    return Device(
+        source,
+        known,
+        backend=backend,
+        start=start,
+        record=record,
+        overflow=overflow,
+        period=period,
+        mount=None if device is None else device.mount,
+    )

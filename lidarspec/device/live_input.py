@@ -1,0 +1,416 @@
+"""How a live source is doing: data, silence, bytes that are no frames, a device that went away; and what to type next.
+
+Frames as they come: what the capture threads queue, decoded every few milliseconds in the consumer's thread.
+
+`next` takes what has arrived, decodes it in one go and hands it on; while it waits it also drives the `Session`: sends what is
+to be sent, gives it the frames that may be answers, and lets it know the time. Whoever calls it has the decoders for himself;
+`send` from another thread waits for its answer while they do the work.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+import time
+from collections import deque
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from lidarspec.device.arrivals import Arrival, Senders, answers, fed
+from lidarspec.device.capture_thread import BoundedQueue, Capture, Event, Mark
+from lidarspec.device.session import Outgoing, Pending, Reply, Session
+from lidarspec.errors import CommandError, LidarSpecError, ReplyTimeout
+from lidarspec.framing.decoder import Counters, Decoder, Spans, backend as backend_named
+from lidarspec.recording.recorders import AnyRecorder
+from lidarspec.spec.description import Command, Sensor
+from lidarspec.transports.open_url import control_link, has_control
+from lidarspec.transports.protocol import Chunk, LiveTransport
+
+#: seconds after which silence, or bytes without a frame, are worth a word.
+PATIENCE = 0.9
+
+
+class Watch:
+    """The state of the data link of a device.
+
+    Attributes:
+        streams: whether a data frame has come, ever.
+    """
+
+    def __init__(self, source: str | Path, sensor: Sensor, opened: LiveTransport, capture: Capture, decoder: Decoder) -> None:
+        self._source, self._sensor, self._transport, self._capture, self._decoder = source, sensor, opened, capture, decoder
+        self._framed, self._bytes = time.monotonic(), 0
+        self._unframed_since: float | None = None
+        self.streams = False
+
+    def saw(self, found: Sequence[Spans]) -> None:
+        """Take note of what was decoded."""
+        if any(map(len, found)):
+            self._framed, self._bytes, self._unframed_since = time.monotonic(), self._decoder.stats.bytes_in, None
+            if not self.streams:
+                self.streams = any(frame.data and name in self._decoder.stats.frames for name, frame in self._sensor.frames.items())
+        elif self._unframed_since is None and self._decoder.stats.bytes_in > self._bytes:
+            self._unframed_since = time.monotonic()
+
+    @property
+    def silent_for(self) -> float:
+        """Seconds since something last arrived."""
+        return time.monotonic() - self._capture.last
+
+    @property
+    def state(self) -> str:
+        """One of "disconnected", "silent", "no frames", "waiting" (for the first frame) and "streaming"."""
+        if not self._capture.connected:
+            return "disconnected"
+        if self.silent_for > PATIENCE:
+            return "silent"
+        if self._unframed_since is not None and time.monotonic() - self._unframed_since > PATIENCE and self._unframed > self._longest:
+            return "no frames"
+        return "streaming" if self._decoder.stats.frames else "waiting"
+
+    @property
+    def warnings(self) -> list[str]:
+        """What is wrong, with the next command."""
+        state = self.state
+        text = {
+            "disconnected": f"{self._source}: the device is gone; waiting for it to come back",
+            "silent": f"{self._source}: nothing has arrived for {self.silent_for:.1f} s",
+            "no frames": f"{self._source}: {self._unframed} bytes, and no frame of {self._sensor.id} among them{self._baud}",
+        }.get(state)
+        return [f"{text}; next: {self.following()}"] if text else []
+
+    def following(self) -> str:
+        """The command that finds out more."""
+        if self._decoder.stats.bytes_in and not self._decoder.stats.frames:
+            return f"lidarspec detect '{str(self._source).partition('?')[0]}'"
+        return f"lidarspec doctor '{self._source}' -s {self._sensor.id}"
+
+    @property
+    def _unframed(self) -> int:
+        return self._decoder.stats.bytes_in - self._bytes
+
+    @property
+    def _longest(self) -> int:
+        return max((frame.max_length * frame.confirm for frame in self._sensor.frames.values()), default=0)
+
+    @property
+    def _baud(self) -> str:
+        baud = getattr(self._transport, "baud", None)
+        return f": {baud} baud is likely wrong" if baud else ""
+
+
+#: seconds between two decodings of what has come, and the longest that a wait goes on before others have their turn.
+PERIOD, TURN = 0.02, 0.05
+#: chunks decoded together.
+TOGETHER = 4096
+#: batches that are kept for whoever iterates next, while commands are sent.
+KEPT = 4096
+#: seconds that the commands at the end may take altogether.
+FAREWELL = 4.0
+
+
+class LiveInput:
+    """A sensor on a live transport.
+
+    Args:
+        source, sensor, opened: the open transport of the data link, and whose.
+        policy: of the queue, "drop_oldest" or "block".
+        recorder: gets everything that arrives and is sent, before the queue.
+        period: seconds between two decodings.
+
+    Attributes:
+        decoder: what finds the frames on the data link.
+        stays_on: whether the sensor is left as it is at the end.
+    """
+
+    is_live = True
+
+    def __init__(
+        self,
+        source: str | Path,
+        sensor: Sensor,
+        opened: LiveTransport,
+        *,
+        backend: str = "auto",
+        policy: str = "drop_oldest",
+        recorder: AnyRecorder | None = None,
+        period: float = PERIOD,
+    ) -> None:
+        self._source, self.sensor, self._recorder, self._period = source, sensor, recorder, period
+        self._backend = calm(backend)
+        self.queue, self._session = BoundedQueue(policy), Session(sensor)
+        self.decoder: Decoder = sensor.decoder(stream=not opened.datagrams, backend=self._backend)
+        self._decoders, self._captures = {"data": self.decoder}, {}
+        self._senders, self._ready = Senders(source, sensor), deque[Arrival]()
+        self._offset = time.time_ns() - time.monotonic_ns()
+        self._turn, self._talk = threading.RLock(), threading.RLock()
+        self._due, self._stops, self._closed, self._foreign = 0.0, False, False, 0
+        self._failure: BaseException | None = None
+        self.stays_on = False
+        self._said: list[str] = []
+        self._captures["data"] = Capture(opened, self.queue, log=recorder, silence=_silence(sensor, opened))
+        self._watch = Watch(source, sensor, opened, self._captures["data"], self.decoder)
+
+    @property
+    def ended(self) -> bool:
+        """Whether it was closed; nothing else ends it."""
+        return self._closed and not self._ready
+
+    @property
+    def state(self) -> str:
+        """What `Watch` says, or "closed"."""
+        return "closed" if self._closed else self._watch.state
+
+    @property
+    def warnings(self) -> list[str]:
+        """What is to be said about the source now."""
+        said = [warning for capture in self._captures.values() for warning in capture.transport.warnings] + self._said
+        if self._recorder is not None and self._recorder.error is not None:
+            said.append(f"the recording has stopped: {self._recorder.error}")
+        return said if self._closed else said + self._watch.warnings
+
+    @property
+    def stats(self) -> Counters:
+        """The counters of the data link, those of the transports included."""
+        stats, captures = self.decoder.stats, list(self._captures.values())
+        stats.kernel_drops = sum(capture.transport.statistics.kernel_drops for capture in captures)
+        stats.foreign = self._foreign + sum(capture.transport.statistics.foreign for capture in captures)
+        stats.disconnects = sum(capture.disconnects for capture in captures)
+        stats.queue_dropped = self.queue.dropped
+        return stats
+
+    def begin(self) -> None:
+        """Send the commands that the sensor declares for its start.
+
+        Raises:
+            CommandError: where it does not answer, unless it sends data all the same.
+        """
+        self._stops = bool(self.sensor.on_open)
+        for name in self.sensor.on_open:
+            try:
+                self.send(name)
+            except ReplyTimeout as error:
+                if not self._watch.streams:
+                    error.add_note(f"next: {self._watch.following()}")
+                    raise
+                self._said.append(f"{error}; data come all the same")
+
+    def next(self, wait: float) -> Arrival | None:
+        """The next frames; None where none come within `wait` seconds, or it was closed.
+
+        Raises:
+            SourceError: where nothing can be read any more.
+            UsageError: where several senders' frames would be mixed.
+        """
+        deadline = time.monotonic() + wait
+        while True:
+            with self._turn:
+                if self._ready:
+                    return self._ready.popleft()
+                if self._failure is not None:
+                    raise self._failure
+                left = deadline - time.monotonic()
+                if self._closed or (left <= 0 and wait > 0):
+                    return None
+                self._pump(min(max(left, 0.0), TURN))
+                if wait <= 0 and not self._ready:
+                    return None
+
+    def mark(self) -> int:
+        """How much has been produced; see `caught_up`."""
+        return self.queue.produced
+
+    def caught_up(self, mark: int) -> bool:
+        """Whether everything that had been produced at a mark has been decoded."""
+        return not self._ready and self.queue.consumed + self.queue.dropped >= mark
+
+    def send(self, name: str, *, timeout: float | None = None, **arguments: Any) -> Reply:
+        """The reply to a command; see `Device.send`."""
+        if name in self.sensor.commands:
+            self._await_sender(self.sensor.commands[name], timeout)
+        with self._talk:
+            pending = self._session.request(name, time.monotonic_ns(), timeout=timeout, **arguments)
+            self._speak()
+        while not pending.done:
+            if self._failure is not None:
+                raise self._failure
+            self._help(pending)
+        return pending.result()
+
+    def _await_sender(self, command: Command, timeout: float | None) -> None:
+        """Wait for a first datagram where it alone says where the sensor is, as long as for a reply."""
+        data = self._captures["data"].transport
+        if command.link not in self._captures and (data.peer() or has_control(self._source)):
+            return
+        limit = time.monotonic() + (command.timeout * (1 + command.retries) if timeout is None else timeout)
+        # only a transport that answers to whoever sent last has to say so
+        while not getattr(data, "addressed", True) and self._failure is None and time.monotonic() < limit:
+            self._help()
+
+    def close(self) -> None:
+        """Stop the sensor where it was started, and give everything back; a second call does nothing."""
+        if self._closed:
+            return
+        try:
+            self._farewell()
+        finally:
+            self._closed = True
+            self.queue.close()
+            for capture in self._captures.values():
+                capture.close()
+
+    def _farewell(self) -> None:
+        """Send the commands for the end, as far as the device still listens."""
+        if self.stays_on:
+            return
+        if self._failure is not None or not self._captures["data"].connected or not (self._stops or self._session.started):
+            return
+        stopping = [name for name, command in self.sensor.commands.items() if command.stops and not command.args][:1]
+        with self._talk:
+            self._session.abandon("the device is being closed")
+            names = self.sensor.on_close or stopping
+            waiting = [self._session.request(name, time.monotonic_ns()) for name in names]
+            self._speak()
+        limit = time.monotonic() + FAREWELL
+        while not all(pending.done for pending in waiting) and time.monotonic() < limit:
+            self._help(next(pending for pending in waiting if not pending.done))
+            self._ready.clear()
+        for pending in waiting:
+            with contextlib.suppress(LidarSpecError):
+                pending.result()
+
+    def _help(self, pending: Pending | None = None) -> None:
+        """Do a turn of the work, unless another thread is at it."""
+        if not self._turn.acquire(timeout=TURN / 5):
+            return
+        try:
+            if pending is None or not pending.done:
+                self._pump(TURN)
+        finally:
+            self._turn.release()
+        while len(self._ready) > KEPT:
+            self._ready.popleft()
+
+    def _pump(self, wait: float) -> None:
+        """Take what has arrived within `wait` seconds, decode it, and let the session know."""
+        with self._talk:
+            self._session.tick(time.monotonic_ns())
+            self._speak()
+            deadline = self._session.deadline
+        if deadline is not None:
+            wait = min(wait, max(deadline - time.monotonic_ns(), 0) / 1e9)
+        events = self.queue.take(wait, until=self._due, chunks=TOGETHER)
+        if events:
+            self._due = time.monotonic() + self._period
+        for link, run in _runs(events):
+            self._take(link, run)
+
+    def _take(self, link: str, run: list[Chunk] | Mark | BaseException) -> None:
+        """Decode consecutive chunks of a link, or note what happened on it."""
+        if isinstance(run, list):
+            self._decode(link, run)
+        elif isinstance(run, Mark):
+            self._hand_on(link, self._decoders[link].rest(), interrupted=run is Mark.LOST)
+            if run is Mark.LOST:
+                with self._talk:
+                    self._session.abandon("the connection was lost")
+            elif run is Mark.BACK and link == "data":
+                self._start_again()
+        elif self._failure is None and not self._closed:
+            self._failure = run
+
+    def _decode(self, link: str, chunks: list[Chunk]) -> None:
+        decoder = self._decoders[link]
+        if chunks[0].gap:
+            self._hand_on(link, decoder.rest(), interrupted=True)
+        if decoder.stream and chunks[0].sender is not None:
+            number = len(chunks)
+            chunks = self._senders.ours(chunks, decoder)
+            self._foreign += number - len(chunks)
+        if not chunks:
+            return
+        found = fed(decoder, chunks)
+        if not decoder.stream:
+            self._senders.check(chunks, found[0])
+        self._hand_on(link, found)
+
+    def _hand_on(self, link: str, found: list[Spans], *, interrupted: bool = False) -> None:
+        with self._talk:
+            awaited = self._session.awaited(link)
+            for item in answers(found, awaited) if awaited else ():
+                at = time.monotonic_ns() if item.at is None else item.at - self._offset
+                self._session.receive([item], at, link=link)
+            if awaited:
+                self._speak()
+        if link == "data":
+            self._watch.saw(found)
+            if interrupted or any(map(len, found)):
+                self._ready.append(Arrival(found, interrupted=interrupted))
+
+    def _start_again(self) -> None:
+        """The device is back: it has forgotten what it was told."""
+        with self._talk:
+            for name in self.sensor.on_open if self._stops else ():
+                self._session.request(name, time.monotonic_ns())
+            self._speak()
+
+    def _speak(self) -> None:
+        """Send what the session wants to be sent."""
+        for outgoing in self._session.outgoing():
+            try:
+                self._write(outgoing)
+            except CommandError:
+                raise
+            except LidarSpecError as error:
+                self._session.abandon(str(error))
+
+    def _write(self, outgoing: Outgoing) -> None:
+        transport = self._opened(outgoing.link)
+        if outgoing.lines:
+            try:
+                transport.lines(**outgoing.lines)
+            except LidarSpecError as error:
+                self._said.append(str(error))
+        if outgoing.data:
+            transport.write(outgoing.data)
+            if self._recorder is not None:
+                self._recorder.write(Chunk(outgoing.data, time.monotonic_ns() + self._offset), "out")
+
+    def _opened(self, link: str) -> LiveTransport:
+        """The transport of a link; one apart from the data's is opened when it is first needed."""
+        if link not in self._captures:
+            opened: Any = control_link(self._source, link, self.sensor.links[link], self._captures["data"].transport.peer())
+            self._decoders[link] = self.sensor.decoder(stream=not opened.datagrams, backend=self._backend)
+            self._captures[link] = Capture(opened, self.queue, link=link)
+        return self._captures[link].transport
+
+
+def _runs(events: list[Event]) -> list[tuple[str, list[Chunk] | Mark | BaseException]]:
+    """Events with consecutive chunks of one link joined, up to where the line was interrupted."""
+    found: list[tuple[str, list[Chunk] | Mark | BaseException]] = []
+    of = ""
+    run: list[Chunk] = []
+    for link, item in events:
+        if not isinstance(item, Chunk):
+            found.append((link, item))
+            of = ""
+        elif link == of and not item.gap:
+            run.append(item)
+        else:
+            run, of = [item], link
+            found.append((link, run))
+    return found
+
+
+def calm(name: str) -> str:
+    """The back end of a live stream: none by itself that stops to compile, since nothing would be decoded meanwhile."""
+    chosen = backend_named(name)
+    return "numpy" if chosen == "auto" else chosen
+
+
+def _silence(sensor: Sensor, opened: LiveTransport) -> float:
+    """Seconds without a byte after which nothing of a frame can be under way: longer than a frame takes on the line."""
+    longest = max((frame.max_length for frame in sensor.frames.values()), default=0)
+    baud = getattr(opened, "baud", None)
+    return max(0.1, 2 * longest * 10 / baud) if baud else 0.1

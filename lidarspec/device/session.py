@@ -1,0 +1,410 @@
+"""What a session hands out: what to send, the promise of a reply, the reply; and which frames can be the reply to what.
+
+Commands and their replies, sans-IO: requests in, what to send out; frames in, replies out.
+
+All times are the caller's, in ns of one monotonic clock. On each link one request is under way at a time; the others wait in
+a queue, also while the device settles. The reply is looked for among all frames that arrive on the link, data or not.
+
+A late answer is never taken for the next one's. A sending that was not answered in time is *owed* an answer, until twice the
+time that it may take has passed since. While one is owed that could be the reply to the next request as well (a type of frame
+in common, and no field in which the two have to differ), that request is held back; an owed answer that does come is counted
+in `late` and frees it. A frame that arrived before a request was sent is no answer to it. An answer that is later still can be
+told from the next one's only by what the command `matches` or `echoes`.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from lidarspec.errors import CommandError, ReplyTimeout, UnknownField, UsageError
+from lidarspec.framing.decoder import Found
+from lidarspec.spec.description import Command, Sensor
+from lidarspec.wire.schema import FieldInfo, schema
+
+#: fields that a reply's repr shows.
+SHOWN = 6
+_MISSING = object()
+
+
+@dataclass(frozen=True)
+class Outgoing:
+    """What is to be done on a link now: first the levels of its control lines, then the bytes."""
+
+    link: str
+    data: bytes
+    lines: Mapping[str, bool] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, repr=False)
+class Reply:
+    """The answer to a command.
+
+    Attributes:
+        command: the name of the command.
+        frame: the type of the frame that answered; None where no answer is documented.
+        values: its fields, raw wire integers as `Sensor.parse` gives them; ``reply["path"]`` is the physical value.
+        confirmed: whether the device answered.
+        at: when, in the session's clock; for one that is not confirmed, when the command was sent.
+        data: the bytes of the frame.
+    """
+
+    command: str
+    frame: str | None
+    values: Any
+    confirmed: bool
+    at: int
+    data: bytes = b""
+    fields: Mapping[str, FieldInfo] = field(default_factory=dict, compare=False)
+
+    def __getitem__(self, path: str) -> Any:
+        """The value of a field in its unit; a list where it is in an array.
+
+        Raises:
+            UnknownField: for a path that the frame does not have.
+        """
+        value = found_at(self.values, path)
+        if path not in self.fields or value is _MISSING:
+            raise UnknownField(path, self.fields, place=f"{self.command} {self.frame or 'without a reply'}")
+        return _physical(self.fields[path], value)
+
+    def __repr__(self) -> str:
+        if not self.confirmed:
+            return f"Reply({self.command}, not confirmed)"
+        free = [info for info in self.fields.values() if info.const is None and found_at(self.values, info.path) is not _MISSING]
+        told = [f"{info.path} {self[info.path]}{' ' * bool(info.unit)}{info.unit}" for info in free[:SHOWN]]
+        return f"Reply({self.command}, {self.frame}: {', '.join(told)}{', ...' * (len(free) > SHOWN)})"
+
+
+class Pending:
+    """A command that was asked for, and becomes its reply or its failure."""
+
+    def __init__(self, place: str) -> None:
+        self._place = place
+        self._outcome: Reply | CommandError | None = None
+
+    @property
+    def done(self) -> bool:
+        """Whether there is a result."""
+        return self._outcome is not None
+
+    def result(self) -> Reply:
+        """The reply.
+
+        Raises:
+            ReplyTimeout: if none came in time.
+            CommandError: if the device answered with something else, or the command was given up.
+            UsageError: if it is not done.
+        """
+        if self._outcome is None:
+            raise UsageError(f"{self._place} is not answered yet")
+        if isinstance(self._outcome, CommandError):
+            raise self._outcome
+        return self._outcome
+
+    def settle(self, outcome: Reply | CommandError) -> None:
+        """Make it done; for the session."""
+        self._outcome = outcome
+
+
+@dataclass(frozen=True)
+class Expected:
+    """The frames that can be the reply to one request.
+
+    Attributes:
+        tables: for each type of frame its fields.
+        values: what its fields must be, those of them that the type has.
+    """
+
+    tables: Mapping[str, Mapping[str, FieldInfo]]
+    values: Mapping[str, Any]
+
+    @classmethod
+    def of(cls, command: Command, tables: Mapping[str, Mapping[str, FieldInfo]], request: Any) -> Expected:
+        """What answers a command of which `request` are the fields sent."""
+        return cls(tables, {**command.matches, **{path: found_at(request, path) for path in command.echoes}})
+
+    def differs(self, frame: str, values: Any) -> list[str]:
+        """What is wrong with a frame as the reply, field by field; empty where it is the reply."""
+        if frame not in self.tables:
+            return [f"a frame {frame}"]
+        asked = {path: value for path, value in self.values.items() if path in self.tables[frame]}
+        got = {path: found_at(values, path) for path in asked}
+        return [
+            f"{path} {'missing' if got[path] is _MISSING else got[path]} instead of {value}"
+            for path, value in asked.items()
+            if got[path] != value
+        ]
+
+    def alike(self, other: Expected) -> bool:
+        """Whether one frame could be the reply to both."""
+        return any(
+            all(other.values.get(path, value) == value for path, value in self.values.items() if path in self.tables[frame])
+            for frame in self.tables.keys() & other.tables.keys()
+        )
+
+
+def found_at(values: Any, path: str) -> Any:
+    """The value at a dotted path of a parsed frame, a list of them below an array, or a mark that there is none."""
+    for name in path.split(".") if path else ():
+        if isinstance(values, list):
+            values = [found_at(element, name) for element in values]
+        elif isinstance(values, Mapping) and name in values:
+            values = values[name]
+        else:
+            return _MISSING
+    return values
+
+
+def _physical(info: FieldInfo, value: Any) -> Any:
+    if isinstance(value, list):
+        return [_physical(info, element) for element in value]
+    return value * info.scale + info.offset if info.scaled and isinstance(value, int | float) else value
+
+
+SECOND = 1_000_000_000
+
+
+@dataclass(eq=False)
+class _Request:
+    """A command on its way: the times of its sendings, and when it is given up."""
+
+    name: str
+    command: Command
+    data: bytes
+    expected: Expected | None
+    timeout: int
+    pending: Pending
+    sent: list[int] = field(default_factory=list)
+    wrong: str = ""
+
+    @property
+    def gives_up(self) -> int:
+        return self.sent[0] + self.timeout
+
+    @property
+    def next_sending(self) -> int | None:
+        """When it is sent once more, None where it is not."""
+        again = self.sent[-1] + _ns(self.command.timeout)
+        return again if len(self.sent) <= self.command.retries and again < self.gives_up else None
+
+    @property
+    def patience(self) -> int:
+        """How long after a sending its answer is still thought possible."""
+        return 2 * max(self.timeout, _ns(self.command.timeout))
+
+
+@dataclass(frozen=True, eq=False)
+class _Owed:
+    """An answer that may still come."""
+
+    expected: Expected
+    until: int
+
+
+@dataclass(eq=False)
+class _Line:
+    """What goes on on one link; nothing is sent before `quiet`."""
+
+    queue: deque[_Request] = field(default_factory=deque)
+    current: _Request | None = None
+    owed: list[_Owed] = field(default_factory=list)
+    quiet: int = 0
+
+    def ready(self) -> int | None:
+        """When the next request in the queue may be sent, None where there is none."""
+        if self.current is not None or not self.queue:
+            return None
+        expected = self.queue[0].expected
+        return max([self.quiet, *(owed.until for owed in self.owed if expected is not None and owed.expected.alike(expected))])
+
+
+@dataclass(eq=False)
+class _Beat:
+    """A command that is repeated."""
+
+    arguments: dict[str, Any]
+    due: int
+    pending: Pending
+
+
+class Session:
+    """The commands of one sensor on its links.
+
+    Feed it every frame that arrives, those included that `Decoder.idle` finds when the line has fallen silent: a device that
+    stops in the middle of a frame answers in what looks like the rest of it.
+
+    Attributes:
+        sensor: the sensor.
+        started: whether a command that starts the sensor was sent, and none since that stops it.
+        late: answers that came after they had been given up.
+    """
+
+    def __init__(self, sensor: Sensor) -> None:
+        self.sensor, self.started, self.late = sensor, False, 0
+        self._lines: dict[str, _Line] = {}
+        self._beats: dict[str, _Beat] = {}
+        self._out: list[Outgoing] = []
+        self._tables: dict[str, dict[str, FieldInfo]] = {}
+
+    def request(self, name: str, now: int, /, *, timeout: float | None = None, **arguments: Any) -> Pending:
+        """The promise of a command's reply; the command is sent as soon as its link is free.
+
+        Args:
+            name: of the command.
+            now: the time in ns.
+            timeout: seconds to wait in all; by default the command's own for each time that it is sent.
+            arguments: of the command, in units.
+
+        Raises:
+            UnknownCommand, UnknownField, MissingField, OutOfRange: for what the sensor does not take; nothing is sent.
+        """
+        data = self.sensor.command(name, **arguments)
+        command = self.sensor.commands[name]
+        tables = {reply: self._table(reply) for reply in command.replies}
+        request = self.sensor.parse(data, command.frame) if command.echoes else None
+        wait = _ns(command.timeout) * (1 + command.retries) if timeout is None else _ns(timeout)
+        pending = Pending(f"{self.sensor.id} {name}")
+        expected = Expected.of(command, tables, request) if tables else None
+        self._line(command.link).queue.append(_Request(name, command, data, expected, wait, pending))
+        if command.every:
+            self._beats[name] = _Beat(arguments, now + _ns(command.every), pending)
+        self._advance(command.link, now)
+        return pending
+
+    def outgoing(self) -> list[Outgoing]:
+        """What is to be sent now, in order; each is given out once."""
+        out, self._out = self._out, []
+        return out
+
+    def awaited(self, link: str = "data") -> frozenset[str]:
+        """The types of frames that `receive` has to see on a link now; it passes over others."""
+        line = self._lines.get(link)
+        if line is None:
+            return frozenset()
+        expected = [owed.expected for owed in line.owed] + ([line.current.expected] if line.current and line.current.expected else [])
+        return frozenset(name for one in expected for name in one.tables)
+
+    def receive(self, found: Iterable[Found], now: int, *, link: str = "data") -> None:
+        """Take frames that arrived on a link at the time `now`."""
+        line = self._lines.get(link)
+        if line is None:
+            return
+        for item in found:
+            if (line.current is not None or line.owed) and item.frame in self.awaited(link):
+                self._take(line, item, now)
+        self._advance(link, now)
+
+    def tick(self, now: int) -> None:
+        """Send again, give up, end settling, and beat, as far as it is time to."""
+        for name, beat in list(self._beats.items()):
+            if now >= beat.due:
+                beat.due = now + _ns(self.sensor.commands[name].every)
+                if beat.pending.done:
+                    self.request(name, now, **beat.arguments)
+        for link, line in self._lines.items():
+            current = line.current
+            if current is not None and now >= current.gives_up:
+                self._give_up(line, current, _silence(self.sensor, current))
+            elif current is not None and current.next_sending is not None and now >= current.next_sending:
+                self._send(line, current, now)
+            self._advance(link, now)
+
+    @property
+    def deadline(self) -> int | None:
+        """When `tick` is needed next; None where nothing is waited for."""
+        times = [beat.due for beat in self._beats.values()]
+        for line in self._lines.values():
+            current = line.current
+            if current is not None:
+                times.append(min(current.gives_up, current.next_sending or current.gives_up))
+            elif (ready := line.ready()) is not None:
+                times.append(ready)
+        return min(times, default=None)
+
+    @property
+    def busy(self) -> bool:
+        """Whether a request waits to be sent or answered; heartbeats to come do not count."""
+        return any(line.current is not None or line.queue for line in self._lines.values())
+
+    def abandon(self, reason: str) -> None:
+        """Give up every request and heartbeat, since the link was lost or nobody waits any more; what was sent stays owed."""
+        self._beats.clear()
+        for line in self._lines.values():
+            waiting = list(line.queue)
+            line.queue.clear()
+            if line.current is not None:
+                self._give_up(line, line.current, CommandError(f"{self.sensor.id} {line.current.name}: {reason}"))
+            for request in waiting:
+                request.pending.settle(CommandError(f"{self.sensor.id} {request.name}: {reason}"))
+
+    def _line(self, link: str) -> _Line:
+        return self._lines.setdefault(link, _Line())
+
+    def _table(self, frame: str) -> dict[str, FieldInfo]:
+        if frame not in self._tables:
+            self._tables[frame] = dict(schema(self.sensor.frames[frame].prepared).fields)
+        return self._tables[frame]
+
+    def _advance(self, link: str, now: int) -> None:
+        """Send what the queue has, up to the first request that is answered or held back."""
+        line = self._lines[link]
+        line.owed = [owed for owed in line.owed if owed.until > now]
+        while (ready := line.ready()) is not None and now >= ready:
+            request = line.queue.popleft()
+            self._send(line, request, now)
+            if request.expected is not None:
+                line.current = request
+            else:
+                line.quiet = now + _ns(request.command.settle)
+                request.pending.settle(Reply(request.name, None, None, False, now))
+
+    def _send(self, line: _Line, request: _Request, now: int) -> None:
+        command = request.command
+        request.sent.append(now)
+        self._out.append(Outgoing(command.link, request.data, command.lines))
+        self.started = (self.started or command.starts) and not command.stops
+
+    def _take(self, line: _Line, item: Found, now: int) -> None:
+        """The reply to the current request, an answer that is owed, or neither."""
+        values = self.sensor.parse(item.data, item.frame)
+        current = line.current
+        differs = ["not asked for"] if current is None or current.expected is None else current.expected.differs(item.frame, values)
+        if current is not None and not differs and now >= current.sent[0]:
+            reply = Reply(current.name, item.frame, values, True, now, item.data, self._table(item.frame))
+            self._close(line, current, answers=1, since=now)
+            current.pending.settle(reply)
+            return
+        for owed in line.owed:
+            if not owed.expected.differs(item.frame, values):
+                line.owed.remove(owed)
+                self.late += 1
+                return
+        if current is not None and current.expected is not None and item.frame in current.expected.tables and now >= current.sent[0]:
+            current.wrong = f"{item.frame} with {', '.join(differs)}"
+
+    def _give_up(self, line: _Line, request: _Request, error: CommandError) -> None:
+        self._close(line, request, answers=0, since=request.sent[-1])
+        request.pending.settle(error)
+
+    def _close(self, line: _Line, request: _Request, *, answers: int, since: int) -> None:
+        """The link is free again; every sending but those answered is owed its answer."""
+        line.current = None
+        line.quiet = since + _ns(request.command.settle)
+        if request.expected is not None:
+            line.owed += [_Owed(request.expected, sent + request.patience) for sent in request.sent[answers:]]
+
+
+def _silence(sensor: Sensor, request: _Request) -> CommandError:
+    """What to say when the time is up."""
+    place = f"{sensor.id} {request.name}"
+    if request.wrong:
+        return CommandError(f"{place}: the device answered with {request.wrong}")
+    often = f", sent {len(request.sent)} times" if len(request.sent) > 1 else ""
+    return ReplyTimeout(f"{place}: no {' or '.join(request.command.replies)} frame came within {request.timeout / SECOND:g} s{often}")
+
+
+def _ns(seconds: float) -> int:
+    return round(seconds * SECOND)

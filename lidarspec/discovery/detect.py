@@ -1,0 +1,297 @@
+"""Which of several sensors with the same frames it is: by how fast its clock runs, and by the names that its frames hold.
+
+A clock that advances from packet to packet as the sensor's own `sweep` says tells models apart that differ in speed. A name is
+what a field of text holds, or what the author's remark calls the value of a field ("0x22 NAME"). The clock comes first: bytes
+that name a model are not always true.
+
+Which installed sensor sent these bytes: each is tried, and what passes checksum and plausibility is counted.
+"""
+
+from __future__ import annotations
+
+import functools
+import itertools
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarspec.device.settings import named
+from lidarspec.discovery.listen import Heard, hear
+from lidarspec.errors import CommandError, LidarSpecError, UsageError, WireError
+from lidarspec.framing.decoder import Found
+from lidarspec.plugins import sensors
+from lidarspec.simulation.simulator import simulate
+from lidarspec.spec.description import Sensor
+from lidarspec.spec.links import Serial
+from lidarspec.transports.files import RecordingTransport
+from lidarspec.transports.open_url import live_address, transport
+from lidarspec.transports.simulated import SimulatedTransport
+from lidarspec.wire.schema import FieldInfo, schema
+
+#: share by which the pace of a clock may be off, frames of a type that are looked into for names, and packets simulated.
+OFF, READ, PACKETS = 0.03, 3, 64
+_VALUE = re.compile(r"\b(0x[0-9a-fA-F]+|\d+)\s+([^,;:]+)")
+
+
+def told_apart(candidates: Sequence[Sensor], found: Sequence[Found]) -> dict[str, str]:
+    """The candidates that the frames speak for, by id, each with why; empty where the frames say nothing.
+
+    Args:
+        candidates: sensors whose frames these are alike.
+        found: frames in the order of their arrival.
+    """
+    by_clock = {sensor.id: why for sensor in candidates if (why := _by_clock(sensor, found))}
+    if by_clock and len(by_clock) < len(candidates):
+        return by_clock
+    by_name = {sensor.id: why for sensor in candidates if (why := _by_name(sensor, found))}
+    return by_name if len(by_name) < len(candidates) else {}
+
+
+def _by_clock(sensor: Sensor, found: Sequence[Found]) -> str:
+    """Why the clock in the frames is this sensor's, "" where it is not."""
+    expected = _pace(sensor.id, sensor) if sensor.clock is not None else None
+    data = [item for item in found if item.frame == sensor.data_frame]
+    if expected is None or len(data) < 3:
+        return ""
+    follows = np.array([after.offset == item.offset + len(item.data) for item, after in itertools.pairwise(data)])
+    steps = _steps(sensor, [item.data for item in data])[follows]
+    steps = steps[(steps >= 0) & (steps <= 10 * expected)]
+    if len(steps) < 2 or steps.mean() <= 0:
+        return ""
+    step, grain = float(steps.mean()), min(float(np.ptp(steps)), expected)  # a coarse clock is as uneven as its steps
+    if abs(step - expected) > OFF * expected + grain / (2 * len(steps) ** 0.5):
+        return ""
+    return f"its clock advances by {step / 1e6:.3g} ms a packet"
+
+
+@functools.lru_cache(maxsize=256)
+def _pace(sensor_id: str, sensor: Sensor) -> float | None:
+    """Nanoseconds by which the sensor's clock advances a packet, None where nobody knows."""
+    try:
+        steps = _steps(sensor, simulate(sensor, PACKETS))
+    except LidarSpecError:
+        return None
+    steps = steps[steps >= 0]
+    return float(steps.mean()) if len(steps) and steps.mean() > 0 else None
+
+
+def _steps(sensor: Sensor, data: Sequence[bytes]) -> NDArray[np.int64]:
+    """By how many ns the clock advances from packet to packet."""
+    return np.diff(sensor.decode(list(data)).time_ns)
+
+
+def _by_name(sensor: Sensor, found: Sequence[Found]) -> str:
+    """Why the frames name this sensor, "" where they do not."""
+    model, read = _plain(sensor.model), dict.fromkeys(sensor.frames, 0)
+    for item in found:
+        if read.get(item.frame, READ) >= READ:
+            continue
+        read[item.frame] += 1
+        fields = _fields(sensor, item.frame)
+        for path, text in _texts(sensor.parse(item.data, item.frame), fields):
+            if _plain(text) == model:
+                return f"{item.frame}.{path} says {text}"
+    return ""
+
+
+def _fields(sensor: Sensor, frame: str) -> Mapping[str, FieldInfo]:
+    return schema(sensor.frames[frame].prepared).fields
+
+
+def _texts(values: object, fields: Mapping[str, FieldInfo], above: str = "") -> Iterator[tuple[str, str]]:
+    """The fields outside arrays that hold a text, or a number with a meaning, and what they say."""
+    if not isinstance(values, Mapping):
+        return
+    for name, value in values.items():
+        path = f"{above}.{name}" if above else str(name)
+        info = fields.get(path)
+        if isinstance(value, Mapping):
+            yield from _texts(value, fields, path)
+        elif isinstance(value, bytes):
+            text = value.split(b"\0")[0].decode("ascii", "replace")
+            if text.isprintable() and text:
+                yield path, text
+        elif info is not None and isinstance(value, int):
+            meanings = {int(number, 0): text.strip() for number, text in _VALUE.findall(info.docs)} | dict(info.labels)
+            if int(value) in meanings:
+                yield path, str(meanings[int(value)])
+
+
+def _plain(text: str) -> str:
+    return re.sub(r"[\W_]", "", text).lower()
+
+
+#: bytes that an error shows.
+SHOWN = 16
+#: share of the bytes that has to be in a sensor's frames for it to fit, how close to the best another is as good, and what is beyond doubt.
+FITS, AS_GOOD, CLEAR = 0.2, 0.01, 0.9
+
+
+@dataclass(frozen=True)
+class Score:
+    """How well a sensor fits: the share of the bytes in its frames, the number of its data frames, and what else speaks for it."""
+
+    sensor: Sensor
+    share: float
+    data_frames: int
+    found: tuple[Found, ...] = ()
+    why: str = ""
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Whose bytes were heard.
+
+    Attributes:
+        heard: the bytes.
+        scores: every sensor that fits, the best first.
+        alike: those that cannot be told apart from the first one; one alone is it.
+    """
+
+    heard: Heard
+    scores: tuple[Score, ...]
+    alike: tuple[Score, ...]
+
+    @property
+    def sensor(self) -> Sensor | None:
+        """The sensor, None where none fits or several do."""
+        return self.alike[0].sensor if len(self.alike) == 1 else None
+
+    @property
+    def is_clear(self) -> bool:
+        """Whether no other baud rate has to be tried."""
+        return bool(self.scores) and self.scores[0].share >= CLEAR and self.scores[0].data_frames > 1
+
+
+def scores(chunks: Sequence[bytes], *, datagrams: bool) -> list[Score]:
+    """Every installed sensor of which a data frame was found, the best first."""
+    known = [sensor for sensor in sensors().values() if any(frame.direction == "in" for frame in sensor.frames.values())]
+    found = _each(known, lambda sensor: _score(sensor, chunks, datagrams=datagrams))
+    if not any(score.share >= FITS for score in found):
+        found += _each(known, lambda sensor: _from_the_middle(sensor, chunks, datagrams=datagrams))
+    return sorted(found, key=lambda score: (-score.share, score.sensor.id))
+
+
+def _each(known: Sequence[Sensor], scored: Callable[[Sensor], Score | None]) -> list[Score]:
+    """The score of each sensor; those with the very same frames share one."""
+    shared: dict[object, Score | None] = {}
+    for sensor in known:
+        frames = (sensor.fillers, *((name, id(frame.struct), frame.plausible, frame.after) for name, frame in sensor.frames.items()))
+        if frames not in shared:
+            shared[frames] = scored(sensor)
+        if (score := shared[frames]) is not None:
+            shared[sensor.id] = replace(score, sensor=sensor)
+    return [score for key, score in shared.items() if isinstance(key, str) and score is not None]
+
+
+def _score(sensor: Sensor, chunks: Sequence[bytes], *, datagrams: bool) -> Score | None:
+    decoder = sensor.decoder(stream=not datagrams)
+    items = [item for chunk in chunks for item in decoder.feed(chunk)] + decoder.finish()
+    number = sum(decoder.stats.frames.get(name, 0) for name, frame in sensor.frames.items() if frame.data)
+    return Score(sensor, 1 - decoder.stats.bytes_skipped / decoder.stats.bytes_in, number, tuple(items)) if number else None
+
+
+def _from_the_middle(sensor: Sensor, chunks: Sequence[bytes], *, datagrams: bool) -> Score | None:
+    """The best score of a sensor whose data frames come after others, as if one of those had been seen before."""
+    answers = [name for name, frame in sensor.frames.items() if frame.data and frame.after is not None]
+    scored = [_score(sensor.configure(answer=name), chunks, datagrams=datagrams) for name in answers]
+    best = max((score for score in scored if score is not None), key=lambda score: score.share, default=None)
+    return None if best is None else replace(best, sensor=sensor)
+
+
+def verdict(heard: Heard) -> Verdict:
+    """Whose bytes were heard: by the frames, then by clocks and names in them, then by the baud rate."""
+    fitting = [score for score in scores(heard.chunks, datagrams=heard.datagrams) if score.share >= FITS]
+    best = [score for score in fitting if score.share >= fitting[0].share - AS_GOOD]
+    alike = best
+    if len(best) > 1:
+        reasons = told_apart([score.sensor for score in best], best[0].found)
+        alike = [replace(score, why=reasons[score.sensor.id]) for score in best if score.sensor.id in reasons] or best
+        if len(alike) > 1 and heard.baud is not None:
+            why = f"it runs at {heard.baud} baud"
+            declared = [replace(score, why=why) for score in alike if heard.baud in _bauds(score.sensor)]
+            alike = declared or alike
+    others = [score for score in fitting if score.sensor.id not in {one.sensor.id for one in alike}]
+    return Verdict(heard, (*alike, *others), tuple(alike))
+
+
+def verdicts(source: str | Path, *, seconds: float | None = None) -> list[Verdict]:
+    """Whose bytes come from a source, one verdict for each sender; of a serial port, at the baud rate that fits best.
+
+    Raises:
+        SourceError: where it cannot be opened.
+    """
+    tried: list[Verdict] = []
+    for heard in hear(source) if seconds is None else hear(source, seconds=seconds):
+        tried.append(verdict(heard))
+        if heard.baud is not None and tried[-1].is_clear:
+            break
+    if len({one.heard.baud for one in tried}) > 1:
+        return [max(tried, key=lambda one: (one.scores[0].share if one.scores else 0.0, one.heard.size))]
+    return tried
+
+
+def detected(source: str | Path) -> Sensor:
+    """The one installed sensor whose frames come from a source; a recording says it itself, where it was made with one.
+
+    Raises:
+        CommandError: where nothing comes from a live source.
+        WireError: where none fits.
+        UsageError: where several fit equally well: they are listed.
+        SourceError: where it cannot be opened.
+    """
+    told = declared(source)
+    if told is not None:
+        return told
+    device = named(source)
+    place = source if device is None else device.source
+    found = verdicts(place)
+    fitting = [one for one in found if one.scores]
+    if not fitting:
+        raise _nothing(str(source), found)
+    if len({one.sensor.id for one in fitting if one.sensor}) > 1:
+        listed = ", ".join(f"{one.sensor.id} ({one.heard.sender})" for one in fitting if one.sensor)
+        raise UsageError(f"{source}: several sensors send, {listed}; choose one with ?src=ADDRESS and -s")
+    alike = fitting[0].alike
+    if len(alike) > 1:
+        raise UsageError(f"{source}: {', '.join(one.sensor.id for one in alike)} send the same frames; name the sensor with -s")
+    return alike[0].sensor
+
+
+def declared(source: str | Path) -> Sensor | None:
+    """The sensor that a source names itself: a device of `lidarspec.toml`, a recording, a simulated sensor; None for any other."""
+    device = named(source)
+    configured = device.configured() if device is not None else None
+    if configured is not None:
+        return configured
+    if str(source) == "-":
+        raise UsageError("name the sensor with -s: standard input can be read only once")
+    address = live_address(source)
+    if address is not None and address.scheme != "sim":
+        return None
+    opened = transport(source)
+    opened.close()
+    if isinstance(opened, RecordingTransport) and opened.header.sensor:
+        return opened.header.known_sensor()
+    return opened.sensor if isinstance(opened, SimulatedTransport) else None
+
+
+def _nothing(source: str, found: Sequence[Verdict]) -> Exception:
+    """What to say where no sensor fits."""
+    heard = max((one.heard for one in found), key=lambda one: one.size, default=Heard(source))
+    if heard.size:
+        return WireError(f"{source}: no installed sensor's frames are in it", data=heard.chunks[0][:SHOWN])
+    if live_address(source) is None:
+        return WireError(f"{source}: it holds no bytes")
+    error = CommandError(f"{source}: nothing comes; a sensor that has to be started first is named with -s")
+    error.add_note(f"next: lidarspec doctor {source}")
+    return error
+
+
+def _bauds(sensor: Sensor) -> tuple[int, ...]:
+    link = sensor.links.get("data")
+    return link.bauds if isinstance(link, Serial) else ()

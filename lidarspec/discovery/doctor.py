@@ -1,0 +1,252 @@
+"""Why nothing comes, or nothing that can be used: what is wrong with a source, one thing at a time, each with the command that mends it."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from shlex import quote
+
+from lidarspec.device.settings import named
+from lidarspec.discovery.detect import Verdict, verdict, verdicts
+from lidarspec.discovery.listen import LISTEN, Heard, bauds, has_no_baud, started_first, udp_ports
+from lidarspec.errors import LidarSpecError, UsageError
+from lidarspec.spec.description import Sensor
+from lidarspec.spec.links import Serial, Udp
+from lidarspec.transports import ports
+from lidarspec.transports.live_transport import Address
+from lidarspec.transports.open_url import live_address, transport
+from lidarspec.transports.udp import BUFFER, shortfall
+
+#: share of the bytes outside frames from which on a line is bad.
+BAD = 0.02
+LOOPBACK = "lo"
+
+
+@dataclass(frozen=True)
+class Finding:
+    """Something that was looked at.
+
+    Attributes:
+        ok: whether it is as it should be.
+        text: what it is.
+        mend: the command that mends it; "" where there is none, or nothing to mend.
+    """
+
+    ok: bool
+    text: str
+    mend: str = ""
+
+
+def examined(source: str | Path, sensor: Sensor | None = None, *, seconds: float = LISTEN) -> Iterator[Finding]:
+    """What is right and wrong with a source, in the order of looking.
+
+    Args:
+        sensor: whose bytes are expected; found out where left out.
+        seconds: to listen for.
+    """
+    device = named(source)
+    text = str(source if device is None else device.source)
+    address = live_address(text)
+    if address is None:
+        yield from _file(text)
+    elif address.scheme == "serial":
+        yield from _serial(text, address, sensor, seconds)
+    elif address.scheme == "udp":
+        yield from _udp(text, address, sensor, seconds)
+    else:
+        yield from _heard(text, sensor, seconds)
+
+
+def computer() -> Iterator[Finding]:
+    """What is right and wrong with the ports of this computer, whatever is connected to them."""
+    found = ports.serial_ports()
+    if not found:
+        yield Finding(True, "there is no serial port: where one should be, its cable or driver is missing", "sudo dmesg | tail")
+    for port in found:
+        yield from _permission(port.path)
+        yield from _in_use(port.path)
+    for number in udp_ports():
+        yield from _port_in_use(number)
+    yield from _buffer()
+
+
+def _file(path: str) -> Iterator[Finding]:
+    if not os.path.exists(path):
+        yield Finding(False, f"{path}: no such file or port", "lidarspec ports")
+    elif not os.access(path, os.R_OK):
+        yield Finding(False, f"{path}: this user may not read it", f"sudo chmod a+r {path}")
+    elif os.path.getsize(path) == 0:
+        yield Finding(False, f"{path} is empty")
+    else:
+        found = max(verdicts(path), key=lambda one: one.heard.size)
+        yield _verdict(path, found, None)
+
+
+def _serial(source: str, address: Address, sensor: Sensor | None, seconds: float) -> Iterator[Finding]:
+    port = address.place
+    if os.name == "posix" and not os.path.exists(port):
+        yield Finding(False, f"{port}: no such port; it is not plugged in, or its driver is missing", "lidarspec ports")
+        return
+    problems = [finding for finding in (*_permission(port), *_in_use(port)) if not finding.ok]
+    yield from problems or [Finding(True, f"{port} is there, and may be opened")]
+    if not problems:
+        yield from _heard(source, sensor, seconds)
+
+
+def _permission(port: str) -> Iterator[Finding]:
+    if not ports.allowed(port):
+        group = ports.group(port)
+        text = f"{port}: this user may not open it"
+        if group:
+            yield Finding(False, f"{text}; the group {group} may, from the next login on", f"sudo usermod -aG {group} $USER")
+        else:
+            yield Finding(False, f"{text}; nobody but root may", _rule(port))
+
+
+def _rule(port: str) -> str:
+    """A udev rule that lets every user open ports of this kind."""
+    kind = os.path.basename(port).rstrip("0123456789")
+    rule = f'KERNEL=="{kind}[0-9]*", MODE="0666"'
+    return f"echo '{rule}' | sudo tee /etc/udev/rules.d/99-lidarspec.spec.rules && sudo udevadm trigger"
+
+
+def _in_use(port: str) -> Iterator[Finding]:
+    for user in ports.users(port):
+        yield Finding(False, f"{port} is in use by {user}", f"kill {user.pid}")
+
+
+def _udp(source: str, address: Address, sensor: Sensor | None, seconds: float) -> Iterator[Finding]:
+    numbers, host = _udp_numbers(address, sensor), address.host_and_port()[0]
+    busy = [finding for number in numbers for finding in _port_in_use(number)]
+    yield from busy
+    yield from _buffer()
+    if busy:
+        return
+    before, began = ports.received(), time.monotonic()
+    found = list(_heard(source, sensor, seconds))
+    yield from found
+    if any("nothing came" in finding.text for finding in found):
+        rates = {name: (count - before.get(name, count)) / (time.monotonic() - began) for name, count in ports.received().items()}
+        yield from _interfaces(numbers, host, rates)
+
+
+def _udp_numbers(address: Address, sensor: Sensor | None) -> list[int]:
+    port, given = address.host_and_port()[1], address.options.get("port", "")
+    if given:
+        return [int(part) for part in given.split(",") if part.isdecimal()]
+    link = sensor.links.get("data") if sensor is not None else None
+    return [port] if port else list(link.ports) if isinstance(link, Udp) else udp_ports()
+
+
+def _port_in_use(number: int) -> Iterator[Finding]:
+    users = ports.udp_users(number)
+    if users is None:
+        return
+    for user in users:
+        yield Finding(False, f"UDP port {number} is in use by {user}", f"kill {user.pid}")
+    if not users:
+        yield Finding(False, f"UDP port {number} is in use by a program of another user", f"sudo ss -ulpn 'sport = :{number}'")
+
+
+def _buffer() -> Iterator[Finding]:
+    limit = Path("/proc/sys/net/core/rmem_max")
+    try:
+        granted = int(limit.read_text(encoding="ascii"))
+    except (OSError, ValueError):
+        return
+    for text in shortfall(BUFFER, min(granted, BUFFER)):
+        said, _, command = text.partition("; next: ")
+        yield Finding(False, said.replace("the system gave", "the system gives at most"), command)
+
+
+def _interfaces(numbers: list[int], host: str, rates: dict[str, float]) -> Iterator[Finding]:
+    """Where packets do arrive while none comes to the ports."""
+    listed = "/".join(map(str, numbers))
+    active = {name: rate for name, rate in rates.items() if name != LOOPBACK and rate >= 1}
+    if host:
+        yield Finding(
+            True, f"only packets to {host} are listened to; a sensor may send to another address", f"lidarspec doctor udp://:{numbers[0]}"
+        )
+    for name, rate in active.items():
+        text = f"{name} receives {rate:.0f} packets/s, none of them on port {listed}: another port, another address, or a firewall"
+        yield Finding(False, text, f"sudo tcpdump -ni {name} udp")
+        if ports.filters_senders(name):
+            text = f"{name} drops senders whose addresses it does not reach, as a sensor with its factory address is (rp_filter)"
+            yield Finding(False, text, f"sudo sysctl -w net.ipv4.conf.all.rp_filter=2 net.ipv4.conf.{name}.rp_filter=2")
+    if rates and not active:
+        yield Finding(
+            False, "no network interface receives anything: cable, power of the sensor, or an interface that is down", "ip -br address"
+        )
+
+
+def _heard(source: str, sensor: Sensor | None, seconds: float) -> Iterator[Finding]:
+    """What comes, and whether it is what should come."""
+    try:
+        found = _as_expected(source, sensor, seconds) if sensor is not None else None
+        if found is None or not found.scores:
+            tried = [*([found] if found is not None else []), *verdicts(source, seconds=seconds)]
+            found = max(tried, key=lambda one: (bool(one.scores), one.heard.size))
+    except UsageError as error:
+        yield Finding(False, str(error), next((note.removeprefix("next: ") for note in getattr(error, "__notes__", ())), ""))
+        return
+    except LidarSpecError as error:
+        command = next((note.removeprefix("next: ") for note in getattr(error, "__notes__", ()) if "doctor" not in note), "")
+        yield Finding(False, str(error), command)
+        return
+    yield _verdict(source, found, sensor)
+
+
+def _as_expected(source: str, sensor: Sensor, seconds: float) -> Verdict | None:
+    """What comes over a source that is opened as the sensor declares."""
+    opened = transport(source, sensor)
+    try:
+        end, chunks = time.monotonic() + seconds, list[bytes]()
+        while (left := end - time.monotonic()) > 0 and hasattr(opened, "read"):
+            chunks += [chunk.data for chunk in opened.read(min(left, 0.1))]
+        address = live_address(source)
+        plain = address is not None and has_no_baud(address.place)
+        datagrams, baud = opened.datagrams, None if plain else getattr(opened, "baud", None)
+    finally:
+        opened.close()
+    return verdict(Heard(source, tuple(chunks), datagrams, baud)) if chunks else None
+
+
+def _verdict(source: str, found: Verdict, sensor: Sensor | None) -> Finding:
+    """One finding on what was heard."""
+    heard, ids = found.heard, [score.sensor.id for score in found.scores]
+    quoted = quote(source)
+    if not heard.size:
+        return _nothing(source, sensor)
+    if not found.scores:
+        at = " at any baud rate" if heard.baud is not None and len(bauds()) > 1 else ""
+        return Finding(False, f"{heard.size} bytes came, and no frame of an installed sensor{at}", f"lidarspec detect {quoted}")
+    at = f" at {heard.baud} baud" if heard.baud is not None else ""
+    if sensor is not None and sensor.id not in ids:
+        return Finding(False, f"it sends frames of {ids[0]}{at}, not of {sensor.id}", f"lidarspec view {quoted} -s {ids[0]}")
+    name = sensor.id if sensor is not None else ids[0]
+    score = next(score for score in found.scores if score.sensor.id == name)
+    link = score.sensor.links.get("data")
+    if heard.baud is not None and isinstance(link, Serial) and heard.baud not in link.bauds:
+        again = quote(f"{source}{'&' if '?' in source else '?'}baud={heard.baud}")
+        return Finding(False, f"{name} sends{at}, and {link.baud} is declared", f"lidarspec view {again} -s {name}")
+    if 1 - score.share > BAD and heard.size > 4096:
+        return Finding(False, f"{name} sends{at}, and {1 - score.share:.0%} of the bytes are in no frame: cable, ground or baud rate")
+    return Finding(True, f"{name} sends{at}: {score.data_frames} data frames, {score.share:.0%} of the bytes in frames")
+
+
+def _nothing(source: str, sensor: Sensor | None) -> Finding:
+    """Nothing was heard."""
+    quoted = quote(source)
+    if sensor is not None and sensor in started_first():
+        start = next(name for name in sensor.on_open if sensor.commands[name].starts)
+        return Finding(
+            False, f"nothing came; {sensor.id} sends nothing before it is started", f"lidarspec send {quoted} {start} -s {sensor.id}"
+        )
+    address = live_address(source)
+    if sensor is None and address is not None and address.scheme == "serial":
+        text = "nothing came: a sensor that has to be started first, no power, or its transmit line is not on our receive line"
+        return Finding(False, text, f"lidarspec detect {quoted} --start")
+    return Finding(False, "nothing came within the time of listening")

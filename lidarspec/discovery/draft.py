@@ -1,0 +1,549 @@
+"""What unknown frames can be told to consist of, as far as their bytes say it: the facts that a first spec is written from.
+
+The structure of a stream is looked for in its beginning and then held against all of it. Constant bytes in front are the sync; what
+rises steadily is no checksum, which rules out most of the places where an XOR fits as well.
+
+The text of a first spec out of a draft: each field with the evidence for it, and honest names for what nobody knows yet.
+"""
+
+from __future__ import annotations
+
+import itertools
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarspec.discovery.checksum_search import search
+from lidarspec.discovery.periods import CIRCLES, FEW, FRONT, STEADY, Candidate, Length, candidates, follows, structure, values
+from lidarspec.discovery.samples import Match, Place
+from lidarspec.errors import WireError
+from lidarspec.spec.checksums import ByteOrder
+
+#: frames that a checksum is looked for with, longest sync, and the same where there are few frames: more may be chance.
+SOUGHT, SYNC, SHORT_SYNC, MANY = 256, 4, 2, 12
+#: fewest blocks, and the share of a frame that they fill.
+BLOCKS, FILLED = 3, 0.5
+#: bytes behind which no count is looked for, and longest and shortest element of what is counted.
+HEADER, LARGEST, SMALLEST = 8, 16, 2
+#: widest checksum, in bytes.
+LONGEST_SEAL = 4
+
+
+@dataclass(frozen=True)
+class Blocks:
+    """Parts of a frame that begin alike: `count` of `size` bytes from `start` on, each beginning with `flag`."""
+
+    start: int
+    size: int
+    count: int
+    flag: bytes
+    candidates: tuple[Candidate, ...] = ()
+
+    @property
+    def end(self) -> int:
+        """The first byte behind them."""
+        return self.start + self.count * self.size
+
+
+@dataclass(frozen=True)
+class Draft:
+    """What is known of the frames in some bytes.
+
+    Attributes:
+        datagrams: whether each frame is a datagram.
+        sync: bytes that every frame begins with.
+        size: their length; None where it varies.
+        length: how they say it then.
+        frames: (offset, bytes) of those that fit it all, in order.
+        bytes_in: the number of bytes that were looked at.
+        candidates: fields that rise, outside the blocks.
+        blocks: parts of the frame that begin alike.
+        seal: the checksum, None where none was found.
+        front: bytes that nearly all frames have at least, where a length counts bytes: as many are looked into.
+    """
+
+    datagrams: bool
+    sync: bytes
+    size: int | None
+    length: Length | None
+    frames: tuple[tuple[int, bytes], ...]
+    bytes_in: int
+    candidates: tuple[Candidate, ...] = ()
+    blocks: Blocks | None = None
+    seal: Match | None = None
+    front: int = 0
+
+    @property
+    def share(self) -> float:
+        """The share of the bytes that are in frames."""
+        return sum(len(frame) for _, frame in self.frames) / self.bytes_in
+
+    @property
+    def tail(self) -> int:
+        """Bytes of a checksum that stands at the end of frames of several lengths."""
+        return -self.seal.place.offset if self.size is None and self.seal is not None and self.seal.place.offset < 0 else 0
+
+    @property
+    def head(self) -> int:
+        """Bytes in front that every frame has: all of them where there is one length."""
+        if self.size is not None or self.length is None:
+            return self.size or 0
+        return max(self.length.rest - self.tail, self.length.end, self.front)
+
+    @property
+    def rows(self) -> NDArray[np.uint8]:
+        """The heads of all frames, shape (n, head)."""
+        return np.frombuffer(b"".join(frame[: self.head] for _, frame in self.frames), np.uint8).reshape(-1, self.head)
+
+
+def draft(chunks: Sequence[bytes], *, datagrams: bool) -> Draft:
+    """What can be told of the frames in unknown bytes.
+
+    Args:
+        chunks: datagrams, or pieces of a stream.
+
+    Raises:
+        WireError: where no frames of one kind can be seen.
+    """
+    found = structure(chunks, datagrams=datagrams, seal=False)
+    if found is None:
+        raise WireError("no frames of one kind can be seen in these bytes", data=b"".join(chunks[:1])[:16])
+    parts = chunks if datagrams else [b"".join(chunks)]
+    size = sum(map(len, chunks))
+    start = 0 if datagrams or found.period is None or size % found.period == 0 else max(parts[0].find(found.sync), 0)
+    first = Draft(datagrams, b"", found.period, found.length, (), size)
+    first = _begun(first, parts, start) or _begun(first, parts, max(parts[0].find(found.sync), 0)) or replace(first, sync=found.sync)
+    known = _counted(replace(first, frames=tuple(_walk(first, parts))), parts[-1])
+    known = _fronted(known, parts)
+    known = replace(known, candidates=tuple(candidates(known.rows)))
+    known = replace(known, seal=_seal(known))
+    return _detailed(replace(known, frames=tuple(_walk(known, parts))))
+
+
+def _begun(first: Draft, parts: Sequence[bytes], start: int) -> Draft | None:
+    """The sync bytes of frames that are cut at equal distances, or have their length in them; None where they begin differently."""
+    if first.datagrams:
+        frames = [part for part in parts if len(part) == first.size]
+    elif first.size is not None:
+        frames = [parts[0][at : at + first.size] for at in range(start, len(parts[0]) - first.size + 1, first.size)]
+    else:
+        return None
+    rows = np.frombuffer(b"".join(frames), np.uint8).reshape(len(frames), -1)
+    usual = np.array([np.bincount(column, minlength=256).argmax() for column in rows[:, :SYNC].T], np.uint8)
+    steady = (rows[:, : len(usual)] == usual).mean(axis=0) >= (STEADY if len(rows) >= FEW else 1)
+    length = int(np.argmin(steady)) if not steady.all() else len(steady)
+    sync = usual[: length if len(rows) >= MANY else min(length, SHORT_SYNC)].tobytes()
+    return replace(first, sync=sync) if any(sync) else None
+
+
+def _walk(known: Draft, parts: Sequence[bytes]) -> Iterator[tuple[int, bytes]]:
+    """The frames that fit, leftmost first, with their places in the whole input; behind one that does not fit, one byte further."""
+    base = 0
+    for part in parts:
+        at = part.find(known.sync)
+        while 0 <= at < len(part):
+            size = _fits(known, part, at)
+            if size:
+                yield base + at, part[at : at + size]
+            if known.datagrams:
+                break
+            at = part.find(known.sync, at + (size or 1))
+        base += len(part)
+
+
+def _fits(known: Draft, part: bytes, at: int) -> int:
+    """The length of the frame that begins here, 0 where none does."""
+    size = known.size
+    if size is None and known.length is not None:
+        size = known.length.of(part[at : at + known.length.end]) if at + known.length.end <= len(part) else 0
+    if not size or at + size > len(part) or (known.datagrams and (at or size != len(part))) or size < known.head + known.tail:
+        return 0
+    return size if known.seal is None or _sealed(known.seal, part[at : at + size]) else 0
+
+
+def _sealed(seal: Match, frame: bytes) -> bool:
+    start = seal.place.start(len(frame))
+    there = int.from_bytes(frame[start : start + seal.place.size], seal.order)
+    covered = b"".join(frame[a:b] for a, b in seal.span.ranges(seal.place, len(frame)))
+    return seal.algorithm(covered) == there
+
+
+def _counted(known: Draft, data: bytes) -> Draft:
+    """Frames of one length, unless what is left of one behind them says another number, where theirs tells their length."""
+    if known.size is None or known.datagrams or not known.frames:
+        return known
+    at, last = known.frames[-1]
+    rest = data[at + len(last) :]
+    for place in range(len(known.sync), HEADER):
+        same = len({frame[: place + 1] for _, frame in known.frames}) == 1
+        if not same or len(rest) <= place or rest[:place] != last[:place] or rest[place] == last[place]:
+            continue
+        told = [Length(place, 1, "little", unit, known.size - unit * last[place]) for unit in range(SMALLEST, LARGEST + 1)]
+        fitting = [length for length in told if length.rest > place and length.of(rest) > len(rest)]
+        if fitting:
+            return replace(known, size=None, length=min(fitting, key=lambda length: length.rest))
+    return known
+
+
+def _fronted(known: Draft, parts: Sequence[bytes]) -> Draft:
+    """Where the length counts bytes, with a head of the fields in front of what varies: short frames are of another kind then."""
+    if known.length is None or known.length.unit > 1 or not known.frames:
+        return known
+    lengths = sorted(len(frame) for _, frame in known.frames)
+    known = replace(known, front=min(FRONT, lengths[int(len(lengths) * (1 - STEADY))] - LONGEST_SEAL))
+    return replace(known, frames=tuple(_walk(known, parts)))
+
+
+def _seal(known: Draft) -> Match | None:
+    """The checksum that fits, the first of those that do not stand where something rises."""
+    frames = [frame for _, frame in known.frames]
+    step = max(1, len(frames) // SOUGHT)
+    shortest = min(map(len, frames), default=0)
+    for match in search(frames[::step][:SOUGHT]):
+        if not any(_overlaps(match.place, one, shortest) for one in known.candidates) and _can_stand(known, match):
+            return match
+    return None
+
+
+def _overlaps(place: Place, one: Candidate, length: int) -> bool:
+    start = place.start(length)
+    return start < one.end and one.offset < start + place.size
+
+
+def _can_stand(known: Draft, match: Match) -> bool:
+    """Whether a struct can have it: not inside of what varies in number, in one range, and not split over nibbles."""
+    if any("nibbles" in remark for remark in match.remarks):
+        return False
+    place, span = match.place, match.span
+    whole = (span.part, span.head, span.tail) == ("all", 0, 0) or (span.part, span.tail) == ("before", 0)
+    at_end = place.offset == -place.size
+    if known.size is None and not at_end:
+        return 0 <= place.offset <= known.head - place.size and whole
+    return whole or at_end or span.part == "behind"
+
+
+def _detailed(known: Draft) -> Draft:
+    """With the fields that rise and the blocks that begin alike; what belongs to the checksum is neither."""
+    if not known.frames:
+        return known
+    rows = known.rows
+    blocks = _blocks(rows) if known.size is not None else None
+    found = known.candidates
+    if blocks is not None:
+        inside = rows[:, blocks.start : blocks.end].reshape(-1, blocks.size)
+        within = tuple(one for one in candidates(inside) if one.offset >= len(blocks.flag))
+        blocks = replace(blocks, candidates=within)
+        found = tuple(one for one in found if one.end <= blocks.start or one.offset >= blocks.end)
+    shortest = min(len(frame) for _, frame in known.frames)
+    free = tuple(one for one in found if known.seal is None or not _overlaps(known.seal.place, one, shortest))
+    return replace(known, candidates=tuple(one for one in free if one.offset >= len(known.sync)), blocks=blocks)
+
+
+def _blocks(rows: NDArray[np.uint8]) -> Blocks | None:
+    """The parts of a frame that begin with the same two constant bytes at equal distances, if they fill much of it."""
+    first, steady = rows[0], (rows == rows[0]).mean(axis=0) >= STEADY
+    pairs: dict[tuple[int, int], list[int]] = {}
+    for spot in np.flatnonzero(steady[:-1] & steady[1:]).tolist():
+        pairs.setdefault((int(first[spot]), int(first[spot + 1])), []).append(spot)
+    found = []
+    for pair, spots in pairs.items():
+        steps = np.diff(spots)
+        if pair in ((0, 0), (255, 255)) or len(spots) < BLOCKS or (steps != steps[0]).any() or steps[0] <= 2:
+            continue
+        size = int(steps[0])
+        count = min(len(spots), (rows.shape[1] - spots[0]) // size)
+        if count >= BLOCKS and count * size >= FILLED * rows.shape[1]:
+            found.append(Blocks(spots[0], size, count, bytes(pair)))
+    return max(found, key=lambda blocks: blocks.count * blocks.size, default=None)
+
+
+#: bytes of a constant that are told, and how many have to be constant together to be a field.
+TOLD, RUN = 8, 2
+#: unknown bytes in a row in which no constant ones are looked for: there the scene decides what changes.
+LONG = 64
+#: doubt below which a checksum may be chance, as one in so many powers of two.
+WEAK = 12
+#: bits of constants and checksum that let noise through: two frames in a row are asked for then.
+FEW_BITS = 24
+
+
+@dataclass(frozen=True)
+class Field:
+    """A line of a struct: where it begins, how long it is, its name, what follows the name, and the evidence."""
+
+    start: int
+    size: int
+    name: str
+    code: str
+    why: tuple[str, ...] = ()
+
+    def lines(self, indent: str) -> Iterator[str]:
+        """Its text."""
+        yield from (f"{indent}# {line}" for line in self.why)
+        gap = f"\n{indent}" if "\n" in self.code else " "
+        yield f'{indent}"{self.name}"{gap}/ {self.code},'
+
+
+def drafted(draft: Draft, *, origin: str, link: str) -> dict[str, str]:
+    """What a template of a module needs: imports, the struct, functions and arguments, as text.
+
+    Args:
+        origin: what the draft was made from, in words.
+        link: the data link as it stands in the module.
+    """
+    fields = list(_fields(draft))
+    seal = _seal_text(draft, fields)
+    angles = _angles(draft)
+    lines = [line for field in fields for line in field.lines(" " * (8 if seal else 4))]
+    body = "\n".join(lines)
+    struct = f"Checksummed(\n    Struct(\n{body}\n    ),\n{seal[0]})" if seal else f"Struct(\n{body}\n)"
+    below = [f"f.{path} < 360" for path in angles if "." not in path]
+    plausible = below[0] if len(below) == 1 else " & ".join(f"({one})" for one in below)
+    is_weak = not draft.datagrams and not below and _strength(draft) <= FEW_BITS
+    counters = [one for one in draft.candidates if one.kind == "counter" and one.offset < draft.head]
+    text = {
+        "frames_told": f"{len(draft.frames)} frame{'s' * (len(draft.frames) != 1)}, {draft.share:.1%} of its {draft.bytes_in} bytes",
+        "origin": origin,
+        "checksum_class": f"\n{seal[1]}\n\n\n" if seal and seal[1] else "",
+        "sealed": "" if seal else "# No checksum was found: XORs, sums and CRCs of 8, 16 and 32 bits were tried.\n",
+        "struct": struct,
+        "plausible": f'def plausible(f: Fields) -> Any:\n    """Angles below 360 degrees."""\n    return {plausible}\n\n\n'
+        if below
+        else "",
+        "azimuth": f"np.deg2rad(f.{angles[0]})" if angles else "np.zeros(1)",
+        "distance": f"0 * f.{angles[0]}" if angles else "np.zeros(1)",
+        "arguments": "".join(f"    {line}\n" for line in _arguments(angles, counters)),
+        "frame_arguments": ", ".join([f"max_length={_longest(draft)}", *["plausible=plausible"] * bool(below), *["confirm=2"] * is_weak]),
+        "link_code": link,
+    }
+    return {**text, **_imports(text)}
+
+
+def _fields(draft: Draft) -> Iterator[Field]:
+    """The fields of a frame in their order."""
+    rows, known = draft.rows, _known(draft)
+    cuts = sorted({0, draft.head, *_span_cuts(draft), *(edge for one in known for edge in (one.start, one.start + one.size))})
+    at = 0
+    for field in [*known, Field(draft.head, 0, "", "")]:
+        yield from _gap(rows, at, field.start, cuts)
+        if field.name:
+            yield field
+        at = field.start + field.size
+    if draft.size is None and draft.length is not None:
+        yield from _varying(draft)
+
+
+def _known(draft: Draft) -> list[Field]:
+    """Those that something is known of, without overlaps."""
+    found = list(_header(draft))
+    if draft.length is not None:
+        told = sorted({len(frame) for _, frame in draft.frames})
+        seen = (
+            f"frames of {told[0]} to {told[-1]} bytes"
+            if len(told) > 1
+            else f"whole frames of {told[0]} bytes, and the beginning of another"
+        )
+        why = f"frames are as long as {draft.length} says: {seen}"
+        found.append(
+            Field(draft.length.place, draft.length.size, _counter_name(draft), _integer(draft.length.size, draft.length.order), (why,))
+        )
+    if draft.seal is not None and not draft.tail:
+        found.append(_check(draft, draft.seal, draft.seal.place.start(draft.head)))
+    if draft.blocks is not None:
+        found.append(_block_field(draft, draft.blocks))
+    found += [_rising(draft, one) for one in draft.candidates]
+    chosen: list[Field] = []
+    for field in found:
+        if all(field.start + field.size <= other.start or other.start + other.size <= field.start for other in chosen):
+            chosen.append(field)
+    return sorted(chosen, key=lambda field: field.start)
+
+
+def _header(draft: Draft) -> Iterator[Field]:
+    """The sync bytes, in pieces where the checksum's span begins among them; those of blocks that begin with them are theirs."""
+    end = len(draft.sync) if draft.blocks is None else min(len(draft.sync), draft.blocks.start)
+    edges = [0, *(cut for cut in _span_cuts(draft) if 0 < cut < end), end]
+    for a, b in itertools.pairwise(edges):
+        if b > a:
+            why = (f"{len(draft.frames)} frames begin so",) if a == 0 else ()
+            yield Field(a, b - a, f"header_{a}" if a else "header", f"Const({_bytes(draft.sync[a:b])})", why)
+
+
+def _gap(rows: NDArray[np.uint8], start: int, end: int, cuts: Sequence[int]) -> Iterator[Field]:
+    """What lies between known fields, in pieces that the checksum's span and constant bytes make."""
+    edges = {start, end, *(cut for cut in cuts if start < cut < end)}
+    if len(rows) >= FEW and end - start <= LONG:
+        edges |= _constant_edges(rows, start, end)
+    for a, b in itertools.pairwise(sorted(edges)):
+        yield Field(a, b - a, f"unknown_{a}", f"Bytes({b - a})", _constant(rows[:, a:b]))
+
+
+def _constant_edges(rows: NDArray[np.uint8], start: int, end: int) -> set[int]:
+    """Where runs of bytes that never change begin and end."""
+    steady = np.concatenate([[False], (rows[:, start:end] == rows[0, start:end]).all(axis=0), [False]])
+    begins, ends = (np.flatnonzero(np.diff(steady.astype(np.int8)) == step) for step in (1, -1))
+    runs = [(int(a), int(b)) for a, b in zip(begins, ends, strict=True) if b - a >= RUN]
+    return {start + edge for run in runs for edge in run}
+
+
+def _constant(columns: NDArray[np.uint8]) -> tuple[str, ...]:
+    if not columns.size or not (columns == columns[0]).all():
+        return ()
+    told = columns[0, :TOLD].tobytes().hex(" ") + (" ..." if columns.shape[1] > TOLD else "")
+    alike = bool((columns[0] == columns[0, 0]).all()) and columns.shape[1] > TOLD
+    return (f"always {f'{columns[0, 0]:02x}' if alike else told} in {len(columns)} frames",)
+
+
+def _rising(draft: Draft, one: Candidate, what: str = "frame") -> Field:
+    """A counter, an angle, or something else that rises."""
+    code = _integer(one.size, one.order)
+    why: tuple[str, ...] = (one.why(what),)
+    if one.kind == "angle":
+        code = f'Scaled({code}, {CIRCLES[one.circle][0]:g}, "deg")'
+    if what == "frame":
+        for other in draft.candidates:
+            same = other.circle == one.circle and other.kind == one.kind != "counter" and other.offset < one.offset
+            first, last = (values(draft.rows, each.offset, each.size, each.order) for each in (other, one))
+            if same and follows(first, last, one.circle) > 1 - 1 / FEW:
+                why = (*why, f"lies between this frame's {other.name} and the next one's: the angle of the last sample?")
+    return Field(one.offset, one.size, one.name, code, why)
+
+
+def _block_field(draft: Draft, blocks: Blocks) -> Field:
+    rows = draft.rows[:, blocks.start : blocks.end].reshape(-1, blocks.size)
+    fields, at = [Field(0, len(blocks.flag), "flag", f"Const({_bytes(blocks.flag)})")], len(blocks.flag)
+    for one in [*(_rising(draft, each, "block") for each in blocks.candidates), Field(blocks.size, 0, "", "")]:
+        fields += _gap(rows, at, one.start, ())
+        fields += [one] if one.name else []
+        at = one.start + one.size
+    indent = " " * (16 if draft.seal else 12)
+    body = "\n".join(line for field in fields for line in field.lines(indent))
+    code = f"Array(\n{indent[8:]}    {blocks.count},\n{indent[8:]}    Struct(\n{body}\n{indent[8:]}    ),\n{indent[8:]})"
+    why = f"{blocks.count} blocks of {blocks.size} bytes that begin with {blocks.flag.hex(' ')}"
+    return Field(blocks.start, blocks.end - blocks.start, "blocks", code, (why,))
+
+
+def _varying(draft: Draft) -> Iterator[Field]:
+    """What varies in number, and the checksum behind it."""
+    assert draft.length is not None
+    rest, name = draft.head + draft.tail - draft.length.rest, _counter_name(draft)
+    if draft.length.unit > 1 and rest == 0:
+        yield Field(draft.head, 0, "samples", f'Array(this.{name}, Struct("unknown_0" / Bytes({draft.length.unit})))')
+    else:
+        number = f"this.{name}" if draft.length.unit == 1 else f"{draft.length.unit} * this.{name}"
+        lengths = {len(frame) for _, frame in draft.frames}
+        step = int(np.gcd.reduce([length - min(lengths) for length in lengths]))
+        why = (f"their lengths differ by multiples of {step}: samples of {step} bytes?",) if step > 1 else ()
+        yield Field(draft.head, 0, f"unknown_{draft.head}", f"Bytes({number} - {rest})" if rest else f"Bytes({number})", why)
+    if draft.tail and draft.seal is not None:
+        yield _check(draft, draft.seal, -draft.tail)
+
+
+def _counter_name(draft: Draft) -> str:
+    return "count" if draft.length is not None and draft.length.unit > 1 else "length"
+
+
+def _check(draft: Draft, seal: Match, start: int) -> Field:
+    chance = "which may be chance: hold more frames against it" if seal.doubt < WEAK else f"a wrong one would be so once in {seal.odds}"
+    elsewhere = tuple(remark for remark in seal.remarks if "constant" not in remark)
+    return Field(
+        start,
+        seal.place.size,
+        "check",
+        _integer(seal.place.size, seal.order),
+        (f"right in {seal.right} of {seal.total} frames, {chance}", *elsewhere),
+    )
+
+
+def _seal_text(draft: Draft, fields: Sequence[Field]) -> tuple[str, str] | None:
+    """The arguments of `Checksummed` behind its struct, and a class where the checksum needs one of its own."""
+    if draft.seal is None:
+        return None
+    own = draft.seal.paste.startswith("class ")
+    algorithm = "Check()" if own else draft.seal.paste.splitlines()[0]
+    over = ""
+    shortest = min(len(frame) for _, frame in draft.frames)
+    ranges = draft.seal.span.ranges(draft.seal.place, shortest)
+    if sum(b - a for a, b in ranges) < shortest - draft.seal.place.size:
+        (first, last), place = (ranges[0][0], ranges[-1][1]), draft.seal.place.start(shortest)
+        inside = [field.name for field in fields if first <= (field.start if field.start >= 0 else place) < last and field.name != "check"]
+        over = f"    over={tuple(inside)!r},\n".replace("'", '"')
+    return f'    field="check",\n    algorithm={algorithm},\n{over}', _typed(draft.seal.paste) if own else ""
+
+
+def _typed(text: str) -> str:
+    return text.replace("def __call__(self, data):", "def __call__(self, data: Any) -> int:").replace(
+        "def describe(self):", "def describe(self) -> str:"
+    )
+
+
+def _span_cuts(draft: Draft) -> list[int]:
+    """Where the checksum's span begins and ends inside of the head."""
+    if draft.seal is None or not draft.frames:
+        return []
+    shortest = min(len(frame) for _, frame in draft.frames)
+    edges = {edge for span in draft.seal.span.ranges(draft.seal.place, shortest) for edge in span}
+    return sorted(edge for edge in edges if edge < draft.head)
+
+
+def _angles(draft: Draft) -> list[str]:
+    """The paths of the angles that wrap, those of blocks first."""
+    inside = [f"blocks.{one.name}" for one in draft.blocks.candidates if one.kind == "angle"] if draft.blocks else []
+    return inside + [one.name for one in draft.candidates if one.kind == "angle"]
+
+
+def _strength(draft: Draft) -> int:
+    """Bits of the constants and the checksum."""
+    flags = len(draft.blocks.flag) * draft.blocks.count if draft.blocks else 0
+    return 8 * (len(draft.sync) + flags + (draft.seal.place.size if draft.seal else 0))
+
+
+def _arguments(angles: Sequence[str], counters: Sequence[Candidate]) -> Iterator[str]:
+    yield f'scan=OnWrap("{angles[0]}"),' if angles else "scan=Every(0.1),  # seconds: no angle is known that a turn could be told by"
+    if counters:
+        one = counters[0]
+        limits = f", first={one.first}, last={one.circle - 1}" if one.wraps else ""
+        yield f'sequence=Sequence("{one.name}"{limits}),  # a jump in it is a loss'
+
+
+def _longest(draft: Draft) -> str:
+    if draft.size is not None or draft.length is None:
+        return str(draft.size)
+    longest = max(len(frame) for _, frame in draft.frames)
+    return str(draft.length.rest + 255 * draft.length.unit if draft.length.size == 1 else 2 * longest)
+
+
+def _imports(text: dict[str, str]) -> dict[str, str]:
+    """The names that the text uses, by the library that they are from."""
+    code = "\n".join(text.values())
+    construct = sorted(set(re.findall(r"\b(Array|Bytes|Const|Int\d+u[lb]|this(?=\.))\b", code)) | {"Struct"})
+    own = {
+        "Fields",
+        "Frame",
+        "Polar",
+        "Sensor",
+        "hookimpl",
+        *re.findall(r"\b(Check(?:sum|summed)|Crc|Every|Fold15|OnWrap|Scaled|Sequence|Serial|Sum|Udp|WordXor|Xor)\b", code),
+    }
+    return {
+        "construct_names": ", ".join(sorted(construct, key=_case)),
+        "own_names": ", ".join(sorted(own, key=_case)),
+        "typing": "from typing import Any\n" if "Any" in code else "",
+    }
+
+
+def _case(name: str) -> tuple[bool, str, int]:
+    """Classes before functions, and numbers by their size."""
+    number = re.search(r"\d+", name)
+    return name[0].islower(), name[: number.start()] if number else name, int(number[0]) if number else 0
+
+
+def _integer(size: int, order: ByteOrder) -> str:
+    return f"Int{8 * size}u{order[0]}" if size > 1 else "Int8ul"
+
+
+def _bytes(data: bytes) -> str:
+    return 'b"' + "".join(f"\\x{byte:02x}" for byte in data) + '"'

@@ -1,0 +1,231 @@
+"""Bytes out of any source, to find out whose they are: the beginning of a file, or a second of what comes over a live one.
+
+Sensors that keep silent until they are started: their start commands are sent, and what comes back is heard.
+"""
+
+from __future__ import annotations
+
+import itertools
+import os
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from lidarspec.device.session import Pending, Session
+from lidarspec.errors import LidarSpecError, SourceError, UsageError
+from lidarspec.framing.decoder import Decoder
+from lidarspec.plugins import sensors
+from lidarspec.spec.description import Sensor
+from lidarspec.spec.links import Serial, Udp
+from lidarspec.transports.open_url import live_address, transport
+from lidarspec.transports.protocol import Chunk, Disconnected, LiveTransport, Transport
+
+#: bytes and datagrams that are looked at; of a live source, bytes that are enough.
+LOOKED_AT, DATAGRAMS, PLENTY = 1 << 17, 400, 1 << 14
+#: seconds to listen for, and between two looks.
+LISTEN, LOOK = 1.2, 0.1
+
+
+@dataclass(frozen=True)
+class Heard:
+    """What came from one source, of one sender.
+
+    Attributes:
+        source: how to open it again.
+        chunks: datagrams, or pieces of a stream.
+        datagrams: whether they are datagrams.
+        baud: at which a serial port was read; None for another source, and for a port that has no baud rate.
+        sender: address of the sender, where there are several.
+        failure: why it could not be opened.
+    """
+
+    source: str
+    chunks: tuple[bytes, ...] = ()
+    datagrams: bool = False
+    baud: int | None = None
+    sender: str = ""
+    failure: SourceError | None = field(default=None, compare=False)
+
+    @property
+    def size(self) -> int:
+        """The number of bytes."""
+        return sum(map(len, self.chunks))
+
+
+def bauds() -> list[int]:
+    """The baud rates that installed sensors declare, those of the most sensors first."""
+    declared = [baud for sensor in sensors().values() for link in sensor.links.values() if isinstance(link, Serial) for baud in link.bauds]
+    return sorted(set(declared), key=lambda baud: (-declared.count(baud), baud))
+
+
+def udp_ports() -> list[int]:
+    """The UDP ports that data of installed sensors come to."""
+    links = (sensor.links.get("data") for sensor in sensors().values())
+    return sorted({port for link in links if isinstance(link, Udp) for port in link.ports})
+
+
+def hear(source: str | Path, *, seconds: float = LISTEN) -> Iterator[Heard]:
+    """What comes from a source; a serial port whose baud rate is not given, once for each that installed sensors declare.
+
+    Args:
+        seconds: to listen for, each time.
+
+    Raises:
+        SourceError: where it cannot be opened.
+    """
+    text, address = str(source), live_address(source)
+    if address is not None and address.scheme == "serial" and "baud" not in address.options:
+        mark = "&" if "?" in text else "?"
+        for baud in bauds()[: 1 if has_no_baud(address.place) else None]:
+            yield from _heard(f"{text}{mark}baud={baud}", seconds, None if has_no_baud(address.place) else baud, text)
+    elif address is not None and address.scheme == "udp" and not address.host_and_port()[1] and "port" not in address.options:
+        mark = "&" if "?" in text else "?"
+        yield from _heard(f"{text}{mark}port={','.join(map(str, udp_ports()))}", seconds, None, text)
+    else:
+        yield from _heard(text, seconds, int(address.options["baud"]) if address is not None and "baud" in address.options else None, text)
+
+
+def has_no_baud(port: str) -> bool:
+    """Whether a port is a pseudo-terminal, at which every baud rate is the same."""
+    return os.path.realpath(port).startswith("/dev/pts/")
+
+
+def _heard(source: str, seconds: float, baud: int | None, name: str) -> Iterator[Heard]:
+    opened = transport(source)
+    try:
+        live = hasattr(opened, "read")
+        chunks = _listened(opened, seconds) if live else _begun(opened)  # type: ignore[arg-type]
+    finally:
+        opened.close()
+    by_sender: dict[str, list[bytes]] = {}
+    for chunk in chunks:
+        by_sender.setdefault(chunk.sender[0] if chunk.sender else "", []).append(chunk.data)
+    for sender, data in (by_sender or {"": []}).items():
+        yield Heard(name, tuple(data), opened.datagrams, baud, sender if len(by_sender) > 1 else "")
+
+
+def _begun(opened: Transport) -> list[Chunk]:
+    """The beginning of a file."""
+    found: list[Chunk] = []
+    size = 0
+    for chunk in itertools.islice(opened.chunks(), DATAGRAMS if opened.datagrams else None):
+        found.append(Chunk(chunk.data[:LOOKED_AT], chunk.at, chunk.sender))
+        size += len(found[-1].data)
+        if size >= LOOKED_AT:
+            break
+    return found
+
+
+def _listened(opened: LiveTransport, seconds: float) -> list[Chunk]:
+    """What comes within some seconds, or as soon as it is plenty."""
+    found: list[Chunk] = []
+    end, size = time.monotonic() + seconds, 0
+    while (left := end - time.monotonic()) > 0 and size < PLENTY:
+        try:
+            chunks = opened.read(min(left, LOOK))
+        except Disconnected:
+            break
+        found += chunks
+        size += sum(len(chunk.data) for chunk in chunks)
+    return found
+
+
+def everywhere(ports: list[str], *, seconds: float = LISTEN) -> Iterator[Heard]:
+    """What comes over every serial port given and every UDP port that installed sensors declare; failures are told, not raised."""
+    for source in (*ports, *(f"udp://:{port}" for port in udp_ports())):
+        try:
+            yield from hear(source, seconds=seconds)
+        except (SourceError, UsageError) as error:
+            yield Heard(source, failure=error if isinstance(error, SourceError) else SourceError(str(error)))
+
+
+#: seconds to wait for data: of a device that has answered, and a motor may have to come up; and of one that has not.
+ANSWERED, UNANSWERED = 4.0, 1.0
+#: seconds that one read takes at most, and after which the line counts as silent.
+TURN = 0.05
+#: seconds for the commands that stop it again.
+STOPPING = 2.0
+
+
+def started_first() -> list[Sensor]:
+    """The installed sensors on a serial port that send nothing before they are told to."""
+    return [sensor for sensor in sensors().values() if _starts(sensor) and isinstance(sensor.links.get("data"), Serial)]
+
+
+def probe(source: str | Path) -> Iterator[Heard]:
+    """What comes after the start commands of each sensor that needs them, at each of its baud rates; it is stopped again.
+
+    Raises:
+        SourceError: where the port cannot be opened.
+    """
+    address, tried = live_address(source), set[object]()
+    if address is None or address.scheme != "serial":
+        return
+    mark, plain = "&" if "?" in str(source) else "?", has_no_baud(address.place)
+    for sensor in started_first():
+        link = sensor.links["data"]
+        for baud in link.bauds if isinstance(link, Serial) else ():
+            asked = (None if plain else baud, *(sensor.command(name) for name in sensor.on_open))
+            if asked in tried or address.options.get("baud", str(baud)) != str(baud):
+                continue
+            tried.add(asked)
+            given = str(source) if "baud" in address.options else f"{source}{mark}baud={baud}"
+            opened: LiveTransport = transport(given, sensor)  # type: ignore[assignment]
+            try:
+                chunks = _Probe(sensor, opened).run()
+            finally:
+                opened.close()
+            yield Heard(str(source), tuple(chunks), baud=None if plain else baud)
+
+
+def _starts(sensor: Sensor) -> bool:
+    return any(sensor.commands[name].starts for name in sensor.on_open)
+
+
+class _Probe:
+    """One conversation with a port."""
+
+    def __init__(self, sensor: Sensor, opened: LiveTransport) -> None:
+        self._sensor, self._opened = sensor, opened
+        self._session, self._decoder = Session(sensor), Decoder(sensor, stream=True)
+        self._heard: list[bytes] = []
+
+    def run(self) -> list[bytes]:
+        """Everything that was heard between start and stop."""
+        try:
+            started = self._asked(self._sensor.on_open)
+            self._turns(lambda: all(pending.done for pending in started), ANSWERED)
+            self._turns(lambda: sum(map(len, self._heard)) >= PLENTY, ANSWERED if any(map(_answered, started)) else UNANSWERED)
+            found = list(self._heard)
+            stopped = self._asked(self._sensor.on_close)
+            self._turns(lambda: all(pending.done for pending in stopped), STOPPING)
+        except LidarSpecError:
+            return self._heard
+        return found
+
+    def _asked(self, names: tuple[str, ...]) -> list[Pending]:
+        self._session.abandon("asked for something else")
+        return [self._session.request(name, time.monotonic_ns()) for name in names]
+
+    def _turns(self, done: object, seconds: float) -> None:
+        """Send, listen and keep time until something is so, or the time is up."""
+        assert callable(done)
+        end = time.monotonic() + seconds
+        while not done() and time.monotonic() < end:
+            self._session.tick(time.monotonic_ns())
+            for out in self._session.outgoing():
+                if out.lines:
+                    self._opened.lines(**out.lines)
+                self._opened.write(out.data)
+            chunks = self._opened.read(TURN)
+            found = [item for chunk in chunks for item in self._decoder.feed(chunk.data)] if chunks else self._decoder.idle()
+            self._heard += [chunk.data for chunk in chunks]
+            self._session.receive(found, time.monotonic_ns())
+
+
+def _answered(pending: Pending) -> bool:
+    try:
+        return pending.done and pending.result().confirmed
+    except LidarSpecError:
+        return False

@@ -1,0 +1,311 @@
+"""Which single flipped bit makes a damaged frame whole again, if any does: each one is tried, through the engine itself.
+
+A frame, byte by byte: what each one is called, what it says, and what is wrong with it.
+
+construct itself reads the frame, unverified, and notes every part on its way. So a frame that is cut off is explained
+as far as it goes, one without a computable layout like any other, and no offset is known here.
+"""
+
+from __future__ import annotations
+
+import io
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import construct
+import numpy as np
+
+from lidarspec.errors import LidarSpecError, WireError
+from lidarspec.explaining.listing import Explanation
+from lidarspec.explaining.wording import Point, Row, Value, hexdump
+from lidarspec.framing.decoder import Counters, Found, packed
+from lidarspec.framing.frame_engine import CompiledCodec, codec
+from lidarspec.framing.plausibility import IMPLAUSIBLE, VALID
+from lidarspec.packets.stream import PacketStream
+from lidarspec.points.plain import evaluate
+from lidarspec.spec.bits import BitField, leaves, probe
+from lidarspec.spec.construct_layer import UNNAMED, Seen, field_path, unwrap
+from lidarspec.spec.description import Frame, Sensor
+from lidarspec.spec.fields import Checksummed, exact
+from lidarspec.spec.rules import children
+from lidarspec.wire.parse import parse_typed
+from lidarspec.wire.schema import FieldInfo, schema
+from lidarspec.wire.wire_table import bit_text, hexed
+
+#: bytes of candidates that are tried in one go, and the longest frame that construct alone has to read so often.
+BLOCK, INTERPRETED = 1 << 20, 128
+
+
+class Flip(NamedTuple):
+    """A bit that may have flipped: byte of the frame, and bit of it, 0 the lowest."""
+
+    offset: int
+    bit: int
+
+    def mended(self, data: bytes) -> bytes:
+        """The bytes with this bit turned back."""
+        return data[: self.offset] + bytes([data[self.offset] ^ 1 << self.bit]) + data[self.offset + 1 :]
+
+
+def flips(sensor: Sensor, name: str, data: bytes) -> list[Flip]:
+    """Every single bit of which the opposite makes the bytes one valid and plausible frame of this type."""
+    frame = sensor.frames[name]
+    engine = codec(frame)
+    if not 0 < len(data) <= frame.max_length or (not isinstance(engine, CompiledCodec) and len(data) > INTERPRETED):
+        return []
+    if engine.size not in (None, len(data)) or any(spot >= len(data) for spot in engine.prefix):
+        return []
+    wrong = {spot for spot, (mask, value) in engine.prefix.items() if data[spot] & mask != value}
+    if len(wrong) > 1:
+        return []
+    found = []
+    for tried in _flipped_blocks([Flip(spot, bit) for spot in wrong or range(len(data)) for bit in range(8)], max(1, BLOCK // len(data))):
+        rows = np.tile(np.frombuffer(data, np.uint8), (len(tried), 1))
+        rows[np.arange(len(tried)), [flip.offset for flip in tried]] ^= np.array([1 << flip.bit for flip in tried], np.uint8)
+        fits = np.ones(len(tried), np.bool_)
+        for spot, (mask, value) in engine.prefix.items():
+            fits &= rows[:, spot] & mask == value
+        places = np.flatnonzero(fits)
+        if not len(places):
+            continue
+        survey = engine.survey(rows.reshape(-1), places * len(data))
+        right = (survey.status == VALID) & (survey.sizes == len(data))
+        found += [tried[place] for place in places[right].tolist()]
+    return found
+
+
+def _flipped_blocks(tried: list[Flip], size: int) -> Iterator[list[Flip]]:
+    for first in range(0, len(tried), size):
+        yield tried[first : first + size]
+
+
+__all__ = ["Explanation", "explain", "hexdump"]
+
+#: most points of a frame without arrays that are told.
+TOLD = 4
+#: most decimals that steps are told apart by, those that may be added to show one in full, and most flipped bits that are told one by one.
+DIGITS, SPARE, FLIPS = 12, 2, 3
+
+Keys = tuple[str | int, ...]
+
+
+def explain(sensor: Sensor, data: bytes, frame: str | None = None) -> Explanation:
+    """What every byte of one frame is; of a damaged or truncated one as far as it goes, with what is wrong.
+
+    Raises:
+        WireError: where the bytes do not even begin like a frame of this sensor.
+        UnknownFrame: for a frame type that it does not have.
+    """
+    data, fault = bytes(data), None
+    try:
+        name, _ = parse_typed(sensor, data, frame=frame)
+    except WireError as error:
+        fault, name = error, error.frame or frame or ""
+        if not name:
+            raise
+    reading = _Reading(sensor.frames[name], data)
+    rows = (*reading.rows(), *reading.rest(fault))
+    if not _valid(sensor, name, data[: reading.end], fault):
+        return Explanation(sensor.id, name, data, rows, fault, tuple(_flipped(sensor, name, data, reading)))
+    points, notes = _points(sensor, name, data[: reading.end], rows)
+    return Explanation(sensor.id, name, data, rows, fault, notes).with_points(points)
+
+
+def _valid(sensor: Sensor, name: str, data: bytes, fault: WireError | None) -> bool:
+    """Whether the bytes without what follows them are a valid frame."""
+    if fault is None:
+        return True
+    try:
+        parse_typed(sensor, data, frame=name)
+    except WireError:
+        return False
+    return True
+
+
+def _flipped(sensor: Sensor, name: str, data: bytes, reading: _Reading) -> Iterator[str]:
+    """Which single flipped bit would explain the damage, with what its field would have said."""
+    found = flips(sensor, name, data)
+    if len(found) > FLIPS:
+        yield f"one flipped bit would explain it, but in any of {len(found)} places, so that nothing can be said of where"
+        return
+    before = reading.values()
+    for flip in found:
+        after = _Reading(sensor.frames[name], flip.mended(data)).values()
+        path = next((path for path, value in after.items() if value.holds(flip.offset, flip.bit)), "")
+        values = [str(part[path]) for part in (before, after) if path in part]
+        said = f", {path} {', sent as '.join(values)}" if path and all(values) else f", {path}" if path else ""
+        yield f"{'one' if len(found) == 1 else 'a'} flipped bit would explain it: byte {flip.offset} bit {flip.bit}{said}"
+
+
+class _Reading:
+    """One frame as construct read it: its parts, how far it came, and the verdicts of its checksums."""
+
+    def __init__(self, frame: Frame, data: bytes) -> None:
+        self._data, self._schema = data, schema(frame.prepared)
+        self._blocks = dict(_blocks(frame.prepared, ""))
+        trail: list[Seen] = []
+        self.failed = True
+        try:
+            frame.prepared.parse_stream(io.BytesIO(data), _verify=False, _trail=trail)
+            self.failed = False
+        except Exception:  # construct lets anything out of expressions; what is wrong has been said by `parse_typed`
+            pass
+        self._parts = [(field_path(seen.path), seen) for seen in trail if seen.seal is None]
+        self._verdicts = {path: verdict for seen in trail if seen.seal is not None for path, verdict in _verdicts(data, seen)}
+        self.end = max((seen.end for path, seen in self._parts if not self._in_block(path)), default=0)
+
+    def rows(self) -> Iterator[Row]:
+        """A row for each part; the parts of an element of an array in one, if it holds no further array."""
+        group: list[tuple[str, Seen]] = []
+        last = ""
+        for path, seen in self._leaves():
+            element = self._element(path)
+            if group and element != last:
+                yield self._row(last, group)
+                group = []
+            group.append((path, seen))
+            last = element
+        if group:
+            yield self._row(last, group)
+
+    def values(self) -> dict[str, Value]:
+        """Every value by its path."""
+        return {value.path: value for row in self.rows() for value in row.values}
+
+    def rest(self, fault: WireError | None) -> Iterator[Row]:
+        """The bytes that no part took: those of the part that is cut off, or more than the frame has."""
+        left = self._data[self.end :]
+        if self.failed and fault is not None:
+            yield Row(self.end, left, fault.path, (), (fault.reason,), right=False)
+        elif left:
+            yield Row(self.end, left, "", (), ("after the frame's end",), right=False)
+
+    def _leaves(self) -> Iterator[tuple[str, Seen]]:
+        for path, seen in self._parts:
+            if not self._in_block(path) and (kind(path) in self._blocks or not isinstance(seen.value, dict | list | None)):
+                yield path, seen
+
+    def _in_block(self, path: str) -> bool:
+        """Whether a part is within a bit block, and so not counted in bytes of the frame."""
+        return any(kind(path).startswith((f"{block}.", f"{block}[")) for block in self._blocks)
+
+    def _element(self, path: str) -> str:
+        """What a part is shown with: the innermost array element that it stands in, or itself."""
+        head, bracket, _ = path.rpartition("]")
+        array = plain(head + bracket)
+        in_blocks = tuple(f"{plain(block)}." for block in self._blocks)
+        further = any(axis.startswith(f"{array}.") and not axis.startswith(in_blocks) for axis in self._arrays())
+        return path if not bracket or further else head + bracket
+
+    def _arrays(self) -> Iterator[str]:
+        for info in self._schema.fields.values():
+            yield from info.axes[:-1] if info.kind == "bytes" else info.axes
+
+    def _row(self, path: str, group: Sequence[tuple[str, Seen]]) -> Row:
+        start, end = group[0][1].start, group[-1][1].end
+        values: list[Value] = []
+        remarks: list[str] = []
+        right = True
+        for part, seen in group:
+            for keys, raw in leaves(seen.value):
+                value, info = self._value(part, seen, keys, raw)
+                values.append(value)
+                if info.const is not None and value.raw != info.const:
+                    remarks.append(f"wrong: {hexed(value.raw, info.bits)}, expected {hexed(info.const, info.bits)}")
+                    right = False
+                if value.path in self._verdicts:
+                    text, good = self._verdicts[value.path]
+                    remarks.append(text)
+                    right = right and good
+        return Row(start, self._data[start:end], path, tuple(values), tuple(remarks), right)
+
+    def _value(self, part: str, seen: Seen, keys: Keys, raw: Any) -> tuple[Value, FieldInfo]:
+        path = part + "".join(f"[{key}]" if isinstance(key, int) else f".{key}" for key in keys)
+        unknown = FieldInfo(plain(path), docs="constant" if path.endswith(UNNAMED) else "")
+        info = self._schema.fields.get(plain(path), unknown)
+        bits = self._blocks.get(kind(part), {}).get(keys)
+        physical = float(raw * info.scale + info.offset) if isinstance(raw, int | float) else None
+        label = info.labels.get(raw, "") if isinstance(raw, int) else ""
+        digits = None if info.kind == "float" else _digits(info)
+        masks = bits.masks(seen.end - seen.start) if bits else b"\xff" * (seen.end - seen.start)
+        return Value(path, raw, physical, info.unit, digits, label, bit_text(bits) if bits else "", info.docs, seen.start, masks), info
+
+
+def plain(path: str) -> str:
+    """A path without indices: "points[1].intensity" is "points.intensity"."""
+    return re.sub(r"\[\d*\]", "", path)
+
+
+def kind(path: str) -> str:
+    """A path for all elements: "points[1].intensity" is "points[].intensity"."""
+    return re.sub(r"\[\d+\]", "[]", path)
+
+
+def _digits(info: FieldInfo) -> int:
+    """Decimals that tell every step of a field from the next; a few more where these show it in full."""
+    steps = (exact(info.scale), exact(info.offset))
+    apart = next((digits for digits in range(DIGITS) if abs(steps[0]) * 10**digits >= 1), DIGITS)
+    return next((digits for digits in range(apart, apart + SPARE + 1) if all(step * 10**digits % 1 == 0 for step in steps)), apart)
+
+
+def _blocks(con: Any, path: str) -> Iterator[tuple[str, Mapping[Keys, BitField]]]:
+    """The bits of each field of each bit block, by the path of the block, arrays in it with "[]"."""
+    if isinstance(con, construct.Renamed):
+        path = f"{path}.{con.name}" if path else str(con.name)
+        con = con.subcon
+    if isinstance(con, construct.Array):
+        path, con = f"{path}[]", con.subcon
+    if unwrap(con, bits=False) is not unwrap(con):
+        yield path, {bits.keys: bits for bits in probe(con, con.sizeof()) or ()}
+        return
+    for child in children(con):
+        yield from _blocks(child, path)
+
+
+def _verdicts(data: bytes, seen: Seen) -> Iterator[tuple[str, tuple[str, bool]]]:
+    """What a checksum says and whether it is right, under the path of its first field."""
+    seal: Checksummed = seen.seal
+    if seal.algorithm is None:
+        return
+    inside = data[seen.start : seen.end]
+    stored, computed = seal.verdict(inside, seen.value, seen.start)
+    number = sum(end - start for start, end in seal.covered(seen.value, len(inside), seen.start))
+    how = f"({seal.algorithm.describe()} over {number} byte{'s' * (number != 1)})"
+    shown, expected = (hexed(value, seal.algorithm.width) for value in (stored, computed))
+    said = "ok" if stored == computed else "means not filled" if stored in seal.absent else f"wrong, expected {expected}"
+    prefix = field_path(seen.path)
+    path = f"{prefix}.{seal.fields[0]}" if prefix else seal.fields[0]
+    yield path, (f"{shown} {said} {how}", stored == computed or stored in seal.absent)
+
+
+def _points(sensor: Sensor, name: str, data: bytes, rows: Sequence[Row]) -> tuple[list[tuple[Point, ...]], tuple[str, ...]]:
+    """The points of each row, and what is to be said of the frame."""
+    frame = sensor.frames[name]
+    survey = codec(frame).survey(np.frombuffer(data, np.uint8), np.zeros(1, np.intp))
+    notes = ["not plausible: a decoder passes over this frame"] * bool(survey.status[0] == IMPLAUSIBLE)
+    none: list[tuple[Point, ...]] = [()] * len(rows)
+    if not (frame.data or frame.points):
+        return none, tuple(notes)
+    try:
+        packets = PacketStream(sensor, name, Counters()).add([packed([Found(name, 0, data)])])
+        found = evaluate(packets)
+    except LidarSpecError as error:
+        return none, (*notes, f"no points: {error}")
+    notes += ["defaults stand in for what a frame of another type would say"] * bool(found.cloud.nominal)
+    points = [Point.of(found.cloud, index) for index in range(len(found.cloud))]
+    chain = packets.table.schema.chain()
+    if not chain:
+        return none, (*notes, *(f"point {point}" for point in points[:TOLD]))
+    inside = found.counts[0].astype(np.bool_)
+    places = np.where(inside, np.cumsum(inside).reshape(inside.shape) - 1, -1)
+    return [tuple(points[place] for place in _places(row.path, chain, found.axes, places)) for row in rows], tuple(notes)
+
+
+def _places(path: str, chain: tuple[str, ...], axes: tuple[str | None, ...], places: Any) -> list[int]:
+    """Which points an element of the innermost array gives; none for any other row."""
+    indices = [int(part.partition("]")[0]) for part in path.split("[")[1:]]
+    if len(indices) != len(chain) or not chain[-1].startswith(plain(path)) or plain(path) not in chain[-1].removesuffix("[]"):
+        return []
+    own = dict(zip(chain, indices, strict=True))
+    return [int(place) for place in np.ravel(places[tuple(own.get(axis or "", slice(None)) for axis in axes)]) if place >= 0]

@@ -1,0 +1,66 @@
+"""What a spec says, in the languages of other tools: kinds of exports by name.
+
+An export is a function from a `Sensor` to a text. It is made from the frame trees of `lidarspec.exports.messages`, and refused, with
+the reason, where its target cannot say what the spec says.
+"""
+
+from __future__ import annotations
+
+import importlib
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from lidarspec.errors import UnknownFrame, UnknownName, UsageError
+
+if TYPE_CHECKING:
+    from lidarspec.spec.description import Sensor
+
+#: kind -> "module:function"; each takes a Sensor and returns the text of the export.
+EXPORTS: dict[str, str] = {
+    "wireshark": "lidarspec.exports.wireshark:dissector",
+    "c": "lidarspec.exports.c:header",
+    "ksy": "lidarspec.exports.ksy:ksy",
+    "md": "lidarspec.exports.reference:page",
+    "svg": "lidarspec.exports.diagram:svg",
+    "json": "lidarspec.exports.json:text",
+    "pyi": "lidarspec.exports.stubs:pyi",
+}
+
+
+class Refused(UsageError):
+    """An export that cannot say what the spec says, with the reason."""
+
+
+class UnknownExport(UnknownName):
+    """There is no export of this kind."""
+
+    what = "export"
+
+
+def narrowed(sensor: Sensor, frame: str) -> Sensor:
+    """The sensor with one frame type alone, and no commands: what exports of a single message are made from.
+
+    Raises:
+        UnknownFrame: if it has no frame type of this name.
+    """
+    if frame not in sensor.frames:
+        raise UnknownFrame(frame, sensor.frames, place=sensor.id)
+    alone = {frame: replace(sensor.frames[frame], after=None)}
+    return replace(sensor, frames=alone, commands={}, state={}, on_open=(), on_close=())
+
+
+def export(kind: str, sensor: Sensor) -> str:
+    """The text of an export of a sensor.
+
+    Args:
+        kind: one of `EXPORTS`.
+
+    Raises:
+        Refused: where the target cannot say what the spec says.
+        UnknownExport: for a kind that is none of them.
+    """
+    if kind not in EXPORTS:
+        raise UnknownExport(kind, EXPORTS)
+    module, _, function = EXPORTS[kind].partition(":")
+    text: str = getattr(importlib.import_module(module), function)(sensor)
+    return text

@@ -1,0 +1,395 @@
+"""What a packet diagram shows of a frame: boxes in the order of the wire, groups that repeat, and parts that some headers leave out.
+
+Packet diagrams as manuals have them: rows of four bytes, every field a box, repeated parts drawn once with their number.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from xml.sax.saxutils import escape, quoteattr
+
+from lidarspec.exports.formulas import Formula, Op, Ref
+from lidarspec.exports.messages import Message, messages
+from lidarspec.exports.tree import Blob, Block, Empty, Node, Number, Part, Repeat, Sealed, Select, Struct, When, nodes
+from lidarspec.spec.description import Sensor
+from lidarspec.wire.wire_table import INDICES, Extent, bit_text, frame_size, meaning, unit_text
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A box: `bits` wide, or with `bits` 0 of a size that only a header tells.
+
+    Attributes:
+        name: what is written in it; `detail`: below that; `said`: all there is to say of it.
+        role: "const", "sum", "spare", "group" or "".
+        offset: where it starts.
+    """
+
+    name: str
+    bits: int
+    detail: str
+    said: str
+    role: str
+    offset: Extent
+
+
+@dataclass(frozen=True)
+class Group:
+    """Boxes that stand together: repeated, or with `optional` there under a condition, as the label says."""
+
+    label: str
+    items: tuple[Item, ...]
+    optional: bool = False
+
+
+Item = Cell | Group
+
+
+def cells(message: Message) -> tuple[Item, ...]:
+    """The items of a frame type."""
+    seals = {path: node for node in nodes(message.root) if isinstance(node, Sealed) for path in node.fields}
+    return _Cells(seals, mixed=not byte_order(message)).visit(message.root, Extent(), 0)[0]
+
+
+def byte_order(message: Message) -> str:
+    """The byte order of all numbers of a frame type, "" where they differ or there are none of several bytes."""
+    orders = {node.order for node in nodes(message.root) if isinstance(node, Number) and node.size > 1}
+    return orders.pop() if len(orders) == 1 else ""
+
+
+def phrase(formula: Formula) -> str:
+    """A formula as people write it."""
+    match formula:
+        case Ref():
+            return formula.path
+        case Op(symbol, (operand,)):
+            return f"{symbol} {phrase(operand)}" if symbol.isalpha() else f"{symbol}{phrase(operand)}"
+        case Op(symbol, (left, right)):
+            one, other = (f"({phrase(part)})" if isinstance(part, Op) else phrase(part) for part in (left, right))
+            return f"{one} {symbol} {other}"
+        case _:
+            return str(formula)
+
+
+@dataclass
+class _Cells:
+    seals: dict[str, Sealed]
+    mixed: bool
+
+    def visit(self, node: Node, start: Extent, depth: int) -> tuple[tuple[Item, ...], Extent]:
+        """The items of a part that begins at `start`, and its size."""
+        match node:
+            case Sealed():
+                return self.visit(node.body, start, depth)
+            case Struct():
+                return self._struct(node, start, depth)
+            case Number():
+                return (self._number(node, start),), Extent(node.size)
+            case Blob():
+                return self._blob(node, start)
+            case Block():
+                return tuple(self._block(node, start)), Extent(node.size)
+            case Repeat():
+                return self._repeat(node, start, depth)
+            case When() | Select():
+                return self._choice(node, start, depth)
+            case Empty():
+                return (), Extent()
+
+    def _struct(self, node: Struct, start: Extent, depth: int) -> tuple[tuple[Item, ...], Extent]:
+        items: list[Item] = []
+        size = Extent()
+        for member in node.members:
+            found, more = self.visit(member, start + size, depth)
+            named = isinstance(member, Struct | Sealed) or (isinstance(member, Block) and member.parts[0].names)
+            items += [replace(item, name=f"{member.name}.{item.name}") if named and isinstance(item, Cell) else item for item in found]
+            size = size + more
+        return tuple(items), size
+
+    def _number(self, node: Number, start: Extent) -> Cell:
+        kind = {"uint": "u", "int": "s", "float": "float "}[node.kind] + str(8 * node.size)
+        order = f" {node.order}" if node.size > 1 else ""
+        said = f"{node.kind}{8 * node.size}{order}"
+        short = f" {node.order[0]}e" if self.mixed and node.size > 1 else ""
+        detail = " ".join(part for part in (kind + short, unit_text(node.info)) if part)
+        return self._cell(node, 8 * node.size, detail, said, start)
+
+    def _blob(self, node: Blob, start: Extent) -> tuple[tuple[Item, ...], Extent]:
+        size = Extent(node.size) if isinstance(node.size, int) else Extent(0, (phrase(node.size),))
+        if node.size == 0:
+            return (), size
+        detail = node.const.hex(" ") if node.const is not None and len(node.const) <= 8 else f"{size} byte{'s' * (str(size) != '1')}"
+        bits = 8 * node.size if isinstance(node.size, int) else 0
+        return (self._cell(node, bits, detail, "bytes", start),), size
+
+    def _cell(self, node: Number | Blob, bits: int, detail: str, kind: str, start: Extent) -> Cell:
+        path, seal = node.info.path, self.seals.get(node.info.path)
+        if isinstance(node, Number) and node.info.const is not None:
+            detail = f"{node.info.const:#0{2 * node.size + 2}x}" if isinstance(node.info.const, int) else str(node.info.const)
+        sealed = "" if seal is None else seal.algorithm.describe()
+        said = "; ".join(part for part in (path, kind, unit_text(node.info), meaning(node.info), sealed) if part)
+        role = "sum" if seal else "const" if node.info.const is not None else "spare" if _is_spare(node.name) else ""
+        return Cell(node.name or "(constant)", bits, detail, said, role, start)
+
+    def _block(self, node: Block, start: Extent) -> list[Cell]:
+        """A box for each run of bits of one value, in the order of the wire, the highest bit of each byte first."""
+        runs = [(run.byte, run.low + run.mask.bit_count() - 1, run, part) for part in node.parts for run in part.bits.segments]
+        found: list[tuple[Part, int, int, int]] = []
+        for byte, _, run, part in sorted(runs, key=lambda entry: (entry[0], -entry[1])):
+            low, high = run.target, run.target + run.mask.bit_count() - 1
+            if found and found[-1][0] is part and found[-1][1] == high + 1:
+                found[-1] = (part, low, *found[-1][2:])
+            else:
+                found.append((part, low, high, byte))
+        return [self._run(node, part, low, high, start + Extent(byte)) for part, low, high, byte in found]
+
+    def _run(self, node: Block, part: Part, low: int, high: int, start: Extent) -> Cell:
+        whole = high - low + 1 == part.bits.width
+        name = ".".join((*([node.name] if len(part.names) == 0 else part.names),)) + "".join(f"[{index}]" for index in part.indices)
+        detail = "" if whole else f"{high}..{low}" if high > low else f"{low}"
+        seal = self.seals.get(part.info.path)
+        texts = (part.info.path, bit_text(part.bits), unit_text(part.info), meaning(part.info), seal.algorithm.describe() if seal else "")
+        role = "sum" if seal else "const" if part.info.const is not None else "spare" if _is_spare(name) else ""
+        unit = unit_text(part.info) if whole else ""
+        return Cell(name, high - low + 1, detail or unit, "; ".join(text for text in texts if text), role, start)
+
+    def _repeat(self, node: Repeat, start: Extent, depth: int) -> tuple[tuple[Item, ...], Extent]:
+        index = INDICES[depth % len(INDICES)]
+        count = node.count if isinstance(node.count, int) else phrase(node.count)
+        _, element = self.visit(node.element, Extent(), depth + 1)
+        items, _ = self.visit(node.element, start + element.times(index), depth + 1)
+        return (Group(f"{node.name} \u00d7\u00a0{count}", items),), element.times(count)
+
+    def _choice(self, node: When | Select, start: Extent, depth: int) -> tuple[tuple[Item, ...], Extent]:
+        if isinstance(node, When):
+            asked = phrase(node.condition)
+            branches = [(f"if {asked}", node.then), (f"unless {asked}", node.otherwise)]
+        else:
+            key = phrase(node.key)
+            branches = [*((f"if {key} == {value}", case) for value, case in node.cases), (f"for other {key}", node.default)]
+        groups: list[Item] = []
+        sizes = set()
+        for label, branch in branches:
+            items, size = self.visit(branch, start, depth)
+            sizes.add(size)
+            groups += [Group(label, items, optional=True)] if items else []
+        return tuple(groups), sizes.pop() if len(sizes) == 1 else Extent(0, (f"size({node.name})",))
+
+
+def _is_spare(name: str) -> bool:
+    """Whether a field is there for nothing yet, by the names that manuals give such fields."""
+    return name.startswith(("reserved", "unused", "spare", "zeros", "padding"))
+
+
+#: bits in a row, pixels of a bit and of a row, of the offsets at the left, of a level of brackets, and around everything.
+BITS, BIT, ROW, LEFT, LEVEL, EDGE = 32, 22, 46, 104, 136, 16
+#: bits that are drawn in full; a longer field is a torn row.
+LONGEST = 128
+#: letters of an offset in one line.
+FORMULA = 13
+FILLS = {"": "#ffffff", "const": "#e4e8ee", "sum": "#fde7b8", "spare": "#f4f4f2"}
+INK, FAINT, LINE = "#1c2430", "#64707f", "#4a5565"
+#: width of a letter in its size, and the sizes of names and of what stands below them.
+LETTER, NAMED, DETAILED, SMALLEST = 0.61, 13, 10.5, 8
+
+
+def svg(sensor: Sensor) -> str:
+    """The frame types of a sensor, one below the other, as an SVG document.
+
+    Raises:
+        Refused: where a frame holds a part that only Python code can decide.
+    """
+    sheet = _Sheet()
+    for message in messages(sensor):
+        size = frame_size(message.frame)
+        order = byte_order(message)
+        detail = f"{size} byte{'s' * (size != '1')}" + (f", integers {order}-endian" if order else "")
+        sheet.title(f"{sensor.vendor} {sensor.model}: {message.name}", detail)
+        sheet.ruler()
+        sheet.items(cells(message), 0)
+        sheet.close()
+    return sheet.document(f"{sensor.id}: packet diagrams")
+
+
+#: left edge, upper edge and bits of what a field has of a row.
+Piece = tuple[float, float, int]
+
+
+@dataclass
+class _Sheet:
+    """A drawing while it grows downwards: `top` is the upper edge of the current row, `used` how many of its bits are taken."""
+
+    parts: list[str] = field(default_factory=list)
+    top: float = EDGE
+    used: int = 0
+    deepest: int = 0
+
+    def title(self, text: str, detail: str) -> None:
+        """The name of a frame type above its rows."""
+        self.parts.append(_text(EDGE, self.top + 14, text, 15, weight="bold"))
+        self.parts.append(_text(EDGE, self.top + 31, detail, 11.5, fill=FAINT))
+        self.top += 48
+
+    def ruler(self) -> None:
+        """Bytes and bits above the first row."""
+        for byte in range(BITS // 8):
+            self.parts.append(_text(LEFT + (8 * byte + 4) * BIT, self.top, f"byte {byte}", 10.5, fill=FAINT, anchor="middle"))
+        for bit in range(BITS):
+            self.parts.append(_text(LEFT + (bit + 0.5) * BIT, self.top + 13, str(7 - bit % 8), 8.5, fill=FAINT, anchor="middle"))
+        self.top += 18
+
+    def items(self, found: Sequence[Item], depth: int) -> None:
+        """Boxes and groups one after another."""
+        for item in found:
+            if isinstance(item, Group):
+                self._group(item, depth)
+            elif item.bits == 0 or item.bits > LONGEST:
+                self._torn(item)
+            else:
+                self._box(item)
+
+    def close(self) -> None:
+        """End the last row and leave room before what comes next."""
+        self._row_ends()
+        self.top += 26
+
+    def document(self, title: str) -> str:
+        """All of it."""
+        width, height = LEFT + BITS * BIT + EDGE + LEVEL * self.deepest, self.top - 26 + EDGE
+        head = (
+            f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width:g} {height:g}" width="{width:g}" height="{height:g}" '
+            'font-family="Helvetica, Arial, sans-serif">'
+        )
+        return "\n".join(
+            [head, f"<title>{escape(title)}</title>", '<rect width="100%" height="100%" fill="#ffffff"/>', *self.parts, "</svg>", ""]
+        )
+
+    def _row_ends(self) -> None:
+        if self.used:
+            self.top, self.used = self.top + ROW, 0
+
+    def _group(self, group: Group, depth: int) -> None:
+        """A part with a bracket at its right; it has rows of its own."""
+        self._row_ends()
+        self.deepest = max(self.deepest, depth + 1 + _depth(group))
+        top = self.top
+        self.items(group.items, depth)
+        self._row_ends()
+        x = LEFT + BITS * BIT + 8 + LEVEL * _depth(group)
+        path = f"M{x} {top + 2:g}h6v{self.top - top - 4:g}h-6"
+        dashes = ' stroke-dasharray="4 3"' if group.optional else ""
+        self.parts.append(f'<path d="{path}" fill="none" stroke="{LINE}" stroke-width="1.4"{dashes}/>')
+        self.parts += _lines(x + 12, (top + self.top) / 2, group.label)
+
+    def _box(self, cell: Cell) -> None:
+        """A field in as many pieces as it takes rows; the name stands in the widest."""
+        pieces: list[Piece] = []
+        left, lead = cell.bits, self.used % 8
+        while left:
+            if self.used == 0:
+                self._offset(cell, (lead + cell.bits - left) // 8)
+            taken = min(left, BITS - self.used)
+            pieces.append((LEFT + self.used * BIT, self.top, taken))
+            self.used, left = self.used + taken, left - taken
+            if self.used == BITS:
+                self._row_ends()
+        widest = max(range(len(pieces)), key=lambda index: pieces[index][2])
+        self.parts += _outlined(pieces, cell)
+        for index, (x, y, bits) in enumerate(pieces):
+            if index == widest:
+                self.parts += _label(x, y, bits * BIT, cell)
+            elif len(pieces) == 2 and not _below(*pieces):
+                self.parts += _label(x, y, bits * BIT, replace(cell, name=f"({cell.name})", detail=""), fill=FAINT)
+
+    def _torn(self, cell: Cell) -> None:
+        """A field too long to draw, or of no known length: a row with a wavy cut."""
+        self._row_ends()
+        self._offset(cell, 0)
+        width = BITS * BIT
+        self.parts += _outlined([(LEFT, self.top, BITS)], cell)
+        for share in (0.12, 0.88):
+            x = LEFT + share * width
+            self.parts.append(
+                f'<path d="M{x - 4:g} {self.top:g}l8 {ROW / 3:g}l-8 {ROW / 3:g}l8 {ROW / 3:g}" fill="none" stroke="{FAINT}"/>'
+            )
+        self.parts += _label(LEFT, self.top, width, cell)
+        self.top, self.used = self.top + ROW, 0
+
+    def _offset(self, cell: Cell, more: int) -> None:
+        """The offset of a row, so many bytes after the field's, left of it; a long formula in two lines."""
+        text = str(cell.offset + Extent(more))
+        middle = text.find(" + ", len(text) // 2 - 4)
+        lines = [text] if len(text) <= FORMULA or middle < 0 else [text[: middle + 2], text[middle + 3 :]]
+        for index, line in enumerate(lines):
+            y = self.top + ROW / 2 + 4 + 13 * (index - (len(lines) - 1) / 2)
+            size = min(11, (LEFT - 12) / (LETTER * len(line)))
+            self.parts.append(_text(LEFT - 8, y, line, size, fill=FAINT, anchor="end"))
+
+
+def _depth(group: Group) -> int:
+    """How many groups are nested in one."""
+    return max((1 + _depth(item) for item in group.items if isinstance(item, Group)), default=0)
+
+
+def _outlined(pieces: Sequence[Piece], cell: Cell) -> Iterator[str]:
+    """The box of a field: its pieces filled, and lines around them but not between two of them."""
+    rects = "".join(f'<rect x="{x:g}" y="{y:g}" width="{bits * BIT}" height="{ROW}"/>' for x, y, bits in pieces)
+    yield f'<g fill="{FILLS[cell.role]}"><title>{escape(cell.said)}</title>{rects}</g>'
+    path = ""
+    for index, piece in enumerate(pieces):
+        x, y, bits = piece
+        end = x + bits * BIT
+        path += f"M{x:g} {y:g}v{ROW}M{end:g} {y:g}v{ROW}"
+        before, after = pieces[index - 1] if index else None, pieces[index + 1] if index + 1 < len(pieces) else None
+        path += f"M{max(x, _end(before)):g} {y:g}H{end:g}" if before is None or _end(before) < end else ""
+        path += f"M{x:g} {y + ROW:g}H{end:g}" if after is None or not _below(piece, after) else ""
+        path += f"M{x:g} {y:g}H{before[0]:g}" if before and before[0] > x else ""
+        path += f"M{_end(after):g} {y + ROW:g}H{end:g}" if after and _below(piece, after) and _end(after) < end else ""
+    yield f'<path d="{path}" fill="none" stroke="{LINE}"/>'
+
+
+def _end(piece: Piece | None) -> float:
+    return 0 if piece is None else piece[0] + piece[2] * BIT
+
+
+def _below(one: Piece, other: Piece) -> bool:
+    """Whether two pieces of a field touch, one above the other."""
+    return abs(one[1] - other[1]) == ROW and max(one[0], other[0]) < min(_end(one), _end(other))
+
+
+def _label(x: float, y: float, width: float, cell: Cell, fill: str = INK) -> Iterator[str]:
+    """The name of a field and what it is, as large as there is room; a name that fits nowhere is written upright."""
+    room = width - 5
+    if LETTER * SMALLEST * len(cell.name) > room:
+        cell = replace(cell, name=cell.name.rpartition(".")[2])
+    size = min(NAMED, room / (LETTER * len(cell.name)))
+    middle = x + width / 2
+    if size < SMALLEST and len(cell.name) > 1:
+        tall = min(NAMED - 2, (ROW - 4) / (LETTER * len(cell.name)))
+        text = cell.name if tall >= SMALLEST - 1 else cell.name[: int((ROW - 4) / (LETTER * (SMALLEST - 1)))]
+        tall = max(tall, SMALLEST - 1)
+        turned = f' transform="rotate(-90 {middle:g} {y + ROW / 2:g})"'
+        yield _text(middle, y + ROW / 2 + tall * 0.35, text, tall, fill=fill, anchor="middle", more=turned)
+        return
+    fits = cell.detail and LETTER * DETAILED * len(cell.detail) <= room
+    yield _text(middle, y + ROW / 2 + (-1 if fits else size * 0.35), cell.name, size, fill=fill, anchor="middle")
+    if fits:
+        yield _text(middle, y + ROW / 2 + 13, cell.detail, DETAILED, fill=FAINT, anchor="middle")
+
+
+def _lines(x: float, y: float, label: str) -> Iterator[str]:
+    """The label of a bracket, in lines that fit its level."""
+    lines, room = [""], (LEVEL - 30) / (LETTER * 12)
+    for word in label.split(" "):
+        if lines[-1] and len(lines[-1]) + 1 + len(word) > room:
+            lines.append("")
+        lines[-1] = f"{lines[-1]} {word}".strip()
+    for index, line in enumerate(lines):
+        size = min(12, (LEVEL - 30) / (LETTER * len(line)))
+        yield _text(x, y + 4 + 15 * (index - (len(lines) - 1) / 2), line, size, weight="bold")
+
+
+def _text(x: float, y: float, text: str, size: float, *, fill: str = INK, anchor: str = "", weight: str = "", more: str = "") -> str:
+    extra = "".join(f" {name}={quoteattr(value)}" for name, value in (("text-anchor", anchor), ("font-weight", weight)) if value)
+    return f'<text x="{x:g}" y="{y:g}" font-size="{size:.3g}" fill="{fill}"{extra}{more}>{escape(text)}</text>'

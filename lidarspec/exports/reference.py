@@ -1,0 +1,182 @@
+"""A sensor's reference page in Markdown: links, commands, the wire table of every frame, checksums, clock and geometry."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+
+import numpy as np
+
+from lidarspec.errors import LidarSpecError
+from lidarspec.framing.decoder import Counters, Found, packed
+from lidarspec.packets.stream import PacketStream
+from lidarspec.points.cloud import PointCloud
+from lidarspec.points.plain import evaluate
+from lidarspec.spec.description import Command, Frame, Sensor
+from lidarspec.spec.links import Link, Serial, Udp
+from lidarspec.spec.timing import Clock, Every, Split
+from lidarspec.wire.wire_table import frame_size, wire_table
+
+STATUSES = {
+    "manual": "written from the manual",
+    "vectors": "agrees with published example frames",
+    "capture": "agrees with captures of the device",
+    "hardware": "tried on the device",
+}
+#: what a scan ends at, by the name of its rule.
+RULES = {
+    "OnWrap": "where `{name}` passes {at:g}",
+    "OnFlag": "before every packet in which `{name}` is set",
+    "OnChange": "before every packet in which `{name}` changes",
+    "OnRewind": "before every packet in which `{name}` falls back",
+}
+#: most channels that are listed.
+RINGS = 128
+
+
+def page(sensor: Sensor, pictures: Mapping[str, str] | None = None) -> str:
+    """The page as Markdown.
+
+    Args:
+        pictures: where the packet diagram of a frame type is, for those that have one.
+    """
+    parts = [f"# {sensor.vendor} {sensor.model}", "\n".join(_facts(sensor))]
+    if sensor.commands:
+        parts += ["## Commands", "\n".join(_commands(sensor))]
+    for name, frame in sensor.frames.items():
+        parts += [*_frame(name, frame, (pictures or {}).get(name, ""))]
+    parts += ["## Geometry", "\n".join(_geometry(sensor))]
+    return "\n\n".join(part for part in parts if part) + "\n"
+
+
+def _facts(sensor: Sensor) -> Iterator[str]:
+    """The table at the top."""
+    rows = [("id", ", ".join(f"`{name}`" for name in (sensor.id, *sensor.aliases)))]
+    rows += [(f"link `{name}`", _link(link)) for name, link in sensor.links.items()]
+    rows += [("range", "{:g} m to {:g} m".format(*sensor.range_limits)), ("scan", f"ends {_rule(sensor.scan)}")]
+    rows += [("clock", _clock(sensor.clock))] if sensor.clock else []
+    rows += [("counter", f"`{sensor.sequence.field}`; a jump is a loss")] if sensor.sequence else []
+    rows += [("fillers", f"`{sensor.fillers.hex(' ')}` between frames")] if sensor.fillers else []
+    rows += [("proven", f"{sensor.status}: {STATUSES[sensor.status]}"), ("source", sensor.source)]
+    return _table(["", ""], rows)
+
+
+def _link(link: Link) -> str:
+    if isinstance(link, Serial):
+        bauds = " or ".join(f"{baud:,}".replace(",", " ") for baud in link.bauds)
+        return ", ".join([f"serial, {bauds} baud, 8N1", *_levels({"dtr": link.dtr, "rts": link.rts})])
+    if isinstance(link, Udp):
+        return f"UDP, port {' and '.join(str(port) for port in link.ports)}" + (", a byte stream in datagrams" if link.stream else "")
+    return f"TCP, port {link.port}"
+
+
+def _levels(lines: Mapping[str, bool | None]) -> list[str]:
+    """Control lines with the level that they are set to."""
+    return [f"{name.upper()} {'high' if level else 'low'}" for name, level in lines.items() if level is not None]
+
+
+def _rule(scan: Split) -> str:
+    return f"every {scan.seconds:g} s" if isinstance(scan, Every) else RULES[type(scan).__name__].format(**vars(scan))
+
+
+def _clock(clock: Clock) -> str:
+    names = [clock.source] if isinstance(clock.source, str) else clock.source
+    fields = "calculated from the packet" if callable(names) else " + ".join(f"`{name}`" for name in names)
+    return fields + (f", starts again at {clock.wraps_at:g} s" if clock.wraps_at else "")
+
+
+def _commands(sensor: Sensor) -> Iterator[str]:
+    rows = [(f"`{name}`", _asked(sensor, name), _answer(command), _effect(sensor, name)) for name, command in sensor.commands.items()]
+    return _table(["command", "bytes or arguments", "reply", ""], rows)
+
+
+def _asked(sensor: Sensor, name: str) -> str:
+    command = sensor.commands[name]
+    said = _levels(command.lines)
+    if command.frame and command.args:
+        args = " and ".join(f"`{arg}` {low:g} to {high:g}" for arg, (_, low, high) in command.args.items())
+        said.insert(0, f"`{command.frame}` with {args}")
+    elif command.frame:
+        said.insert(0, f"`{sensor.command(name).hex(' ')}`")
+    return ", ".join(said)
+
+
+def _answer(command: Command) -> str:
+    return " or ".join(f"`{name}`" for name in command.replies) if command.replies else "none documented"
+
+
+def _effect(sensor: Sensor, name: str) -> str:
+    command = sensor.commands[name]
+    said = {
+        "starts the data": command.starts,
+        "stops the data": command.stops,
+        f"{command.settle:g} s before the next command": command.settle > 0,
+        f"again every {command.every:g} s": command.every > 0,
+        "sent on opening": name in sensor.on_open,
+        "sent on closing": name in sensor.on_close,
+        f"over the link `{command.link}`": command.link != "data",
+    }
+    return "; ".join(text for text, holds in said.items() if holds)
+
+
+def _frame(name: str, frame: Frame, picture: str) -> Iterator[str]:
+    kind = "to the sensor" if frame.direction == "out" else "points" if frame.data else "from the sensor"
+    yield f"## `{name}`: {kind}"
+    size = frame_size(frame)
+    said = [f"{size} bytes" if size.isdigit() else f"`{size}` bytes, at most {frame.max_length}"]
+    said += [f"looked for after a `{frame.after}`"] * (frame.after is not None)
+    said += [f"believed in runs of {frame.confirm} or more"] * (frame.confirm > 1)
+    said += ["a plausibility test turns down what no sensor would send"] * (frame.plausible is not None)
+    yield "; ".join(said) + "."
+    if picture:
+        yield f"![{name}: packet diagram]({picture})"
+    rows = [(row.offset, row.size, row.type, f"`{row.field}`", row.unit, row.meaning) for row in wire_table(frame)]
+    yield "\n".join(_table(["offset", "size", "type", "field", "unit", "meaning"], rows))
+
+
+def _geometry(sensor: Sensor) -> Iterator[str]:
+    """What points there are, in which axes, and the direction of each channel where that is fixed."""
+    yield "Points are in metres, x forward, y left, z up; the manual's zero direction is +x, and azimuth counts counter-clockwise."
+    if sensor.vendor_axes:
+        x, y, z = sensor.vendor_axes
+        yield f"With `configure(frame='vendor')` they are in the vendor's own: x {x}, y {y}, z {z}."
+    for name, frame in sensor.frames.items():
+        cloud = _cloud(sensor, name) if frame.data else None
+        if cloud is None:
+            continue
+        more = [column for column in ("intensity", "ring", "return_index") if getattr(cloud, column) is not None]
+        many = "a point" if len(cloud) == 1 else f"{len(cloud)} points" if frame_size(frame).isdigit() else "points by its header"
+        yield ""
+        yield f"A `{name}` frame has {many}" + (f", with {', '.join(more[:-1])}{' and ' * (len(more) > 1)}{more[-1]}." if more else ".")
+        rows = _rings(cloud)
+        if rows:
+            yield "" if not cloud.nominal else "\nThe directions below are the default ones; a calibration file gives the device's own."
+            yield from _table(["channel", "elevation"], rows)
+
+
+def _cloud(sensor: Sensor, name: str) -> PointCloud | None:
+    """The points of an example frame; None where it has none of its own."""
+    try:
+        found = packed([Found(name, 0, sensor.example(name))])
+        return evaluate(PacketStream(sensor, name, Counters()).add([found])).cloud
+    except LidarSpecError:
+        return None
+
+
+def _rings(cloud: PointCloud) -> Sequence[tuple[str, str]]:
+    """The elevation of each channel, where it is one and the same in all points."""
+    if cloud.ring is None:
+        return []
+    rows = []
+    for ring in np.unique(cloud.ring).tolist():
+        angles = np.rad2deg(cloud.elevation[cloud.ring == ring])
+        if not len(angles) or not np.isfinite(angles).all() or np.ptp(angles) > 1e-3:
+            return []
+        rows.append((str(ring), f"{angles[0] + 0.0:.3f} deg"))
+    return rows if 1 < len(rows) <= RINGS else []
+
+
+def _table(headers: Sequence[str], rows: Sequence[Sequence[str]]) -> Iterator[str]:
+    yield f"| {' | '.join(headers)} |"
+    yield f"|{'---|' * len(headers)}"
+    for row in rows:
+        yield f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in row)} |"

@@ -1,0 +1,168 @@
+"""A spec as a type stub for editors and type checkers: a class for each struct of each frame, and the sensor's own methods.
+
+What `parse` returns has the fields as attributes, so a frame can be typed by the class of its type:
+
+    if TYPE_CHECKING:
+        from acme_x1 import Data, AcmeX1
+    sensor = cast("AcmeX1", ls.sensor("acme-x1"))
+    sensor.parse(data, "data").start_angle          # int, completed by the editor
+"""
+
+from __future__ import annotations
+
+import keyword
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+from lidarspec.exports import Refused
+from lidarspec.exports.messages import Message, messages
+from lidarspec.exports.tree import Blob, Block, Empty, Node, Number, Repeat, Sealed, Select, Struct, When
+from lidarspec.spec.description import Command, Sensor
+from lidarspec.wire.schema import FieldInfo, schema
+from lidarspec.wire.wire_table import meaning, unit_text
+
+
+def pyi(sensor: Sensor) -> str:
+    """The stub of a sensor.
+
+    Raises:
+        Refused: where a frame holds Python code, or two frame types have one class name.
+    """
+    found = messages(sensor)
+    names = {message.name: camel(message.name) for message in found}
+    if len(set(names.values())) < len(names):
+        raise Refused(f"{sensor.id}: two frame types have one class name")
+    classes = _Classes({camel(sensor.id)})
+    for message in found:
+        names[message.name] = classes.add(message.root, names[message.name], f"A frame of the type {message.name}.")
+    parts = [_HEAD.format(id=sensor.id, title=f"{sensor.vendor} {sensor.model}"), *classes.done, _sensor(sensor, found, names)]
+    return "\n\n".join(part.rstrip() + "\n" for part in parts)
+
+
+def camel(name: str) -> str:
+    """A name as a class has it."""
+    found = "".join(part[:1].upper() + part[1:] for part in re.split(r"\W+|_+", name) if part)
+    return found if found[:1].isalpha() else f"_{found}"
+
+
+_HEAD = '''"""{title}: the types of what `parse` returns and `build` and `command` take. Made by lidarspec export pyi {id}."""
+
+from typing import Any, Literal, overload
+
+from lidarspec import Sensor'''
+
+
+@dataclass
+class _Classes:
+    """The classes written so far, the inner ones before those that hold them, and the names that are taken."""
+
+    taken: set[str]
+    done: list[str] = field(default_factory=list)
+
+    def add(self, node: Struct | Sealed | Block, name: str, says: str) -> str:
+        """Write the class of a struct or block; its name."""
+        while name in self.taken:
+            name += "_"
+        self.taken.add(name)
+        lines = [line for member in self._members(node) for line in self._attribute(name, *member)]
+        self.done.append("\n".join([f"class {name}:", f'    """{_quoted(says)}"""', "", *(lines or ["    ..."])]))
+        return name
+
+    def _members(self, node: Struct | Sealed | Block) -> Iterator[tuple[str, Node | list[FieldInfo]]]:
+        if isinstance(node, Sealed):
+            node = node.body
+        if isinstance(node, Struct):
+            yield from ((member.name, member) for member in node.members if member.name)
+            return
+        heads: dict[str, list[FieldInfo]] = {}
+        for part in node.parts:
+            heads.setdefault(part.names[0], []).append(part.info)
+        yield from heads.items()
+
+    def _attribute(self, owner: str, name: str, node: Node | list[FieldInfo]) -> list[str]:
+        if isinstance(node, list):
+            kind, infos = "int" if len(node) == 1 else "Any", node
+        else:
+            kind, infos = self._type(owner, name, node), [node.info] if isinstance(node, Number | Blob | Block) else []
+        said = "; ".join(part for part in (unit_text(infos[0]), meaning(infos[0])) if part) if infos else ""
+        line = f"    {name}: {kind}" + ("  # a keyword: getattr()" if keyword.iskeyword(name) else "")
+        return [line if not keyword.iskeyword(name) else f"    # {line.strip()}", *([f'    """{_quoted(said)}"""'] if said else [])]
+
+    def _type(self, owner: str, name: str, node: Node) -> str:
+        match node:
+            case Number():
+                return "float" if node.kind == "float" else "int"
+            case Blob():
+                return "bytes"
+            case Block() if not node.parts[0].names:
+                return "int" if len(node.parts) == 1 else "list[int]"
+            case Struct() | Sealed() | Block():
+                return self.add(node, owner + camel(name), f"`{name}` of `{owner}`.")
+            case Repeat():
+                return f"list[{self._type(owner, name, node.element)}]"
+            case When():
+                return self._either(owner, name, [node.then, node.otherwise])
+            case Select():
+                return self._either(owner, name, [*(case for _, case in node.cases), node.default])
+            case Empty():
+                return "None"
+
+    def _either(self, owner: str, name: str, branches: list[Node]) -> str:
+        return " | ".join(dict.fromkeys(self._type(owner, name, branch) for branch in branches))
+
+
+def _sensor(sensor: Sensor, found: tuple[Message, ...], names: dict[str, str]) -> str:
+    """The class of the sensor: what `parse`, `build`, `example` and `command` take and give."""
+    frames = "\n".join(
+        f'    @overload\n    def parse(self, data: bytes, frame: Literal["{frame}"], *, verify: bool = True) -> {name}: ...'
+        for frame, name in names.items()
+    )
+    builds = "\n".join(_build(message) for message in found)
+    commands = "\n".join(_command(name, command) for name, command in sensor.commands.items())
+    rest = "    @overload\n    def command(self, name: str, **arguments: Any) -> bytes: ..." if len(sensor.commands) > 0 else ""
+    literals = ", ".join(f'"{name}"' for name in names)
+    fields = ", ".join(f'"{path}"' for path in _paths(sensor))
+    return f'''FrameName = Literal[{literals}]
+FieldPath = Literal[{fields}]
+
+class {camel(sensor.id)}(Sensor):
+    """The sensor itself: cast what `lidarspec.sensor("{sensor.id}")` returns to it."""
+
+{frames}
+    @overload
+    def parse(self, data: bytes, frame: str | None = None, *, verify: bool = True) -> Any: ...
+{builds}
+    @overload
+    def build(self, _frame: str, _value: Any = None, /, *, units: bool = False, **values: Any) -> bytes: ...
+{commands}
+{rest}'''
+
+
+def _build(message: Message) -> str:
+    """The signature that builds a frame: its fields by name, numbers raw or with `units` physical; constants and sums are filled in."""
+    body = message.root.body if isinstance(message.root, Sealed) else message.root
+    fields = "".join(
+        f", {member.name}: {'float' if isinstance(member, Number) else 'Any'} = ..."
+        for member in body.members
+        if member.name not in ("", "self", "units")
+        and not keyword.iskeyword(member.name)
+        and not (isinstance(member, Number | Blob) and member.info.const is not None)
+    )
+    more = f", units: bool = False{fields}, **values: Any"
+    return f'    @overload\n    def build(self, _frame: Literal["{message.name}"], _value: Any = None, /, *{more}) -> bytes: ...'
+
+
+def _command(name: str, command: Command) -> str:
+    args = "".join(f", {arg}: float" for arg in command.args)
+    return f'    @overload\n    def command(self, name: Literal["{name}"]{", *" * bool(args)}{args}) -> bytes: ...'
+
+
+def _paths(sensor: Sensor) -> list[str]:
+    """The fields of the data frame, as packets name them."""
+    frame = next((frame for frame in sensor.frames.values() if frame.data), None) or next(iter(sensor.frames.values()))
+    return list(schema(frame.prepared).fields)
+
+
+def _quoted(said: str) -> str:
+    return said.replace("\\", "\\\\").replace('"', "'")

@@ -1,0 +1,427 @@
+"""Values and formulas as Lua.
+
+The tree of a frame type as Lua tables, and the fields that Wireshark knows it by.
+
+A Wireshark dissector: what a spec says as Lua tables, and the Lua code that walks them.
+
+What depends on the sensor is written here; ``wireshark.lua``, beside this module, is the same for all.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from importlib import resources
+from typing import Any
+
+from lidarspec._version import __version__
+from lidarspec.exports import Refused
+from lidarspec.exports.formulas import Formula, Op, Ref, refs
+from lidarspec.exports.messages import Message, messages
+from lidarspec.exports.tree import Blob, Block, Empty, Node, Number, Part, Repeat, Sealed, Select, Struct, When, formulas, nodes
+from lidarspec.framing.frame_engine import codec
+from lidarspec.spec.bits import BitField
+from lidarspec.spec.checksums import Checksum, Crc, Fold15, Sum, WordXor, Xor, ZeroPadded
+from lidarspec.spec.description import Sensor
+from lidarspec.spec.links import Tcp, Udp
+from lidarspec.wire.schema import FieldInfo
+
+WIDTH = 140
+
+
+class Code(str):
+    """Lua as it stands, not to be quoted."""
+
+
+_BARE = {"+": "({} + {})", "-": "({} - {})", "*": "({} * {})", "<<": "({} * 2 ^ {})"}
+_COMPARED = {"==": "==", "!=": "~=", "<": "<", "<=": "<=", ">": ">", ">=": ">="}
+_CALLED = {"//": "int.div", "%": "int.mod", "&": "int.band", "|": "int.bor", "^": "int.bxor"}
+
+
+def formula(value: Formula) -> Code:
+    """A formula as a number, or as a function of the values of fields."""
+    return Code(str(value)) if isinstance(value, int) else Code(f"function(v) return {_term(value)} end")
+
+
+def _term(value: Formula) -> str:
+    if isinstance(value, Ref):
+        return f"v[{quoted(value.path)}]"
+    if isinstance(value, Op):
+        args = [_term(arg) for arg in value.args]
+        if value.symbol == "not":
+            return f"int.truth({args[0]} == 0)"
+        if len(args) == 1:
+            return f"(-{args[0]})"
+        if value.symbol in _COMPARED:
+            return f"int.truth({args[0]} {_COMPARED[value.symbol]} {args[1]})"
+        if value.symbol == ">>":
+            return f"int.div({args[0]}, 2 ^ {args[1]})"
+        if value.symbol in _CALLED:
+            return f"{_CALLED[value.symbol]}({args[0]}, {args[1]})"
+        return _BARE[value.symbol].format(*args)
+    return f"({value})" if value < 0 else str(value)
+
+
+def lua(value: Any, indent: str = "") -> str:
+    """Plain data as a Lua expression, on one line where it fits."""
+    if isinstance(value, Code):
+        return str(value)
+    if isinstance(value, str):
+        return quoted(value)
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, float) and not math.isfinite(value):
+        raise ValueError(f"{value!r} has no Lua literal")
+    if isinstance(value, int | float):
+        return repr(value)
+    entries = _entries(value, indent + "  ")
+    line = "{" + ", ".join(entries) + "}"
+    if len(indent) + len(line) <= WIDTH and "\n" not in line:
+        return line
+    return "{\n" + "".join(f"{indent}  {entry},\n" for entry in entries) + indent + "}"
+
+
+def _entries(value: Any, indent: str) -> list[str]:
+    if isinstance(value, Mapping):
+        return [f"{_key(key)} = {lua(item, indent)}" for key, item in value.items() if item is not None]
+    assert isinstance(value, Iterable)
+    return [lua(item, indent) for item in value]
+
+
+def _key(key: object) -> str:
+    return key if isinstance(key, str) and key.isidentifier() and key.isascii() else f"[{lua(key)}]"
+
+
+def quoted(text: str | bytes) -> str:
+    """A Lua string; what is not printable ASCII as decimal escapes."""
+    data = text.encode() if isinstance(text, str) else text
+    return '"' + "".join(chr(byte) if 32 <= byte < 127 and byte not in b'"\\' else f"\\{byte:03d}" for byte in data) + '"'
+
+
+#: elements of arrays say what is in them, where it is no more than this.
+SUMMED = 4
+Table = dict[str, Any]
+
+
+def tables(message: Message, prefix: str) -> Table:
+    """The root of a frame type as a table; `prefix` begins the names of its fields in Wireshark's filters."""
+    return _Writer(message, prefix).node(message.root)
+
+
+@dataclass
+class _Writer:
+    """What is known of one frame type while it is written."""
+
+    message: Message
+    prefix: str
+    kept: set[str] = field(default_factory=set)
+    marked: set[str] = field(default_factory=set)
+    seals: set[str] = field(default_factory=set)
+    types: dict[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for node in nodes(self.message.root):
+            self.kept |= {ref.path for value in formulas(node) for ref in refs(value)}
+            if isinstance(node, Sealed):
+                self.seals |= set(node.fields)
+                self.marked |= set(node.over or ())
+        self.kept |= self.seals
+
+    def node(self, node: Node, path: str = "") -> Table:
+        """A node as a table; `skip` says how many bytes it takes where it need not be looked at to measure the frame."""
+        match node:
+            case Number():
+                return self._number(node)
+            case Blob():
+                return self._blob(node)
+            case Block():
+                return self._block(node)
+            case Struct():
+                return self._struct(node)
+            case Sealed():
+                return {"kind": "sealed", "name": node.name or None, "body": self.node(node.body), "seal": self._seal(node)}
+            case Repeat():
+                return self._repeat(node, path)
+            case When():
+                then, otherwise = self.node(node.then, path), self.node(node.otherwise, path)
+                return {"kind": "when", "name": node.name, "condition": _function(node.condition), "yes": then, "no": otherwise}
+            case Select():
+                cases = {value: self.node(case, path) for value, case in node.cases}
+                default = self.node(node.default, path)
+                return {"kind": "select", "name": node.name, "key": _function(node.key), "cases": cases, "default": default}
+            case Empty():
+                return {"kind": "empty", "skip": 0}
+
+    def _number(self, node: Number) -> Table:
+        kind = {"uint": "UINT", "int": "INT", "float": "FLOAT"}[node.kind] + ("" if node.kind == "float" else str(_width(8 * node.size)))
+        if node.kind == "float" and node.size == 8:
+            kind = "DOUBLE"
+        table: Table = {"kind": "number", "name": node.name, "type": node.kind, "size": node.size}
+        table |= {"le": (node.order == "little" and node.size > 1) or None, **self._described(node.info, kind)}
+        return table | {"skip": self._skip(node.info, node.size)}
+
+    def _blob(self, node: Blob) -> Table:
+        name = node.name or "constant"
+        path = node.info.path if node.name else ".".join(part for part in (node.info.path, name) if part)
+        new = self._new("BYTES", path, name, node.info.docs, "NONE")
+        table: Table = {"kind": "bytes", "name": name, "field": new, "size": formula(node.size), "keep": self._keep(path)}
+        table["const"] = Code(quoted(node.const)) if node.const is not None else None
+        return table | {"skip": self._skip(node.info, node.size) if isinstance(node.size, int) and node.const is None else None}
+
+    def _block(self, node: Block) -> Table:
+        order = _word_order(node)
+        parts = [self._part(node, part, order) for part in node.parts]
+        looked_at = any("keep" in part or "const" in part for part in ({k: v for k, v in p.items() if v is not None} for p in parts))
+        return {
+            "kind": "block",
+            "name": node.name,
+            "size": node.size,
+            "le": order == "little" or None,
+            "is_struct": any(part.names for part in node.parts),
+            "skip": None if looked_at else node.size,
+            "parts": parts,
+        }
+
+    def _part(self, block: Block, part: Part, order: str | None) -> Table:
+        spots = [segment.byte for segment in part.bits.segments]
+        letters = "INT" if part.bits.signed else "UINT"
+        is_masked = order is not None and part.bits.width < 8 * block.size
+        kind = f"{letters}{8 * block.size if is_masked else _width(part.bits.width)}"
+        mask = _mask(part.bits, block.size, order) if is_masked and order is not None else None
+        label = ".".join(part.names) + "".join(f"[{index}]" for index in part.indices)
+        return {
+            "name": part.info.name,
+            "label": label if label != part.info.name else None,
+            "first": min(spots),
+            "last": max(spots),
+            "width": part.bits.width,
+            "signed": part.bits.signed or None,
+            "masked": is_masked or None,
+            "segments": [[one.byte, one.low, one.mask.bit_count(), one.target] for one in part.bits.segments],
+            **self._described(part.info, kind, mask),
+        }
+
+    def _struct(self, node: Struct) -> Table:
+        members = []
+        for member in node.members:
+            path = ".".join(part for part in (node.path, member.name) if part)
+            table = self.node(member, path)
+            members.append(table | {"mark": path} if path in self.marked and member.name else table)
+        sizes = [None if "mark" in member else member.get("skip") for member in members]
+        total = None if None in sizes else sum(size for size in sizes if size is not None)
+        return {"kind": "struct", "name": node.name or None, "skip": total, "members": members}
+
+    def _repeat(self, node: Repeat, path: str) -> Table:
+        element = self.node(node.element, path)
+        size = element.get("skip")
+        whole = size * node.count if isinstance(node.count, int) and size is not None else None
+        few = isinstance(node.element, Block) or (isinstance(node.element, Struct) and len(_leaves(node.element)) <= SUMMED)
+        summed = (few and bool(_leaves(node.element))) or None
+        return {"kind": "repeat", "name": node.name, "count": formula(node.count), "summed": summed, "skip": whole, "element": element}
+
+    def _described(self, info: FieldInfo, kind: str, mask: int | None = None) -> Table:
+        """What a number says of itself, and its fields in Wireshark."""
+        is_hex = (info.path in self.seals or info.const is not None) and kind.startswith("UINT")
+        shown = "HEX" if is_hex else "NONE" if kind in ("FLOAT", "DOUBLE") else "DEC"
+        table: Table = {"field": self._new(kind, info.path, info.name, info.docs, shown, info.labels, mask)}
+        if info.scaled:
+            table["physical"] = self._new("DOUBLE", f"{info.path}.physical", info.name, f"{info.docs} in {info.unit}".strip(), "NONE")
+        table |= {"scale": info.scale if info.scaled else None, "offset": info.offset or None, "unit": info.unit or None}
+        return table | {"labels": dict(info.labels) or None, "const": info.const, "keep": self._keep(info.path)}
+
+    def _new(self, kind: str, path: str, name: str, docs: str, base: str, labels: Any = None, mask: int | None = None) -> Code:
+        """A field of Wireshark; one name stands for numbers of one family only."""
+        family = "".join(letter for letter in kind if letter.isalpha()) + "64" * kind.endswith("64")
+        abbreviation = f"{self.prefix}.{path}"
+        while self.types.setdefault(abbreviation, family) != family:
+            abbreviation += "_"
+        valued = "{" + ", ".join(f"[{value}] = {quoted(text)}" for value, text in labels.items()) + "}" if labels else "nil"
+        masked = f"0x{mask:x}" if mask is not None else "nil"
+        return Code(f"new({quoted(abbreviation)}, {quoted(name)}, ftypes.{kind}, base.{base}, {valued}, {masked}, {quoted(docs)})")
+
+    def _keep(self, path: str) -> str | None:
+        return path if path in self.kept else None
+
+    def _skip(self, info: FieldInfo, size: int) -> int | None:
+        return None if info.path in self.kept or info.const is not None else size
+
+    def _seal(self, node: Sealed) -> Table:
+        widths = dict(_widths(node))
+        return {
+            **_algorithm(node.algorithm),
+            "fields": [{"path": path, "width": widths[path]} for path in node.fields],
+            "first": node.over[0] if node.over else None,
+            "last": node.over[1] if node.over else None,
+            "big": node.algorithm.order == "big" or None,
+            "is_wide": (len(node.fields) == 1 and widths[node.fields[0]] > 32) or None,
+            "absent": dict.fromkeys(node.absent, True),
+        }
+
+
+def _widths(node: Sealed) -> Iterator[tuple[str, int]]:
+    """The fields of a struct and how many bits each has."""
+    for below in nodes(node):
+        if isinstance(below, Block):
+            yield from ((part.info.path, part.bits.width) for part in below.parts)
+        elif isinstance(below, Number | Blob):
+            yield below.info.path, below.info.bits
+
+
+def _algorithm(algorithm: Checksum) -> Table:
+    match algorithm:
+        case Crc():
+            digits = {name: f"{getattr(algorithm, name):x}" for name in ("poly", "init", "xorout")}
+            return {"algorithm": "crc", "width": algorithm.width, **digits, "refin": algorithm.refin, "refout": algorithm.refout}
+        case Xor():
+            return {"algorithm": "xor"}
+        case Sum():
+            return {"algorithm": "sum", "width": algorithm.width}
+        case WordXor():
+            halves = [half for size in algorithm.groups for half in range(size)]
+            return {"algorithm": "word_xor", "head": algorithm.head, "halves": halves}
+        case Fold15():
+            return {"algorithm": "fold15"}
+        case ZeroPadded():
+            if isinstance(algorithm.algorithm, ZeroPadded):
+                raise Refused("a checksum padded twice")
+            return {**_algorithm(algorithm.algorithm), "pad": algorithm.to}
+    raise Refused(f"the checksum {type(algorithm).__name__} is Python code, which Wireshark does not run")
+
+
+def _function(value: Formula) -> Code:
+    return Code(f"function() return {value} end") if isinstance(value, int) else formula(value)
+
+
+def _leaves(node: Node) -> list[Node | Part]:
+    """The numbers in a node; none where it holds arrays or parts that come and go."""
+    found: list[Node | Part] = []
+    for below in nodes(node):
+        if isinstance(below, Repeat | When | Select):
+            return []
+        found += list(below.parts) if isinstance(below, Block) else [below] if isinstance(below, Number) else []
+    return found
+
+
+def _width(bits: int) -> int:
+    return next(width for width in (8, 16, 24, 32, 64) if bits <= width)
+
+
+def _word_order(block: Block) -> str | None:
+    """The byte order by which all parts are runs of bits of one word, which Wireshark can draw; None where there is none."""
+    if block.size > 4:
+        return None
+    for order in ("big", "little"):
+        if all(_run(part.bits, block.size, order) is not None for part in block.parts):
+            return order
+    return None
+
+
+def _run(bits: BitField, size: int, order: str) -> int | None:
+    """The lowest bit of a field in the word that a block is, None where it is no run of bits in order."""
+    places = {
+        8 * (segment.byte if order == "little" else size - 1 - segment.byte) + segment.low - segment.target for segment in bits.segments
+    }
+    return places.pop() if len(places) == 1 else None
+
+
+def _mask(bits: BitField, size: int, order: str) -> int:
+    return ((1 << bits.width) - 1) << (_run(bits, size, order) or 0)
+
+
+#: the link types that captures keep for private use, USER0 to USER15, by the numbers that Wireshark's wtap gives them.
+USER_LINKS = tuple(range(45, 61))
+
+_HEAD = """\
+-- {title}: a dissector for Wireshark and tshark, made by lidarspec {version}.
+-- Source: {source}
+--
+--     wireshark -X lua_script:THIS_FILE CAPTURE
+--
+-- or put it into the personal Lua plugins folder (Help, About Wireshark, Folders).
+-- It takes UDP and TCP by port, UDP on other ports by its constants, and captures of link type USER0 to USER15, which hold what came
+-- over a serial line ("lidarspec record SOURCE -s SENSOR -o FILE.pcap" writes them).
+-- A field is the raw number of the wire; where it has a unit, FIELD.physical can be filtered by as well.
+
+local proto = Proto({name}, {title_quoted})
+local int = {{}}
+
+local fields = {{}}
+local function new(abbreviation, name, type, shown, labels, mask, text)
+  local key = table.concat({{abbreviation, type, shown, mask or 0}}, " ")
+  fields[key] = fields[key] or ProtoField.new(name, abbreviation, type, labels, shown, mask, text)
+  return fields[key]
+end
+
+local kind = new({name} .. ".frame", "frame type", ftypes.STRING, base.NONE)
+local verdicts = {{[0] = "Bad", [1] = "Good", [2] = "Not filled"}}
+local status = new({name} .. ".checksum.status", "checksum status", ftypes.UINT8, base.NONE, verdicts)
+local marks = {{
+  checksum = ProtoExpert.new({name} .. ".checksum.bad", "checksum wrong", expert.group.CHECKSUM, expert.severity.ERROR),
+  constant = ProtoExpert.new({name} .. ".constant.bad", "not the constant that stands here", expert.group.MALFORMED, expert.severity.ERROR),
+  short = ProtoExpert.new({name} .. ".cut_off", "the frame ends before its last field", expert.group.MALFORMED, expert.severity.ERROR),
+  skipped = ProtoExpert.new({name} .. ".skipped", "bytes of no frame", expert.group.UNDECODED, expert.severity.WARN),
+}}
+"""
+
+_REGISTERED = """
+local listed = {}
+for _, field in pairs(fields) do table.insert(listed, field) end
+proto.fields = listed
+proto.experts = {marks.checksum, marks.constant, marks.short, marks.skipped}
+"""
+
+
+def dissector(sensor: Sensor) -> str:
+    """A Lua dissector for Wireshark: of the sensor's UDP and TCP ports, and of captures of a serial line.
+
+    Raises:
+        Refused: where only Python code can decide what a frame is made of.
+    """
+    name = sensor.id.replace("-", "_")
+    found = sorted(messages(sensor), key=lambda message: message.frame.direction)  # "in" before "out": what both could be came in
+    about = {
+        "title": _title(sensor),
+        "is_stream": any(isinstance(link, Udp) and link.stream for link in sensor.links.values()),
+        "announcing": {frame.after: True for frame in sensor.frames.values() if frame.after},
+        "places": _places(sensor),
+        "frames": [_frame(message, name) for message in found],
+    }
+    head = _HEAD.format(
+        title=_title(sensor),
+        version=__version__,
+        source=" ".join(sensor.source.split()),
+        name=quoted(name),
+        title_quoted=quoted(_title(sensor)),
+    )
+    return "\n".join([head, f"local sensor = {lua(about)}", _REGISTERED, _walker()])
+
+
+def _title(sensor: Sensor) -> str:
+    return f"{sensor.vendor} {sensor.model}"
+
+
+def _frame(message: Message, name: str) -> dict[str, Any]:
+    prefix = codec(message.frame).prefix
+    return {
+        "name": message.name,
+        "longest": message.frame.max_length,
+        "after": message.frame.after,
+        "magic": [[spot, mask, value] for spot, (mask, value) in sorted(prefix.items())],
+        "root": tables(message, f"{name}.{message.name}"),
+    }
+
+
+def _places(sensor: Sensor) -> dict[str, list[int]]:
+    """Where frames are found: Wireshark's table -> its patterns."""
+    links = sensor.links.values()
+    places = {
+        "udp.port": [port for link in links if isinstance(link, Udp) for port in link.ports],
+        "tcp.port": [link.port for link in links if isinstance(link, Tcp)],
+        "wtap_encap": list(USER_LINKS),
+    }
+    return {place: sorted(set(patterns)) for place, patterns in places.items() if patterns}
+
+
+def _walker() -> str:
+    return resources.files("lidarspec.exports").joinpath("wireshark.lua").read_text(encoding="utf-8")

@@ -1,0 +1,353 @@
+"""Whether candidates are frames: their constants, their checksums, and what is plausible, for many at a time.
+
+The order is that of the counters: a candidate with a wrong constant is none at all, one with a wrong checksum is counted
+as such, and only what is intact is asked whether it is plausible.
+
+A frame's test of plausibility, taken apart: tables by the bytes that each part of it looks at.
+
+`plausible` is traced once. What it combines with ``&`` are conditions of their own, and one that depends on no more than
+two bytes beside each other is evaluated for all that these can hold. Frames are then judged by looking these bytes up, with
+the same answers, without making a column of every field. What cannot be traced is evaluated as it stands (`None`).
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+import traceback
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarspec.columns.columns import Batch, Column, Fields, unpadded
+from lidarspec.columns.graph import Node, Traced, Untraceable, trace
+from lidarspec.spec.description import Frame
+from lidarspec.wire.frame_table import Group, Rows, Table
+from lidarspec.wire.layout import Bytes2D, Layout, Leaf, Seal, elements, marks, right, words
+from lidarspec.wire.schema import FieldInfo, Schema
+
+VALID, SHORT, LENGTH, CONSTANT, CHECKSUM, IMPLAUSIBLE, PLUGIN = range(7)
+
+Status = NDArray[np.uint8]
+
+
+class Judge:
+    """Judges candidates of one layout, whose first constants (`prefix`) are known to be right.
+
+    Args:
+        checks: the test of plausibility, taken apart; None where only the function itself can tell.
+    """
+
+    def __init__(
+        self, frame: Frame, schema: Schema, layout: Layout, prefix: Mapping[int, tuple[int, int]], checks: list[Check] | None
+    ) -> None:
+        self._frame, self._schema, self._layout, self._checks = frame, schema, layout, checks
+        self._constants = words(marks({spot: known for spot, known in layout.constants.items() if prefix.get(spot) != known}))
+
+    def __call__(self, rows: Bytes2D, errors: list[str]) -> Status:
+        """The status of each candidate, (n,); tracebacks out of plugins go to `errors`."""
+        status = np.zeros(len(rows), np.uint8)
+        held = right(self._constants, rows) if len(rows) else None
+        if held is not None:
+            status[~held] = CONSTANT
+        for seal in self._layout.seals:
+            _among(status, rows, functools.partial(intactness, seal, errors))
+        if self._checks is not None:
+            self._check(status, rows, self._checks)
+        elif self._frame.plausible is not None:
+            _among(status, rows, lambda some: self._asked(some, errors))
+        return status
+
+    def _check(self, status: Status, rows: Bytes2D, checks: list[Check]) -> None:
+        for check in checks:
+            held = check(rows)
+            if np.count_nonzero(held) < len(held):
+                status[~held & (status == VALID)] = IMPLAUSIBLE
+
+    def _asked(self, rows: Bytes2D, errors: list[str]) -> Status:
+        return plausibility(self._frame, Rows(self._schema, [Group(self._layout, np.arange(len(rows)), rows)]), errors)
+
+
+def _among(status: Status, rows: Bytes2D, judge: Callable[[Bytes2D], Status]) -> None:
+    """Judge those that are valid so far."""
+    if not np.count_nonzero(status):
+        status[:] = judge(rows)
+        return
+    left = np.flatnonzero(status == VALID)
+    if len(left):
+        status[left] = judge(taken(rows, left))
+
+
+def taken(rows: Bytes2D, which: NDArray[np.intp] | NDArray[np.bool_]) -> Bytes2D:
+    """Some of the rows, by index or mask, each copied as one piece."""
+    whole = rows.view(f"V{rows.shape[1]}")[:, 0]
+    some = whole.take(which) if which.dtype != np.bool_ and rows.flags.c_contiguous else whole[which]
+    return some.view(np.uint8).reshape(-1, rows.shape[1])
+
+
+def intactness(seal: Seal, errors: list[str], rows: Bytes2D) -> Status:
+    """`VALID`, `CHECKSUM` or `PLUGIN` for each frame, by one of its checksums."""
+    try:
+        wrong = ~seal.intact(rows)
+        return np.multiply(wrong.view(np.uint8), np.uint8(CHECKSUM))
+    except Exception:
+        errors += [traceback.format_exc()] * len(rows)
+        return np.full(len(rows), PLUGIN, np.uint8)
+
+
+def plausibility(frame: Frame, table: Table, errors: list[str]) -> Status:
+    """`VALID`, `IMPLAUSIBLE` or `PLUGIN` for each frame of a table, by the frame's own test."""
+    assert frame.plausible is not None
+    batch = Batch(table, np.zeros(len(table), np.bool_))
+    try:
+        with np.errstate(all="ignore"):
+            answer = frame.plausible(Fields(batch))
+        array = np.broadcast_to(np.asarray(answer), (len(table), *np.shape(answer)[1:])) if np.ndim(answer) else np.full(len(table), answer)
+        return np.where(_all(array, answer, batch), VALID, IMPLAUSIBLE).astype(np.uint8)
+    except Exception:
+        errors += [traceback.format_exc()] * len(table)
+        return np.full(len(table), PLUGIN, np.uint8)
+
+
+def _all(array: NDArray[Any], answer: Any, batch: Batch) -> NDArray[np.bool_]:
+    """Whether a condition holds everywhere in each frame, padding left out."""
+    flat = array.reshape(len(array), math.prod(array.shape[1:])).astype(np.bool_)
+    mask = unpadded(answer.axes, array.shape, batch) if isinstance(answer, Column) else None
+    return np.asarray((flat if mask is None else flat | ~mask).all(axis=1))
+
+
+@dataclass(frozen=True, eq=False)
+class Survey:
+    """What candidates are.
+
+    Attributes:
+        status: of each.
+        sizes: of those that are valid; for those short of bytes how many tell more (0: any).
+        errors: tracebacks out of plugins.
+        rows: the bytes of all candidates, one a row, where all have one layout and are whole.
+        layout: that all have, where that is known.
+    """
+
+    status: Status
+    sizes: NDArray[np.intp]
+    errors: tuple[str, ...] = ()
+    rows: Bytes2D | None = None
+    layout: Layout | None = None
+
+
+#: values of a few bits that are compared one by one.
+ALLOWED = 2
+
+Check = Callable[[Bytes2D], NDArray[np.bool_]]
+
+
+@dataclass(frozen=True, eq=False)
+class Condition:
+    """A part of the test: a node of the trace, and the fields that it depends on, all in the same arrays."""
+
+    node: Node
+    fields: tuple[FieldInfo, ...]
+
+    def holds(self, columns: Mapping[str, NDArray[np.float64]]) -> NDArray[np.bool_]:
+        """Whether it is true, for columns of the fields in their units, element by element."""
+        with np.errstate(all="ignore"):
+            return np.asarray(value_of(self.node, columns, {})).astype(np.bool_)
+
+
+class Conditions:
+    """The test of one frame type.
+
+    Args:
+        plausible: as in `Frame`.
+        schema: of the frame.
+        layout: any of its layouts, to trace it on.
+    """
+
+    def __init__(self, plausible: Callable[[Any], Any], schema: Schema, layout: Layout) -> None:
+        self._parts = _parts(plausible, schema, layout)
+        self._tables: dict[tuple[Any, ...], _Table] = {}
+
+    def checks(self, layout: Layout) -> list[Check] | None:
+        """What frames of a layout, as rows of bytes, have to pass; None where only the function itself can tell."""
+        if self._parts is None:
+            return None
+        leaves = [{info.path: leaf for info in part.fields if (leaf := layout.leaves.get(info.path))} for part in self._parts]
+        if any(
+            part.fields[0].axes and all(0 in leaf.shape for leaf in own.values()) for part, own in zip(self._parts, leaves, strict=True)
+        ):
+            return []  # a test on no elements holds, and what is combined with it is a test on none either
+        return [self._check(part, own) for part, own in zip(self._parts, leaves, strict=True)]
+
+    def _check(self, part: Condition, leaves: Mapping[str, Leaf]) -> Check:
+        places = {(leaf.shape, leaf.strides) for leaf in leaves.values()}
+        first, last = _window(leaves.values())
+        if last - first > 2 or len(places) > 1 or any(len(shape) != len(strides) for shape, strides in places):
+            return _Computed(part, leaves)
+        key = (id(part), *((path, leaf.offset - first, leaf.wire, leaf.elements) for path, leaf in leaves.items()))
+        if key not in self._tables:
+            single = {path: replace(leaf.at(first), shape=(), strides=()) for path, leaf in leaves.items()}
+            self._tables[key] = _table(part, single, last - first)
+        shape, strides = places.pop() if places else ((), ())
+        return _LookedUp(self._tables[key], first, shape, strides)
+
+
+@dataclass(frozen=True, eq=False)
+class _Computed:
+    """A condition on more bytes than a table is made for."""
+
+    part: Condition
+    leaves: Mapping[str, Leaf]
+
+    def __call__(self, rows: Bytes2D) -> NDArray[np.bool_]:
+        held = self.part.holds(_physical(self.part, self.leaves, rows))
+        held = np.broadcast_to(held, (len(rows), *held.shape[1:]))
+        return np.asarray(held.all(axis=tuple(range(1, held.ndim))))
+
+
+@dataclass(frozen=True, eq=False)
+class _Table:
+    """For which values of some bytes, taken as one integer, a condition holds.
+
+    Attributes:
+        limits: from one to another; None where they are no such range.
+        bits: else the bits that it depends on, and what they may be, if that is little; None where it is not.
+        listed: for each value.
+    """
+
+    dtype: np.dtype[Any]
+    limits: tuple[int, int] | None
+    listed: NDArray[np.bool_]
+    bits: tuple[int, tuple[int, ...]] | None = None
+
+    def holds(self, values: NDArray[Any]) -> NDArray[np.bool_]:
+        """Whether it holds for each of the values."""
+        if self.limits is not None:
+            low, high = self.limits
+            held = values <= high
+            return np.asarray(held & (values >= low) if low else held)
+        if self.bits is not None:
+            mask, allowed = self.bits
+            left = values & values.dtype.type(mask)
+            held = left == allowed[0]
+            for value in allowed[1:]:
+                held |= left == value
+            return np.asarray(held)
+        if values.itemsize > 1:
+            return self.listed.take(values)
+        return np.frombuffer(values.tobytes().translate(self.listed.tobytes()), np.bool_).reshape(values.shape)
+
+
+@dataclass(frozen=True, eq=False)
+class _LookedUp:
+    """A condition on one or two bytes of a frame, or of each element of an array in it."""
+
+    table: _Table
+    spot: int
+    shape: tuple[int, ...]
+    strides: tuple[int, ...]
+
+    def __call__(self, rows: Bytes2D) -> NDArray[np.bool_]:
+        if not len(rows):
+            return np.empty(0, np.bool_)
+        view = elements(rows, self.table.dtype, self.spot, self.shape, self.strides)
+        values = view if view.itemsize == 1 else view.astype(self.table.dtype.newbyteorder("="))
+        held = self.table.holds(values)
+        return np.asarray(held.all(axis=tuple(range(1, held.ndim)))) if self.shape else held
+
+
+def _table(part: Condition, leaves: Mapping[str, Leaf], size: int) -> _Table:
+    """A condition on so many bytes, at most two."""
+    for dtype in map(np.dtype, ("<u2", ">u2") if size == 2 else ("u1",)):
+        blocks = np.split(np.arange(1 << 8 * dtype.itemsize, dtype=dtype), 16)  # so that it takes little memory at a time
+        listed = np.concatenate([_tried(part, leaves, codes) for codes in blocks])
+        true = np.flatnonzero(listed)
+        if len(true) and true[-1] - true[0] == len(true) - 1:
+            return _Table(dtype, (int(true[0]), int(true[-1])), listed)
+    return _Table(dtype, None, listed, _bits(listed))
+
+
+def _bits(listed: NDArray[np.bool_]) -> tuple[int, tuple[int, ...]] | None:
+    """The bits on which a list depends, and with which values of these it holds, if they are one or two; else None."""
+    values = np.arange(len(listed))
+    mask = sum(bit for bit in map(int, 1 << np.arange(16)) if bit < len(listed) and (listed != listed[values ^ bit]).any())
+    allowed = np.unique(values[listed] & mask).tolist()
+    return (mask, tuple(allowed)) if 0 < len(allowed) <= ALLOWED else None
+
+
+def _tried(part: Condition, leaves: Mapping[str, Leaf], codes: NDArray[Any]) -> NDArray[np.bool_]:
+    """Whether a condition holds where the bytes are these integers."""
+    rows = codes.view(np.uint8).reshape(len(codes), -1)
+    return np.broadcast_to(part.holds(_physical(part, leaves, rows)), len(rows))
+
+
+def _physical(part: Condition, leaves: Mapping[str, Leaf], rows: Bytes2D) -> dict[str, NDArray[np.float64]]:
+    """The fields of a condition in their units; nan where the layout lacks one."""
+    found = {}
+    for info in part.fields:
+        leaf = leaves.get(info.path)
+        array = np.full(len(rows), np.nan) if leaf is None else leaf.load(rows).astype(np.float64)
+        found[info.path] = array * info.scale + info.offset if info.scaled else array
+    return found
+
+
+def _window(leaves: Iterable[Leaf]) -> tuple[int, int]:
+    """First byte that the first elements of some fields take, and the one after their last."""
+    spots = []
+    for leaf in leaves:
+        spots += [leaf.offset, leaf.offset + leaf.size - 1] if leaf.wire else []
+        spots += [leaf.offset + segment.byte for element in leaf.elements for segment in element.segments]
+    return (min(spots), max(spots) + 1) if spots else (0, 0)
+
+
+def _parts(plausible: Callable[[Any], Any], schema: Schema, layout: Layout) -> list[Condition] | None:
+    rows = np.zeros((2, layout.size), np.uint8)
+    sample = Batch(Rows(schema, [Group(layout, np.arange(2), rows)]), np.zeros(2, np.bool_))
+    try:
+        answer, _ = trace(plausible, sample)
+        if not isinstance(answer, Traced):
+            return None
+        return [Condition(node, fields_of(node, schema)) for node in _conjuncts(answer.node)]
+    except Exception:  # the function itself will say so, frame by frame
+        return None
+
+
+def _conjuncts(node: Node) -> Iterator[Node]:
+    """The conditions that have to hold together."""
+    both = node.kind == "call" and node.function in (np.bitwise_and, np.logical_and)
+    if both and all(isinstance(arg, Node) and arg.sample.array.dtype == np.bool_ for arg in node.args):
+        for arg in node.args:
+            yield from _conjuncts(arg)
+    else:
+        yield node
+
+
+def fields_of(node: Node, schema: Schema) -> tuple[FieldInfo, ...]:
+    """The fields that a node depends on, each once.
+
+    Raises:
+        Untraceable: if it depends on more than the frame itself, or on fields that do not stand side by side.
+    """
+    found: dict[str, FieldInfo] = {}
+    pending = [node]
+    while pending:
+        node = pending.pop()
+        if node.kind not in ("field", "call") or any(np.size(arg) != 1 for arg in node.args if not isinstance(arg, Node)):
+            raise Untraceable(f"{node.kind} in a test of plausibility")
+        if node.kind == "field":
+            found[node.path] = schema.fields[node.path]
+        pending += [arg for arg in node.args if isinstance(arg, Node)]
+    if len({info.axes for info in found.values()}) != 1:
+        raise Untraceable("fields of different arrays in a test of plausibility")
+    return tuple(found.values())
+
+
+def value_of(node: Node, columns: Mapping[str, NDArray[np.float64]], known: dict[Node, Any]) -> Any:
+    """What a node comes to for columns of the fields."""
+    if node.kind == "field":
+        return columns[node.path]
+    if node not in known:
+        known[node] = node.function(*(value_of(arg, columns, known) if isinstance(arg, Node) else arg for arg in node.args))
+    return known[node]

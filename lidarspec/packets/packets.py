@@ -1,0 +1,193 @@
+"""Packets: frames of one type as columns, raw and physical, in stream order."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarspec.columns.columns import Batch, physical
+from lidarspec.errors import SpecError, UnknownField
+from lidarspec.framing.decoder import Counters
+from lidarspec.spec.description import Sensor
+from lidarspec.wire.frame_table import Table
+from lidarspec.wire.schema import Schema
+
+if TYPE_CHECKING:
+    from lidarspec.points.cloud import PointCloud
+
+StateOf = tuple[Table | None, NDArray[np.intp]]
+#: a column, or the numbers of a range, which become one when it is read.
+Numbers = NDArray[np.int64] | range
+
+
+class Packets:
+    """n frames of one type. Their arrays are to be read only: some share memory.
+
+    Attributes:
+        sensor, frame: whose, and of which type.
+        table: their raw columns.
+        time_ns: (n,) int64, by the sensor's clock, unwrapped; else the host's.
+        host_ns: (n,) int64 arrival times; 0 where the caller gave none.
+        breaks: (n,) True where something was lost before the packet.
+        state: for each other frame type, its frames and which of them was last before each packet.
+        stats: the counters of the decoder.
+        backend: what makes points of them, "auto", "numpy" or "jit".
+    """
+
+    def __init__(
+        self,
+        sensor: Sensor,
+        frame: str,
+        table: Table,
+        *,
+        offset: Numbers,
+        time_ns: NDArray[np.int64],
+        host_ns: NDArray[np.int64],
+        index: Numbers,
+        breaks: NDArray[np.bool_],
+        state: Mapping[str, StateOf],
+        stats: Counters,
+        backend: str = "auto",
+    ) -> None:
+        self.sensor, self.frame, self.table = sensor, frame, table
+        self._offset, self.time_ns, self.host_ns, self._index, self.breaks = offset, time_ns, host_ns, index, breaks
+        self.state, self.stats, self.backend = state, stats, backend
+
+    @cached_property
+    def offset(self) -> NDArray[np.int64]:
+        """The first byte of each in the input, (n,)."""
+        return _column(self._offset)
+
+    @cached_property
+    def index(self) -> NDArray[np.int64]:
+        """The unwrapped sequence number of each, (n,); 0, 1, 2 ... where the sensor has none."""
+        return _column(self._index)
+
+    def __len__(self) -> int:
+        return len(self.table)
+
+    def __repr__(self) -> str:
+        span = f", {(int(self.time_ns[-1]) - int(self.time_ns[0])) / 1e9:.3f} s" if len(self) > 1 else ""
+        return f"Packets({len(self)} {self.frame} frames of {self.sensor.id}{span})"
+
+    def __getitem__(self, path: str) -> NDArray[np.float64]:
+        """A field in its unit: float64, shape (n, *lengths of its arrays); nan where a frame lacks the field.
+
+        Raises:
+            UnknownField: with the closest known path.
+        """
+        info = self.table.schema.fields.get(path)
+        if info is None:
+            raise UnknownField(path, self.table.schema.fields, place=f"{self.sensor.id} {self.frame}")
+        return physical(info, self.table)
+
+    def _ipython_key_completions_(self) -> list[str]:
+        return list(self.table.schema.fields)
+
+    @property
+    def raw(self) -> NDArray[Any]:
+        """The integers of the wire: a structured array (n,), nested as in the struct, variable arrays padded with 0."""
+        columns = {path: self.table.raw(path) for path in self.table.schema.fields}
+        found = np.zeros(len(self), _nested(self.table.schema, columns, ""))
+        for path, column in columns.items():
+            target = found
+            for name in path.split("."):
+                target = target[name]
+            target[...] = column
+        return found
+
+    def count(self, array: str) -> NDArray[np.intp]:
+        """The length of an array in each packet, (n,)."""
+        if array not in self.table.schema.arrays:
+            raise UnknownField(array, self.table.schema.arrays, place=f"{self.sensor.id} {self.frame}")
+        return self.table.counts(array)
+
+    def points(self) -> PointCloud:
+        """The points of all packets in stream order; see `PointCloud`."""
+        return _evaluators[0](self)
+
+    def take(self, which: Any) -> Packets:
+        """Some of the packets: by indices, a mask or a slice."""
+        indices = np.arange(len(self))[which]
+        return Packets(
+            self.sensor,
+            self.frame,
+            self.table.take(indices),
+            offset=self.offset[indices],
+            time_ns=self.time_ns[indices],
+            host_ns=self.host_ns[indices],
+            index=self.index[indices],
+            breaks=self.breaks[indices],
+            state={name: (table, chosen[indices]) for name, (table, chosen) in self.state.items()},
+            stats=self.stats,
+            backend=self.backend,
+        )
+
+    def batch(self, carry: dict[int, NDArray[np.float64]] | None = None) -> Batch:
+        """What `points` and `plausible` functions are given, see `Fields`."""
+        return Batch(self.table, self.breaks, self.state, self.sensor.state, dict(carry or {}))
+
+
+_evaluators: list[Callable[[Packets], PointCloud]] = []
+
+
+def install_points(function: Callable[[Packets], PointCloud]) -> None:
+    """Make `function` what ``Packets.points()`` calls; done by the module that evaluates `points`."""
+    _evaluators[:] = [function]
+
+
+def joined(parts: Sequence[Packets]) -> Packets:
+    """Batches of one stream, one after another."""
+    if len(parts) == 1:
+        return parts[0]
+    head = parts[0]
+    state = {}
+    for name in head.state:
+        tables = [part.state[name][0] for part in parts]
+        known = [table for table in tables if table is not None]
+        starts = np.cumsum([0] + [0 if table is None else len(table) for table in tables])
+        which = [np.where(part.state[name][1] < 0, -1, part.state[name][1] + start) for part, start in zip(parts, starts[:-1], strict=True)]
+        state[name] = (joined_tables(known) if known else None, np.concatenate(which))
+    columns = {key: np.concatenate([getattr(part, key) for part in parts]) for key in ("offset", "time_ns", "host_ns", "index", "breaks")}
+    table = joined_tables([part.table for part in parts])
+    return Packets(head.sensor, head.frame, table, **columns, state=state, stats=parts[-1].stats, backend=head.backend)
+
+
+def joined_tables(tables: Sequence[Any]) -> Table:
+    """Several tables of one frame type, one after another."""
+    return type(tables[0]).joined(tables)  # type: ignore[no-any-return]
+
+
+def _column(numbers: Numbers) -> NDArray[np.int64]:
+    return np.arange(numbers.start, numbers.stop, numbers.step) if isinstance(numbers, range) else numbers
+
+
+def _nested(schema: Schema, columns: Mapping[str, NDArray[Any]], prefix: str) -> np.dtype[Any]:
+    """The structured dtype of one level of the struct; SpecError where one name is a value, a struct or an array by turns."""
+    members: list[Any] = []
+    seen: set[str] = set()
+    for path, info in schema.fields.items():
+        if not path.startswith(prefix):
+            continue
+        name, _, below = path[len(prefix) :].partition(".")
+        if name in seen:
+            continue
+        seen.add(name)
+        here = prefix + name
+        if len(_forms(schema, here)) > 1:
+            raise SpecError("a value, a struct or an array by turns in its branches: ask for its columns one by one", path=here)
+        own = [index for index, axis in enumerate(info.axes) if axis.rstrip("[]") == here]
+        shape = tuple(columns[path].shape[1 + index] for index in own)
+        kind = _nested(schema, columns, f"{here}.") if below else columns[path].dtype
+        members.append((name, kind, shape) if shape else (name, kind))
+    return np.dtype(members)
+
+
+def _forms(schema: Schema, here: str) -> set[tuple[bool, int]]:
+    """What a name is in the branches that have it: whether a value, and in how many arrays of its own."""
+    parts = [(path, info) for path, info in schema.fields.items() if path == here or path.startswith(f"{here}.")]
+    return {(path == here, sum(axis.rstrip("[]") == here for axis in info.axes)) for path, info in parts}

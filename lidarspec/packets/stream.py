@@ -1,0 +1,280 @@
+"""From frames to packets: clocks unwrapped, sequences checked, other frames kept as state.
+
+A `PacketStream` remembers between batches what the next one needs: the last clock reading, the last sequence number,
+the last frame of each other type, and whether bytes were skipped since the last packet.
+"""
+
+from __future__ import annotations
+
+import traceback
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarspec.columns.columns import Batch
+from lidarspec.errors import UnknownFrame
+from lidarspec.framing.decoder import Counters, Spans
+from lidarspec.framing.frame_engine import Codec, CompiledCodec, codec
+from lidarspec.framing.results import Alike
+from lidarspec.packets.clocks import Unwrapper, clock_ns
+from lidarspec.packets.packets import Numbers, Packets, StateOf, joined_tables
+from lidarspec.packets.sequences import SequenceTracker
+from lidarspec.spec.description import Sensor
+from lidarspec.wire.arrays import alike, repeated, some
+from lidarspec.wire.frame_table import Table
+
+
+class PacketStream:
+    """The packets of one frame type out of a decoder's frames.
+
+    Args:
+        sensor, frame: whose, and of which type.
+        stats: the decoder's counters; lost, duplicate and late packets are added to them.
+        interpreted: parse with construct.
+        backend: see `Decoder`.
+        state: frames of other types, by name, that count as seen before the first packet.
+    """
+
+    def __init__(
+        self,
+        sensor: Sensor,
+        frame: str,
+        stats: Counters,
+        *,
+        interpreted: bool = False,
+        backend: str = "auto",
+        state: Mapping[str, bytes] | None = None,
+    ) -> None:
+        if frame not in sensor.frames:
+            raise UnknownFrame(frame, sensor.frames, place=sensor.id)
+        self.sensor, self.frame, self.stats, self._interpreted = sensor, frame, stats, interpreted
+        self._backend = backend
+        self._codec: Codec = codec(sensor.frames[frame], interpreted=interpreted)
+        self._others = [name for name, other in sensor.frames.items() if other.direction == "in" and not other.data and name != frame]
+        self._state: dict[str, bytes] = dict(state or {})
+        data = sensor.frames[frame].data
+        self._sequence = SequenceTracker(sensor.sequence, stats) if sensor.sequence and data and _counted(sensor, frame) else None
+        self._clock = Unwrapper(sensor.clock.wraps_at) if sensor.clock and data else None
+        self._gap, self._number = False, 0
+        self._tables: dict[str, tuple[bytes, Table]] = {}
+
+    def add(self, found: Sequence[Spans], *, whole: bool = False) -> Packets:
+        """The packets among these frames.
+
+        Args:
+            whole: the frames are a whole input: packets before the first frame of another type see that one as state.
+        """
+        parts = [_Part.of(spans, self.frame) for spans in found if len(spans)]
+        breaks = _joined([self._breaks(part) for part in parts], np.bool_)
+        table = self._table(parts)
+        state = self._states(parts, len(table), whole=whole)
+        offset, host = _offsets(parts), _times([part.column("at") for part in parts])
+        index: Numbers = range(self._number, self._number + len(table))
+        time = host
+        self._number += len(table)
+        if len(table) and (self._sequence is not None or self._clock is not None):
+            batch = Batch(table, breaks, state, self.sensor.state)
+            with np.errstate(all="ignore"):
+                if self._sequence is not None:
+                    index, jumps = self._guarded(self._sequence.push, (index, None), batch)
+                    breaks = breaks if jumps is None else breaks | jumps
+                if self._clock is not None:
+                    time = self._guarded(self._times, host, batch, host)
+        return Packets(
+            self.sensor,
+            self.frame,
+            table,
+            offset=offset,
+            time_ns=time,
+            host_ns=host,
+            index=index,
+            breaks=breaks,
+            state=state,
+            stats=self.stats,
+            backend=self._backend,
+        )
+
+    def interrupt(self) -> None:
+        """Input was lost here: there is a break before the next packet."""
+        self._gap = True
+
+    def _guarded(self, function: Callable[..., Any], otherwise: Any, *args: Any) -> Any:
+        try:
+            return function(*args)
+        except Exception:
+            self.stats.error(traceback.format_exc())
+            return otherwise
+
+    def _times(self, batch: Batch, host: NDArray[np.int64]) -> NDArray[np.int64]:
+        assert self._clock is not None
+        return self._clock.push(clock_ns(self.sensor, batch), host)
+
+    def _breaks(self, part: _Part) -> NDArray[np.bool_]:
+        """Whether something was lost before each of our frames, since ours before it."""
+        breaks = np.zeros(part.number, np.bool_)
+        if alike(part.spans.gaps) != 0 and part.spans.gaps.any():
+            losses = np.cumsum(part.spans.gaps > 0)
+            marks = losses[part.own]
+            breaks[:1] = marks[:1] > 0
+            breaks[1:] = marks[1:] > marks[:-1]
+            left = int(losses[-1]) > (int(marks[-1]) if part.number else 0)
+        else:
+            left = False
+        if part.number:
+            breaks[0] |= self._gap
+        self._gap = left or (self._gap and not part.number)
+        return breaks
+
+    def _table(self, parts: Sequence[_Part]) -> Table:
+        tables = [part.table(self._codec) for part in parts if part.number]
+        if not tables:
+            return self._codec.table([])
+        return tables[0] if len(tables) == 1 else joined_tables(tables)
+
+    def _states(self, parts: Sequence[_Part], number: int, *, whole: bool) -> dict[str, StateOf]:
+        """The frames of each other type, and which of them was the last before each packet."""
+        if all(part.where is None for part in parts):
+            if not self._state:
+                return dict.fromkeys(self._others, (None, repeated(-1, number)))
+            return {name: self._unchanged(name, number) for name in self._others}
+        seen = self._others_in(parts)
+        return {name: self._state_of(name, *seen[name], number=number, whole=whole) for name in self._others}
+
+    def _others_in(self, parts: Sequence[_Part]) -> dict[str, tuple[list[bytes], list[int]]]:
+        """The frames of other types, and how many of ours came before each."""
+        seen: dict[str, tuple[list[bytes], list[int]]] = {name: ([], []) for name in self._others}
+        number = 0
+        for part in parts:
+            if part.where is not None:
+                others = np.ones(len(part.spans), np.bool_)
+                others[part.own] = False
+                for rank, index in enumerate(np.flatnonzero(others).tolist()):
+                    name = part.spans.names[part.spans.kinds[index]]
+                    if name in seen:
+                        seen[name][0].append(part.spans.data(index))
+                        seen[name][1].append(number + index - rank)
+            number += part.number
+        return seen
+
+    def _unchanged(self, name: str, number: int) -> StateOf:
+        """The state of packets during which no frame of this other type came."""
+        if name not in self._state:
+            return None, repeated(-1, number)
+        return self._last(name), repeated(0, number)
+
+    def _last(self, name: str) -> Table:
+        """The last frame of another type, as a table."""
+        data = self._state[name]
+        known = self._tables.get(name)
+        if known is None or known[0] is not data:
+            known = self._tables[name] = (data, codec(self.sensor.frames[name], interpreted=self._interpreted).table([data]))
+        return known[1]
+
+    def _state_of(self, name: str, frames: list[bytes], before: list[int], *, number: int, whole: bool) -> StateOf:
+        if not frames:
+            return self._unchanged(name, number)
+        if name in self._state:
+            frames, before = [self._state[name], *frames], [0, *before]
+        elif whole:
+            before = [0, *before[1:]]
+        which = np.repeat(np.arange(-1, len(before)), np.diff([0, *before, number])) if any(before) else repeated(len(before) - 1, number)
+        self._state[name] = frames[-1]
+        table: Table = codec(self.sensor.frames[name], interpreted=self._interpreted).table(frames)
+        return table, which
+
+
+@dataclass(frozen=True, eq=False)
+class _Part:
+    """Our frames in a piece of input: indices, or None where all are ours."""
+
+    spans: Spans
+    where: NDArray[np.intp] | None
+    number: int
+
+    @classmethod
+    def of(cls, spans: Spans, frame: str) -> _Part:
+        """The frames of one type in a piece."""
+        if isinstance(spans, Alike) and spans.names[spans.kind] == frame:
+            return cls(spans, None, len(spans))
+        own, kind = spans.names.index(frame) if frame in spans.names else -1, alike(spans.kinds)
+        if kind is not None and kind == own:
+            return cls(spans, None, len(spans.kinds))
+        mine = spans.kinds == own
+        if mine.all():
+            return cls(spans, None, len(mine))
+        where = np.flatnonzero(mine)
+        return cls(spans, where, len(where))
+
+    @cached_property
+    def own(self) -> NDArray[np.intp] | slice:
+        """Which frames are ours, as a slice where they follow one another."""
+        where = self.where
+        if where is None or not len(where):
+            return slice(0, self.number)
+        first, last = where.item(0), where.item(-1)
+        return slice(first, last + 1) if last - first == len(where) - 1 else where
+
+    def column(self, name: str) -> NDArray[Any]:
+        """An array of the spans, for our frames."""
+        array: NDArray[Any] = getattr(self.spans, name)
+        return array if self.where is None else some(array, self.own)
+
+    def table(self, codec: Codec) -> Table:
+        """Our frames as columns."""
+        spans = self.spans
+        if isinstance(spans, Alike) and self.where is None and isinstance(codec, CompiledCodec):
+            return codec.lined(spans.layout, spans.rows, room=len(spans.buffer))
+        return codec.gather(spans.buffer, self.column("starts"), self.column("sizes"))
+
+
+def data_frame(sensor: Sensor, found: Sequence[Spans]) -> str | None:
+    """The data frame type that an input is read by where none is asked for: the configured one, or the first that arrived.
+
+    Returns:
+        None where the sensor has several, none is configured, and none has arrived yet.
+    """
+    names = [name for name, frame in sensor.frames.items() if frame.data]
+    if len(names) < 2 or sensor.options.get("answer") in names:
+        return sensor.data_frame
+    arrived = ((spans.names, spans.kinds[np.isin(spans.kinds, _kinds(spans, names))]) for spans in found)
+    return next((known[kinds[0]] for known, kinds in arrived if len(kinds)), None)
+
+
+def _counted(sensor: Sensor, frame: str) -> bool:
+    """Whether packets of this type are counted: not, if only other data frames have the counter."""
+    assert sensor.sequence is not None
+    having = [name for name, other in sensor.frames.items() if other.data and sensor.sequence.field in codec(other).schema.fields]
+    return frame in having or not having
+
+
+def _kinds(spans: Spans, names: Sequence[str]) -> list[int]:
+    return [index for index, name in enumerate(spans.names) if name in names]
+
+
+def _offsets(parts: Sequence[_Part]) -> Numbers:
+    """Where our frames begin in the input; as a range, where all have one size and follow one another."""
+    runs = [part.spans.run for part in parts if part.where is None and isinstance(part.spans, Alike)]
+    follow = all(before.stop == after.start and before.step == after.step for before, after in pairwise(runs))
+    if runs and len(runs) == len(parts) and follow:
+        return range(runs[0].start, runs[-1].stop, runs[0].step)
+    return _joined([part.column("offsets") for part in parts], np.int64)
+
+
+def _times(parts: Sequence[NDArray[np.int64]]) -> NDArray[np.int64]:
+    """Arrival times, 0 where nobody knows them."""
+    known = {alike(part) for part in parts if len(part)}
+    if len(known) == 1 and (only := known.pop()) is not None:
+        return repeated(max(only, 0), sum(map(len, parts)))
+    found = _joined(parts, np.int64)
+    return np.maximum(found, 0) if len(found) and int(found.min()) < 0 else found
+
+
+def _joined(parts: Sequence[NDArray[Any]], dtype: Any) -> NDArray[Any]:
+    if len(parts) == 1:
+        return parts[0]
+    return np.concatenate(parts) if parts else np.empty(0, dtype)

@@ -1,0 +1,129 @@
+"""Checksums of many frames by compiled code, where each byte adds its share by XOR: a table of 256 for each place.
+
+A CRC is such a sum, and so is every XOR of bytes or words: the checksum of a frame is that of zeros, XORed with what each
+byte, alone among zeros, changes about it. The tables are made by the algorithm itself; where a share is the byte as it
+stands, words of eight bytes are XORed instead.
+"""
+
+from __future__ import annotations
+
+from weakref import WeakKeyDictionary
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarspec.points.numba_kernels.kernels import function_of, require
+from lidarspec.points.numba_kernels.source import HEAD
+from lidarspec.spec.checksums import Crc, WordXor, Xor
+from lidarspec.wire.layout import Bytes2D, Seal, Sums
+
+#: frames of a layout that earn its tables, and that a batch has to have.
+EARNED, FEW = 4096, 64
+#: bytes whose tables stay in the fastest caches.
+LONGEST = 128
+
+_SHARES = (
+    HEAD
+    + """\
+@njit([(BYTES, INTEGER, PLACES, WORDS, INTEGER, MADE_PLACES)], cache=True, nogil=True)
+def kernel(rows, size, places, tables, start, found):
+    for i in range(len(found)):
+        total, base = start, i * size
+        for k in range(len(places)):
+            word, first = word_at(rows, base + at(places, k)), k * 2048
+            total ^= np.int64(at(tables, first + (word & 255)) ^ at(tables, first + 256 + (word >> 8 & 255)))
+            total ^= np.int64(at(tables, first + 512 + (word >> 16 & 255)) ^ at(tables, first + 768 + (word >> 24 & 255)))
+            total ^= np.int64(at(tables, first + 1024 + (word >> 32 & 255)) ^ at(tables, first + 1280 + (word >> 40 & 255)))
+            total ^= np.int64(at(tables, first + 1536 + (word >> 48 & 255)) ^ at(tables, first + 1792 + (word >> 56 & 255)))
+        put(found, i, total)
+"""
+)
+_XORED = (
+    HEAD
+    + """\
+@njit([(BYTES, INTEGER, PLACES, PLACES, PLACES, INTEGER, MADE_PLACES)], cache=True, nogil=True)
+def kernel(rows, size, places, lows, highs, start, found):
+    for i in range(len(found)):
+        low, high, base = 0, 0, i * size
+        for k in range(len(places)):
+            word = word_at(rows, base + at(places, k))
+            low ^= word & at(lows, k)
+            high ^= word & at(highs, k)
+        for bits in (32, 16, 8):
+            low ^= low >> bits
+            high ^= high >> bits
+        put(found, i, start ^ (low & 255) ^ (high & 255) << 8)
+"""
+)
+
+
+class _Shares:
+    """What each byte of a frame changes about one checksum, once it is worth asking.
+
+    Attributes:
+        words: where eight bytes are loaded at a time.
+        tables: of each of these bytes, its share by its value; 0 for those that are not covered, or were before.
+        is_plain: whether all shares are the bytes as they stand, in the low byte of the checksum or the high one.
+        lows, highs: where shares are the bytes themselves, which of them go into the low byte of the checksum, and the high one.
+    """
+
+    def __init__(self, seal: Seal) -> None:
+        self.seen = 0
+        self._seal = seal
+        self._places = np.concatenate([np.arange(*span, dtype=np.int64) for span in seal.spans])
+        self.is_suited = isinstance(seal.algorithm, Crc | Xor | WordXor) and seal.algorithm.width <= 16 and len(self._places) <= LONGEST
+        self.start, self.tables = 0, np.empty(0, np.uint16)
+
+    def make(self, size: int) -> None:
+        """Ask the algorithm, for frames of so many bytes."""
+        places = self._places.tolist()
+        rows = np.zeros((len(places), 256, len(places)), np.uint8)
+        rows[np.arange(len(places)), :, np.arange(len(places))] = np.arange(256)
+        values = self._seal.algorithm.batch(rows.reshape(-1, len(places))).astype(np.uint16)
+        shares = dict(zip(places, (values ^ values[0]).reshape(-1, 256), strict=True))
+        words: list[int] = []
+        for place in sorted(shares):
+            if not words or place >= words[-1] + 8:
+                words.append(min(place, size - 8))
+        none = np.zeros(256, np.uint16)
+        self.words, self.start = np.array(words, np.int64), int(values[0])
+        self.tables = np.concatenate([shares.pop(word + byte, none) for word in words for byte in range(8)])
+        low, high = (self.tables.reshape(-1, 256)[:, 1] == one for one in (1, 256))
+        bytes_ = np.arange(256, dtype=np.uint16)
+        self.is_plain = np.array_equal(self.tables.reshape(-1, 256), np.outer(low, bytes_) + np.outer(high, bytes_ << 8))
+        self.lows, self.highs = (np.packbits(np.repeat(part, 8)).view("<i8").astype(np.int64) for part in (low, high))
+
+    def values(self, rows: Bytes2D) -> NDArray[np.uint64]:
+        """The checksums of frames, (n,)."""
+        found, flat = np.empty(len(rows), np.int64), rows.reshape(-1)
+        if self.is_plain:
+            function_of(_XORED)(flat, rows.shape[1], self.words, self.lows, self.highs, self.start, found)
+        else:
+            function_of(_SHARES)(flat, rows.shape[1], self.words, self.tables, self.start, found)
+        return found.view(np.uint64)
+
+
+_KNOWN: WeakKeyDictionary[Seal, _Shares] = WeakKeyDictionary()
+
+
+def checksums(seal: Seal, rows: Bytes2D) -> NDArray[np.uint64] | None:
+    """The checksums of frames, (n,); None where NumPy is to compute them."""
+    known = _KNOWN.get(seal)
+    if known is None:
+        known = _KNOWN[seal] = _Shares(seal)
+    known.seen += len(rows)
+    if not known.is_suited or len(rows) < FEW or known.seen < EARNED or rows.shape[1] < 8 or not rows.flags.c_contiguous:
+        return None
+    if not len(known.tables):
+        known.make(rows.shape[1])
+    return known.values(rows)
+
+
+def compiled() -> Sums:
+    """The function that a decoder computes checksums by; the values are the same.
+
+    Raises:
+        UsageError: where Numba is not installed, or does not work here.
+    """
+    require()
+    return checksums

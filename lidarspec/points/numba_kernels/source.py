@@ -1,0 +1,420 @@
+"""The source of a kernel: the columns of a plan as one loop over packets, blocks and points, which reads the frames' bytes.
+
+Each value is computed in the loop at which it varies: what a packet has once outside the loop over its blocks, and so on.
+Where sines and cosines of each point's own angle are left, the points of a few packets go through scratch arrays into a
+second, flat loop, which computes several at a time. Lengths and places stand in the text as numbers where all frames have
+the same, else they are arguments, so that one kernel serves all lengths.
+
+The text of a kernel: the loops around what `kernelsource.Writer` has written, and where the columns go.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Set
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarspec.columns.graph import Node, is_full, only_field
+from lidarspec.points.numba_kernels.writer import TEMPLATES, Value, Wanted, Writer, is_cheap, line
+from lidarspec.points.numpy_plan.windows import every_value, possible, window
+from lidarspec.spec.vocabulary import LookUp, side_by_side
+from lidarspec.wire.layout import Layout
+
+#: points of which the scratch arrays stay in the fastest cache.
+CHUNK = 2048
+#: half turns up to which an angle is kept in float32 in a table.
+SMALL = 0.125
+
+
+@dataclass(frozen=True, eq=False)
+class Later:
+    """A product or sum (`sign`) of float32 values, one of which is the sine or cosine of an angle that the flat loop takes."""
+
+    sign: str
+    parts: tuple[Any, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Trig:
+    """The cosine or sine of an angle, by its number."""
+
+    name: str
+    angle: int
+
+
+class Expressions(Writer):
+    """Writes traced expressions into the loops, each value where it varies."""
+
+    def double(self, value: Any, depth: int = 0) -> Value:
+        """An expression in float64, or a condition."""
+        if not isinstance(value, Node):
+            return self.constant(value, depth)
+        return self.once(("double", value), lambda: self._double(value))  # type: ignore[no-any-return]
+
+    def _double(self, node: Node) -> Value:
+        if node.kind == "field":
+            return self._physical(node)
+        if node.kind == "call" and not self.shared(node):
+            source = only_field(node)
+            if source is not None and is_full(source, self.width) and not is_cheap(node):
+                found = self.looked_up(node, source, np.float64, 1.0)
+                if found is not None:
+                    return found
+            return self._call(node)
+        return self.given(node)
+
+    def shared(self, node: Node) -> bool:
+        """Whether an expression is made of other frames' fields only: then NumPy computes it, mostly once for all packets."""
+        return self.once(("shared", node), lambda: self._shared(node))  # type: ignore[no-any-return]
+
+    def _shared(self, node: Node) -> bool:
+        if node.kind in ("state", "on"):
+            return node.kind == "state" or self.shared(node.args[0])
+        return node.kind == "call" and all(self.shared(arg) for arg in node.args if isinstance(arg, Node))
+
+    def _call(self, node: Node) -> Value:
+        depth = max(len(arg.shape) for arg in node.args if isinstance(arg, Node))
+        if any(np.ndim(arg) > depth + 1 or (np.ndim(arg) == depth + 1 and len(arg) != 1) for arg in node.args if not isinstance(arg, Node)):
+            return self.given(node)
+        if node.function is side_by_side and len(node.shape) == depth + 1:
+            parts = [self.double(arg, depth) for arg in node.args]
+            chain = "".join(f"{part.text} if i{depth} == {at} else " for at, part in enumerate(parts[:-1]))
+            return self.let(2 + depth, f"{chain}{parts[-1].text}") if len(parts) > 1 else parts[0]
+        if len(node.shape) != depth:
+            return self.given(node)
+        if isinstance(node.function, LookUp) and len(node.function.entries):
+            index, table = self.double(node.args[0]), self.array(node.function.entries)
+            return self.let(index.level, f"looked_up({table}, {index.text})")
+        if node.function is np.where and len(node.args) == 3:
+            return self._where(*(self.double(arg, depth) for arg in node.args))
+        template = self._template(node)
+        if template is None:
+            return self.given(node)
+        args = [self.double(arg, depth) for arg in node.args]
+        return self.let(max(arg.level for arg in args), template.format(*(arg.text for arg in args)))
+
+    def _template(self, node: Node) -> str | None:
+        kinds = [arg.sample.array.dtype.kind if isinstance(arg, Node) else np.asarray(arg).dtype.kind for arg in node.args]
+        if all(kind == "b" for kind in kinds):
+            logical: dict[Any, str] = {np.bitwise_and: "({} & {})", np.bitwise_or: "({} | {})", np.invert: "(not {})"}
+            logical |= {np.logical_and: "({} & {})", np.logical_or: "({} | {})", np.logical_not: "(not {})"}
+            return logical.get(node.function)
+        found = TEMPLATES.get(node.function)
+        return found if found is not None and found.count("{}") == len(node.args) else None
+
+    def _where(self, condition: Value, first: Value, second: Value) -> Value:
+        level = max(condition.level, first.level, second.level)
+        return self.let(level, f"{first.text} if {condition.text} else {second.text}")
+
+    def _physical(self, node: Node) -> Value:
+        leaf = self.layout.leaves.get(node.path)
+        raw = self.raw(leaf) if leaf is not None else None
+        if raw is None or leaf is None:
+            return self.given(node)
+        info = leaf.info
+        return self.let(
+            raw.level, f"{raw.text} * {float(info.scale)!r} + {float(info.offset)!r}" if info.scaled else f"np.float64({raw.text})"
+        )
+
+    def single(self, value: Any, *, exact: bool = False, root: bool = False) -> Any:
+        """An expression in float32: a `Value`, or a `Later` that the flat loop completes.
+
+        Args:
+            exact: as the plain evaluation rounds it.
+            root: sums are those of places, which may be taken in float32.
+        """
+        if not isinstance(value, Node):
+            return self.constant(value, len(self.shape), "float32")
+        return self.once(("single", value, exact), lambda: self._single(value, exact=exact, root=root))
+
+    def _single(self, node: Node, *, exact: bool, root: bool) -> Any:
+        found = self._of_field(node, exact=exact)
+        if found is not None:
+            return found
+        if is_full(node, self.width) and node.kind == "call" and not exact:
+            if node.function is np.multiply or (root and node.function in (np.add, np.subtract)):
+                sign = {np.multiply: "*", np.add: "+", np.subtract: "-"}[node.function]
+                return self.combined(sign, *(self.single(arg) for arg in node.args))
+            if node.function in (np.cos, np.sin) and is_full(node.args[0], self.width):
+                return Trig(node.function.__name__, self.angle_of(node.args[0]))
+        made = self.double(node)
+        return self.let(made.level, f"np.float32({made.text if not exact else f'number({made.text})'})")
+
+    def combined(self, sign: str, first: Any, second: Any) -> Any:
+        """A product or sum; in the loops where both parts are there."""
+        if isinstance(first, Value) and isinstance(second, Value):
+            return self.let(max(first.level, second.level), f"{first.text} {sign} {second.text}")
+        return Later(sign, (first, second))
+
+    def _of_field(self, node: Node, *, exact: bool) -> Value | None:
+        """An expression of one field that each point has: by a straight line or a table."""
+        source = only_field(node)
+        leaf = self.layout.leaves.get(source.path) if source is not None and is_full(source, self.width) else None
+        if leaf is None or source is None or window(leaf) is None:
+            return None
+        values = every_value(node, leaf)
+        assert values is not None
+        straight = line(leaf, values, exact=exact)
+        raw = self.raw(leaf) if straight is not None else None
+        if straight is not None and raw is not None:
+            return self.let(self.inner, straight.text(raw.text))
+        if node.function in (np.cos, np.sin) and node.args[0] in self.both:
+            return self.beside(node, leaf)
+        return self.looked_up(node, source, np.float32, 1.0)
+
+    def angle_of(self, node: Node) -> int:
+        """The number of an angle whose cosine or sine the flat loop takes."""
+
+        def make() -> int:
+            self.angles.append(self.angle(node, 1 / np.pi, len(node.shape)))
+            return len(self.angles) - 1
+
+        return int(self.once(("angle", node), make))
+
+    def angle(self, value: Any, factor: float, depth: int) -> Value:
+        """An angle times a factor that makes half turns of it, in float64."""
+        if not isinstance(value, Node):
+            return self.constant(np.asarray(value) * factor, depth)
+        if not is_full(value, self.width) or value.kind != "call" or self.shared(value):
+            return self._scaled(value, factor)
+        source = only_field(value)
+        if source is not None and not is_cheap(value):
+            found = self._small_angle(value, source, factor)
+            return found if found is not None else self._scaled(value, factor)
+        return self._sum(value, factor)
+
+    def _sum(self, node: Node, factor: float) -> Value:
+        function, args = node.function, node.args
+        depth = max(len(arg.shape) for arg in args if isinstance(arg, Node))
+        simple = {np.negative: -1.0, np.positive: 1.0, np.deg2rad: np.pi / 180, np.radians: np.pi / 180}
+        if function in simple:
+            return self.angle(args[0], factor * simple[function], depth)
+        if function in (np.add, np.subtract):
+            first, second = (self.angle(arg, factor, depth) for arg in args)
+            return self.let(max(first.level, second.level), f"{first.text} {'+' if function is np.add else '-'} {second.text}")
+        if function is np.multiply and any(not isinstance(arg, Node) for arg in args):
+            known, other = args if not isinstance(args[0], Node) else args[::-1]
+            if np.size(known) == 1:
+                return self.angle(other, factor * float(np.asarray(known).reshape(())), depth)
+            row, made = self.constant(np.asarray(known) * factor, depth), self.double(other)
+            return self.let(max(row.level, made.level), f"{made.text} * {row.text}")
+        if function is np.where and len(args) == 3:
+            return self._where(self.double(args[0], depth), *(self.angle(arg, factor, depth) for arg in args[1:]))
+        return self._scaled(node, factor)
+
+    def _scaled(self, node: Node, factor: float) -> Value:
+        made = self.double(node)
+        return self.let(made.level, f"{made.text} * {factor!r}")
+
+    def _small_angle(self, node: Node, source: Node, factor: float) -> Value | None:
+        """An angle by one field: a table in float32 where that is exact enough."""
+        values = possible(node, self.layout.leaves)
+        if values is None:
+            return None
+        with np.errstate(all="ignore"):
+            short = bool(np.nanmax(np.abs(values[~np.isinf(values)] * factor), initial=0) <= SMALL)
+        return self.looked_up(node, source, np.float32 if short else np.float64, factor)
+
+
+HEAD = """\
+# Made by lidarspec; kept so that it is compiled only once.
+import math
+
+import numpy as np
+from numba import njit
+
+from lidarspec.points.numba_kernels.arithmetic import (
+    BYTES, DOUBLES, INTEGER, MADE_PLACES, MADE_SINGLES, PLACES, SINGLES, WORDS,
+    at, byte_at, cos_sin, larger, looked_up, modulo, narrowed, number, put, smaller, word_at,
+)
+
+nan, inf = np.nan, np.inf
+
+
+"""
+
+#: a kernel that puts the points of packets to where they belong.
+SPREAD = (
+    HEAD
+    + """\
+@njit([(SINGLES, PLACES, INTEGER, MADE_SINGLES)], cache=True, nogil=True)
+def kernel(values, first, width, found):
+    for p in range(len(first)):
+        start = at(first, p)
+        if start >= 0:
+            for i in range(width):
+                put(found, start + i, at(values, p * width + i))
+"""
+)
+
+_TYPES = {"float32": "SINGLES", "float64": "DOUBLES", "int64": "PLACES"}
+
+
+@dataclass(frozen=True, eq=False)
+class Text:
+    """A kernel.
+
+    Attributes:
+        source: of a module with the function `kernel`.
+        wanted: what it is called with.
+        names: of the columns it makes, float32 all of them.
+    """
+
+    source: str
+    wanted: Wanted
+    names: tuple[str, ...]
+
+
+class Assembly:
+    """The stores of a kernel, in its loops and in the flat one after them."""
+
+    def __init__(self, writer: Expressions) -> None:
+        self.writer = writer
+        self.flat: list[str] = []
+        self._kept: dict[str, str] = {}
+        self.scratch: list[str] = []
+
+    def column(self, name: str, made: Any) -> None:
+        """Where a column goes."""
+        if isinstance(made, Value):
+            self.writer.lines[-1].append(f"put(out_{name}, o, {made.text})")
+        else:
+            self.flat.append(f"put(out_{name}, o, {self.text(made)})")
+
+    def together(self, made: Mapping[str, Any]) -> None:
+        """Coordinates that are nan all or none."""
+        if all(isinstance(value, Value) for value in made.values()):
+            lines, texts = self.writer.lines[-1], {name: value.text for name, value in made.items()}
+        else:
+            lines, texts = self.flat, {name: self.text(value) for name, value in made.items()}
+        lines += [f"{name} = {text}" for name, text in texts.items()]
+        lines.append(f"bad = np.float32({' + '.join(f'{name} * np.float32(0)' for name in made)})")
+        lines += [f"put(out_{name}, o, {name} + bad)" for name in made]
+
+    def text(self, made: Any) -> str:
+        """An expression in the flat loop."""
+        if isinstance(made, Later):
+            return f"({f' {made.sign} '.join(map(self.text, made.parts))})"
+        if isinstance(made, Trig):
+            return f"{made.name}{made.angle}"
+        if made.level == 0:
+            return str(made.text)
+        return self._stored(made, "float32")
+
+    def _stored(self, made: Value, kind: str) -> str:
+        """A value of the loops, kept for the flat one."""
+        if made.text not in self._kept:
+            name = self._kept[made.text] = f"h{len(self.scratch)}"
+            self.scratch.append(f"{name} = np.empty(held, np.{kind})")
+            self.writer.lines[-1].append(f"put({name}, k, {made.text})")
+        return f"at({self._kept[made.text]}, k)"
+
+    def turns(self) -> list[str]:
+        """The cosines and sines that the flat loop begins with."""
+        return [f"cos{index}, sin{index} = cos_sin({self._stored(made, 'float64')})" for index, made in enumerate(self.writer.angles)]
+
+
+def written(
+    layout: Layout,
+    shape: tuple[int, ...],
+    expressions: Mapping[str, Any],
+    tables: dict[Any, NDArray[Any]],
+    varying: Set[str],
+    *,
+    together: bool,
+) -> Text:
+    """The kernel of some columns.
+
+    Args:
+        layout, shape, tables, varying: see `Writer`.
+        expressions: of the columns, by name.
+        together: where one coordinate is nan, all are.
+    """
+    writer = Expressions(layout, shape, tables, varying)
+    assembly = Assembly(writer)
+    writer.both = _both(expressions.values())
+    made = {name: _made(writer, name, value) for name, value in expressions.items()}
+    places = {name: value for name, value in made.items() if name in "xyz"} if together else {}
+    if places:
+        assembly.together(places)
+    for name, value in made.items():
+        if name not in places:
+            assembly.column(name, value)
+    turns = assembly.turns()
+    return Text(HEAD + _function(writer, assembly, turns, tuple(made)), writer.wanted, tuple(made))
+
+
+def _both(expressions: Iterable[Any]) -> set[Node]:
+    """The angles of which the cosine and the sine are wanted."""
+    seen, waiting = set[Node](), [value for value in expressions if isinstance(value, Node)]
+    while waiting:
+        node = waiting.pop()
+        if node not in seen:
+            seen.add(node)
+            waiting += [arg for arg in node.args if isinstance(arg, Node)]
+    cosines, sines = ({node.args[0] for node in seen if node.function is function} for function in (np.cos, np.sin))
+    return {node for node in cosines & sines if isinstance(node, Node)}
+
+
+def _made(writer: Expressions, name: str, value: Any) -> Any:
+    if name == "azimuth":
+        angle = writer.double(value, len(writer.shape))
+        return writer.let(angle.level, f"narrowed({angle.text})")
+    return writer.single(value, exact=name == "intensity", root=True)
+
+
+def _function(writer: Writer, assembly: Assembly, turns: list[str], names: tuple[str, ...]) -> str:
+    """The signature and the loops."""
+    width = writer.number(writer.width)
+    held = writer.number(max(CHUNK // writer.width, 1)) if turns else "count"
+    loops = _loops(writer, width)
+    wanted = writer.wanted
+    parameters = [("rows", "BYTES"), ("stride", "INTEGER"), ("first", "INTEGER"), ("count", "INTEGER"), ("numbers", "PLACES")]
+    parameters += [(f"c{index}", _TYPES[array.dtype.name]) for index, array in enumerate(wanted.arrays)]
+    for index in range(len(wanted.nodes)):
+        parameters += [(f"g{index}", "DOUBLES"), (f"s{index}", "INTEGER")]
+    parameters += [(f"out_{name}", "MADE_SINGLES") for name in names]
+    arguments, types = ", ".join(name for name, _ in parameters), ", ".join(kind for _, kind in parameters)
+    body = [f"n{index} = at(numbers, {index})" for index in range(len(wanted.numbers))]
+    body += [f"step = {held}", f"held = step * {width}", *assembly.scratch, *writer.lines[0]]
+    body += [
+        "for begin in range(first, first + count, step):",
+        "    end = min(begin + step, first + count)",
+        "    start = begin * " + width,
+    ]
+    body += ["    for p in range(begin, end):", "        base = p * stride", *(f"        {text}" for text in loops)]
+    if turns:
+        body += [f"    for k in range((end - begin) * {width}):", "        o = start + k"]
+        body += [f"        {text}" for text in (*turns, *assembly.flat)]
+    head = f'@njit([({types},)], cache=True, nogil=True, error_model="numpy")\ndef kernel({arguments}):\n'
+    return head + "".join(f"    {text}\n" for text in body)
+
+
+def _loops(writer: Writer, width: str) -> list[str]:
+    """What is done for a packet: its own values, then the loops over its arrays."""
+    lines = [*writer.lines[1]]
+    depth = 0
+    for level in range(2, writer.inner + 1):
+        length = writer.shape[level - 2]
+        if length > 1:
+            lines.append(f"{'    ' * depth}for i{level - 2} in range({writer.number(length)}):")
+            depth += 1
+        if level == writer.inner:
+            lines += [f"{'    ' * depth}{text}" for text in _spot(writer, width)]
+        lines += [f"{'    ' * depth}{text}" for text in writer.lines[level]]
+    if writer.inner == 1:
+        lines = [*_spot(writer, width), *lines]
+    return lines
+
+
+def _spot(writer: Writer, width: str) -> list[str]:
+    """Where a point stands among those under way, and among all."""
+    return [f"k = (p - begin) * {width} + {writer.place(writer.shape)}", "o = start + k"]
+
+
+def empty(names: tuple[str, ...], size: int) -> dict[str, NDArray[np.float32]]:
+    """The columns before a kernel fills them."""
+    return {name: np.empty(size, np.float32) for name in names}

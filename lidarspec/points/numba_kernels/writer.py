@@ -1,0 +1,343 @@
+"""What the generated kernels know of single fields and functions: bytes to integers, straight lines in tables, NumPy's names.
+
+What a kernel's source is written with: variables in the loops, arguments, the bytes of fields, tables by them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Set
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarspec.columns.graph import Node, key, last_axis
+from lidarspec.points.numpy_plan.windows import every_value, possible, raw_values, window
+from lidarspec.wire.layout import Layout, Leaf
+
+#: how a kernel writes NumPy's functions of numbers; what is not here is computed by NumPy itself.
+TEMPLATES: dict[Any, str] = {
+    np.add: "({} + {})",
+    np.subtract: "({} - {})",
+    np.multiply: "({} * {})",
+    np.true_divide: "({} / {})",
+    np.negative: "(-{})",
+    np.positive: "{}",
+    np.absolute: "abs({})",
+    np.deg2rad: f"({{}} * {np.pi / 180!r})",
+    np.radians: f"({{}} * {np.pi / 180!r})",
+    np.rad2deg: f"({{}} * {180 / np.pi!r})",
+    np.degrees: f"({{}} * {180 / np.pi!r})",
+    np.minimum: "smaller({}, {})",
+    np.maximum: "larger({}, {})",
+    np.less: "({} < {})",
+    np.less_equal: "({} <= {})",
+    np.greater: "({} > {})",
+    np.greater_equal: "({} >= {})",
+    np.equal: "({} == {})",
+    np.not_equal: "({} != {})",
+    np.floor: "np.floor({})",
+    np.ceil: "np.ceil({})",
+    np.trunc: "np.trunc({})",
+    np.rint: "np.rint({})",
+    np.mod: "modulo({}, {})",
+    np.sqrt: "np.sqrt({})",
+    np.sin: "math.sin({})",
+    np.cos: "math.cos({})",
+    np.tan: "math.tan({})",
+    np.arctan: "math.atan({})",
+    np.arctan2: "math.atan2({}, {})",
+    np.exp: "math.exp({})",
+    np.exp2: "np.exp2({})",
+    np.isfinite: "math.isfinite({})",
+    np.isnan: "math.isnan({})",
+    np.nan_to_num: "number({})",
+}
+
+#: what costs hardly more than looking its result up; with these, whatever is made of numbers stays a number.
+CHEAP: set[Any] = {np.add, np.subtract, np.multiply, np.negative, np.positive, np.absolute, np.deg2rad, np.radians, np.minimum, np.maximum}
+CHEAP |= {np.less, np.less_equal, np.greater, np.greater_equal, np.equal, np.not_equal, np.where}
+FEW = 8
+#: dividing by one of these numbers, or the rest of it, is a number too.
+_DIVISIONS = {np.true_divide, np.mod}
+
+
+def is_cheap(node: Node) -> bool:
+    """Whether an expression of one field is a few simple operations."""
+    number, waiting = 0, [node]
+    while waiting and number <= FEW:
+        this = waiting.pop()
+        number += 1
+        if this.kind == "call" and this.function not in CHEAP:
+            return False
+        waiting += [arg for arg in this.args if isinstance(arg, Node)]
+    return number <= FEW
+
+
+def is_number(value: Any, leaves: Any) -> bool:
+    """Whether an expression is finite whatever the bytes are: made of integer fields that the layout has, by safe operations."""
+    if not isinstance(value, Node):
+        return bool(np.isfinite(value).all())
+    if value.kind == "field":
+        return value.path in leaves and leaves[value.path].info.kind != "float"
+    if value.kind != "call":
+        return False
+    found = possible(value, leaves)
+    if found is not None:
+        return bool(np.isfinite(found).all())
+    if value.function in _DIVISIONS:
+        divisor = value.args[1]
+        return not isinstance(divisor, Node) and bool(np.all(divisor)) and is_number(value.args[0], leaves)
+    return (value.function in CHEAP or value.function in (np.sin, np.cos)) and all(is_number(arg, leaves) for arg in value.args)
+
+
+def integer(leaf: Leaf, byte: Any) -> str | None:
+    """The raw value of a field as an expression of its bytes, `byte(offset)` each; None where it has no simple one."""
+    if leaf.wire is not None:
+        size, kind = leaf.wire.itemsize, leaf.wire.kind
+        if kind not in "iu" or size > 4:
+            return None
+        order = range(size) if leaf.wire.byteorder != ">" else reversed(range(size))
+        total = " | ".join(
+            f"{byte(leaf.offset + at)} << {8 * power}" if power else byte(leaf.offset + at) for power, at in enumerate(order)
+        )
+        return f"np.int64(np.int{8 * size}({total}))" if kind == "i" else f"({total})"
+    if len(leaf.shape) > len(leaf.strides) or leaf.elements[0].width > 48:
+        return None
+    element = leaf.elements[0]
+    parts = []
+    for part in element.segments:
+        bits = byte(leaf.offset + part.byte)
+        bits = bits if part.mask == 0xFF else f"({bits} & {part.mask})"
+        bits = f"({bits} >> {part.low})" if part.low else bits
+        parts.append(f"({bits} << {part.target})" if part.target else bits)
+    total, sign = f"({' | '.join(parts)})", 1 << (element.width - 1)
+    return f"(({total} ^ {sign}) - {sign})" if element.signed else total
+
+
+@dataclass(frozen=True)
+class Line:
+    """A table that is a straight line of the raw value from `low` to `high`, and `other` for all values besides.
+
+    Attributes:
+        exact: whether the arithmetic has to be that of float64.
+    """
+
+    slope: float
+    start: float
+    low: int | None
+    high: int | None
+    other: float
+    exact: bool
+
+    def text(self, raw: str) -> str:
+        """The value as an expression of the raw one."""
+        if self.exact:
+            found = f"np.float32({raw} * {self.slope!r} + {self.start!r})"
+        elif self.slope == 1 and self.start == 0:
+            found = f"np.float32(np.int32({raw}))"
+        else:
+            found = f"(np.float32(np.int32({raw})) * np.float32({self.slope!r})" + (
+                f" + np.float32({self.start!r}))" if self.start else ")"
+            )
+        tests = [f"{raw} {sign} {limit}" for sign, limit in ((">=", self.low), ("<=", self.high)) if limit is not None]
+        return f"({found} if {' and '.join(tests)} else np.float32({'nan' if np.isnan(self.other) else 'inf'}))" if tests else found
+
+
+def line(leaf: Leaf, values: NDArray[Any], *, exact: bool) -> Line | None:
+    """The line that a table by a field's window is, in float32: equal where `exact`, else within a unit in the last place."""
+    seen = window(leaf)
+    assert seen is not None
+    raw = raw_values(leaf, seen).astype(np.int64)
+    good = np.isfinite(values)
+    if not good.any():
+        return None
+    low, high = int(raw[good].min()), int(raw[good].max())
+    others = values[~good]
+    if ((raw[~good] >= low) & (raw[~good] <= high)).any() or high == low:
+        return None
+    if len(others) and not (np.isnan(others).all() or (others == np.inf).all()):
+        return None
+    first, last = float(values[raw == low][0]), float(values[raw == high][0])
+    slope = (last - first) / (high - low)
+    start = first - slope * low
+    slope, start = float(f"{slope:.12g}"), 0.0 if abs(start) < 1e-9 * abs(slope) else float(f"{start:.12g}")
+    wanted, some = values[good].astype(np.float32), raw[good]
+    limits = (low if (raw < low).any() else None, high if (raw > high).any() else None)
+    other = float(others[0]) if len(others) else 0.0
+    with np.errstate(all="ignore"):
+        short = some.astype(np.float32) * np.float32(slope) + np.float32(start)
+        apart = np.abs(short.astype(np.float64) - wanted)
+        if (apart <= (0 if exact else np.spacing(np.abs(wanted)))).all():
+            return Line(slope, start, *limits, other, exact=False)
+        long = (some * slope + start).astype(np.float32)
+        if (np.abs(long.astype(np.float64) - wanted) <= (0 if exact else np.spacing(np.abs(wanted)))).all():
+            return Line(slope, start, *limits, other, exact=True)
+    return None
+
+
+@dataclass(frozen=True)
+class Value:
+    """An expression in a kernel, and the loop at which it varies: 0 never, 1 with the packet, 2 with its first array, and so on."""
+
+    text: str
+    level: int
+
+
+@dataclass
+class Wanted:
+    """What a kernel is called with besides the bytes: arrays and numbers that are known, results of nodes that are not."""
+
+    arrays: list[NDArray[Any]] = field(default_factory=list)
+    numbers: list[int] = field(default_factory=list)
+    nodes: list[Node] = field(default_factory=list)
+
+
+class Writer:
+    """Writes values into the loops.
+
+    Args:
+        layout, shape: of the frames, and of the points of a packet.
+        varying: the arrays whose lengths differ from frame to frame.
+        tables: those known already, by what they are of; added to.
+    """
+
+    def __init__(self, layout: Layout, shape: tuple[int, ...], tables: dict[Any, NDArray[Any]], varying: Set[str]) -> None:
+        self.layout, self.shape, self.width, self.varying = layout, shape, math.prod(shape), varying
+        self.inner = 1 + last_axis(shape)
+        self.wanted = Wanted()
+        self.lines: list[list[str]] = [[] for _ in range(self.inner + 1)]
+        self.angles: list[Value] = []
+        self.both: set[Node] = set()
+        self._tables = tables
+        self._known: dict[Any, Any] = {}
+        self._made = 0
+
+    def number(self, value: int) -> str:
+        """A length or place in the text."""
+        if not self.varying or value in (0, 1):
+            return str(value)
+        self.wanted.numbers.append(value)
+        return f"n{len(self.wanted.numbers) - 1}"
+
+    def once(self, name: Any, make: Callable[[], Any]) -> Any:
+        """What was made under this name."""
+        if name not in self._known:
+            self._known[name] = make()
+        return self._known[name]
+
+    def let(self, level: int, text: str) -> Value:
+        """A variable in a loop."""
+        self._made += 1
+        self.lines[level].append(f"v{self._made} = {text}")
+        return Value(f"v{self._made}", level)
+
+    def place(self, shape: tuple[int, ...]) -> str:
+        """The index of an element of an array of this shape in the loops."""
+        return self.strided(shape, tuple(self.number(math.prod(shape[axis + 1 :])) for axis in range(len(shape))))
+
+    def strided(self, shape: tuple[int, ...], strides: tuple[str, ...]) -> str:
+        """The same with steps along each axis."""
+        parts = [
+            f"i{axis}" if stride == "1" else f"i{axis} * {stride}"
+            for axis, (length, stride) in enumerate(zip(shape, strides, strict=True))
+            if length > 1
+        ]
+        return " + ".join(parts) or "0"
+
+    def array(self, values: NDArray[Any]) -> str:
+        """An array that is known, as an argument; flat."""
+        flat = np.ascontiguousarray(values).reshape(-1)
+        return str(self.once(("array", id(values)), lambda: (self._keep(flat), values))[0])
+
+    def _keep(self, flat: NDArray[Any]) -> str:
+        self.wanted.arrays.append(flat)
+        return f"c{len(self.wanted.arrays) - 1}"
+
+    def constant(self, value: Any, depth: int, kind: str = "float64") -> Value:
+        """A number, or an element of an array that all packets share."""
+        array = np.asarray(value)
+        if array.size == 1:
+            number = array.reshape(()).astype(np.float64 if array.dtype.kind != "b" else np.bool_).item()
+            return Value(f"np.float32({number!r})" if kind == "float32" else repr(number), 0)
+        shape = (1,) * (depth - array.ndim) + array.shape[max(array.ndim - depth, 0) :]
+        name = self.array(self.once(("cast", id(value), kind), lambda: (array.astype(kind), value))[0])
+        return self.once(("element", name, shape), lambda: self.let(1 + last_axis(shape), f"at({name}, {self.place(shape)})"))  # type: ignore[no-any-return]
+
+    def given(self, node: Node) -> Value:
+        """What NumPy has computed before."""
+        if node not in self.wanted.nodes:
+            self.wanted.nodes.append(node)
+        name = self.wanted.nodes.index(node)
+        found = self.once(
+            ("given", node), lambda: self.let(1 + last_axis(node.shape), f"at(g{name}, p * s{name} + {self.place(node.shape)})")
+        )
+        if node.sample.array.dtype.kind != "b":
+            return found  # type: ignore[no-any-return]
+        return self.once(("given flag", node), lambda: self.let(found.level, f"{found.text} != 0"))  # type: ignore[no-any-return]
+
+    def raw(self, leaf: Leaf) -> Value | None:
+        """The integer of a field."""
+        if leaf.info.path not in self._known:
+            text = integer(leaf, lambda offset: self.byte(leaf, offset).text)
+            self._known[leaf.info.path] = None if text is None else self.let(1 + last_axis(leaf.shape), text)
+        return self._known[leaf.info.path]  # type: ignore[no-any-return]
+
+    def byte(self, leaf: Leaf, offset: int) -> Value:
+        """A byte of the element of an array, or of the frame."""
+        shape, level = leaf.shape[: len(leaf.strides)], 1 + last_axis(leaf.shape[: len(leaf.strides)])
+        steps = self.once(("element", shape, leaf.strides), lambda: self.let(level, f"base + {self.strided(shape, self._strides(leaf))}"))
+        place = str(offset) if self._stays(leaf) else self.number(offset)
+        return self.once(  # type: ignore[no-any-return]
+            ("byte", shape, leaf.strides, offset), lambda: self.let(level, f"byte_at(rows, {steps.text} + {place})")
+        )
+
+    def _strides(self, leaf: Leaf) -> tuple[str, ...]:
+        """The steps of a field's arrays; that of the innermost arrays of all, on which most depends, is the same in all frames."""
+        strides = [self.number(stride) for stride in leaf.strides]
+        if leaf.strides and len(leaf.info.axes) == max(len(other.info.axes) for other in self.layout.leaves.values()):
+            strides[-1] = str(leaf.strides[-1])
+        return tuple(strides)
+
+    def _stays(self, leaf: Leaf) -> bool:
+        """Whether a field has the same place in all frames: it stands before what varies, or in the first element of it."""
+        leaves = self.layout.leaves.values()
+        found = [(other.offset, other.strides) for other in leaves if any(axis in self.varying for axis in other.info.axes)]
+        first, strides = min(found, default=(self.layout.size, ()))
+        inside = bool(strides) and leaf.strides == strides and leaf.offset - first < strides[-1]
+        return leaf.offset <= first or inside
+
+    def looked_up(self, node: Node, source: Node, kind: Any, factor: float) -> Value | None:
+        """An expression of one field from a table; None where the field has too many values."""
+        leaf = self.layout.leaves.get(source.path)
+        seen = window(leaf) if leaf is not None else None
+        if leaf is None or seen is None:
+            return None
+        table = self._table(node, leaf, kind, factor)
+        return self.let(self.inner, f"at({self.array(table)}, {self._code(leaf)})")
+
+    def _table(self, node: Node, leaf: Leaf, kind: Any, factor: float) -> NDArray[Any]:
+        seen = window(leaf)
+        assert seen is not None
+        name = ("kernel", np.dtype(kind).name, factor, seen.offset - leaf.offset, seen.size, leaf.size, leaf.info.path, key(node))
+        if name not in self._tables:
+            self._tables[name] = np.ascontiguousarray(np.asarray(every_value(node, leaf)) * factor, kind)
+        return self._tables[name]
+
+    def _code(self, leaf: Leaf) -> str:
+        seen = window(leaf)
+        assert seen is not None
+        first = self.byte(leaf, seen.offset).text
+        return first if seen.size == 1 else f"({first} | {self.byte(leaf, seen.offset + 1).text} << 8)"
+
+    def beside(self, node: Node, leaf: Leaf) -> Value:
+        """A cosine or sine from a table that has both side by side, so that they are fetched together."""
+        name = ("kernel", "both", leaf.info.path, leaf.size, key(node.args[0]))
+        if name not in self._tables:
+            angles = np.asarray(every_value(node.args[0], leaf))
+            self._tables[name] = np.stack([np.cos(angles), np.sin(angles)], axis=1).astype(np.float32)
+        table = self.array(self._tables[name])
+        index = self.once(("spot", name), lambda: self.let(self.inner, f"{self._code(leaf)} << 1"))
+        return self.let(self.inner, f"at({table}, {index.text}{' + 1' if node.function is np.sin else ''})")

@@ -1,0 +1,285 @@
+"""Sums of what packets or blocks have once, times rows that all of them share: matrix products, and angles that are near half a turn.
+
+Cosines and sines of angles that lie close together: the one in the middle of a packet or block, turned by a series.
+
+cos(m + d) is a polynomial of d whose coefficients are cosines and sines of m. So the points of a packet or block cost one
+row of a matrix product in float32, and no trigonometry.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarspec.columns.graph import Node, Term
+from lidarspec.points.numpy_plan.registers import Run
+
+Floats = NDArray[np.float64]
+
+TURN = 2 * np.pi
+#: radians from which on float32 is too coarse for an angle.
+NEAR = 4.0
+#: multiplications up to which OpenBLAS stays in one thread (`SMP_THRESHOLD_MIN` times `GEMM_MULTITHREAD_THRESHOLD`).
+_ALONE = 1 << 18
+
+
+@dataclass(frozen=True, eq=False)
+class Product:
+    """Numbers of packets or blocks times rows, summed.
+
+    Attributes:
+        lows: the numbers, None for 1.
+        rows: (k, inner), of each the row that it is multiplied by.
+        outer: the axes after the packets' that the numbers have.
+    """
+
+    lows: Sequence[Node | None]
+    rows: Floats
+    outer: tuple[int, ...]
+
+    @classmethod
+    def of(cls, parts: Sequence[Term], shape: tuple[int, ...], level: int) -> Product:
+        """The product of the parts of a sum that are low, for points of this shape; `level`: axes that the numbers may have."""
+        inner = math.prod(shape[level:])
+        rows = [np.broadcast_to(part.row, shape[level:] if part.row.ndim else (inner,)).reshape(inner) for part in parts]
+        return cls([part.low for part in parts], np.stack(rows), shape[:level])
+
+    @property
+    def inner(self) -> int:
+        """The length of a row."""
+        return int(self.rows.shape[1])
+
+    @property
+    def nodes(self) -> list[Node]:
+        """What has to be known of a batch."""
+        return [low for low in self.lows if low is not None]
+
+    def left(self, run: Run) -> Floats:
+        """The numbers, (k, n times what `outer` holds)."""
+        found = np.empty((len(self.lows), len(run.rows), *self.outer))
+        for column, low in zip(found, self.lows, strict=True):
+            column[...] = 1.0 if low is None else self.values(run, low)
+        return found.reshape(len(self.lows), -1)
+
+    def values(self, run: Run, low: Node) -> Floats:
+        """The numbers of one column, (n or 1, *outer)."""
+        values = run.values(low)
+        return values.reshape(values.shape[: 1 + len(self.outer)])
+
+
+@dataclass(frozen=True, eq=False)
+class Angles:
+    """Angles that lie around one of their packet or block, which alone is reduced to half a turn.
+
+    Attributes:
+        start: what makes that one: numbers of packets or blocks, each with its factor.
+        around: the others; the first column of its product is for the start.
+        more: radians that other parts of the angles add, at least and at most.
+    """
+
+    start: Sequence[tuple[Node | None, float]]
+    around: Product
+    more: tuple[float, float]
+
+    @classmethod
+    def of(cls, product: Product, more: tuple[float, float]) -> Angles | None:
+        """The angles that a product makes; None where nothing is the same for all points of a packet or block."""
+        level = [bool((row == row[0]).all()) for row in product.rows]
+        start = [(low, float(row[0])) for low, row, is_level in zip(product.lows, product.rows, level, strict=True) if is_level]
+        if not any(low is not None for low, _ in start) or not np.isfinite((*product.rows.flat, *more)).all():
+            return None
+        others = [index for index, is_level in enumerate(level) if not is_level]
+        rows = np.vstack([np.ones(product.inner), product.rows[others]])
+        return cls(start, Product([None, *(product.lows[index] for index in others)], rows, product.outer), more)
+
+    @property
+    def nodes(self) -> list[Node]:
+        """What has to be known of a batch."""
+        return [*self.around.nodes, *(low for low, _ in self.start if low is not None)]
+
+    @property
+    def all_alike(self) -> bool:
+        """Whether all points of a packet or block have the same angle."""
+        return len(self.around.rows) == 1 and self.more == (0.0, 0.0)
+
+    def left(self, run: Run) -> tuple[Floats, NDArray[np.bool_]]:
+        """The numbers, (k, rows), the first of each within half a turn; and where angles may be that have to be reduced all the same."""
+        found, rows = self.around.left(run), self.around.rows
+        start = found[0].reshape(len(run.rows), *self.around.outer)
+        start[...] = 0
+        for low, factor in self.start:
+            start += factor if low is None else self.around.values(run, low) * factor
+        (lowest, highest), least, most = self.more, rows.min(axis=1), rows.max(axis=1)
+        middle = found[0] + (highest + lowest) / 2
+        for numbers, at in zip(found[1:], (least + most)[1:] / 2, strict=True):
+            middle += numbers * at
+        whole = np.rint(middle * (1 / TURN))
+        whole *= TURN
+        found[0] -= whole
+        middle -= whole
+        reach = np.abs(middle, out=middle)
+        for numbers, half in zip(found[1:], (most - least)[1:] / 2, strict=True):
+            reach += np.abs(numbers * half)
+        return found, ~(reach <= NEAR - (highest - lowest) / 2)
+
+
+def reduced(angles: Floats) -> Floats:
+    """Radians without whole turns: within half a turn either way."""
+    return angles - np.rint(angles / TURN) * TURN
+
+
+def multiplied(left: NDArray[Any], right: NDArray[Any], out: NDArray[Any]) -> None:
+    """A matrix product in pieces that a BLAS does in one thread; with two, a chunk would wait for the one that is busy elsewhere.
+
+    Rows come out the same in any company: for that a lone one needs another, as it would be summed in another order.
+    """
+    step = max(_ALONE // right.size, 2)
+    for start in range(0, len(left), step):
+        part, target = left[start : start + step], out[start : start + step]
+        if len(part) > 1:
+            np.matmul(part, right, out=target)
+        else:
+            target[...] = (part.repeat(2, axis=0) @ right)[:1]
+
+
+Singles = NDArray[np.float32]
+
+#: terms of the series, and radians from the middle up to which what follows them is below 1e-8.
+TERMS, NARROW = 5, 1 / 16
+#: of the derivatives of a cosine and of a sine, where cosine and sine take turns.
+_SIGNS = (1, -1, -1, 1, 1), (1, 1, -1, -1, 1)
+#: packets or blocks whose coefficients are made together.
+_WINDOW = 1 << 14
+
+
+@dataclass(frozen=True, eq=False)
+class Rotation:
+    """How the points of a packet or block are turned from its middle.
+
+    Attributes:
+        angles: what is turned.
+        moving: whether packets or blocks have a number of their own for how far; else it is the same in all.
+    """
+
+    angles: Angles
+    moving: bool
+
+    @classmethod
+    def of(cls, angles: Angles) -> Rotation | None:
+        """The rotation that makes these angles; None where that takes more than one row of numbers besides their middle."""
+        lows = angles.around.lows
+        return None if len(lows) > 2 or angles.more != (0.0, 0.0) else cls(angles, lows[-1] is not None)
+
+    @property
+    def inner(self) -> int:
+        """Points of a packet or block."""
+        return self.angles.around.inner
+
+    @cached_property
+    def span(self) -> tuple[float, float]:
+        """What is in the middle of the row, and half of its width."""
+        row = self.angles.around.rows[-1]
+        return (float(row.max()) + float(row.min())) / 2, (float(row.max()) - float(row.min())) / 2
+
+    @cached_property
+    def rows(self) -> tuple[Singles, Singles]:
+        """The right sides of the products, for cosines and for sines, (k, inner)."""
+        middle, half = self.span
+        row = self.angles.around.rows[-1] - middle
+        if not self.moving:
+            return _single([np.cos(row), -np.sin(row)]), _single([np.cos(row), np.sin(row)])
+        series = [(row / half) ** term / math.factorial(term) for term in range(TERMS)]
+        return tuple(_single([s * t for s, t in zip(signs, series, strict=True)]) for signs in _SIGNS)  # type: ignore[return-value]
+
+    def turns(self, run: Run) -> Turns:
+        """The left sides of the products, for a batch."""
+        around, (middle, half) = self.angles.around, self.span
+        terms = [*self.angles.start, (around.lows[-1], middle)]
+        values = [(around.values(run, low), factor / TURN) for low, factor in terms if low is not None]
+        return Turns(self, len(run.rows), values, sum(factor for low, factor in terms if low is None) / TURN, half)
+
+
+class Turns:
+    """The left sides of the products of a batch, chunk by chunk.
+
+    Args:
+        rotation: whose.
+        number: of packets.
+        terms: what makes the angle in the middle: numbers, (n or 1, *outer), and their factors in turns; the last are those that move.
+        fixed: turns that are added to it.
+        half: the factor of those that makes the distance of the farthest points from the middle.
+
+    Attributes:
+        left: for cosines and for sines, (rows of the chunk, k).
+        wide: which rows are not close enough together.
+        some_wide, all_wide: whether there are such, and no others.
+    """
+
+    def __init__(self, rotation: Rotation, number: int, terms: list[tuple[Floats, float]], fixed: float, half: float) -> None:
+        self._rotation, self._number, self._terms, self._fixed, self._half = rotation, number, terms, fixed, half
+        self._outer = math.prod(rotation.angles.around.outer)
+        self._first = self._last = 0
+
+    def move(self, start: int, stop: int) -> None:
+        """Go to the packets from `start` to `stop`."""
+        if not self._first <= start < stop <= self._last:
+            self._first, self._last = start, min(max(stop, start + _WINDOW // self._outer), self._number)
+            self._expand()
+        rows = slice((start - self._first) * self._outer, (stop - self._first) * self._outer)
+        self.left = self._series[:, 0, rows].T, self._series[:, 1, rows].T
+        self.some_wide = self.all_wide = False
+        if self._any_wide:
+            wide = self._wide[rows]
+            self.some_wide, self.all_wide = bool(wide.any()), bool(wide.all())
+            self.wide: slice | NDArray[np.intp] = slice(None) if self.all_wide else np.flatnonzero(wide)
+            self._chunk = self._middle[rows][self.wide], self._moved[rows][self.wide]
+
+    def _expand(self) -> None:
+        """The coefficients of the packets that come next: of each, its cosine and sine times powers of how far its points go."""
+        chosen = [self._rows(values) for values, _ in self._terms]
+        middle = chosen[0] * self._terms[0][1]
+        for values, (_, factor) in zip(chosen[1:], self._terms[1:], strict=True):
+            middle += values * factor
+        middle += self._fixed
+        middle -= np.rint(middle)
+        middle *= TURN
+        single = middle.astype(np.float32)
+        rest = (middle - single).astype(np.float32)
+        cos, sin = np.cos(single), np.sin(single)
+        series = self._series = np.empty((len(self._rotation.rows[0]), 2, len(middle)), np.float32)
+        np.subtract(cos, rest * sin, out=series[0, 0])
+        np.add(sin, rest * cos, out=series[0, 1])
+        self._any_wide = False
+        if self._rotation.moving:
+            self._moved, self._middle = chosen[-1], middle
+            aside = (chosen[-1] * self._half).astype(np.float32)
+            self._wide = ~(np.abs(aside) <= NARROW)
+            self._any_wide = bool(self._wide.any())
+            np.multiply(series[0, ::-1], aside, out=series[1])
+            aside *= aside
+            np.multiply(series[:2], aside, out=series[2:4])
+            np.multiply(series[2], aside, out=series[4])
+        else:
+            series[1] = series[0, ::-1]
+
+    def _rows(self, values: Floats) -> Floats:
+        """Numbers of the packets that come next, one for each of their rows."""
+        if len(values) == 1:
+            return np.broadcast_to(values.reshape(-1), (self._last - self._first, self._outer)).reshape(-1)
+        return values[self._first : self._last].reshape(-1)
+
+    def angles(self) -> Floats:
+        """The angles of the rows that are wide, (rows, inner) radians."""
+        middle, moved = self._chunk
+        row, (at, _) = self._rotation.angles.around.rows[-1], self._rotation.span
+        return reduced(middle[:, None] + moved[:, None] * (row - at))
+
+
+def _single(rows: Sequence[Floats]) -> Singles:
+    return np.stack(rows).astype(np.float32)

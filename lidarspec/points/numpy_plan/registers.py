@@ -1,0 +1,165 @@
+"""Memory for what is computed on the way, used again and again, so that it stays in the cache; in each thread another.
+
+The registers of a program: what a chunk computes, and which of them can share memory, so that all of it stays in the cache.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarspec.columns.graph import Node
+from lidarspec.wire.layout import Bytes2D
+
+#: pieces of memory kept for use again, and bytes of each at most.
+MOST_KEPT, LARGEST = 2, 1 << 23
+
+#: bytes; where arrays begin, and what is left between them, so that they do not all fall on the same places of a cache.
+ALIGNED, APART = 64, 320
+
+
+class Scratch:
+    """A piece of memory from which arrays are taken one after another."""
+
+    def __init__(self) -> None:
+        self._memory, self._wanted = _aligned(0), 0
+        self._arranged: tuple[object, int, list[NDArray[Any]]] | None = None
+
+    def arrays(self, owner: object, number: int, kinds: Sequence[tuple[int, np.dtype[Any]]]) -> list[NDArray[Any]]:
+        """Arrays that hold anything.
+
+        Args:
+            owner, number: who asks for how much; the same two get the same arrays the next time.
+            kinds: elements of each array for each of `number`, and their type.
+        """
+        if self._arranged is None or self._arranged[0] is not owner or self._arranged[1] != number:
+            self._wanted = 0
+            self._arranged = owner, number, [self._taken(number * count, dtype) for count, dtype in kinds]
+        return self._arranged[2]
+
+    def _taken(self, count: int, dtype: np.dtype[Any]) -> NDArray[Any]:
+        start, size = self._wanted, count * dtype.itemsize
+        self._wanted = start + size + -size % ALIGNED + APART
+        memory = self._memory[start : start + size] if start + size <= len(self._memory) else np.empty(size, np.uint8)
+        return memory.view(dtype)
+
+    def grow(self) -> None:
+        """See to it that the next arrays have room, if as much is wanted."""
+        wanted = min(self._wanted, LARGEST)
+        if wanted > len(self._memory):
+            self._memory, self._arranged = _aligned(wanted), None
+
+
+_KEPT: list[Scratch] = []
+
+
+def _aligned(size: int) -> NDArray[np.uint8]:
+    memory = np.empty(size + ALIGNED, np.uint8)
+    start = -memory.__array_interface__["data"][0] % ALIGNED
+    return memory[start : start + size]
+
+
+def borrowed() -> Scratch:
+    """Memory that nobody else uses until it is given back."""
+    try:
+        return _KEPT.pop()  # at once, whatever other threads do
+    except IndexError:
+        return Scratch()
+
+
+def given_back(scratch: Scratch) -> None:
+    """Its arrays are not used any more; where this is never said, it is just freed."""
+    scratch.grow()
+    if len(_KEPT) < MOST_KEPT:
+        _KEPT.append(scratch)
+
+
+TYPES: dict[str, np.dtype[Any]] = {
+    "single": np.dtype(np.float32),
+    "double": np.dtype(np.float64),
+    "index": np.dtype(np.intp),
+    "flag": np.dtype(np.bool_),
+    "u1": np.dtype("u1"),
+    "u2": np.dtype("u2"),
+}
+
+Values = Callable[[Node], NDArray[Any]]
+
+
+@dataclass
+class Run:
+    """One execution: the frames, the low values, and the chunk under way."""
+
+    rows: Bytes2D
+    values: Values
+    views: list[NDArray[Any]] = field(default_factory=list)
+    start: int = 0
+    stop: int = 0
+    prepared: dict[Any, Any] = field(default_factory=dict)
+
+    def part(self, array: NDArray[Any]) -> NDArray[Any]:
+        """The chunk's packets of values that each packet has, or that all share."""
+        return array[self.start : self.stop] if len(array) > 1 else array
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """One call: `run(execution, output)`, and the registers that it reads or uses besides."""
+
+    text: str
+    run: Callable[[Run, NDArray[Any]], None]
+    output: int
+    reads: tuple[int, ...] = ()
+
+
+@dataclass(frozen=True)
+class Read:
+    """A register as an argument of a step."""
+
+    register: int
+
+    def __call__(self, run: Run) -> NDArray[Any]:
+        return run.views[self.register]
+
+
+@dataclass(frozen=True)
+class Number:
+    """A number as an argument of a step."""
+
+    value: float
+
+    def __call__(self, run: Run) -> float:
+        return self.value
+
+
+def deep(array: NDArray[Any], depth: int) -> NDArray[Any]:
+    """Values of packets with as many axes as the points have."""
+    return array.reshape(*array.shape, *(1,) * (1 + depth - array.ndim))
+
+
+def shared(steps: Sequence[Step], kinds: Sequence[str], own: Collection[int]) -> list[int]:
+    """A slot for each register, so that registers of one kind that are never needed at the same time have the same one.
+
+    Args:
+        steps: in their order.
+        kinds: of the registers.
+        own: registers that have memory of their own.
+    """
+    last = {register: place for place, step in enumerate(steps) for register in (step.output, *step.reads)}
+    slots, free, count = [-1] * len(kinds), dict[str, list[int]](), 0
+    for place, step in enumerate(steps):
+        for register in {step.output, *step.reads} - set(own):
+            if slots[register] < 0:
+                waiting = free.setdefault(kinds[register], [])
+                if not waiting:
+                    waiting.append(count)
+                    count += 1
+                slots[register] = waiting.pop()
+        for register in {step.output, *step.reads} - set(own):
+            if last[register] == place:
+                free[kinds[register]].append(slots[register])
+    return slots

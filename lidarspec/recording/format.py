@@ -1,0 +1,327 @@
+"""What a recording says of itself: the JSON of its first record.
+
+The bytes of an .lsr recording: records, each complete in itself, packed and found again.
+
+    offset  size  of a record, little-endian
+    0       4     mark b"\xb5LS\x1e"
+    4       1     kind: 0 header, 1 received, 2 sent, 3 event
+    5       1     flags: 1 a datagram, 2 the line was interrupted before it, 4 it had fallen silent
+    6       1     a, bytes of addresses
+    7       2     n, bytes of data
+    9       8     arrival time, ns since 1970, signed; the least number: nobody knows
+    17      a     sender, receiver: each a length byte, that many bytes of address, and, if there are any, the port in 2 bytes
+    17+a    n     data
+    17+a+n  4     CRC-32 (zlib) of everything before
+
+Theory of operation: a length is at most what its one or two bytes can say, so no record claims more than 66 kB, and none is
+believed before its checksum passes. The reader keeps a window of the file that holds one record and what was read with it.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import struct
+import zlib
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, fields
+from functools import lru_cache
+from typing import Any, BinaryIO, Literal
+
+from lidarspec.errors import UsageError, WireError
+from lidarspec.plugins import sensor as named_sensor
+from lidarspec.spec.description import Sensor
+
+VERSION = 1
+_ID = re.compile(r"[a-z0-9]+(-[a-z0-9]+)*")
+_WORD = re.compile(r"[A-Za-z0-9_+-]{1,40}")
+
+
+@dataclass(frozen=True)
+class Header:
+    """What a recording says of itself.
+
+    Attributes:
+        sensor, options: id and options of the sensor; "" where it was recorded raw.
+        source: the SOURCE that it came from.
+        datagrams: whether the link carried datagrams.
+        baud: of a serial port.
+        versions: of lidarspec and of the sensor's distribution.
+        created: date and time with the zone, ISO 8601.
+        wall_ns, monotonic_ns: the same moment on both clocks of the recording machine.
+        version: of the format.
+    """
+
+    sensor: str = ""
+    options: Mapping[str, Any] = field(default_factory=dict)
+    source: str = ""
+    datagrams: bool = False
+    baud: int | None = None
+    versions: Mapping[str, str] = field(default_factory=dict)
+    created: str = ""
+    wall_ns: int = 0
+    monotonic_ns: int = 0
+    version: int = VERSION
+
+    def to_json(self) -> bytes:
+        """The header as it stands in the file; an option that JSON does not know stands as its text."""
+        return json.dumps({item.name: getattr(self, item.name) for item in fields(self)}, default=_plain).encode()
+
+    def known_sensor(self) -> Sensor:
+        """The installed sensor that it names, with the options of then.
+
+        Raises:
+            UsageError: where it names none, or one with an option that only the caller should give, such as a file.
+            UnknownSensor: where that one is not installed.
+        """
+        if not _ID.fullmatch(self.sensor):
+            raise UsageError(f"its header gives {self.sensor[:40]!r} for the id of a sensor" if self.sensor else "it names no sensor")
+        for name, value in self.options.items():
+            if not isinstance(value, bool | int | float) and not (isinstance(value, str) and _WORD.fullmatch(value)):
+                raise UsageError(f"it was recorded with {name}={value!r}: give the sensor, configured so")
+        found = named_sensor(self.sensor)
+        return found.configure(**self.options) if self.options else found
+
+
+_BLANK = Header()
+_KINDS: dict[str, type | tuple[type, ...]] = {
+    "sensor": str,
+    "options": dict,
+    "source": str,
+    "datagrams": bool,
+    "baud": (int, type(None)),
+    "versions": dict,
+    "created": str,
+    "wall_ns": int,
+    "monotonic_ns": int,
+    "version": int,
+}
+
+
+def read_header(data: bytes) -> Header:
+    """The header that bytes stand for; names that this version does not know are passed over.
+
+    Raises:
+        WireError: for bytes that are none.
+    """
+    try:
+        values = json.loads(data)
+    except (ValueError, RecursionError):
+        values = None
+    if not isinstance(values, dict):
+        raise WireError("the header of the recording is no JSON object", data=data[:16])
+    known = {name: values.get(name, getattr(_BLANK, name)) for name in _KINDS}
+    for name, kind in _KINDS.items():
+        if not isinstance(known[name], kind) or (isinstance(known[name], bool) and kind is not bool):
+            raise WireError(f"the header of the recording has {name} = {str(known[name])[:40]!r}", path=name, got=known[name])
+    return Header(**known)
+
+
+def _plain(value: Any) -> Any:
+    return dict(value) if isinstance(value, Mapping) else str(value)
+
+
+MAGIC = b"\x89LSR\r\n\x1a\n"
+MARK = b"\xb5LS\x1e"
+HEADER, RECEIVED, SENT, EVENT = range(4)
+DATAGRAM, GAP, QUIET = 1, 2, 4
+#: most bytes of data in one record.
+LARGEST = 0xFFFF
+_HEAD = struct.Struct("<4sBBBHq")
+_CRC = struct.Struct("<I")
+_PORT = struct.Struct("<H")
+_UNKNOWN = -(1 << 63)
+_BLOCK = 1 << 16
+
+Address = tuple[str, int]
+Direction = Literal["in", "out", "event"]
+DIRECTIONS: dict[int, Direction] = {RECEIVED: "in", SENT: "out", EVENT: "event"}
+
+
+@dataclass(frozen=True, slots=True)
+class Record:
+    """One entry of a recording.
+
+    Attributes:
+        direction: "in" received, "out" sent, "event" something that happened to the line.
+        data: the bytes; of an event its JSON.
+        at: arrival time, ns since 1970; None where nobody knows it.
+        sender, receiver: addresses and ports of a datagram, where known.
+        datagram: whether `data` is a whole datagram.
+        gap: whether the line was interrupted before it.
+        quiet: whether it had fallen silent before it.
+    """
+
+    direction: Direction
+    data: bytes
+    at: int | None = None
+    sender: Address | None = None
+    receiver: Address | None = None
+    datagram: bool = False
+    gap: bool = False
+    quiet: bool = False
+
+
+def packed(
+    kind: int, data: bytes, at: int | None = None, *, flags: int = 0, sender: Address | None = None, receiver: Address | None = None
+) -> bytes:
+    """The bytes of a record.
+
+    Raises:
+        UsageError: for more data, a longer address or another port or time than a record can hold.
+    """
+    addresses = _endpoint(sender) + _endpoint(receiver) if sender or receiver else b""
+    try:
+        head = _HEAD.pack(MARK, kind, flags, len(addresses), len(data), _UNKNOWN if at is None else at)
+    except struct.error:
+        raise UsageError(f"a record of {len(data)} bytes at {at} ns from {sender} to {receiver}: no record can hold that") from None
+    body = b"".join((head, addresses, data))
+    return body + _CRC.pack(zlib.crc32(body))
+
+
+def size_at(buffer: bytes | bytearray | memoryview, start: int = 0) -> int:
+    """The length that a record claims; 0 where its first bytes are not all there, -1 where it is none."""
+    mark = bytes(buffer[start : start + len(MARK)])
+    if mark != MARK[: len(mark)]:
+        return -1
+    if len(buffer) - start < _HEAD.size:
+        return 0
+    _, _, _, addresses, size, _ = _HEAD.unpack_from(buffer, start)
+    return int(_HEAD.size + addresses + size + _CRC.size)
+
+
+def whole_records(buffer: bytes | bytearray | memoryview, limit: int) -> int:
+    """The bytes of those records at the beginning of the buffer that end within the first `limit` bytes."""
+    end = 0
+    while 0 < (size := size_at(buffer, end)) <= limit - end:
+        end += size
+    return end
+
+
+class RecordReader:
+    """The records of an open file, from behind its magic bytes on; memory is bounded by a block and a record.
+
+    Args:
+        salvage: look for the next good record behind a damaged place, instead of stopping there.
+
+    Attributes:
+        records: good records so far.
+        damaged: places that hold no good record; `leftover` the bytes in them.
+        is_cut: whether the last of them is a record that the file ends in.
+        offset: file offset of the next record, or of the damage that ended the reading.
+    """
+
+    def __init__(self, file: BinaryIO, *, salvage: bool = False) -> None:
+        self._file, self._salvage = file, salvage
+        self._window, self._place = b"", 0
+        self.records = self.damaged = self.leftover = 0
+        self.is_cut, self.offset = False, len(MAGIC)
+
+    def __iter__(self) -> Iterator[tuple[int, Record]]:
+        """Kind and content of every good record."""
+        while self._holds(1):
+            if (size := self._good()) > 0:
+                kind, record = _unpacked(self._window[self._place : self._place + size])
+                self._skip(size)
+                self.records += 1
+                yield kind, record
+                continue
+            self.damaged += 1
+            if not self._salvage:
+                self.leftover += self._rest()
+                return
+            self.leftover += self._next_mark()
+
+    def _good(self) -> int:
+        """The length of the record in place; 0 where it is damaged or not whole."""
+        self._holds(_HEAD.size)
+        size = size_at(self._window, self._place)
+        self.is_cut = size == 0 or (size > 0 and not self._holds(size))
+        if size < 0 or self.is_cut:
+            return 0
+        end = self._place + size - _CRC.size
+        passes = zlib.crc32(self._window[self._place : end]) == _CRC.unpack_from(self._window, end)[0]
+        return size if passes and _addresses_fit(self._window, self._place) else 0
+
+    def _holds(self, number: int) -> bool:
+        """Whether so many bytes are in the window from the place on, after reading more where it takes that."""
+        while len(self._window) - self._place < number:
+            block = self._file.read(_BLOCK)
+            if not block:
+                return False
+            self._window, self._place = self._window[self._place :] + block, 0
+        return True
+
+    def _skip(self, number: int) -> None:
+        self._place += number
+        self.offset += number
+
+    def _next_mark(self) -> int:
+        """Go to the next mark, or to the end; the bytes passed over."""
+        before = self.offset
+        self._skip(1)
+        while self._holds(1):
+            found = self._window.find(MARK, self._place)
+            if found >= 0:
+                self._skip(found - self._place)
+                break
+            keep = min(len(MARK) - 1, len(self._window) - self._place)
+            self._skip(len(self._window) - self._place - keep)
+            if not self._holds(keep + 1):
+                self._skip(keep)
+                break
+        return self.offset - before
+
+    def _rest(self) -> int:
+        """The bytes from the place to the end of the file."""
+        if self._file.seekable():
+            return self._file.seek(0, os.SEEK_END) - self.offset
+        left = len(self._window) - self._place
+        while block := self._file.read(_BLOCK):
+            left += len(block)
+        return left
+
+
+def _unpacked(record: bytes) -> tuple[int, Record]:
+    _, kind, flags, addresses, size, at = _HEAD.unpack_from(record)
+    start = _HEAD.size + addresses
+    sender, receiver = _endpoints(record[_HEAD.size : start]) if addresses else (None, None)
+    known = None if at == _UNKNOWN else at
+    direction = DIRECTIONS.get(kind, "event")
+    marks = (bool(flags & mark) for mark in (DATAGRAM, GAP, QUIET))
+    return kind, Record(direction, record[start : start + size], known, sender, receiver, *marks)
+
+
+def _addresses_fit(buffer: bytes, start: int) -> bool:
+    """Whether the addresses of a record are two, and fill their place."""
+    length = buffer[start + 6]
+    place, end = start + _HEAD.size, start + _HEAD.size + length
+    for _ in range(2 if length else 0):
+        if place >= end:
+            return False
+        place += 1 + buffer[place] + 2 * bool(buffer[place])
+    return place == end
+
+
+@lru_cache(maxsize=256)
+def _endpoint(address: Address | None) -> bytes:
+    if address is None or not address[0]:
+        return b"\0"
+    host = address[0].encode()
+    try:
+        return bytes([len(host)]) + host + _PORT.pack(address[1])
+    except (ValueError, struct.error):
+        raise UsageError(f"{address}: no address and port that a record can hold") from None
+
+
+@lru_cache(maxsize=256)
+def _endpoints(data: bytes) -> tuple[Address | None, Address | None]:
+    found: list[Address | None] = []
+    place = 0
+    for _ in range(2):
+        length = data[place]
+        host = data[place + 1 : place + 1 + length].decode("utf-8", "replace")
+        found.append((host, _PORT.unpack_from(data, place + 1 + length)[0]) if length else None)
+        place += 1 + length + 2 * bool(length)
+    return found[0], found[1]

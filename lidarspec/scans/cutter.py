@@ -1,0 +1,223 @@
+"""Where one scan ends and the next begins, by the sensor's declared rule; remembers the value before each batch."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarspec.columns.columns import Column
+from lidarspec.errors import SpecError
+from lidarspec.packets.packets import Packets
+from lidarspec.points.cloud import COLUMNS
+from lidarspec.points.plain import Evaluated
+from lidarspec.spec.timing import Every, OnChange, OnFlag, OnRewind, OnWrap, Split
+
+#: an angle has to have been this part of a turn away from the cut before it cuts again, so that jitter does not.
+AWAY = 1 / 8
+
+
+class Turning:
+    """Which way an angle turns: the way of the last half turn, and at the start of what it has turned so far.
+
+    Each step is judged by those before it alone, so that batches do not change where scans are cut.
+    """
+
+    def __init__(self) -> None:
+        self._direction, self._total, self._furthest = 0, 0.0, 0.0
+
+    def push(self, steps: NDArray[np.float64]) -> NDArray[np.float64]:
+        """1 or -1 for each of the next steps, (k,), given in turns; of length 1 where it is the same for all."""
+        totals = steps.copy()
+        totals[:1] += self._total
+        np.cumsum(totals, out=totals)
+        first = self._direction
+        self._total = float(totals[-1]) if len(totals) else self._total
+        found: NDArray[np.float64] | None = None
+        start, size, is_new = 0, 64, True
+        while start < len(totals):
+            if self._direction and is_new:
+                is_new = False
+                if self._only_ahead(float(totals[start]), steps[start + 1 :]):
+                    if found is not None:
+                        found[start:] = self._direction
+                    break
+            part = totals[start : start + size]
+            if self._direction == 0:
+                found = np.ones(len(totals)) if found is None else found
+                found[start : start + len(part)] = np.where(part < 0, -1, 1)
+                turned = np.abs(part) >= 0.5
+            else:
+                if found is not None:
+                    found[start : start + len(part)] = self._direction
+                ahead = self._direction * part
+                furthest = np.maximum(np.maximum.accumulate(ahead), self._furthest)
+                turned = furthest - ahead >= 0.5
+                self._furthest = float(furthest[-1])
+            start, size = start + len(part), size * 2
+            if turned.any():
+                spot = int(turned.argmax())
+                start, size = start - len(part) + spot, 64
+                found = np.full(len(totals), float(first)) if found is None else found
+                self._direction = -self._direction or (1 if part[spot] > 0 else -1)
+                self._furthest = self._direction * float(part[spot])
+        if found is not None and not (found == found[0]).all():
+            return found
+        return np.array([float(first or 1)]) if found is None else found[:1]
+
+    def _only_ahead(self, total: float, steps: NDArray[np.float64]) -> bool:
+        """Whether the angle has come further than ever with this total, and all steps after it go on the same way."""
+        if self._direction * total < self._furthest or float((self._direction * steps).min(initial=0.0)) < 0:
+            return False
+        self._furthest = self._direction * self._total
+        return True
+
+
+class Cutter:
+    """The cuts of one stream of points."""
+
+    def __init__(self, rule: Split) -> None:
+        self._rule = rule
+        self._before: float | None = None
+        self._armed, self._turning = True, Turning()
+        self._start: int | None = None
+
+    def cuts(self, packets: Packets, found: Evaluated) -> list[int]:
+        """Indices of the points of this batch before which to cut, ascending."""
+        rule = self._rule
+        if isinstance(rule, Every):
+            return self._periods(rule, packets, found)
+        if isinstance(rule, OnWrap) and rule.name in COLUMNS:
+            angles = np.asarray(getattr(found.cloud, rule.name), np.float64)
+            return self._wraps(angles, 2 * np.pi, rule.at).tolist()  # type: ignore[no-any-return]
+        column = _field(found, rule.name)
+        values, starts = _rows(column, found)
+        if isinstance(rule, OnWrap):
+            unit = packets.table.schema.fields[column.source].unit
+            rows = self._wraps(values, 360.0 if unit == "deg" else 2 * np.pi, rule.at)
+        else:
+            rows = self._changes(rule, values)
+        return starts[rows].tolist()  # type: ignore[no-any-return]
+
+    def _changes(self, rule: OnFlag | OnChange | OnRewind, values: NDArray[np.float64]) -> NDArray[np.intp]:
+        if isinstance(rule, OnFlag):
+            return np.flatnonzero(values != 0)
+        if not len(values):
+            return np.empty(0, np.intp)
+        before = _before(values, self._before)
+        self._before = float(values[-1])
+        return np.flatnonzero(values < before if isinstance(rule, OnRewind) else values != before)
+
+    def _wraps(self, angles: NDArray[np.float64], full: float, at: float) -> NDArray[np.intp]:
+        """Places where the angle has gone on past `at`, in whichever direction the sensor turns."""
+        finite = np.isfinite(angles)
+        known = None if finite.all() else np.flatnonzero(finite)
+        values = angles if known is None else angles[known]
+        if not len(values):
+            return np.empty(0, np.intp)
+        before = _before(values, self._before)
+        self._before = float(values[-1])
+        direction = self._turning.push((_folded(values - before + full / 2, full) - full / 2) / full)
+        if len(direction) == 1:
+            turned = _folded(direction * (values - at), full)
+            earlier = _before(turned, float(_folded(direction * (before[:1] - at), full)[0]))
+        else:
+            turned, earlier = (_folded(direction * (some - at), full) for some in (values, before))
+        passed = np.flatnonzero(earlier - turned > full / 2)
+        found = self._armed_at(passed, turned, full)
+        return np.array(found, np.intp) if known is None else known[np.array(found, np.intp)]
+
+    def _armed_at(self, passed: NDArray[np.intp], turned: NDArray[np.float64], full: float) -> list[int]:
+        """Those of the places where an angle passes that come after it was far away."""
+        found: list[int] = []
+        since = 0
+        for spot in passed.tolist():
+            if self._armed or _was_far(turned[since:spot], full):
+                found.append(spot)
+                self._armed, since = False, spot
+        self._armed = self._armed or _was_far(turned[since:], full)
+        return found
+
+    def _periods(self, rule: Every, packets: Packets, found: Evaluated) -> list[int]:
+        times = packets.time_ns[: found.ready]
+        if not len(times):
+            return []
+        self._start = int(times[0]) if self._start is None else self._start
+        period = (times - self._start) // int(rule.seconds * 1e9)
+        before = _before(period.astype(np.float64), self._before)
+        self._before = float(period[-1])
+        starts = _starts(_sums(found.counts, 1))
+        return starts[np.flatnonzero(period > before)].tolist()  # type: ignore[no-any-return]
+
+
+def _field(found: Evaluated, path: str) -> Column:
+    column: Any = found.fields
+    for name in path.split("."):
+        column = getattr(column, name)
+    if not isinstance(column, Column):
+        raise SpecError("scans are cut by a field, and this is a struct", path=path)
+    return column
+
+
+def _rows(column: Column, found: Evaluated) -> tuple[NDArray[np.float64], NDArray[np.intp]]:
+    """The values of a field row by row in stream order, and the index of the first point of each row."""
+    levels = 1 + max((index for index, name in enumerate(column.axes) if name is not None), default=-1)
+    counts = found.counts
+    array = column.array[: found.ready]
+    if not levels and len(array) == len(counts):
+        return array.reshape(-1), _starts(_sums(counts, 1))
+    shape = np.broadcast_shapes((found.ready, *array.shape[1 : 1 + levels]), counts.shape[: 1 + levels])
+    numbers = _sums(np.broadcast_to(counts, (*shape, *counts.shape[1 + levels :])), 1 + levels)
+    values = np.broadcast_to(array.reshape(len(array), *array.shape[1 : 1 + levels]), shape).reshape(-1)
+    if numbers.size and not any(numbers.strides) and (each := int(numbers.flat[0])):
+        return values, np.arange(len(values)) * each
+    points = numbers.reshape(-1)
+    starts = _starts(points)
+    kept = points > 0 if levels else np.ones(len(points), np.bool_)
+    return values[kept], starts[kept]
+
+
+def _sums(counts: NDArray[Any], kept: int) -> NDArray[np.intp]:
+    """Sums over all axes but the first `kept`; along axes that repeat one number they are products."""
+    times = 1
+    while counts.ndim > kept:
+        repeats = counts.strides[-1] == 0 and counts.shape[-1] > 0
+        times *= counts.shape[-1] if repeats else 1
+        counts = counts[..., 0] if repeats else counts.sum(axis=-1)
+    return np.broadcast_to(counts.flat[0] * times, counts.shape) if counts.size and not any(counts.strides) else counts * times
+
+
+def _was_far(angles: NDArray[np.float64], full: float) -> bool:
+    """Whether any of these angles is far from the cut at 0."""
+    least, most = full * AWAY, full * (1 - AWAY)
+    if len(angles) and least < angles[len(angles) // 2] < most:
+        return True
+    return bool(((angles > least) & (angles < most)).any())
+
+
+def _folded(angles: NDArray[np.float64], full: float) -> NDArray[np.float64]:
+    """Angles in [0, full), which are not to be written to; the same as `np.mod`, and several times as fast."""
+    outside = np.flatnonzero((angles < 0) | (angles >= full))
+    if not len(outside):
+        return angles
+    if 8 * len(outside) < len(angles):
+        found = angles.copy()
+        found[outside] = _folded(angles[outside], full)
+        return found
+    turns = angles / full
+    np.floor(turns, out=turns)
+    turns *= full
+    return np.subtract(angles, turns, out=turns)
+
+
+def _before(values: NDArray[np.float64], first: float | None) -> NDArray[np.float64]:
+    """The value before each; before the first one `first`, or itself."""
+    found = np.empty_like(values)
+    found[:1] = values[:1] if first is None else first
+    found[1:] = values[:-1]
+    return found
+
+
+def _starts(points: NDArray[np.intp]) -> NDArray[np.intp]:
+    return np.cumsum(points) - points

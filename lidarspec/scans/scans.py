@@ -1,0 +1,204 @@
+"""Scans: one revolution or frame period each, cut by the sensor's declared rule."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarspec.columns.columns import Carry
+from lidarspec.packets.packets import Packets, joined as joined_packets
+from lidarspec.packets.sequences import Reorder
+from lidarspec.points.cloud import Mount, PointCloud, joined, restamped
+from lidarspec.points.evaluate import guarded
+from lidarspec.points.plain import Evaluated
+from lidarspec.scans.cutter import Cutter
+from lidarspec.spec.description import Sensor
+
+
+@dataclass(frozen=True, eq=False)
+class LaserScan:
+    """A planar scan with ROS's names: `ranges[i]` is at ``angle_min + i * angle_increment``, inf where there is no return.
+
+    Attributes:
+        ranges, intensities: (n,) float32.
+        angle_min, angle_max, angle_increment: radians, counter-clockwise; ``angle_max = angle_min + (n - 1) * angle_increment``.
+        time_increment, scan_time: seconds.
+        range_min, range_max: metres, the sensor's.
+        stamp_ns: of the first point.
+    """
+
+    angle_min: float
+    angle_max: float
+    angle_increment: float
+    time_increment: float
+    scan_time: float
+    range_min: float
+    range_max: float
+    ranges: NDArray[np.float32]
+    intensities: NDArray[np.float32]
+    stamp_ns: int = 0
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Scan:
+    """The points between two cuts.
+
+    Attributes:
+        points: in stream order.
+        rate_hz: one over the time to the next scan; nan where that is not known.
+        complete: whether both ends were seen; the first and the last piece of a stream are not complete.
+        sensor: whose.
+    """
+
+    points: PointCloud
+    rate_hz: float
+    complete: bool
+    sensor: Sensor
+
+    @property
+    def stamp_ns(self) -> int:
+        """Time of the first point, int64 ns."""
+        return self.points.stamp_ns
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def __repr__(self) -> str:
+        ranges = self.points.range[self.points.valid]
+        span = f"{ranges.min():.2f}..{ranges.max():.2f} m" if len(ranges) else "no returns"
+        rate = f"{self.rate_hz:.1f} Hz, " if np.isfinite(self.rate_hz) else ""
+        return f"Scan({len(self)} points, {rate}{span}, {'complete' if self.complete else 'partial'})"
+
+    def to_bins(self, n: int) -> NDArray[np.float32]:
+        """The nearest return in each of n equal sectors from -pi on: (n,) float32 metres, inf where there is none."""
+        return self._binned(n)[0]
+
+    def to_laserscan(self, n: int | None = None) -> LaserScan:
+        """The scan on an even grid of n angles over the whole turn, by default as many as there are points."""
+        count = max(len(self), 1) if n is None else n
+        ranges, intensities = self._binned(count, centred=True)
+        step = 2 * np.pi / count
+        period = (
+            1 / self.rate_hz if np.isfinite(self.rate_hz) and self.rate_hz > 0 else float(np.ptp(self.points.time)) if len(self) else 0.0
+        )
+        near, far = self.sensor.range_limits
+        return LaserScan(-np.pi, -np.pi + (count - 1) * step, step, period / count, period, near, far, ranges, intensities, self.stamp_ns)
+
+    def _binned(self, n: int, *, centred: bool = False) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        valid = self.points.valid
+        turns = (self.points.azimuth[valid].astype(np.float64) + np.pi) / (2 * np.pi) * n
+        spots = (np.rint(turns) if centred else np.floor(turns)).astype(np.intp) % n
+        ranges = self.points.range[valid]
+        nearest = np.lexsort((ranges, spots))
+        first = np.ones(len(nearest), np.bool_)
+        first[1:] = np.diff(spots[nearest]) > 0
+        chosen = nearest[first]
+        found, strength = np.full(n, np.inf, np.float32), np.zeros(n, np.float32)
+        found[spots[chosen]] = ranges[chosen]
+        if self.points.intensity is not None:
+            strength[spots[chosen]] = self.points.intensity[valid][chosen]
+        return found, strength
+
+
+class ScanStream:
+    """Scans out of batches of packets; remembers what the next batch needs.
+
+    Args:
+        sensor: whose.
+        mount: how it is mounted; the scans come in its carrier's axes.
+    """
+
+    def __init__(self, sensor: Sensor, mount: Mount | None = None) -> None:
+        self._sensor, self._mount = sensor, mount
+        self._reorder = Reorder(enabled=sensor.sequence is not None)
+        self._cutter = Cutter(sensor.scan)
+        self._waiting: Packets | None = None
+        self._carry: Carry = {}
+        self._parts: list[PointCloud] = []
+        self._started = False
+        self._epoch: int | None = None
+        self._begins: int | None = None  # time of the first point of the scan under way, ns, where it is known
+
+    def add(self, packets: Packets) -> list[Scan]:
+        """The scans that these packets complete."""
+        return [scan for batch in self._reorder.push(packets) for scan in self._push(batch, final=False)]
+
+    def finish(self) -> list[Scan]:
+        """The scans that waited for more, and the piece that is left."""
+        found = [scan for batch in self._reorder.finish() for scan in self._push(batch, final=False)]
+        if self._waiting is not None and len(self._waiting):
+            waiting, self._waiting = self._waiting, None
+            found += self._push(waiting, final=True)
+        left = self._close(None, complete=False)
+        return found + ([left] if left else [])
+
+    def _push(self, packets: Packets, *, final: bool) -> list[Scan]:
+        if self._waiting is not None and len(self._waiting):
+            packets = joined_packets([self._waiting, packets])
+        self._waiting = None
+        if self._epoch is None:
+            self._epoch = int(packets.time_ns[0])  # one for the whole stream, so that batches do not change a bit of any time
+        found = guarded(packets, self._carry, final=final, epoch=self._epoch)
+        if found is None:
+            return []
+        self._carry = found.carry
+        if found.ready < len(packets):
+            self._waiting = packets.take(slice(found.ready, None))
+        return list(self._cut(packets, found))
+
+    def _cut(self, packets: Packets, found: Evaluated) -> Iterator[Scan]:
+        start, cloud, cuts = 0, found.cloud, self._cutter.cuts(packets, found)
+        first, *times = _times_ns(cloud, [0, *cuts])
+        self._begins = first if self._begins is None else self._begins
+        for cut, ends in zip(cuts, times, strict=True):
+            self._take(cloud, start, cut)
+            scan = self._close(ends, complete=self._started)
+            self._begins = ends
+            if scan is not None:
+                self._started = True
+                yield scan
+            start = cut
+        self._take(cloud, start, len(cloud))
+
+    def _take(self, cloud: PointCloud, start: int, stop: int) -> None:
+        if start < stop:
+            self._parts.append(cloud.stretch(start, stop))
+
+    def _close(self, ends: int | None, *, complete: bool) -> Scan | None:
+        """The scan of the points so far; `ends`: the time of the first point after it, ns."""
+        parts, self._parts = self._parts, []
+        if not parts:
+            return None
+        cloud = joined(parts)
+        begins = self._begins
+        assert begins is not None  # since there are points
+        period = (ends - begins) * 1e-9 if ends is not None else np.nan
+        rate = 1 / period if period > 0 else np.nan
+        cloud = restamped(cloud, begins)
+        mounted = cloud if self._mount is None else self._mount.applied(cloud)
+        return Scan(mounted, float(rate) if complete else np.nan, complete, self._sensor)
+
+
+def _times_ns(cloud: PointCloud, indices: Sequence[int]) -> list[int | None]:
+    """The times of some points in order, ns; None for those past the end."""
+    known = [index for index in indices if index < len(cloud)]
+    times = cloud.times_at(np.array(known, np.intp)).tolist() if known else []
+    return [cloud.stamp_ns + round(time * 1e9) for time in times] + [None] * (len(indices) - len(known))
+
+
+def scans_of(sensor: Sensor, batches: Iterable[Packets]) -> Iterator[Scan]:
+    """Every scan of batches of one stream."""
+    stream = ScanStream(sensor)
+    for batch in batches:
+        yield from handed_out(stream.add(batch))
+    yield from stream.finish()
+
+
+def handed_out(scans: list[Scan]) -> Iterator[Scan]:
+    """Scans one by one, each of which is forgotten then, and with it the columns that are made of it."""
+    scans.reverse()
+    while scans:
+        yield scans.pop()

@@ -1,0 +1,250 @@
+"""A simulated sensor as a device, sans-IO: bytes in, bytes out, in real time or any other.
+
+It behaves as its spec says and knows no sensor: data frames come at the pace of the sensor's clock, commands are answered with the
+documented replies, start and stop are honoured, other frames come at their own rate. A sensor that no command starts sends by itself.
+
+All times are the caller's, in ns of one monotonic clock.
+"""
+
+from __future__ import annotations
+
+import bisect
+import heapq
+import math
+import random
+from collections import Counter
+from dataclasses import dataclass, field
+
+from lidarspec.errors import SpecError
+from lidarspec.simulation.faults import Faults, Line
+from lidarspec.simulation.replies import Answering, Request
+from lidarspec.simulation.scenes import Scene, furnished
+from lidarspec.simulation.simulator import Simulation, simulation
+from lidarspec.spec.description import Sensor
+from lidarspec.spec.links import is_datagram
+
+SECOND = 1_000_000_000
+#: ns of the device's time for which data is made in one go, and the most packets.
+AHEAD, MOST = SECOND // 4, 128
+#: fillers that are sent in a pause.
+FILLERS = 14
+#: ns that a device may be behind; where nobody asked it for longer, its time stood still.
+BEHIND = SECOND
+
+Packet = tuple[str, bytes]
+
+
+@dataclass(order=True, frozen=True)
+class _Due:
+    """Something to be sent at a time, ns since the device was switched on; what was planned first goes first."""
+
+    at: float
+    number: int
+    link: str = field(compare=False)
+    frame: str = field(compare=False)
+    data: bytes = field(compare=False)
+
+
+class _Stream:
+    """The data frames of one type, from a time on, ns since the device was switched on.
+
+    Attributes:
+        due: when the next one is sent.
+    """
+
+    def __init__(self, made: Simulation, frame: str, scene: Scene, began: float) -> None:
+        self._made, self._scene, self.frame = made, scene, frame
+        self._next, self._end = 0, began
+        self._frames: list[bytes] = []
+        self._times: list[float] = []
+        self._spot = 0
+        self.due = began
+
+    def take(self, upto: float) -> list[tuple[float, bytes]]:
+        """The frames that are due by then, with the times at which they are."""
+        taken: list[tuple[float, bytes]] = []
+        while self.due <= upto:
+            if self._spot == len(self._frames):
+                self._more()
+            first, self._spot = self._spot, bisect.bisect_right(self._times, upto)
+            taken += zip(self._times[first : self._spot], self._frames[first : self._spot], strict=True)
+            self.due = self._times[self._spot] if self._spot < len(self._frames) else self._end
+        return taken
+
+    def _more(self) -> None:
+        """The next batch."""
+        count = max(min(int(AHEAD / max(self._made.interval, 1)), MOST), 1)
+        block = self._made.block(self._next, count, self._scene, self._end / SECOND)
+        times = (self._end + block.times).tolist()
+        self._frames, self._times, self._spot = block.frames, times[:-1], 0
+        self._next, self._end = self._next + count, times[-1]
+
+
+class SimulatedDevice:
+    """A sensor that stands in a scene and can be talked to.
+
+    Args:
+        scene: what it sees; by default a room of the seed's, in which somebody walks.
+        seed: of the scene, the faults and the fillers.
+        rate: how many times faster than in reality; inf: as fast as it is asked.
+        faults: what goes wrong on its links.
+
+    Attributes:
+        present: whether it is plugged in.
+        heard: the names of the commands that it was sent.
+        sent: number of frames sent by type, before anything went wrong.
+        lines: by link, what went wrong.
+
+    Raises:
+        UsageError: where the sensor declares no `sweep`.
+        SpecError: where nothing says how fast it sends.
+    """
+
+    def __init__(
+        self, sensor: Sensor, *, scene: Scene | None = None, seed: int = 0, rate: float = 1.0, faults: Faults | None = None
+    ) -> None:
+        self.sensor, self.rate, self.faults = sensor, rate, faults or Faults()
+        self.present, self.heard, self.sent = True, list[str](), Counter[str]()
+        self.lines = {name: Line(self.faults, seed=seed, stream=not is_datagram(link)) for name, link in sensor.links.items()}
+        self._scene = scene or furnished(seed)
+        self._source = random.Random(f"device {seed}")
+        self._answering = Answering(sensor)
+        self._plan: list[_Due] = []
+        self._planned = 0
+        self._stream: _Stream | None = None
+        self._powered, self._time = 0, 0.0
+        self._plug: int | None = None
+        self._simulation(sensor.data_frame)
+
+    def start(self, now: int) -> None:
+        """Switch it on, or off and on again."""
+        self._plan, self._stream, self._powered, self._time, self.present = [], None, now, 0.0, True
+        self._plug = now + int(self.faults.unplug * SECOND) if self.faults.unplug else None
+        for name, frame in self.sensor.frames.items():
+            if frame.rate and frame.direction == "in" and not frame.data:
+                self._put(0.0, "data", name, self._answering.frame(name))
+        if not any(command.starts for command in self.sensor.commands.values()):
+            self._begin(0.0, self.sensor.data_frame)
+
+    def unplug(self) -> None:
+        """Pull the plug; `start` puts it in again."""
+        self.present, self._plug = False, None
+
+    def receive(self, data: bytes, now: int, link: str = "data") -> None:
+        """Bytes, or a datagram, that arrive at the device."""
+        self._plugged(now)
+        if self.present:
+            for request in self._answering.requests(data, now, link):
+                self._obey(request, self._clock(now))
+
+    def outgoing(self, now: int) -> list[tuple[str, bytes]]:
+        """What leaves the device by now: for each link its bytes, or its datagrams one by one, in order."""
+        return [(link, data) for link, _, data in self.sendings(now)]
+
+    def sendings(self, now: int) -> list[tuple[str, str, bytes]]:
+        """The same with the type of each frame: (link, type, bytes); of a byte stream all in one, without a type."""
+        self._plugged(now)
+        if not self.present:
+            return []
+        self._time = self._clock(now) + (AHEAD if math.isinf(self.rate) else 0)
+        packets: dict[str, list[Packet]] = {}
+        for link, frame, data in self._due(self._time):
+            packets.setdefault(link, []).append((frame, data))
+        out: list[tuple[str, str, bytes]] = []
+        for link, mine in packets.items():
+            self.sent.update(frame for frame, _ in mine if frame)
+            arrived = self.lines[link].carry(mine)
+            if is_datagram(self.sensor.links[link]):
+                out += [(link, frame, data) for frame, data in arrived]
+            elif arrived:
+                out.append((link, "", b"".join(data for _, data in arrived)))
+        return out
+
+    @property
+    def deadline(self) -> int | None:
+        """When `outgoing` next has something to give, or the plug is pulled or put in; None if nothing will happen by itself."""
+        times = [self._plug] if self._plug is not None else []
+        if self.present:
+            due = [self._plan[0].at] if self._plan else []
+            due += [self._stream.due] if self._stream else []
+            times += [self._powered + math.ceil(at / self.rate) for at in due]
+        return min(times, default=None)
+
+    def _clock(self, now: int) -> float:
+        """The device's own time, ns since it was switched on; one that has no pace goes on whenever it is asked for data."""
+        if math.isinf(self.rate):
+            return self._time
+        late = int((now - self._powered) - self._time / self.rate) - BEHIND
+        self._powered += max(late, 0)
+        return (now - self._powered) * self.rate
+
+    def _due(self, upto: float) -> list[tuple[str, str, bytes]]:
+        """What is due by then, in the order of its times."""
+        found: list[tuple[float, str, str, bytes]] = []
+        while self._plan and self._plan[0].at <= upto:
+            due = heapq.heappop(self._plan)
+            found.append((due.at, due.link, due.frame, due.data))
+            self._again(due)
+        planned = len(found)
+        if self._stream is not None:
+            found += [(at, "data", self._stream.frame, data) for at, data in self._stream.take(upto)]
+        if planned and len(found) > planned:
+            found.sort(key=lambda item: item[0])
+        return [item[1:] for item in found]
+
+    def _again(self, due: _Due) -> None:
+        """Plan the next one of a frame that is sent by itself."""
+        rate = self.sensor.frames[due.frame].rate if due.frame else 0.0
+        if rate:
+            number = round(due.at * rate / SECOND) + 1
+            self._put(due.at + SECOND / rate, due.link, due.frame, self._answering.frame(due.frame, number))
+
+    def _obey(self, request: Request, now: float) -> None:
+        """Answer a command; where it starts the sensor, data follows the answer."""
+        self.heard.append(request.name)
+        command, at, mode = request.command, now, None
+        if command.starts or command.stops:
+            self._stream = None
+            self._plan = [due for due in self._plan if due.frame and self.sensor.frames[due.frame].rate]
+            heapq.heapify(self._plan)
+        announcing = {frame.after for frame in self.sensor.frames.values() if frame.after}
+        for answer in self._answering.answers(request):
+            if answer.pause:
+                at = self._settle(at, answer.pause, command.link)
+            else:
+                self._put(at, command.link, answer.frame, answer.data)
+                mode = answer.frame if answer.frame in announcing else mode
+        if command.starts:
+            kinds = [name for name, frame in self.sensor.frames.items() if frame.data and frame.after == mode]
+            chosen = self.sensor.data_frame if self.sensor.data_frame in kinds else next(iter(kinds), None)
+            if chosen is not None:
+                self._begin(at, chosen)
+
+    def _settle(self, at: float, seconds: float, link: str) -> float:
+        """The end of a pause, in which fillers are sent."""
+        for step in range(FILLERS if self.sensor.fillers else 0):
+            data = bytes([self._source.choice(self.sensor.fillers)])
+            self._put(at + seconds * SECOND * (step + 1) / (FILLERS + 1), link, "", data)
+        return at + seconds * SECOND
+
+    def _begin(self, at: float, frame: str) -> None:
+        self._stream = _Stream(self._simulation(frame), frame, self._scene, at)
+
+    def _simulation(self, frame: str) -> Simulation:
+        made = simulation(self.sensor, frame)
+        if not made.interval:
+            raise SpecError("nothing says how often it is sent: declare its `rate`", path=frame, sensor=self.sensor.id)
+        return made
+
+    def _put(self, at: float, link: str, frame: str, data: bytes) -> None:
+        self._planned += 1
+        heapq.heappush(self._plan, _Due(at, self._planned, link, frame, data))
+
+    def _plugged(self, now: int) -> None:
+        """Pull the plug, or put it in, where it is time."""
+        if self._plug is None or now < self._plug:
+            return
+        if self.present:
+            self.present, self._plug = False, now + int(self.faults.absent * SECOND)
+        else:
+            self.start(now)

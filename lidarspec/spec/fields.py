@@ -1,0 +1,243 @@
+"""Units of physical values, by name, and exact conversions of the few that the engine itself needs.
+
+What a struct needs beyond construct: a unit on a field, and a checksum that seals a struct.
+
+Both are ordinary construct classes, so that they nest in anything; neither changes the raw integers of the wire.
+"""
+
+from __future__ import annotations
+
+import io
+import re
+from collections.abc import Iterable, Sequence
+from fractions import Fraction
+from typing import Any
+
+from construct import Construct, Container, Subconstruct
+
+from lidarspec.errors import UsageError
+from lidarspec.spec.checksums import Checksum
+from lidarspec.spec.construct_layer import MarkedStruct, Mismatch, bit_width, member, note, prepare, unwrap, verifying
+
+#: unit -> how many of the SI unit it is; only units that someone may type on the command line.
+_FACTORS: dict[str, dict[str, Fraction]] = {
+    "m": {"m": Fraction(1), "cm": Fraction(1, 100), "mm": Fraction(1, 1000)},
+    "s": {"s": Fraction(1), "ms": Fraction(1, 1000), "us": Fraction(1, 10**6), "ns": Fraction(1, 10**9)},
+    "deg": {"deg": Fraction(1)},
+    "rad": {"rad": Fraction(1)},
+    "deg/s": {"deg/s": Fraction(1), "Hz": Fraction(360), "rpm": Fraction(6)},
+    "Hz": {"Hz": Fraction(1), "rpm": Fraction(1, 60)},
+    "rpm": {"rpm": Fraction(1), "Hz": Fraction(60)},
+}
+
+
+def exact(number: float | int) -> Fraction:
+    """The decimal number that was written, not the binary one nearest to it: 0.001 is 1/1000."""
+    return Fraction(repr(float(number))) if isinstance(number, float) else Fraction(number)
+
+
+def factor(unit: str, target: str) -> Fraction | None:
+    """How many `target` one `unit` is, or None where the two measure different things."""
+    if unit == target:
+        return Fraction(1)
+    return _FACTORS.get(target, {}).get(unit)
+
+
+def split_unit(text: str) -> tuple[str, str]:
+    """A number and its unit out of "324.27deg"; the unit is empty where there is none."""
+    known = sorted({unit for table in _FACTORS.values() for unit in table}, key=len, reverse=True)
+    for unit in known:
+        if text.endswith(unit) and _is_number(text[: -len(unit)]):
+            return text[: -len(unit)].strip(), unit
+    return text, ""
+
+
+def slug(unit: str) -> str:
+    """A unit as part of a name: "deg/s" is "deg_s"."""
+    return re.sub(r"\W+", "_", unit).strip("_").lower()
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def duration(text: str) -> float:
+    """Seconds out of "10s", "500ms", "2min", or a bare number of seconds.
+
+    Raises:
+        UsageError: where it is no duration, or a negative one.
+    """
+    for unit, seconds in (("min", 60.0), ("ms", 1e-3), ("us", 1e-6), ("h", 3600.0), ("s", 1.0), ("", 1.0)):
+        number = text.strip().removesuffix(unit)
+        if text.strip().endswith(unit) and _is_number(number) and 0 <= float(number) < float("inf"):
+            return float(number) * seconds
+    raise UsageError(f"{text!r} is no duration: a number with ms, s, min or h, such as 10s")
+
+
+class Scaled(Subconstruct):  # type: ignore[misc]
+    """A number on the wire with what it measures: ``physical = raw * scale + offset`` in `unit`.
+
+    Parses and builds the raw number; the unit is used where physical values are asked for, and never twice.
+
+    Args:
+        subcon: a construct field that parses to a number.
+        scale: the size of one raw step, in `unit`.
+        unit: "m", "s", "deg", "deg/s", "Hz", ... ("" for a pure number).
+        offset: physical value of raw 0, in `unit`.
+    """
+
+    def __init__(self, subcon: Construct, scale: float, unit: str, offset: float = 0) -> None:
+        super().__init__(subcon)
+        self.scale, self.unit, self.offset = scale, unit, offset
+
+    def _parse(self, stream: Any, context: Any, path: str) -> Any:
+        return self.subcon._parsereport(stream, context, path)
+
+    def _build(self, obj: Any, stream: Any, context: Any, path: str) -> Any:
+        return self.subcon._build(obj, stream, context, path)
+
+
+class Checksummed(Subconstruct):  # type: ignore[misc]
+    """A struct sealed by one of its own fields, wherever in it that field stands. May nest.
+
+    Args:
+        struct: a construct Struct.
+        field: dotted name of the field (or fields, low bits first) that holds the checksum.
+        algorithm: a `Checksum`; where left out, a ``lidarspec_checksum`` hook has to supply it.
+        over: names of consecutive fields that the checksum covers; by default every byte of the struct except
+            those that hold a bit of `field`.
+        absent: values of the field that mean "not filled": they pass, and stay as they are when built.
+    """
+
+    def __init__(
+        self,
+        struct: Construct,
+        field: str | Sequence[str],
+        algorithm: Checksum | None = None,
+        over: str | Iterable[str] | None = None,
+        absent: Iterable[int] = (),
+    ) -> None:
+        super().__init__(struct)
+        self.fields = (field,) if isinstance(field, str) else tuple(field)
+        self.algorithm = algorithm
+        self.over = (over,) if isinstance(over, str) else tuple(over) if over is not None else None
+        self.absent = frozenset(absent)
+
+    def _parse(self, stream: Any, context: Any, path: str) -> Any:
+        start = stream.tell()
+        obj = self._marked._parsereport(stream, context, path)
+        end = stream.tell()
+        note(context, path, start, end, obj, self)
+        if not verifying(context, checksums=True):
+            return obj
+        stream.seek(start)
+        data = stream.read(end - start)
+        stored, computed = self._stored(obj), self._computed(data, obj, start)
+        if stored != computed and stored not in self.absent:
+            name = self.fields[0]
+            width = (self._width() + 3) // 4
+            expected, got = (f"0x{value:0{width}x}" for value in (computed, stored))
+            reason = "checksum"
+            raise Mismatch(f"{path} -> {name.replace('.', ' -> ')}", self._span(obj, name)[0], expected, got, reason)
+        return obj
+
+    def _build(self, obj: Any, stream: Any, context: Any, path: str) -> Any:
+        given = [member(obj, name, None) for name in self.fields]
+        blank = obj
+        for name, value in zip(self.fields, given, strict=True):
+            blank = _replaced(blank, name, self._zero(name) if value is None else value)
+        con, trial = self._marked, io.BytesIO()
+        con._build(blank, trial, context, path)
+        data = trial.getvalue()
+        parsed = con._parsereport(io.BytesIO(data), _unverified(context), path)
+        if None not in given and self._stored(parsed) in self.absent:
+            return con._build(blank, stream, context, path)
+        return con._build(self._filled(blank, self._computed(data, parsed, 0)), stream, context, path)
+
+    @property
+    def _marked(self) -> Construct:
+        """The struct as a frame has it, which notes where its members stand; an author may also parse with it alone."""
+        return self.subcon if isinstance(unwrap(self.subcon), MarkedStruct) else prepare(self.subcon)
+
+    def verdict(self, data: bytes, obj: Any, base: int = 0) -> tuple[int, int]:
+        """The checksum that stands in one parsed struct and the one that should, for its bytes, which began at `base`."""
+        return self._stored(obj), self._computed(data, obj, base)
+
+    def covered(self, obj: Any, size: int, base: int = 0) -> list[tuple[int, int]]:
+        """The byte ranges (start, end) within the struct that the checksum covers, for one parsed frame."""
+        if self.over is not None:
+            spans = [self._span(obj, name) for name in self.over]
+            return [(spans[0][0] - base, spans[-1][1] - base)]
+        held = sorted(self._span(obj, name) for name in self.fields)
+        edges = [0, *(edge - base for span in held for edge in span), size]
+        return [(a, b) for a, b in zip(edges[::2], edges[1::2], strict=True) if b > a]
+
+    def _computed(self, data: bytes, obj: Any, base: int) -> int:
+        if self.algorithm is None:
+            raise Mismatch("", 0, "a checksum algorithm", "none; a lidarspec_checksum hook has to supply it", "checksum")
+        return self.algorithm(b"".join(data[a:b] for a, b in self.covered(obj, len(data), base)))
+
+    def _stored(self, obj: Any) -> int:
+        value = shift = 0
+        for name in self.fields:
+            part = member(obj, name)
+            if isinstance(part, bytes):
+                part = int.from_bytes(part, self.algorithm.order if self.algorithm else "little")
+            value |= int(part) << shift
+            shift += bit_width(self._field(name))
+        return value
+
+    def _filled(self, obj: Any, value: int) -> Any:
+        for name in self.fields:
+            con = self._field(name)
+            width = bit_width(con)
+            part: int | bytes = value & ((1 << width) - 1)
+            if isinstance(self._zero(name), bytes):
+                assert self.algorithm is not None
+                part = int(part).to_bytes(width // 8, self.algorithm.order)
+            obj = _replaced(obj, name, part)
+            value >>= width
+        return obj
+
+    def _width(self) -> int:
+        return sum(bit_width(self._field(name)) for name in self.fields)
+
+    def _field(self, name: str) -> Construct:
+        con = self.subcon
+        for part in name.split("."):
+            con = unwrap(unwrap(con)._subcons[part])
+        return con
+
+    def _zero(self, name: str) -> int | bytes:
+        return self._field(name).parse(bytes(8 * bit_width(self._field(name))))  # type: ignore[no-any-return]
+
+    def _span(self, obj: Any, name: str) -> tuple[int, int]:
+        """Where a dotted field stands, in bytes of the stream that was parsed; a bit field by the bytes that hold it."""
+        con, parts = self._marked, name.split(".")
+        for depth, part in enumerate(parts):
+            start, end = obj["_marks"][part]
+            con, obj = unwrap(con, bits=False)._subcons[part], obj[part]
+            if unwrap(con, bits=False) is not unwrap(con):
+                from lidarspec.spec.bits import bytes_of  # few checksums are bit fields, and every plugin imports this module
+
+                inside = bytes_of(con, parts[depth + 1 :])
+                return start + min(inside), start + max(inside) + 1
+        return start, end
+
+
+def _replaced(obj: Any, name: str, value: object) -> Any:
+    head, _, rest = name.partition(".")
+    copy = Container(obj)
+    copy[head] = _replaced(copy.get(head, {}), rest, value) if rest else value
+    return copy
+
+
+def _unverified(context: Any) -> Any:
+    """The same context for parsing back what was just built, with checks off."""
+    copy = Container(context)
+    copy["_params"] = Container(_verify=False)
+    return copy

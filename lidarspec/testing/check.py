@@ -1,0 +1,448 @@
+"""What can be checked: an installed sensor, a file that describes sensors, a distribution with all of its plugins.
+
+Where in a plugin's text a part of its spec stands: fields, frames, functions, commands and sensors, by file and line.
+
+Mistakes that show in the text of a plugin: what Python accepts, and what then does something else than it says.
+
+`lidarspec check` without the command line: every property and every rule over a sensor, a file or a distribution.
+"""
+
+from __future__ import annotations
+
+import ast
+import importlib.util
+import inspect
+import re
+import tomllib
+import traceback
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from lidarspec.errors import SourceError, SpecError
+from lidarspec.plugins import GROUP, EntryPoint, Registry, entry_points, file_module, registry
+from lidarspec.spec.description import Sensor
+from lidarspec.testing.conformance import PROPERTIES
+from lidarspec.testing.declared import declared
+from lidarspec.testing.findings import Finding, left_over
+from lidarspec.testing.subject import EXAMPLES, Subject
+
+#: the name of a file of golden vectors.
+VECTORS = "vectors.json"
+#: what the registry says -> the rule.
+SAID = (
+    ("there is no hook", "LS002"),
+    ("lacks @hookimpl", "LS003"),
+    ("another sensor has this id", "LS005"),
+    ("returns sensors, not", "LS006"),
+    ("that returns a sensor", "LS006"),
+    ("definition", "LS004"),
+    ("lidarspec_checksum for", "LS010"),
+)
+
+
+@dataclass(eq=False)
+class Target:
+    """Something to check.
+
+    Attributes:
+        sensors: that were found in it.
+        findings: what kept others from being found.
+        files: the modules that it is written in.
+        vectors: its golden vectors: beside a file; of a distribution with one sensor, in its folder or its tests.
+    """
+
+    sensors: list[Sensor] = field(default_factory=list)
+    findings: list[Finding] = field(default_factory=list)
+    files: list[Path] = field(default_factory=list)
+    vectors: Path | None = None
+
+
+def target(text: str | Path) -> Target:
+    """What a name stands for: a file, the id or alias of an installed sensor, or a distribution, by its name or its folder.
+
+    Raises:
+        SourceError: for a file that is not there, and for the folder of a distribution that is not installed.
+        UnknownSensor: for a name that is nothing of all this.
+    """
+    name = str(text)
+    if (Path(name) / "pyproject.toml").is_file():
+        return _folder(Path(name))
+    if "/" in name or "\\" in name or name.endswith(".py"):
+        return _file(Path(name))
+    entries = [entry for entry in entry_points(GROUP) if _normal(entry.distribution) == _normal(name)]
+    if entries:
+        return _distribution(entries)
+    sensor = registry().sensor(name)
+    homes = [plugin for plugin in registry().plugins if sensor.id in plugin.sensors]
+    files = [file for plugin in homes for file in module_files(plugin.entry_point.partition(" = ")[2])]
+    alone = [file.parent for file in files if [plugin.sensors for plugin in homes] == [(sensor.id,)]]
+    return Target([sensor], [], files, _vectors(*alone, *(folder.parent for folder in alone)))
+
+
+def _file(file: Path) -> Target:
+    found = Target(files=[file], vectors=_vectors(file.parent))
+    try:
+        found.sensors = _added(file_module(file), str(file))
+        if not found.sensors:
+            raise SpecError("there is no function lidarspec_sensors, marked @hookimpl, that returns a sensor")
+    except SourceError:
+        raise
+    except (Exception, SystemExit) as error:
+        found.findings.append(loading(error, [file]))
+        found.files = found.files if _readable(file) else []
+    return found
+
+
+def _folder(folder: Path) -> Target:
+    """The distribution whose source is in a folder."""
+    try:
+        name = str(tomllib.loads((folder / "pyproject.toml").read_text(encoding="utf-8"))["project"]["name"])
+    except (ValueError, KeyError) as error:
+        raise SourceError(f"{folder / 'pyproject.toml'} names no project: {error}") from None
+    entries = [entry for entry in entry_points(GROUP) if _normal(entry.distribution) == _normal(name)]
+    if not entries:
+        raise SourceError(f"{name} is not installed, or has no sensors: pip install -e {folder}")
+    found = _distribution(entries)
+    found.vectors = _vectors(folder, folder / "tests") if len(found.sensors) == 1 else None
+    return found
+
+
+def _vectors(*folders: Path) -> Path | None:
+    return next((folder / VECTORS for folder in folders if (folder / VECTORS).is_file()), None)
+
+
+def _distribution(entries: list[EntryPoint]) -> Target:
+    found = Target()
+    known = registry().sensors()
+    for entry in entries:
+        value = entry.value
+        try:
+            sensors = _added(entry.load(), value)
+        except (Exception, SystemExit) as error:
+            finding = loading(error, module_files(value))
+            found.findings.append(replace(finding, path=finding.path or f"{entry.name} = {value}"))
+            continue
+        found.files += [file for file in module_files(value) if file not in found.files]
+        found.sensors += [known.get(sensor.id, sensor) for sensor in sensors if sensor.id not in {one.id for one in found.sensors}]
+    names = {_normal(entry.distribution) for entry in entries}
+    told = [(plugin, _said(plugin.error)) for plugin in registry().plugins if _normal(plugin.distribution) in names and plugin.error]
+    found.findings += [Finding(code, plugin.error, plugin.entry_point) for plugin, code in told if code in ("LS005", "LS010")]
+    return found
+
+
+def _added(plugin: Any, name: str) -> list[Sensor]:
+    """The sensors of a plugin, loaded on its own, with its own hooks applied.
+
+    Raises:
+        Exception: whatever it fails with.
+    """
+    local = Registry()
+    ids = local.add(plugin, name=name)
+    sensors = [local.sensor(one) for one in ids]
+    hook: Any = getattr(plugin, "lidarspec_checksum", None)
+    for sensor in sensors if callable(hook) else []:
+        for frame in sensor.frames.values():
+            given = {"sensor": sensor, "frame": frame}
+            try:
+                _asked(hook, given)
+            except Exception as error:
+                raise SpecError(f"lidarspec_checksum for {sensor.id}: {type(error).__name__}: {error}", rule="LS010") from error
+    return [registry().hooked(sensor) for sensor in sensors]
+
+
+def _asked(hook: Callable[..., Any], given: dict[str, Any]) -> None:
+    """Call a hook with those of the arguments that it wants."""
+    hook(**{key: given[key] for key in inspect.signature(hook).parameters})
+
+
+def loading(error: BaseException, files: list[Path]) -> Finding:
+    """The finding for what a plugin failed with when it was loaded."""
+    cause = error.__cause__ if isinstance(error, SpecError) and error.__cause__ is not None else error
+    spots = [(spot.filename, spot.lineno or 0) for each in (error, cause) for spot in traceback.extract_tb(each.__traceback__)]
+    own = [spot for spot in spots if any(Path(spot[0]) == file.resolve() or Path(spot[0]) == file for file in files)]
+    if isinstance(cause, SyntaxError) and cause.filename:
+        own = [(cause.filename, cause.lineno or 0)]
+    file, line = own[-1] if own else (str(files[0]) if len(files) == 1 else "", 0)
+    path = error.path if isinstance(error, SpecError) and error.rule else ""
+    sensor = getattr(error, "sensor", "")
+    text = error.reason if isinstance(error, SpecError) and cause is error else f"{type(cause).__name__}: {cause}"
+    return Finding(_loading_rule(error, cause), " ".join(text.split()), path, sensor, file, line)
+
+
+def _loading_rule(error: BaseException, cause: BaseException) -> str:
+    """The rule of a failure, by its kind and by what was going on."""
+    functions = [spot.name for spot in traceback.extract_tb(cause.__traceback__)]
+    if isinstance(error, SpecError) and error.rule:
+        return error.rule
+    if isinstance(cause, TypeError) and "max_length" in str(cause):
+        return "LS009"
+    if "sizeof" in functions or "_sizeof" in functions:
+        return "LS008"
+    if isinstance(cause, SpecError):
+        return _said(str(cause)) or "LS007"
+    return "LS006" if "lidarspec_sensors" in functions else "LS001"
+
+
+def _said(text: str) -> str:
+    return next((code for words, code in SAID if words in text), "")
+
+
+def module_files(value: str) -> list[Path]:
+    """The files of the module, or of the package, that an entry point names; none where there is none."""
+    try:
+        found = importlib.util.find_spec(value.partition("[")[0].partition(":")[0].strip())
+    except (Exception, SystemExit):
+        return []
+    if found is None or not found.origin or not found.origin.endswith(".py"):
+        return []
+    file = Path(found.origin)
+    return sorted(file.parent.rglob("*.py")) if file.name == "__init__.py" else [file]
+
+
+def _readable(file: Path) -> bool:
+    """Whether its text is Python."""
+    try:
+        compile(file.read_text(encoding="utf-8"), str(file), "exec")
+    except (SyntaxError, ValueError):
+        return False
+    return True
+
+
+def _normal(name: str) -> str:
+    return re.sub(r"[-_.]+", "-", name).lower()
+
+
+Spot = tuple[str, int]
+
+
+class Places:
+    """The text of some modules, to be asked where things stand in it."""
+
+    def __init__(self, files: Iterable[Path]) -> None:
+        self._fields: list[tuple[tuple[str, ...], Spot]] = []
+        self._keys: dict[str, Spot] = {}
+        self._frames: dict[str, Spot] = {}
+        self._sensors: dict[str, Spot] = {}
+        for file in files:
+            tree = ast.parse(file.read_text(encoding="utf-8"), str(file))
+            self._fields += [(chain, (str(file), line)) for chain, line in _fields(tree, ())]
+            self._read(tree, str(file))
+
+    def placed(self, finding: Finding, sensor: Sensor | None = None) -> Finding:
+        """The finding with the file and line of what it is about, where they can be told."""
+        if finding.file:
+            return finding
+        spot = self._spot(finding.path, sensor) or (self._sensors.get(sensor.id) if sensor else None)
+        return replace(finding, file=spot[0], line=spot[1]) if spot else finding
+
+    def _spot(self, path: str, sensor: Sensor | None) -> Spot | None:
+        path = re.sub(r"\[\d*\]", "", path.rpartition(" ")[2])
+        frame, _, below = path.partition(".")
+        if frame == "commands":
+            return self._keys.get(below.partition(".")[0])
+        function = self._function(frame, below, sensor) if below in ("points", "plausible", "sweep") else None
+        return function or (self._field(tuple(below.split("."))) if below else None) or self._frames.get(frame)
+
+    def _function(self, frame: str, name: str, sensor: Sensor | None) -> Spot | None:
+        if sensor is None or frame not in sensor.frames:
+            return None
+        function = getattr(sensor.frames[frame], name, None) or getattr(sensor, name, None)
+        code = getattr(function, "__code__", None)
+        return (code.co_filename, code.co_firstlineno) if code is not None else None
+
+    def _field(self, parts: tuple[str, ...]) -> Spot | None:
+        """The field whose names in the text are the longest end of the path."""
+        fitting = [(len(chain), spot) for chain, spot in self._fields if parts[-len(chain) :] == chain]
+        return max(fitting, key=lambda found: found[0])[1] if fitting else None
+
+    def _read(self, tree: ast.Module, file: str) -> None:
+        for node in ast.walk(tree):
+            match node:
+                case ast.Dict(keys=keys, values=values):
+                    for key, value in zip(keys, values, strict=True):
+                        if isinstance(key, ast.Constant) and isinstance(key.value, str):
+                            self._keys.setdefault(key.value, (file, key.lineno))
+                            if isinstance(value, ast.Call) and ast.unparse(value.func).endswith(("Frame", "replace")):
+                                self._frames.setdefault(key.value, (file, key.lineno))
+                case ast.Call(args=[ast.Constant(value=str(name)), *_]):
+                    self._sensors.setdefault(name, (file, node.lineno))
+                case ast.keyword(arg="id", value=ast.Constant(value=str(name))):
+                    self._sensors.setdefault(name, (file, node.value.lineno))
+
+
+def _fields(node: ast.AST, chain: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...], int]]:
+    """Every ``"name" / construct`` with the names that it stands within."""
+    match node:
+        case ast.BinOp(op=ast.Div(), left=ast.Constant(value=str(name)), right=right):
+            yield (*chain, name), node.lineno
+            yield from _fields(right, (*chain, name))
+        case _:
+            for child in ast.iter_child_nodes(node):
+                yield from _fields(child, chain)
+
+
+#: calls that read the clock of the wall.
+WALL_CLOCKS = frozenset(
+    ["time.time", "time.time_ns", "datetime.now", "datetime.utcnow", "datetime.today", "datetime.datetime.now", "datetime.datetime.utcnow"]
+)
+BROAD = frozenset({"Exception", "BaseException"})
+
+
+def written(files: Iterable[Path]) -> list[Finding]:
+    """The findings in the text of some modules."""
+    found = []
+    for file in files:
+        tree = ast.parse(file.read_text(encoding="utf-8"), str(file))
+        found += [Finding(code, what, file=str(file), line=node.lineno) for code, what, node in _mistakes(tree)]
+    return found
+
+
+def _mistakes(tree: ast.Module) -> Iterator[tuple[str, str, ast.expr | ast.stmt | ast.ExceptHandler]]:
+    expressions = _names_of_this(tree)
+    sockets = any(isinstance(node, ast.Import | ast.ImportFrom) and "socket" in ast.unparse(node) for node in ast.walk(tree))
+    for node in ast.walk(tree):
+        match node:
+            case ast.ExceptHandler() if _broad(node.type) and _silent(node.body):
+                yield "LS801", f"except {ast.unparse(node.type) if node.type else ''}: {ast.unparse(node.body[0])}", node
+            case ast.Call() if ast.unparse(node.func) in WALL_CLOCKS:
+                yield "LS802", f"{ast.unparse(node.func)}()", node
+            case ast.Call(func=ast.Name(id="hasattr"), args=[ast.Name(id=name), *_]) if name in expressions:
+                yield "LS805", ast.unparse(node), node
+            case ast.Expr(value=ast.Call() as call) if _short_write(call, sockets=sockets):
+                yield "LS803", f"what {ast.unparse(call.func)} returns is dropped", node
+        for test in _tests(node):
+            if _is_expression(test, expressions):
+                yield "LS804", f"Python asks whether `{ast.unparse(test)}` is true", test
+
+
+def _names_of_this(tree: ast.Module) -> set[str]:
+    """The names under which construct's `this` and `obj_` are known in a module."""
+    imported = [alias for node in ast.walk(tree) if isinstance(node, ast.ImportFrom) and node.module == "construct" for alias in node.names]
+    return {alias.asname or alias.name for alias in imported if alias.name in ("this", "obj_", "len_")}
+
+
+def _tests(node: ast.AST) -> list[ast.expr]:
+    """The expressions whose truth Python asks for at a node."""
+    match node:
+        case ast.If(test=test) | ast.While(test=test) | ast.IfExp(test=test) | ast.Assert(test=test):
+            return [test]
+        case ast.BoolOp(values=values):
+            return values
+        case ast.UnaryOp(op=ast.Not(), operand=operand):
+            return [operand]
+    return []
+
+
+def _is_expression(test: ast.expr, names: set[str]) -> bool:
+    """Whether a test is an expression of construct: made of `this`, and no call."""
+    if isinstance(test, ast.BoolOp | ast.Call):
+        return False
+    return any(isinstance(node, ast.Name) and node.id in names for node in ast.walk(test))
+
+
+def _broad(kind: ast.expr | None) -> bool:
+    return kind is None or any(isinstance(node, ast.Name) and node.id in BROAD for node in ast.walk(kind))
+
+
+def _silent(body: list[ast.stmt]) -> bool:
+    """Whether a handler does nothing with what it caught."""
+    only = body[0]
+    if len(body) > 1:
+        return False
+    constant = isinstance(only, ast.Return) and (
+        only.value is None or isinstance(only.value, ast.Constant | ast.List | ast.Dict | ast.Tuple)
+    )
+    return constant or isinstance(only, ast.Pass | ast.Continue) or (isinstance(only, ast.Expr) and isinstance(only.value, ast.Constant))
+
+
+def _short_write(call: ast.Call, *, sockets: bool) -> bool:
+    """Whether a call writes as much as it can, and its count is what is dropped."""
+    match call.func:
+        case ast.Attribute(value=ast.Name(id="os"), attr="write"):
+            return True
+        case ast.Attribute(attr="send"):
+            return sockets and len(call.args) == 1 and not isinstance(call.args[0], ast.Constant)
+    return False
+
+
+#: rules without which there is nothing to try, and what is skipped then.
+FATAL, ELSE = frozenset({"LS114", "LS115", "LS301"}), "everything else"
+
+
+@dataclass(eq=False)
+class Report:
+    """What was found.
+
+    Attributes:
+        name: the sensor's id, or what was checked where there is none.
+        findings: what is wrong.
+        held: how many properties hold.
+        skipped: property -> why it does not apply.
+        measured: what was measured along the way.
+    """
+
+    name: str
+    findings: list[Finding]
+    held: int = 0
+    skipped: dict[str, str] = field(default_factory=dict)
+    measured: dict[str, str] = field(default_factory=dict)
+
+    def to_dict(self) -> dict[str, Any]:
+        """The report as JSON has it."""
+        return {**vars(self), "findings": [finding.to_dict() for finding in self.findings]}
+
+
+def reports(
+    target: Target, name: str, *, examples: int = EXAMPLES, vectors: Path | None = None, watch: Callable[[str], None] | None = None
+) -> Iterator[Report]:
+    """A report of the text and the loading of a target, where there is something to say, and one of each of its sensors.
+
+    Args:
+        name: what was asked for.
+        examples: of each frame type, for each property.
+        vectors: golden vectors; by default those that the target has.
+        watch: is told what is looked at.
+    """
+    places = Places(target.files)
+    mistakes = [places.placed(finding) for finding in target.findings] + written(target.files)
+    single = [sensor for sensor in target.sensors if len(target.sensors) == 1]
+    if mistakes and not single:
+        yield Report(name, mistakes)
+    for sensor in target.sensors:
+        subject = Subject(sensor, examples, vectors=vectors or target.vectors)
+        yield _report(subject, places, mistakes if single else [], watch or (lambda text: None))
+
+
+def _report(subject: Subject, places: Places, mistakes: list[Finding], watch: Callable[[str], None]) -> Report:
+    sensor: Sensor = subject.sensor
+    report = Report(sensor.id, list(mistakes))
+    if not sensor.frames:
+        report.skipped["all properties"] = "it has no frames before it is configured with its file"
+        return report
+    watch(f"{sensor.id}: declaration")
+    report.findings += declared(subject)
+    for one in PROPERTIES:
+        reason = one.lacks(subject) or _in_vain(one.unless, report.findings)
+        if reason:
+            report.skipped[one.name] = reason
+            continue
+        watch(f"{sensor.id}: {one.name}")
+        found = one.findings(subject)
+        report.held += not found
+        report.findings += found
+        if any(finding.code in FATAL for finding in report.findings):
+            report.skipped[ELSE] = "nothing can be tried before what is found is mended"
+            break
+    distinct = list({(finding.code, finding.path): finding for finding in reversed(report.findings)}.values())[::-1]
+    left = left_over(distinct, sensor, whole=ELSE not in report.skipped)
+    report.findings = [places.placed(finding, sensor) for finding in left]
+    report.measured = subject.measured
+    return report
+
+
+def _in_vain(unless: tuple[str, ...], findings: list[Finding]) -> str:
+    """Why a property would only say again what was found."""
+    found = sorted({finding.code for finding in findings} & set(unless))
+    return f"{', '.join(found)} is found already" if found else ""

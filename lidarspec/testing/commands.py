@@ -1,0 +1,88 @@
+"""Commands: they parse back, hold their arguments to their ranges, and the simulated sensor answers as documented."""
+
+from __future__ import annotations
+
+from lidarspec.device.session import Reply, Session
+from lidarspec.errors import CommandError, LidarSpecError, OutOfRange
+from lidarspec.framing.frame_engine import codec
+from lidarspec.simulation.device import SimulatedDevice
+from lidarspec.spec.links import is_datagram
+from lidarspec.testing.comparisons import assert_command
+from lidarspec.testing.findings import Violation, require
+from lidarspec.testing.subject import Subject
+
+#: ns of one step of a simulated conversation.
+STEP = 20_000_000
+
+
+def arguments(subject: Subject, name: str, share: float) -> dict[str, float]:
+    """An argument for each that a command takes, so far between its lowest and its highest value."""
+    return {key: low + share * (high - low) for key, (_, low, high) in subject.sensor.commands[name].args.items()}
+
+
+def a_command_parses_back(subject: Subject, name: str) -> None:
+    """The frame of a command has its fixed values, its arguments within half a step, and builds again."""
+    for share in (0.0, 0.37, 1.0):
+        try:
+            assert_command(subject.sensor, name, arguments(subject, name, share))
+        except LidarSpecError as error:
+            raise Violation("LS601", str(error), f"commands.{name}") from error
+
+
+def arguments_are_held_to_their_ranges(subject: Subject, name: str) -> None:
+    """An argument outside its range is refused."""
+    for key, (_, low, high) in subject.sensor.commands[name].args.items():
+        for outside in (low - 1, high + 1):
+            try:
+                subject.sensor.command(name, **{**arguments(subject, name, 0.0), key: outside})
+            except OutOfRange:
+                continue
+            raise Violation("LS602", f"{key} = {outside:g} is sent, and {low:g} .. {high:g} is declared", f"commands.{name}.args.{key}")
+
+
+def replies_can_match(subject: Subject, name: str) -> None:
+    """Every field that a reply is told by is a field of one of the replies."""
+    command = subject.sensor.commands[name]
+    answers = [codec(subject.sensor.frames[reply]).schema.fields for reply in command.replies]
+    for path in (*command.matches, *command.echoes) if answers else ():
+        require(any(path in fields for fields in answers), "LS603", f"no reply has a field {path!r}", f"commands.{name}")
+
+
+def the_simulated_sensor_answers(subject: Subject, name: str) -> None:
+    """The simulated sensor gives the documented reply in time, to the lowest, a middle or the highest arguments at least."""
+    command = subject.sensor.commands[name]
+    if command.frame is None or not command.replies:
+        return
+    refused = ""
+    for share in (0.0, 0.37, 1.0) if command.args else (0.0,):
+        try:
+            reply = _asked(subject, name, arguments(subject, name, share))
+        except CommandError as error:
+            refused = refused or str(error)
+            continue
+        require(reply.confirmed, "LS604", "the reply is not confirmed", f"commands.{name}")
+        return
+    raise Violation("LS604", refused, f"commands.{name}")
+
+
+def _asked(subject: Subject, name: str, given: dict[str, float]) -> Reply:
+    """The reply of a simulated sensor to a command.
+
+    Raises:
+        CommandError: where there is none, or another one.
+    """
+    command, sensor = subject.sensor.commands[name], subject.sensor
+    device, session = SimulatedDevice(sensor), Session(sensor)
+    device.start(0)
+    pending = session.request(name, 0, **given)
+    decoder = sensor.decoder(stream=not is_datagram(sensor.links[command.link]))
+    now = 0
+    while not pending.done:
+        for out in session.outgoing():
+            device.receive(out.data, now, out.link)
+        now += STEP
+        mine = [data for arrived, data in device.outgoing(now) if arrived == command.link]
+        found = [item for data in mine for item in decoder.feed(data)] if mine else decoder.idle()
+        session.receive(found, now, link=command.link)
+        session.tick(now)
+    return pending.result()

@@ -1,0 +1,339 @@
+"""Where the points of a frame come from: the fields that `points` uses for each of its columns, and the beams of simulated packets.
+
+Geometry: clouds by the conventions, directions in radians, in order, across the full circle, and for a single point.
+
+What a simulated sensor measures is where the scene is: simulated, decoded, and held against the scene's own surfaces.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+import random
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarspec.columns.columns import Batch, Fields, aligned, unpadded
+from lidarspec.columns.graph import Node, Traced, trace
+from lidarspec.errors import LidarSpecError, SpecError, UsageError
+from lidarspec.framing.frame_engine import CompiledCodec, codec
+from lidarspec.packets.packets import Packets
+from lidarspec.points.plain import evaluate, points_function
+from lidarspec.simulation.frame_maker import FrameMaker, examples, sealed
+from lidarspec.simulation.scenes import Room, furnished
+from lidarspec.simulation.simulator import simulation
+from lidarspec.spec.fields import factor
+from lidarspec.spec.results import Polar
+from lidarspec.spec.timing import OnWrap
+from lidarspec.testing import subject as material
+from lidarspec.testing.comparisons import assert_well_formed
+from lidarspec.testing.findings import Violation, require
+from lidarspec.testing.frames import acceptable
+from lidarspec.testing.subject import Subject
+from lidarspec.wire.frame_table import Group, Rows
+from lidarspec.wire.schema import FieldInfo
+
+Floats = NDArray[np.float64]
+
+
+def data_frames(subject: Subject) -> list[str]:
+    """The names of the frame types that carry points."""
+    return [name for name, frame in subject.sensor.frames.items() if frame.data]
+
+
+def swept(subject: Subject, name: str, packets: int, start: int = 0) -> list[bytes]:
+    """Packets along the sensor's `sweep`; none where it declares none, or the frame type is not compiled."""
+    sweep = subject.sensor.frames[name].sweep or subject.sensor.sweep
+    if sweep is None:
+        return []
+    try:
+        return sealed(FrameMaker(subject.sensor, name).table([sweep(start + index) for index in range(packets)]))
+    except LidarSpecError:
+        return []
+
+
+def read(subject: Subject, name: str, frames: list[bytes]) -> Packets:
+    """Frames of one data type, decoded: a mode that another frame switches to is begun with that frame."""
+    sensor = subject.sensor
+    if sum(frame.data for frame in sensor.frames.values()) > 1:
+        sensor = sensor.configure(answer=name)
+    return sensor.decode(frames if sensor.datagrams else b"".join(frames), name)
+
+
+def traced(subject: Subject, name: str) -> Any:
+    """What `points` returns for traced columns of one example; None where the frame is not compiled.
+
+    Raises:
+        Untraceable: where it cannot be traced, with the reason.
+    """
+    packets = read(subject, name, [subject.example(name)] * subject.sensor.frames[name].confirm)
+    if not isinstance(packets.table, Rows) or not packets.table.groups:
+        return None
+    group = packets.table.groups[0]
+    batch = packets.batch()
+    table = Rows(batch.table.schema, [Group(group.layout, np.arange(2), np.ascontiguousarray(group.rows[[0, 0]]))])
+    state = {key: (frames, which[group.where[[0, 0]]]) for key, (frames, which) in batch.state.items()}
+    return trace(points_function(subject.sensor, name), Batch(table, np.zeros(2, np.bool_), state, batch.defaults))[0]
+
+
+def used(value: Any) -> Iterator[tuple[Node, bool]]:
+    """The fields that a traced value is made of, and whether each is only looked up in a table."""
+    pending = [(value.node, False)] if isinstance(value, Traced) else []
+    while pending:
+        node, looked_up = pending.pop()
+        if node.kind in ("field", "state"):
+            yield node, looked_up
+        looked_up = looked_up or getattr(node.function, "__qualname__", "").startswith("take.")
+        pending += [(arg, looked_up) for arg in node.args if isinstance(arg, Node)]
+
+
+def field_of(subject: Subject, name: str, node: Node) -> FieldInfo | None:
+    """The field that a node is, of this frame type or of the state that another one leaves."""
+    from lidarspec.framing.frame_engine import codec
+
+    frame, path = name, node.path
+    if node.kind == "state":
+        _, frame, path = node.path.split(".", 2)
+    return codec(subject.sensor.frames[frame]).schema.fields.get(path)
+
+
+@dataclass(frozen=True, eq=False)
+class Beams:
+    """Directions of points as `points` gives them, before they are folded, padding left out."""
+
+    azimuth: Floats
+    elevation: Floats
+
+
+def beams(subject: Subject, name: str, packets: Packets) -> Beams | None:
+    """The directions of the points of some packets; None where they are not polar."""
+    batch = packets.batch()
+    with np.errstate(all="ignore"):
+        polar = points_function(subject.sensor, name)(Fields(batch))
+        if not isinstance(polar, Polar):
+            return None
+        arrays, axes, _ = aligned((polar.azimuth, polar.elevation, polar.range), batch)
+    shape = np.broadcast_shapes((len(packets), *(1,) * len(axes)), *(array.shape for array in arrays))
+    mask = unpadded(axes, shape, batch)
+    azimuth, elevation = (
+        np.broadcast_to(np.asarray(array, np.float64), shape).reshape(shape[0], math.prod(shape[1:])) for array in arrays[:2]
+    )
+    return Beams(azimuth[mask], elevation[mask]) if mask is not None else Beams(azimuth, elevation)
+
+
+#: packets along the sweep whose directions are looked at.
+PACKETS = 400
+#: radians beyond which an azimuth along a sweep, or a drawn one, can only be degrees.
+TURNS, DRAWN = 4 * np.pi, 15 * np.pi
+#: share of the steps that go one way where a sensor rotates, and the step against it that is too much, radians and medians.
+ONE_WAY, BACK, MEDIANS = 0.8, np.deg2rad(1.5), 4
+#: raw steps by which an angle is moved to see whether the points move with it.
+SMALL = 4
+FULL = {"deg": 360.0, "rad": 2 * np.pi}
+
+
+def clouds_keep_the_conventions(subject: Subject, name: str) -> None:
+    """float32 metres and radians, azimuth in [-pi, pi), no place without a return; and `points` does not fail."""
+    frames = [subject.example(name, seed=seed) for seed in range(max(len(subject.seeds(subject.sensor.frames[name])), 2))]
+    try:
+        packets = read(subject, name, frames)
+        cloud = packets.points()
+    except SpecError as error:
+        raise Violation("LS414", str(error), f"{name}.points") from error
+    errors = packets.stats.tracebacks
+    require(not packets.stats.plugin_errors, "LS414", errors[0].strip().splitlines()[-1] if errors else "", name)
+    try:
+        assert_well_formed(cloud)
+    except AssertionError as error:
+        raise Violation("LS501", str(error).splitlines()[0] or "the cloud is not well formed", f"{name}.points") from error
+
+
+def directions_are_radians(subject: Subject, name: str) -> None:
+    """No direction is so large that it can only be degrees."""
+    if any(info.kind == "float" for info in codec(subject.sensor.frames[name]).schema.fields.values()):
+        return  # which may hold any number
+    along = swept(subject, name, 64)
+    frames = along or [subject.example(name, seed=seed) for seed in range(16)]
+    found = beams(subject, name, read(subject, name, frames))
+    if found is None:
+        return
+    azimuth, elevation = (float(np.nanmax(np.abs(part), initial=0)) for part in (found.azimuth, found.elevation))
+    require(azimuth <= (TURNS if along else DRAWN), "LS502", f"an azimuth of {azimuth:.4g} rad", f"{name}.points")
+    require(not along or elevation <= np.pi / 2 + 1e-6, "LS502", f"an elevation of {elevation:.4g} rad", f"{name}.points")
+
+
+def a_single_point_has_a_direction(subject: Subject, name: str) -> None:
+    """Where the number of points is in the header, frames with one point have as sound a direction as others."""
+    engine, source = codec(subject.sensor.frames[name]), random.Random(subject.sensor.id)
+    if not isinstance(engine, CompiledCodec):
+        return
+    counts = [path for path in engine.tree.choose(source)[1] if engine.schema.fields[path].const is None]
+    for path in counts:
+        try:
+            single = examples(subject.sensor, name, source, {**subject.drawers(name), path: lambda _: 1})
+        except SpecError:
+            continue
+        try:
+            cloud = read(subject, name, (single * 3)[: max(3, subject.sensor.frames[name].confirm)]).points()
+        except SpecError as error:
+            raise Violation("LS503", f"with {path} = 1: {error.reason}", f"{name}.{path}") from error
+        unknown = bool(len(cloud)) and bool(np.isnan(cloud.azimuth).all())
+        known = read(subject, name, [subject.example(name, seed=seed) for seed in range(12)]).points()
+        require(not unknown or np.isnan(known.azimuth).all(), "LS503", f"with {path} = 1 every azimuth is nan", f"{name}.{path}")
+
+
+def the_full_circle_is_the_same_as_none(subject: Subject, name: str) -> None:
+    """A frame with an angle of exactly 360 degrees, where it is plausible, has the points of the one with 0."""
+    for path, info in codec(subject.sensor.frames[name]).schema.fields.items():
+        full = _full_circle(info)
+        if full is None:
+            continue
+        clouds: list[Any] = []
+        for value in (full[0], full[0] + SMALL, full[1]):
+            frame = _with(subject, name, path, value)
+            if frame is None:
+                break
+            try:
+                packets = read(subject, name, [frame] * max(2, subject.sensor.frames[name].confirm))
+                clouds += [packets.points()] if len(packets) else []
+            except SpecError as error:
+                raise Violation("LS505", f"{path} of exactly {FULL[info.unit]:g} {info.unit}: {error.reason}", f"{name}.{path}") from error
+        if len(clouds) < 3 or len({len(cloud) for cloud in clouds}) > 1:
+            continue
+        nought, turned, circle = clouds
+        moved = np.abs((turned.azimuth - nought.azimuth + np.pi) % (2 * np.pi) - np.pi)
+        along = float(np.nanmax(moved, initial=0)) / (SMALL * abs(info.scale) * 2 * np.pi / FULL[info.unit])
+        if not 0.5 < along < 1.5:
+            continue  # points do not move with it: a rate, a step, or another angle than the azimuth
+        apart = np.nanmax(np.abs(nought.xyz - circle.xyz) / (1 + np.abs(nought.range))[:, None], initial=0)
+        same = np.array_equal(nought.valid, circle.valid) and apart < 1e-3
+        require(same, "LS505", f"{path} of exactly {FULL[info.unit]:g} {info.unit} gives other points than 0", f"{name}.{path}")
+
+
+def angles_are_in_order(subject: Subject, name: str) -> None:
+    """Along the sweep of a sensor that rotates, the azimuths of each laser go one way, also across the full circle."""
+    frames = swept(subject, name, PACKETS if subject.sensor.frames[name].max_length <= material.SHORT else PACKETS // 4)
+    if not frames:
+        return
+    found = evaluate(read(subject, name, frames))
+    counts = found.counts.reshape(len(found.counts), -1).sum(axis=1) if found.counts.ndim > 1 else found.counts
+    cloud, packet = found.cloud, np.repeat(np.arange(found.ready), counts)
+    rings = cloud.ring if cloud.ring is not None else np.zeros(len(cloud))
+    for ring in np.unique(rings)[:4]:
+        mine = (rings == ring) & np.isfinite(cloud.azimuth)
+        angle, number = cloud.azimuth[mine].astype(np.float64), packet[mine]
+        steps = (np.diff(angle) + np.pi) % (2 * np.pi) - np.pi
+        moving = np.abs(steps) > 1e-9
+        if moving.sum() < 8:
+            continue
+        median = float(np.median(steps[moving]))
+        one_way = float((np.sign(steps[moving]) == np.sign(median)).mean())
+        back = steps * np.sign(median) < -max(BACK, MEDIANS * abs(median))
+        if one_way < ONE_WAY:
+            wraps = isinstance(subject.sensor.scan, OnWrap)
+            require(
+                not wraps, "LS506", f"only {one_way:.0%} of the steps go the same way, and scans are cut where it wraps", f"{name}.points"
+            )
+            continue
+        if back.any():
+            spot = int(np.flatnonzero(back)[0])
+            said = (
+                f"from {np.rad2deg(angle[spot]):.1f} to {np.rad2deg(angle[spot + 1]):.1f} degrees in packet {number[spot + 1]} of the sweep"
+            )
+            inside = number[spot] == number[spot + 1]
+            raise Violation("LS504" if inside else "LS506", said, f"{name}.points")
+
+
+def counters_run_on(subject: Subject, name: str) -> None:
+    """Along the sweep no packet counts as lost, late or doubled, and time does not run back."""
+    frames = swept(subject, name, 700 if subject.sensor.frames[name].max_length <= 1500 else 260)
+    if not frames or name != subject.sensor.data_frame:
+        return
+    packets = read(subject, name, frames)
+    stats = packets.stats
+    if subject.sensor.sequence is not None:
+        said = f"along the sweep {stats.lost} packets are lost, {stats.late} late, {stats.duplicates} doubled"
+        require((stats.lost, stats.late, stats.duplicates) == (0, 0, 0), "LS510", said, f"{name}.{subject.sensor.sequence.field}")
+    if subject.sensor.clock is not None and len(packets) > 1:
+        back = np.diff(packets.time_ns)
+        spot = int(back.argmin())
+        require(back.min() >= 0, "LS509", f"packet {spot + 1} of the sweep is {-back.min() / 1e9:g} s before the one in front of it", name)
+
+
+def _full_circle(info: FieldInfo) -> tuple[int, int] | None:
+    """The raw values of no angle and of the full circle; None where the field cannot hold both."""
+
+    if info.kind != "int" or info.const is not None or info.unit not in FULL or not info.scale:
+        return None
+    raw = [(value - info.offset) / info.scale for value in (0.0, FULL[info.unit])]
+    low, high = info.limits
+    whole = all(abs(value - round(value)) < 1e-6 and low <= round(value) <= high for value in raw)
+    return (round(raw[0]), round(raw[1])) if whole else None
+
+
+def _with(subject: Subject, name: str, path: str, value: int) -> bytes | None:
+    """An example with every element of one field set; None where no frame can carry it."""
+    parsed = copy.deepcopy(subject.sensor.parse(subject.example(name, seed=1), frame=name))
+    for holder, key, own in list(material.integers(parsed)):
+        if own == path:
+            holder[key] = value
+    built = acceptable(subject, name, parsed)
+    try:
+        return built if built is not None and subject.sensor.parse(built, frame=name) is not None else None
+    except LidarSpecError:
+        return None
+
+
+SCENE_PACKETS = 200
+#: metres by which a point may be off its surface beyond half a step: float32, and steps that a header or a code word widens.
+EXACT, UNTOLD = 2e-6, 0.004
+
+
+def off(room: Room, xyz: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Metres from points to the nearest surface of a room: nothing of the simulator's own geometry is used."""
+    found = np.full(len(xyz), np.inf)
+    for body in (room.walls, *room.boxes):
+        if body is None:
+            continue
+        middle = (np.array(body.low) + body.high) / 2
+        beyond = np.abs(xyz - middle) - (np.array(body.high) - body.low) / 2
+        outside = np.linalg.norm(np.maximum(beyond, 0), axis=1)
+        found = np.minimum(found, np.abs(outside + np.minimum(beyond.max(axis=1), 0)))
+    return found
+
+
+def half_step(subject: Subject, name: str) -> float:
+    """Half a step of the coarsest range field, at least what a header or a code word may widen it to."""
+    fields = codec(subject.sensor.frames[name]).schema.fields.values()
+    metres = [abs(info.scale) * float(factor(info.unit, "m") or 0) for info in fields if factor(info.unit, "m") is not None]
+    return max([UNTOLD, *metres]) / 2 if max(metres, default=0) > UNTOLD else UNTOLD
+
+
+def a_simulated_scene_comes_back(subject: Subject, name: str) -> None:
+    """Packets simulated in a room decode to points on its walls, within the steps of the format."""
+    room = furnished(len(subject.sensor.id))
+    room = Room(room.walls, room.boxes)
+    try:
+        frames = simulation(subject.sensor, name).block(5, SCENE_PACKETS, room).frames
+    except UsageError:
+        return
+    except LidarSpecError as error:
+        raise Violation("LS508", str(error), f"{name}.sweep") from error
+    cloud = read(subject, name, frames).points()
+    known = len(cloud) - 2 * len(cloud) // len(frames)  # directions of the last packet may ask for what follows
+    valid = cloud.valid[:known]
+    share = float(valid.mean()) if known else 0.0
+    require(share > 0.5, "LS507", f"{share:.0%} of the beams in a closed room return", f"{name}.points")
+    apart = off(room, cloud.xyz[:known][valid].astype(np.float64))
+    worst = float(apart.max(initial=0))
+    require(
+        worst < half_step(subject, name) + EXACT, "LS507", f"a point lies {worst:.4f} m from every surface of the scene", f"{name}.points"
+    )
+    near, far = subject.sensor.range_limits
+    ranges = cloud.range[:known][valid]
+    inside = not len(ranges) or (ranges.min() >= near - UNTOLD and ranges.max() <= far + UNTOLD)
+    require(inside, "LS507", f"ranges of {ranges.min() if len(ranges) else 0:.3f} to {ranges.max() if len(ranges) else 0:.3f} m", name)

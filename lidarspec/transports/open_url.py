@@ -1,0 +1,119 @@
+"""SOURCE, the one noun for where bytes come from: text to transport."""
+
+from __future__ import annotations
+
+import importlib
+import re
+from pathlib import Path
+from typing import Any
+from urllib.parse import parse_qs
+
+from lidarspec.device.settings import named
+from lidarspec.errors import UnknownOption, UsageError
+from lidarspec.plugins import registry
+from lidarspec.spec.description import Sensor
+from lidarspec.spec.links import Link, Tcp, Udp
+from lidarspec.transports.files import open_file
+from lidarspec.transports.live_transport import Address, failure
+from lidarspec.transports.protocol import Transport
+
+#: scheme -> the module of lidarspec.transports whose `connect(address, sensor)` opens it.
+SCHEMES = {"serial": "serial", "udp": "udp", "tcp": "tcp", "sim": "simulated"}
+_SCHEME = re.compile(r"^([a-z][a-z0-9+.-]+):")
+#: names of serial ports: Windows' COM4, and everything that POSIX systems call theirs.
+_PORT = re.compile(r"(COM\d+|\\\\\.\\\w+|/dev/(tty|cu\.|pts/|serial/|rfcomm).*)", re.IGNORECASE)
+#: what stands in /dev and is read like a file.
+_NO_PORTS = {"null", "zero", "full", "random", "urandom", "stdin", "fd"}
+
+
+def transport(source: str | Path, sensor: Sensor | None = None) -> Transport:
+    """The open transport for a SOURCE.
+
+    Args:
+        sensor: whose declared link says what the source leaves out: baud rate, control lines, ports.
+
+    Raises:
+        UsageError: for a scheme that neither the package nor a plugin knows, and what each kind of source does not take.
+        SourceError: where it cannot be opened.
+    """
+    device = named(source)
+    text = str(source) if device is None else device.source
+    address = live_address(text)
+    if address is not None:
+        return _live(address, sensor)
+    path, mark, query = text.rpartition("?")
+    if mark and not Path(text).exists():
+        options = parse_qs(query, keep_blank_values=True)
+        unknown = set(options) - {"src"}
+        if unknown:
+            raise UnknownOption(min(unknown), ["src"], place=text)
+        return open_file(path, sender=options["src"][-1] if "src" in options else None)
+    return open_file(text)
+
+
+def live_address(source: str | Path) -> Address | None:
+    """What a SOURCE says where it is no file: its scheme, place and options; None for files and standard input."""
+    text = str(source)
+    if is_port(text):
+        return Address.parse(text, scheme="serial")
+    scheme = _SCHEME.match(text)
+    return Address.parse(text) if scheme is not None and not Path(text).exists() else None
+
+
+def is_port(text: str) -> bool:
+    """Whether a SOURCE without a scheme names a serial port."""
+    name = text.partition("?")[0]
+    path = Path(name)
+    if path.is_char_device():
+        return path.name not in _NO_PORTS and path.resolve().name not in _NO_PORTS
+    return _PORT.fullmatch(name) is not None and not path.is_file()
+
+
+def has_control(source: str | Path) -> bool:
+    """Whether a source says by itself where commands go: ``control=HOST[:PORT]``."""
+    address = live_address(source)
+    return address is not None and bool(address.options.get("control"))
+
+
+def control_link(source: str | Path, name: str, link: Link, host: str | None) -> Transport:
+    """The open transport of a link that commands go over apart from the data.
+
+    Args:
+        name, link: the link as the sensor declares it.
+        host: the sensor's address as far as it is known; ``control=HOST[:PORT]`` of the source comes before it.
+
+    Raises:
+        UsageError: where nobody says the address.
+        SourceError: where it cannot be opened.
+    """
+    address = live_address(source)
+    said = address.options.get("control", "") if address is not None else ""
+    if live_address(said) is not None:
+        return transport(said)
+    found, port = Address(said, "", said).host_and_port()
+    known = found or host
+    if isinstance(link, Tcp) and known:
+        return transport(f"tcp://{_bracketed(known)}:{port or link.port}")
+    if isinstance(link, Udp) and known and (port or link.ports):
+        from lidarspec.transports.udp import UdpTransport
+
+        remote = (known, port or link.ports[0])
+        return UdpTransport(f"udp://{_bracketed(known)}:{remote[1]}", [0], sender=known, remote=remote)
+    raise failure(f"{source}: nobody knows the address of the {name} link", f"the same with ?control=ADDRESS in {source}")
+
+
+def _live(address: Address, sensor: Sensor | None) -> Transport:
+    if address.scheme in SCHEMES:
+        module = importlib.import_module(f"lidarspec.transports.{SCHEMES[address.scheme]}")
+        opened: Transport = module.connect(address, sensor)
+        return opened
+    found: Any = registry().call("lidarspec_source", url=address.text)
+    if found is None:
+        known = ", ".join(f"{scheme}:" for scheme in SCHEMES)
+        raise UsageError(f"no transport is installed for {address.scheme!r} sources; known are files, - (standard input), {known}")
+    plugged: Transport = found
+    return plugged
+
+
+def _bracketed(host: str) -> str:
+    return f"[{host}]" if ":" in host else host

@@ -1,0 +1,341 @@
+"""Where each field of a frame stands, as data: offsets, strides, bits, constants, checksums; and loading by it.
+
+A `Layout` holds for frames of one kind of header; `lidarspec.wire.layout_tree` makes it from the construct tree.
+
+Constants of frames: compared in words of up to eight bytes, for many frames at a time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from contextvars import ContextVar
+from dataclasses import dataclass, field, replace
+from functools import cached_property, lru_cache
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarspec.spec.bits import BitField
+from lidarspec.spec.checksums import Checksum
+from lidarspec.wire.schema import FieldInfo
+
+Bytes2D = NDArray[np.uint8]
+
+
+def elements(rows: Bytes2D, dtype: np.dtype[Any], offset: int, shape: tuple[int, ...], strides: tuple[int, ...]) -> NDArray[Any]:
+    """What stands at an offset of each row (contiguous by itself) and at these strides from there, (n, *shape), not copied."""
+    if rows.flags.c_contiguous:
+        return np.ndarray((len(rows), *shape), dtype, rows, offset, (rows.shape[1], *strides))
+    first = rows[:, offset : offset + dtype.itemsize].view(dtype)
+    if not shape:
+        return first[:, 0]
+    return np.lib.stride_tricks.as_strided(first, (len(rows), *shape), (rows.strides[0], *strides))
+
+
+def span(rows: Bytes2D) -> NDArray[np.uint8]:
+    """All bytes from the first of the first row to the last of the last one, those between the rows included, (k,), not copied."""
+    if rows.flags.c_contiguous:
+        return rows.reshape(-1)
+    return np.lib.stride_tricks.as_strided(rows, ((len(rows) - 1) * rows.strides[0] + rows.shape[1],), (1,))
+
+
+@dataclass(frozen=True, eq=False)
+class Leaf:
+    """The place of one field.
+
+    Attributes:
+        info: what the field is.
+        offset: of its first element, in bytes from the start of the frame.
+        shape, strides: number of elements and bytes from one to the next along each of its arrays.
+        wire: its type with byte order where it can be read directly, else None.
+        elements: else the bits of each element of the innermost array (one, if that is not inside the bit block).
+        size: bytes of one element, or of the block that it is a part of.
+    """
+
+    info: FieldInfo
+    offset: int
+    shape: tuple[int, ...]
+    strides: tuple[int, ...]
+    size: int
+    wire: np.dtype[Any] | None = None
+    elements: tuple[BitField, ...] = ()
+
+    def load(self, rows: Bytes2D) -> NDArray[Any]:
+        """The raw values of frames given as rows of bytes, shape (n, *shape), native byte order."""
+        if self.wire is not None:
+            return self._view(rows, self.wire, 0).astype(self._native)
+        assert self.info.dtype is not None
+        if not self._packed:
+            return self._bits(rows, self.elements[0])
+        columns = [self._bits(rows, element) for element in self.elements]
+        return np.stack(columns, axis=-1)
+
+    def scalar(self, frame: bytes) -> int:
+        """The raw value of an integer field outside arrays, in the bytes of one frame."""
+        if self.elements:
+            return self.elements[0].value(frame[self.offset : self.offset + self.size])
+        assert self.wire is not None
+        order: Literal["big", "little"] = "big" if self.wire.byteorder == ">" else "little"
+        return int.from_bytes(frame[self.offset : self.offset + self.size], order, signed=self.wire.kind == "i")
+
+    def store(self, rows: Bytes2D, values: Any) -> None:
+        """Write raw values, broadcast to (n, *shape), into frames given as rows of bytes."""
+        full = np.broadcast_to(np.asarray(values), (len(rows), *self.shape))
+        if self.wire is not None:
+            self._view(rows, self.wire, 0)[...] = full.astype(self.wire.newbyteorder("="))
+            return
+        for index, element in enumerate(self.elements):
+            column = (full[..., index] if self._packed else full).astype(np.int64)
+            for part in element.segments:
+                view = self._view(rows, np.dtype("u1"), part.byte)
+                bits = (column >> part.target << part.low).astype(np.uint8) & np.uint8(part.mask)
+                view[...] = (view & np.uint8(~part.mask & 0xFF)) | bits
+
+    @cached_property
+    def _native(self) -> np.dtype[Any]:
+        assert self.wire is not None
+        return self.wire.newbyteorder("=")
+
+    @property
+    def _packed(self) -> bool:
+        """Whether the innermost array is inside the bit block, and so has no stride."""
+        return len(self.shape) > len(self.strides)
+
+    def _view(self, rows: Bytes2D, dtype: np.dtype[Any], offset: int) -> NDArray[Any]:
+        shape = self.shape[: len(self.strides)]
+        if not len(rows) or 0 in shape:
+            return np.empty((len(rows), *shape), dtype)
+        return elements(rows, dtype, self.offset + offset, shape, self.strides)
+
+    def _bits(self, rows: Bytes2D, element: BitField) -> NDArray[Any]:
+        assert self.info.dtype is not None
+        wide = np.dtype(f"u{self.info.dtype.itemsize}")
+        whole = self._whole(rows, element, wide)
+        words = element.words if wide.itemsize > 2 and whole is None else None
+        if whole is not None:
+            total = whole
+        elif words is not None:
+            total = self._view(rows, np.dtype(words[0][0]), words[0][1]).astype(wide) << wide.type(words[0][2])
+            for word, byte, target in words[1:]:
+                total |= self._view(rows, np.dtype(word), byte).astype(wide) << wide.type(target)
+        else:
+            total = np.zeros((len(rows), *self.shape[: len(self.strides)]), wide)
+            for part in element.segments:
+                bits = (self._view(rows, np.dtype("u1"), part.byte) & np.uint8(part.mask)) >> part.low
+                total |= bits.astype(wide) << wide.type(part.target)
+        if element.signed:
+            sign = wide.type(1 << (element.width - 1))
+            return np.asarray(((total ^ sign) - sign).view(self.info.dtype))
+        return total.astype(self.info.dtype, copy=False)
+
+    def _whole(self, rows: Bytes2D, element: BitField, wide: np.dtype[Any]) -> NDArray[Any] | None:
+        """Values of whole bytes in a row, cut out of the words that end with them; None where there is not so much before."""
+        if element.run is None or wide.itemsize < 4:
+            return None
+        order, first, count = element.run
+        spare = wide.itemsize - count
+        if self.offset + first < spare:
+            return None
+        total = self._view(rows, np.dtype(f"{order}u{wide.itemsize}"), first - spare).astype(wide)
+        if spare and order == "<":
+            total >>= wide.type(8 * spare)
+        elif spare:
+            total &= wide.type((1 << 8 * count) - 1)
+        return total
+
+    def at(self, offset: int) -> Leaf:
+        """The same field with its place counted from `offset`."""
+        return replace(self, offset=self.offset - offset)
+
+
+@dataclass(frozen=True, eq=False)
+class Seal:
+    """A checksum of the frame: the fields that hold it, low bits first, and the byte ranges that it covers."""
+
+    leaves: tuple[Leaf, ...]
+    spans: tuple[tuple[int, int], ...]
+    algorithm: Checksum
+    absent: tuple[int, ...]
+
+    def stored(self, rows: Bytes2D) -> NDArray[np.uint64]:
+        """The values that stand in the frames, (n,)."""
+        if len(self.leaves) == 1 and self.leaves[0].info.kind != "bytes":
+            return self.leaves[0].load(rows).astype(np.uint64)
+        total, shift = np.zeros(len(rows), np.uint64), 0
+        for leaf in self.leaves:
+            if leaf.info.kind == "bytes":
+                values = leaf.load(rows).astype(np.uint64)
+                order = range(values.shape[1]) if self.algorithm.order == "little" else reversed(range(values.shape[1]))
+                for power, column in enumerate(order):
+                    total |= values[:, column] << np.uint64(shift + 8 * power)
+            else:
+                total |= leaf.load(rows).astype(np.uint64) << np.uint64(shift)
+            shift += leaf.info.bits
+        return total
+
+    def computed(self, rows: Bytes2D) -> NDArray[np.uint64]:
+        """The values that should stand there, (n,)."""
+        sums = _SUMS.get()
+        found = sums(self, rows) if sums is not None else None
+        if found is not None:
+            return found
+        return self.algorithm.over(rows, self.spans or ((0, 0),))
+
+    def fill(self, rows: Bytes2D) -> None:
+        """Write the right value into each frame."""
+        values, shift = self.computed(rows), 0
+        for leaf in self.leaves:
+            part = (values >> np.uint64(shift)) & np.uint64((1 << leaf.info.bits) - 1)
+            if leaf.info.kind == "bytes":
+                size = leaf.shape[-1]
+                powers = range(size) if self.algorithm.order == "little" else reversed(range(size))
+                part = np.stack([part >> np.uint64(8 * power) & np.uint64(0xFF) for power in powers], axis=1)
+            leaf.store(rows, part)
+            shift += leaf.info.bits
+
+    def sound(self, frame: bytes) -> bool:
+        """Whether one frame carries the right value, or one that means "not filled"."""
+        stored = shift = 0
+        for leaf in self.leaves:
+            if leaf.info.kind == "bytes":
+                stored |= int.from_bytes(frame[leaf.offset : leaf.offset + leaf.size], self.algorithm.order) << shift
+            else:
+                stored |= (leaf.scalar(frame) & ((1 << leaf.info.bits) - 1)) << shift
+            shift += leaf.info.bits
+        parts = [frame[a:b] for a, b in self.spans]
+        return stored == self.algorithm(parts[0] if len(parts) == 1 else b"".join(parts)) or stored in self.absent
+
+    def intact(self, rows: Bytes2D) -> NDArray[np.bool_]:
+        """Which frames carry the right value, or one that means "not filled"."""
+        stored = self.stored(rows)
+        right = np.asarray(stored == self.computed(rows))
+        return right | np.isin(stored, np.array(self.absent, np.uint64)) if self.absent else right
+
+
+#: the checksums of frames, (n,); None where the algorithm is to compute them itself.
+Sums = Callable[[Seal, Bytes2D], NDArray[np.uint64] | None]
+_SUMS: ContextVar[Sums | None] = ContextVar("sums", default=None)
+
+
+class summed_by:
+    """As long as it lasts, checksums are computed by this function first."""
+
+    def __init__(self, sums: Sums | None) -> None:
+        self._sums = sums
+
+    def __enter__(self) -> None:
+        self._token = _SUMS.set(self._sums)
+
+    def __exit__(self, *_: object) -> None:
+        _SUMS.reset(self._token)
+
+
+@dataclass(frozen=True, eq=False)
+class Layout:
+    """A frame of one kind of header.
+
+    Attributes:
+        size: in bytes.
+        leaves: where each field stands, by path.
+        constants: offset -> (mask, value).
+        seals: its checksums, inner ones first.
+        places: byte range of each named part outside arrays.
+        branches: what each If and Switch chose.
+        following: fields whose values follow from this header in a frame that is made, and those; they are not asked of one that comes.
+        lengths: of each array, by its axis; 0 in an array without elements.
+        notes: what is worked out from the layout and kept with it.
+    """
+
+    size: int
+    leaves: Mapping[str, Leaf]
+    constants: Mapping[int, tuple[int, int]]
+    seals: tuple[Seal, ...]
+    places: Mapping[str, tuple[int, int]]
+    branches: Mapping[str, Any] = field(default_factory=dict)
+    following: tuple[tuple[Leaf, int], ...] = ()
+    lengths: Mapping[str, int] = field(default_factory=dict)
+    notes: dict[Any, Any] = field(default_factory=dict, repr=False)
+
+    def __post_init__(self) -> None:
+        spots = sorted(self.constants)
+        masks, values = ([self.constants[spot][i] for spot in spots] for i in (0, 1))
+        object.__setattr__(self, "_constants", (np.array(spots, np.intp), np.array(masks, np.uint8), np.array(values, np.uint8)))
+
+    def sound(self, frame: bytes) -> bool:
+        """Whether one frame has this size, all constants and the right checksums."""
+        return (
+            len(frame) == self.size
+            and all(frame[spot] & mask == value for spot, (mask, value) in self.constants.items())
+            and all(seal.sound(frame) for seal in self.seals)
+        )
+
+    def seal(self, rows: Bytes2D) -> None:
+        """Write what follows from the header, the constants and the checksums into frames given as rows of bytes."""
+        for leaf, value in self.following:
+            leaf.store(rows, value)
+        spots, masks, values = self._constants  # type: ignore[attr-defined]
+        rows[:, spots] = rows[:, spots] & ~masks | values
+        for seal in self.seals:
+            seal.fill(rows)
+
+    def constant(self, rows: Bytes2D) -> NDArray[np.bool_]:
+        """Which frames have all constants in place."""
+        spots, masks, values = self._constants  # type: ignore[attr-defined]
+        return np.asarray(((rows[:, spots] & masks) == values).all(axis=1))
+
+
+#: constants: offset, mask, value.
+Marks = tuple[tuple[int, int, int], ...]
+
+#: some of them side by side: offset, type, mask (None: all bits), value.
+Word = tuple[int, np.dtype[Any], Any, Any]
+
+
+def marks(constants: Mapping[int, tuple[int, int]]) -> Marks:
+    """Constants by offset, as mask and value: whole bytes first, which tell the most."""
+    found = [(spot, mask, value) for spot, (mask, value) in constants.items()]
+    return tuple(sorted(found, key=lambda mark: (mark[1] != 0xFF, mark[0])))
+
+
+@lru_cache(maxsize=2048)
+def words(constants: Marks) -> tuple[Word, ...]:
+    """Constants as few words of 1, 2, 4 or 8 bytes, each from a byte with a constant to another."""
+    left, found = {spot: (mask, value) for spot, mask, value in constants}, list[Word]()
+    while left:
+        first = min(left)
+        size = next(size for size in (8, 4, 2, 1) if first + size - 1 in left)
+        parts = [left.pop(spot, (0, 0)) for spot in range(first, first + size)]
+        dtype = np.dtype(f"<u{size}")
+        mask, value = (np.frombuffer(bytes(part), dtype)[0] for part in zip(*parts, strict=True))
+        found.append((first, dtype, None if all(part[0] == 0xFF for part in parts) else mask, value))
+    return tuple(found)
+
+
+def exclude(some: Marks, others: Marks) -> bool:
+    """Whether no frame has some constants and the others as well."""
+    known = {spot: (mask, value) for spot, mask, value in others}
+    both = [(mask & known[spot][0], value ^ known[spot][1]) for spot, mask, value in some if spot in known]
+    return any(mask & differing for mask, differing in both)
+
+
+def equal(found: NDArray[Any], word: Word) -> NDArray[np.bool_]:
+    """Where the right constants stand, of what stands at their place."""
+    _, _, mask, value = word
+    return np.asarray((found if mask is None else found & mask) == value)
+
+
+def right(constants: tuple[Word, ...], rows: Bytes2D) -> NDArray[np.bool_] | None:
+    """Which rows have all constants; None where all have."""
+    held: NDArray[np.bool_] | None = None
+    for word in constants:
+        spot, dtype, _, _ = word
+        if spot + dtype.itemsize > rows.shape[1]:
+            return np.zeros(len(rows), np.bool_)
+        each = equal(elements(rows, dtype, spot, (), ()), word)
+        number = np.count_nonzero(each)
+        if number < len(rows):
+            held = each if held is None else np.bitwise_and(held, each, out=held)
+        if not number:
+            break
+    return held
