@@ -169,7 +169,7 @@ def _module_name(source: str) -> str:
     """A name by all that the compiled code depends on, but for the processor, which Numba looks after."""
     from importlib.metadata import version
 
-    vocabulary = Path(__file__).with_name("kernelmath.py").read_bytes()
+    vocabulary = Path(__file__).with_name("arithmetic.py").read_bytes()
     parts = (source, __version__, version("numba"), np.__version__, sys.version)
     digest = hashlib.sha256("\0".join(parts).encode() + vocabulary)
     return f"lidarspec_kernel_{digest.hexdigest()[:24]}"
