@@ -14,8 +14,7 @@ import lidarspec
 from lidarspec import Sensor
 from lidarspec.framing.frame_engine import CompiledCodec, codec
 from lidarspec.testing import subject as material
-from lidarspec.testing.framing import worst
-from lidarspec.testing.subject import Subject
+from tests.engine.streams import worst
 from tests.shapes import SHAPES
 
 EVERY = {**lidarspec.sensors(), **SHAPES}
@@ -58,7 +57,7 @@ def fed(sensor: Sensor, data: bytes, times: int = 1, chunk: int = 4096) -> None:
 @each_stream
 def test_a_decoder_holds_less_than_its_longest_frame(sensor: Sensor) -> None:
     bound = max(frame.max_length * frame.confirm for frame in sensor.frames.values() if frame.direction == "in")
-    for data in (garbage(20_000), worst(Subject(sensor), 20_000), material.stream(sensor)):
+    for data in (garbage(20_000), worst(sensor, 20_000), material.stream(sensor)):
         decoder, source = sensor.decoder(), random.Random(1)
         for chunk in material.pieces(data, source):
             decoder.feed(chunk)
@@ -80,7 +79,7 @@ def test_fifty_megabytes_of_garbage_take_no_memory(sensor: Sensor) -> None:
 
 @pytest.mark.parametrize("sensor", COMPILED.values(), ids=COMPILED)
 def test_the_worst_stream_takes_little_memory(sensor: Sensor) -> None:
-    data = worst(Subject(sensor), MEGABYTE // 8)
+    data = worst(sensor, MEGABYTE // 8)
     fed(sensor, data[:8192])
     assert peak(lambda: fed(sensor, data)) < 2 * MEGABYTE
 

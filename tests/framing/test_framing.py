@@ -9,8 +9,9 @@ import pytest
 import lidarspec
 from lidarspec import Sensor
 from lidarspec.testing import subject as material
-from lidarspec.testing.comparisons import assert_backends_agree
-from lidarspec.testing.framing import Books, Oracle, damaged, decoded
+from lidarspec.testing.agreement import assert_backends_agree
+from tests.engine.oracle import Oracle
+from tests.engine.streams import Books, damaged, decoded
 from tests.shapes import SHAPES
 
 EVERY = {**lidarspec.sensors(), **SHAPES}

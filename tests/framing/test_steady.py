@@ -15,7 +15,7 @@ from lidarspec.framing.results import Alike
 from lidarspec.framing.steady import SMALL
 from lidarspec.spec.row_checksums import FEW, SHORT, registers
 from lidarspec.testing import subject as material
-from lidarspec.testing.framing import Books, damaged
+from tests.engine.streams import Books, damaged
 from tests.shapes import SHAPES
 
 TWINS = SHAPES["shape-twins"]

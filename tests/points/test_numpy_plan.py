@@ -17,7 +17,7 @@ from lidarspec.points.plain import evaluate, points_function
 from lidarspec.points.plan import Plan, plan_for
 from lidarspec.spec.links import is_datagram
 from lidarspec.testing import subject as material
-from lidarspec.testing.comparisons import assert_same_points
+from lidarspec.testing.agreement import assert_same_points
 from lidarspec.wire.frame_table import Rows
 from tests.shapes import SHAPES
 

@@ -18,7 +18,7 @@ from lidarspec.points.plain import evaluate, points_function
 from lidarspec.points.plan import Plan, plan_for
 from lidarspec.simulation.simulator import simulate
 from lidarspec.spec.vocabulary import following, previous, spread, take, wrap
-from lidarspec.testing.comparisons import assert_same_points
+from lidarspec.testing.agreement import assert_same_points
 
 Expression = Callable[[Fields], Any]
 

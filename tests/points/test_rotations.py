@@ -17,7 +17,7 @@ from lidarspec.points.plain import evaluate, points_function
 from lidarspec.points.plan import Plan, plan_for
 from lidarspec.simulation.simulator import simulate
 from lidarspec.spec.vocabulary import spread
-from lidarspec.testing.comparisons import assert_same_points
+from lidarspec.testing.agreement import assert_same_points
 
 STL27L = lidarspec.sensor("ldrobot-stl27l")
 OFFSETS = np.linspace(-40, 25, 12)
