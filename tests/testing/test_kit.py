@@ -6,11 +6,12 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 from construct import Const, Int8ul, Int16ul, Struct
 from hypothesis import strategies as st
 
-from lidarspec import Checksummed, Frame, Sensor, Sum
+from lidarspec import Checksummed, Fields, Frame, Polar, Sensor, Sum, take
 from lidarspec.spec.description import replaced
 from lidarspec.testing.check import Target, reports
 from lidarspec.testing.declared import declared
@@ -127,6 +128,14 @@ def test_what_is_meant_is_acknowledged_with_a_reason() -> None:
     assert left(replaced(far, acknowledged={"LS210 data.samples.distance": "the next model reaches so far"})) == set()
     assert left(replaced(far, acknowledged={"LS210": " "})) == {"LS209", "LS210"}
     assert left(replaced(far, acknowledged={"LS210 data.tilt": "no"})) == {"LS209", "LS210"}
+
+
+def test_what_only_looks_up_a_table_needs_no_unit() -> None:
+    def points(f: Fields) -> Polar:
+        return Polar(f.samples.distance, take(np.linspace(0, 1, 256), f.number))
+
+    assert left(sound.sensor(points=points)) == set()
+    assert left(sound.sensor(points=lambda f: Polar(f.samples.distance, f.number / 256))) == {"LS201"}
 
 
 def test_vectors_that_prove_nothing_are_findings(tmp_path: Path) -> None:
