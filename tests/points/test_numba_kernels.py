@@ -7,7 +7,6 @@ import functools
 import os
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -34,15 +33,6 @@ pytest.importorskip("numba", reason="the fused back end needs Numba: pip install
 SENSORS = {**lidarspec.sensors(), **{name: sensor for name, sensor in SHAPES.items() if sensor.frames}}
 ULPS = 6
 MANY = 16
-
-
-@pytest.fixture(autouse=True, scope="module")
-def cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    base = tmp_path_factory.getbasetemp()
-    folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "kernels"  # one for all workers
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("LIDARSPEC_CACHE", str(folder))
-        yield folder
 
 
 @functools.cache
@@ -142,7 +132,7 @@ print(bool(sys.modules.get("numba")), len(x))
 """
 
 
-def test_the_environment_names_the_default_and_nothing_else_imports_numba(cache: Path) -> None:
+def test_the_environment_names_the_default_and_nothing_else_imports_numba() -> None:
     assert run(DECODING).stdout.split() == ["False", "36"]
     assert run(DECODING, LIDARSPEC_BACKEND="jit").stdout.split() == ["True", "36"]
     wrong = run(DECODING, LIDARSPEC_BACKEND="fast")
