@@ -24,9 +24,10 @@ from construct import (
     this,
 )
 
-from lidarspec import Scaled, SpecError
+from lidarspec import SpecError
 from lidarspec.exports.messages import messages
 from lidarspec.framing.frame_engine import CompiledCodec, codec
+from lidarspec.spec import Scaled
 from lidarspec.spec.tree import Select, nodes
 from tests.alike import BACKENDS, agree, sensor
 

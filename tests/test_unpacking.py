@@ -29,8 +29,9 @@ from construct import (
 
 import lidarspec as ls
 from lidarspec.framing.frame_engine import CompiledCodec, codec
+from lidarspec.spec import Frame
 from lidarspec.spec.construct_layer import clean
-from lidarspec.spec.description import Sensor
+from lidarspec.spec.sensor import Sensor
 from lidarspec.wire import layout_tree
 from lidarspec.wire.layout import Layout
 from lidarspec.wire.layout_tree import HeaderTree, frame_layouts
@@ -58,7 +59,7 @@ def same(one: Any, other: Any) -> None:
         assert one == other
 
 
-def unpack(frame: ls.Frame, data: bytes) -> Any:
+def unpack(frame: Frame, data: bytes) -> Any:
     """What the layout of a frame gives, None where it is left to construct."""
     layouts = frame_layouts(frame)
     assert isinstance(layouts, HeaderTree)
@@ -115,7 +116,7 @@ ARRAYS = {
 
 @pytest.mark.parametrize("name", ARRAYS)
 def test_arrays_of_all_kinds(name: str) -> None:
-    frame = ls.Frame(Struct("head" / Const(b"\x5a"), "inside" / ARRAYS[name], "tail" / Int16ul), max_length=1 << 20)
+    frame = Frame(Struct("head" / Const(b"\x5a"), "inside" / ARRAYS[name], "tail" / Int16ul), max_length=1 << 20)
     size = frame.prepared.sizeof()
     layouts = frame_layouts(frame)
     assert isinstance(layouts, HeaderTree)
@@ -136,7 +137,7 @@ def test_headers_lead_to_their_own_layout_also_after_some_were_forgotten(monkeyp
     kinds = Switch(this.kind, {1: Int8ub, 2: Int16ub}, default=Int24ul)
     rows = Array(this.count, Int16ul)
     struct = Struct("head" / Const(b"\x5a"), "kind" / Int8ub, "count" / Int8ub, "rows" / rows, "more" / kinds, "end" / Int8ub)
-    frame = ls.Frame(struct, max_length=700)
+    frame = Frame(struct, max_length=700)
     for count in [*range(60), *range(60), 3, 3]:
         for kind in range(4):
             data = bytes([0x5A, kind, count]) + random.Random(count).randbytes(2 * count + {1: 1, 2: 2}.get(kind, 3) + 1)

@@ -28,7 +28,7 @@ from lidarspec.exports.c_fields import (
 )
 from lidarspec.exports.messages import Message, messages
 from lidarspec.spec.checksums import Checksum, Crc, Fold15, Sum, WordXor, Xor, ZeroPadded
-from lidarspec.spec.description import Sensor
+from lidarspec.spec.sensor import Sensor
 from lidarspec.spec.tree import Blob, Block, Formula, Number, Op, Ref, Repeat, Sealed, formulas, refs
 
 _FUNCTION = """\

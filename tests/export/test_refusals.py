@@ -8,9 +8,10 @@ from typing import Any
 import pytest
 from construct import Array, Bytes, Const, Int8ub, Int16ub, Struct, Switch, this
 
-from lidarspec import Checksum, Checksummed, Frame, Sensor, UsageError
+from lidarspec import Sensor, UsageError
 from lidarspec.exports import Refused, UnknownExport, export
 from lidarspec.exports.messages import messages
+from lidarspec.spec import Checksum, Checksummed, Frame
 from lidarspec.spec.tree import Op, Ref, Repeat, nodes
 from tests.export.oddities import SENSOR
 from tests.shapes.calibration import BARE
