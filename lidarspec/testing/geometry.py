@@ -30,6 +30,7 @@ from lidarspec.simulation.simulator import simulation
 from lidarspec.spec.fields import factor
 from lidarspec.spec.results import Polar
 from lidarspec.spec.timing import OnWrap
+from lidarspec.spec.tree import FieldInfo
 from lidarspec.spec.vocabulary import LookUp
 from lidarspec.testing import subject as material
 from lidarspec.testing.agreement import assert_well_formed
@@ -37,7 +38,6 @@ from lidarspec.testing.findings import Violation, require
 from lidarspec.testing.frames import acceptable
 from lidarspec.testing.subject import Subject
 from lidarspec.wire.frame_table import Group, Rows
-from lidarspec.wire.schema import FieldInfo
 
 Floats = NDArray[np.float64]
 
