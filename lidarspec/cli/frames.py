@@ -34,7 +34,7 @@ def parse(words: Sequence[str], sensor_id: str | None, count: int | None, as_jso
     given, sensor, fits, found = _found(words, sensor_id, count)
     if not found:
         raise no_frame(sensor, given)
-    frames = [(piece, explained(sensor, piece.data, piece.frame)) for piece in found if piece.frame]
+    frames = [(piece, explained(piece.data, sensor, piece.frame)) for piece in found if piece.frame]
     if as_json:
         told = [{"frame": f.frame, "offset": p.offset, "size": len(p.data), "fields": _raw(sensor, p)} for p, f in frames]
         emit_json({"sensor": sensor.id, "fits": fits, "frames": told}, output)
@@ -145,7 +145,7 @@ def _sensor(given: Input, sensor_id: str | None, *, damaged: bool) -> tuple[Sens
 def _explained(sensor: Sensor, piece: Piece) -> Explanation:
     """A frame explained; "?" for bytes that may begin like one."""
     try:
-        return explained(sensor, piece.data, None if piece.frame == "?" else piece.frame)
+        return explained(piece.data, sensor, None if piece.frame == "?" else piece.frame)
     except WireError as fault:
         raise suggest(fault, f"lidarspec show {sensor.id}") from None
 
@@ -160,9 +160,9 @@ def _parts(sensor: Sensor, piece: Piece) -> Iterator[tuple[Piece, Explanation]]:
         if start < end:
             continue
         try:
-            found = explained(sensor, data[start:])
+            found = explained(data[start:], sensor)
             left = found.rows[-1].data if found.rows and not found.rows[-1].path else b""
-            found = explained(sensor, data[start : len(data) - len(left)], found.frame)
+            found = explained(data[start : len(data) - len(left)], sensor, found.frame)
         except WireError:
             continue
         if start > end:

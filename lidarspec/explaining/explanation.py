@@ -90,7 +90,7 @@ DIGITS, SPARE, FLIPS = 12, 2, 3
 Keys = tuple[str | int, ...]
 
 
-def explain(sensor: Sensor, data: bytes, frame: str | None = None) -> Explanation:
+def explain(data: bytes, sensor: Sensor, frame: str | None = None) -> Explanation:
     """What every byte of one frame is; of a damaged or truncated one as far as it goes, with what is wrong.
 
     Raises:
