@@ -9,7 +9,7 @@ from construct import Array, Bytes, BytesInteger, Construct, FormatField
 
 from lidarspec.exports import Refused
 from lidarspec.exports.formulas import Ref, Scope, formula, labelled
-from lidarspec.exports.tree import Blob, Block, Empty, Node, Number, Part, Repeat, Sealed, Select, Struct, When
+from lidarspec.exports.tree import Blob, Block, Empty, Node, Number, Part, Repeat, Sealed, Select, Struct, When, nodes
 from lidarspec.spec.bits import probe
 from lidarspec.spec.description import Frame, Sensor
 from lidarspec.spec.fields import Checksummed
@@ -23,6 +23,11 @@ class Message:
     name: str
     frame: Frame
     root: Struct | Sealed
+
+    @property
+    def seals(self) -> dict[str, Sealed]:
+        """The checksums, by the path of each field that holds one or a part of it."""
+        return {path: node for node in nodes(self.root) if isinstance(node, Sealed) for path in node.fields}
 
 
 def messages(sensor: Sensor) -> tuple[Message, ...]:
