@@ -18,6 +18,8 @@ from lidarspec.spec.bits import BitField, probe
 from lidarspec.spec.construct_layer import UNNAMED, unwrap
 from lidarspec.spec.description import Frame
 from lidarspec.spec.fields import Checksummed
+from lidarspec.exports.formula_text import written
+from lidarspec.exports.formulas import Formula
 from lidarspec.wire.schema import FieldInfo, fields_below, peeled
 
 INDICES = "ijklmn"
@@ -187,6 +189,12 @@ def _resolved(text: str, path: str) -> str:
     for name in text.split(".")[1:]:
         scope = [] if name == "_root" else scope[:-1] if name == "_" else [*scope, name]
     return ".".join(scope)
+
+
+def phrase(formula: Formula) -> str:
+    """A formula as people write it."""
+    text = written(formula, lambda ref: ref.path, {})
+    return text[1:-1] if _enclosed(text) else text
 
 
 def bit_text(bits: BitField) -> str:
