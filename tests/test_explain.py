@@ -13,7 +13,8 @@ from construct import Array, Const, Enum, Int8ul, Int16ub, Int16ul, Struct
 
 import lidarspec as ls
 from lidarspec import Checksummed, Frame, Scaled, Sensor, WireError, Xor
-from lidarspec.explaining.explanation import Explanation, explain, hexdump
+from lidarspec.explaining.explanation import Explanation, explain
+from lidarspec.explaining.wording import hexdump
 from tests.shapes import SHAPES
 
 EXAMPLE = bytes.fromhex("542c6808ab7ee000e4dc00e2d900e5d500e3d300e4d000e9cd00e4ca00e2c700e9c500e5c200e5c000e5be823a1a50")

@@ -8,7 +8,7 @@ import pytest
 
 import lidarspec as ls
 from lidarspec.explaining.explanation import Flip, explain, flips
-from lidarspec.explaining.listing import differences, folded, parents, text, told as told_differences
+from lidarspec.explaining.listing import folded, parents, text, told
 from lidarspec.explaining.wording import Span, bit_picture
 from tests.cli.running import EXAMPLE, printed, process, ran
 from tests.shapes import SHAPES
@@ -93,14 +93,14 @@ def test_where_any_bit_may_have_flipped_only_that_is_told() -> None:
 def test_differences_are_told_field_by_field_and_to_the_bit() -> None:
     other = STL.build("data", {**STL.parse(EXAMPLE), "end_angle": 0x82BF})
     first, second = explain(EXAMPLE, STL), explain(other, STL)
-    found = differences(first, second)
+    found = first.differences(second)
     assert [part.path for part in found] == ["end_angle", "crc"]
-    assert [text(line) for line in told_differences(first, second, found)][:3] == [
+    assert [text(line) for line in told(found, (47, 47))][:3] == [
         "002a  end_angle  334.70 deg -> 334.71 deg (+0.01 deg)",
         "      - be 82        .......0 ..",
         "      + bf 82        .......1 ..",
     ]
-    assert text(list(told_differences(first, first, differences(first, first)))[-1]) == "47 bytes, all alike"
+    assert text(list(told(first.differences(first), (47, 47)))[-1]) == "47 bytes, all alike"
 
 
 def test_fields_that_one_frame_alone_has_are_told_together() -> None:
@@ -108,7 +108,7 @@ def test_fields_that_one_frame_alone_has_are_told_together() -> None:
     samples = [dict(distance=1000, intensity=9, exposure=2)] * 3
     head = dict(mt=dict(frequency=0, start=0), fsa=dict(angle=64), lsa=dict(angle=640))
     parts = [explain(sensor.build("data", **head, samples=samples[:count]), sensor) for count in (1, 3)]
-    shown = [text(line) for line in told_differences(*parts, differences(*parts))]
+    shown = [text(line) for line in told(parts[0].differences(parts[1]), (len(parts[0].data), len(parts[1].data)))]
     assert "      samples[1].distance to samples[2].exposure  in the second frame alone" in shown
 
 
@@ -119,7 +119,7 @@ def test_differences_count_every_bit_of_frames_of_one_layout(sensor: str, frame:
     other[-1] ^= 0x41
     first, second = (explain(bytes(part), SENSORS[sensor], frame) for part in (data, other))
     if second.rows[-1].values and [row.path for row in first.rows] == [row.path for row in second.rows]:
-        assert sum(mask.bit_count() for part in differences(first, second) for mask in part.masks) == 2
+        assert sum(mask.bit_count() for part in first.differences(second) for mask in part.masks) == 2
 
 
 def test_the_verb_compares_with_another_frame_or_the_next() -> None:

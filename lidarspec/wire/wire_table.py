@@ -14,12 +14,12 @@ from typing import Any
 import construct
 from construct import Array, Bytes, BytesInteger, Construct, FormatField, Struct
 
+from lidarspec.exports.formula_text import written
+from lidarspec.exports.formulas import Formula
 from lidarspec.spec.bits import BitField, probe
 from lidarspec.spec.construct_layer import UNNAMED, unwrap
 from lidarspec.spec.description import Frame
 from lidarspec.spec.fields import Checksummed
-from lidarspec.exports.formula_text import written
-from lidarspec.exports.formulas import Formula
 from lidarspec.wire.schema import FieldInfo, fields_below, peeled
 
 INDICES = "ijklmn"
