@@ -72,6 +72,18 @@ def test_the_values_are_those_that_parse_gives(sensor: str, frame: str) -> None:
     assert len(values) == leaves(parsed)
 
 
+def test_an_explanation_has_fields_by_path_and_a_verdict() -> None:
+    whole = explain(EXAMPLE, ls.sensor("ldrobot-stl27l"))
+    assert (whole.frame, whole.verdict) == ("data", "valid")
+    assert whole.fields["points[3].distance"].physical == pytest.approx(0.213)
+    assert list(whole.fields)[-1] == "crc"
+    damaged = explain(EXAMPLE[:-1] + b"\x51", ls.sensor("ldrobot-stl27l"))
+    assert damaged.fault is not None
+    assert damaged.verdict == damaged.fault.reason
+    assert "checksum" in damaged.verdict
+    assert [difference.path for difference in whole.differences(damaged)] == ["crc"]
+
+
 def leaves(parsed: object) -> int:
     if isinstance(parsed, dict | list):
         return sum(leaves(value) for value in (parsed.values() if isinstance(parsed, dict) else parsed))
