@@ -82,7 +82,7 @@ def arguments(sensor: Sensor, name: str, assignments: Sequence[str]) -> dict[str
             raise UsageError(f"{sensor.id} {name}: {text!r} is not argument=value")
         if argument not in command.args or command.frame is None:
             raise UnknownField(argument, command.args, place=f"{sensor.id} {name}")
-        unit = schema(sensor.frames[command.frame].prepared).fields[command.args[argument][0]].unit
+        unit = schema(sensor.frames[command.frame].tree).fields[command.args[argument][0]].unit
         found[argument] = _number(value, unit, f"{sensor.id} {name}: {argument}")
     return found
 

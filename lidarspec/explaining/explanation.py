@@ -14,7 +14,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
-import construct
 import numpy as np
 
 from lidarspec.errors import LidarSpecError, WireError
@@ -25,13 +24,13 @@ from lidarspec.framing.frame_engine import Codec, CompiledCodec, codec
 from lidarspec.framing.plausibility import IMPLAUSIBLE, VALID
 from lidarspec.packets.stream import PacketStream
 from lidarspec.points.plain import evaluate
-from lidarspec.spec.bits import BitField, leaves, probe
-from lidarspec.spec.construct_layer import UNNAMED, Seen, field_path, unwrap
+from lidarspec.spec.bits import BitField
+from lidarspec.spec.construct_layer import UNNAMED, Seen, field_path, leaves
 from lidarspec.spec.description import Frame, Sensor
 from lidarspec.spec.fields import Checksummed, exact
-from lidarspec.spec.rules import children
+from lidarspec.spec.tree import Block, FieldInfo, Node, Opaque, Repeat, Struct, children
 from lidarspec.wire.parse import parse_typed
-from lidarspec.wire.schema import FieldInfo, schema
+from lidarspec.wire.schema import schema
 from lidarspec.wire.wire_table import bit_text, hexed
 
 #: bytes of candidates that are tried in one go, and the longest frame that construct alone has to read so often.
@@ -195,8 +194,8 @@ class _Trail:
     """One frame as construct read it: its parts, how far it came, and the verdicts of its checksums."""
 
     def __init__(self, frame: Frame, data: bytes) -> None:
-        self._data, self._schema = data, schema(frame.prepared)
-        self._blocks = dict(_blocks(frame.prepared, ""))
+        self._data, self._schema = data, schema(frame.tree)
+        self._blocks = dict(_blocks(frame.tree, ""))
         trail: list[Seen] = []
         self.failed = True
         try:
@@ -302,18 +301,19 @@ def _digits(info: FieldInfo) -> int:
     return next((digits for digits in range(apart, apart + SPARE + 1) if all(step * 10**digits % 1 == 0 for step in steps)), apart)
 
 
-def _blocks(con: Any, path: str) -> Iterator[tuple[str, Mapping[Keys, BitField]]]:
+def _blocks(node: Node, path: str) -> Iterator[tuple[str, Mapping[Keys, BitField]]]:
     """The bits of each field of each bit block, by the path of the block, arrays in it with "[]"."""
-    if isinstance(con, construct.Renamed):
-        path = f"{path}.{con.name}" if path else str(con.name)
-        con = con.subcon
-    if isinstance(con, construct.Array):
-        path, con = f"{path}[]", con.subcon
-    if unwrap(con, bits=False) is not unwrap(con):
-        yield path, {bits.keys: bits for bits in probe(con, con.sizeof()) or ()}
-        return
-    for child in children(con):
-        yield from _blocks(child, path)
+    match node:
+        case Block():
+            yield path, {part.bits.keys: part.bits for part in node.parts}
+        case Opaque(in_bits=True):
+            yield path, {}
+        case Struct():
+            for member in node.members:
+                yield from _blocks(member, ".".join(filter(None, (path, member.name))))
+        case _:
+            for child in children(node):
+                yield from _blocks(child, f"{path}[]" if isinstance(node, Repeat) else path)
 
 
 def _verdicts(data: bytes, seen: Seen) -> Iterator[tuple[str, tuple[str, bool]]]:

@@ -16,11 +16,29 @@ from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 from lidarspec.exports import Refused
-from lidarspec.exports.formula_text import COMPARISONS, written
-from lidarspec.exports.formulas import Formula, Op, Ref, refs
 from lidarspec.exports.messages import Message
-from lidarspec.exports.tree import Blob, Block, Empty, Node, Number, Part, Repeat, Sealed, Select, Struct, When, formulas, nodes
-from lidarspec.wire.schema import FieldInfo
+from lidarspec.spec.tree import (
+    COMPARISONS,
+    Blob,
+    Block,
+    Empty,
+    FieldInfo,
+    Formula,
+    Node,
+    Number,
+    Op,
+    Part,
+    Ref,
+    Repeat,
+    Sealed,
+    Select,
+    Struct,
+    When,
+    formulas,
+    nodes,
+    refs,
+    written,
+)
 from lidarspec.wire.wire_table import Extent, meaning, unit_text
 
 #: bits of a value that a formula in 64-bit integers may reach.

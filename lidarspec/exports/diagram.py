@@ -12,9 +12,8 @@ from dataclasses import dataclass, field, replace
 from xml.sax.saxutils import escape, quoteattr
 
 from lidarspec.exports.messages import Message, messages
-from lidarspec.exports.tree import Blob, Block, Empty, Node, Number, Part, Repeat, Sealed, Select, Struct, When, nodes
 from lidarspec.spec.description import Sensor
-from lidarspec.wire.schema import FieldInfo
+from lidarspec.spec.tree import Blob, Block, Empty, FieldInfo, Node, Number, Part, Repeat, Sealed, Select, Struct, When, nodes
 from lidarspec.wire.wire_table import INDICES, Extent, bit_text, frame_size, meaning, phrase, unit_text
 
 

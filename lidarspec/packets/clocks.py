@@ -15,9 +15,10 @@ from lidarspec.errors import SpecError
 from lidarspec.framing.plausibility import fields_of, value_of
 from lidarspec.spec.description import Sensor
 from lidarspec.spec.fields import exact, factor
+from lidarspec.spec.tree import FieldInfo
 from lidarspec.wire.arrays import alike
 from lidarspec.wire.frame_table import Group, Rows, Table
-from lidarspec.wire.schema import FieldInfo, Schema
+from lidarspec.wire.schema import Schema
 
 Times = NDArray[np.int64]
 

@@ -20,11 +20,12 @@ from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeVar
 from construct import Construct
 
 from lidarspec.errors import SpecError, UnknownFrame
-from lidarspec.spec.construct_layer import prepare
+from lidarspec.spec.construct_layer import frame_tree, prepare
 from lidarspec.spec.links import Link, is_datagram
 from lidarspec.spec.results import Points
 from lidarspec.spec.rules import check_struct
 from lidarspec.spec.timing import Clock, Sequence, Split
+from lidarspec.spec.tree import Node
 
 if TYPE_CHECKING:
     from lidarspec.framing.decoder import Decoder, Found
@@ -117,6 +118,15 @@ class Frame:
         _freeze(self, "acknowledged")
         object.__setattr__(self, "prepared", prepare(self.struct))
         check_struct(self.prepared)
+
+    @functools.cached_property
+    def tree(self) -> Node:
+        """The frame as nodes; made when it is first asked for.
+
+        Raises:
+            SpecError: for a constant that its Enum has no value for.
+        """
+        return frame_tree(self.prepared)
 
 
 @dataclass(frozen=True)

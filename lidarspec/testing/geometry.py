@@ -29,13 +29,13 @@ from lidarspec.simulation.simulator import simulation
 from lidarspec.spec.fields import factor
 from lidarspec.spec.results import Polar
 from lidarspec.spec.timing import OnWrap
+from lidarspec.spec.tree import FieldInfo
 from lidarspec.testing import subject as material
 from lidarspec.testing.comparisons import assert_well_formed
 from lidarspec.testing.findings import Violation, require
 from lidarspec.testing.frames import acceptable
 from lidarspec.testing.subject import Subject
 from lidarspec.wire.frame_table import Group, Rows
-from lidarspec.wire.schema import FieldInfo
 
 Floats = NDArray[np.float64]
 

@@ -69,7 +69,7 @@ def test_diagrams_name_every_field_and_stay_within_their_rows(name: str) -> None
     root = ElementTree.fromstring(export(SENSORS[name], "svg"))
     says = {title.text or "" for title in root.iter("{http://www.w3.org/2000/svg}title")}
     for frame in SENSORS[name].frames.values():
-        for path in schema(frame.prepared).fields:
+        for path in schema(frame.tree).fields:
             assert any(said.split("; ")[0] == path for said in says), path
     boxes = [box for group in root.iter("{http://www.w3.org/2000/svg}g") for box in group.iter("{http://www.w3.org/2000/svg}rect")]
     for box in boxes:
@@ -92,7 +92,7 @@ def test_pages_have_every_frame_command_and_field(name: str) -> None:
     sensor, text = SENSORS[name], export(SENSORS[name], "md")
     for frame, value in sensor.frames.items():
         assert f"## `{frame}`: " in text
-        for field in schema(value.prepared).fields.values():
+        for field in schema(value.tree).fields.values():
             assert re.search(rf"`(\w+(\[\w\])*\.)*{field.name}(\[\w\])*`", text), field.path
     assert all(f"| `{command}` |" in text for command in sensor.commands)
     for table in re.findall(r"(?:^\|.*\n)+", text, flags=re.MULTILINE):

@@ -10,9 +10,8 @@ from construct import Array, Bytes, Const, Int8ub, Int16ub, Struct, Switch, this
 
 from lidarspec import Checksum, Checksummed, Frame, Sensor, UsageError
 from lidarspec.exports import Refused, UnknownExport, export
-from lidarspec.exports.formulas import Op, Ref
 from lidarspec.exports.messages import messages
-from lidarspec.exports.tree import Repeat, nodes
+from lidarspec.spec.tree import Op, Ref, Repeat, nodes
 from tests.export.oddities import SENSOR
 from tests.shapes.calibration import BARE
 
