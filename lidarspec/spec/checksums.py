@@ -387,19 +387,19 @@ Single = Callable[[bytes], int]
 def single(algorithm: Checksum) -> Single:
     """A function from bytes to their checksum, made for one frame at a time; of other algorithms the algorithm itself."""
     if type(algorithm) is Crc:
-        return _crc(algorithm)
+        return _single_crc(algorithm)
     if type(algorithm) is Xor:
-        return _xor
+        return _single_xor
     if type(algorithm) is Sum:
         mask = (1 << algorithm.width) - 1
         return lambda data: sum(data) & mask
     if type(algorithm) is WordXor:
-        return _word_xor(algorithm)
+        return _single_word_xor(algorithm)
     return algorithm
 
 
 @lru_cache(maxsize=256)
-def _crc(algorithm: Crc) -> Single:
+def _single_crc(algorithm: Crc) -> Single:
     init, xorout = algorithm.init, algorithm.xorout
     if (algorithm.width, algorithm.poly, algorithm.refin, algorithm.refout) == (16, 0x1021, False, False):
         return lambda data: binascii.crc_hqx(data, init) ^ xorout
@@ -424,14 +424,14 @@ def _crc(algorithm: Crc) -> Single:
     return crc8
 
 
-def _xor(data: bytes) -> int:
+def _single_xor(data: bytes) -> int:
     value = int.from_bytes(data, "little")
     for power in _powers(8, len(data)):
         value ^= value >> power
     return value & 0xFF
 
 
-def _word_xor(algorithm: WordXor) -> Single:
+def _single_word_xor(algorithm: WordXor) -> Single:
     """Groups of words are XORed as a whole, whatever their sizes, and only their XOR is taken apart."""
     head, groups = algorithm.head, algorithm.groups
     size = sum(groups)

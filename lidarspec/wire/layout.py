@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from lidarspec.spec.bits import BitField
 from lidarspec.spec.checksums import Checksum, Single, single
-from lidarspec.spec.tree import FieldInfo
+from lidarspec.spec.tree import FieldInfo, Node
 
 Bytes2D = NDArray[np.uint8]
 
@@ -245,7 +245,7 @@ class Layout:
         constants: offset -> (mask, value).
         seals: its checksums, inner ones first.
         places: byte range of each named part outside arrays.
-        branches: what each If and Switch chose.
+        branches: what each `When` and `Select` chose.
         following: fields whose values follow from this header in a frame that is made, and those; they are not asked of one that comes.
         lengths: of each array, by its axis; 0 in an array without elements.
         notes: what is worked out from the layout and kept with it.
@@ -256,7 +256,7 @@ class Layout:
     constants: Mapping[int, tuple[int, int]]
     seals: tuple[Seal, ...]
     places: Mapping[str, tuple[int, int]]
-    branches: Mapping[str, Any] = field(default_factory=dict)
+    branches: Mapping[Node, Node] = field(default_factory=dict)
     following: tuple[tuple[Leaf, int], ...] = ()
     lengths: Mapping[str, int] = field(default_factory=dict)
     notes: dict[Any, Any] = field(default_factory=dict, repr=False)
