@@ -10,6 +10,7 @@ import subprocess
 import sys
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -194,7 +195,7 @@ def test_datagrams_go_to_the_declared_ports_by_their_kind_unless_one_is_named() 
         receiver.bind(("127.0.0.1", 0))
         receiver.settimeout(SLACK)
     ports = [receiver.getsockname()[1] for receiver in receivers]
-    sensor = ls.spec.replaced(VLP, links={"data": Udp(*ports)})
+    sensor = replace(VLP, links={"data": Udp(*ports)})
     with virtual_port(sensor, to="udp://") as port:
         assert port.path == f"udp://127.0.0.1?port={ports[0]},{ports[1]}"
         assert [{len(receiver.recv(2000)) for _ in range(20)} for receiver in receivers] == [{1206}, {512}]
