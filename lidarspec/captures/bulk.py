@@ -26,7 +26,7 @@ import struct
 import weakref
 from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import dataclass
-from typing import Any, BinaryIO, NamedTuple, Protocol, runtime_checkable
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -404,18 +404,6 @@ class Batch:
             known = hosts.setdefault(found.names[kind], [])
             known += [self.names[sender][0]] if self.names[sender][0] not in known else []
         return hosts
-
-
-@runtime_checkable
-class BulkTransport(Protocol):
-    """A transport of datagrams that gives many at a time; see `files.Transport`."""
-
-    def batches(self) -> Iterator[Batch]:
-        """The same datagrams as those of `chunks`.
-
-        Raises:
-            SourceError: where they cannot be read.
-        """
 
 
 def first_frames(decoder: Decoder, batches: Iterable[Batch], wanted: Collection[str]) -> dict[str, bytes]:

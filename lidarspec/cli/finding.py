@@ -30,7 +30,7 @@ from lidarspec.discovery.samples import Match
 from lidarspec.errors import SourceError, UsageError
 from lidarspec.plugins import sensor as named_sensor, sensors
 from lidarspec.spec.checksums import CRCS, Crc
-from lidarspec.spec.links import Udp
+from lidarspec.spec.links import Serial, Udp
 from lidarspec.transports.open_url import live_address
 from lidarspec.transports.ports import SerialPort, User, serial_ports, udp_users
 
@@ -310,7 +310,7 @@ def _again(one: Verdict) -> str:
     """The source as it has to be opened for the sensor that was found."""
     source, heard = one.heard.source, one.heard
     link = one.sensor.links.get("data") if one.sensor is not None else None
-    if heard.baud is not None and "baud=" not in source and heard.baud != getattr(link, "baud", None):
+    if heard.baud is not None and "baud=" not in source and not (isinstance(link, Serial) and link.baud == heard.baud):
         source += f"{'&' if '?' in source else '?'}baud={heard.baud}"
     if heard.sender and "src=" not in source:
         source += f"{'&' if '?' in source else '?'}src={heard.sender}"

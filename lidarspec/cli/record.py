@@ -7,7 +7,6 @@ import os
 import shlex
 import time
 from dataclasses import dataclass, replace
-from typing import cast
 
 import click
 
@@ -60,10 +59,10 @@ class Task:
 
     def opened(self, source: Transport) -> AnyRecorder:
         """The recorder, now that the source is open."""
-        counts = source.datagrams or (self.sensor is not None and hasattr(source, "read"))
+        counts = source.datagrams or (self.sensor is not None and isinstance(source, LiveTransport))
         if self.count is not None and not counts:
             raise UsageError(f"-n counts packets, and {self.source} is a byte stream: name the sensor with -s, or give a time with -t")
-        header = source.header if isinstance(source, RecordingTransport) else Header(source=self.source, baud=getattr(source, "baud", None))
+        header = source.header if isinstance(source, RecordingTransport) else Header(source=self.source, baud=source.baud)
         links = self.sensor.links.values() if self.sensor else ()
         self.recorder = recorder(
             self.target,
@@ -184,18 +183,18 @@ def _received(task: Task) -> None:
     """Record a source as it comes, or what is in a file."""
     source = RecordingTransport(task.source, salvage=True) if task.salvage else transport(task.source, task.sensor)
     with contextlib.closing(source), task.opened(source):
-        if hasattr(source, "read"):
+        if isinstance(source, LiveTransport):
             _captured(task, source)
         else:
             _copied(task, source)
-        for warning in getattr(source, "warnings", []):
+        for warning in source.warnings:
             task.say(warning)
 
 
-def _captured(task: Task, source: Transport) -> None:
+def _captured(task: Task, source: LiveTransport) -> None:
     """What arrives is recorded by a thread; here it is counted and thrown away."""
     queue = BoundedQueue()
-    with contextlib.closing(Capture(cast(LiveTransport, source), queue, log=task.recorder)):
+    with contextlib.closing(Capture(source, queue, log=task.recorder)):
         while task.goes_on():
             for _, item in queue.take(TURN):
                 if isinstance(item, BaseException):

@@ -141,7 +141,7 @@ def _play(file: str, target: Player, speed: float | None, played: Played, progre
                 progress.clear()
                 note(str(gone))
             else:
-                for warning in [] if loop else getattr(source, "warnings", []):
+                for warning in () if loop else source.warnings:
                     progress.clear()
                     note(warning)
         if not played.chunks:

@@ -19,8 +19,7 @@ from enum import Enum
 from typing import Protocol
 
 from lidarspec.errors import SourceError, UsageError
-from lidarspec.transports.live_transport import POLL
-from lidarspec.transports.protocol import Chunk, Disconnected, LiveTransport
+from lidarspec.transports.protocol import POLL, Chunk, Disconnected, LiveTransport
 
 #: what waits in a queue at most: chunks, and bytes in them; several seconds of the fastest sensors.
 CHUNKS, BYTES = 1 << 16, 1 << 25

@@ -29,7 +29,7 @@ from lidarspec.recording.recorders import AnyRecorder, RecordTo, recorder_for
 from lidarspec.scans.scans import Scan, ScanStream, handed_out
 from lidarspec.spec.description import Sensor
 from lidarspec.transports.open_url import transport
-from lidarspec.transports.protocol import Transport
+from lidarspec.transports.protocol import LiveTransport, Transport
 
 #: batches kept while nobody knows yet which data frame the sensor answers in.
 UNDECIDED = 256
@@ -279,15 +279,15 @@ class Device:
         return f"Device({self.sensor.id} on {self._source}, {self.state}: {self.stats})"
 
     def _opened(self, backend: str, record: RecordTo | None, overflow: str | None, period: float) -> FileInput | LiveInput:
-        opened: Any = transport(self._source, self.sensor)
+        opened = transport(self._source, self.sensor)
         try:
-            if not hasattr(opened, "read"):
+            if not isinstance(opened, LiveTransport):
                 if record is not None:
                     raise UsageError(f"{self._source} is a file already: there is nothing to record")
                 return FileInput(self._source, self.sensor, opened, backend=backend)
             kept, is_own = (None, False) if record is None else recorder_for(record, self.sensor, self._source, opened)
             self._own_recorder = kept if is_own else None
-            policy: str = getattr(opened, "overflow", "drop_oldest") if overflow is None else overflow
+            policy = opened.overflow if overflow is None else overflow
             return LiveInput(self._source, self.sensor, opened, backend=backend, policy=policy, recorder=kept, period=period)
         except BaseException:
             _close(opened, self._own_recorder)

@@ -16,8 +16,9 @@ from lidarspec.errors import LidarSpecError, UsageError
 from lidarspec.spec.description import Sensor
 from lidarspec.spec.links import Serial, Udp
 from lidarspec.transports import ports
-from lidarspec.transports.live_transport import Address
+from lidarspec.transports.base import Address
 from lidarspec.transports.open_url import live_address, transport
+from lidarspec.transports.protocol import LiveTransport
 from lidarspec.transports.udp import BUFFER, shortfall
 
 #: share of the bytes outside frames from which on a line is bad.
@@ -204,11 +205,11 @@ def _as_expected(source: str, sensor: Sensor, seconds: float) -> Verdict | None:
     opened = transport(source, sensor)
     try:
         end, chunks = time.monotonic() + seconds, list[bytes]()
-        while (left := end - time.monotonic()) > 0 and hasattr(opened, "read"):
+        while (left := end - time.monotonic()) > 0 and isinstance(opened, LiveTransport):
             chunks += [chunk.data for chunk in opened.read(min(left, 0.1))]
         address = live_address(source)
         plain = address is not None and has_no_baud(address.place)
-        datagrams, baud = opened.datagrams, None if plain else getattr(opened, "baud", None)
+        datagrams, baud = opened.datagrams, None if plain else opened.baud
     finally:
         opened.close()
     return verdict(Heard(source, tuple(chunks), datagrams, baud)) if chunks else None

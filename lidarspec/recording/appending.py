@@ -207,7 +207,7 @@ class Appender:
                         self._changed.notify_all()
         except Exception as error:
             with self._changed:
-                reason = getattr(error, "strerror", None) or error
+                reason = (error.strerror if isinstance(error, OSError) else None) or error
                 self.error = SourceError(f"{self.path}: {reason}; the recording is whole up to byte {self._file.size}")
                 self._changed.notify_all()
         finally:

@@ -169,7 +169,7 @@ def recorder(
 def recorder_for(target: RecordTo, sensor: Sensor | str | None, source: str | Path, opened: Transport) -> tuple[AnyRecorder, bool]:
     """The recorder that a caller asks for, and whether it was made here, and has to be closed here."""
     if isinstance(target, str | Path):
-        return recorder(target, sensor, source, datagrams=opened.datagrams, baud=getattr(opened, "baud", None)), True
+        return recorder(target, sensor, source, datagrams=opened.datagrams, baud=opened.baud), True
     return (target, False) if isinstance(target, AnyRecorder) else (target(opened), True)
 
 

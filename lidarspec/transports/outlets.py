@@ -27,8 +27,8 @@ from lidarspec.recording.recorders import AnyRecorder
 from lidarspec.recording.replaying import Player
 from lidarspec.spec.description import Sensor
 from lidarspec.spec.links import Tcp, Udp
-from lidarspec.transports.live_transport import POLL, Address, failure, listener, reason
-from lidarspec.transports.protocol import Chunk, Disconnected
+from lidarspec.transports.base import Address, failure, reason
+from lidarspec.transports.protocol import POLL, Chunk, Disconnected
 
 #: bytes of commands read at once, and bytes that wait for a slow reader of a connection at most.
 BLOCK, BACKLOG = 1 << 16, 1 << 20
@@ -36,6 +36,20 @@ HERE = "127.0.0.1"
 
 #: what leaves a device: link, type of frame, bytes.
 Sending = tuple[str, str, bytes]
+
+
+def listener(host: str, port: int) -> socket.socket:
+    """A TCP socket that listens at an address; port 0 takes any that is free.
+
+    Raises:
+        SourceError: where the address cannot be had.
+    """
+    try:
+        return socket.create_server((host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET)
+    except OSError as error:
+        text = f"tcp://{host}:{port}: cannot listen there: {reason(error)}"
+        is_taken = error.errno == errno.EADDRINUSE
+        raise failure(text, f"ss -ltnp 'sport = :{port}'" if is_taken else f"the same with tcp://127.0.0.1:{port}") from None
 
 
 class Door(Protocol):

@@ -16,9 +16,9 @@ from lidarspec.recording.recorders import recorder
 from lidarspec.simulation.device import SECOND, SimulatedDevice
 from lidarspec.spec.description import Sensor
 from lidarspec.spec.links import Udp
-from lidarspec.transports.live_transport import POLL, Address, failure
+from lidarspec.transports.base import Address, failure
 from lidarspec.transports.outlets import HERE, Door, TcpDoor, UdpDoor
-from lidarspec.transports.protocol import Chunk
+from lidarspec.transports.protocol import POLL, Chunk
 
 #: seconds at least between two sendings.
 PAUSE = 0.001

@@ -86,6 +86,6 @@ class Switch:
         begin = f"{self.sensor_id}-{time.strftime('%Y%m%d-%H%M%S')}"
         names = (f"{begin}{f'-{number}' if number else ''}.lsr" for number in range(TRIES))
         path = self._folder / next(name for name in names if not (self._folder / name).exists())
-        datagrams, baud = self._opened.datagrams, getattr(self._opened, "baud", None)
-        self._recorder = recorder(path, self.sensor_id, self._source, datagrams=datagrams, baud=baud)
+        opened = self._opened
+        self._recorder = recorder(path, self.sensor_id, self._source, datagrams=opened.datagrams, baud=opened.baud)
         self.name = path.name
