@@ -20,9 +20,9 @@ from typing import Any
 from lidarspec.device.arrivals import Arrival, Senders, answers, fed
 from lidarspec.device.capture_thread import BoundedQueue, Capture, Event, Mark
 from lidarspec.device.session import Outgoing, Pending, Reply, Session
-from lidarspec.errors import CommandError, LidarSpecError, ReplyTimeout
+from lidarspec.errors import CommandError, LidarSpecError, ReplyTimeout, suggest
 from lidarspec.framing.decoder import Counters, Decoder, Spans, backend as backend_named
-from lidarspec.recording.recorders import AnyRecorder
+from lidarspec.recording.appending import Log
 from lidarspec.spec.description import Command, Sensor
 from lidarspec.transports.open_url import control_link, has_control
 from lidarspec.transports.protocol import Chunk, LiveTransport
@@ -134,7 +134,7 @@ class LiveInput:
         *,
         backend: str = "auto",
         policy: str = "drop_oldest",
-        recorder: AnyRecorder | None = None,
+        recorder: Log | None = None,
         period: float = PERIOD,
     ) -> None:
         self._source, self.sensor, self._recorder, self._period = source, sensor, recorder, period
@@ -192,8 +192,7 @@ class LiveInput:
                 self.send(name)
             except ReplyTimeout as error:
                 if not self._watch.streams:
-                    error.add_note(f"next: {self._watch.following()}")
-                    raise
+                    raise suggest(error, self._watch.following()) from None
                 self._said.append(f"{error}; data come all the same")
 
     def next(self, wait: float) -> Arrival | None:

@@ -12,7 +12,7 @@ from shlex import quote
 from lidarspec.device.settings import named
 from lidarspec.discovery.detect import Verdict, verdict, verdicts
 from lidarspec.discovery.listen import LISTEN, Heard, bauds, has_no_baud, started_first, udp_ports
-from lidarspec.errors import LidarSpecError, UsageError
+from lidarspec.errors import LidarSpecError, UsageError, suggestion
 from lidarspec.spec.description import Sensor
 from lidarspec.spec.links import Serial, Udp
 from lidarspec.transports import ports
@@ -191,11 +191,11 @@ def _heard(source: str, sensor: Sensor | None, seconds: float) -> Iterator[Findi
             tried = [*([found] if found is not None else []), *verdicts(source, seconds=seconds)]
             found = max(tried, key=lambda one: (bool(one.scores), one.heard.size))
     except UsageError as error:
-        yield Finding(False, str(error), next((note.removeprefix("next: ") for note in getattr(error, "__notes__", ())), ""))
+        yield Finding(False, str(error), suggestion(error))
         return
     except LidarSpecError as error:
-        command = next((note.removeprefix("next: ") for note in getattr(error, "__notes__", ()) if "doctor" not in note), "")
-        yield Finding(False, str(error), command)
+        command = suggestion(error)
+        yield Finding(False, str(error), "" if "doctor" in command else command)
         return
     yield _verdict(source, found, sensor)
 

@@ -11,7 +11,7 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from urllib.parse import parse_qs
 
-from lidarspec.errors import SourceError, UnknownOption, UsageError
+from lidarspec.errors import SourceError, UnknownOption, UsageError, suggest
 from lidarspec.spec.description import Sensor
 from lidarspec.transports.protocol import Disconnected
 
@@ -105,9 +105,7 @@ def readable(descriptor: int, timeout: float) -> bool:
 
 def failure(text: str, following: str) -> SourceError:
     """A SourceError with the next command to type."""
-    error = SourceError(text)
-    error.add_note(f"next: {following}")
-    return error
+    return suggest(SourceError(text), following)
 
 
 def lost(label: str, error: Exception | str) -> Disconnected:

@@ -16,7 +16,8 @@ from typing import BinaryIO
 from lidarspec.captures.bulk import Batch, CaptureBatches
 from lidarspec.captures.pcap import CaptureReader, CaptureStats, StreamReader, is_capture, is_stream_capture
 from lidarspec.errors import SourceError, WireError
-from lidarspec.recording.recordings import MAGIC, Header, Record, Recording
+from lidarspec.recording.format import MAGIC, Header, Record
+from lidarspec.recording.recordings import Recording
 from lidarspec.transports.protocol import Chunk, Transport
 
 #: events behind which a frame begun earlier does not go on.
