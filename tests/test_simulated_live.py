@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import os
 import re
@@ -21,7 +22,7 @@ from lidarspec.errors import UnknownFormat
 from lidarspec.simulation.device import SimulatedDevice
 from lidarspec.simulation.faults import Faults
 from lidarspec.simulation.scenes import Room, read_scene
-from lidarspec.spec.description import replaced
+from lidarspec.spec import Udp
 from lidarspec.testing.fixtures import virtual_port
 from lidarspec.transports.outlets import simulated_outlet
 from lidarspec.transports.serving import Served, write_file
@@ -195,7 +196,7 @@ def test_datagrams_go_to_the_declared_ports_by_their_kind_unless_one_is_named() 
         receiver.bind(("127.0.0.1", 0))
         receiver.settimeout(SLACK)
     ports = [receiver.getsockname()[1] for receiver in receivers]
-    sensor = replaced(VLP, links={"data": ls.Udp(*ports)})
+    sensor = dataclasses.replace(VLP, links={"data": Udp(*ports)})
     with virtual_port(sensor, to="udp://") as port:
         assert port.path == f"udp://127.0.0.1?port={ports[0]},{ports[1]}"
         assert [{len(receiver.recv(2000)) for _ in range(20)} for receiver in receivers] == [{1206}, {512}]

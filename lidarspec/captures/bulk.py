@@ -31,7 +31,6 @@ from lidarspec.captures.records import (
     records,
 )
 from lidarspec.framing.decoder import Decoder, Spans
-from lidarspec.wire.arrays import keep_freed_memory
 
 #: bytes of a record, from its start, that are compared at most; longer headers are read plainly.
 WIDEST = 128
@@ -236,7 +235,6 @@ class CaptureBatches(CaptureReader):
 
     def batches(self) -> Iterator[Batch]:
         """The datagrams of the file, as many at once as were read at once."""
-        keep_freed_memory()
         known: list[Alike] = []
         with self._to_the_end():
             form = records(self._source)

@@ -22,7 +22,7 @@ from lidarspec.plugins import sensor as named_sensor
 from lidarspec.recording.appending import Appender
 from lidarspec.recording.format import Header
 from lidarspec.recording.recorders import Recorder, check_suffix, recorder
-from lidarspec.spec.description import Sensor
+from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.files import RecordingTransport
 from lidarspec.transports.open_url import live_address, transport
 from lidarspec.transports.protocol import Chunk, LiveTransport, Transport

@@ -16,7 +16,7 @@ from lidarspec.errors import LidarSpecError, UsageError, WireError, suggest
 from lidarspec.plugins import sensor as named_sensor
 from lidarspec.recording.format import Header
 from lidarspec.recording.recorders import SUFFIXES, declared_port, recorder
-from lidarspec.spec.description import Sensor
+from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.files import RecordingTransport
 from lidarspec.transports.open_url import live_address, transport
 from lidarspec.transports.outlets import FileOutlet, Outlet, replay_outlet

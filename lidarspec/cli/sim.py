@@ -19,7 +19,7 @@ from lidarspec.recording.recorders import SUFFIXES
 from lidarspec.simulation.device import SimulatedDevice
 from lidarspec.simulation.faults import Faults
 from lidarspec.simulation.scenes import read_scene
-from lidarspec.spec.description import Sensor
+from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.outlets import HERE, Outlet, simulated_outlet
 from lidarspec.transports.serving import serve, write_file
 from lidarspec.transports.simulated import rate_of

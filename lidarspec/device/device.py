@@ -28,7 +28,7 @@ from lidarspec.points.cloud import Mount
 from lidarspec.recording.appending import Log
 from lidarspec.recording.recorders import RecordTo, recorder_for
 from lidarspec.scans.scans import Scan, ScanStream, handed_out
-from lidarspec.spec.description import Sensor
+from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.open_url import transport
 from lidarspec.transports.protocol import LiveTransport, Transport
 

@@ -22,8 +22,8 @@ from lidarspec.framing.results import Found
 from lidarspec.plugins import registry, sensor as named_sensor
 from lidarspec.recording.appending import Appender, Log
 from lidarspec.recording.format import DATAGRAM, EVENT, GAP, HEADER, LARGEST, MAGIC, QUIET, RECEIVED, SENT, Header, packed, whole_records
-from lidarspec.spec.description import Sensor
 from lidarspec.spec.links import Udp
+from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.protocol import Chunk, Transport
 
 SUFFIXES = (".lsr", ".pcap", ".bin")

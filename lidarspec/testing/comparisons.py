@@ -16,7 +16,7 @@ from lidarspec.packets.packets import Packets
 from lidarspec.packets.stream import PacketStream
 from lidarspec.points.cloud import PointCloud
 from lidarspec.spec.construct_layer import member
-from lidarspec.spec.description import Sensor
+from lidarspec.spec.sensor import Sensor
 
 #: units in the last place by which coordinates of two evaluations may differ, at the size of the range.
 ULPS = 4

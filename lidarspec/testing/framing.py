@@ -26,7 +26,8 @@ from lidarspec.errors import SpecError
 from lidarspec.framing.frame_engine import CompiledCodec, InterpretedCodec, codec
 from lidarspec.framing.results import Counters
 from lidarspec.simulation.frame_maker import examples
-from lidarspec.spec.description import Frame, Sensor
+from lidarspec.spec.description import Frame
+from lidarspec.spec.sensor import Sensor
 from lidarspec.testing import subject as material
 from lidarspec.testing.comparisons import cuts
 from lidarspec.testing.findings import Violation, require

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from urllib.parse import parse_qs
 
 from lidarspec.errors import SourceError, UnknownOption, UsageError, suggest
-from lidarspec.spec.description import Sensor
+from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.protocol import Disconnected
 
 #: options that every live SOURCE takes: the address of the link that commands go over, where it is not that of the data.

@@ -19,8 +19,8 @@ from pathlib import Path
 
 from lidarspec.errors import SourceError, UsageError
 from lidarspec.recording.appending import Appender
-from lidarspec.spec.description import Sensor
 from lidarspec.spec.links import Tcp, Udp
+from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.base import Address, failure, reason
 from lidarspec.transports.protocol import POLL, Chunk
 
