@@ -7,10 +7,9 @@ from typing import Any
 
 import click
 
-from lidarspec.cli.failures import suggest
 from lidarspec.cli.inputs import Input, Piece, fitting, likely_starts, nearest, no_frame, pieces, read
 from lidarspec.cli.output import emit, emit_json, emit_lines, note, output_options, sensor_option, table
-from lidarspec.errors import UsageError, WireError
+from lidarspec.errors import UsageError, WireError, suggest
 from lidarspec.explaining.explanation import Explanation, explain as explained
 from lidarspec.explaining.listing import LINED, Line, told
 from lidarspec.explaining.wording import Row, Span, number
