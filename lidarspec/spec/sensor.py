@@ -11,8 +11,8 @@ from lidarspec.framing.frame_engine import codec
 from lidarspec.packets.packets import Packets
 from lidarspec.packets.stream import PacketStream, data_frame
 from lidarspec.plugins import registry
-from lidarspec.points.cloud import axis_matrix
-from lidarspec.points.numba_kernels import checksums as kernelsums
+from lidarspec.points.conventions import axis_matrix
+from lidarspec.points.numba_kernels import compiled_sums
 from lidarspec.scans.scans import Scan, scans_of
 from lidarspec.simulation import frame_maker as examples
 from lidarspec.spec.description import Configure, Sensor, replaced
@@ -60,7 +60,7 @@ class StandardEngine:
 
     def decoder(self, sensor: Sensor, *, stream: bool | None, backend: str) -> Decoder:
         chosen = checked_backend(backend)
-        sums = kernelsums.compiled() if chosen == "jit" else None
+        sums = compiled_sums() if chosen == "jit" else None
         stream = not sensor.datagrams if stream is None else stream
         return Decoder(sensor, stream=stream, interpreted=chosen == "construct", backend=chosen, sums=sums)
 
