@@ -87,6 +87,11 @@ class Node:
         return tuple(found)
 
     @cached_property
+    def _first(self) -> int:
+        """The place of the first node among the arguments."""
+        return next(place for place, arg in enumerate(self.args) if isinstance(arg, Node))
+
+    @cached_property
     def _operands(self) -> list[tuple[bool, Any]]:
         """Of what is called with: whether it is a node, and the axes that it lacks of the deepest one; or else what it is, as an array."""
         depth = max(len(arg.sample.axes) for arg in self.args if isinstance(arg, Node))
@@ -96,9 +101,9 @@ class Node:
         """What it comes to, from what its arguments do: a column where these are columns, else an array where they are arrays."""
         if self.kind != "call":
             return self.function(*args)
-        for arg in args:
-            if isinstance(arg, Column):
-                return arg.applied(self.function, *args)
+        first = args[self._first]
+        if isinstance(first, Column):
+            return first.applied(self.function, *args)
         arrays = [
             known if not is_node else arg.reshape(*arg.shape, *known) if known else arg
             for arg, (is_node, known) in zip(args, self._operands, strict=True)

@@ -233,7 +233,7 @@ class Stretches(ColumnSource):
 
     def _joined(self, name: str) -> NDArray[Any] | None:
         """What the sources have, one after another."""
-        columns = list[NDArray[Any]]()
+        columns: list[NDArray[Any]] = []
         for part in self._parts:
             column = part.source.part(name, part.start, part.stop)
             if column is None:
