@@ -39,7 +39,8 @@ if TYPE_CHECKING:
         UsageError as UsageError,
         WireError as WireError,
     )
-    from lidarspec.framing.decoder import Counters as Counters, Decoder as Decoder, Found as Found
+    from lidarspec.framing.decoder import Decoder as Decoder
+    from lidarspec.framing.results import Counters as Counters, Found as Found
     from lidarspec.packets.packets import Packets as Packets
     from lidarspec.plugins import hookimpl as hookimpl, sensor as sensor, sensors as sensors
     from lidarspec.points.cloud import PointCloud as PointCloud
@@ -91,7 +92,8 @@ _HOMES: dict[str, tuple[str, ...]] = {
     "plugins": ("hookimpl", "sensor", "sensors"),
     "device.device": ("open", "Device"),
     "device.async_device": ("open_async", "AsyncDevice"),
-    "framing.decoder": ("Decoder", "Found", "Counters"),
+    "framing.decoder": ("Decoder",),
+    "framing.results": ("Counters", "Found"),
     "packets.packets": ("Packets",),
     "points.cloud": ("PointCloud",),
     "scans.scans": ("Scan", "LaserScan"),

@@ -11,7 +11,7 @@ import pytest
 
 import lidarspec as ls
 from lidarspec import Command, CommandError, OutOfRange, ReplyTimeout, Sensor, Session, Udp, UnknownCommand, UnknownField, UsageError
-from lidarspec.framing.decoder import Found
+from lidarspec.framing.results import Found
 from tests.shapes.commands import SENSOR
 
 SECOND = 1_000_000_000

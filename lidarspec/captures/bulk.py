@@ -47,8 +47,8 @@ from lidarspec.captures.records import (
     records,
 )
 from lidarspec.errors import SourceError
-from lidarspec.framing.decoder import Decoder, Spans
-from lidarspec.wire.arrays import keep_freed_memory
+from lidarspec.framing.decoder import Decoder
+from lidarspec.framing.results import Frames
 
 #: bytes of a record, from its start, that are compared at most; longer headers are read plainly.
 WIDEST = 128
@@ -342,9 +342,6 @@ def _first_size(file: BinaryIO) -> int:
     return min(max(status.st_size, SMALLEST), LARGEST) if stat.S_ISREG(status.st_mode) else SMALLEST
 
 
-keep_freed_memory()
-
-
 #: kinds of datagrams that are known at a time, and that become known in one batch: nobody's capture makes this slow.
 MOST_KNOWN = 16
 
@@ -391,7 +388,7 @@ class Batch:
         parts = {name: np.flatnonzero(self.senders == index) for index, name in enumerate(self.names)}
         return {name: part for name, part in parts.items() if len(part)}
 
-    def hosts(self, found: Spans) -> dict[str, list[str]]:
+    def hosts(self, found: Frames) -> dict[str, list[str]]:
         """The addresses that frames found in these datagrams came from, by type of frame."""
         hosts: dict[str, list[str]] = {}
         if len(self.names) == 1:

@@ -9,7 +9,8 @@ from lidarspec.captures.bulk import BulkTransport, first_frames
 from lidarspec.device.arrivals import Arrival, Senders, fed
 from lidarspec.device.session import Reply
 from lidarspec.errors import CommandError
-from lidarspec.framing.decoder import Counters, Decoder
+from lidarspec.framing.decoder import Decoder
+from lidarspec.framing.results import Counters
 from lidarspec.spec.description import Sensor
 from lidarspec.transports.open_url import transport
 from lidarspec.transports.protocol import Chunk, Transport

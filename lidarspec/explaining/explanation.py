@@ -19,9 +19,8 @@ import numpy as np
 from lidarspec.errors import LidarSpecError, WireError
 from lidarspec.explaining.listing import Explanation
 from lidarspec.explaining.wording import Point, Row, Value, hexdump
-from lidarspec.framing.decoder import Counters, Found, packed
 from lidarspec.framing.frame_engine import CompiledCodec, codec
-from lidarspec.framing.plausibility import IMPLAUSIBLE, VALID
+from lidarspec.framing.results import IMPLAUSIBLE, VALID, Counters, Found, packed
 from lidarspec.packets.stream import PacketStream
 from lidarspec.points.plain import evaluate
 from lidarspec.spec.bits import BitField, leaves, probe

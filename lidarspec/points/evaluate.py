@@ -25,7 +25,6 @@ from lidarspec.points.numba_kernels.kernels import Kernel
 from lidarspec.points.numpy_plan.program import Program
 from lidarspec.points.plain import Evaluated, evaluate, points_function
 from lidarspec.points.plan import Plan, plan_for, tables_of, worth_compiling
-from lidarspec.wire.arrays import keep_freed_memory
 from lidarspec.wire.frame_table import Group, Rows, ascends
 
 
@@ -272,5 +271,4 @@ def _cloud(packets: Packets) -> PointCloud:
     return (found if found is not None else evaluate(packets)).cloud
 
 
-keep_freed_memory()
 install_points(_cloud)

@@ -27,7 +27,8 @@ from lidarspec.spec.rules import check_struct
 from lidarspec.spec.timing import Clock, Sequence, Split
 
 if TYPE_CHECKING:
-    from lidarspec.framing.decoder import Decoder, Found
+    from lidarspec.framing.decoder import Decoder
+    from lidarspec.framing.results import Found
     from lidarspec.packets.packets import Packets
     from lidarspec.scans.scans import Scan
 

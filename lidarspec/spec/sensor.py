@@ -6,8 +6,9 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from lidarspec.errors import MissingField, OutOfRange, SpecError, UnknownCommand, UnknownField, UnknownOption, UsageError
-from lidarspec.framing.decoder import Decoder, Found, backend as checked_backend, is_stream, spans_of
+from lidarspec.framing.decoder import Decoder, backend as checked_backend, frames_of, is_stream
 from lidarspec.framing.frame_engine import codec
+from lidarspec.framing.results import Found
 from lidarspec.packets.packets import Packets
 from lidarspec.packets.stream import PacketStream, data_frame
 from lidarspec.plugins import registry
@@ -65,12 +66,12 @@ class StandardEngine:
         return Decoder(sensor, stream=stream, interpreted=chosen == "construct", backend=chosen, sums=sums)
 
     def split(self, sensor: Sensor, data: Any, *, backend: str) -> list[Found]:
-        found = spans_of(self.decoder(sensor, stream=is_stream(data), backend=backend), data)
+        found = frames_of(self.decoder(sensor, stream=is_stream(data), backend=backend), data)
         return [one for spans in found for one in spans.found()]
 
     def decode(self, sensor: Sensor, data: Any, *, frame: str | None, backend: str) -> Packets:
         decoder = self.decoder(sensor, stream=is_stream(data), backend=backend)
-        found = spans_of(decoder, data)
+        found = frames_of(decoder, data)
         name = frame or data_frame(sensor, found) or sensor.data_frame
         return PacketStream(sensor, name, decoder.stats, interpreted=decoder.interpreted, backend=decoder.backend).add(found, whole=True)
 

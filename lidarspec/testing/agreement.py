@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from lidarspec.framing.decoder import Decoder, packed
+from lidarspec.framing.decoder import Decoder
 from lidarspec.framing.frame_engine import codec
+from lidarspec.framing.results import packed
 from lidarspec.packets.packets import joined
 from lidarspec.packets.stream import PacketStream
 from lidarspec.scans.scans import Scan, scans_of

@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.errors import SpecError
-from lidarspec.framing.decoder import Decoder, Found, Spans, is_stream, spans_of
+from lidarspec.framing.decoder import Decoder, frames_of, is_stream
 from lidarspec.framing.frame_engine import codec
+from lidarspec.framing.results import Found, Frames
 from lidarspec.packets.packets import Packets
 from lidarspec.packets.stream import PacketStream
 from lidarspec.points.cloud import PointCloud
@@ -113,7 +114,7 @@ def same(one: NDArray[Any], other: NDArray[Any]) -> bool:
 def assert_backends_agree(sensor: Sensor, data: Any) -> None:
     """Fail unless the compiled and the interpreted path give the same frames, packets, points and counters, and no plugin failed."""
     decoders = [sensor.decoder(stream=is_stream(data), backend=backend) for backend in ("auto", "construct")]
-    found = [spans_of(decoder, data) for decoder in decoders]
+    found = [frames_of(decoder, data) for decoder in decoders]
     split = [cuts(one for spans in each for one in spans.found()) for each in found]
     assert split[0] == split[1]
     for name in dict.fromkeys((sensor.data_frame, *(name for name, _, _ in split[0]))):
@@ -127,7 +128,7 @@ def assert_backends_agree(sensor: Sensor, data: Any) -> None:
             assert_same_points(cloud, interpreted.points())
 
 
-def _packets(decoder: Decoder, name: str, found: Sequence[Spans]) -> Packets:
+def _packets(decoder: Decoder, name: str, found: Sequence[Frames]) -> Packets:
     """The packets of one type among the frames of a whole input, which is framed once for all types."""
     stats = copy.deepcopy(decoder.stats)
     return PacketStream(decoder.sensor, name, stats, interpreted=decoder.interpreted).add(found, whole=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from lidarspec import Counters, Found, Sensor
-from lidarspec.framing.decoder import packed
+from lidarspec.framing.results import packed
 from tests.broken import sound
 
 HEADERS = {b"\xaa\x55\xc3": "data", b"\x17\x71\x44": "ack"}
@@ -33,7 +33,7 @@ class Parser:
 
     finish = idle
 
-    def spans(self, data: bytes, at: int | None = None) -> list[Any]:
+    def frames(self, data: bytes, at: int | None = None) -> list[Any]:
         """The same as `feed`, as the engine asks for it."""
         return [packed(self.feed(data, at))]
 
