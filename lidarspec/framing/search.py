@@ -110,6 +110,10 @@ class Framing:
         """Whether a frame of this type changes what is looked for."""
         return self.names[kind] in self.named and self.names[kind] != mode.after
 
+    def switching(self, mode: Mode) -> NDArray[np.bool_]:
+        """Whether a frame of each type changes what is looked for, by its index; False for -1."""
+        return np.array([*(self.switches(kind, mode) for kind in range(len(self.names))), False])
+
     def survey(self, kind: int, buffer: Bytes1D, offsets: Offsets, *, gathered: bool = True) -> Frames:
         """The candidates at these offsets, which have the constants of a type; see `Codec.survey`."""
         return self.codecs[kind].survey(buffer, offsets, kind=kind, gathered=gathered, sums=self._sums)
@@ -133,7 +137,7 @@ class Framing:
             buffer = buffer[: max(limit, self.reach)]
             spots = {kind: offsets[: int(np.searchsorted(offsets, len(buffer)))] for kind, offsets in spots.items()}
         surveys = [self.survey(kind, buffer, offsets) for kind, offsets in spots.items() if len(offsets)]
-        return buffer, [one if one.is_sound or (right := one.status != CONSTANT).all() else one.only(right) for one in surveys]
+        return buffer, [own if own.is_sound or (right := own.status != CONSTANT).all() else own.only(right) for own in surveys]
 
 
 def matches(buffer: Bytes1D, constants: Marks) -> Offsets:
@@ -202,10 +206,9 @@ def leftmost(framing: Framing, buffer: Bytes1D, mode: Mode, *, final: bool) -> P
 def merged(candidates: Sequence[Frames], *, final: bool) -> Frames:
     """The candidates of several types that are valid or wait for bytes, by offset, at each the one whose type comes first."""
     worst = VALID if final else SHORT
-    live = Frames.joined(
-        [one if one.is_sound or bool((one.status <= worst).all()) else one.only(one.status <= worst) for one in candidates]
-    )
-    if len(candidates) == 1:
+    parts = [own if own.is_sound or bool((own.status <= worst).all()) else own.only(own.status <= worst) for own in candidates]
+    live = Frames.joined(parts)
+    if len(parts) == 1:
         return live
     order = np.argsort(live.starts, kind="stable")  # at each offset still in the order of the types
     return live.only(order[np.diff(live.starts[order], prepend=-1) > 0])
@@ -236,8 +239,7 @@ def _chain(live: Frames, length: int) -> Offsets | None:
 
 def _until_switched(framing: Framing, frames: Frames, mode: Mode, piece: Piece) -> Frames:
     """The frames up to the first one that changes what is looked for; the piece ends with it."""
-    switching = np.array([framing.switches(kind, mode) for kind in range(len(framing.names))])
-    spots = np.flatnonzero(switching[frames.kinds])
+    spots = np.flatnonzero(framing.switching(mode)[frames.kinds])
     if not len(spots):
         return frames
     last = int(spots[0])
