@@ -17,8 +17,8 @@ from lidarspec.device.device import Device, open as open_device
 from lidarspec.device.session import Reply
 from lidarspec.errors import CommandError, UnknownCommand, UnknownField, UsageError
 from lidarspec.explaining.explanation import explain
-from lidarspec.spec.description import Sensor
 from lidarspec.spec.fields import factor, split_unit
+from lidarspec.spec.sensor import Sensor
 from lidarspec.wire.schema import schema
 
 
@@ -82,7 +82,7 @@ def arguments(sensor: Sensor, name: str, assignments: Sequence[str]) -> dict[str
             raise UsageError(f"{sensor.id} {name}: {text!r} is not argument=value")
         if argument not in command.args or command.frame is None:
             raise UnknownField(argument, command.args, place=f"{sensor.id} {name}")
-        unit = schema(sensor.frames[command.frame].prepared).fields[command.args[argument][0]].unit
+        unit = schema(sensor.frames[command.frame].tree).fields[command.args[argument][0]].unit
         found[argument] = _number(value, unit, f"{sensor.id} {name}: {argument}")
     return found
 

@@ -26,8 +26,9 @@ from numpy.lib.mixins import NDArrayOperatorsMixin
 from numpy.typing import NDArray
 
 from lidarspec.errors import SpecError, UnknownField
+from lidarspec.spec.tree import FieldInfo
 from lidarspec.wire.frame_table import Group, Rows, Table
-from lidarspec.wire.schema import FieldInfo, Schema
+from lidarspec.wire.schema import Schema
 
 #: NumPy functions that work element by element, and so keep axes; others see plain arrays.
 ELEMENTWISE = {np.where, np.clip, np.nan_to_num, np.round, np.isclose, np.real_if_close}

@@ -24,13 +24,15 @@ from lidarspec.framing.frame_engine import CompiledCodec, codec
 from lidarspec.framing.plausibility import IMPLAUSIBLE, VALID
 from lidarspec.packets.stream import PacketStream
 from lidarspec.points.plain import evaluate
-from lidarspec.spec.bits import BitField, leaves, probe
-from lidarspec.spec.construct_layer import UNNAMED, Seen, field_path, unwrap
-from lidarspec.spec.description import Frame, Sensor
+from lidarspec.spec.bits import BitField
+from lidarspec.spec.construct_layer import UNNAMED, Seen, field_path, leaves, probed, unwrap
+from lidarspec.spec.description import Frame
 from lidarspec.spec.fields import Checksummed, exact
 from lidarspec.spec.rules import children
+from lidarspec.spec.sensor import Sensor
+from lidarspec.spec.tree import FieldInfo
 from lidarspec.wire.parse import parse_typed
-from lidarspec.wire.schema import FieldInfo, schema
+from lidarspec.wire.schema import schema
 from lidarspec.wire.wire_table import bit_text, hexed
 
 #: bytes of candidates that are tried in one go, and the longest frame that construct alone has to read so often.
@@ -142,7 +144,7 @@ class _Reading:
     """One frame as construct read it: its parts, how far it came, and the verdicts of its checksums."""
 
     def __init__(self, frame: Frame, data: bytes) -> None:
-        self._data, self._schema = data, schema(frame.prepared)
+        self._data, self._schema = data, schema(frame.tree)
         self._blocks = dict(_blocks(frame.prepared, ""))
         trail: list[Seen] = []
         self.failed = True
@@ -257,7 +259,7 @@ def _blocks(con: Any, path: str) -> Iterator[tuple[str, Mapping[Keys, BitField]]
     if isinstance(con, construct.Array):
         path, con = f"{path}[]", con.subcon
     if unwrap(con, bits=False) is not unwrap(con):
-        yield path, {bits.keys: bits for bits in probe(con, con.sizeof()) or ()}
+        yield path, {bits.keys: bits for bits in probed(con, con.sizeof()) or ()}
         return
     for child in children(con):
         yield from _blocks(child, path)

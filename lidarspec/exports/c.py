@@ -26,11 +26,10 @@ from lidarspec.exports.c_fields import (
     pieces,
     quoted,
 )
-from lidarspec.exports.formulas import Formula, Op, Ref, refs
 from lidarspec.exports.messages import Message, messages
-from lidarspec.exports.tree import Blob, Block, Number, Repeat, Sealed, formulas
 from lidarspec.spec.checksums import Checksum, Crc, Fold15, Sum, WordXor, Xor, ZeroPadded
-from lidarspec.spec.description import Sensor
+from lidarspec.spec.sensor import Sensor
+from lidarspec.spec.tree import Blob, Block, Formula, Number, Op, Ref, Repeat, Sealed, formulas, refs
 
 _FUNCTION = """\
 /* {text} */

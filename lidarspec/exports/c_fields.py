@@ -14,10 +14,27 @@ from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 from lidarspec.exports import Refused
-from lidarspec.exports.formulas import Formula, Op, Ref, refs
 from lidarspec.exports.messages import Message
-from lidarspec.exports.tree import Blob, Block, Empty, Node, Number, Part, Repeat, Sealed, Select, Struct, When, formulas, nodes
-from lidarspec.wire.schema import FieldInfo
+from lidarspec.spec.tree import (
+    Blob,
+    Block,
+    Empty,
+    FieldInfo,
+    Formula,
+    Node,
+    Number,
+    Op,
+    Part,
+    Ref,
+    Repeat,
+    Sealed,
+    Select,
+    Struct,
+    When,
+    formulas,
+    nodes,
+    refs,
+)
 from lidarspec.wire.wire_table import meaning, unit_text
 
 #: bits of a value that a formula in 64-bit integers may reach.

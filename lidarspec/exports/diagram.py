@@ -9,10 +9,9 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from xml.sax.saxutils import escape, quoteattr
 
-from lidarspec.exports.formulas import Formula, Op, Ref
 from lidarspec.exports.messages import Message, messages
-from lidarspec.exports.tree import Blob, Block, Empty, Node, Number, Part, Repeat, Sealed, Select, Struct, When, nodes
-from lidarspec.spec.description import Sensor
+from lidarspec.spec.sensor import Sensor
+from lidarspec.spec.tree import Blob, Block, Empty, Formula, Node, Number, Op, Part, Ref, Repeat, Sealed, Select, Struct, When, nodes
 from lidarspec.wire.wire_table import INDICES, Extent, bit_text, frame_size, meaning, unit_text
 
 

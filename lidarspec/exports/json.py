@@ -10,13 +10,12 @@ import dataclasses
 import json
 from typing import Any
 
-from lidarspec.exports.formulas import Formula, Op, Ref
 from lidarspec.exports.messages import Message, messages
-from lidarspec.exports.tree import Blob, Block, Empty, Node, Number, Part, Repeat, Sealed, Select, Struct, When
 from lidarspec.spec.checksums import Checksum
-from lidarspec.spec.description import Command, Sensor
+from lidarspec.spec.description import Command
 from lidarspec.spec.links import Link, Serial, Tcp, Udp
-from lidarspec.wire.schema import FieldInfo
+from lidarspec.spec.sensor import Sensor
+from lidarspec.spec.tree import Blob, Block, Empty, FieldInfo, Formula, Node, Number, Op, Part, Ref, Repeat, Sealed, Select, Struct, When
 from lidarspec.wire.wire_table import frame_size
 
 #: raised whenever a key changes its meaning or goes.

@@ -20,13 +20,28 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from lidarspec.exports import Refused
-from lidarspec.exports.formulas import Formula, Op, Ref
 from lidarspec.exports.messages import Message, messages
-from lidarspec.exports.tree import Blob, Block, Empty, Node, Number, Part, Repeat, Sealed, Select, Struct, When, nodes
 from lidarspec.spec.bits import BitField, Segment
-from lidarspec.spec.description import Sensor
 from lidarspec.spec.fields import slug
-from lidarspec.wire.schema import FieldInfo
+from lidarspec.spec.sensor import Sensor
+from lidarspec.spec.tree import (
+    Blob,
+    Block,
+    Empty,
+    FieldInfo,
+    Formula,
+    Node,
+    Number,
+    Op,
+    Part,
+    Ref,
+    Repeat,
+    Sealed,
+    Select,
+    Struct,
+    When,
+    nodes,
+)
 from lidarspec.wire.wire_table import meaning, unit_text
 
 #: a string that means the same without quotes.

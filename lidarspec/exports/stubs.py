@@ -17,9 +17,10 @@ from dataclasses import dataclass, field
 
 from lidarspec.exports import Refused
 from lidarspec.exports.messages import Message, messages
-from lidarspec.exports.tree import Blob, Block, Empty, Node, Number, Repeat, Sealed, Select, Struct, When
-from lidarspec.spec.description import Command, Sensor
-from lidarspec.wire.schema import FieldInfo, schema
+from lidarspec.spec.description import Command
+from lidarspec.spec.sensor import Sensor
+from lidarspec.spec.tree import Blob, Block, Empty, FieldInfo, Node, Number, Repeat, Sealed, Select, Struct, When
+from lidarspec.wire.schema import schema
 from lidarspec.wire.wire_table import meaning, unit_text
 
 
@@ -161,7 +162,7 @@ def _command(name: str, command: Command) -> str:
 def _paths(sensor: Sensor) -> list[str]:
     """The fields of the data frame, as packets name them."""
     frame = next((frame for frame in sensor.frames.values() if frame.data), None) or next(iter(sensor.frames.values()))
-    return list(schema(frame.prepared).fields)
+    return list(schema(frame.tree).fields)
 
 
 def _quoted(said: str) -> str:

@@ -17,15 +17,32 @@ from typing import Any
 
 from lidarspec._version import __version__
 from lidarspec.exports import Refused
-from lidarspec.exports.formulas import Formula, Op, Ref, refs
 from lidarspec.exports.messages import Message, messages
-from lidarspec.exports.tree import Blob, Block, Empty, Node, Number, Part, Repeat, Sealed, Select, Struct, When, formulas, nodes
 from lidarspec.framing.frame_engine import codec
 from lidarspec.spec.bits import BitField
 from lidarspec.spec.checksums import Checksum, Crc, Fold15, Sum, WordXor, Xor, ZeroPadded
-from lidarspec.spec.description import Sensor
 from lidarspec.spec.links import Tcp, Udp
-from lidarspec.wire.schema import FieldInfo
+from lidarspec.spec.sensor import Sensor
+from lidarspec.spec.tree import (
+    Blob,
+    Block,
+    Empty,
+    FieldInfo,
+    Formula,
+    Node,
+    Number,
+    Op,
+    Part,
+    Ref,
+    Repeat,
+    Sealed,
+    Select,
+    Struct,
+    When,
+    formulas,
+    nodes,
+    refs,
+)
 
 WIDTH = 140
 

@@ -25,9 +25,10 @@ from numpy.typing import NDArray
 from lidarspec.columns.columns import Batch, Column, Fields, unpadded
 from lidarspec.columns.graph import Node, Traced, conjuncts, evaluate, fields_beside, sample_of, trace
 from lidarspec.spec.description import Frame
+from lidarspec.spec.tree import FieldInfo
 from lidarspec.wire.frame_table import Group, Rows, Table
 from lidarspec.wire.layout import Bytes2D, Layout, Leaf, Seal, elements, marks, right, words
-from lidarspec.wire.schema import FieldInfo, Schema
+from lidarspec.wire.schema import Schema
 
 VALID, SHORT, LENGTH, CONSTANT, CHECKSUM, IMPLAUSIBLE, PLUGIN = range(7)
 

@@ -12,11 +12,12 @@ from numpy.typing import NDArray
 from lidarspec.columns.columns import Batch, Fields
 from lidarspec.columns.graph import Node, Untraceable, evaluate, fields_beside, sample_of, trace
 from lidarspec.errors import SpecError
-from lidarspec.spec.description import Sensor
+from lidarspec.spec.description import Spec
 from lidarspec.spec.fields import exact, factor
+from lidarspec.spec.tree import FieldInfo
 from lidarspec.wire.arrays import alike
 from lidarspec.wire.frame_table import Rows, Table
-from lidarspec.wire.schema import FieldInfo, Schema
+from lidarspec.wire.schema import Schema
 
 Times = NDArray[np.int64]
 
@@ -63,7 +64,7 @@ class Unwrapper:
         return times
 
 
-def clock_ns(sensor: Sensor, batch: Batch) -> Times:
+def clock_ns(sensor: Spec, batch: Batch) -> Times:
     """The sensor's own clock in each packet, (n,) int64 nanoseconds, as it stands on the wire."""
     assert sensor.clock is not None
     source = sensor.clock.source

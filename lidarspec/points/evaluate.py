@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from lidarspec.columns.columns import Batch, Carry, Column, Fields
 from lidarspec.errors import SpecError
-from lidarspec.packets.packets import Packets, install_points
+from lidarspec.packets.packets import Packets
 from lidarspec.points.cloud import LazyCloud, PointCloud
 from lidarspec.points.conventions import rows_of
 from lidarspec.points.lazy_columns import BatchColumns, Plain, Share
@@ -130,9 +130,7 @@ def guarded(packets: Packets, carry: Carry | None = None, *, final: bool, epoch:
         return None
 
 
-def _cloud(packets: Packets) -> PointCloud:
+def cloud_of(packets: Packets) -> PointCloud:
+    """The points of packets that stand alone."""
     planned = _planned(packets, None, final=True, epoch=None, alone=True)
     return (planned if planned is not None else evaluate(packets)).cloud
-
-
-install_points(_cloud)

@@ -29,7 +29,7 @@ from lidarspec.points.conventions import (
     turned_azimuth,
     vendor_turn,
 )
-from lidarspec.spec.description import Sensor
+from lidarspec.spec.description import Spec
 from lidarspec.spec.results import Cartesian, Points, Polar
 
 _OPTIONAL = ("intensity", "ring", "return_index")
@@ -56,7 +56,7 @@ class Evaluated:
     axes: tuple[str | None, ...]
 
 
-def points_function(sensor: Sensor, frame: str) -> Callable[[Any], Points]:
+def points_function(sensor: Spec, frame: str) -> Callable[[Any], Points]:
     """The function that makes points of this frame type.
 
     Raises:

@@ -14,11 +14,11 @@ from typing import Any
 import construct
 from construct import Array, Bytes, BytesInteger, Construct, FormatField, Struct
 
-from lidarspec.spec.bits import BitField, probe
-from lidarspec.spec.construct_layer import UNNAMED, unwrap
+from lidarspec.spec.bits import BitField
+from lidarspec.spec.construct_layer import UNNAMED, fields_below, peeled, probed, unwrap
 from lidarspec.spec.description import Frame
 from lidarspec.spec.fields import Checksummed
-from lidarspec.wire.schema import FieldInfo, fields_below, peeled
+from lidarspec.spec.tree import FieldInfo
 
 INDICES = "ijklmn"
 _ITEM = re.compile(r"\['(\w+)'\]")
@@ -155,7 +155,7 @@ class _Table:
     def _block(self, con: Construct, place: _Place, start: Extent) -> Extent:
         size = int(con.sizeof())
         infos = fields_below(con, place.info)
-        for bits in probe(con, size) or ():
+        for bits in probed(con, size) or ():
             names = ".".join(key for key in bits.keys if isinstance(key, str))
             indices = "".join(f"[{key}]" for key in bits.keys if isinstance(key, int))
             row = WireRow(str(start), f"{bits.width} bit{'s' * (bits.width > 1)}", bit_text(bits), _joined(place.shown, names) + indices)
