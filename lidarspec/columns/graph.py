@@ -30,8 +30,9 @@ from numpy.typing import NDArray
 
 from lidarspec.columns.columns import ELEMENTWISE, Batch, Column, Fields, called
 from lidarspec.errors import SpecError
+from lidarspec.spec.tree import FieldInfo
 from lidarspec.wire.frame_table import Group
-from lidarspec.wire.schema import FieldInfo, Schema
+from lidarspec.wire.schema import Schema
 
 
 class Untraceable(Exception):

@@ -658,7 +658,7 @@ class _Builder:
         members = []
         for child in con.subcons:
             path = ".".join(part for part in (info.path, child.name) if part)
-            said = FieldInfo(path, info.axes, optional=info.optional)
+            said = FieldInfo(path, info.axes, docs=info.docs if place.in_bits else "", optional=info.optional)
             members.append(self.node(child, _Place(said, scope, child.name or "", place.in_bits)))
         self.scopes[info.path] = scope
         return tree.Struct(place.name, info.path, tuple(members))
@@ -701,7 +701,7 @@ class _Builder:
             fields = None
         if fields is None:
             reason = "a bit block whose values are not plain bits of it"
-            return Opaque(place.name, place.info, type(con).__name__, reason, (inside,))
+            return Opaque(place.name, place.info, type(con).__name__, reason, (inside,), in_bits=True)
         infos = {node.info.path: node.info for node in nodes(inside) if isinstance(node, Number | Blob | Opaque)}
         parts = []
         for bits in fields:
@@ -850,3 +850,8 @@ def fields_below(con: Construct, info: FieldInfo) -> dict[str, FieldInfo]:
 def probed(con: Construct, size: int) -> list[BitField] | None:
     """The bit fields of a block; None where construct decides on its bits, or values are no plain integers."""
     return _probed(con, size)
+
+
+def is_expression(value: object) -> bool:
+    """Whether a value is an expression or a part of a struct, where a number is wanted."""
+    return isinstance(value, ExprMixin | Construct)
