@@ -34,7 +34,7 @@ from lidarspec.plugins import registry, sensor as named_sensor
 from lidarspec.scans.scans import Scan
 from lidarspec.simulation.device import SimulatedDevice
 from lidarspec.simulation.faults import Faults
-from lidarspec.spec.description import Sensor
+from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.outlets import HERE
 from lidarspec.transports.serving import Served, door
 from lidarspec.view.polar import look, picture
@@ -164,7 +164,8 @@ WIDEST, HIGHEST, SUMMARY = 100, 42, 8
 @click.option("--json", "as_json", is_flag=True, help="Print the summary as JSON.")
 def demo(sensor_id: str | None, count: int, errors: float, as_json: bool) -> None:
     """A simulated sensor on a port: started, read through a bad line, recorded, read again, drawn."""
-    sensor = named_sensor(sensor_id) if sensor_id else next((s for s in registry().sensors().values() if s.sweep), None)
+    simulated = (one for one in registry().sensors().values() if any(one.simulation_of(name).sweep for name in one.data_frames))
+    sensor = named_sensor(sensor_id) if sensor_id else next(simulated, None)
     if sensor is None:
         raise UsageError(NO_SENSORS)
     result = run(sensor, turns=count, errors=errors)

@@ -23,7 +23,7 @@ from lidarspec.errors import LidarSpecError, UsageError, WireError
 from lidarspec.formats import format_of, write
 from lidarspec.plugins import sensor as named_sensor
 from lidarspec.scans.scans import Scan
-from lidarspec.spec.description import Sensor
+from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.open_url import transport
 from lidarspec.view.polar import look
 from lidarspec.view.svg import svg

@@ -15,7 +15,7 @@ from lidarspec.explaining.explanation import explain as explained
 from lidarspec.explaining.listing import LINED, Explanation, Line, differences, told as told_differences
 from lidarspec.explaining.wording import Row, Span, number
 from lidarspec.plugins import sensor as named_sensor
-from lidarspec.spec.description import Sensor
+from lidarspec.spec.sensor import Sensor
 
 #: places in bytes between frames that are explained as damaged frames, at most.
 DAMAGED = 64

@@ -18,7 +18,7 @@ from lidarspec.errors import LidarSpecError, SourceError, UsageError, WireError
 from lidarspec.framing.frame_engine import codec
 from lidarspec.framing.plausibility import VALID
 from lidarspec.plugins import sensors
-from lidarspec.spec.description import Sensor
+from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.open_url import is_port, live_address, transport
 from lidarspec.wire.parse import parse_typed
 

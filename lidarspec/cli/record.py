@@ -22,8 +22,8 @@ from lidarspec.errors import CommandError, LidarSpecError, SourceError, UnknownF
 from lidarspec.plugins import sensor as named_sensor
 from lidarspec.recording.recorders import AnyRecorder, check_suffix, recorder
 from lidarspec.recording.recordings import Header, Recorder
-from lidarspec.spec.description import Sensor
 from lidarspec.spec.links import Udp
+from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.files import RecordingTransport
 from lidarspec.transports.open_url import live_address, transport
 from lidarspec.transports.protocol import Chunk, LiveTransport, Transport

@@ -17,8 +17,8 @@ from lidarspec.device.device import Device, open as open_device
 from lidarspec.device.session import Reply
 from lidarspec.errors import CommandError, UnknownCommand, UnknownField, UsageError
 from lidarspec.explaining.explanation import explain
-from lidarspec.spec.description import Sensor
 from lidarspec.spec.fields import factor, split_unit
+from lidarspec.spec.sensor import Sensor
 from lidarspec.wire.schema import schema
 
 

@@ -20,7 +20,7 @@ from lidarspec.recording.recorders import SUFFIXES
 from lidarspec.simulation.device import SimulatedDevice
 from lidarspec.simulation.faults import Faults
 from lidarspec.simulation.scenes import read_scene
-from lidarspec.spec.description import Sensor
+from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.outlets import HERE, Door, UdpDoor
 from lidarspec.transports.serving import door, is_file, serve, write_file
 from lidarspec.transports.simulated import rate_of

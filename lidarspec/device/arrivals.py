@@ -12,7 +12,7 @@ import numpy as np
 from lidarspec.errors import UsageError
 from lidarspec.framing.decoder import Decoder, Found, Spans
 from lidarspec.framing.results import Alike
-from lidarspec.spec.description import Sensor
+from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.protocol import Chunk
 
 #: other senders of a stream that are looked at; datagrams of further ones are foreign unseen.

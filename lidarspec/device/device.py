@@ -27,7 +27,7 @@ from lidarspec.plugins import sensor as named_sensor
 from lidarspec.points.cloud import Mount
 from lidarspec.recording.recorders import AnyRecorder, RecordTo, recorder_for
 from lidarspec.scans.scans import Scan, ScanStream, handed_out
-from lidarspec.spec.description import Sensor
+from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.open_url import transport
 from lidarspec.transports.protocol import Transport
 

@@ -10,7 +10,7 @@ from lidarspec.device.arrivals import Arrival, Senders, fed
 from lidarspec.device.session import Reply
 from lidarspec.errors import CommandError
 from lidarspec.framing.decoder import Counters, Decoder
-from lidarspec.spec.description import Sensor
+from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.open_url import transport
 from lidarspec.transports.protocol import Chunk, Transport
 

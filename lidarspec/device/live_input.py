@@ -23,7 +23,8 @@ from lidarspec.device.session import Outgoing, Pending, Reply, Session
 from lidarspec.errors import CommandError, LidarSpecError, ReplyTimeout
 from lidarspec.framing.decoder import Counters, Decoder, Spans, backend as backend_named
 from lidarspec.recording.recorders import AnyRecorder
-from lidarspec.spec.description import Command, Sensor
+from lidarspec.spec.description import Command
+from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.open_url import control_link, has_control
 from lidarspec.transports.protocol import Chunk, LiveTransport
 

@@ -25,8 +25,8 @@ from lidarspec.errors import CommandError, LidarSpecError, UsageError, WireError
 from lidarspec.framing.decoder import Found
 from lidarspec.plugins import sensors
 from lidarspec.simulation.simulator import simulate
-from lidarspec.spec.description import Sensor
 from lidarspec.spec.links import Serial
+from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.files import RecordingTransport
 from lidarspec.transports.open_url import live_address, transport
 from lidarspec.transports.simulated import SimulatedTransport

@@ -13,8 +13,8 @@ from lidarspec.device.settings import named
 from lidarspec.discovery.detect import Verdict, verdict, verdicts
 from lidarspec.discovery.listen import LISTEN, Heard, bauds, has_no_baud, started_first, udp_ports
 from lidarspec.errors import LidarSpecError, UsageError
-from lidarspec.spec.description import Sensor
 from lidarspec.spec.links import Serial, Udp
+from lidarspec.spec.sensor import Sensor
 from lidarspec.transports import ports
 from lidarspec.transports.live_transport import Address
 from lidarspec.transports.open_url import live_address, transport

@@ -16,8 +16,8 @@ from lidarspec.device.session import Pending, Session
 from lidarspec.errors import LidarSpecError, SourceError, UsageError
 from lidarspec.framing.decoder import Decoder
 from lidarspec.plugins import sensors
-from lidarspec.spec.description import Sensor
 from lidarspec.spec.links import Serial, Udp
+from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.open_url import live_address, transport
 from lidarspec.transports.protocol import Chunk, Disconnected, LiveTransport, Transport
 

@@ -26,9 +26,10 @@ from lidarspec.packets.stream import PacketStream
 from lidarspec.points.plain import evaluate
 from lidarspec.spec.bits import BitField, leaves, probe
 from lidarspec.spec.construct_layer import UNNAMED, Seen, field_path, unwrap
-from lidarspec.spec.description import Frame, Sensor
+from lidarspec.spec.description import Frame
 from lidarspec.spec.fields import Checksummed, exact
 from lidarspec.spec.rules import children
+from lidarspec.spec.sensor import Sensor
 from lidarspec.wire.parse import parse_typed
 from lidarspec.wire.schema import FieldInfo, schema
 from lidarspec.wire.wire_table import bit_text, hexed

@@ -30,7 +30,7 @@ from lidarspec.exports.formulas import Formula, Op, Ref, refs
 from lidarspec.exports.messages import Message, messages
 from lidarspec.exports.tree import Blob, Block, Number, Repeat, Sealed, formulas
 from lidarspec.spec.checksums import Checksum, Crc, Fold15, Sum, WordXor, Xor, ZeroPadded
-from lidarspec.spec.description import Sensor
+from lidarspec.spec.sensor import Sensor
 
 _FUNCTION = """\
 /* {text} */

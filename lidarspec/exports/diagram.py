@@ -12,7 +12,7 @@ from xml.sax.saxutils import escape, quoteattr
 from lidarspec.exports.formulas import Formula, Op, Ref
 from lidarspec.exports.messages import Message, messages
 from lidarspec.exports.tree import Blob, Block, Empty, Node, Number, Part, Repeat, Sealed, Select, Struct, When, nodes
-from lidarspec.spec.description import Sensor
+from lidarspec.spec.sensor import Sensor
 from lidarspec.wire.wire_table import INDICES, Extent, bit_text, frame_size, meaning, unit_text
 
 

@@ -14,8 +14,9 @@ from lidarspec.exports.formulas import Formula, Op, Ref
 from lidarspec.exports.messages import Message, messages
 from lidarspec.exports.tree import Blob, Block, Empty, Node, Number, Part, Repeat, Sealed, Select, Struct, When
 from lidarspec.spec.checksums import Checksum
-from lidarspec.spec.description import Command, Sensor
+from lidarspec.spec.description import Command
 from lidarspec.spec.links import Link, Serial, Tcp, Udp
+from lidarspec.spec.sensor import Sensor
 from lidarspec.wire.schema import FieldInfo
 from lidarspec.wire.wire_table import frame_size
 

@@ -24,8 +24,8 @@ from lidarspec.exports.formulas import Formula, Op, Ref
 from lidarspec.exports.messages import Message, messages
 from lidarspec.exports.tree import Blob, Block, Empty, Node, Number, Part, Repeat, Sealed, Select, Struct, When, nodes
 from lidarspec.spec.bits import BitField, Segment
-from lidarspec.spec.description import Sensor
 from lidarspec.spec.fields import slug
+from lidarspec.spec.sensor import Sensor
 from lidarspec.wire.schema import FieldInfo
 from lidarspec.wire.wire_table import meaning, unit_text
 

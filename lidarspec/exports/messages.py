@@ -11,8 +11,9 @@ from lidarspec.exports import Refused
 from lidarspec.exports.formulas import Ref, Scope, formula, labelled
 from lidarspec.exports.tree import Blob, Block, Empty, Node, Number, Part, Repeat, Sealed, Select, Struct, When
 from lidarspec.spec.bits import probe
-from lidarspec.spec.description import Frame, Sensor
+from lidarspec.spec.description import Frame
 from lidarspec.spec.fields import Checksummed
+from lidarspec.spec.sensor import Sensor
 from lidarspec.wire.schema import FieldInfo, axis_path, fields_below, peeled
 
 

@@ -18,7 +18,8 @@ from dataclasses import dataclass, field
 from lidarspec.exports import Refused
 from lidarspec.exports.messages import Message, messages
 from lidarspec.exports.tree import Blob, Block, Empty, Node, Number, Repeat, Sealed, Select, Struct, When
-from lidarspec.spec.description import Command, Sensor
+from lidarspec.spec.description import Command
+from lidarspec.spec.sensor import Sensor
 from lidarspec.wire.schema import FieldInfo, schema
 from lidarspec.wire.wire_table import meaning, unit_text
 

@@ -14,7 +14,7 @@ from lidarspec.framing.results import Found
 from lidarspec.plugins import sensor as named_sensor
 from lidarspec.recording.appending import Appender
 from lidarspec.recording.recordings import Recorder
-from lidarspec.spec.description import Sensor
+from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.protocol import Chunk, Transport
 
 SUFFIXES = (".lsr", ".pcap", ".bin")

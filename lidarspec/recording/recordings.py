@@ -39,7 +39,7 @@ from lidarspec.recording.format import (
     read_header,
     whole_records,
 )
-from lidarspec.spec.description import Sensor
+from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.protocol import Chunk
 
 __all__ = ["LARGEST", "MAGIC", "Header", "Record", "Recorder", "Recording"]

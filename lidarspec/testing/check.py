@@ -21,8 +21,8 @@ from pathlib import Path
 from typing import Any
 
 from lidarspec.errors import SourceError, SpecError
-from lidarspec.plugins import GROUP, EntryPoint, Registry, entry_points, file_module, registry
-from lidarspec.spec.description import Sensor
+from lidarspec.plugins import GROUP, SENSORS, EntryPoint, Registry, entry_points, file_module, registry
+from lidarspec.spec.sensor import Sensor
 from lidarspec.testing.conformance import PROPERTIES
 from lidarspec.testing.declared import declared
 from lidarspec.testing.findings import Finding, left_over
@@ -39,6 +39,7 @@ SAID = (
     ("that returns a sensor", "LS006"),
     ("definition", "LS004"),
     ("lidarspec_checksum for", "LS010"),
+    ("max_length may be left out", "LS009"),
 )
 
 
@@ -71,7 +72,7 @@ def target(text: str | Path) -> Target:
         return _folder(Path(name))
     if "/" in name or "\\" in name or name.endswith(".py"):
         return _file(Path(name))
-    entries = [entry for entry in entry_points(GROUP) if _normal(entry.distribution) == _normal(name)]
+    entries = _entries(name)
     if entries:
         return _distribution(entries)
     sensor = registry().sensor(name)
@@ -101,7 +102,7 @@ def _folder(folder: Path) -> Target:
         name = str(tomllib.loads((folder / "pyproject.toml").read_text(encoding="utf-8"))["project"]["name"])
     except (ValueError, KeyError) as error:
         raise SourceError(f"{folder / 'pyproject.toml'} names no project: {error}") from None
-    entries = [entry for entry in entry_points(GROUP) if _normal(entry.distribution) == _normal(name)]
+    entries = _entries(name)
     if not entries:
         raise SourceError(f"{name} is not installed, or has no sensors: pip install -e {folder}")
     found = _distribution(entries)
@@ -111,6 +112,12 @@ def _folder(folder: Path) -> Target:
 
 def _vectors(*folders: Path) -> Path | None:
     return next((folder / VECTORS for folder in folders if (folder / VECTORS).is_file()), None)
+
+
+def _entries(distribution: str) -> list[EntryPoint]:
+    """What a distribution adds: modules with hooks, and sensors by id and alias."""
+    entries = [*entry_points(GROUP), *entry_points(SENSORS)]
+    return [entry for entry in entries if _normal(entry.distribution) == _normal(distribution)]
 
 
 def _distribution(entries: list[EntryPoint]) -> Target:
@@ -138,6 +145,8 @@ def _added(plugin: Any, name: str) -> list[Sensor]:
     Raises:
         Exception: whatever it fails with.
     """
+    if isinstance(plugin, Sensor):
+        return [registry().hooked(plugin)]
     local = Registry()
     ids = local.add(plugin, name=name)
     sensors = [local.sensor(one) for one in ids]
@@ -176,8 +185,6 @@ def _loading_rule(error: BaseException, cause: BaseException) -> str:
     functions = [spot.name for spot in traceback.extract_tb(cause.__traceback__)]
     if isinstance(error, SpecError) and error.rule:
         return error.rule
-    if isinstance(cause, TypeError) and "max_length" in str(cause):
-        return "LS009"
     if "sizeof" in functions or "_sizeof" in functions:
         return "LS008"
     if isinstance(cause, SpecError):

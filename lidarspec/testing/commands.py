@@ -7,8 +7,8 @@ from lidarspec.errors import CommandError, LidarSpecError, OutOfRange
 from lidarspec.framing.frame_engine import codec
 from lidarspec.simulation.device import SimulatedDevice
 from lidarspec.spec.construct_layer import member
-from lidarspec.spec.description import Sensor
 from lidarspec.spec.links import is_datagram
+from lidarspec.spec.sensor import Sensor
 from lidarspec.testing.findings import Violation, require
 from lidarspec.testing.subject import Subject
 

@@ -17,7 +17,7 @@ import pytest
 
 from lidarspec.errors import SpecError
 from lidarspec.framing.frame_engine import CompiledCodec, codec
-from lidarspec.spec.description import Sensor
+from lidarspec.spec.sensor import Sensor
 from lidarspec.testing import agreement, commands, frames, geometry, hostile, vectors
 from lidarspec.testing.declared import declared
 from lidarspec.testing.findings import Finding, Violation, left_over
@@ -33,7 +33,7 @@ def _nothing(subject: Subject) -> str:
 
 def _no_sweep(subject: Subject) -> str:
     names = data_frames(subject)
-    if not (subject.sensor.sweep or any(subject.sensor.frames[name].sweep for name in names)):
+    if not any(subject.sensor.simulation_of(name).sweep for name in names):
         return "it declares no `sweep`, and cannot be simulated"
     alone = [name for name in names if not isinstance(codec(subject.sensor.frames[name]), CompiledCodec)]
     return f"{', '.join(alone)} is not compiled, and cannot be simulated" if alone else ""

@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from lidarspec.spec.description import Sensor
+from lidarspec.spec.sensor import Sensor
 
 
 class Rule(NamedTuple):

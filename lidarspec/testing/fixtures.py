@@ -11,7 +11,7 @@ from lidarspec.plugins import sensor as named_sensor
 from lidarspec.simulation.device import SimulatedDevice
 from lidarspec.simulation.faults import Faults
 from lidarspec.simulation.scenes import Scene
-from lidarspec.spec.description import Sensor
+from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.serving import Served, door
 
 

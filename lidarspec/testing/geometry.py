@@ -61,7 +61,7 @@ def data_frames(subject: Subject) -> list[str]:
 
 def swept(subject: Subject, name: str, packets: int, start: int = 0) -> list[bytes]:
     """Packets along the sensor's `sweep`; none where it declares none, or the frame type is not compiled."""
-    sweep = subject.sensor.frames[name].sweep or subject.sensor.sweep
+    sweep = subject.sensor.simulation_of(name).sweep
     if sweep is None:
         return []
     try:

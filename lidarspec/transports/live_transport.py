@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from urllib.parse import parse_qs
 
 from lidarspec.errors import SourceError, UnknownOption, UsageError
-from lidarspec.spec.description import Sensor
+from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.protocol import Chunk, Disconnected, Statistics
 
 #: seconds between two looks at whether somebody wants to stop.

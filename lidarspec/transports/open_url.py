@@ -11,8 +11,8 @@ from urllib.parse import parse_qs
 from lidarspec.device.settings import named
 from lidarspec.errors import UnknownOption, UsageError
 from lidarspec.plugins import registry
-from lidarspec.spec.description import Sensor
 from lidarspec.spec.links import Link, Tcp, Udp
+from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.files import open_file
 from lidarspec.transports.live_transport import Address, failure
 from lidarspec.transports.protocol import Transport

@@ -25,8 +25,8 @@ from typing import Protocol
 from lidarspec.errors import SourceError, UsageError
 from lidarspec.recording.recorders import AnyRecorder
 from lidarspec.recording.replaying import Player
-from lidarspec.spec.description import Sensor
 from lidarspec.spec.links import Tcp, Udp
+from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.live_transport import POLL, Address, failure, listener, reason
 from lidarspec.transports.protocol import Chunk, Disconnected
 

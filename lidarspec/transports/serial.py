@@ -15,8 +15,8 @@ import time
 import serial
 
 from lidarspec.errors import SourceError, UsageError
-from lidarspec.spec.description import Sensor
 from lidarspec.spec.links import Serial
+from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.live_transport import Address, LiveBase, failure, lost, named, readable, reason
 from lidarspec.transports.protocol import Chunk
 

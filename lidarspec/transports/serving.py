@@ -14,8 +14,8 @@ from types import TracebackType
 from lidarspec.errors import UsageError
 from lidarspec.recording.recorders import recorder
 from lidarspec.simulation.device import SECOND, SimulatedDevice
-from lidarspec.spec.description import Sensor
 from lidarspec.spec.links import Udp
+from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.live_transport import POLL, Address, failure
 from lidarspec.transports.outlets import HERE, Door, TcpDoor, UdpDoor
 from lidarspec.transports.protocol import Chunk

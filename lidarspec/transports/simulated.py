@@ -12,8 +12,8 @@ from lidarspec.plugins import sensor as named_sensor
 from lidarspec.simulation.device import SECOND, SimulatedDevice
 from lidarspec.simulation.faults import FAULTS, faults_of
 from lidarspec.simulation.scenes import read_scene
-from lidarspec.spec.description import Sensor
 from lidarspec.spec.links import Serial
+from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.live_transport import Address, LiveBase, failure
 from lidarspec.transports.protocol import Chunk, Disconnected
 

@@ -28,8 +28,8 @@ import time
 from collections.abc import Iterable, Iterator, Sequence
 
 from lidarspec.errors import SourceError, UsageError
-from lidarspec.spec.description import Sensor
 from lidarspec.spec.links import Udp, is_datagram
+from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.live_transport import Address, LiveBase, failure, lost, named, reason
 from lidarspec.transports.protocol import Chunk, Statistics
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 import lidarspec as ls
-from lidarspec.errors import SourceError, UsageError
+from lidarspec.errors import ReplyTimeout, SourceError, UsageError
 from tests.device.test_commands import SENSOR, START, STOP, Obedient
 from tests.lines import SLACK, Port, paced, port, turning, until, working
 from tests.shapes import SHAPES
@@ -103,7 +103,7 @@ def test_cancelled_while_opening(line: Port) -> None:
                 raise AssertionError("it does not answer")
 
     with working(device.work):
-        with pytest.raises((TimeoutError, ls.ReplyTimeout)):
+        with pytest.raises((TimeoutError, ReplyTimeout)):
             asyncio.run(use())
         until(lambda: device.heard == [START, STOP])
     ls.open(f"serial://{line.name}", SENSOR, start=False).close()

@@ -22,6 +22,7 @@ import pytest
 import lidarspec as ls
 from lidarspec.errors import CommandError, OutOfRange, ReplyTimeout, SourceError
 from lidarspec.recording.recordings import Recording
+from lidarspec.spec import Tcp, Udp
 from tests.lines import SLACK, Port, free_port, port, turning, udp, until, working
 from tests.shapes import SHAPES
 
@@ -237,7 +238,7 @@ def server() -> Iterator[socket.socket]:
 def test_commands_over_a_link_of_their_own(server: socket.socket, named: str) -> None:
     number, data = server.getsockname()[1], free_port()
     commands = {name: dataclasses.replace(command, link="control") for name, command in SENSOR.commands.items() if name != "spin"}
-    sensor = dataclasses.replace(SENSOR, links={"data": ls.Udp(data), "control": ls.Tcp(number)}, commands=commands)
+    sensor = dataclasses.replace(SENSOR, links={"data": Udp(data), "control": Tcp(number)}, commands=commands)
     heard: list[int] = []
 
     def obey(stop: threading.Event) -> None:
@@ -280,7 +281,7 @@ def silent_at_first(number: int, seconds: float, heard: list[str]) -> Iterator[N
 
 
 def datagram_sensor(number: int) -> ls.Sensor:
-    return dataclasses.replace(SENSOR, links={"data": ls.Udp(number)}, on_open=(), on_close=())
+    return dataclasses.replace(SENSOR, links={"data": Udp(number)}, on_open=(), on_close=())
 
 
 def test_a_command_waits_for_the_first_datagram_that_says_where_the_sensor_is() -> None:
@@ -302,7 +303,7 @@ def test_a_sensor_that_nothing_was_heard_of_cannot_be_sent_to() -> None:
 
 def test_an_unknown_control_address_is_asked_for() -> None:
     commands = {"start": dataclasses.replace(SENSOR.commands["start"], link="control")}
-    links: dict[str, ls.Udp | ls.Tcp] = {"data": ls.Udp(7009), "control": ls.Tcp(7010)}
+    links: dict[str, Udp | Tcp] = {"data": Udp(7009), "control": Tcp(7010)}
     sensor = dataclasses.replace(SENSOR, links=links, commands=commands, on_close=())
     with pytest.raises((SourceError, CommandError), match="nobody knows the address of the control link"):
         ls.open(f"udp://127.0.0.1:{free_port()}", sensor)

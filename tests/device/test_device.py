@@ -17,6 +17,7 @@ import lidarspec as ls
 from lidarspec.device.arrivals import fed
 from lidarspec.errors import SourceError, UsageError
 from lidarspec.recording.recordings import Recording
+from lidarspec.spec import Udp
 from lidarspec.transports.protocol import Chunk
 from tests.lines import SLACK, Port, free_port, paced, port, turning, udp, until, working
 from tests.shapes import SHAPES
@@ -198,7 +199,7 @@ def test_two_senders_are_listed_and_one_can_be_chosen() -> None:
 
 
 def test_a_stream_in_datagrams_is_joined_by_sender() -> None:
-    sensor = dataclasses.replace(TURNING, links={"data": ls.Udp(7009, stream=True)})
+    sensor = dataclasses.replace(TURNING, links={"data": Udp(7009, stream=True)})
     number, frames = free_port(), turning(sensor, 12)
     stream = b"".join(frames)
     with ls.open(f"udp://:{number}", sensor) as device, udp("127.0.0.2") as one, udp("127.0.0.3") as two:

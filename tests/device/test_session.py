@@ -10,8 +10,10 @@ from collections.abc import Sequence
 import pytest
 
 import lidarspec as ls
-from lidarspec import Command, CommandError, OutOfRange, ReplyTimeout, Sensor, Session, Udp, UnknownCommand, UnknownField, UsageError
+from lidarspec import CommandError, Sensor, Session, UsageError
+from lidarspec.errors import OutOfRange, ReplyTimeout, UnknownCommand, UnknownField
 from lidarspec.framing.decoder import Found
+from lidarspec.spec import Command, Udp
 from tests.shapes.commands import SENSOR
 
 SECOND = 1_000_000_000

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 import lidarspec
-from lidarspec import Checksum, Crc, Fold15, Sum, WordXor, Xor
 from lidarspec.discovery.checksum_search import search
 from lidarspec.discovery.crc_search import common_divisor, divisors, quotient, remainder, solve
 from lidarspec.discovery.samples import Match, Place
 from lidarspec.discovery.sum_search import Changed, WordSum
 from lidarspec.simulation.simulator import simulate
+from lidarspec.spec import Checksum, Crc, Fold15, Sum, WordXor, Xor
 from lidarspec.spec.checksums import CRCS, name_of
 
 HEAD = b"\xaa\x55"

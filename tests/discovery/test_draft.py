@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import lidarspec as ls
-from lidarspec import Checksum, Crc, Fold15, Sum, UsageError, WireError, WordXor, Xor
+from lidarspec import UsageError, WireError
 from lidarspec.columns.columns import aligned
 from lidarspec.discovery.draft import Draft, draft
 from lidarspec.discovery.periods import candidates
@@ -19,6 +19,7 @@ from lidarspec.discovery.samples import Place
 from lidarspec.discovery.scaffold import Names
 from lidarspec.discovery.sum_search import Changed
 from lidarspec.simulation.simulator import simulate
+from lidarspec.spec import Checksum, Crc, Fold15, Sequence, Sum, WordXor, Xor
 from lidarspec.transports.open_url import transport
 from tests.cli.running import ran
 from tests.sensors.evidence import capture
@@ -183,7 +184,7 @@ def test_an_index_that_starts_again_is_a_counter_with_its_limits(tmp_path: Path)
     data = b"".join(frame + Sum(16)(frame).to_bytes(2, "little") for frame in frames)
     (tmp_path / "some.bin").write_bytes(data)
     sensor = module(tmp_path, tmp_path / "some.bin")
-    assert (sensor.sequence, share(sensor, tmp_path / "some.bin")) == (ls.Sequence("counter_1", first=0xA0, last=0xF9), 1.0)
+    assert (sensor.sequence, share(sensor, tmp_path / "some.bin")) == (Sequence("counter_1", first=0xA0, last=0xF9), 1.0)
     assert sensor.decode(data[: 22 * 50] + data[22 * 53 :]).stats.lost == 3
 
 

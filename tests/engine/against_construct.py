@@ -16,7 +16,8 @@ import numpy as np
 import pytest
 from construct import Construct
 
-from lidarspec import Every, Fields, Frame, Packets, Polar, Sensor, SpecError, Udp, WireError
+from lidarspec import Packets, Sensor, SpecError, WireError
+from lidarspec.spec import Every, Fields, Frame, Polar, Udp
 from lidarspec.wire.schema import schema
 
 BACKENDS = ("auto", "construct")

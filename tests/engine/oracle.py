@@ -12,9 +12,10 @@ from typing import Any
 import numpy as np
 from construct import ConstructError
 
-from lidarspec import Frame, Sensor
+from lidarspec import Sensor
 from lidarspec.columns.columns import Batch, Fields
 from lidarspec.framing.frame_engine import InterpretedCodec
+from lidarspec.spec import Frame
 
 #: (name, offset, bytes) of a frame.
 Cut = tuple[str, int, bytes]

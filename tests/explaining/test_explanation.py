@@ -12,8 +12,10 @@ import pytest
 from construct import Array, Const, Enum, Int8ul, Int16ub, Int16ul, Struct
 
 import lidarspec as ls
-from lidarspec import Checksummed, Frame, Scaled, Sensor, WireError, Xor
+from lidarspec import Sensor, WireError
+from lidarspec.errors import UnknownFrame
 from lidarspec.explaining.explanation import Explanation, explain, hexdump
+from lidarspec.spec import Checksummed, Frame, Polar, Scaled, Simulation, Sum, Xor
 from tests.shapes import SHAPES
 
 EXAMPLE = bytes.fromhex("542c6808ab7ee000e4dc00e2d900e5d500e3d300e4d000e9cd00e4ca00e2c700e9c500e5c200e5c000e5be823a1a50")
@@ -175,7 +177,7 @@ def variant(*fields: object) -> Sensor:
     """The sensor of a shape with another struct in its place."""
     struct = Checksummed(Struct(*fields), field="check", algorithm=Xor())
     frame = Frame(struct, data=True, max_length=9)
-    return dataclasses.replace(SHAPES["shape-count"], frames={"data": frame}, points=lambda f: ls.Polar(range=f.far, azimuth=0))
+    return dataclasses.replace(SHAPES["shape-count"], frames={"data": frame}, points=lambda f: Polar(range=f.far, azimuth=0))
 
 
 def test_renamed_and_reordered_fields_are_followed() -> None:
@@ -205,7 +207,7 @@ def test_constants_without_a_name_and_documented_elements_keep_their_places() ->
 
 
 def test_a_checksum_within_a_frame_is_judged_over_its_own_bytes() -> None:
-    inner = Checksummed(Struct("far" / Scaled(Int16ul, 0.01, "m"), "sum" / Int8ul), field="sum", algorithm=ls.Sum(8))
+    inner = Checksummed(Struct("far" / Scaled(Int16ul, 0.01, "m"), "sum" / Int8ul), field="sum", algorithm=Sum(8))
     sensor = variant("sync" / Const(b"\x01\x02"), "far" / Int8ul, "inner" / inner, "check" / Int8ul)
     rows = {row.path: row for row in explain(sensor, sensor.build("data", far=1, inner={"far": 0x1234})).rows}
     assert rows["inner.sum"].remarks == ("0x46 ok (8-bit sum over 2 bytes)",)
@@ -224,7 +226,7 @@ def test_look_ahead_and_implausible_frames_are_told() -> None:
 def test_bytes_that_begin_like_no_frame_are_refused() -> None:
     with pytest.raises(WireError, match="no frame type fits"):
         explain(ls.sensor("robosense-m1"), b"hello, world")
-    with pytest.raises(ls.UnknownFrame, match="did you mean 'data'"):
+    with pytest.raises(UnknownFrame, match="did you mean 'data'"):
         explain(ls.sensor("robosense-m1"), b"", "dat")
 
 
@@ -295,7 +297,9 @@ def test_a_value_has_the_decimals_that_its_steps_need(scale: float, offset: floa
     """One raw step more shows another number, and what is shown is built as it was read."""
     shape = SHAPES["shape-numbers"]
     frame = Frame(Struct("magic" / Const(b"\xf0\x0d"), "x" / Scaled(Int16ul, scale, "u", offset)), data=True, max_length=4)
-    sensor = dataclasses.replace(shape, frames={"data": frame}, points=lambda f: ls.Polar(f.x, 0), sequence=None, clock=None, sweep=None)
+    sensor = dataclasses.replace(
+        shape, frames={"data": frame}, points=lambda f: Polar(f.x, 0), sequence=None, clock=None, simulation=Simulation()
+    )
 
     def said(raw: int) -> str:
         row = explain(sensor, sensor.build("data", x=raw)).rows[-1]

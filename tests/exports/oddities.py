@@ -32,7 +32,8 @@ from construct import (
     this,
 )
 
-from lidarspec import Checksummed, Crc, Fields, Fold15, Frame, OnWrap, Polar, Scaled, Sensor, Serial, Sum, Tcp, WordXor, Xor, ZeroPadded
+from lidarspec import Sensor
+from lidarspec.spec import Checksummed, Crc, Fields, Fold15, Frame, OnWrap, Polar, Scaled, Serial, Sum, Tcp, WordXor, Xor, ZeroPadded
 
 FORMULAS = Struct(
     "magic" / Const(b"\xf0\x01"),

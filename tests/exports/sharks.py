@@ -10,9 +10,10 @@ from pathlib import Path
 
 import pytest
 
-from lidarspec import Sensor, Udp
+from lidarspec import Sensor
 from lidarspec.captures.pcap import USER_LINKS, Datagram, PcapWriter
 from lidarspec.exports import export
+from lidarspec.spec import Udp
 
 TSHARK = shutil.which("tshark")
 needs_tshark = pytest.mark.skipif(TSHARK is None, reason="tshark is not installed")

@@ -9,6 +9,7 @@ import re
 import shutil
 import subprocess
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,6 @@ import pytest
 from lidarspec import Sensor, WireError
 from lidarspec.exports import Refused, export
 from lidarspec.framing.frame_engine import codec
-from lidarspec.spec.description import replaced
 from lidarspec.testing import subject as material
 from lidarspec.wire.schema import Schema
 from tests.exports.trees import DISTINCT, EVERY, values
@@ -77,7 +77,7 @@ def test_every_header_compiles_without_a_warning(tmp_path: Path) -> None:
 
 @needs_gcc
 def test_an_id_that_begins_with_a_digit_makes_names_all_the_same(tmp_path: Path) -> None:
-    (tmp_path / "it.h").write_text(export("c", replaced(SENSORS["shape-count"], id="3acme-x1")))
+    (tmp_path / "it.h").write_text(export("c", replace(SENSORS["shape-count"], id="3acme-x1")))
     (tmp_path / "it.c").write_text('#include "it.h"\nint main(void) { return lidar_3acme_x1_data_count((const uint8_t *)"abc") != 99; }\n')
     subprocess.run([str(GCC), *STRICT, "-o", "it", "it.c"], cwd=tmp_path, check=True)
     subprocess.run([tmp_path / "it"], check=True)

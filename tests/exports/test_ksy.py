@@ -9,9 +9,10 @@ import pytest
 from construct import Array, Bytes, BytesInteger, Const, Float16b, If, IfThenElse, Int8ul, Int16ul, Int24sb, Struct, this
 
 import lidarspec as ls
-from lidarspec import Frame, Sensor
+from lidarspec import Sensor
 from lidarspec.exports import Refused, export
 from lidarspec.exports.ksy import yaml
+from lidarspec.spec import Every, Frame, Polar, Serial
 from tests.exports import kaitai
 from tests.shapes import SHAPES
 
@@ -29,9 +30,9 @@ def made(*fields: Any, case: str = "odd") -> Sensor:
         vendor="Acme",
         model="Odd",
         frames={"data": frame},
-        points=lambda f: ls.Polar(range=0, azimuth=0),
-        scan=ls.Every(1.0),
-        links={"data": ls.Serial(9600)},
+        points=lambda f: Polar(range=0, azimuth=0),
+        scan=Every(1.0),
+        links={"data": Serial(9600)},
         range_limits=(0, 1),
         status="manual",
         source="the tests",

@@ -8,11 +8,12 @@ from typing import Any
 import pytest
 from construct import Array, Bytes, Const, Int8ub, Int16ub, Struct, Switch, this
 
-from lidarspec import Checksum, Checksummed, Frame, Sensor, UsageError
+from lidarspec import Sensor, UsageError
 from lidarspec.exports import Refused, UnknownExport, export
 from lidarspec.exports.formulas import Op, Ref
 from lidarspec.exports.messages import messages
 from lidarspec.exports.tree import Repeat, nodes
+from lidarspec.spec import Checksum, Checksummed, Frame
 from tests.exports.oddities import SENSOR
 from tests.shapes.calibration import BARE
 

@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 
 import lidarspec as ls
-from lidarspec import PointCloud, Scan, SourceError, UnknownFormat
+from lidarspec import PointCloud, Scan, SourceError
+from lidarspec.errors import UnknownFormat
 from lidarspec.formats import format_of, formats, write
 
 COLUMNS = ["x", "y", "z", "range", "azimuth", "elevation", "intensity", "time"]
@@ -137,14 +138,16 @@ def test_a_plugin_adds_a_format_and_takes_none_away(tmp_path: Path) -> None:
 from pathlib import Path
 import lidarspec as ls
 from lidarspec.formats import format_of, formats, write
-from lidarspec.plugins import registry
+from lidarspec.plugins import hookimpl, registry
+from lidarspec.errors import UnknownFormat
+from lidarspec.transports.protocol import Format
 
 class Plugin:
-    @ls.hookimpl
+    @hookimpl
     def lidarspec_formats(self):
         def lines(path, scans, *, every_point):
             Path(path).write_text(f"{{len(list(scans))}} scans, {{every_point}}")
-        return [ls.Format(".count", "how many", lines), ls.Format(".csv", "not mine", lines)]
+        return [Format(".count", "how many", lines), Format(".csv", "not mine", lines)]
 
 registry().add(Plugin(), name="by hand")
 assert formats()[".csv"].description.startswith("comma")
@@ -152,7 +155,7 @@ assert format_of("a.count").description == "how many"
 write(r"{tmp_path / "a.count"}", [1, 2, 3], every_point=True)
 try:
     format_of("a.coumt")
-except ls.UnknownFormat as error:
+except UnknownFormat as error:
     assert "did you mean '.count'" in str(error)
 """
     subprocess.run([sys.executable, "-c", script], check=True, timeout=60)
@@ -163,10 +166,12 @@ def test_a_plugin_whose_hook_fails_is_a_spec_error() -> None:
     script = """
 import lidarspec as ls
 from lidarspec.formats import format_of
-from lidarspec.plugins import registry
+from lidarspec.plugins import hookimpl, registry
+from lidarspec.errors import UnknownFormat
+from lidarspec.transports.protocol import Format
 
 class Plugin:
-    @ls.hookimpl
+    @hookimpl
     def lidarspec_formats(self):
         raise ZeroDivisionError("by hand")
 

@@ -15,7 +15,7 @@ from construct import Const, Int8ul, Int16ub, Struct
 from numpy.typing import NDArray
 
 import lidarspec
-from lidarspec import Frame, Sensor
+from lidarspec import Sensor
 from lidarspec.columns.columns import Batch, Fields
 from lidarspec.framing.decoder import Counters, Spans
 from lidarspec.framing.frame_engine import CompiledCodec, codec
@@ -23,6 +23,7 @@ from lidarspec.framing.results import Alike
 from lidarspec.packets.clocks import Unwrapper, clock_ns
 from lidarspec.packets.packets import joined
 from lidarspec.packets.stream import PacketStream
+from lidarspec.spec import Frame
 from lidarspec.wire.arrays import repeated
 from lidarspec.wire.frame_table import Rows
 from tests.shapes import SHAPES

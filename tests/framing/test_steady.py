@@ -10,9 +10,10 @@ import pytest
 from construct import Bytes, Const, Struct
 
 import lidarspec
-from lidarspec import Checksummed, Frame, Sensor, Xor
+from lidarspec import Sensor
 from lidarspec.framing.results import Alike
 from lidarspec.framing.steady import SMALL
+from lidarspec.spec import Checksummed, Frame, Xor
 from lidarspec.spec.row_checksums import FEW, SHORT, registers
 from lidarspec.testing import subject as material
 from tests.engine.streams import Books, damaged

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,9 +10,9 @@ import pytest
 from construct import Array, Const, Int8ul, Struct, this
 
 import lidarspec
-from lidarspec import Frame, Polar, Sensor, SpecError
+from lidarspec import Sensor, SpecError
 from lidarspec.simulation.simulator import simulate
-from lidarspec.spec.description import replaced
+from lidarspec.spec import Cartesian, Fields, Frame, Polar, Sequence, Simulation
 from tests.made_captures import frame, pcap
 from tests.shapes import headed, lengths
 
@@ -65,13 +66,13 @@ def test_only_frames_with_the_counter_are_counted() -> None:
 
 
 def test_a_counter_that_no_data_frame_has_is_an_error_of_the_plugin() -> None:
-    wrong = replaced(lengths.SENSOR, sequence=lidarspec.Sequence("countre"))
+    wrong = replace(lengths.SENSOR, sequence=Sequence("countre"))
     assert wrong.decode(simulate(PLAIN, 2)).stats.plugin_errors == 1
 
 
 def test_a_sweep_may_name_fields_of_the_other_form_but_none_that_do_not_exist() -> None:
     assert [frame[-2:] for frame in simulate(COUNTED, 3)] == [b"\0\0", b"\1\0", b"\2\0"]
-    wrong = replaced(lengths.SENSOR, sweep=lambda i: {"azimuth": 0, "countre": i})
+    wrong = replace(lengths.SENSOR, simulation=Simulation(lambda i: {"azimuth": 0, "countre": i}))
     with pytest.raises(SpecError, match="countre"):
         simulate(wrong, 1)
 
@@ -97,7 +98,7 @@ def test_packets_whose_header_leaves_the_counter_out_follow_each_other(
 
 
 def test_distances_are_in_the_unit_of_the_header_also_when_simulated() -> None:
-    coarse = replaced(headed.SENSOR, sweep=lambda i: {**headed.sweep(i), "unit": 8})
+    coarse = replace(headed.SENSOR, simulation=Simulation(lambda i: {**headed.sweep(i), "unit": 8}))
     fine, rough = (sensor.decode(simulate(sensor, 12)) for sensor in (headed.SENSOR, coarse))
     assert set(fine["unit"]) == {4}
     assert set(rough["unit"]) == {8}
@@ -132,7 +133,9 @@ def test_an_array_in_one_without_elements_may_have_a_length_of_its_own() -> None
     row = Struct("cells" / Array(this._.width, Int8ul))
     struct = Struct("magic" / Const(b"RW"), "height" / Int8ul, "width" / Int8ul, "rows" / Array(this.height, row))
     frame_type = Frame(struct, data=True, max_length=40)
-    sensor = replaced(headed.SENSOR, frames={"data": frame_type}, points=lambda f: Polar(f.rows.cells, 0), sequence=None, sweep=None)
+    sensor = replace(
+        headed.SENSOR, frames={"data": frame_type}, points=lambda f: Polar(f.rows.cells, 0), sequence=None, simulation=Simulation()
+    )
     data = [bytes.fromhex("5257 00 05"), bytes.fromhex("5257 02 03 010203 040506")]
     for backend in ("auto", "construct"):
         packets = sensor.decode(data, backend=backend)
@@ -142,9 +145,9 @@ def test_an_array_in_one_without_elements_may_have_a_length_of_its_own() -> None
 
 
 def test_cartesian_points_can_be_nominal_too() -> None:
-    def points(f: lidarspec.Fields) -> lidarspec.Cartesian:
-        return lidarspec.Cartesian(f.distances, 0, 0, nominal=True)
+    def points(f: Fields) -> Cartesian:
+        return Cartesian(f.distances, 0, 0, nominal=True)
 
     plain = Frame(lengths.PLAIN, data=True, max_length=10)
-    sensor = replaced(lengths.SENSOR, frames={"plain": plain}, points=points, sequence=None)
+    sensor = replace(lengths.SENSOR, frames={"plain": plain}, points=points, sequence=None)
     assert bool(sensor.decode(simulate(PLAIN, 2)).points().nominal)

@@ -10,9 +10,10 @@ import pytest
 from construct import Const, Int8ul, Struct
 
 import lidarspec
-from lidarspec import Checksummed, Frame, OnWrap, Polar, Sensor, Serial, SpecError, Sum, Xor, hookimpl
+from lidarspec import Sensor, SpecError
 from lidarspec.plugins import Registry
 from lidarspec.scans.scans import scans_of
+from lidarspec.spec import Checksummed, Frame, OnWrap, Polar, Serial, Sum, Xor, hookimpl
 from tests.plugins.test_plugins import STRANGER
 from tests.shapes import SHAPES
 

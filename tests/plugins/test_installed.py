@@ -8,15 +8,17 @@ import sys
 import zipfile
 from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
-from lidarspec import Sensor, SpecError, UnknownSensor, hookimpl
-from lidarspec.plugins import EntryPoint, Registry, entry_points
-from lidarspec.spec.description import replaced
+from lidarspec import Sensor, SpecError
+from lidarspec.errors import UnknownSensor
+from lidarspec.plugins import EntryPoint, HookedPoints, Registry, entry_points
+from lidarspec.spec import hookimpl
 from tests.shapes import SHAPES
 
 
@@ -78,14 +80,28 @@ def test_an_entry_point_loads_as_its_reference_does(value: str) -> None:
     assert EntryPoint("x", value, "d", "1").load() is reference
 
 
+class Module(SimpleNamespace):
+    """A module that notes which of its sensors it was asked for by name."""
+
+    def __getattr__(self, name: str) -> Sensor:
+        known = self.__dict__.get("by_name", {})
+        if name not in known:
+            raise AttributeError(name)
+        self.given.append(known[name].id)
+        sensor: Sensor = known[name]
+        return sensor
+
+
 @pytest.fixture
 def plugins(monkeypatch: pytest.MonkeyPatch) -> dict[str, SimpleNamespace]:
     """Modules that can be loaded by name; each notes that it was asked for its sensors."""
     found: dict[str, SimpleNamespace] = {}
 
     def made(name: str, *ids: str, aliases: tuple[str, ...] = (), **hooks: Any) -> SimpleNamespace:
-        sensors = [replaced(SHAPES["shape-count"], id=one, aliases=aliases, model=name) for one in ids]
-        module = SimpleNamespace(asked=0, **{hook: hookimpl(specname=None)(function) for hook, function in hooks.items()})
+        sensors = [replace(SHAPES["shape-count"], id=one, aliases=aliases, model=name) for one in ids]
+        module = Module(asked=0, given=[], **{hook: hookimpl(specname=None)(function) for hook, function in hooks.items()})
+        module.by_name = {sensor.id.replace("-", "_"): sensor for sensor in sensors}
+        module.by_name |= {alias.replace("-", "_"): sensors[0] for alias in aliases}
 
         def lidarspec_sensors() -> list[Sensor]:
             module.asked += 1
@@ -101,79 +117,107 @@ def plugins(monkeypatch: pytest.MonkeyPatch) -> dict[str, SimpleNamespace]:
     made("plain", "plain-x1")
     made("again", "acme-x2", "acme-x3")
     made("liar", "liar-x1", "acme-x9")
+    made("odd")
     made("meddler", "meddler-x1", lidarspec_points=lambda sensor, fields: None)
     return found
 
 
-def registry(*entries: str) -> Registry:
-    """A registry of entry points given as "name = value", in the order in which they would be found."""
-    return Registry(EntryPoint(name, value, "dist", "1") for name, _, value in sorted(entry.partition(" = ") for entry in entries))
+def registry(*entries: str, offered: str = "") -> Registry:
+    """A registry of modules given as "name = value", and of sensors given by their ids, in the order in which they would be found.
+
+    Args:
+        offered: "id = module" for each sensor, separated by blanks around a comma.
+    """
+
+    def found(texts: Iterable[str]) -> list[EntryPoint]:
+        return [EntryPoint(name, value, "dist", "1") for name, _, value in sorted(text.partition(" = ") for text in texts)]
+
+    named = (text.partition(" = ") for text in offered.split(", ") if text)
+    sensors = [f"{name} = {module}:{name.replace('-', '_')}" for name, _, module in named]
+    return Registry(found(entries), found(sensors))
 
 
-def test_a_vendor_is_loaded_when_one_of_its_ids_is_asked_for(plugins: dict[str, SimpleNamespace]) -> None:
-    found = registry("acme- = acme", "beta- = beta", "b- = beta", "plain = plain")
-    assert (plugins["plain"].asked, plugins["acme"].asked) == (1, 0)
+OFFERED = "acme-x1 = acme, acme-x2 = acme, beta-x1 = beta, b-one = beta"
+
+
+def test_a_sensor_is_loaded_when_it_is_asked_for(plugins: dict[str, SimpleNamespace]) -> None:
+    found = registry("plain = plain", offered=OFFERED)
+    assert (plugins["plain"].asked, plugins["acme"].asked, plugins["beta"].asked) == (1, 0, 0)
     assert found.sensor("acme-x2").id == "acme-x2"
-    assert found.sensor("acme-x1") is found.sensor("acme-x1")
-    assert (plugins["acme"].asked, plugins["beta"].asked) == (1, 0)
+    assert found.sensor("acme-x2") is found.sensor("acme-x2")
+    assert (plugins["acme"].given, plugins["beta"].given) == (["acme-x2"], [])
     assert found.sensor("b-one") is found.sensor("beta-x1")
     assert sorted(found.sensors()) == ["acme-x1", "acme-x2", "beta-x1", "plain-x1"]
-    assert {name: module.asked for name, module in plugins.items()} == dict(acme=1, beta=1, plain=1, again=0, liar=0, meddler=0)
-    assert [plugin.entry_point for plugin in found.plugins] == ["plain = plain", "acme- = acme", "b-, beta- = beta"]
+    assert plugins["again"].given == []
+    assert [(plugin.entry_point, plugin.sensors) for plugin in found.plugins] == [
+        ("plain = plain", ("plain-x1",)),
+        ("lidarspec.sensors = acme", ("acme-x1", "acme-x2")),
+        ("lidarspec.sensors = beta", ("beta-x1",)),
+    ]
+
+
+def test_an_alias_without_an_entry_of_its_own_is_known_once_all_are_loaded(plugins: dict[str, SimpleNamespace]) -> None:
+    assert registry(offered="acme-x1 = acme, beta-x1 = beta").sensor("b-one").id == "beta-x1"
 
 
 def test_an_unknown_id_is_told_with_the_ids_of_all_plugins(plugins: dict[str, SimpleNamespace]) -> None:
     with pytest.raises(UnknownSensor, match="did you mean 'beta-x1'"):
-        registry("acme- = acme", "beta- = beta", "b- = beta").sensor("bta-x1")
+        registry(offered=OFFERED).sensor("bta-x1")
 
 
 @pytest.mark.parametrize("asked", [["acme-x1"], ["acme-x3"], ["other-x1"], ["acme-x2"], []])
 def test_of_two_with_one_id_the_first_wins_whichever_is_asked_for(plugins: dict[str, SimpleNamespace], asked: list[str]) -> None:
-    found = registry("acme- = acme", "other- = again", "acme- = again")
+    found = registry(offered="acme-x1 = acme, acme-x2 = acme, acme-x2 = again, acme-x3 = again")
     for name in asked:
         with contextlib.suppress(UnknownSensor):
             found.sensor(name)
     assert found.sensor("acme-x2").model == "acme"
+    assert sorted(found.sensors()) == ["acme-x1", "acme-x2", "acme-x3"]
     assert [(plugin.error, plugin.sensors) for plugin in found.plugins] == [
         ("", ("acme-x1", "acme-x2")),
-        ("acme-x2: another sensor has this id already", ()),
+        ("acme-x2: another sensor has this id already", ("acme-x3",)),
     ]
 
 
 @pytest.mark.parametrize(
-    ("entry", "error"),
+    ("offered", "error"),
     [
-        ("liar- = liar", "acme-x9: its entry point says that ids begin with 'liar-'"),
-        ("meddler- = meddler", "lidarspec_points would not always be loaded"),
-        ("beta- = beta", "b-one: its entry point says that ids begin with 'beta-'"),
-        ("gone- = a_module_that_nobody_has", "ModuleNotFoundError"),
+        ("liar-x2 = liar", "liar-x1: its entry point is called 'liar-x2', which is none of its names"),
+        ("odd-x1 = odd", "lidarspec_sensors returns sensors, not int"),
+        ("gone-x1 = a_module_that_nobody_has", "ModuleNotFoundError"),
+        ("acme-x7 = acme", "AttributeError"),
     ],
 )
-def test_a_broken_promise_is_named_and_leaves_nothing(plugins: dict[str, SimpleNamespace], entry: str, error: str) -> None:
-    found = registry(entry, "plain = plain")
+def test_an_entry_that_names_no_such_sensor_is_named_and_leaves_nothing(
+    plugins: dict[str, SimpleNamespace], offered: str, error: str
+) -> None:
+    plugins["liar"].liar_x2 = plugins["liar"].liar_x1
+    plugins["odd"].odd_x1 = 1
+    found = registry("plain = plain", offered=offered)
     assert list(found.sensors()) == ["plain-x1"]
     (broken,) = [plugin for plugin in found.plugins if plugin.error]
     assert error in broken.error
     assert broken.traceback
 
 
-def test_a_vendor_cannot_take_an_id_from_a_plugin_that_is_always_loaded(plugins: dict[str, SimpleNamespace]) -> None:
-    found = registry("acme- = acme", "zz = again")
+def test_a_sensor_cannot_take_an_id_from_a_module_that_is_always_loaded(plugins: dict[str, SimpleNamespace]) -> None:
+    found = registry("zz = again", offered="acme-x2 = acme")
     assert found.sensor("acme-x2").model == "again"
     assert [plugin.error for plugin in found.plugins] == ["", "acme-x2: another sensor has this id already"]
 
 
 def test_threads_that_ask_at_once_get_the_same_sensor(plugins: dict[str, SimpleNamespace]) -> None:
     for _ in range(50):
-        found = registry("acme- = acme", "beta- = beta", "b- = beta")
+        found = registry(offered=OFFERED)
         with ThreadPoolExecutor(8) as pool:
             sensors = list(pool.map(found.sensor, ["acme-x1", "b-one", "beta-x1", "acme-x1"] * 4))
         assert len({id(sensor) for sensor in sensors}) == 2
         assert not any(plugin.error for plugin in found.plugins)
 
 
-def test_a_hook_that_is_always_loaded_reaches_the_sensors_of_a_vendor(plugins: dict[str, SimpleNamespace]) -> None:
-    found = registry("acme- = acme", "meddler = meddler")
-    assert getattr(found.sensor("acme-x1").points, "asks_hooks", False)
+def test_a_hook_that_is_always_loaded_reaches_the_sensors_that_are_offered(plugins: dict[str, SimpleNamespace]) -> None:
+    found = registry("meddler = meddler", offered="acme-x1 = acme")
+    assert isinstance(found.sensor("acme-x1").points, HookedPoints)
+    found.sensor("acme-x1")
     with pytest.raises(SpecError):
-        found.add(plugins["again"], name="again")
+        found.add(plugins["acme"], name="again")

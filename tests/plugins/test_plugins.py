@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 
 import lidarspec
-from lidarspec import SourceError, SpecError, UnknownSensor, UsageError
+from lidarspec import SourceError, SpecError, UsageError
+from lidarspec.errors import UnknownSensor
 from lidarspec.testing import SensorConformance
 
 HERE = Path(__file__).resolve().parents[1] / "shapes"
@@ -230,7 +231,7 @@ def test_a_file_that_is_no_sensor_is_a_clear_error(tmp_path: Path) -> None:
         "def broken(:": "SyntaxError",
         "raise SystemExit(3)": "SystemExit",
         "": "no function lidarspec_sensors",
-        "from lidarspec import hookimpl\n@hookimpl\ndef lidarspec_sensors():\n    return [1 / 0]": "ZeroDivisionError",
+        "from lidarspec.spec import hookimpl\n@hookimpl\ndef lidarspec_sensors():\n    return [1 / 0]": "ZeroDivisionError",
     }.items():
         file.write_text(text, encoding="utf-8")
         with pytest.raises(SpecError, match=message):

@@ -14,13 +14,14 @@ import numpy as np
 import pytest
 
 import lidarspec
-from lidarspec import Checksum, Crc, Fields, Polar, UsageError, WordXor, Xor
+from lidarspec import UsageError
 from lidarspec.packets.packets import Packets
 from lidarspec.points.evaluate import evaluated
 from lidarspec.points.numba_kernels import checksums as kernelsums
 from lidarspec.points.plain import evaluate, points_function
 from lidarspec.points.plan import Plan, plan_for
 from lidarspec.simulation.simulator import opening, simulate
+from lidarspec.spec import Checksum, Crc, Fields, Polar, WordXor, Xor
 from lidarspec.spec.links import is_datagram
 from lidarspec.testing import subject as material
 from lidarspec.testing.agreement import assert_same_points

@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 
 import lidarspec
-from lidarspec import Fields, Polar, Sensor
+from lidarspec import Sensor
 from lidarspec.packets.packets import Packets
 from lidarspec.points.evaluate import evaluated
 from lidarspec.points.plain import evaluate, points_function
 from lidarspec.points.plan import Plan, plan_for
+from lidarspec.spec import Fields, Polar
 from lidarspec.spec.links import is_datagram
 from lidarspec.testing import subject as material
 from lidarspec.testing.agreement import assert_same_points

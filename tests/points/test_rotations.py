@@ -10,12 +10,13 @@ import numpy as np
 import pytest
 
 import lidarspec
-from lidarspec import Fields, Polar, Sensor
+from lidarspec import Sensor
 from lidarspec.columns.columns import remainder
 from lidarspec.points.evaluate import evaluated
 from lidarspec.points.plain import evaluate, points_function
 from lidarspec.points.plan import Plan, plan_for
 from lidarspec.simulation.simulator import simulate
+from lidarspec.spec import Fields, Polar
 from lidarspec.spec.vocabulary import spread
 from lidarspec.testing.agreement import assert_same_points
 

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 from construct import Const, ConstructError, Int16ub, Int16ul, Rebuild, Struct, this
 
-from lidarspec import Checksummed, Frame, OutOfRange, PointCloud, Sensor, Sum, UsageError, Xor, spread, wrap
+from lidarspec import PointCloud, Sensor, UsageError
+from lidarspec.errors import OutOfRange
 from lidarspec.simulation.simulator import simulate
-from lidarspec.spec.description import replaced
+from lidarspec.spec import Checksummed, Frame, Simulation, Sum, Xor, spread, wrap
 from tests.shapes import SHAPES, calibration
 
 both = pytest.mark.parametrize("backend", ["auto", "construct"])
@@ -67,7 +69,7 @@ def test_a_length_that_follows_from_another_is_filled_in_wherever_a_frame_is_mad
 def test_a_length_may_follow_from_a_constant() -> None:
     struct = Struct("magic" / Const(b"SZ"), "length" / Rebuild(Int16ub, this.size + 5), "size" / Const(1, Int16ub), "speed" / Int16ub)
     shape = SHAPES["shape-sized"]
-    sensor = replaced(shape, frames={**shape.frames, "speed": Frame(struct, max_length=8, plausible=lambda f: f.length == 6)})
+    sensor = replace(shape, frames={**shape.frames, "speed": Frame(struct, max_length=8, plausible=lambda f: f.length == 6)})
     assert sensor.build("speed", speed=7) == b"SZ\0\6\0\1\0\7"
     assert sensor.parse(sensor.example("speed"), "speed").length == 6
 
@@ -77,7 +79,9 @@ def test_plausible_frames_are_found_around_the_lengths_of_the_sweep() -> None:
     shape = SHAPES["shape-sized"]
     children = [child if child.name != "length" else "length" / Int16ub for child in shape.frames["data"].struct.subcon.subcons]
     plain = dataclasses.replace(shape.frames["data"], struct=Checksummed(Struct(*children), "sum", Sum(16)))
-    sensor = replaced(shape, frames={"data": plain}, sweep=lambda i: dict(length=7 + 3 * (i % 9), size=2 + 3 * (i % 9), angle=7.0))
+    sensor = replace(
+        shape, frames={"data": plain}, simulation=Simulation(lambda i: dict(length=7 + 3 * (i % 9), size=2 + 3 * (i % 9), angle=7.0))
+    )
     assert len({len(sensor.example("data", seed=seed)) for seed in range(20)}) > 3
 
 

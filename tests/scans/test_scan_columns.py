@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import lidarspec as ls
-from lidarspec import OnChange, OnWrap, Sensor
+from lidarspec import Sensor
 from lidarspec.captures.pcap import Datagram, PcapWriter
 from lidarspec.framing.decoder import Decoder
 from lidarspec.packets.packets import Packets
@@ -21,6 +21,7 @@ from lidarspec.points import lazy_columns as stretches
 from lidarspec.points.cloud import COLUMNS, PointCloud
 from lidarspec.scans.scans import Scan, scans_of
 from lidarspec.simulation.simulator import simulate
+from lidarspec.spec import OnChange, OnWrap
 from lidarspec.wire.frame_table import Rows
 from tests.shapes import SHAPES
 

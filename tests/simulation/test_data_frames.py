@@ -9,6 +9,7 @@ import pytest
 
 import lidarspec as ls
 from lidarspec.simulation.simulator import opening, simulate
+from lidarspec.spec import Fields, Polar, Simulation, following, wrap
 from tests.shapes import SHAPES
 
 MODES, AHEAD, OUTER = SHAPES["shape-modes"], SHAPES["shape-ahead"], SHAPES["shape-outer"]
@@ -27,11 +28,11 @@ def test_a_sensor_that_needs_no_opening_has_none() -> None:
 
 
 def test_simulated_packets_that_need_the_next_do_not_depend_on_batches() -> None:
-    def points(f: ls.Fields) -> ls.Polar:
-        step = ls.wrap(ls.following(f.angle) - f.angle, 360) / 8
-        return ls.Polar(range=f.distances, azimuth=np.deg2rad(f.angle + step * np.arange(8)))
+    def points(f: Fields) -> Polar:
+        step = wrap(following(f.angle) - f.angle, 360) / 8
+        return Polar(range=f.distances, azimuth=np.deg2rad(f.angle + step * np.arange(8)))
 
-    sensor = dataclasses.replace(AHEAD, points=points, sweep=lambda i: {"angle": i * 8 % 360})
+    sensor = dataclasses.replace(AHEAD, points=points, simulation=Simulation(lambda i: {"angle": i * 8 % 360}))
     assert simulate(sensor, 20) == simulate(sensor, 7) + simulate(sensor, 13, start=7)
 
 

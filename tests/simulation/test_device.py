@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 import lidarspec as ls
-from lidarspec import OutOfRange, Sensor, UsageError
+from lidarspec import Sensor, UsageError
+from lidarspec.errors import OutOfRange
 from lidarspec.simulation.device import SECOND, SimulatedDevice
 from lidarspec.simulation.faults import Faults, Line, faults_of
 from lidarspec.spec.fields import duration

@@ -21,6 +21,7 @@ from lidarspec.errors import UnknownFormat
 from lidarspec.simulation.device import SimulatedDevice
 from lidarspec.simulation.faults import Faults
 from lidarspec.simulation.scenes import Room, read_scene
+from lidarspec.spec import Udp
 from lidarspec.testing.fixtures import virtual_port
 from lidarspec.transports.serving import Served, door, write_file
 from tests.lines import SLACK, free_port
@@ -193,7 +194,7 @@ def test_datagrams_go_to_the_declared_ports_by_their_kind_unless_one_is_named() 
         receiver.bind(("127.0.0.1", 0))
         receiver.settimeout(SLACK)
     ports = [receiver.getsockname()[1] for receiver in receivers]
-    sensor = ls.spec.replaced(VLP, links={"data": ls.Udp(*ports)})
+    sensor = ls.spec.replaced(VLP, links={"data": Udp(*ports)})
     with virtual_port(sensor, to="udp://") as port:
         assert port.path == f"udp://127.0.0.1?port={ports[0]},{ports[1]}"
         assert [{len(receiver.recv(2000)) for _ in range(20)} for receiver in receivers] == [{1206}, {512}]

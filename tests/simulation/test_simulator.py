@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,11 +11,11 @@ import pytest
 from numpy.typing import NDArray
 
 import lidarspec as ls
-from lidarspec import Cartesian, Frame, Polar, Sensor, SourceError, SpecError, UsageError
+from lidarspec import Sensor, SourceError, SpecError, UsageError
 from lidarspec.simulation.device import SECOND, SimulatedDevice
 from lidarspec.simulation.scenes import Box, Mover, Room, furnished, read_scene, scene_of
 from lidarspec.simulation.simulator import simulate, simulation
-from lidarspec.spec.description import replaced
+from lidarspec.spec import Cartesian, Frame, Polar, Serial, Simulation, Udp
 from lidarspec.testing.geometry import off
 from tests.shapes import count, sized
 
@@ -145,15 +146,15 @@ def test_the_pace_is_that_of_the_clock_of_the_points_of_the_declaration_or_of_th
     }
     for name, seconds in wanted.items():
         assert simulation(ls.sensor(name), ls.sensor(name).data_frame).interval == pytest.approx(seconds * 1e9, rel=0.01)
-    bare = replaced(SHAPE, links={"data": ls.Serial(9600)})
+    bare = replace(SHAPE, links={"data": Serial(9600)})
     assert simulation(bare, "data").interval == pytest.approx((9 + 3 * 40) * 10 / 9600 * 1e9)
 
 
 def test_a_sensor_without_time_on_datagrams_has_to_declare_its_rate() -> None:
-    bare = replaced(SHAPE, links={"data": ls.Udp(2000)})
+    bare = replace(SHAPE, links={"data": Udp(2000)})
     with pytest.raises(SpecError, match="declare its `rate`"):
         SimulatedDevice(bare)
-    paced = replaced(bare, frames={**bare.frames, "data": replaced(bare.frames["data"], rate=50.0)})
+    paced = replace(bare, frames={**bare.frames, "data": replace(bare.frames["data"], simulation=Simulation(rate=50.0))})
     device = SimulatedDevice(paced)
     device.start(0)
     assert sum(len(device.outgoing(now)) for now in range(0, SECOND + 1, SECOND // 100)) == 51
@@ -162,15 +163,15 @@ def test_a_sensor_without_time_on_datagrams_has_to_declare_its_rate() -> None:
 def test_what_cannot_be_simulated_says_why() -> None:
     sensor = SHAPE
     with pytest.raises(UsageError, match="declares no sweep"):
-        simulate(replaced(sensor, sweep=None), 1)
+        simulate(replace(sensor, simulation=Simulation(None)), 1)
     with pytest.raises(SpecError, match="has to give `encode`"):
-        simulate(replaced(sensor, points=lambda f: Polar(f.samples.distance * 0 + 1, 0)), 1)
+        simulate(replace(sensor, points=lambda f: Polar(f.samples.distance * 0 + 1, 0)), 1)
     with pytest.raises(SpecError, match="only polar points"):
-        simulate(replaced(sensor, points=lambda f: Cartesian(f.samples.distance, 0, 0)), 1)
+        simulate(replace(sensor, points=lambda f: Cartesian(f.samples.distance, 0, 0)), 1)
     with pytest.raises(SpecError, match="sweep has to give 'size', which the length"):
-        simulate(replaced(sized.SENSOR, sweep=lambda i: {"angle": 0}), 1)
+        simulate(replace(sized.SENSOR, simulation=Simulation(lambda i: {"angle": 0})), 1)
     with pytest.raises(SpecError, match="with size = 500 there is no frame of at most 99 bytes"):
-        simulate(replaced(sized.SENSOR, sweep=lambda i: {"angle": 0, "size": 500}), 1)
+        simulate(replace(sized.SENSOR, simulation=Simulation(lambda i: {"angle": 0, "size": 500})), 1)
 
 
 @pytest.mark.parametrize(("stretch", "shift"), [(1, 0.1), (1, -0.02), (1.01, 0.05), (0.98, 0)])
@@ -182,8 +183,8 @@ def test_corrected_ranges_go_back_through_the_correction(stretch: float, shift: 
         return Polar(np.where(polar.range > 0, polar.range * stretch + shift, 0), polar.azimuth, intensity=polar.intensity)
 
     room = Room()
-    frames = simulate(replaced(SHAPE, points=corrected), 9, scene=room)
-    cloud = replaced(SHAPE, points=corrected).decode(b"".join(frames)).points()
+    frames = simulate(replace(SHAPE, points=corrected), 9, scene=room)
+    cloud = replace(SHAPE, points=corrected).decode(b"".join(frames)).points()
     assert cloud.valid.all()
     assert off(room, cloud.xyz.astype(np.float64)).max() < 0.0005 * stretch + EXACT
     raw = SHAPE.decode(b"".join(frames)).points()
@@ -195,8 +196,8 @@ def test_a_frame_may_encode_its_ranges_itself() -> None:
         return {"samples.distance": np.rint(np.asarray(polar.range) * 1000 / 3)}
 
     sensor = SHAPE
-    frame: Frame = replaced(sensor.frames["data"], encode=encode)
-    thirds = replaced(sensor, frames={**sensor.frames, "data": frame})
+    frame: Frame = replace(sensor.frames["data"], simulation=Simulation(encode=encode))
+    thirds = replace(sensor, frames={**sensor.frames, "data": frame})
     plain, third = (s.decode(b"".join(simulate(s, 20)))["samples.distance"] for s in (sensor, thirds))
     assert np.abs(third * 3 - plain).max() < 0.003
     assert plain.max() > 1

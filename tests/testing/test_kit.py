@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,8 +12,8 @@ import pytest
 from construct import Const, Int8ul, Int16ul, Struct
 from hypothesis import strategies as st
 
-from lidarspec import Checksummed, Fields, Frame, Polar, Sensor, Sum, take
-from lidarspec.spec.description import replaced
+from lidarspec import Sensor
+from lidarspec.spec import Checksummed, Fields, Frame, Polar, Sum, take
 from lidarspec.testing.check import Target, reports
 from lidarspec.testing.declared import declared
 from lidarspec.testing.findings import Violation, left_over
@@ -23,6 +24,7 @@ from tests.broken import sound
 
 AUTHOR = """
 import lidarspec as ls
+from lidarspec import errors
 import pytest
 from lidarspec.testing import SensorConformance
 
@@ -40,7 +42,7 @@ def test_a_port(sensor, virtual_port):
 
 def test_nothing_is_installed(bare_registry):
     assert ls.sensors() == {{}}
-    with pytest.raises(ls.UnknownSensor):
+    with pytest.raises(errors.UnknownSensor):
         ls.sensor("ldrobot-stl27l")
 
 def test_all_is_installed_again():
@@ -93,7 +95,7 @@ INFO = Checksummed(Struct("header" / Const(b"\x18\x81\x55"), "key" / Int16ul, "c
 @pytest.mark.parametrize("how", [st.just(0xBEEF), lambda source: 0xBEEF], ids=["strategy", "function"])
 def test_what_cannot_be_derived_is_asked_for_by_name(how: object) -> None:
     plain = sound.sensor()
-    sensor = replaced(plain, frames={**plain.frames, "info": Frame(INFO, max_length=6, plausible=rare)})
+    sensor = replace(plain, frames={**plain.frames, "info": Frame(INFO, max_length=6, plausible=rare)})
     assert codes(sensor) == {"LS301"}
     subject = Subject(sensor, 6, strategies={"info.key": how})
     assert {sensor.parse(subject.example("info", seed=seed)).key for seed in range(5)} == {0xBEEF}
@@ -124,10 +126,10 @@ def left(sensor: Sensor) -> set[str]:
 def test_what_is_meant_is_acknowledged_with_a_reason() -> None:
     far = sound.sensor(range_limits=(0.05, 100.0))
     assert left(far) == {"LS210"}
-    assert left(replaced(far, acknowledged={"LS210": "the next model reaches so far"})) == set()
-    assert left(replaced(far, acknowledged={"LS210 data.samples.distance": "the next model reaches so far"})) == set()
-    assert left(replaced(far, acknowledged={"LS210": " "})) == {"LS209", "LS210"}
-    assert left(replaced(far, acknowledged={"LS210 data.tilt": "no"})) == {"LS209", "LS210"}
+    assert left(replace(far, acknowledged={"LS210": "the next model reaches so far"})) == set()
+    assert left(replace(far, acknowledged={"LS210 data.samples.distance": "the next model reaches so far"})) == set()
+    assert left(replace(far, acknowledged={"LS210": " "})) == {"LS209", "LS210"}
+    assert left(replace(far, acknowledged={"LS210 data.tilt": "no"})) == {"LS209", "LS210"}
 
 
 def test_what_only_looks_up_a_table_needs_no_unit() -> None:

@@ -29,8 +29,9 @@ from construct import (
 
 import lidarspec as ls
 from lidarspec.framing.frame_engine import CompiledCodec, codec
+from lidarspec.spec import Frame
 from lidarspec.spec.construct_layer import clean
-from lidarspec.spec.description import Sensor
+from lidarspec.spec.sensor import Sensor
 from lidarspec.wire import single_frames as dispatch, single_frames as unpacking
 from lidarspec.wire.layout import Layout
 from tests.shapes import SHAPES
@@ -111,7 +112,7 @@ ARRAYS = {
 @pytest.mark.parametrize("name", ARRAYS)
 def test_arrays_of_all_kinds(name: str, lines: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(unpacking, "_WRITTEN_OUT", lines)
-    frame = ls.Frame(Struct("head" / Const(b"\x5a"), "inside" / ARRAYS[name], "tail" / Int16ul), max_length=1 << 20)
+    frame = Frame(Struct("head" / Const(b"\x5a"), "inside" / ARRAYS[name], "tail" / Int16ul), max_length=1 << 20)
     engine = codec(frame)
     assert isinstance(engine, CompiledCodec)
     size = frame.prepared.sizeof()
@@ -132,7 +133,7 @@ def test_headers_lead_to_their_own_code_also_after_some_were_forgotten(monkeypat
     kinds = Switch(this.kind, {1: Int8ub, 2: Int16ub}, default=Int24ul)
     rows = Array(this.count, Int16ul)
     struct = Struct("head" / Const(b"\x5a"), "kind" / Int8ub, "count" / Int8ub, "rows" / rows, "more" / kinds, "end" / Int8ub)
-    engine = codec(ls.Frame(struct, max_length=700))
+    engine = codec(Frame(struct, max_length=700))
     assert isinstance(engine, CompiledCodec)
     for count in [*range(60), *range(60), 3, 3]:
         for kind in range(4):

@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import pytest
 
-from lidarspec import Checksum, Crc, Fold15, Sum, WordXor, Xor
+from lidarspec.spec import Checksum, Crc, Fold15, Sum, WordXor, Xor
 from lidarspec.wire.single_frames import single
 
 

@@ -9,6 +9,7 @@ from construct import Struct
 
 import lidarspec as ls
 from lidarspec.framing.frame_engine import CompiledCodec, codec
+from lidarspec.spec import Frame
 from lidarspec.wire.layout import Layout
 from lidarspec.wire.wire_table import INDICES, Extent, WireRow, frame_size, wire_table
 from tests.shapes import SHAPES
@@ -108,4 +109,4 @@ def test_extents_multiply(extent: Extent, factor: int | str, text: str) -> None:
 
 
 def test_an_empty_struct_has_no_rows() -> None:
-    assert wire_table(ls.Frame(Struct(), max_length=1)) == ()
+    assert wire_table(Frame(Struct(), max_length=1)) == ()
