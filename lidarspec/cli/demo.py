@@ -23,7 +23,8 @@ import numpy as np
 from rich.text import Text
 
 from lidarspec.cli.failures import FINDINGS
-from lidarspec.cli.output import drawn, emit_json, sensor_option, size
+from lidarspec.cli.options import sensor_option
+from lidarspec.cli.output import drawn, emit_json, size
 from lidarspec.cli.sensors import NO_SENSORS
 from lidarspec.device.device import Device, open as open_device
 from lidarspec.device.session import Reply

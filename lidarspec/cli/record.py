@@ -11,8 +11,9 @@ from dataclasses import dataclass, replace
 import click
 
 from lidarspec.cli.failures import INTERRUPTED
-from lidarspec.cli.output import Progress, emit_json, note, sensor_option, size
-from lidarspec.cli.streams import DURATION, nothing_came
+from lidarspec.cli.inputs import nothing_came
+from lidarspec.cli.options import DURATION, sensor_option
+from lidarspec.cli.output import Progress, emit_json, note, size
 from lidarspec.device.capture_thread import BoundedQueue, Capture, Mark
 from lidarspec.device.device import Device
 from lidarspec.device.settings import named

@@ -9,8 +9,8 @@ import shlex
 import click
 
 from lidarspec.cli.failures import INTERRUPTED
-from lidarspec.cli.output import Progress, emit_json, note, sensor_option, size
-from lidarspec.cli.streams import SPEED
+from lidarspec.cli.options import SPEED, sensor_option
+from lidarspec.cli.output import Progress, emit_json, note, size
 from lidarspec.device.settings import named
 from lidarspec.errors import LidarSpecError, UsageError, WireError, suggest
 from lidarspec.plugins import sensor as named_sensor

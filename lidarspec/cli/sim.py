@@ -11,8 +11,8 @@ from pathlib import Path
 
 import click
 
+from lidarspec.cli.options import DURATION, SHARE
 from lidarspec.cli.output import Progress, emit_json, note, size
-from lidarspec.cli.streams import DURATION, SHARE
 from lidarspec.errors import UsageError, suggest
 from lidarspec.plugins import sensor as named_sensor
 from lidarspec.recording.recorders import SUFFIXES
