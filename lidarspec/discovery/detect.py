@@ -27,10 +27,11 @@ from lidarspec.plugins import sensors
 from lidarspec.simulation.simulator import simulate
 from lidarspec.spec.links import Serial
 from lidarspec.spec.sensor import Sensor
+from lidarspec.spec.tree import FieldInfo
 from lidarspec.transports.files import RecordingTransport
 from lidarspec.transports.open_url import live_address, transport
 from lidarspec.transports.simulated import SimulatedTransport
-from lidarspec.wire.schema import FieldInfo, schema
+from lidarspec.wire.schema import schema
 
 #: share by which the pace of a clock may be off, frames of a type that are looked into for names, and packets simulated.
 OFF, READ, PACKETS = 0.03, 3, 64
@@ -99,7 +100,7 @@ def _by_name(sensor: Sensor, found: Sequence[Found]) -> str:
 
 
 def _fields(sensor: Sensor, frame: str) -> Mapping[str, FieldInfo]:
-    return schema(sensor.frames[frame].prepared).fields
+    return schema(sensor.frames[frame].tree).fields
 
 
 def _texts(values: object, fields: Mapping[str, FieldInfo], above: str = "") -> Iterator[tuple[str, str]]:

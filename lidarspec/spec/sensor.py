@@ -117,10 +117,10 @@ class Sensor(Spec):
             stream: True reads a byte stream, False one datagram for each `feed`; by default what the data link says.
         """
         from lidarspec.framing.decoder import Decoder, backend as checked_backend
-        from lidarspec.points.numba_kernels import checksums
+        from lidarspec.points.numba_kernels import compiled_sums
 
         chosen = checked_backend(backend)
-        sums = checksums.compiled() if chosen == "jit" else None
+        sums = compiled_sums() if chosen == "jit" else None
         stream = not self.datagrams if stream is None else stream
         return Decoder(self, stream=stream, interpreted=chosen == "construct", backend=chosen, sums=sums)
 

@@ -1,6 +1,7 @@
-"""What the conformance tests are fed: conversations out of a sensor's own examples, their edits, cuts and noise.
+"""A sensor under test, and what it is fed: conversations out of its own examples, their edits, cuts and noise.
 
-A sensor under test: its examples, with the author's own strategies in them, and what was measured along the way.
+A `Subject` has the sensor, its examples (drawn by the author's own strategies where there are some) and what was measured along the way.
+Everything that is drawn is seeded, so that what fails once fails again.
 """
 
 from __future__ import annotations
