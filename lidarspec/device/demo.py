@@ -18,7 +18,7 @@ from pathlib import Path
 from lidarspec.device.device import Device, open as open_device
 from lidarspec.device.session import Reply
 from lidarspec.errors import SourceError
-from lidarspec.framing.decoder import Counters
+from lidarspec.framing.results import Counters
 from lidarspec.scans.scans import Scan
 from lidarspec.simulation.device import SimulatedDevice
 from lidarspec.simulation.faults import Faults
@@ -73,7 +73,7 @@ def demonstrate(sensor: Sensor, *, turns: int = 5, errors: float = 0.01, seed: i
     simulated = SimulatedDevice(sensor, seed=seed, faults=faults)
     with tempfile.TemporaryDirectory(prefix="lidarspec-demo-") as folder:
         path = Path(folder) / "demo.lsr"
-        place, replies, scans, stats = _live(simulated, path, turns)
+        place, replies, scans, stats = _live(sensor, simulated, path, turns)
         line, recorded = simulated.lines["data"], path.stat().st_size
         with open_device(path, sensor) as recording:
             again = digest(_whole(recording.scans(), turns))
@@ -91,9 +91,8 @@ def digest(scans: Sequence[Scan]) -> str:
     return found.hexdigest()
 
 
-def _live(simulated: SimulatedDevice, path: Path, turns: int) -> tuple[str, tuple[Reply, ...], tuple[Scan, ...], Counters]:
+def _live(sensor: Sensor, simulated: SimulatedDevice, path: Path, turns: int) -> tuple[str, tuple[Reply, ...], tuple[Scan, ...], Counters]:
     """The place of the sensor, its replies, its scans and the counters; everything that came is recorded."""
-    sensor = simulated.sensor
     if sensor.datagrams:
         port = _free_port()
         at = f"udp://{HERE}:{port}"

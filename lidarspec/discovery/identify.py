@@ -15,7 +15,7 @@ import numpy as np
 from lidarspec.discovery.detect import AS_GOOD, scores
 from lidarspec.errors import LidarSpecError, WireError
 from lidarspec.framing.frame_engine import codec
-from lidarspec.framing.plausibility import VALID
+from lidarspec.framing.results import VALID
 from lidarspec.plugins import sensors
 from lidarspec.spec.sensor import Sensor
 from lidarspec.wire.parse import parse_typed
