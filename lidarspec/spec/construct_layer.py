@@ -489,6 +489,22 @@ def _traced(expression: Any, scope: _Scope) -> Any:
     return expression(scope) if callable(expression) else expression
 
 
+def _spelled(expression: Any, path: str) -> str:
+    """An expression of the part at `path` as its author wrote it, with fields by their whole paths; "?" for a function."""
+    text = repr(expression)
+    if " at 0x" in text:
+        return "?"
+    return re.sub(r"\bthis(?:\.\w+)+", functools.partial(_whole_path, path), re.sub(r"\['(\w+)'\]", r".\1", text))
+
+
+def _whole_path(path: str, way: re.Match[str]) -> str:
+    """``this.count`` or ``this._.count`` in the part at `path` as the path from the top of the frame."""
+    names = path.split(".")[:-1]
+    for name in way[0].split(".")[1:]:
+        names = [] if name == "_root" else names[:-1] if name == "_" else [*names, name]
+    return ".".join(names)
+
+
 class _Fields:
     """What an expression sees when it is evaluated: values by name, as construct shows them."""
 
@@ -619,9 +635,8 @@ class _Builder:
         while scope is not None:
             paths.append(scope.path)
             scope = scope.parent
-        text = repr(expression)
         function = functools.partial(_evaluated, expression, tuple(paths or [""]))
-        return Code(function, tuple(dict.fromkeys(asked)), f"{place.info.path}: {reason}", "?" if " at 0x" in text else text, blind)
+        return Code(function, tuple(dict.fromkeys(asked)), f"{place.info.path}: {reason}", _spelled(expression, place.info.path), blind)
 
     def _select(self, con: construct.Switch, place: _Place) -> Select:
         key = self._formula(con.keyfunc, place, is_key=True)
@@ -829,19 +844,6 @@ def peeled(con: Construct, info: FieldInfo) -> tuple[Construct, FieldInfo]:
         elif not isinstance(con, construct.Default):
             return con, info
         con = con.subcon
-
-
-def fields_below(con: Construct, info: FieldInfo) -> dict[str, FieldInfo]:
-    """The fields of a part of a struct, by path; `info` says where it stands."""
-    found = _Builder({}).node(con, _Place(info, None, info.name))
-    infos = [part.info for node in nodes(found) if isinstance(node, Block) for part in node.parts]
-    infos += [node.info for node in nodes(found) if isinstance(node, Number | Blob | Opaque)]
-    return {info.path: info for info in infos if info.path}
-
-
-def probed(con: Construct, size: int) -> list[BitField] | None:
-    """The bit fields of a block; None where construct decides on its bits, or values are no plain integers."""
-    return _probed(con, size)
 
 
 def is_expression(value: object) -> bool:
