@@ -2,7 +2,7 @@
 
     python docs/reference_pages.py [FOLDER]
 
-`make reference` runs it; tests/test_reference_pages.py holds that the pages are up to date.
+`make reference` runs it; tests/docs/test_reference_pages.py holds that the pages are up to date.
 """
 
 from __future__ import annotations

@@ -11,9 +11,8 @@ from typing import Any
 
 import click
 
-from lidarspec.cli.failures import suggest
 from lidarspec.cli.output import emit, emit_json, output_options
-from lidarspec.errors import LidarSpecError, OutOfRange, SourceError, UnknownField, UnknownFrame, UsageError
+from lidarspec.errors import LidarSpecError, OutOfRange, SourceError, UnknownField, UnknownFrame, UsageError, suggest
 from lidarspec.plugins import sensor as named_sensor
 from lidarspec.spec.fields import exact, factor, split_unit
 from lidarspec.spec.tree import FieldInfo, evaluated

@@ -7,15 +7,14 @@ from typing import Any
 
 import click
 
-from lidarspec.cli.failures import suggest
 from lidarspec.cli.inputs import Input, Piece, fitting, likely_starts, nearest, no_frame, pieces, read
 from lidarspec.cli.output import emit, emit_json, emit_lines, note, output_options, sensor_option, table
-from lidarspec.errors import UsageError, WireError
+from lidarspec.errors import UsageError, WireError, suggest
 from lidarspec.explaining.explanation import Explanation, explain as explained
 from lidarspec.explaining.listing import LINED, Line, told
 from lidarspec.explaining.wording import Row, Span, number
 from lidarspec.plugins import sensor as named_sensor
-from lidarspec.spec.description import Sensor
+from lidarspec.spec.sensor import Sensor
 
 #: places in bytes between frames that are explained as damaged frames, at most.
 DAMAGED = 64

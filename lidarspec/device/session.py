@@ -21,7 +21,8 @@ from typing import Any
 
 from lidarspec.errors import CommandError, ReplyTimeout, UnknownField, UsageError
 from lidarspec.framing.decoder import Found
-from lidarspec.spec.description import Command, Sensor
+from lidarspec.spec.description import Command
+from lidarspec.spec.sensor import Sensor
 from lidarspec.spec.tree import FieldInfo
 from lidarspec.wire.schema import schema
 

@@ -21,12 +21,12 @@ from numpy.typing import NDArray
 
 from lidarspec.device.settings import named
 from lidarspec.discovery.listen import Heard, hear
-from lidarspec.errors import CommandError, LidarSpecError, UsageError, WireError
+from lidarspec.errors import CommandError, LidarSpecError, UsageError, WireError, suggest
 from lidarspec.framing.decoder import Found
 from lidarspec.plugins import sensors
 from lidarspec.simulation.simulator import simulate
-from lidarspec.spec.description import Sensor
 from lidarspec.spec.links import Serial
+from lidarspec.spec.sensor import Sensor
 from lidarspec.spec.tree import FieldInfo
 from lidarspec.transports.files import RecordingTransport
 from lidarspec.transports.open_url import live_address, transport
@@ -289,8 +289,7 @@ def _nothing(source: str, found: Sequence[Verdict]) -> Exception:
     if live_address(source) is None:
         return WireError(f"{source}: it holds no bytes")
     error = CommandError(f"{source}: nothing comes; a sensor that has to be started first is named with -s")
-    error.add_note(f"next: lidarspec doctor {source}")
-    return error
+    return suggest(error, f"lidarspec doctor {source}")
 
 
 def _bauds(sensor: Sensor) -> tuple[int, ...]:

@@ -26,8 +26,9 @@ from lidarspec.packets.stream import PacketStream
 from lidarspec.points.plain import evaluate
 from lidarspec.spec.bits import BitField
 from lidarspec.spec.construct_layer import UNNAMED, Seen, field_path, leaves
-from lidarspec.spec.description import Frame, Sensor
+from lidarspec.spec.description import Frame
 from lidarspec.spec.fields import Checksummed, exact
+from lidarspec.spec.sensor import Sensor
 from lidarspec.spec.tree import Block, FieldInfo, Node, Opaque, Repeat, Struct, children
 from lidarspec.wire.parse import parse_typed
 from lidarspec.wire.schema import schema

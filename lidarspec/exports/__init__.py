@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from lidarspec.errors import UnknownFrame, UnknownName, UsageError
 
 if TYPE_CHECKING:
-    from lidarspec.spec.description import Sensor
+    from lidarspec.spec.sensor import Sensor
 
 #: kind -> "module:function"; each takes a Sensor and returns the text of the export.
 EXPORTS: dict[str, str] = {

@@ -12,8 +12,22 @@ from dataclasses import dataclass, field, replace
 from xml.sax.saxutils import escape, quoteattr
 
 from lidarspec.exports.messages import Message, messages
-from lidarspec.spec.description import Sensor
-from lidarspec.spec.tree import Blob, Block, Empty, FieldInfo, Node, Number, Part, Repeat, Sealed, Select, Struct, When, nodes
+from lidarspec.spec.sensor import Sensor
+from lidarspec.spec.tree import (
+    Blob,
+    Block,
+    Empty,
+    FieldInfo,
+    Node,
+    Number,
+    Part,
+    Repeat,
+    Sealed,
+    Select,
+    Struct,
+    When,
+    nodes,
+)
 from lidarspec.wire.wire_table import INDICES, Extent, bit_text, frame_size, meaning, phrase, unit_text
 
 

@@ -12,8 +12,9 @@ from typing import Any
 
 from lidarspec.exports.messages import Message, messages
 from lidarspec.spec.checksums import Checksum
-from lidarspec.spec.description import Command, Sensor
+from lidarspec.spec.description import Command
 from lidarspec.spec.links import Link, Serial, Tcp, Udp
+from lidarspec.spec.sensor import Sensor
 from lidarspec.spec.tree import Blob, Block, Empty, FieldInfo, Formula, Node, Number, Op, Part, Ref, Repeat, Sealed, Select, Struct, When
 from lidarspec.wire.wire_table import frame_size
 

@@ -18,8 +18,8 @@ from typing import Any
 from lidarspec.exports import Refused
 from lidarspec.exports.messages import Message, messages
 from lidarspec.spec.bits import BitField, Segment
-from lidarspec.spec.description import Sensor
 from lidarspec.spec.fields import slug
+from lidarspec.spec.sensor import Sensor
 from lidarspec.spec.tree import (
     COMPARISONS,
     Blob,

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 from lidarspec.errors import SpecError
 from lidarspec.exports import Refused
-from lidarspec.spec.description import Frame, Sensor
+from lidarspec.spec.description import Frame
+from lidarspec.spec.sensor import Sensor
 from lidarspec.spec.tree import Code, Node, Opaque, Sealed, Struct, formulas, nodes
 
 

@@ -17,7 +17,8 @@ from dataclasses import dataclass, field
 
 from lidarspec.exports import Refused
 from lidarspec.exports.messages import Message, messages
-from lidarspec.spec.description import Command, Sensor
+from lidarspec.spec.description import Command
+from lidarspec.spec.sensor import Sensor
 from lidarspec.spec.tree import Blob, Block, Empty, FieldInfo, Node, Number, Repeat, Sealed, Select, Struct, When
 from lidarspec.wire.schema import schema
 from lidarspec.wire.wire_table import meaning, unit_text

@@ -20,8 +20,8 @@ from lidarspec.exports.messages import Message, messages
 from lidarspec.framing.frame_engine import codec
 from lidarspec.spec.bits import BitField
 from lidarspec.spec.checksums import Checksum, Crc, Fold15, Sum, WordXor, Xor, ZeroPadded
-from lidarspec.spec.description import Sensor
 from lidarspec.spec.links import Tcp, Udp
+from lidarspec.spec.sensor import Sensor
 from lidarspec.spec.tree import (
     COMPARISONS,
     Blob,

@@ -13,7 +13,7 @@ from lidarspec.columns.columns import Batch, Fields
 from lidarspec.columns.graph import Node, Untraceable, trace
 from lidarspec.errors import SpecError
 from lidarspec.framing.plausibility import fields_of, value_of
-from lidarspec.spec.description import Sensor
+from lidarspec.spec.description import Spec
 from lidarspec.spec.fields import exact, factor
 from lidarspec.spec.tree import FieldInfo
 from lidarspec.wire.arrays import alike
@@ -65,7 +65,7 @@ class Unwrapper:
         return times
 
 
-def clock_ns(sensor: Sensor, batch: Batch) -> Times:
+def clock_ns(sensor: Spec, batch: Batch) -> Times:
     """The sensor's own clock in each packet, (n,) int64 nanoseconds, as it stands on the wire."""
     assert sensor.clock is not None
     source = sensor.clock.source

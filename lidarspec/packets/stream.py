@@ -24,7 +24,7 @@ from lidarspec.framing.results import Alike
 from lidarspec.packets.clocks import Unwrapper, clock_ns
 from lidarspec.packets.packets import Numbers, Packets, StateOf, joined_tables
 from lidarspec.packets.sequences import SequenceTracker
-from lidarspec.spec.description import Sensor
+from lidarspec.spec.description import Spec
 from lidarspec.wire.arrays import alike, repeated, some
 from lidarspec.wire.frame_table import Table
 
@@ -42,7 +42,7 @@ class PacketStream:
 
     def __init__(
         self,
-        sensor: Sensor,
+        sensor: Spec,
         frame: str,
         stats: Counters,
         *,
@@ -232,7 +232,7 @@ class _Part:
         return codec.gather(spans.buffer, self.column("starts"), self.column("sizes"))
 
 
-def data_frame(sensor: Sensor, found: Sequence[Spans]) -> str | None:
+def data_frame(sensor: Spec, found: Sequence[Spans]) -> str | None:
     """The data frame type that an input is read by where none is asked for: the configured one, or the first that arrived.
 
     Returns:
@@ -245,7 +245,7 @@ def data_frame(sensor: Sensor, found: Sequence[Spans]) -> str | None:
     return next((known[kinds[0]] for known, kinds in arrived if len(kinds)), None)
 
 
-def _counted(sensor: Sensor, frame: str) -> bool:
+def _counted(sensor: Spec, frame: str) -> bool:
     """Whether packets of this type are counted: not, if only other data frames have the counter."""
     assert sensor.sequence is not None
     having = [name for name, other in sensor.frames.items() if other.data and sensor.sequence.field in codec(other).schema.fields]

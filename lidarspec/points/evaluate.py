@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from lidarspec.columns.columns import Batch, Carry, Column, Fields, called, field_array
 from lidarspec.columns.graph import Node
 from lidarspec.errors import SpecError
-from lidarspec.packets.packets import Packets, install_points
+from lidarspec.packets.packets import Packets
 from lidarspec.points.cloud import LazyCloud, PointCloud
 from lidarspec.points.lazy_columns import Points
 from lidarspec.points.numba_kernels.kernels import Kernel
@@ -267,10 +267,9 @@ def guarded(packets: Packets, carry: Carry | None = None, *, final: bool, epoch:
         return None
 
 
-def _cloud(packets: Packets) -> PointCloud:
+def cloud_of(packets: Packets) -> PointCloud:
     found = _planned(packets, None, final=True, epoch=None, alone=True)
     return (found if found is not None else evaluate(packets)).cloud
 
 
 keep_freed_memory()
-install_points(_cloud)

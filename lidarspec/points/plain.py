@@ -16,7 +16,7 @@ from lidarspec.columns.columns import Batch, Carry, Column, Fields, aligned, unp
 from lidarspec.errors import SpecError
 from lidarspec.packets.packets import Packets
 from lidarspec.points.cloud import PointCloud, axis_matrix, narrowed
-from lidarspec.spec.description import Sensor
+from lidarspec.spec.description import Spec
 from lidarspec.spec.results import Cartesian, Points, Polar
 
 _OPTIONAL = ("intensity", "ring", "return_index")
@@ -43,7 +43,7 @@ class Evaluated:
     axes: tuple[str | None, ...]
 
 
-def points_function(sensor: Sensor, frame: str) -> Callable[[Any], Points]:
+def points_function(sensor: Spec, frame: str) -> Callable[[Any], Points]:
     """The function that makes points of this frame type.
 
     Raises:

@@ -15,7 +15,7 @@ from lidarspec.points.cloud import Mount, PointCloud, joined, restamped
 from lidarspec.points.evaluate import guarded
 from lidarspec.points.plain import Evaluated
 from lidarspec.scans.cutter import Cutter
-from lidarspec.spec.description import Sensor
+from lidarspec.spec.description import Spec
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +56,7 @@ class Scan:
     points: PointCloud
     rate_hz: float
     complete: bool
-    sensor: Sensor
+    sensor: Spec
 
     @property
     def stamp_ns(self) -> int:
@@ -111,7 +111,7 @@ class ScanStream:
         mount: how it is mounted; the scans come in its carrier's axes.
     """
 
-    def __init__(self, sensor: Sensor, mount: Mount | None = None) -> None:
+    def __init__(self, sensor: Spec, mount: Mount | None = None) -> None:
         self._sensor, self._mount = sensor, mount
         self._reorder = Reorder(enabled=sensor.sequence is not None)
         self._cutter = Cutter(sensor.scan)
@@ -189,7 +189,7 @@ def _times_ns(cloud: PointCloud, indices: Sequence[int]) -> list[int | None]:
     return [cloud.stamp_ns + round(time * 1e9) for time in times] + [None] * (len(indices) - len(known))
 
 
-def scans_of(sensor: Sensor, batches: Iterable[Packets]) -> Iterator[Scan]:
+def scans_of(sensor: Spec, batches: Iterable[Packets]) -> Iterator[Scan]:
     """Every scan of batches of one stream."""
     stream = ScanStream(sensor)
     for batch in batches:

@@ -23,7 +23,7 @@ from lidarspec.errors import SpecError, UnknownFrame, UsageError
 from lidarspec.framing.frame_engine import CompiledCodec, InterpretedCodec, codec
 from lidarspec.framing.plausibility import VALID, plausibility
 from lidarspec.spec.construct_layer import clean, peeled, seen
-from lidarspec.spec.description import Sensor
+from lidarspec.spec.description import Spec
 from lidarspec.spec.tree import FieldInfo
 from lidarspec.wire.build import build
 from lidarspec.wire.frame_table import Group, Rows
@@ -40,7 +40,7 @@ class FrameMaker:
         SpecError: where the frame type is not compiled.
     """
 
-    def __init__(self, sensor: Sensor, frame: str) -> None:
+    def __init__(self, sensor: Spec, frame: str) -> None:
         engine = codec(sensor.frames[frame])
         if not isinstance(engine, CompiledCodec):
             raise SpecError(f"cannot be simulated, since it is not compiled: {engine.reason}", path=frame, sensor=sensor.id)
@@ -149,14 +149,14 @@ Drawn = Mapping[str, Callable[[random.Random], Any]]
 NOTHING: Drawn = {}
 
 
-def example(sensor: Sensor, frame: str, *, seed: int = 0) -> bytes:
+def example(sensor: Spec, frame: str, *, seed: int = 0) -> bytes:
     """See `Sensor.example`."""
     if frame not in sensor.frames:
         raise UnknownFrame(frame, sensor.frames, place=sensor.id)
     return examples(sensor, frame, random.Random(f"{sensor.id} {frame} {seed}"))[0]
 
 
-def examples(sensor: Sensor, frame: str, source: random.Random, drawn: Drawn = NOTHING) -> list[bytes]:
+def examples(sensor: Spec, frame: str, source: random.Random, drawn: Drawn = NOTHING) -> list[bytes]:
     """Some valid frames of one random header, at least one: what `example` picks from, for tests that need many.
 
     Args:
@@ -179,7 +179,7 @@ def examples(sensor: Sensor, frame: str, source: random.Random, drawn: Drawn = N
     return [_swept(sensor, frame, engine, source)]
 
 
-def _interpreted(sensor: Sensor, frame: str, engine: InterpretedCodec, source: random.Random, drawn: Drawn) -> bytes:
+def _interpreted(sensor: Spec, frame: str, engine: InterpretedCodec, source: random.Random, drawn: Drawn) -> bytes:
     """A frame that construct alone can read."""
     for _ in range(BATCH * TRIES):
         try:
@@ -199,7 +199,7 @@ def _headed(rows: NDArray[np.uint8], layout: Layout, chosen: dict[str, int]) -> 
     return rows
 
 
-def _plausible(sensor: Sensor, frame: str, layout: Layout, rows: NDArray[np.uint8]) -> list[bytes]:
+def _plausible(sensor: Spec, frame: str, layout: Layout, rows: NDArray[np.uint8]) -> list[bytes]:
     table = Rows(codec(sensor.frames[frame]).schema, [Group(layout, np.arange(len(rows)), rows)])
     if sensor.frames[frame].plausible is None:
         return [row.tobytes() for row in rows]
@@ -210,9 +210,9 @@ def _plausible(sensor: Sensor, frame: str, layout: Layout, rows: NDArray[np.uint
     return [row.tobytes() for row in rows[good]]
 
 
-def _swept(sensor: Sensor, frame: str, engine: CompiledCodec, source: random.Random) -> bytes:
+def _swept(sensor: Spec, frame: str, engine: CompiledCodec, source: random.Random) -> bytes:
     """A frame around the values that the sensor's `sweep` declares, where random ones are never plausible."""
-    sweep = sensor.frames[frame].sweep or (sensor.sweep if sensor.frames[frame].data else None)
+    sweep = sensor.simulation_of(frame).sweep
     if sweep is None:
         raise SpecError("no random frame passes `plausible`, and there is no `sweep` to start from", path=frame, sensor=sensor.id)
     for _ in range(TRIES):

@@ -278,6 +278,14 @@ def bit_width(con: Construct) -> int:
     return 8 * int(inner.sizeof())
 
 
+def fixed_size(con: Construct) -> int:
+    """The number of bytes of a struct of fixed size; 0 where it depends on what is parsed."""
+    try:
+        return int(con.sizeof())
+    except Exception:  # construct lets a KeyError through where a condition asks for a field
+        return 0
+
+
 def member(obj: Any, dotted: str, default: object = _MISSING) -> Any:
     """The member of a nested mapping under a dotted name."""
     for part in dotted.split("."):

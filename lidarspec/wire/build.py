@@ -10,14 +10,14 @@ import construct
 import numpy as np
 from construct import Container
 
-from lidarspec.errors import LidarSpecError, MissingField, OutOfRange, SpecError, UnknownField, UnknownFrame, UsageError
+from lidarspec.errors import LidarSpecError, MissingField, OutOfRange, SpecError, UnknownCommand, UnknownField, UnknownFrame, UsageError
 from lidarspec.spec.construct_layer import Mismatch, WireNaN, field_path, seen
-from lidarspec.spec.description import Sensor
+from lidarspec.spec.description import Spec
 from lidarspec.spec.tree import Blob, FieldInfo, Formula, Node, Number, Read, Sealed, Struct, evaluated, nodes, refs
 from lidarspec.wire.schema import Schema, schema
 
 
-def build(sensor: Sensor, frame: str, value: Any, values: Mapping[str, Any], *, units: bool = False) -> bytes:
+def build(sensor: Spec, frame: str, value: Any, values: Mapping[str, Any], *, units: bool = False) -> bytes:
     """See `Sensor.build`."""
     if frame not in sensor.frames:
         raise UnknownFrame(frame, sensor.frames, place=sensor.id)
@@ -176,6 +176,48 @@ def given_value(given: Mapping[str, Any], fields: Mapping[str, FieldInfo], path:
     info = fields[path]
     raw = next((raw for raw, name in info.labels.items() if name == value), value) if isinstance(value, str) else value
     return None if value is None else (info, raw)
+
+
+def build_command(sensor: Spec, name: str, arguments: Mapping[str, Any]) -> bytes:
+    """The bytes of a command, none for one that only moves lines.
+
+    Args:
+        arguments: by name, in the units of their fields.
+
+    Raises:
+        UnknownCommand: for a command that the sensor does not have.
+        UnknownField, MissingField: for an argument that it does not take, or that is left out.
+        OutOfRange: for one beyond its limits.
+    """
+    if name not in sensor.commands:
+        raise UnknownCommand(name, sensor.commands, place=sensor.id)
+    command, place = sensor.commands[name], f"{sensor.id} {name}"
+    unknown = set(arguments) - set(command.args)
+    if unknown:
+        raise UnknownField(min(unknown), command.args, place=place)
+    if command.frame is None:
+        return b""
+    fields = schema(sensor.frames[command.frame].tree).fields
+    values: dict[str, Any] = {}
+    for path, value in command.values.items():
+        _put(values, path, value)
+    for argument, (path, low, high) in command.args.items():
+        if argument not in arguments:
+            raise MissingField(argument, place=place)
+        value = arguments[argument]
+        if not low <= value <= high:
+            raise OutOfRange(argument, value, low, high, unit=fields[path].unit, place=place)
+        raw = round((value - fields[path].offset) / fields[path].scale)
+        bottom, top = fields[path].limits
+        _put(values, path, min(max(raw, bottom), top))
+    return build(sensor, command.frame, None, values)
+
+
+def _put(values: dict[str, Any], path: str, value: Any) -> None:
+    *parents, last = path.split(".")
+    for parent in parents:
+        values = values.setdefault(parent, {})
+    values[last] = value
 
 
 def _solved(count: Formula, read: Read, holder: Container, field: str, length: int, info: FieldInfo | None, axis: str) -> int:

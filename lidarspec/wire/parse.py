@@ -18,13 +18,13 @@ from construct import Container, ListContainer
 from lidarspec.errors import SpecError, UnknownFrame, WireError, refuse_text
 from lidarspec.spec.bits import BitField
 from lidarspec.spec.construct_layer import Mismatch, WireNaN, clean, field_path, seen, unnamed
-from lidarspec.spec.description import Sensor
+from lidarspec.spec.description import Spec
 from lidarspec.spec.tree import Blob, Block, FieldInfo, Node, Number, Repeat, Sealed, Select, Struct, When
 from lidarspec.wire.layout import Layout, Leaf
 from lidarspec.wire.layout_tree import NotCompilable, Refused, frame_layouts, prefix_of
 
 
-def parse(sensor: Sensor, data: bytes, *, frame: str | None = None, verify: bool = True) -> Any:
+def parse(sensor: Spec, data: bytes, *, frame: str | None = None, verify: bool = True) -> Any:
     """See `Sensor.parse`."""
     if not isinstance(data, bytes):
         refuse_text(data)
@@ -200,7 +200,7 @@ def _joined(field: BitField, columns: Mapping[int, Reader], frame: bytes) -> Seq
     return [value == 1 for value in values] if field.flag else values
 
 
-def parse_typed(sensor: Sensor, data: bytes, *, frame: str | None = None, verify: bool = True) -> tuple[str, Any]:
+def parse_typed(sensor: Spec, data: bytes, *, frame: str | None = None, verify: bool = True) -> tuple[str, Any]:
     """The name of the frame type, and the parsed frame."""
     if not isinstance(data, bytes):
         refuse_text(data)
@@ -226,7 +226,7 @@ def parse_typed(sensor: Sensor, data: bytes, *, frame: str | None = None, verify
     raise _likeliest(sensor, data, faults)
 
 
-def _parse_as(sensor: Sensor, name: str, data: bytes, *, verify: bool) -> Any:
+def _parse_as(sensor: Spec, name: str, data: bytes, *, verify: bool) -> Any:
     frame = sensor.frames[name]
     stream = io.BytesIO(data)
     where: dict[str, Any] = {"sensor": sensor.id, "frame": name, "data": data}
@@ -261,7 +261,7 @@ def _parse_as(sensor: Sensor, name: str, data: bytes, *, verify: bool) -> Any:
     return parsed
 
 
-def _first_byte(sensor: Sensor, name: str, data: bytes, path: str, offset: int) -> int:
+def _first_byte(sensor: Spec, name: str, data: bytes, path: str, offset: int) -> int:
     """Where a field begins; within a bit block construct counts bits, and the layout knows the byte."""
     layout = layout_of(sensor, name, data)
     leaf = layout.leaves.get("".join(_without_indices(path))) if isinstance(layout, Layout) else None
@@ -272,7 +272,7 @@ def _first_byte(sensor: Sensor, name: str, data: bytes, path: str, offset: int) 
     return start + min(segment.byte for segment in leaf.elements[0].segments)
 
 
-def _truncated(sensor: Sensor, name: str, data: bytes, path: str) -> WireError:
+def _truncated(sensor: Spec, name: str, data: bytes, path: str) -> WireError:
     """Where the bytes end, and what the field there would have needed."""
     layout = layout_of(sensor, name, data)
     total = f" of {layout.size}" if isinstance(layout, Layout) else ""
@@ -305,13 +305,13 @@ def _without_indices(path: str) -> str:
     return parts[0] + "".join(part.partition("]")[2] for part in parts[1:])
 
 
-def layout_of(sensor: Sensor, name: str, data: bytes) -> Layout | Refused | None:
+def layout_of(sensor: Spec, name: str, data: bytes) -> Layout | Refused | None:
     """The layout that the header of this frame leads to; None where it is not compiled or not all there."""
     layouts = frame_layouts(sensor.frames[name])
     return None if isinstance(layouts, NotCompilable) else layouts.layout(data)
 
 
-def _progress(sensor: Sensor, fault: WireError) -> tuple[int, int]:
+def _progress(sensor: Spec, fault: WireError) -> tuple[int, int]:
     """How far a type was right before it failed: a frame of this very size, or one in front, comes before all others."""
     layout = layout_of(sensor, fault.frame, fault.data)
     fits = isinstance(layout, Layout) and layout.size == len(fault.data)
@@ -319,7 +319,7 @@ def _progress(sensor: Sensor, fault: WireError) -> tuple[int, int]:
     return (1, len(fault.data)) if whole else (0, fault.offset)
 
 
-def _likeliest(sensor: Sensor, data: bytes, faults: list[WireError]) -> WireError:
+def _likeliest(sensor: Spec, data: bytes, faults: list[WireError]) -> WireError:
     best = max(faults, key=functools.partial(_progress, sensor))
     if best.offset > 0 or len(sensor.frames) == 1:
         return best
