@@ -25,10 +25,9 @@ from lidarspec.framing.plausibility import IMPLAUSIBLE, VALID
 from lidarspec.packets.stream import PacketStream
 from lidarspec.points.plain import evaluate
 from lidarspec.spec.bits import BitField
-from lidarspec.spec.construct_layer import UNNAMED, Seen, field_path, leaves, probed, unwrap
+from lidarspec.spec.construct_layer import UNNAMED, Seen, children, field_path, leaves, probed, unwrap
 from lidarspec.spec.description import Frame
 from lidarspec.spec.fields import Checksummed, exact
-from lidarspec.spec.rules import children
 from lidarspec.spec.sensor import Sensor
 from lidarspec.spec.tree import FieldInfo
 from lidarspec.wire.parse import parse_typed

@@ -14,11 +14,10 @@ from lidarspec.columns.columns import Batch, Fields
 from lidarspec.columns.graph import Traced, Untraceable
 from lidarspec.errors import LidarSpecError
 from lidarspec.framing.frame_engine import CompiledCodec, codec
-from lidarspec.spec.construct_layer import unwrap
+from lidarspec.spec.construct_layer import children, unwrap
 from lidarspec.spec.description import Frame
 from lidarspec.spec.fields import Scaled, factor
 from lidarspec.spec.results import Polar
-from lidarspec.spec.rules import children
 from lidarspec.spec.sensor import Sensor
 from lidarspec.spec.timing import Clock
 from lidarspec.testing.findings import Finding
