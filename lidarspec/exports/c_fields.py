@@ -21,6 +21,7 @@ from lidarspec.spec.tree import (
     COMPARISONS,
     Blob,
     Block,
+    Code,
     Empty,
     FieldInfo,
     Formula,
@@ -97,6 +98,8 @@ def bits(value: Formula) -> int:
         return value.info.bits
     if isinstance(value, int):
         return value.bit_length()
+    if isinstance(value, Code):
+        raise Refused(value.reason)
     args = [bits(arg) for arg in value.args]
     match value.symbol:
         case "+" | "-":

@@ -31,6 +31,7 @@ from lidarspec.spec.tree import (
     Formula,
     Node,
     Number,
+    Opaque,
     Part,
     Repeat,
     Sealed,
@@ -159,7 +160,7 @@ class _Writer:
                 cases = {value: self.node(case, path) for value, case in node.cases}
                 default = self.node(node.default, path)
                 return {"kind": "select", "name": node.name, "key": _function(node.key), "cases": cases, "default": default}
-            case Empty():
+            case Empty() | Opaque():
                 return {"kind": "empty", "skip": 0}
 
     def _number(self, node: Number) -> Table:
