@@ -28,7 +28,7 @@ from lidarspec.cli.sensors import NO_SENSORS
 from lidarspec.device.device import Device, open as open_device
 from lidarspec.device.session import Reply
 from lidarspec.errors import SourceError, UsageError
-from lidarspec.framing.decoder import Counters
+from lidarspec.framing.results import Counters
 from lidarspec.plugins import registry, sensor as named_sensor
 from lidarspec.scans.scans import Scan
 from lidarspec.simulation.device import SimulatedDevice

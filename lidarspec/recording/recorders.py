@@ -16,7 +16,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 from lidarspec._version import __version__
-from lidarspec.captures.pcap import NOBODY, USER_LINKS, Datagram, PcapWriter, is_capture
+from lidarspec.captures.pcap import NOBODY, USER_LINKS, Datagram, PcapWriter
+from lidarspec.captures.records import is_capture
 from lidarspec.errors import UnknownFormat, UsageError
 from lidarspec.framing.results import Found
 from lidarspec.plugins import registry, sensor as named_sensor

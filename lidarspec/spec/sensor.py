@@ -12,7 +12,13 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from lidarspec.errors import UnknownOption, UsageError
+from lidarspec.framing.decoder import Decoder, backend as checked_backend, frames_of, is_stream
+from lidarspec.framing.results import Found
+from lidarspec.packets.packets import Packets
+from lidarspec.packets.stream import PacketStream, data_frame
+from lidarspec.scans.scans import Scan, scans_of
 from lidarspec.spec.description import Spec
+from lidarspec.wire.build import build
 
 if TYPE_CHECKING:
     from lidarspec.framing.decoder import Decoder
@@ -90,7 +96,6 @@ class Sensor(Spec):
         Raises:
             UsageError: for a missing or unknown field, or a value that its field cannot hold.
         """
-        from lidarspec.wire.build import build
 
         return build(self, frame, value, values, units=units)
 
@@ -116,11 +121,11 @@ class Sensor(Spec):
         Args:
             stream: True reads a byte stream, False one datagram for each `feed`; by default what the data link says.
         """
-        from lidarspec.framing.decoder import Decoder, backend as checked_backend
-        from lidarspec.points.numba_kernels import checksums
+        from lidarspec.framing.decoder import Decoder
+        from lidarspec.points.numba_kernels import compiled_sums
 
         chosen = checked_backend(backend)
-        sums = checksums.compiled() if chosen == "jit" else None
+        sums = compiled_sums() if chosen == "jit" else None
         stream = not self.datagrams if stream is None else stream
         return Decoder(self, stream=stream, interpreted=chosen == "construct", backend=chosen, sums=sums)
 
@@ -131,10 +136,9 @@ class Sensor(Spec):
             data: bytes (a stream), an iterable of datagrams, or an (n, size) uint8 array of datagrams.
             backend: "auto", "numpy", "jit" or "construct": the same results.
         """
-        from lidarspec.framing.decoder import is_stream, spans_of
 
         decoder = self.decoder(stream=is_stream(data), backend=backend)
-        return [found for spans in spans_of(decoder, data) for found in spans.found()]
+        return [found for spans in frames_of(decoder, data) for found in spans.found()]
 
     def decode(self, data: Any, frame: str | None = None, *, backend: str = "auto") -> Packets:
         """The data frames, or those of another type, as columns.
@@ -143,11 +147,9 @@ class Sensor(Spec):
             data: bytes (a stream), an iterable of datagrams, or an (n, size) uint8 array of datagrams.
             backend: "auto", "numpy", "jit" or "construct": the same results.
         """
-        from lidarspec.framing.decoder import is_stream, spans_of
-        from lidarspec.packets.stream import PacketStream, data_frame
 
         decoder = self.decoder(stream=is_stream(data), backend=backend)
-        spans = spans_of(decoder, data)
+        spans = frames_of(decoder, data)
         name = frame or data_frame(self, spans) or self.data_frame
         return PacketStream(self, name, decoder.stats, interpreted=decoder.interpreted, backend=decoder.backend).add(spans, whole=True)
 
@@ -158,7 +160,6 @@ class Sensor(Spec):
             data: bytes (a stream), an iterable of datagrams, or an (n, size) uint8 array of datagrams.
             backend: "auto", "numpy", "jit" or "construct": the same results.
         """
-        from lidarspec.scans.scans import scans_of
 
         return scans_of(self, [self.decode(data, backend=backend)])
 
