@@ -18,9 +18,9 @@ from lidarspec.errors import WireError
 from lidarspec.framing.frame_engine import codec
 from lidarspec.plugins import sensor as named_sensor
 from lidarspec.simulation.frame_maker import examples
+from lidarspec.spec.construct_layer import children
 from lidarspec.spec.description import Frame
 from lidarspec.spec.fields import Checksummed
-from lidarspec.spec.rules import children
 from lidarspec.spec.sensor import Sensor
 
 #: frames up to this length are cut at every byte, longer ones at so many places.
