@@ -131,7 +131,7 @@ def export(kind: str, sensor_id: str, output: str | None, frame: str | None) -> 
     sensor = named_sensor(sensor_id)
     chosen = sensor if frame is None else narrowed(sensor, frame)
     try:
-        text = exported(kind, chosen)
+        text = exported(chosen, kind)
     except Refused as refused:
         raise suggest(refused, f"lidarspec show {sensor.id}") from None
     emit(text.removesuffix("\n"), output)

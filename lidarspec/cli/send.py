@@ -104,7 +104,7 @@ def _number(text: str, unit: str, place: str) -> float | int:
 def _text(sensor: Sensor, reply: Reply, output: str | None) -> str:
     if not reply.confirmed or reply.frame is None:
         return f"{sensor.id} {reply.command}: sent; no answer is documented, so whether it took is not known"
-    values = [value for row in explain(sensor, reply.data, reply.frame).rows for value in row.values]
+    values = explain(reply.data, sensor, reply.frame).fields.values()
     rows = [[value.path, value.raw.hex(" ") if isinstance(value.raw, bytes) else str(value), value.docs] for value in values]
     return f"{sensor.id} {reply.command}: answered with {reply.frame}\n{table(['field', 'value', 'meaning'], rows, output)}"
 
@@ -113,6 +113,5 @@ def _told(sensor: Sensor, reply: Reply) -> dict[str, Any]:
     told: dict[str, Any] = {"sensor": sensor.id, "command": reply.command, "confirmed": reply.confirmed, "frame": reply.frame}
     if reply.frame is None:
         return {**told, "hex": None, "fields": None, "values": []}
-    rows = explain(sensor, reply.data, reply.frame).rows
-    values = [value.to_dict() for row in rows for value in row.values]
+    values = [value.to_dict() for value in explain(reply.data, sensor, reply.frame).fields.values()]
     return {**told, "hex": reply.data.hex(" "), "fields": plain(reply.values), "values": values}

@@ -147,8 +147,8 @@ def formula_data(formula: Formula) -> Any:
 
 def _info(info: FieldInfo) -> dict[str, Any]:
     const = info.const.hex() if isinstance(info.const, bytes | bytearray) else info.const
-    found = {"path": info.path, "unit": info.unit, "scale": info.scale, "offset": info.offset, "const": const, "docs": info.docs}
-    return {**found, "labels": {str(value): name for value, name in info.labels.items()}}
+    facts = {"path": info.path, "unit": info.unit, "scale": info.scale, "offset": info.offset, "const": const, "docs": info.docs}
+    return {**facts, "labels": {str(value): name for value, name in info.labels.items()}}
 
 
 def _part(part: Part) -> dict[str, Any]:

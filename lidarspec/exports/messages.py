@@ -19,6 +19,11 @@ class Message:
     frame: Frame
     root: Struct | Sealed
 
+    @property
+    def seals(self) -> dict[str, Sealed]:
+        """The checksums, by the path of each field that holds one or a part of it."""
+        return {path: node for node in nodes(self.root) if isinstance(node, Sealed) for path in node.fields}
+
 
 def messages(sensor: Sensor) -> tuple[Message, ...]:
     """All frame types of a sensor, in their order.

@@ -696,7 +696,7 @@ class _Builder:
         members = []
         for child in con.subcons:
             path = ".".join(part for part in (info.path, child.name) if part)
-            said = FieldInfo(path, info.axes, optional=info.optional)
+            said = FieldInfo(path, info.axes, docs=info.docs if place.in_bits else "", optional=info.optional)
             members.append(self.node(child, _Place(said, scope, child.name or "", place.in_bits)))
         self.scopes[info.path] = scope
         return tree.Struct(place.name, info.path, tuple(members))
@@ -739,7 +739,7 @@ class _Builder:
             fields = None
         if fields is None:
             reason = "a bit block whose values are not plain bits of it"
-            return Opaque(place.name, place.info, type(con).__name__, reason, (inside,))
+            return Opaque(place.name, place.info, type(con).__name__, reason, (inside,), in_bits=True)
         infos = {node.info.path: node.info for node in nodes(inside) if isinstance(node, Number | Blob | Opaque)}
         parts = []
         for bits in fields:
@@ -859,32 +859,6 @@ def leaves(parsed: Any, keys: tuple[str | int, ...] = ()) -> Iterator[tuple[tupl
         yield keys, int(parsed) if isinstance(parsed, construct.EnumIntegerString) else parsed
 
 
-def peeled(con: Construct, info: FieldInfo) -> tuple[Construct, FieldInfo]:
-    """What is below the wrappers that only describe (name, unit, labels, constant), and what they say."""
-    while True:
-        if isinstance(con, construct.Renamed):
-            info = replace(info, docs=con.docs or info.docs)
-        elif isinstance(con, Describing):
-            info = con.described(info)
-        elif isinstance(con, construct.Enum):
-            info = replace(info, labels={int(value): str(name) for value, name in con.ksymapping.items()})
-        elif isinstance(con, Const):
-            info = replace(info, const=_constant(con))
-        elif isinstance(con, construct.Rebuild):
-            info = replace(info, rebuilt=con.func)
-        elif not isinstance(con, construct.Default):
-            return con, info
-        con = con.subcon
-
-
-def fields_below(con: Construct, info: FieldInfo) -> dict[str, FieldInfo]:
-    """The fields of a part of a struct, by path; `info` says where it stands."""
-    found = _Builder({}).node(con, _Place(info, None, info.name))
-    infos = [part.info for node in nodes(found) if isinstance(node, Block) for part in node.parts]
-    infos += [node.info for node in nodes(found) if isinstance(node, Number | Blob | Opaque)]
-    return {info.path: info for info in infos if info.path}
-
-
-def probed(con: Construct, size: int) -> list[BitField] | None:
-    """The bit fields of a block; None where construct decides on its bits, or values are no plain integers."""
-    return _probed(con, size)
+def is_expression(value: object) -> bool:
+    """Whether a value is an expression or a part of a struct, where a number is wanted."""
+    return isinstance(value, ExprMixin | Construct)

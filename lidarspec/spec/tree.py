@@ -172,6 +172,30 @@ def evaluated(formula: Formula, read: Read) -> Any:
     return formula
 
 
+#: operations that give 1 or 0.
+COMPARISONS = frozenset({"==", "!=", "<", "<=", ">", ">="})
+
+
+def written(formula: Formula, named: Callable[[Ref], str], operations: Mapping[str, str]) -> str:
+    """A formula, without `Code` in it, as an expression of another language.
+
+    Args:
+        named: what gives the text of a field.
+        operations: symbol -> text with "{}" for each argument, where the language says it in another way than Python.
+    """
+    match formula:
+        case Ref():
+            return named(formula)
+        case Op("-", (operand,)):
+            return f"(-{written(operand, named, operations)})"
+        case Op(symbol, args):
+            text = operations.get(symbol, "(not {})" if symbol == "not" else f"({{}} {symbol} {{}})")
+            return text.format(*(written(arg, named, operations) for arg in args))
+        case Code():
+            raise ValueError(formula.reason)
+    return f"({formula})" if formula < 0 else str(formula)
+
+
 def refs(formula: Formula) -> tuple[Ref, ...]:
     """The fields that a formula depends on, in the order in which it names them, each once."""
     match formula:
@@ -342,6 +366,7 @@ class Opaque:
         inside: the parts of a bit block, or of a struct, that cannot be read as one; they have no places.
         size: in bytes, None where only the bytes themselves tell.
         form: how a field stands on the wire: "text up to" its terminator, else its kind.
+        in_bits: whether it is a bit block.
     """
 
     name: str
@@ -351,6 +376,7 @@ class Opaque:
     inside: tuple[Node, ...] = ()
     size: Formula | None = None
     form: str = ""
+    in_bits: bool = False
 
 
 Node = Number | Blob | Block | Struct | Sealed | Repeat | When | Select | Empty | Opaque
@@ -393,6 +419,16 @@ def formulas(node: Node) -> tuple[Formula, ...]:
             return (node.condition,)
         case Select():
             return (node.key,)
+    return ()
+
+
+def infos(node: Node) -> tuple[FieldInfo, ...]:
+    """The fields that a node is: one, or those of the parts of a block; none for a struct, an array or a choice."""
+    match node:
+        case Number() | Blob() | Opaque():
+            return (node.info,)
+        case Block():
+            return tuple(part.info for part in node.parts)
     return ()
 
 
