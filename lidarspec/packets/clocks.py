@@ -14,8 +14,8 @@ from lidarspec.columns.graph import Node, Untraceable, trace
 from lidarspec.errors import SpecError
 from lidarspec.framing.plausibility import fields_of, value_of
 from lidarspec.spec.description import Spec
-from lidarspec.spec.fields import exact, factor
-from lidarspec.spec.tree import FieldInfo
+from lidarspec.spec.fields import factor
+from lidarspec.spec.tree import FieldInfo, exact
 from lidarspec.wire.arrays import alike
 from lidarspec.wire.frame_table import Group, Rows, Table
 from lidarspec.wire.schema import Schema
@@ -174,8 +174,7 @@ class _Term:
     def _computed(self, columns: list[NDArray[Any]]) -> Times:
         found = {}
         for info, column in zip(self._fields, columns, strict=True):
-            array = column.astype(np.float64)
-            found[info.path] = array * info.scale + info.offset if info.scaled else array
+            found[info.path] = info.physical(column.astype(np.float64))
         return _nanoseconds(value_of(self._node, found, {}), len(columns[0]))
 
 

@@ -25,9 +25,9 @@ from lidarspec.packets.clocks import clock_ns
 from lidarspec.simulation.frame_maker import FrameMaker, sealed
 from lidarspec.simulation.measuring import Beams, Measurement
 from lidarspec.simulation.scenes import Room, Scene
-from lidarspec.spec.fields import exact
 from lidarspec.spec.links import Serial
 from lidarspec.spec.sensor import Sensor
+from lidarspec.spec.tree import exact
 from lidarspec.wire.frame_table import Rows
 
 Times = NDArray[np.int64]

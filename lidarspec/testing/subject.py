@@ -115,7 +115,7 @@ def physical(sensor: Sensor, name: str, data: bytes) -> Any:
         if info is not None and info.scaled and info.kind == "int":
             if info.bits > 48:
                 return None
-            holder[key] = holder[key] * info.scale + info.offset
+            holder[key] = info.physical(holder[key])
     return parsed
 
 

@@ -67,9 +67,8 @@ def every_value(node: Node, leaf: Leaf) -> NDArray[Any] | None:
     if seen is None:
         return None
     raw = raw_values(leaf, seen).astype(np.float64)
-    physical = raw * leaf.info.scale + leaf.info.offset if leaf.info.scaled else raw
     with np.errstate(all="ignore"):
-        return np.broadcast_to(_evaluated(node, physical), raw.shape)
+        return np.broadcast_to(_evaluated(node, leaf.info.physical(raw)), raw.shape)
 
 
 def possible(node: Node, leaves: Mapping[str, Leaf]) -> NDArray[Any] | None:
