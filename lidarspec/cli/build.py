@@ -11,9 +11,9 @@ from typing import Any
 
 import click
 
-from lidarspec.cli.failures import suggest
-from lidarspec.cli.output import emit, emit_json, output_options
-from lidarspec.errors import LidarSpecError, OutOfRange, SourceError, UnknownField, UnknownFrame, UsageError
+from lidarspec.cli.options import output_options
+from lidarspec.cli.output import emit, emit_json
+from lidarspec.errors import LidarSpecError, OutOfRange, SourceError, UnknownField, UnknownFrame, UsageError, suggest
 from lidarspec.plugins import sensor as named_sensor
 from lidarspec.spec.fields import factor, split_unit
 from lidarspec.spec.tree import FieldInfo, evaluated

@@ -9,13 +9,12 @@ from typing import Any
 
 import click
 
-from lidarspec.cli.failures import suggest
 from lidarspec.cli.frames import plain
-from lidarspec.cli.output import emit, emit_json, output_options, sensor_option, table
-from lidarspec.cli.streams import Duration
+from lidarspec.cli.options import DURATION, output_options, sensor_option
+from lidarspec.cli.output import emit, emit_json, table
 from lidarspec.device.device import Device, open as open_device
 from lidarspec.device.session import Reply
-from lidarspec.errors import CommandError, UnknownCommand, UnknownField, UsageError
+from lidarspec.errors import CommandError, UnknownCommand, UnknownField, UsageError, suggest
 from lidarspec.explaining.explanation import explain
 from lidarspec.spec.fields import factor, split_unit
 from lidarspec.spec.sensor import Sensor
@@ -27,7 +26,7 @@ from lidarspec.wire.schema import schema
 @click.argument("command")
 @click.argument("assignments", metavar="ARGUMENT=VALUE", nargs=-1)
 @sensor_option
-@click.option("--timeout", type=Duration(), metavar="TIME", help="How long to wait for the reply; by default what the sensor declares.")
+@click.option("--timeout", type=DURATION, metavar="TIME", help="How long to wait for the reply; by default what the sensor declares.")
 @output_options
 def send(
     source: str,

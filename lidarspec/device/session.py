@@ -20,7 +20,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from lidarspec.errors import CommandError, ReplyTimeout, UnknownField, UsageError
-from lidarspec.framing.decoder import Found
+from lidarspec.framing.results import Found
 from lidarspec.spec.description import Command
 from lidarspec.spec.sensor import Sensor
 from lidarspec.spec.tree import FieldInfo

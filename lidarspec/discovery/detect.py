@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 
 from lidarspec.device.settings import named
 from lidarspec.discovery.listen import Heard, hear
-from lidarspec.errors import CommandError, LidarSpecError, UsageError, WireError
-from lidarspec.framing.decoder import Found
+from lidarspec.errors import CommandError, LidarSpecError, UsageError, WireError, suggest
+from lidarspec.framing.results import Found
 from lidarspec.plugins import sensors
 from lidarspec.simulation.simulator import simulate
 from lidarspec.spec.links import Serial
@@ -289,8 +289,7 @@ def _nothing(source: str, found: Sequence[Verdict]) -> Exception:
     if live_address(source) is None:
         return WireError(f"{source}: it holds no bytes")
     error = CommandError(f"{source}: nothing comes; a sensor that has to be started first is named with -s")
-    error.add_note(f"next: lidarspec doctor {source}")
-    return error
+    return suggest(error, f"lidarspec doctor {source}")
 
 
 def _bauds(sensor: Sensor) -> tuple[int, ...]:

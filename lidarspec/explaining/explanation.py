@@ -19,9 +19,8 @@ import numpy as np
 from lidarspec.errors import LidarSpecError, WireError
 from lidarspec.explaining.listing import Line, listed, text
 from lidarspec.explaining.wording import Difference, Point, Row, Span, Value
-from lidarspec.framing.decoder import Counters, Found, packed
 from lidarspec.framing.frame_engine import Codec, CompiledCodec, codec
-from lidarspec.framing.plausibility import IMPLAUSIBLE, VALID
+from lidarspec.framing.results import IMPLAUSIBLE, VALID, Counters, Found, packed
 from lidarspec.packets.stream import PacketStream
 from lidarspec.points.plain import evaluate
 from lidarspec.spec.bits import BitField

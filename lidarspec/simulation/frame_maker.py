@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 
 from lidarspec.errors import SpecError, UnknownFrame, UsageError
 from lidarspec.framing.frame_engine import CompiledCodec, InterpretedCodec, codec
-from lidarspec.framing.plausibility import VALID, plausibility
+from lidarspec.framing.plausibility import plausibility
+from lidarspec.framing.results import VALID
 from lidarspec.spec.construct_layer import random_value
 from lidarspec.spec.description import Spec
 from lidarspec.wire.build import build

@@ -544,6 +544,22 @@ def _traced(expression: Any, scope: Scope) -> Any:
     return expression(scope) if callable(expression) else expression
 
 
+def _spelled(expression: Any, path: str) -> str:
+    """An expression of the part at `path` as its author wrote it, with fields by their whole paths; "?" for a function."""
+    text = repr(expression)
+    if " at 0x" in text:
+        return "?"
+    return re.sub(r"\bthis(?:\.\w+)+", functools.partial(_whole_path, path), re.sub(r"\['(\w+)'\]", r".\1", text))
+
+
+def _whole_path(path: str, way: re.Match[str]) -> str:
+    """``this.count`` or ``this._.count`` in the part at `path` as the path from the top of the frame."""
+    names = path.split(".")[:-1]
+    for name in way[0].split(".")[1:]:
+        names = [] if name == "_root" else names[:-1] if name == "_" else [*names, name]
+    return ".".join(names)
+
+
 class _Fields:
     """What an expression sees when it is evaluated: values by name, as construct shows them."""
 
@@ -674,9 +690,8 @@ class _Builder:
         while scope is not None:
             paths.append(scope.path)
             scope = scope.parent
-        text = repr(expression)
         function = functools.partial(_evaluated, expression, tuple(paths or [""]))
-        return Code(function, tuple(dict.fromkeys(asked)), f"{place.info.path}: {reason}", "?" if " at 0x" in text else text, blind)
+        return Code(function, tuple(dict.fromkeys(asked)), f"{place.info.path}: {reason}", _spelled(expression, place.info.path), blind)
 
     def _select(self, con: construct.Switch, place: _Place) -> Select:
         key = self._formula(con.keyfunc, place, is_key=True)

@@ -28,6 +28,7 @@ API = 1
 STATUSES = ("manual", "vectors", "capture", "hardware")
 #: what a field can say of the device itself, in `Spec.info`.
 ROLES = ("serial", "firmware", "model", "temperature")
+#: where an axis can point: along x, y and z of REP-103, each with its opposite.
 DIRECTIONS = ("forward", "back", "left", "right", "up", "down")
 #: what a sensor sends for a command, see `Simulation.answers`.
 Answer = str | tuple[str, Mapping[str, Any]] | bytes | float

@@ -75,12 +75,12 @@ def _is_number(text: str) -> bool:
 
 
 def duration(text: str) -> float:
-    """Seconds out of "10s", "500ms", "2min", or a bare number of seconds.
+    """Seconds out of "10s", "500ms", "2min" or "2m", "1h", or a bare number of seconds.
 
     Raises:
         UsageError: where it is no duration, or a negative one.
     """
-    for unit, seconds in (("min", 60.0), ("ms", 1e-3), ("us", 1e-6), ("h", 3600.0), ("s", 1.0), ("", 1.0)):
+    for unit, seconds in (("min", 60.0), ("m", 60.0), ("ms", 1e-3), ("us", 1e-6), ("h", 3600.0), ("s", 1.0), ("", 1.0)):
         number = text.strip().removesuffix(unit)
         if text.strip().endswith(unit) and _is_number(number) and 0 <= float(number) < float("inf"):
             return float(number) * seconds

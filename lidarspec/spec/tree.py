@@ -160,7 +160,7 @@ class Code:
         function: from what reads a field (see `Read`) to the value.
         refs: fields that it is known to ask for; which others depends on their values.
         reason: why it cannot be written down, with the path of the part that it belongs to.
-        text: as the author wrote it, "?" where that cannot be read.
+        text: as the author wrote it, with fields by their whole paths; "?" where that cannot be read.
         blind: whether it asks for something that is no field before it, which construct alone may know.
     """
 
