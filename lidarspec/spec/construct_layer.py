@@ -478,7 +478,7 @@ def random_value(con: Construct, source: random.Random, drawn: Drawn, scope: Any
     if path in drawn:
         return drawn[path](source)
     if isinstance(con, Const):
-        return con.value
+        return con.parse(con.build(con.value), _verify=False)  # a name of an Enum with its number, as other expressions see it
     if isinstance(con, construct.Rebuild):
         with contextlib.suppress(Exception):  # it may ask for what comes after it, and is evaluated again when the frame is built
             return con.func(scope)
