@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 import lidarspec as ls
 from lidarspec.simulation.faults import Faults
+from lidarspec.spec import Crc
 from lidarspec.testing.fixtures import virtual_port
 from lidarspec.view.canvas import BLANK, INKS, Cells
 from lidarspec.view.feed import Feed
@@ -136,7 +137,7 @@ def shown(command: str, link: Path) -> str:
 def sealed(index: int) -> bytes:
     """A frame of nobody's: two bytes of sync, a counter, noise, and a CRC."""
     body = b"\x9a\x51" + index.to_bytes(2, "little") + random.Random(index).randbytes(20)
-    return body + ls.Crc(16, 0x1021, 0xFFFF)(body).to_bytes(2, "little")
+    return body + Crc(16, 0x1021, 0xFFFF)(body).to_bytes(2, "little")
 
 
 if __name__ == "__main__":

@@ -1,19 +1,21 @@
-"""The hooks that a plugin can implement; each is a function of this name, marked with ``@hookimpl``.
+"""Plugins: the hooks that they may have, how they are found, and the registry of what they add.
 
-Which plugins are installed: their entry points, read straight from the folders that Python imports from.
+A distribution names its sensors in the entry-point group ``lidarspec.sensors``, one entry for each id and alias, so that asking for
+one sensor loads one plugin; modules with other hooks stand in the group ``lidarspec``, and are loaded before any sensor is handed out.
+A hook is a function of a name below, marked with ``@hookimpl``.
 
-importlib.metadata finds the same ones, but importing it takes longer than all else that finding a sensor takes. It is
-asked where something could be installed in another way than as a folder: in a zip file or an egg, or by an import hook.
+Entry points are read straight from the folders that Python imports from: importlib.metadata finds the same ones, but importing it takes
+longer than all else that finding a sensor takes. It is asked where something could be installed in another way than as a folder: in a
+zip file or an egg, or by an import hook.
 
-The registry: plugins found through entry points, each loaded on its own, and the sensors that they add.
-
-A plugin that cannot be imported, names a hook that does not exist or adds a sensor that cannot be, is named with its
-distribution and its error, rolled back, and disturbs no other.
+Each plugin is loaded on its own. One that cannot be imported, names a hook that does not exist or adds a sensor that cannot be, is named
+with its distribution and its error, rolled back, and disturbs no other.
 """
 
 from __future__ import annotations
 
 import contextlib
+import copyreg
 import functools
 import importlib
 import importlib.util
@@ -22,7 +24,7 @@ import os
 import re
 import sys
 import traceback
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from importlib.machinery import PathFinder
 from types import ModuleType
@@ -32,10 +34,12 @@ import pluggy
 
 from lidarspec.errors import LidarSpecError, SourceError, SpecError, UnknownSensor, UsageError
 from lidarspec.spec.checksums import Checksum
-from lidarspec.spec.description import Frame, Sensor, replaced
+from lidarspec.spec.construct_layer import prepare
+from lidarspec.spec.description import Frame
 from lidarspec.spec.fields import Checksummed
 from lidarspec.spec.results import Points
 from lidarspec.spec.rules import children
+from lidarspec.spec.sensor import Sensor
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -86,34 +90,16 @@ class EntryPoint(NamedTuple):
     distribution: str
     version: str
 
+    @property
+    def module(self) -> str:
+        """The module that it stands for, or that holds its object."""
+        return self.value.partition("[")[0].partition(":")[0].strip()
+
     def load(self) -> Any:
         """The module, or the object in it, imported."""
-        module, _, attributes = self.value.partition("[")[0].partition(":")
+        attributes = self.value.partition("[")[0].partition(":")[2]
         names = [name for name in attributes.strip().split(".") if name]
-        return functools.reduce(getattr, names, importlib.import_module(module.strip()))
-
-
-class Vendor(NamedTuple):
-    """A plugin with a promise in the names of its entry points: all its ids and aliases begin so, and sensors are all it adds.
-
-    So it is loaded when such an id is asked for, and not before.
-    """
-
-    entry: EntryPoint
-    prefixes: tuple[str, ...]
-
-    def shares(self, names: Iterable[str]) -> bool:
-        """Whether one of the names, or an id that begins with one of them, could be its own."""
-        return any(name.startswith(prefix) or prefix.startswith(name) for name in names for prefix in self.prefixes)
-
-
-def vendors(entries: Iterable[EntryPoint]) -> list[Vendor]:
-    """The plugins whose entry points end in a hyphen, one for each: a plugin may have several such names."""
-    found: dict[tuple[str, str], list[EntryPoint]] = {}
-    for entry in entries:
-        if entry.name.endswith("-"):
-            found.setdefault((entry.distribution, entry.value), []).append(entry)
-    return [Vendor(same[0], tuple(entry.name for entry in same)) for same in found.values()]
+        return functools.reduce(getattr, names, importlib.import_module(self.module))
 
 
 def entry_points(group: str) -> list[EntryPoint]:
@@ -184,7 +170,21 @@ def _by_metadata(group: str) -> list[EntryPoint]:
 
 
 GROUP = "lidarspec"
+SENSORS = "lidarspec.sensors"
 HOOKS = tuple(name for name in globals() if name.startswith("lidarspec_"))
+
+
+@dataclass(frozen=True, eq=False)
+class HookedPoints:
+    """A `points` function of a sensor that asks the hooks of installed plugins first."""
+
+    sensor: Sensor
+    own: Callable[[Any], Points]
+    hooks: Callable[..., Points | None]
+
+    def __call__(self, fields: Any) -> Points:
+        answer = self.hooks(sensor=self.sensor, fields=fields)
+        return self.own(fields) if answer is None else answer
 
 
 @dataclass(frozen=True)
@@ -202,31 +202,33 @@ class Plugin:
 class Registry:
     """The plugins of this environment, and the sensors with their hooks applied.
 
-    Plugins whose entry point ends in a hyphen ("acme-") are loaded when they are needed, all others at once and before them. Two
-    threads may load the same one at the same time: it adds the same sensors twice.
+    Two threads may load the same sensor at the same time: it is then added twice, and is the same.
+
+    Args:
+        modules: entry points of modules with hooks; each is loaded at once.
+        offered: entry points of sensors, by id and alias; each is loaded when it is asked for.
     """
 
-    def __init__(self, entries: Iterable[EntryPoint] = ()) -> None:
+    def __init__(self, modules: Iterable[EntryPoint] = (), offered: Iterable[EntryPoint] = ()) -> None:
         self._manager = pluggy.PluginManager(NAMESPACE)
         self._manager.add_hookspecs(sys.modules[__name__])
         self._loaded: dict[str, Sensor] = {}
         self._aliases: dict[str, str] = {}
         self._owners: dict[str, Any] = {}
         self._ready: dict[str, Sensor] = {}
-        entries = list(entries)
-        self._vendors = vendors(entries)
-        self._seen: dict[Vendor, Plugin] = {}
-        self._plugins = [
-            self._tried(entry, entry.name, functools.partial(self.add, name=f"{entry.distribution}:{entry.name}"))
-            for entry in entries
-            if not entry.name.endswith("-")
+        self._offered: dict[tuple[str, str], list[EntryPoint]] = {}
+        for entry in offered:
+            self._offered.setdefault((entry.distribution, entry.module), []).append(entry)
+        self._tried: dict[EntryPoint, Plugin] = {}
+        self._modules = [
+            _loaded(entry, entry.name, functools.partial(self.add, name=f"{entry.distribution}:{entry.name}")) for entry in modules
         ]
 
     @property
     def plugins(self) -> list[Plugin]:
         """Every plugin that was found; those that could not be loaded say why."""
-        self._load(self._vendors)
-        return self._plugins + [self._seen[vendor] for vendor in self._vendors]
+        self._load_all()
+        return self._modules + [self._together(entries) for entries in self._offered.values()]
 
     def add(self, plugin: Any, *, name: str) -> list[str]:
         """Register one plugin (a module or object with hooks) and return the ids that it adds.
@@ -248,37 +250,30 @@ class Registry:
         self._ready.clear()
         return [sensor.id for sensor in sensors]
 
-    def _load(self, vendors: Iterable[Vendor]) -> None:
-        for vendor in vendors:
-            if vendor not in self._seen:
-                add = functools.partial(self._add_vendor, vendor)
-                self._seen[vendor] = self._tried(vendor.entry, ", ".join(vendor.prefixes), add)
+    def _load(self, entry: EntryPoint) -> None:
+        if entry not in self._tried:
+            self._tried[entry] = _loaded(entry, entry.name, functools.partial(self._add_offered, entry))
 
-    def _add_vendor(self, vendor: Vendor, plugin: Any) -> list[str]:
-        """Keep the sensors of a plugin that keeps its promise; it has no hook for which pluggy would have to know it."""
-        _check_hooks(plugin, vendor.entry.name)
-        for hook in HOOKS:
-            if hook != "lidarspec_sensors" and hasattr(plugin, hook):
-                raise SpecError(f"{hook} would not always be loaded: give the entry point a name without a hyphen at its end")
-        sensors = self._sensors_of(plugin)
-        for sensor in sensors:
-            for name in (sensor.id, *sensor.aliases):
-                if not name.startswith(vendor.prefixes):
-                    begin = " or ".join(map(repr, vendor.prefixes))
-                    raise SpecError(f"its entry point says that ids begin with {begin}", sensor=name)
-        self._keep(plugin, sensors)
-        return [sensor.id for sensor in sensors]
+    def _load_all(self) -> None:
+        for entries in self._offered.values():
+            for entry in entries:
+                self._load(entry)
 
-    def _tried(self, entry: EntryPoint, names: str, add: Callable[[Any], list[str]]) -> Plugin:
-        """What became of an entry point that is loaded and added; whatever it raises disturbs no other."""
-        found = Plugin(entry.distribution, entry.version, f"{names} = {entry.value}")
-        try:
-            return replace(found, sensors=tuple(add(entry.load())))
-        except KeyboardInterrupt:
-            raise
-        except BaseException as error:
-            reason = str(error) if isinstance(error, LidarSpecError) else f"{type(error).__name__}: {error}"
-            return replace(found, error=reason, traceback=traceback.format_exc())
+    def _add_offered(self, entry: EntryPoint, sensor: Any) -> list[str]:
+        """Keep a sensor that an entry point names by its id or one of its aliases."""
+        owner = (entry.distribution, entry.module)
+        self._check(sensor, [sensor], owner)
+        if entry.name not in (sensor.id, *sensor.aliases):
+            raise SpecError(f"its entry point is called {entry.name!r}, which is none of its names", sensor=sensor.id)
+        self._keep(owner, [sensor])
+        return [sensor.id]
+
+    def _together(self, entries: list[EntryPoint]) -> Plugin:
+        """What became of all sensors that a module offers."""
+        tried = [self._tried[entry] for entry in entries]
+        ids = dict.fromkeys(name for plugin in tried for name in plugin.sensors)
+        failed = next((plugin for plugin in tried if plugin.error), tried[0])
+        return replace(failed, entry_point=f"{SENSORS} = {entries[0].module}", sensors=tuple(ids))
 
     def _sensors_of(self, plugin: Any) -> list[Sensor]:
         function = getattr(plugin, "lidarspec_sensors", None)
@@ -295,7 +290,7 @@ class Registry:
 
     def sensors(self) -> dict[str, Sensor]:
         """Every sensor by id, sorted, with its hooks applied."""
-        self._load(self._vendors)
+        self._load_all()
         return {name: self.sensor(name) for name in sorted(self._loaded)}
 
     def sensor(self, name: str) -> Sensor:
@@ -304,9 +299,12 @@ class Registry:
         Raises:
             UnknownSensor: with a suggestion, or with what to install where there is no sensor at all.
         """
-        self._load(self._likely(name))
+        for entries in self._offered.values():
+            for entry in entries:
+                if entry.name == name:
+                    self._load(entry)
         if name not in self._loaded and name not in self._aliases:
-            self._load(self._vendors)
+            self._load_all()
         name = self._aliases.get(name, name)
         if name not in self._loaded:
             hint = "" if self._loaded else "; no sensor is installed: pip install 'lidarspec[all]'"
@@ -315,34 +313,18 @@ class Registry:
             self._ready[name] = self.hooked(self._loaded[name])
         return self._ready[name]
 
-    def _likely(self, name: str) -> list[Vendor]:
-        """The plugins that could add this id, and all that could add an id of one of these, so that the first of them wins as ever."""
-        names, found = {name}, set[Vendor]()
-        while more := {vendor for vendor in self._vendors if vendor not in found and vendor.shares(names)}:
-            found |= more
-            names = {prefix for vendor in more for prefix in vendor.prefixes}
-        return [vendor for vendor in self._vendors if vendor in found]
-
     def hooked(self, sensor: Sensor) -> Sensor:
         """The sensor with the checksum and points hooks of all plugins applied to it."""
         frames = {name: self._sealed(sensor, frame) for name, frame in sensor.frames.items()}
         points = self._manager.hook.lidarspec_points
         if not points.get_hookimpls():
-            return sensor if all(frames[name] is frame for name, frame in sensor.frames.items()) else replaced(sensor, frames=frames)
+            return replace(sensor, frames=frames, hooked=self.hooked)
 
-        def with_hooks(function: Any) -> Any:
-            if function is None or getattr(function, "asks_hooks", False):
-                return function
+        def asked(function: Any) -> Any:
+            return function if function is None or isinstance(function, HookedPoints) else HookedPoints(sensor, function, points)
 
-            def hooked_points(fields: Any) -> Any:
-                found = points(sensor=sensor, fields=fields)
-                return function(fields) if found is None else found
-
-            hooked_points.asks_hooks = True  # type: ignore[attr-defined]  # configured sensors come here a second time
-            return hooked_points
-
-        frames = {name: _with_points(frame, with_hooks(frame.points)) for name, frame in frames.items()}
-        return replaced(sensor, frames=frames, points=with_hooks(sensor.points))
+        frames = {name: replace(frame, points=asked(frame.points)) for name, frame in frames.items()}
+        return replace(sensor, frames=frames, points=asked(sensor.points), hooked=self.hooked)
 
     def call(self, hook: str, **arguments: Any) -> Any:
         """The result of another hook."""
@@ -361,20 +343,32 @@ class Registry:
         return frame
 
     def _failed(self, name: str, reason: str) -> None:
-        for index, plugin in enumerate(self._plugins):
+        for index, plugin in enumerate(self._modules):
             if f"{plugin.distribution}:{plugin.entry_point.partition(' = ')[0]}" == name and not plugin.error:
-                self._plugins[index] = replace(plugin, error=reason, traceback=traceback.format_exc())
+                self._modules[index] = replace(plugin, error=reason, traceback=traceback.format_exc())
 
     def _check(self, sensor: Any, own: list[Any], plugin: Any) -> None:
         if not isinstance(sensor, Sensor):
             raise SpecError(f"lidarspec_sensors returns sensors, not {type(sensor).__name__}")
         for name in (sensor.id, *sensor.aliases):
-            if self._owners.get(name, plugin) is not plugin or sum(name in (s.id, *s.aliases) for s in own) > 1:
+            if self._owners.get(name, plugin) != plugin or sum(name in (s.id, *s.aliases) for s in own) > 1:
                 raise SpecError("another sensor has this id already", sensor=name)
 
     def _rollback(self, name: str) -> None:
         if self._manager.has_plugin(name):
             self._manager.unregister(name=name)
+
+
+def _loaded(entry: EntryPoint, names: str, add: Callable[[Any], list[str]]) -> Plugin:
+    """What became of an entry point that is loaded and added; whatever it raises disturbs no other."""
+    plugin = Plugin(entry.distribution, entry.version, f"{names} = {entry.value}")
+    try:
+        return replace(plugin, sensors=tuple(add(entry.load())))
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:
+        reason = str(error) if isinstance(error, LidarSpecError) else f"{type(error).__name__}: {error}"
+        return replace(plugin, error=reason, traceback=traceback.format_exc())
 
 
 def _seals(con: Any) -> list[Checksummed]:
@@ -385,20 +379,12 @@ def _seals(con: Any) -> list[Checksummed]:
 def _resealed(frame: Frame, algorithm: Any) -> Frame:
     if not isinstance(algorithm, Checksum):
         raise SpecError(f"returns a Checksum or None, not {type(algorithm).__name__}")
-    changed = replaced(frame)
-    seal = next(iter(_seals(changed.prepared)), None)
+    struct = prepare(frame.struct)
+    seal = next(iter(_seals(struct)), None)
     if seal is None:
         raise SpecError("answers for a frame without a checksum")
     seal.algorithm = algorithm
-    return changed
-
-
-def _with_points(frame: Frame, points: Any) -> Frame:
-    if points is None:
-        return frame
-    changed = replaced(frame, points=points)
-    object.__setattr__(changed, "prepared", frame.prepared)
-    return changed
+    return replace(frame, struct=struct)
 
 
 def _is_hook(function: Any) -> bool:
@@ -424,7 +410,7 @@ _registries: list[Registry] = []
 def registry() -> Registry:
     """The registry of this environment."""
     if not _registries:
-        _registries.append(Registry(entry_points(GROUP)))
+        _registries.append(Registry(entry_points(GROUP), entry_points(SENSORS)))
     return _registries[-1]
 
 
@@ -499,3 +485,16 @@ def file_module(file: Path) -> ModuleType:
     except (Exception, SystemExit) as error:
         raise SpecError(f"{type(error).__name__}: {error}", path=str(file)) from error
     return module
+
+
+def rebuilt(sensor_id: str, options: Mapping[str, Any]) -> Sensor:
+    """An installed sensor, configured: what a pickled one is read back from."""
+    known = sensor(sensor_id)
+    return known.configure(**options) if options else known
+
+
+def _reduced(value: Sensor) -> tuple[Callable[..., Sensor], tuple[str, dict[str, Any]]]:
+    return rebuilt, (value.id, dict(value.options))
+
+
+copyreg.pickle(Sensor, _reduced)

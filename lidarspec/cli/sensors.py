@@ -12,11 +12,13 @@ from lidarspec.cli.output import emit, emit_json, note, output_options, table
 from lidarspec.columns.columns import Batch
 from lidarspec.errors import SpecError
 from lidarspec.plugins import registry, sensor as named_sensor
+from lidarspec.points.numpy_plan import describe
 from lidarspec.points.plain import points_function
 from lidarspec.points.plan import Plan, plan_for
 from lidarspec.simulation.frame_maker import FrameMaker
-from lidarspec.spec.description import Command, Frame, Sensor
+from lidarspec.spec.description import Command, Frame
 from lidarspec.spec.links import Link, Serial, Tcp, Udp
+from lidarspec.spec.sensor import Sensor
 from lidarspec.wire.wire_table import frame_size, wire_table
 
 #: packets that a plan is shown for: as many as a turn may take, since some of them are shorter.
@@ -76,14 +78,14 @@ def show(sensor_id: str, as_plan: bool, as_json: bool, output: str | None) -> No
 def _plan(sensor: Sensor, frame: str) -> list[str]:
     """The plan of a data frame in lines, or why there is none."""
     try:
-        made, sweep = FrameMaker(sensor, frame), sensor.frames[frame].sweep or sensor.sweep
+        made, sweep = FrameMaker(sensor, frame), sensor.simulation_of(frame).sweep
     except SpecError as error:
         return [f"plain evaluation: {error}"]
     table = made.table([sweep(index) for index in range(PACKETS)]) if sweep else made.engine.table([sensor.example(frame)])
     state = {name: (None, np.full(len(table), -1, np.intp)) for name in sensor.state}
     largest = max(table.groups, key=lambda group: group.layout.size)
     found = plan_for(points_function(sensor, frame), Batch(table, np.zeros(len(table), np.bool_), state, sensor.state), largest)
-    return found.describe() if isinstance(found, Plan) else [f"plain evaluation: {found}"]
+    return describe(found) if isinstance(found, Plan) else [f"plain evaluation: {found}"]
 
 
 @click.command()

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarspec.errors import UsageError
+from lidarspec.errors import UsageError, suggest
 from lidarspec.framing.decoder import Decoder
 from lidarspec.framing.results import Found, Frames
-from lidarspec.spec.description import Sensor
+from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.protocol import Chunk
 
 #: other senders of a stream that are looked at; datagrams of further ones are foreign unseen.
@@ -105,8 +105,7 @@ class Senders:
     def _several(self, first: str, other: str, what: str) -> UsageError:
         mark = "&" if "?" in str(self._source) else "?"
         error = UsageError(f"{self._source}: {first} and {other} both send {what}; choose one with {mark}src={first}")
-        error.add_note(f"next: the same with '{self._source}{mark}src={first}'")
-        return error
+        return suggest(error, f"the same with '{self._source}{mark}src={first}'")
 
 
 def fed(decoder: Decoder, chunks: Sequence[Chunk]) -> list[Frames]:

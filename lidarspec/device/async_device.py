@@ -21,7 +21,7 @@ from lidarspec.errors import UsageError
 from lidarspec.framing.results import Counters
 from lidarspec.packets.packets import Packets
 from lidarspec.scans.scans import Scan
-from lidarspec.spec.description import Sensor
+from lidarspec.spec.sensor import Sensor
 
 T = TypeVar("T")
 #: seconds that a thread waits before it looks whether it is still wanted.

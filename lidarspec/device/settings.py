@@ -23,7 +23,7 @@ from typing import Any
 from lidarspec.errors import SourceError, UsageError, did_you_mean
 from lidarspec.plugins import sensor as named_sensor
 from lidarspec.points.cloud import Mount
-from lidarspec.spec.description import Sensor
+from lidarspec.spec.sensor import Sensor
 
 FILE = "lidarspec.toml"
 #: what can be a name: nothing that has a suffix, a scheme or a folder, and no port of a system that calls them by letters.

@@ -70,7 +70,6 @@ class Names:
         """Everything for the templates."""
         return {
             "id": self.id,
-            "prefix": f"{self.id.partition('-')[0]}-",
             "vendor": self.vendor,
             "model": self.model,
             "constant": self.constant,
@@ -83,7 +82,6 @@ def invented(names: Names, link: Link) -> dict[str, str]:
     """The files of a distribution with an invented sensor that has everything, by path."""
     values = {
         **names.values(),
-        "link": link.capitalize(),
         "speed_remark": ", with code 3; else 0" if link == "serial" else "",
     }
     return {

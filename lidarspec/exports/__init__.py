@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from lidarspec.errors import UnknownFrame, UnknownName, UsageError
 
 if TYPE_CHECKING:
-    from lidarspec.spec.description import Sensor
+    from lidarspec.spec.sensor import Sensor
 
 #: kind -> "module:function"; each takes a Sensor and returns the text of the export.
 EXPORTS: dict[str, str] = {
@@ -49,7 +49,7 @@ def narrowed(sensor: Sensor, frame: str) -> Sensor:
     return replace(sensor, frames=alone, commands={}, state={}, on_open=(), on_close=())
 
 
-def export(kind: str, sensor: Sensor) -> str:
+def export(sensor: Sensor, kind: str) -> str:
     """The text of an export of a sensor.
 
     Args:

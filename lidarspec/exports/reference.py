@@ -1,4 +1,8 @@
-"""A sensor's reference page in Markdown: links, commands, the wire table of every frame, checksums, clock and geometry."""
+"""A sensor's reference page in Markdown: links, commands, the wire table of every frame, checksums, clock and geometry.
+
+Each section is a table or a few sentences made from the spec alone. Only geometry looks at bytes: the points of an example frame say which
+columns there are, and in which directions the channels look.
+"""
 
 from __future__ import annotations
 
@@ -11,8 +15,9 @@ from lidarspec.framing.results import Counters, Found, packed
 from lidarspec.packets.stream import PacketStream
 from lidarspec.points.cloud import PointCloud
 from lidarspec.points.plain import evaluate
-from lidarspec.spec.description import Command, Frame, Sensor
+from lidarspec.spec.description import Command, Frame
 from lidarspec.spec.links import Link, Serial, Udp
+from lidarspec.spec.sensor import Sensor
 from lidarspec.spec.timing import Clock, Every, Split
 from lidarspec.wire.wire_table import frame_size, wire_table
 
@@ -156,8 +161,8 @@ def _geometry(sensor: Sensor) -> Iterator[str]:
 def _cloud(sensor: Sensor, name: str) -> PointCloud | None:
     """The points of an example frame; None where it has none of its own."""
     try:
-        found = packed([Found(name, 0, sensor.example(name))])
-        return evaluate(PacketStream(sensor, name, Counters()).add([found])).cloud
+        frames = packed([Found(name, 0, sensor.example(name))])
+        return evaluate(PacketStream(sensor, name, Counters()).add([frames])).cloud
     except LidarSpecError:
         return None
 

@@ -20,7 +20,7 @@ from lidarspec.framing.frame_engine import codec
 from lidarspec.framing.results import Counters, Found, Frames, Numbers, array_of
 from lidarspec.framing.search import Framing, Mode, Piece
 from lidarspec.framing.weak_frames import cut
-from lidarspec.spec.description import Frame, Sensor
+from lidarspec.spec.description import Frame, Spec
 from lidarspec.wire.arrays import alike, repeated
 from lidarspec.wire.layout import Sums
 
@@ -50,7 +50,7 @@ class Decoder:
         sums: what computes checksums; by default their algorithms.
     """
 
-    def __init__(self, sensor: Sensor, *, stream: bool, interpreted: bool = False, backend: str = "auto", sums: Sums | None = None) -> None:
+    def __init__(self, sensor: Spec, *, stream: bool, interpreted: bool = False, backend: str = "auto", sums: Sums | None = None) -> None:
         incoming = {name: frame for name, frame in sensor.frames.items() if frame.direction == "in"}
         if not incoming:
             raise UsageError(f"{sensor.id} has no frames yet: configure it with its file first")
@@ -262,7 +262,7 @@ def _sizes(lengths: list[int]) -> NDArray[np.intp]:
     return np.array(lengths, np.intp)
 
 
-def _first_mode(sensor: Sensor) -> str | None:
+def _first_mode(sensor: Spec) -> str | None:
     """`configure(answer=...)` starts as if the frame that the answer comes after had been seen."""
     answer = sensor.options.get("answer")
     return sensor.frames[answer].after if isinstance(answer, str) and answer in sensor.frames else None

@@ -8,12 +8,11 @@ the reference.
 
 from __future__ import annotations
 
-import contextlib
 import functools
 import io
 import traceback
 from collections.abc import Iterable, Mapping
-from typing import Any, Protocol
+from typing import Protocol
 
 import construct
 import numpy as np
@@ -27,9 +26,8 @@ from lidarspec.spec.description import Frame
 from lidarspec.wire.arrays import counted, repeated
 from lidarspec.wire.frame_table import Group, Records, Rows, Table
 from lidarspec.wire.layout import Layout, Marks, Sums, marks
-from lidarspec.wire.layout_tree import HeaderTree, NotCompilable, Refused, Unread, Walk, check_compilable, rows_at
+from lidarspec.wire.layout_tree import NotCompilable, Refused, frame_layouts, prefix_of, rows_at
 from lidarspec.wire.schema import Schema, schema
-from lidarspec.wire.single_frames import frame_parser
 
 #: bytes of candidates looked at in one go, so that memory stays small on hostile streams.
 BLOCK = 1 << 19
@@ -84,19 +82,14 @@ class CompiledCodec:
     """
 
     def __init__(self, frame: Frame) -> None:
-        check_compilable(frame.prepared)
-        self.frame, self.schema = frame, schema(frame.prepared)
-        for info in self.schema.fields.values():
-            if info.dtype is None:
-                wide = f"its {info.bits} bits are more than a column holds"
-                raise NotCompilable(info.path, wide if info.bits > 64 else "its values are not all plain numbers of one kind")
-        self.tree = HeaderTree(frame.prepared, frame.max_length)
+        layouts = frame_layouts(frame)
+        if isinstance(layouts, NotCompilable):
+            raise layouts
+        self.frame, self.schema, self.tree = frame, schema(frame.tree), layouts
         self.prefix, self.size = self.tree.prefix, _size(frame)
         self.marks = marks(self.prefix)
         layout = self.tree.layout(b"")
         self.layout: Layout | None = layout if isinstance(layout, Layout) else None
-        #: the Container of one whole, sound frame; None where construct has to look at it
-        self.parse = frame_parser(frame.prepared, self.tree)
         self._conditions: Conditions | None = None
 
     def survey(
@@ -197,8 +190,8 @@ class InterpretedCodec:
     """A frame type that construct parses, one candidate at a time; `reason` says why it is not compiled."""
 
     def __init__(self, frame: Frame, reason: str = "") -> None:
-        self.frame, self.reason, self.schema = frame, reason, schema(frame.prepared)
-        self.prefix, self.size = _prefix(frame), _size(frame)
+        self.frame, self.reason, self.schema = frame, reason, schema(frame.tree)
+        self.prefix, self.size = prefix_of(frame.tree, frame.max_length), _size(frame)
         self.marks = marks(self.prefix)
         self.layout: Layout | None = None
 
@@ -264,18 +257,6 @@ def _size(frame: Frame) -> int | None:
         return int(frame.prepared.sizeof())
     except Exception:  # of a part of the struct, which may be anybody's
         return None
-
-
-def _prefix(frame: Frame) -> dict[int, tuple[int, int]]:
-    """The constants at the start of a frame that cannot be compiled as a whole."""
-
-    def stop(leaf: Any) -> int:
-        raise Unread
-
-    state = Walk(stop, frame.max_length)
-    with contextlib.suppress(Exception):  # what comes before counts; the rest is construct's to judge
-        state.run(frame.prepared)
-    return dict(state.constants)
 
 
 @functools.lru_cache(maxsize=2048)

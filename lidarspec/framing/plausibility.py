@@ -13,7 +13,7 @@ from __future__ import annotations
 import functools
 import math
 import traceback
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -21,13 +21,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.columns.columns import Batch, Column, Fields, unpadded
-from lidarspec.columns.graph import Node, Traced, Untraceable, trace
+from lidarspec.columns.graph import Node, Traced, conjuncts, evaluate, fields_beside, sample_of, trace
 from lidarspec.framing.results import CHECKSUM, CONSTANT, IMPLAUSIBLE, PLUGIN, VALID
 from lidarspec.spec.description import Frame
+from lidarspec.spec.tree import FieldInfo
 from lidarspec.wire.arrays import taken
 from lidarspec.wire.frame_table import Group, Rows, Table
 from lidarspec.wire.layout import Bytes2D, Layout, Leaf, Seal, Sums, elements, marks, right, words
-from lidarspec.wire.schema import FieldInfo, Schema
+from lidarspec.wire.schema import Schema
 
 #: values of a few bits that are compared one by one.
 ALLOWED = 2
@@ -129,7 +130,7 @@ class Condition:
     def holds(self, columns: Mapping[str, NDArray[np.float64]]) -> NDArray[np.bool_]:
         """Whether it is true, for columns of the fields in their units, element by element."""
         with np.errstate(all="ignore"):
-            return np.asarray(value_of(self.node, columns, {})).astype(np.bool_)
+            return np.asarray(evaluate(self.node, {}, lambda node: columns.get(node.path))).astype(np.bool_)
 
 
 class Conditions:
@@ -278,51 +279,11 @@ def _window(leaves: Iterable[Leaf]) -> tuple[int, int]:
 
 
 def _parts(plausible: Callable[[Any], Any], schema: Schema, layout: Layout) -> list[Condition] | None:
-    rows = np.zeros((2, layout.size), np.uint8)
-    sample = Batch(Rows(schema, [Group(layout, np.arange(2), rows)]), np.zeros(2, np.bool_))
+    blank = Group(layout, np.zeros(1, np.intp), np.zeros((1, layout.size), np.uint8))
     try:
-        answer, _ = trace(plausible, sample)
+        answer, _ = trace(plausible, sample_of(Batch(Rows(schema, [blank]), np.zeros(1, np.bool_)), blank))
         if not isinstance(answer, Traced):
             return None
-        return [Condition(node, fields_of(node, schema)) for node in _conjuncts(answer.node)]
+        return [Condition(node, fields_beside(node, schema)) for node in conjuncts(answer.node)]
     except Exception:  # the function itself will say so, frame by frame
         return None
-
-
-def _conjuncts(node: Node) -> Iterator[Node]:
-    """The conditions that have to hold together."""
-    both = node.kind == "call" and node.function in (np.bitwise_and, np.logical_and)
-    if both and all(isinstance(arg, Node) and arg.sample.array.dtype == np.bool_ for arg in node.args):
-        for arg in node.args:
-            yield from _conjuncts(arg)
-    else:
-        yield node
-
-
-def fields_of(node: Node, schema: Schema) -> tuple[FieldInfo, ...]:
-    """The fields that a node depends on, each once.
-
-    Raises:
-        Untraceable: if it depends on more than the frame itself, or on fields that do not stand side by side.
-    """
-    found: dict[str, FieldInfo] = {}
-    pending = [node]
-    while pending:
-        node = pending.pop()
-        if node.kind not in ("field", "call") or any(np.size(arg) != 1 for arg in node.args if not isinstance(arg, Node)):
-            raise Untraceable(f"{node.kind} in a test of plausibility")
-        if node.kind == "field":
-            found[node.path] = schema.fields[node.path]
-        pending += [arg for arg in node.args if isinstance(arg, Node)]
-    if len({info.axes for info in found.values()}) != 1:
-        raise Untraceable("fields of different arrays in a test of plausibility")
-    return tuple(found.values())
-
-
-def value_of(node: Node, columns: Mapping[str, NDArray[np.float64]], known: dict[Node, Any]) -> Any:
-    """What a node comes to for columns of the fields."""
-    if node.kind == "field":
-        return columns[node.path]
-    if node not in known:
-        known[node] = node.function(*(value_of(arg, columns, known) if isinstance(arg, Node) else arg for arg in node.args))
-    return known[node]

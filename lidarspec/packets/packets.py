@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from lidarspec.columns.columns import Batch, physical
 from lidarspec.errors import SpecError, UnknownField
 from lidarspec.framing.results import Counters, Numbers, array_of
-from lidarspec.spec.description import Sensor
+from lidarspec.spec.description import Spec
 from lidarspec.wire.frame_table import Table
 from lidarspec.wire.schema import Schema
 
@@ -38,7 +38,7 @@ class Packets:
 
     def __init__(
         self,
-        sensor: Sensor,
+        sensor: Spec,
         frame: str,
         table: Table,
         *,
@@ -106,7 +106,9 @@ class Packets:
 
     def points(self) -> PointCloud:
         """The points of all packets in stream order; see `PointCloud`."""
-        return _evaluators[0](self)
+        from lidarspec.points.evaluate import cloud_of
+
+        return cloud_of(self)
 
     def take(self, which: Any) -> Packets:
         """Some of the packets: by indices, a mask or a slice."""
@@ -128,14 +130,6 @@ class Packets:
     def batch(self, carry: dict[int, NDArray[np.float64]] | None = None) -> Batch:
         """What `points` and `plausible` functions are given, see `Fields`."""
         return Batch(self.table, self.breaks, self.state, self.sensor.state, dict(carry or {}))
-
-
-_evaluators: list[Callable[[Packets], PointCloud]] = []
-
-
-def install_points(function: Callable[[Packets], PointCloud]) -> None:
-    """Make `function` what ``Packets.points()`` calls; done by the module that evaluates `points`."""
-    _evaluators[:] = [function]
 
 
 def joined(parts: Sequence[Packets]) -> Packets:

@@ -23,7 +23,7 @@ from lidarspec.framing.results import Counters, Frames, Numbers
 from lidarspec.packets.clocks import Unwrapper, clock_ns
 from lidarspec.packets.packets import Packets, StateOf, joined_tables
 from lidarspec.packets.sequences import SequenceTracker
-from lidarspec.spec.description import Sensor
+from lidarspec.spec.description import Spec
 from lidarspec.wire.arrays import alike, repeated, some
 from lidarspec.wire.frame_table import Table
 
@@ -41,7 +41,7 @@ class PacketStream:
 
     def __init__(
         self,
-        sensor: Sensor,
+        sensor: Spec,
         frame: str,
         stats: Counters,
         *,
@@ -220,7 +220,7 @@ class _Part:
         return array if self.where is None else some(array, self.own)
 
 
-def data_frame(sensor: Sensor, found: Sequence[Frames]) -> str | None:
+def data_frame(sensor: Spec, found: Sequence[Frames]) -> str | None:
     """The data frame type that an input is read by where none is asked for: the configured one, or the first that arrived.
 
     Returns:
@@ -233,7 +233,7 @@ def data_frame(sensor: Sensor, found: Sequence[Frames]) -> str | None:
     return next(arrived, None)
 
 
-def _counted(sensor: Sensor, frame: str) -> bool:
+def _counted(sensor: Spec, frame: str) -> bool:
     """Whether packets of this type are counted: not, if only other data frames have the counter."""
     assert sensor.sequence is not None
     having = [name for name, other in sensor.frames.items() if other.data and sensor.sequence.field in codec(other).schema.fields]

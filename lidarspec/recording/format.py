@@ -31,7 +31,7 @@ from typing import Any, BinaryIO, Literal
 
 from lidarspec.errors import UsageError, WireError
 from lidarspec.plugins import sensor as named_sensor
-from lidarspec.spec.description import Sensor
+from lidarspec.spec.sensor import Sensor
 
 VERSION = 1
 _ID = re.compile(r"[a-z0-9]+(-[a-z0-9]+)*")

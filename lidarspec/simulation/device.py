@@ -20,8 +20,8 @@ from lidarspec.simulation.faults import Faults, Line
 from lidarspec.simulation.replies import Answering, Request
 from lidarspec.simulation.scenes import Scene, furnished
 from lidarspec.simulation.simulator import Simulation, simulation
-from lidarspec.spec.description import Sensor
 from lidarspec.spec.links import is_datagram
+from lidarspec.spec.sensor import Sensor
 
 SECOND = 1_000_000_000
 #: ns of the device's time for which data is made in one go, and the most packets.
@@ -120,8 +120,8 @@ class SimulatedDevice:
         """Switch it on, or off and on again."""
         self._plan, self._stream, self._powered, self._time, self.present = [], None, now, 0.0, True
         self._plug = now + int(self.faults.unplug * SECOND) if self.faults.unplug else None
-        for name, frame in self.sensor.frames.items():
-            if frame.rate and frame.direction == "in" and not frame.data:
+        for name, frame in self.sensor.incoming.items():
+            if frame.simulation.rate and not frame.data:
                 self._put(0.0, "data", name, self._answering.frame(name))
         if not any(command.starts for command in self.sensor.commands.values()):
             self._begin(0.0, self.sensor.data_frame)
@@ -194,7 +194,7 @@ class SimulatedDevice:
 
     def _again(self, due: _Due) -> None:
         """Plan the next one of a frame that is sent by itself."""
-        rate = self.sensor.frames[due.frame].rate if due.frame else 0.0
+        rate = self.sensor.frames[due.frame].simulation.rate if due.frame else 0.0
         if rate:
             number = round(due.at * rate / SECOND) + 1
             self._put(due.at + SECOND / rate, due.link, due.frame, self._answering.frame(due.frame, number))
@@ -205,7 +205,7 @@ class SimulatedDevice:
         command, at, mode = request.command, now, None
         if command.starts or command.stops:
             self._stream = None
-            self._plan = [due for due in self._plan if due.frame and self.sensor.frames[due.frame].rate]
+            self._plan = [due for due in self._plan if due.frame and self.sensor.frames[due.frame].simulation.rate]
             heapq.heapify(self._plan)
         announcing = {frame.after for frame in self.sensor.frames.values() if frame.after}
         for answer in self._answering.answers(request):

@@ -23,13 +23,13 @@ from lidarspec.errors import SpecError, UnknownFrame, UsageError
 from lidarspec.framing.frame_engine import CompiledCodec, InterpretedCodec, codec
 from lidarspec.framing.plausibility import plausibility
 from lidarspec.framing.results import VALID
-from lidarspec.spec.construct_layer import clean
-from lidarspec.spec.description import Sensor
+from lidarspec.spec.construct_layer import clean, peeled, seen
+from lidarspec.spec.description import Spec
+from lidarspec.spec.tree import FieldInfo
 from lidarspec.wire.build import build
 from lidarspec.wire.frame_table import Group, Rows
 from lidarspec.wire.layout import Layout, Leaf
-from lidarspec.wire.layout_tree import TooLong, walk
-from lidarspec.wire.schema import FieldInfo, peeled
+from lidarspec.wire.layout_tree import TooLong, Unknown, layout_of
 
 Values = Mapping[str, Any]
 
@@ -41,7 +41,7 @@ class FrameMaker:
         SpecError: where the frame type is not compiled.
     """
 
-    def __init__(self, sensor: Sensor, frame: str) -> None:
+    def __init__(self, sensor: Spec, frame: str) -> None:
         engine = codec(sensor.frames[frame])
         if not isinstance(engine, CompiledCodec):
             raise SpecError(f"cannot be simulated, since it is not compiled: {engine.reason}", path=frame, sensor=sensor.id)
@@ -85,7 +85,11 @@ class FrameMaker:
     def _walked(self, values: Values, asked: list[str]) -> Layout:
         frame, fields = self.engine.frame, self.engine.schema.fields
         try:
-            return walk(frame.prepared, functools.partial(self._read, values, asked), frame.max_length).layout()
+            while True:
+                try:
+                    return layout_of(frame.tree, {path: self._raw(values, path) for path in asked}, frame.max_length)
+                except Unknown as unknown:
+                    asked.append(unknown.leaf.info.path)
         except TooLong as error:
             left_out = [path for path in asked if path not in values and fields[path].const is None]
             given = ", ".join(f"{path} = {values[path]}" for path in asked if path in values)
@@ -105,11 +109,6 @@ class FrameMaker:
             leaf.store(rows, _steps(leaf, [values.get(path, 0) for values in frames]))
         layout.seal(rows)
         return rows
-
-    def _read(self, values: Values, asked: list[str], leaf: Leaf) -> int:
-        if leaf.info.path not in asked:
-            asked.append(leaf.info.path)
-        return self._raw(values, leaf.info.path)
 
     def _raw(self, values: Values, path: str) -> int:
         info = self.engine.schema.fields[path]
@@ -151,14 +150,14 @@ Drawn = Mapping[str, Callable[[random.Random], Any]]
 NOTHING: Drawn = {}
 
 
-def example(sensor: Sensor, frame: str, *, seed: int = 0) -> bytes:
+def example(sensor: Spec, frame: str, *, seed: int = 0) -> bytes:
     """See `Sensor.example`."""
     if frame not in sensor.frames:
         raise UnknownFrame(frame, sensor.frames, place=sensor.id)
     return examples(sensor, frame, random.Random(f"{sensor.id} {frame} {seed}"))[0]
 
 
-def examples(sensor: Sensor, frame: str, source: random.Random, drawn: Drawn = NOTHING) -> list[bytes]:
+def examples(sensor: Spec, frame: str, source: random.Random, drawn: Drawn = NOTHING) -> list[bytes]:
     """Some valid frames of one random header, at least one: what `example` picks from, for tests that need many.
 
     Args:
@@ -181,7 +180,7 @@ def examples(sensor: Sensor, frame: str, source: random.Random, drawn: Drawn = N
     return [_swept(sensor, frame, engine, source)]
 
 
-def _interpreted(sensor: Sensor, frame: str, engine: InterpretedCodec, source: random.Random, drawn: Drawn) -> bytes:
+def _interpreted(sensor: Spec, frame: str, engine: InterpretedCodec, source: random.Random, drawn: Drawn) -> bytes:
     """A frame that construct alone can read."""
     for _ in range(BATCH * TRIES):
         try:
@@ -201,7 +200,7 @@ def _headed(rows: NDArray[np.uint8], layout: Layout, chosen: dict[str, int]) -> 
     return rows
 
 
-def _plausible(sensor: Sensor, frame: str, layout: Layout, rows: NDArray[np.uint8]) -> list[bytes]:
+def _plausible(sensor: Spec, frame: str, layout: Layout, rows: NDArray[np.uint8]) -> list[bytes]:
     table = Rows(codec(sensor.frames[frame]).schema, [Group(layout, np.arange(len(rows)), rows)])
     if sensor.frames[frame].plausible is None:
         return [row.tobytes() for row in rows]
@@ -212,9 +211,9 @@ def _plausible(sensor: Sensor, frame: str, layout: Layout, rows: NDArray[np.uint
     return [row.tobytes() for row in rows[good]]
 
 
-def _swept(sensor: Sensor, frame: str, engine: CompiledCodec, source: random.Random) -> bytes:
+def _swept(sensor: Spec, frame: str, engine: CompiledCodec, source: random.Random) -> bytes:
     """A frame around the values that the sensor's `sweep` declares, where random ones are never plausible."""
-    sweep = sensor.frames[frame].sweep or (sensor.sweep if sensor.frames[frame].data else None)
+    sweep = sensor.simulation_of(frame).sweep
     if sweep is None:
         raise SpecError("no random frame passes `plausible`, and there is no `sweep` to start from", path=frame, sensor=sensor.id)
     for _ in range(TRIES):
@@ -252,7 +251,7 @@ def _random(con: Construct, source: random.Random, scope: Any, drawn: Drawn, pat
         return drawn[path](source)
     con, info = peeled(con, FieldInfo(""))
     if info.const is not None:
-        return info.seen(info.const)
+        return seen(info, info.const)
     if info.rebuilt is not None:
         with contextlib.suppress(Exception):  # it may ask for what comes after it, and is evaluated again when the frame is built
             return info.rebuilt(scope)
@@ -267,7 +266,7 @@ def _random(con: Construct, source: random.Random, scope: Any, drawn: Drawn, pat
     if isinstance(con, construct.IfThenElse | construct.Switch):
         return _random(_chosen(con, scope), source, scope, drawn, path)
     if isinstance(con, construct.NullTerminated) or not isinstance(con, construct.Subconstruct):
-        return info.seen(_leaf(con, source, scope, info)) if info.labels else _leaf(con, source, scope, info)
+        return seen(info, _leaf(con, source, scope, info)) if info.labels else _leaf(con, source, scope, info)
     if isinstance(con, construct.Adapter):
         return clean(con.parse(con.subcon.build(_random(con.subcon, source, scope, drawn, path))))
     return _random(con.subcon, source, scope, drawn, path)

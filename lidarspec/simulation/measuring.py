@@ -18,9 +18,9 @@ from lidarspec.columns.columns import Batch, Column, Fields, aligned
 from lidarspec.errors import SpecError
 from lidarspec.points.plain import points_function
 from lidarspec.simulation.scenes import Scene
-from lidarspec.spec.description import Sensor
 from lidarspec.spec.fields import factor
 from lidarspec.spec.results import Polar
+from lidarspec.spec.sensor import Sensor
 from lidarspec.wire.frame_table import Rows
 
 Floats = NDArray[np.float64]
@@ -75,7 +75,7 @@ class Measurement:
     def __init__(self, sensor: Sensor, frame: str, table: Rows) -> None:
         self._sensor = sensor
         self._points = points_function(sensor, frame)
-        self._encode: Callable[[Polar], Mapping[str, Any]] | None = sensor.frames[frame].encode or sensor.encode
+        self._encode: Callable[[Polar], Mapping[str, Any]] | None = sensor.simulation_of(frame).encode
         self._targets = () if self._encode else self._traced(table)
         self._intensity = self.beams(table).intensity
         self._coupled = self._encode is not None or self._turning(table)

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from lidarspec.framing.decoder import Decoder
 from lidarspec.framing.frame_engine import codec
 from lidarspec.simulation.frame_maker import FrameMaker
-from lidarspec.spec.description import Answer, Command, Sensor, replaced
+from lidarspec.spec.description import Answer, Command
 from lidarspec.spec.links import is_datagram
+from lidarspec.spec.sensor import Sensor
 
 #: ns of silence after which half a request is forgotten.
 PATIENCE = 50_000_000
@@ -58,7 +59,7 @@ class Answering:
 
     def answers(self, request: Request) -> list[Answered]:
         """All that is sent for a command before any data."""
-        declared = request.command.answers
+        declared = self._sensor.simulation.answers.get(request.name)
         chosen: Iterable[Answer] = request.command.replies[:1]
         if declared is not None:
             chosen = declared(request.values) if callable(declared) else declared
@@ -69,7 +70,7 @@ class Answering:
         maker = self._makers.get(name)
         if maker is None:
             maker = self._makers[name] = FrameMaker(self._sensor, name)
-        sweep = self._sensor.frames[name].sweep
+        sweep = self._sensor.frames[name].simulation.sweep
         return maker.frame({**self._sensor.state.get(name, {}), **(sweep(number) if sweep else {}), **(values or {})})
 
     def _answer(self, answer: Answer, request: Request) -> Answered:
@@ -102,8 +103,8 @@ class Answering:
 
 def _listening(sensor: Sensor, link: str) -> Decoder:
     """A decoder of what is sent to the sensor: the outgoing frames, seen from its side."""
-    frames = {name: replaced(frame, direction="in") for name, frame in sensor.frames.items() if frame.direction == "out"}
-    mirrored = replaced(sensor, frames=frames, commands={}, state={}, on_open=(), on_close=())
+    frames = {name: replace(frame, direction="in") for name, frame in sensor.frames.items() if frame.direction == "out"}
+    mirrored = replace(sensor, frames=frames, commands={}, state={}, on_open=(), on_close=())
     return Decoder(mirrored, stream=not is_datagram(sensor.links.get(link)))
 
 

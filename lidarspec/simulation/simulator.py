@@ -25,9 +25,9 @@ from lidarspec.packets.clocks import clock_ns
 from lidarspec.simulation.frame_maker import FrameMaker, sealed
 from lidarspec.simulation.measuring import Beams, Measurement
 from lidarspec.simulation.scenes import Room, Scene
-from lidarspec.spec.description import Sensor
 from lidarspec.spec.fields import exact
 from lidarspec.spec.links import Serial
+from lidarspec.spec.sensor import Sensor
 from lidarspec.wire.frame_table import Rows
 
 Times = NDArray[np.int64]
@@ -48,7 +48,7 @@ class Pace:
     """
 
     def __init__(self, sensor: Sensor, frame: str, table: Rows, beams: Beams) -> None:
-        self._sensor, self._rate = sensor, sensor.frames[frame].rate
+        self._sensor, self._rate = sensor, sensor.simulation_of(frame).rate
         self._point = _seconds_per_point(beams)
         self._baud = next((link.baud for link in (sensor.links.get("data"),) if isinstance(link, Serial)), 0)
         times = self.times(table, lambda: beams)
@@ -120,7 +120,7 @@ class Simulation:
     """
 
     def __init__(self, sensor: Sensor, frame: str) -> None:
-        sweep = sensor.frames[frame].sweep or sensor.sweep
+        sweep = sensor.simulation_of(frame).sweep
         if sweep is None:
             raise UsageError(f"{sensor.id} declares no sweep for {frame!r} frames, and cannot be simulated")
         self._sweep: Callable[[int], Mapping[str, Any]] = sweep

@@ -1,1 +1,86 @@
-"""spec"""
+"""What a sensor is: the names of those who write one.
+
+    from lidarspec.spec import Checksummed, Clock, Crc, Fields, Frame, OnWrap, Polar, Scaled, Sensor, Serial, Simulation, hookimpl, spread
+
+A plugin imports from here and from `lidarspec` alone. The modules, in reading order: description (`Spec`, `Frame`, `Command`,
+`Simulation`: what must fit together), sensor (a `Spec` with everything that can be done with it), fields (units and seals), checksums,
+links, timing (clocks, counters, where scans end), results (what a `points` function returns), vocabulary (what it is written with), and
+below them what knows construct: construct_layer. Nothing in this package reads bytes of a stream.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from lidarspec.columns.columns import Column as Column, Fields as Fields
+    from lidarspec.plugins import hookimpl as hookimpl
+    from lidarspec.spec.checksums import (
+        Checksum as Checksum,
+        Crc as Crc,
+        Fold15 as Fold15,
+        Sum as Sum,
+        WordXor as WordXor,
+        Xor as Xor,
+        ZeroPadded as ZeroPadded,
+    )
+    from lidarspec.spec.description import Command as Command, Frame as Frame, Simulation as Simulation
+    from lidarspec.spec.fields import Checksummed as Checksummed, Scaled as Scaled
+    from lidarspec.spec.links import Serial as Serial, Tcp as Tcp, Udp as Udp
+    from lidarspec.spec.results import Cartesian as Cartesian, Points as Points, Polar as Polar
+    from lidarspec.spec.sensor import Sensor as Sensor
+    from lidarspec.spec.timing import (
+        Clock as Clock,
+        Every as Every,
+        OnChange as OnChange,
+        OnFlag as OnFlag,
+        OnRewind as OnRewind,
+        OnWrap as OnWrap,
+        Sequence as Sequence,
+    )
+    from lidarspec.spec.vocabulary import (
+        following as following,
+        last as last,
+        previous as previous,
+        spread as spread,
+        stack as stack,
+        take as take,
+        wrap as wrap,
+    )
+    from lidarspec.transports.protocol import (
+        Chunk as Chunk,
+        Disconnected as Disconnected,
+        Format as Format,
+        LiveTransport as LiveTransport,
+        Transport as Transport,
+    )
+
+_NAMES = {
+    "spec.sensor": ("Sensor",),
+    "spec.description": ("Frame", "Command", "Simulation"),
+    "spec.fields": ("Scaled", "Checksummed"),
+    "spec.checksums": ("Checksum", "Crc", "Xor", "Sum", "WordXor", "Fold15", "ZeroPadded"),
+    "spec.links": ("Serial", "Udp", "Tcp"),
+    "spec.timing": ("Clock", "Sequence", "OnWrap", "OnFlag", "OnChange", "OnRewind", "Every"),
+    "columns.columns": ("Fields", "Column"),
+    "spec.results": ("Points", "Polar", "Cartesian"),
+    "spec.vocabulary": ("spread", "wrap", "following", "previous", "last", "stack", "take"),
+    "plugins": ("hookimpl",),
+    "transports.protocol": ("Format", "Transport", "LiveTransport", "Chunk", "Disconnected"),
+}
+_HOMES = {name: module for module, names in _NAMES.items() for name in names}
+
+__all__ = list(_HOMES)
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module 'lidarspec.spec' has no attribute {name!r}")
+    value = getattr(importlib.import_module(f"lidarspec.{_HOMES[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

@@ -1,75 +1,61 @@
-"""What can be done with a sensor, as an interface, and where the engine comes from that does it.
+"""What a sensor is, as values: message types, commands, links, clock, geometry, and what a simulation needs.
 
-A sensor is found and looked at far more often than all of this is needed, so the engine is imported by the first method that asks for it.
-
-A sensor as a value: message types, commands, links, clock and geometry, written down once.
-
-Everything here is immutable and knows nothing of streams or arrays. What can be done with a sensor (parse, decode,
-...) is offered as methods, which hand over to the one `lidarspec.spec.description.Engine` that the package installs.
+A `Spec` holds what the manual says, and checks that its parts fit together. Everything here is immutable, knows nothing of streams or
+arrays, and has no engine: engines are functions of a `Spec`. `lidarspec.spec.sensor.Sensor` is a `Spec` with these functions as methods.
 """
 
 from __future__ import annotations
 
-import functools
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, field, fields
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeVar
+from typing import Any, Literal
 
 from construct import Construct
 
 from lidarspec.errors import SpecError, UnknownFrame
-from lidarspec.spec.construct_layer import prepare
+from lidarspec.spec.construct_layer import fixed_size, frame_tree, prepare
 from lidarspec.spec.links import Link, is_datagram
 from lidarspec.spec.results import Points
 from lidarspec.spec.rules import check_struct
 from lidarspec.spec.timing import Clock, Sequence, Split
-
-if TYPE_CHECKING:
-    from lidarspec.framing.decoder import Decoder
-    from lidarspec.framing.results import Found
-    from lidarspec.packets.packets import Packets
-    from lidarspec.scans.scans import Scan
-
-
-class Engine(Protocol):
-    """What the methods of `Sensor` hand over to."""
-
-    def parse(self, sensor: Sensor, data: bytes, *, frame: str | None, verify: bool) -> Any: ...
-    def build(self, sensor: Sensor, frame: str, value: Any, values: Mapping[str, Any], *, units: bool) -> bytes: ...
-    def example(self, sensor: Sensor, frame: str, *, seed: int) -> bytes: ...
-    def command(self, sensor: Sensor, name: str, arguments: Mapping[str, Any]) -> bytes: ...
-    def decoder(self, sensor: Sensor, *, stream: bool | None, backend: str) -> Decoder: ...
-    def split(self, sensor: Sensor, data: Any, *, backend: str) -> list[Found]: ...
-    def decode(self, sensor: Sensor, data: Any, *, frame: str | None, backend: str) -> Packets: ...
-    def scans(self, sensor: Sensor, data: Any, *, backend: str) -> Iterator[Scan]: ...
-    def configure(self, sensor: Sensor, options: Mapping[str, Any]) -> Sensor: ...
-    def rebuild(self, sensor_id: str, options: Mapping[str, Any]) -> Sensor: ...
-
-
-_loaders: list[Callable[[], Engine]] = []
-
-
-def install(load: Callable[[], Engine]) -> None:
-    """Make what `load` returns the engine of every sensor; it is called once, by the first method that needs it."""
-    _loaders[:] = [load]
-    engine.cache_clear()
-
-
-@functools.cache
-def engine() -> Engine:
-    """The engine that is installed."""
-    return _loaders[0]()
-
+from lidarspec.spec.tree import Node
 
 #: version of the plugin interface; the engine reads this one and the one before.
 API = 1
 STATUSES = ("manual", "vectors", "capture", "hardware")
-Value = TypeVar("Value", "Frame", "Sensor")
-#: what a sensor sends for a command: see `Command.answers`.
+#: what a field can say of the device itself, in `Spec.info`.
+ROLES = ("serial", "firmware", "model", "temperature")
+DIRECTIONS = ("forward", "back", "left", "right", "up", "down")
+#: what a sensor sends for a command, see `Simulation.answers`.
 Answer = str | tuple[str, Mapping[str, Any]] | bytes | float
+Answers = tuple[Answer, ...] | Callable[[Mapping[str, Any]], Iterable[Answer]]
 _ID = re.compile(r"[a-z0-9]+(-[a-z0-9]+)+")
+
+
+@dataclass(frozen=True, eq=False)
+class Simulation:
+    """What only a simulated sensor needs; of a sensor, or of one frame type of its own.
+
+    Args:
+        sweep: the physical values, by path, of frame number i that are not measured: angles, counters, time.
+        encode: the measured `Polar` of a batch to the raw values of its fields, by path, where ranges have no field of their own.
+        rate: how many frames a second are sent; of data, where neither the clock nor the times of the points tell; of other frames,
+            where they are sent again and again by themselves.
+        answers: command -> all that the sensor sends for it before any data, in order: frames by name, or (name, values) with physical
+            values by path, bytes as they are, and seconds of a pause, in which it sends its fillers; or a function from the raw fields
+            of the request to these. A command that is left out is answered by its reply. Of a sensor only.
+    """
+
+    sweep: Callable[[int], Mapping[str, Any]] | None = None
+    encode: Callable[..., Mapping[str, Any]] | None = None
+    rate: float = 0.0
+    answers: Mapping[str, Answers] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        _freeze(self, "answers")
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,15 +67,13 @@ class Frame:
         direction: "in" from the sensor to us, "out" from us to it.
         data: whether it carries the points.
         points: a `points` function of its own, for sensors that can answer in several data frames.
-        max_length: the longest it can be, in bytes; longer candidates are not frames.
+        max_length: the longest it can be, in bytes; longer candidates are not frames. Left out, it is the size of the struct, where that
+            is fixed.
         plausible: a function of `Fields`: False where no sensor would send such values, reduced with `all` per packet.
         after: name of the frame that has to be the last seen, of all named by any `after`, for this one to be looked for.
         confirm: how many in an unbroken run it takes to believe any of them.
-        sweep: a `sweep` function of its own, for sensors that can answer in several data frames, and for other frames that
-            random values never make.
-        encode: an `encode` function of its own: the measured `Polar` of a batch to the raw values of its fields, by path.
-        rate: how many a second are sent; of data, where neither the clock nor the times of the points tell; of other frames, where
-            they are sent again and again by themselves.
+        simulation: what a simulated sensor needs for this frame alone, where the sensor can answer in several data frames, or sends
+            others that random values never make, or again and again by themselves.
         acknowledged: findings of `lidarspec check` that are true and meant, as "LS204" or "LS205 path.of.a.field" -> the reason.
 
     Raises:
@@ -100,24 +84,33 @@ class Frame:
     direction: Literal["in", "out"] = field(default="in", kw_only=True)
     data: bool = field(default=False, kw_only=True)
     points: Callable[[Any], Points] | None = field(default=None, kw_only=True)
-    max_length: int = field(kw_only=True)
+    max_length: int = field(default=0, kw_only=True)
     plausible: Callable[[Any], Any] | None = field(default=None, kw_only=True)
     after: str | None = field(default=None, kw_only=True)
     confirm: int = field(default=1, kw_only=True)
-    sweep: Callable[[int], Mapping[str, Any]] | None = field(default=None, kw_only=True)
-    encode: Callable[..., Mapping[str, Any]] | None = field(default=None, kw_only=True)
-    rate: float = field(default=0.0, kw_only=True)
+    simulation: Simulation = field(default_factory=Simulation, kw_only=True)
     acknowledged: Mapping[str, str] = field(default_factory=dict, kw_only=True)
     prepared: Construct = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         if self.direction not in ("in", "out"):
             raise SpecError(f"direction is 'in' or 'out', not {self.direction!r}")
-        if self.max_length < 1 or self.confirm < 1:
+        if self.max_length < 0 or self.confirm < 1:
             raise SpecError("max_length and confirm are at least 1")
         _freeze(self, "acknowledged")
         object.__setattr__(self, "prepared", prepare(self.struct))
         check_struct(self.prepared)
+        if not self.max_length:
+            object.__setattr__(self, "max_length", _whole_length(self.prepared))
+
+    @cached_property
+    def tree(self) -> Node:
+        """The frame as nodes; made when it is first asked for.
+
+        Raises:
+            SpecError: for a constant that its Enum has no value for.
+        """
+        return frame_tree(self.prepared)
 
 
 @dataclass(frozen=True)
@@ -139,9 +132,6 @@ class Command:
         lines: levels of control lines, {"dtr": False}, set with it.
         starts, stops: whether the sensor sends data after it, or no longer does.
         every: seconds after which it is sent once more, again and again from its first time on (a heartbeat); 0: never.
-        answers: all that the sensor sends for it before any data, in order, for simulation: frames by name, or (name, values) with
-            physical values by path, bytes as they are, and seconds of a pause, in which it sends its fillers; or a function from the
-            raw fields of the request to these. Left out, it is the reply.
     """
 
     frame: str | None = None
@@ -158,7 +148,6 @@ class Command:
     starts: bool = False
     stops: bool = False
     every: float = 0.0
-    answers: tuple[Answer, ...] | Callable[[Mapping[str, Any]], Iterable[Answer]] | None = None
 
     def __post_init__(self) -> None:
         _freeze(self, "values", "args", "matches", "lines")
@@ -170,50 +159,11 @@ class Command:
         return (self.reply,) if isinstance(self.reply, str) else tuple(self.reply or ())
 
 
-@dataclass(frozen=True)
-class Configure:
-    """``sensor.configure(...)``: the engine's options, then the sensor's own function, on a new value."""
-
-    sensor: Sensor
-    function: Callable[..., Sensor] | None
-
-    def __call__(self, **options: Any) -> Sensor:
-        """A new sensor with these options; the old one stays as it is.
-
-        Raises:
-            UnknownOption: for an option that neither the engine nor the sensor has.
-        """
-        return engine().configure(self.sensor, options)
-
-
 @dataclass(frozen=True, eq=False, repr=False)
-class Sensor:
-    """One sensor, described.
+class Spec:
+    """One sensor as its manual describes it: facts, without the methods of a `Sensor`.
 
-    Args:
-        id: vendor-model in lower case with hyphens; the same everywhere and for ever.
-        vendor, model: as people write them.
-        frames: every message type by name, in both directions; where several fit at one place, their order decides.
-        points: a function of `Fields` that returns `Polar` or `Cartesian`; None where each data frame has its own.
-        scan: where one scan ends and the next begins.
-        links: by name; the data come over "data", commands over the link that they name.
-        commands: what can be asked of it, by name.
-        clock: its own time, if it has one.
-        sequence: its counter of packets, if it has one.
-        fillers: bytes that it sends between frames; they are counted on their own.
-        state: defaults of other frames' fields for ``f.state``, by frame and path, in units.
-        sweep: the physical values, by path, of data frame number i that are not measured: all that a simulation needs.
-        encode: the measured `Polar` of a batch to the raw values of its fields, where ranges have no field of their own.
-        configure: a function of the sensor and its options, by name, that returns another sensor.
-        on_open, on_close: names of the commands that are sent when it is opened and closed.
-        range_limits: the shortest and the longest range that it can measure, metres.
-        vendor_axes: where the vendor's x, y and z point, of forward, backward, left, right, up and down, for ``frame="vendor"``.
-        status: how far it is proven: "manual", "vectors", "capture" or "hardware".
-        source: the manual with its revision and sections, the captures.
-        aliases: other ids that it is known by.
-        api: the version of this interface that it was written for.
-        acknowledged: findings of `lidarspec check` about the sensor as a whole that are true and meant, as "LS401" -> the reason.
-        options: what it was configured with; not for plugins to set.
+    Its fields are the arguments of `lidarspec.spec.Sensor`, which says what each of them is.
 
     Raises:
         SpecError: for an id, status or reference between its parts that cannot be.
@@ -231,27 +181,29 @@ class Sensor:
     sequence: Sequence | None = field(default=None, kw_only=True)
     fillers: bytes = field(default=b"", kw_only=True)
     state: Mapping[str, Mapping[str, Any]] = field(default_factory=dict, kw_only=True)
-    sweep: Callable[[int], Mapping[str, Any]] | None = field(default=None, kw_only=True)
-    encode: Callable[..., Any] | None = field(default=None, kw_only=True)
+    simulation: Simulation = field(default_factory=Simulation, kw_only=True)
     configure: Any = field(default=None, kw_only=True)
     on_open: tuple[str, ...] = field(default=(), kw_only=True)
     on_close: tuple[str, ...] = field(default=(), kw_only=True)
     range_limits: tuple[float, float] = field(kw_only=True)
     vendor_axes: tuple[str, str, str] | None = field(default=None, kw_only=True)
+    beams: int | None = field(default=None, kw_only=True)
+    turn: tuple[float, float] | None = field(default=None, kw_only=True)
+    relatives: Mapping[str, str] = field(default_factory=dict, kw_only=True)
+    info: Mapping[str, str] = field(default_factory=dict, kw_only=True)
     status: str = field(kw_only=True)
     source: str = field(kw_only=True)
     aliases: tuple[str, ...] = field(default=(), kw_only=True)
     api: int = field(default=API, kw_only=True)
     acknowledged: Mapping[str, str] = field(default_factory=dict, kw_only=True)
     options: Mapping[str, Any] = field(default_factory=dict, kw_only=True)
+    hooked: Callable[[Any], Any] | None = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
-        _freeze(self, "frames", "links", "commands", "state", "acknowledged", "options")
-        function = self.configure.function if isinstance(self.configure, Configure) else self.configure
-        object.__setattr__(self, "configure", Configure(self, function))
+        _freeze(self, "frames", "links", "commands", "state", "relatives", "info", "acknowledged", "options")
         for name in ("on_open", "on_close", "aliases"):
             object.__setattr__(self, name, tuple(getattr(self, name)))
-        _check_sensor(self)
+        _check_spec(self)
 
     @property
     def data_frame(self) -> str:
@@ -260,88 +212,39 @@ class Sensor:
         Raises:
             UnknownFrame: if it has none yet (a sensor that needs a file first).
         """
-        names = [name for name, frame in self.frames.items() if frame.data]
+        names = self.data_frames
         if not names:
             raise UnknownFrame("data", self.frames, place=self.id, hint="; configure the sensor first")
         answer = self.options.get("answer")
         return answer if answer in names else names[0]
+
+    @cached_property
+    def incoming(self) -> Mapping[str, Frame]:
+        """The frame types that the sensor sends, by name, in the order that decides where several fit."""
+        return {name: frame for name, frame in self.frames.items() if frame.direction == "in"}
+
+    @cached_property
+    def data_frames(self) -> tuple[str, ...]:
+        """The names of the frame types that carry points."""
+        return tuple(name for name, frame in self.frames.items() if frame.data)
+
+    def points_of(self, frame: str) -> Callable[[Any], Points] | None:
+        """The `points` function of a frame type: its own, or the sensor's."""
+        return self.frames[frame].points or self.points
+
+    def simulation_of(self, frame: str) -> Simulation:
+        """What a simulation of one frame type needs: the frame's own, and for data the sensor's where the frame has none."""
+        own, shared = self.frames[frame].simulation, self.simulation if self.frames[frame].data else Simulation()
+        return Simulation(own.sweep or shared.sweep, own.encode or shared.encode, own.rate or shared.rate)
 
     @property
     def datagrams(self) -> bool:
         """Whether frames come one to a datagram."""
         return is_datagram(self.links.get("data"))
 
-    def parse(self, data: bytes, frame: str | None = None, *, verify: bool = True) -> Any:
-        """Exactly one frame as a construct Container of raw wire integers.
-
-        Args:
-            frame: its type; found out where left out.
-            verify: False accepts wrong constants, a wrong checksum and trailing bytes.
-
-        Raises:
-            WireError: where the bytes are not such a frame: sensor, offset, field path, expected and got.
-        """
-        return engine().parse(self, data, frame=frame, verify=verify)
-
-    def build(self, frame: str, value: Any = None, /, *, units: bool = False, **values: Any) -> bytes:
-        """The bytes of one frame; constants, counts and the checksum are filled in.
-
-        Args:
-            value: a mapping of all fields, such as what `parse` returned; `values` override it.
-            units: take physical values, and round them to the wire's steps.
-
-        Raises:
-            UsageError: for a missing or unknown field, or a value that its field cannot hold.
-        """
-        return engine().build(self, frame, value, values, units=units)
-
-    def example(self, frame: str, *, seed: int = 0) -> bytes:
-        """The bytes of a valid frame with seeded random content."""
-        return engine().example(self, frame, seed=seed)
-
-    def command(self, name: str, **arguments: Any) -> bytes:
-        """The bytes of a command; arguments by name, in units.
-
-        Raises:
-            UnknownCommand, OutOfRange: for what the sensor does not take.
-        """
-        return engine().command(self, name, arguments)
-
-    def decoder(self, *, stream: bool | None = None, backend: str = "auto") -> Decoder:
-        """A new incremental decoder, sans-IO and independent of every other.
-
-        Args:
-            stream: True reads a byte stream, False one datagram for each `feed`; by default what the data link says.
-        """
-        return engine().decoder(self, stream=stream, backend=backend)
-
-    def split(self, data: Any, *, backend: str = "auto") -> list[Found]:
-        """Every incoming frame of all types in stream order; `data` as in `decode`."""
-        return engine().split(self, data, backend=backend)
-
-    def decode(self, data: Any, frame: str | None = None, *, backend: str = "auto") -> Packets:
-        """The data frames, or those of another type, as columns.
-
-        Args:
-            data: bytes (a stream), an iterable of datagrams, or an (n, size) uint8 array of datagrams.
-            backend: "auto", "numpy", "jit" or "construct": the same results.
-        """
-        return engine().decode(self, data, frame=frame, backend=backend)
-
-    def scans(self, data: Any, *, backend: str = "auto") -> Iterator[Scan]:
-        """Every scan of the data; the first and last piece are marked ``complete=False``."""
-        return engine().scans(self, data, backend=backend)
-
     def __repr__(self) -> str:
         options = "".join(f", {name}={value!r}" for name, value in self.options.items())
         return f"Sensor({self.id}, {self.vendor} {self.model}, frames: {', '.join(self.frames) or 'none yet'}{options})"
-
-    def __reduce__(self) -> tuple[Callable[..., Sensor], tuple[str, dict[str, Any]]]:
-        return _rebuild, (self.id, dict(self.options))
-
-
-def _rebuild(sensor_id: str, options: Mapping[str, Any]) -> Sensor:
-    return engine().rebuild(sensor_id, options)
 
 
 def _freeze(value: object, *names: str) -> None:
@@ -349,7 +252,7 @@ def _freeze(value: object, *names: str) -> None:
         object.__setattr__(value, name, MappingProxyType(dict(getattr(value, name))))
 
 
-def _check_sensor(sensor: Sensor) -> None:
+def _check_spec(sensor: Spec) -> None:
     if not _ID.fullmatch(sensor.id):
         raise SpecError("an id is vendor-model in lower case with hyphens", path="id", sensor=sensor.id)
     if sensor.status not in STATUSES:
@@ -363,19 +266,31 @@ def _check_sensor(sensor: Sensor) -> None:
         _known(sensor, f"commands.{name}.link", [command.link], sensor.links)
         if "timeout" in command.args:
             raise SpecError("'timeout' is how long its reply is waited for, and cannot be an argument", path=f"commands.{name}.args")
+    if sensor.commands:
+        _known(sensor, "simulation.answers", sensor.simulation.answers, sensor.commands)
     _known(sensor, "state", sensor.state, sensor.frames)
+    _known(sensor, "info", [path.partition(".")[0] for path in sensor.info.values()], sensor.frames)
+    if unknown := sorted(set(sensor.info) - set(ROLES)):
+        raise SpecError(f"{unknown[0]!r} is not among {', '.join(ROLES)}", path="info", sensor=sensor.id)
+    if unknown := sorted(set(sensor.vendor_axes or ()) - set(DIRECTIONS)):
+        raise SpecError(f"no direction {unknown[0]!r}", path="vendor_axes", sensor=sensor.id)
+    if sensor.beams is not None and sensor.beams < 1:
+        raise SpecError(f"a scan has at least 1 point, not {sensor.beams}", path="beams", sensor=sensor.id)
+    if sensor.turn is not None and not 0 < sensor.turn[0] <= sensor.turn[1]:
+        raise SpecError(f"the slowest and the fastest number of scans a second, not {sensor.turn}", path="turn", sensor=sensor.id)
     _known(sensor, "on_open, on_close", [*sensor.on_open, *sensor.on_close], sensor.commands)
     if sensor.points is None and any(frame.data and frame.points is None for frame in sensor.frames.values()):
         raise SpecError("a data frame without a points function", path="points", sensor=sensor.id)
 
 
-def _known(sensor: Sensor, path: str, names: Iterable[str | None], table: Mapping[str, Any]) -> None:
+def _known(sensor: Spec, path: str, names: Iterable[str | None], table: Mapping[str, Any]) -> None:
     for name in names:
         if name is not None and name not in table and sensor.frames:
             raise SpecError(f"{name!r} is not among {', '.join(table) or 'none'}", path=path, sensor=sensor.id)
 
 
-def replaced(value: Value, **changes: Any) -> Value:
-    """A copy of a frame or sensor with changes; what is derived from its parts is made anew."""
-    given = {f.name: getattr(value, f.name) for f in fields(value) if f.init}
-    return type(value)(**{**given, **changes})
+def _whole_length(struct: Construct) -> int:
+    size = fixed_size(struct)
+    if not size:
+        raise SpecError("max_length may be left out only where the struct has a fixed size")
+    return size

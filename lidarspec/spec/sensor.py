@@ -1,124 +1,205 @@
-"""What every sensor can do: the methods of `Sensor`, carried out by the floors below."""
+"""A sensor: its `Spec`, and what can be done with it as methods.
+
+Each method hands over to the station that does it: wire (parse, build), simulation (example), framing (decoder, split), packets (decode),
+scans. They are imported when a method is called first: a sensor is found and looked at far more often than all of them are needed.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from typing import Any
+import inspect
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
 
-from lidarspec.errors import MissingField, OutOfRange, SpecError, UnknownCommand, UnknownField, UnknownOption, UsageError
-from lidarspec.framing.decoder import Decoder, backend as checked_backend, frames_of, is_stream
-from lidarspec.framing.frame_engine import codec
-from lidarspec.framing.results import Found
-from lidarspec.packets.packets import Packets
-from lidarspec.packets.stream import PacketStream, data_frame
-from lidarspec.plugins import registry
-from lidarspec.points.cloud import axis_matrix
-from lidarspec.points.numba_kernels import checksums as kernelsums
-from lidarspec.scans.scans import Scan, scans_of
-from lidarspec.simulation import frame_maker as examples
-from lidarspec.spec.description import Configure, Sensor, replaced
-from lidarspec.wire import parse as parsing
-from lidarspec.wire.build import build
+from lidarspec.errors import UnknownOption, UsageError
+from lidarspec.spec.description import Spec
 
-#: options that the engine itself understands, for every sensor.
+if TYPE_CHECKING:
+    from lidarspec.framing.decoder import Decoder
+    from lidarspec.framing.results import Found
+    from lidarspec.packets.packets import Packets
+    from lidarspec.scans.scans import Scan
+
+#: options that every sensor has.
+OPTIONS = ("frame", "answer")
 FRAMES_OF_REFERENCE = ("rep103", "vendor")
 
 
-class StandardEngine:
-    """The engine; it holds nothing, everything is a function of the sensor."""
+class Sensor(Spec):
+    """One sensor, described, and all that can be done with it.
 
-    parse = staticmethod(parsing.parse)
+    Args:
+        id: vendor-model in lower case with hyphens; the same everywhere and for ever.
+        vendor, model: as people write them.
+        frames: every message type by name, in both directions; where several fit at one place, their order decides.
+        points: a function of `Fields` that returns `Polar` or `Cartesian`; None where each data frame has its own.
+        scan: where one scan ends and the next begins.
+        links: by name; the data come over "data", commands over the link that they name.
+        commands: what can be asked of it, by name.
+        clock: its own time, if it has one.
+        sequence: its counter of packets, if it has one.
+        fillers: bytes that it sends between frames; they are counted on their own.
+        state: defaults of other frames' fields for ``f.state``, by frame and path, in units.
+        simulation: what a simulated sensor needs beyond all this.
+        configure: a function of the sensor and its options, by name, that returns another sensor.
+        on_open, on_close: names of the commands that are sent when it is opened and closed.
+        range_limits: the shortest and the longest range that it can measure, metres.
+        vendor_axes: where the vendor's x, y and z point, of forward, back, left, right, up and down, for ``frame="vendor"``.
+        beams: points of a scan, where their number is constant.
+        turn: the slowest and the fastest number of scans a second.
+        relatives: ids of sensors that it can be mistaken for -> the field or the rhythm that tells them apart.
+        info: what frames say of the device ("serial", "firmware", "model", "temperature") -> the field, as "frame.path".
+        status: how far it is proven: "manual", "vectors", "capture" or "hardware".
+        source: the manual with its revision and sections, the captures.
+        aliases: other ids that it is known by.
+        api: the version of this interface that it was written for.
+        acknowledged: findings of `lidarspec check` about the sensor as a whole that are true and meant, as "LS401" -> the reason.
+        options: what it was configured with; not for plugins to set.
+        hooked: applies the hooks of installed plugins to a value like this one; not for plugins to set.
 
-    def build(self, sensor: Sensor, frame: str, value: Any, values: Mapping[str, Any], *, units: bool) -> bytes:
-        return build(sensor, frame, value, values, units=units)
+    Raises:
+        SpecError: for an id, status or reference between its parts that cannot be.
+    """
 
-    def example(self, sensor: Sensor, frame: str, *, seed: int) -> bytes:
-        return examples.example(sensor, frame, seed=seed)
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        function = self.configure.function if isinstance(self.configure, Configure) else self.configure
+        object.__setattr__(self, "configure", Configure(self, function))
 
-    def command(self, sensor: Sensor, name: str, arguments: Mapping[str, Any]) -> bytes:
-        if name not in sensor.commands:
-            raise UnknownCommand(name, sensor.commands, place=sensor.id)
-        command, place = sensor.commands[name], f"{sensor.id} {name}"
-        unknown = set(arguments) - set(command.args)
-        if unknown:
-            raise UnknownField(min(unknown), command.args, place=place)
-        if command.frame is None:
-            return b""
-        fields = codec(sensor.frames[command.frame]).schema.fields
-        values: dict[str, Any] = {}
-        for path, value in command.values.items():
-            _put(values, path, value)
-        for argument, (path, low, high) in command.args.items():
-            if argument not in arguments:
-                raise MissingField(argument, place=place)
-            value = arguments[argument]
-            if not low <= value <= high:
-                raise OutOfRange(argument, value, low, high, unit=fields[path].unit, place=place)
-            raw = round((value - fields[path].offset) / fields[path].scale)
-            bottom, top = fields[path].limits
-            _put(values, path, min(max(raw, bottom), top))
-        return build(sensor, command.frame, None, values)
+    def parse(self, data: bytes, frame: str | None = None, *, verify: bool = True) -> Any:
+        """Exactly one frame as a construct Container of raw wire integers.
 
-    def decoder(self, sensor: Sensor, *, stream: bool | None, backend: str) -> Decoder:
+        Args:
+            frame: its type; found out where left out.
+            verify: False accepts wrong constants, a wrong checksum and trailing bytes.
+
+        Raises:
+            WireError: where the bytes are not such a frame: sensor, offset, field path, expected and got.
+        """
+        from lidarspec.wire.parse import parse
+
+        return parse(self, data, frame=frame, verify=verify)
+
+    def build(self, frame: str, value: Any = None, /, *, units: bool = False, **values: Any) -> bytes:
+        """The bytes of one frame; constants, counts and the checksum are filled in.
+
+        Args:
+            value: a mapping of all fields, such as what `parse` returned; `values` override it.
+            units: take physical values, and round them to the wire's steps.
+
+        Raises:
+            UsageError: for a missing or unknown field, or a value that its field cannot hold.
+        """
+        from lidarspec.wire.build import build
+
+        return build(self, frame, value, values, units=units)
+
+    def example(self, frame: str, *, seed: int = 0) -> bytes:
+        """The bytes of a valid frame with seeded random content."""
+        from lidarspec.simulation.frame_maker import example
+
+        return example(self, frame, seed=seed)
+
+    def command(self, name: str, **arguments: Any) -> bytes:
+        """The bytes of a command; arguments by name, in units.
+
+        Raises:
+            UnknownCommand, OutOfRange: for what the sensor does not take.
+        """
+        from lidarspec.wire.build import build_command
+
+        return build_command(self, name, arguments)
+
+    def decoder(self, *, stream: bool | None = None, backend: str = "auto") -> Decoder:
+        """A new incremental decoder, sans-IO and independent of every other.
+
+        Args:
+            stream: True reads a byte stream, False one datagram for each `feed`; by default what the data link says.
+        """
+        from lidarspec.framing.decoder import Decoder, backend as checked_backend
+        from lidarspec.points.numba_kernels import compiled_sums
+
         chosen = checked_backend(backend)
-        sums = kernelsums.compiled() if chosen == "jit" else None
-        stream = not sensor.datagrams if stream is None else stream
-        return Decoder(sensor, stream=stream, interpreted=chosen == "construct", backend=chosen, sums=sums)
+        sums = compiled_sums() if chosen == "jit" else None
+        stream = not self.datagrams if stream is None else stream
+        return Decoder(self, stream=stream, interpreted=chosen == "construct", backend=chosen, sums=sums)
 
-    def split(self, sensor: Sensor, data: Any, *, backend: str) -> list[Found]:
-        found = frames_of(self.decoder(sensor, stream=is_stream(data), backend=backend), data)
-        return [one for spans in found for one in spans.found()]
+    def split(self, data: Any, *, backend: str = "auto") -> list[Found]:
+        """Every incoming frame of all types, in stream order.
 
-    def decode(self, sensor: Sensor, data: Any, *, frame: str | None, backend: str) -> Packets:
-        decoder = self.decoder(sensor, stream=is_stream(data), backend=backend)
-        found = frames_of(decoder, data)
-        name = frame or data_frame(sensor, found) or sensor.data_frame
-        return PacketStream(sensor, name, decoder.stats, interpreted=decoder.interpreted, backend=decoder.backend).add(found, whole=True)
+        Args:
+            data: bytes (a stream), an iterable of datagrams, or an (n, size) uint8 array of datagrams.
+            backend: "auto", "numpy", "jit" or "construct": the same results.
+        """
+        from lidarspec.framing.decoder import frames_of, is_stream
 
-    def scans(self, sensor: Sensor, data: Any, *, backend: str) -> Iterator[Scan]:
-        return scans_of(sensor, [self.decode(sensor, data, frame=None, backend=backend)])
+        decoder = self.decoder(stream=is_stream(data), backend=backend)
+        return [found for frames in frames_of(decoder, data) for found in frames.found()]
 
-    def configure(self, sensor: Sensor, options: Mapping[str, Any]) -> Sensor:
-        own = {name: value for name, value in options.items() if name in ("frame", "answer")}
-        rest = {name: value for name, value in options.items() if name not in own}
-        _check_own(sensor, own)
-        found = sensor
-        if rest:
-            function = sensor.configure.function
-            if function is None:
-                raise UnknownOption(min(rest), ("frame", "answer"), place=sensor.id)
-            try:
-                found = registry().hooked(function(sensor, **rest))
-            except TypeError as error:
-                if "keyword" in str(error) or "argument" in str(error):
-                    raise UnknownOption(min(rest), ("frame", "answer"), place=sensor.id, hint=f": {error}") from None
-                raise
-        configure = Configure(found, sensor.configure.function)
-        return replaced(found, options={**sensor.options, **options}, configure=configure)
+    def decode(self, data: Any, frame: str | None = None, *, backend: str = "auto") -> Packets:
+        """The data frames, or those of another type, as columns.
 
-    def rebuild(self, sensor_id: str, options: Mapping[str, Any]) -> Sensor:
-        sensor = registry().sensor(sensor_id)
-        return self.configure(sensor, options) if options else sensor
+        Args:
+            data: bytes (a stream), an iterable of datagrams, or an (n, size) uint8 array of datagrams.
+            backend: "auto", "numpy", "jit" or "construct": the same results.
+        """
+        from lidarspec.framing.decoder import frames_of, is_stream
+        from lidarspec.packets.stream import PacketStream, data_frame
 
+        decoder = self.decoder(stream=is_stream(data), backend=backend)
+        frames = frames_of(decoder, data)
+        name = frame or data_frame(self, frames) or self.data_frame
+        return PacketStream(self, name, decoder.stats, interpreted=decoder.interpreted, backend=decoder.backend).add(frames, whole=True)
 
-def _check_own(sensor: Sensor, own: Mapping[str, Any]) -> None:
-    if "frame" in own:
-        if own["frame"] not in FRAMES_OF_REFERENCE:
-            raise UsageError(f"{sensor.id}: frame is one of {', '.join(FRAMES_OF_REFERENCE)}, not {own['frame']!r}")
-        if own["frame"] == "vendor" and sensor.vendor_axes is None:
-            raise UsageError(f"{sensor.id} declares no axes of its vendor")
-        if sensor.vendor_axes is not None:
-            try:
-                axis_matrix(sensor.vendor_axes)
-            except KeyError as error:
-                raise SpecError(f"no direction {error}", path="vendor_axes", sensor=sensor.id) from None
-    answers = [name for name, frame in sensor.frames.items() if frame.data]
-    if "answer" in own and own["answer"] not in answers:
-        raise UsageError(f"{sensor.id}: answer is one of {', '.join(answers)}, not {own['answer']!r}")
+    def scans(self, data: Any, *, backend: str = "auto") -> Iterator[Scan]:
+        """Every scan of the data; the first and last piece are marked ``complete=False``.
+
+        Args:
+            data: bytes (a stream), an iterable of datagrams, or an (n, size) uint8 array of datagrams.
+            backend: "auto", "numpy", "jit" or "construct": the same results.
+        """
+        from lidarspec.scans.scans import scans_of
+
+        return scans_of(self, [self.decode(data, backend=backend)])
 
 
-def _put(values: dict[str, Any], path: str, value: Any) -> None:
-    *parents, last = path.split(".")
-    for parent in parents:
-        values = values.setdefault(parent, {})
-    values[last] = value
+@dataclass(frozen=True)
+class Configure:
+    """``sensor.configure(...)``: the options of every sensor, then the sensor's own function, on a new value."""
+
+    sensor: Sensor
+    function: Callable[..., Sensor] | None
+
+    def __call__(self, **options: Any) -> Sensor:
+        """A new sensor with these options; the old one stays as it is.
+
+        Raises:
+            UnknownOption: for an option that neither every sensor nor this one has.
+            UsageError: for a value that an option cannot have.
+        """
+        sensor = self.sensor
+        own = {name: value for name, value in options.items() if name not in OPTIONS}
+        _check_shared(sensor, options)
+        configured = self._by_function(own) if own else sensor
+        return replace(configured, options={**sensor.options, **options}, configure=self.function)
+
+    def _by_function(self, options: Mapping[str, Any]) -> Sensor:
+        if self.function is None:
+            raise UnknownOption(min(options), OPTIONS, place=self.sensor.id)
+        try:
+            inspect.signature(self.function).bind(self.sensor, **options)
+        except TypeError as error:
+            raise UnknownOption(min(options), OPTIONS, place=self.sensor.id, hint=f": {error}") from None
+        configured = self.function(self.sensor, **options)
+        hooked: Sensor = self.sensor.hooked(configured) if self.sensor.hooked else configured
+        return hooked
+
+
+def _check_shared(sensor: Spec, options: Mapping[str, Any]) -> None:
+    frame = options.get("frame", FRAMES_OF_REFERENCE[0])
+    if frame not in FRAMES_OF_REFERENCE:
+        raise UsageError(f"{sensor.id}: frame is one of {', '.join(FRAMES_OF_REFERENCE)}, not {frame!r}")
+    if frame == "vendor" and sensor.vendor_axes is None:
+        raise UsageError(f"{sensor.id} declares no axes of its vendor")
+    if "answer" in options and options["answer"] not in sensor.data_frames:
+        raise UsageError(f"{sensor.id}: answer is one of {', '.join(sensor.data_frames)}, not {options['answer']!r}")

@@ -1,10 +1,10 @@
-"""What can be checked: an installed sensor, a file that describes sensors, a distribution with all of its plugins.
+"""`lidarspec check` without the command line: every property and every rule over a sensor, a file or a distribution.
 
-Where in a plugin's text a part of its spec stands: fields, frames, functions, commands and sensors, by file and line.
-
-Mistakes that show in the text of a plugin: what Python accepts, and what then does something else than it says.
-
-`lidarspec check` without the command line: every property and every rule over a sensor, a file or a distribution.
+A name is made a `Target` first: the sensors that it stands for, what kept others from being loaded, and the modules that they are written
+in. The text of these modules is read twice: for mistakes that show in it alone (what Python accepts, and what then does something else
+than it says), and for where fields, frames, functions, commands and sensors stand, so that a finding names file and line (`Places`). Then
+each sensor is held to its declaration and to the properties of `conformance`, in their order, and what it acknowledges is left out of the
+`Report`.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from pathlib import Path
 from typing import Any
 
 from lidarspec.errors import SourceError, SpecError
-from lidarspec.plugins import GROUP, EntryPoint, Registry, entry_points, file_module, registry
-from lidarspec.spec.description import Sensor
+from lidarspec.plugins import GROUP, SENSORS, EntryPoint, Registry, entry_points, file_module, registry
+from lidarspec.spec.sensor import Sensor
 from lidarspec.testing.conformance import PROPERTIES
 from lidarspec.testing.declared import declared
 from lidarspec.testing.findings import Finding, left_over
@@ -71,7 +71,7 @@ def target(text: str | Path) -> Target:
         return _folder(Path(name))
     if "/" in name or "\\" in name or name.endswith(".py"):
         return _file(Path(name))
-    entries = [entry for entry in entry_points(GROUP) if _normal(entry.distribution) == _normal(name)]
+    entries = _entries(name)
     if entries:
         return _distribution(entries)
     sensor = registry().sensor(name)
@@ -101,7 +101,7 @@ def _folder(folder: Path) -> Target:
         name = str(tomllib.loads((folder / "pyproject.toml").read_text(encoding="utf-8"))["project"]["name"])
     except (ValueError, KeyError) as error:
         raise SourceError(f"{folder / 'pyproject.toml'} names no project: {error}") from None
-    entries = [entry for entry in entry_points(GROUP) if _normal(entry.distribution) == _normal(name)]
+    entries = _entries(name)
     if not entries:
         raise SourceError(f"{name} is not installed, or has no sensors: pip install -e {folder}")
     found = _distribution(entries)
@@ -111,6 +111,12 @@ def _folder(folder: Path) -> Target:
 
 def _vectors(*folders: Path) -> Path | None:
     return next((folder / VECTORS for folder in folders if (folder / VECTORS).is_file()), None)
+
+
+def _entries(distribution: str) -> list[EntryPoint]:
+    """What a distribution adds: modules with hooks, and sensors by id and alias."""
+    entries = [*entry_points(GROUP), *entry_points(SENSORS)]
+    return [entry for entry in entries if _normal(entry.distribution) == _normal(distribution)]
 
 
 def _distribution(entries: list[EntryPoint]) -> Target:
@@ -138,6 +144,8 @@ def _added(plugin: Any, name: str) -> list[Sensor]:
     Raises:
         Exception: whatever it fails with.
     """
+    if isinstance(plugin, Sensor):
+        return [registry().hooked(plugin)]
     local = Registry()
     ids = local.add(plugin, name=name)
     sensors = [local.sensor(one) for one in ids]

@@ -10,7 +10,7 @@ import pytest
 
 if TYPE_CHECKING:
     from lidarspec.plugins import Registry
-    from lidarspec.spec.description import Sensor
+    from lidarspec.spec.sensor import Sensor
     from lidarspec.transports.serving import Served
 
 
@@ -23,7 +23,7 @@ def pytest_configure(config: pytest.Config) -> None:
 def sensor(request: pytest.FixtureRequest) -> Sensor:
     """The sensor under test: that of ``@pytest.mark.lidarspec("acme-x1")``, or of the test class."""
     from lidarspec.plugins import sensor as named
-    from lidarspec.spec.description import Sensor
+    from lidarspec.spec.sensor import Sensor
 
     marker = request.node.get_closest_marker("lidarspec")
     wanted = marker.args[0] if marker else getattr(request.cls, "sensor", None)

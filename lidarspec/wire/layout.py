@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.spec.bits import BitField
-from lidarspec.spec.checksums import Checksum
-from lidarspec.wire.schema import FieldInfo
+from lidarspec.spec.checksums import Checksum, Single, single
+from lidarspec.spec.tree import FieldInfo, Node
 
 Bytes2D = NDArray[np.uint8]
 
@@ -208,7 +208,11 @@ class Seal:
                 stored |= (leaf.scalar(frame) & ((1 << leaf.info.bits) - 1)) << shift
             shift += leaf.info.bits
         parts = [frame[a:b] for a, b in self.spans]
-        return stored == self.algorithm(parts[0] if len(parts) == 1 else b"".join(parts)) or stored in self.absent
+        return stored == self._single(parts[0] if len(parts) == 1 else b"".join(parts)) or stored in self.absent
+
+    @cached_property
+    def _single(self) -> Single:
+        return single(self.algorithm)
 
     def intact(self, rows: Bytes2D, sums: Sums | None = None) -> NDArray[np.bool_]:
         """Which frames carry the right value, or one that means "not filled", (n,); `sums` as in `computed`."""
@@ -227,7 +231,7 @@ class Layout:
         constants: offset -> (mask, value).
         seals: its checksums, inner ones first.
         places: byte range of each named part outside arrays.
-        branches: what each If and Switch chose.
+        branches: what each `When` and `Select` chose.
         following: fields whose values follow from this header in a frame that is made, and those; they are not asked of one that comes.
         lengths: of each array, by its axis; 0 in an array without elements.
         notes: what is worked out from the layout and kept with it.
@@ -238,7 +242,7 @@ class Layout:
     constants: Mapping[int, tuple[int, int]]
     seals: tuple[Seal, ...]
     places: Mapping[str, tuple[int, int]]
-    branches: Mapping[str, Any] = field(default_factory=dict)
+    branches: Mapping[Node, Node] = field(default_factory=dict)
     following: tuple[tuple[Leaf, int], ...] = ()
     lengths: Mapping[str, int] = field(default_factory=dict)
     notes: dict[Any, Any] = field(default_factory=dict, repr=False)
@@ -248,11 +252,20 @@ class Layout:
         masks, values = ([self.constants[spot][i] for spot in spots] for i in (0, 1))
         object.__setattr__(self, "_constants", (np.array(spots, np.intp), np.array(masks, np.uint8), np.array(values, np.uint8)))
 
+    @cached_property
+    def _mask(self) -> int:
+        """The bits of a frame that are constant, as one number."""
+        return sum(mask << 8 * spot for spot, (mask, _) in self.constants.items())
+
+    @cached_property
+    def _value(self) -> int:
+        return sum(value << 8 * spot for spot, (_, value) in self.constants.items())
+
     def sound(self, frame: bytes) -> bool:
         """Whether one frame has this size, all constants and the right checksums."""
         return (
             len(frame) == self.size
-            and all(frame[spot] & mask == value for spot, (mask, value) in self.constants.items())
+            and int.from_bytes(frame, "little") & self._mask == self._value
             and all(seal.sound(frame) for seal in self.seals)
         )
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from lidarspec import hookimpl
+from lidarspec.spec import hookimpl
 from tests.broken.sound import sensor
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 
-from lidarspec import hookimpl
+from lidarspec.spec import hookimpl
 from tests.broken.sound import sensor
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from construct import Const
 
-from lidarspec import Command, Frame, hookimpl
+from lidarspec.spec import Command, Frame, hookimpl
 from tests.broken.sound import sensor
 
 PLAIN = sensor()

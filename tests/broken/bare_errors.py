@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from construct import StreamError
 
-from lidarspec import Sensor, WireError, hookimpl
+from lidarspec import Sensor, WireError
+from lidarspec.spec import hookimpl
 from tests.broken.sound import sensor
 
 

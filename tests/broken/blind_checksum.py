@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from lidarspec import Checksum, Checksummed, hookimpl
+from lidarspec.spec import Checksum, Checksummed, hookimpl
 from tests.broken.sound import frame, sensor, struct
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from lidarspec import Clock, hookimpl
+from lidarspec.spec import Clock, hookimpl
 from tests.broken.sound import sensor
 
 

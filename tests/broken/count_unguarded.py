@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from lidarspec import Polar, hookimpl, spread
+from lidarspec.spec import Polar, hookimpl, spread
 from tests.broken.sound import sensor
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from lidarspec import Polar, hookimpl, spread
+from lidarspec.spec import Polar, hookimpl, spread
 from tests.broken.sound import sensor
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from lidarspec import Polar, hookimpl, spread, take
+from lidarspec.spec import Polar, hookimpl, spread, take
 from tests.broken.sound import LONGEST, WRAP, frame, sensor
 
 OFFSETS = np.full(360, 0.25)  # degrees

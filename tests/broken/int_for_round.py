@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from construct import Const, ExprAdapter, Int16ul, Struct
 
-from lidarspec import Frame, hookimpl
+from lidarspec.spec import Frame, hookimpl
 from tests.broken.sound import sensor
 
 CENTIMETRES = ExprAdapter(Int16ul, lambda value, context: value * 0.01, lambda value, context: int(value / 0.01))

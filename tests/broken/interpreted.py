@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from construct import Const, ExprAdapter, Int8ul, Struct
 
-from lidarspec import Frame, hookimpl
+from lidarspec.spec import Frame, hookimpl
 from tests.broken.sound import sensor
 
 WHITENED = ExprAdapter(Int8ul, lambda value, context: value ^ 0x55, lambda value, context: value ^ 0x55)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from construct import Bytes, Int8ul
 
-from lidarspec import hookimpl
+from lidarspec.spec import hookimpl
 from tests.broken.sound import SIZE, frame, sealed, sensor
 
 LENGTHS = {1: 1, 2: 2, 3: 3}

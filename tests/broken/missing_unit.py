@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from construct import Array, Int8ul, Int16ul, Struct, this
 
-from lidarspec import hookimpl
+from lidarspec.spec import hookimpl
 from tests.broken.sound import frame, sealed, sensor
 
 SAMPLE = Struct("distance" / Int16ul, "quality" / Int8ul)

@@ -1,6 +1,6 @@
 """A hook that does not exist."""
 
-from lidarspec import hookimpl
+from lidarspec.spec import hookimpl
 from tests.broken.sound import sensor
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from lidarspec import hookimpl
+from lidarspec.spec import Simulation, hookimpl
 from tests.broken.sound import frame, sensor
 
 
@@ -12,4 +12,4 @@ def plausible(f):
 
 @hookimpl
 def lidarspec_sensors():
-    return [sensor(frame(plausible=plausible), sweep=None)]
+    return [sensor(frame(plausible=plausible), simulation=Simulation())]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from lidarspec import Frame, hookimpl
+from lidarspec.spec import Frame, hookimpl
 from tests.broken.sound import sealed, sensor
 
 DATA = Frame(sealed(), data=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from construct import Const, Int8ul
 
-from lidarspec import Checksummed, Xor, hookimpl
+from lidarspec.spec import Checksummed, Xor, hookimpl
 from tests.broken.sound import SIZE, frame, sensor, struct
 
 DATA = Checksummed(struct(header=Const(b"\xaa"), sum=Int8ul), field="sum", algorithm=Xor())

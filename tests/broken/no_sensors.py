@@ -1,6 +1,6 @@
 """A plugin that lists something else than sensors."""
 
-from lidarspec import hookimpl
+from lidarspec.spec import hookimpl
 
 
 @hookimpl

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from construct import Int16ul, Rebuild, this
 
-from lidarspec import hookimpl
+from lidarspec.spec import hookimpl
 from tests.broken.sound import FIELDS, SIZE, frame, sealed, sensor
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from construct import Int8ul, Pointer
 
-from lidarspec import hookimpl
+from lidarspec.spec import hookimpl
 from tests.broken.sound import SIZE, frame, sealed, sensor
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from lidarspec import Xor, hookimpl
+from lidarspec.spec import Xor, hookimpl
 from tests.broken import sound
 
 ALGORITHMS = {"other-one": Xor()}

@@ -1,6 +1,6 @@
 """A hook that fails while it lists its sensors."""
 
-from lidarspec import hookimpl
+from lidarspec.spec import hookimpl
 from tests.broken.sound import sensor
 
 

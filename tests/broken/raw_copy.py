@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from construct import Checksum, Int8ul, RawCopy, Struct, this
 
-from lidarspec import hookimpl
+from lidarspec.spec import hookimpl
 from tests.broken.sound import SIZE, frame, sensor, struct
 
 DATA = Struct(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from lidarspec import Command, hookimpl
+from lidarspec.spec import Command, hookimpl
 from tests.broken.sound import sensor
 
 

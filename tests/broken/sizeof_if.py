@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from construct import Const, If, Int8ul, Struct, this
 
-from lidarspec import hookimpl
+from lidarspec.spec import hookimpl
 from tests.broken.sound import frame, sensor
 
 EXTENDED = Struct("header" / Const(b"\xaa\x55"), "kind" / Int8ul, "extra" / If(this.kind == 1, Int8ul))

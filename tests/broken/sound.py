@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 from construct import Array, Const, Int8ul, Int16sl, Int16ul, Struct, this
 
-from lidarspec import (
+from lidarspec import Sensor
+from lidarspec.spec import (
     Checksummed,
     Clock,
     Command,
@@ -16,9 +17,9 @@ from lidarspec import (
     OnWrap,
     Polar,
     Scaled,
-    Sensor,
     Sequence,
     Serial,
+    Simulation,
     Sum,
     Xor,
     hookimpl,
@@ -100,7 +101,7 @@ def sensor(data: Frame | None = None, kind: type[Sensor] = Sensor, **changes: An
         links={"data": Serial(115_200)},
         clock=Clock("time", wraps_at=WRAP),
         sequence=Sequence("number"),
-        sweep=sweep,
+        simulation=Simulation(sweep),
         range_limits=(0.05, 30.0),
         status="manual",
         source="invented for the tests",

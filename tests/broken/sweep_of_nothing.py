@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from lidarspec import hookimpl
+from lidarspec.spec import Simulation, hookimpl
 from tests.broken import sound
 
 
@@ -12,4 +12,4 @@ def sweep(i):
 
 @hookimpl
 def lidarspec_sensors():
-    return [sound.sensor(sweep=sweep)]
+    return [sound.sensor(simulation=Simulation(sweep))]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from lidarspec import Checksummed, Sum, hookimpl
+from lidarspec.spec import Checksummed, Sum, hookimpl
 from tests.broken.sound import frame, sensor, struct
 
 DATA = Checksummed(struct(), field="sum", algorithm=Sum(16), over=("header", "number", "time", "tilt", "first", "last", "count"))

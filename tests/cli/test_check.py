@@ -46,12 +46,12 @@ def test_json_has_the_same(tmp_path: Path) -> None:
 
 def test_a_distribution_is_checked_with_all_of_its_sensors() -> None:
     found = json.loads(ran("check", "lidarspec-ldrobot", "--max-examples", "3", "--json").stdout)
-    assert [report["name"] for report in found] == ["ldrobot-stl27l", "ldrobot-ld06"]
+    assert [report["name"] for report in found] == ["ldrobot-ld06", "ldrobot-stl27l"]
 
 
 def test_a_distribution_is_checked_by_its_folder(tmp_path: Path) -> None:
     report, _ = json.loads(ran("check", ROOT / "plugins" / "lidarspec-ldrobot", "--max-examples", "3", "--json").stdout)
-    assert report["name"] == "ldrobot-stl27l"
+    assert report["name"] == "ldrobot-ld06"
     (tmp_path / "pyproject.toml").write_text('[project]\nname = "lidarspec-nobody-has"\n', encoding="utf-8")
     assert f"lidarspec-nobody-has is not installed, or has no sensors: pip install -e {tmp_path}" in ran("check", tmp_path, code=3).output
 

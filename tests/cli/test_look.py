@@ -71,7 +71,7 @@ def test_show_works_for_every_sensor(sensor: str) -> None:
 
 def test_plugins_names_distributions() -> None:
     found = {plugin["distribution"]: plugin for plugin in printed("plugins")}
-    assert found["lidarspec-ldrobot"]["sensors"] == ["ldrobot-stl27l", "ldrobot-ld06"]
+    assert found["lidarspec-ldrobot"]["sensors"] == ["ldrobot-ld06", "ldrobot-stl27l"]
     assert "lidarspec-ldrobot" in ran("plugins").stdout
 
 

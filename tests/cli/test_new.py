@@ -28,8 +28,9 @@ def installed(folder: Path) -> dict[str, str]:
     project = tomllib.loads((folder / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     about = folder / f"{project['name'].replace('-', '_')}-{project['version']}.dist-info"
     about.mkdir(exist_ok=True)
-    entries = "".join(f"{name} = {value}\n" for name, value in project["entry-points"]["lidarspec"].items())
-    (about / "entry_points.txt").write_text(f"[lidarspec]\n{entries}", encoding="utf-8")
+    groups = {group: "".join(f"{name} = {value}\n" for name, value in named.items()) for group, named in project["entry-points"].items()}
+    entries = "".join(f"[{group}]\n{listed}" for group, listed in groups.items())
+    (about / "entry_points.txt").write_text(entries, encoding="utf-8")
     header = f"Metadata-Version: 2.1\nName: {project['name']}\nVersion: {project['version']}\n"
     (about / "METADATA").write_text(header, encoding="utf-8")
     paths = [str(folder), *filter(None, [os.environ.get("PYTHONPATH")])]
@@ -105,7 +106,7 @@ def test_its_simulation_can_be_viewed_and_recorded(made: Path) -> None:
 def test_it_is_exported_to_every_other_tool(made: Path) -> None:
     sensor = ls.sensor(made / "lidarspec_acme_x1" / "__init__.py")
     for kind in EXPORTS:
-        text = export(kind, sensor)
+        text = export(sensor, kind)
         assert "checksum" in text.lower() or "crc" in text.lower() or kind == "pyi", kind
         assert "distance" in text, kind
 

@@ -17,6 +17,7 @@ import pytest
 
 import lidarspec as ls
 from lidarspec.simulation.simulator import simulate
+from lidarspec.spec import Crc
 from lidarspec.testing.fixtures import virtual_port
 from tests.cli.running import printed, process, ran
 from tests.lines import paced, port, udp, working
@@ -90,7 +91,7 @@ class TestDetect:
         source = random.Random(3)
         bodies = [b"\x99\x88\x77" + bytes([index]) + source.randbytes(20) for index in range(60)]
         path = tmp_path / "unknown.bin"
-        path.write_bytes(b"".join(body + ls.Crc(16, 0x8005, 0xFFFF, True, True)(body).to_bytes(2, "little") for body in bodies))
+        path.write_bytes(b"".join(body + Crc(16, 0x8005, 0xFFFF, True, True)(body).to_bytes(2, "little") for body in bodies))
         found = ran("detect", path, code=4)
         assert "sync      99 88 77" in found.stdout
         assert "26 bytes each: 60 of them" in found.stdout

@@ -11,6 +11,7 @@ import pytest
 from construct import Array, BitsInteger, BitStruct, ByteSwapped, Const, Int8ul, Int16ul, Struct, this
 
 import lidarspec as ls
+from lidarspec.spec import Checksummed, Fields, Frame, OnFlag, Polar, Scaled, WordXor, spread
 from tests.sensors.evidence import capture, clockwise, decoded, vector_bytes, vectors
 
 FILE = "vectors_serial2d.json"
@@ -22,7 +23,7 @@ def turn(*, start: int = 0, number: int = 17) -> bytes:
     """Packets along the sensor's sweep, all at 1 m."""
     frames = []
     for i in range(start, start + number):
-        values = SENSOR.sweep(i) if SENSOR.sweep else {}
+        values = SENSOR.simulation.sweep(i) if SENSOR.simulation.sweep else {}
         samples = [{"distance": 1.0, "intensity": 7, "exposure": values["samples.exposure"]}] * int(values["lsn"])
         nested: dict[str, Any] = {"samples": samples}
         for path in ("mt.frequency", "mt.start", "fsa.angle", "lsa.angle"):
@@ -136,34 +137,34 @@ def test_a_command_seen_on_the_line_is_no_frame_of_the_sensor() -> None:
     assert SENSOR.split(SENSOR.command("start") + SENSOR.command("stop")) == []
 
 
-def changed_struct() -> ls.Checksummed:
+def changed_struct() -> Checksummed:
     """The point packet with fields renamed and in another order, and the distance beside the intensity by bytes."""
-    angle = ByteSwapped(BitStruct("value" / ls.Scaled(BitsInteger(15), 1 / 64, "deg"), "check" / Const(1, BitsInteger(1))))
-    sample = Struct("strength" / Int8ul, "far" / ls.Scaled(Int16ul, 0.001, "m"))
-    return ls.Checksummed(
+    angle = ByteSwapped(BitStruct("value" / Scaled(BitsInteger(15), 1 / 64, "deg"), "check" / Const(1, BitsInteger(1))))
+    sample = Struct("strength" / Int8ul, "far" / Scaled(Int16ul, 0.001, "m"))
+    return Checksummed(
         Struct(
             "header" / Const(b"\xaa\x55"),
             "number" / Int8ul,
-            "turn" / BitStruct("begins" / BitsInteger(1), "hertz" / ls.Scaled(BitsInteger(7), 0.1, "Hz")),
+            "turn" / BitStruct("begins" / BitsInteger(1), "hertz" / Scaled(BitsInteger(7), 0.1, "Hz")),
             "last" / angle,
             "first" / angle,
             "returns" / Array(this.number, sample),
             "seal" / Int16ul,
         ),
         field="seal",
-        algorithm=ls.WordXor(),
+        algorithm=WordXor(),
     )
 
 
-def changed_points(f: ls.Fields) -> ls.Polar:
+def changed_points(f: Fields) -> Polar:
     """The points of `changed_struct`, without the correction."""
-    angles = ls.spread(f.first.value, f.last.value, f.number, full=360.0)
-    return ls.Polar(range=f.returns.far, azimuth=-np.deg2rad(angles), intensity=f.returns.strength)
+    angles = spread(f.first.value, f.last.value, f.number, full=360.0)
+    return Polar(range=f.returns.far, azimuth=-np.deg2rad(angles), intensity=f.returns.strength)
 
 
 def test_decoding_follows_a_struct_with_renamed_and_reordered_fields() -> None:
-    frame = ls.Frame(changed_struct(), data=True, max_length=1000)
-    other = dataclasses.replace(COIN, frames={**COIN.frames, "data": frame}, points=changed_points, scan=ls.OnFlag("turn.begins"))
+    frame = Frame(changed_struct(), data=True, max_length=1000)
+    other = dataclasses.replace(COIN, frames={**COIN.frames, "data": frame}, points=changed_points, scan=OnFlag("turn.begins"))
     samples = [{"far": 1.0, "strength": 5}, {"far": 2.0, "strength": 6}, {"far": 4.0, "strength": 7}, {"far": 8.0, "strength": 8}]
     turn = {"begins": 0, "hertz": 0}
     data = other.build("data", units=True, turn=turn, first={"value": 30}, last={"value": 300}, returns=samples)

@@ -12,7 +12,7 @@ import pytest
 import lidarspec as ls
 from lidarspec.captures.pcap import CaptureReader
 from lidarspec.packets.stream import PacketStream
-from lidarspec.testing.comparisons import assert_same_points
+from lidarspec.testing.agreement import assert_same_points
 from tests.sensors.evidence import assert_points, capture, clockwise, decoded, vector_bytes, vectors
 
 FILE = "vectors_udp3d.json"

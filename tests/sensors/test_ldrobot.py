@@ -13,6 +13,7 @@ from construct import Array, Const, Int8ul, Int16ul, Struct
 
 import lidarspec as ls
 from lidarspec.packets.stream import PacketStream
+from lidarspec.spec import Checksummed, Clock, Crc, Fields, Frame, Polar, Scaled, Serial, spread
 from tests.sensors.evidence import assert_points, capture, clockwise, decoded, vector_bytes, vectors
 
 FILE = "vectors_serial2d.json"
@@ -91,7 +92,7 @@ def test_frames_of_the_ld14_are_not_ours(name: str) -> None:
 
 def test_the_crc_has_all_256_entries() -> None:
     # The manual's table lacks entries 175 to 186; the register after one byte from 0 is the entry of that byte.
-    crc = ls.Crc(width=8, poly=0x4D)
+    crc = Crc(width=8, poly=0x4D)
     assert bytes(crc(bytes([index])) for index in range(175, 187)).hex(" ") == "3f ca 87 50 1d b3 fe 29 64 38 75 a2"
     assert [crc(bytes([index])) for index in (1, 2, 174, 187, 255)] == [0x4D, 0x9A, 0x72, 0xEF, 0xA8]
     assert crc(b"123456789") == 0xC3
@@ -189,9 +190,9 @@ def test_points_of_a_frame_are_apart_by_the_rate_of_the_model(sensor: ls.Sensor,
 
 @pytest.mark.parametrize(("sensor", "number"), [(SENSOR, 2160), (LD06, 450)])
 def test_turns_are_cut_where_the_angle_passes_zero(sensor: ls.Sensor, number: int) -> None:
-    assert sensor.sweep is not None
+    assert sensor.simulation.sweep is not None
     points = [dict(distance=2.0, intensity=9)] * 12
-    frames = [sensor.build("data", units=True, points=points, **sensor.sweep(i)) for i in range(5 * number // 24)]
+    frames = [sensor.build("data", units=True, points=points, **sensor.simulation.sweep(i)) for i in range(5 * number // 24)]
     scans = list(sensor.scans(b"".join(frames)))
     assert scans[1].complete
     assert not scans[-1].complete
@@ -202,30 +203,30 @@ def test_turns_are_cut_where_the_angle_passes_zero(sensor: ls.Sensor, number: in
 
 def test_speed_and_links() -> None:
     assert SENSOR.decode(QUADRANTS)["speed"].tolist() == [3600]  # degrees per second: 10 Hz
-    assert (SENSOR.links["data"], LD06.links["data"]) == (ls.Serial(921_600), ls.Serial(230_400))
+    assert (SENSOR.links["data"], LD06.links["data"]) == (Serial(921_600), Serial(230_400))
     assert not SENSOR.commands
 
 
 def test_decoding_follows_a_struct_with_renamed_and_reordered_fields() -> None:
-    struct = ls.Checksummed(
+    struct = Checksummed(
         Struct(
             "header" / Const(b"\x54\x2c"),
             "crc" / Int8ul,
-            "clock" / ls.Scaled(Int16ul, 0.001, "s"),
-            "echoes" / Array(12, Struct("strength" / Int8ul, "far" / ls.Scaled(Int16ul, 0.001, "m"))),
-            "to" / ls.Scaled(Int16ul, 0.01, "deg"),
-            "since" / ls.Scaled(Int16ul, 0.01, "deg"),
-            "speed" / ls.Scaled(Int16ul, 1, "deg/s"),
+            "clock" / Scaled(Int16ul, 0.001, "s"),
+            "echoes" / Array(12, Struct("strength" / Int8ul, "far" / Scaled(Int16ul, 0.001, "m"))),
+            "to" / Scaled(Int16ul, 0.01, "deg"),
+            "since" / Scaled(Int16ul, 0.01, "deg"),
+            "speed" / Scaled(Int16ul, 1, "deg/s"),
         ),
         field="crc",
-        algorithm=ls.Crc(width=8, poly=0x4D),
+        algorithm=Crc(width=8, poly=0x4D),
     )
 
-    def points(f: ls.Fields) -> ls.Polar:
-        return ls.Polar(f.echoes.far, -np.deg2rad(ls.spread(f.since, f.to, 12, full=360.0)), intensity=f.echoes.strength)
+    def points(f: Fields) -> Polar:
+        return Polar(f.echoes.far, -np.deg2rad(spread(f.since, f.to, 12, full=360.0)), intensity=f.echoes.strength)
 
     other = dataclasses.replace(
-        SENSOR, frames={"data": ls.Frame(struct, data=True, max_length=47)}, points=points, clock=ls.Clock("clock", wraps_at=30.0)
+        SENSOR, frames={"data": Frame(struct, data=True, max_length=47)}, points=points, clock=Clock("clock", wraps_at=30.0)
     )
     echoes = [dict(far=1 + k / 2, strength=10 + k) for k in range(12)]
     data = other.build("data", units=True, clock=1.0, since=30, to=277.5, speed=3600, echoes=echoes)

@@ -10,6 +10,7 @@ import pytest
 from construct import Array, Bytes, Const, Int8ub, Int16ub, Int32ub, Struct
 
 import lidarspec as ls
+from lidarspec.spec import Clock, Fields, Frame, OnRewind, Polar, Scaled, Sequence, Udp
 from tests.sensors.evidence import assert_points, decoded, vector_bytes, vectors
 
 FILE = "vectors_udp3d.json"
@@ -159,7 +160,7 @@ def test_the_device_information() -> None:
     )
     assert ".".join(map(str, parsed.lidar_ip)) == expected["lidar_ip"]
     assert ".".join(map(str, parsed.host_ip)) == expected["host_ip"]
-    assert SENSOR.links["data"] == ls.Udp(parsed.msop_port, parsed.difop_port)
+    assert SENSOR.links["data"] == Udp(parsed.msop_port, parsed.difop_port)
 
 
 @pytest.mark.parametrize("size", [0, 1, 255, 257, 1209, 1211, 62152])
@@ -179,10 +180,10 @@ def test_errors_name_the_field() -> None:
 
 
 def test_the_sweep_stays_in_the_field_of_view() -> None:
-    assert SENSOR.sweep is not None
+    assert SENSOR.simulation.sweep is not None
     seen: dict[str, list[Any]] = {"azimuth": [], "elevation": []}
     for i in range(0, 630, 3):
-        values = SENSOR.sweep(i)
+        values = SENSOR.simulation.sweep(i)
         assert values["pkt_psn"] == i + 1
         for name, angles in seen.items():
             angles.append(values[f"blocks.channels.{name}"])
@@ -191,30 +192,30 @@ def test_the_sweep_stays_in_the_field_of_view() -> None:
     assert (azimuth.min(), azimuth.max()) == (pytest.approx(-60, abs=0.2), pytest.approx(60, abs=0.2))
     assert (elevation.min(), elevation.max()) == (pytest.approx(-12.5, abs=0.3), pytest.approx(12.5, abs=0.3))
     np.testing.assert_allclose(np.ptp(azimuth, axis=(0, 1)), 24, atol=0.3)  # each channel a fifth of 120 degrees
-    assert SENSOR.sweep(630)["pkt_psn"] == 1
-    assert SENSOR.sweep(6300 + 63)["seconds"] + SENSOR.sweep(6300 + 63)["microseconds"] == pytest.approx(1.01)
+    assert SENSOR.simulation.sweep(630)["pkt_psn"] == 1
+    assert SENSOR.simulation.sweep(6300 + 63)["seconds"] + SENSOR.simulation.sweep(6300 + 63)["microseconds"] == pytest.approx(1.01)
 
 
 def test_decoding_follows_a_struct_with_renamed_and_reordered_fields() -> None:
-    shot = Struct("bearing" / ls.Scaled(Int16ub, 0.01, "deg", offset=-327.68), "far" / ls.Scaled(Int16ub, 0.005, "m"), "spare" / Bytes(2))
-    group = Struct("shots" / Array(5, shot), "delay" / ls.Scaled(Int8ub, 1e-6, "s"))
+    shot = Struct("bearing" / Scaled(Int16ub, 0.01, "deg", offset=-327.68), "far" / Scaled(Int16ub, 0.005, "m"), "spare" / Bytes(2))
+    group = Struct("shots" / Array(5, shot), "delay" / Scaled(Int8ub, 1e-6, "s"))
     struct = Struct(
         "magic" / Const(b"\x55\xaa\x5a\xa5"),
         "groups" / Array(3, group),
-        "micros" / ls.Scaled(Int32ub, 1e-6, "s"),
+        "micros" / Scaled(Int32ub, 1e-6, "s"),
         "turn" / Int16ub,
     )
 
-    def points(f: ls.Fields) -> ls.Polar:
-        return ls.Polar(f.groups.shots.far, np.deg2rad(f.groups.shots.bearing), time=f.groups.delay)
+    def points(f: Fields) -> Polar:
+        return Polar(f.groups.shots.far, np.deg2rad(f.groups.shots.bearing), time=f.groups.delay)
 
     other = dataclasses.replace(
         SENSOR,
-        frames={"data": ls.Frame(struct, data=True, max_length=103)},
+        frames={"data": Frame(struct, data=True, max_length=103)},
         points=points,
-        clock=ls.Clock("micros"),
-        sequence=ls.Sequence("turn"),
-        scan=ls.OnRewind("turn"),
+        clock=Clock("micros"),
+        sequence=Sequence("turn"),
+        scan=OnRewind("turn"),
     )
     groups = [{"delay": 0.00001 * g, "shots": [{"far": 1 + g, "bearing": 10 * k, "spare": b"xy"} for k in range(5)]} for g in range(3)]
     data = other.build("data", units=True, groups=groups, micros=0.5, turn=7)

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 import lidarspec as ls
+from lidarspec.errors import OutOfRange
 from lidarspec.framing.frame_engine import codec
 from tests.sensors.evidence import assert_points, clockwise, decoded, vector_bytes, vectors
 from tests.sensors.rplidar import believing
@@ -213,7 +214,7 @@ def test_requests_with_payload() -> None:
     assert A3.command("start_motor") == bytes.fromhex("a5f002 9402 c1")  # 660 of 1023
     assert S2.command("motor_speed", speed=600) == S2.command("start_motor") == bytes.fromhex("a5a802 5802 55")
     assert A3.command("get_accessory") == bytes.fromhex("a5ff04 00000000 5e")
-    with pytest.raises(ls.OutOfRange):
+    with pytest.raises(OutOfRange):
         A3.command("motor_duty", duty=1024)
 
 

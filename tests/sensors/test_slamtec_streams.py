@@ -7,10 +7,11 @@ import random
 import numpy as np
 import pytest
 
-import lidarspec as ls
 from lidarspec.simulation.simulator import simulate
-from lidarspec.testing.framing import Oracle, damaged
+from lidarspec.spec import Polar
 from lidarspec_slamtec.capsules import ultra_codes
+from tests.engine.oracle import Oracle
+from tests.engine.streams import damaged
 from tests.sensors.evidence import clockwise, decoded
 from tests.sensors.rplidar import A1, ANSWERS, believing, capsule, capsules, nodes_in, turns
 
@@ -111,7 +112,7 @@ def test_the_start_bit_stands_where_scans_begin() -> None:
 
 def test_simulated_predictions_that_cannot_reach_their_point_are_no_returns() -> None:
     near, far = 0.3, 20.0
-    polar = ls.Polar(np.array([[[near, far, near], [far, far, near], [0.0, near, 0.0]]]), 0)
+    polar = Polar(np.array([[[near, far, near], [far, far, near], [0.0, near, 0.0]]]), 0)
     codes = ultra_codes(polar)
     assert codes["cabins.predict1"][0].tolist()[0] == 511
     assert codes["cabins.major"][0, 2] == 0

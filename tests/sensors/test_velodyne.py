@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import lidarspec as ls
+from lidarspec.errors import UnknownOption
 from lidarspec.simulation.simulator import simulate
 from tests.sensors.evidence import assert_points, clockwise, decoded, vector_bytes, vectors
 
@@ -228,7 +229,7 @@ def test_the_option_is_checked_and_kept() -> None:
     assert VLP16.decode([filled(0)]).points().valid.all()
     with pytest.raises(ls.UsageError, match="previous, invalid"):
         VLP16.configure(last_block="mean")
-    with pytest.raises(ls.UnknownOption):
+    with pytest.raises(UnknownOption):
         VLP16.configure(last="invalid")
 
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from construct import Array, BitsInteger, BitsSwapped, BitStruct, ByteSwapped, Const, Int16ub, Int24sb, Int24ul, Struct
 
-from lidarspec import Checksummed, Crc, Fields, Frame, OnWrap, Polar, Scaled, Sensor, Serial, stack
+from lidarspec import Sensor
+from lidarspec.spec import Checksummed, Crc, Fields, Frame, OnWrap, Polar, Scaled, Serial, stack
 
 SAMPLES = 6
 

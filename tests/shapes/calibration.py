@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 from construct import Array, Const, Int8ul, Int16ul, Struct
 
-from lidarspec import Checksummed, Crc, Fields, Frame, OnWrap, Polar, Scaled, Sensor, Serial, UsageError, take
+from lidarspec import Sensor, UsageError
+from lidarspec.spec import Checksummed, Crc, Fields, Frame, OnWrap, Polar, Scaled, Serial, take
 
 EXAMPLE = Path(__file__).with_name("calibration.json")
 

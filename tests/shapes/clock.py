@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from construct import Array, Const, Int8ul, Int16ul, Struct
 
-from lidarspec import Checksummed, Clock, Every, Fields, Frame, Polar, Scaled, Sensor, Serial, Sum
+from lidarspec import Sensor
+from lidarspec.spec import Checksummed, Clock, Every, Fields, Frame, Polar, Scaled, Serial, Sum
 
 SAMPLES = 4
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from construct import Array, Const, Int8ul, Int16ul, Struct
 
-from lidarspec import Checksummed, Command, Fields, Frame, OnWrap, Polar, Scaled, Sensor, Serial, Sum, Xor
+from lidarspec import Sensor
+from lidarspec.spec import Checksummed, Command, Fields, Frame, OnWrap, Polar, Scaled, Serial, Sum, Xor
 
 SAMPLES = 3
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from construct import Array, Bytes, Const, Int8ub, Int16ub, Struct
 
-from lidarspec import Fields, Frame, OnWrap, Polar, Scaled, Sensor, Sequence, Udp
+from lidarspec import Sensor
+from lidarspec.spec import Fields, Frame, OnWrap, Polar, Scaled, Sequence, Udp
 
 BLOCKS, CHANNELS = 4, 3
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from construct import Array, Const, Int8ul, Int16ul, Struct
 
-from lidarspec import Checksummed, Fields, Frame, OnChange, Polar, Scaled, Sensor, Serial, Xor, stack
+from lidarspec import Sensor
+from lidarspec.spec import Checksummed, Fields, Frame, OnChange, Polar, Scaled, Serial, Xor, stack
 
 BEAMS = 5
 

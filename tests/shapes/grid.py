@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from construct import Array, Const, Int8sb, Int16ub, Struct
 
-from lidarspec import Cartesian, Checksummed, Crc, Fields, Frame, OnChange, Scaled, Sensor, Serial
+from lidarspec import Sensor
+from lidarspec.spec import Cartesian, Checksummed, Crc, Fields, Frame, OnChange, Scaled, Serial
 
 ROWS, COLUMNS = 3, 4
 

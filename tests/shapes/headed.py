@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 from construct import Array, Const, If, Int8ul, Int16ul, Struct, this
 
-from lidarspec import Fields, Frame, OnWrap, Polar, Scaled, Sensor, Sequence, Udp
+from lidarspec import Sensor
+from lidarspec.spec import Fields, Frame, OnWrap, Polar, Scaled, Sequence, Simulation, Udp
 
 CHANNELS = 3
 EXAMPLE = Path(__file__).with_name("calibration.json")
@@ -64,7 +65,7 @@ SENSOR = Sensor(
     scan=OnWrap("blocks.azimuth"),
     links={"data": Udp(7004)},
     sequence=Sequence("counter"),
-    sweep=sweep,
+    simulation=Simulation(sweep),
     configure=configure,
     range_limits=(0.1, 60.0),
     status="manual",

@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 from construct import Array, Const, Int16ul, Struct
 
-from lidarspec import Fields, Frame, OnWrap, Polar, Scaled, Sensor, Sequence, Udp
+from lidarspec import Sensor
+from lidarspec.spec import Fields, Frame, OnWrap, Polar, Scaled, Sequence, Simulation, Udp
 
 PLAIN = Struct(
     "magic" / Const(b"LN"),
@@ -38,7 +39,7 @@ SENSOR = Sensor(
     scan=OnWrap("azimuth"),
     links={"data": Udp(7003)},
     sequence=Sequence("counter"),
-    sweep=sweep,
+    simulation=Simulation(sweep),
     range_limits=(0.1, 60.0),
     status="manual",
     source="invented for the tests: data frames that differ in length alone",

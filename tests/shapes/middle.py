@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from construct import Array, Const, Int8ul, Int16ub, Int16ul, Struct
 
-from lidarspec import Checksummed, Fields, Frame, OnWrap, Polar, Scaled, Sensor, Serial, WordXor
+from lidarspec import Sensor
+from lidarspec.spec import Checksummed, Fields, Frame, OnWrap, Polar, Scaled, Serial, WordXor
 
 SAMPLES = 4
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from construct import Array, BitsInteger, BitStruct, Const, Int8ul, Int16ul, Struct
 
-from lidarspec import Checksummed, Fields, Frame, OnWrap, Polar, Scaled, Sensor, Serial, Sum
+from lidarspec import Sensor
+from lidarspec.spec import Checksummed, Fields, Frame, OnWrap, Polar, Scaled, Serial, Simulation, Sum
 
 SAMPLES = 4
 
@@ -51,10 +52,22 @@ SENSOR = Sensor(
         "begin_plain": Frame(Struct("descriptor" / Const(b"\xa5\x5a\x05\x81")), max_length=4),
         "begin_express": Frame(Struct("descriptor" / Const(b"\xa5\x5a\x54\x82")), max_length=4),
         "plain": Frame(
-            PLAIN, data=True, points=plain, max_length=6, plausible=lambda f: f.angle < 360, after="begin_plain", sweep=sweep_plain
+            PLAIN,
+            data=True,
+            points=plain,
+            max_length=6,
+            plausible=lambda f: f.angle < 360,
+            after="begin_plain",
+            simulation=Simulation(sweep_plain),
         ),
         "express": Frame(
-            EXPRESS, data=True, points=express, max_length=13, plausible=lambda f: f.angle < 360, after="begin_express", sweep=sweep_express
+            EXPRESS,
+            data=True,
+            points=express,
+            max_length=13,
+            plausible=lambda f: f.angle < 360,
+            after="begin_express",
+            simulation=Simulation(sweep_express),
         ),
     },
     points=None,

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from construct import Array, Bytes, Const, Int8ub, Int16ub, Int32ub, Struct
 
-from lidarspec import Checksummed, Crc, Fields, Frame, OnWrap, Polar, Scaled, Sensor, Serial, Sum
+from lidarspec import Sensor
+from lidarspec.spec import Checksummed, Crc, Fields, Frame, OnWrap, Polar, Scaled, Serial, Sum
 
 SAMPLES = 3
 

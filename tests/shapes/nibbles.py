@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from construct import Array, BitsInteger, BitStruct, Const, Int16ul, Struct
 
-from lidarspec import Checksummed, Fields, Frame, OnWrap, Polar, Scaled, Sensor, Serial, Xor
+from lidarspec import Sensor
+from lidarspec.spec import Checksummed, Fields, Frame, OnWrap, Polar, Scaled, Serial, Xor
 
 SAMPLES = 5
 

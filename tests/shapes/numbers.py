@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from construct import Array, Bytes, Const, Float32b, Float64l, Int8ul, Int16sl, Int16ul, Int32sb, Int64sb, Int64ul, Struct
 
-from lidarspec import Checksummed, Clock, Crc, Fields, Frame, OnWrap, Polar, Scaled, Sensor, Serial
+from lidarspec import Sensor
+from lidarspec.spec import Checksummed, Clock, Crc, Fields, Frame, OnWrap, Polar, Scaled, Serial
 
 SAMPLES = 3
 

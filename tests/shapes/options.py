@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from construct import Array, BitsInteger, BitStruct, Const, If, Int8ub, Int16ub, Int16ul, Int32ub, Struct, Switch, this
 
-from lidarspec import Checksummed, Crc, Fields, Frame, OnRewind, Polar, Scaled, Sensor, Serial
+from lidarspec import Sensor
+from lidarspec.spec import Checksummed, Crc, Fields, Frame, OnRewind, Polar, Scaled, Serial
 
 LONGEST = 48
 

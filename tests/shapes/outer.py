@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from construct import Array, BitsInteger, BitStruct, Const, Int8ul, Int16ul, Struct, this
 
-from lidarspec import Checksummed, Fields, Frame, OnWrap, Polar, Scaled, Sensor, Serial, Sum
+from lidarspec import Sensor
+from lidarspec.spec import Checksummed, Fields, Frame, OnWrap, Polar, Scaled, Serial, Sum
 
 MOST = 15
 

@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 from construct import Array, Const, Int8ub, Int16ub, Rebuild, Struct, this
 
-from lidarspec import Checksummed, Fields, Frame, OnWrap, Polar, Scaled, Sensor, Serial, Sum, spread
+from lidarspec import Sensor
+from lidarspec.spec import Checksummed, Fields, Frame, OnWrap, Polar, Scaled, Serial, Simulation, Sum, spread
 
 LONGEST = 30
 
@@ -47,7 +48,7 @@ SENSOR = Sensor(
     points=points,
     scan=OnWrap("azimuth"),
     links={"data": Serial(115_200)},
-    sweep=sweep,
+    simulation=Simulation(sweep),
     range_limits=(0.05, 30.0),
     status="manual",
     source="invented for the tests: a length that follows from another",

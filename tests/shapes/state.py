@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from construct import Array, Const, Int8ul, Int16sl, Int16ul, Struct
 
-from lidarspec import Checksummed, Fields, Frame, OnWrap, Polar, Scaled, Sensor, Serial, Sum
+from lidarspec import Sensor
+from lidarspec.spec import Checksummed, Fields, Frame, OnWrap, Polar, Scaled, Serial, Sum
 
 BLOCKS, CHANNELS = 3, 4
 

@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 from construct import Adapter, Const, GreedyBytes, NullTerminated, Struct, ValidationError
 
-from lidarspec import Fields, Frame, OnWrap, Polar, Scaled, Sensor, Serial
+from lidarspec import Sensor
+from lidarspec.spec import Fields, Frame, OnWrap, Polar, Scaled, Serial
 
 
 class Decimal(Adapter):  # type: ignore[misc]

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from construct import Array, Const, Int8ul, Int16ul, Struct
 
-from lidarspec import Checksummed, Crc, Fields, Frame, OnWrap, Polar, Scaled, Sensor, Serial, Xor
+from lidarspec import Sensor
+from lidarspec.spec import Checksummed, Crc, Fields, Frame, OnWrap, Polar, Scaled, Serial, Xor
 
 SAMPLES = 6
 MAGIC = b"\x5a\xa5"

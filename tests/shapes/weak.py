@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 from construct import BitsInteger, BitStruct, ByteSwapped, Const, Int8ul, Int16ul, Struct
 
-from lidarspec import Checksummed, Fields, Frame, OnFlag, Polar, Scaled, Sensor, Serial, Sum
+from lidarspec import Sensor
+from lidarspec.spec import Checksummed, Fields, Frame, OnFlag, Polar, Scaled, Serial, Sum
 
 DATA = Struct(
     "head" / BitStruct("quality" / BitsInteger(6), "inverse" / BitsInteger(1), "start" / BitsInteger(1)),

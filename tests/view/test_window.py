@@ -139,9 +139,11 @@ def broken(self, columns, lines):
     raise MemoryError("by hand")
 
 live.Window.cells = broken
+from lidarspec.spec import hookimpl
+
 found = ls.sensor("ldrobot-stl27l")
 
-@ls.hookimpl
+@hookimpl
 def lidarspec_sensors():
     return [found]
 """

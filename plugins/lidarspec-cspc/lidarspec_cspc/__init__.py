@@ -20,7 +20,8 @@ from typing import Any
 import numpy as np
 from construct import Array, BitsInteger, BitStruct, Bytes, ByteSwapped, Const, Construct, Int8ul, Int16ul, Struct, this
 
-from lidarspec import (
+from lidarspec import Sensor, UsageError
+from lidarspec.spec import (
     Checksummed,
     Command,
     Fields,
@@ -28,10 +29,9 @@ from lidarspec import (
     OnFlag,
     Polar,
     Scaled,
-    Sensor,
     Serial,
+    Simulation,
     Sum,
-    UsageError,
     WordXor,
     Xor,
     hookimpl,
@@ -206,6 +206,8 @@ def started(firmware: int, model: bytes, revision: int, *noise: bytes) -> tuple[
     return ("ack", {"firmware": firmware}), SETTLING, *noise, ("info", {"model": model, "revision": revision}), "scan_start"
 
 
+VERSION = (("ack", {"firmware": 3}),)
+
 M1C1_MINI = Sensor(
     "cspc-m1c1-mini",
     vendor="CSPC",
@@ -222,15 +224,15 @@ M1C1_MINI = Sensor(
     # 150 000 for this 3-byte format and DTR low: the SDK; 115 200: v1.1, for the older 2-byte format.
     links={"data": Serial(150_000, 115_200, dtr=False)},
     commands={
-        "start": asking(0xF0, starts=True, answers=started(3, b"M1C1_Mini", 4)),
+        "start": asking(0xF0, starts=True),
         "stop": asking(0xF5, stops=True),
         "low_exposure": Command("command", {"mode": 0xF1}),
         "high_exposure": Command("command", {"mode": 0xF2}),
-        "get_version": asking(0xFC, answers=(("ack", {"firmware": 3}),)),
+        "get_version": asking(0xFC),
     },
     fillers=b"\xfe\xff",
     state={"info": {"correction": 1, "zero_angle": 12}},  # the device information printed in the manual, 2.2.2
-    sweep=sweep,
+    simulation=Simulation(sweep, answers={"start": started(3, b"M1C1_Mini", 4), "get_version": VERSION}),
     configure=configure,
     on_open=("start",),
     on_close=("stop",),
@@ -245,7 +247,7 @@ COIN_D4 = dataclasses.replace(
     id="cspc-coin-d4",
     model="COIN-D4",
     links={"data": Serial(230_400, dtr=False)},
-    commands={**M1C1_MINI.commands, "start": asking(0xF0, starts=True, answers=started(1, b"COIN-D4", 1, b"\xfa\xfa"))},
+    simulation=Simulation(sweep, answers={"start": started(1, b"COIN-D4", 1, b"\xfa\xfa"), "get_version": VERSION}),
     state={"info": {"correction": 0, "zero_angle": 0}},  # the device information of a live unit
     status="capture",
     source="the M1C1_Mini's manual; baud rate from the vendor's SDK; a captured start-up of a COIN-D4",

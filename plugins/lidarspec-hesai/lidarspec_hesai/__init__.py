@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from lidarspec import Sensor, hookimpl
+from lidarspec import Sensor
+from lidarspec.spec import hookimpl
 from lidarspec_hesai.pandar40p import PANDAR40P
 from lidarspec_hesai.qt64 import QT64
 from lidarspec_hesai.xt import XT16, XT32

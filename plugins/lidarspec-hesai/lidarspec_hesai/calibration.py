@@ -16,7 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec import Points, Sensor, UsageError
+from lidarspec import Sensor, UsageError
+from lidarspec.spec import Points
 
 Table = NDArray[np.float64]
 

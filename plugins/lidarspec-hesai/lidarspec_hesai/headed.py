@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from construct import Array, BitsInteger, BitStruct, Bytes, Const, Construct, If, Int8ul, Int16ul, Int32ul, Struct, this
 
-from lidarspec import Fields, Polar, Scaled
+from lidarspec.spec import Fields, Polar, Scaled
 from lidarspec_hesai.calibration import Calibration
 from lidarspec_hesai.parts import beams
 

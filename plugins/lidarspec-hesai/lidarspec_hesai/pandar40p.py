@@ -16,7 +16,8 @@ from typing import Any
 import numpy as np
 from construct import Array, Bytes, Const, Int8ul, Int16ul, Int32ul, Struct
 
-from lidarspec import Clock, Fields, Frame, OnWrap, Polar, Scaled, Sensor, Sequence, Udp
+from lidarspec import Sensor
+from lidarspec.spec import Clock, Fields, Frame, OnWrap, Polar, Scaled, Sequence, Simulation, Udp
 from lidarspec_hesai.calibration import Calibration, configuring, nominal
 from lidarspec_hesai.parts import FACTORY, RETURN_MODES, UTC, beams, clock, turning
 
@@ -102,7 +103,7 @@ PANDAR40P = Sensor(
     links={"data": Udp(2368)},
     clock=Clock(clock),
     sequence=Sequence("sequence"),
-    sweep=sweep,
+    simulation=Simulation(sweep),
     configure=configuring(TABLE, points_with),
     range_limits=(0.3, 200.0),
     vendor_axes=("right", "forward", "up"),

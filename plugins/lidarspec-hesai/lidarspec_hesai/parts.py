@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from construct import Int8ul, Struct
 
-from lidarspec import Fields, Polar
+from lidarspec.spec import Fields, Polar
 from lidarspec_hesai.calibration import Calibration
 
 RETURN_MODES = "33 first, 34 second, 37 strongest, 38 last, 39 last and strongest, 3b first and last, 3c first and strongest, 3d three"

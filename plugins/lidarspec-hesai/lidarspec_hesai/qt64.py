@@ -9,7 +9,8 @@ from typing import Any
 
 from construct import Bytes, Int8ul, Int16ul, Int32ul
 
-from lidarspec import Clock, Frame, OnWrap, Scaled, Sensor, Sequence, Udp, take
+from lidarspec import Sensor
+from lidarspec.spec import Clock, Frame, OnWrap, Scaled, Sequence, Simulation, Udp, take
 from lidarspec_hesai.calibration import configuring, nominal
 from lidarspec_hesai.headed import header, longest, packet, plausible, points_by
 from lidarspec_hesai.parts import FACTORY, RETURN_MODES, UTC, clock, turning
@@ -73,7 +74,7 @@ QT64 = Sensor(
     links={"data": Udp(2368)},
     clock=Clock(clock),
     sequence=Sequence("sequence"),
-    sweep=sweep,
+    simulation=Simulation(sweep),
     configure=configuring(TABLE, points_with),
     range_limits=(0.1, 60.0),
     vendor_axes=("right", "forward", "up"),

@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 from construct import Bytes, Int8ul, Int16ul, Int32ul
 
-from lidarspec import Clock, Frame, OnWrap, Scaled, Sensor, Sequence, Udp
+from lidarspec import Sensor
+from lidarspec.spec import Clock, Frame, OnWrap, Scaled, Sequence, Simulation, Udp
 from lidarspec_hesai.calibration import configuring, nominal
 from lidarspec_hesai.headed import channel_times, header, longest, packet, plausible, points_by
 from lidarspec_hesai.parts import FACTORY, RETURN_MODES, UTC, clock, turning
@@ -54,7 +55,7 @@ XT32 = Sensor(
     links={"data": Udp(2368)},
     clock=Clock(clock),
     sequence=Sequence("sequence"),
-    sweep=sweep,
+    simulation=Simulation(sweep),
     configure=configuring(TABLE_32, points_with),
     range_limits=(0.05, 120.0),
     vendor_axes=("right", "forward", "up"),

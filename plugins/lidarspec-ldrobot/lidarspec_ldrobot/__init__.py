@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 from construct import Array, Const, Int8ul, Int16ul, Struct
 
-from lidarspec import Checksummed, Clock, Crc, Fields, Frame, OnWrap, Polar, Scaled, Sensor, Serial, hookimpl, spread
+from lidarspec import Sensor
+from lidarspec.spec import Checksummed, Clock, Crc, Fields, Frame, OnWrap, Polar, Scaled, Serial, Simulation, hookimpl, spread
 
 POINTS = 12
 RATE_STL27L = 21_600  # points per second (STL-27L manual, section 1)
@@ -82,7 +83,7 @@ STL27L = Sensor(
     scan=OnWrap("azimuth"),
     links={"data": Serial(921_600)},
     clock=Clock("timestamp", wraps_at=30.0),
-    sweep=sweep_at(RATE_STL27L),
+    simulation=Simulation(sweep_at(RATE_STL27L)),
     range_limits=(0.03, 25.0),
     vendor_axes=("forward", "right", "up"),
     status="vectors",
@@ -94,7 +95,7 @@ LD06 = dataclasses.replace(
     id="ldrobot-ld06",
     model="LD06",
     points=points_at(RATE_LD06),
-    sweep=sweep_at(RATE_LD06),
+    simulation=Simulation(sweep_at(RATE_LD06)),
     links={"data": Serial(230_400)},
     range_limits=(0.02, 12.0),
     status="capture",

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from lidarspec import Sensor, hookimpl
+from lidarspec import Sensor
+from lidarspec.spec import hookimpl
 from lidarspec_robosense.helios import HELIOS_16P
 from lidarspec_robosense.m1 import M1
 

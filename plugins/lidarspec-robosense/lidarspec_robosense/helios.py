@@ -23,7 +23,8 @@ from typing import Any
 import numpy as np
 from construct import Array, BitsInteger, BitStruct, Bytes, BytesInteger, ByteSwapped, Const, Construct, Int8ub, Int16ub, Int32ub, Struct
 
-from lidarspec import Clock, Fields, Frame, OnWrap, Polar, Scaled, Sensor, Sequence, Udp, following, previous, wrap
+from lidarspec import Sensor
+from lidarspec.spec import Clock, Fields, Frame, OnWrap, Polar, Scaled, Sequence, Simulation, Udp, following, previous, wrap
 
 BLOCKS, GROUPS, LASERS = 12, 2, 16
 DUAL, STRONGEST = 0, 4  # return modes (manual 5.4.2)
@@ -212,7 +213,11 @@ HELIOS_16P = Sensor(
     model="RS-Helios-16P",
     frames={
         "data": Frame(DATA, data=True, max_length=1248, plausible=plausible),
-        "difop": Frame(DIFOP, max_length=1248, sweep=sweep_difop, rate=1),  # the rate: assumed, the M1's
+        "difop": Frame(
+            DIFOP,
+            max_length=1248,
+            simulation=Simulation(sweep_difop, rate=1),
+        ),  # the rate: assumed, the M1's
     },
     points=points,
     scan=OnWrap("blocks.azimuth"),
@@ -229,7 +234,7 @@ HELIOS_16P = Sensor(
             "horizontal.value": np.zeros(LASERS),
         }
     },
-    sweep=sweep,
+    simulation=Simulation(sweep),
     range_limits=(0.1, 180.0),  # rs_driver's limits for this model
     vendor_axes=("forward", "left", "up"),
     status="capture",

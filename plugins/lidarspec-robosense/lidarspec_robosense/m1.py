@@ -18,7 +18,8 @@ from typing import Any
 import numpy as np
 from construct import Array, Bytes, BytesInteger, Const, Int8ub, Int16ub, Int32ub, Struct
 
-from lidarspec import Clock, Fields, Frame, OnRewind, Polar, Scaled, Sensor, Sequence, Udp
+from lidarspec import Sensor
+from lidarspec.spec import Clock, Fields, Frame, OnRewind, Polar, Scaled, Sequence, Simulation, Udp
 
 BLOCKS, CHANNELS = 25, 5
 SINGLE, DUAL = 630, 1260  # packets of a frame (rs_driver; M1P user guide: the counter restarts with each frame)
@@ -142,14 +143,18 @@ M1 = Sensor(
     model="RS-LiDAR-M1",
     frames={
         "data": Frame(DATA, data=True, max_length=1210, plausible=plausible),
-        "difop": Frame(DIFOP, max_length=256, sweep=sweep_difop, rate=1),  # M1 user guide; the M1P's: 10 a second
+        "difop": Frame(
+            DIFOP,
+            max_length=256,
+            simulation=Simulation(sweep_difop, rate=1),
+        ),  # M1 user guide; the M1P's: 10 a second
     },
     points=points,
     scan=OnRewind("pkt_psn"),
     links={"data": Udp(6699, 7788)},
     clock=Clock(("seconds", "microseconds")),
     sequence=Sequence("pkt_psn", first=1, last=packets_per_frame),
-    sweep=sweep,
+    simulation=Simulation(sweep),
     range_limits=(0.2, 200.0),  # rs_driver's limits for this model
     vendor_axes=("forward", "left", "up"),
     status="vectors",

@@ -24,7 +24,8 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterable, Mapping
 
-from lidarspec import Command, Frame, OnWrap, Sensor, Serial, UsageError, hookimpl
+from lidarspec import Sensor, UsageError
+from lidarspec.spec import Command, Frame, OnWrap, Serial, Simulation, hookimpl
 from lidarspec_slamtec import capsules, nodes, units
 from lidarspec_slamtec.answers import ANSWERS, DESCRIPTORS
 from lidarspec_slamtec.commands import BY_DTR, BY_PWM, BY_SPEED, COMMANDS, express
@@ -40,8 +41,7 @@ EXPRESS = Frame(
     capsules.EXPRESS,
     data=True,
     points=capsules.express_points(),
-    sweep=capsules.sweep_by(capsules.EXPRESS_STEP),
-    rate=capsules.EXPRESS_RATE,
+    simulation=Simulation(capsules.sweep_by(capsules.EXPRESS_STEP), rate=capsules.EXPRESS_RATE),
     max_length=84,
     plausible=capsules.plausible,
     after="express_descriptor",
@@ -50,9 +50,7 @@ ULTRA = Frame(
     capsules.ULTRA,
     data=True,
     points=capsules.ultra_points,
-    sweep=capsules.sweep_by(capsules.ULTRA_STEP),
-    encode=capsules.ultra_codes,
-    rate=capsules.ULTRA_RATE,
+    simulation=Simulation(capsules.sweep_by(capsules.ULTRA_STEP), encode=capsules.ultra_codes, rate=capsules.ULTRA_RATE),
     max_length=132,
     plausible=capsules.plausible,
     after="ultra_descriptor",
@@ -62,8 +60,7 @@ DENSE = Frame(
     capsules.DENSE,
     data=True,
     points=capsules.dense_points,
-    sweep=capsules.sweep_by(capsules.DENSE_STEP),
-    rate=capsules.DENSE_RATE,
+    simulation=Simulation(capsules.sweep_by(capsules.DENSE_STEP), rate=capsules.DENSE_RATE),
     max_length=84,
     plausible=capsules.plausible,
     after="dense_descriptor",
@@ -72,9 +69,7 @@ ULTRA_DENSE = Frame(
     capsules.ULTRA_DENSE,
     data=True,
     points=capsules.ultra_dense_points,
-    sweep=capsules.sweep_by(capsules.ULTRA_DENSE_STEP),
-    encode=capsules.ultra_dense_codes,
-    rate=capsules.ULTRA_DENSE_RATE,
+    simulation=Simulation(capsules.sweep_by(capsules.ULTRA_DENSE_STEP), encode=capsules.ultra_dense_codes, rate=capsules.ULTRA_DENSE_RATE),
     max_length=170,
     plausible=capsules.plausible,
     after="ultra_dense_descriptor",
@@ -84,8 +79,7 @@ HQ = Frame(
     nodes.HQ,
     data=True,
     points=nodes.hq_points,
-    sweep=nodes.hq_sweep,
-    rate=nodes.HQ_RATE,
+    simulation=Simulation(nodes.hq_sweep, rate=nodes.HQ_RATE),
     max_length=781,
     after="hq_descriptor",
 )
@@ -93,8 +87,7 @@ NODE = Frame(
     nodes.NODE,
     data=True,
     points=nodes.node_points,
-    sweep=nodes.node_sweep,
-    rate=nodes.RATE,
+    simulation=Simulation(nodes.node_sweep, rate=nodes.RATE),
     max_length=5,
     plausible=nodes.plausible,
     after="scan_descriptor",
@@ -132,9 +125,13 @@ def configure(sensor: Sensor, *, dtheta: str | None = None, mode: int | None = N
     if mode is not None:
         if mode not in range(0x100):
             raise UsageError(f"{sensor.id}: mode is a number from 0 to 255, not {mode!r}")
-        scan = dataclasses.replace(express(mode), answers=sensor.commands["express_scan"].answers)
-        commands = {**sensor.commands, "mode_scan": scan}
-        sensor = dataclasses.replace(sensor, commands=commands, on_open=("stop", "start_motor", "mode_scan"))
+        answers = {**sensor.simulation.answers, "mode_scan": sensor.simulation.answers["express_scan"]}
+        sensor = dataclasses.replace(
+            sensor,
+            commands={**sensor.commands, "mode_scan": express(mode)},
+            simulation=Simulation(answers=answers),
+            on_open=("stop", "start_motor", "mode_scan"),
+        )
     return sensor
 
 
@@ -150,7 +147,8 @@ def rplidar(
         points=None,
         scan=OnWrap("azimuth"),
         links={"data": Serial(baud)},
-        commands=unit.answering({**COMMANDS, **motor}),
+        commands={**COMMANDS, **motor},
+        simulation=Simulation(answers=unit.answers({**COMMANDS, **motor})),
         configure=configure,
         on_open=("stop", "start_motor", "scan"),
         on_close=("stop", "stop_motor"),

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from construct import BitsInteger, BitStruct, Bytes, ByteSwapped, Const, Construct, Int8ul, Int16ul, Int32ul, Struct, Switch, this
 
-from lidarspec import Fields, Frame, Scaled, take
+from lidarspec.spec import Fields, Frame, Scaled, take
 
 SINGLE, STREAM = 0, 1  # the modes of a descriptor
 LONGEST_NAME = 64  # bytes of the name of a scan mode (SDK, LidarScanMode)

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from construct import Array, BitsInteger, BitStruct, ByteSwapped, Const, Construct, Int16ul, Int32ul, Struct
 
-from lidarspec import Checksummed, Fields, Polar, Scaled, Xor, following, stack, take, wrap
+from lidarspec.spec import Checksummed, Fields, Polar, Scaled, Xor, following, stack, take, wrap
 
 EXPRESS_CABINS, ULTRA_CABINS, DENSE_CABINS, ULTRA_DENSE_CABINS = 16, 32, 40, 32
 SIGNED = 32  # dtheta has six bits; read as signed, this one and those above are negative

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from lidarspec import Command
+from lidarspec.spec import Command
 from lidarspec_slamtec import answers
 
 AFTER_STOP = 0.1  # seconds (SDK; the protocol asks for at least 1 ms)

@@ -28,7 +28,7 @@ from typing import Any
 import numpy as np
 from construct import Array, BitsInteger, BitStruct, ByteSwapped, Const, Int8ul, Int16ul, Int32ul, Int64ul, Struct
 
-from lidarspec import Checksummed, Crc, Fields, Polar, Scaled, ZeroPadded
+from lidarspec.spec import Checksummed, Crc, Fields, Polar, Scaled, ZeroPadded
 
 CONFIRM = 10  # nodes in an unbroken run; see the measurement above
 HQ_NODES = 96

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from construct import BitsInteger, BitStruct, Bytes, Const, Construct, Int8ul, Int16ul, Int32ul, Struct, this
 
-from lidarspec import Checksummed, Frame, Scaled, Xor
+from lidarspec.spec import Checksummed, Frame, Scaled, Xor
 
 START = Const(b"\xa5")
 

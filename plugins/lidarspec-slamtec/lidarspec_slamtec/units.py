@@ -6,18 +6,17 @@ other modes are those that the vendor's SDK prints for such models, and only the
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from lidarspec import Command
+from lidarspec.spec import Command
 from lidarspec_slamtec import answers
 
 NODE, EXPRESS, ULTRA, DENSE = 0x81, 0x82, 0x84, 0x85
 DESCRIPTOR = {NODE: "scan_descriptor", EXPRESS: "express_descriptor", ULTRA: "ultra_descriptor", DENSE: "dense_descriptor"}
 
-Answers = Iterable[tuple[str, Mapping[str, Any]]]
+Answered = Iterable[tuple[str, Mapping[str, Any]]]
 
 
 @dataclass(frozen=True)
@@ -37,7 +36,7 @@ class Unit:
     model: int
     modes: tuple[Mode, ...]
 
-    def config(self, request: Mapping[str, Any]) -> Answers:
+    def config(self, request: Mapping[str, Any]) -> Answered:
         """The answer to a request for a configuration value; none for a key or mode that it does not have."""
         key, number = request["key"], request.get("mode", 0)
         if number >= len(self.modes):
@@ -56,30 +55,25 @@ class Unit:
         size, field, value = known[key]
         return [("config", {"descriptor.length": 4 + size, "key": key, f"value.{field}": value})]
 
-    def capsules(self, request: Mapping[str, Any]) -> Answers:
+    def capsules(self, request: Mapping[str, Any]) -> Answered:
         """The descriptor of the scan mode that is asked for; mode 0 of an express request is the plain express scan."""
         number = request["mode"]
         if number >= len(self.modes):
             return []
         return [(DESCRIPTOR[self.modes[number].kind if number else EXPRESS], {})]
 
-    def answering(self, commands: Mapping[str, Command]) -> dict[str, Command]:
-        """The same commands, answered by this unit."""
-        return {name: self._answering(command) for name, command in commands.items()}
-
-    def _answering(self, command: Command) -> Command:
+    def answers(self, commands: Mapping[str, Command]) -> dict[str, Any]:
+        """What this unit answers, by command, where that is more than the reply as it stands."""
         information = {"model": self.model, "firmware_minor": 29, "firmware_major": 1, "hardware": 7, "serial": bytes(range(1, 17))}
         times = {"standard": round(self.modes[0].us_per_sample), "express": round(self.modes[-1].us_per_sample)}
-        fixed: dict[str, Answers] = {
+        by_reply = {
             "info": (("info", information),),
             "sample_rate": (("sample_rate", times),),
             "accessory": (("accessory", {"flags": 1}),),
         }
-        if command.frame in ("config_request", "mode_config_request"):
-            return dataclasses.replace(command, answers=self.config)
-        if command.frame == "express_request":
-            return dataclasses.replace(command, answers=self.capsules)
-        return dataclasses.replace(command, answers=tuple(fixed.get(command.replies[0], ())) or None if command.replies else None)
+        by_request = {"config_request": self.config, "mode_config_request": self.config, "express_request": self.capsules}
+        answers = {name: by_request.get(str(command.frame)) or by_reply.get(str(command.reply)) for name, command in commands.items()}
+        return {name: answer for name, answer in answers.items() if answer}
 
 
 A1 = Unit(

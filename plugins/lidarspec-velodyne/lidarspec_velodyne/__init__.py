@@ -12,7 +12,8 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from lidarspec import Clock, OnWrap, Sensor, Udp, hookimpl
+from lidarspec import Sensor
+from lidarspec.spec import Clock, OnWrap, Simulation, Udp, hookimpl
 from lidarspec_velodyne.firings import Firings, configuring, points_of, sweep_of
 from lidarspec_velodyne.frames import FRAMES, HOUR, SLOTS
 
@@ -50,7 +51,7 @@ def _sensor(name: str, model: str, firings: Firings, range_limits: tuple[float, 
         scan=OnWrap("blocks.azimuth"),
         links={"data": Udp(2368, 8308)},
         clock=Clock("timestamp", wraps_at=HOUR),
-        sweep=sweep_of(firings),
+        simulation=Simulation(sweep_of(firings)),
         configure=configuring(firings),
         range_limits=range_limits,
         vendor_axes=("right", "forward", "up"),

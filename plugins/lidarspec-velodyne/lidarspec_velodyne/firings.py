@@ -25,7 +25,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec import Fields, Points, Polar, Sensor, UsageError, following, previous, wrap
+from lidarspec import Sensor, UsageError
+from lidarspec.spec import Fields, Points, Polar, following, previous, wrap
 from lidarspec_velodyne.frames import BLOCKS, DUAL, HOUR, STRONGEST
 
 LAST_BLOCK = ("previous", "invalid")

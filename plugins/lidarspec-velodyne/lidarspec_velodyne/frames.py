@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from construct import Array, Bytes, Const, Int8ul, Int16sl, Int16ul, Int32ul, Struct
 
-from lidarspec import Fields, Frame, Scaled
+from lidarspec.spec import Fields, Frame, Scaled, Simulation
 
 BLOCKS, SLOTS = 12, 32
 STRONGEST, DUAL = 0x37, 0x39
@@ -92,8 +92,7 @@ FRAMES = {
         POSITION,
         max_length=512,
         plausible=plausible_position,
-        sweep=sweep_position,
-        rate=POSITIONS,
+        simulation=Simulation(sweep_position, rate=POSITIONS),
         acknowledged={"LS201 inertial.temperature": "signed in the low 12 bits from an HDL-32E, and no number at all from a VLP-16"},
     ),
 }

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from lidarspec import Polar, hookimpl
+from lidarspec.spec import Polar, hookimpl
 from tests.broken import sound
 
 

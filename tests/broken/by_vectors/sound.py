@@ -1,6 +1,6 @@
 """The sound sensor beside the vectors."""
 
-from lidarspec import hookimpl
+from lidarspec.spec import hookimpl
 from tests.broken.sound import sensor
 
 

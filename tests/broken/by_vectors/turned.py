@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from lidarspec import Polar, hookimpl
+from lidarspec.spec import Polar, hookimpl
 from tests.broken import sound
 
 

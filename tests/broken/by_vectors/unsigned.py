@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from construct import Int16ul
 
-from lidarspec import Scaled, hookimpl
+from lidarspec.spec import Scaled, hookimpl
 from tests.broken.sound import frame, sealed, sensor
 
 

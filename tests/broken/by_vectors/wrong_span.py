@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from lidarspec import Checksummed, Sum, hookimpl
+from lidarspec.spec import Checksummed, Sum, hookimpl
 from tests.broken.sound import frame, sensor, struct
 
 COVERED = ("number", "time", "tilt", "first", "last", "count", "samples")

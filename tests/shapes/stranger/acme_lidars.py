@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 from construct import Array, BitsInteger, BitStruct, ByteSwapped, Const, Int8ul, Int16ul, Struct, this
 
-from lidarspec import (
+from lidarspec import Sensor, UsageError
+from lidarspec.spec import (
     Checksummed,
     Command,
     Crc,
@@ -23,9 +24,8 @@ from lidarspec import (
     OnWrap,
     Polar,
     Scaled,
-    Sensor,
     Serial,
-    UsageError,
+    Simulation,
     Xor,
     following,
     hookimpl,
@@ -105,7 +105,7 @@ X1 = Sensor(
     links={"data": Serial(256_000)},
     commands={"spin": Command("order", args={"rate": ("rate", 5.0, 15.0)})},
     state={"mount": {"zero": 0.0}},
-    sweep=sweep,
+    simulation=Simulation(sweep),
     configure=configure,
     range_limits=(0.1, 30.0),
     aliases=("acme-x1-lite",),

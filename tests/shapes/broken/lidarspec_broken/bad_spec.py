@@ -2,6 +2,6 @@
 
 from construct import Flag, Int8ul, Padding, Struct
 
-from lidarspec import Frame
+from lidarspec.spec import Frame
 
 FRAME = Frame(Struct("kind" / Int8ul, "on" / Flag, Padding(2)), max_length=4)

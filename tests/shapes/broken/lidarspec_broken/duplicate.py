@@ -2,7 +2,7 @@
 
 import dataclasses
 
-from lidarspec import hookimpl
+from lidarspec.spec import hookimpl
 from lidarspec_broken.failing import plain
 
 

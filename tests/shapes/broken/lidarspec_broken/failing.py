@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 from construct import Array, Const, Int8ul, Struct, this
 
-from lidarspec import Checksum, Checksummed, Fields, Frame, OnWrap, Polar, Sensor, Serial, hookimpl
+from lidarspec import Sensor
+from lidarspec.spec import Checksum, Checksummed, Fields, Frame, OnWrap, Polar, Serial, hookimpl
 
 BODY = ("header" / Const(b"\xbb\xad"), "angle" / Int8ul, "distances" / Array(4, Int8ul), "check" / Int8ul)
 

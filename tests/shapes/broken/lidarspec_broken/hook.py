@@ -1,6 +1,6 @@
 """A checksum hook that fails for every sensor there is."""
 
-from lidarspec import hookimpl
+from lidarspec.spec import hookimpl
 
 
 @hookimpl

@@ -1,6 +1,6 @@
 """Lists something that is no sensor."""
 
-from lidarspec import hookimpl
+from lidarspec.spec import hookimpl
 
 
 @hookimpl

@@ -1,6 +1,6 @@
 """Fails while it lists its sensors."""
 
-from lidarspec import hookimpl
+from lidarspec.spec import hookimpl
 
 
 @hookimpl

@@ -1,6 +1,6 @@
 """A hook with an argument that the engine does not pass."""
 
-from lidarspec import hookimpl
+from lidarspec.spec import hookimpl
 
 
 @hookimpl

@@ -1,0 +1,398 @@
+"""A device on a live line: scans as they come, silence, a slow consumer, unplugging; through real pseudo terminals and sockets."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import lidarspec as ls
+from lidarspec.device.arrivals import fed
+from lidarspec.errors import SourceError, UsageError
+from lidarspec.recording.recordings import Recording
+from lidarspec.spec import Udp
+from lidarspec.transports.protocol import Chunk
+from tests.lines import SLACK, Port, free_port, paced, port, turning, udp, until, working
+from tests.shapes import SHAPES
+
+pytestmark = pytest.mark.skipif(os.name != "posix", reason="pseudo terminals are POSIX")
+
+TURNING = SHAPES["shape-clock"]
+WHOLE = SHAPES["shape-datagrams"]
+
+
+@pytest.fixture
+def line(tmp_path: Path) -> Iterator[Port]:
+    with port(tmp_path) as made:
+        yield made
+
+
+def packets(device: ls.Device, number: int) -> list[ls.Packets]:
+    """Batches until there are so many packets; fails where they do not come."""
+    found: list[ls.Packets] = []
+    deadline = time.monotonic() + SLACK
+    for batch in device.packets(wait=0.05):
+        found += [batch] if len(batch) else []
+        if sum(map(len, found)) >= number:
+            return found
+        assert time.monotonic() < deadline, f"{device}"
+    raise AssertionError("the device ended")
+
+
+def test_what_comes_over_a_line_is_what_the_bytes_hold(line: Port) -> None:
+    frames = turning(TURNING, 40)
+    with ls.open(f"serial://{line.name}", TURNING) as device:
+        assert device.state == "waiting"
+        for frame in frames:
+            line.send(b"\x00" + frame)
+        found = packets(device, 40)
+        assert device.state == "streaming"
+        assert device.warnings == []
+    expected = TURNING.decode(b"".join(b"\x00" + frame for frame in frames))
+    assert sum(map(len, found)) == len(expected)
+    assert np.array_equal(np.concatenate([batch.raw for batch in found]), expected.raw)
+    hosts = np.concatenate([batch.host_ns for batch in found])
+    assert (np.diff(hosts) >= 0).all()
+    assert abs(int(hosts[-1]) - time.time_ns()) < SLACK * 1e9
+    assert device.state == "closed"
+    assert device.stats.bytes_in == sum(len(frame) + 1 for frame in frames)
+
+
+def test_frames_have_the_time_of_the_chunk_that_completes_them() -> None:
+    stream = b"".join(turning(TURNING, 4))
+    size = len(stream) // 4
+    chunks = [
+        Chunk(stream[: size + 3], 10),
+        Chunk(stream[size + 3 : 2 * size], 20),
+        Chunk(stream[2 * size : -1], 30),
+        Chunk(stream[-1:], 40),
+    ]
+    decoder = TURNING.decoder()
+    decoder.feed(b"\x00" * 7)
+    assert np.concatenate([spans.at for spans in fed(decoder, chunks)]).tolist() == [10, 20, 30, 40]
+    whole = [Chunk(stream[:size], 50), Chunk(stream[size:], 60)]
+    assert np.concatenate([spans.at for spans in fed(decoder, whole)]).tolist() == [50, 60, 60, 60]
+
+
+def test_datagrams_and_their_gaps(line: Port) -> None:
+    number = free_port()
+    frames = turning(WHOLE, 20)
+    with ls.open(f"udp://127.0.0.1:{number}", WHOLE) as device, udp() as sender:
+        for frame in frames:
+            sender.sendto(frame, ("127.0.0.1", number))
+            sender.sendto(b"noise", ("127.0.0.1", number))
+        found = packets(device, 20)
+        until(lambda: device.newest(0.01) or device.stats.bytes_in == sum(len(frame) + 5 for frame in frames))
+    assert np.array_equal(np.concatenate([batch.raw for batch in found]), WHOLE.decode(frames).raw)
+    assert device.stats.bytes_skipped == 5 * len(frames)
+
+
+def test_a_frame_is_out_when_the_line_falls_silent(line: Port) -> None:
+    """A false header in front claims more bytes than ever come: only silence gives the frame behind it up."""
+    sensor = SHAPES["shape-count"]
+    frame = sensor.example("data", seed=3)
+    prefix = b"\xaa\x55\x20"
+    with ls.open(f"serial://{line.name}", sensor) as device:
+        decoder = sensor.decoder()
+        assert not decoder.feed(prefix + frame)
+        line.send(prefix + frame)
+        assert len(packets(device, 1)[0]) == 1
+        assert device.stats.pending == 0
+
+
+def test_silence_is_noticed_and_told(line: Port) -> None:
+    with ls.open(f"serial://{line.name}", TURNING) as device:
+        took = until(lambda: device.state == "silent")
+        assert took > 0.5
+        (warning,) = device.warnings
+        assert "nothing has arrived for" in warning
+        assert warning.endswith(f"next: lidarspec doctor 'serial://{line.name}' -s {TURNING.id}")
+        line.send(turning(TURNING, 1)[0])
+        packets(device, 1)
+        assert device.state == "streaming"
+
+
+def test_bytes_without_frames_name_the_baud_rate(line: Port) -> None:
+    noise = np.random.default_rng(1).integers(0, 256, 2000, np.uint8).tobytes()
+    with (
+        ls.open(f"serial://{line.name}?baud=9600", TURNING) as device,
+        working(lambda stop: [line.send(noise[:20]) or stop.wait(0.02) for _ in range(500) if not stop.is_set()] and None),
+    ):
+        until(lambda: device.newest(0.01) or device.state == "no frames")
+        (warning,) = device.warnings
+        assert "9600 baud is likely wrong" in warning
+        assert warning.endswith(f"next: lidarspec detect 'serial://{line.name}'")
+
+
+def test_latest_never_falls_behind(line: Port) -> None:
+    frames = turning(TURNING, 2000)
+    with ls.open(f"serial://{line.name}", TURNING) as device, working(lambda stop: paced(line.send, frames, 400, stop) and None):
+        stamps = []
+        for _ in range(4):
+            scan = device.latest(SLACK)
+            assert scan.complete
+            stamps.append(scan.stamp_ns)
+            age = time.time_ns() - int(max(batch.host_ns[-1] for batch in [next(device.packets())]))
+            assert age < SLACK * 1e8
+            time.sleep(0.3)
+        assert np.diff(stamps).min() > 0.15e9, "each is newer by about what was slept"
+
+
+def test_a_slow_consumer_loses_the_oldest_and_knows_it(line: Port) -> None:
+    frames = turning(WHOLE, 50)
+    number = free_port()
+    with ls.open(f"udp://127.0.0.1:{number}", WHOLE) as device, udp() as sender:
+        device._input.queue._most = 30  # type: ignore[union-attr]
+        for frame in frames:
+            sender.sendto(frame, ("127.0.0.1", number))
+        queue = device._input.queue  # type: ignore[union-attr]
+        until(lambda: queue.produced == 50)
+        batch = packets(device, 30)
+        found = np.concatenate([one.raw for one in batch])
+        assert np.array_equal(found, WHOLE.decode(frames[20:]).raw)
+        assert batch[0].breaks[0]
+        assert device.stats.queue_dropped == 20
+        assert queue.produced == queue.consumed + queue.dropped + len(queue)
+
+
+def test_a_blocking_queue_loses_nothing(line: Port) -> None:
+    frames = turning(TURNING, 60)
+    with ls.open(f"serial://{line.name}", TURNING, overflow="block") as device:
+        device._input.queue._largest = 64  # type: ignore[union-attr]
+        for frame in frames:
+            line.send(frame)
+        time.sleep(0.1)
+        assert sum(map(len, packets(device, 60))) == 60
+        assert device.stats.queue_dropped == 0
+
+
+def test_an_unknown_policy_is_refused(line: Port) -> None:
+    with pytest.raises(UsageError, match="drop_oldest or block"):
+        ls.open(f"serial://{line.name}", TURNING, overflow="forget")
+    ls.open(f"serial://{line.name}", TURNING).close()
+
+
+def test_two_senders_are_listed_and_one_can_be_chosen() -> None:
+    number, frames = free_port(), turning(WHOLE, 4)
+    with udp("127.0.0.2") as one, udp("127.0.0.3") as two:
+
+        def send() -> None:
+            for frame in frames:
+                one.sendto(frame, ("127.0.0.1", number))
+                two.sendto(frame, ("127.0.0.1", number))
+
+        with ls.open(f"udp://:{number}", WHOLE) as device:
+            send()
+            with pytest.raises(UsageError, match=r"127\.0\.0\.2 and 127\.0\.0\.3 both send data frames; choose one with \?src=127"):
+                packets(device, 8)
+        with ls.open(f"udp://:{number}?src=127.0.0.3", WHOLE) as device:
+            send()
+            packets(device, 4)
+            until(lambda: device.stats.foreign == 4)
+
+
+def test_a_stream_in_datagrams_is_joined_by_sender() -> None:
+    sensor = dataclasses.replace(TURNING, links={"data": Udp(7009, stream=True)})
+    number, frames = free_port(), turning(sensor, 12)
+    stream = b"".join(frames)
+    with ls.open(f"udp://:{number}", sensor) as device, udp("127.0.0.2") as one, udp("127.0.0.3") as two:
+        for start in range(0, len(stream), 7):
+            one.sendto(stream[start : start + 7], ("127.0.0.1", number))
+            two.sendto(b"\xaa\xbb", ("127.0.0.1", number))
+        found = packets(device, 12)
+        assert np.array_equal(np.concatenate([batch.raw for batch in found]), sensor.decode(stream).raw)
+        assert device.stats.foreign == -(-len(stream) // 7)
+        for frame in frames:
+            two.sendto(frame, ("127.0.0.1", number))
+        with pytest.raises(UsageError, match="both send frames"):
+            packets(device, 100)
+
+
+@pytest.mark.parametrize("cycles", [3, pytest.param(100, marks=pytest.mark.soak)])
+def test_unplugged_and_plugged_in_again(line: Port, cycles: int) -> None:
+    frames = turning(TURNING, 10)
+    half = len(frames[0]) // 2
+    threads = threading.active_count()
+    with ls.open(f"serial://{line.name}", TURNING) as device:
+        for frame in frames:
+            line.send(frame)
+        packets(device, 10)
+        descriptors = len(os.listdir("/dev/fd"))
+        for cycle in range(cycles):
+            line.send(frames[0][:half])
+            until(lambda: device.newest(0.01) or device.stats.pending == half)
+            line.unplug()
+            assert until(lambda: device.newest(0.01) or device.state == "disconnected") < SLACK
+            assert any("waiting for it to come back" in warning for warning in device.warnings)
+            line.plug()
+            assert until(lambda: device.newest(0.01) or device.state != "disconnected") < SLACK
+            line.send(frames[0][half:] + b"".join(frames[1:]))
+            batch = packets(device, 9)
+            assert sum(map(len, batch)) == 9, "no frame is spliced over the gap"
+            assert batch[0].breaks[0]
+            assert device.stats.disconnects == cycle + 1
+        assert device.stats.frames == {"data": 10 + 9 * cycles}
+        assert threading.active_count() == threads + 1
+        assert len(os.listdir("/dev/fd")) == descriptors
+    assert threading.active_count() == threads
+
+
+def test_an_absent_device_costs_next_to_nothing(line: Port) -> None:
+    with ls.open(f"serial://{line.name}", TURNING) as device:
+        line.unplug()
+        until(lambda: device.state == "disconnected")
+        used, began = time.process_time(), time.monotonic()
+        time.sleep(0.6)
+        spent = (time.process_time() - used) / (time.monotonic() - began)
+        line.plug()
+    assert spent < 0.02 * SLACK
+
+
+def test_a_scan_does_not_go_on_over_an_interruption(line: Port) -> None:
+    frames = turning(TURNING, 180)
+    with ls.open(f"serial://{line.name}", TURNING) as device:
+        line.send(b"".join(frames[:90]))
+        scans = device.scans(wait=0.2)
+        before = list(iter(lambda: next(scans), None))
+        line.unplug()
+        line.plug()
+        until(lambda: device.stats.disconnects == 1 and device.state != "disconnected")
+        line.send(b"".join(frames[90:]))
+        after = list(iter(lambda: next(scans), None))
+    assert len(before) >= 2
+    assert not after[0].complete, "the piece before the gap"
+    assert not after[1].complete, "the piece after the gap"
+
+
+def test_everything_is_recorded_before_the_queue(line: Port, tmp_path: Path) -> None:
+    frames = turning(TURNING, 30)
+    path = tmp_path / "all.lsr"
+    with ls.open(f"serial://{line.name}", TURNING, record=path) as device:
+        device._input.queue._most = 1  # type: ignore[union-attr]
+        for frame in frames:
+            line.send(frame)
+            time.sleep(0.005)
+        until(lambda: device._own_recorder and device._own_recorder.bytes == sum(map(len, frames)))
+        assert device.stats.queue_dropped > 0 or device._input.queue.produced == 1  # type: ignore[union-attr]
+    with Recording(path) as recording:
+        assert b"".join(record.data for record in recording if record.direction == "in") == b"".join(frames)
+        assert recording.header.sensor == TURNING.id
+        assert recording.header.baud == 115_200
+
+
+def test_a_recording_knows_where_the_line_was_interrupted(line: Port, tmp_path: Path) -> None:
+    frames, path = turning(TURNING, 20), tmp_path / "all.lsr"
+    with ls.open(f"serial://{line.name}", TURNING, record=path) as device:
+        line.send(b"".join(frames[:10]) + frames[10][:6])
+        live = packets(device, 10)
+        line.unplug()
+        until(lambda: device.newest(0.01) or device.state == "disconnected")
+        line.plug()
+        until(lambda: device.newest(0.01) or device.state != "disconnected")
+        line.send(frames[10][6:] + b"".join(frames[11:]))
+        live += packets(device, 9)
+    with Recording(path) as recording:
+        found = list(recording)
+    assert [record.gap for record in found if record.direction == "in"].count(True) == 1
+    assert [b"disconnect" in record.data for record in found if record.direction == "event"] == [True, False]
+    with ls.open(path, TURNING) as again:
+        replayed = list(again.packets())
+        assert again.stats.disconnects == 1
+    for name in ("raw", "host_ns", "breaks"):
+        assert np.array_equal(*(np.concatenate([getattr(batch, name) for batch in batches]) for batches in (live, replayed))), name
+
+
+def test_a_file_is_not_recorded(tmp_path: Path) -> None:
+    path = tmp_path / "raw.bin"
+    path.write_bytes(b"".join(turning(TURNING, 3)))
+    with pytest.raises(UsageError, match="nothing to record"):
+        ls.open(path, TURNING, record=tmp_path / "more.lsr")
+    assert not (tmp_path / "more.lsr").exists()
+
+
+def test_a_file_gives_one_scan_after_another(tmp_path: Path) -> None:
+    path = tmp_path / "raw.bin"
+    path.write_bytes(b"".join(turning(TURNING, 100)))
+    with ls.open(path, TURNING) as device:
+        whole = [scan for scan in device.scans() if scan.complete]
+    with ls.open(path, TURNING) as device:
+        assert [device.latest().stamp_ns for _ in whole] == [scan.stamp_ns for scan in whole]
+        with pytest.raises(SourceError, match="no further scan, since the input is ended"):
+            device.latest()
+
+
+def test_packets_and_scans_of_a_file_go_on_where_its_scan_was_found(tmp_path: Path) -> None:
+    path = tmp_path / "raw.bin"
+    frames = turning(TURNING, 200)
+    path.write_bytes(b"".join(frames))
+    with ls.open(path, TURNING) as device:
+        times = [scan.stamp_ns for scan in device.scans()]
+    with ls.open(path, TURNING) as device:
+        first, second = device.latest(), device.latest()
+        assert times[1:3] == [first.stamp_ns, second.stamp_ns]
+        (packets,) = device.packets()
+        assert len(packets) == len(frames)
+        assert device.stats.frames["data"] == len(frames)
+        assert (device.stats.duplicates, device.stats.lost) == (0, 0)
+        for read_again in (device.packets, device.scans):
+            with pytest.raises(SourceError, match="has been read to its end: open it again"):
+                next(read_again())
+    with ls.open(path, TURNING) as device:
+        device.latest()
+        assert [scan.stamp_ns for scan in device.scans()] == times
+    with ls.open(path, TURNING) as device:
+        device.latest()
+        assert sum(len(packets) for packets in device.packets("data")) == len(frames)
+
+
+def test_a_long_file_goes_on_behind_what_was_read_before(tmp_path: Path) -> None:
+    path = tmp_path / "raw.bin"
+    frames = turning(TURNING, 40_000)
+    path.write_bytes(b"".join(frames))
+    with ls.open(path, TURNING) as device:
+        whole = [len(packets) for packets in device.packets()]
+    assert len(whole) > 2
+    with ls.open(path, TURNING) as device:
+        device.latest()
+        assert [len(packets) for packets in device.packets()] == whole
+    with ls.open(path, TURNING) as device:
+        iterator = device.packets()
+        assert len(next(iterator)) == whole[0]
+        device.latest()
+        assert [len(packets) for packets in device.packets()] == whole[1:]
+
+
+def test_closing_from_another_thread_ends_the_iteration(line: Port) -> None:
+    with ls.open(f"serial://{line.name}", TURNING) as device:
+        timer = threading.Timer(0.2, device.close)
+        timer.start()
+        assert list(device.scans()) == []
+        timer.join()
+
+
+def test_a_device_that_is_forgotten_gives_its_port_back(line: Port) -> None:
+    threads = threading.active_count()
+    device: ls.Device | None = ls.open(f"serial://{line.name}", TURNING)
+    assert threading.active_count() == threads + 1
+    assert device is not None
+    device = None
+    assert threading.active_count() == threads
+    ls.open(f"serial://{line.name}", TURNING).close()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="counts descriptors as Linux does")
+def test_what_fails_while_opening_leaves_nothing_behind(tmp_path: Path, line: Port) -> None:
+    before, threads = len(os.listdir("/dev/fd")), threading.active_count()
+    (tmp_path / "there.lsr").touch()
+    with pytest.raises(UsageError):
+        ls.open(f"serial://{line.name}", TURNING, record=tmp_path / "there.lsr")
+    with pytest.raises(UsageError):
+        ls.open(f"serial://{line.name}", TURNING, backend="magic")
+    assert (len(os.listdir("/dev/fd")), threading.active_count()) == (before, threads)

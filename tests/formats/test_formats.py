@@ -1,0 +1,187 @@
+"""Files appear whole or not at all, in the format of their suffix, and hold what the clouds hold."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import weakref
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import lidarspec as ls
+from lidarspec import PointCloud, Scan, SourceError
+from lidarspec.errors import UnknownFormat
+from lidarspec.formats import format_of, formats, write
+
+COLUMNS = ["x", "y", "z", "range", "azimuth", "elevation", "intensity", "time"]
+
+
+def scan(number: int, points: int = 5, *, intensity: bool = True) -> Scan:
+    source = np.random.default_rng(number)
+    xyz = source.normal(size=(3, points)).astype(np.float32)
+    valid = np.arange(points) != 1
+    cloud = PointCloud(
+        x=np.where(valid, xyz[0], np.nan),
+        y=np.where(valid, xyz[1], np.nan),
+        z=np.where(valid, xyz[2], np.nan),
+        range=np.where(valid, np.linalg.norm(xyz, axis=0), np.inf).astype(np.float32),
+        azimuth=np.arctan2(xyz[1], xyz[0]),
+        elevation=np.zeros(points, np.float32),
+        time=np.arange(points) * 1e-9,
+        valid=valid,
+        intensity=source.integers(0, 255, points).astype(np.float32) if intensity else None,
+        stamp_ns=10**18 + number,
+    )
+    return Scan(cloud, 10.0 + number, number > 0, ls.sensor("ldrobot-stl27l"))
+
+
+def rows(path: Path) -> tuple[list[str], np.ndarray]:
+    header, *lines = path.read_text(encoding="ascii").splitlines()
+    return header.split(","), np.array([[float(cell) for cell in line.split(",")] for line in lines])
+
+
+@pytest.mark.parametrize("every_point", [False, True])
+def test_csv_holds_the_columns_of_the_clouds(tmp_path: Path, every_point: bool) -> None:
+    scans = [scan(0), scan(1, points=20_000), scan(2, points=2)]
+    write(tmp_path / "a.csv", scans, every_point=every_point)
+    header, values = rows(tmp_path / "a.csv")
+    assert header == [*COLUMNS, "scan"]
+    clouds = [one.points if every_point else one.points[one.points.valid] for one in scans]
+    for index, name in enumerate(COLUMNS):
+        expected = np.concatenate([cloud.columns[name] for cloud in clouds])
+        np.testing.assert_allclose(values[:, index], expected, rtol=5.1e-7, atol=0)
+    np.testing.assert_array_equal(values[:, -1], np.repeat([0, 1, 2], [len(cloud) for cloud in clouds]))
+
+
+@pytest.mark.parametrize("every_point", [False, True])
+def test_npz_holds_the_columns_of_the_clouds_and_the_stamps(tmp_path: Path, every_point: bool) -> None:
+    scans = [scan(0), scan(1)]
+    write(tmp_path / "a.npz", scans, every_point=every_point)
+    with np.load(tmp_path / "a.npz") as arrays:
+        assert list(arrays) == [*COLUMNS, "scan", "stamp_ns", "rate_hz", "complete"]
+        for name in COLUMNS:
+            expected = np.concatenate([one.points.columns[name][one.points.valid | every_point] for one in scans])
+            assert arrays[name].dtype == expected.dtype
+            np.testing.assert_array_equal(arrays[name], expected)
+        assert arrays["stamp_ns"].tolist() == [10**18, 10**18 + 1]
+        assert arrays["rate_hz"].tolist() == [10, 11]
+        assert arrays["complete"].tolist() == [False, True]
+
+
+def test_a_column_that_a_sensor_lacks_is_left_out(tmp_path: Path) -> None:
+    write(tmp_path / "a.csv", [scan(0, intensity=False)])
+    assert rows(tmp_path / "a.csv")[0] == [*(name for name in COLUMNS if name != "intensity"), "scan"]
+    write(tmp_path / "a.csv", [scan(0), scan(1, intensity=False)])
+    header, values = rows(tmp_path / "a.csv")
+    assert np.isnan(values[-4:, header.index("intensity")]).all()
+
+
+def test_csv_holds_one_scan_at_a_time(tmp_path: Path) -> None:
+    alive: weakref.WeakSet[Scan] = weakref.WeakSet()
+    most = 0
+
+    def scans() -> Iterator[Scan]:
+        nonlocal most
+        for number in range(30):
+            one = scan(number)
+            alive.add(one)
+            most = max(most, len(alive))
+            yield one
+            del one
+
+    write(tmp_path / "a.csv", scans())
+    assert most <= 2
+
+
+@pytest.mark.parametrize("name", ["a.csv", "a.npz"])
+def test_a_failure_leaves_the_old_file_and_nothing_else(tmp_path: Path, name: str) -> None:
+    (tmp_path / name).write_text("old", encoding="ascii")
+
+    def scans() -> Iterator[Scan]:
+        yield scan(0)
+        raise SourceError("the line broke")
+
+    with pytest.raises(SourceError, match="the line broke"):
+        write(tmp_path / name, scans())
+    assert [path.name for path in tmp_path.iterdir()] == [name]
+    assert (tmp_path / name).read_text(encoding="ascii") == "old"
+
+
+def test_a_folder_that_is_not_there_is_a_source_error(tmp_path: Path) -> None:
+    with pytest.raises(SourceError, match=r"none.a\.csv"):
+        write(tmp_path / "none" / "a.csv", [scan(0)])
+
+
+@pytest.mark.parametrize(
+    ("name", "told"),
+    [
+        ("a.cvs", "did you mean '.csv'"),
+        ("a", "unknown format 'a'"),
+        ("a.np", "did you mean '.npz'"),
+        ("a.pcd", r"unknown format '.pcd' \(known: "),
+    ],
+)
+def test_an_unknown_suffix_gets_a_suggestion(name: str, told: str) -> None:
+    with pytest.raises(UnknownFormat, match=told):
+        format_of(name)
+
+
+def test_suffixes_are_known_in_capitals() -> None:
+    assert format_of("A.CSV") is formats()[".csv"]
+
+
+def test_a_plugin_adds_a_format_and_takes_none_away(tmp_path: Path) -> None:
+    script = f"""
+from pathlib import Path
+import lidarspec as ls
+from lidarspec.formats import format_of, formats, write
+from lidarspec.plugins import hookimpl, registry
+from lidarspec.errors import UnknownFormat
+from lidarspec.transports.protocol import Format
+
+class Plugin:
+    @hookimpl
+    def lidarspec_formats(self):
+        def lines(path, scans, *, every_point):
+            Path(path).write_text(f"{{len(list(scans))}} scans, {{every_point}}")
+        return [Format(".count", "how many", lines), Format(".csv", "not mine", lines)]
+
+registry().add(Plugin(), name="by hand")
+assert formats()[".csv"].description.startswith("comma")
+assert format_of("a.count").description == "how many"
+write(r"{tmp_path / "a.count"}", [1, 2, 3], every_point=True)
+try:
+    format_of("a.coumt")
+except UnknownFormat as error:
+    assert "did you mean '.count'" in str(error)
+"""
+    subprocess.run([sys.executable, "-c", script], check=True, timeout=60)
+    assert (tmp_path / "a.count").read_text(encoding="utf-8") == "3 scans, True"
+
+
+def test_a_plugin_whose_hook_fails_is_a_spec_error() -> None:
+    script = """
+import lidarspec as ls
+from lidarspec.formats import format_of
+from lidarspec.plugins import hookimpl, registry
+from lidarspec.errors import UnknownFormat
+from lidarspec.transports.protocol import Format
+
+class Plugin:
+    @hookimpl
+    def lidarspec_formats(self):
+        raise ZeroDivisionError("by hand")
+
+registry().add(Plugin(), name="by hand")
+assert format_of("a.csv")
+try:
+    format_of("a.count")
+except ls.SpecError as error:
+    assert "ZeroDivisionError: by hand" in str(error)
+else:
+    raise SystemExit("no error")
+"""
+    subprocess.run([sys.executable, "-c", script], check=True, timeout=60)

@@ -1,0 +1,223 @@
+"""Entry points as importlib.metadata finds them, and the plugins that are loaded only for their own ids."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.metadata
+import sys
+import zipfile
+from collections.abc import Iterable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from lidarspec import Sensor, SpecError
+from lidarspec.errors import UnknownSensor
+from lidarspec.plugins import EntryPoint, HookedPoints, Registry, entry_points
+from lidarspec.spec import hookimpl
+from tests.shapes import SHAPES
+
+
+def by_metadata(group: str) -> list[tuple[str, str, str, str]]:
+    """The reference."""
+    found = [(e.name, e.value, e.dist.name, e.dist.version) for e in importlib.metadata.entry_points(group=group) if e.dist]
+    return sorted(found, key=lambda entry: entry[:2])
+
+
+def distribution(place: Path, name: str, version: str, entries: str, kind: str = "dist-info") -> None:
+    """A distribution as an installer leaves it behind."""
+    folder = place / f"{name}-{version}.{kind}"
+    folder.mkdir(parents=True)
+    (folder / "entry_points.txt").write_text(entries, encoding="utf-8")
+    header = f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n\nName: a line of its description\n"
+    (folder / ("METADATA" if kind == "dist-info" else "PKG-INFO")).write_text(header, encoding="utf-8")
+
+
+@pytest.mark.parametrize("group", ["lidarspec", "console_scripts", "pytest11", "nobody.has.this"])
+def test_what_is_installed_is_what_importlib_metadata_finds(group: str) -> None:
+    assert entry_points(group) == by_metadata(group)
+
+
+@pytest.mark.parametrize("zipped", [False, True])
+def test_odd_installations_are_read_as_importlib_metadata_reads_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, zipped: bool) -> None:
+    first, second, other = tmp_path / "first", tmp_path / "second", tmp_path / "other.zip"
+    distribution(first, "Some.Lidars", "2.0", "[else]\nx = no\n[odd.group]\n# y = no\n b = some.lidars:inner.part [extra]\n\na- = some\n")
+    distribution(second, "some_lidars", "1.0", "[odd.group]\nold = hidden\n")
+    distribution(second, "eggs", "3", "[odd.group]\nc = eggs\n", "egg-info")
+    (second / "bare-1.dist-info").mkdir()
+    with zipfile.ZipFile(other, "w") as archive:
+        archive.writestr("packed-4.dist-info/entry_points.txt", "[odd.group]\nd = packed\n")
+        archive.writestr("packed-4.dist-info/METADATA", "Name: packed\nVersion: 4\n")
+    places = [str(first), str(second), str(tmp_path / "missing"), *([str(other)] if zipped else [])]
+    monkeypatch.setattr(sys, "path", [*places, *sys.path])
+    found = entry_points("odd.group")
+    assert found == by_metadata("odd.group")
+    assert [entry.name for entry in found] == ["a-", "b", "c", *(["d"] if zipped else [])]
+    assert found[0][2:] == ("Some.Lidars", "2.0")
+
+
+def test_an_import_hook_that_finds_distributions_is_asked(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    distribution(tmp_path, "hooked", "1", "[odd.group]\nh = hooked\n")
+
+    class Finder(importlib.metadata.DistributionFinder):
+        def find_spec(self, *_: Any) -> None:
+            return None
+
+        def find_distributions(self, context: Any = None) -> Iterable[importlib.metadata.Distribution]:
+            return [importlib.metadata.PathDistribution(tmp_path / "hooked-1.dist-info")]
+
+    monkeypatch.setattr(sys, "meta_path", [*sys.meta_path, Finder()])
+    assert [entry.name for entry in entry_points("odd.group")] == ["h"]
+
+
+@pytest.mark.parametrize("value", ["json", "json:decoder.JSONDecoder", " json : decoder.JSONDecoder ", "json:dumps [extra]"])
+def test_an_entry_point_loads_as_its_reference_does(value: str) -> None:
+    reference = importlib.metadata.EntryPoint("x", value.strip(), "g").load()
+    assert EntryPoint("x", value, "d", "1").load() is reference
+
+
+class Module(SimpleNamespace):
+    """A module that notes which of its sensors it was asked for by name."""
+
+    def __getattr__(self, name: str) -> Sensor:
+        known = self.__dict__.get("by_name", {})
+        if name not in known:
+            raise AttributeError(name)
+        self.given.append(known[name].id)
+        sensor: Sensor = known[name]
+        return sensor
+
+
+@pytest.fixture
+def plugins(monkeypatch: pytest.MonkeyPatch) -> dict[str, SimpleNamespace]:
+    """Modules that can be loaded by name; each notes that it was asked for its sensors."""
+    found: dict[str, SimpleNamespace] = {}
+
+    def made(name: str, *ids: str, aliases: tuple[str, ...] = (), **hooks: Any) -> SimpleNamespace:
+        sensors = [replace(SHAPES["shape-count"], id=one, aliases=aliases, model=name) for one in ids]
+        module = Module(asked=0, given=[], **{hook: hookimpl(specname=None)(function) for hook, function in hooks.items()})
+        module.by_name = {sensor.id.replace("-", "_"): sensor for sensor in sensors}
+        module.by_name |= {alias.replace("-", "_"): sensors[0] for alias in aliases}
+
+        def lidarspec_sensors() -> list[Sensor]:
+            module.asked += 1
+            return sensors
+
+        module.lidarspec_sensors = hookimpl(lidarspec_sensors)
+        monkeypatch.setitem(sys.modules, name, module)
+        found[name] = module
+        return module
+
+    made("acme", "acme-x1", "acme-x2", aliases=())
+    made("beta", "beta-x1", aliases=("b-one",))
+    made("plain", "plain-x1")
+    made("again", "acme-x2", "acme-x3")
+    made("liar", "liar-x1", "acme-x9")
+    made("odd")
+    made("meddler", "meddler-x1", lidarspec_points=lambda sensor, fields: None)
+    return found
+
+
+def registry(*entries: str, offered: str = "") -> Registry:
+    """A registry of modules given as "name = value", and of sensors given by their ids, in the order in which they would be found.
+
+    Args:
+        offered: "id = module" for each sensor, separated by blanks around a comma.
+    """
+
+    def found(texts: Iterable[str]) -> list[EntryPoint]:
+        return [EntryPoint(name, value, "dist", "1") for name, _, value in sorted(text.partition(" = ") for text in texts)]
+
+    named = (text.partition(" = ") for text in offered.split(", ") if text)
+    sensors = [f"{name} = {module}:{name.replace('-', '_')}" for name, _, module in named]
+    return Registry(found(entries), found(sensors))
+
+
+OFFERED = "acme-x1 = acme, acme-x2 = acme, beta-x1 = beta, b-one = beta"
+
+
+def test_a_sensor_is_loaded_when_it_is_asked_for(plugins: dict[str, SimpleNamespace]) -> None:
+    found = registry("plain = plain", offered=OFFERED)
+    assert (plugins["plain"].asked, plugins["acme"].asked, plugins["beta"].asked) == (1, 0, 0)
+    assert found.sensor("acme-x2").id == "acme-x2"
+    assert found.sensor("acme-x2") is found.sensor("acme-x2")
+    assert (plugins["acme"].given, plugins["beta"].given) == (["acme-x2"], [])
+    assert found.sensor("b-one") is found.sensor("beta-x1")
+    assert sorted(found.sensors()) == ["acme-x1", "acme-x2", "beta-x1", "plain-x1"]
+    assert plugins["again"].given == []
+    assert [(plugin.entry_point, plugin.sensors) for plugin in found.plugins] == [
+        ("plain = plain", ("plain-x1",)),
+        ("lidarspec.sensors = acme", ("acme-x1", "acme-x2")),
+        ("lidarspec.sensors = beta", ("beta-x1",)),
+    ]
+
+
+def test_an_alias_without_an_entry_of_its_own_is_known_once_all_are_loaded(plugins: dict[str, SimpleNamespace]) -> None:
+    assert registry(offered="acme-x1 = acme, beta-x1 = beta").sensor("b-one").id == "beta-x1"
+
+
+def test_an_unknown_id_is_told_with_the_ids_of_all_plugins(plugins: dict[str, SimpleNamespace]) -> None:
+    with pytest.raises(UnknownSensor, match="did you mean 'beta-x1'"):
+        registry(offered=OFFERED).sensor("bta-x1")
+
+
+@pytest.mark.parametrize("asked", [["acme-x1"], ["acme-x3"], ["other-x1"], ["acme-x2"], []])
+def test_of_two_with_one_id_the_first_wins_whichever_is_asked_for(plugins: dict[str, SimpleNamespace], asked: list[str]) -> None:
+    found = registry(offered="acme-x1 = acme, acme-x2 = acme, acme-x2 = again, acme-x3 = again")
+    for name in asked:
+        with contextlib.suppress(UnknownSensor):
+            found.sensor(name)
+    assert found.sensor("acme-x2").model == "acme"
+    assert sorted(found.sensors()) == ["acme-x1", "acme-x2", "acme-x3"]
+    assert [(plugin.error, plugin.sensors) for plugin in found.plugins] == [
+        ("", ("acme-x1", "acme-x2")),
+        ("acme-x2: another sensor has this id already", ("acme-x3",)),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("offered", "error"),
+    [
+        ("liar-x2 = liar", "liar-x1: its entry point is called 'liar-x2', which is none of its names"),
+        ("odd-x1 = odd", "lidarspec_sensors returns sensors, not int"),
+        ("gone-x1 = a_module_that_nobody_has", "ModuleNotFoundError"),
+        ("acme-x7 = acme", "AttributeError"),
+    ],
+)
+def test_an_entry_that_names_no_such_sensor_is_named_and_leaves_nothing(
+    plugins: dict[str, SimpleNamespace], offered: str, error: str
+) -> None:
+    plugins["liar"].liar_x2 = plugins["liar"].liar_x1
+    plugins["odd"].odd_x1 = 1
+    found = registry("plain = plain", offered=offered)
+    assert list(found.sensors()) == ["plain-x1"]
+    (broken,) = [plugin for plugin in found.plugins if plugin.error]
+    assert error in broken.error
+    assert broken.traceback
+
+
+def test_a_sensor_cannot_take_an_id_from_a_module_that_is_always_loaded(plugins: dict[str, SimpleNamespace]) -> None:
+    found = registry("zz = again", offered="acme-x2 = acme")
+    assert found.sensor("acme-x2").model == "again"
+    assert [plugin.error for plugin in found.plugins] == ["", "acme-x2: another sensor has this id already"]
+
+
+def test_threads_that_ask_at_once_get_the_same_sensor(plugins: dict[str, SimpleNamespace]) -> None:
+    for _ in range(50):
+        found = registry(offered=OFFERED)
+        with ThreadPoolExecutor(8) as pool:
+            sensors = list(pool.map(found.sensor, ["acme-x1", "b-one", "beta-x1", "acme-x1"] * 4))
+        assert len({id(sensor) for sensor in sensors}) == 2
+        assert not any(plugin.error for plugin in found.plugins)
+
+
+def test_a_hook_that_is_always_loaded_reaches_the_sensors_that_are_offered(plugins: dict[str, SimpleNamespace]) -> None:
+    found = registry("meddler = meddler", offered="acme-x1 = acme")
+    assert isinstance(found.sensor("acme-x1").points, HookedPoints)
+    found.sensor("acme-x1")
+    with pytest.raises(SpecError):
+        found.add(plugins["acme"], name="again")

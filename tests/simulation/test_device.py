@@ -1,0 +1,263 @@
+"""A simulated sensor as a device, sans-IO: commands and their documented answers, start-up, pace, faults."""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+import lidarspec as ls
+from lidarspec import Sensor, UsageError
+from lidarspec.errors import OutOfRange
+from lidarspec.simulation.device import SECOND, SimulatedDevice
+from lidarspec.simulation.faults import Faults, Line, faults_of
+from lidarspec.spec.fields import duration
+
+MINI, STL, A1 = ls.sensor("cspc-m1c1-mini"), ls.sensor("ldrobot-stl27l"), ls.sensor("slamtec-rplidar-a1")
+MS = SECOND // 1000
+
+
+def on(sensor: Sensor, **options: object) -> SimulatedDevice:
+    device = SimulatedDevice(sensor, **options)  # type: ignore[arg-type]
+    device.start(0)
+    return device
+
+
+def asked(device: SimulatedDevice, name: str, now: int, **arguments: object) -> bytes:
+    """What comes at once for a command."""
+    command = device.sensor.commands[name]
+    device.receive(device.sensor.command(name, **arguments), now, command.link)
+    return b"".join(data for _, data in device.outgoing(now))
+
+
+def passing(device: SimulatedDevice, start: int, end: int, step: int = 10 * MS) -> bytes:
+    return b"".join(data for now in range(start, end, step) for _, data in device.outgoing(now))
+
+
+def test_the_m1c1_mini_starts_as_its_manual_says() -> None:
+    device = on(MINI)
+    assert passing(device, 0, 2 * SECOND) == b""
+    assert asked(device, "start", 2 * SECOND) == bytes.fromhex("A55A 50 07 03 000000000000 AB")
+    settling = passing(device, 2 * SECOND, 3 * SECOND)
+    assert len(settling) == 14
+    assert set(settling) == {0xFE, 0xFF}
+    rest = passing(device, 3 * SECOND, 4 * SECOND)
+    information = bytes.fromhex("A55A 1400 0304 01 4D3143315F4D696E69000000 0C00 00 01 000000 04")
+    assert rest.startswith(information + bytes.fromhex("A55A 0000 8001 81") + b"\xaa\x55")
+    assert [item.frame for item in MINI.split(rest)[:3]] == ["info", "scan_start", "data"]
+    stop = asked(device, "stop", 4 * SECOND)
+    assert stop == bytes.fromhex("A55A 55 07 00000000000000 AD")
+    assert passing(device, 4 * SECOND, 5 * SECOND) == b""
+    assert device.heard == ["start", "stop"]
+
+
+def test_a_captured_start_of_a_coin_d4_comes_out_byte_for_byte_up_to_its_points() -> None:
+    device = on(ls.sensor("cspc-coin-d4"), seed=4)
+    started = asked(device, "start", 0) + passing(device, 0, SECOND + 5 * MS)
+    captured = bytes.fromhex("a55a500701000000000000a9 fafa a55a1400e30201") + b"COIN-D4" + bytes(12) + bytes.fromhex("01 a55a0000800181")
+    shown = started[:12] + started[26:]
+    assert shown.startswith(captured)
+
+
+def test_commands_without_an_answer_get_none_and_noise_is_ignored() -> None:
+    device = on(MINI)
+    assert asked(device, "low_exposure", 0) == b""
+    device.receive(b"\x00\xaa\x55garbage", 0)
+    assert asked(device, "get_version", SECOND)[2] == 0xFC ^ 0xA0
+    assert device.heard == ["low_exposure", "get_version"]
+
+
+def test_half_a_command_is_forgotten_when_the_line_falls_silent() -> None:
+    device = on(A1)
+    device.receive(b"\xa5\xa5\xff", 0)  # the beginning of a request with a long payload
+    device.receive(A1.command("get_info"), 10 * MS)
+    assert device.outgoing(10 * MS) == []
+    assert A1.parse(asked(device, "get_health", 200 * MS)).status == 0
+
+
+def test_an_rplidar_says_what_it_is_and_scans_in_the_mode_that_is_asked_for() -> None:
+    device = on(A1)
+    info = A1.parse(asked(device, "get_info", 0))
+    assert (info.model, info.firmware_major, info.firmware_minor, info.hardware) == (0x18, 1, 29, 7)
+    assert A1.parse(asked(device, "get_mode_count", 0)).value.mode_count == 4
+    assert A1.parse(asked(device, "get_us_per_sample", 0, mode=3)).value.us_per_sample == 127 * 256
+    assert bytes(A1.parse(asked(device, "get_mode_name", 0, mode=3)).value.data) == b"Sensitivity\0"
+    assert asked(device, "get_mode_name", 0, mode=9) == b""
+    kinds = {}
+    for mode in range(4):
+        kind = A1.parse(asked(device, "get_answer_type", 0, mode=mode)).value.answer_type
+        started = asked(device, "express_scan", mode * SECOND, mode=mode) if mode else asked(device, "scan", 0)
+        started += passing(device, mode * SECOND, mode * SECOND + SECOND // 2)
+        assert A1.parse(started[:7])["type"] == kind
+        found = A1.decode(started).stats
+        assert found.bytes_skipped == 0
+        kinds[mode] = sorted(found.frames)
+        passing(device, mode * SECOND + SECOND // 2, (mode + 1) * SECOND)
+    assert kinds == {
+        0: ["node", "scan_descriptor"],
+        1: ["express", "express_descriptor"],
+        2: ["ultra", "ultra_descriptor"],
+        3: ["ultra", "ultra_descriptor"],
+    }
+    assert asked(device, "stop", 5 * SECOND).count(b"\xa5\x5a") == 0
+    assert passing(device, 5 * SECOND, 6 * SECOND) == b""
+
+
+def test_a_scan_mode_that_is_not_there_starts_nothing() -> None:
+    device = on(A1)
+    assert asked(device, "express_scan", 0, mode=9) + passing(device, 0, SECOND) == b""
+
+
+def test_other_frames_come_at_their_own_rate_with_the_defaults_of_the_spec() -> None:
+    helios = ls.sensor("robosense-helios16p")
+    device = on(helios)
+    out = [data for now in range(0, 3 * SECOND + MS, 5 * MS) for _, data in device.outgoing(now)]
+    packets = helios.decode(out)
+    assert (device.sent["difop"], packets.stats.frames["difop"]) == (4, 4)
+    assert out[0] == next(data for data in out if data[:2] == b"\xa5\xff")
+    assert not packets.points().nominal
+    assert np.array_equal(helios.decode([data for data in out if data[:2] != b"\xa5\xff"]).points().xyz, packets.points().xyz)
+
+
+@pytest.mark.parametrize("name", ["ldrobot-stl27l", "cspc-m1c1-mini", "velodyne-vlp16", "slamtec-rplidar-s2"])
+@pytest.mark.parametrize("rate", [0.5, 1.0, 4.0])
+def test_the_pace_does_not_depend_on_how_often_it_is_asked(name: str, rate: float) -> None:
+    sensor, numbers, streams = ls.sensor(name), [], []
+    for step in (3 * MS, 50 * MS):
+        device = on(sensor, rate=rate)
+        for command in sensor.on_open:
+            device.receive(sensor.command(command), 0)
+        streams.append(passing(device, 0, 2 * SECOND, step))
+        numbers.append(device.sent[sensor.data_frame if name != "slamtec-rplidar-s2" else "node"])
+    shorter = min(map(len, streams))
+    assert streams[0][:shorter] == streams[1][:shorter]
+    interval = {"ldrobot-stl27l": 12 / 21_600, "cspc-m1c1-mini": 1 / (17 * 5.5), "velodyne-vlp16": 1 / 753.5, "slamtec-rplidar-s2": 508e-6}[
+        name
+    ]
+    settling = 1.0 if name == "cspc-m1c1-mini" else 0.0
+    assert numbers[0] == pytest.approx((2 * rate - settling) / interval, rel=0.03)
+
+
+def test_a_deadline_is_when_something_comes() -> None:
+    device = on(STL)
+    for _ in range(50):
+        due = device.deadline
+        assert due is not None
+        assert device.outgoing(due - 1) == []
+        assert device.outgoing(due) != []
+    assert on(MINI).deadline is None
+
+
+def test_a_device_that_nobody_asked_for_long_does_not_flood() -> None:
+    device = on(STL)
+    device.outgoing(0)
+    device.outgoing(3600 * SECOND)
+    assert 1700 < device.sent["data"] < 1900
+    assert device.deadline is not None
+    assert device.deadline > 3600 * SECOND
+
+
+def test_without_a_pace_it_gives_data_whenever_it_is_asked() -> None:
+    device = on(MINI, rate=math.inf)
+    device.receive(MINI.command("start"), 0)
+    out = b"".join(data for _ in range(50) for _, data in device.outgoing(0))
+    assert len([scan for scan in MINI.scans(out) if scan.complete]) > 40
+    assert out[:27].count(b"\xa5\x5a") == 1
+
+
+@pytest.mark.parametrize("name", ["ldrobot-stl27l", "velodyne-vlp16"])
+def test_the_same_seed_does_the_same_harm(name: str) -> None:
+    sensor = ls.sensor(name)
+    faults = Faults(errors=0.001, loss=0.02, reorder=4 if sensor.datagrams else 0)
+    first, second, other = (
+        passing(on(sensor, faults=faults, seed=seed), 0, SECOND, step) for seed, step in ((1, MS), (1, 7 * MS), (2, MS))
+    )
+    shorter = min(len(first), len(second))
+    assert first[:shorter] == second[:shorter]
+    assert first[:shorter] != other[:shorter]
+
+
+def test_damaged_bytes_are_as_many_as_asked_for_and_the_sound_frames_come_through() -> None:
+    device = on(STL, faults=Faults(errors=0.002))
+    data = passing(device, 0, 3 * SECOND)
+    line, stats = device.lines["data"], STL.decode(data).stats
+    assert line.sent == device.sent["data"] == pytest.approx(5400, abs=20)
+    assert line.intact / line.sent == pytest.approx((1 - 0.002) ** 47, abs=0.02)
+    assert line.intact - 5 <= stats.frames["data"] <= line.intact + 5
+
+
+def test_lost_packets_are_missing_and_reordered_ones_are_late() -> None:
+    m1 = ls.sensor("robosense-m1")
+    clean, harmed = on(m1), on(m1, faults=Faults(loss=0.01, reorder=5))
+    sound, out = ([data for now in range(0, SECOND, 2 * MS) for _, data in device.outgoing(now)] for device in (clean, harmed))
+    line, places = harmed.lines["data"], {data: place for place, data in enumerate(sound)}
+    assert 0.005 < line.lost / line.sent < 0.02
+    order = [places[data] for data in out]
+    late = [max(order[: index + 1]) - place for index, place in enumerate(order)]
+    assert 0 < max(late) <= 5
+    assert 0.03 < np.mean(np.array(late) > 0) < 0.12
+    stats = m1.decode(out).stats
+    assert stats.lost == pytest.approx(line.lost, abs=8)
+    assert stats.late > 100
+
+
+def test_damage_in_datagrams_keeps_their_length() -> None:
+    line = Line(Faults(errors=0.1), stream=False)
+    out = line.carry([("data", bytes(100))] * 50)
+    assert [len(data) for _, data in out] == [100] * 50
+    assert 0.07 < np.mean([sum(map(bool, data)) for _, data in out]) / 100 < 0.13
+
+
+def test_every_byte_of_a_line_can_be_damaged() -> None:
+    out = Line(Faults(errors=1.0), stream=True).carry([("", bytes(300))])
+    assert 150 < len(out[0][1]) < 450
+    assert all(a or b for a, b in pairwise(Line(Faults(errors=1.0), stream=False).carry([("", bytes(300))])[0][1]))
+
+
+def test_the_plug_is_pulled_and_put_in_again() -> None:
+    device = on(MINI, faults=Faults(unplug=3.0, absent=1.0))
+    device.receive(MINI.command("start"), 0)
+    assert passing(device, 0, 3 * SECOND)
+    assert device.outgoing(3 * SECOND) == []
+    assert not device.present
+    assert device.deadline == 4 * SECOND
+    device.receive(MINI.command("start"), 3 * SECOND + SECOND // 2)
+    assert passing(device, 3 * SECOND, 6 * SECOND) == b""
+    assert device.present
+    assert asked(device, "start", 6 * SECOND + 10 * MS)
+    assert passing(device, 6 * SECOND + 20 * MS, 7 * SECOND)
+    assert device.outgoing(7 * SECOND) == []
+
+
+def test_a_start_begins_anew() -> None:
+    device = on(A1)
+    first = asked(device, "scan", 0) + passing(device, 0, SECOND)
+    again = asked(device, "scan", SECOND) + passing(device, SECOND, 2 * SECOND)
+    assert again[:7] == first[:7]
+    assert A1.decode(first + again).stats.bytes_skipped == 0
+
+
+@pytest.mark.parametrize(
+    ("options", "error"),
+    [
+        ({"errors": "2"}, OutOfRange),
+        ({"loss": "-0.1"}, OutOfRange),
+        ({"errors": "nan"}, OutOfRange),
+        ({"reorder": "x"}, UsageError),
+        ({"unplug": "soon"}, UsageError),
+        ({"unplug": "-3s"}, UsageError),
+    ],
+)
+def test_faults_that_cannot_be_are_refused(options: dict[str, str], error: type[Exception]) -> None:
+    with pytest.raises(error):
+        faults_of(options)
+
+
+def test_faults_by_text() -> None:
+    asked_for = {"errors": "0.01", "loss": "0.02", "reorder": "4", "unplug": "30s", "absent": "500ms"}
+    assert faults_of(asked_for) == Faults(0.01, 0.02, 4, 30.0, 0.5)
+    assert (duration("2min"), duration("1.5h"), duration("7"), duration("20us")) == (120, 5400, 7, pytest.approx(20e-6))
+    with pytest.raises(UsageError, match="keep their order"):
+        on(STL, faults=Faults(reorder=2))

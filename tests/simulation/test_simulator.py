@@ -1,0 +1,258 @@
+"""What a simulated sensor measures is where the scene is, for every installed sensor and every kind of its data frames."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+import lidarspec as ls
+from lidarspec import Sensor, SourceError, SpecError, UsageError
+from lidarspec.simulation.device import SECOND, SimulatedDevice
+from lidarspec.simulation.scenes import Box, Mover, Room, furnished, read_scene, scene_of
+from lidarspec.simulation.simulator import simulate, simulation
+from lidarspec.spec import Cartesian, Frame, Polar, Serial, Simulation, Udp
+from lidarspec.testing.geometry import off
+from tests.shapes import count, sized
+
+#: metres by which a point may be off its surface: half a step of the range, and float32.
+EXACT = 2e-6
+#: half of the widest step of each kind of data frame, metres, where it is not in the unit of a field.
+STEPS = {"ultra": 0.004, "ultra_dense": 0.0015}
+#: metres of one step where the header says the unit.
+BY_HEADER = 0.004
+EVERY = [(name, frame) for name, sensor in ls.sensors().items() for frame in sensor.frames if sensor.frames[frame].data]
+
+
+#: 40 samples a packet, and nothing that says when they are sent.
+SHAPE = count.SENSOR
+
+
+def placed(cloud: ls.PointCloud, packets: int) -> NDArray[np.float64]:
+    """The coordinates of the valid points; those of the last packet are left out, where directions ask for what follows."""
+    xyz = np.stack([cloud.x, cloud.y, cloud.z], axis=1)[: len(cloud) - 2 * len(cloud) // packets]
+    return xyz[cloud.valid[: len(xyz)]].astype(np.float64)
+
+
+def half_step(sensor: Sensor, frame: str) -> float:
+    """Half a step of the coarsest range field."""
+    if frame in STEPS:
+        return STEPS[frame]
+    fields = ls.sensor(sensor.id).decode(b"" if not sensor.datagrams else [], frame).table.schema.fields.values()
+    metres = [info.scale for info in fields if info.unit == "m" and info.axes] or [info.scale for info in fields if info.unit == "m"]
+    return max(metres, default=BY_HEADER) / 2
+
+
+def streamed(sensor: Sensor, seconds: float, room: Room) -> tuple[list[bytes], SimulatedDevice]:
+    """What a device sends in so many seconds of its time, opened as a program would."""
+    device = SimulatedDevice(sensor, scene=room)
+    device.start(0)
+    out: list[bytes] = []
+    answer = sensor.options.get("answer")
+    opening = [name for name in sensor.on_open if sensor.commands[name].frame]
+    for name in opening if answer in (None, "node") else []:
+        device.receive(sensor.command(name), 0, sensor.commands[name].link)
+    for now in range(0, int(seconds * SECOND), SECOND // 50):
+        out += [data for _, data in device.outgoing(now)]
+    return out, device
+
+
+@pytest.mark.parametrize(("name", "frame"), EVERY)
+def test_a_simulated_stream_gives_the_scene_back_within_the_steps_of_its_format(name: str, frame: str) -> None:
+    sensor, room = ls.sensor(name), furnished(len(name))
+    room = Room(room.walls, room.boxes)
+    several = sum(other.data for other in sensor.frames.values()) > 1
+    sensor = sensor.configure(answer=frame) if several else sensor
+    frames = simulate(sensor, 300, start=5, scene=room)
+    cloud = sensor.decode(frames if sensor.datagrams else b"".join(frames)).points()
+    assert cloud.valid.mean() > 0.98
+    assert off(room, placed(cloud, len(frames))).max() < half_step(sensor, frame) + EXACT
+
+
+@pytest.mark.parametrize("name", ls.sensors())
+def test_the_bytes_of_a_device_decode_to_the_scene_without_a_byte_too_many(name: str) -> None:
+    sensor, room = ls.sensor(name), Room()
+    out, device = streamed(sensor, 1.3, room)
+    packets = sensor.decode(out if sensor.datagrams else b"".join(out))
+    cloud = packets.points()
+    assert packets.stats.frames == dict(device.sent)
+    assert packets.stats.bytes_skipped - packets.stats.bytes_filler in (0, 2)  # two stray bytes that a COIN-D4 was seen to send
+    assert (packets.stats.lost, packets.stats.plugin_errors) == (0, 0)
+    assert off(room, placed(cloud, len(packets))).max() < half_step(sensor, packets.frame) + EXACT
+    assert set(np.round(np.sign(np.diff(packets.time_ns))).tolist()) <= {0.0, 1.0}
+
+
+def test_a_mirrored_or_turned_scene_would_show() -> None:
+    room = Room()
+    xyz = np.random.default_rng(3).normal(size=(500, 3))
+    xyz = xyz / np.linalg.norm(xyz, axis=1)[:, None]
+    azimuth, elevation = np.arctan2(xyz[:, 1], xyz[:, 0]), np.arcsin(xyz[:, 2])
+    hits = xyz * room.measure(azimuth, elevation)[:, None]
+    assert off(room, hits).max() < 1e-9
+    assert off(room, hits * [1, -1, 1]).max() > 0.1
+    assert off(room, hits * [-1, 1, 1]).max() > 0.1
+
+
+def test_beams_begin_where_they_are_said_to() -> None:
+    room, origin = Room(), (0.5, -0.25, 0.125)
+    azimuth = np.linspace(-np.pi, np.pi, 400, endpoint=False)
+    ranges = room.measure(azimuth, np.full(400, 0.1), origin)
+    hits = np.stack([np.cos(0.1) * np.cos(azimuth), np.cos(0.1) * np.sin(azimuth), np.full(400, np.sin(0.1))], axis=1) * ranges[:, None]
+    assert off(room, hits + origin).max() < 1e-9
+
+
+def test_somebody_walks() -> None:
+    walker = Mover((0.4, 0.4, 2), ((1, -1), (1, 1)), speed=1.0, floor=-1)
+    scene = Room(walls=None, boxes=(), movers=(walker,))
+    times = np.array([0.0, 1.0, 2.0, 3.0, 4.0])
+    azimuth = np.arctan2([-1, 0, 1, 0, -1], 1.0)
+    ranges = scene.measure(azimuth, np.zeros(5), time=times)
+    assert np.isfinite(ranges).all()
+    assert ranges[1] == ranges[3] == pytest.approx(0.8)
+    assert np.isinf(scene.measure(azimuth, np.zeros(5), time=times + 1)).all()
+
+
+def test_what_a_device_sees_moves_with_its_own_time() -> None:
+    sensor, scene = ls.sensor("ldrobot-stl27l"), Room(boxes=(), movers=(Mover((0.3, 0.3, 2), ((1.5, -1), (1.5, 1)), speed=1.0, floor=-1),))
+    out, _ = streamed(sensor, 2.05, scene)
+    whole = [scan.points for scan in sensor.scans(b"".join(out)) if scan.complete]
+    seen = [np.median(points.y[(points.range < 2) & (np.abs(points.y) < 1.3) & (points.x > 1)]) for points in whole]
+    assert len(seen) >= 18
+    assert np.allclose(np.diff(seen), 0.1, atol=0.03)
+
+
+def test_a_seed_makes_a_room_and_the_same_one_each_time() -> None:
+    assert furnished(3) == furnished(3) != furnished(4)
+    assert furnished() == furnished(0)
+
+
+@pytest.mark.parametrize("start", [0, 7, 1000])
+def test_packets_are_the_same_however_they_are_asked_for(start: int) -> None:
+    sensor = ls.sensor("ldrobot-stl27l")
+    assert simulate(sensor, 12, start=start)[4:] == simulate(sensor, 8, start=start + 4)
+
+
+def test_the_pace_is_that_of_the_clock_of_the_points_of_the_declaration_or_of_the_line() -> None:
+    wanted = {
+        "ldrobot-stl27l": 12 / 21_600,  # its clock, in steps of a millisecond
+        "robosense-m1": 1 / 6300,
+        "hesai-xt32": 8 / 20_000,
+        "cspc-m1c1-mini": 380 / 17 / 5.5 / 380,  # the times of its points
+        "slamtec-rplidar-a1": 508e-6,  # declared
+    }
+    for name, seconds in wanted.items():
+        assert simulation(ls.sensor(name), ls.sensor(name).data_frame).interval == pytest.approx(seconds * 1e9, rel=0.01)
+    bare = replace(SHAPE, links={"data": Serial(9600)})
+    assert simulation(bare, "data").interval == pytest.approx((9 + 3 * 40) * 10 / 9600 * 1e9)
+
+
+def test_a_sensor_without_time_on_datagrams_has_to_declare_its_rate() -> None:
+    bare = replace(SHAPE, links={"data": Udp(2000)})
+    with pytest.raises(SpecError, match="declare its `rate`"):
+        SimulatedDevice(bare)
+    paced = replace(bare, frames={**bare.frames, "data": replace(bare.frames["data"], simulation=Simulation(rate=50.0))})
+    device = SimulatedDevice(paced)
+    device.start(0)
+    assert sum(len(device.outgoing(now)) for now in range(0, SECOND + 1, SECOND // 100)) == 51
+
+
+def test_what_cannot_be_simulated_says_why() -> None:
+    sensor = SHAPE
+    with pytest.raises(UsageError, match="declares no sweep"):
+        simulate(replace(sensor, simulation=Simulation(None)), 1)
+    with pytest.raises(SpecError, match="has to give `encode`"):
+        simulate(replace(sensor, points=lambda f: Polar(f.samples.distance * 0 + 1, 0)), 1)
+    with pytest.raises(SpecError, match="only polar points"):
+        simulate(replace(sensor, points=lambda f: Cartesian(f.samples.distance, 0, 0)), 1)
+    with pytest.raises(SpecError, match="sweep has to give 'size', which the length"):
+        simulate(replace(sized.SENSOR, simulation=Simulation(lambda i: {"angle": 0})), 1)
+    with pytest.raises(SpecError, match="with size = 500 there is no frame of at most 99 bytes"):
+        simulate(replace(sized.SENSOR, simulation=Simulation(lambda i: {"angle": 0, "size": 500})), 1)
+
+
+@pytest.mark.parametrize(("stretch", "shift"), [(1, 0.1), (1, -0.02), (1.01, 0.05), (0.98, 0)])
+def test_corrected_ranges_go_back_through_the_correction(stretch: float, shift: float) -> None:
+    """As a site's calibration makes them, in a hook."""
+
+    def corrected(f: Any) -> Polar:
+        polar = count.points(f)
+        return Polar(np.where(polar.range > 0, polar.range * stretch + shift, 0), polar.azimuth, intensity=polar.intensity)
+
+    room = Room()
+    frames = simulate(replace(SHAPE, points=corrected), 9, scene=room)
+    cloud = replace(SHAPE, points=corrected).decode(b"".join(frames)).points()
+    assert cloud.valid.all()
+    assert off(room, cloud.xyz.astype(np.float64)).max() < 0.0005 * stretch + EXACT
+    raw = SHAPE.decode(b"".join(frames)).points()
+    np.testing.assert_allclose(cloud.range, raw.range * stretch + shift, atol=1e-5)
+
+
+def test_a_frame_may_encode_its_ranges_itself() -> None:
+    def encode(polar: Polar) -> dict[str, NDArray[np.float64]]:
+        return {"samples.distance": np.rint(np.asarray(polar.range) * 1000 / 3)}
+
+    sensor = SHAPE
+    frame: Frame = replace(sensor.frames["data"], simulation=Simulation(encode=encode))
+    thirds = replace(sensor, frames={**sensor.frames, "data": frame})
+    plain, third = (s.decode(b"".join(simulate(s, 20)))["samples.distance"] for s in (sensor, thirds))
+    assert np.abs(third * 3 - plain).max() < 0.003
+    assert plain.max() > 1
+
+
+GOOD = """
+[room]
+low = [-3, -2.2, -1.2]
+high = [4.6, 3.1, 1.6]
+[[box]]
+low = [2.0, 0.8, -1.2]
+high = [2.7, 1.6, 0.9]
+[[mover]]
+size = [0.4, 0.5, 1.7]
+path = [[1.4, -1.5], [0.8, 1.9]]
+"""
+
+
+def test_a_scene_can_be_a_small_file(tmp_path: Path) -> None:
+    path = tmp_path / "hall.toml"
+    path.write_text(GOOD)
+    walker = Mover((0.4, 0.5, 1.7), ((1.4, -1.5), (0.8, 1.9)))
+    assert read_scene(path) == Room(Room().walls, (Box((2.0, 0.8, -1.2), (2.7, 1.6, 0.9)),), (walker,))
+    assert scene_of({}) == Room(None, ())
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("[room]", "[rom]", "unknown key 'rom'; did you mean 'room'"),
+        ("[[box]]", "[box]", r"box: tables in double brackets, \[\[box\]\]"),
+        ("high = [2.7, 1.6, 0.9]", "hihg = [2.7, 1.6, 0.9]", r"box\[0\]: unknown key 'hihg'; did you mean 'high'"),
+        ("high = [2.7, 1.6, 0.9]", "high = [2.7, 1.6]", r"box\[0\].high: 3 numbers"),
+        ("high = [2.7, 1.6, 0.9]", "high = [2.7, 1.6, -2]", r"box\[0\]: every number of high"),
+        ("high = [4.6, 3.1, 1.6]", "high = [-1, 3.1, 1.6]", "room: the sensor, at"),
+        ("size = [0.4, 0.5, 1.7]", "size = [0.4, 'a', 1.7]", r"mover\[0\].size: a number, not 'a'"),
+        ("size = [0.4, 0.5, 1.7]", "size = [0.4, 0, 1.7]", r"mover\[0\].size: numbers above 0"),
+        ("path = [[1.4, -1.5], [0.8, 1.9]]", "path = [[1.4, -1.5]]", r"mover\[0\].path: two places"),
+        ("path = [[1.4, -1.5], [0.8, 1.9]]", "path = [[1, 1], [1, 1]]", r"mover\[0\].path: it leads nowhere"),
+        ("path = [[1.4, -1.5], [0.8, 1.9]]", "path = [[1, 1], [2]]", r"path\[1\]: 2 numbers"),
+        ("[room]", "[room", "line 2"),
+        ("low = [-3, -2.2, -1.2]", "low = [-3, -2.2, nan]", "room.low: a number, not nan"),
+    ],
+)
+def test_a_mistake_in_a_scene_is_named_by_its_key(tmp_path: Path, old: str, new: str, said: str) -> None:
+    path = tmp_path / "hall.toml"
+    assert old in GOOD
+    path.write_text(GOOD.replace(old, new, 1))
+    with pytest.raises(UsageError, match=said):
+        read_scene(path)
+
+
+def test_a_scene_that_cannot_be_read_is_the_systems_fault(tmp_path: Path) -> None:
+    with pytest.raises(SourceError, match="No such file"):
+        read_scene(tmp_path / "none.toml")
+    (tmp_path / "binary.toml").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(UsageError, match="UTF-8"):
+        read_scene(tmp_path / "binary.toml")

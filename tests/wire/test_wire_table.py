@@ -1,0 +1,112 @@
+"""Wire tables say where the fields are: their offsets and formulas against the compiled layout of example frames."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+from construct import Struct
+
+import lidarspec as ls
+from lidarspec.framing.frame_engine import CompiledCodec, codec
+from lidarspec.spec import Frame
+from lidarspec.wire.layout import Layout
+from lidarspec.wire.wire_table import INDICES, Extent, WireRow, frame_size, wire_table
+from tests.shapes import SHAPES
+
+SENSORS = {**ls.sensors(), **SHAPES}
+FRAMES = [
+    (sensor, name) for sensor, value in SENSORS.items() for name, frame in value.frames.items() if isinstance(codec(frame), CompiledCodec)
+]
+
+
+def evaluated(formula: str, names: dict[str, object]) -> int:
+    return int(eval(formula, {"__builtins__": {}}, names))
+
+
+@pytest.mark.parametrize(("sensor", "frame"), FRAMES)
+def test_offsets_are_those_of_the_layout(sensor: str, frame: str) -> None:
+    value = SENSORS[sensor]
+    data = value.example(frame, seed=2)
+    engine = codec(value.frames[frame])
+    assert isinstance(engine, CompiledCodec)
+    layout = engine.tree.layout(data)
+    assert isinstance(layout, Layout)
+    names = dict(value.parse(data, frame))
+    if "(" not in frame_size(value.frames[frame]).replace("*(", ""):
+        assert evaluated(frame_size(value.frames[frame]), names) == len(data)
+    checked = 0
+    for row in wire_table(value.frames[frame]):
+        leaf = layout.leaves.get(re.sub(r"\[\w\]", "", row.field))
+        if leaf is None or row.type == "array" or "size(" in row.offset or "?" in row.offset or 0 in leaf.shape:
+            continue
+        origin = evaluated(row.offset, {**names, **dict.fromkeys(INDICES, 0)})
+        assert origin == leaf.offset, row
+        for index, stride in zip(INDICES, leaf.strides, strict=False):
+            if f"[{index}]" in row.field:
+                assert evaluated(row.offset, {**names, **dict.fromkeys(INDICES, 0), index: 1}) == origin + stride, row
+        checked += 1
+    assert checked
+
+
+@pytest.mark.parametrize(("sensor", "frame"), FRAMES)
+def test_every_field_has_a_row(sensor: str, frame: str) -> None:
+    fields = set(codec(SENSORS[sensor].frames[frame]).schema.fields)
+    rows = {re.sub(r"\[\w\]", "", row.field) for row in wire_table(SENSORS[sensor].frames[frame]) if row.type != "array"}
+    assert rows - {"(constant)"} == fields
+
+
+def test_rows_tell_type_unit_and_meaning() -> None:
+    rows = {row.field: row for row in wire_table(ls.sensor("robosense-m1").frames["data"])}
+    assert rows["blocks[i].channels[j].azimuth"] == WireRow(
+        "38 + 47*i + 9*j", "2", "uint16 be", "blocks[i].channels[j].azimuth", "0.01 deg - 327.68", ""
+    )
+    assert rows["magic"].meaning == "always 55 aa 5a a5"
+    assert rows["seconds"].type == "uint48 be"
+    rows = {row.field: row for row in wire_table(ls.sensor("cspc-m1c1-mini").frames["data"])}
+    assert rows["samples[i].distance"].type == "byte 2 bits 7-0, byte 1 bits 7-2"
+    assert rows["samples"].size == "3*lsn"
+
+
+def test_what_some_headers_leave_out_is_marked() -> None:
+    rows = [row for row in wire_table(SHAPES["shape-options"].frames["data"]) if row.field.startswith(("extension", "extra"))]
+    assert [(row.field, row.meaning) for row in rows] == [
+        ("extension.serial", "if options.extended == 1"),
+        ("extension.trim", "if options.extended == 1"),
+        ("extra.rpm", "if options.kind == 1"),
+        ("extra.rpm", "if options.kind == 2"),
+        ("extra.volts", "if options.kind == 2"),
+    ]
+    assert frame_size(SHAPES["shape-options"].frames["data"]) == "9 + size(extension) + size(extra) + 2*(rows * columns)"
+
+
+def test_a_length_that_follows_from_another_says_from_which() -> None:
+    frame = SHAPES["shape-sized"].frames["data"]
+    rows = {row.field: row for row in wire_table(frame)}
+    assert rows["length"].meaning == "= size + 5; all bytes before the sum"
+    assert rows["samples"].meaning == "(size - 2) // 3 elements of 3"
+    assert frame_size(frame) == "9 + 3*((size - 2) // 3)"
+
+
+def test_text_has_no_size_of_its_own() -> None:
+    rows = {row.field: row for row in wire_table(SHAPES["shape-text"].frames["data"])}
+    assert (rows["angle"].offset, rows["angle"].size, rows["angle"].type) == ("2", "varies", "text up to ','")
+    assert rows["strength"].offset == "2 + size(angle) + size(distance)"
+
+
+@pytest.mark.parametrize(
+    ("extent", "factor", "text"),
+    [
+        (Extent(3), 4, "12"),
+        (Extent(3), "i", "3*i"),
+        (Extent(1), "n", "n"),
+        (Extent(2), "a * b", "2*(a * b)"),
+        (Extent(1, ("n",)), "i", "(1 + n)*i"),
+    ],
+)
+def test_extents_multiply(extent: Extent, factor: int | str, text: str) -> None:
+    assert str(extent.times(factor)) == text
+
+
+def test_an_empty_struct_has_no_rows() -> None:
+    assert wire_table(Frame(Struct(), max_length=1)) == ()
