@@ -242,6 +242,10 @@ class Spec:
         """Whether frames come one to a datagram."""
         return is_datagram(self.links.get("data"))
 
+    def cloud_of(self, packets: Any) -> Any:
+        """The points of some of its packets, in stream order, as a `PointCloud`: known to `Sensor`, not to its description alone."""
+        raise NotImplementedError
+
     def __repr__(self) -> str:
         options = "".join(f", {name}={value!r}" for name, value in self.options.items())
         return f"Sensor({self.id}, {self.vendor} {self.model}, frames: {', '.join(self.frames) or 'none yet'}{options})"

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from lidarspec.framing.decoder import Decoder
     from lidarspec.framing.results import Found
     from lidarspec.packets.packets import Packets
+    from lidarspec.points.cloud import PointCloud
     from lidarspec.scans.scans import Scan
 
 #: options that every sensor has.
@@ -150,6 +151,12 @@ class Sensor(Spec):
         frames = frames_of(decoder, data)
         name = frame or data_frame(self, frames) or self.data_frame
         return PacketStream(self, name, decoder.stats, interpreted=decoder.interpreted, backend=decoder.backend).add(frames, whole=True)
+
+    def cloud_of(self, packets: Packets) -> PointCloud:
+        """The points of some of its packets, in stream order; what ``packets.points()`` returns."""
+        from lidarspec.points.evaluate import cloud_of
+
+        return cloud_of(packets)
 
     def scans(self, data: Any, *, backend: str = "auto") -> Iterator[Scan]:
         """Every scan of the data; the first and last piece are marked ``complete=False``.
