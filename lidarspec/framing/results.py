@@ -110,7 +110,7 @@ class Frames:
         layouts, forms: the layouts of compiled frames, and which of them each has, as an index; -1 where nobody knows.
         status: `VALID`, or why a candidate is no frame.
         offsets: where each begins in everything fed so far (for datagram links in the payloads, joined).
-        places: the same, as a range where the frames have one size and follow one another.
+        places: these offsets, as a range where the frames have one size and follow one another.
         gaps: bytes (other than fillers) skipped before each.
         at: arrival times in ns, -1 where nobody knows them.
         rows: the bytes of each, one a row, where all have one layout and somebody gathered them; of candidates, of as many
@@ -196,7 +196,7 @@ class Frames:
         return not np.count_nonzero(self.status)
 
     def only(self, which: NDArray[np.bool_] | Indices | slice) -> Frames:
-        """Some of them: by a mask, by ascending indices, or by a slice."""
+        """The frames that a mask, ascending indices or a slice choose."""
         rows = self.rows
         if rows is not None:
             rows = rows[which] if isinstance(which, slice) else taken(rows, which if which.dtype != np.bool_ else which[: len(rows)])
@@ -219,7 +219,7 @@ class Frames:
         return [(self.layouts[form], which) for form, which in zip(present, parts, strict=True)]
 
     def located(self, names: tuple[str, ...], places: Numbers, gaps: NDArray[np.int64], at: NDArray[np.int64]) -> Frames:
-        """The same frames with their place in the input; gathered rows stand for the buffer, so that the rest of it can go."""
+        """These frames with their place in the input; gathered rows stand for the buffer, so that the rest of it can go."""
         if self.rows is None or isinstance(self._starts, range):
             return self._with(names=names, places=places, gaps=gaps, at=at)
         number, size = self.rows.shape
@@ -227,7 +227,7 @@ class Frames:
         return self._with(names=names, places=places, gaps=gaps, at=at, buffer=self.rows.reshape(-1), _starts=starts)
 
     def arrived(self, at: NDArray[np.int64]) -> Frames:
-        """The same frames with other times of arrival."""
+        """These frames with other times of arrival, (n,) ns."""
         return self._with(at=at)
 
     def _with(self, **changes: Any) -> Frames:
