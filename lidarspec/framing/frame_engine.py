@@ -97,10 +97,9 @@ class CompiledCodec:
     ) -> Frames:
         groups = [(self.layout, counted(len(offsets)))] if self.layout is not None else self.tree.classify(buffer, offsets)[0]
         kinds, errors = repeated(kind, len(offsets)), list[str]()
-        if len(groups) == 1 and len(groups[0][1]) == len(offsets) and isinstance(groups[0][0], Layout):
-            layout = groups[0][0]
-            status, sizes, rows = self._judged(buffer, offsets, layout, errors, gathered=gathered, sums=sums)
-            return Frames(buffer, kinds, offsets, sizes, layouts=(layout,), status=status, rows=rows, errors=tuple(errors))
+        if len(groups) == 1 and len(groups[0][1]) == len(offsets) and isinstance(only := groups[0][0], Layout):
+            status, sizes, rows = self._judged(buffer, offsets, only, errors, gathered=gathered, sums=sums)
+            return Frames(buffer, kinds, offsets, sizes, layouts=(only,), status=status, rows=rows, errors=tuple(errors))
         status, forms = np.full(len(offsets), SHORT, np.uint8), np.full(len(offsets), -1, np.intp)
         layouts, short = list[Layout](), list[tuple[NDArray[np.intp], NDArray[np.intp]]]()
         for layout, which in groups:
