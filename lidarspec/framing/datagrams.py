@@ -1,6 +1,6 @@
 """Datagrams, each one frame, whole, or none: of which type each is, judged together.
 
-The same rule as in a stream, without the search: at the first byte of a datagram the order of the types decides, a type
+The rule of streams, without the search: at the first byte of a datagram the order of the types decides, a type
 with `after` only counts while it is announced, and a frame has to be as long as its datagram. Datagrams that are all alike
 are judged as rows (`lidarspec.framing.steady`); of others each type judges those that no type before it has taken. Only what
 makes a plugin fail is judged alone, so that one datagram does not cost the others.

@@ -23,7 +23,7 @@ from lidarspec.framing.plausibility import Check, Conditions, Judge, plausibilit
 from lidarspec.framing.results import CHECKSUM, CONSTANT, LENGTH, PLUGIN, SHORT, VALID, Frames, Status
 from lidarspec.spec.construct_layer import Mismatch
 from lidarspec.spec.description import Frame
-from lidarspec.wire.arrays import counted, repeated
+from lidarspec.wire.arrays import alike, counted, repeated
 from lidarspec.wire.frame_table import Group, Records, Rows, Table
 from lidarspec.wire.layout import Layout, Marks, Sums, marks
 from lidarspec.wire.layout_tree import NotCompilable, Refused, frame_layouts, prefix_of, rows_at
@@ -96,22 +96,24 @@ class CompiledCodec:
         self, buffer: NDArray[np.uint8], offsets: NDArray[np.intp], *, kind: int = 0, gathered: bool = True, sums: Sums | None = None
     ) -> Frames:
         groups = [(self.layout, counted(len(offsets)))] if self.layout is not None else self.tree.classify(buffer, offsets)[0]
-        if len(groups) == 1 and len(groups[0][1]) == len(offsets) and isinstance(groups[0][0], Layout):
-            return self._surveyed(buffer, offsets, groups[0][0], kind=kind, gathered=gathered, sums=sums)
-        status = np.full(len(offsets), SHORT, np.uint8)
-        sizes, forms = np.zeros((2, len(offsets)), np.intp)
-        forms -= 1
-        layouts, errors = list[Layout](), list[str]()
+        kinds, errors = repeated(kind, len(offsets)), list[str]()
+        if len(groups) == 1 and len(groups[0][1]) == len(offsets) and isinstance(only := groups[0][0], Layout):
+            status, sizes, rows = self._judged(buffer, offsets, only, errors, gathered=gathered, sums=sums)
+            return Frames(buffer, kinds, offsets, sizes, layouts=(only,), status=status, rows=rows, errors=tuple(errors))
+        status, forms = np.full(len(offsets), SHORT, np.uint8), np.full(len(offsets), -1, np.intp)
+        layouts, short = list[Layout](), list[tuple[NDArray[np.intp], NDArray[np.intp]]]()
         for layout, which in groups:
             if isinstance(layout, Refused):
                 status[which] = PLUGIN if layout.error else LENGTH
                 errors += [layout.error] * len(which) if layout.error else []
                 continue
-            part = self._surveyed(buffer, offsets[which], layout, kind=kind, gathered=gathered, sums=sums)
-            status[which], sizes[which], forms[which] = part.status, part.sizes, len(layouts)
+            status[which], own, _ = self._judged(buffer, offsets[which], layout, errors, gathered=gathered, sums=sums)
+            forms[which] = len(layouts)
             layouts.append(layout)
-            errors += part.errors
-        kinds = repeated(kind, len(offsets))
+            short += [(which, own)] if alike(own) is None else []
+        sizes = np.array([*(layout.size for layout in layouts), 0], np.intp)[forms]
+        for which, own in short:
+            sizes[which] = own
         return Frames(buffer, kinds, offsets, sizes, layouts=tuple(layouts), forms=forms, status=status, errors=tuple(errors))
 
     def survey_rows(self, rows: NDArray[np.uint8], *, sums: Sums | None = None) -> tuple[Layout, Status, tuple[str, ...]] | None:
@@ -121,28 +123,31 @@ class CompiledCodec:
         errors: list[str] = []
         return layout, self._judge(layout)(rows, errors, sums), tuple(errors)
 
-    def _surveyed(
-        self, buffer: NDArray[np.uint8], offsets: NDArray[np.intp], layout: Layout, *, kind: int, gathered: bool, sums: Sums | None
-    ) -> Frames:
-        """Candidates of one layout."""
-        whole = offsets <= len(buffer) - layout.size
-        count, number = np.count_nonzero(whole), len(offsets)
-        errors: list[str] = []
-        if count == number:
-            status, rows = self._judged(buffer, offsets, layout, errors, gathered=gathered, sums=sums)
-            sizes: NDArray[np.intp] = repeated(layout.size, number)
-        else:
-            is_lead = bool(whole[:count].all())
-            some, rows = self._judged(buffer, offsets[whole], layout, errors, gathered=gathered and is_lead, sums=sums)
-            status, sizes = np.empty(number, np.uint8), np.full(number, layout.size)
-            status[whole] = some
-            status[~whole], sizes[~whole] = _partial(buffer, offsets[~whole], layout)
-        return Frames(buffer, repeated(kind, number), offsets, sizes, layouts=(layout,), status=status, rows=rows, errors=tuple(errors))
-
     def _judged(
         self, buffer: NDArray[np.uint8], offsets: NDArray[np.intp], layout: Layout, errors: list[str], *, gathered: bool, sums: Sums | None
+    ) -> tuple[NDArray[np.uint8], NDArray[np.intp], NDArray[np.uint8] | None]:
+        """Candidates of one layout.
+
+        Returns:
+            The status of each; how many bytes it has, or how many tell more; and the bytes of those that are whole, one a row, if
+            these are wanted, are in front, and are not too many.
+        """
+        whole = offsets <= len(buffer) - layout.size
+        count, number = np.count_nonzero(whole), len(offsets)
+        if count == number:
+            judged, rows = self._judged_whole(buffer, offsets, layout, errors, gathered=gathered, sums=sums)
+            return judged, repeated(layout.size, number), rows
+        are_in_front = bool(whole[:count].all())
+        judged, rows = self._judged_whole(buffer, offsets[whole], layout, errors, gathered=gathered and are_in_front, sums=sums)
+        status, sizes = np.empty(number, np.uint8), np.full(number, layout.size)
+        status[whole] = judged
+        status[~whole], sizes[~whole] = _partial(buffer, offsets[~whole], layout)
+        return status, sizes, rows
+
+    def _judged_whole(
+        self, buffer: NDArray[np.uint8], offsets: NDArray[np.intp], layout: Layout, errors: list[str], *, gathered: bool, sums: Sums | None
     ) -> tuple[NDArray[np.uint8], NDArray[np.uint8] | None]:
-        """The status of whole candidates of one layout; their bytes, one a row, if they are not too many."""
+        """The status of whole candidates of one layout; their bytes, one a row, if they are wanted and not too many."""
         judge = self._judge(layout)
         step = max(BLOCK // layout.size, 1)
         if len(offsets) <= step or not gathered:

@@ -110,9 +110,7 @@ class Frames:
         layouts, forms: the layouts of compiled frames, and which of them each has, as an index; -1 where nobody knows.
         status: `VALID`, or why a candidate is no frame.
         offsets: where each begins in everything fed so far (for datagram links in the payloads, joined).
-        places: the same, as a range where the frames have one size and follow one another.
-        gaps: bytes (other than fillers) skipped before each.
-        at: arrival times in ns, -1 where nobody knows them.
+        places: these offsets, as a range where the frames have one size and follow one another.
         rows: the bytes of each, one a row, where all have one layout and somebody gathered them; of candidates, of as many
             from the first one on as are whole.
         errors: tracebacks out of plugins.
@@ -137,7 +135,6 @@ class Frames:
         self.forms = repeated(0 if layouts else -1, number) if forms is None else forms
         self.status = repeated(VALID, number) if status is None else status
         self.names: tuple[str, ...] = ()
-        self.gaps, self.at = repeated(0, number), repeated(-1, number)
 
     @classmethod
     def none(cls, buffer: NDArray[np.uint8]) -> Frames:
@@ -146,7 +143,7 @@ class Frames:
 
     @classmethod
     def joined(cls, parts: Sequence[Frames]) -> Frames:
-        """Candidates in one buffer, one part after another."""
+        """Candidates in one buffer, one part after another, without their rows and tracebacks."""
         if len(parts) == 1:
             return parts[0]
         layouts, firsts = list[Layout](), dict[int, int]()
@@ -160,9 +157,8 @@ class Frames:
             np.concatenate([part.starts for part in parts]),
             np.concatenate([part.sizes for part in parts]),
             layouts=tuple(layouts),
-            forms=np.concatenate([np.where(part.forms < 0, -1, part.forms + firsts[id(part.layouts)]) for part in parts]),
+            forms=np.concatenate([_shifted(part.forms, firsts[id(part.layouts)]) for part in parts]),
             status=np.concatenate([part.status for part in parts]),
-            errors=tuple(error for part in parts for error in part.errors),
         )
 
     def __len__(self) -> int:
@@ -177,6 +173,16 @@ class Frames:
     def offsets(self) -> NDArray[np.int64]:
         """Where each begins in the input."""
         return array_of(self.places)
+
+    @cached_property
+    def gaps(self) -> NDArray[np.int64]:
+        """The bytes (other than fillers) skipped before each; 0 until the decoder says otherwise."""
+        return repeated(0, len(self))
+
+    @cached_property
+    def at(self) -> NDArray[np.int64]:
+        """The arrival time of each in ns, -1 where nobody knows it."""
+        return repeated(-1, len(self))
 
     @property
     def layout(self) -> Layout | None:
@@ -196,11 +202,14 @@ class Frames:
         return not np.count_nonzero(self.status)
 
     def only(self, which: NDArray[np.bool_] | Indices | slice) -> Frames:
-        """Some of them: by a mask, by ascending indices, or by a slice."""
+        """The frames that a mask, ascending indices or a slice choose."""
+        which = which if isinstance(which, slice) or which.dtype != np.bool_ else np.flatnonzero(which)
         rows = self.rows
         if rows is not None:
-            rows = rows[which] if isinstance(which, slice) else taken(rows, which if which.dtype != np.bool_ else which[: len(rows)])
-        chosen = {name: some(getattr(self, name), which) for name in ("kinds", "sizes", "forms", "status", "gaps", "at")}
+            rows = rows[which] if isinstance(which, slice) else taken(rows, which[: which.searchsorted(len(rows))])
+        chosen = {
+            name: some(getattr(self, name), which) for name in ("kinds", "sizes", "forms", "status", "gaps", "at") if name in vars(self)
+        }
         starts = _chosen(self._starts, which)
         places = starts if self.places is self._starts else _chosen(self.places, which)
         return self._with(**chosen, rows=rows, _starts=starts, places=places)
@@ -219,7 +228,7 @@ class Frames:
         return [(self.layouts[form], which) for form, which in zip(present, parts, strict=True)]
 
     def located(self, names: tuple[str, ...], places: Numbers, gaps: NDArray[np.int64], at: NDArray[np.int64]) -> Frames:
-        """The same frames with their place in the input; gathered rows stand for the buffer, so that the rest of it can go."""
+        """These frames with their place in the input; gathered rows stand for the buffer, so that the rest of it can go."""
         if self.rows is None or isinstance(self._starts, range):
             return self._with(names=names, places=places, gaps=gaps, at=at)
         number, size = self.rows.shape
@@ -227,7 +236,7 @@ class Frames:
         return self._with(names=names, places=places, gaps=gaps, at=at, buffer=self.rows.reshape(-1), _starts=starts)
 
     def arrived(self, at: NDArray[np.int64]) -> Frames:
-        """The same frames with other times of arrival."""
+        """These frames with other times of arrival, (n,) ns."""
         return self._with(at=at)
 
     def _with(self, **changes: Any) -> Frames:
@@ -264,6 +273,12 @@ def packed(found: Sequence[Found]) -> Frames:
 def array_of(numbers: Numbers) -> NDArray[np.int64]:
     """The numbers as an array."""
     return np.arange(numbers.start, numbers.stop, numbers.step) if isinstance(numbers, range) else numbers
+
+
+def _shifted(forms: Indices, first: int) -> Indices:
+    """Indices of layouts that stand behind others."""
+    form = alike(forms)
+    return np.where(forms < 0, -1, forms + first) if form is None else repeated(form + first if form >= 0 else -1, len(forms))
 
 
 def _chosen(numbers: Numbers, which: NDArray[np.bool_] | Indices | slice) -> Numbers:

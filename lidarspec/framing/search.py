@@ -207,7 +207,7 @@ def merged(candidates: Sequence[Frames], *, final: bool) -> Frames:
     """The candidates of several types that are valid or wait for bytes, by offset, at each the one whose type comes first."""
     worst = VALID if final else SHORT
     parts = [own if own.is_sound or bool((own.status <= worst).all()) else own.only(own.status <= worst) for own in candidates]
-    live = Frames.joined(parts)
+    live = Frames.joined([part for part in parts if len(part)] or parts[:1])
     if len(parts) == 1:
         return live
     order = np.argsort(live.starts, kind="stable")  # at each offset still in the order of the types

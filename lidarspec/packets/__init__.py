@@ -1,1 +1,10 @@
-"""packets"""
+"""Packets: frames of one type in order and in time.
+
+In: `Frames` out of a decoder. Out: `Packets`, the frames of one type as columns, with the times, indices and breaks that follow from the
+sensor's clock and counter, and with what frames of other types said last. Modules in reading order:
+
+* `packets`: the columns of n frames, raw and physical.
+* `clocks`: the sensor's own time as integer nanoseconds that run on.
+* `sequences`: what was lost, came twice or late; packets put back in order.
+* `stream`: what is remembered from batch to batch.
+"""

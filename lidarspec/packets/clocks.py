@@ -158,7 +158,7 @@ class _Term:
         return np.repeat(values, np.diff(starts, append=len(table)))
 
     def _once(self, columns: list[NDArray[Any]]) -> Times:
-        """The same for one packet, which a later one with the same readings shares."""
+        """Its nanoseconds in one packet, (1,), which a later one with equal readings shares."""
         key = tuple(column.item(0) for column in columns)
         found = self._known.get(key)
         if found is None:

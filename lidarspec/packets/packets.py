@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,12 +12,11 @@ from numpy.typing import NDArray
 from lidarspec.columns.columns import Batch, physical
 from lidarspec.errors import SpecError, UnknownField
 from lidarspec.framing.results import Counters, Numbers, array_of
+from lidarspec.points.cloud import PointCloud
+from lidarspec.points.evaluate import cloud_of
 from lidarspec.spec.description import Spec
 from lidarspec.wire.frame_table import Table
 from lidarspec.wire.schema import Schema
-
-if TYPE_CHECKING:
-    from lidarspec.points.cloud import PointCloud
 
 StateOf = tuple[Table | None, NDArray[np.intp]]
 
@@ -106,8 +105,6 @@ class Packets:
 
     def points(self) -> PointCloud:
         """The points of all packets in stream order; see `PointCloud`."""
-        from lidarspec.points.evaluate import cloud_of
-
         return cloud_of(self)
 
     def take(self, which: Any) -> Packets:

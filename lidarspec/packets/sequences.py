@@ -1,8 +1,8 @@
 """Sequence numbers of packets: what was lost, what came twice or late, and where each packet stands.
 
-Numbers are unwrapped to an index that runs on over restarts of the counter, so that packets can be put in order.
-
-Packets put in order by their sequence, doubles left out, so that a late packet gives the same scan as a punctual one.
+Numbers are unwrapped to an index that runs on over restarts of the counter (`SequenceTracker`). By this index packets are put in
+order, doubles left out (`Reorder`), so that a late packet gives the same scan as a punctual one: what stands behind a gap is kept
+back for a while.
 """
 
 from __future__ import annotations
@@ -102,7 +102,7 @@ class SequenceTracker:
         return np.array([index for index, _ in found], np.int64), np.array([jump for _, jump in found], np.bool_)
 
     def _runs(self, numbers: NDArray[np.int64], periods: int | NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.bool_] | None]:
-        """The same for packets that are all numbered; those that follow one another are counted together."""
+        """The index of packets that are all numbered, and where some are missing; those that follow one another are counted together."""
         one, each = (periods, None) if isinstance(periods, int) else (0, periods)
         steady = numbers[1:] - numbers[:-1]
         ones = steady == 1
@@ -218,7 +218,7 @@ class Reorder:
         return [self._marked(held.take(np.argsort(held.index, kind="stable")), self._next)]
 
     def _ascending(self, packets: Packets, steps: NDArray[np.int64] | None) -> list[Packets]:
-        """The same for packets none of which is late: those behind the first gap that is still open are kept back.
+        """Packets none of which is late, in order: those behind the first gap that is still open are kept back.
 
         Args:
             steps: of the index from each packet to the next; None where all are 1.
@@ -256,7 +256,7 @@ class Reorder:
 
     @staticmethod
     def _marked(packets: Packets, before: int | None = None) -> Packets:
-        """The same packets with a break wherever the index jumps, and nowhere else."""
+        """These packets with a break wherever the index jumps, and nowhere else."""
         start = int(packets.index[0]) if before is None else before
         marked = copy.copy(packets)
         marked.breaks = np.diff(packets.index, prepend=start - 1) != 1

@@ -13,7 +13,6 @@ from __future__ import annotations
 import bisect
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any, NamedTuple, cast
 
 import numpy as np
@@ -27,29 +26,13 @@ from lidarspec.points.cloud import ColumnSource, Stretch, later
 from lidarspec.points.conventions import TYPES, narrowed, numbers_of, seconds_since, turned_azimuth, vendor_turn
 from lidarspec.points.plain import PacketBatch
 from lidarspec.points.plan import REMEMBERING, Maker, Plan
+from lidarspec.wire.arrays import keep_freed_memory
 from lidarspec.wire.frame_table import Group
 
 _MAIN = ("x", "y", "z", "intensity")
 
 #: points of a scan from which on its columns are made for itself; smaller ones share those of so many points.
 LEAST, SHARED = 1 << 14, 1 << 16
-
-
-#: bytes; what is freed at the end of the heap is kept up to twice as much.
-_KEPT = 1 << 24
-
-
-@lru_cache(maxsize=1)
-def _keep_freed_memory() -> None:
-    """Lets the allocator keep freed blocks, 32 MiB of them at most, from the first batch of points on.
-
-    The columns of a batch are blocks of some hundred kilobytes that live for milliseconds. glibc takes such blocks from the system and
-    gives them back, page by page, and fetching the pages anew costs several times what computing the columns costs. It stops doing so for
-    blocks smaller than the largest one that was ever freed, so one is: it is never touched, and takes no memory.
-
-    Source: mallopt(3), M_MMAP_THRESHOLD: the threshold is adjusted dynamically, and M_TRIM_THRESHOLD to twice its value.
-    """
-    np.empty(_KEPT, np.uint8)
 
 
 class Plain:
@@ -305,7 +288,7 @@ class BatchColumns(ColumnSource):
         self.size, self.base, self.rows, self.nominal = size, base, rows, nominal
         self._made: dict[str, NDArray[Any]] = {}
         self._blocks: list[Block] = []
-        _keep_freed_memory()
+        keep_freed_memory()
 
     @property
     def even(self) -> Share | None:

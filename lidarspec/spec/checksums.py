@@ -1,8 +1,7 @@
-"""Checksum algorithms as values: for one frame, or for every frame of a batch at once.
+"""Checksum algorithms as values: of one message, or of every frame of a batch at once; and the CRCs in common use by their names.
 
-The arithmetic on rows of bytes side by side is that of `lidarspec.spec.row_checksums`.
-
-The CRCs in common use, by the names that catalogues give them.
+An algorithm is immutable, hashable and equal to another by its parameters. `Checksum.batch` gives what calls one by one would give; the
+arithmetic on rows of bytes side by side is that of `lidarspec.spec.row_checksums`. `CRCS` has the names that catalogues give.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.spec import row_checksums as lanes
+from lidarspec.spec import row_checksums
 
 ByteOrder: TypeAlias = Literal["little", "big"]
 Bytes: TypeAlias = bytes | bytearray | memoryview
@@ -52,9 +51,9 @@ class Checksum(ABC):
         """The checksum of each row, shape (n,), for frames of one length, shape (n, m), contiguous or not."""
         return np.fromiter((self(row.tobytes()) for row in rows), np.uint64, len(rows))
 
-    def over(self, rows: NDArray[np.uint8], spans: lanes.Spans) -> Values:
+    def over(self, rows: NDArray[np.uint8], spans: row_checksums.Spans) -> Values:
         """The checksum of some bytes of each row, shape (n,): from one place to another, one span after another."""
-        return self.batch(lanes.cut(rows, spans))
+        return self.batch(row_checksums.cut(rows, spans))
 
 
 class _Worded(Checksum):
@@ -63,17 +62,17 @@ class _Worded(Checksum):
     def batch(self, rows: NDArray[np.uint8]) -> Values:
         return self.over(rows, ((0, rows.shape[1]),))
 
-    def over(self, rows: NDArray[np.uint8], spans: lanes.Spans) -> Values:
+    def over(self, rows: NDArray[np.uint8], spans: row_checksums.Spans) -> Values:
         if self._are_few(rows, spans):
-            return super().batch(lanes.cut(rows, spans))
+            return super().batch(row_checksums.cut(rows, spans))
         return _in_blocks(lambda block: self._values(block, spans), rows)
 
-    def _are_few(self, rows: NDArray[np.uint8], spans: lanes.Spans) -> bool:
+    def _are_few(self, rows: NDArray[np.uint8], spans: row_checksums.Spans) -> bool:
         """Whether the rows are done one by one sooner than together."""
         return len(rows) < _FEW
 
     @abstractmethod
-    def _values(self, rows: NDArray[np.uint8], spans: lanes.Spans) -> Values:
+    def _values(self, rows: NDArray[np.uint8], spans: row_checksums.Spans) -> Values:
         """The checksums of a block of rows."""
 
 
@@ -114,32 +113,32 @@ class Crc(_Worded):
                 register = table[(register ^ byte) & 0xFF] ^ register >> 8
         if not self.refin:
             register = int.from_bytes(register.to_bytes(size, "little"), "big") >> 8 * size - self.width
-        return (register if self.refin == self.refout else lanes.reflected(register, self.width)) ^ self.xorout
+        return (register if self.refin == self.refout else row_checksums.reflected(register, self.width)) ^ self.xorout
 
     def describe(self) -> str:
         digits, order = -(-self.width // 4), ("", " refin", " refout", " reflected")[self.refin + 2 * self.refout]
         values = (f" {name} 0x{getattr(self, name):0{digits}x}" for name in ("poly", "init", "xorout") if getattr(self, name))
         return f"CRC-{self.width}{''.join(values)}{order}"
 
-    def _are_few(self, rows: NDArray[np.uint8], spans: lanes.Spans) -> bool:
+    def _are_few(self, rows: NDArray[np.uint8], spans: row_checksums.Spans) -> bool:
         length = sum(stop - start for start, stop in spans)
         return len(rows) * length < (_NARROW_LOOP_BYTES if self.width <= 8 else _LOOP_BYTES)
 
-    def _values(self, rows: NDArray[np.uint8], spans: lanes.Spans) -> Values:
-        registers = lanes.registers(rows, spans, self._loop[1], self.width, self.poly, self.refin)
+    def _values(self, rows: NDArray[np.uint8], spans: row_checksums.Spans) -> Values:
+        registers = row_checksums.registers(rows, spans, self._loop[1], self.width, self.poly, self.refin)
         if not self.refin:
             registers = registers.byteswap() >> 8 * registers.itemsize - self.width
         values = registers.astype(np.uint64)
         if self.refin != self.refout:
-            mirrored = np.frombuffer(lanes.MIRROR, np.uint8).take(values.byteswap().view(np.uint8))
+            mirrored = np.frombuffer(row_checksums.MIRROR, np.uint8).take(values.byteswap().view(np.uint8))
             values = mirrored.view(np.uint64) >> np.uint64(64 - self.width)
         return values ^ np.uint64(self.xorout) if self.xorout else values
 
     @cached_property
     def _loop(self) -> tuple[tuple[int, ...], int, int]:
         """What a loop over bytes needs: its table, the register that it starts with, and the bytes of a register."""
-        table, start = lanes.byte_table(self.width, self.poly, self.refin), lanes.reflected(self.init, self.width)
-        return table, start if self.refin else lanes.mirrored_bytes(start), lanes.REGISTER_BYTES[self.width]
+        table, start = row_checksums.byte_table(self.width, self.poly, self.refin), row_checksums.reflected(self.init, self.width)
+        return table, start if self.refin else row_checksums.mirrored_bytes(start), row_checksums.REGISTER_BYTES[self.width]
 
 
 @dataclass(frozen=True)
@@ -154,9 +153,9 @@ class Xor(_Worded):
     def describe(self) -> str:
         return "XOR-8"
 
-    def _values(self, rows: NDArray[np.uint8], spans: lanes.Spans) -> Values:
-        columns = lanes.words(rows, spans=spans)
-        return lanes.folded_xor(lanes.xor(columns, range(len(columns))))
+    def _values(self, rows: NDArray[np.uint8], spans: row_checksums.Spans) -> Values:
+        columns = row_checksums.words(rows, spans=spans)
+        return row_checksums.folded_xor(row_checksums.xor(columns, range(len(columns))))
 
 
 @dataclass(frozen=True)
@@ -175,8 +174,8 @@ class Sum(_Worded):
     def describe(self) -> str:
         return f"{self.width}-bit sum"
 
-    def _values(self, rows: NDArray[np.uint8], spans: lanes.Spans) -> Values:
-        return lanes.byte_sums(lanes.words(rows, spans=spans)) & np.uint64((1 << self.width) - 1)
+    def _values(self, rows: NDArray[np.uint8], spans: row_checksums.Spans) -> Values:
+        return row_checksums.byte_sums(row_checksums.words(rows, spans=spans)) & np.uint64((1 << self.width) - 1)
 
 
 @dataclass(frozen=True)
@@ -205,14 +204,14 @@ class WordXor(_Worded):
     def describe(self) -> str:
         return f"XOR-16 of {'+'.join(map(str, self.groups))}-byte words" + (f" after a head of {self.head} bytes" if self.head else "")
 
-    def _values(self, rows: NDArray[np.uint8], spans: lanes.Spans) -> Values:
-        columns = lanes.words(rows, spans=spans)
+    def _values(self, rows: NDArray[np.uint8], spans: row_checksums.Spans) -> Values:
+        columns = row_checksums.words(rows, spans=spans)
         low, high, part = np.zeros((3, len(rows)), np.uint64)
         for which, masks in _word_masks(self, len(columns)):
-            alike = lanes.xor(columns, which)
+            alike = row_checksums.xor(columns, which)
             np.bitwise_xor(low, np.bitwise_and(alike, masks[0], out=part), out=low)
             np.bitwise_xor(high, np.bitwise_and(alike, masks[1], out=part), out=high)
-        return lanes.folded_xor(low) | lanes.folded_xor(high) << np.uint64(8)
+        return row_checksums.folded_xor(low) | row_checksums.folded_xor(high) << np.uint64(8)
 
     @cached_property
     def halves(self) -> tuple[list[slice], list[slice]]:
@@ -285,7 +284,7 @@ class ZeroPadded(Checksum):
 
 @lru_cache(maxsize=512)
 def _word_masks(algorithm: WordXor, number: int) -> list[tuple[list[int], tuple[np.uint64, np.uint64]]]:
-    """Where the low and the high bytes stand in so many words of `lanes.words`, as masks; with the words that have the same."""
+    """Where the low and the high bytes stand in so many words of `row_checksums.words`, as masks; with the words that have the same."""
     masks = np.zeros((2, 8 * number), np.uint8)
     for mask, half in zip(masks, algorithm.halves, strict=True):
         for part in half:

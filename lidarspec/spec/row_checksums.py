@@ -169,12 +169,12 @@ def _narrow(rows: NDArray[np.uint8], spans: Spans, start: int, width: int, poly:
         moved = left[:half].tobytes().translate(_advance(8 * distance, width, poly, refin))
         left = left[half:]
         left[-half:] ^= np.frombuffer(moved, np.uint64).reshape(half, -1)
-    lanes: NDArray[Any] = left[0]
+    side: NDArray[Any] = left[0]
     for size in (4, 2, 1):
-        parts = lanes.view(f"<u{size}")
+        parts = side.view(f"<u{size}")
         moved = parts[::2].tobytes().translate(_advance(size, width, poly, refin))
-        lanes = np.frombuffer(moved, f"<u{size}") ^ parts[1::2]
-    return np.frombuffer(lanes.tobytes().translate(_advance(1, width, poly, refin)), np.uint8)
+        side = np.frombuffer(moved, f"<u{size}") ^ parts[1::2]
+    return np.frombuffer(side.tobytes().translate(_advance(1, width, poly, refin)), np.uint8)
 
 
 def _summed(columns: NDArray[np.uint64], poly: int) -> NDArray[np.uint64]:
@@ -215,12 +215,12 @@ def _wide(rows: NDArray[np.uint8], spans: Spans, start: int, width: int, poly: i
     padded = np.zeros((count, -(-length // segment) * segment), np.uint8)
     padded[:, -length:] = rows
     padded[:, -length:][:, :8] ^= np.frombuffer(start.to_bytes(8, "little"), np.uint8)[:length]
-    lanes = np.zeros(padded.size // segment, table.dtype)
-    low = lanes.view("<u2")[:: table.itemsize // 2]
+    side = np.zeros(padded.size // segment, table.dtype)
+    low = side.view("<u2")[:: table.itemsize // 2]
     for pair in np.ascontiguousarray(padded.reshape(-1, segment).view("<u2").T):
         after = table.take(low ^ pair)
-        lanes[:] = after if width <= 16 else after ^ lanes >> 16
-    found = lanes.reshape(count, -1)
+        side[:] = after if width <= 16 else after ^ side >> 16
+    found = side.reshape(count, -1)
     while found.shape[1] > 1:
         odd = found.shape[1] % 2
         jumped = _jumped(found[:, odd::2].ravel(), _jump_table(segment.bit_length() - 1, width, poly, refin))

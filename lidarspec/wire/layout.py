@@ -1,8 +1,8 @@
 """Where each field of a frame stands, as data: offsets, strides, bits, constants, checksums; and loading by it.
 
-A `Layout` holds for frames of one kind of header; `lidarspec.wire.layout_tree` makes it from the construct tree.
-
-Constants of frames: compared in words of up to eight bytes, for many frames at a time.
+A `Layout` holds for frames of one kind of header; `lidarspec.wire.layout_tree` makes it from the frame tree. A `Leaf` is the place of one
+field, a `Seal` a checksum with the bytes that it covers. All work on many frames at a time, given as rows of bytes; constants are
+compared in words of up to eight bytes.
 """
 
 from __future__ import annotations
@@ -144,7 +144,7 @@ class Leaf:
         return total
 
     def at(self, offset: int) -> Leaf:
-        """The same field with its place counted from `offset`."""
+        """This field with its place counted from `offset`."""
         return replace(self, offset=self.offset - offset)
 
 

@@ -36,7 +36,7 @@ class Parser:
         """The frames in what waits at the end of the input."""
         return self.idle()
 
-    def spans(self, data: bytes, at: int | None = None) -> list[Any]:
+    def frames(self, data: bytes, at: int | None = None) -> list[Any]:
         """The frames that these bytes complete, as the engine asks for them."""
         return [packed(self.feed(data, at))]
 
