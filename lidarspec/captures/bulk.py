@@ -30,7 +30,8 @@ from lidarspec.captures.records import (
     Truncated,
     records,
 )
-from lidarspec.framing.decoder import Decoder, Spans
+from lidarspec.framing.decoder import Decoder
+from lidarspec.framing.results import Frames
 
 #: bytes of a record, from its start, that are compared at most; longer headers are read plainly.
 WIDEST = 128
@@ -199,7 +200,7 @@ class Batch:
         parts = {name: np.flatnonzero(self.senders == index) for index, name in enumerate(self.names)}
         return {name: part for name, part in parts.items() if len(part)}
 
-    def hosts(self, found: Spans) -> dict[str, list[str]]:
+    def hosts(self, found: Frames) -> dict[str, list[str]]:
         """The addresses that frames found in these datagrams came from, by type of frame."""
         hosts: dict[str, list[str]] = {}
         if len(self.names) == 1:

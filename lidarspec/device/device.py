@@ -20,7 +20,8 @@ from lidarspec.device.session import Reply
 from lidarspec.device.settings import named
 from lidarspec.discovery.detect import detected
 from lidarspec.errors import SourceError, UsageError, suggest
-from lidarspec.framing.decoder import Counters, Decoder, Spans
+from lidarspec.framing.decoder import Decoder
+from lidarspec.framing.results import Counters, Frames
 from lidarspec.packets.packets import Packets
 from lidarspec.packets.stream import PacketStream, data_frame
 from lidarspec.plugins import sensor as named_sensor
@@ -50,7 +51,7 @@ class PacketReader:
 
     def __init__(self, sensor: Sensor, frame: str | None, decoder: Decoder, state: Mapping[str, bytes]) -> None:
         self._sensor, self._decoder, self._state = sensor, decoder, state
-        self._waiting: deque[Spans] = deque(maxlen=UNDECIDED)
+        self._waiting: deque[Frames] = deque(maxlen=UNDECIDED)
         self._stream = self._made(frame) if frame is not None else None
         self.last: Packets | None = None
 
@@ -154,7 +155,7 @@ class Device:
         """Whether data come at their own pace, and not from a file."""
         return self._input.is_live
 
-    def spans(self) -> Iterator[list[Spans]]:
+    def spans(self) -> Iterator[list[Frames]]:
         """Every incoming frame of all types, in batches."""
         for arrival in self._arrivals(None):
             if arrival is not None and arrival.found:

@@ -21,7 +21,8 @@ from lidarspec.device.arrivals import Arrival, Senders, answers, fed
 from lidarspec.device.capture_thread import BoundedQueue, Capture, Event, Mark
 from lidarspec.device.session import Outgoing, Pending, Reply, Session
 from lidarspec.errors import CommandError, LidarSpecError, ReplyTimeout, suggest
-from lidarspec.framing.decoder import Counters, Decoder, Spans, backend as backend_named
+from lidarspec.framing.decoder import Decoder, backend as backend_named
+from lidarspec.framing.results import Counters, Frames
 from lidarspec.recording.appending import Log
 from lidarspec.spec.description import Command
 from lidarspec.spec.sensor import Sensor
@@ -45,7 +46,7 @@ class Watch:
         self._unframed_since: float | None = None
         self.streams = False
 
-    def saw(self, found: Sequence[Spans]) -> None:
+    def saw(self, found: Sequence[Frames]) -> None:
         """Take note of what was decoded."""
         if any(map(len, found)):
             self._framed, self._bytes, self._unframed_since = time.monotonic(), self._decoder.stats.bytes_in, None
@@ -334,7 +335,7 @@ class LiveInput:
             self._senders.check(chunks, found[0])
         self._hand_on(link, found)
 
-    def _hand_on(self, link: str, found: list[Spans], *, interrupted: bool = False) -> None:
+    def _hand_on(self, link: str, found: list[Frames], *, interrupted: bool = False) -> None:
         with self._talk:
             awaited = self._session.awaited(link)
             for item in answers(found, awaited) if awaited else ():

@@ -20,7 +20,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from lidarspec.errors import CommandError, ReplyTimeout, UnknownField, UsageError
-from lidarspec.framing.decoder import Found
+from lidarspec.framing.results import Found
 from lidarspec.spec.description import Command
 from lidarspec.spec.sensor import Sensor
 from lidarspec.spec.tree import FieldInfo
@@ -163,7 +163,7 @@ def found_at(values: Any, path: str) -> Any:
 def _physical(info: FieldInfo, value: Any) -> Any:
     if isinstance(value, list):
         return [_physical(info, element) for element in value]
-    return value * info.scale + info.offset if info.scaled and isinstance(value, int | float) else value
+    return info.physical(value) if isinstance(value, int | float) else value
 
 
 SECOND = 1_000_000_000

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from lidarspec.device.settings import named
 from lidarspec.discovery.listen import Heard, hear
 from lidarspec.errors import CommandError, LidarSpecError, UsageError, WireError, suggest
-from lidarspec.framing.decoder import Found
+from lidarspec.framing.results import Found
 from lidarspec.plugins import sensors
 from lidarspec.simulation.simulator import simulate
 from lidarspec.spec.links import Serial

@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 
 from lidarspec.errors import LidarSpecError
-from lidarspec.framing.decoder import Counters, Found, packed
+from lidarspec.framing.results import Counters, Found, packed
 from lidarspec.packets.stream import PacketStream
 from lidarspec.points.cloud import PointCloud
 from lidarspec.points.plain import evaluate

@@ -15,7 +15,7 @@ import numpy as np
 
 from lidarspec.errors import SpecError, UsageError, WireError
 from lidarspec.framing.frame_engine import CompiledCodec, codec
-from lidarspec.framing.plausibility import VALID
+from lidarspec.framing.results import VALID
 from lidarspec.spec.tree import FieldInfo
 from lidarspec.testing import subject as material
 from lidarspec.testing.findings import Violation, require

@@ -8,7 +8,6 @@ Constants of frames: compared in words of up to eight bytes, for many frames at 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from contextvars import ContextVar
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from typing import Any, Literal
@@ -149,6 +148,10 @@ class Leaf:
         return replace(self, offset=self.offset - offset)
 
 
+#: the checksums of frames by one of their seals, (n,); None where its algorithm is to compute them.
+Sums = Callable[["Seal", Bytes2D], "NDArray[np.uint64] | None"]
+
+
 @dataclass(frozen=True, eq=False)
 class Seal:
     """A checksum of the frame: the fields that hold it, low bits first, and the byte ranges that it covers."""
@@ -174,13 +177,14 @@ class Seal:
             shift += leaf.info.bits
         return total
 
-    def computed(self, rows: Bytes2D) -> NDArray[np.uint64]:
-        """The values that should stand there, (n,)."""
-        sums = _SUMS.get()
-        found = sums(self, rows) if sums is not None else None
-        if found is not None:
-            return found
-        return self.algorithm.over(rows, self.spans or ((0, 0),))
+    def computed(self, rows: Bytes2D, sums: Sums | None = None) -> NDArray[np.uint64]:
+        """The values that should stand there, (n,).
+
+        Args:
+            sums: asked first, before the algorithm.
+        """
+        values = None if sums is None else sums(self, rows)
+        return self.algorithm.over(rows, self.spans or ((0, 0),)) if values is None else values
 
     def fill(self, rows: Bytes2D) -> None:
         """Write the right value into each frame."""
@@ -210,29 +214,11 @@ class Seal:
     def _single(self) -> Single:
         return single(self.algorithm)
 
-    def intact(self, rows: Bytes2D) -> NDArray[np.bool_]:
-        """Which frames carry the right value, or one that means "not filled"."""
+    def intact(self, rows: Bytes2D, sums: Sums | None = None) -> NDArray[np.bool_]:
+        """Which frames carry the right value, or one that means "not filled", (n,); `sums` as in `computed`."""
         stored = self.stored(rows)
-        right = np.asarray(stored == self.computed(rows))
+        right = np.asarray(stored == self.computed(rows, sums))
         return right | np.isin(stored, np.array(self.absent, np.uint64)) if self.absent else right
-
-
-#: the checksums of frames, (n,); None where the algorithm is to compute them itself.
-Sums = Callable[[Seal, Bytes2D], NDArray[np.uint64] | None]
-_SUMS: ContextVar[Sums | None] = ContextVar("sums", default=None)
-
-
-class summed_by:
-    """As long as it lasts, checksums are computed by this function first."""
-
-    def __init__(self, sums: Sums | None) -> None:
-        self._sums = sums
-
-    def __enter__(self) -> None:
-        self._token = _SUMS.set(self._sums)
-
-    def __exit__(self, *_: object) -> None:
-        _SUMS.reset(self._token)
 
 
 @dataclass(frozen=True, eq=False)
