@@ -156,11 +156,15 @@ class MarkedStruct(Struct):  # type: ignore[misc]
 
 
 class IndexedArray(Array):  # type: ignore[misc]
-    """An Array that says in an error's path which element it was."""
+    """An Array that says in an error's path which element it was, and has no more elements than its frame can have bytes (or bits)."""
+
+    def __init__(self, count: Any, subcon: Construct, limit: int) -> None:
+        super().__init__(count, subcon)
+        self.limit = limit
 
     def _parse(self, stream: Any, context: Any, path: str) -> Any:
         count = construct.evaluate(self.count, context)
-        if count < 0:
+        if not 0 <= count <= self.limit:
             raise construct.RangeError(f"invalid count {count}", path=path)
         found = construct.ListContainer()
         for index in range(count):
@@ -269,10 +273,14 @@ def verifying(context: Any, *, checksums: bool = False) -> bool:
     return wanted is True if checksums else bool(wanted)
 
 
-def prepare(con: Construct) -> Construct:
-    """A copy of an author's tree with the engine's own classes in the places of construct's."""
+def prepare(con: Construct, limit: int = sys.maxsize) -> Construct:
+    """A copy of an author's struct with the engine's own classes in the places of construct's.
+
+    Args:
+        limit: the longest frame, in bytes; within a bit block in bits.
+    """
     if isinstance(con, Struct):
-        return MarkedStruct(*(prepare(child) for child in con.subcons))
+        return MarkedStruct(*(prepare(child, limit) for child in con.subcons))
     if isinstance(con, FormatField):
         if con.fmtstr[-1] not in "efd":
             return con
@@ -280,25 +288,26 @@ def prepare(con: Construct) -> Construct:
     if isinstance(con, Bytes):
         return CountedBytes(con.length)
     if isinstance(con, Array):
-        return IndexedArray(con.count, prepare(con.subcon))
+        return IndexedArray(con.count, prepare(con.subcon, limit), limit)
     if isinstance(con, Const):
-        return CheckedConst(con.value, prepare(con.subcon))
+        return CheckedConst(con.value, prepare(con.subcon, limit))
     if isinstance(con, construct.Enum):
-        named = NamedEnum(prepare(con.subcon))
+        named = NamedEnum(prepare(con.subcon, limit))
         named.encmapping, named.decmapping, named.ksymapping = con.encmapping, con.decmapping, con.ksymapping
         return named
     if isinstance(con, construct.IfThenElse):
-        return construct.IfThenElse(con.condfunc, prepare(con.thensubcon), prepare(con.elsesubcon))
+        return construct.IfThenElse(con.condfunc, prepare(con.thensubcon, limit), prepare(con.elsesubcon, limit))
     if isinstance(con, construct.Switch):
-        return construct.Switch(con.keyfunc, {key: prepare(case) for key, case in con.cases.items()}, prepare(con.default))
+        cases = {key: prepare(case, limit) for key, case in con.cases.items()}
+        return construct.Switch(con.keyfunc, cases, prepare(con.default, limit))
     if isinstance(con, construct.Renamed):
         inner = con.subcon
         while isinstance(inner, construct.Renamed):  # ("name" / con) * "docs" wraps twice, and the path would name it twice
             inner = inner.subcon
-        return construct.Renamed(prepare(inner), newname=con.name, newdocs=con.docs)
+        return construct.Renamed(prepare(inner, limit), newname=con.name, newdocs=con.docs)
     if isinstance(con, Subconstruct):
         same = copy.copy(con)
-        same.subcon = prepare(con.subcon)
+        same.subcon = prepare(con.subcon, 8 * limit if isinstance(con, construct.Transformed | construct.Restreamed) else limit)
         return same
     return con
 
@@ -473,7 +482,7 @@ def random_value(con: Construct, source: random.Random, drawn: Drawn, scope: Any
     if path in drawn:
         return drawn[path](source)
     if isinstance(con, Const):
-        return con.value
+        return con.parse(con.build(con.value), _verify=False)  # a name of an Enum with its number, as other expressions see it
     if isinstance(con, construct.Rebuild):
         with contextlib.suppress(Exception):  # it may ask for what comes after it, and is evaluated again when the frame is built
             return con.func(scope)
@@ -718,7 +727,7 @@ class _Builder:
             said = FieldInfo(path, info.axes, docs=info.docs if place.in_bits else "", optional=info.optional)
             members.append(self.node(child, _Place(said, scope, child.name or "", place.in_bits)))
         self.scopes[info.path] = scope
-        return tree.Struct(place.name, info.path, tuple(members))
+        return tree.Struct(place.name, info.path, tuple(members), info.docs)
 
     def _sealed(self, con: Sealing, place: _Place) -> Node:
         body = self.node(con.subcon, place)

@@ -7,6 +7,7 @@ arrays, and has no engine: engines are functions of a `Spec`. `lidarspec.spec.se
 from __future__ import annotations
 
 import re
+import sys
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -98,7 +99,7 @@ class Frame:
         if self.max_length < 0 or self.confirm < 1:
             raise SpecError("max_length and confirm are at least 1")
         _freeze(self, "acknowledged")
-        object.__setattr__(self, "prepared", prepare(self.struct))
+        object.__setattr__(self, "prepared", prepare(self.struct, self.max_length or sys.maxsize))
         check_struct(self.prepared)
         if not self.max_length:
             object.__setattr__(self, "max_length", _whole_length(self.prepared))

@@ -20,6 +20,7 @@ from construct import (
     Int8sb,
     Int8ub,
     Int16ub,
+    Int32ub,
     NullTerminated,
     Prefixed,
     Struct,
@@ -195,3 +196,17 @@ def test_the_reason_why_a_frame_is_not_compiled_is_true(part: Any, reason: str) 
     found = codec(sensor(Struct("a" / Int8ub, "b" / part)).frames["data"])
     assert isinstance(found, InterpretedCodec)
     assert reason in found.reason
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_count_is_bounded_by_the_longest_frame_also_where_elements_have_no_bytes(backend: str) -> None:
+    """Else ten bytes of noise would cost a loop over four thousand million elements."""
+    empty = Array(this.n, Struct("x" / If(this._.k > 2, Int8ub)))
+    bits = BitStruct("low" / Array(24, BitsInteger(1)))  # more elements than bytes, and they are bits
+    ours = sensor(Struct("k" / Int8ub, "n" / Int32ub, "bits" / bits, "v" / empty), max_length=20)
+    short, huge = b"\0\0\0\0\3\7\7\7", b"\0\xff\xff\xff\xff\7\7\7"
+    stats = ours.decode([short, huge], backend=backend).stats
+    assert (stats.frames, stats.bad_length, stats.plugin_errors) == ({"data": 1}, 1, 0)
+    assert len(ours.parse(short).v) == 3
+    with pytest.raises(WireError, match="v: invalid count 4294967295"):
+        ours.parse(huge)

@@ -12,12 +12,14 @@ from construct import (
     BitStruct,
     Const,
     Enum,
+    GreedyBytes,
     If,
     IfThenElse,
     Int8ub,
     Int16ub,
     Int24ub,
     Int32ub,
+    NullTerminated,
     Rebuild,
     Struct,
     Switch,
@@ -86,6 +88,12 @@ def test_what_build_fills_in_is_not_asked_of_a_frame_that_comes(inside: bool) ->
 def test_examples_are_of_every_name() -> None:
     ours = sensor(CHOICES["names"])
     assert {len(ours.example("data", seed=seed)) for seed in range(40)} == {2, 3, 5}
+
+
+def test_examples_of_what_construct_alone_reads_know_the_number_of_a_named_constant() -> None:
+    rows = Array(lambda found: int(found.kind) % 4, Int8ub)
+    ours = sensor(Struct("kind" / Const("busy", KIND), "rows" / rows, "text" / NullTerminated(GreedyBytes)))
+    assert {len(ours.parse(ours.example("data", seed=seed)).rows) for seed in range(5)} == {2}
 
 
 def test_a_constant_is_one_of_the_names() -> None:
