@@ -149,7 +149,8 @@ class ColumnSource:
         """Some values of the column "time"; the others need not be made for them."""
         times = self.column("time")
         assert times is not None  # since every cloud has it
-        return np.asarray(times[indices])
+        picked: NDArray[np.float64] = times[indices]
+        return picked
 
     def together(self, parts: Sequence[Stretch]) -> ColumnSource | None:
         """What makes the columns of stretches of this and further sources for these points alone; None where nothing does."""

@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 
 from lidarspec.columns.columns import Batch, Column, Fields, field_array
 from lidarspec.columns.graph import Node, evaluate
-from lidarspec.errors import UsageError
 from lidarspec.points import numpy_plan
 from lidarspec.points.cloud import ColumnSource, Stretch, later
 from lidarspec.points.conventions import TYPES, narrowed, numbers_of, seconds_since, turned_azimuth, vendor_turn
@@ -118,17 +117,13 @@ class Share:
 
 
 def maker_of(plan: Plan, names: tuple[str, ...], backend: str, number: int) -> Maker:
-    """What makes columns of so many frames: by a kernel where `backend` asks for one, or where it is free to and that pays.
-
-    Raises:
-        UsageError: where a kernel is asked for, and Numba is missing.
-    """
+    """What makes columns of so many frames: a kernel where `backend` asks for one, or where it is free to and that pays."""
     if backend in ("auto", "jit"):
         try:
             from lidarspec.points import numba_kernels
-        except ImportError as error:  # a back end that may be left out
+        except ImportError:  # a back end that may be left out
             if backend == "jit":
-                raise UsageError(f"backend 'jit' is not part of this installation ({error})") from error
+                raise
         else:
             kernel = numba_kernels.compile(plan, names, None if backend == "jit" else number)
             if kernel is not None:
@@ -296,7 +291,9 @@ class BatchColumns(ColumnSource):
         return self.shares[0] if len(self.shares) == 1 and self.shares[0].first is None else None
 
     def column(self, name: str) -> NDArray[Any] | None:
-        return Computed([(self, 0, self.size)], self._made).column(name)
+        if name not in self._made:
+            Computed([(self, 0, self.size)], self._made).column(name)
+        return self._made.get(name)
 
     def holds(self, name: str) -> bool:
         return name in self._made
