@@ -26,14 +26,10 @@ from lidarspec.packets.stream import PacketStream
 from lidarspec.spec import Frame
 from lidarspec.wire.arrays import repeated
 from lidarspec.wire.frame_table import Rows
+from tests.all_sensors import DISTINCT
 from tests.shapes import SHAPES
 
-#: one of each family: relatives that share their frames are cut alike.
-EVERY = {
-    sensor.id: sensor
-    for sensor in {tuple(map(id, sensor.frames.values())): sensor for sensor in {**lidarspec.sensors(), **SHAPES}.values()}.values()
-}
-each_sensor = pytest.mark.parametrize("sensor", EVERY.values(), ids=EVERY)
+each_sensor = pytest.mark.parametrize("sensor", DISTINCT.values(), ids=DISTINCT)
 EXAMPLES = 40
 
 
