@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import hashlib
 import itertools
-import os
 import shutil
 import socket
 import tempfile
@@ -29,14 +28,14 @@ from lidarspec.cli.sensors import NO_SENSORS
 from lidarspec.device.device import Device, open as open_device
 from lidarspec.device.session import Reply
 from lidarspec.errors import SourceError, UsageError
-from lidarspec.framing.decoder import Counters
+from lidarspec.framing.results import Counters
 from lidarspec.plugins import registry, sensor as named_sensor
 from lidarspec.scans.scans import Scan
 from lidarspec.simulation.device import SimulatedDevice
 from lidarspec.simulation.faults import Faults
 from lidarspec.spec.sensor import Sensor
-from lidarspec.transports.outlets import HERE
-from lidarspec.transports.serving import Served, door
+from lidarspec.transports.outlets import HERE, has_terminals, simulated_outlet
+from lidarspec.transports.serving import Served
 from lidarspec.view.polar import look, picture
 
 #: seconds that the scans may take beyond those that they last.
@@ -104,22 +103,17 @@ def digest(scans: Sequence[Scan]) -> str:
     return found.hexdigest()
 
 
-def has_terminals() -> bool:
-    """Whether the system has pseudo-terminals."""
-    return hasattr(os, "openpty")
-
-
 def _live(simulated: SimulatedDevice, path: Path, turns: int) -> tuple[str, tuple[Reply, ...], tuple[Scan, ...], Counters]:
     """The place of the sensor, its replies, its scans and the counters; everything that came is recorded."""
     sensor = simulated.sensor
     if sensor.datagrams:
         port = _free_port()
         at = f"udp://{HERE}:{port}"
-        with open_device(at, sensor, start=False, record=path) as device, Served(simulated, door(sensor, at)) as served:
+        with open_device(at, sensor, start=False, record=path) as device, Served(simulated, simulated_outlet(sensor, at)) as served:
             return at, *_read(device, served, turns)
     to = "pty" if has_terminals() else f"tcp://{HERE}:0"
     with (
-        Served(simulated, door(sensor, to), patient=True) as served,
+        Served(simulated, simulated_outlet(sensor, to), patient=True) as served,
         open_device(served.path, sensor, start=False, record=path) as device,
     ):
         return served.path, *_read(device, served, turns)

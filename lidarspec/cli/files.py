@@ -13,13 +13,12 @@ from pathlib import Path
 
 import click
 
-from lidarspec.cli.failures import suggest
 from lidarspec.cli.inputs import Input, nearest, no_frame
 from lidarspec.cli.output import emit, emit_json, note, sensor_option
 from lidarspec.cli.streams import nothing_came, scans_of
 from lidarspec.device.device import Device, open as open_device
 from lidarspec.discovery.detect import detected, scores
-from lidarspec.errors import LidarSpecError, UsageError, WireError
+from lidarspec.errors import LidarSpecError, UsageError, WireError, suggest
 from lidarspec.formats import format_of, write
 from lidarspec.plugins import sensor as named_sensor
 from lidarspec.scans.scans import Scan

@@ -11,12 +11,11 @@ from shlex import quote
 
 import numpy as np
 
-from lidarspec.cli.failures import suggest
 from lidarspec.device.settings import devices
 from lidarspec.discovery.detect import scores
-from lidarspec.errors import LidarSpecError, SourceError, UsageError, WireError
+from lidarspec.errors import LidarSpecError, SourceError, UsageError, WireError, suggest
 from lidarspec.framing.frame_engine import codec
-from lidarspec.framing.plausibility import VALID
+from lidarspec.framing.results import VALID
 from lidarspec.plugins import sensors
 from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.open_url import is_port, live_address, transport

@@ -19,7 +19,7 @@ import numpy as np
 
 from lidarspec.cli.failures import FINDINGS
 from lidarspec.cli.output import note, sensor_option
-from lidarspec.cli.streams import Duration, Patience, Share, nothing_came
+from lidarspec.cli.streams import DURATION, SHARE, Patience, nothing_came
 from lidarspec.device.device import Device, open as open_device
 from lidarspec.errors import UnknownFrame
 from lidarspec.packets.packets import Packets
@@ -54,7 +54,7 @@ Units = Mapping[str, str]
 @click.option("--packets", "whole", is_flag=True, help="A row for each packet of the data frame, not for each point.")
 @click.option("-f", "--frame", metavar="NAME", help="The packets of this frame type.")
 @click.option("-n", "--count", type=click.IntRange(min=1), help="Rows at most.")
-@click.option("-t", "--duration", type=Duration(), help="How long at most, such as 10s.")
+@click.option("-t", "--duration", type=DURATION, help="How long at most, such as 10s.")
 @click.option("--all", "every_point", is_flag=True, help="Points without a valid return as well.")
 @click.option("--json", "as_json", is_flag=True, help="Print a JSON object on each line.")
 def read(
@@ -233,9 +233,9 @@ class Lines:
 @click.argument("source", metavar="SOURCE")
 @sensor_option
 @click.option("-n", "--count", type=click.IntRange(min=1), help="Lines at most.")
-@click.option("-t", "--duration", type=Duration(), help="How long, such as 10s; without it until the input ends.")
-@click.option("--interval", type=Duration(), default="1s", show_default=True, help="From line to line.")
-@click.option("--max-errors", type=Share(), help="Exit code 1 where more of the frames are wrong or lost, such as 1%.")
+@click.option("-t", "--duration", type=DURATION, help="How long, such as 10s; without it until the input ends.")
+@click.option("--interval", type=DURATION, default="1s", show_default=True, help="From line to line.")
+@click.option("--max-errors", type=SHARE, help="Exit code 1 where more of the frames are wrong or lost, such as 1%.")
 @click.option("--json", "as_json", is_flag=True, help="Print a JSON object on each line.")
 def stats(
     source: str, sensor_id: str | None, count: int | None, duration: float | None, interval: float, max_errors: float | None, as_json: bool

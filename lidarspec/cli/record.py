@@ -7,22 +7,21 @@ import os
 import shlex
 import time
 from dataclasses import dataclass, replace
-from typing import cast
 
 import click
 
-from lidarspec.cli.failures import INTERRUPTED, suggest
+from lidarspec.cli.failures import INTERRUPTED
 from lidarspec.cli.output import Progress, emit_json, note, sensor_option, size
-from lidarspec.cli.streams import Duration, nothing_came
+from lidarspec.cli.streams import DURATION, nothing_came
 from lidarspec.device.capture_thread import BoundedQueue, Capture, Mark
 from lidarspec.device.device import Device
 from lidarspec.device.settings import named
 from lidarspec.discovery.detect import declared
-from lidarspec.errors import CommandError, LidarSpecError, SourceError, UnknownFormat, UsageError, WireError
+from lidarspec.errors import CommandError, LidarSpecError, SourceError, UnknownFormat, UsageError, WireError, suggest
 from lidarspec.plugins import sensor as named_sensor
-from lidarspec.recording.recorders import AnyRecorder, check_suffix, recorder
-from lidarspec.recording.recordings import Header, Recorder
-from lidarspec.spec.links import Udp
+from lidarspec.recording.appending import Appender
+from lidarspec.recording.format import Header
+from lidarspec.recording.recorders import Recorder, check_suffix, recorder
 from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.files import RecordingTransport
 from lidarspec.transports.open_url import live_address, transport
@@ -55,23 +54,21 @@ class Task:
     packets: int = 0
     elapsed: float = 0.0
     began: float = 0.0
-    recorder: AnyRecorder | None = None
+    recorder: Appender | None = None
     device: Device | None = None
 
-    def opened(self, source: Transport) -> AnyRecorder:
+    def opened(self, source: Transport) -> Appender:
         """The recorder, now that the source is open."""
-        counts = source.datagrams or (self.sensor is not None and hasattr(source, "read"))
+        counts = source.datagrams or (self.sensor is not None and isinstance(source, LiveTransport))
         if self.count is not None and not counts:
             raise UsageError(f"-n counts packets, and {self.source} is a byte stream: name the sensor with -s, or give a time with -t")
-        header = source.header if isinstance(source, RecordingTransport) else Header(source=self.source, baud=getattr(source, "baud", None))
-        links = self.sensor.links.values() if self.sensor else ()
+        header = source.header if isinstance(source, RecordingTransport) else Header(source=self.source, baud=source.baud)
         self.recorder = recorder(
             self.target,
             self.sensor or header.sensor,
             header.source,
             datagrams=source.datagrams,
             baud=header.baud,
-            port=next((port for link in links if isinstance(link, Udp) for port in link.ports), 0),
             overwrite=self.overwrite,
         )
         self.began = time.monotonic()
@@ -103,7 +100,7 @@ class Task:
 @click.argument("source", metavar="SOURCE")
 @click.option("-o", "--output", "target", metavar="FILE", required=True, help="The file: .lsr, .pcap for Wireshark, .bin for bytes alone.")
 @sensor_option
-@click.option("-t", "--duration", "seconds", type=Duration(), help="How long, such as 10s; until Ctrl-C by default.")
+@click.option("-t", "--duration", "seconds", type=DURATION, help="How long, such as 10s; until Ctrl-C by default.")
 @click.option("-n", "--count", type=click.IntRange(min=1), help="So many packets at least: the sensor's data packets, or datagrams.")
 @click.option("--no-start", is_flag=True, help="Send the sensor no commands.")
 @click.option("--force", is_flag=True, help="Overwrite FILE.")
@@ -184,18 +181,18 @@ def _received(task: Task) -> None:
     """Record a source as it comes, or what is in a file."""
     source = RecordingTransport(task.source, salvage=True) if task.salvage else transport(task.source, task.sensor)
     with contextlib.closing(source), task.opened(source):
-        if hasattr(source, "read"):
+        if isinstance(source, LiveTransport):
             _captured(task, source)
         else:
             _copied(task, source)
-        for warning in getattr(source, "warnings", []):
+        for warning in source.warnings:
             task.say(warning)
 
 
-def _captured(task: Task, source: Transport) -> None:
+def _captured(task: Task, source: LiveTransport) -> None:
     """What arrives is recorded by a thread; here it is counted and thrown away."""
     queue = BoundedQueue()
-    with contextlib.closing(Capture(cast(LiveTransport, source), queue, log=task.recorder)):
+    with contextlib.closing(Capture(source, queue, log=task.recorder)):
         while task.goes_on():
             for _, item in queue.take(TURN):
                 if isinstance(item, BaseException):

@@ -11,18 +11,17 @@ from pathlib import Path
 
 import click
 
-from lidarspec.cli.failures import suggest
 from lidarspec.cli.output import Progress, emit_json, note, size
-from lidarspec.cli.streams import Duration, Share
-from lidarspec.errors import UsageError
+from lidarspec.cli.streams import DURATION, SHARE
+from lidarspec.errors import UsageError, suggest
 from lidarspec.plugins import sensor as named_sensor
 from lidarspec.recording.recorders import SUFFIXES
 from lidarspec.simulation.device import SimulatedDevice
 from lidarspec.simulation.faults import Faults
 from lidarspec.simulation.scenes import read_scene
 from lidarspec.spec.sensor import Sensor
-from lidarspec.transports.outlets import HERE, Door, UdpDoor
-from lidarspec.transports.serving import door, is_file, serve, write_file
+from lidarspec.transports.outlets import HERE, Outlet, simulated_outlet
+from lidarspec.transports.serving import serve, write_file
 from lidarspec.transports.simulated import rate_of
 
 #: seconds that go into a file where nobody says how many.
@@ -33,15 +32,15 @@ IN_A_FILE = 10.0
 @click.argument("sensor_id", metavar="SENSOR")
 @click.option("--to", metavar="PLACE", help="pty, udp://HOST:PORT, tcp://HOST:PORT, or a file (.lsr, .pcap, .bin).  [default: pty or udp]")
 @click.option("--link", metavar="PATH", help="A symbolic link that leads to the pty.")
-@click.option("-t", "--duration", type=Duration(), help="End after so long; of a file, how much goes in.  [default: never; 10s]")
+@click.option("-t", "--duration", type=DURATION, help="End after so long; of a file, how much goes in.  [default: never; 10s]")
 @click.option("--rate", metavar="FACTOR", default="1", show_default=True, help="How many times faster than in reality, or max.")
 @click.option("--scene", metavar="FILE", help="What the sensor sees, a TOML file.  [default: a room]")
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Of the room and of what goes wrong.")
-@click.option("--errors", type=Share(), default="0", show_default=True, help="Share of the bytes that the line damages.")
-@click.option("--loss", type=Share(), default="0", show_default=True, help="Share of the packets that get lost.")
+@click.option("--errors", type=SHARE, default="0", show_default=True, help="Share of the bytes that the line damages.")
+@click.option("--loss", type=SHARE, default="0", show_default=True, help="Share of the packets that get lost.")
 @click.option("--reorder", type=click.IntRange(0, 1000), default=0, show_default=True, help="How many places late a datagram may come.")
-@click.option("--unplug", type=Duration(), help="Pull the plug after so long, again and again.")
-@click.option("--absent", type=Duration(), default="2s", show_default=True, help="How long it is out then.")
+@click.option("--unplug", type=DURATION, help="Pull the plug after so long, again and again.")
+@click.option("--absent", type=DURATION, default="2s", show_default=True, help="How long it is out then.")
 @click.option("--force", is_flag=True, help="Write over a file that exists.")
 @click.option("--json", "as_json", is_flag=True, help="Print as JSON where the sensor is.")
 def sim(
@@ -70,7 +69,7 @@ def sim(
     seen = read_scene(scene) if scene is not None else None
     device = SimulatedDevice(sensor, scene=seen, seed=seed, rate=rate_of(rate), faults=faults)
     place = to or ("udp://" if sensor.datagrams else "pty")
-    if is_file(place):
+    if place != "pty" and "://" not in place:
         if link is not None:
             raise UsageError("a link leads to a pseudo-terminal: it goes with --to pty")
         if Path(place).suffix.lower() not in SUFFIXES:
@@ -80,23 +79,17 @@ def sim(
         note(f"{_sent(device)}, {size(written)}")
         return
     try:
-        opened = door(sensor, place, link)
+        opened = simulated_outlet(sensor, place, link)
     except UsageError as error:
         raise suggest(error, f"lidarspec sim {sensor_id} --to {'udp://' + HERE if sensor.datagrams else 'pty'}") from None
     try:
-        _tell(sensor, opened.where, source_of(opened), as_json=as_json)
+        _tell(sensor, opened.place, opened.source, as_json=as_json)
         with _ended_by_terminate(), Progress() as progress:
             serve(device, opened, seconds=duration, turn=_watching(device, opened, progress))
     finally:
         opened.close()
         lost = f"; nobody was there for {size(opened.unsent)}" if opened.unsent else ""
         note(f"{_sent(device)}{lost}")
-
-
-def source_of(opened: Door) -> str:
-    """The SOURCE by which the sensor is read: from elsewhere, datagrams come in at every interface."""
-    where = opened.where
-    return "udp://" + where.removeprefix(f"udp://{opened.host}") if isinstance(opened, UdpDoor) and opened.host != HERE else where
 
 
 def _tell(sensor: Sensor, where: str, source: str, *, as_json: bool) -> None:
@@ -109,7 +102,7 @@ def _tell(sensor: Sensor, where: str, source: str, *, as_json: bool) -> None:
     note(f"{sensor.id}, simulated\n  next: {following}")
 
 
-def _watching(device: SimulatedDevice, opened: Door, progress: Progress) -> Callable[[], None]:
+def _watching(device: SimulatedDevice, opened: Outlet, progress: Progress) -> Callable[[], None]:
     """What is called while the sensor is at work: says which commands arrive, and that the plug was pulled."""
     began, heard, present = time.monotonic(), 0, True
 
@@ -121,7 +114,7 @@ def _watching(device: SimulatedDevice, opened: Door, progress: Progress) -> Call
         heard = len(device.heard)
         if device.present != present and not present:
             progress.clear()
-            note(f"{time.monotonic() - began:.1f} s: plugged in again, {opened.where}")
+            note(f"{time.monotonic() - began:.1f} s: plugged in again, {opened.place}")
         elif device.present != present:
             progress.clear()
             note(f"{time.monotonic() - began:.1f} s: unplugged")

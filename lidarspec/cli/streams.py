@@ -2,60 +2,73 @@
 
 from __future__ import annotations
 
-import re
+import math
 import time
-from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterator
+from typing import Any
 
 import click
 
-from lidarspec.cli.failures import suggest
 from lidarspec.device.device import Device
-from lidarspec.errors import CommandError, LidarSpecError, WireError
+from lidarspec.errors import CommandError, LidarSpecError, UsageError, WireError, suggest
 from lidarspec.scans.scans import Scan
+from lidarspec.spec.fields import duration
 
 #: seconds that a device is given for its first frame.
 PATIENCE = 10.0
 #: seconds between two looks at a source that sends nothing.
 LOOK = 0.1
-_UNITS = {"": 1.0, "s": 1.0, "ms": 1e-3, "us": 1e-6, "min": 60.0, "m": 60.0, "h": 3600.0}
 
 
-if TYPE_CHECKING:
-    Parameter = click.ParamType[float]
-else:
-    Parameter = click.ParamType
+class Number(click.ParamType):  # type: ignore[type-arg]  # older versions of click have no types
+    """A number that is written in a way of its own.
 
+    Args:
+        name: what it is, for help pages.
+        parse: the number of a text; a text that is none is a ValueError or UsageError.
+        form: how it looks, for messages.
+    """
 
-class Duration(Parameter):
-    """Seconds from "10s", "500ms", "2min", "1h" or a bare number."""
-
-    name = "duration"
+    def __init__(self, name: str, parse: Callable[[str], float], form: str) -> None:
+        self.name, self._parse, self._form = name, parse, form
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
-        """The seconds."""
+        """The number."""
         if isinstance(value, float | int):
             return float(value)
-        found = re.fullmatch(r"(\d+(?:\.\d*)?|\.\d+)\s*([a-z]*)", value.strip())
-        if found is None or found[2] not in _UNITS or float(found[1]) <= 0:
-            self.fail(f"{value!r} is no duration above 0, such as 10s, 500ms, 2min or 1h", param, ctx)
-        return float(found[1]) * _UNITS[found[2]]
+        try:
+            return self._parse(value)
+        except (ValueError, UsageError):
+            self.fail(f"{value!r} is no {self._form}", param, ctx)
 
 
-class Share(Parameter):
-    """A number from 0 to 1, from "1%" or "0.01"."""
+def _duration(text: str) -> float:
+    seconds = duration(text)
+    if seconds <= 0:
+        raise ValueError(text)
+    return seconds
 
-    name = "share"
 
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
-        """The share."""
-        if isinstance(value, float):
-            return value
-        found = re.fullmatch(r"(\d+(?:\.\d*)?|\.\d+)\s*(%?)", value.strip())
-        share = float(found[1]) / (100 if found[2] else 1) if found else -1.0
-        if not 0 <= share <= 1:
-            self.fail(f"{value!r} is no share, such as 1% or 0.01", param, ctx)
-        return share
+def _share(text: str) -> float:
+    share = float(text.removesuffix("%")) / (100 if text.endswith("%") else 1)
+    if not 0 <= share <= 1:
+        raise ValueError(text)
+    return share
+
+
+def _speed(text: str) -> float:
+    speed = 0.0 if text == "max" else float(text.removesuffix("x"))
+    if text != "max" and not 0 < speed < math.inf:
+        raise ValueError(text)
+    return speed
+
+
+#: seconds from "10s", "500ms", "2min", "1h" or a bare number.
+DURATION = Number("duration", _duration, "duration above 0, such as 10s, 500ms, 2min or 1h")
+#: a number from 0 to 1, from "1%" or "0.01".
+SHARE = Number("share", _share, "share, such as 1% or 0.01")
+#: a factor above 0; 0 for "max".
+SPEED = Number("speed", _speed, "speed: a factor such as 1, 0.5 or 10, or max")
 
 
 def nothing_came(device: Device, source: str, seconds: float | None = None) -> LidarSpecError:

@@ -49,7 +49,7 @@ def narrowed(sensor: Sensor, frame: str) -> Sensor:
     return replace(sensor, frames=alone, commands={}, state={}, on_open=(), on_close=())
 
 
-def export(kind: str, sensor: Sensor) -> str:
+def export(sensor: Sensor, kind: str) -> str:
     """The text of an export of a sensor.
 
     Args:

@@ -21,14 +21,15 @@ from numpy.typing import NDArray
 
 from lidarspec.errors import SpecError, UnknownFrame, UsageError
 from lidarspec.framing.frame_engine import CompiledCodec, InterpretedCodec, codec
-from lidarspec.framing.plausibility import VALID, plausibility
-from lidarspec.spec.construct_layer import clean
+from lidarspec.framing.plausibility import plausibility
+from lidarspec.framing.results import VALID
+from lidarspec.spec.construct_layer import clean, peeled, seen
 from lidarspec.spec.description import Spec
+from lidarspec.spec.tree import FieldInfo
 from lidarspec.wire.build import build
 from lidarspec.wire.frame_table import Group, Rows
 from lidarspec.wire.layout import Layout, Leaf
-from lidarspec.wire.layout_tree import TooLong, walk
-from lidarspec.wire.schema import FieldInfo, peeled
+from lidarspec.wire.layout_tree import TooLong, Unknown, layout_of
 
 Values = Mapping[str, Any]
 
@@ -84,7 +85,11 @@ class FrameMaker:
     def _walked(self, values: Values, asked: list[str]) -> Layout:
         frame, fields = self.engine.frame, self.engine.schema.fields
         try:
-            return walk(frame.prepared, functools.partial(self._read, values, asked), frame.max_length).layout()
+            while True:
+                try:
+                    return layout_of(frame.tree, {path: self._raw(values, path) for path in asked}, frame.max_length)
+                except Unknown as unknown:
+                    asked.append(unknown.leaf.info.path)
         except TooLong as error:
             left_out = [path for path in asked if path not in values and fields[path].const is None]
             given = ", ".join(f"{path} = {values[path]}" for path in asked if path in values)
@@ -104,11 +109,6 @@ class FrameMaker:
             leaf.store(rows, _steps(leaf, [values.get(path, 0) for values in frames]))
         layout.seal(rows)
         return rows
-
-    def _read(self, values: Values, asked: list[str], leaf: Leaf) -> int:
-        if leaf.info.path not in asked:
-            asked.append(leaf.info.path)
-        return self._raw(values, leaf.info.path)
 
     def _raw(self, values: Values, path: str) -> int:
         info = self.engine.schema.fields[path]
@@ -251,7 +251,7 @@ def _random(con: Construct, source: random.Random, scope: Any, drawn: Drawn, pat
         return drawn[path](source)
     con, info = peeled(con, FieldInfo(""))
     if info.const is not None:
-        return info.seen(info.const)
+        return seen(info, info.const)
     if info.rebuilt is not None:
         with contextlib.suppress(Exception):  # it may ask for what comes after it, and is evaluated again when the frame is built
             return info.rebuilt(scope)
@@ -266,7 +266,7 @@ def _random(con: Construct, source: random.Random, scope: Any, drawn: Drawn, pat
     if isinstance(con, construct.IfThenElse | construct.Switch):
         return _random(_chosen(con, scope), source, scope, drawn, path)
     if isinstance(con, construct.NullTerminated) or not isinstance(con, construct.Subconstruct):
-        return info.seen(_leaf(con, source, scope, info)) if info.labels else _leaf(con, source, scope, info)
+        return seen(info, _leaf(con, source, scope, info)) if info.labels else _leaf(con, source, scope, info)
     if isinstance(con, construct.Adapter):
         return clean(con.parse(con.subcon.build(_random(con.subcon, source, scope, drawn, path))))
     return _random(con.subcon, source, scope, drawn, path)

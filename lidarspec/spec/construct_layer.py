@@ -1,19 +1,27 @@
-"""The thin layer over construct: one struct, made fit for the engine, and construct's errors made ours.
+"""The layer over construct, and the only module that knows its classes: an author's struct made fit for the engine, and read off.
 
-`prepare` copies an author's tree with a few classes replaced, and nothing else changed: structs note where their
-members stand, arrays put the index into error paths, constants can be read unchecked, and a NaN keeps its payload.
+`prepare` copies an author's struct with a few classes replaced, and nothing else changed: structs note where their members stand,
+arrays put the index into error paths, constants can be read unchecked, and a NaN keeps its payload. `frame_tree` reads the same struct
+off as nodes (`lidarspec.spec.tree`): expressions are called with symbols in place of fields and what they do with them is written down,
+and the bits of a bit block are found out by parsing it with construct, so that no rule about bit order stands anywhere else. What no
+node stands for stays a part of construct's, with the reason.
 """
 
 from __future__ import annotations
 
 import copy
+import functools
 import math
 import operator
 import re
 import struct
+import sys
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import construct
+import numpy as np
 from construct import (
     Array,
     BitsInteger,
@@ -26,6 +34,34 @@ from construct import (
     FormatField,
     Struct,
     Subconstruct,
+)
+from construct.expr import BinExpr, ExprMixin, UniExpr
+
+from lidarspec.errors import SpecError
+from lidarspec.spec import tree
+from lidarspec.spec.bits import BitField, probe
+from lidarspec.spec.checksums import Checksum
+from lidarspec.spec.tree import (
+    Blob,
+    Block,
+    Code,
+    Empty,
+    FieldInfo,
+    Formula,
+    Node,
+    Number,
+    Op,
+    Opaque,
+    Part,
+    Read,
+    Ref,
+    Repeat,
+    Sealed,
+    Select,
+    When,
+    calculated,
+    nodes,
+    refs,
 )
 
 _MISSING = object()
@@ -276,3 +312,546 @@ def field_path(path: str | None) -> str:
 
 def _shown(value: object) -> str:
     return value.hex(" ") if isinstance(value, bytes) else f"0x{value:x}" if isinstance(value, int) else repr(value)
+
+
+class Describing(Subconstruct):  # type: ignore[misc]
+    """A part that only says something of the field below it: parses and builds what that does."""
+
+    def described(self, info: FieldInfo) -> FieldInfo:
+        """What is known of the field, with what this part says of it."""
+        raise NotImplementedError
+
+    def _parse(self, stream: Any, context: Any, path: str) -> Any:
+        return self.subcon._parsereport(stream, context, path)
+
+    def _build(self, obj: Any, stream: Any, context: Any, path: str) -> Any:
+        return self.subcon._build(obj, stream, context, path)
+
+
+class Sealing(Subconstruct):  # type: ignore[misc]
+    """A struct with a checksum.
+
+    Attributes:
+        fields: names of the fields that hold it, low bits first.
+        algorithm: of the checksum, None where a hook has to supply it.
+        over: names of the fields that it covers, in a row; None: all bytes that hold no bit of `fields`.
+        absent: values that mean "not filled".
+    """
+
+    fields: tuple[str, ...]
+    algorithm: Checksum | None
+    over: tuple[str, ...] | None
+    absent: frozenset[int]
+
+
+def frame_tree(con: Construct) -> Node:
+    """The tree of a struct.
+
+    Raises:
+        SpecError: for a constant that its Enum has no value for.
+    """
+    first = _Builder({})
+    root = first.node(con, _Place(FieldInfo(""), None))
+    return _Builder(first.scopes).node(con, _Place(FieldInfo(""), None)) if first.rebuilding else root
+
+
+class _Scope:
+    """What an expression of a struct sees of the fields before it, as symbols."""
+
+    def __init__(self, parent: _Scope | None, path: str, asked: list[Ref]) -> None:
+        self.parent, self.path, self.asked = parent, path, asked
+        self.names: dict[str, Ref | _Scope] = {}
+        #: names of parts that branches have in different forms.
+        self.several: set[str] = set()
+
+    def add(self, name: str, part: Ref | _Scope) -> None:
+        """Make a field or struct known from here on."""
+        known = self.names.get(name)
+        if known is not None and not (isinstance(known, Ref) and isinstance(part, Ref) and known.info.labels == part.info.labels):
+            self.several.add(name)
+        self.names[name] = part
+
+    def __getitem__(self, name: str) -> Any:
+        if name == "_":
+            return self.parent
+        if name == "_root":
+            return self.parent["_root"] if self.parent is not None else self
+        if name not in self.names:
+            raise _Blind(f"an expression asks for {name!r}, which is not a field before it")
+        part = self.names[name]
+        if isinstance(part, _Scope):
+            return part
+        self.asked.append(part)
+        if name in self.several:
+            raise _Untraceable(f"an expression asks for {name!r}, which has several forms")
+        return _Symbol(part)
+
+    def __getattr__(self, name: str) -> Any:
+        return self[name]
+
+    def __len__(self) -> int:
+        raise _Blind("an expression asks for the length of an array")
+
+
+class _Untraceable(Exception):
+    """Why an expression cannot be written down as data."""
+
+
+class _Blind(_Untraceable):
+    """What an expression asks for that construct alone may know."""
+
+
+class _Symbol:
+    """A value that is not known yet; what is done with it is kept."""
+
+    __hash__ = None  # type: ignore[assignment]
+
+    def __init__(self, formula: Formula) -> None:
+        self.formula = formula
+
+    def __bool__(self) -> bool:
+        raise _Untraceable("a Python function decides on the values of fields")
+
+    __index__ = __int__ = __float__ = __len__ = __iter__ = __bool__
+
+    def __invert__(self) -> _Symbol:
+        return _Symbol(Op("-", (Op("+", (self.formula, 1)),)))
+
+    def __neg__(self) -> _Symbol:
+        return _Symbol(Op("-", (self.formula,)))
+
+    def __pos__(self) -> _Symbol:
+        return self
+
+    def __getattr__(self, name: str) -> Any:
+        raise _Untraceable(f"an expression asks for {name!r} of a number")
+
+    def __getitem__(self, key: object) -> Any:
+        raise _Untraceable("an expression takes an element of an array, or a byte")
+
+
+def _traced_operation(symbol: str, left: Any, right: Any) -> _Symbol:
+    pair: list[Any] = [part.formula if isinstance(part, _Symbol) else part for part in (left, right)]
+    for one, other in ((0, 1), (1, 0)):
+        known = pair[other]
+        if not isinstance(known, Ref) or not known.info.labels:
+            continue
+        if symbol not in ("==", "!=") or not isinstance(pair[one], int | str):
+            raise _Untraceable("an expression takes the name of a value for a number")
+        if pair[one] in known.info.labels:  # construct has the name in place of such a number
+            return _Symbol(int(symbol == "!="))
+        pair[one] = _labelled(known, pair[one]) if isinstance(pair[one], str) else pair[one]
+    wrong = next((part for part in pair if not isinstance(part, int | Ref | Op)), None)
+    if wrong is not None:
+        raise _Untraceable(f"an expression with {wrong!r}")
+    return _Symbol(calculated(symbol, *(int(part) if isinstance(part, bool) else part for part in pair)))
+
+
+def _no_integer(sign: str) -> Any:
+    raise _Untraceable(f"an expression with {sign!r}, which need not give an integer")
+
+
+def _operators() -> None:
+    both = {
+        "add": "+",
+        "sub": "-",
+        "mul": "*",
+        "floordiv": "//",
+        "mod": "%",
+        "and": "&",
+        "or": "|",
+        "xor": "^",
+        "lshift": "<<",
+        "rshift": ">>",
+    }
+    for name, symbol in both.items():
+        setattr(_Symbol, f"__{name}__", lambda self, other, symbol=symbol: _traced_operation(symbol, self, other))
+        setattr(_Symbol, f"__r{name}__", lambda self, other, symbol=symbol: _traced_operation(symbol, other, self))
+    for name, symbol in {"eq": "==", "ne": "!=", "lt": "<", "le": "<=", "gt": ">", "ge": ">="}.items():
+        setattr(_Symbol, f"__{name}__", lambda self, other, symbol=symbol: _traced_operation(symbol, self, other))
+    for name, sign in {"truediv": "/", "pow": "**", "divmod": "divmod", "matmul": "@"}.items():
+        for full in (f"__{name}__", f"__r{name}__"):
+            setattr(_Symbol, full, lambda self, other, sign=sign: _no_integer(sign))
+
+
+_operators()
+
+
+def _labelled(ref: Ref, label: str) -> int:
+    """The raw value that a name of construct's Enum stands for."""
+    for value, name in ref.info.labels.items():
+        if name == str(label):
+            return value
+    raise _Untraceable(f"{ref.path} has no value named {label!r}")
+
+
+def _traced(expression: Any, scope: _Scope) -> Any:
+    """What an expression comes to; construct's own are walked, since its ``~`` asks for the truth of a value."""
+    if isinstance(expression, BinExpr):
+        return expression.op(_traced(expression.lhs, scope), _traced(expression.rhs, scope))
+    if isinstance(expression, UniExpr):
+        operand = _traced(expression.operand, scope)
+        if expression.op is operator.not_ and isinstance(operand, _Symbol):
+            return _Symbol(Op("not", (operand.formula,)))
+        return expression.op(operand)
+    return expression(scope) if callable(expression) else expression
+
+
+class _Fields:
+    """What an expression sees when it is evaluated: values by name, as construct shows them."""
+
+    def __init__(self, read: Read, paths: tuple[str, ...]) -> None:
+        self._read, self._paths = read, paths
+
+    def __getitem__(self, name: str) -> Any:
+        if name == "_":
+            return _Fields(self._read, self._paths[1:]) if len(self._paths) > 1 else None
+        if name == "_root":
+            return _Fields(self._read, self._paths[-1:])
+        value = self._read(f"{self._paths[0]}.{name}" if self._paths[0] else name)
+        if isinstance(value, str):
+            return _Fields(self._read, (value, *self._paths))
+        return value and seen(*value)
+
+    def __getattr__(self, name: str) -> Any:
+        return self[name]
+
+
+def seen(info: FieldInfo, raw: int) -> Any:
+    """A raw value as the expressions of a struct see it: where construct's Enum has a name for it, that name."""
+    return construct.EnumIntegerString.new(raw, info.labels[raw]) if raw in info.labels else raw
+
+
+def unnamed(raw: int) -> Any:
+    """A raw value that construct's Enum has no name for."""
+    return construct.EnumInteger(raw)
+
+
+def _evaluated(expression: Any, paths: tuple[str, ...], read: Read) -> Any:
+    """The value of an expression in a struct; `paths` of that and of all around it, innermost first."""
+    return expression(_Fields(read, paths)) if callable(expression) else expression
+
+
+@dataclass(frozen=True)
+class _Place:
+    """Where in the tree a construct stands: what is said of it, what its expressions see, and whether it is a part of a bit block."""
+
+    info: FieldInfo
+    scope: _Scope | None
+    name: str = ""
+    in_bits: bool = False
+
+    def inside(self, **changes: Any) -> _Place:
+        """The same place with other facts of the field."""
+        return replace(self, info=replace(self.info, **changes))
+
+
+class _Builder:
+    """Makes the nodes of a struct; `scopes`: what was known at the end of each struct, for values that follow from later ones."""
+
+    def __init__(self, known: Mapping[str, _Scope]) -> None:
+        self._known, self.scopes, self.rebuilding = known, dict[str, _Scope](), False
+        self._asked: list[Ref] = []
+
+    def node(self, con: Construct, place: _Place) -> Node:
+        """The node of a construct, whatever it is."""
+        inner, place = self._peeled(con, place)
+        name, info = place.name, place.info
+        is_block = isinstance(inner, construct.Transformed | construct.Restreamed)
+        if not place.in_bits and (is_block or (isinstance(inner, BytesInteger) and _is_odd(inner))):
+            return self._block(inner, place)
+        if is_block:
+            return self.node(inner.subcon, place)
+        if isinstance(inner, Sealing):
+            return self._sealed(inner, place)
+        if isinstance(inner, Struct):
+            return self._struct(inner, place)
+        if isinstance(inner, Array):
+            axis = axis_path(info)
+            count = self._formula(inner.count, place)
+            return Repeat(name, axis, count, self.node(inner.subcon, place.inside(axes=(*info.axes, axis))))
+        if isinstance(inner, construct.IfThenElse):
+            condition = self._formula(inner.condfunc, place)
+            branches = (self.node(branch, place.inside(optional=True)) for branch in (inner.thensubcon, inner.elsesubcon))
+            return When(name, condition, *branches)
+        if isinstance(inner, construct.Switch):
+            return self._select(inner, place)
+        return Empty(name) if inner is construct.Pass else self._leaf(inner, place)
+
+    def _peeled(self, con: Construct, place: _Place) -> tuple[Construct, _Place]:
+        """What is below the wrappers that only describe (name, unit, labels, constant), and what they say."""
+        while True:
+            if isinstance(con, construct.Renamed):
+                place = place.inside(docs=con.docs or place.info.docs)
+            elif isinstance(con, Describing):
+                place = replace(place, info=con.described(place.info))
+            elif isinstance(con, construct.Enum):
+                place = place.inside(labels={int(value): str(name) for value, name in con.ksymapping.items()})
+            elif isinstance(con, Const):
+                place = place.inside(const=_constant(con))
+            elif isinstance(con, construct.Rebuild):
+                self.rebuilding = True
+                known = None if place.scope is None else self._known.get(place.scope.path)
+                place = place.inside(rebuilt=self._formula(con.func, place, known))
+            elif not isinstance(con, construct.Default):
+                return con, place
+            con = con.subcon
+
+    def _formula(self, expression: Any, place: _Place, known: _Scope | None = None, *, is_key: bool = False) -> Formula:
+        """A count, length, condition or key as data, as far as it can be written down."""
+        if isinstance(expression, int):
+            return int(expression)
+        scope = next((scope for scope in (known, place.scope) if scope is not None), _Scope(None, "", self._asked))
+        scope.asked.clear()
+        blind = False
+        try:
+            value = _traced(expression, scope)
+            if not isinstance(expression, ExprMixin) and any(ref.info.optional for ref in scope.asked):
+                reason = "a Python function of a field that may be left out"
+            elif isinstance(value, bool | int):
+                return int(value)
+            elif not isinstance(value, _Symbol):
+                reason = f"an expression that gives {value!r}"
+            elif not is_key and isinstance(value.formula, Ref) and value.formula.info.labels:
+                reason = "an expression takes the name of a value for a number"
+            else:
+                return value.formula
+        except _Untraceable as untraceable:
+            reason, blind = str(untraceable), isinstance(untraceable, _Blind)
+        except Exception as error:
+            reason = f"a Python function of other fields ({type(error).__name__}: {error})"
+        return self._code(expression, place, reason, tuple(scope.asked), blind=blind)
+
+    def _code(self, expression: Any, place: _Place, reason: str, asked: tuple[Ref, ...], *, blind: bool = False) -> Code:
+        paths, scope = list[str](), place.scope
+        while scope is not None:
+            paths.append(scope.path)
+            scope = scope.parent
+        text = repr(expression)
+        function = functools.partial(_evaluated, expression, tuple(paths or [""]))
+        return Code(function, tuple(dict.fromkeys(asked)), f"{place.info.path}: {reason}", "?" if " at 0x" in text else text, blind)
+
+    def _select(self, con: construct.Switch, place: _Place) -> Select:
+        key = self._formula(con.keyfunc, place, is_key=True)
+        labels = key.info.labels if isinstance(key, Ref) else {}
+        raw = {name: value for value, name in labels.items()}
+        # construct looks a value that has a name up by that name alone
+        values = {case: raw.get(str(case), case) if isinstance(case, str) else case for case in con.cases if case not in labels}
+        odd = [case for case, value in values.items() if not isinstance(value, int)]
+        if odd and not isinstance(key, Code):
+            named = isinstance(key, Ref) and isinstance(odd[0], str)
+            reason = f"{key.path} has no value named {odd[0]!r}" if named else f"a case for {odd[0]!r}, which is no integer"  # type: ignore[union-attr]
+            key = self._code(con.keyfunc, place, reason, tuple(refs(key)))
+        if isinstance(key, Code):
+            values = {case: case for case in con.cases}
+        cases = tuple((value, self._branch(con.cases[case], place)) for case, value in values.items())
+        return Select(place.name, key, cases, self._branch(con.default, place))
+
+    def _branch(self, con: Construct, place: _Place) -> Node:
+        return self.node(con, place.inside(optional=True))
+
+    def _struct(self, con: Struct, place: _Place) -> tree.Struct:
+        info = place.info
+        scope = _Scope(place.scope, info.path, self._asked)
+        if place.name and place.scope is not None:
+            place.scope.add(place.name, scope)
+        members = []
+        for child in con.subcons:
+            path = ".".join(part for part in (info.path, child.name) if part)
+            said = FieldInfo(path, info.axes, docs=info.docs if place.in_bits else "", optional=info.optional)
+            members.append(self.node(child, _Place(said, scope, child.name or "", place.in_bits)))
+        self.scopes[info.path] = scope
+        return tree.Struct(place.name, info.path, tuple(members))
+
+    def _sealed(self, con: Sealing, place: _Place) -> Node:
+        body = self.node(con.subcon, place)
+        if not isinstance(body, tree.Struct):
+            return Opaque(place.name, place.info, type(con).__name__, "a checksum around something that is no struct", (body,))
+        prefix = f"{place.info.path}." if place.info.path else ""
+        over = (prefix + con.over[0], prefix + con.over[-1]) if con.over is not None else None
+        return Sealed(body, tuple(prefix + name for name in con.fields), over, con.algorithm, tuple(sorted(con.absent)))
+
+    def _leaf(self, con: Construct, place: _Place) -> Node:
+        name, info = place.name, _typed(con, place.info)
+        if name and place.scope is not None:
+            place.scope.add(name, Ref(info.path, info))
+        if isinstance(con, FormatField) and con.fmtstr[-1] != "?":
+            kind = "float" if con.fmtstr[-1] in "efd" else "uint" if con.fmtstr[-1].isupper() else "int"
+            big = con.fmtstr[0] in ">!" or (con.fmtstr[0] == "=" and sys.byteorder == "big")
+            node: Node = Number(info, con.length, kind, "big" if big else "little")  # type: ignore[arg-type]
+        elif isinstance(con, BytesInteger) and not _is_odd(con):
+            node = Number(info, con.length, "int" if con.signed else "uint", "little" if con.swapped else "big")
+        elif isinstance(con, Bytes):
+            node = Blob(name, info, self._formula(con.length, place), info.const)
+        else:
+            kind = type(con).__name__
+            size = self._formula(con.length, place) if isinstance(con, construct.FixedSized) else None
+            node = Opaque(name, info, kind, f"{kind} has no fixed place", size=size, form=_form(con))
+        if not name and info.const is not None and not isinstance(node, Opaque):
+            return Blob("", info, con.length, con.build(info.const))
+        return node
+
+    def _block(self, con: Construct, place: _Place) -> Node:
+        """A bit block: the bits of each field come from probing construct itself."""
+        inside = self.node(con, replace(place, in_bits=True))
+        try:
+            size = int(con.sizeof())
+            fields = _probed(con, size)
+        except (ConstructError, LookupError):
+            fields = None
+        if fields is None:
+            reason = "a bit block whose values are not plain bits of it"
+            return Opaque(place.name, place.info, type(con).__name__, reason, (inside,), in_bits=True)
+        infos = {node.info.path: node.info for node in nodes(inside) if isinstance(node, Number | Blob | Opaque)}
+        parts = []
+        for bits in fields:
+            names = tuple(key for key in bits.keys if isinstance(key, str))
+            info = infos[".".join(part for part in (place.info.path, *names) if part)]
+            parts.append(Part(info, bits, names, tuple(key for key in bits.keys if isinstance(key, int))))
+        return Block(place.name, place.info, size, tuple(parts))
+
+
+def axis_path(info: FieldInfo) -> str:
+    """The name of the axis of an array at this place; an array directly in an array gets brackets."""
+    path = info.path
+    while path in info.axes:
+        path += "[]"
+    return path
+
+
+def integer_type(bits: int, *, signed: bool = False) -> np.dtype[Any]:
+    """The smallest integer type of at least so many bits."""
+    size = next(size for size in (1, 2, 4, 8) if bits <= 8 * size)
+    return np.dtype(f"{'i' if signed else 'u'}{size}")
+
+
+def _typed(con: Construct, info: FieldInfo) -> FieldInfo:
+    """What is known of a field, with the type of its values."""
+    if isinstance(con, FormatField):
+        code = con.fmtstr[-1]
+        kind, letter = ("float", "f") if code in "efd" else ("int", "u" if code.isupper() or code == "?" else "i")
+        return replace(info, dtype=np.dtype(f"{letter}{con.length}"), kind=kind, bits=8 * con.length)
+    if isinstance(con, BytesInteger | BitsInteger) and isinstance(con.length, int):
+        bits = con.length * (8 if isinstance(con, BytesInteger) else 1)
+        dtype = integer_type(bits, signed=bool(con.signed)) if bits <= 64 else None
+        return replace(info, dtype=dtype, kind="int" if dtype is not None else "other", bits=bits)
+    if isinstance(con, type(construct.Flag)):
+        return replace(info, dtype=np.dtype("u1"), kind="int", bits=1)
+    if isinstance(con, Bytes):
+        bits = 8 * con.length if isinstance(con.length, int) else 0
+        return replace(info, dtype=np.dtype("u1"), kind="bytes", bits=bits, axes=(*info.axes, axis_path(info)))
+    if _is_text(con):
+        return replace(info, dtype=np.dtype("u1"), kind="bytes", axes=(*info.axes, axis_path(info)))
+    return info
+
+
+def _is_text(con: Construct) -> bool:
+    """Whether it gives the bytes up to a terminator, or as many as are said in front of them."""
+    while isinstance(con, construct.NullTerminated | construct.NullStripped | construct.FixedSized | construct.Prefixed):
+        con = con.subcon
+    return con is construct.GreedyBytes
+
+
+def _form(con: Construct) -> str:
+    """How a field without a size of its own stands on the wire."""
+    below = con
+    while isinstance(below, Subconstruct):
+        if isinstance(below, construct.NullTerminated):
+            return f"text up to {str(below.term)[1:]}"
+        below = below.subcon
+    return type(con).__name__
+
+
+def _constant(con: Const) -> Any:
+    """The raw value of a constant, also where it is given by the name that construct's Enum has for it."""
+    below = con.subcon
+    while isinstance(con.value, str) and isinstance(below, Subconstruct):
+        if isinstance(below, construct.Enum):
+            if con.value not in below.encmapping:
+                raise SpecError(f"the constant {str(con.value)!r} is none of {', '.join(map(str, below.encmapping))}")
+            return int(below.encmapping[con.value])
+        below = below.subcon
+    return con.value
+
+
+def _is_odd(con: BytesInteger) -> bool:
+    """Whether its length or byte order is not plain."""
+    return not isinstance(con.length, int) or con.length > 8 or not isinstance(con.swapped, bool)
+
+
+@functools.lru_cache(maxsize=4096)
+def _probed(con: Construct, size: int) -> list[BitField] | None:
+    """The bit fields of a block; None where construct decides on its bits, or values are no plain integers."""
+    return probe(functools.partial(_values, con), size) if _is_even(con) else None
+
+
+def _values(con: Construct, block: bytes) -> dict[tuple[str | int, ...], Any]:
+    """The values of a block of bytes by where the parsed block holds them; constants are not checked, since every pattern is tried."""
+    return dict(leaves(con.parse(block, _verify=False)))
+
+
+def _is_even(con: Construct) -> bool:
+    """Whether every block is read in the same way: what a value decides on shows with few blocks only, and probing could miss it."""
+    if isinstance(con, Struct):
+        return all(map(_is_even, con.subcons))
+    if isinstance(con, Subconstruct):
+        return (isinstance(con, construct.Enum) or not isinstance(con, construct.Adapter)) and _is_even(con.subcon)
+    return isinstance(con, BitsInteger | Bytes | BytesInteger | FormatField | type(construct.Flag))
+
+
+def bytes_of(con: Construct, names: Iterable[str]) -> list[int]:
+    """The offsets of the bytes of a block that hold any bit of one of its fields."""
+    keys = tuple(names)
+    for field in _probed(con, con.sizeof()) or ():
+        if field.keys == keys:
+            return [segment.byte for segment in field.segments]
+    raise KeyError(".".join(keys))
+
+
+def leaves(parsed: Any, keys: tuple[str | int, ...] = ()) -> Iterator[tuple[tuple[str | int, ...], Any]]:
+    """The values of a parsed object with where they stand in it, private entries left out."""
+    if isinstance(parsed, dict):
+        for name, value in parsed.items():
+            if not name.startswith("_"):
+                yield from leaves(value, (*keys, name))
+    elif isinstance(parsed, list):
+        for index, value in enumerate(parsed):
+            yield from leaves(value, (*keys, index))
+    else:
+        yield keys, int(parsed) if isinstance(parsed, construct.EnumIntegerString) else parsed
+
+
+def peeled(con: Construct, info: FieldInfo) -> tuple[Construct, FieldInfo]:
+    """What is below the wrappers that only describe (name, unit, labels, constant), and what they say."""
+    while True:
+        if isinstance(con, construct.Renamed):
+            info = replace(info, docs=con.docs or info.docs)
+        elif isinstance(con, Describing):
+            info = con.described(info)
+        elif isinstance(con, construct.Enum):
+            info = replace(info, labels={int(value): str(name) for value, name in con.ksymapping.items()})
+        elif isinstance(con, Const):
+            info = replace(info, const=_constant(con))
+        elif isinstance(con, construct.Rebuild):
+            info = replace(info, rebuilt=con.func)
+        elif not isinstance(con, construct.Default):
+            return con, info
+        con = con.subcon
+
+
+def fields_below(con: Construct, info: FieldInfo) -> dict[str, FieldInfo]:
+    """The fields of a part of a struct, by path; `info` says where it stands."""
+    found = _Builder({}).node(con, _Place(info, None, info.name))
+    infos = [part.info for node in nodes(found) if isinstance(node, Block) for part in node.parts]
+    infos += [node.info for node in nodes(found) if isinstance(node, Number | Blob | Opaque)]
+    return {info.path: info for info in infos if info.path}
+
+
+def probed(con: Construct, size: int) -> list[BitField] | None:
+    """The bit fields of a block; None where construct decides on its bits, or values are no plain integers."""
+    return _probed(con, size)
+
+
+def is_expression(value: object) -> bool:
+    """Whether a value is an expression or a part of a struct, where a number is wanted."""
+    return isinstance(value, ExprMixin | Construct)

@@ -16,7 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.errors import SpecError
-from lidarspec.framing.decoder import Decoder, Found, Spans, is_stream, packed, spans_of
+from lidarspec.framing.decoder import Decoder, frames_of, is_stream
+from lidarspec.framing.results import Found, Frames, packed
 from lidarspec.packets.packets import Packets, joined
 from lidarspec.packets.stream import PacketStream
 from lidarspec.points.cloud import PointCloud
@@ -130,8 +131,8 @@ def assert_backends_agree(sensor: Sensor, data: Any) -> None:
         data: bytes, or a list of datagrams.
     """
     decoders = [sensor.decoder(stream=is_stream(data), backend=backend) for backend in ("auto", "construct")]
-    found = [spans_of(decoder, data) for decoder in decoders]
-    split = [cuts(frame for spans in each for frame in spans.found()) for each in found]
+    found = [frames_of(decoder, data) for decoder in decoders]
+    split = [cuts(frame for frames in each for frame in frames.found()) for each in found]
     assert split[0] == split[1]
     for name in dict.fromkeys((sensor.data_frame, *(name for name, _, _ in split[0]))):
         compiled, interpreted = (_packets(decoder, name, each) for decoder, each in zip(decoders, found, strict=True))
@@ -143,7 +144,7 @@ def assert_backends_agree(sensor: Sensor, data: Any) -> None:
             assert_same_points(cloud, interpreted.points())
 
 
-def _packets(decoder: Decoder, name: str, found: Sequence[Spans]) -> Packets:
+def _packets(decoder: Decoder, name: str, found: Sequence[Frames]) -> Packets:
     """The packets of one type among the frames of a whole input, which is framed once for all types."""
     stats = copy.deepcopy(decoder.stats)
     return PacketStream(decoder.sensor, name, stats, interpreted=decoder.interpreted).add(found, whole=True)

@@ -15,12 +15,12 @@ import numpy as np
 
 from lidarspec.errors import SpecError, UsageError, WireError
 from lidarspec.framing.frame_engine import CompiledCodec, codec
-from lidarspec.framing.plausibility import VALID
+from lidarspec.framing.results import VALID
+from lidarspec.spec.tree import FieldInfo
 from lidarspec.testing import subject as material
 from lidarspec.testing.findings import Violation, require
 from lidarspec.testing.subject import Subject
 from lidarspec.wire.layout import Layout
-from lidarspec.wire.schema import FieldInfo
 
 #: values that each byte of a frame is changed to where construct alone reads it.
 CHANGES = 8

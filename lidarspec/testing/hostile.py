@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from lidarspec.errors import SpecError, WireError
 from lidarspec.framing.frame_engine import CompiledCodec, codec
-from lidarspec.framing.plausibility import VALID
+from lidarspec.framing.results import VALID
 from lidarspec.testing import subject as material
 from lidarspec.testing.findings import Violation, require
 from lidarspec.testing.subject import MANY, Subject

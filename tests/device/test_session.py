@@ -12,7 +12,7 @@ import pytest
 import lidarspec as ls
 from lidarspec import CommandError, Sensor, Session, UsageError
 from lidarspec.errors import OutOfRange, ReplyTimeout, UnknownCommand, UnknownField
-from lidarspec.framing.decoder import Found
+from lidarspec.framing.results import Found
 from lidarspec.spec import Command, Udp
 from tests.shapes.commands import SENSOR
 

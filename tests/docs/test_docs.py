@@ -93,9 +93,8 @@ def test_every_public_name_is_on_the_pages_of_the_python_interface() -> None:
 
 
 def public_errors() -> set[str]:
-    return {name for name, value in vars(errors).items() if isinstance(value, type) and issubclass(value, errors.LidarSpecError)} - {
-        "UnknownName"
-    }
+    classes = {name for name, value in vars(errors).items() if isinstance(value, type) and issubclass(value, errors.LidarSpecError)}
+    return classes - {"UnknownName"}
 
 
 @pytest.mark.parametrize("value", [ls.Sensor, Frame, Command, Scaled, Checksummed, Clock, Sequence, Polar])

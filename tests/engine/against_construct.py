@@ -18,6 +18,7 @@ from construct import Construct
 
 from lidarspec import Packets, Sensor, SpecError, WireError
 from lidarspec.spec import Every, Fields, Frame, Polar, Udp
+from lidarspec.spec.construct_layer import frame_tree
 from lidarspec.wire.schema import schema
 
 BACKENDS = ("auto", "construct")
@@ -125,7 +126,7 @@ def clouds_agree(struct: Construct, frames: Iterable[bytes], *, max_length: int 
     kept = [(data, wanted) for data, wanted in whole if wanted is not None]
     if not has_raw_form(plain_sensor.decode([data for data, _ in kept])):
         return 0  # what is an array in one branch alone has no length in the others
-    table, tried = schema(struct), 0
+    table, tried = schema(frame_tree(struct)), 0
     for path, info in table.fields.items():
         is_small = info.kind == "int" and info.bits <= 16 and not info.scaled
         if not is_small or not info.axes or info.axes != table.chain() or any(path.startswith(f"{other}.") for other in table.fields):

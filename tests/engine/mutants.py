@@ -6,7 +6,7 @@ import re
 from typing import Any
 
 from lidarspec import Counters, Found, Sensor, WireError
-from lidarspec.framing.decoder import packed
+from lidarspec.framing.results import packed
 from tests.broken import sound
 
 HEADERS = {b"\xaa\x55\xc3": "data", b"\x17\x71\x44": "ack"}

@@ -14,7 +14,8 @@ from construct import Array, Const, Enum, Int8ul, Int16ub, Int16ul, Struct
 import lidarspec as ls
 from lidarspec import Sensor, WireError
 from lidarspec.errors import UnknownFrame
-from lidarspec.explaining.explanation import Explanation, explain, hexdump
+from lidarspec.explaining.explanation import Explanation, explain
+from lidarspec.explaining.wording import hexdump
 from lidarspec.spec import Checksummed, Frame, Polar, Scaled, Simulation, Sum, Xor
 from tests.all_sensors import EVERY as SENSORS, FRAMES
 from tests.shapes import SHAPES
@@ -39,7 +40,7 @@ def named(explanation: Explanation) -> bytes:
 @pytest.mark.parametrize(("sensor", "frame"), FRAMES)
 def test_every_byte_is_named_once(sensor: str, frame: str) -> None:
     for data in examples(sensor, frame):
-        found = explain(SENSORS[sensor], data, frame)
+        found = explain(data, SENSORS[sensor], frame)
         assert named(found) == data
         assert found.fault is None
         assert all(row.right and row.path for row in found.rows)
@@ -49,9 +50,9 @@ def test_every_byte_is_named_once(sensor: str, frame: str) -> None:
 @pytest.mark.parametrize(("sensor", "frame"), FRAMES)
 def test_a_truncated_frame_is_explained_as_far_as_it_goes(sensor: str, frame: str) -> None:
     data = examples(sensor, frame)[0]
-    whole = explain(SENSORS[sensor], data, frame)
+    whole = explain(data, SENSORS[sensor], frame)
     for end in range(len(data)) if len(data) <= SMALL else (1, len(data) // 2, len(data) - 1):
-        found = explain(SENSORS[sensor], data[:end], frame)
+        found = explain(data[:end], SENSORS[sensor], frame)
         assert named(found) == data[:end]
         assert found.fault is not None
         assert not found.rows[-1].right
@@ -63,13 +64,25 @@ def test_a_truncated_frame_is_explained_as_far_as_it_goes(sensor: str, frame: st
 def test_the_values_are_those_that_parse_gives(sensor: str, frame: str) -> None:
     data = examples(sensor, frame)[1]
     parsed = SENSORS[sensor].parse(data, frame)
-    values = [value for row in explain(SENSORS[sensor], data, frame).rows for value in row.values]
+    values = [value for row in explain(data, SENSORS[sensor], frame).rows for value in row.values]
     for value in values:
         found = parsed
         for name in re.findall(r"\w+", value.path):
             found = found[int(name)] if name.isdigit() else found[name]
         assert value.raw == found or (value.raw != value.raw and found != found)
     assert len(values) == leaves(parsed)
+
+
+def test_an_explanation_has_fields_by_path_and_a_verdict() -> None:
+    whole = explain(EXAMPLE, ls.sensor("ldrobot-stl27l"))
+    assert (whole.frame, whole.verdict) == ("data", "valid")
+    assert whole.fields["points[3].distance"].physical == pytest.approx(0.213)
+    assert list(whole.fields)[-1] == "crc"
+    damaged = explain(EXAMPLE[:-1] + b"\x51", ls.sensor("ldrobot-stl27l"))
+    assert damaged.fault is not None
+    assert damaged.verdict == damaged.fault.reason
+    assert "checksum" in damaged.verdict
+    assert [difference.path for difference in whole.differences(damaged)] == ["crc"]
 
 
 def leaves(parsed: object) -> int:
@@ -83,7 +96,7 @@ def test_points_are_those_of_the_cloud(sensor: str) -> None:
     value = SENSORS[sensor]
     frame = value.data_frame if value.frames else ""
     data = examples(sensor, frame)[0]
-    found = explain(value, data, frame)
+    found = explain(data, value, frame)
     points = [point for row in found.rows for point in row.points]
     if value.frames[frame].confirm > 1 or value.frames[frame].after or not points:
         assert sensor in {"shape-weak", "shape-modes", "shape-text"} or not points or value.frames[frame].after
@@ -103,7 +116,7 @@ def test_points_stand_in_the_rows_that_they_come_from() -> None:
     values = sensor.parse(bytes(data))
     channel = values.blocks[24].channels[3]
     channel.radius, channel.elevation, channel.azimuth = 2000, 32768, 32768 + 9000
-    row = next(row for row in explain(sensor, sensor.build("data", values)).rows if row.path == "blocks[24].channels[3]")
+    row = next(row for row in explain(sensor.build("data", values), sensor).rows if row.path == "blocks[24].channels[3]")
     (point,) = row.points
     assert (round(point.x, 4), round(point.y, 4), round(point.z, 4)) == (0, 10, 0)
     assert point.azimuth_deg == pytest.approx(90)
@@ -115,7 +128,7 @@ def test_text_is_as_the_conventions_say() -> None:
     values.speed, values.start_angle, values.end_angle = 3600, 0, 220
     values.points[0].distance, values.points[0].intensity = 1000, 200
     values.points[1].distance = 0
-    lines = str(explain(sensor, sensor.build("data", values))).splitlines()
+    lines = str(explain(sensor.build("data", values), sensor)).splitlines()
     assert lines[1] == "0002  10 0e     speed        3600 deg/s = 10.0 Hz"
     assert lines[3] == "0006  e8 03 c8  points[0]    1.000 m, intensity 200, at 0.00 deg -> x 1.000 y 0.000"
     assert lines[4] == "0009  00 00 e2  points[1]    0.000 m, intensity 226, at -0.20 deg -> no return"
@@ -124,20 +137,20 @@ def test_text_is_as_the_conventions_say() -> None:
 
 
 def test_a_wrong_checksum_is_told_with_the_right_one_and_gives_no_points() -> None:
-    found = explain(ls.sensor("ldrobot-stl27l"), EXAMPLE[:-1] + b"\x51")
+    found = explain(EXAMPLE[:-1] + b"\x51", ls.sensor("ldrobot-stl27l"))
     assert found.rows[-1].meaning == "0x51 wrong, expected 0x50 (CRC-8 poly 0x4d over 46 bytes)"
     assert [row.right for row in found.rows] == [True] * (len(found.rows) - 1) + [False]
     assert not any(row.points for row in found.rows)
 
 
 def test_a_wrong_constant_is_told() -> None:
-    found = explain(ls.sensor("ldrobot-stl27l"), b"\x54\x2d" + EXAMPLE[2:])
+    found = explain(b"\x54\x2d" + EXAMPLE[2:], ls.sensor("ldrobot-stl27l"))
     assert found.rows[0].remarks == ("wrong: 54 2d, expected 54 2c",)
     assert not found.rows[0].right
 
 
 def test_what_follows_the_frame_is_told_and_the_frame_still_gives_points() -> None:
-    found = explain(ls.sensor("ldrobot-stl27l"), EXAMPLE + b"abc")
+    found = explain(EXAMPLE + b"abc", ls.sensor("ldrobot-stl27l"))
     assert (found.rows[-1].data, found.rows[-1].meaning) == (b"abc", "after the frame's end")
     assert sum(len(row.points) for row in found.rows) == 12
 
@@ -145,7 +158,7 @@ def test_what_follows_the_frame_is_told_and_the_frame_still_gives_points() -> No
 def test_checksums_of_every_kind_are_judged() -> None:
     said = {}
     for sensor in ("shape-nested", "shape-nibbles", "shape-middle", "shape-numbers"):
-        rows = explain(SHAPES[sensor], SHAPES[sensor].example("data", seed=5)).rows
+        rows = explain(SHAPES[sensor].example("data", seed=5), SHAPES[sensor]).rows
         said[sensor] = [row.remarks[0].partition(" ")[2] for row in rows if row.remarks]
     assert said["shape-nested"] == [
         "ok (8-bit sum over 4 bytes)",
@@ -154,7 +167,7 @@ def test_checksums_of_every_kind_are_judged() -> None:
     assert said["shape-nibbles"] == ["ok (XOR-8 over 12 bytes)"]
     assert said["shape-middle"] == ["ok (XOR-16 of 1+2-byte words after a head of 4 bytes over 16 bytes)"]
     values = SHAPES["shape-numbers"].parse(SHAPES["shape-numbers"].example("data", seed=5))
-    row = explain(SHAPES["shape-numbers"], SHAPES["shape-numbers"].build("data", values, crc=0)).rows[-1]
+    row = explain(SHAPES["shape-numbers"].build("data", values, crc=0), SHAPES["shape-numbers"]).rows[-1]
     assert row.remarks == ("0x0000 means not filled (CRC-16 poly 0x1021 init 0xffff over 55 bytes)",)
     assert row.right
 
@@ -162,7 +175,7 @@ def test_checksums_of_every_kind_are_judged() -> None:
 def test_bit_fields_show_their_bits() -> None:
     sensor = ls.sensor("cspc-m1c1-mini")
     data = bytes.fromhex("aa55 00 02 01 05 01 06 0000 2c2b0a 38570a".replace(" ", ""))
-    rows = {row.path: row for row in explain(sensor, data, "data").rows}
+    rows = {row.path: row for row in explain(data, sensor, "data").rows}
     values = {value.name: (value.raw, value.bits) for value in rows["samples[1]"].values}
     assert values == {
         "distance": (0x0A5738 >> 10, "byte 2 bits 7-0, byte 1 bits 7-2"),
@@ -182,8 +195,8 @@ def variant(*fields: object) -> Sensor:
 def test_renamed_and_reordered_fields_are_followed() -> None:
     first = variant("sync" / Const(b"\x01\x02"), "far" / Scaled(Int16ul, 0.01, "m"), "mode" / Enum(Int8ul, slow=1), "check" / Int8ul)
     other = variant("pace" / Enum(Int8ul, slow=1), "check" / Int8ul, "sync" / Const(b"\x01\x02"), "far" / Scaled(Int16ub, 0.01, "m"))
-    before = explain(first, first.build("data", far=4660, mode=1))
-    after = explain(other, other.build("data", far=4660, pace=1))
+    before = explain(first.build("data", far=4660, mode=1), first)
+    after = explain(other.build("data", far=4660, pace=1), other)
     assert [(row.offset, row.path, row.data.hex()) for row in before.rows] == [
         (0, "sync", "0102"),
         (2, "far", "3412"),
@@ -201,32 +214,32 @@ def test_renamed_and_reordered_fields_are_followed() -> None:
 
 def test_constants_without_a_name_and_documented_elements_keep_their_places() -> None:
     sensor = variant(Const(b"\x77"), "far" / Scaled(Int16ul, 0.01, "m"), "pairs" / Array(2, Struct("a" / Int8ul) * "one"), "check" / Int8ul)
-    found = explain(sensor, sensor.build("data", far=1, pairs=[{"a": 3}, {"a": 4}]))
+    found = explain(sensor.build("data", far=1, pairs=[{"a": 3}, {"a": 4}]), sensor)
     assert [(row.offset, row.path) for row in found.rows] == [(0, "(constant)"), (1, "far"), (3, "pairs[0]"), (4, "pairs[1]"), (5, "check")]
 
 
 def test_a_checksum_within_a_frame_is_judged_over_its_own_bytes() -> None:
     inner = Checksummed(Struct("far" / Scaled(Int16ul, 0.01, "m"), "sum" / Int8ul), field="sum", algorithm=Sum(8))
     sensor = variant("sync" / Const(b"\x01\x02"), "far" / Int8ul, "inner" / inner, "check" / Int8ul)
-    rows = {row.path: row for row in explain(sensor, sensor.build("data", far=1, inner={"far": 0x1234})).rows}
+    rows = {row.path: row for row in explain(sensor.build("data", far=1, inner={"far": 0x1234}), sensor).rows}
     assert rows["inner.sum"].remarks == ("0x46 ok (8-bit sum over 2 bytes)",)
     assert rows["check"].remarks[0].endswith("ok (XOR-8 over 6 bytes)")
 
 
 def test_look_ahead_and_implausible_frames_are_told() -> None:
-    ahead = explain(SHAPES["shape-ahead"], SHAPES["shape-ahead"].example("data"))
+    ahead = explain(SHAPES["shape-ahead"].example("data"), SHAPES["shape-ahead"])
     assert any("direction not known from this frame alone" in row.meaning for row in ahead.rows)
     values = ls.sensor("ldrobot-stl27l").parse(EXAMPLE)
     values.start_angle = 36001
-    found = explain(ls.sensor("ldrobot-stl27l"), ls.sensor("ldrobot-stl27l").build("data", values))
+    found = explain(ls.sensor("ldrobot-stl27l").build("data", values), ls.sensor("ldrobot-stl27l"))
     assert found.notes == ("not plausible: a decoder passes over this frame",)
 
 
 def test_bytes_that_begin_like_no_frame_are_refused() -> None:
     with pytest.raises(WireError, match="no frame type fits"):
-        explain(ls.sensor("robosense-m1"), b"hello, world")
+        explain(b"hello, world", ls.sensor("robosense-m1"))
     with pytest.raises(UnknownFrame, match="did you mean 'data'"):
-        explain(ls.sensor("robosense-m1"), b"", "dat")
+        explain(b"", ls.sensor("robosense-m1"), "dat")
 
 
 def fault(data: bytes) -> WireError:
@@ -268,7 +281,7 @@ def test_hexdumps_of_long_frames_show_the_lines_before_the_place() -> None:
 
 
 def test_numbers_are_shown_with_the_steps_of_their_scale() -> None:
-    found = explain(SHAPES["shape-numbers"], SHAPES["shape-numbers"].example("data", seed=3))
+    found = explain(SHAPES["shape-numbers"].example("data", seed=3), SHAPES["shape-numbers"])
     serial = next(value for row in found.rows for value in row.values if value.name == "serial")
     assert str(serial) == str(serial.raw)
     assert not any(math.isinf(value.physical) for row in found.rows for value in row.values if value.name == "serial")
@@ -301,7 +314,7 @@ def test_a_value_has_the_decimals_that_its_steps_need(scale: float, offset: floa
     )
 
     def said(raw: int) -> str:
-        row = explain(sensor, sensor.build("data", x=raw)).rows[-1]
+        row = explain(sensor.build("data", x=raw), sensor).rows[-1]
         return str(row.values[0]).split()[0]
 
     assert said(19_201) == shown

@@ -8,7 +8,7 @@ import pytest
 
 import lidarspec as ls
 from lidarspec.explaining.explanation import Flip, explain, flips
-from lidarspec.explaining.listing import differences, folded, parents, text, told as told_differences
+from lidarspec.explaining.listing import folded, parents, text, told
 from lidarspec.explaining.wording import Span, bit_picture
 from tests.all_sensors import EVERY as SENSORS, FRAMES
 from tests.cli.running import EXAMPLE, printed, process, ran
@@ -19,7 +19,7 @@ DAMAGED = EXAMPLE[:-1] + b"\x51"
 
 
 def lines(sensor: str, data: bytes, frame: str | None = None) -> list[str]:
-    return str(explain(SENSORS[sensor], data, frame)).splitlines()
+    return str(explain(data, SENSORS[sensor], frame)).splitlines()
 
 
 def test_parts_are_indented_below_what_holds_them() -> None:
@@ -32,7 +32,7 @@ def test_parts_are_indented_below_what_holds_them() -> None:
 
 
 def test_bit_fields_are_drawn_in_the_first_element_and_on_request_in_all() -> None:
-    found = explain(ls.sensor("cspc-m1c1-mini"), M1C1, "data")
+    found = explain(M1C1, ls.sensor("cspc-m1c1-mini"), "data")
     listed = [text(line) for line in found.lines()]
     told = {" ".join(line.split()) for line in listed}
     assert "000a .. 001010.. 00001010 distance 0.650 m (byte 2 bits 7-0, byte 1 bits 7-2); 0: no return" in told
@@ -43,7 +43,7 @@ def test_bit_fields_are_drawn_in_the_first_element_and_on_request_in_all() -> No
 
 @pytest.mark.parametrize(("sensor", "frame"), FRAMES)
 def test_pictures_show_every_bit_of_a_block_once(sensor: str, frame: str) -> None:
-    for row in explain(SENSORS[sensor], SENSORS[sensor].example(frame), frame).rows:
+    for row in explain(SENSORS[sensor].example(frame), SENSORS[sensor], frame).rows:
         shown = [bytearray(len(row.data)) for _ in range(2)]
         for value in row.values:
             assert value.masks or value.raw == b""
@@ -75,38 +75,38 @@ def test_what_a_flip_is_said_to_mend_is_mended(sensor: str, frame: str) -> None:
 
 
 def test_damage_that_one_bit_explains_is_told_with_the_field() -> None:
-    notes = explain(STL, Flip(46, 0).mended(EXAMPLE)).notes
+    notes = explain(Flip(46, 0).mended(EXAMPLE), STL).notes
     assert "a flipped bit would explain it: byte 46 bit 0, crc 81, sent as 80" in notes
     assert "a flipped bit would explain it: byte 15 bit 7, points[3].distance 0.213 m, sent as 0.085 m" in notes
-    assert explain(STL, EXAMPLE[:20]).notes == ()
+    assert explain(EXAMPLE[:20], STL).notes == ()
 
 
 def test_where_any_bit_may_have_flipped_only_that_is_told() -> None:
     sensor = ls.sensor("cspc-m1c1-mini")
     data = sensor.example("data", seed=2)
-    (note,) = explain(sensor, Flip(20, 2).mended(data), "data").notes
+    (note,) = explain(Flip(20, 2).mended(data), sensor, "data").notes
     assert re.fullmatch(r"one flipped bit would explain it, but in any of \d+ places, so that nothing can be said of where", note)
 
 
 def test_differences_are_told_field_by_field_and_to_the_bit() -> None:
     other = STL.build("data", {**STL.parse(EXAMPLE), "end_angle": 0x82BF})
-    first, second = explain(STL, EXAMPLE), explain(STL, other)
-    found = differences(first, second)
+    first, second = explain(EXAMPLE, STL), explain(other, STL)
+    found = first.differences(second)
     assert [part.path for part in found] == ["end_angle", "crc"]
-    assert [text(line) for line in told_differences(first, second, found)][:3] == [
+    assert [text(line) for line in told(found, (47, 47))][:3] == [
         "002a  end_angle  334.70 deg -> 334.71 deg (+0.01 deg)",
         "      - be 82        .......0 ..",
         "      + bf 82        .......1 ..",
     ]
-    assert text(list(told_differences(first, first, differences(first, first)))[-1]) == "47 bytes, all alike"
+    assert text(list(told(first.differences(first), (47, 47)))[-1]) == "47 bytes, all alike"
 
 
 def test_fields_that_one_frame_alone_has_are_told_together() -> None:
     sensor = ls.sensor("cspc-m1c1-mini")
     samples = [dict(distance=1000, intensity=9, exposure=2)] * 3
     head = dict(mt=dict(frequency=0, start=0), fsa=dict(angle=64), lsa=dict(angle=640))
-    parts = [explain(sensor, sensor.build("data", **head, samples=samples[:count])) for count in (1, 3)]
-    shown = [text(line) for line in told_differences(*parts, differences(*parts))]
+    parts = [explain(sensor.build("data", **head, samples=samples[:count]), sensor) for count in (1, 3)]
+    shown = [text(line) for line in told(parts[0].differences(parts[1]), (len(parts[0].data), len(parts[1].data)))]
     assert "      samples[1].distance to samples[2].exposure  in the second frame alone" in shown
 
 
@@ -115,9 +115,9 @@ def test_differences_count_every_bit_of_frames_of_one_layout(sensor: str, frame:
     data = SENSORS[sensor].example(frame, seed=3)
     other = bytearray(data)
     other[-1] ^= 0x41
-    first, second = (explain(SENSORS[sensor], bytes(part), frame) for part in (data, other))
+    first, second = (explain(bytes(part), SENSORS[sensor], frame) for part in (data, other))
     if second.rows[-1].values and [row.path for row in first.rows] == [row.path for row in second.rows]:
-        assert sum(mask.bit_count() for part in differences(first, second) for mask in part.masks) == 2
+        assert sum(mask.bit_count() for part in first.differences(second) for mask in part.masks) == 2
 
 
 def test_the_verb_compares_with_another_frame_or_the_next() -> None:

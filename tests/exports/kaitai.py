@@ -29,7 +29,7 @@ def compile_all(sensors: Iterable[Sensor], folder: Path) -> None:
     specs = []
     for sensor in sensors:
         specs.append(folder / f"{sensor.id}.ksy")
-        specs[-1].write_text(export("ksy", sensor), encoding="utf-8")
+        specs[-1].write_text(export(sensor, "ksy"), encoding="utf-8")
     if shutil.which(COMPILER):
         command = [COMPILER, "--target", "python", "--outdir", str(folder), *map(str, specs)]
     elif _has_packages():

@@ -40,7 +40,7 @@ def columns(capture: Path, script: Path, names: Sequence[str], *arguments: str) 
 @functools.cache
 def dissector(sensor: Sensor) -> str:
     """The dissector of a sensor, made once."""
-    return export("wireshark", sensor)
+    return export(sensor, "wireshark")
 
 
 def written(sensor: Sensor, folder: Path) -> Path:

@@ -65,7 +65,7 @@ int main(void)
 def test_what_only_python_can_decide_is_refused_with_the_reason() -> None:
     for name, reason in REFUSED.items():
         with pytest.raises(Refused, match=reason):
-            export("c", EVERY[name])
+            export(EVERY[name], "c")
 
 
 @needs_gcc
@@ -77,7 +77,7 @@ def test_every_header_compiles_without_a_warning(tmp_path: Path) -> None:
 
 @needs_gcc
 def test_an_id_that_begins_with_a_digit_makes_names_all_the_same(tmp_path: Path) -> None:
-    (tmp_path / "it.h").write_text(export("c", replace(SENSORS["shape-count"], id="3acme-x1")))
+    (tmp_path / "it.h").write_text(export(replace(SENSORS["shape-count"], id="3acme-x1"), "c"))
     (tmp_path / "it.c").write_text('#include "it.h"\nint main(void) { return lidar_3acme_x1_data_count((const uint8_t *)"abc") != 99; }\n')
     subprocess.run([str(GCC), *STRICT, "-o", "it", "it.c"], cwd=tmp_path, check=True)
     subprocess.run([tmp_path / "it"], check=True)
@@ -157,7 +157,7 @@ def test_scaling(tmp_path: Path) -> None:
 
 def _included(folder: Path) -> str:
     for sensor in SENSORS.values():
-        (folder / f"{sensor.id}.h").write_text(export("c", sensor))
+        (folder / f"{sensor.id}.h").write_text(export(sensor, "c"))
     return "".join(f'#include "{name}.h"\n' for name in SENSORS)
 
 
@@ -203,7 +203,7 @@ def _printed(table: Schema, path: str, prefix: str, text: str) -> Iterator[str]:
 @functools.cache
 def export_of(name: str) -> str:
     """The header of a sensor, made once."""
-    return export("c", EVERY[name])
+    return export(EVERY[name], "c")
 
 
 def _examples(sensor: Sensor, name: str) -> list[bytes]:

@@ -33,7 +33,7 @@ def test_the_frame_on_the_page_is_what_tshark_prints(tmp_path: Path) -> None:
 
 @pytest.mark.skipif(shutil.which("gcc") is None, reason="gcc is not installed")
 def test_the_program_on_the_page_runs(tmp_path: Path) -> None:
-    (tmp_path / "stl27l.h").write_text(export("c", lidarspec.sensor(NAME)))
+    (tmp_path / "stl27l.h").write_text(export(lidarspec.sensor(NAME), "c"))
     array = ", ".join(map(str, b"\x54\x2c\x00" + EXAMPLE))
     main = f"int main(void) {{ static const uint8_t bytes[] = {{{array}}}; print_distances(bytes, sizeof bytes); return 0; }}\n"
     (tmp_path / "it.c").write_text(first("c") + main)

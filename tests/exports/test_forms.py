@@ -30,7 +30,7 @@ NAMED = {"links", "frames", "commands", "values", "args", "matches", "lines", "l
 
 @pytest.mark.parametrize("name", SPOKEN)
 def test_json_is_enough_to_decode_frames(name: str) -> None:
-    sensor, spec = SENSORS[name], json.loads(export("json", SENSORS[name]))
+    sensor, spec = SENSORS[name], json.loads(export(SENSORS[name], "json"))
     for frame, said in spec["frames"].items():
         for seed in range(3):
             data = sensor.example(frame, seed=seed)
@@ -60,16 +60,16 @@ def keys(value: Any, above: str = "") -> Iterator[str]:
 
 def test_every_key_of_the_json_is_documented() -> None:
     page = PAGE.read_text(encoding="utf-8")
-    used = {key for name in SPOKEN for key in keys(json.loads(export("json", SENSORS[name])))}
+    used = {key for name in SPOKEN for key in keys(json.loads(export(SENSORS[name], "json")))}
     assert used - set(re.findall(r"`(\w+)`", page)) == set()
 
 
 @pytest.mark.parametrize("name", SPOKEN)
 def test_diagrams_name_every_field_and_stay_within_their_rows(name: str) -> None:
-    root = ElementTree.fromstring(export("svg", SENSORS[name]))
+    root = ElementTree.fromstring(export(SENSORS[name], "svg"))
     says = {title.text or "" for title in root.iter("{http://www.w3.org/2000/svg}title")}
     for frame in SENSORS[name].frames.values():
-        for path in schema(frame.prepared).fields:
+        for path in schema(frame.tree).fields:
             assert any(said.split("; ")[0] == path for said in says), path
     boxes = [box for group in root.iter("{http://www.w3.org/2000/svg}g") for box in group.iter("{http://www.w3.org/2000/svg}rect")]
     for box in boxes:
@@ -77,7 +77,7 @@ def test_diagrams_name_every_field_and_stay_within_their_rows(name: str) -> None
 
 
 def test_boxes_do_not_overlap_and_fill_their_bits() -> None:
-    root = ElementTree.fromstring(export("svg", narrowed(ls.sensor("cspc-m1c1-mini"), "info")))
+    root = ElementTree.fromstring(export(narrowed(ls.sensor("cspc-m1c1-mini"), "info"), "svg"))
     seen: set[tuple[float, float]] = set()
     for box in root.iter("{http://www.w3.org/2000/svg}rect"):
         if "x" in box.attrib:
@@ -89,10 +89,10 @@ def test_boxes_do_not_overlap_and_fill_their_bits() -> None:
 
 @pytest.mark.parametrize("name", list(SENSORS))
 def test_pages_have_every_frame_command_and_field(name: str) -> None:
-    sensor, text = SENSORS[name], export("md", SENSORS[name])
+    sensor, text = SENSORS[name], export(SENSORS[name], "md")
     for frame, value in sensor.frames.items():
         assert f"## `{frame}`: " in text
-        for field in schema(value.prepared).fields.values():
+        for field in schema(value.tree).fields.values():
             assert re.search(rf"`(\w+(\[\w\])*\.)*{field.name}(\[\w\])*`", text), field.path
     assert all(f"| `{command}` |" in text for command in sensor.commands)
     for table in re.findall(r"(?:^\|.*\n)+", text, flags=re.MULTILINE):
@@ -100,10 +100,10 @@ def test_pages_have_every_frame_command_and_field(name: str) -> None:
 
 
 def test_a_page_says_what_a_user_looks_for() -> None:
-    text = export("md", ls.sensor("cspc-m1c1-mini"))
+    text = export(ls.sensor("cspc-m1c1-mini"), "md")
     assert "| link `data` | serial, 150 000 or 115 200 baud, 8N1" in text
     assert "| `start` | `aa 55 f0 0f` | `ack` | starts the data; sent on opening |" in text
-    assert "| 15 | 15.000 deg |" in export("md", ls.sensor("velodyne-vlp16"))
+    assert "| 15 | 15.000 deg |" in export(ls.sensor("velodyne-vlp16"), "md")
 
 
 SNIPPET = """
@@ -125,7 +125,7 @@ mini.command("strat").nothing
 
 def test_a_type_checker_takes_the_stubs_and_finds_misspelt_fields(tmp_path: Path) -> None:
     for name in SPOKEN:
-        (tmp_path / f"{name.replace('-', '_')}.pyi").write_text(export("pyi", SENSORS[name]), encoding="utf-8")
+        (tmp_path / f"{name.replace('-', '_')}.pyi").write_text(export(SENSORS[name], "pyi"), encoding="utf-8")
     (tmp_path / "snippet.py").write_text(SNIPPET, encoding="utf-8")
     stubs = [f"{name.replace('-', '_')}.pyi" for name in SPOKEN]
     command = [sys.executable, "-m", "mypy", "--strict", "--follow-imports=silent", "snippet.py", *stubs]
@@ -141,22 +141,22 @@ def test_a_type_checker_takes_the_stubs_and_finds_misspelt_fields(tmp_path: Path
 @pytest.mark.parametrize("kind", ["ksy", "svg", "json", "pyi"])
 def test_python_code_is_refused_with_the_reason(kind: str) -> None:
     with pytest.raises(Refused, match="shape-text data: angle: Decimal is Python code"):
-        export(kind, SHAPES["shape-text"])
+        export(SHAPES["shape-text"], kind)
 
 
 def test_an_unknown_kind_is_told() -> None:
     with pytest.raises(UnknownExport, match="did you mean 'json'"):
-        export("jsn", ls.sensor("ldrobot-stl27l"))
+        export(ls.sensor("ldrobot-stl27l"), "jsn")
 
 
 @pytest.mark.parametrize("kind", ["ksy", "md", "svg", "json", "pyi"])
 def test_the_verb_prints_and_writes_every_kind(kind: str, tmp_path: Path) -> None:
     assert kind in EXPORTS
     printed = ran("export", kind, "robosense-m1").stdout
-    assert printed == export(kind, ls.sensor("robosense-m1"))
+    assert printed == export(ls.sensor("robosense-m1"), kind)
     ran("export", kind, "robosense-m1", "-o", tmp_path / "out", "--frame", "difop")
     alone = (tmp_path / "out").read_text(encoding="utf-8")
-    assert alone == export(kind, narrowed(ls.sensor("robosense-m1"), "difop"))
+    assert alone == export(narrowed(ls.sensor("robosense-m1"), "difop"), kind)
     assert "return_seq" not in alone
 
 

@@ -98,16 +98,16 @@ def test_unusual_structs_are_read_alike(compiled: Path, case: str) -> None:
 @pytest.mark.parametrize("name", list(REFUSED))
 def test_what_kaitai_cannot_say_is_refused_with_the_reason(name: str) -> None:
     with pytest.raises(Refused, match=REFUSED[name]):
-        export("ksy", SENSORS[name])
+        export(SENSORS[name], "ksy")
 
 
 def test_other_refusals_have_reasons_too() -> None:
     with pytest.raises(Refused, match="a float of 2 bytes"):
-        export("ksy", made("half" / Float16b))
+        export(made("half" / Float16b), "ksy")
     with pytest.raises(Refused, match="two members that are called 'speed'"):
-        export("ksy", made("speed" / Int8ul, "Speed" / Int8ul))
+        export(made("speed" / Int8ul, "Speed" / Int8ul), "ksy")
     with pytest.raises(Refused, match="Python function decides"):
-        export("ksy", made("count" / Int8ul, "items_" / Array(lambda this: 2 if this.count > 3 else 1, Int8ul)))
+        export(made("count" / Int8ul, "items_" / Array(lambda this: 2 if this.count > 3 else 1, Int8ul)), "ksy")
 
 
 def test_yaml_quotes_what_would_mean_something_else() -> None:

@@ -10,10 +10,9 @@ from construct import Array, Bytes, Const, Int8ub, Int16ub, Struct, Switch, this
 
 from lidarspec import Sensor, UsageError
 from lidarspec.exports import Refused, UnknownExport, export
-from lidarspec.exports.formulas import Op, Ref
 from lidarspec.exports.messages import messages
-from lidarspec.exports.tree import Repeat, nodes
 from lidarspec.spec import Checksum, Checksummed, Frame
+from lidarspec.spec.tree import Op, Ref, Repeat, nodes
 from tests.exports.oddities import SENSOR
 from tests.shapes.calibration import BARE
 
@@ -55,7 +54,7 @@ def with_frame(*fields: Any, algorithm: Checksum | None = None) -> Sensor:
 )
 def test_refused_with_the_reason(kind: str, sensor: Sensor, reason: str) -> None:
     with pytest.raises(Refused) as caught:
-        export(kind, sensor)
+        export(sensor, kind)
     assert reason in str(caught.value)
     assert isinstance(caught.value, UsageError)
 
@@ -63,11 +62,11 @@ def test_refused_with_the_reason(kind: str, sensor: Sensor, reason: str) -> None
 def test_c_has_no_place_for_elements_that_differ_in_size_and_no_number_for_all_products() -> None:
     chain = with_frame("parts" / Array(3, Struct("n" / Int8ub, "data" / Bytes(this.n))))
     with pytest.raises(Refused, match="parts: its elements differ in size"):
-        export("c", chain)
-    assert "parts" in export("wireshark", chain)
+        export(chain, "c")
+    assert "parts" in export(chain, "wireshark")
     wide = with_frame(*(f"f{number}" / Int16ub for number in range(4)), "x" / Bytes(this.f0 * this.f1 * this.f2 * this.f3))
     with pytest.raises(Refused, match="64-bit"):
-        export("c", wide)
+        export(wide, "c")
 
 
 def test_a_function_that_only_calculates_is_written_down() -> None:
@@ -82,4 +81,4 @@ def test_a_function_that_only_calculates_is_written_down() -> None:
 
 def test_an_unknown_kind_is_told_with_a_suggestion() -> None:
     with pytest.raises(UnknownExport, match="did you mean 'wireshark'"):
-        export("wiresark", SENSOR)
+        export(SENSOR, "wiresark")

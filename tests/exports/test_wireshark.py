@@ -43,7 +43,7 @@ pytestmark = needs_tshark
 def test_what_only_python_can_decide_is_refused_with_the_reason() -> None:
     for name, reason in REFUSED.items():
         with pytest.raises(Refused, match=reason):
-            export("wireshark", EVERY[name])
+            export(EVERY[name], "wireshark")
 
 
 @pytest.mark.parametrize("sensor", SENSORS)

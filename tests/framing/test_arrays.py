@@ -17,9 +17,8 @@ from numpy.typing import NDArray
 import lidarspec
 from lidarspec import Sensor
 from lidarspec.columns.columns import Batch, Fields
-from lidarspec.framing.decoder import Counters, Spans
 from lidarspec.framing.frame_engine import CompiledCodec, codec
-from lidarspec.framing.results import Alike
+from lidarspec.framing.results import Counters, Frames
 from lidarspec.packets.clocks import Unwrapper, clock_ns
 from lidarspec.packets.packets import joined
 from lidarspec.packets.stream import PacketStream
@@ -44,7 +43,7 @@ def damaged(sensor: Sensor) -> NDArray[np.uint8]:
     return rows
 
 
-def facts(spans: Spans) -> list[tuple[str, int, bytes, int]]:
+def facts(spans: Frames) -> list[tuple[str, int, bytes, int]]:
     return [(found.frame, found.offset, found.data, found.gap) for found in spans.found()]
 
 
@@ -86,7 +85,7 @@ def test_arrays_of_sound_frames_alone_and_with_damaged_ones_in_turn(sensor: Sens
     listed = [one_by_one.datagrams([row.tobytes()]) for array in arrays for row in array]
     assert [fact for spans in found for fact in facts(spans)] == [fact for spans in listed for fact in facts(spans)]
     assert together.stats == one_by_one.stats
-    assert not len(sound) or isinstance(found[5], Alike) == isinstance(codec(sensor.frames[sensor.data_frame]), CompiledCodec)
+    assert not len(sound) or (found[5].layout is not None) == isinstance(codec(sensor.frames[sensor.data_frame]), CompiledCodec)
     streams = [PacketStream(sensor, sensor.data_frame, Counters()) for _ in range(3)]
     whole, wanted = streams[0].add(found, whole=True), streams[1].add(listed, whole=True)
     parts = joined([streams[2].add([spans], whole=True) for spans in found])

@@ -10,7 +10,7 @@ import pytest
 from construct import Bytes, Const, Struct
 
 from lidarspec import Sensor
-from lidarspec.framing.results import Alike
+from lidarspec.framing.results import Frames
 from lidarspec.framing.steady import SMALL
 from lidarspec.spec import Checksummed, Frame, Xor
 from lidarspec.spec.row_checksums import FEW, SHORT, registers
@@ -35,6 +35,11 @@ def as_it_comes(data: bytes, size: int, seed: int) -> list[bytes]:
     return found
 
 
+def is_steady(frames: Frames) -> bool:
+    """Whether frames were found as rows, one after another, without a search."""
+    return isinstance(frames.places, range)
+
+
 @pytest.mark.parametrize("sensor", STREAMS.values(), ids=STREAMS)
 @pytest.mark.parametrize("rate", [0.0, 1e-3, 5e-3])
 def test_pieces_of_a_few_frames_give_what_the_whole_gives(sensor: Sensor, rate: float) -> None:
@@ -57,8 +62,8 @@ def test_pieces_of_a_few_frames_give_what_the_whole_gives(sensor: Sensor, rate: 
 def test_clean_frames_are_found_so() -> None:
     data = b"".join(TWINS.example("data", seed=seed) for seed in range(40))
     decoder = TWINS.decoder()
-    found = [spans for piece in as_it_comes(data, 18, 1) for spans in decoder.spans(piece)]
-    assert sum(isinstance(spans, Alike) for spans in found) > 5
+    found = [frames for piece in as_it_comes(data, 18, 1) for frames in decoder.frames(piece)]
+    assert sum(is_steady(frames) for frames in found) > 5
     assert sum(map(len, found)) == 40
 
 
@@ -71,8 +76,8 @@ def test_long_pieces_are_taken_up_to_the_first_damage(faults: int) -> None:
         spot = source.randrange(len(data))
         data[spot : spot + source.randrange(2)] = source.randbytes(source.randint(0, 30))
     whole, parts = TWINS.decoder(), TWINS.decoder()
-    found = [*whole.spans(bytes(data)), *whole.rest()]
-    pieces = [spans for start in range(0, len(data), 5000) for spans in parts.spans(bytes(data[start : start + 5000]))]
+    found = [*whole.frames(bytes(data)), *whole.rest()]
+    pieces = [spans for start in range(0, len(data), 5000) for spans in parts.frames(bytes(data[start : start + 5000]))]
     pieces += parts.rest()
     for name in ("offsets", "gaps", "kinds"):
         assert (
@@ -80,7 +85,7 @@ def test_long_pieces_are_taken_up_to_the_first_damage(faults: int) -> None:
             == np.concatenate([getattr(one, name) for one in pieces]).tolist()
         )
     assert whole.stats == parts.stats
-    longest = max(len(spans) * len(frames[0]) for spans in found if isinstance(spans, Alike) or faults > 2)
+    longest = max(len(spans) * len(frames[0]) for spans in found if is_steady(spans) or faults > 2)
     assert longest > SMALL
 
 
@@ -88,7 +93,7 @@ def test_a_type_that_comes_first_is_looked_for_at_each_frame() -> None:
     data = b"".join(SHORT_FIRST.example("data", seed=seed) for seed in range(40))
     decoder = SHORT_FIRST.decoder()
     for piece in as_it_comes(data, 18, 1):
-        decoder.spans(piece)
+        decoder.frames(piece)
     assert decoder.stats.frames == {"data": 40}
     assert decoder.stats.bad_checksum + decoder.stats.implausible == 40
 
@@ -100,7 +105,7 @@ def test_a_type_that_comes_first_is_looked_for_where_only_some_frames_begin_like
     frames = [TWINS.build("data", angle=angle, distances=[1, 2, 3, 4, 5, 6]) for angle in (7, 8, 263, 9, 7, 10) * 4]
     decoder = sensor.decoder()
     for start in range(0, len(frames), 3):
-        decoder.spans(b"".join(frames[start : start + 3]))
+        decoder.frames(b"".join(frames[start : start + 3]))
     assert decoder.stats.frames == {"data": 24}
     assert decoder.stats.bad_checksum == 12
 
@@ -108,8 +113,8 @@ def test_a_type_that_comes_first_is_looked_for_where_only_some_frames_begin_like
 def test_what_cannot_become_a_frame_is_not_waited_for() -> None:
     frame = TWINS.example("data", seed=1)
     decoder = TWINS.decoder()
-    decoder.spans(frame * 3)
-    decoder.spans(frame * 3 + bytes(10))
+    decoder.frames(frame * 3)
+    decoder.frames(frame * 3 + bytes(10))
     assert (decoder.stats.pending, decoder.stats.bytes_skipped) == (0, 10)
 
 
@@ -117,8 +122,8 @@ def test_a_shorter_frame_behind_the_others_is_not_waited_for() -> None:
     count = SHAPES["shape-count"]
     long, short = (count.build("data", first=0, last=9, samples=[dict(distance=1, quality=2)] * number) for number in (9, 2))
     decoder = count.decoder()
-    decoder.spans(long * 3)
-    assert sum(map(len, decoder.spans(long * 3 + short))) == 4
+    decoder.frames(long * 3)
+    assert sum(map(len, decoder.frames(long * 3 + short))) == 4
 
 
 @pytest.mark.parametrize("width", [3, 8, 16, 24, 32, 64])

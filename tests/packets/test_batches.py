@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import lidarspec as ls
-from lidarspec.framing.decoder import Counters
+from lidarspec.framing.results import Counters
 from lidarspec.packets.packets import Packets
 from lidarspec.packets.stream import PacketStream
 from lidarspec.scans.scans import Scan, ScanStream

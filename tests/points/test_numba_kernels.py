@@ -106,8 +106,8 @@ def test_it_is_chosen_by_itself_once_enough_points_were_made(compiled: bool, mon
     sensor = dataclasses.replace(SENSORS["ldrobot-stl27l"], points=functools.partial(points_of_another_kind))
     packets = sensor.decode(b"".join(frames_of("ldrobot-stl27l")))
     enough = 3 * 12 * len(packets)
-    monkeypatch.setattr("lidarspec.points.plan.WARM", enough if compiled else 0)
-    monkeypatch.setattr("lidarspec.points.plan.COLD", 10 * enough if compiled else enough)
+    monkeypatch.setattr("lidarspec.points.numba_kernels.kernels.WARM", enough if compiled else 0)
+    monkeypatch.setattr("lidarspec.points.numba_kernels.kernels.COLD", 10 * enough if compiled else enough)
     monkeypatch.setattr("lidarspec.points.numba_kernels.kernels.compiled_before", lambda source: compiled)
     used = []
     for _ in range(4):

@@ -13,6 +13,7 @@ import lidarspec
 from lidarspec import Sensor
 from lidarspec.columns.columns import remainder
 from lidarspec.points.evaluate import evaluated
+from lidarspec.points.numpy_plan import describe
 from lidarspec.points.plain import evaluate, points_function
 from lidarspec.points.plan import Plan, plan_for
 from lidarspec.simulation.simulator import simulate
@@ -30,7 +31,7 @@ def steps_in(azimuth: Callable[[Fields], Any]) -> tuple[Sensor, list[str]]:
     packets = sensor.decode(b"".join(simulate(STL27L, 3)))
     plan = plan_for(points_function(sensor, "data"), packets.batch(), packets.table.groups[0])  # type: ignore[attr-defined]
     assert isinstance(plan, Plan)
-    return sensor, plan.describe()
+    return sensor, describe(plan)
 
 
 def turning(f: Fields) -> Any:

@@ -22,8 +22,9 @@ import pytest
 import lidarspec as ls
 from lidarspec.errors import SourceError, UsageError, WireError
 from lidarspec.recording import appending
-from lidarspec.recording.format import _HEAD, HEADER, packed, read_header
-from lidarspec.recording.recordings import LARGEST, MAGIC, Record, Recorder, Recording
+from lidarspec.recording.format import _HEAD, HEADER, LARGEST, MAGIC, Record, packed, read_header
+from lidarspec.recording.recorders import Recorder
+from lidarspec.recording.recordings import Recording
 from lidarspec.transports.open_url import transport
 from lidarspec.transports.protocol import Chunk
 from tests.sensors.evidence import capture
@@ -221,7 +222,7 @@ def test_several_threads_may_write(path: Path) -> None:
 WRITER = """
 import os, sys
 from lidarspec.transports.protocol import Chunk
-from lidarspec.recording.recordings import Recorder
+from lidarspec.recording.recorders import Recorder
 
 recorder = Recorder(sys.argv[1])
 for number in range(10**9):

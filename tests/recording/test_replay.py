@@ -10,7 +10,7 @@ import sys
 import threading
 import time
 import tty
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -18,12 +18,11 @@ import pytest
 
 import lidarspec as ls
 from lidarspec.errors import SourceError, UsageError
-from lidarspec.recording.recorders import recorder
-from lidarspec.recording.recordings import Recorder
-from lidarspec.recording.replaying import Deadlines, Player, replayed
+from lidarspec.recording.recorders import Recorder, recorder
 from lidarspec.transports.open_url import transport
-from lidarspec.transports.outlets import FilePlayer, PtyPlayer, TcpPlayer, UdpPlayer, player
+from lidarspec.transports.outlets import FileOutlet, Outlet, PtyOutlet, TcpOutlet, UdpOutlet, replay_outlet
 from lidarspec.transports.protocol import Chunk, Disconnected
+from lidarspec.transports.serving import Deadlines, replayed
 from tests.lines import SLACK
 
 STREAM, DATAGRAMS = "ldrobot-stl27l", "velodyne-vlp16"
@@ -62,13 +61,13 @@ def datagrams(tmp_path: Path) -> Path:
 
 
 @contextlib.contextmanager
-def playing(path: Path, target: Player, *, speed: float | None, began: list[float] | None = None) -> Iterator[list[BaseException]]:
+def playing(path: Path, target: Outlet, *, speed: float | None, began: list[float] | None = None) -> Iterator[list[BaseException]]:
     """A replay in a thread of its own; what went wrong there, and by `began` when it began."""
     failed: list[BaseException] = []
 
     def run() -> None:
         try:
-            target.wait()
+            target.await_listener()
             if began is not None:
                 began.append(time.monotonic())
             with contextlib.closing(transport(path)) as source:
@@ -77,6 +76,7 @@ def playing(path: Path, target: Player, *, speed: float | None, began: list[floa
         except BaseException as error:
             failed.append(error)
         finally:
+            target.finish()
             target.close()
 
     thread = threading.Thread(target=run)
@@ -119,7 +119,7 @@ def until_the_end(read: Callable[[], bytes]) -> Iterator[bytes]:
 @pytest.mark.parametrize("speed", [0.5, 1.0, 10.0, None])
 @pytest.mark.parametrize("kind", [pytest.param("pty", marks=posix), "tcp"])
 def test_a_stream_comes_out_as_it_went_in_at_every_speed(stream: Path, kind: str, speed: float | None) -> None:
-    target = PtyPlayer() if kind == "pty" else TcpPlayer("tcp://127.0.0.1:0")
+    target = PtyOutlet() if kind == "pty" else TcpOutlet("127.0.0.1", 0, sole=True)
     with playing(stream, target, speed=speed) as failed:
         received = (from_pty if kind == "pty" else from_tcp)(target.place)
     assert not failed
@@ -134,7 +134,7 @@ def test_datagrams_come_out_as_they_went_in_at_every_speed(datagrams: Path, spee
         receiver.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 20)
         receiver.bind(("127.0.0.1", 0))
         receiver.settimeout(SLACK * LASTS * 2)
-        with playing(datagrams, UdpPlayer(f"udp://127.0.0.1:{receiver.getsockname()[1]}"), speed=speed) as failed:
+        with playing(datagrams, UdpOutlet(ports=receiver.getsockname()[1:]), speed=speed) as failed:
             received = [receiver.recv(65536) for _ in range(100)]
     assert not failed
     with contextlib.closing(transport(datagrams)) as source:
@@ -147,7 +147,7 @@ def test_datagrams_come_out_as_they_went_in_at_every_speed(datagrams: Path, spee
 @pytest.mark.parametrize("suffix", [".lsr", ".pcap"])
 def test_into_a_file_datagrams_keep_their_times_and_addresses(datagrams: Path, tmp_path: Path, suffix: str) -> None:
     copy = tmp_path / f"copy{suffix}"
-    with playing(datagrams, FilePlayer(recorder(copy, DATAGRAMS, datagrams=True)), speed=None) as failed:
+    with playing(datagrams, FileOutlet(recorder(copy, DATAGRAMS, datagrams=True)), speed=None) as failed:
         pass
     assert not failed
     with contextlib.closing(transport(datagrams)) as before, contextlib.closing(transport(copy)) as after:
@@ -163,18 +163,18 @@ def test_datagrams_go_to_the_ports_of_then(datagrams: Path) -> None:
         for receiver in receivers:
             receiver.bind(("127.0.0.1", 0))
             receiver.settimeout(SLACK)
-        target = stack.enter_context(contextlib.closing(UdpPlayer("udp://127.0.0.1")))
+        target = stack.enter_context(contextlib.closing(UdpOutlet()))
         for number, receiver in enumerate(receivers):
-            target.send(Chunk(bytes([number]), receiver=("10.0.0.1", receiver.getsockname()[1])))
+            target.send([Chunk(bytes([number]), receiver=("10.0.0.1", receiver.getsockname()[1]))], patient=True)
             assert receiver.recv(9) == bytes([number])
         with pytest.raises(UsageError, match="which port"):
-            target.send(Chunk(b"nowhere"))
+            target.send([Chunk(b"nowhere")], patient=True)
 
 
 @posix
 @pytest.mark.parametrize("speed", [1.0, 2.0])
 def test_arrivals_keep_the_times_of_then(stream: Path, speed: float) -> None:
-    target, began, arrived = PtyPlayer(), list[float](), list[tuple[float, int]]()
+    target, began, arrived = PtyOutlet(), list[float](), list[tuple[float, int]]()
     with playing(stream, target, speed=speed, began=began):
         descriptor, total = os.open(target.place, os.O_RDWR | os.O_NOCTTY), 0
         with contextlib.suppress(OSError):
@@ -202,17 +202,16 @@ class Clock:
         self.time += round(seconds * SECOND) + 3 * MS
 
 
-class Listener:
+class Listener(Outlet):
     """Remembers when each chunk came."""
-
-    place = "here"
 
     def __init__(self, clock: Clock) -> None:
         self.clock, self.times = clock, list[int]()
 
-    def wait(self) -> None: ...
+    def receive(self, wait: float) -> list[bytes]:
+        return []
 
-    def send(self, chunk: Chunk) -> None:
+    def send(self, chunks: Sequence[Chunk], *, patient: bool) -> None:
         self.times.append(self.clock.now())
 
     def close(self) -> None: ...
@@ -248,13 +247,13 @@ def test_times_that_go_back_hold_nothing_up() -> None:
 
 @posix
 def test_a_reader_that_leaves_is_noticed(stream: Path) -> None:
-    target = PtyPlayer()
+    target = PtyOutlet()
     with playing(stream, target, speed=1.0) as failed:
         descriptor = os.open(target.place, os.O_RDWR | os.O_NOCTTY)
         os.read(descriptor, 1)
         os.close(descriptor)
     assert [type(error) for error in failed] == [Disconnected]
-    server = TcpPlayer("tcp://127.0.0.1:0")
+    server = TcpOutlet("127.0.0.1", 0, sole=True)
     with playing(stream, server, speed=1.0) as failed, socket.create_connection(("127.0.0.1", int(server.place.split(":")[2]))) as reader:
         reader.recv(1)
     assert [type(error) for error in failed] == [Disconnected]
@@ -262,7 +261,7 @@ def test_a_reader_that_leaves_is_noticed(stream: Path) -> None:
 
 @posix
 def test_the_last_bytes_reach_a_slow_reader(stream: Path) -> None:
-    target = PtyPlayer()
+    target = PtyOutlet()
     received = bytearray()
     with playing(stream, target, speed=None):
         descriptor = os.open(target.place, os.O_RDWR | os.O_NOCTTY)
@@ -286,17 +285,17 @@ def test_the_last_bytes_reach_a_slow_reader(stream: Path) -> None:
 )
 def test_places_that_cannot_take_it_say_why(place: str, *, holds_datagrams: bool, reason: str) -> None:
     with pytest.raises(UsageError, match=reason):
-        player(place, datagrams=holds_datagrams)
+        replay_outlet(place, datagrams=holds_datagrams)
 
 
 def test_an_address_in_use_is_told() -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken, pytest.raises(SourceError, match="in use"):
-        TcpPlayer(f"tcp://127.0.0.1:{taken.getsockname()[1]}")
+        TcpOutlet("127.0.0.1", taken.getsockname()[1])
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="counts descriptors in /proc")
 def test_players_give_everything_back(stream: Path) -> None:
     before = len(os.listdir("/proc/self/fd"))
-    for made in (PtyPlayer(), TcpPlayer("tcp://127.0.0.1:0"), UdpPlayer("udp://127.0.0.1:9")):
+    for made in (PtyOutlet(), TcpOutlet("127.0.0.1", 0, sole=True), UdpOutlet(ports=[9])):
         made.close()
     assert len(os.listdir("/proc/self/fd")) == before

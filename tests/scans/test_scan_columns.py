@@ -17,7 +17,7 @@ from lidarspec.captures.pcap import Datagram, PcapWriter
 from lidarspec.framing.decoder import Decoder
 from lidarspec.packets.packets import Packets
 from lidarspec.packets.stream import PacketStream
-from lidarspec.points import lazy_columns as stretches
+from lidarspec.points import lazy_columns
 from lidarspec.points.cloud import COLUMNS, PointCloud
 from lidarspec.scans.scans import Scan, scans_of
 from lidarspec.simulation.simulator import simulate
@@ -61,8 +61,8 @@ def assert_cut_from(scans: list[Scan], whole: PointCloud, names: tuple[str, ...]
 @pytest.mark.parametrize("least", [0, 1 << 14, 1 << 30])
 @pytest.mark.parametrize("name", ["velodyne-vlp16", "robosense-m1", "hesai-xt32"])
 def test_scans_are_the_points_of_the_whole_cut(name: str, least: int, backend: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(stretches, "LEAST", least)
-    monkeypatch.setattr(stretches, "SHARED", 5000)
+    monkeypatch.setattr(lazy_columns, "LEAST", least)
+    monkeypatch.setattr(lazy_columns, "SHARED", 5000)
     packets = packets_of(name, 700, backend)
     scans = list(scans_of(packets.sensor, batches(packets, 1, 300, 2, 333)))
     assert len(scans) > 1

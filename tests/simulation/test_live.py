@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import os
 import re
@@ -23,7 +24,8 @@ from lidarspec.simulation.faults import Faults
 from lidarspec.simulation.scenes import Room, read_scene
 from lidarspec.spec import Udp
 from lidarspec.testing.fixtures import virtual_port
-from lidarspec.transports.serving import Served, door, write_file
+from lidarspec.transports.outlets import simulated_outlet
+from lidarspec.transports.serving import Served, write_file
 from tests.lines import SLACK, free_port
 from tests.simulation.test_simulator import off
 
@@ -155,7 +157,7 @@ def test_what_is_sent_while_nobody_listens_is_lost_as_on_a_wire() -> None:
                 sent = port.device.sent["data"]
                 assert abs(int(first["timestamp"][0] * 1800) - sent) < 0.5 * 1800
             time.sleep(0.2)
-        assert port.door.unsent > 0.3 * 84_600
+        assert port.outlet.unsent > 0.3 * 84_600
 
 
 @posix
@@ -180,11 +182,11 @@ def test_a_link_stands_on_no_file_of_somebody_else(tmp_path: Path) -> None:
     taken = tmp_path / "notes"
     taken.write_text("mine")
     with pytest.raises(SourceError, match="File exists"):
-        door(STL, "pty", taken)
+        simulated_outlet(STL, "pty", taken)
     assert taken.read_text() == "mine"
     stale = tmp_path / "ttyOLD"
     stale.symlink_to("/dev/pts/does-not-exist")
-    door(STL, "pty", stale).close()
+    simulated_outlet(STL, "pty", stale).close()
     assert not stale.is_symlink()
 
 
@@ -194,7 +196,7 @@ def test_datagrams_go_to_the_declared_ports_by_their_kind_unless_one_is_named() 
         receiver.bind(("127.0.0.1", 0))
         receiver.settimeout(SLACK)
     ports = [receiver.getsockname()[1] for receiver in receivers]
-    sensor = ls.spec.replaced(VLP, links={"data": Udp(*ports)})
+    sensor = dataclasses.replace(VLP, links={"data": Udp(*ports)})
     with virtual_port(sensor, to="udp://") as port:
         assert port.path == f"udp://127.0.0.1?port={ports[0]},{ports[1]}"
         assert [{len(receiver.recv(2000)) for _ in range(20)} for receiver in receivers] == [{1206}, {512}]
@@ -218,7 +220,7 @@ def test_over_tcp_several_listen_and_a_slow_one_holds_nobody_up() -> None:
             assert scans(device, 2)
             assert scans(other, 2)
         with pytest.raises(SourceError, match="in use"):
-            door(STL, port.path)
+            simulated_outlet(STL, port.path)
         port.unplug()
         with pytest.raises(SourceError):
             ls.open(port.path, STL)
@@ -254,13 +256,13 @@ def test_a_destination_that_cannot_carry_the_sensor_is_refused(tmp_path: Path) -
         (VLP, "udp://127.0.0.1:99999", "a port is a number"),
     ):
         with pytest.raises(UsageError, match=said):
-            door(sensor, place)
+            simulated_outlet(sensor, place)
     with pytest.raises(UsageError, match="goes with pty alone"):
-        door(VLP, "udp://", tmp_path / "link")
+        simulated_outlet(VLP, "udp://", tmp_path / "link")
     with pytest.raises(UnknownFormat):
         write_file(SimulatedDevice(STL), tmp_path / "made.csv", 1)
     with pytest.raises(SourceError):
-        door(VLP, "udp://no-such-host.invalid")
+        simulated_outlet(VLP, "udp://no-such-host.invalid")
 
 
 @posix
@@ -272,7 +274,7 @@ def test_what_goes_wrong_in_the_thread_of_a_port_is_raised_at_its_end() -> None:
             tried.set()
             raise ZeroDivisionError
 
-    port = Served(Broken(STL, faults=Faults()), door(STL, "pty"))
+    port = Served(Broken(STL, faults=Faults()), simulated_outlet(STL, "pty"))
     assert tried.wait(10)
     with pytest.raises(ZeroDivisionError):
         port.close()

@@ -26,9 +26,9 @@ from construct import (
 
 from lidarspec import SpecError
 from lidarspec.exports.messages import messages
-from lidarspec.exports.tree import Select, nodes
 from lidarspec.framing.frame_engine import CompiledCodec, codec
 from lidarspec.spec import Scaled
+from lidarspec.spec.tree import Select, nodes
 from tests.engine.against_construct import BACKENDS, agree, sensor
 
 KIND = Enum(Int8ub, idle=1, busy=2, lost=7)

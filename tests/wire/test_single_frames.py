@@ -8,7 +8,7 @@ from collections.abc import Callable
 import pytest
 
 from lidarspec.spec import Checksum, Crc, Fold15, Sum, WordXor, Xor
-from lidarspec.wire.single_frames import single
+from lidarspec.spec.checksums import single
 
 
 class Own(Checksum):

@@ -1,23 +1,20 @@
-"""What serial ports, UDP and TCP have in common: addresses with options, the host's clock, failures with the next command."""
+"""What transports share: addresses with options, the host's clock, waiting for a descriptor, failures with the next command."""
 
 from __future__ import annotations
 
-import errno
 import os
 import re
 import select
-import socket
+import sys
 import time
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from urllib.parse import parse_qs
 
-from lidarspec.errors import SourceError, UnknownOption, UsageError
+from lidarspec.errors import SourceError, UnknownOption, UsageError, suggest
 from lidarspec.spec.sensor import Sensor
-from lidarspec.transports.protocol import Chunk, Disconnected, Statistics
+from lidarspec.transports.protocol import Disconnected
 
-#: seconds between two looks at whether somebody wants to stop.
-POLL = 0.05
 #: options that every live SOURCE takes: the address of the link that commands go over, where it is not that of the data.
 COMMON = frozenset({"control"})
 _SWITCH = {"0": False, "1": True, "false": False, "true": True, "off": False, "on": True}
@@ -97,62 +94,18 @@ class HostClock:
         return time.monotonic_ns() + self._offset
 
 
-class LiveBase:
-    """A transport that does not end; see `lidarspec.transports.protocol.LiveTransport`."""
-
-    datagrams = False
-    label = ""
-
-    def __init__(self) -> None:
-        self.statistics, self.clock = Statistics(), HostClock()
-        self.warnings: list[str] = []
-        self.closed = False
-
-    def read(self, timeout: float) -> list[Chunk]:
-        raise NotImplementedError
-
-    def chunks(self) -> Iterator[Chunk]:
-        """What arrives, until the transport is closed or its device goes away."""
-        while not self.closed:
-            yield from self.read(POLL)
-
-    def lines(self, *, dtr: bool | None = None, rts: bool | None = None) -> None:
-        """Set control lines, which only a serial port has."""
-        raise UsageError(f"{self.label}: only a serial port has control lines")
-
-    def peer(self) -> str | None:
-        """The host of the device, as far as it is known."""
-        return None
-
-
 def readable(descriptor: int, timeout: float) -> bool:
     """Whether there is something to read, or the other side has hung up, within so many seconds."""
-    if not hasattr(select, "poll"):
+    if sys.platform == "win32":  # which has no poll
         return bool(select.select([descriptor], [], [], timeout)[0])
     poller = select.poll()
     poller.register(descriptor, select.POLLIN)
     return bool(poller.poll(timeout * 1000))
 
 
-def listener(host: str, port: int) -> socket.socket:
-    """A TCP socket that listens at an address; port 0 takes any that is free.
-
-    Raises:
-        SourceError: where the address cannot be had.
-    """
-    try:
-        return socket.create_server((host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET)
-    except OSError as error:
-        text = f"tcp://{host}:{port}: cannot listen there: {reason(error)}"
-        is_taken = error.errno == errno.EADDRINUSE
-        raise failure(text, f"ss -ltnp 'sport = :{port}'" if is_taken else f"the same with tcp://127.0.0.1:{port}") from None
-
-
 def failure(text: str, following: str) -> SourceError:
     """A SourceError with the next command to type."""
-    error = SourceError(text)
-    error.add_note(f"next: {following}")
-    return error
+    return suggest(SourceError(text), following)
 
 
 def lost(label: str, error: Exception | str) -> Disconnected:
