@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from lidarspec.columns.columns import Batch, Carry, Column, Fields, aligned, unpadded
 from lidarspec.errors import SpecError
-from lidarspec.framing.decoder import Counters
+from lidarspec.framing.results import Counters
 from lidarspec.points.cloud import PointCloud
 from lidarspec.points.conventions import (
     coordinates,
