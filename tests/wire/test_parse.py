@@ -27,10 +27,10 @@ from construct import (
     this,
 )
 
+from lidarspec import Sensor
 from lidarspec.framing.frame_engine import CompiledCodec, codec
 from lidarspec.spec import Frame
 from lidarspec.spec.construct_layer import clean
-from lidarspec.spec.sensor import Sensor
 from lidarspec.wire import layout_tree
 from lidarspec.wire.layout import Layout
 from lidarspec.wire.layout_tree import HeaderTree, frame_layouts
