@@ -19,4 +19,6 @@ def streams(sensors: dict[str, Sensor]) -> dict[str, Sensor]:
 
 EVERY: dict[str, Sensor] = {**lidarspec.sensors(), **SHAPES}
 DISTINCT = distinct(EVERY)
+#: (sensor, frame type), each frame once, whichever sensors have it.
+FRAMES = list({id(frame): (sensor.id, name) for sensor in EVERY.values() for name, frame in sensor.frames.items()}.values())
 STREAMS = streams(EVERY)

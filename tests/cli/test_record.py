@@ -21,7 +21,7 @@ import pytest
 import lidarspec as ls
 from lidarspec.recording.recorders import Recorder
 from lidarspec.recording.recordings import Recording
-from lidarspec.transports.protocol import Chunk
+from lidarspec.spec import Chunk
 from tests.cli.running import printed, process, ran
 from tests.lines import SLACK, port
 

@@ -10,9 +10,8 @@ from collections.abc import Sequence
 import pytest
 
 import lidarspec as ls
-from lidarspec import CommandError, Sensor, Session, UsageError
+from lidarspec import CommandError, Found, Sensor, Session, UsageError
 from lidarspec.errors import OutOfRange, ReplyTimeout, UnknownCommand, UnknownField
-from lidarspec.framing.results import Found
 from lidarspec.spec import Command, Udp
 from tests.shapes.commands import SENSOR
 

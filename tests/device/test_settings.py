@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 import lidarspec as ls
+from lidarspec import Scan
 from lidarspec.device import settings
 from lidarspec.points.cloud import Mount
-from lidarspec.scans.scans import Scan
 from lidarspec.simulation.simulator import simulate
 from tests.cli.running import ran
 

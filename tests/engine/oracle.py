@@ -13,9 +13,9 @@ import numpy as np
 from construct import ConstructError
 
 from lidarspec import Sensor
-from lidarspec.columns.columns import Batch, Fields
+from lidarspec.columns.columns import Batch
 from lidarspec.framing.frame_engine import InterpretedCodec
-from lidarspec.spec import Frame
+from lidarspec.spec import Fields, Frame
 
 #: (name, offset, bytes) of a frame.
 Cut = tuple[str, int, bytes]

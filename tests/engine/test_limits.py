@@ -14,15 +14,10 @@ import lidarspec
 from lidarspec import Sensor
 from lidarspec.framing.frame_engine import CompiledCodec, codec
 from lidarspec.testing import subject as material
+from tests.all_sensors import STREAMS
 from tests.engine.streams import worst
 from tests.shapes import SHAPES
 
-EVERY = {**lidarspec.sensors(), **SHAPES}
-#: one of each family on a byte stream: relatives that share their frames are cut alike.
-STREAMS = {
-    sensor.id: sensor
-    for sensor in {tuple(map(id, sensor.frames.values())): sensor for sensor in EVERY.values() if not sensor.datagrams}.values()
-}
 COMPILED = {name: sensor for name, sensor in STREAMS.items() if isinstance(codec(sensor.frames[sensor.data_frame]), CompiledCodec)}
 MEGABYTE = 1 << 20
 

@@ -15,12 +15,12 @@ import numpy as np
 import pytest
 
 import lidarspec as ls
+from lidarspec import Scan
 from lidarspec.device.capture_thread import BoundedQueue
 from lidarspec.formats import write
 from lidarspec.packets.clocks import Unwrapper
-from lidarspec.scans.scans import Scan
 from lidarspec.simulation.simulator import simulate
-from lidarspec.transports.protocol import Chunk
+from lidarspec.spec import Chunk
 from tests.cli.running import ran
 from tests.lines import Port, port, turning
 from tests.shapes import SHAPES

@@ -17,11 +17,10 @@ from lidarspec.errors import UnknownFrame
 from lidarspec.explaining.explanation import Explanation, explain
 from lidarspec.explaining.wording import hexdump
 from lidarspec.spec import Checksummed, Frame, Polar, Scaled, Simulation, Sum, Xor
+from tests.all_sensors import EVERY as SENSORS, FRAMES
 from tests.shapes import SHAPES
 
 EXAMPLE = bytes.fromhex("542c6808ab7ee000e4dc00e2d900e5d500e3d300e4d000e9cd00e4ca00e2c700e9c500e5c200e5c000e5be823a1a50")
-SENSORS = {**ls.sensors(), **SHAPES}
-FRAMES = [(sensor, frame) for sensor, value in SENSORS.items() for frame in value.frames]
 SMALL = 150
 
 

@@ -10,12 +10,10 @@ import lidarspec as ls
 from lidarspec.explaining.explanation import Flip, explain, flips
 from lidarspec.explaining.listing import folded, parents, text, told
 from lidarspec.explaining.wording import Span, bit_picture
+from tests.all_sensors import EVERY as SENSORS, FRAMES
 from tests.cli.running import EXAMPLE, printed, process, ran
-from tests.shapes import SHAPES
 
 STL = ls.sensor("ldrobot-stl27l")
-SENSORS = {**ls.sensors(), **SHAPES}
-FRAMES = [(sensor, frame) for sensor, value in SENSORS.items() for frame in value.frames]
 M1C1 = bytes.fromhex("aa55 00 02 0105 0106 0000 2c2b0a 38570a".replace(" ", ""))
 DAMAGED = EXAMPLE[:-1] + b"\x51"
 

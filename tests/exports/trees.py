@@ -4,16 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
-import lidarspec
-from lidarspec import Sensor
+from tests import all_sensors
 from tests.exports import oddities
-from tests.shapes import SHAPES
 
-EVERY: dict[str, Sensor] = {**lidarspec.sensors(), **SHAPES, oddities.SENSOR.id: oddities.SENSOR}
-#: one sensor of those that share their frames.
-DISTINCT: dict[str, Sensor] = {
-    sensor.id: sensor for sensor in {tuple(map(id, each.frames.values())): each for each in EVERY.values()}.values()
-}
+EVERY = {**all_sensors.EVERY, oddities.SENSOR.id: oddities.SENSOR}
+DISTINCT = all_sensors.distinct(EVERY)
 
 
 def values(parsed: Any) -> dict[str, list[Any]]:

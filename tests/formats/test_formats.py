@@ -138,9 +138,10 @@ def test_a_plugin_adds_a_format_and_takes_none_away(tmp_path: Path) -> None:
 from pathlib import Path
 import lidarspec as ls
 from lidarspec.formats import format_of, formats, write
-from lidarspec.plugins import hookimpl, registry
+from lidarspec.spec import hookimpl
+from lidarspec.plugins import registry
 from lidarspec.errors import UnknownFormat
-from lidarspec.transports.protocol import Format
+from lidarspec.spec import Format
 
 class Plugin:
     @hookimpl
@@ -166,9 +167,10 @@ def test_a_plugin_whose_hook_fails_is_a_spec_error() -> None:
     script = """
 import lidarspec as ls
 from lidarspec.formats import format_of
-from lidarspec.plugins import hookimpl, registry
+from lidarspec.spec import hookimpl
+from lidarspec.plugins import registry
 from lidarspec.errors import UnknownFormat
-from lidarspec.transports.protocol import Format
+from lidarspec.spec import Format
 
 class Plugin:
     @hookimpl

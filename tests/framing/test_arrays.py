@@ -15,24 +15,20 @@ from construct import Const, Int8ul, Int16ub, Struct
 from numpy.typing import NDArray
 
 import lidarspec
-from lidarspec import Sensor
-from lidarspec.columns.columns import Batch, Fields
+from lidarspec import Counters, Sensor
+from lidarspec.columns.columns import Batch
 from lidarspec.framing.frame_engine import CompiledCodec, codec
-from lidarspec.framing.results import Counters, Frames
+from lidarspec.framing.results import Frames
 from lidarspec.packets.clocks import Unwrapper, clock_ns
 from lidarspec.packets.packets import joined
 from lidarspec.packets.stream import PacketStream
-from lidarspec.spec import Frame
+from lidarspec.spec import Fields, Frame
 from lidarspec.wire.arrays import repeated
 from lidarspec.wire.frame_table import Rows
+from tests.all_sensors import DISTINCT
 from tests.shapes import SHAPES
 
-#: one of each family: relatives that share their frames are cut alike.
-EVERY = {
-    sensor.id: sensor
-    for sensor in {tuple(map(id, sensor.frames.values())): sensor for sensor in {**lidarspec.sensors(), **SHAPES}.values()}.values()
-}
-each_sensor = pytest.mark.parametrize("sensor", EVERY.values(), ids=EVERY)
+each_sensor = pytest.mark.parametrize("sensor", DISTINCT.values(), ids=DISTINCT)
 EXAMPLES = 40
 
 

@@ -9,24 +9,20 @@ import numpy as np
 import pytest
 from construct import Bytes, Const, Struct
 
-import lidarspec
 from lidarspec import Sensor
 from lidarspec.framing.results import Frames
 from lidarspec.framing.steady import SMALL
 from lidarspec.spec import Checksummed, Frame, Xor
 from lidarspec.spec.row_checksums import FEW, SHORT, registers
 from lidarspec.testing import subject as material
+from tests.all_sensors import streams
 from tests.engine.streams import Books, damaged
 from tests.shapes import SHAPES
 
 TWINS = SHAPES["shape-twins"]
 #: the short type first: it begins where each of the long ones does.
 SHORT_FIRST = dataclasses.replace(TWINS, id="shape-short-first", frames=dict(reversed(TWINS.frames.items())))
-EVERY = {**lidarspec.sensors(), **SHAPES, SHORT_FIRST.id: SHORT_FIRST}
-STREAMS = {
-    sensor.id: sensor
-    for sensor in {tuple(map(id, sensor.frames.values())): sensor for sensor in EVERY.values() if not sensor.datagrams}.values()
-}
+STREAMS = {**streams(SHAPES), SHORT_FIRST.id: SHORT_FIRST}
 
 
 def as_it_comes(data: bytes, size: int, seed: int) -> list[bytes]:

@@ -11,10 +11,9 @@ import numpy as np
 import pytest
 
 import lidarspec as ls
-from lidarspec.framing.results import Counters
-from lidarspec.packets.packets import Packets
+from lidarspec import Counters, Packets, Scan
 from lidarspec.packets.stream import PacketStream
-from lidarspec.scans.scans import Scan, ScanStream
+from lidarspec.scans.scans import ScanStream
 from lidarspec.simulation.simulator import simulate
 from tests.shapes import SHAPES
 

@@ -14,8 +14,7 @@ import numpy as np
 import pytest
 
 import lidarspec
-from lidarspec import UsageError
-from lidarspec.packets.packets import Packets
+from lidarspec import Packets, UsageError
 from lidarspec.points.evaluate import evaluated
 from lidarspec.points.numba_kernels import checksums as kernelsums
 from lidarspec.points.plain import evaluate, points_function

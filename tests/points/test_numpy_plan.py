@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 import lidarspec
-from lidarspec import Sensor
-from lidarspec.packets.packets import Packets
+from lidarspec import Packets, Sensor
 from lidarspec.points.evaluate import evaluated
 from lidarspec.points.plain import evaluate, points_function
 from lidarspec.points.plan import Plan, plan_for

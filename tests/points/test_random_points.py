@@ -11,14 +11,12 @@ import numpy as np
 import pytest
 
 import lidarspec
-from lidarspec import Sensor
-from lidarspec.packets.packets import Packets
+from lidarspec import Packets, Sensor
 from lidarspec.points.evaluate import evaluated
 from lidarspec.points.plain import evaluate, points_function
 from lidarspec.points.plan import Plan, plan_for
 from lidarspec.simulation.simulator import simulate
-from lidarspec.spec import Fields, Polar
-from lidarspec.spec.vocabulary import following, previous, spread, take, wrap
+from lidarspec.spec import Fields, Polar, following, previous, spread, take, wrap
 from lidarspec.testing.agreement import assert_same_points
 
 Expression = Callable[[Fields], Any]

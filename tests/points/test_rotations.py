@@ -17,8 +17,7 @@ from lidarspec.points.numpy_plan import describe
 from lidarspec.points.plain import evaluate, points_function
 from lidarspec.points.plan import Plan, plan_for
 from lidarspec.simulation.simulator import simulate
-from lidarspec.spec import Fields, Polar
-from lidarspec.spec.vocabulary import spread
+from lidarspec.spec import Fields, Polar, spread
 from lidarspec.testing.agreement import assert_same_points
 
 STL27L = lidarspec.sensor("ldrobot-stl27l")

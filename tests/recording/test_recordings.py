@@ -25,8 +25,8 @@ from lidarspec.recording import appending
 from lidarspec.recording.format import _HEAD, HEADER, LARGEST, MAGIC, Record, packed, read_header
 from lidarspec.recording.recorders import Recorder
 from lidarspec.recording.recordings import Recording
+from lidarspec.spec import Chunk
 from lidarspec.transports.open_url import transport
-from lidarspec.transports.protocol import Chunk
 from tests.sensors.evidence import capture
 
 STREAM, DATAGRAMS = "ldrobot-stl27l", "velodyne-hdl32e"
@@ -221,7 +221,7 @@ def test_several_threads_may_write(path: Path) -> None:
 
 WRITER = """
 import os, sys
-from lidarspec.transports.protocol import Chunk
+from lidarspec.spec import Chunk
 from lidarspec.recording.recorders import Recorder
 
 recorder = Recorder(sys.argv[1])

@@ -19,9 +19,9 @@ import pytest
 import lidarspec as ls
 from lidarspec.errors import SourceError, UsageError
 from lidarspec.recording.recorders import Recorder, recorder
+from lidarspec.spec import Chunk, Disconnected
 from lidarspec.transports.open_url import transport
 from lidarspec.transports.outlets import FileOutlet, Outlet, PtyOutlet, TcpOutlet, UdpOutlet, replay_outlet
-from lidarspec.transports.protocol import Chunk, Disconnected
 from lidarspec.transports.serving import Deadlines, replayed
 from tests.lines import SLACK
 

@@ -12,14 +12,12 @@ import numpy as np
 import pytest
 
 import lidarspec as ls
-from lidarspec import Sensor
+from lidarspec import Decoder, Packets, PointCloud, Scan, Sensor
 from lidarspec.captures.pcap import Datagram, PcapWriter
-from lidarspec.framing.decoder import Decoder
-from lidarspec.packets.packets import Packets
 from lidarspec.packets.stream import PacketStream
 from lidarspec.points import lazy_columns
-from lidarspec.points.cloud import COLUMNS, PointCloud
-from lidarspec.scans.scans import Scan, scans_of
+from lidarspec.points.cloud import COLUMNS
+from lidarspec.scans.scans import scans_of
 from lidarspec.simulation.simulator import simulate
 from lidarspec.spec import OnChange, OnWrap
 from lidarspec.wire.frame_table import Rows

@@ -2,26 +2,22 @@
 
 from __future__ import annotations
 
-import lidarspec
 from lidarspec import Sensor
 from lidarspec.framing.frame_engine import InterpretedCodec, codec
 from lidarspec.testing import SensorConformance
-from tests.shapes import SHAPES
-
-EVERY: dict[str, Sensor] = {**lidarspec.sensors(), **SHAPES}
+from lidarspec.testing.conformance import PROPERTIES
+from tests.all_sensors import DISTINCT, EVERY
 
 #: frames that construct alone can read.
 REFUSED = {"shape-text data"}
-
-_tried: set[tuple[int, ...]] = set()
+#: what is left out for a relative: what holds for the frames is tried on one sensor of those that share them.
+OF_FRAMES = {f"test_{one.name}": None for one in PROPERTIES if one.each == "frame"}
 
 
 def _tests(sensor: Sensor) -> type[SensorConformance]:
-    """The test class of one sensor; a relative that shares its frames with one before is tried with fewer of them."""
-    frames = tuple(map(id, sensor.frames.values()))
-    effort = {"examples": SensorConformance.examples // 5} if frames in _tried else {}
-    _tried.add(frames)
-    return type(f"Test_{sensor.id.replace('-', '_')}", (SensorConformance,), {"sensor": sensor, "__module__": __name__, **effort})
+    """The test class of one sensor."""
+    shared = {} if sensor.id in DISTINCT else OF_FRAMES
+    return type(f"Test_{sensor.id.replace('-', '_')}", (SensorConformance,), {"sensor": sensor, "__module__": __name__, **shared})
 
 
 globals().update({case.__name__: case for case in map(_tests, EVERY.values())})

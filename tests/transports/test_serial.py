@@ -10,8 +10,8 @@ import pytest
 
 import lidarspec as ls
 from lidarspec.errors import SourceError, UsageError
+from lidarspec.spec import Disconnected
 from lidarspec.transports.open_url import is_port, transport
-from lidarspec.transports.protocol import Disconnected
 from lidarspec.transports.serial import SerialTransport
 from tests.lines import Port, port, until
 from tests.shapes import SHAPES

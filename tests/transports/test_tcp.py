@@ -8,8 +8,8 @@ from collections.abc import Iterator
 import pytest
 
 from lidarspec.errors import SourceError, UsageError
+from lidarspec.spec import Disconnected
 from lidarspec.transports.open_url import transport
-from lidarspec.transports.protocol import Disconnected
 from lidarspec.transports.tcp import TcpTransport
 from tests.lines import until
 

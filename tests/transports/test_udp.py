@@ -10,8 +10,8 @@ import pytest
 
 import lidarspec as ls
 from lidarspec.errors import SourceError, UsageError
+from lidarspec.spec import Chunk
 from lidarspec.transports.open_url import transport
-from lidarspec.transports.protocol import Chunk
 from lidarspec.transports.udp import BUFFER, UdpTransport, _Socket, shortfall
 from tests.lines import free_port, udp, until
 from tests.shapes import SHAPES

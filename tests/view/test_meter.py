@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 import lidarspec as ls
-from lidarspec.framing.decoder import Decoder
-from lidarspec.packets.packets import Packets
+from lidarspec import Decoder, Packets
 from lidarspec.packets.stream import PacketStream
 from lidarspec.scans.scans import ScanStream
 from lidarspec.simulation.simulator import simulate

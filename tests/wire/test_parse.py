@@ -27,19 +27,17 @@ from construct import (
     this,
 )
 
-import lidarspec as ls
+from lidarspec import Sensor
 from lidarspec.framing.frame_engine import CompiledCodec, codec
 from lidarspec.spec import Frame
 from lidarspec.spec.construct_layer import clean
-from lidarspec.spec.sensor import Sensor
 from lidarspec.wire import layout_tree
 from lidarspec.wire.layout import Layout
 from lidarspec.wire.layout_tree import HeaderTree, frame_layouts
 from lidarspec.wire.parse import unpacked
-from tests.shapes import SHAPES
+from tests.all_sensors import EVERY, FRAMES
 
-EVERY = {**ls.sensors(), **SHAPES}
-CASES = [(sensor, name) for sensor in EVERY.values() for name, frame in sensor.frames.items() if isinstance(codec(frame), CompiledCodec)]
+CASES = [(EVERY[sensor], name) for sensor, name in FRAMES if isinstance(codec(EVERY[sensor].frames[name]), CompiledCodec)]
 
 
 def same(one: Any, other: Any) -> None:

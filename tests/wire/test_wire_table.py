@@ -12,12 +12,10 @@ from lidarspec.framing.frame_engine import CompiledCodec, codec
 from lidarspec.spec import Frame
 from lidarspec.wire.layout import Layout
 from lidarspec.wire.wire_table import INDICES, Extent, WireRow, frame_size, wire_table
+from tests.all_sensors import EVERY as SENSORS, FRAMES as EVERY_FRAME
 from tests.shapes import SHAPES
 
-SENSORS = {**ls.sensors(), **SHAPES}
-FRAMES = [
-    (sensor, name) for sensor, value in SENSORS.items() for name, frame in value.frames.items() if isinstance(codec(frame), CompiledCodec)
-]
+FRAMES = [(sensor, name) for sensor, name in EVERY_FRAME if isinstance(codec(SENSORS[sensor].frames[name]), CompiledCodec)]
 
 
 def evaluated(formula: str, names: dict[str, object]) -> int:
