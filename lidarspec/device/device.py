@@ -1,6 +1,7 @@
-"""Packets and scans out of what arrives, with what one batch has to know of the one before.
+"""A sensor on a source: packets and scans as they come, commands, counters.
 
-A sensor on a source: packets and scans as they come, commands, counters.
+A `Device` asks its input for what has arrived: a `FileInput` or a `LiveInput`, which look the same from here. `PacketReader` makes
+packets of one type out of it, with what one batch has to know of the one before, and scans out of those.
 """
 
 from __future__ import annotations
@@ -35,6 +36,8 @@ from lidarspec.transports.protocol import LiveTransport, Transport
 
 #: batches kept while nobody knows yet which data frame the sensor answers in.
 UNDECIDED = 256
+#: seconds that one wait for data takes where there is no end to waiting.
+LONG = 3600.0
 
 
 class PacketReader:
@@ -89,10 +92,6 @@ class PacketReader:
     def _made(self, name: str) -> PacketStream:
         decoder = self._decoder
         return PacketStream(self._sensor, name, decoder.stats, interpreted=decoder.interpreted, backend=decoder.backend, state=self._state)
-
-
-#: seconds that one wait for data takes where there is no end to waiting.
-LONG = 3600.0
 
 
 class Device:
