@@ -14,7 +14,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, overload
 
-from lidarspec.device.arrivals import Arrival
+from lidarspec.device.arrivals import Arrival, Input
 from lidarspec.device.file_input import FileInput
 from lidarspec.device.live_input import PERIOD, LiveInput
 from lidarspec.device.session import Reply
@@ -121,7 +121,7 @@ class Device:
         self._own_recorder: Log | None = None
         self._input = self._opened(backend, record, overflow, period)
         self._finalizer = weakref.finalize(self, _close, self._input, self._own_recorder)
-        if start and isinstance(self._input, LiveInput):
+        if start:
             try:
                 self._input.begin()
             except BaseException:
@@ -147,7 +147,7 @@ class Device:
     @property
     def queued(self) -> int | None:
         """Chunks that have arrived and wait to be decoded; None for a file."""
-        return len(self._input.queue) if isinstance(self._input, LiveInput) else None
+        return self._input.queued
 
     @property
     def is_live(self) -> bool:
@@ -222,7 +222,11 @@ class Device:
         return found
 
     def newest(self, wait: float) -> Scan | None:
-        """The same as `latest`, but None where no scan comes within `wait` seconds."""
+        """The newest complete scan, newer than the one given last; None where none comes within `wait` seconds.
+
+        Raises:
+            SourceError: where the input has ended or the device was closed.
+        """
         deadline, mark, reader = time.monotonic() + wait, self._input.mark(), self._reader(None)
         while not (self._unseen and self._input.caught_up(mark)):
             if self._input.ended:
@@ -262,8 +266,7 @@ class Device:
 
     def leave_on(self) -> None:
         """Let the sensor go on as it is when the device is closed."""
-        if isinstance(self._input, LiveInput):
-            self._input.stays_on = True
+        self._input.stays_on = True
 
     def close(self) -> None:
         """Stop the sensor where it was started, and give the source back; a second call does nothing."""
@@ -278,7 +281,7 @@ class Device:
     def __repr__(self) -> str:
         return f"Device({self.sensor.id} on {self._source}, {self.state}: {self.stats})"
 
-    def _opened(self, backend: str, record: RecordTo | None, overflow: str | None, period: float) -> FileInput | LiveInput:
+    def _opened(self, backend: str, record: RecordTo | None, overflow: str | None, period: float) -> Input:
         opened = transport(self._source, self.sensor)
         try:
             if not isinstance(opened, LiveTransport):
@@ -295,8 +298,7 @@ class Device:
 
     def _reader(self, frame: str | None) -> PacketReader:
         if frame not in self._streams:
-            first = self._input.first_state() if isinstance(self._input, FileInput) else {}
-            self._streams[frame] = PacketReader(self.sensor, frame, self._input.decoder, first)
+            self._streams[frame] = PacketReader(self.sensor, frame, self._input.decoder, self._input.first_state())
         return self._streams[frame]
 
     def _taken_back(self) -> Arrival | None:
@@ -319,7 +321,7 @@ class Device:
                 yield arrival
 
 
-def _close(source: FileInput | LiveInput | Transport, recorder: Log | None) -> None:
+def _close(source: Input | Transport, recorder: Log | None) -> None:
     """Give everything back; the recording is closed even where the source fails."""
     try:
         source.close()

@@ -179,6 +179,15 @@ class LiveInput:
         stats.queue_dropped = self.queue.dropped
         return stats
 
+    @property
+    def queued(self) -> int:
+        """Chunks that have arrived and wait to be decoded."""
+        return len(self.queue)
+
+    def first_state(self) -> dict[str, bytes]:
+        """Nothing is known of a live sensor before it says it."""
+        return {}
+
     def begin(self) -> None:
         """Send the commands that the sensor declares for its start.
 
@@ -216,7 +225,7 @@ class LiveInput:
                     return None
 
     def mark(self) -> int:
-        """How much has been produced; see `caught_up`."""
+        """How much has been produced, as a number for `caught_up`."""
         return self.queue.produced
 
     def caught_up(self, mark: int) -> bool:
@@ -224,7 +233,12 @@ class LiveInput:
         return not self._ready and self.queue.consumed + self.queue.dropped >= mark
 
     def send(self, name: str, *, timeout: float | None = None, **arguments: Any) -> Reply:
-        """The reply to a command; see `Device.send`."""
+        """The reply to a command, which other threads may wait for at the same time.
+
+        Raises:
+            UnknownCommand, UnknownField, MissingField, OutOfRange: for what the sensor does not take; nothing is sent.
+            CommandError: where the device refuses, or the connection is lost; ReplyTimeout where it keeps silent.
+        """
         if name in self.sensor.commands:
             self._await_sender(self.sensor.commands[name], timeout)
         with self._talk:
