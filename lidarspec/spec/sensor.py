@@ -12,13 +12,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from lidarspec.errors import UnknownOption, UsageError
-from lidarspec.framing.decoder import Decoder, backend as checked_backend, frames_of, is_stream
-from lidarspec.framing.results import Found
-from lidarspec.packets.packets import Packets
-from lidarspec.packets.stream import PacketStream, data_frame
-from lidarspec.scans.scans import Scan, scans_of
 from lidarspec.spec.description import Spec
-from lidarspec.wire.build import build
 
 if TYPE_CHECKING:
     from lidarspec.framing.decoder import Decoder
@@ -96,6 +90,7 @@ class Sensor(Spec):
         Raises:
             UsageError: for a missing or unknown field, or a value that its field cannot hold.
         """
+        from lidarspec.wire.build import build
 
         return build(self, frame, value, values, units=units)
 
@@ -121,11 +116,13 @@ class Sensor(Spec):
         Args:
             stream: True reads a byte stream, False one datagram for each `feed`; by default what the data link says.
         """
-        from lidarspec.framing.decoder import Decoder
-        from lidarspec.points.numba_kernels import compiled_sums
+        from lidarspec.framing.decoder import Decoder, backend as checked_backend
 
-        chosen = checked_backend(backend)
-        sums = compiled_sums() if chosen == "jit" else None
+        chosen, sums = checked_backend(backend), None
+        if chosen == "jit":
+            from lidarspec.points.numba_kernels import compiled_sums
+
+            sums = compiled_sums()
         stream = not self.datagrams if stream is None else stream
         return Decoder(self, stream=stream, interpreted=chosen == "construct", backend=chosen, sums=sums)
 
@@ -136,9 +133,10 @@ class Sensor(Spec):
             data: bytes (a stream), an iterable of datagrams, or an (n, size) uint8 array of datagrams.
             backend: "auto", "numpy", "jit" or "construct": the same results.
         """
+        from lidarspec.framing.decoder import frames_of, is_stream
 
         decoder = self.decoder(stream=is_stream(data), backend=backend)
-        return [found for spans in frames_of(decoder, data) for found in spans.found()]
+        return [found for frames in frames_of(decoder, data) for found in frames.found()]
 
     def decode(self, data: Any, frame: str | None = None, *, backend: str = "auto") -> Packets:
         """The data frames, or those of another type, as columns.
@@ -147,11 +145,13 @@ class Sensor(Spec):
             data: bytes (a stream), an iterable of datagrams, or an (n, size) uint8 array of datagrams.
             backend: "auto", "numpy", "jit" or "construct": the same results.
         """
+        from lidarspec.framing.decoder import frames_of, is_stream
+        from lidarspec.packets.stream import PacketStream, data_frame
 
         decoder = self.decoder(stream=is_stream(data), backend=backend)
-        spans = frames_of(decoder, data)
-        name = frame or data_frame(self, spans) or self.data_frame
-        return PacketStream(self, name, decoder.stats, interpreted=decoder.interpreted, backend=decoder.backend).add(spans, whole=True)
+        frames = frames_of(decoder, data)
+        name = frame or data_frame(self, frames) or self.data_frame
+        return PacketStream(self, name, decoder.stats, interpreted=decoder.interpreted, backend=decoder.backend).add(frames, whole=True)
 
     def scans(self, data: Any, *, backend: str = "auto") -> Iterator[Scan]:
         """Every scan of the data; the first and last piece are marked ``complete=False``.
@@ -160,6 +160,7 @@ class Sensor(Spec):
             data: bytes (a stream), an iterable of datagrams, or an (n, size) uint8 array of datagrams.
             backend: "auto", "numpy", "jit" or "construct": the same results.
         """
+        from lidarspec.scans.scans import scans_of
 
         return scans_of(self, [self.decode(data, backend=backend)])
 
