@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from lidarspec.cli import inputs
 from tests.cli.places import babbling, busy, forbidden, nothing, refused, silent, taken
 from tests.cli.running import EXAMPLE, ran
 from tests.lines import free_port
