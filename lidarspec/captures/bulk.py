@@ -42,6 +42,9 @@ _TRAILER = 4
 _HEAD = 12  # bytes of a record of either format, as far as they tell the length
 #: records of one length in a row for which looking at all of them at once is worth while.
 _RUN = 16
+#: kinds of datagrams that are known at a time, and that become known in one batch: nobody's capture makes this slow.
+MOST_KNOWN = 16
+Sender = tuple[str, int]
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,12 +155,6 @@ def _windows(storage: NDArray[np.uint8], starts: NDArray[np.intp], width: int) -
     """The bytes from each start on, (n, width)."""
     everywhere: NDArray[np.void] = np.ndarray((len(storage) - width + 1,), f"V{width}", storage, 0, (1,))
     return everywhere[starts].view(np.uint8).reshape(len(starts), width)
-
-
-#: kinds of datagrams that are known at a time, and that become known in one batch: nobody's capture makes this slow.
-MOST_KNOWN = 16
-
-Sender = tuple[str, int]
 
 
 @dataclass(frozen=True, eq=False)

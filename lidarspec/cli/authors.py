@@ -1,9 +1,4 @@
-"""The verb that makes a new sensor's distribution.
-
-The verb that checks a plugin.
-
-`export`: a spec in the language of another tool.
-"""
+"""`new`, `check` and `export`: for those who write a sensor."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""The verbs from file to file.
-
-`plot`: a scan as a picture in a file.
-"""
+"""`convert` and `plot`: from file to file, and a scan as a picture."""
 
 from __future__ import annotations
 

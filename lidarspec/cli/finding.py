@@ -1,11 +1,4 @@
-"""The verb that lists the ports of this computer.
-
-The verb that finds out which checksum it is.
-
-The verb that finds out which sensor it is.
-
-The verb that finds out why nothing comes.
-"""
+"""`ports`, `detect`, `doctor` and `crc`: what is there, whose bytes come, why nothing comes, and which checksum it is."""
 
 from __future__ import annotations
 
@@ -33,6 +26,14 @@ from lidarspec.spec.checksums import CRCS, Crc
 from lidarspec.spec.links import Serial, Udp
 from lidarspec.transports.open_url import live_address
 from lidarspec.transports.ports import SerialPort, User, serial_ports, udp_users
+
+#: doubt below which a match may well be chance.
+WEAK = 12
+#: matches that are printed, and the texts that read as hexadecimal.
+PRINTED = 4
+HEX = (".hex", ".txt")
+#: checksums that are told of unknown bytes.
+TOLD = 2
 
 
 @click.command()
@@ -79,13 +80,6 @@ def _serial(port: SerialPort) -> dict[str, Any]:
 
 def _udp(port: int, users: tuple[User, ...] | None) -> dict[str, Any]:
     return {"port": port, "sensors": _senders(port), "free": users is None, "users": [vars(user) for user in users or ()]}
-
-
-#: doubt below which a match may well be chance.
-WEAK = 12
-#: matches that are printed, and the texts that read as hexadecimal.
-PRINTED = 4
-HEX = (".hex", ".txt")
 
 
 @click.command()
@@ -177,10 +171,6 @@ def _text(match: Match, length: int) -> str:
         else ["  paste:", *("    " + line for line in match.paste.splitlines())]
     )
     return "\n".join(lines)
-
-
-#: checksums that are told of unknown bytes.
-TOLD = 2
 
 
 @click.command()

@@ -22,6 +22,18 @@ from lidarspec.explaining.listing import Line, folded, text as plain_text
 
 #: seconds between two lines.
 PERIOD = 0.2
+#: the colours of what stands in a line, by its role.
+STYLES = {
+    "title": "bold",
+    "offset": "dim",
+    "hex": "cyan",
+    "bits": "yellow",
+    "docs": "dim",
+    "good": "green",
+    "bad": "bold red",
+    "point": "magenta",
+    "note": "bold yellow",
+}
 
 
 class Progress:
@@ -61,20 +73,6 @@ def size(number: float) -> str:
     """Bytes in words: "1.5 MB"."""
     power = 0 if number < 1000 else 1 if number < 1e6 else 2 if number < 1e9 else 3
     return f"{number:.0f} bytes" if not power else f"{number / 1000**power:.1f} {'?kMG'[power]}B"
-
-
-#: the colours of what stands in a line, by its role.
-STYLES = {
-    "title": "bold",
-    "offset": "dim",
-    "hex": "cyan",
-    "bits": "yellow",
-    "docs": "dim",
-    "good": "green",
-    "bad": "bold red",
-    "point": "magenta",
-    "note": "bold yellow",
-}
 
 
 def emit(text: str, output: str | None) -> None:

@@ -44,6 +44,10 @@ KEPT = 14
 
 Row = dict[str, Any]
 Units = Mapping[str, str]
+#: lines after which the names of the columns are said again.
+AGAIN = 20
+#: seconds by which sums of intervals may be off.
+ROUNDED = 1e-6
 
 
 @click.command()
@@ -169,10 +173,6 @@ def _plain(value: Any) -> Any:
     return number
 
 
-#: lines after which the names of the columns are said again.
-AGAIN = 20
-#: seconds by which sums of intervals may be off.
-ROUNDED = 1e-6
 #: name and unit of each figure, the width of its column (0: only in the summary), and its text.
 FIGURES: tuple[tuple[str, str, int, Callable[[Reading], str]], ...] = (
     ("speed", "Hz", 6, lambda r: _number(r.speed_hz, ".2f")),

@@ -1,4 +1,4 @@
-"""What comes out of an input, live or not: frames in batches, and who may have sent them."""
+"""What a device reads from, live or not: an input that gives frames in batches, and who may have sent them."""
 
 from __future__ import annotations
 
@@ -6,12 +6,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import accumulate
 from pathlib import Path
+from typing import Any, Protocol
 
 import numpy as np
 
+from lidarspec.device.session import Reply
 from lidarspec.errors import UsageError, suggest
 from lidarspec.framing.decoder import Decoder
-from lidarspec.framing.results import Found, Frames
+from lidarspec.framing.results import Counters, Found, Frames
 from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.protocol import Chunk
 
@@ -30,6 +32,70 @@ class Arrival:
 
     found: list[Frames] = field(default_factory=list)
     interrupted: bool = False
+
+
+class Input(Protocol):
+    """Where a device has its frames from, live or not.
+
+    Attributes:
+        is_live: whether data come at their own pace, and not from a file.
+        decoder: what finds the frames on the data link.
+        stays_on: whether the sensor is left as it is at the end.
+    """
+
+    is_live: bool
+    decoder: Decoder
+    stays_on: bool
+
+    @property
+    def state(self) -> str:
+        """How it is doing, in one or two words."""
+
+    @property
+    def ended(self) -> bool:
+        """Whether nothing comes any more."""
+
+    @property
+    def warnings(self) -> list[str]:
+        """What is to be said about the source now."""
+
+    @property
+    def stats(self) -> Counters:
+        """The counters of everything read so far, those of the transports included."""
+
+    @property
+    def queued(self) -> int | None:
+        """Chunks that have arrived and wait to be decoded; None where nothing waits."""
+
+    def begin(self) -> None:
+        """Send the commands that the sensor declares for its start.
+
+        Raises:
+            CommandError: where the device does not start.
+        """
+
+    def next(self, wait: float) -> Arrival | None:
+        """The next frames; None where none come within `wait` seconds, or at the end."""
+
+    def mark(self) -> int:
+        """How much has been produced; for `caught_up`."""
+
+    def caught_up(self, mark: int) -> bool:
+        """Whether everything that had been produced at a mark has been decoded."""
+
+    def send(self, name: str, *, timeout: float | None = None, **arguments: Any) -> Reply:
+        """The reply to a command.
+
+        Raises:
+            UsageError: for what the sensor does not take.
+            CommandError: where the device refuses or keeps silent, or there is none.
+        """
+
+    def first_state(self) -> dict[str, bytes]:
+        """Frames of other types, by name, that count as seen before the first packet."""
+
+    def close(self) -> None:
+        """Stop the sensor where it was started, and give everything back."""
 
 
 class Senders:

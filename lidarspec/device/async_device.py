@@ -1,4 +1,4 @@
-"""The same device for asyncio: each wait goes on in a thread of the device's own, so that the event loop is never held up.
+"""A device for asyncio: each wait goes on in a thread of the device's own, so that the event loop is never held up.
 
 What a thread has found is kept where the next call finds it: a call that is cancelled loses nothing.
 """

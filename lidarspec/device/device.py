@@ -1,6 +1,7 @@
-"""Packets and scans out of what arrives, with what one batch has to know of the one before.
+"""A sensor on a source: packets and scans as they come, commands, counters.
 
-A sensor on a source: packets and scans as they come, commands, counters.
+A `Device` asks its input for what has arrived: a `FileInput` or a `LiveInput`, which look the same from here. `PacketReader` makes
+packets of one type out of it, with what one batch has to know of the one before, and scans out of those.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, overload
 
-from lidarspec.device.arrivals import Arrival
+from lidarspec.device.arrivals import Arrival, Input
 from lidarspec.device.file_input import FileInput
 from lidarspec.device.live_input import PERIOD, LiveInput
 from lidarspec.device.session import Reply
@@ -35,6 +36,8 @@ from lidarspec.transports.protocol import LiveTransport, Transport
 
 #: batches kept while nobody knows yet which data frame the sensor answers in.
 UNDECIDED = 256
+#: seconds that one wait for data takes where there is no end to waiting.
+LONG = 3600.0
 
 
 class PacketReader:
@@ -91,10 +94,6 @@ class PacketReader:
         return PacketStream(self._sensor, name, decoder.stats, interpreted=decoder.interpreted, backend=decoder.backend, state=self._state)
 
 
-#: seconds that one wait for data takes where there is no end to waiting.
-LONG = 3600.0
-
-
 class Device:
     """A sensor read from a source; a context manager.
 
@@ -122,7 +121,7 @@ class Device:
         self._own_recorder: Log | None = None
         self._input = self._opened(backend, record, overflow, period)
         self._finalizer = weakref.finalize(self, _close, self._input, self._own_recorder)
-        if start and isinstance(self._input, LiveInput):
+        if start:
             try:
                 self._input.begin()
             except BaseException:
@@ -148,7 +147,7 @@ class Device:
     @property
     def queued(self) -> int | None:
         """Chunks that have arrived and wait to be decoded; None for a file."""
-        return len(self._input.queue) if isinstance(self._input, LiveInput) else None
+        return self._input.queued
 
     @property
     def is_live(self) -> bool:
@@ -223,7 +222,11 @@ class Device:
         return found
 
     def newest(self, wait: float) -> Scan | None:
-        """The same as `latest`, but None where no scan comes within `wait` seconds."""
+        """The newest complete scan, newer than the one given last; None where none comes within `wait` seconds.
+
+        Raises:
+            SourceError: where the input has ended or the device was closed.
+        """
         deadline, mark, reader = time.monotonic() + wait, self._input.mark(), self._reader(None)
         while not (self._unseen and self._input.caught_up(mark)):
             if self._input.ended:
@@ -263,8 +266,7 @@ class Device:
 
     def leave_on(self) -> None:
         """Let the sensor go on as it is when the device is closed."""
-        if isinstance(self._input, LiveInput):
-            self._input.stays_on = True
+        self._input.stays_on = True
 
     def close(self) -> None:
         """Stop the sensor where it was started, and give the source back; a second call does nothing."""
@@ -279,7 +281,7 @@ class Device:
     def __repr__(self) -> str:
         return f"Device({self.sensor.id} on {self._source}, {self.state}: {self.stats})"
 
-    def _opened(self, backend: str, record: RecordTo | None, overflow: str | None, period: float) -> FileInput | LiveInput:
+    def _opened(self, backend: str, record: RecordTo | None, overflow: str | None, period: float) -> Input:
         opened = transport(self._source, self.sensor)
         try:
             if not isinstance(opened, LiveTransport):
@@ -296,8 +298,7 @@ class Device:
 
     def _reader(self, frame: str | None) -> PacketReader:
         if frame not in self._streams:
-            first = self._input.first_state() if isinstance(self._input, FileInput) else {}
-            self._streams[frame] = PacketReader(self.sensor, frame, self._input.decoder, first)
+            self._streams[frame] = PacketReader(self.sensor, frame, self._input.decoder, self._input.first_state())
         return self._streams[frame]
 
     def _taken_back(self) -> Arrival | None:
@@ -320,7 +321,7 @@ class Device:
                 yield arrival
 
 
-def _close(source: FileInput | LiveInput | Transport, recorder: Log | None) -> None:
+def _close(source: Input | Transport, recorder: Log | None) -> None:
     """Give everything back; the recording is closed even where the source fails."""
     try:
         source.close()

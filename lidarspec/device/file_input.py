@@ -30,6 +30,8 @@ class FileInput:
     """
 
     is_live = False
+    queued = None
+    stays_on = True
 
     def __init__(self, source: str | Path, sensor: Sensor, opened: Transport, *, backend: str) -> None:
         self._source, self._sensor, self._transport = source, sensor, opened
@@ -61,12 +63,15 @@ class FileInput:
             self.state = "ended"
         return found
 
+    def begin(self) -> None:
+        """A file has no sensor to be started."""
+
     def caught_up(self, mark: int) -> bool:
         """A file has no newest scan: each is looked at in its turn."""
         return True
 
     def mark(self) -> int:
-        """See `caught_up`."""
+        """Nothing is produced but what is asked for."""
         return 0
 
     def send(self, name: str, *, timeout: float | None = None, **arguments: object) -> Reply:

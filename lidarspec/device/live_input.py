@@ -1,10 +1,9 @@
-"""How a live source is doing: data, silence, bytes that are no frames, a device that went away; and what to type next.
-
-Frames as they come: what the capture threads queue, decoded every few milliseconds in the consumer's thread.
+"""Frames as they come: what the capture threads queue, decoded every few milliseconds in the consumer's thread.
 
 `next` takes what has arrived, decodes it in one go and hands it on; while it waits it also drives the `Session`: sends what is
 to be sent, gives it the frames that may be answers, and lets it know the time. Whoever calls it has the decoders for himself;
-`send` from another thread waits for its answer while they do the work.
+`send` from another thread waits for its answer while they do the work. `Watch` says how the source is doing: data, silence, bytes that
+are no frames, a device that went away; and what to type next.
 """
 
 from __future__ import annotations
@@ -31,6 +30,14 @@ from lidarspec.transports.protocol import Chunk, LiveTransport
 
 #: seconds after which silence, or bytes without a frame, are worth a word.
 PATIENCE = 0.9
+#: seconds between two decodings of what has come, and the longest that a wait goes on before others have their turn.
+PERIOD, TURN = 0.02, 0.05
+#: chunks decoded together.
+TOGETHER = 4096
+#: batches that are kept for whoever iterates next, while commands are sent.
+KEPT = 4096
+#: seconds that the commands at the end may take altogether.
+FAREWELL = 4.0
 
 
 class Watch:
@@ -100,16 +107,6 @@ class Watch:
     def _baud(self) -> str:
         baud = self._transport.baud
         return f": {baud} baud is likely wrong" if baud else ""
-
-
-#: seconds between two decodings of what has come, and the longest that a wait goes on before others have their turn.
-PERIOD, TURN = 0.02, 0.05
-#: chunks decoded together.
-TOGETHER = 4096
-#: batches that are kept for whoever iterates next, while commands are sent.
-KEPT = 4096
-#: seconds that the commands at the end may take altogether.
-FAREWELL = 4.0
 
 
 class LiveInput:
@@ -182,6 +179,15 @@ class LiveInput:
         stats.queue_dropped = self.queue.dropped
         return stats
 
+    @property
+    def queued(self) -> int:
+        """Chunks that have arrived and wait to be decoded."""
+        return len(self.queue)
+
+    def first_state(self) -> dict[str, bytes]:
+        """Nothing is known of a live sensor before it says it."""
+        return {}
+
     def begin(self) -> None:
         """Send the commands that the sensor declares for its start.
 
@@ -219,7 +225,7 @@ class LiveInput:
                     return None
 
     def mark(self) -> int:
-        """How much has been produced; see `caught_up`."""
+        """How much has been produced, as a number for `caught_up`."""
         return self.queue.produced
 
     def caught_up(self, mark: int) -> bool:
@@ -227,7 +233,12 @@ class LiveInput:
         return not self._ready and self.queue.consumed + self.queue.dropped >= mark
 
     def send(self, name: str, *, timeout: float | None = None, **arguments: Any) -> Reply:
-        """The reply to a command; see `Device.send`."""
+        """The reply to a command, which other threads may wait for at the same time.
+
+        Raises:
+            UnknownCommand, UnknownField, MissingField, OutOfRange: for what the sensor does not take; nothing is sent.
+            CommandError: where the device refuses, or the connection is lost; ReplyTimeout where it keeps silent.
+        """
         if name in self.sensor.commands:
             self._await_sender(self.sensor.commands[name], timeout)
         with self._talk:

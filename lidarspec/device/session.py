@@ -1,6 +1,4 @@
-"""What a session hands out: what to send, the promise of a reply, the reply; and which frames can be the reply to what.
-
-Commands and their replies, sans-IO: requests in, what to send out; frames in, replies out.
+"""Commands and their replies, sans-IO: requests in, what to send out; frames in, replies out.
 
 All times are the caller's, in ns of one monotonic clock. On each link one request is under way at a time; the others wait in
 a queue, also while the device settles. The reply is looked for among all frames that arrive on the link, data or not.
@@ -29,6 +27,7 @@ from lidarspec.wire.schema import schema
 #: fields that a reply's repr shows.
 SHOWN = 6
 _MISSING = object()
+SECOND = 1_000_000_000
 
 
 @dataclass(frozen=True)
@@ -164,9 +163,6 @@ def _physical(info: FieldInfo, value: Any) -> Any:
     if isinstance(value, list):
         return [_physical(info, element) for element in value]
     return info.physical(value) if isinstance(value, int | float) else value
-
-
-SECOND = 1_000_000_000
 
 
 @dataclass(eq=False)

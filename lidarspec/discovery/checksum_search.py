@@ -25,6 +25,7 @@ CERTAIN = 0.95
 ANYWHERE = "an XOR of a whole frame fits at other places of it as well: of those that do, this is where bytes vary most"
 #: heads and groups of words that are tried.
 HEADS, GROUPS = (0, 2, 4, 6, 8, 10, 12), ((2,), (1, 2), (2, 1), (1, 1, 2))
+_PADDED = {"little": "", "big": '.ljust(2, b"\\0")'}
 
 
 @dataclass(frozen=True)
@@ -223,6 +224,3 @@ def _class(algorithm: Checksum) -> str:
         f"class Check(Checksum):\n    width = {changed.width}\n\n    def __call__(self, data):\n{body}\n"
         f'    def describe(self):\n        return "{algorithm.describe()}"'
     )
-
-
-_PADDED = {"little": "", "big": '.ljust(2, b"\\0")'}

@@ -23,6 +23,17 @@ from lidarspec.spec.checksums import CRCS, KNOWN, ByteOrder, Crc, name_of
 
 #: how much larger than sought a common divisor may be, where its divisors are tried one by one.
 SPARE = 11
+#: the widest first: the polynomial of a narrow one can be a divisor of that of a wide one.
+WIDTHS = (32, 16, 8)
+#: frames longer than this are divided for a checksum at their end alone; elsewhere the catalogue is tried.
+DIVIDED = 256
+#: frames of one length that a polynomial is sought with; at the usual place other picks are tried where one fails, in case of damage.
+TAKEN, PICKS = 4, 6
+#: most polynomials that are held against all frames for one place and span.
+WEIGHED = 64
+_MIRROR = bytes(int(f"{byte:08b}"[::-1], 2) for byte in range(256))
+#: (size of what is covered, message with the checksum behind it) of each frame.
+Codewords = list[tuple[int, int]]
 
 
 def remainder(a: int, b: int) -> int:
@@ -103,17 +114,6 @@ def solve(equations: Sequence[tuple[int, int]], width: int) -> tuple[int, list[i
     return solution, [1 << bit | sum(1 << lead for lead, row in rows.items() if row >> bit & 1) for bit in free]
 
 
-#: the widest first: the polynomial of a narrow one can be a divisor of that of a wide one.
-WIDTHS = (32, 16, 8)
-#: frames longer than this are divided for a checksum at their end alone; elsewhere the catalogue is tried.
-DIVIDED = 256
-#: frames of one length that a polynomial is sought with; at the usual place other picks are tried where one fails, in case of damage.
-TAKEN, PICKS = 4, 6
-#: most polynomials that are held against all frames for one place and span.
-WEIGHED = 64
-_MIRROR = bytes(int(f"{byte:08b}"[::-1], 2) for byte in range(256))
-
-
 @dataclass(frozen=True)
 class _Reading:
     """How frames are read as polynomials: bytes and register with the lowest bit first, or not."""
@@ -140,10 +140,6 @@ class _Reading:
     def crc(self, poly: int, init: int, xorout: int) -> Crc:
         low = poly & ((1 << self.width) - 1)
         return Crc(self.width, low, init, self.refin, self.refout, self.register(xorout))
-
-
-#: (size of what is covered, message with the checksum behind it) of each frame.
-Codewords = list[tuple[int, int]]
 
 
 def crc_matches(samples: Samples, *, mixed: bool = False) -> Iterator[Match]:

@@ -1,10 +1,8 @@
-"""Which of several sensors with the same frames it is: by how fast its clock runs, and by the names that its frames hold.
+"""Which installed sensor sent these bytes: each is tried, and what passes checksum and plausibility is counted.
 
-A clock that advances from packet to packet as the sensor's own `sweep` says tells models apart that differ in speed. A name is
-what a field of text holds, or what the author's remark calls the value of a field ("0x22 NAME"). The clock comes first: bytes
-that name a model are not always true.
-
-Which installed sensor sent these bytes: each is tried, and what passes checksum and plausibility is counted.
+Sensors with the same frames are told apart by how fast their clocks run, and by the names that their frames hold. A clock that advances
+from packet to packet as the sensor's own `sweep` says tells models apart that differ in speed. A name is what a field of text holds, or
+what the author's remark calls the value of a field ("0x22 NAME"). The clock comes first: bytes that name a model are not always true.
 """
 
 from __future__ import annotations
@@ -36,6 +34,10 @@ from lidarspec.wire.schema import schema
 #: share by which the pace of a clock may be off, frames of a type that are looked into for names, and packets simulated.
 OFF, READ, PACKETS = 0.03, 3, 64
 _VALUE = re.compile(r"\b(0x[0-9a-fA-F]+|\d+)\s+([^,;:]+)")
+#: bytes that an error shows.
+SHOWN = 16
+#: share of the bytes that has to be in a sensor's frames for it to fit, how close to the best another is as good, and what is beyond doubt.
+FITS, AS_GOOD, CLEAR = 0.2, 0.01, 0.9
 
 
 def told_apart(candidates: Sequence[Sensor], found: Sequence[Found]) -> dict[str, str]:
@@ -124,12 +126,6 @@ def _texts(values: object, fields: Mapping[str, FieldInfo], above: str = "") -> 
 
 def _plain(text: str) -> str:
     return re.sub(r"[\W_]", "", text).lower()
-
-
-#: bytes that an error shows.
-SHOWN = 16
-#: share of the bytes that has to be in a sensor's frames for it to fit, how close to the best another is as good, and what is beyond doubt.
-FITS, AS_GOOD, CLEAR = 0.2, 0.01, 0.9
 
 
 @dataclass(frozen=True)

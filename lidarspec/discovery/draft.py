@@ -43,6 +43,14 @@ TAKEN = {"ACK", "COMMAND", "DATA", "RATE", "SAMPLES", "TURNS"}
 VECTORS = 3
 _ID = re.compile(r"([a-z0-9]+)-([a-z0-9]+(?:-[a-z0-9]+)*)")
 _CONDITION = re.compile(r"^(.*?) *#if (\w+)\n", re.MULTILINE)
+#: bytes of a constant that are told, and how many have to be constant together to be a field.
+TOLD, RUN = 8, 2
+#: unknown bytes in a row in which no constant ones are looked for: there the scene decides what changes.
+LONG = 64
+#: doubt below which a checksum may be chance, as one in so many powers of two.
+WEAK = 12
+#: bits of constants and checksum that let noise through: two frames in a row are asked for then.
+FEW_BITS = 24
 
 
 @dataclass(frozen=True)
@@ -271,16 +279,6 @@ def _blocks(rows: NDArray[np.uint8]) -> Blocks | None:
         if count >= BLOCKS and count * size >= FILLED * rows.shape[1]:
             found.append(Blocks(spots[0], size, count, bytes(pair)))
     return max(found, key=lambda blocks: blocks.count * blocks.size, default=None)
-
-
-#: bytes of a constant that are told, and how many have to be constant together to be a field.
-TOLD, RUN = 8, 2
-#: unknown bytes in a row in which no constant ones are looked for: there the scene decides what changes.
-LONG = 64
-#: doubt below which a checksum may be chance, as one in so many powers of two.
-WEAK = 12
-#: bits of constants and checksum that let noise through: two frames in a row are asked for then.
-FEW_BITS = 24
 
 
 @dataclass(frozen=True)

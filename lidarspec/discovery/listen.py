@@ -1,6 +1,6 @@
 """Bytes out of any source, to find out whose they are: the beginning of a file, or a second of what comes over a live one.
 
-Sensors that keep silent until they are started: their start commands are sent, and what comes back is heard.
+Some sensors keep silent until they are started: `probe` sends their start commands, and hears what comes back.
 """
 
 from __future__ import annotations
@@ -25,6 +25,12 @@ from lidarspec.transports.protocol import Chunk, Disconnected, LiveTransport, Tr
 LOOKED_AT, DATAGRAMS, PLENTY = 1 << 17, 400, 1 << 14
 #: seconds to listen for, and between two looks.
 LISTEN, LOOK = 1.2, 0.1
+#: seconds to wait for data: of a device that has answered, and a motor may have to come up; and of one that has not.
+ANSWERED, UNANSWERED = 4.0, 1.0
+#: seconds that one read takes at most, and after which the line counts as silent.
+TURN = 0.05
+#: seconds for the commands that stop it again.
+STOPPING = 2.0
 
 
 @dataclass(frozen=True)
@@ -137,14 +143,6 @@ def everywhere(ports: list[str], *, seconds: float = LISTEN) -> Iterator[Heard]:
             yield from hear(source, seconds=seconds)
         except (SourceError, UsageError) as error:
             yield Heard(source, failure=error if isinstance(error, SourceError) else SourceError(str(error)))
-
-
-#: seconds to wait for data: of a device that has answered, and a motor may have to come up; and of one that has not.
-ANSWERED, UNANSWERED = 4.0, 1.0
-#: seconds that one read takes at most, and after which the line counts as silent.
-TURN = 0.05
-#: seconds for the commands that stop it again.
-STOPPING = 2.0
 
 
 def started_first() -> list[Sensor]:

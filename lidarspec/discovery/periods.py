@@ -1,13 +1,12 @@
-"""Fields of unknown frames that show by how they change: counters, angles that wrap at a full circle, clocks.
-
-A field that rises from frame to frame does so by about the same step each time; the wrong byte order, or a field read one byte
-off, jumps. What it falls back from tells its scale: an angle in hundredths of a degree never reaches 36 000.
-
-What unknown bytes are made of: where frames may begin, how long they are, and which checksum seals them.
+"""What unknown bytes are made of: where frames may begin, how long they are, which checksum seals them, and which fields change steadily.
 
 Frames of one length show as a distance at which many bytes are equal; their sync bytes are then the longest run of bytes that
 never change. Frames of several lengths show as a pair of bytes that comes again and again, at distances that a length field in
 front of each frame explains.
+
+Counters, angles that wrap at a full circle and clocks show by how they change: such a field rises from frame to frame by about the same
+step each time; the wrong byte order, or a field read one byte off, jumps. What it falls back from tells its scale: an angle in
+hundredths of a degree never reaches 36 000.
 """
 
 from __future__ import annotations
@@ -44,6 +43,18 @@ MOST, EVEN, GRAIN = 0.9, 0.05, 4
 ROUGH = 1.5
 #: part of all values that a step may be, and share of frames in which something may stay as it is (two returns of one firing).
 WIDE, STILL = 4, 0.75
+#: bytes that are looked at, and the shortest and longest period.
+LOOKED_AT, SHORTEST, LONGEST = 1 << 15, 4, 4096
+#: distances that are tried as a length, and the share of frames in which a byte that never changes is the same.
+LAGS, STEADY = 48, 0.9
+#: share of the bytes that has to be in frames, shares that are about the same, and many frames.
+HALF, CLOSE, MANY = 0.5, 0.03, 12
+#: part of the best weight that a shorter period needs.
+ALIKE = 0.75
+#: pairs of bytes that are tried as sync bytes, and frames that a structure needs.
+PAIRS, FRAMES = 32, 3
+#: bytes behind the sync that may hold a length, and the largest size of one unit of it.
+HEADER, UNIT = 8, 16
 
 
 @dataclass(frozen=True)
@@ -198,20 +209,6 @@ def _circle(highest: int, fallen: int, usual: int) -> int:
     """What a field wraps at: a full circle that it comes near to and never reaches, else about as much as it was seen to fall."""
     near = [circle for circle in CIRCLES if highest < circle <= highest + 3 * usual and abs(fallen - circle) <= 3 * usual]
     return min(near, key=lambda circle: abs(fallen - circle), default=fallen)
-
-
-#: bytes that are looked at, and the shortest and longest period.
-LOOKED_AT, SHORTEST, LONGEST = 1 << 15, 4, 4096
-#: distances that are tried as a length, and the share of frames in which a byte that never changes is the same.
-LAGS, STEADY = 48, 0.9
-#: share of the bytes that has to be in frames, shares that are about the same, and many frames.
-HALF, CLOSE, MANY = 0.5, 0.03, 12
-#: part of the best weight that a shorter period needs.
-ALIKE = 0.75
-#: pairs of bytes that are tried as sync bytes, and frames that a structure needs.
-PAIRS, FRAMES = 32, 3
-#: bytes behind the sync that may hold a length, and the largest size of one unit of it.
-HEADER, UNIT = 8, 16
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,4 @@
-"""What a recording says of itself: the JSON of its first record.
-
-The bytes of an .lsr recording: records, each complete in itself, packed and found again.
+"""The bytes of an .lsr recording: records, each complete in itself, packed and found again; the first says what it is, in JSON.
 
     offset  size  of a record, little-endian
     0       4     mark b"\xb5LS\x1e"
@@ -36,6 +34,32 @@ from lidarspec.spec.sensor import Sensor
 VERSION = 1
 _ID = re.compile(r"[a-z0-9]+(-[a-z0-9]+)*")
 _WORD = re.compile(r"[A-Za-z0-9_+-]{1,40}")
+_KINDS: dict[str, type | tuple[type, ...]] = {
+    "sensor": str,
+    "options": dict,
+    "source": str,
+    "datagrams": bool,
+    "baud": (int, type(None)),
+    "versions": dict,
+    "created": str,
+    "wall_ns": int,
+    "monotonic_ns": int,
+    "version": int,
+}
+MAGIC = b"\x89LSR\r\n\x1a\n"
+MARK = b"\xb5LS\x1e"
+HEADER, RECEIVED, SENT, EVENT = range(4)
+DATAGRAM, GAP, QUIET = 1, 2, 4
+#: most bytes of data in one record.
+LARGEST = 0xFFFF
+_HEAD = struct.Struct("<4sBBBHq")
+_CRC = struct.Struct("<I")
+_PORT = struct.Struct("<H")
+_UNKNOWN = -(1 << 63)
+_BLOCK = 1 << 16
+Address = tuple[str, int]
+Direction = Literal["in", "out", "event"]
+DIRECTIONS: dict[int, Direction] = {RECEIVED: "in", SENT: "out", EVENT: "event"}
 
 
 @dataclass(frozen=True)
@@ -85,18 +109,6 @@ class Header:
 
 
 _BLANK = Header()
-_KINDS: dict[str, type | tuple[type, ...]] = {
-    "sensor": str,
-    "options": dict,
-    "source": str,
-    "datagrams": bool,
-    "baud": (int, type(None)),
-    "versions": dict,
-    "created": str,
-    "wall_ns": int,
-    "monotonic_ns": int,
-    "version": int,
-}
 
 
 def read_header(data: bytes) -> Header:
@@ -120,23 +132,6 @@ def read_header(data: bytes) -> Header:
 
 def _plain(value: Any) -> Any:
     return dict(value) if isinstance(value, Mapping) else str(value)
-
-
-MAGIC = b"\x89LSR\r\n\x1a\n"
-MARK = b"\xb5LS\x1e"
-HEADER, RECEIVED, SENT, EVENT = range(4)
-DATAGRAM, GAP, QUIET = 1, 2, 4
-#: most bytes of data in one record.
-LARGEST = 0xFFFF
-_HEAD = struct.Struct("<4sBBBHq")
-_CRC = struct.Struct("<I")
-_PORT = struct.Struct("<H")
-_UNKNOWN = -(1 << 63)
-_BLOCK = 1 << 16
-
-Address = tuple[str, int]
-Direction = Literal["in", "out", "event"]
-DIRECTIONS: dict[int, Direction] = {RECEIVED: "in", SENT: "out", EVENT: "event"}
 
 
 @dataclass(frozen=True, slots=True)

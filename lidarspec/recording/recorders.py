@@ -32,6 +32,8 @@ SUFFIXES = (".lsr", ".pcap", ".bin")
 #: bytes between frames that make one packet at most.
 LARGEST_GAP = 1 << 16
 _HEAD, _RECORD = 24, 16
+#: a file, a recorder, or what makes one when the source is open.
+RecordTo = str | Path | Appender | Callable[[Transport], Log]
 
 
 class Recorder(Appender):
@@ -179,10 +181,6 @@ class RawRecorder(Appender):
         """Take bytes that were received."""
         if direction == "in":
             self._put(chunk.data, len(chunk.data))
-
-
-#: a file, a recorder, or what makes one when the source is open.
-RecordTo = str | Path | Appender | Callable[[Transport], Log]
 
 
 def declared_port(sensor: Spec | None) -> int:

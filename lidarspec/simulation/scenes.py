@@ -1,9 +1,7 @@
 """Scenes for simulated sensors: what a beam in a direction meets, and how far away.
 
 Everything is upright boxes in the sensor's axes: x forward, y left, z up, metres, the sensor at the origin. Beams may begin beside
-the origin, and what moves stands elsewhere at another time, so both can be given for each beam.
-
-Scenes as small TOML files.
+the origin, and what moves stands elsewhere at another time, so both can be given for each beam. A scene is read from a small TOML file:
 
 [room]                                  # walls, floor and ceiling; left out: in the open
 low = [-3.0, -2.2, -1.2]                # metres, in the sensor's axes: x forward, y left, z up

@@ -33,6 +33,10 @@ Times = NDArray[np.int64]
 BITS = 10
 #: ns; a clock that strays less from even steps is taken for a coarse one, and the steps for even.
 COARSE = 1_000_000
+#: packets simulated beyond those asked for, since directions may depend on the next packet.
+AHEAD = 1
+#: packets on which it is found out how a sensor carries its ranges, and how fast it is.
+PROBED = 256
 
 
 class Pace:
@@ -90,12 +94,6 @@ def _sizes(table: Rows) -> NDArray[np.intp]:
     for group in table.groups:
         sizes[group.where] = group.layout.size
     return sizes
-
-
-#: packets simulated beyond those asked for, since directions may depend on the next packet.
-AHEAD = 1
-#: packets on which it is found out how a sensor carries its ranges, and how fast it is.
-PROBED = 256
 
 
 @dataclass(frozen=True, eq=False)

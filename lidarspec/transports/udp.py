@@ -1,16 +1,13 @@
-"""Linux's recvmmsg, which Python does not have: many datagrams in one system call.
-
-Each system call of Python gives the interpreter away and has to win it back, which takes milliseconds beside a thread that
-computes. With a call for each datagram that is too slow for a fast sensor; with one for hundreds it does not matter.
-
-UDP: datagrams from a sensor, as many as there are at each wake-up, with what the kernel knows of each.
+"""UDP: datagrams from a sensor, as many as there are at each wake-up, with what the kernel knows of each.
 
 A sensor sends to this computer's address or to everybody, so that the sockets have to be bound to all interfaces ("udp://"),
 unless one is named ("udp://127.0.0.1:2368"). Nothing is sent, and nobody is answered, before a command is.
 
 Linux says with each datagram when it arrived, however late we fetch it, and how many the socket has dropped before it; so a
 short pause after each reading, in which some gather, costs no accuracy. The receive buffer is what a stalled program lives on;
-what the kernel really gives is read back.
+what the kernel really gives is read back. Many datagrams are fetched in one system call, recvmmsg, which Python does not have
+(`Slots`): each call of Python gives the interpreter away and has to win it back, which takes milliseconds beside a thread that
+computes, and with a call for each datagram a fast sensor is lost.
 """
 
 from __future__ import annotations
@@ -38,6 +35,18 @@ MANY, LARGEST = 256, 1 << 16
 NAME, CONTROL = 32, 128
 _HEADER, _TWO = struct.Struct("@Nii"), struct.Struct("@Niiqq")
 _ALIGN = struct.calcsize("@N")
+#: bytes of receive buffer that are asked for.
+BUFFER = 8 << 20
+#: datagrams of one socket that are fetched before the others have their turn.
+TOGETHER = 1024
+#: seconds between two readings, where the kernel keeps the times: a wake-up for each datagram would cost more than all the rest.
+PAUSE = 0.002
+#: ns that a datagram may have waited in the kernel, at most; more is a clock that was set.
+LATEST = 60_000_000_000
+#: socket options that Python has no names for (Linux, asm-generic/socket.h).
+SO_RCVBUFFORCE, SO_TIMESTAMPNS, SO_RXQ_OVFL = 33, 35, 40
+TIME = struct.Struct("qq")
+OPTIONS = ("port", "group", "src")
 
 
 class _Vector(ctypes.Structure):
@@ -147,20 +156,6 @@ def _address(name: bytes) -> tuple[str, int]:
     family, port = int.from_bytes(name[:2], sys.byteorder), int.from_bytes(name[2:4], "big")
     packed = name[8:24] if family == socket.AF_INET6 else name[4:8]
     return socket.inet_ntop(family, packed), port
-
-
-#: bytes of receive buffer that are asked for.
-BUFFER = 8 << 20
-#: datagrams of one socket that are fetched before the others have their turn.
-TOGETHER = 1024
-#: seconds between two readings, where the kernel keeps the times: a wake-up for each datagram would cost more than all the rest.
-PAUSE = 0.002
-#: ns that a datagram may have waited in the kernel, at most; more is a clock that was set.
-LATEST = 60_000_000_000
-#: socket options that Python has no names for (Linux, asm-generic/socket.h).
-SO_RCVBUFFORCE, SO_TIMESTAMPNS, SO_RXQ_OVFL = 33, 35, 40
-TIME = struct.Struct("qq")
-OPTIONS = ("port", "group", "src")
 
 
 class UdpTransport(LiveTransport):

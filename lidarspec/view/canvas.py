@@ -1,8 +1,7 @@
-"""Colours by number: what each ink looks like with true colour, 256 colours, 16, or none.
+"""Pictures in character cells: two by four dots of braille in each, square where a cell is twice as high as wide.
 
-Pictures hold numbers, so that two of them are compared cell by cell; only the terminal knows what it can show.
-
-Pictures in character cells: two by four dots of braille in each, square where a cell is twice as high as wide.
+Pictures hold the numbers of inks, so that two of them are compared cell by cell; only the terminal knows what it can show, and what
+each ink looks like with true colour, 256 colours, 16, or none.
 """
 
 from __future__ import annotations
@@ -28,6 +27,15 @@ _RANGE: tuple[Rgb, ...] = ((255, 92, 87), (255, 170, 60), (236, 220, 72), (96, 2
 _INTENSITY: tuple[Rgb, ...] = ((92, 78, 190), (160, 70, 190), (226, 84, 140), (255, 138, 84), (255, 204, 92), (255, 250, 190))
 #: the same two for 16 colours.
 _RANGE_16, _INTENSITY_16 = (91, 33, 92, 96, 94, 95), (34, 35, 95, 31, 93, 97)
+PLAIN, STRONG, FAINT, LABEL, GOOD, ALARM = range(6)
+ACROSS, DOWN = 2, 4
+#: the bit of each dot of a braille character, by row and column.
+BITS = np.array([[0x01, 0x08], [0x02, 0x10], [0x04, 0x20], [0x40, 0x80]], np.int64)
+BLANK = 0x2800
+_SPACE = ord(" ")
+#: what stands for a character where only ASCII can be shown; braille by the number of its dots.
+ASCII = {"▲": "^", "▶": ">", "▼": "v", "◀": "<", "│": "|", "─": "-", "━": "#", "°": "d", "●": "*", "‖": "=", "±": "+", "·": "."}
+_BY_DOTS = " ..::oo##"
 
 
 @dataclass(frozen=True)
@@ -47,7 +55,6 @@ def _ramp(stops: Sequence[Rgb], standard: Sequence[int]) -> list[Ink]:
     return [Ink((round(r), round(g), round(b)), standard[n]) for r, g, b, n in zip(*channels, nearest.tolist(), strict=True)]
 
 
-PLAIN, STRONG, FAINT, LABEL, GOOD, ALARM = range(6)
 _FIXED = (
     Ink(),
     Ink(bold=True),
@@ -96,16 +103,6 @@ def _cube(rgb: Rgb) -> int:
     if sum((8 + 10 * grey - part) ** 2 for part in rgb) < cube_error:
         return 232 + grey
     return 16 + 36 * near[0] + 6 * near[1] + near[2]
-
-
-ACROSS, DOWN = 2, 4
-#: the bit of each dot of a braille character, by row and column.
-BITS = np.array([[0x01, 0x08], [0x02, 0x10], [0x04, 0x20], [0x40, 0x80]], np.int64)
-BLANK = 0x2800
-_SPACE = ord(" ")
-#: what stands for a character where only ASCII can be shown; braille by the number of its dots.
-ASCII = {"▲": "^", "▶": ">", "▼": "v", "◀": "<", "│": "|", "─": "-", "━": "#", "°": "d", "●": "*", "‖": "=", "±": "+", "·": "."}
-_BY_DOTS = " ..::oo##"
 
 
 @dataclass(frozen=True, eq=False)

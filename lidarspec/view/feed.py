@@ -1,6 +1,6 @@
-"""How a sensor is doing: speed, rates, losses and jitter over the last moments, and over everything.
+"""What a device delivers, taken in between two pictures or two lines of figures: the newest scan kept, and everything counted.
 
-What a device delivers, taken in between two pictures or two lines of figures: counted, and the newest scan kept.
+`Meter` says how the sensor is doing: speed, rates, losses and jitter over the last moments, and over everything.
 """
 
 from __future__ import annotations
@@ -23,6 +23,10 @@ from lidarspec.scans.scans import Scan, ScanStream
 #: scans kept for means and medians.
 KEPT = 1 << 12
 Seconds = NDArray[np.float64]
+#: seconds from scan to scan of a file where their times do not say it, and the longest pause that is kept.
+STEP, LONGEST = 0.1, 2.0
+#: seconds that one look at a live source waits for data.
+LOOK = 0.04
 
 
 @dataclass(frozen=True)
@@ -175,12 +179,6 @@ def _share(some: int, others: int) -> float:
 
 def _mean(values: Sequence[int]) -> float | None:
     return float(np.mean(values)) if values else None
-
-
-#: seconds from scan to scan of a file where their times do not say it, and the longest pause that is kept.
-STEP, LONGEST = 0.1, 2.0
-#: seconds that one look at a live source waits for data.
-LOOK = 0.04
 
 
 class Feed:

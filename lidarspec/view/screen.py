@@ -1,9 +1,7 @@
-"""Single keys from a terminal, without waiting for a line: termios on POSIX, msvcrt on Windows, behind one class.
-
-A terminal taken over for a while: the alternate screen, of which only the cells that changed are written.
+"""A terminal taken over for a while: the alternate screen, of which only the cells that changed are written, and single keys.
 
 rich would draw every cell of every picture anew, 50 times what changes; so pictures go out from here, and rich serves
-for what is printed once.
+for what is printed once. Keys come without waiting for a line: termios on POSIX, msvcrt on Windows, behind one class.
 """
 
 from __future__ import annotations
@@ -26,6 +24,12 @@ _POSIX = {"[A": "up", "[B": "down", "[C": "right", "[D": "left", "OA": "up", "OB
 _WINDOWS = {"H": "up", "P": "down", "M": "right", "K": "left"}
 #: seconds between two looks at the keyboard on Windows, which has nothing to wait on.
 _LOOK = 0.02
+#: the alternate screen, no cursor, no wrapping at the edge; and all of it back.
+ENTER, LEAVE = "\x1b[?1049h\x1b[?25l\x1b[?7l\x1b[2J", "\x1b[?2026l\x1b[0m\x1b[?7h\x1b[?25h\x1b[?1049l"
+#: the terminal holds a picture back until all of it is there, where it knows how to.
+BEGIN, END = "\x1b[?2026h", "\x1b[?2026l"
+#: unchanged cells between two changed ones that are written along: moving the cursor costs as much.
+BRIDGED = 4
 
 
 class Keys(Protocol):
@@ -141,14 +145,6 @@ else:
             return Keyboard(sys.stdin.fileno()) if sys.stdin.isatty() and not taken else Keyboard(os.open("/dev/tty", os.O_RDONLY))
         except (OSError, ValueError, termios.error):
             return NoKeys()
-
-
-#: the alternate screen, no cursor, no wrapping at the edge; and all of it back.
-ENTER, LEAVE = "\x1b[?1049h\x1b[?25l\x1b[?7l\x1b[2J", "\x1b[?2026l\x1b[0m\x1b[?7h\x1b[?25h\x1b[?1049l"
-#: the terminal holds a picture back until all of it is there, where it knows how to.
-BEGIN, END = "\x1b[?2026h", "\x1b[?2026l"
-#: unchanged cells between two changed ones that are written along: moving the cursor costs as much.
-BRIDGED = 4
 
 
 class Terminated(BaseException):

@@ -13,6 +13,11 @@ from pathlib import Path
 import pytest
 
 import lidarspec as ls
+from lidarspec.cli.options import DURATION
+from lidarspec.simulation.faults import faults_of
+from lidarspec.spec.fields import duration
+from lidarspec.transports.base import Address
+from lidarspec.transports.simulated import connect
 from tests.cli.running import process, ran
 from tests.lines import SLACK
 
@@ -126,3 +131,9 @@ def test_a_link_that_stands_already_is_the_systems_fault(tmp_path: Path) -> None
     done = process("sim", STL, "--link", taken)
     assert done.returncode == 3
     assert b"File exists" in done.stderr
+
+
+@pytest.mark.parametrize("text", ["2m", "2min", "1.5h", "300ms", "20us", "3s", "7"])
+def test_a_duration_reads_the_same_as_an_option_and_in_a_source(text: str) -> None:
+    assert DURATION.convert(text, None, None) == duration(text) == faults_of({"unplug": text}).unplug
+    assert connect(Address.parse(f"sim:ldrobot-stl27l?unplug={text}")).device.faults.unplug == duration(text)

@@ -1,0 +1,53 @@
+"""Sources of plugins: what may stand behind a scheme of their own."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+
+import lidarspec as ls
+from lidarspec.plugins import Registry, hookimpl, standing_in
+from lidarspec.transports.open_url import live, transport
+from lidarspec.transports.protocol import Chunk, Transport
+
+
+class Once(Transport):
+    """One chunk, and no more."""
+
+    def chunks(self) -> Iterator[Chunk]:
+        yield Chunk(b"once")
+
+    def write(self, data: bytes) -> None:
+        raise ls.SourceError("nothing can be sent")
+
+    def close(self) -> None: ...
+
+
+class Sources:
+    @hookimpl
+    def lidarspec_source(self, url: str) -> object:
+        return {"once:": Once(), "other:": object()}.get(url)
+
+
+@pytest.fixture(autouse=True)
+def registry() -> Iterator[None]:
+    own = Registry()
+    with standing_in(own):
+        own.add(Sources(), name="sources")
+        yield
+
+
+def test_a_transport_of_a_plugin_has_what_it_does_not_say() -> None:
+    opened = transport("once:")
+    assert [chunk.data for chunk in opened.chunks()] == [b"once"]
+    assert (opened.datagrams, opened.baud, list(opened.warnings), opened.foreign) == (False, None, [], 0)
+    with pytest.raises(ls.UsageError, match="is a file"):
+        live("once:")
+
+
+def test_anything_else_is_the_fault_of_the_plugin() -> None:
+    with pytest.raises(ls.SpecError, match="has to derive from Transport"):
+        transport("other:")
+    with pytest.raises(ls.UsageError, match="no transport is installed"):
+        transport("unknown:")
