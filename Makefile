@@ -29,7 +29,7 @@ test: $(DEVELOPERS)
 
 # The conformance suite with a hundred times the examples: hours.
 test-long: $(DEVELOPERS)
-	@LIDARSPEC_EXAMPLES=4000 $(BIN)/python -m pytest -n auto tests/test_conformance.py $(ARGS)
+	@LIDARSPEC_EXAMPLES=4000 $(BIN)/python -m pytest -n auto tests/sensors/test_conformance.py $(ARGS)
 
 soak: $(DEVELOPERS)
 	@$(BIN)/python -m pytest -m soak $(ARGS)

@@ -2,7 +2,7 @@
 
     python docs/reference_pages.py [FOLDER]
 
-`make reference` runs it; tests/test_reference_pages.py holds that the pages are up to date.
+`make reference` runs it; tests/docs/test_reference_pages.py holds that the pages are up to date.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ def pages() -> dict[str, str]:
     for name, sensor in ls.sensors().items():
         data = [frame for frame, value in sensor.frames.items() if value.data]
         pictures = {frame: f"{name}.svg" if len(data) == 1 else f"{name}-{frame}.svg" for frame in data}
-        found |= {picture: export("svg", narrowed(sensor, frame)) for frame, picture in pictures.items()}
+        found |= {picture: export(narrowed(sensor, frame), "svg") for frame, picture in pictures.items()}
         found[f"{name}.md"] = page(sensor, pictures)
         rows.append(f"| [{sensor.vendor} {sensor.model}]({name}.md) | `{name}` | {sensor.status} |")
     return found | {"index.md": "\n".join(rows) + "\n"}

@@ -8,7 +8,8 @@ own text from typed arguments, so that the place of a fault can be read from the
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from typing import TypeVar
 
 
 class LidarSpecError(Exception):
@@ -68,6 +69,23 @@ def did_you_mean(name: str, known: Iterable[str], *, alike: float = 0.5) -> str:
     by_letters = {other.lower(): other for other in known}
     close = difflib.get_close_matches(name.lower(), list(by_letters), n=1, cutoff=alike)
     return f"; did you mean {by_letters[close[0]]!r}?" if close else ""
+
+
+_NEXT = "next: "
+_Failure = TypeVar("_Failure", bound=BaseException)
+
+
+def suggest(error: _Failure, command: str) -> _Failure:
+    """The same error with the next command to type, as a note; one that it has already stays."""
+    if not suggestion(error):
+        error.add_note(_NEXT + command)
+    return error
+
+
+def suggestion(error: BaseException) -> str:
+    """The next command to type that an error was given, "" where it has none."""
+    notes: Sequence[str] = getattr(error, "__notes__", ())
+    return next((note.removeprefix(_NEXT) for note in notes if note.startswith(_NEXT)), "")
 
 
 def refuse_text(data: object) -> None:

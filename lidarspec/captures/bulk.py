@@ -1,32 +1,17 @@
-"""Records of a capture that look like one whose datagram is known, found many at a time.
+"""Datagrams of a capture by the hundred, as arrays: where they stand in one buffer, when they came and from whom.
 
-Consecutive datagrams of a device differ in their payloads, their times and little else. So one record is read plainly
-(`records`, `ip`); what was found there holds for every record of the same length whose headers have the same
-bytes, except for those that `ip.headers` names and the times. `Alike` is such a record; `walked` finds where records
-begin. Whatever is not alike has to be read plainly too, so both ways give the same datagrams.
-
-A capture read into buffers that are lent out and used again.
-
-`Window` is a `Source` that holds as much of the file as fits into one buffer. `lent` gives that buffer away as an array;
-it is not written to again while that array, or anything made from it without a copy, is alive. So whoever needs the
-bytes for longer just keeps them: another buffer is used then, and the kept one is theirs.
-
-Datagrams by the hundred, as arrays: where they stand in one buffer, when they came and from whom.
-
-`CaptureBatches` reads captures so: of each kind of datagram the first is read plainly, and all that look the same are then
-found at once (`alike`). What does not is read plainly, one by one, so that the datagrams, their order and what is
-counted are those of `CaptureReader`.
+Consecutive datagrams of a device differ in their payloads, their times and little else. So `CaptureBatches` reads one record as
+`CaptureReader` does; what was found there holds for every record of the same length whose headers have the same bytes, except for
+those that `ip.headers` and the file's format name as free. `walked` finds where the records of a buffer begin, and all that are
+`Alike` are then found at once. Whatever is not alike is read one by one, so that the datagrams, their order and what is counted
+are the same, whatever is in the file.
 """
 
 from __future__ import annotations
 
-import os
-import stat
-import struct
-import weakref
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass
-from typing import Any, BinaryIO, NamedTuple, Protocol, runtime_checkable
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,68 +19,29 @@ from numpy.typing import NDArray
 from lidarspec.captures.ip import Headers, headers
 from lidarspec.captures.pcap import CaptureReader, Datagram
 from lidarspec.captures.records import (
-    ENHANCED_PACKET,
     LARGEST_BLOCK,
-    LARGEST_PACKET,
     CapturedPacket,
     Damaged,
     Passed,
     PcapngBlocks,
     PcapRecords,
     Source,
+    Times,
     Truncated,
     records,
 )
-from lidarspec.errors import SourceError
-from lidarspec.framing.decoder import Decoder, Spans
-from lidarspec.wire.arrays import keep_freed_memory
+from lidarspec.framing.decoder import Decoder
+from lidarspec.framing.results import Frames
 
 #: bytes of a record, from its start, that are compared at most; longer headers are read plainly.
 WIDEST = 128
 
-_SECOND = 1_000_000_000
-_FURTHEST = 4_000_000_000  # seconds; times further on are read plainly, so that none overflows
-_PCAP_HEAD, _BLOCK_HEAD, _BLOCK_TAIL = 16, 28, 4
-_SECTION = 0x0A0D0D0A
-_HEAD = 12  # of either kind, as far as it tells the length
+#: bytes that a buffer grows to, where the file has so many.
+LARGEST = 8 * LARGEST_BLOCK
+_TRAILER = 4
+_HEAD = 12  # bytes of a record of either format, as far as they tell the length
 #: records of one length in a row for which looking at all of them at once is worth while.
 _RUN = 16
-
-
-@dataclass(frozen=True)
-class Times:
-    """How a record's time is read from its two words.
-
-    Attributes:
-        word: their type, with its byte order.
-        high, low: which words of the record they are.
-        ticks: of `low` in a second where `high` counts seconds, else of both together.
-        is_split: whether `high` counts seconds.
-        offset: ns.
-    """
-
-    word: str
-    high: int
-    low: int
-    ticks: int
-    is_split: bool
-    offset: int = 0
-
-    def fits(self) -> bool:
-        """Whether all times up to `_FURTHEST` can be had without overflow."""
-        return self.ticks <= 9 * _SECOND and abs(self.offset) < 1 << 62
-
-    def ns(self, heads: NDArray[np.uint8]) -> tuple[NDArray[np.int64], NDArray[np.bool_] | None]:
-        """Times of records in ns since 1970, and which of them are right; None where all are."""
-        words = heads.view(self.word)
-        high, low = words[:, self.high].astype(np.int64), words[:, self.low]
-        if self.is_split:
-            high *= _SECOND
-            high += low * np.int64(_SECOND // self.ticks)
-            return high, None
-        seconds, fraction = np.divmod(high << 32 | low, self.ticks)
-        right = (high < 1 << 31) & (seconds < _FURTHEST)
-        return seconds * _SECOND + fraction * _SECOND // self.ticks + self.offset, right
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,7 +81,7 @@ class Alike:
         differs &= self.mask
         at, good = self.times.ns(heads)
         if self.trailer is not None:
-            ends = _windows(storage, starts + (self.length - _BLOCK_TAIL), _BLOCK_TAIL).view(self.trailer).ravel()
+            ends = _windows(storage, starts + (self.length - _TRAILER), _TRAILER).view(self.trailer).ravel()
             whole: NDArray[np.bool_] = np.asarray(ends == self.length, np.bool_)
             good = whole if good is None else np.asarray(good & whole, np.bool_)
         if differs.any():
@@ -154,25 +100,18 @@ def alike(
         packet, headers, source: what was found in it.
         form: the file it stands in.
     """
-    word = f"{form.order}u4"
-    if isinstance(form, PcapRecords):
-        head, free, trailer = _PCAP_HEAD, [*range(8), *range(12, 16)], None
-        times = Times(word, 0, 1, _SECOND // form.unit, True)
-    else:
-        if struct.unpack_from(form.order + "I", record)[0] != ENHANCED_PACKET:
-            return None
-        head, free, trailer = _BLOCK_HEAD, [*range(12, 20), *range(24, 28)], word
-        interface = form.interfaces[struct.unpack_from(form.order + "I", record, 8)[0]]
-        times = Times(word, 3, 4, interface.ticks, False, interface.offset)
-    start = head + headers.size
-    if start > WIDEST or not times.fits():
+    pattern = form.pattern(record)
+    if pattern is None:
+        return None
+    head, start = pattern.head, pattern.head + headers.size
+    if start > WIDEST or not pattern.times.fits():
         return None
     size = start + -start % 8
     mask = np.zeros(size, np.uint8)
     mask[:start] = 0xFF
-    mask[[*free, *(head + place for place in headers.free)]] = 0
+    mask[[*pattern.free, *(head + place for place in headers.free)]] = 0
     value = np.frombuffer(record[:start].ljust(size, b"\0"), np.uint64)
-    return Alike(len(record), start, headers.payload, source, times, value, mask.view(np.uint64), trailer)
+    return Alike(len(record), start, headers.payload, source, pattern.times, value, mask.view(np.uint64), pattern.trailer)
 
 
 class Walk(NamedTuple):
@@ -187,12 +126,10 @@ def walked(storage: NDArray[np.uint8], start: int, stop: int, form: PcapRecords 
     pieces: list[NDArray[np.intp]] = []
     single: list[int] = []
     at, before, patience, length = start, 0, 0, -1
-    step = _pcap_step if isinstance(form, PcapRecords) else _pcapng_step
-    unpack = struct.Struct(form.order + "II").unpack_from
     view = storage.data
     if stop - at < _HEAD:
         return Walk(np.array([at], np.intp), False)
-    while stop - at >= _HEAD and (length := step(unpack, view, at)) and at + length <= stop:
+    while stop - at >= _HEAD and (length := form.length(view, at)) and at + length <= stop:
         if length == before and not patience and stop - at >= _RUN * length:
             run = _same(storage, at, (stop - at) // length, length, form)
             pieces += [np.array(single, np.intp), np.arange(at, at + run * length, length)]
@@ -203,20 +140,9 @@ def walked(storage: NDArray[np.uint8], start: int, stop: int, form: PcapRecords 
     return Walk(np.concatenate([*pieces, np.array([*single, at], np.intp)]), length == 0)
 
 
-def _pcap_step(unpack: Callable[..., tuple[int, int]], view: memoryview, at: int) -> int:
-    """The length of a record, 0 where it says something that cannot be."""
-    captured, _ = unpack(view, at + 8)
-    return _PCAP_HEAD + captured if captured <= LARGEST_PACKET else 0
-
-
-def _pcapng_step(unpack: Callable[..., tuple[int, int]], view: memoryview, at: int) -> int:
-    kind, length = unpack(view, at)
-    return 0 if kind == _SECTION or length < 12 or length % 4 or length > LARGEST_BLOCK else length
-
-
 def _same(storage: NDArray[np.uint8], at: int, count: int, length: int, form: PcapRecords | PcapngBlocks) -> int:
     """How many of `count` records that would begin every `length` bytes do have that length, until the first that has not."""
-    place, claim = (8, length - _PCAP_HEAD) if isinstance(form, PcapRecords) else (4, length)
+    place, claim = form.claim(length)
     claims: NDArray[np.uint32] = np.ndarray((count,), f"{form.order}u4", storage, at + place, (length,))
     others = claims != claim
     return int(others.argmax()) if others.any() else count
@@ -226,123 +152,6 @@ def _windows(storage: NDArray[np.uint8], starts: NDArray[np.intp], width: int) -
     """The bytes from each start on, (n, width)."""
     everywhere: NDArray[np.void] = np.ndarray((len(storage) - width + 1,), f"V{width}", storage, 0, (1,))
     return everywhere[starts].view(np.uint8).reshape(len(starts), width)
-
-
-#: bytes of a buffer: of the first as many as the file has; each that is filled makes the next one longer.
-SMALLEST, LARGEST = 1 << 16, 8 * LARGEST_BLOCK
-
-#: bytes behind what was read that may be looked at, whatever they are, so that records can be compared in words.
-SLACK = 256
-
-#: buffers kept for use again.
-MOST_KEPT = 2
-
-
-class Window(Source):
-    """Bytes of a file or pipe, in buffers that can be lent out.
-
-    Attributes:
-        storage: the buffer in use, `SLACK` bytes longer than it is ever filled.
-    """
-
-    def __init__(self, file: BinaryIO) -> None:
-        super().__init__(file)
-        into: Callable[[Any], int | None] | None = getattr(file, "readinto1", getattr(file, "readinto", None))
-        self._into = into
-        self._kept: list[tuple[NDArray[np.uint8], weakref.ref[Any]]] = []
-        self._lent: weakref.ref[Any] | None = None
-        self._adopt(np.empty(_first_size(file) + SLACK, np.uint8), 0)
-
-    @property
-    def at(self) -> int:
-        """Where in `storage` the next byte stands."""
-        return self._at
-
-    @property
-    def stop(self) -> int:
-        """How much of `storage` is filled."""
-        return len(self._data)
-
-    def go(self, at: int) -> None:
-        """Makes the byte at this place of `storage` the next one."""
-        self._at = at
-
-    def more(self) -> bool:
-        """Whether bytes came after those that are there; they may all move."""
-        return self._has(len(self._data) - self._at + 1)
-
-    def lent(self) -> NDArray[np.uint8]:
-        """What is in the buffer, read-only: not written to again while this array or a view of it is alive."""
-        array = np.frombuffer(self._view[: len(self._data)], np.uint8)
-        array.flags.writeable = False
-        self._lent = weakref.ref(array)
-        return array
-
-    def _has(self, size: int) -> bool:
-        have = len(self._data) - self._at
-        if have >= size:
-            return True
-        self._turn(have)
-        while have < size:
-            if have == len(self.storage) - SLACK:
-                self._turn(have)
-            count = self._read_at(have)
-            if not count:
-                break
-            have += count
-            self._data = self._view[:have]
-        return have >= size
-
-    def _read_at(self, start: int) -> int:
-        """How many bytes came; they stand in the buffer from `start` on."""
-        free = self._view[start : len(self.storage) - SLACK]
-        try:
-            if self._into is not None:
-                return self._into(free) or 0
-            piece = self._read(len(free))
-        except OSError as error:
-            raise SourceError(f"cannot read the capture: {error}") from error
-        free[: len(piece)] = piece
-        return len(piece)
-
-    def _turn(self, have: int) -> None:
-        """Puts what is not read yet to the front of a buffer that nobody holds."""
-        size = len(self.storage) - SLACK
-        tail, at = self.storage[self._at : self._at + have], self._at
-        if len(self._data) == size:
-            size = min(2 * size, LARGEST)
-        if self._lent is not None:
-            self._kept = [*self._kept[1 - MOST_KEPT :], (self.storage, self._lent)]
-        spare = self._spare(size)
-        spare[:have] = tail
-        self._passed += at
-        self._adopt(spare, have)
-
-    def _spare(self, size: int) -> NDArray[np.uint8]:
-        if self._lent is None and len(self.storage) - SLACK == size:
-            return self.storage
-        self._lent = None
-        for index, (storage, lent) in enumerate(self._kept):
-            if lent() is None and len(storage) - SLACK == size:
-                del self._kept[index]
-                return storage
-        return np.empty(size + SLACK, np.uint8)
-
-    def _adopt(self, storage: NDArray[np.uint8], have: int) -> None:
-        self.storage = storage
-        self._view = storage.data
-        self._data, self._at = self._view[:have], 0
-
-
-def _first_size(file: BinaryIO) -> int:
-    try:
-        status = os.fstat(file.fileno())
-    except (AttributeError, OSError):
-        return SMALLEST
-    return min(max(status.st_size, SMALLEST), LARGEST) if stat.S_ISREG(status.st_mode) else SMALLEST
-
-
-keep_freed_memory()
 
 
 #: kinds of datagrams that are known at a time, and that become known in one batch: nobody's capture makes this slow.
@@ -391,7 +200,7 @@ class Batch:
         parts = {name: np.flatnonzero(self.senders == index) for index, name in enumerate(self.names)}
         return {name: part for name, part in parts.items() if len(part)}
 
-    def hosts(self, found: Spans) -> dict[str, list[str]]:
+    def hosts(self, found: Frames) -> dict[str, list[str]]:
         """The addresses that frames found in these datagrams came from, by type of frame."""
         hosts: dict[str, list[str]] = {}
         if len(self.names) == 1:
@@ -404,18 +213,6 @@ class Batch:
             known = hosts.setdefault(found.names[kind], [])
             known += [self.names[sender][0]] if self.names[sender][0] not in known else []
         return hosts
-
-
-@runtime_checkable
-class BulkTransport(Protocol):
-    """A transport of datagrams that gives many at a time; see `files.Transport`."""
-
-    def batches(self) -> Iterator[Batch]:
-        """The same datagrams as those of `chunks`.
-
-        Raises:
-            SourceError: where they cannot be read.
-        """
 
 
 def first_frames(decoder: Decoder, batches: Iterable[Batch], wanted: Collection[str]) -> dict[str, bytes]:
@@ -434,8 +231,8 @@ def first_frames(decoder: Decoder, batches: Iterable[Batch], wanted: Collection[
 class CaptureBatches(CaptureReader):
     """The same datagrams as `CaptureReader`'s, in batches; to be read either way, not both."""
 
-    _reading = Window
-    _source: Window
+    def _reading(self, file: BinaryIO) -> Source:
+        return Source(file, largest=LARGEST)
 
     def batches(self) -> Iterator[Batch]:
         """The datagrams of the file, as many at once as were read at once."""
@@ -461,7 +258,7 @@ class _Records:
     """The records that are whole in the window; where there are none, the one that comes next."""
 
     def __init__(
-        self, reader: CaptureReader, source: Window, form: PcapRecords | PcapngBlocks, starts: NDArray[np.intp], known: list[Alike]
+        self, reader: CaptureReader, source: Source, form: PcapRecords | PcapngBlocks, starts: NDArray[np.intp], known: list[Alike]
     ) -> None:
         self._reader, self._source, self._form, self._known = reader, source, form, known
         number = max(len(starts) - 1, 1)
@@ -472,7 +269,7 @@ class _Records:
         self._plain: dict[int, Datagram] = {}
         self._learnt = self._counted = 0  # kinds; packets that were read plainly and are known all the same
         self._only: Alike | None = None  # what all records are like
-        self._section = _sections(form)
+        self._section = form.sections
 
     def read(self) -> Exception | None:
         """What ended the reading of the file, if it ended here."""
@@ -480,24 +277,24 @@ class _Records:
             for index in np.flatnonzero(self._kinds < 0).tolist():
                 if self._kinds[index] >= 0:
                     continue  # like one that became known meanwhile
-                self._source.go(int(self._starts[index]))
+                self._source.at = int(self._starts[index])
                 try:
                     self._read_plainly(index)
                 except (Damaged, Truncated) as ended:
                     self._kinds = self._kinds[:index]
                     return ended
-                if _sections(self._form) != self._section:
+                if self._form.sections != self._section:
                     self._kinds = self._kinds[: index + 1]
                     return None
                 if self._only is not None:
                     break
         if self._are_whole:
-            self._source.go(int(self._starts[-1]))
+            self._source.at = int(self._starts[-1])
         return None
 
     def still_known(self) -> list[Alike]:
         """What is worth comparing the next records with, most frequent first."""
-        if _sections(self._form) != self._section:
+        if self._form.sections != self._section:
             return []
         if len(self._known) == 1:
             return self._known
@@ -578,7 +375,3 @@ class _Records:
         self._kinds[left] = kind
         self._at[left] = at
         return found is None
-
-
-def _sections(form: PcapRecords | PcapngBlocks) -> int:
-    return form.sections if isinstance(form, PcapngBlocks) else 0

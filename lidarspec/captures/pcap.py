@@ -10,7 +10,7 @@ from __future__ import annotations
 import ipaddress
 import os
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
@@ -96,8 +96,6 @@ class CaptureReader:
         SourceError: the file cannot be read, or is no capture at all. Damage further on is counted, never raised.
     """
 
-    _reading: Callable[[BinaryIO], Source] = Source
-
     def __init__(self, file: BinaryIO | str | os.PathLike[str]) -> None:
         self.stats = CaptureStats()
         self._owned: BinaryIO | None = None
@@ -130,6 +128,9 @@ class CaptureReader:
         """Closes the file, if it was given as a path."""
         if self._owned is not None:
             self._owned.close()
+
+    def _reading(self, file: BinaryIO) -> Source:
+        return Source(file)
 
     def _walk(self) -> Iterator[Datagram]:
         with self._to_the_end():

@@ -1,7 +1,8 @@
-"""The records of pcap and pcapng files: from bytes of a file to captured frames.
+"""The records of pcap and pcapng files: all that is known of the two formats, for one record and for many alike.
 
 Hostile input: `Source` reads in bounded steps, so that a length in the file never becomes an allocation, and each turn of
-the walkers either advances or ends the reading.
+the walkers either advances or ends the reading. It reads into buffers that can be lent out: one is not written to again while an
+array that was `lent`, or anything made from it without a copy, is alive. So whoever needs the bytes for longer just keeps them.
 
 Source: the IETF drafts "PCAP Capture File Format" (draft-ietf-opsawg-pcap) and "PCAP Now Generic Capture File Format"
 (draft-ietf-opsawg-pcapng).
@@ -9,10 +10,19 @@ Source: the IETF drafts "PCAP Capture File Format" (draft-ietf-opsawg-pcap) and 
 
 from __future__ import annotations
 
+import functools
+import io
+import os
+import stat
 import struct
+import weakref
 from collections.abc import Callable
+from dataclasses import dataclass
 from enum import Enum
-from typing import BinaryIO, NamedTuple
+from typing import Any, BinaryIO, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
 
 from lidarspec.errors import SourceError
 
@@ -26,15 +36,22 @@ _PCAP = {  # magic: byte order, nanoseconds in a unit of time
     b"\xa1\xb2\x3c\x4d": (">", 1),
 }
 _SECTION = b"\x0a\x0d\x0d\x0a"  # the same in both byte orders
+_SECTION_KIND = int.from_bytes(_SECTION)
 _ORDERS = {b"\x4d\x3c\x2b\x1a": "<", b"\x1a\x2b\x3c\x4d": ">"}
 _INTERFACE, _OBSOLETE_PACKET, _SIMPLE_PACKET, ENHANCED_PACKET = 1, 2, 3, 6
 _PACKETS = {_OBSOLETE_PACKET, _SIMPLE_PACKET, ENHANCED_PACKET}
 _TIME_RESOLUTION, _TIME_OFFSET = 9, 14  # options of an interface
 
-_STEP = 1 << 16
+#: bytes of a buffer at first, and most of those that are passed over at once.
+SMALLEST = 1 << 16
+#: bytes behind what was read that may be looked at, whatever they are, so that records can be compared in words.
+SLACK = 256
+#: buffers kept for use again.
+MOST_KEPT = 2
 LARGEST_BLOCK = 1 << 20  # a packet with its options; longer blocks are passed over unread
 _MOST_INTERFACES = 1024
 _SECOND = 1_000_000_000
+_FURTHEST = 4_000_000_000  # seconds; times further on are read one by one, so that none overflows
 
 
 class Truncated(Exception):
@@ -69,28 +86,39 @@ class Passed(Enum):
 
 
 class Source:
-    """Bytes of a file or pipe, read in steps: what is held follows what is there, never a length that the file claims.
+    """Bytes of a file or pipe, in buffers that can be lent out: what is held follows what is there, never a length that it claims.
+
+    Args:
+        largest: bytes that a buffer grows to where the file has so many; a record that does not fit makes it longer.
 
     Attributes:
-        record: offset of the record that was begun last.
+        storage: the buffer in use, `SLACK` bytes longer than it is ever filled.
+        at: where in `storage` the next byte stands.
+        record: file offset of the record that was begun last.
     """
 
-    def __init__(self, file: BinaryIO) -> None:
-        # A pipe's read1 returns what has arrived; its read would wait for the whole step.
-        self._read: Callable[[int], bytes] = getattr(file, "read1", file.read)
-        self._data: bytes | memoryview = b""
-        self._at = 0
-        self._passed = 0  # bytes of the file before `_data`
-        self.record = 0
+    def __init__(self, file: BinaryIO, *, largest: int = SMALLEST) -> None:
+        self._into, self._largest = _into(file), largest
+        self._kept: list[tuple[NDArray[np.uint8], weakref.ref[Any]]] = []
+        self._lent: weakref.ref[Any] | None = None
+        self._data = memoryview(b"")
+        self._passed = 0  # bytes of the file before `storage`
+        self.record = self.at = 0
+        self._adopt(np.empty(_first_size(file, largest) + SLACK, np.uint8), 0)
+
+    @property
+    def stop(self) -> int:
+        """How much of `storage` is filled."""
+        return len(self._data)
 
     def magic(self) -> bytes:
         """The next four bytes, which stay there; fewer at the end."""
         self._has(4)
-        return bytes(self._data[self._at : self._at + 4])
+        return bytes(self._data[self.at : self.at + 4])
 
     def begin_record(self) -> bool:
         """Whether a record begins here, rather than the end of the input."""
-        self.record = self._passed + self._at
+        self.record = self._passed + self.at
         return self._has(1)
 
     def take(self, size: int) -> bytes:
@@ -101,8 +129,8 @@ class Source:
         """
         if not self._has(size):
             raise Truncated
-        self._at += size
-        return bytes(self._data[self._at - size : self._at])
+        self.at += size
+        return bytes(self._data[self.at - size : self.at])
 
     def skip(self, size: int) -> None:
         """Passes over `size` bytes, however many.
@@ -111,24 +139,89 @@ class Source:
             Truncated: fewer are left.
         """
         while size:
-            step = min(size, _STEP)
-            self.take(step)
+            step = min(size, SMALLEST)
+            if not self._has(step):
+                raise Truncated
+            self.at += step
             size -= step
 
+    def more(self) -> bool:
+        """Whether bytes came after those that are there; they may all move."""
+        return self._has(len(self._data) - self.at + 1)
+
+    def lent(self) -> NDArray[np.uint8]:
+        """What is in the buffer, read-only: not written to again while this array or a view of it is alive."""
+        array = np.frombuffer(self._view[: len(self._data)], np.uint8)
+        array.flags.writeable = False
+        self._lent = weakref.ref(array)
+        return array
+
     def _has(self, size: int) -> bool:
-        have = len(self._data) - self._at
+        have = len(self._data) - self.at
         if have >= size:
             return True
-        pieces = [self._data[self._at :]]
-        try:
-            while have < size and (piece := self._read(_STEP)):
-                pieces.append(piece)
-                have += len(piece)
-        except OSError as error:
-            raise SourceError(f"cannot read the capture: {error}") from error
-        self._passed += self._at
-        self._data, self._at = b"".join(pieces), 0
+        self._turn(have)
+        while have < size:
+            if have == len(self.storage) - SLACK:
+                self._turn(have)
+            try:
+                count = self._into(self._view[have : len(self.storage) - SLACK])
+            except OSError as error:
+                raise SourceError(f"cannot read the capture: {error}") from error
+            if not count:
+                break
+            have += count
+            self._data = self._view[:have]
         return have >= size
+
+    def _turn(self, have: int) -> None:
+        """Puts what is not read yet to the front of a buffer that nobody holds."""
+        size = len(self.storage) - SLACK
+        tail, at = self.storage[self.at : self.at + have], self.at
+        if len(self._data) == size:
+            size = 2 * size if have == size else max(size, min(2 * size, self._largest))
+        if self._lent is not None:
+            self._kept = [*self._kept[1 - MOST_KEPT :], (self.storage, self._lent)]
+        spare = self._spare(size)
+        spare[:have] = tail
+        self._passed += at
+        self._adopt(spare, have)
+
+    def _spare(self, size: int) -> NDArray[np.uint8]:
+        if self._lent is None and len(self.storage) - SLACK == size:
+            return self.storage
+        self._lent = None
+        for index, (storage, lent) in enumerate(self._kept):
+            if lent() is None and len(storage) - SLACK == size:
+                del self._kept[index]
+                return storage
+        return np.empty(size + SLACK, np.uint8)
+
+    def _adopt(self, storage: NDArray[np.uint8], have: int) -> None:
+        self.storage = storage
+        self._view = storage.data
+        self._data, self.at = self._view[:have], 0
+
+
+def _into(file: BinaryIO) -> Callable[[memoryview], int | None]:
+    """What fills a buffer with the bytes that have arrived: of a pipe, others would wait for as many as there is room for."""
+    if isinstance(file, io.BufferedIOBase):
+        return file.readinto1
+    return file.readinto if isinstance(file, io.RawIOBase) else functools.partial(_copied, file)
+
+
+def _copied(file: BinaryIO, buffer: memoryview) -> int:
+    data = file.read(len(buffer))
+    buffer[: len(data)] = data
+    return len(data)
+
+
+def _first_size(file: BinaryIO, largest: int) -> int:
+    try:
+        status = os.fstat(file.fileno())
+    except (AttributeError, OSError):
+        return SMALLEST
+    return min(max(status.st_size, SMALLEST), largest) if stat.S_ISREG(status.st_mode) else SMALLEST
 
 
 def is_capture(head: bytes) -> bool:
@@ -136,21 +229,90 @@ def is_capture(head: bytes) -> bool:
     return head[:4] in _PCAP or head[:4] == _SECTION
 
 
+@dataclass(frozen=True)
+class Times:
+    """How a record's time is read from its two words.
+
+    Attributes:
+        word: their type, with its byte order.
+        high, low: which words of the record they are.
+        ticks: of `low` in a second where `high` counts seconds, else of both together.
+        is_split: whether `high` counts seconds.
+        offset: ns.
+    """
+
+    word: str
+    high: int
+    low: int
+    ticks: int
+    is_split: bool
+    offset: int = 0
+
+    def fits(self) -> bool:
+        """Whether all times up to `_FURTHEST` can be had in 64 bits without overflow."""
+        return self.ticks <= 9 * _SECOND and abs(self.offset) < 1 << 62
+
+    def ns(self, heads: NDArray[np.uint8]) -> tuple[NDArray[np.int64], NDArray[np.bool_] | None]:
+        """Times of records in ns since 1970, and which of them are right; None where all are."""
+        words = heads.view(self.word)
+        high, low = words[:, self.high].astype(np.int64), words[:, self.low]
+        if self.is_split:
+            high *= _SECOND
+            high += low * np.int64(_SECOND // self.ticks)
+            return high, None
+        seconds, fraction = np.divmod(high << 32 | low, self.ticks)
+        right = (high < 1 << 31) & (seconds < _FURTHEST)
+        return seconds * _SECOND + fraction * _SECOND // self.ticks + self.offset, right
+
+
+class Pattern(NamedTuple):
+    """What the records of a stream of packets have in common, as far as the file's format says.
+
+    Attributes:
+        head: bytes of a record before the packet.
+        free: places of bytes among them that differ from record to record: times, and the length before the packet was cut.
+        times: how the time is read from them.
+        trailer: type of the word at the end that repeats the length, with its byte order; None where there is none.
+    """
+
+    head: int
+    free: tuple[int, ...]
+    times: Times
+    trailer: str | None
+
+
 class PcapRecords:
     """The records of a pcap file.
 
     Attributes:
+        sections: 0, since it is one whole.
         order: the byte order of the file, as in `struct`.
-        unit: nanoseconds in the unit of the second half of its times.
         link: its link-layer type.
     """
 
+    sections = 0
+
     def __init__(self, source: Source) -> None:
         self._source = source
-        self.order, self.unit = _PCAP[source.take(4)]
+        self.order, self._unit = _PCAP[source.take(4)]
         *_, link = struct.unpack(self.order + "HHiIII", source.take(20))
         self.link = link & 0xFFFF  # the upper half tells the length of the frame check sequence
         self._head = struct.Struct(self.order + "IIII")
+        self._lengths = struct.Struct(self.order + "II")
+
+    def length(self, data: memoryview | bytes, at: int) -> int:
+        """The length of the record that begins there, of which 12 bytes are there; 0 where it says something that cannot be."""
+        captured, _ = self._lengths.unpack_from(data, at + 8)
+        return self._head.size + captured if captured <= LARGEST_PACKET else 0
+
+    def claim(self, length: int) -> tuple[int, int]:
+        """Where in a record of a length its length stands, and the number that stands there."""
+        return 8, length - self._head.size
+
+    def pattern(self, record: bytes) -> Pattern:
+        """What records like this one have in common."""
+        free = (*range(8), *range(12, 16))
+        return Pattern(self._head.size, free, Times(f"{self.order}u4", 0, 1, _SECOND // self._unit, True), None)
 
     def read(self) -> CapturedPacket:
         """The packet of the record that begins here.
@@ -158,10 +320,11 @@ class PcapRecords:
         Raises:
             Truncated, Damaged: nothing can be read from `source.record` on.
         """
-        seconds, fraction, captured, original = self._head.unpack(self._source.take(self._head.size))
-        if captured > LARGEST_PACKET:
+        head = self._source.take(self._head.size)
+        if not self.length(head, 0):
             raise Damaged
-        return CapturedPacket(self.link, seconds * _SECOND + fraction * self.unit, self._source.take(captured), original)
+        seconds, fraction, captured, original = self._head.unpack(head)
+        return CapturedPacket(self.link, seconds * _SECOND + fraction * self._unit, self._source.take(captured), original)
 
 
 class Interface(NamedTuple):
@@ -179,14 +342,31 @@ class PcapngBlocks:
     Attributes:
         sections: how many have begun.
         order: the byte order of the section, as in `struct`.
-        interfaces: those of the section so far.
     """
 
     def __init__(self, source: Source) -> None:
         self._source = source
         self.sections = 0
         self.order = ""
-        self.interfaces: list[Interface] = []
+        self._interfaces: list[Interface] = []
+
+    def length(self, data: memoryview | bytes, at: int) -> int:
+        """The length of the block that begins there; 0 where it can only be read by itself, since it says something that cannot be,
+        begins a section, or is longer than is ever held."""
+        kind, length = struct.unpack_from(self.order + "II", data, at)
+        return 0 if kind == _SECTION_KIND or length > LARGEST_BLOCK or not _can_be(length) else length
+
+    def claim(self, length: int) -> tuple[int, int]:
+        """Where in a block of a length its length stands, and the number that stands there."""
+        return 4, length
+
+    def pattern(self, record: bytes) -> Pattern | None:
+        """What blocks like this one have in common; None for kinds that are read one by one."""
+        kind, _, number = struct.unpack_from(self.order + "III", record)
+        if kind != ENHANCED_PACKET:
+            return None
+        interface, word = self._interfaces[number], f"{self.order}u4"
+        return Pattern(28, (*range(12, 20), *range(24, 28)), Times(word, 3, 4, interface.ticks, False, interface.offset), word)
 
     def read(self) -> CapturedPacket | Passed:
         """The packet of the block that begins here.
@@ -198,16 +378,16 @@ class PcapngBlocks:
         if head[:4] == _SECTION:
             if head[8:] not in _ORDERS:
                 raise Damaged
-            self.order, self.interfaces, self.sections = _ORDERS[head[8:]], [], self.sections + 1
+            self.order, self._interfaces, self.sections = _ORDERS[head[8:]], [], self.sections + 1
         kind, length = struct.unpack_from(self.order + "II", head)
         body = _block_body(self._source, head, length)
         if kind == _INTERFACE:
             # Packets name interfaces by number: with one lost, all that follows would be misread.
-            if body is None or len(body) < 8 or len(self.interfaces) == _MOST_INTERFACES:
+            if body is None or len(body) < 8 or len(self._interfaces) == _MOST_INTERFACES:
                 raise Damaged
-            self.interfaces.append(_interface(self.order, body))
+            self._interfaces.append(_interface(self.order, body))
         elif kind in _PACKETS:
-            packet = None if body is None else _block_packet(self.order, kind, body, self.interfaces)
+            packet = None if body is None else _block_packet(self.order, kind, body, self._interfaces)
             return packet or Passed.MALFORMED
         elif body is None and length <= LARGEST_BLOCK:
             return Passed.MALFORMED
@@ -223,9 +403,14 @@ def records(source: Source) -> PcapRecords | PcapngBlocks:
     return PcapngBlocks(source) if source.magic() == _SECTION else PcapRecords(source)
 
 
+def _can_be(length: int) -> bool:
+    """Whether a block can have a length: that of its head and tail at least, in words."""
+    return length >= 12 and length % 4 == 0
+
+
 def _block_body(source: Source, head: bytes, length: int) -> bytes | None:
     """What stands between the two lengths of a block, None where they differ or the block is too long to be held."""
-    if length < 12 or length % 4:
+    if not _can_be(length):
         raise Damaged
     if length > LARGEST_BLOCK:
         source.skip(length - 12)

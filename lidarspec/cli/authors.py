@@ -13,11 +13,10 @@ from shlex import quote
 
 import click
 
-from lidarspec.cli.failures import FINDINGS, suggest
+from lidarspec.cli.failures import FINDINGS
 from lidarspec.cli.output import Progress, emit, emit_json, note
-from lidarspec.discovery.draft import draft
-from lidarspec.discovery.scaffold import Link, Names, captured, invented, write
-from lidarspec.errors import UsageError, WireError
+from lidarspec.discovery.draft import Link, Names, captured, draft, invented, write
+from lidarspec.errors import UsageError, WireError, suggest
 from lidarspec.exports import EXPORTS, Refused, export as exported, narrowed
 from lidarspec.plugins import sensor as named_sensor, sensors
 from lidarspec.testing.check import Report, reports, target
@@ -131,7 +130,7 @@ def export(kind: str, sensor_id: str, output: str | None, frame: str | None) -> 
     sensor = named_sensor(sensor_id)
     chosen = sensor if frame is None else narrowed(sensor, frame)
     try:
-        text = exported(kind, chosen)
+        text = exported(chosen, kind)
     except Refused as refused:
         raise suggest(refused, f"lidarspec show {sensor.id}") from None
     emit(text.removesuffix("\n"), output)

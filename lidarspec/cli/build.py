@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import re
 from collections.abc import Callable, Mapping, Sequence
 from fractions import Fraction
@@ -10,12 +11,14 @@ from typing import Any
 
 import click
 
-from lidarspec.cli.failures import suggest
-from lidarspec.cli.output import emit, emit_json, output_options
-from lidarspec.errors import LidarSpecError, OutOfRange, SourceError, UnknownField, UnknownFrame, UsageError
+from lidarspec.cli.options import output_options
+from lidarspec.cli.output import emit, emit_json
+from lidarspec.errors import LidarSpecError, OutOfRange, SourceError, UnknownField, UnknownFrame, UsageError, suggest
 from lidarspec.plugins import sensor as named_sensor
 from lidarspec.spec.fields import exact, factor, split_unit
-from lidarspec.wire.schema import FieldInfo, Schema, schema
+from lidarspec.spec.tree import FieldInfo, evaluated
+from lidarspec.wire.build import given_value
+from lidarspec.wire.schema import Schema, schema
 
 _STEP = re.compile(r"(\w+)((?:\[(?:\d+|\*)\])*)")
 _PATH = re.compile(rf"{_STEP.pattern}(?:\.{_STEP.pattern})*")
@@ -39,7 +42,7 @@ def build(sensor_id: str, frame: str, assignments: Sequence[str], as_json: bool,
     if frame not in sensor.frames:
         raise suggest(UnknownFrame(frame, sensor.frames, place=sensor.id), f"lidarspec show {sensor_id}")
     try:
-        data = sensor.build(frame, values(schema(sensor.frames[frame].prepared), assignments, f"{sensor.id} {frame}"))
+        data = sensor.build(frame, values(schema(sensor.frames[frame].tree), assignments, f"{sensor.id} {frame}"))
     except LidarSpecError as error:
         raise suggest(error, f"lidarspec show {sensor_id}") from None
     if as_json:
@@ -155,24 +158,13 @@ def _elements(array: list[Any], indices: list[Index], rest: Steps, value: Any, l
             array[place] = value
 
 
-class _Scope(dict[str, Any]):
-    """What the length of an array is computed from: the values given so far, by item and by attribute."""
-
-    def __getattr__(self, name: str) -> Any:
-        return self[name]
-
-
-def _scope(value: Any) -> Any:
-    return _Scope({name: _scope(element) for name, element in value.items()}) if isinstance(value, Mapping) else value
-
-
 def _length(table: Schema, given: Mapping[str, Any], path: str, place: str) -> int:
     """The length of an array: declared, or from the count fields given; 0 where it follows from single elements given."""
     declared = table.arrays[path]
     if isinstance(declared, int):
         return declared
     try:
-        return int(declared(_scope(given)))
+        return int(evaluated(declared, functools.partial(given_value, given, table.fields)))  # type: ignore[arg-type]
     except Exception:
         target: Any = given
         for name in path.removesuffix("[]").split("."):

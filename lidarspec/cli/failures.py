@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import traceback
-from typing import TypeVar
 
 import click
 
@@ -30,16 +29,6 @@ CODES: tuple[tuple[type[Exception], int, str], ...] = (
     (click.ClickException, USAGE, "lidarspec {verb} --help"),
     (OSError, SOURCE, "lidarspec {verb} --help"),
 )
-NEXT = "next: "
-
-Failure = TypeVar("Failure", bound=Exception)
-
-
-def suggest(error: Failure, command: str) -> Failure:
-    """The same error, with the next command to type; one that it has already stays."""
-    if not any(note.startswith(NEXT) for note in getattr(error, "__notes__", ())):
-        error.add_note(NEXT + command)
-    return error
 
 
 def report(error: Exception, verb: str) -> int:
@@ -52,7 +41,7 @@ def report(error: Exception, verb: str) -> int:
         click.echo("  next: the same with LIDARSPEC_DEBUG=1, and report it with what that prints", err=True)
         return code
     click.echo(_message(error), err=True)
-    suggest(error, _following(error, command, verb))
+    errors.suggest(error, _following(error, command, verb))
     for note in error.__notes__:
         click.echo(f"  {note}", err=True)
     return code

@@ -16,10 +16,10 @@ from typing import Any
 
 import click
 
-from lidarspec.cli.failures import DEVICE, FINDINGS, NO_DATA, suggest
+from lidarspec.cli.failures import DEVICE, FINDINGS, NO_DATA
 from lidarspec.cli.inputs import read
-from lidarspec.cli.output import emit, emit_json, note, output_options, sensor_option, table
-from lidarspec.cli.streams import Duration
+from lidarspec.cli.options import DURATION, output_options, sensor_option
+from lidarspec.cli.output import emit, emit_json, note, table
 from lidarspec.device.settings import named
 from lidarspec.discovery.checksum_search import search
 from lidarspec.discovery.detect import Score, Verdict, verdict, verdicts
@@ -27,10 +27,10 @@ from lidarspec.discovery.doctor import Finding, computer, examined
 from lidarspec.discovery.listen import LISTEN, Heard, everywhere, hear, probe, started_first, udp_ports
 from lidarspec.discovery.periods import Structure, cut, structure
 from lidarspec.discovery.samples import Match
-from lidarspec.errors import SourceError, UsageError
+from lidarspec.errors import SourceError, UsageError, suggest
 from lidarspec.plugins import sensor as named_sensor, sensors
 from lidarspec.spec.checksums import CRCS, Crc
-from lidarspec.spec.links import Udp
+from lidarspec.spec.links import Serial, Udp
 from lidarspec.transports.open_url import live_address
 from lidarspec.transports.ports import SerialPort, User, serial_ports, udp_users
 
@@ -185,7 +185,7 @@ TOLD = 2
 
 @click.command()
 @click.argument("source", required=False)
-@click.option("-t", "--duration", type=Duration(), default=LISTEN, metavar="TIME", help="How long to listen for, each time.")
+@click.option("-t", "--duration", type=DURATION, default=LISTEN, metavar="TIME", help="How long to listen for, each time.")
 @click.option("--start", is_flag=True, help="Also send the start commands of sensors that keep silent until they are started.")
 @output_options
 def detect(source: str | None, duration: float, start: bool, as_json: bool, output: str | None) -> None:
@@ -310,7 +310,7 @@ def _again(one: Verdict) -> str:
     """The source as it has to be opened for the sensor that was found."""
     source, heard = one.heard.source, one.heard
     link = one.sensor.links.get("data") if one.sensor is not None else None
-    if heard.baud is not None and "baud=" not in source and heard.baud != getattr(link, "baud", None):
+    if heard.baud is not None and "baud=" not in source and not (isinstance(link, Serial) and link.baud == heard.baud):
         source += f"{'&' if '?' in source else '?'}baud={heard.baud}"
     if heard.sender and "src=" not in source:
         source += f"{'&' if '?' in source else '?'}src={heard.sender}"
@@ -366,7 +366,7 @@ def _structure_text(found: Structure) -> str:
 @click.command()
 @click.argument("source", required=False)
 @sensor_option
-@click.option("-t", "--duration", type=Duration(), default=LISTEN, metavar="TIME", help="How long to listen for, each time.")
+@click.option("-t", "--duration", type=DURATION, default=LISTEN, metavar="TIME", help="How long to listen for, each time.")
 @output_options
 def doctor(source: str | None, sensor_id: str | None, duration: float, as_json: bool, output: str | None) -> None:
     """What keeps a sensor's bytes from coming, and the command that mends it.

@@ -7,12 +7,13 @@ from typing import Any
 
 import click
 
-from lidarspec.cli.failures import suggest
-from lidarspec.cli.inputs import Input, Piece, fitting, likely_starts, nearest, no_frame, pieces, read
-from lidarspec.cli.output import emit, emit_json, emit_lines, note, output_options, sensor_option, table
-from lidarspec.errors import UsageError, WireError
-from lidarspec.explaining.explanation import explain as explained
-from lidarspec.explaining.listing import LINED, Explanation, Line, differences, told as told_differences
+from lidarspec.cli.inputs import Input, nearest_fault, no_frame, read
+from lidarspec.cli.options import output_options, sensor_option
+from lidarspec.cli.output import emit, emit_json, emit_lines, note, table
+from lidarspec.discovery.identify import Piece, fitting, likely_starts, pieces
+from lidarspec.errors import UsageError, WireError, suggest
+from lidarspec.explaining.explanation import Explanation, explain as explained
+from lidarspec.explaining.listing import LINED, Line, told
 from lidarspec.explaining.wording import Row, Span, number
 from lidarspec.plugins import sensor as named_sensor
 from lidarspec.spec.sensor import Sensor
@@ -34,17 +35,17 @@ def parse(words: Sequence[str], sensor_id: str | None, count: int | None, as_jso
     given, sensor, fits, found = _found(words, sensor_id, count)
     if not found:
         raise no_frame(sensor, given)
-    frames = [(piece, explained(sensor, piece.data, piece.frame)) for piece in found if piece.frame]
+    frames = [(piece, explained(piece.data, sensor, piece.frame)) for piece in found if piece.frame]
     if as_json:
-        told = [{"frame": f.frame, "offset": p.offset, "size": len(p.data), "fields": _raw(sensor, p)} for p, f in frames]
-        emit_json({"sensor": sensor.id, "fits": fits, "frames": told}, output)
+        listed = [{"frame": f.frame, "offset": p.offset, "size": len(p.data), "fields": _raw(sensor, p)} for p, f in frames]
+        emit_json({"sensor": sensor.id, "fits": fits, "frames": listed}, output)
         return
     skipped = sum(len(piece.data) for piece in found if not piece.frame)
     if skipped:
         note(f"{skipped} bytes are in no frame; lidarspec explain names them")
     parts = []
     for piece, frame in frames:
-        rows = [[value.path, _raw_text(value.raw), str(value) if value.unit or value.label else ""] for value in _values(frame)]
+        rows = [[value.path, _raw_text(value.raw), str(value) if value.unit or value.label else ""] for value in frame.fields.values()]
         parts.append(_title(sensor, piece) + "\n" + table(["field", "raw", "value"], rows, output))
     emit("\n\n".join(parts), output)
 
@@ -78,8 +79,8 @@ def explain(
         return
     parts = [part for piece in found or [Piece(0, given.data, "?")] for part in _parts(sensor, piece)]
     if as_json:
-        told = [{"offset": piece.offset, **part.to_dict()} for piece, part in parts]
-        emit_json({"sensor": sensor.id, "fits": fits, "frames": told}, output)
+        listed = [{"offset": piece.offset, **part.to_dict()} for piece, part in parts]
+        emit_json({"sensor": sensor.id, "fits": fits, "frames": listed}, output)
     else:
         lines: list[Line] = []
         for piece, part in parts:
@@ -99,14 +100,15 @@ def _compare(sensor: Sensor, given: Input, found: list[Piece], diff: str, frame:
         other = same[0]
     else:
         data = read([diff])
-        rest = [Piece(0, data.data, frame)] if frame else [piece for piece in pieces(sensor, data) if piece.frame]
+        whole = [Piece(0, data.data, frame)] if frame else pieces(sensor, data.chunks, datagrams=data.datagrams)
+        rest = [piece for piece in whole if piece.frame]
         other = next((piece for piece in rest if piece.frame == frames[0].frame), Piece(0, data.data, frames[0].frame))
     first, second = _explained(sensor, frames[0]), _explained(sensor, other)
-    differing = differences(first, second)
+    differing = first.differences(second)
     if as_json:
         emit_json({"sensor": sensor.id, "frame": first.frame, "differences": [part.to_dict() for part in differing]}, output)
     else:
-        emit_lines([(Span(f"{sensor.id} {first.frame}", "title"),), *told_differences(first, second, differing)], output)
+        emit_lines([(Span(f"{sensor.id} {first.frame}", "title"),), *told(differing, (len(first.data), len(second.data)))], output)
 
 
 def _found(
@@ -119,7 +121,7 @@ def _found(
     """
     given = read(words)
     sensor, fits = _sensor(given, sensor_id, damaged=damaged)
-    found = [Piece(0, given.data, frame)] if frame else pieces(sensor, given)
+    found = [Piece(0, given.data, frame)] if frame else pieces(sensor, given.chunks, datagrams=given.datagrams)
     places = [place for place, piece in enumerate(found) if piece.frame]
     if count is not None and len(places) >= count:
         found = found[: places[count - 1] + 1]
@@ -130,12 +132,12 @@ def _sensor(given: Input, sensor_id: str | None, *, damaged: bool) -> tuple[Sens
     """The sensor named, or the one whose bytes these are, and the ids of all whose bytes they could be."""
     if sensor_id is not None:
         return named_sensor(sensor_id), []
-    found = fitting(given)
+    found = fitting(given.chunks, datagrams=given.datagrams)
     if found:
         fits = [sensor.id for sensor in found]
         note(f"these bytes fit {fits[0]}" + (f"; so do {', '.join(fits[1:])}: choose with -s" if fits[1:] else ""))
         return found[0], fits
-    fault = nearest(given)
+    fault = nearest_fault(given)
     if not damaged or not fault.sensor:
         raise fault
     note(f"these bytes fit no sensor; they come nearest to {fault.sensor}")
@@ -145,7 +147,7 @@ def _sensor(given: Input, sensor_id: str | None, *, damaged: bool) -> tuple[Sens
 def _explained(sensor: Sensor, piece: Piece) -> Explanation:
     """A frame explained; "?" for bytes that may begin like one."""
     try:
-        return explained(sensor, piece.data, None if piece.frame == "?" else piece.frame)
+        return explained(piece.data, sensor, None if piece.frame == "?" else piece.frame)
     except WireError as fault:
         raise suggest(fault, f"lidarspec show {sensor.id}") from None
 
@@ -160,9 +162,9 @@ def _parts(sensor: Sensor, piece: Piece) -> Iterator[tuple[Piece, Explanation]]:
         if start < end:
             continue
         try:
-            found = explained(sensor, data[start:])
+            found = explained(data[start:], sensor)
             left = found.rows[-1].data if found.rows and not found.rows[-1].path else b""
-            found = explained(sensor, data[start : len(data) - len(left)], found.frame)
+            found = explained(data[start : len(data) - len(left)], sensor, found.frame)
         except WireError:
             continue
         if start > end:
@@ -181,11 +183,6 @@ def _title(sensor: Sensor, piece: Piece, part: Explanation | None = None) -> str
     kind = part.frame if part is not None else piece.frame
     where = f" at byte {piece.offset}" if piece.offset else ""
     return f"{sensor.id} {kind or 'skipped'}{where}, {len(piece.data)} byte{'s' * (len(piece.data) != 1)}"
-
-
-def _values(frame: Explanation) -> Iterator[Any]:
-    for row in frame.rows:
-        yield from row.values
 
 
 def _raw_text(raw: Any) -> str:

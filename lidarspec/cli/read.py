@@ -1,7 +1,4 @@
-"""`read`: what a sensor sends, as rows.
-
-`stats`: how a sensor is doing, a line at a time.
-"""
+"""`read` and `stats`: what a sensor sends, as rows; and how it is doing, a line at a time."""
 
 from __future__ import annotations
 
@@ -18,8 +15,9 @@ import click
 import numpy as np
 
 from lidarspec.cli.failures import FINDINGS
-from lidarspec.cli.output import note, sensor_option
-from lidarspec.cli.streams import Duration, Patience, Share, nothing_came
+from lidarspec.cli.inputs import Patience, nothing_came
+from lidarspec.cli.options import DURATION, SHARE, sensor_option
+from lidarspec.cli.output import note
 from lidarspec.device.device import Device, open as open_device
 from lidarspec.errors import UnknownFrame
 from lidarspec.packets.packets import Packets
@@ -54,7 +52,7 @@ Units = Mapping[str, str]
 @click.option("--packets", "whole", is_flag=True, help="A row for each packet of the data frame, not for each point.")
 @click.option("-f", "--frame", metavar="NAME", help="The packets of this frame type.")
 @click.option("-n", "--count", type=click.IntRange(min=1), help="Rows at most.")
-@click.option("-t", "--duration", type=Duration(), help="How long at most, such as 10s.")
+@click.option("-t", "--duration", type=DURATION, help="How long at most, such as 10s.")
 @click.option("--all", "every_point", is_flag=True, help="Points without a valid return as well.")
 @click.option("--json", "as_json", is_flag=True, help="Print a JSON object on each line.")
 def read(
@@ -173,6 +171,8 @@ def _plain(value: Any) -> Any:
 
 #: lines after which the names of the columns are said again.
 AGAIN = 20
+#: seconds by which sums of intervals may be off.
+ROUNDED = 1e-6
 #: name and unit of each figure, the width of its column (0: only in the summary), and its text.
 FIGURES: tuple[tuple[str, str, int, Callable[[Reading], str]], ...] = (
     ("speed", "Hz", 6, lambda r: _number(r.speed_hz, ".2f")),
@@ -233,9 +233,9 @@ class Lines:
 @click.argument("source", metavar="SOURCE")
 @sensor_option
 @click.option("-n", "--count", type=click.IntRange(min=1), help="Lines at most.")
-@click.option("-t", "--duration", type=Duration(), help="How long, such as 10s; without it until the input ends.")
-@click.option("--interval", type=Duration(), default="1s", show_default=True, help="From line to line.")
-@click.option("--max-errors", type=Share(), help="Exit code 1 where more of the frames are wrong or lost, such as 1%.")
+@click.option("-t", "--duration", type=DURATION, help="How long, such as 10s; without it until the input ends.")
+@click.option("--interval", type=DURATION, default="1s", show_default=True, help="From line to line.")
+@click.option("--max-errors", type=SHARE, help="Exit code 1 where more of the frames are wrong or lost, such as 1%.")
 @click.option("--json", "as_json", is_flag=True, help="Print a JSON object on each line.")
 def stats(
     source: str, sensor_id: str | None, count: int | None, duration: float | None, interval: float, max_errors: float | None, as_json: bool
@@ -279,7 +279,7 @@ class _Live:
         """Print until the end."""
         edge = last = self._start
         end = self._start + self._end
-        while edge < end and not self._feed.ended:
+        while end - edge > ROUNDED and not self._feed.ended:
             edge = min(edge + self._interval, end)
             self._feed.pump(edge)
             self._patience.check()

@@ -9,13 +9,12 @@ from typing import Any
 
 import click
 
-from lidarspec.cli.failures import suggest
 from lidarspec.cli.frames import plain
-from lidarspec.cli.output import emit, emit_json, output_options, sensor_option, table
-from lidarspec.cli.streams import Duration
+from lidarspec.cli.options import DURATION, output_options, sensor_option
+from lidarspec.cli.output import emit, emit_json, table
 from lidarspec.device.device import Device, open as open_device
 from lidarspec.device.session import Reply
-from lidarspec.errors import CommandError, UnknownCommand, UnknownField, UsageError
+from lidarspec.errors import CommandError, UnknownCommand, UnknownField, UsageError, suggest
 from lidarspec.explaining.explanation import explain
 from lidarspec.spec.fields import factor, split_unit
 from lidarspec.spec.sensor import Sensor
@@ -27,7 +26,7 @@ from lidarspec.wire.schema import schema
 @click.argument("command")
 @click.argument("assignments", metavar="ARGUMENT=VALUE", nargs=-1)
 @sensor_option
-@click.option("--timeout", type=Duration(), metavar="TIME", help="How long to wait for the reply; by default what the sensor declares.")
+@click.option("--timeout", type=DURATION, metavar="TIME", help="How long to wait for the reply; by default what the sensor declares.")
 @output_options
 def send(
     source: str,
@@ -82,7 +81,7 @@ def arguments(sensor: Sensor, name: str, assignments: Sequence[str]) -> dict[str
             raise UsageError(f"{sensor.id} {name}: {text!r} is not argument=value")
         if argument not in command.args or command.frame is None:
             raise UnknownField(argument, command.args, place=f"{sensor.id} {name}")
-        unit = schema(sensor.frames[command.frame].prepared).fields[command.args[argument][0]].unit
+        unit = schema(sensor.frames[command.frame].tree).fields[command.args[argument][0]].unit
         found[argument] = _number(value, unit, f"{sensor.id} {name}: {argument}")
     return found
 
@@ -104,7 +103,7 @@ def _number(text: str, unit: str, place: str) -> float | int:
 def _text(sensor: Sensor, reply: Reply, output: str | None) -> str:
     if not reply.confirmed or reply.frame is None:
         return f"{sensor.id} {reply.command}: sent; no answer is documented, so whether it took is not known"
-    values = [value for row in explain(sensor, reply.data, reply.frame).rows for value in row.values]
+    values = explain(reply.data, sensor, reply.frame).fields.values()
     rows = [[value.path, value.raw.hex(" ") if isinstance(value.raw, bytes) else str(value), value.docs] for value in values]
     return f"{sensor.id} {reply.command}: answered with {reply.frame}\n{table(['field', 'value', 'meaning'], rows, output)}"
 
@@ -113,6 +112,5 @@ def _told(sensor: Sensor, reply: Reply) -> dict[str, Any]:
     told: dict[str, Any] = {"sensor": sensor.id, "command": reply.command, "confirmed": reply.confirmed, "frame": reply.frame}
     if reply.frame is None:
         return {**told, "hex": None, "fields": None, "values": []}
-    rows = explain(sensor, reply.data, reply.frame).rows
-    values = [value.to_dict() for row in rows for value in row.values]
+    values = [value.to_dict() for value in explain(reply.data, sensor, reply.frame).fields.values()]
     return {**told, "hex": reply.data.hex(" "), "fields": plain(reply.values), "values": values}

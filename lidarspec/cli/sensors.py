@@ -8,10 +8,12 @@ from typing import Any
 import click
 import numpy as np
 
-from lidarspec.cli.output import emit, emit_json, note, output_options, table
+from lidarspec.cli.options import output_options
+from lidarspec.cli.output import emit, emit_json, note, table
 from lidarspec.columns.columns import Batch
 from lidarspec.errors import SpecError
 from lidarspec.plugins import registry, sensor as named_sensor
+from lidarspec.points.numpy_plan import describe
 from lidarspec.points.plain import points_function
 from lidarspec.points.plan import Plan, plan_for
 from lidarspec.simulation.frame_maker import FrameMaker
@@ -84,7 +86,7 @@ def _plan(sensor: Sensor, frame: str) -> list[str]:
     state = {name: (None, np.full(len(table), -1, np.intp)) for name in sensor.state}
     largest = max(table.groups, key=lambda group: group.layout.size)
     found = plan_for(points_function(sensor, frame), Batch(table, np.zeros(len(table), np.bool_), state, sensor.state), largest)
-    return found.describe() if isinstance(found, Plan) else [f"plain evaluation: {found}"]
+    return describe(found) if isinstance(found, Plan) else [f"plain evaluation: {found}"]
 
 
 @click.command()

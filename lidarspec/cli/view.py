@@ -9,8 +9,9 @@ from pathlib import Path
 
 import click
 
-from lidarspec.cli.output import drawn, note, sensor_option
-from lidarspec.cli.streams import PATIENCE, Duration, nothing_came
+from lidarspec.cli.inputs import PATIENCE, nothing_came
+from lidarspec.cli.options import DURATION, sensor_option
+from lidarspec.cli.output import drawn, note
 from lidarspec.device.device import Device, open as open_device
 from lidarspec.device.settings import named
 from lidarspec.transports.open_url import live_address
@@ -25,7 +26,7 @@ from lidarspec.view.screen import Screen, Terminated, encodable, interactive, ke
 @click.command()
 @click.argument("source", metavar="SOURCE")
 @sensor_option
-@click.option("-t", "--duration", type=Duration(), help="How long at most, such as 30s; for a first picture 10s.")
+@click.option("-t", "--duration", type=DURATION, help="How long at most, such as 30s; for a first picture 10s.")
 @click.option("--once", is_flag=True, help="Print one picture and end, as where standard output is no terminal.")
 @click.option("--colour", "ramp", type=click.Choice(["range", "intensity"]), default="range", show_default=True, help="What colours show.")
 def view(source: str, sensor_id: str | None, duration: float | None, once: bool, ramp: str) -> None:

@@ -1,11 +1,17 @@
-"""Columns: what `points` and `plausible` functions compute with.
+"""Columns: what `points`, `plausible` and clock functions compute with.
 
-A `Column` is an array with one axis for the packets and one for each array level of the struct, each axis named by
-its array, so that arithmetic lines up by itself and sibling arrays cannot be mixed by accident. It also knows the
-batch it comes from: where packets were lost, how long variable arrays are, and how many packets are already certain
-(``ready``) where a value depends on what follows.
+A `Batch` is a table of packets with what surrounds them: where something was lost, the frames of other types that were last before each
+packet, and what the batch before left over. `Fields` is what a function is given as ``f``: the fields of a batch by attribute, each of
+which is a `Column`.
 
-The fields of a batch by attribute: what a `points` or `plausible` function is given as ``f``.
+A `Column` is an array with one axis for the packets and one for each array level of the struct, of length 1 where its field is further
+out. Each axis is named by its array, so that arithmetic lines up by itself, and sibling arrays cannot be mixed by accident. A column also
+knows its batch, and so where packets were lost and how long variable arrays are; and how many packets are already certain (``ready``)
+where a value depends on what follows. `RowOfValues` is a column as one run of values in stream order, without padding, which is what
+`previous`, `following` and `last` mean by "before" and "after".
+
+Axes that are kept by name whatever the depth (M3), elements of an array by index and tables over two indices (M8) belong here: in
+`Column.on`, in `aligned`, and in a ``__getitem__`` of `Fields`.
 """
 
 from __future__ import annotations
@@ -13,17 +19,16 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.lib.mixins import NDArrayOperatorsMixin
 from numpy.typing import NDArray
 
 from lidarspec.errors import SpecError, UnknownField
-
-if TYPE_CHECKING:
-    from lidarspec.wire.frame_table import Table
-    from lidarspec.wire.schema import FieldInfo, Schema
+from lidarspec.spec.tree import FieldInfo
+from lidarspec.wire.frame_table import Group, Rows, Table
+from lidarspec.wire.schema import Schema
 
 #: NumPy functions that work element by element, and so keep axes; others see plain arrays.
 ELEMENTWISE = {np.where, np.clip, np.nan_to_num, np.round, np.isclose, np.real_if_close}
@@ -57,6 +62,12 @@ class Batch:
     def carried(self, ready: int) -> Carry:
         """What the next batch has to know, if it starts with packet `ready` of this one."""
         return {slot: rest(ready) for slot, rest in enumerate(self.left)}
+
+    def of(self, group: Group) -> Batch:
+        """The packets of a group, in its order, as a batch of their own, which no other follows."""
+        table = Rows(self.table.schema, [Group(group.layout, np.arange(len(group.where)), group.rows)])
+        state = {name: (frames, which[group.where]) for name, (frames, which) in self.state.items()}
+        return Batch(table, self.breaks[group.where], state, self.defaults, nominal=self.nominal)
 
 
 class Column(NDArrayOperatorsMixin):
@@ -102,9 +113,9 @@ class Column(NDArrayOperatorsMixin):
     def applied(self, function: Callable[..., Any], *values: Any) -> Column:
         """`function` of arrays, lined up by axes; columns on the left, arrays by their last axes as in NumPy."""
         arrays, axes, ready = aligned(values, self.batch)
-        found = called(function, arrays)
-        names = (*axes, *(f"<{index}>" for index in range(len(axes), found.ndim - 1)))
-        return Column(found, names, self.batch, ready=ready)
+        array = called(function, arrays)
+        names = (*axes, *(f"<{index}>" for index in range(len(axes), array.ndim - 1)))
+        return Column(array, names, self.batch, ready=ready)
 
     def on(self, *axes: str) -> Column:
         """The same values on other axes, by the names of arrays; its own axes go to the last of those named."""
@@ -112,10 +123,10 @@ class Column(NDArrayOperatorsMixin):
         own = [index for index, name in enumerate(self.axes) if name is not None]
         if len(axes) < len(own):
             raise SpecError(f"a column with {len(own)} axes cannot be put on {axes}")
-        spots = [_position(name, chain) for name in axes][len(axes) - len(own) :]
+        places = [_position(name, chain) for name in axes][len(axes) - len(own) :]
         shape, names = [1] * max(len(chain), len(self.axes)), [None] * max(len(chain), len(self.axes))
-        for index, spot in zip(own, spots, strict=True):
-            shape[spot], names[spot] = self.array.shape[1 + index], chain[spot]  # type: ignore[call-overload]
+        for index, place in zip(own, places, strict=True):
+            shape[place], names[place] = self.array.shape[1 + index], chain[place]  # type: ignore[call-overload]
         return Column(self.array.reshape(self.array.shape[0], *shape), tuple(names), self.batch, ready=self.ready)
 
     def steps(self) -> NDArray[np.intp]:
@@ -123,43 +134,43 @@ class Column(NDArrayOperatorsMixin):
         return np.arange(int(np.nanmax(self.array, initial=0)))
 
     def shifted(self, step: int) -> Column:
-        """The values `step` places later (earlier if negative) in stream order; see `angles.following`."""
-        rows = Rows1D(self)
+        """The values `step` places later (earlier if negative) in stream order; see `spec.vocabulary.following`."""
+        row = RowOfValues(self)
         size = abs(step)
         slot = len(self.batch.left)
         carried = self.batch.carry.get(slot, np.empty(0))
-        values = np.concatenate([carried, rows.values]) if len(carried) else rows.values
-        edges = rows.edges + len(carried)
-        found = np.empty(len(values))
+        values = np.concatenate([carried, row.values]) if len(carried) else row.values
+        edges = row.edges + len(carried)
+        shifted = np.empty(len(values))
         ahead, behind, inside = max(step, 0), max(-step, 0), max(len(values) - size, 0)
-        found[behind : behind + inside] = values[ahead : ahead + inside]
-        found[:behind] = found[behind + inside :] = np.nan
+        shifted[behind : behind + inside] = values[ahead : ahead + inside]
+        shifted[:behind] = shifted[behind + inside :] = np.nan
         for edge in edges.tolist() if size else ():
-            found[max(edge - ahead, 0) : edge + behind] = np.nan
+            shifted[max(edge - ahead, 0) : edge + behind] = np.nan
         ready = self.ready
         if step > 0:
-            certain = rows.starts[ready] - step
-            ready = min(ready, int(np.searchsorted(rows.starts, certain, side="right")) - 1 if certain >= 0 else 0)
-        self.batch.left.append(lambda upto: _tail(values, edges, len(carried) + rows.starts[upto], 0 if step > 0 else size))
-        return Column(rows.spread(found[len(carried) :]), self.axes, self.batch, ready=max(ready, 0))
+            certain = row.starts[ready] - step
+            ready = min(ready, int(np.searchsorted(row.starts, certain, side="right")) - 1 if certain >= 0 else 0)
+        self.batch.left.append(lambda upto: _tail(values, edges, len(carried) + row.starts[upto], 0 if step > 0 else size))
+        return Column(row.spread(shifted[len(carried) :]), self.axes, self.batch, ready=max(ready, 0))
 
     def latest(self, where: Any = None) -> Column:
-        """The most recent value at which `where` was true; see `angles.last`."""
+        """The most recent value at which `where` was true; see `spec.vocabulary.last`."""
         (values, flags), axes, ready = aligned((self, np.isfinite(self) if where is None else where), self.batch)
         shape = np.broadcast_shapes(values.shape, flags.shape)
         both = [Column(np.broadcast_to(array, shape), axes, self.batch, ready=ready) for array in (values, flags)]
-        rows, known = (Rows1D(column) for column in both)
+        row, known = (RowOfValues(column) for column in both)
         slot = len(self.batch.left)
         carried = self.batch.carry.get(slot, np.empty(0))
-        numbers = np.concatenate([carried, rows.values])
-        spots = np.where(np.concatenate([np.ones(len(carried)), known.values]) > 0, np.arange(len(numbers)), -1)
-        spots = np.maximum.accumulate(spots) if len(spots) else spots
-        found = np.where(spots >= 0, numbers[spots], np.nan)
-        self.batch.left.append(lambda upto: found[: len(carried) + rows.starts[upto]][-1:])
-        return Column(rows.spread(found[len(carried) :]), axes, self.batch, ready=ready)
+        numbers = np.concatenate([carried, row.values])
+        indices = np.where(np.concatenate([np.ones(len(carried)), known.values]) > 0, np.arange(len(numbers)), -1)
+        indices = np.maximum.accumulate(indices) if len(indices) else indices
+        latest = np.where(indices >= 0, numbers[indices], np.nan)
+        self.batch.left.append(lambda upto: latest[: len(carried) + row.starts[upto]][-1:])
+        return Column(row.spread(latest[len(carried) :]), axes, self.batch, ready=ready)
 
 
-class Rows1D:
+class RowOfValues:
     """A column as one run of values in stream order, without padding.
 
     Attributes:
@@ -251,11 +262,11 @@ def remainder(values: Any, full: Any) -> NDArray[Any]:
     if np.ndim(full) or not full > 0 or np.ndim(values) == 0 or values.dtype != np.float64:
         return np.asarray(np.remainder(values, full))
     turns = np.subtract(values < 0, values >= full, dtype=np.int8)
-    found: NDArray[np.float64] = values + full * turns
-    inside = (found >= 0) & (found < full)
+    rest: NDArray[np.float64] = values + full * turns
+    inside = (rest >= 0) & (rest < full)
     if not inside.all():
-        found[~inside] = np.remainder(values[~inside], full)
-    return found
+        rest[~inside] = np.remainder(values[~inside], full)
+    return rest
 
 
 def _position(name: str, chain: tuple[str, ...]) -> int:
@@ -275,7 +286,6 @@ def _tail(values: NDArray[np.float64], edges: NDArray[np.intp], end: int, size: 
 
 def field_column(info: FieldInfo, table: Table, depth: int, batch: Batch, which: NDArray[np.intp] | None = None) -> Column:
     """A field in its unit as a column of `depth` array axes; `which`: the frame of the table for each packet."""
-
     array = field_array(info, table, depth)
     if which is not None:
         array = array[which]
@@ -310,7 +320,7 @@ def physical(info: FieldInfo, table: Table) -> NDArray[np.float64]:
 
 
 class Fields:
-    """The fields of a batch of packets by attribute, as `Column`s: ``f.points.distance``, ``f.state.difop.vertical``."""
+    """The fields of a batch of packets by attribute, as columns: ``f.points.distance``, ``f.state.difop.vertical``."""
 
     def __init__(self, batch: Batch, schema: Schema | None = None, prefix: str = "") -> None:
         self._batch, self._schema, self._prefix = batch, schema or batch.table.schema, prefix
@@ -341,12 +351,12 @@ class Watched(Fields):
         self._seen = seen
 
     def __getattr__(self, name: str) -> Any:
-        found = super().__getattr__(name)
-        if isinstance(found, Fields):
+        value = super().__getattr__(name)
+        if isinstance(value, Fields):
             return Watched(self._batch, self._seen, self._schema, f"{self._prefix}{name}.")
         path = f"{self._prefix}{name}"
         self._seen.add(path if path in self._schema.fields else UNKNOWN)
-        return found
+        return value
 
 
 class _States:
@@ -383,7 +393,6 @@ class _State:
         raise UnknownField(path, known, place=f"state.{self._frame}")
 
     def _column(self, path: str, table: Table | None, which: NDArray[np.intp], defaults: Mapping[str, Any]) -> Column:
-
         batch, depth = self._batch, self._batch.table.schema.depth()
         missing = which < 0
         if not missing.any() and table is not None:

@@ -1,26 +1,38 @@
-"""What a `points` function computes, as a graph: it is called once with columns that note down what is done to them.
+"""What a function of fields computes, as a graph: it is called once with columns that note down what is done to them.
 
-Every traced column carries the plain result for two sample packets beside its node, so shapes and axes need no rules of
-their own. What cannot be noted down (a branch on data, reductions, attributes of arrays) is `Untraceable`, with the reason.
+`trace` calls a `points`, `plausible` or clock function with `TracedFields`, and gives back what it returned, with the `Tape` of its
+steps. A step is a `Node`: a field, a state column, an elementwise call, or one of the steps that know packets by name (`on`, `shifted`,
+`latest`). Every node carries the plain result for two sample packets, so shapes and axes need no rules of their own. What cannot be
+noted down (a branch on data, reductions, attributes of arrays) is `Untraceable`, with the reason.
 
-What can be said of a traced expression without computing it: what it depends on, and sums taken apart.
+Whoever works with a graph goes through it with `traverse`, and computes it with `evaluate`: the plain evaluation of a batch, tables of all
+values that a field can have, tests of plausibility and clocks differ only in what they say the fields are. The compilers of points
+(`points.numpy_plan`, `points.numba_kernels`) write a graph down in another form; what they ask of it stands here, too: the fields that a
+value is made of, conditions and sums taken apart. For them a value is *full* where each point has its own, else *low*: then it is
+computed once for its packet or block, plainly.
 
-A value is *full* where each point has its own, else *low*: then it is computed once for its packet or block, plainly.
+Room is left for what is to come. Axes by name (M3): a node's axes are those of its sample, so constants that name an axis are operands
+like columns. Elements of an array and tables over two indices (M8): kinds of nodes beside "on". More columns of a point (M5): further
+values that are traced. Points by coordinates (M2): their expressions are nodes like any others.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
 from numpy.lib.mixins import NDArrayOperatorsMixin
 from numpy.typing import NDArray
 
-from lidarspec.columns.columns import ELEMENTWISE, Batch, Column, Fields
+from lidarspec.columns.columns import ELEMENTWISE, Batch, Column, Fields, called
 from lidarspec.errors import SpecError
+from lidarspec.spec.tree import FieldInfo
+from lidarspec.wire.frame_table import Group
+from lidarspec.wire.schema import Schema
 
 
 class Untraceable(Exception):
@@ -33,11 +45,12 @@ class Node:
 
     Attributes:
         kind: "field", "state", "shift", "latest", "on" or "call".
-        function: for "call" what is applied to arrays that broadcast; for the others what makes the column of a batch.
+        function: for "call" what is applied to arrays that broadcast; for "field" and "state" what makes its column of `Fields`; for the
+            others what makes a column of columns.
         args: nodes, numbers and arrays.
         sample: the result for the sample.
         number: position in the order of evaluation.
-        path: of a field.
+        path: of a field or state column, as it is written after ``f.``.
     """
 
     kind: str
@@ -59,20 +72,44 @@ class Node:
         return size if self.sample.shape[0] > 1 else 0
 
     @cached_property
-    def operands(self) -> list[tuple[Node | None, Any]]:
-        """What is called with: nodes, each with the axes that it lacks of the deepest; None with what is no node, as an array."""
-        depth = max(len(arg.sample.axes) for arg in self.args if isinstance(arg, Node))
-        return [(arg, (1,) * (depth - len(arg.sample.axes))) if isinstance(arg, Node) else (None, np.asarray(arg)) for arg in self.args]
+    def fields(self) -> tuple[Node, ...] | None:
+        """The fields of the frame that it is made of, each once, with numbers and element by element; None where it is made of more."""
+        if self.kind == "field":
+            return (self,)
+        depth = max((len(arg.sample.axes) for arg in self.args if isinstance(arg, Node)), default=0)
+        if self.kind != "call" or len(self.sample.axes) != depth:
+            return None
+        found: dict[Node, None] = {}
+        for arg in self.args:
+            fields = arg.fields if isinstance(arg, Node) else () if np.size(arg) == 1 else None
+            if fields is None:
+                return None
+            found |= dict.fromkeys(fields)
+        return tuple(found)
 
-    def column(self, values: list[Any], fields: Fields) -> Column:
-        """The plain result for a batch, from the results of the nodes before."""
-        args = [values[arg.number] if isinstance(arg, Node) else arg for arg in self.args]
-        if self.kind in ("field", "state"):
-            return self.function(fields)  # type: ignore[no-any-return]
-        if self.kind == "call":
-            first = next(arg for arg in args if isinstance(arg, Column))
+    @cached_property
+    def _first(self) -> int:
+        """The place of the first node among the arguments."""
+        return next(place for place, arg in enumerate(self.args) if isinstance(arg, Node))
+
+    @cached_property
+    def _operands(self) -> list[tuple[bool, Any]]:
+        """Of what is called with: whether it is a node, and the axes that it lacks of the deepest one; or else what it is, as an array."""
+        depth = max(len(arg.sample.axes) for arg in self.args if isinstance(arg, Node))
+        return [(True, (1,) * (depth - len(arg.sample.axes))) if isinstance(arg, Node) else (False, np.asarray(arg)) for arg in self.args]
+
+    def value(self, args: list[Any]) -> Any:
+        """What it comes to, from what its arguments do: a column where these are columns, else an array where they are arrays."""
+        if self.kind != "call":
+            return self.function(*args)
+        first = args[self._first]
+        if isinstance(first, Column):
             return first.applied(self.function, *args)
-        return self.function(*args)  # type: ignore[no-any-return]
+        arrays = [
+            known if not is_node else arg.reshape(*arg.shape, *known) if known else arg
+            for arg, (is_node, known) in zip(args, self._operands, strict=True)
+        ]
+        return called(self.function, arrays)
 
 
 @dataclass
@@ -86,12 +123,16 @@ class Tape:
 
     nodes: list[Node] = field(default_factory=list)
     steps: list[tuple[Node, int]] = field(default_factory=list)
+    _read: dict[str, Node] = field(default_factory=dict)
 
     def add(self, kind: str, function: Callable[..., Any], args: tuple[Any, ...], sample: Column, path: str = "") -> Traced:
-        """A new node, as a traced column."""
-        plain = tuple(arg.node if isinstance(arg, Traced) else arg for arg in args)
-        node = Node(kind, function, plain, sample, len(self.nodes), path)
+        """A new node, as a traced column; a field that was read before has one already."""
+        if path in self._read:
+            return Traced(self._read[path], self)
+        node = Node(kind, function, tuple(map(node_of, args)), sample, len(self.nodes), path)
         self.nodes.append(node)
+        if path:
+            self._read[path] = node
         return Traced(node, self)
 
 
@@ -167,18 +208,16 @@ class TracedFields:
     def __getattr__(self, name: str) -> Any:
         if name.startswith("__"):
             raise AttributeError(name)
-        found, names = getattr(self._real, name), (*self._names, name)
-        if not isinstance(found, Column):
-            return TracedFields(found, self._tape, names)
-        kind = "state" if names[0] == "state" else "field"
-        return self._tape.add(kind, lambda fields: walked(fields, names), (), found, ".".join(names))
+        value, names = getattr(self._real, name), (*self._names, name)
+        if not isinstance(value, Column):
+            return TracedFields(value, self._tape, names)
+        path = ".".join(names)
+        return self._tape.add("state" if names[0] == "state" else "field", attrgetter(path), (), value, path)
 
 
-def walked(fields: Any, names: tuple[str, ...]) -> Any:
-    """The attribute of an attribute ... of fields."""
-    for name in names:
-        fields = getattr(fields, name)
-    return fields
+def node_of(value: Any) -> Any:
+    """The node of a traced column; what is none as it is."""
+    return value.node if isinstance(value, Traced) else value
 
 
 def trace(function: Callable[[Any], Any], sample: Batch) -> tuple[Any, Tape]:
@@ -192,8 +231,76 @@ def trace(function: Callable[[Any], Any], sample: Batch) -> tuple[Any, Tape]:
         return function(TracedFields(Fields(sample), tape)), tape
 
 
+def sample_of(batch: Batch, group: Group) -> Batch:
+    """The first frame of a group of a batch, twice, as a batch to trace functions on: enough to tell what all packets share."""
+    return batch.of(Group(group.layout, group.where[[0, 0]], np.ascontiguousarray(group.rows[[0, 0]])))
+
+
+def traverse(*values: Any, into: Callable[[Node], bool] = lambda node: True) -> Iterator[Node]:
+    """The nodes that values, traced columns or nodes, are made of, themselves included, each once.
+
+    Args:
+        into: whether to go on to what a node is made of.
+    """
+    seen, waiting = set[Node](), [node_of(value) for value in values]
+    while waiting:
+        node = waiting.pop()
+        if isinstance(node, Node) and node not in seen:
+            seen.add(node)
+            yield node
+            waiting += node.args if into(node) else ()
+
+
+def evaluate(node: Node, known: dict[Node, Any], source: Callable[[Node], Any] = lambda node: None) -> Any:
+    """What a node comes to, by what the fields are.
+
+    Args:
+        known: the values of nodes: columns, or arrays whose first axis is for the packets; added to, so that each is computed once.
+        source: the value of a node that is not computed from others, such as a field; None for those that are.
+
+    Returns:
+        A column or an array, as those that it is made of are.
+    """
+    value = known.get(node)
+    if value is None:
+        value = source(node)
+        if value is None:
+            value = node.value([evaluate(arg, known, source) if isinstance(arg, Node) else arg for arg in node.args])
+        known[node] = value
+    return value
+
+
+def only_field(node: Node) -> Node | None:
+    """The one field that an expression is made of besides numbers; None where there is no such one."""
+    return node.fields[0] if node.fields is not None and len(node.fields) == 1 else None
+
+
+def fields_beside(node: Node, schema: Schema) -> tuple[FieldInfo, ...]:
+    """The fields that an expression is made of, all in the same arrays, each once.
+
+    Raises:
+        Untraceable: if it is made of more than fields of the frame that stand side by side.
+    """
+    if node.fields is None:
+        raise Untraceable("made of more than fields of the frame")
+    infos = tuple(schema.fields[source.path] for source in node.fields)
+    if len({info.axes for info in infos}) != 1:
+        raise Untraceable("made of fields of different arrays")
+    return infos
+
+
+def conjuncts(node: Node) -> Iterator[Node]:
+    """The conditions that have to hold together for a condition to hold."""
+    both = node.kind == "call" and node.function in (np.bitwise_and, np.logical_and)
+    if both and all(isinstance(arg, Node) and arg.sample.array.dtype == np.bool_ for arg in node.args):
+        for arg in node.args:
+            yield from conjuncts(arg)
+    else:
+        yield node
+
+
 #: one-argument functions that are a multiplication.
-_FACTORS = {
+FACTORS = {
     np.negative: -1.0,
     np.positive: 1.0,
     np.deg2rad: np.pi / 180,
@@ -219,22 +326,6 @@ class Term:
 def is_full(value: Any, width: int) -> bool:
     """Whether each of the `width` points of a packet has its own value."""
     return isinstance(value, Node) and value.width == width
-
-
-def only_field(node: Node) -> Node | None:
-    """The one field that an expression depends on besides numbers; None where there is no such one."""
-    found: dict[str, Node] = {}
-    waiting = [node]
-    while waiting:
-        this = waiting.pop()
-        if this.kind == "field":
-            found[this.path] = this
-        elif this.kind != "call" or any(not isinstance(arg, Node) and np.size(arg) != 1 for arg in this.args):
-            return None
-        if len(found) > 1:
-            return None
-        waiting += [arg for arg in this.args if isinstance(arg, Node)]
-    return next(iter(found.values()), None)
 
 
 def chosen(node: Node, width: int) -> tuple[Node, Any, Any] | None:
@@ -263,8 +354,8 @@ def terms(value: Any, width: int) -> list[Term]:
         return [Term(np.ones(()), low=value)]
     function, args = value.function, value.args
     if value.kind == "call" and only_field(value) is None:
-        if function in _FACTORS:
-            return _scaled(value, terms(args[0], width), _FACTORS[function])
+        if function in FACTORS:
+            return _scaled(value, terms(args[0], width), FACTORS[function])
         if function in (np.add, np.subtract):
             sign = 1.0 if function is np.add else -1.0
             return terms(args[0], width) + [term.times(sign) for term in terms(args[1], width)]
@@ -283,7 +374,7 @@ def _scaled(value: Node, parts: list[Term], factor: Any) -> list[Term]:
     return [part.times(factor) for part in parts]
 
 
-def split_level(parts: list[Term], depth: int) -> int | None:
+def split_level(parts: Sequence[Term], depth: int) -> int | None:
     """The axis from which on only rows vary, and before which only low values do; None where they cross."""
     level = max((last_axis(part.low.shape) for part in parts if part.low is not None), default=0)
     for part in parts:

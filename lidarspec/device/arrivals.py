@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarspec.errors import UsageError
-from lidarspec.framing.decoder import Decoder, Found, Spans
-from lidarspec.framing.results import Alike
+from lidarspec.errors import UsageError, suggest
+from lidarspec.framing.decoder import Decoder
+from lidarspec.framing.results import Found, Frames
 from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.protocol import Chunk
 
@@ -28,7 +28,7 @@ class Arrival:
         interrupted: whether input is missing behind them: no frame, packet or scan goes on there.
     """
 
-    found: list[Spans] = field(default_factory=list)
+    found: list[Frames] = field(default_factory=list)
     interrupted: bool = False
 
 
@@ -45,7 +45,7 @@ class Senders:
         self._ours: str | None = None
         self._others: dict[str, Decoder] = {}
 
-    def check(self, chunks: Sequence[Chunk], found: Spans) -> None:
+    def check(self, chunks: Sequence[Chunk], found: Frames) -> None:
         """Look who sent the frames of these datagrams.
 
         Raises:
@@ -54,7 +54,7 @@ class Senders:
         senders = {chunk.sender for chunk in chunks}
         sender = senders.pop() if len(senders) == 1 else None
         if sender is not None and all(host == sender[0] for host in self._first.values()):
-            for kind in [found.kind] if isinstance(found, Alike) else np.unique(found.kinds).tolist():
+            for kind in np.unique(found.kinds).tolist():
                 self._first.setdefault(found.names[kind], sender[0])
             return
         hosts = [chunk.sender[0] if chunk.sender else None for chunk in chunks]
@@ -105,24 +105,23 @@ class Senders:
     def _several(self, first: str, other: str, what: str) -> UsageError:
         mark = "&" if "?" in str(self._source) else "?"
         error = UsageError(f"{self._source}: {first} and {other} both send {what}; choose one with {mark}src={first}")
-        error.add_note(f"next: the same with '{self._source}{mark}src={first}'")
-        return error
+        return suggest(error, f"the same with '{self._source}{mark}src={first}'")
 
 
-def fed(decoder: Decoder, chunks: Sequence[Chunk]) -> list[Spans]:
+def fed(decoder: Decoder, chunks: Sequence[Chunk]) -> list[Frames]:
     """The frames that consecutive chunks complete, each with the arrival time of the chunk that holds its last byte."""
     if not decoder.stream:
         return [decoder.datagrams([chunk.data for chunk in chunks], [chunk.at for chunk in chunks])]
     if len(chunks) == 1:
-        return decoder.spans(chunks[0].data, chunks[0].at)
+        return decoder.frames(chunks[0].data, chunks[0].at)
     data = [chunk.data for chunk in chunks]
     ends = np.array([*accumulate(map(len, data), initial=decoder.stats.bytes_in)])[1:]
-    found = decoder.spans(b"".join(data), chunks[-1].at)
+    found = decoder.frames(b"".join(data), chunks[-1].at)
     times = np.array([-1 if chunk.at is None else chunk.at for chunk in chunks], np.int64)
-    return [spans.arrived(times[ends.searchsorted(spans.offsets + spans.sizes)]) for spans in found]
+    return [frames.arrived(times[ends.searchsorted(frames.offsets + frames.sizes)]) for frames in found]
 
 
-def answers(found: Sequence[Spans], awaited: frozenset[str]) -> list[Found]:
+def answers(found: Sequence[Frames], awaited: frozenset[str]) -> list[Found]:
     """The frames of some types, one by one."""
     picked = []
     for spans in found:

@@ -18,7 +18,7 @@ from typing import Any, Generic, TypeVar
 from lidarspec.device.device import Device, open as open_device
 from lidarspec.device.session import Reply
 from lidarspec.errors import UsageError
-from lidarspec.framing.decoder import Counters
+from lidarspec.framing.results import Counters
 from lidarspec.packets.packets import Packets
 from lidarspec.scans.scans import Scan
 from lidarspec.spec.sensor import Sensor

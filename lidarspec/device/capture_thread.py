@@ -16,11 +16,10 @@ from collections import deque
 from collections.abc import Iterable
 from dataclasses import replace
 from enum import Enum
-from typing import Protocol
 
 from lidarspec.errors import SourceError, UsageError
-from lidarspec.transports.live_transport import POLL
-from lidarspec.transports.protocol import Chunk, Disconnected, LiveTransport
+from lidarspec.recording.appending import Log
+from lidarspec.transports.protocol import POLL, Chunk, Disconnected, LiveTransport
 
 #: what waits in a queue at most: chunks, and bytes in them; several seconds of the fastest sensors.
 CHUNKS, BYTES = 1 << 16, 1 << 25
@@ -39,14 +38,6 @@ class Mark(Enum):
 
 Item = Chunk | Mark | BaseException
 Event = tuple[str, Item]
-
-
-class Log(Protocol):
-    """Where everything that arrives is recorded."""
-
-    def write(self, chunk: Chunk) -> None: ...
-
-    def event(self, name: str, at: int | None = None) -> None: ...
 
 
 class BoundedQueue:

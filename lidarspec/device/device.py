@@ -19,17 +19,19 @@ from lidarspec.device.live_input import PERIOD, LiveInput
 from lidarspec.device.session import Reply
 from lidarspec.device.settings import named
 from lidarspec.discovery.detect import detected
-from lidarspec.errors import SourceError, UsageError
-from lidarspec.framing.decoder import Counters, Decoder, Spans
+from lidarspec.errors import SourceError, UsageError, suggest
+from lidarspec.framing.decoder import Decoder
+from lidarspec.framing.results import Counters, Frames
 from lidarspec.packets.packets import Packets
 from lidarspec.packets.stream import PacketStream, data_frame
 from lidarspec.plugins import sensor as named_sensor
 from lidarspec.points.cloud import Mount
-from lidarspec.recording.recorders import AnyRecorder, RecordTo, recorder_for
+from lidarspec.recording.appending import Log
+from lidarspec.recording.recorders import RecordTo, recorder_for
 from lidarspec.scans.scans import Scan, ScanStream, handed_out
 from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.open_url import transport
-from lidarspec.transports.protocol import Transport
+from lidarspec.transports.protocol import LiveTransport, Transport
 
 #: batches kept while nobody knows yet which data frame the sensor answers in.
 UNDECIDED = 256
@@ -49,7 +51,7 @@ class PacketReader:
 
     def __init__(self, sensor: Sensor, frame: str | None, decoder: Decoder, state: Mapping[str, bytes]) -> None:
         self._sensor, self._decoder, self._state = sensor, decoder, state
-        self._waiting: deque[Spans] = deque(maxlen=UNDECIDED)
+        self._waiting: deque[Frames] = deque(maxlen=UNDECIDED)
         self._stream = self._made(frame) if frame is not None else None
         self.last: Packets | None = None
 
@@ -117,7 +119,7 @@ class Device:
         self._streams: dict[str | None, PacketReader] = {}
         self._latest, self._unseen = ScanStream(sensor, mount), deque[Scan]()
         self._ahead: Arrival | None = None
-        self._own_recorder: AnyRecorder | None = None
+        self._own_recorder: Log | None = None
         self._input = self._opened(backend, record, overflow, period)
         self._finalizer = weakref.finalize(self, _close, self._input, self._own_recorder)
         if start and isinstance(self._input, LiveInput):
@@ -153,7 +155,7 @@ class Device:
         """Whether data come at their own pace, and not from a file."""
         return self._input.is_live
 
-    def spans(self) -> Iterator[list[Spans]]:
+    def spans(self) -> Iterator[list[Frames]]:
         """Every incoming frame of all types, in batches."""
         for arrival in self._arrivals(None):
             if arrival is not None and arrival.found:
@@ -243,8 +245,7 @@ class Device:
     def overdue(self) -> SourceError:
         """What to say when a scan did not come in time."""
         error = SourceError(f"{self._source}: no scan in time; the source is {self.state}")
-        error.add_note(f"next: lidarspec doctor '{self._source}' -s {self.sensor.id}")
-        return error
+        return suggest(error, f"lidarspec doctor '{self._source}' -s {self.sensor.id}")
 
     def send(self, name: str, *, timeout: float | None = None, **arguments: Any) -> Reply:
         """The reply to a command; at once with ``confirmed=False`` where none is documented.
@@ -279,15 +280,15 @@ class Device:
         return f"Device({self.sensor.id} on {self._source}, {self.state}: {self.stats})"
 
     def _opened(self, backend: str, record: RecordTo | None, overflow: str | None, period: float) -> FileInput | LiveInput:
-        opened: Any = transport(self._source, self.sensor)
+        opened = transport(self._source, self.sensor)
         try:
-            if not hasattr(opened, "read"):
+            if not isinstance(opened, LiveTransport):
                 if record is not None:
                     raise UsageError(f"{self._source} is a file already: there is nothing to record")
                 return FileInput(self._source, self.sensor, opened, backend=backend)
             kept, is_own = (None, False) if record is None else recorder_for(record, self.sensor, self._source, opened)
             self._own_recorder = kept if is_own else None
-            policy: str = getattr(opened, "overflow", "drop_oldest") if overflow is None else overflow
+            policy = opened.overflow if overflow is None else overflow
             return LiveInput(self._source, self.sensor, opened, backend=backend, policy=policy, recorder=kept, period=period)
         except BaseException:
             _close(opened, self._own_recorder)
@@ -319,7 +320,7 @@ class Device:
                 yield arrival
 
 
-def _close(source: FileInput | LiveInput | Transport, recorder: AnyRecorder | None) -> None:
+def _close(source: FileInput | LiveInput | Transport, recorder: Log | None) -> None:
     """Give everything back; the recording is closed even where the source fails."""
     try:
         source.close()

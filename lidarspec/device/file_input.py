@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
-from lidarspec.captures.bulk import BulkTransport, first_frames
+from lidarspec.captures.bulk import first_frames
 from lidarspec.device.arrivals import Arrival, Senders, fed
 from lidarspec.device.session import Reply
 from lidarspec.errors import CommandError
-from lidarspec.framing.decoder import Counters, Decoder
+from lidarspec.framing.decoder import Decoder
+from lidarspec.framing.results import Counters
 from lidarspec.spec.sensor import Sensor
+from lidarspec.transports.files import CaptureTransport
 from lidarspec.transports.open_url import transport
 from lidarspec.transports.protocol import Chunk, Transport
 
@@ -43,14 +45,14 @@ class FileInput:
     @property
     def warnings(self) -> list[str]:
         """What is to be said about the source, such as a file that is cut off."""
-        return list(getattr(self._transport, "warnings", []))
+        return list(self._transport.warnings)
 
     @property
     def stats(self) -> Counters:
         """The counters."""
-        for name in ("foreign", "disconnects"):
-            setattr(self.decoder.stats, name, getattr(self._transport, name, 0))
-        return self.decoder.stats
+        stats = self.decoder.stats
+        stats.foreign, stats.disconnects = self._transport.foreign, self._transport.disconnects
+        return stats
 
     def next(self, wait: float) -> Arrival | None:
         """The next frames; None at the end."""
@@ -85,7 +87,7 @@ class FileInput:
         source = transport(self._source)
         decoder = self._sensor.decoder(stream=not source.datagrams)
         try:
-            if isinstance(source, BulkTransport):
+            if isinstance(source, CaptureTransport):
                 return first_frames(decoder, source.batches(), wanted)
             for chunk in source.chunks():
                 for item in decoder.feed(chunk.data, chunk.at):
@@ -99,7 +101,7 @@ class FileInput:
 
     def _read(self) -> Iterator[Arrival]:
         """Every incoming frame, in batches."""
-        if isinstance(self._transport, BulkTransport) and not self.decoder.stream:
+        if isinstance(self._transport, CaptureTransport) and not self.decoder.stream:
             for datagrams in self._transport.batches():
                 spans = self.decoder.placed(datagrams.buffer, datagrams.starts, datagrams.sizes, datagrams.at)
                 self._senders.see(datagrams.hosts(spans))

@@ -20,9 +20,10 @@ from typing import Any
 from lidarspec.device.arrivals import Arrival, Senders, answers, fed
 from lidarspec.device.capture_thread import BoundedQueue, Capture, Event, Mark
 from lidarspec.device.session import Outgoing, Pending, Reply, Session
-from lidarspec.errors import CommandError, LidarSpecError, ReplyTimeout
-from lidarspec.framing.decoder import Counters, Decoder, Spans, backend as backend_named
-from lidarspec.recording.recorders import AnyRecorder
+from lidarspec.errors import CommandError, LidarSpecError, ReplyTimeout, suggest
+from lidarspec.framing.decoder import Decoder, backend as backend_named
+from lidarspec.framing.results import Counters, Frames
+from lidarspec.recording.appending import Log
 from lidarspec.spec.description import Command
 from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.open_url import control_link, has_control
@@ -45,7 +46,7 @@ class Watch:
         self._unframed_since: float | None = None
         self.streams = False
 
-    def saw(self, found: Sequence[Spans]) -> None:
+    def saw(self, found: Sequence[Frames]) -> None:
         """Take note of what was decoded."""
         if any(map(len, found)):
             self._framed, self._bytes, self._unframed_since = time.monotonic(), self._decoder.stats.bytes_in, None
@@ -97,7 +98,7 @@ class Watch:
 
     @property
     def _baud(self) -> str:
-        baud = getattr(self._transport, "baud", None)
+        baud = self._transport.baud
         return f": {baud} baud is likely wrong" if baud else ""
 
 
@@ -135,7 +136,7 @@ class LiveInput:
         *,
         backend: str = "auto",
         policy: str = "drop_oldest",
-        recorder: AnyRecorder | None = None,
+        recorder: Log | None = None,
         period: float = PERIOD,
     ) -> None:
         self._source, self.sensor, self._recorder, self._period = source, sensor, recorder, period
@@ -175,8 +176,8 @@ class LiveInput:
     def stats(self) -> Counters:
         """The counters of the data link, those of the transports included."""
         stats, captures = self.decoder.stats, list(self._captures.values())
-        stats.kernel_drops = sum(capture.transport.statistics.kernel_drops for capture in captures)
-        stats.foreign = self._foreign + sum(capture.transport.statistics.foreign for capture in captures)
+        stats.kernel_drops = sum(capture.transport.kernel_drops for capture in captures)
+        stats.foreign = self._foreign + sum(capture.transport.foreign for capture in captures)
         stats.disconnects = sum(capture.disconnects for capture in captures)
         stats.queue_dropped = self.queue.dropped
         return stats
@@ -193,8 +194,7 @@ class LiveInput:
                 self.send(name)
             except ReplyTimeout as error:
                 if not self._watch.streams:
-                    error.add_note(f"next: {self._watch.following()}")
-                    raise
+                    raise suggest(error, self._watch.following()) from None
                 self._said.append(f"{error}; data come all the same")
 
     def next(self, wait: float) -> Arrival | None:
@@ -245,8 +245,7 @@ class LiveInput:
         if command.link not in self._captures and (data.peer() or has_control(self._source)):
             return
         limit = time.monotonic() + (command.timeout * (1 + command.retries) if timeout is None else timeout)
-        # only a transport that answers to whoever sent last has to say so
-        while not getattr(data, "addressed", True) and self._failure is None and time.monotonic() < limit:
+        while not data.addressed and self._failure is None and time.monotonic() < limit:
             self._help()
 
     def close(self) -> None:
@@ -336,7 +335,7 @@ class LiveInput:
             self._senders.check(chunks, found[0])
         self._hand_on(link, found)
 
-    def _hand_on(self, link: str, found: list[Spans], *, interrupted: bool = False) -> None:
+    def _hand_on(self, link: str, found: list[Frames], *, interrupted: bool = False) -> None:
         with self._talk:
             awaited = self._session.awaited(link)
             for item in answers(found, awaited) if awaited else ():
@@ -381,7 +380,7 @@ class LiveInput:
     def _opened(self, link: str) -> LiveTransport:
         """The transport of a link; one apart from the data's is opened when it is first needed."""
         if link not in self._captures:
-            opened: Any = control_link(self._source, link, self.sensor.links[link], self._captures["data"].transport.peer())
+            opened = control_link(self._source, link, self.sensor.links[link], self._captures["data"].transport.peer())
             self._decoders[link] = self.sensor.decoder(stream=not opened.datagrams, backend=self._backend)
             self._captures[link] = Capture(opened, self.queue, link=link)
         return self._captures[link].transport
@@ -413,5 +412,4 @@ def calm(name: str) -> str:
 def _silence(sensor: Sensor, opened: LiveTransport) -> float:
     """Seconds without a byte after which nothing of a frame can be under way: longer than a frame takes on the line."""
     longest = max((frame.max_length for frame in sensor.frames.values()), default=0)
-    baud = getattr(opened, "baud", None)
-    return max(0.1, 2 * longest * 10 / baud) if baud else 0.1
+    return max(0.1, 2 * longest * 10 / opened.baud) if opened.baud else 0.1

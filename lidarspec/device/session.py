@@ -20,10 +20,11 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from lidarspec.errors import CommandError, ReplyTimeout, UnknownField, UsageError
-from lidarspec.framing.decoder import Found
+from lidarspec.framing.results import Found
 from lidarspec.spec.description import Command
 from lidarspec.spec.sensor import Sensor
-from lidarspec.wire.schema import FieldInfo, schema
+from lidarspec.spec.tree import FieldInfo
+from lidarspec.wire.schema import schema
 
 #: fields that a reply's repr shows.
 SHOWN = 6
@@ -346,7 +347,7 @@ class Session:
 
     def _table(self, frame: str) -> dict[str, FieldInfo]:
         if frame not in self._tables:
-            self._tables[frame] = dict(schema(self.sensor.frames[frame].prepared).fields)
+            self._tables[frame] = dict(schema(self.sensor.frames[frame].tree).fields)
         return self._tables[frame]
 
     def _advance(self, link: str, now: int) -> None:

@@ -21,16 +21,17 @@ from numpy.typing import NDArray
 
 from lidarspec.device.settings import named
 from lidarspec.discovery.listen import Heard, hear
-from lidarspec.errors import CommandError, LidarSpecError, UsageError, WireError
-from lidarspec.framing.decoder import Found
+from lidarspec.errors import CommandError, LidarSpecError, UsageError, WireError, suggest
+from lidarspec.framing.results import Found
 from lidarspec.plugins import sensors
 from lidarspec.simulation.simulator import simulate
 from lidarspec.spec.links import Serial
 from lidarspec.spec.sensor import Sensor
+from lidarspec.spec.tree import FieldInfo
 from lidarspec.transports.files import RecordingTransport
 from lidarspec.transports.open_url import live_address, transport
 from lidarspec.transports.simulated import SimulatedTransport
-from lidarspec.wire.schema import FieldInfo, schema
+from lidarspec.wire.schema import schema
 
 #: share by which the pace of a clock may be off, frames of a type that are looked into for names, and packets simulated.
 OFF, READ, PACKETS = 0.03, 3, 64
@@ -99,7 +100,7 @@ def _by_name(sensor: Sensor, found: Sequence[Found]) -> str:
 
 
 def _fields(sensor: Sensor, frame: str) -> Mapping[str, FieldInfo]:
-    return schema(sensor.frames[frame].prepared).fields
+    return schema(sensor.frames[frame].tree).fields
 
 
 def _texts(values: object, fields: Mapping[str, FieldInfo], above: str = "") -> Iterator[tuple[str, str]]:
@@ -288,8 +289,7 @@ def _nothing(source: str, found: Sequence[Verdict]) -> Exception:
     if live_address(source) is None:
         return WireError(f"{source}: it holds no bytes")
     error = CommandError(f"{source}: nothing comes; a sensor that has to be started first is named with -s")
-    error.add_note(f"next: lidarspec doctor {source}")
-    return error
+    return suggest(error, f"lidarspec doctor {source}")
 
 
 def _bauds(sensor: Sensor) -> tuple[int, ...]:

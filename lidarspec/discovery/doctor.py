@@ -12,12 +12,13 @@ from shlex import quote
 from lidarspec.device.settings import named
 from lidarspec.discovery.detect import Verdict, verdict, verdicts
 from lidarspec.discovery.listen import LISTEN, Heard, bauds, has_no_baud, started_first, udp_ports
-from lidarspec.errors import LidarSpecError, UsageError
+from lidarspec.errors import LidarSpecError, UsageError, suggestion
 from lidarspec.spec.links import Serial, Udp
 from lidarspec.spec.sensor import Sensor
 from lidarspec.transports import ports
-from lidarspec.transports.live_transport import Address
+from lidarspec.transports.base import Address
 from lidarspec.transports.open_url import live_address, transport
+from lidarspec.transports.protocol import LiveTransport
 from lidarspec.transports.udp import BUFFER, shortfall
 
 #: share of the bytes outside frames from which on a line is bad.
@@ -190,11 +191,11 @@ def _heard(source: str, sensor: Sensor | None, seconds: float) -> Iterator[Findi
             tried = [*([found] if found is not None else []), *verdicts(source, seconds=seconds)]
             found = max(tried, key=lambda one: (bool(one.scores), one.heard.size))
     except UsageError as error:
-        yield Finding(False, str(error), next((note.removeprefix("next: ") for note in getattr(error, "__notes__", ())), ""))
+        yield Finding(False, str(error), suggestion(error))
         return
     except LidarSpecError as error:
-        command = next((note.removeprefix("next: ") for note in getattr(error, "__notes__", ()) if "doctor" not in note), "")
-        yield Finding(False, str(error), command)
+        command = suggestion(error)
+        yield Finding(False, str(error), "" if "doctor" in command else command)
         return
     yield _verdict(source, found, sensor)
 
@@ -204,11 +205,11 @@ def _as_expected(source: str, sensor: Sensor, seconds: float) -> Verdict | None:
     opened = transport(source, sensor)
     try:
         end, chunks = time.monotonic() + seconds, list[bytes]()
-        while (left := end - time.monotonic()) > 0 and hasattr(opened, "read"):
+        while (left := end - time.monotonic()) > 0 and isinstance(opened, LiveTransport):
             chunks += [chunk.data for chunk in opened.read(min(left, 0.1))]
         address = live_address(source)
         plain = address is not None and has_no_baud(address.place)
-        datagrams, baud = opened.datagrams, None if plain else getattr(opened, "baud", None)
+        datagrams, baud = opened.datagrams, None if plain else opened.baud
     finally:
         opened.close()
     return verdict(Heard(source, tuple(chunks), datagrams, baud)) if chunks else None

@@ -18,7 +18,7 @@ from lidarspec.framing.decoder import Decoder
 from lidarspec.plugins import sensors
 from lidarspec.spec.links import Serial, Udp
 from lidarspec.spec.sensor import Sensor
-from lidarspec.transports.open_url import live_address, transport
+from lidarspec.transports.open_url import live, live_address, transport
 from lidarspec.transports.protocol import Chunk, Disconnected, LiveTransport, Transport
 
 #: bytes and datagrams that are looked at; of a live source, bytes that are enough.
@@ -94,8 +94,7 @@ def has_no_baud(port: str) -> bool:
 def _heard(source: str, seconds: float, baud: int | None, name: str) -> Iterator[Heard]:
     opened = transport(source)
     try:
-        live = hasattr(opened, "read")
-        chunks = _listened(opened, seconds) if live else _begun(opened)  # type: ignore[arg-type]
+        chunks = _listened(opened, seconds) if isinstance(opened, LiveTransport) else _begun(opened)
     finally:
         opened.close()
     by_sender: dict[str, list[bytes]] = {}
@@ -171,7 +170,7 @@ def probe(source: str | Path) -> Iterator[Heard]:
                 continue
             tried.add(asked)
             given = str(source) if "baud" in address.options else f"{source}{mark}baud={baud}"
-            opened: LiveTransport = transport(given, sensor)  # type: ignore[assignment]
+            opened = live(given, sensor)
             try:
                 chunks = _Probe(sensor, opened).run()
             finally:

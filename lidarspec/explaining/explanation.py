@@ -1,9 +1,9 @@
-"""Which single flipped bit makes a damaged frame whole again, if any does: each one is tried, through the engine itself.
+"""A frame, byte by byte: what each one is called, what it says, what is wrong with it, and what differs from another frame.
 
-A frame, byte by byte: what each one is called, what it says, and what is wrong with it.
-
-construct itself reads the frame, unverified, and notes every part on its way. So a frame that is cut off is explained
-as far as it goes, one without a computable layout like any other, and no offset is known here.
+construct itself reads the frame, unverified, and notes every part on its way (`_Trail`). So a frame that is cut off is explained as
+far as it goes, one without a computable layout like any other, and no offset is known here. What the author says of a part comes from the
+frame tree: names of values, units, constants, and which bits of a block are whose. Of a damaged frame each single bit is
+flipped and tried, through the engine itself, for the one that would make it whole again. A valid frame goes on to its points.
 """
 
 from __future__ import annotations
@@ -11,31 +11,126 @@ from __future__ import annotations
 import io
 import re
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
-import construct
 import numpy as np
 
 from lidarspec.errors import LidarSpecError, WireError
-from lidarspec.explaining.listing import Explanation
-from lidarspec.explaining.wording import Point, Row, Value, hexdump
-from lidarspec.framing.decoder import Counters, Found, packed
-from lidarspec.framing.frame_engine import CompiledCodec, codec
-from lidarspec.framing.plausibility import IMPLAUSIBLE, VALID
+from lidarspec.explaining.listing import Line, listed, text
+from lidarspec.explaining.wording import Difference, Point, Row, Span, Value
+from lidarspec.framing.frame_engine import Codec, CompiledCodec, codec
+from lidarspec.framing.results import IMPLAUSIBLE, VALID, Counters, Found, packed
 from lidarspec.packets.stream import PacketStream
 from lidarspec.points.plain import evaluate
-from lidarspec.spec.bits import BitField, leaves, probe
-from lidarspec.spec.construct_layer import UNNAMED, Seen, field_path, unwrap
+from lidarspec.spec.bits import BitField
+from lidarspec.spec.construct_layer import UNNAMED, Seen, field_path, leaves
 from lidarspec.spec.description import Frame
 from lidarspec.spec.fields import Checksummed, exact
-from lidarspec.spec.rules import children
 from lidarspec.spec.sensor import Sensor
+from lidarspec.spec.tree import Block, FieldInfo, Node, Opaque, Repeat, Struct, children
 from lidarspec.wire.parse import parse_typed
-from lidarspec.wire.schema import FieldInfo, schema
+from lidarspec.wire.schema import schema
 from lidarspec.wire.wire_table import bit_text, hexed
 
 #: bytes of candidates that are tried in one go, and the longest frame that construct alone has to read so often.
 BLOCK, INTERPRETED = 1 << 20, 128
+#: most points of a frame without arrays that are told.
+TOLD = 4
+#: most decimals that steps are told apart by, those that may be added to show one in full, and most flipped bits that are told one by one.
+DIGITS, SPARE, FLIPS = 12, 2, 3
+
+Keys = tuple[str | int, ...]
+
+
+@dataclass(frozen=True)
+class Explanation:
+    """A frame explained: rows that name every byte exactly once, in order. Its text is the listing that the command line prints.
+
+    Attributes:
+        sensor, frame: ids.
+        data: the bytes.
+        rows: one for each field, bit block or array element.
+        fault: what is wrong with the frame as a whole; None if it is valid.
+        notes: what concerns the whole frame.
+    """
+
+    sensor: str
+    frame: str
+    data: bytes
+    rows: tuple[Row, ...]
+    fault: WireError | None = None
+    notes: tuple[str, ...] = ()
+
+    def __str__(self) -> str:
+        return "\n".join(text(line) for line in self.lines())
+
+    @property
+    def fields(self) -> dict[str, Value]:
+        """Every value by its path with array indices, "points[1].intensity", in the order of the wire."""
+        return {value.path: value for row in self.rows for value in row.values}
+
+    @property
+    def verdict(self) -> str:
+        """What is wrong with the frame, in one sentence; "valid" where nothing is."""
+        return "valid" if self.fault is None else self.fault.reason
+
+    def lines(self, *, every: bool = False) -> list[Line]:
+        """The listing in pieces; `every` draws the bits of all elements of an array, and not of the first alone."""
+        return [*listed(self.rows, every=every), *((Span("note: ", "note"), Span(note)) for note in self.notes)]
+
+    def differences(self, other: Explanation) -> list[Difference]:
+        """The fields that another frame does not have alike, in the order of the wire."""
+        before, after = self.fields, other.fields
+        pairs = ((path, before.get(path), after.get(path)) for path in {**before, **after})
+        compared = [Difference(path, old, new, self._bytes(old), other._bytes(new)) for path, old, new in pairs]
+        return [pair for pair in compared if pair.missing or len(pair.first) != len(pair.second) or any(pair.masks)]
+
+    def to_dict(self) -> dict[str, Any]:
+        """The explanation for JSON."""
+        fault = None if self.fault is None else {"reason": self.fault.reason, "offset": self.fault.offset, "path": self.fault.path}
+        head = {"sensor": self.sensor, "frame": self.frame, "size": len(self.data), "fault": fault, "notes": list(self.notes)}
+        return {**head, "rows": [row.to_dict() for row in self.rows]}
+
+    def _bytes(self, value: Value | None) -> bytes:
+        return b"" if value is None else self.data[value.start : value.start + len(value.masks)]
+
+
+def explain(data: bytes, sensor: Sensor, frame: str | None = None) -> Explanation:
+    """What every byte of one frame is; of a damaged or truncated one as far as it goes, with what is wrong.
+
+    Args:
+        frame: the frame type; by default the one that fits, or comes nearest.
+
+    Raises:
+        WireError: where the bytes do not even begin like a frame of this sensor.
+        UnknownFrame: for a frame type that it does not have.
+    """
+    data, fault = bytes(data), None
+    try:
+        name, _ = parse_typed(sensor, data, frame=frame)
+    except WireError as error:
+        fault, name = error, error.frame or frame or ""
+        if not name:
+            raise
+    trail = _Trail(sensor.frames[name], data)
+    rows = (*trail.rows(), *trail.rest(fault))
+    if not _is_valid(sensor, name, data[: trail.end], fault):
+        return Explanation(sensor.id, name, data, rows, fault, tuple(_flipped(sensor, name, data, trail)))
+    points, notes = _points(sensor, name, data[: trail.end], rows)
+    rows = tuple(replace(row, points=given) for row, given in zip(rows, points, strict=True))
+    return Explanation(sensor.id, name, data, rows, fault, notes)
+
+
+def _is_valid(sensor: Sensor, name: str, data: bytes, fault: WireError | None) -> bool:
+    """Whether the bytes without what follows them are a valid frame."""
+    if fault is None:
+        return True
+    try:
+        parse_typed(sensor, data, frame=name)
+    except WireError:
+        return False
+    return True
 
 
 class Flip(NamedTuple):
@@ -55,96 +150,52 @@ def flips(sensor: Sensor, name: str, data: bytes) -> list[Flip]:
     engine = codec(frame)
     if not 0 < len(data) <= frame.max_length or (not isinstance(engine, CompiledCodec) and len(data) > INTERPRETED):
         return []
-    if engine.size not in (None, len(data)) or any(spot >= len(data) for spot in engine.prefix):
+    if engine.size not in (None, len(data)) or any(offset >= len(data) for offset in engine.prefix):
         return []
-    wrong = {spot for spot, (mask, value) in engine.prefix.items() if data[spot] & mask != value}
+    wrong = {offset for offset, (mask, value) in engine.prefix.items() if data[offset] & mask != value}
     if len(wrong) > 1:
         return []
-    found = []
-    for tried in _flipped_blocks([Flip(spot, bit) for spot in wrong or range(len(data)) for bit in range(8)], max(1, BLOCK // len(data))):
-        rows = np.tile(np.frombuffer(data, np.uint8), (len(tried), 1))
-        rows[np.arange(len(tried)), [flip.offset for flip in tried]] ^= np.array([1 << flip.bit for flip in tried], np.uint8)
-        fits = np.ones(len(tried), np.bool_)
-        for spot, (mask, value) in engine.prefix.items():
-            fits &= rows[:, spot] & mask == value
-        places = np.flatnonzero(fits)
-        if not len(places):
-            continue
-        survey = engine.survey(rows.reshape(-1), places * len(data))
-        right = (survey.status == VALID) & (survey.sizes == len(data))
-        found += [tried[place] for place in places[right].tolist()]
-    return found
+    tried = [Flip(offset, bit) for offset in wrong or range(len(data)) for bit in range(8)]
+    size = max(1, BLOCK // len(data))
+    return [flip for first in range(0, len(tried), size) for flip in _mending(tried[first : first + size], data, engine)]
 
 
-def _flipped_blocks(tried: list[Flip], size: int) -> Iterator[list[Flip]]:
-    for first in range(0, len(tried), size):
-        yield tried[first : first + size]
+def _mending(tried: list[Flip], data: bytes, engine: Codec) -> list[Flip]:
+    """Those of some flips after which the bytes are one valid and plausible frame."""
+    rows = np.tile(np.frombuffer(data, np.uint8), (len(tried), 1))
+    rows[np.arange(len(tried)), [flip.offset for flip in tried]] ^= np.array([1 << flip.bit for flip in tried], np.uint8)
+    fits = np.ones(len(tried), np.bool_)
+    for offset, (mask, value) in engine.prefix.items():
+        fits &= rows[:, offset] & mask == value
+    fitting = np.flatnonzero(fits)
+    if not len(fitting):
+        return []
+    survey = engine.survey(rows.reshape(-1), fitting * len(data))
+    right = (survey.status == VALID) & (survey.sizes == len(data))
+    return [tried[number] for number in fitting[right].tolist()]
 
 
-__all__ = ["Explanation", "explain", "hexdump"]
-
-#: most points of a frame without arrays that are told.
-TOLD = 4
-#: most decimals that steps are told apart by, those that may be added to show one in full, and most flipped bits that are told one by one.
-DIGITS, SPARE, FLIPS = 12, 2, 3
-
-Keys = tuple[str | int, ...]
-
-
-def explain(sensor: Sensor, data: bytes, frame: str | None = None) -> Explanation:
-    """What every byte of one frame is; of a damaged or truncated one as far as it goes, with what is wrong.
-
-    Raises:
-        WireError: where the bytes do not even begin like a frame of this sensor.
-        UnknownFrame: for a frame type that it does not have.
-    """
-    data, fault = bytes(data), None
-    try:
-        name, _ = parse_typed(sensor, data, frame=frame)
-    except WireError as error:
-        fault, name = error, error.frame or frame or ""
-        if not name:
-            raise
-    reading = _Reading(sensor.frames[name], data)
-    rows = (*reading.rows(), *reading.rest(fault))
-    if not _valid(sensor, name, data[: reading.end], fault):
-        return Explanation(sensor.id, name, data, rows, fault, tuple(_flipped(sensor, name, data, reading)))
-    points, notes = _points(sensor, name, data[: reading.end], rows)
-    return Explanation(sensor.id, name, data, rows, fault, notes).with_points(points)
-
-
-def _valid(sensor: Sensor, name: str, data: bytes, fault: WireError | None) -> bool:
-    """Whether the bytes without what follows them are a valid frame."""
-    if fault is None:
-        return True
-    try:
-        parse_typed(sensor, data, frame=name)
-    except WireError:
-        return False
-    return True
-
-
-def _flipped(sensor: Sensor, name: str, data: bytes, reading: _Reading) -> Iterator[str]:
+def _flipped(sensor: Sensor, name: str, data: bytes, trail: _Trail) -> Iterator[str]:
     """Which single flipped bit would explain the damage, with what its field would have said."""
-    found = flips(sensor, name, data)
-    if len(found) > FLIPS:
-        yield f"one flipped bit would explain it, but in any of {len(found)} places, so that nothing can be said of where"
+    mending = flips(sensor, name, data)
+    if len(mending) > FLIPS:
+        yield f"one flipped bit would explain it, but in any of {len(mending)} places, so that nothing can be said of where"
         return
-    before = reading.values()
-    for flip in found:
-        after = _Reading(sensor.frames[name], flip.mended(data)).values()
+    before = trail.values()
+    for flip in mending:
+        after = _Trail(sensor.frames[name], flip.mended(data)).values()
         path = next((path for path, value in after.items() if value.holds(flip.offset, flip.bit)), "")
         values = [str(part[path]) for part in (before, after) if path in part]
         said = f", {path} {', sent as '.join(values)}" if path and all(values) else f", {path}" if path else ""
-        yield f"{'one' if len(found) == 1 else 'a'} flipped bit would explain it: byte {flip.offset} bit {flip.bit}{said}"
+        yield f"{'one' if len(mending) == 1 else 'a'} flipped bit would explain it: byte {flip.offset} bit {flip.bit}{said}"
 
 
-class _Reading:
+class _Trail:
     """One frame as construct read it: its parts, how far it came, and the verdicts of its checksums."""
 
     def __init__(self, frame: Frame, data: bytes) -> None:
-        self._data, self._schema = data, schema(frame.prepared)
-        self._blocks = dict(_blocks(frame.prepared, ""))
+        self._data, self._schema = data, schema(frame.tree)
+        self._blocks = dict(_blocks(frame.tree, ""))
         trail: list[Seen] = []
         self.failed = True
         try:
@@ -250,18 +301,19 @@ def _digits(info: FieldInfo) -> int:
     return next((digits for digits in range(apart, apart + SPARE + 1) if all(step * 10**digits % 1 == 0 for step in steps)), apart)
 
 
-def _blocks(con: Any, path: str) -> Iterator[tuple[str, Mapping[Keys, BitField]]]:
+def _blocks(node: Node, path: str) -> Iterator[tuple[str, Mapping[Keys, BitField]]]:
     """The bits of each field of each bit block, by the path of the block, arrays in it with "[]"."""
-    if isinstance(con, construct.Renamed):
-        path = f"{path}.{con.name}" if path else str(con.name)
-        con = con.subcon
-    if isinstance(con, construct.Array):
-        path, con = f"{path}[]", con.subcon
-    if unwrap(con, bits=False) is not unwrap(con):
-        yield path, {bits.keys: bits for bits in probe(con, con.sizeof()) or ()}
-        return
-    for child in children(con):
-        yield from _blocks(child, path)
+    match node:
+        case Block():
+            yield path, {part.bits.keys: part.bits for part in node.parts}
+        case Opaque(in_bits=True):
+            yield path, {}
+        case Struct():
+            for member in node.members:
+                yield from _blocks(member, ".".join(filter(None, (path, member.name))))
+        case _:
+            for child in children(node):
+                yield from _blocks(child, f"{path}[]" if isinstance(node, Repeat) else path)
 
 
 def _verdicts(data: bytes, seen: Seen) -> Iterator[tuple[str, tuple[str, bool]]]:
@@ -290,23 +342,23 @@ def _points(sensor: Sensor, name: str, data: bytes, rows: Sequence[Row]) -> tupl
         return none, tuple(notes)
     try:
         packets = PacketStream(sensor, name, Counters()).add([packed([Found(name, 0, data)])])
-        found = evaluate(packets)
+        evaluated = evaluate(packets)
     except LidarSpecError as error:
         return none, (*notes, f"no points: {error}")
-    notes += ["defaults stand in for what a frame of another type would say"] * bool(found.cloud.nominal)
-    points = [Point.of(found.cloud, index) for index in range(len(found.cloud))]
+    notes += ["defaults stand in for what a frame of another type would say"] * bool(evaluated.cloud.nominal)
+    points = [Point.of(evaluated.cloud, index) for index in range(len(evaluated.cloud))]
     chain = packets.table.schema.chain()
     if not chain:
         return none, (*notes, *(f"point {point}" for point in points[:TOLD]))
-    inside = found.counts[0].astype(np.bool_)
-    places = np.where(inside, np.cumsum(inside).reshape(inside.shape) - 1, -1)
-    return [tuple(points[place] for place in _places(row.path, chain, found.axes, places)) for row in rows], tuple(notes)
+    inside = evaluated.counts[0].astype(np.bool_)
+    numbers = np.where(inside, np.cumsum(inside).reshape(inside.shape) - 1, -1)
+    return [tuple(points[number] for number in _numbers(row.path, chain, evaluated.axes, numbers)) for row in rows], tuple(notes)
 
 
-def _places(path: str, chain: tuple[str, ...], axes: tuple[str | None, ...], places: Any) -> list[int]:
-    """Which points an element of the innermost array gives; none for any other row."""
+def _numbers(path: str, chain: tuple[str, ...], axes: tuple[str | None, ...], numbers: Any) -> list[int]:
+    """The numbers of the points that an element of the innermost array gives; none for any other row."""
     indices = [int(part.partition("]")[0]) for part in path.split("[")[1:]]
     if len(indices) != len(chain) or not chain[-1].startswith(plain(path)) or plain(path) not in chain[-1].removesuffix("[]"):
         return []
     own = dict(zip(chain, indices, strict=True))
-    return [int(place) for place in np.ravel(places[tuple(own.get(axis or "", slice(None)) for axis in axes)]) if place >= 0]
+    return [int(number) for number in np.ravel(numbers[tuple(own.get(axis or "", slice(None)) for axis in axes)]) if number >= 0]

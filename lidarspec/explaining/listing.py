@@ -1,66 +1,27 @@
-"""An explained frame, and how it is listed: a line for each part, indented as the struct is nested, bit fields drawn below.
+"""How an explained frame is listed: a line for each part, indented as the struct is nested, bit fields drawn below.
 
-Lines are pieces with roles, so that who has a terminal can colour them; their texts alone say the same.
-
-What differs between two frames, field by field and down to the bit.
+Lines are pieces with roles, so that who has a terminal can colour them; their texts alone say the same. What differs between two
+frames is listed in the same way, field by field and down to the bit.
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
 from itertools import groupby
-from typing import Any
 
-from lidarspec.errors import WireError
-from lidarspec.explaining.wording import Point, Row, Span, Value, bit_picture, fixed, number
+from lidarspec.explaining.wording import Difference, Row, Span, Value, bit_picture, number
 from lidarspec.wire.wire_table import hexed
 
 #: bytes in a line, spaces of a level of nesting, and the widest columns of bits and of names.
 LINED, LEVEL, PICTURES, NAMES = 8, 2, 35, 36
 
+#: bytes of a field in a line of its differences.
+COMPARED = 4
 #: pieces of a line that are columns, and how much room there has to be beside them for folding.
 FIXED, FOLDED = 3, 24
 
 Line = tuple[Span, ...]
-
-
-@dataclass(frozen=True)
-class Explanation:
-    """A frame explained: rows that name every byte exactly once, in order.
-
-    Attributes:
-        sensor, frame: ids.
-        data: the bytes.
-        rows: one for each field, bit block or array element.
-        fault: what is wrong with the frame as a whole; None if it is valid.
-        notes: what concerns the whole frame.
-    """
-
-    sensor: str
-    frame: str
-    data: bytes
-    rows: tuple[Row, ...]
-    fault: WireError | None = None
-    notes: tuple[str, ...] = ()
-
-    def __str__(self) -> str:
-        return "\n".join(text(line) for line in self.lines())
-
-    def lines(self, *, every: bool = False) -> list[Line]:
-        """The listing in pieces; `every` draws the bits of all elements of an array, and not of the first alone."""
-        return [*_Listing(self.rows, every=every).lines(), *((Span("note: ", "note"), Span(note)) for note in self.notes)]
-
-    def to_dict(self) -> dict[str, Any]:
-        """The explanation for JSON."""
-        fault = None if self.fault is None else {"reason": self.fault.reason, "offset": self.fault.offset, "path": self.fault.path}
-        head = {"sensor": self.sensor, "frame": self.frame, "size": len(self.data), "fault": fault, "notes": list(self.notes)}
-        return {**head, "rows": [row.to_dict() for row in self.rows]}
-
-    def with_points(self, points: Sequence[tuple[Point, ...]]) -> Explanation:
-        """The same with points for each row."""
-        return replace(self, rows=tuple(replace(row, points=found) for row, found in zip(self.rows, points, strict=True)))
 
 
 def text(line: Line) -> str:
@@ -87,6 +48,11 @@ def parents(path: str) -> list[str]:
     """The structs and elements that a path goes through, outermost first: "a[0].b.c" is in "a[0]" and "a[0].b"."""
     parts = path.split(".")
     return [".".join(parts[:depth]) for depth in range(1, len(parts))]
+
+
+def listed(rows: Sequence[Row], *, every: bool = False) -> Iterator[Line]:
+    """The lines of the rows of a frame; `every` draws the bits of all elements of an array, and not of the first alone."""
+    return _Listing(rows, every=every).lines()
 
 
 class _Listing:
@@ -144,75 +110,19 @@ def _indented(path: str, depth: int) -> str:
     return " " * LEVEL * depth + path.rpartition(".")[2]
 
 
-#: bytes of a field in a line.
-COMPARED = 4
-
-
-@dataclass(frozen=True)
-class Difference:
-    """A field that two frames do not have alike.
-
-    Attributes:
-        path: with array indices.
-        before, after: its value in each; None where the frame has no such field.
-        first, second: its bytes in each.
-    """
-
-    path: str
-    before: Value | None
-    after: Value | None
-    first: bytes
-    second: bytes
-
-    @property
-    def masks(self) -> bytes:
-        """The bits that differ, of bytes that both frames have; bits of other fields in the same bytes are not among them."""
-        own = self.before.masks if self.before else b""
-        return bytes((a ^ b) & mask for a, b, mask in zip(self.first, self.second, own, strict=False))
-
-    @property
-    def change(self) -> str:
-        """By how much a physical value went up or down; "" for what is no number."""
-        if not self.before or not self.after or self.before.physical is None or self.after.physical is None or self.before.label:
-            return ""
-        step = fixed(self.after.physical - self.before.physical, self.before.digits)
-        return f"{'' if step.startswith('-') else '+'}{step} {self.before.unit}".strip()
-
-    def to_dict(self) -> dict[str, Any]:
-        """The difference for JSON."""
-        values = {name: None if value is None else value.to_dict() for name, value in (("before", self.before), ("after", self.after))}
-        offsets = {name: None if value is None else value.start for name, value in (("offset", self.before), ("offset_after", self.after))}
-        return {"path": self.path, **offsets, **values, "bits": sum(mask.bit_count() for mask in self.masks)}
-
-
-def differences(first: Explanation, second: Explanation) -> list[Difference]:
-    """The fields that two frames do not have alike, in the order of the wire."""
-    before, after = ({value.path: (value, _bytes(frame, value)) for row in frame.rows for value in row.values} for frame in (first, second))
-    found = []
-    for path in dict.fromkeys((*before, *after)):
-        (old, a), (new, b) = before.get(path, (None, b"")), after.get(path, (None, b""))
-        difference = Difference(path, old, new, a, b)
-        if old is None or new is None or len(a) != len(b) or any(difference.masks):
-            found.append(difference)
-    return found
-
-
-def told(first: Explanation, second: Explanation, found: list[Difference]) -> Iterator[Line]:
-    """The differences as lines: each field with both values, and below it the bits that differ, dots for those that do not."""
-    for missing, group in groupby(found, lambda difference: (difference.before is None) - (difference.after is None)):
+def told(differences: list[Difference], sizes: tuple[int, int]) -> Iterator[Line]:
+    """The differences of two frames of so many bytes: each field with both values, and the bits that differ below it."""
+    for missing, group in groupby(differences, lambda difference: difference.missing):
         if missing:
-            yield _missing(list(group), "second" if missing > 0 else "first")
+            yield _missing(list(group), missing)
             continue
         for difference in group:
             yield from _lines(difference)
-    sizes = f"{len(first.data)} bytes" if len(first.data) == len(second.data) else f"{len(first.data)} and {len(second.data)} bytes"
-    bits = sum(mask.bit_count() for difference in found for mask in difference.masks)
-    same = (
-        f"{bits} bit{'s' * (bits != 1)} in {len(found)} field{'s' * (len(found) != 1)} of {sizes} differ"
-        if found
-        else f"{sizes}, all alike"
-    )
-    yield (Span(same, "note"),)
+    length = f"{' and '.join(map(str, dict.fromkeys(sizes)))} bytes"
+    bits = sum(mask.bit_count() for difference in differences for mask in difference.masks)
+    fields = len(differences)
+    differing = f"{bits} bit{'s' * (bits != 1)} in {fields} field{'s' * (fields != 1)} of {length} differ"
+    yield (Span(differing if fields else f"{length}, all alike", "note"),)
 
 
 def _lines(difference: Difference) -> Iterator[Line]:
@@ -241,7 +151,3 @@ def _missing(group: list[Difference], which: str) -> Line:
 def _said(value: Value) -> str:
     text = str(value)
     return text or (hexed(value.raw, 0) if isinstance(value.raw, bytes) else str(number(value.raw)))
-
-
-def _bytes(frame: Explanation, value: Value) -> bytes:
-    return frame.data[value.start : value.start + len(value.masks)]

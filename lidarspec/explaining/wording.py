@@ -172,6 +172,48 @@ def _named(value: Value, name: str, *, plain: bool, bits: bool) -> str:
     return f"{text}{where}" if plain else f"{name} {text or value.raw.hex(' ')}{where}"
 
 
+@dataclass(frozen=True)
+class Difference:
+    """A field that two frames do not have alike.
+
+    Attributes:
+        path: with array indices.
+        before, after: its value in each; None where the frame has no such field.
+        first, second: its bytes in each.
+    """
+
+    path: str
+    before: Value | None
+    after: Value | None
+    first: bytes
+    second: bytes
+
+    @property
+    def missing(self) -> str:
+        """Which frame alone has the field, "first" or "second"; "" for both."""
+        return "second" if self.before is None else "first" if self.after is None else ""
+
+    @property
+    def masks(self) -> bytes:
+        """The bits that differ, of bytes that both frames have; bits of other fields in the same bytes are not among them."""
+        own = self.before.masks if self.before else b""
+        return bytes((a ^ b) & mask for a, b, mask in zip(self.first, self.second, own, strict=False))
+
+    @property
+    def change(self) -> str:
+        """By how much a physical value went up or down; "" for what is no number."""
+        if not self.before or not self.after or self.before.physical is None or self.after.physical is None or self.before.label:
+            return ""
+        step = fixed(self.after.physical - self.before.physical, self.before.digits)
+        return f"{'' if step.startswith('-') else '+'}{step} {self.before.unit}".strip()
+
+    def to_dict(self) -> dict[str, Any]:
+        """The difference for JSON."""
+        values = {name: None if value is None else value.to_dict() for name, value in (("before", self.before), ("after", self.after))}
+        offsets = {name: None if value is None else value.start for name, value in (("offset", self.before), ("offset_after", self.after))}
+        return {"path": self.path, **offsets, **values, "bits": sum(mask.bit_count() for mask in self.masks)}
+
+
 def bit_picture(data: bytes, masks: bytes) -> str:
     """The bits of one value in some bytes, the highest of each byte first: ".. 000001.. 00011000"; dots are bits of other values."""
     parts = []

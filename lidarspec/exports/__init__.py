@@ -49,7 +49,7 @@ def narrowed(sensor: Sensor, frame: str) -> Sensor:
     return with_frames(sensor, {frame: replace(sensor.frames[frame], after=None)})
 
 
-def export(kind: str, sensor: Sensor) -> str:
+def export(sensor: Sensor, kind: str) -> str:
     """The text of an export of a sensor.
 
     Args:

@@ -1,36 +1,40 @@
-"""Checksum algorithms as C functions of the byte ranges that they cover.
+"""A C99 header for a sensor: accessors, lengths, checksums and scaling, as functions of bytes; nothing in it depends on struct packing.
 
-What tells whether bytes are a frame of one type: its length, its checksums, its constants.
-
-A C99 header for a sensor: accessors, lengths, checksums and scaling, as functions of bytes; nothing in it depends on struct packing.
+`header` puts together what all headers have (``c_bytes.h``, beside this module), a function for each checksum algorithm that the sensor
+uses, and for each frame type the accessors of `lidarspec.exports.c_fields` and the functions of the whole frame: how long it is by its
+header, whether a whole, sound frame stands there, and each checksum as it is and as it has to be. A checksum's function takes the byte
+ranges that it covers, so that one serves every frame; `frame_length` looks at no byte before it has asked whether the byte is there.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from importlib import resources
+from typing import Any
 
 from lidarspec._version import __version__
 from lidarspec.exports import Refused
 from lidarspec.exports.c_fields import (
-    Extent,
-    Piece,
-    Places,
-    Spot,
+    Access,
+    CLayout,
+    Entry,
+    accesses,
     arguments,
     comment,
     fields,
     identifier,
     index,
     parameters,
-    pieces,
     quoted,
+    word,
 )
-from lidarspec.exports.formulas import Formula, Op, Ref, refs
 from lidarspec.exports.messages import Message, messages
-from lidarspec.exports.tree import Blob, Block, Number, Repeat, Sealed, formulas
 from lidarspec.spec.checksums import Checksum, Crc, Fold15, Sum, WordXor, Xor, ZeroPadded
+from lidarspec.spec.row_checksums import byte_table, mirrored_bytes, reflected
 from lidarspec.spec.sensor import Sensor
+from lidarspec.spec.tree import Blob, Block, Formula, Number, Op, Repeat, Sealed, formulas, refs
+from lidarspec.wire.wire_table import Extent
 
 _FUNCTION = """\
 /* {text} */
@@ -113,43 +117,19 @@ def _word_xor(algorithm: WordXor) -> _Body:
 
 
 def _crc(crc: Crc) -> _Body:
-    """By a table; the register is aligned to the top of its type unless bits enter lowest first."""
+    """By the engine's own table, with the register as it has it: its low byte is the one that meets the next byte of data."""
     size = next(size for size in (8, 16, 32, 64) if crc.width <= size)
-    kind, shift = f"uint{size}_t", size - crc.width
-    poly, init = (_mirrored(crc.poly, crc.width), _mirrored(crc.init, crc.width)) if crc.refin else (crc.poly << shift, crc.init << shift)
-    entries = [_literal(_entry(byte, poly, size, refin=crc.refin), size) for byte in range(256)]
+    entries = [_literal(register, size) for register in byte_table(crc.width, crc.poly, crc.refin)]
     per_line = max(96 // (len(entries[0]) + 2), 1)
-    lines = [", ".join(entries[first : first + per_line]) for first in range(0, 256, per_line)]
-    table = ",\n    ".join(lines)
-    begin = f"static const {kind} table[256] = {{\n    {table}}};\n{kind} total = {_literal(init, size)};"
-    if crc.refin:
-        step = f"total = ({kind})({_shifted('>>', size)}table[(total ^ byte) & 0xff]);"
-        result = "total"
-    else:
-        top = f"(total >> {size - 8})" if size > 8 else "total"
-        step = f"total = ({kind})({_shifted('<<', size)}table[({top} ^ byte) & 0xff]);"
-        result = f"(total >> {shift})" if shift else "total"
+    table = ",\n    ".join(", ".join(entries[first : first + per_line]) for first in range(0, 256, per_line))
+    start = reflected(crc.init, crc.width)
+    begin = f"static const uint{size}_t table[256] = {{\n    {table}}};\n"
+    begin += f"uint{size}_t total = {_literal(start if crc.refin else mirrored_bytes(start), size)};"
+    step = f"total = (uint{size}_t)(table[(total ^ byte) & 0xff] ^ total >> 8);"
+    result = "(uint64_t)total" if crc.refin else f"lidarspec_swapped(total, {size // 8}) >> {size - crc.width}"
     if crc.refin != crc.refout:
         result = f"lidarspec_mirrored({result}, {crc.width})"
-    return _Body(begin, step, f"{result} ^ {_literal(crc.xorout, size)}" if crc.xorout else f"(uint64_t){result}")
-
-
-def _shifted(sign: str, size: int) -> str:
-    return "" if size == 8 else f"(total {sign} 8) ^ "
-
-
-def _entry(byte: int, poly: int, size: int, *, refin: bool) -> int:
-    value, mask = byte if refin else byte << (size - 8), (1 << size) - 1
-    for _ in range(8):
-        if refin:
-            value = value >> 1 ^ (poly if value & 1 else 0)
-        else:
-            value = (value << 1 ^ (poly if value >> (size - 1) else 0)) & mask
-    return value
-
-
-def _mirrored(value: int, width: int) -> int:
-    return int(f"{value:0{width}b}"[::-1], 2)
+    return _Body(begin, step, f"({result}) ^ {_literal(crc.xorout, size)}" if crc.xorout else result)
 
 
 def _literal(value: int, size: int) -> str:
@@ -197,43 +177,38 @@ static inline int {name}(const uint8_t *p, size_t n)
 """
 
 
-def frame(places: Places, algorithm: Callable[[Sealed], str]) -> Iterator[str]:
+def frame(layout: CLayout, algorithm: Callable[[Sealed], str]) -> Iterator[str]:
     """The functions of a frame type that are about the whole of it; `algorithm` gives the name of a checksum's function."""
-    checks, longest = _lines(_needs(places)), places.message.frame.max_length
+    length, longest = layout.name("", "frame_length"), layout.message.frame.max_length
+    checks = _lines(_needs(layout))
     unused = "" if checks else "    (void)p;\n    (void)n;\n"
-    yield _LENGTH.format(name=places.name("", "frame_length"), unused=unused, checks=checks, size=places.size, longest=longest)
-    seals = [spot for spot in places.spots if isinstance(spot.node, Sealed)]
-    for spot in seals:
-        yield _checksum(places, spot, algorithm)
-    wrong = [*_constants(places), *(_within(spot, f"!{places.name(spot.path, 'checksum_ok')}({arguments(spot.depth)})") for spot in seals)]
-    yield _IS_FRAME.format(name=places.name("", "is_frame"), length=places.name("", "frame_length"), checks=_lines(wrong))
+    yield _LENGTH.format(name=length, unused=unused, checks=checks, size=layout.size, longest=longest)
+    seals = [(entry, entry.node) for entry in layout.entries if isinstance(entry.node, Sealed)]
+    for entry, seal in seals:
+        yield _checksum(layout, entry, seal, algorithm)
+    sealed = [_unless(entry, f"!{layout.name(entry.path, 'checksum_ok')}({arguments(entry.depth)})") for entry, _ in seals]
+    yield _IS_FRAME.format(name=layout.name("", "is_frame"), length=length, checks=_lines([*_constants(layout), *sealed]))
 
 
-def _lines(statements: list[str] | Iterator[str]) -> str:
+def _lines(statements: Iterable[str]) -> str:
     return "".join(f"    {statement}\n" for statement in dict.fromkeys(statements))
 
 
-def _needs(places: Places) -> Iterator[str]:
+def _needs(layout: CLayout) -> Iterator[str]:
     """Checks that what the length depends on is there, and makes sense, in the order in which it is met."""
-    longest = places.message.frame.max_length
-    for spot in places.spots:
-        where = " && ".join(condition.text for condition in spot.conditions if condition.is_fixed)
-        before = f"{where} && " if where else ""
-        for value in formulas(spot.node):
+    longest = layout.message.frame.max_length
+    for entry in layout.entries:
+        before = "".join(f"{condition.text} && " for condition in entry.conditions if condition.is_fixed)
+        for value in formulas(entry.node):
             if any(ref.info.axes for ref in refs(value)):
                 continue
             for ref in refs(value):
-                yield from (f"if ({before}(int64_t)n < {end}) return 0;" for end in _ends(places, ref))
+                ends = [other.start + other.size for other in layout.named(ref.path)]
+                yield from (f"if ({before}(int64_t)n < {end}) return 0;" for end in ends)
             for divisor in _divisors(value):
-                yield f"if ({before}!lidarspec_int({places.formula(divisor)})) return 0;"
-            if isinstance(spot.node, Repeat | Blob) and not isinstance(value, int):
-                yield f"if ({before}!lidarspec_within({places.formula(value)}, {longest})) return 0;"
-
-
-def _ends(places: Places, ref: Ref) -> Iterator[Extent]:
-    """The byte behind a field, at each of its places."""
-    for spot in places.named(ref.path):
-        yield spot.start + spot.size
+                yield f"if ({before}!lidarspec_int({layout.formula(divisor)})) return 0;"
+            if isinstance(entry.node, Repeat | Blob) and not isinstance(value, int):
+                yield f"if ({before}!lidarspec_within({layout.formula(value)}, {longest})) return 0;"
 
 
 def _divisors(value: Formula) -> Iterator[Formula]:
@@ -244,100 +219,80 @@ def _divisors(value: Formula) -> Iterator[Formula]:
             yield value.args[1]
 
 
-def _checksum(places: Places, spot: Spot, algorithm: Callable[[Sealed], str]) -> str:
-    node = spot.node
-    assert isinstance(node, Sealed)
-    held = []
-    for path in node.fields:
-        found = pieces(places, path) or [Piece(spot) for spot in places.named(path)]
-        if len(found) != 1 or found[0].spot.depth != spot.depth:
+def _checksum(layout: CLayout, entry: Entry, seal: Sealed, algorithm: Callable[[Sealed], str]) -> str:
+    held = [access for path in seal.fields for access in accesses(layout, path)]
+    for path in seal.fields:
+        if [access.entry.depth for access in held if access.info.path == path] != [entry.depth]:
             raise Refused(f"{path}: a checksum that stands in several places")
-        held.append(found[0])
     return _CHECKSUM.format(
-        name=places.name(spot.path, "checksum_ok").removesuffix("_ok"),
-        parameters=parameters(spot.depth),
-        arguments=arguments(spot.depth),
-        spans=", ".join(f"{{{start}, {end}}}" for start, end in _spans(places, spot, node, held)),
-        algorithm=algorithm(node),
-        stored=_stored(held, big=node.algorithm.order == "big"),
-        absent="".join(f"stored == UINT64_C({value}) || " for value in node.absent),
+        name=layout.name(entry.path, "checksum_ok").removesuffix("_ok"),
+        parameters=parameters(entry.depth),
+        arguments=arguments(entry.depth),
+        spans=", ".join(f"{{{start}, {end}}}" for start, end in _spans(layout, entry, seal, held)),
+        algorithm=algorithm(seal),
+        stored=_stored(held, seal.algorithm.order),
+        absent="".join(f"stored == UINT64_C({value}) || " for value in seal.absent),
     )
 
 
-def _spans(places: Places, spot: Spot, node: Sealed, held: list[Piece]) -> Iterator[tuple[Extent, Extent]]:
-    if node.over is not None:
-        first, last = (places.whole(path) for path in node.over)
+def _spans(layout: CLayout, entry: Entry, seal: Sealed, held: list[Access]) -> Iterator[tuple[Extent, Extent]]:
+    """The byte ranges that a checksum covers: from its first to its last part, or all that holds no bit of it."""
+    if seal.over is not None:
+        first, last = (layout.whole(path) for path in seal.over)
         yield first.start, last.start + last.size
         return
-    start = spot.start
-    order = {id(other): number for number, other in enumerate(places.spots)}
-    for piece in sorted(held, key=lambda piece: (order[id(piece.spot)], _first(piece))):
-        begin = piece.spot.start + Extent(_first(piece))
+    start = entry.start
+    order = {id(other): number for number, other in enumerate(layout.entries)}
+    for access in sorted(held, key=lambda access: (order[id(access.entry)], access.span[0])):
+        first_byte, size = access.span
+        begin = access.entry.start + Extent(first_byte)
         if str(begin) != str(start):
             yield start, begin
-        start = piece.spot.start + (Extent(_last(piece) + 1) if piece.part is not None else piece.spot.size)
-    if str(start) != str(spot.start + spot.size):
-        yield start, spot.start + spot.size
+        start = access.entry.start + size
+    if str(start) != str(entry.start + entry.size):
+        yield start, entry.start + entry.size
 
 
-def _first(piece: Piece) -> int:
-    return min(segment.byte for segment in piece.part.bits.segments) if piece.part else 0
-
-
-def _last(piece: Piece) -> int:
-    return max(segment.byte for segment in piece.part.bits.segments) if piece.part else 0
-
-
-def _stored(held: list[Piece], *, big: bool) -> str:
+def _stored(held: list[Access], order: str) -> str:
     """The value that several fields hold, low bits first."""
     terms, shift = [], 0
-    for piece in held:
-        node = piece.spot.node
-        if piece.part is not None:
-            value, width = piece.expression, piece.part.bits.width
-        elif isinstance(node, Blob):
+    for access in held:
+        node = access.entry.node
+        if isinstance(node, Blob):
             assert isinstance(node.size, int)
-            value, width = f"lidarspec_{'be' if big else 'le'}(p + {piece.spot.start}, {node.size})", 8 * node.size
+            value, width = word(access.entry.start, node.size, order), 8 * node.size
         else:
-            assert isinstance(node, Number)
-            value, width = piece.expression, 8 * node.size
+            value, width = access.expression, access.info.bits
         value = f"((uint64_t)({value}) & UINT64_C(0x{(1 << width) - 1:x}))"
-        terms.append(f"{value} << {shift}" if shift else value)
+        terms.append(f"({value} << {shift})" if shift else value)
         shift += width
-    return " | ".join(f"({term})" if "<<" in term else term for term in terms)
+    return " | ".join(terms)
 
 
-def _constants(places: Places) -> Iterator[str]:
-    for spot in places.spots:
-        node = spot.node
+def _constants(layout: CLayout) -> Iterator[str]:
+    for entry in layout.entries:
+        node = entry.node
         if isinstance(node, Blob) and node.const is not None:
-            yield _within(spot, f"memcmp(p + {spot.start}, {quoted(node.const)}, {len(node.const)}) != 0")
-        elif isinstance(node, Number) and node.info.const is not None:
-            yield _within(spot, f"{Piece(spot).expression} != {_number(node.info.const)}")
-        elif isinstance(node, Block):
-            for part in node.parts:
-                if part.info.const is not None:
-                    yield _within(spot, f"({Piece(spot, part).expression}) != {_number(part.info.const)}")
+            yield _unless(entry, f"memcmp(p + {entry.start}, {quoted(node.const)}, {len(node.const)}) != 0")
+        elif isinstance(node, Number | Block):
+            for part in node.parts if isinstance(node, Block) else (None,):
+                access = Access(entry, part)
+                if access.info.const is not None:
+                    yield _unless(entry, f"({access.expression}) != {_number(access.info.const)}")
 
 
-def _number(value: object) -> str:
-    if isinstance(value, float):
+def _number(value: Any) -> str:
+    """A constant as C, unsigned where it is not negative."""
+    if isinstance(value, float) or value < 0:
         return repr(value)
-    return (
-        f"UINT64_C({value})"
-        if isinstance(value, int) and value > 0x7FFFFFFF
-        else f"{value}u"
-        if isinstance(value, int) and value >= 0
-        else f"{value}"
-    )
+    return f"UINT64_C({value})" if value > 0x7FFFFFFF else f"{value}u"
 
 
-def _within(spot: Spot, wrong: str) -> str:
+def _unless(entry: Entry, wrong: str) -> str:
     """A statement that ends with 0 where something is wrong, for every element of the arrays that it is in."""
-    where = " && ".join([*(condition.text for condition in spot.conditions), wrong])
-    loops = "".join(
-        f"for (size_t {index(level)} = 0; {index(level)} < (size_t)({count}); ++{index(level)}) " for level, count in enumerate(spot.loops)
-    )
+    where = " && ".join(filter(None, (entry.where, wrong)))
+    names = [(index(level), count) for level, count in enumerate(entry.loops)]
+    loops = "".join(f"for (size_t {name} = 0; {name} < (size_t)({count}); ++{name}) " for name, count in names)
     return f"{loops}if ({where}) return 0;"
 
 
@@ -369,67 +324,6 @@ extern "C" {{
 #endif
 """
 
-_HELPERS = """\
-#ifndef LIDARSPEC_BYTES
-#define LIDARSPEC_BYTES
-static inline uint64_t lidarspec_le(const uint8_t *p, int size)
-{
-    uint64_t value = 0;
-    while (size-- > 0)
-        value = value << 8 | p[size];
-    return value;
-}
-static inline uint64_t lidarspec_be(const uint8_t *p, int size)
-{
-    uint64_t value = 0;
-    while (size-- > 0)
-        value = value << 8 | *p++;
-    return value;
-}
-static inline int64_t lidarspec_signed(uint64_t value, int width)
-{
-    const uint64_t sign = UINT64_C(1) << (width - 1);
-    return value & sign ? -(int64_t)(~value & (sign - 1)) - 1 : (int64_t)value;
-}
-static inline float lidarspec_float(uint64_t bits)
-{
-    const uint32_t word = (uint32_t)bits;
-    float value;
-    memcpy(&value, &word, sizeof value);
-    return value;
-}
-static inline double lidarspec_double(uint64_t bits)
-{
-    double value;
-    memcpy(&value, &bits, sizeof value);
-    return value;
-}
-static inline float lidarspec_half(uint64_t bits)
-{
-    const uint32_t sign = (uint32_t)(bits & 0x8000) << 16, exponent = (uint32_t)(bits >> 10) & 31, fraction = (uint32_t)bits & 0x3ff;
-    if (exponent == 0) return (sign ? -1.0f : 1.0f) * (float)fraction / 16777216.0f;
-    return lidarspec_float(sign | (exponent == 31 ? 0x7f800000u : (exponent + 112) << 23) | fraction << 13);
-}
-static inline int64_t lidarspec_int(int64_t value) { return value; }
-static inline int lidarspec_within(int64_t value, int64_t most) { return value >= 0 && value <= most; }
-static inline int64_t lidarspec_floor_div(int64_t a, int64_t b)
-{
-    return b == 0 ? 0 : a / b - (a % b != 0 && (a % b < 0) != (b < 0));
-}
-static inline int64_t lidarspec_floor_mod(int64_t a, int64_t b)
-{
-    return b == 0 ? 0 : a - b * lidarspec_floor_div(a, b);
-}
-static inline uint64_t lidarspec_mirrored(uint64_t value, int width)
-{
-    uint64_t found = 0;
-    for (; width > 0; --width, value >>= 1)
-        found = found << 1 | (value & 1);
-    return found;
-}
-#endif
-"""
-
 _TAIL = """\
 #ifdef __cplusplus
 }
@@ -444,24 +338,25 @@ def header(sensor: Sensor) -> str:
     """A C99 header that reads the frames of a sensor.
 
     Raises:
-        Refused: where only Python code can decide what a frame is made of, or its places cannot be computed in C.
+        Refused: where only Python code can decide what a frame is made of, or its layout cannot be computed in C.
     """
     prefix = identifier(sensor.id if sensor.id[0].isalpha() else f"lidar_{sensor.id}")
     title, source = f"{sensor.vendor} {sensor.model}", " ".join(sensor.source.split()).replace("*/", "* /")
     names, algorithms = _Names(prefix), _Algorithms(prefix)
     frames = ["\n".join(_frame(message, names, algorithms)) for message in messages(sensor)]
     head = _HEAD.format(title=title, version=__version__, source=source, prefix=prefix, guard=f"{prefix.upper()}_H")
-    return "\n".join([head, _HELPERS, *algorithms.texts, *frames, _TAIL])
+    helpers = resources.files("lidarspec.exports").joinpath("c_bytes.h").read_text(encoding="utf-8")
+    return "\n".join([head, helpers, *algorithms.texts, *frames, _TAIL])
 
 
 def _frame(message: Message, names: _Names, algorithms: _Algorithms) -> Iterator[str]:
-    places = Places(message, names.of(message))
+    layout = CLayout(message, names.of(message))
     longest = f"#define {names.prefix.upper()}_{identifier(message.name).upper()}_MAX_LENGTH {message.frame.max_length}"
     yield comment(f"---- {message.name}: {'from' if message.frame.direction == 'in' else 'to'} the sensor ----")
     yield longest
-    yield from (text for text in fields(places) if text)
+    yield from (text for text in fields(layout) if text)
     yield ""
-    yield from frame(places, algorithms.of)
+    yield from frame(layout, algorithms.of)
 
 
 class _Names:

@@ -1,8 +1,10 @@
-"""Values, formulas and places as C.
+"""Where everything in a frame type stands, as C expressions, and the C functions that read it.
 
-Where everything in a frame type stands, as C expressions of its bytes and of array indices.
-
-The functions that read one frame type: an accessor for each field, counts of arrays, and scaling.
+`CLayout` walks a frame tree once and notes an `Entry` for each node: its first byte as a C expression of the frame's bytes and of array
+indices, its size, the conditions under which it is there and the counts of the arrays around it. A length or count that a header decides is
+a call of the function that reads it, so that no expression grows with the header. From the entries come an accessor for each field,
+which tries what alternatives have of it one after another, the counts of arrays, whether an optional field is there, and the scaling
+to its unit and to the SI unit.
 """
 
 from __future__ import annotations
@@ -14,46 +16,43 @@ from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 from lidarspec.exports import Refused
-from lidarspec.exports.formulas import Formula, Op, Ref, refs
 from lidarspec.exports.messages import Message
-from lidarspec.exports.tree import Blob, Block, Empty, Node, Number, Part, Repeat, Sealed, Select, Struct, When, formulas, nodes
-from lidarspec.wire.schema import FieldInfo
-from lidarspec.wire.wire_table import meaning, unit_text
+from lidarspec.spec.tree import (
+    COMPARISONS,
+    Blob,
+    Block,
+    Code,
+    Empty,
+    FieldInfo,
+    Formula,
+    Node,
+    Number,
+    Op,
+    Part,
+    Ref,
+    Repeat,
+    Sealed,
+    Select,
+    Struct,
+    When,
+    formulas,
+    infos,
+    nodes,
+    refs,
+    written,
+)
+from lidarspec.wire.wire_table import Extent, meaning, unit_text
 
 #: bits of a value that a formula in 64-bit integers may reach.
 MOST_BITS = 62
-_CALLED = {"//": "lidarspec_floor_div", "%": "lidarspec_floor_mod"}
-COMPARISONS = frozenset({"==", "!=", "<", "<=", ">", ">="})
+#: comparisons go through a function: compilers warn of what a narrow number can never be.
+_OPERATIONS = {
+    **{"//": "lidarspec_floor_div({}, {})", "%": "lidarspec_floor_mod({}, {})", "not": "(int64_t)!{}"},
+    **{symbol: f"(lidarspec_int({{}}) {symbol} {{}})" for symbol in COMPARISONS},
+}
 #: (path, ending) -> the C name of a function.
 Name = Callable[[str, str], str]
 _INDICES = "ijklmnoq"
-
-
-@dataclass(frozen=True)
-class Extent:
-    """A number of bytes: a constant, and C expressions added to it."""
-
-    number: int = 0
-    terms: tuple[str, ...] = ()
-
-    def __add__(self, other: Extent) -> Extent:
-        return Extent(self.number + other.number, self.terms + other.terms)
-
-    def times(self, factor: int | str) -> Extent:
-        """The extent of so many of them."""
-        if isinstance(factor, int) and not self.terms:
-            return Extent(self.number * factor)
-        if str(self) == "0":
-            return self
-        return Extent(0, (str(factor) if str(self) == "1" else f"{self.grouped} * {factor}",))
-
-    @property
-    def grouped(self) -> str:
-        """As a factor in a product."""
-        return f"({self})" if len(self.terms) + (self.number != 0) > 1 else str(self)
-
-    def __str__(self) -> str:
-        return " + ".join([str(self.number)] * (self.number != 0 or not self.terms) + list(self.terms))
 
 
 def index(depth: int) -> str:
@@ -84,7 +83,7 @@ def formula(value: Formula, name: Name) -> str:
     """
     if bits(value) > MOST_BITS:
         raise Refused("a formula that may pass what a 64-bit integer holds")
-    return _term(value, name)
+    return written(value, lambda ref: f"(int64_t){name(ref.path, '')}({arguments(len(ref.info.axes))})", _OPERATIONS)
 
 
 def truth(value: Formula, name: Name) -> str:
@@ -93,29 +92,14 @@ def truth(value: Formula, name: Name) -> str:
     return text[1:-1] if isinstance(value, Op) and value.symbol in COMPARISONS else f"{text} != 0"
 
 
-def _term(value: Formula, name: Name) -> str:
-    if isinstance(value, Ref):
-        return f"(int64_t){name(value.path, '')}({arguments(len(value.info.axes))})"
-    if isinstance(value, Op):
-        args = [_term(arg, name) for arg in value.args]
-        if value.symbol == "not":
-            return f"(int64_t)!{args[0]}"
-        if len(args) == 1:
-            return f"(-{args[0]})"
-        if value.symbol in _CALLED:
-            return f"{_CALLED[value.symbol]}({args[0]}, {args[1]})"
-        if value.symbol in COMPARISONS:  # through a function: compilers warn of what a narrow number can never be
-            return f"(lidarspec_int({args[0]}) {value.symbol} {args[1]})"
-        return f"({args[0]} {value.symbol} {args[1]})"
-    return f"({value})" if value < 0 else str(value)
-
-
 def bits(value: Formula) -> int:
     """How many bits, besides a sign, a formula takes at most."""
     if isinstance(value, Ref):
         return value.info.bits
     if isinstance(value, int):
         return value.bit_length()
+    if isinstance(value, Code):
+        raise Refused(value.reason)
     args = [bits(arg) for arg in value.args]
     match value.symbol:
         case "+" | "-":
@@ -132,13 +116,13 @@ def bits(value: Formula) -> int:
     return 1 if value.symbol in COMPARISONS else max(args)
 
 
-def number_type(infos: Sequence[FieldInfo]) -> str:
+def number_type(fields: Sequence[FieldInfo]) -> str:
     """The C type that holds what any of these fields holds."""
-    if any(info.kind == "float" for info in infos):
-        return "double" if max(info.bits for info in infos) > 32 or any(info.kind != "float" for info in infos) else "float"
-    signed = any(info.dtype is not None and info.dtype.kind == "i" for info in infos)
-    mixed = signed and any(info.dtype is not None and info.dtype.kind == "u" for info in infos)
-    width = next(size for size in (8, 16, 32, 64) if max(info.bits for info in infos) + mixed <= size or size == 64)
+    if any(info.kind == "float" for info in fields):
+        return "double" if max(info.bits for info in fields) > 32 or any(info.kind != "float" for info in fields) else "float"
+    signed = any(info.dtype is not None and info.dtype.kind == "i" for info in fields)
+    mixed = signed and any(info.dtype is not None and info.dtype.kind == "u" for info in fields)
+    width = next(size for size in (8, 16, 32, 64) if max(info.bits for info in fields) + mixed <= size or size == 64)
     return f"{'int' if signed else 'uint'}{width}_t"
 
 
@@ -153,9 +137,6 @@ def quoted(data: bytes) -> str:
     return '"' + "".join(f"\\{byte:03o}" for byte in data) + '"'
 
 
-_NONE = Extent()
-
-
 class Condition(NamedTuple):
     """A C expression, and whether it depends on nothing in arrays."""
 
@@ -164,8 +145,8 @@ class Condition(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Spot:
-    """One place of a node.
+class Entry:
+    """A node at one of the places where it stands.
 
     Attributes:
         path: of the node, without indices; of an array that of its axis.
@@ -178,11 +159,16 @@ class Spot:
 
     path: str
     node: Node
-    start: Extent = _NONE
-    size: Extent = _NONE
+    start: Extent
+    size: Extent
     depth: int = 0
     conditions: tuple[Condition, ...] = ()
     loops: tuple[str, ...] = ()
+
+    @property
+    def where(self) -> str:
+        """The conditions as one; "" for none."""
+        return " && ".join(condition.text for condition in self.conditions)
 
 
 def given(node: Node, depth: int) -> str:
@@ -192,44 +178,43 @@ def given(node: Node, depth: int) -> str:
 
 
 @dataclass
-class Places:
-    """All places of a frame type, in the order of the wire.
+class CLayout:
+    """The entries of a frame type, in the order of the wire.
 
-    Args:
+    Attributes:
         message: the frame type.
         name: the C name of what stands at a path, given as its path and an ending.
+        size: of a frame, in bytes.
 
     Raises:
-        Refused: where a place cannot be computed without reading all elements before it.
+        Refused: where an entry cannot be found without reading all elements before it.
     """
 
     message: Message
     name: Callable[[str, str], str]
-    spots: list[Spot] = field(default_factory=list)
+    entries: list[Entry] = field(default_factory=list)
     size: Extent = field(init=False)
 
     def __post_init__(self) -> None:
-        top = Spot("", self.message.root)
+        top = Entry("", self.message.root, Extent(), Extent())
         self.size = self.extent(top)
         self._visit(top)
 
-    def named(self, path: str) -> list[Spot]:
-        """Every place of the numbers, bytes or bits at a path: one, unless alternatives have it each."""
-        found = []
-        for spot in self.spots:
-            if isinstance(spot.node, Block):
-                found += [spot] * any(part.info.path == path for part in spot.node.parts)
-            elif isinstance(spot.node, Number | Blob):
-                found += [spot] * (spot.path == path)
-        return found
+    def named(self, path: str) -> list[Entry]:
+        """Every entry of the numbers, bytes or bits at a path: one, unless alternatives have it each."""
+        return [entry for entry in self.entries if any(info.path == path for info in infos(entry.node))]
 
-    def whole(self, path: str) -> Spot:
-        """The place of the part at a path, of whatever kind: all of an array, all alternatives."""
-        return next(spot for spot in self.spots if spot.path == path)
+    def whole(self, path: str) -> Entry:
+        """The entry of the part at a path, of whatever kind: all of an array, all alternatives."""
+        return next(entry for entry in self.entries if entry.path == path)
 
     def formula(self, value: Formula) -> str:
         """A formula as C."""
         return formula(value, self.name)
+
+    def length(self, value: Formula) -> str:
+        """A number of elements or bytes as C."""
+        return str(value) if isinstance(value, int) else f"(size_t)({self.formula(value)})"
 
     def count(self, node: Repeat, depth: int) -> int | str:
         """The number of elements of an array in so many others: a number, or C."""
@@ -237,81 +222,83 @@ class Places:
             return node.count
         return f"(int64_t){self.name(node.axis, 'count')}({given(node, depth)})"
 
-    def extent(self, spot: Spot) -> Extent:
+    def extent(self, entry: Entry) -> Extent:
         """The size of what stands somewhere."""
-        match spot.node:
+        match entry.node:
             case Number() | Block():
-                return Extent(spot.node.size)
+                return Extent(entry.node.size)
             case Blob(size=int() as size):
                 return Extent(size)
             case Blob():
-                return Extent(0, (f"(int64_t){self.name(spot.path, 'size')}({given(spot.node, spot.depth)})",))
+                return Extent(0, (f"(int64_t){self.name(entry.path, 'size')}({given(entry.node, entry.depth)})",))
             case Repeat():
-                return self._element(spot, spot.node).times(self.count(spot.node, spot.depth))
+                return self._element(entry, entry.node).times(self.count(entry.node, entry.depth))
             case When() | Select():
-                sizes = self.sizes(spot)
+                sizes = self.sizes(entry)
                 if len({str(size) for _, size in sizes}) == 1:
                     return sizes[0][1]
-                return Extent(0, (f"(int64_t){self.extent_name(spot)}({given(spot.node, spot.depth)})",))
+                return Extent(0, (f"(int64_t){self.extent_name(entry)}({given(entry.node, entry.depth)})",))
             case Empty():
                 return Extent()
-        return sum((self.extent(below) for below in self._below(spot)), Extent())
+        return sum((self.extent(below) for below in self._below(entry)), Extent())
 
-    def extent_name(self, spot: Spot) -> str:
+    def extent_name(self, entry: Entry) -> str:
         """The function that gives the size of a part with alternatives; one of these may be the alternative of another."""
-        alike = [id(node) for node in nodes(self.message.root) if isinstance(node, When | Select) and node.name == spot.node.name]
-        return self.name(spot.path, f"extent{alike.index(id(spot.node)) or ''}")
+        alike = [id(node) for node in nodes(self.message.root) if isinstance(node, When | Select) and node.name == entry.node.name]
+        return self.name(entry.path, f"extent{alike.index(id(entry.node)) or ''}")
 
-    def sizes(self, spot: Spot) -> list[tuple[str, Extent]]:
-        """The sizes of the alternatives at a place, each with its condition."""
-        return [(condition.text, self.extent(below)) for condition, below in self._cases(spot)]
+    def sizes(self, entry: Entry) -> list[tuple[str, Extent]]:
+        """The sizes of the alternatives of a part, each with its condition."""
+        return [(condition.text, self.extent(below)) for condition, below in self._cases(entry)]
 
-    def _visit(self, spot: Spot) -> None:
-        """Note a place and all in it."""
-        node = spot.node
+    def _visit(self, entry: Entry) -> None:
+        """Note an entry and all in it."""
+        node = entry.node
         if not isinstance(node, Empty):
-            path = node.axis if isinstance(node, Repeat) else spot.path
-            self.spots.append(replace(spot, path=path, size=self.extent(spot)))
+            path = node.axis if isinstance(node, Repeat) else entry.path
+            self.entries.append(replace(entry, path=path, size=self.extent(entry)))
         if isinstance(node, Repeat):
-            step = self._element(spot, node).times(f"(int64_t){index(spot.depth)}")
-            loops = (*spot.loops, str(self.count(node, spot.depth)))
-            self._visit(replace(spot, node=node.element, start=spot.start + step, depth=spot.depth + 1, loops=loops))
+            step = self._element(entry, node).times(f"(int64_t){index(entry.depth)}")
+            loops = (*entry.loops, str(self.count(node, entry.depth)))
+            self._visit(replace(entry, node=node.element, start=entry.start + step, depth=entry.depth + 1, loops=loops))
         elif isinstance(node, When | Select):
-            for condition, below in self._cases(spot):
-                self._visit(replace(below, conditions=(*spot.conditions, condition)))
+            for condition, below in self._cases(entry):
+                self._visit(replace(below, conditions=(*entry.conditions, condition)))
         else:
-            start = spot.start
-            for below in self._below(spot):
+            start = entry.start
+            for below in self._below(entry):
                 self._visit(replace(below, start=start))
                 start = start + self.extent(below)
 
-    def _below(self, spot: Spot) -> Iterator[Spot]:
-        """The members of a struct, their places left out."""
-        node = spot.node
+    def _below(self, entry: Entry) -> Iterator[Entry]:
+        """The members of a struct, all at its own start."""
+        node = entry.node
         if isinstance(node, Sealed):
-            yield replace(spot, node=node.body)
+            yield replace(entry, node=node.body)
         elif isinstance(node, Struct):
             for member in node.members:
-                yield replace(spot, node=member, path=".".join(part for part in (node.path, member.name) if part))
+                yield replace(entry, node=member, path=".".join(filter(None, (node.path, member.name))))
 
-    def _element(self, spot: Spot, node: Repeat) -> Extent:
-        size = self.extent(replace(spot, node=node.element, depth=spot.depth + 1))
+    def _element(self, entry: Entry, node: Repeat) -> Extent:
+        size = self.extent(replace(entry, node=node.element, depth=entry.depth + 1))
         used = [ref for below in nodes(node.element) for value in formulas(below) for ref in refs(value)]
         if size.terms and any(node.axis in ref.info.axes for ref in used):
             raise Refused(f"{node.axis}: its elements differ in size, so that none has a place of its own without reading those before it")
         return size
 
-    def _cases(self, spot: Spot) -> list[tuple[Condition, Spot]]:
-        node = spot.node
+    def _cases(self, entry: Entry) -> list[tuple[Condition, Entry]]:
+        """The alternatives of a part, each with its condition."""
+        node = entry.node
         is_fixed = not any(ref.info.axes for value in formulas(node) for ref in refs(value))
         if isinstance(node, When):
-            named = [(truth(node.condition, self.name), node.then), (f"!({truth(node.condition, self.name)})", node.otherwise)]
-            return [(Condition(text, is_fixed), replace(spot, node=below)) for text, below in named]
-        assert isinstance(node, Select)
-        key = self.formula(node.key)
-        others = " && ".join(f"{key} != {value}" for value, _ in node.cases) or "1"
-        named = [*((f"{key} == {value}", case) for value, case in node.cases), (others, node.default)]
-        return [(Condition(text, is_fixed), replace(spot, node=below)) for text, below in named]
+            asked = truth(node.condition, self.name)
+            cases = [(asked, node.then), (f"!({asked})", node.otherwise)]
+        else:
+            assert isinstance(node, Select)
+            key = self.formula(node.key)
+            others = " && ".join(f"{key} != {value}" for value, _ in node.cases) or "1"
+            cases = [*((f"{key} == {value}", case) for value, case in node.cases), (others, node.default)]
+        return [(Condition(text, is_fixed), replace(entry, node=case)) for text, case in cases]
 
 
 #: unit -> the SI unit that it is a multiple of, as part of a C name; factor and offset.
@@ -334,98 +321,108 @@ FLOATS = {2: "lidarspec_half", 4: "lidarspec_float", 8: "lidarspec_double"}
 
 
 @dataclass(frozen=True)
-class Piece:
-    """One way to read a field: at one of its places, one of its elements in a bit block."""
+class Access:
+    """One way to read a field: in one entry, and of a bit block one of its parts."""
 
-    spot: Spot
+    entry: Entry
     part: Part | None = None
 
     @property
     def info(self) -> FieldInfo:
         """The field."""
-        assert self.part is not None or isinstance(self.spot.node, Number | Blob)
-        return self.part.info if self.part is not None else self.spot.node.info  # type: ignore[union-attr]
+        return self.part.info if self.part is not None else infos(self.entry.node)[0]
 
     @property
     def expression(self) -> str:
         """What is read there, as C."""
-        node, spot = self.spot.node, self.spot
+        node, entry = self.entry.node, self.entry
         if self.part is not None:
-            return _bits(self.part, spot)
+            return _bits(self.part, entry)
         assert isinstance(node, Number)
-        raw = (
-            f"p[{spot.start}]" if node.size == 1 else f"lidarspec_{'le' if node.order == 'little' else 'be'}(p + {spot.start}, {node.size})"
-        )
+        raw = f"p[{entry.start}]" if node.size == 1 else word(entry.start, node.size, node.order)
         if node.kind == "float":
             return f"{FLOATS[node.size]}({raw})"
         return f"lidarspec_signed({raw}, {8 * node.size})" if node.kind == "int" else raw
 
     @property
+    def span(self) -> tuple[int, Extent]:
+        """Its first byte, and the end of its last, from the start of the entry."""
+        if self.part is None:
+            return 0, self.entry.size
+        offsets = [segment.byte for segment in self.part.bits.segments]
+        return min(offsets), Extent(max(offsets) + 1)
+
+    @property
     def condition(self) -> str:
         """When it is there; "" for always."""
-        inside = [f"{index(self.spot.depth + level)} == {place}" for level, place in enumerate(self.part.indices if self.part else ())]
-        return " && ".join([*(condition.text for condition in self.spot.conditions), *inside])
+        indices = self.part.indices if self.part else ()
+        inside = [f"{index(self.entry.depth + level)} == {number}" for level, number in enumerate(indices)]
+        return " && ".join(filter(None, (self.entry.where, *inside)))
 
 
-def _bits(part: Part, spot: Spot) -> str:
+def word(start: Extent, size: int, order: str) -> str:
+    """An unsigned integer of several bytes."""
+    return f"lidarspec_{'le' if order == 'little' else 'be'}(p + {start}, {size})"
+
+
+def _bits(part: Part, entry: Entry) -> str:
     wide = "uint64_t" if part.bits.width > 32 else "uint32_t"
     terms = []
-    for one in part.bits.segments:
-        byte = f"p[{spot.start + Extent(one.byte)}]"
-        term = f"({byte} & 0x{one.mask:02x}u)" if one.mask != 0xFF else byte
-        term = f"({wide}){term}"
-        shift = one.target - one.low
+    for segment in part.bits.segments:
+        byte = f"p[{entry.start + Extent(segment.byte)}]"
+        term = f"({wide})" + (f"({byte} & 0x{segment.mask:02x}u)" if segment.mask != 0xFF else byte)
+        shift = segment.target - segment.low
         terms.append(f"{term} {'<<' if shift > 0 else '>>'} {abs(shift)}" if shift else term)
     value = " | ".join(f"({term})" for term in terms) if len(terms) > 1 else terms[0]
     return f"lidarspec_signed({value}, {part.bits.width})" if part.bits.signed else value
 
 
-def pieces(places: Places, path: str) -> list[Piece]:
+def accesses(layout: CLayout, path: str) -> list[Access]:
     """All ways to read a field."""
-    found = []
-    for spot in places.named(path):
-        if isinstance(spot.node, Block):
-            found += [Piece(spot, part) for part in spot.node.parts if part.info.path == path]
-        else:
-            found.append(Piece(spot))
-    return found
+    ways: list[Access] = []
+    for entry in layout.named(path):
+        parts = entry.node.parts if isinstance(entry.node, Block) else (None,)
+        ways += [Access(entry, part) for part in parts if part is None or part.info.path == path]
+    return ways
 
 
-def fields(places: Places) -> Iterator[str]:
+def fields(layout: CLayout) -> Iterator[str]:
     """The functions of all fields in the order of the wire; one that stands in several alternatives comes with the last."""
-    last: dict[tuple[str, str], int] = {}
-    owned = [list(dict.fromkeys(_functions(spot))) for spot in places.spots]
-    for number, functions in enumerate(owned):
-        last |= dict.fromkeys(functions, number)
-    extents = list(_extents(places))
+    owned = [list(dict.fromkeys(_functions(entry))) for entry in layout.entries]
+    last = {function: number for number, functions in enumerate(owned) for function in functions}
+    extents = list(_extents(layout))
     yield from (text.partition("\n")[0].partition(" {")[0] + ";" for text in extents)
     for number, functions in enumerate(owned):
-        for kind, path in functions:
-            if last[kind, path] == number:
-                yield from _MADE[kind](places, path)
+        for write, path in functions:
+            if last[write, path] == number:
+                yield from write(layout, path)
     yield from extents
 
 
-def _functions(spot: Spot) -> Iterator[tuple[str, str]]:
-    """What is made for a place: ("field", path), ("count", axis) or, in a bit block, ("inner", axis)."""
-    if isinstance(spot.node, Block):
-        for part in spot.node.parts:
-            yield from (("inner", axis) for axis in _inner(part))
-            yield "field", part.info.path
-    elif isinstance(spot.node, Number) or (isinstance(spot.node, Blob) and spot.node.name):
-        yield "field", spot.path
-    elif isinstance(spot.node, Repeat):
-        yield "count", spot.path
+#: what writes a function, or several, of the field or the array at a path.
+Writer = Callable[[CLayout, str], Iterator[str]]
 
 
-def _extents(places: Places) -> Iterator[str]:
+def _functions(entry: Entry) -> Iterator[tuple[Writer, str]]:
+    """What is written for an entry, and the path of what it is about."""
+    if isinstance(entry.node, Block):
+        for part in entry.node.parts:
+            yield from ((_inner_count, axis) for axis in _inner(part))
+            yield _field, part.info.path
+    elif isinstance(entry.node, Number) or (isinstance(entry.node, Blob) and entry.node.name):
+        yield _field, entry.path
+    elif isinstance(entry.node, Repeat):
+        yield _count, entry.path
+
+
+def _extents(layout: CLayout) -> Iterator[str]:
     """The sizes of parts that have alternatives of several sizes."""
-    for spot in places.spots:
-        if isinstance(spot.node, When | Select):
-            sizes = places.sizes(spot)
+    for entry in layout.entries:
+        if isinstance(entry.node, When | Select):
+            sizes = layout.sizes(entry)
             if len({str(size) for _, size in sizes}) > 1:
                 ways = [*((condition, f"(size_t)({size})") for condition, size in sizes[:-1]), ("", f"(size_t)({sizes[-1][1]})")]
-                yield _function("size_t", places.extent_name(spot), spot.depth, ways)
+                yield _function("size_t", layout.extent_name(entry), entry.depth, ways)
 
 
 def _inner(part: Part) -> tuple[str, ...]:
@@ -433,90 +430,56 @@ def _inner(part: Part) -> tuple[str, ...]:
     return part.info.axes[len(part.info.axes) - len(part.indices) :]
 
 
-def _inner_count(places: Places, axis: str) -> Iterator[str]:
+def _inner_count(layout: CLayout, axis: str) -> Iterator[str]:
     """The number of elements of an array inside a bit block."""
-    found = [(spot, part) for spot in places.spots if isinstance(spot.node, Block) for part in spot.node.parts if axis in _inner(part)]
-    spot, part = found[0]
+    blocks = [(entry, entry.node.parts) for entry in layout.entries if isinstance(entry.node, Block)]
+    inside = [(entry, part) for entry, parts in blocks for part in parts if axis in _inner(part)]
+    entry, part = inside[0]
     level = _inner(part).index(axis)
-    count = max(part.indices[level] for _, part in found) + 1
-    yield _function("size_t", places.name(axis, "count"), spot.depth + level, [("", str(count))])
+    count = max(part.indices[level] for _, part in inside) + 1
+    yield _function("size_t", layout.name(axis, "count"), entry.depth + level, [("", str(count))])
 
 
-def _count(places: Places, axis: str) -> Iterator[str]:
-    spots = [spot for spot in places.spots if spot.path == axis and isinstance(spot.node, Repeat)]
-    ways = []
-    for spot in spots:
-        assert isinstance(spot.node, Repeat)
-        count = str(spot.node.count) if isinstance(spot.node.count, int) else f"(size_t)({places.formula(spot.node.count)})"
-        ways.append((" && ".join(condition.text for condition in spot.conditions), count))
-    yield _function("size_t", places.name(axis, "count"), spots[0].depth, ways)
+def _count(layout: CLayout, axis: str) -> Iterator[str]:
+    arrays = [(entry, entry.node.count) for entry in layout.entries if entry.path == axis and isinstance(entry.node, Repeat)]
+    ways = [(entry.where, layout.length(count)) for entry, count in arrays]
+    yield _function("size_t", layout.name(axis, "count"), arrays[0][0].depth, ways)
 
 
-def _field(places: Places, path: str) -> Iterator[str]:
-    found = pieces(places, path)
-    infos, name = [piece.info for piece in found], places.name(path, "")
-    part = found[0].part
-    depth = found[0].spot.depth + (len(part.indices) if part else 0)
-    yield from _labels(infos[0], name)
-    yield comment(unit_text(infos[0]), meaning(infos[0]))
-    if isinstance(found[0].spot.node, Blob):
-        yield from _bytes(places, path, [piece.spot for piece in found])
-        return
-    kind = number_type(infos)
-    ways = [(piece.condition, f"({kind}){_grouped(piece.expression)}") for piece in found]
-    yield _function(kind, name, depth, ways)
-    if any(piece.spot.conditions for piece in found):
-        conditions = [" && ".join(condition.text for condition in piece.spot.conditions) or "1" for piece in found]
-        yield _present(places, path, depth, conditions)
-    if infos[0].scaled or infos[0].unit:
-        yield from _scaling(infos[0], name, kind)
-
-
-def _bytes(places: Places, path: str, spots: list[Spot]) -> Iterator[str]:
-    ways, sizes, name = [], [], places.name(path, "")
-    for spot in spots:
-        assert isinstance(spot.node, Blob)
-        condition = " && ".join(condition.text for condition in spot.conditions)
-        size = str(spot.node.size) if isinstance(spot.node.size, int) else f"(size_t)({places.formula(spot.node.size)})"
-        ways.append((condition, f"p + ({spot.start})"))
-        sizes.append((condition, size))
-    depth = spots[0].depth
-    yield _function("size_t", places.name(path, "size"), depth, sizes)
-    yield _function("const uint8_t *", name, depth, ways)
-    if any(spot.conditions for spot in spots):
-        yield _present(places, path, depth, [condition or "1" for condition, _ in ways])
-
-
-def _present(places: Places, path: str, depth: int, conditions: list[str]) -> str:
-    both = " || ".join(f"({condition})" for condition in dict.fromkeys(conditions))
-    return _function("int", places.name(path, "present"), depth, [("", both)])
+def _field(layout: CLayout, path: str) -> Iterator[str]:
+    """The functions of a field: what it holds, whether it is there, its scaling; and the names of its values."""
+    ways = accesses(layout, path)
+    name, first = layout.name(path, ""), ways[0]
+    depth = first.entry.depth + (len(first.part.indices) if first.part else 0)
+    yield from (f"#define {name.upper()}_{identifier(label).upper()} {value}" for value, label in first.info.labels.items())
+    yield comment(unit_text(first.info), meaning(first.info))
+    if isinstance(first.entry.node, Blob):
+        kind = ""
+        sizes = [(access.entry.where, layout.length(access.entry.node.size)) for access in ways if isinstance(access.entry.node, Blob)]
+        yield _function("size_t", layout.name(path, "size"), depth, sizes)
+        yield _function("const uint8_t *", name, depth, [(access.entry.where, f"p + ({access.entry.start})") for access in ways])
+    else:
+        kind = number_type([access.info for access in ways])
+        yield _function(kind, name, depth, [(access.condition, f"({kind}){_grouped(access.expression)}") for access in ways])
+    if any(access.entry.conditions for access in ways):
+        places = dict.fromkeys(access.entry.where or "1" for access in ways)
+        yield _function("int", layout.name(path, "present"), depth, [("", " || ".join(f"({where})" for where in places))])
+    if kind and (first.info.scaled or first.info.unit):
+        yield from _scaling(first.info, name, kind)
 
 
 def _function(kind: str, name: str, depth: int, ways: list[tuple[str, str]]) -> str:
     """A function that gives the first value whose condition holds, else 0."""
     used = " ".join(condition + " " + value for condition, value in ways)
-    lines = [f"    (void){argument};" for argument in arguments(depth).split(", ") if not _mentions(used, argument)]
-    for condition, value in ways:
-        lines.append(f"    if ({condition}) return {value};" if condition else f"    return {value};")
-    if ways[-1][0]:
-        lines.append("    return 0;")
-    space = "" if kind.endswith("*") else " "
-    if len(lines) == 1:
-        return f"static inline {kind}{space}{name}({parameters(depth)}) {{ {lines[0].strip()} }}"
-    return "\n".join([f"static inline {kind}{space}{name}({parameters(depth)})", "{", *lines, "}"])
-
-
-def _mentions(text: str, name: str) -> bool:
-    return re.search(rf"\b{name}\b", text) is not None
+    lines = [f"    (void){argument};" for argument in arguments(depth).split(", ") if not re.search(rf"\b{argument}\b", used)]
+    lines += [f"    if ({condition}) return {value};" if condition else f"    return {value};" for condition, value in ways]
+    lines += ["    return 0;"] * bool(ways[-1][0])
+    head = f"static inline {kind}{'' if kind.endswith('*') else ' '}{name}({parameters(depth)})"
+    return f"{head} {{ {lines[0].strip()} }}" if len(lines) == 1 else "\n".join([head, "{", *lines, "}"])
 
 
 def _grouped(expression: str) -> str:
     return f"({expression})" if " " in expression and not expression.startswith(("lidarspec_", "p[")) else expression
-
-
-def _labels(info: FieldInfo, name: str) -> Iterator[str]:
-    for value, label in info.labels.items():
-        yield f"#define {name.upper()}_{identifier(label).upper()} {value}"
 
 
 def _scaling(info: FieldInfo, name: str, kind: str) -> Iterator[str]:
@@ -533,8 +496,4 @@ def _conversion(name: str, kind: str, scale: float, offset: float) -> str:
 
 
 def _unit_name(unit: str) -> str:
-    named = unit.replace("/", "_per_").replace("%", "percent").replace("^", "").replace("**", "")
-    return identifier(named) if named else "value"
-
-
-_MADE = {"field": _field, "count": _count, "inner": _inner_count}
+    return identifier(unit.replace("/", "_per_").replace("%", "percent").replace("^", "").replace("**", "")) or "value"

@@ -1,19 +1,33 @@
-"""What a packet diagram shows of a frame: boxes in the order of the wire, groups that repeat, and parts that some headers leave out.
+"""Packet diagrams as manuals have them: rows of four bytes, every field a box, repeated parts drawn once with their number.
 
-Packet diagrams as manuals have them: rows of four bytes, every field a box, repeated parts drawn once with their number.
+A diagram is made in two steps. `cells` says what is shown of a frame tree: boxes in the order of the wire (`Cell`), and groups
+that repeat or that some headers leave out (`Group`). `_Sheet` draws these from top to bottom as SVG: a box across the end of a row goes on
+in the next, a group has rows of its own with a bracket beside them, and a field too long to draw, or of no fixed length, is a torn row.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from xml.sax.saxutils import escape, quoteattr
 
-from lidarspec.exports.formulas import Formula, Op, Ref
 from lidarspec.exports.messages import Message, messages
-from lidarspec.exports.tree import Blob, Block, Empty, Node, Number, Part, Repeat, Sealed, Select, Struct, When, nodes
 from lidarspec.spec.sensor import Sensor
-from lidarspec.wire.wire_table import INDICES, Extent, bit_text, frame_size, meaning, unit_text
+from lidarspec.spec.tree import (
+    Blob,
+    Block,
+    FieldInfo,
+    Node,
+    Number,
+    Part,
+    Repeat,
+    Sealed,
+    Select,
+    Struct,
+    When,
+    nodes,
+)
+from lidarspec.wire.wire_table import INDICES, Extent, bit_text, branches, extent, frame_size, meaning, phrase, unit_text
 
 
 @dataclass(frozen=True)
@@ -48,8 +62,7 @@ Item = Cell | Group
 
 def cells(message: Message) -> tuple[Item, ...]:
     """The items of a frame type."""
-    seals = {path: node for node in nodes(message.root) if isinstance(node, Sealed) for path in node.fields}
-    return _Cells(seals, mixed=not byte_order(message)).visit(message.root, Extent(), 0)[0]
+    return _Cells(message.seals, mixed=not byte_order(message)).visit(message.root, Extent(), 0)
 
 
 def byte_order(message: Message) -> str:
@@ -58,123 +71,88 @@ def byte_order(message: Message) -> str:
     return orders.pop() if len(orders) == 1 else ""
 
 
-def phrase(formula: Formula) -> str:
-    """A formula as people write it."""
-    match formula:
-        case Ref():
-            return formula.path
-        case Op(symbol, (operand,)):
-            return f"{symbol} {phrase(operand)}" if symbol.isalpha() else f"{symbol}{phrase(operand)}"
-        case Op(symbol, (left, right)):
-            one, other = (f"({phrase(part)})" if isinstance(part, Op) else phrase(part) for part in (left, right))
-            return f"{one} {symbol} {other}"
-        case _:
-            return str(formula)
-
-
 @dataclass
 class _Cells:
-    seals: dict[str, Sealed]
+    """Makes the items of a frame type.
+
+    Attributes:
+        seals: path of a field that holds a checksum -> its seal.
+        mixed: whether its numbers have several byte orders, so that each says its own.
+    """
+
+    seals: Mapping[str, Sealed]
     mixed: bool
 
-    def visit(self, node: Node, start: Extent, depth: int) -> tuple[tuple[Item, ...], Extent]:
-        """The items of a part that begins at `start`, and its size."""
+    def visit(self, node: Node, start: Extent, depth: int) -> tuple[Item, ...]:
+        """The items of a part that begins at `start`."""
         match node:
             case Sealed():
                 return self.visit(node.body, start, depth)
             case Struct():
-                return self._struct(node, start, depth)
+                return tuple(self._struct(node, start, depth))
             case Number():
-                return (self._number(node, start),), Extent(node.size)
-            case Blob():
-                return self._blob(node, start)
+                return (self._number(node, start),)
+            case Blob() if node.size != 0:
+                return (self._blob(node, start),)
             case Block():
-                return tuple(self._block(node, start)), Extent(node.size)
+                return tuple(self._block(node, start))
             case Repeat():
-                return self._repeat(node, start, depth)
+                return (self._repeat(node, start, depth),)
             case When() | Select():
-                return self._choice(node, start, depth)
-            case Empty():
-                return (), Extent()
+                parts = ((label, self.visit(branch, start, depth)) for label, branch in branches(node))
+                return tuple(Group(label, items, optional=True) for label, items in parts if items)
+        return ()
 
-    def _struct(self, node: Struct, start: Extent, depth: int) -> tuple[tuple[Item, ...], Extent]:
-        items: list[Item] = []
-        size = Extent()
+    def _struct(self, node: Struct, start: Extent, depth: int) -> Iterator[Item]:
         for member in node.members:
-            found, more = self.visit(member, start + size, depth)
             named = isinstance(member, Struct | Sealed) or (isinstance(member, Block) and member.parts[0].names)
-            items += [replace(item, name=f"{member.name}.{item.name}") if named and isinstance(item, Cell) else item for item in found]
-            size = size + more
-        return tuple(items), size
+            for item in self.visit(member, start, depth):
+                yield replace(item, name=f"{member.name}.{item.name}") if named and isinstance(item, Cell) else item
+            start = start + extent(member, member.name)
 
     def _number(self, node: Number, start: Extent) -> Cell:
-        kind = {"uint": "u", "int": "s", "float": "float "}[node.kind] + str(8 * node.size)
-        order = f" {node.order}" if node.size > 1 else ""
-        said = f"{node.kind}{8 * node.size}{order}"
-        short = f" {node.order[0]}e" if self.mixed and node.size > 1 else ""
-        detail = " ".join(part for part in (kind + short, unit_text(node.info)) if part)
-        return self._cell(node, 8 * node.size, detail, said, start)
-
-    def _blob(self, node: Blob, start: Extent) -> tuple[tuple[Item, ...], Extent]:
-        size = Extent(node.size) if isinstance(node.size, int) else Extent(0, (phrase(node.size),))
-        if node.size == 0:
-            return (), size
-        detail = node.const.hex(" ") if node.const is not None and len(node.const) <= 8 else f"{size} byte{'s' * (str(size) != '1')}"
-        bits = 8 * node.size if isinstance(node.size, int) else 0
-        return (self._cell(node, bits, detail, "bytes", start),), size
-
-    def _cell(self, node: Number | Blob, bits: int, detail: str, kind: str, start: Extent) -> Cell:
-        path, seal = node.info.path, self.seals.get(node.info.path)
-        if isinstance(node, Number) and node.info.const is not None:
+        width, is_long = 8 * node.size, node.size > 1
+        short = {"uint": "u", "int": "s", "float": "float "}[node.kind] + f"{width}{f' {node.order[0]}e' * (self.mixed and is_long)}"
+        detail = " ".join(filter(None, (short, unit_text(node.info))))
+        if node.info.const is not None:
             detail = f"{node.info.const:#0{2 * node.size + 2}x}" if isinstance(node.info.const, int) else str(node.info.const)
-        sealed = "" if seal is None else seal.algorithm.describe()
-        said = "; ".join(part for part in (path, kind, unit_text(node.info), meaning(node.info), sealed) if part)
-        role = "sum" if seal else "const" if node.info.const is not None else "spare" if _is_spare(node.name) else ""
-        return Cell(node.name or "(constant)", bits, detail, said, role, start)
+        return self._cell(node.info, node.name, width, detail, f"{node.kind}{width}{f' {node.order}' * is_long}", start)
+
+    def _blob(self, node: Blob, start: Extent) -> Cell:
+        size = extent(node)
+        detail = node.const.hex(" ") if node.const is not None and len(node.const) <= 8 else f"{size} byte{'s' * (str(size) != '1')}"
+        return self._cell(node.info, node.name, 8 * size.number, detail, "bytes", start)
 
     def _block(self, node: Block, start: Extent) -> list[Cell]:
         """A box for each run of bits of one value, in the order of the wire, the highest bit of each byte first."""
-        runs = [(run.byte, run.low + run.mask.bit_count() - 1, run, part) for part in node.parts for run in part.bits.segments]
-        found: list[tuple[Part, int, int, int]] = []
-        for byte, _, run, part in sorted(runs, key=lambda entry: (entry[0], -entry[1])):
+        segments = [(run.byte, run.low + run.mask.bit_count() - 1, run, part) for part in node.parts for run in part.bits.segments]
+        runs: list[tuple[Part, int, int, int]] = []
+        for byte, _, run, part in sorted(segments, key=lambda entry: (entry[0], -entry[1])):
             low, high = run.target, run.target + run.mask.bit_count() - 1
-            if found and found[-1][0] is part and found[-1][1] == high + 1:
-                found[-1] = (part, low, *found[-1][2:])
+            if runs and runs[-1][0] is part and runs[-1][1] == high + 1:
+                runs[-1] = (part, low, *runs[-1][2:])
             else:
-                found.append((part, low, high, byte))
-        return [self._run(node, part, low, high, start + Extent(byte)) for part, low, high, byte in found]
+                runs.append((part, low, high, byte))
+        return [self._run(node, part, low, high, start + Extent(byte)) for part, low, high, byte in runs]
 
     def _run(self, node: Block, part: Part, low: int, high: int, start: Extent) -> Cell:
-        whole = high - low + 1 == part.bits.width
-        name = ".".join((*([node.name] if len(part.names) == 0 else part.names),)) + "".join(f"[{index}]" for index in part.indices)
-        detail = "" if whole else f"{high}..{low}" if high > low else f"{low}"
-        seal = self.seals.get(part.info.path)
-        texts = (part.info.path, bit_text(part.bits), unit_text(part.info), meaning(part.info), seal.algorithm.describe() if seal else "")
-        role = "sum" if seal else "const" if part.info.const is not None else "spare" if _is_spare(name) else ""
-        unit = unit_text(part.info) if whole else ""
-        return Cell(name, high - low + 1, detail or unit, "; ".join(text for text in texts if text), role, start)
+        """The box of some bits of a value, with their numbers where it has others, too."""
+        width = high - low + 1
+        name = (".".join(part.names) or node.name) + "".join(f"[{index}]" for index in part.indices)
+        numbers = f"{high}..{low}" if high > low else f"{low}"
+        detail = unit_text(part.info) if width == part.bits.width else numbers
+        return self._cell(part.info, name, width, detail, bit_text(part.bits), start)
 
-    def _repeat(self, node: Repeat, start: Extent, depth: int) -> tuple[tuple[Item, ...], Extent]:
-        index = INDICES[depth % len(INDICES)]
+    def _cell(self, info: FieldInfo, name: str, bits: int, detail: str, kind: str, start: Extent) -> Cell:
+        seal = self.seals.get(info.path)
+        role = "sum" if seal else "const" if info.const is not None else "spare" if _is_spare(name) else ""
+        said = (info.path, kind, unit_text(info), meaning(info), seal.algorithm.describe() if seal else "")
+        return Cell(name or "(constant)", bits, detail, "; ".join(filter(None, said)), role, start)
+
+    def _repeat(self, node: Repeat, start: Extent, depth: int) -> Group:
+        step = extent(node.element, node.name).times(INDICES[depth % len(INDICES)])
         count = node.count if isinstance(node.count, int) else phrase(node.count)
-        _, element = self.visit(node.element, Extent(), depth + 1)
-        items, _ = self.visit(node.element, start + element.times(index), depth + 1)
-        return (Group(f"{node.name} \u00d7\u00a0{count}", items),), element.times(count)
-
-    def _choice(self, node: When | Select, start: Extent, depth: int) -> tuple[tuple[Item, ...], Extent]:
-        if isinstance(node, When):
-            asked = phrase(node.condition)
-            branches = [(f"if {asked}", node.then), (f"unless {asked}", node.otherwise)]
-        else:
-            key = phrase(node.key)
-            branches = [*((f"if {key} == {value}", case) for value, case in node.cases), (f"for other {key}", node.default)]
-        groups: list[Item] = []
-        sizes = set()
-        for label, branch in branches:
-            items, size = self.visit(branch, start, depth)
-            sizes.add(size)
-            groups += [Group(label, items, optional=True)] if items else []
-        return tuple(groups), sizes.pop() if len(sizes) == 1 else Extent(0, (f"size({node.name})",))
+        return Group(f"{node.name} \u00d7\u00a0{count}", self.visit(node.element, start + step, depth + 1))
 
 
 def _is_spare(name: str) -> bool:
@@ -239,9 +217,9 @@ class _Sheet:
             self.parts.append(_text(LEFT + (bit + 0.5) * BIT, self.top + 13, str(7 - bit % 8), 8.5, fill=FAINT, anchor="middle"))
         self.top += 18
 
-    def items(self, found: Sequence[Item], depth: int) -> None:
+    def items(self, items: Sequence[Item], depth: int) -> None:
         """Boxes and groups one after another."""
-        for item in found:
+        for item in items:
             if isinstance(item, Group):
                 self._group(item, depth)
             elif item.bits == 0 or item.bits > LONGEST:
@@ -372,9 +350,9 @@ def _label(x: float, y: float, width: float, cell: Cell, fill: str = INK) -> Ite
         turned = f' transform="rotate(-90 {middle:g} {y + ROW / 2:g})"'
         yield _text(middle, y + ROW / 2 + tall * 0.35, text, tall, fill=fill, anchor="middle", more=turned)
         return
-    fits = cell.detail and LETTER * DETAILED * len(cell.detail) <= room
-    yield _text(middle, y + ROW / 2 + (-1 if fits else size * 0.35), cell.name, size, fill=fill, anchor="middle")
-    if fits:
+    has_room = cell.detail and LETTER * DETAILED * len(cell.detail) <= room
+    yield _text(middle, y + ROW / 2 + (-1 if has_room else size * 0.35), cell.name, size, fill=fill, anchor="middle")
+    if has_room:
         yield _text(middle, y + ROW / 2 + 13, cell.detail, DETAILED, fill=FAINT, anchor="middle")
 
 

@@ -10,14 +10,29 @@ import dataclasses
 import json
 from typing import Any
 
-from lidarspec.exports.formulas import Formula, Op, Ref
 from lidarspec.exports.messages import Message, messages
-from lidarspec.exports.tree import Blob, Block, Empty, Node, Number, Part, Repeat, Sealed, Select, Struct, When
 from lidarspec.spec.checksums import Checksum
 from lidarspec.spec.description import Command
 from lidarspec.spec.links import Link, Serial, Tcp, Udp
 from lidarspec.spec.sensor import Sensor
-from lidarspec.wire.schema import FieldInfo
+from lidarspec.spec.tree import (
+    Blob,
+    Block,
+    Empty,
+    FieldInfo,
+    Formula,
+    Node,
+    Number,
+    Op,
+    Opaque,
+    Part,
+    Ref,
+    Repeat,
+    Sealed,
+    Select,
+    Struct,
+    When,
+)
 from lidarspec.wire.wire_table import frame_size
 
 #: raised whenever a key changes its meaning or goes.
@@ -132,7 +147,7 @@ def node_data(node: Node) -> dict[str, Any]:
         case Select():
             cases = [{"value": value, "part": node_data(case)} for value, case in node.cases]
             return {"kind": "switch", "name": node.name, "key": formula_data(node.key), "cases": cases, "default": node_data(node.default)}
-        case Empty():
+        case Empty() | Opaque():
             return {"kind": "nothing", "name": node.name}
 
 
@@ -149,8 +164,8 @@ def formula_data(formula: Formula) -> Any:
 
 def _info(info: FieldInfo) -> dict[str, Any]:
     const = info.const.hex() if isinstance(info.const, bytes | bytearray) else info.const
-    found = {"path": info.path, "unit": info.unit, "scale": info.scale, "offset": info.offset, "const": const, "docs": info.docs}
-    return {**found, "labels": {str(value): name for value, name in info.labels.items()}}
+    facts = {"path": info.path, "unit": info.unit, "scale": info.scale, "offset": info.offset, "const": const, "docs": info.docs}
+    return {**facts, "labels": {str(value): name for value, name in info.labels.items()}}
 
 
 def _part(part: Part) -> dict[str, Any]:

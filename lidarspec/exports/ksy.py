@@ -1,13 +1,9 @@
-"""Plain data as YAML: mappings, lists, strings, numbers and booleans in block style, short lists of numbers in one line.
+"""A spec as a Kaitai Struct format, for Kaitai's compiler, its web IDE and its visualizer.
 
-Counts, conditions and keys as Kaitai writes them, with fields by their way from the type that asks.
-
-Bit blocks in Kaitai: integers of so many bits where they stand in a row in one of its two bit orders, else calculated from bytes.
-
-A spec as a Kaitai Struct format, for its compiler, its web IDE and its visualizer.
-
-A frame type becomes a type, and so does each struct in it. Bit blocks become bit-sized integers where Kaitai's two bit orders
-can say them, else bytes and calculated instances; a field with a scale gets an instance with the physical value. Checksums,
+A frame type becomes a Kaitai type, and so does each struct in it: a type has attributes in the order of the wire (`seq`), calculated
+`instances` and inner `types`, and is plain data until `yaml` writes the document. Formulas name a field by its way from the type that asks
+(`Scope`), since Kaitai knows no paths from the top. Bit blocks become bit-sized integers where one of Kaitai's two bit orders meets their
+parts in a row, else bytes and calculated instances; a field with a scale gets an instance with the physical value. Checksums,
 plausibility and what points are made of cannot be said in Kaitai: checksums are named in the documentation of their fields.
 """
 
@@ -20,13 +16,29 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from lidarspec.exports import Refused
-from lidarspec.exports.formulas import Formula, Op, Ref
 from lidarspec.exports.messages import Message, messages
-from lidarspec.exports.tree import Blob, Block, Empty, Node, Number, Part, Repeat, Sealed, Select, Struct, When, nodes
 from lidarspec.spec.bits import BitField, Segment
 from lidarspec.spec.fields import slug
 from lidarspec.spec.sensor import Sensor
-from lidarspec.wire.schema import FieldInfo
+from lidarspec.spec.tree import (
+    COMPARISONS,
+    Blob,
+    Block,
+    Empty,
+    FieldInfo,
+    Formula,
+    Node,
+    Number,
+    Op,
+    Part,
+    Ref,
+    Repeat,
+    Sealed,
+    Select,
+    Struct,
+    When,
+    written,
+)
 from lidarspec.wire.wire_table import meaning, unit_text
 
 #: a string that means the same without quotes.
@@ -84,78 +96,61 @@ def _scalar(value: Any) -> str:
     return repr(value)
 
 
-COMPARISONS = {"==", "!=", "<", "<=", ">", ">="}
-
-
 def identifier(name: str) -> str:
     """A name as Kaitai takes it."""
     return re.sub(r"[^a-z0-9_]", "_", name.lower())
 
 
 @dataclass(frozen=True)
-class Names:
-    """The types that a place stands in, outermost first, by the path of their struct; None for one that has no struct."""
+class Scope:
+    """The types that an expression stands in, outermost first, by the path of their struct; None for one that has no struct."""
 
     levels: tuple[str | None, ...] = ()
 
-    def inside(self, path: str) -> Names:
-        """In the type of the struct at a path."""
-        return Names((*self.levels, path))
+    def inside(self, path: str | None) -> Scope:
+        """In the type of the struct at a path, or with None in one that holds a single part."""
+        return Scope((*self.levels, path))
 
-    def wrapped(self) -> Names:
-        """In a type that holds one part alone."""
-        return Names((*self.levels, None))
-
-    def way(self, ref: Ref) -> str:
-        """The way from here to a field.
+    def field(self, ref: Ref) -> str:
+        """A field as an integer, by its way from here.
 
         Raises:
-            Refused: to one that no type around this place holds.
+            Refused: where no type around this place holds it.
         """
         for up, path in enumerate(reversed(self.levels)):
             if path is not None and (path == "" or ref.path.startswith(f"{path}.")):
-                below = ref.path[len(path) + 1 :] if path else ref.path
-                return "_parent." * up + ".".join(identifier(name) for name in below.split("."))
+                names = ref.path.removeprefix(f"{path}.").split(".")
+                return "_parent." * up + ".".join(map(identifier, names)) + ".to_i" * (ref.info.bits == 1)
         raise Refused(f"{ref.path} cannot be reached in Kaitai")
 
 
-def number(formula: Formula, names: Names) -> str:
+_OPERATIONS = {"//": "({} / {})", "not": "({} == 0 ? 1 : 0)", **{symbol: f"({{}} {symbol} {{}} ? 1 : 0)" for symbol in COMPARISONS}}
+
+
+def number(formula: Formula, scope: Scope) -> str:
     """A formula as an integer."""
-    match formula:
-        case Ref():
-            return names.way(formula) + (".to_i" if formula.info.bits == 1 else "")
-        case Op(symbol) if symbol in COMPARISONS or symbol == "not":
-            return f"({truth(formula, names)} ? 1 : 0)"
-        case Op(symbol, (operand,)):
-            return f"({symbol}{number(operand, names)})"
-        case Op(symbol, (left, right)):
-            return f"({number(left, names)} {'/' if symbol == '//' else symbol} {number(right, names)})"
-        case _:
-            return str(formula)
+    return written(formula, scope.field, _OPERATIONS)
 
 
-def truth(formula: Formula, names: Names) -> str:
+def truth(formula: Formula, scope: Scope) -> str:
     """A formula as a condition: not 0."""
     match formula:
         case Op("not", (operand,)):
-            return f"not ({truth(operand, names)})"
+            return f"not ({truth(operand, scope)})"
         case Op(symbol, (left, right)) if symbol in COMPARISONS:
-            return f"{number(left, names)} {symbol} {number(right, names)}"
+            return f"{number(left, scope)} {symbol} {number(right, scope)}"
         case int():
             return "true" if formula else "false"
-        case _:
-            return f"{number(formula, names)} != 0"
+    return f"{number(formula, scope)} != 0"
 
 
-BitAttribute = dict[str, Any]
+Attribute = dict[str, Any]
 
-#: bits that Kaitai reads in one go.
-WIDEST = 64
-#: bytes of its other integers.
-SIZES = (1, 2, 4, 8)
+#: bits that Kaitai reads in one go, and bytes of its other integers and of its floats.
+WIDEST, INTEGERS, FLOATS = 64, (1, 2, 4, 8), (4, 8)
 
 
-def block_type(block: Block, doc: Callable[[Part], BitAttribute]) -> tuple[list[BitAttribute], dict[str, BitAttribute]]:
+def block_type(block: Block, doc: Callable[[FieldInfo], Attribute]) -> tuple[list[Attribute], dict[str, Attribute]]:
     """The attributes and the instances of the type of a block, with what is said of each part.
 
     Raises:
@@ -163,104 +158,95 @@ def block_type(block: Block, doc: Callable[[Part], BitAttribute]) -> tuple[list[
     """
     if any(part.bits.width > WIDEST for part in block.parts):
         raise Refused(f"{block.info.path}: an integer of more than {WIDEST} bits")
-    rows, suffix = _from_high(block), "be"
-    if rows is None:
-        rows, suffix = _from_low(block), "le"
-    if rows is None:
-        found = {_name(part): {"value": _assembled(part, "raw")} | doc(part) for part in block.parts}
-        return [{"id": "raw", "size": block.size}], found
-    seq: list[BitAttribute] = []
-    instances: dict[str, BitAttribute] = {}
-    for part in rows:
+    ordered = _in_order(block)
+    if ordered is None:
+        calculated = {_name(part): {"value": _assembled(part, "raw")} | doc(part.info) for part in block.parts}
+        return [{"id": "raw", "size": block.size}], calculated
+    seq: list[Attribute] = []
+    instances: dict[str, Attribute] = {}
+    for part in ordered[0]:
         name, width = _name(part), part.bits.width
-        kind: BitAttribute = {"type": f"b{width}{suffix}"}
+        kind: Attribute = {"type": f"b{width}{ordered[1]}"}
         if part.bits.signed:
-            instances[name] = {"value": f"{name}_bits - (({name}_bits >> {width - 1}) << {width})"} | doc(part)
+            instances[name] = {"value": f"{name}_bits - (({name}_bits >> {width - 1}) << {width})"} | doc(part.info)
             seq.append({"id": f"{name}_bits"} | kind)
         else:
-            seq.append({"id": name} | kind | _valid(part) | doc(part))
+            seq.append({"id": name} | kind | _valid(part) | doc(part.info))
     return seq, instances
 
 
-def inline(block: Block, more: Mapping[str, Any]) -> tuple[BitAttribute, dict[str, BitAttribute]] | None:
+def inline(block: Block, more: Mapping[str, Any]) -> tuple[Attribute, dict[str, Attribute]] | None:
     """The attribute and the instances of a block that is one plain integer; None for any other block."""
     if len(block.parts) != 1 or block.parts[0].names or block.parts[0].indices or not block.name:
         return None
-    part, name = block.parts[0], identifier(block.name)
-    for order, suffix in ((_from_high, "be"), (_from_low, "le")):
-        if order(block) is not None and not part.bits.signed and part.bits.width <= WIDEST:
-            return {"id": name, "type": f"b{part.bits.width}{suffix}", **more} | _valid(part), {}
+    part, name, ordered = block.parts[0], identifier(block.name), _in_order(block)
+    if ordered is not None and not part.bits.signed and part.bits.width <= WIDEST:
+        return {"id": name, "type": f"b{part.bits.width}{ordered[1]}", **more} | _valid(part), {}
     if "repeat" in more:
         return None
-    conditions = {"if": more["if"]} if "if" in more else {}
-    return {"id": f"{name}_raw", "size": block.size, **more}, {name: {"value": _assembled(part, f"{name}_raw"), **conditions}}
+    return {"id": f"{name}_raw", "size": block.size, **more}, {name: {"value": _assembled(part, f"{name}_raw")} | _condition(more)}
 
 
-def odd(node: Number) -> Block | None:
-    """An integer of a size that Kaitai has no type for, as a block of one part; None for any other number."""
-    if node.kind == "float" or node.size in SIZES:
-        return None
-    targets = [8 * (place if node.order == "little" else node.size - 1 - place) for place in range(node.size)]
-    runs = tuple(Segment(place, 0xFF, 0, target) for place, target in enumerate(targets))
-    return Block(node.name, node.info, node.size, (Part(node.info, BitField((), runs, 8 * node.size, node.kind == "int"), (), ()),))
+def odd(node: Node) -> Node:
+    """A node, or where it is an integer of a size that Kaitai has no type for, the block of one part that says the same."""
+    if not isinstance(node, Number) or node.kind == "float" or node.size in INTEGERS:
+        return node
+    targets = [8 * (byte if node.order == "little" else node.size - 1 - byte) for byte in range(node.size)]
+    segments = tuple(Segment(byte, 0xFF, 0, target) for byte, target in enumerate(targets))
+    return Block(node.name, node.info, node.size, (Part(node.info, BitField((), segments, 8 * node.size, node.kind == "int"), (), ()),))
 
 
 def _name(part: Part) -> str:
     """What a part is called in the type of its block."""
-    return identifier("_".join([*(part.names or ("value",)), *(str(index) for index in part.indices)]))
+    return identifier("_".join([*(part.names or ("value",)), *map(str, part.indices)]))
 
 
-def _valid(part: Part) -> BitAttribute:
+def _valid(part: Part) -> Attribute:
     if part.info.const is None:
         return {}
     return {"valid": bool(part.info.const) if part.bits.width == 1 else part.info.const}
 
 
-def _from_high(block: Block) -> Sequence[Part] | None:
-    """The parts in the order in which reading from each byte's highest bit meets them; None where that does not make them."""
-    starts = _starts(block, lambda byte, bit: 8 * byte + 7 - bit, lambda part, target: part.bits.width - 1 - target)
-    return None if starts is None else [part for _, part in starts]
+def _condition(more: Mapping[str, Any]) -> Attribute:
+    """The condition under which an attribute is there, for the instances that are made from it."""
+    return {"if": more["if"]} if "if" in more else {}
 
 
-def _from_low(block: Block) -> Sequence[Part] | None:
-    """The same from each byte's lowest bit."""
-    starts = _starts(block, lambda byte, bit: 8 * byte + bit, lambda _, target: target)
-    return None if starts is None else [part for _, part in starts]
+def _in_order(block: Block) -> tuple[list[Part], str] | None:
+    """The parts as one of Kaitai's bit orders meets them, and its suffix; None where they do not fill the block in either.
+
+    "be" reads each byte from its highest bit on and fills integers from the top, "le" does both from the lowest bit on.
+    """
+    if sum(part.bits.width for part in block.parts) != 8 * block.size:
+        return None
+    for suffix in ("be", "le"):
+        starts = [_starts(part.bits, suffix) for part in block.parts]
+        if all(len(of_part) == 1 for of_part in starts):
+            return sorted(block.parts, key=lambda part: min(_starts(part.bits, suffix))), suffix
+    return None
 
 
-def _starts(block: Block, place: Callable[[int, int], int], inside: Callable[[Part, int], int]) -> list[tuple[int, Part]] | None:
-    """Where each part starts, if its bits follow each other from there on and the parts fill the block."""
-    found = []
-    for part in block.parts:
-        starts = {
-            place(run.byte, run.low + step) - inside(part, run.target + step)
-            for run in part.bits.segments
-            for step in range(run.mask.bit_count())
-        }
-        if len(starts) != 1:
-            return None
-        found.append((starts.pop(), part))
-    found.sort(key=lambda pair: pair[0])
-    return found if sum(part.bits.width for _, part in found) == 8 * block.size else None
+def _starts(bits: BitField, suffix: str) -> set[int]:
+    """Where reading would have begun for each bit to stand where it does; one number if the bits follow each other."""
+    starts = set()
+    for segment in bits.segments:
+        for step in range(segment.mask.bit_count()):
+            bit, target = segment.low + step, segment.target + step
+            starts.add(8 * segment.byte + (bit - target if suffix == "le" else 8 - bit - bits.width + target))
+    return starts
 
 
 def _assembled(part: Part, raw: str) -> str:
     """A part as an expression of the block's bytes."""
-    pieces = []
-    for run in part.bits.segments:
-        byte = f"{raw}[{run.byte}]" if run.mask == 0xFF else f"({raw}[{run.byte}] & {run.mask:#04x})"
-        shift = run.target - run.low
-        pieces.append(f"({byte} {'<<' if shift > 0 else '>>'} {abs(shift)})" if shift else byte)
-    value = " | ".join(pieces)
+    terms = []
+    for segment in part.bits.segments:
+        byte = f"{raw}[{segment.byte}]" if segment.mask == 0xFF else f"({raw}[{segment.byte}] & {segment.mask:#04x})"
+        shift = segment.target - segment.low
+        terms.append(f"({byte} {'<<' if shift > 0 else '>>'} {abs(shift)})" if shift else byte)
+    value = " | ".join(terms)
     if part.bits.width == 1:
         return f"({value}) != 0"
     return f"({value}) - ((({value}) >> {part.bits.width - 1}) << {part.bits.width})" if part.bits.signed else value
-
-
-Attribute = dict[str, Any]
-
-#: bytes of a float that Kaitai can read.
-FLOATS = (4, 8)
 
 
 def ksy(sensor: Sensor) -> str:
@@ -269,10 +255,10 @@ def ksy(sensor: Sensor) -> str:
     Raises:
         Refused: for what Kaitai cannot say: half-precision floats, Python code, names that are one name there.
     """
-    found = messages(sensor)
-    main = next((message for message in found if message.frame.data), found[0])
-    types = {identifier(message.name): _frame(sensor, message) for message in found}
-    if len(types) < len(found):
+    frames = messages(sensor)
+    main = next((message for message in frames if message.frame.data), frames[0])
+    types = {identifier(message.name): _frame(sensor, message) for message in frames}
+    if len(types) < len(frames):
         raise Refused(f"{sensor.id}: two frame types have one name in Kaitai, where names are in lower case")
     name = identifier(sensor.id)
     document = {
@@ -285,15 +271,10 @@ def ksy(sensor: Sensor) -> str:
 
 
 def _frame(sensor: Sensor, message: Message) -> Attribute:
-    sealed = {path: seal for seal in _seals(message.root) for path in seal.fields}
     try:
-        return _Types(sealed).struct(message.root, Names())
+        return _Types(message.seals).struct(message.root, Scope())
     except Refused as refused:
         raise Refused(f"{sensor.id} {message.name}: {refused}") from None
-
-
-def _seals(node: Node) -> Iterator[Sealed]:
-    yield from (found for found in nodes(node) if isinstance(found, Sealed))
 
 
 @dataclass
@@ -314,95 +295,93 @@ class _Type:
         twice = next((name for name in ids if ids.count(name) > 1), None)
         if twice:
             raise Refused(f"{path or 'the frame'} has two members that are called {twice!r} in Kaitai")
-        parts = {"seq": self.seq, "instances": self.instances, "types": self.types}
-        return {name: part for name, part in parts.items() if part or name == "seq"}
+        return {name: part for name, part in vars(self).items() if part or name == "seq"}
 
 
 @dataclass
 class _Types:
-    """Writes the types of one frame."""
+    """Writes the types of one frame; `seals`: path of a field that holds a checksum -> its seal."""
 
     seals: Mapping[str, Sealed]
 
-    def struct(self, node: Struct | Sealed, names: Names) -> Attribute:
-        """The type of a struct; `names` says which types it stands in."""
+    def struct(self, node: Struct | Sealed, scope: Scope) -> Attribute:
+        """The type of a struct; `scope` says which types it stands in."""
         body = node.body if isinstance(node, Sealed) else node
-        made = _Type()
+        kaitai = _Type()
         for member in body.members:
-            self._member(made, member, names.inside(body.path))
-        return made.done(body.path)
+            self._member(kaitai, member, scope.inside(body.path))
+        return kaitai.done(body.path)
 
-    def _member(self, made: _Type, node: Node, names: Names, **more: Any) -> None:
+    def _member(self, kaitai: _Type, node: Node, scope: Scope, **more: Any) -> None:
         """Add a part to a type, with what else is said of its attribute."""
+        node = odd(node)
         match node:
             case Empty():
                 return
             case When(otherwise=Empty()):
-                self._member(made, node.then, names, **more, **{"if": truth(node.condition, names)})
+                self._member(kaitai, node.then, scope, **more, **{"if": truth(node.condition, scope)})
             case When():
                 cases = {"1": node.then, "0": node.otherwise}
-                self._switch(made, node.name, f"{truth(node.condition, names)} ? 1 : 0", cases, names, **more)
+                self._switch(kaitai, node.name, f"{truth(node.condition, scope)} ? 1 : 0", cases, scope, **more)
             case Select():
                 cases = {str(value): case for value, case in node.cases} | {"_": node.default}
-                self._switch(made, node.name, number(node.key, names), cases, names, **more)
+                self._switch(kaitai, node.name, number(node.key, scope), cases, scope, **more)
             case Repeat():
-                self._repeat(made, node, names, **more)
-            case Number() if (block := odd(node)) is not None:
-                self._member(made, block, names, **more)
-            case Block() if (found := inline(node, more)) is not None:
-                made.seq.append(found[0] | self._doc(node.info))
-                made.instances |= found[1]
-                self._physical(made, node.info, more)
+                self._repeat(kaitai, node, scope, **more)
+            case Block() if (plain := inline(node, more)) is not None:
+                kaitai.seq.append(plain[0] | self._doc(node.info))
+                kaitai.instances |= plain[1]
+                self._physical(kaitai, node.info, more)
             case Number() | Blob():
-                made.seq.append(self._plain(node, names) | more)
-                self._physical(made, node.info, more)
+                kaitai.seq.append(self._plain(node, scope) | more)
+                self._physical(kaitai, node.info, more)
             case _:
-                name = identifier(node.name)
-                made.types[name] = self._type(node, names)
-                made.seq.append({"id": name, "type": name, **more})
+                self._typed(kaitai, node.name, node, scope, **more)
 
-    def _type(self, node: Node, names: Names) -> Attribute:
+    def _typed(self, kaitai: _Type, name: str, node: Node, scope: Scope, **more: Any) -> None:
+        """Add an attribute whose type is one of its own."""
+        name = identifier(name)
+        kaitai.types[name] = self._type(node, scope)
+        kaitai.seq.append({"id": name, "type": name, **more})
+
+    def _type(self, node: Node, scope: Scope) -> Attribute:
         """A type for any part: its own, or one that holds it as `value`."""
         if isinstance(node, Struct | Sealed):
-            return self.struct(node, names)
-        made = _Type()
+            return self.struct(node, scope)
+        kaitai = _Type()
         if isinstance(node, Block):
-            docs = {id(part): self._doc(part.info) for part in node.parts}
-            made.seq, made.instances = block_type(node, lambda part: docs[id(part)])
+            kaitai.seq, kaitai.instances = block_type(node, self._doc)
             for part in node.parts:
                 if not part.indices:
-                    self._physical(made, part.info, {}, name="_".join(part.names) or "value")
-            return made.done(node.info.path)
-        self._member(made, _value(node), names.wrapped())
-        return made.done(node.name)
+                    self._physical(kaitai, part.info, {}, name="_".join(part.names) or "value")
+            return kaitai.done(node.info.path)
+        self._member(kaitai, _value(node), scope.inside(None))
+        return kaitai.done(node.name)
 
-    def _repeat(self, made: _Type, node: Repeat, names: Names, **more: Any) -> None:
-        more |= {"repeat": "expr", "repeat-expr": _size(node.count, names)}
-        element = (odd(node.element) if isinstance(node.element, Number) else None) or node.element
+    def _repeat(self, kaitai: _Type, node: Repeat, scope: Scope, **more: Any) -> None:
+        more |= {"repeat": "expr", "repeat-expr": _size(node.count, scope)}
+        element = odd(node.element)
         if isinstance(element, Number | Blob):
-            made.seq.append(self._plain(element, names) | {"id": identifier(node.name)} | more)
-            return
-        if isinstance(element, Block) and (found := inline(element, more)) is not None:
-            made.seq.append(found[0] | self._doc(element.info))
-            return
-        name = identifier(node.name)
-        made.types[name] = self._type(element, names)
-        made.seq.append({"id": name, "type": name, **more})
+            kaitai.seq.append(self._plain(element, scope) | {"id": identifier(node.name)} | more)
+        elif isinstance(element, Block) and (plain := inline(element, more)) is not None:
+            kaitai.seq.append(plain[0] | self._doc(element.info))
+        else:
+            self._typed(kaitai, node.name, element, scope, **more)
 
-    def _switch(self, made: _Type, name: str, key: str, cases: Mapping[str, Node], names: Names, **more: Any) -> None:
+    def _switch(self, kaitai: _Type, name: str, key: str, cases: Mapping[str, Node], scope: Scope, **more: Any) -> None:
         types = {}
         for value, case in cases.items():
             if value == "_" and isinstance(case, Empty):
                 continue
             types[value] = identifier(f"{name}_{'other' if value == '_' else value.replace('-', 'minus_')}")
-            made.types[types[value]] = {"seq": []} if isinstance(case, Empty) else self._type(case, names)
-        made.seq.append({"id": identifier(name), "type": {"switch-on": key, "cases": types}, **more})
+            kaitai.types[types[value]] = {"seq": []} if isinstance(case, Empty) else self._type(case, scope)
+        kaitai.seq.append({"id": identifier(name), "type": {"switch-on": key, "cases": types}, **more})
 
-    def _plain(self, node: Number | Blob, names: Names) -> Attribute:
+    def _plain(self, node: Number | Blob, scope: Scope) -> Attribute:
         """The attribute of a number or of bytes."""
         head = {"id": identifier(node.name)} if node.name else {}
         if isinstance(node, Blob):
-            size = _size(node.size, names)
+            size = _size(node.size, scope)
             kind: Attribute = {"size": size} if node.const is None else {"contents": [Byte(byte) for byte in node.const]}
             return head | kind | self._doc(node.info)
         letter = {"uint": "u", "int": "s", "float": "f"}[node.kind]
@@ -414,23 +393,21 @@ class _Types:
 
     def _doc(self, info: FieldInfo) -> Attribute:
         seal = self.seals.get(info.path)
-        said = [unit_text(info), meaning(info), "" if seal is None else f"{seal.algorithm.describe()} over {_span(seal)}; not checked here"]
-        text = "; ".join(part for part in said if part)
+        sealed = "" if seal is None else f"{seal.algorithm.describe()} over {_span(seal)}; not checked here"
+        text = "; ".join(filter(None, (unit_text(info), meaning(info), sealed)))
         return {"doc": text} if text else {}
 
-    def _physical(self, made: _Type, info: FieldInfo, more: Mapping[str, Any], *, name: str = "") -> None:
+    def _physical(self, kaitai: _Type, info: FieldInfo, more: Mapping[str, Any], *, name: str = "") -> None:
         """An instance with the physical value of a field that has a scale."""
         own = identifier(name or info.name)
-        if not info.scaled or not own:
-            return
-        value = f"{own} * {info.scale!r}" + (f" + {info.offset!r}" if info.offset else "")
-        conditions = {"if": more["if"]} if "if" in more else {}
-        made.instances[f"{own}_{slug(info.unit) or 'physical'}"] = {"value": value.replace("+ -", "- "), **conditions}
+        if info.scaled and own:
+            value = f"{own} * {info.scale!r}" + (f" + {info.offset!r}" if info.offset else "")
+            kaitai.instances[f"{own}_{slug(info.unit) or 'physical'}"] = {"value": value.replace("+ -", "- "), **_condition(more)}
 
 
-def _size(formula: Formula, names: Names) -> int | str:
+def _size(formula: Formula, scope: Scope) -> int | str:
     """A number of bytes or elements."""
-    return formula if isinstance(formula, int) else number(formula, names)
+    return formula if isinstance(formula, int) else number(formula, scope)
 
 
 def _value(node: Node) -> Node:

@@ -1,4 +1,8 @@
-"""A sensor's reference page in Markdown: links, commands, the wire table of every frame, checksums, clock and geometry."""
+"""A sensor's reference page in Markdown: links, commands, the wire table of every frame, checksums, clock and geometry.
+
+Each section is a table or a few sentences made from the spec alone. Only geometry looks at bytes: the points of an example frame say which
+columns there are, and in which directions the channels look.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +11,7 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 
 from lidarspec.errors import LidarSpecError
-from lidarspec.framing.decoder import Counters, Found, packed
+from lidarspec.framing.results import Counters, Found, packed
 from lidarspec.packets.stream import PacketStream
 from lidarspec.points.cloud import PointCloud
 from lidarspec.points.plain import evaluate
@@ -157,8 +161,8 @@ def _geometry(sensor: Sensor) -> Iterator[str]:
 def _cloud(sensor: Sensor, name: str) -> PointCloud | None:
     """The points of an example frame; None where it has none of its own."""
     try:
-        found = packed([Found(name, 0, sensor.example(name))])
-        return evaluate(PacketStream(sensor, name, Counters()).add([found])).cloud
+        frames = packed([Found(name, 0, sensor.example(name))])
+        return evaluate(PacketStream(sensor, name, Counters()).add([frames])).cloud
     except LidarSpecError:
         return None
 

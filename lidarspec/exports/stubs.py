@@ -17,10 +17,10 @@ from dataclasses import dataclass, field
 
 from lidarspec.exports import Refused
 from lidarspec.exports.messages import Message, messages
-from lidarspec.exports.tree import Blob, Block, Empty, Node, Number, Repeat, Sealed, Select, Struct, When
 from lidarspec.spec.description import Command
 from lidarspec.spec.sensor import Sensor
-from lidarspec.wire.schema import FieldInfo, schema
+from lidarspec.spec.tree import Blob, Block, Empty, FieldInfo, Node, Number, Opaque, Repeat, Sealed, Select, Struct, When
+from lidarspec.wire.schema import schema
 from lidarspec.wire.wire_table import meaning, unit_text
 
 
@@ -30,21 +30,21 @@ def pyi(sensor: Sensor) -> str:
     Raises:
         Refused: where a frame holds Python code, or two frame types have one class name.
     """
-    found = messages(sensor)
-    names = {message.name: camel(message.name) for message in found}
+    frames = messages(sensor)
+    names = {message.name: camel(message.name) for message in frames}
     if len(set(names.values())) < len(names):
         raise Refused(f"{sensor.id}: two frame types have one class name")
     classes = _Classes({camel(sensor.id)})
-    for message in found:
+    for message in frames:
         names[message.name] = classes.add(message.root, names[message.name], f"A frame of the type {message.name}.")
-    parts = [_HEAD.format(id=sensor.id, title=f"{sensor.vendor} {sensor.model}"), *classes.done, _sensor(sensor, found, names)]
+    parts = [_HEAD.format(id=sensor.id, title=f"{sensor.vendor} {sensor.model}"), *classes.done, _sensor(sensor, frames, names)]
     return "\n\n".join(part.rstrip() + "\n" for part in parts)
 
 
 def camel(name: str) -> str:
     """A name as a class has it."""
-    found = "".join(part[:1].upper() + part[1:] for part in re.split(r"\W+|_+", name) if part)
-    return found if found[:1].isalpha() else f"_{found}"
+    words = "".join(part[:1].upper() + part[1:] for part in re.split(r"\W+|_+", name) if part)
+    return words if words[:1].isalpha() else f"_{words}"
 
 
 _HEAD = '''"""{title}: the types of what `parse` returns and `build` and `command` take. Made by lidarspec export pyi {id}."""
@@ -75,18 +75,17 @@ class _Classes:
             node = node.body
         if isinstance(node, Struct):
             yield from ((member.name, member) for member in node.members if member.name)
-            return
-        heads: dict[str, list[FieldInfo]] = {}
-        for part in node.parts:
-            heads.setdefault(part.names[0], []).append(part.info)
-        yield from heads.items()
+        else:
+            for name in dict.fromkeys(part.names[0] for part in node.parts):
+                yield name, [part.info for part in node.parts if part.names[0] == name]
 
     def _attribute(self, owner: str, name: str, node: Node | list[FieldInfo]) -> list[str]:
+        """The lines of a member: a node, or the infos of the parts of a bit block that begin with its name."""
         if isinstance(node, list):
             kind, infos = "int" if len(node) == 1 else "Any", node
         else:
             kind, infos = self._type(owner, name, node), [node.info] if isinstance(node, Number | Blob | Block) else []
-        said = "; ".join(part for part in (unit_text(infos[0]), meaning(infos[0])) if part) if infos else ""
+        said = "; ".join(filter(None, (text(info) for info in infos[:1] for text in (unit_text, meaning))))
         line = f"    {name}: {kind}" + ("  # a keyword: getattr()" if keyword.iskeyword(name) else "")
         return [line if not keyword.iskeyword(name) else f"    # {line.strip()}", *([f'    """{_quoted(said)}"""'] if said else [])]
 
@@ -106,20 +105,20 @@ class _Classes:
                 return self._either(owner, name, [node.then, node.otherwise])
             case Select():
                 return self._either(owner, name, [*(case for _, case in node.cases), node.default])
-            case Empty():
+            case Empty() | Opaque():
                 return "None"
 
     def _either(self, owner: str, name: str, branches: list[Node]) -> str:
         return " | ".join(dict.fromkeys(self._type(owner, name, branch) for branch in branches))
 
 
-def _sensor(sensor: Sensor, found: tuple[Message, ...], names: dict[str, str]) -> str:
+def _sensor(sensor: Sensor, frames: tuple[Message, ...], names: dict[str, str]) -> str:
     """The class of the sensor: what `parse`, `build`, `example` and `command` take and give."""
-    frames = "\n".join(
+    parses = "\n".join(
         f'    @overload\n    def parse(self, data: bytes, frame: Literal["{frame}"], *, verify: bool = True) -> {name}: ...'
         for frame, name in names.items()
     )
-    builds = "\n".join(_build(message) for message in found)
+    builds = "\n".join(_build(message) for message in frames)
     commands = "\n".join(_command(name, command) for name, command in sensor.commands.items())
     rest = "    @overload\n    def command(self, name: str, **arguments: Any) -> bytes: ..." if len(sensor.commands) > 0 else ""
     literals = ", ".join(f'"{name}"' for name in names)
@@ -130,7 +129,7 @@ FieldPath = Literal[{fields}]
 class {camel(sensor.id)}(Sensor):
     """The sensor itself: cast what `lidarspec.sensor("{sensor.id}")` returns to it."""
 
-{frames}
+{parses}
     @overload
     def parse(self, data: bytes, frame: str | None = None, *, verify: bool = True) -> Any: ...
 {builds}
@@ -162,7 +161,7 @@ def _command(name: str, command: Command) -> str:
 def _paths(sensor: Sensor) -> list[str]:
     """The fields of the data frame, as packets name them."""
     frame = next((frame for frame in sensor.frames.values() if frame.data), None) or next(iter(sensor.frames.values()))
-    return list(schema(frame.prepared).fields)
+    return list(schema(frame.tree).fields)
 
 
 def _quoted(said: str) -> str:

@@ -1,31 +1,49 @@
-"""Values and formulas as Lua.
+"""A Wireshark dissector: what a spec says as Lua tables, and the Lua code that walks them.
 
-The tree of a frame type as Lua tables, and the fields that Wireshark knows it by.
-
-A Wireshark dissector: what a spec says as Lua tables, and the Lua code that walks them.
-
-What depends on the sensor is written here; ``wireshark.lua``, beside this module, is the same for all.
+``wireshark.lua``, beside this module, is the same for all sensors: it finds frames, measures them, checks them and fills Wireshark's tree.
+What depends on the sensor is written here: each node of a frame tree becomes a table that says what kind it is, which field of Wireshark
+shows it (`_Writer`), which values later formulas ask for (`keep`), and how many bytes may be skipped where a frame is only measured.
+Formulas are Lua functions of the values kept so far. Lua counts in floats there, so that what Python does with integers is called by name.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from importlib import resources
 from typing import Any
 
 from lidarspec._version import __version__
 from lidarspec.exports import Refused
-from lidarspec.exports.formulas import Formula, Op, Ref, refs
 from lidarspec.exports.messages import Message, messages
-from lidarspec.exports.tree import Blob, Block, Empty, Node, Number, Part, Repeat, Sealed, Select, Struct, When, formulas, nodes
 from lidarspec.framing.frame_engine import codec
 from lidarspec.spec.bits import BitField
 from lidarspec.spec.checksums import Checksum, Crc, Fold15, Sum, WordXor, Xor, ZeroPadded
 from lidarspec.spec.links import Tcp, Udp
 from lidarspec.spec.sensor import Sensor
-from lidarspec.wire.schema import FieldInfo
+from lidarspec.spec.tree import (
+    COMPARISONS,
+    Blob,
+    Block,
+    Empty,
+    FieldInfo,
+    Formula,
+    Node,
+    Number,
+    Opaque,
+    Part,
+    Repeat,
+    Sealed,
+    Select,
+    Struct,
+    When,
+    formulas,
+    infos,
+    nodes,
+    refs,
+    written,
+)
 
 WIDTH = 140
 
@@ -34,33 +52,23 @@ class Code(str):
     """Lua as it stands, not to be quoted."""
 
 
-_BARE = {"+": "({} + {})", "-": "({} - {})", "*": "({} * {})", "<<": "({} * 2 ^ {})"}
-_COMPARED = {"==": "==", "!=": "~=", "<": "<", "<=": "<=", ">": ">", ">=": ">="}
-_CALLED = {"//": "int.div", "%": "int.mod", "&": "int.band", "|": "int.bor", "^": "int.bxor"}
+_OPERATIONS = {
+    "<<": "({} * 2 ^ {})",
+    ">>": "int.div({}, 2 ^ {})",
+    **{"//": "int.div({}, {})", "%": "int.mod({}, {})", "&": "int.band({}, {})", "|": "int.bor({}, {})", "^": "int.bxor({}, {})"},
+    **{symbol: f"int.truth({{}} {'~=' if symbol == '!=' else symbol} {{}})" for symbol in COMPARISONS},
+    "not": "int.truth({} == 0)",
+}
 
 
 def formula(value: Formula) -> Code:
     """A formula as a number, or as a function of the values of fields."""
-    return Code(str(value)) if isinstance(value, int) else Code(f"function(v) return {_term(value)} end")
+    return Code(str(value)) if isinstance(value, int) else _function(value)
 
 
-def _term(value: Formula) -> str:
-    if isinstance(value, Ref):
-        return f"v[{quoted(value.path)}]"
-    if isinstance(value, Op):
-        args = [_term(arg) for arg in value.args]
-        if value.symbol == "not":
-            return f"int.truth({args[0]} == 0)"
-        if len(args) == 1:
-            return f"(-{args[0]})"
-        if value.symbol in _COMPARED:
-            return f"int.truth({args[0]} {_COMPARED[value.symbol]} {args[1]})"
-        if value.symbol == ">>":
-            return f"int.div({args[0]}, 2 ^ {args[1]})"
-        if value.symbol in _CALLED:
-            return f"{_CALLED[value.symbol]}({args[0]}, {args[1]})"
-        return _BARE[value.symbol].format(*args)
-    return f"({value})" if value < 0 else str(value)
+def _function(value: Formula) -> Code:
+    """A formula as a function of the values of fields."""
+    return Code(f"function(v) return {written(value, lambda ref: f'v[{quoted(ref.path)}]', _OPERATIONS)} end")
 
 
 def lua(value: Any, indent: str = "") -> str:
@@ -111,22 +119,24 @@ def tables(message: Message, prefix: str) -> Table:
 
 @dataclass
 class _Writer:
-    """What is known of one frame type while it is written."""
+    """Writes the tables of one frame type.
+
+    Attributes:
+        kept: paths of the fields whose values are asked for later.
+        marked: paths of the parts at which what a checksum covers begins or ends.
+        types: name of a field of Wireshark -> family of its type.
+    """
 
     message: Message
     prefix: str
-    kept: set[str] = field(default_factory=set)
-    marked: set[str] = field(default_factory=set)
-    seals: set[str] = field(default_factory=set)
+    kept: set[str] = field(init=False)
+    marked: set[str] = field(init=False)
     types: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        for node in nodes(self.message.root):
-            self.kept |= {ref.path for value in formulas(node) for ref in refs(value)}
-            if isinstance(node, Sealed):
-                self.seals |= set(node.fields)
-                self.marked |= set(node.over or ())
-        self.kept |= self.seals
+        asked = {ref.path for node in nodes(self.message.root) for value in formulas(node) for ref in refs(value)}
+        self.kept = asked | self.message.seals.keys()
+        self.marked = {path for seal in self.message.seals.values() for path in seal.over or ()}
 
     def node(self, node: Node, path: str = "") -> Table:
         """A node as a table; `skip` says how many bytes it takes where it need not be looked at to measure the frame."""
@@ -150,7 +160,7 @@ class _Writer:
                 cases = {value: self.node(case, path) for value, case in node.cases}
                 default = self.node(node.default, path)
                 return {"kind": "select", "name": node.name, "key": _function(node.key), "cases": cases, "default": default}
-            case Empty():
+            case Empty() | Opaque():
                 return {"kind": "empty", "skip": 0}
 
     def _number(self, node: Number) -> Table:
@@ -163,7 +173,7 @@ class _Writer:
 
     def _blob(self, node: Blob) -> Table:
         name = node.name or "constant"
-        path = node.info.path if node.name else ".".join(part for part in (node.info.path, name) if part)
+        path = node.info.path if node.name else ".".join(filter(None, (node.info.path, name)))
         new = self._new("BYTES", path, name, node.info.docs, "NONE")
         table: Table = {"kind": "bytes", "name": name, "field": new, "size": formula(node.size), "keep": self._keep(path)}
         table["const"] = Code(quoted(node.const)) if node.const is not None else None
@@ -172,7 +182,7 @@ class _Writer:
     def _block(self, node: Block) -> Table:
         order = _word_order(node)
         parts = [self._part(node, part, order) for part in node.parts]
-        looked_at = any("keep" in part or "const" in part for part in ({k: v for k, v in p.items() if v is not None} for p in parts))
+        looked_at = any(part["keep"] is not None or part["const"] is not None for part in parts)
         return {
             "kind": "block",
             "name": node.name,
@@ -184,7 +194,7 @@ class _Writer:
         }
 
     def _part(self, block: Block, part: Part, order: str | None) -> Table:
-        spots = [segment.byte for segment in part.bits.segments]
+        offsets = [segment.byte for segment in part.bits.segments]
         letters = "INT" if part.bits.signed else "UINT"
         is_masked = order is not None and part.bits.width < 8 * block.size
         kind = f"{letters}{8 * block.size if is_masked else _width(part.bits.width)}"
@@ -193,8 +203,8 @@ class _Writer:
         return {
             "name": part.info.name,
             "label": label if label != part.info.name else None,
-            "first": min(spots),
-            "last": max(spots),
+            "first": min(offsets),
+            "last": max(offsets),
             "width": part.bits.width,
             "signed": part.bits.signed or None,
             "masked": is_masked or None,
@@ -205,11 +215,11 @@ class _Writer:
     def _struct(self, node: Struct) -> Table:
         members = []
         for member in node.members:
-            path = ".".join(part for part in (node.path, member.name) if part)
+            path = ".".join(filter(None, (node.path, member.name)))
             table = self.node(member, path)
             members.append(table | {"mark": path} if path in self.marked and member.name else table)
         sizes = [None if "mark" in member else member.get("skip") for member in members]
-        total = None if None in sizes else sum(size for size in sizes if size is not None)
+        total = None if None in sizes else sum(filter(None, sizes))
         return {"kind": "struct", "name": node.name or None, "skip": total, "members": members}
 
     def _repeat(self, node: Repeat, path: str) -> Table:
@@ -222,7 +232,7 @@ class _Writer:
 
     def _described(self, info: FieldInfo, kind: str, mask: int | None = None) -> Table:
         """What a number says of itself, and its fields in Wireshark."""
-        is_hex = (info.path in self.seals or info.const is not None) and kind.startswith("UINT")
+        is_hex = (info.path in self.message.seals or info.const is not None) and kind.startswith("UINT")
         shown = "HEX" if is_hex else "NONE" if kind in ("FLOAT", "DOUBLE") else "DEC"
         table: Table = {"field": self._new(kind, info.path, info.name, info.docs, shown, info.labels, mask)}
         if info.scaled:
@@ -247,7 +257,7 @@ class _Writer:
         return None if info.path in self.kept or info.const is not None else size
 
     def _seal(self, node: Sealed) -> Table:
-        widths = dict(_widths(node))
+        widths = {info.path: info.bits for below in nodes(node) for info in infos(below)}
         return {
             **_algorithm(node.algorithm),
             "fields": [{"path": path, "width": widths[path]} for path in node.fields],
@@ -257,15 +267,6 @@ class _Writer:
             "is_wide": (len(node.fields) == 1 and widths[node.fields[0]] > 32) or None,
             "absent": dict.fromkeys(node.absent, True),
         }
-
-
-def _widths(node: Sealed) -> Iterator[tuple[str, int]]:
-    """The fields of a struct and how many bits each has."""
-    for below in nodes(node):
-        if isinstance(below, Block):
-            yield from ((part.info.path, part.bits.width) for part in below.parts)
-        elif isinstance(below, Number | Blob):
-            yield below.info.path, below.info.bits
 
 
 def _algorithm(algorithm: Checksum) -> Table:
@@ -289,18 +290,12 @@ def _algorithm(algorithm: Checksum) -> Table:
     raise Refused(f"the checksum {type(algorithm).__name__} is Python code, which Wireshark does not run")
 
 
-def _function(value: Formula) -> Code:
-    return Code(f"function() return {value} end") if isinstance(value, int) else formula(value)
-
-
 def _leaves(node: Node) -> list[Node | Part]:
     """The numbers in a node; none where it holds arrays or parts that come and go."""
-    found: list[Node | Part] = []
-    for below in nodes(node):
-        if isinstance(below, Repeat | When | Select):
-            return []
-        found += list(below.parts) if isinstance(below, Block) else [below] if isinstance(below, Number) else []
-    return found
+    below = list(nodes(node))
+    if any(isinstance(part, Repeat | When | Select) for part in below):
+        return []
+    return [leaf for part in below for leaf in (part.parts if isinstance(part, Block) else (part,) if isinstance(part, Number) else ())]
 
 
 def _width(bits: int) -> int:
@@ -319,10 +314,10 @@ def _word_order(block: Block) -> str | None:
 
 def _run(bits: BitField, size: int, order: str) -> int | None:
     """The lowest bit of a field in the word that a block is, None where it is no run of bits in order."""
-    places = {
+    starts = {
         8 * (segment.byte if order == "little" else size - 1 - segment.byte) + segment.low - segment.target for segment in bits.segments
     }
-    return places.pop() if len(places) == 1 else None
+    return starts.pop() if len(starts) == 1 else None
 
 
 def _mask(bits: BitField, size: int, order: str) -> int:
@@ -378,27 +373,24 @@ def dissector(sensor: Sensor) -> str:
     Raises:
         Refused: where only Python code can decide what a frame is made of.
     """
-    name = sensor.id.replace("-", "_")
-    found = sorted(messages(sensor), key=lambda message: message.frame.direction)  # "in" before "out": what both could be came in
+    name, title = sensor.id.replace("-", "_"), f"{sensor.vendor} {sensor.model}"
+    by_direction = sorted(messages(sensor), key=lambda message: message.frame.direction)  # "in" first: what both could be came in
     about = {
-        "title": _title(sensor),
+        "title": title,
         "is_stream": any(isinstance(link, Udp) and link.stream for link in sensor.links.values()),
         "announcing": {frame.after: True for frame in sensor.frames.values() if frame.after},
-        "places": _places(sensor),
-        "frames": [_frame(message, name) for message in found],
+        "places": _patterns(sensor),
+        "frames": [_frame(message, name) for message in by_direction],
     }
     head = _HEAD.format(
-        title=_title(sensor),
+        title=title,
         version=__version__,
         source=" ".join(sensor.source.split()),
         name=quoted(name),
-        title_quoted=quoted(_title(sensor)),
+        title_quoted=quoted(title),
     )
-    return "\n".join([head, f"local sensor = {lua(about)}", _REGISTERED, _walker()])
-
-
-def _title(sensor: Sensor) -> str:
-    return f"{sensor.vendor} {sensor.model}"
+    walker = resources.files("lidarspec.exports").joinpath("wireshark.lua").read_text(encoding="utf-8")
+    return "\n".join([head, f"local sensor = {lua(about)}", _REGISTERED, walker])
 
 
 def _frame(message: Message, name: str) -> dict[str, Any]:
@@ -407,21 +399,17 @@ def _frame(message: Message, name: str) -> dict[str, Any]:
         "name": message.name,
         "longest": message.frame.max_length,
         "after": message.frame.after,
-        "magic": [[spot, mask, value] for spot, (mask, value) in sorted(prefix.items())],
+        "magic": [[offset, mask, value] for offset, (mask, value) in sorted(prefix.items())],
         "root": tables(message, f"{name}.{message.name}"),
     }
 
 
-def _places(sensor: Sensor) -> dict[str, list[int]]:
+def _patterns(sensor: Sensor) -> dict[str, list[int]]:
     """Where frames are found: Wireshark's table -> its patterns."""
     links = sensor.links.values()
-    places = {
+    patterns = {
         "udp.port": [port for link in links if isinstance(link, Udp) for port in link.ports],
         "tcp.port": [link.port for link in links if isinstance(link, Tcp)],
         "wtap_encap": list(USER_LINKS),
     }
-    return {place: sorted(set(patterns)) for place, patterns in places.items() if patterns}
-
-
-def _walker() -> str:
-    return resources.files("lidarspec.exports").joinpath("wireshark.lua").read_text(encoding="utf-8")
+    return {table: sorted(set(numbers)) for table, numbers in patterns.items() if numbers}

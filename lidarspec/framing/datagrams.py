@@ -1,7 +1,9 @@
 """Datagrams, each one frame, whole, or none: of which type each is, judged together.
 
 The same rule as in a stream, without the search: at the first byte of a datagram the order of the types decides, a type
-with `after` only counts while it is announced, and a frame has to be as long as its datagram.
+with `after` only counts while it is announced, and a frame has to be as long as its datagram. Datagrams that are all alike
+are judged as rows (`lidarspec.framing.steady`); of others each type judges those that no type before it has taken. Only what
+makes a plugin fail is judged alone, so that one datagram does not cost the others.
 """
 
 from __future__ import annotations
@@ -12,85 +14,75 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.framing.frame_engine import CompiledCodec
-from lidarspec.framing.plausibility import PLUGIN, SHORT, VALID, Status, Survey
-from lidarspec.framing.search import COUNTED, Bytes1D, Framing, Mode, Offsets
+from lidarspec.framing.results import CONSTANT, LENGTH, PLUGIN, SHORT, VALID, Frames, Indices, Numbers, array_of
+from lidarspec.framing.search import Bytes1D, Framing, Mode, Piece
+from lidarspec.framing.steady import steady_datagrams, step_between
 from lidarspec.wire.arrays import alike, repeated
-from lidarspec.wire.layout import Bytes2D, Layout, equal, exclude, right
-
-#: constants that tell the types of most datagrams.
-TOLD = 4
+from lidarspec.wire.layout import Layout, equal
 
 
-class Datagrams:
-    """The frame types of a sensor, ready to be told from each other.
+def sorted_datagrams(framing: Framing, buffer: Bytes1D, starts: Numbers, sizes: Indices, mode: Mode) -> Piece:
+    """The type of each datagram.
 
-    Attributes:
-        rejected: number of datagrams of the last batch that are none, by counter.
-        errors: tracebacks out of plugins, of the last batch.
+    Args:
+        buffer: what the datagrams stand in.
+        starts, sizes: of each, in the order of their arrival.
+        mode: remembered between batches, changed here.
+
+    Returns:
+        All datagrams as frames, those that are none with the kind -1.
+    """
+    steady = steady_datagrams(framing, buffer, starts, sizes, mode)
+    if steady is not None and steady.is_sound:
+        return Piece(steady, len(buffer))
+    return _Batch(framing, buffer, array_of(starts), sizes, steady).sorted(mode)
+
+
+class _Batch:
+    """Some datagrams, judged once for each of the frames that may have been announced.
+
+    Args:
+        steady: what they are as frames of one type and layout, where that was tried.
     """
 
-    def __init__(self, framing: Framing) -> None:
-        self._framing = framing
-        self.rejected: dict[str, int] = {}
-        self.errors: list[str] = []
-        self._surveyed: tuple[int, Survey] | None = None
+    def __init__(self, framing: Framing, buffer: Bytes1D, starts: Indices, sizes: Indices, steady: Frames | None) -> None:
+        self._framing, self._buffer, self._starts, self._sizes, self._steady = framing, buffer, starts, sizes, steady
+        self._known: dict[str | None, tuple[int, Frames, list[int]]] = {}
+        self._piece = Piece(Frames.none(buffer), len(buffer))
 
-    def alike(self, rows: Bytes2D, mode: Mode) -> tuple[int, Layout] | None:
-        """The type and layout of datagrams of one size, one a row; None where they are to be told apart by `kinds`.
-
-        So they are where not all are frames of one type and layout, and where they change what is looked for.
-        """
-        self._surveyed = None
-        kind = self._likely(rows, mode)
-        if kind is None or right(self._framing.words[kind], rows) is not None or self._framing.switches(kind, mode):
-            return None
-        survey = self._framing.codecs[kind].alike(rows)
-        if survey is None or survey.layout is None:
-            return None
-        if np.count_nonzero(survey.status):
-            self._surveyed = kind, survey
-            return None
-        return kind, survey.layout
-
-    def _likely(self, rows: Bytes2D, mode: Mode) -> int | None:
-        """The type that the first datagram resembles, if none of those with its constants resembles one that comes first; else None."""
-        first, before = rows[0].tobytes(), list[int]()
-        for kind in self._framing.active(mode):
-            if self._framing.codecs[kind].size not in (None, len(first)) or self._framing.ends[kind] > len(first):
-                continue
-            if all(first[spot] & mask == value for spot, mask, value in self._framing.marks[kind][:TOLD]):
-                return None if any(self._resembled(other, kind, rows) for other in before) else kind
-            before.append(kind)
-        return None
-
-    def _resembled(self, kind: int, other: int, rows: Bytes2D) -> bool:
-        """Whether any row with the constants of the other type has those of this type as well."""
-        if exclude(self._framing.marks[kind], self._framing.marks[other]):
-            return False
-        marked = right(self._framing.words[kind], rows)
-        return marked is None or bool(np.count_nonzero(marked))
-
-    def kinds(self, buffer: Bytes1D, starts: Offsets, sizes: Offsets, mode: Mode) -> Offsets:
-        """The type of each datagram, as its index, -1 where it is none.
-
-        Args:
-            mode: remembered between batches, changed here.
-        """
-        self.rejected, self.errors = {}, []
-        batch = _Batch(self, buffer, starts, sizes)
-        position, parts = 0, []
-        while position < len(starts):
-            part = batch.kinds_from(position, mode)
+    def sorted(self, mode: Mode) -> Piece:
+        """All of them."""
+        position, parts = 0, list[Frames]()
+        while position < len(self._starts):
+            part = self._from(position, mode)
             parts.append(part)
             position += len(part)
-        self._surveyed = None
-        return parts[0] if len(parts) == 1 else np.concatenate([np.empty(0, np.intp), *parts])
+        if parts:
+            self._piece.frames = Frames.joined(parts)
+        return self._piece
 
-    def judged(self, buffer: Bytes1D, starts: Offsets, sizes: Offsets, mode: Mode) -> Offsets:
-        """The type of each datagram while nothing changes what is looked for."""
+    def _from(self, position: int, mode: Mode) -> Frames:
+        """The types from here up to the datagram that changes what is looked for."""
+        if mode.after not in self._known:
+            frames = self._judged(self._starts[position:], self._sizes[position:], mode)
+            spots = (np.flatnonzero(self._framing.switching(mode)[frames.kinds]) + position).tolist() if self._framing.named else []
+            self._known[mode.after] = position, frames, spots
+        first, frames, spots = self._known[mode.after]
+        index = bisect.bisect_left(spots, position)
+        stop = spots[index] + 1 if index < len(spots) else len(self._starts)
+        frames = frames.only(slice(position - first, stop - first))
+        lost = np.flatnonzero(frames.kinds < 0)
+        frames = self._rejected(frames, lost, mode) if len(lost) else frames
+        if len(frames) and frames.kinds[-1] >= 0 and self._framing.switches(int(frames.kinds[-1]), mode):
+            mode.after = self._framing.names[int(frames.kinds[-1])]
+        return frames
+
+    def _judged(self, starts: Indices, sizes: Indices, mode: Mode) -> Frames:
+        """The type and layout of each datagram while nothing changes what is looked for."""
         number, known = len(starts), alike(sizes)
         least, most = (known, known) if known is not None else (int(sizes.min()), int(sizes.max())) if number else (0, 0)
-        kinds, left = None, None if least else np.flatnonzero(sizes)
+        kinds, forms, left = repeated(-1, number), repeated(-1, number), None if least else np.flatnonzero(sizes)
+        layouts: tuple[Layout, ...] = ()
         for kind in self._framing.active(mode):
             if left is not None and not len(left):
                 break
@@ -98,68 +90,83 @@ class Datagrams:
             if size is not None and not least <= size <= most:
                 continue
             own, lengths = (starts, sizes) if left is None else (starts[left], sizes[left])
-            marked = self._marked(kind, buffer, own, lengths)
-            if np.count_nonzero(marked) < len(marked):
+            marked = np.flatnonzero(self._marked(kind, own, lengths))
+            if not len(marked):
+                continue
+            if len(marked) < len(own):
                 own, lengths = own[marked], lengths[marked]
-                if not len(own):
-                    continue
-            survey = self._survey(kind, buffer, own, whole=left is None and len(own) == number)
-            valid = not np.count_nonzero(survey.status)
-            if valid and left is None and len(own) == number and _same(survey.sizes, lengths):
-                return repeated(kind, number)
-            right = survey.sizes == lengths
-            if not valid:
-                right &= survey.status == VALID
-            found = np.flatnonzero(marked)[right]
-            kinds = np.full(number, -1, np.intp) if kinds is None else kinds
-            kinds[found if left is None else left[found]] = kind
+            frames = self._survey(kind, own)
+            fits = frames.sizes == lengths
+            if not frames.is_sound:
+                fits &= frames.status == VALID
+            elif len(own) == number and fits.all():
+                return frames
+            if alike(kinds) is not None:
+                kinds, forms = np.full((2, number), -1, np.intp)
+            which = marked[fits] if left is None else left[marked[fits]]
+            kinds[which] = kind
+            forms[which] = np.where(frames.forms < 0, -1, frames.forms + len(layouts))[fits]
+            layouts += frames.layouts
             left = np.flatnonzero((kinds < 0) & (sizes > 0))
-        return np.full(number, -1, np.intp) if kinds is None else kinds
+        return Frames(self._buffer, kinds, starts, sizes, layouts=layouts, forms=forms)
 
-    def _survey(self, kind: int, buffer: Bytes1D, starts: Offsets, *, whole: bool) -> Survey:
-        """What datagrams are, if they are of a type; `whole`: all of the batch, which `alike` may have looked at already."""
-        known, self._surveyed = self._surveyed, None
-        if whole and known is not None and known[0] == kind:
-            return known[1]
-        return self._framing.codecs[kind].survey(buffer, starts, gathered=False)
+    def _survey(self, kind: int, starts: Indices) -> Frames:
+        """What datagrams are, if they are of a type."""
+        steady, self._steady = self._steady, None
+        if steady is not None and steady.kinds[0] == kind and len(starts) == len(steady):
+            return steady
+        return self._framing.survey(kind, self._buffer, starts, gathered=False)
 
-    def refused(self, buffer: Bytes1D, starts: Offsets, sizes: Offsets, mode: Mode) -> Status:
+    def _rejected(self, frames: Frames, lost: Indices, mode: Mode) -> Frames:
+        """Count those that are no frames; the types again, up to one that turns out to be a frame that changes what is looked for."""
+        reasons = self._refused(frames.starts[lost], frames.sizes[lost], mode)
+        parts, begun = list[Frames](), 0
+        for index in lost[reasons == PLUGIN].tolist():
+            alone = self._judged_alone(frames.only(slice(index, index + 1)), mode)
+            if alone is None:
+                continue
+            parts += [frames.only(slice(begun, index)), alone]
+            begun = index + 1
+            if self._framing.switches(alone.kinds.item(0), mode):
+                frames = frames.only(slice(0, begun))
+                break
+        self._count(reasons[(reasons != PLUGIN) & (lost < len(frames))])
+        return Frames.joined([*parts, frames.only(slice(begun, None))]) if parts else frames
+
+    def _refused(self, starts: Indices, sizes: Indices, mode: Mode) -> NDArray[np.uint8]:
         """Why datagrams that are no frames are none, (n,), 0 where they resemble none; `PLUGIN` where each is to be judged alone."""
         reasons = np.zeros(len(starts), np.uint8)
         for kind in self._framing.active(mode):
-            codec = self._framing.codecs[kind]
-            if not isinstance(codec, CompiledCodec):
+            if not isinstance(self._framing.codecs[kind], CompiledCodec):
                 return np.full(len(starts), PLUGIN, np.uint8)
-            marked = np.flatnonzero(self._marked(kind, buffer, starts, sizes))
+            marked = np.flatnonzero(self._marked(kind, starts, sizes))
             if len(marked):
-                survey, own = codec.survey(buffer, starts[marked], gathered=False), sizes[marked]
-                status = np.where(survey.sizes > own, np.uint8(SHORT), survey.status)
-                status[(status == VALID) & (survey.sizes == own)] = PLUGIN
+                frames, own = self._framing.survey(kind, self._buffer, starts[marked], gathered=False), sizes[marked]
+                status = np.where(frames.sizes > own, np.uint8(SHORT), frames.status)
+                status[(status == VALID) & (frames.sizes == own)] = PLUGIN
                 reasons[marked] = np.maximum(reasons[marked], status)
         return reasons
 
-    def count(self, reasons: Status) -> None:
-        """Count datagrams as rejected."""
-        for reason, number in enumerate(np.bincount(reasons).tolist()):
-            if number:
-                counter = COUNTED.get(reason, "bad_length")
-                self.rejected[counter] = self.rejected.get(counter, 0) + number
-
-    def judged_alone(self, datagram: Bytes1D, mode: Mode) -> int:
-        """The type of one datagram, -1 where it is none; counts why."""
-        rejected, size = 0, np.array([len(datagram)])
-        for kind in self._framing.active(mode) if len(datagram) else ():
-            if not self._marked(kind, datagram, np.zeros(1, np.intp), size).all():
+    def _judged_alone(self, datagram: Frames, mode: Mode) -> Frames | None:
+        """One datagram as a frame, None where it is none; counts why."""
+        rejected, start, size = 0, datagram.starts, datagram.sizes
+        data = self._buffer[start.item(0) : start.item(0) + size.item(0)]
+        for kind in self._framing.active(mode) if len(data) else ():
+            if not self._marked(kind, start, size).all():
                 continue
-            survey = self._framing.codecs[kind].survey(datagram, np.zeros(1, np.intp))
-            if survey.status[0] == VALID and survey.sizes[0] == len(datagram):
-                return kind
-            rejected = max(rejected, int(survey.status[0]))
-            self.errors += survey.errors
-        self.count(np.array([rejected], np.uint8))
-        return -1
+            frame = self._framing.survey(kind, data, np.zeros(1, np.intp))
+            if frame.status[0] == VALID and frame.sizes[0] == len(data):
+                return Frames(self._buffer, frame.kinds, start, size, layouts=frame.layouts, forms=frame.forms)
+            rejected = max(rejected, int(frame.status[0]))
+            self._piece.errors += frame.errors
+        self._count(np.array([rejected], np.uint8))
+        return None
 
-    def _marked(self, kind: int, buffer: Bytes1D, starts: Offsets, sizes: Offsets) -> NDArray[np.bool_]:
+    def _count(self, reasons: NDArray[np.uint8]) -> None:
+        """Count datagrams as rejected; those that resemble no frame, too, as none has their length."""
+        self._piece.reject(np.bincount(np.where(np.isin(reasons, (VALID, CONSTANT)), LENGTH, reasons)).tolist(), ())
+
+    def _marked(self, kind: int, starts: Indices, sizes: Indices) -> NDArray[np.bool_]:
         """Which datagrams have the constants of a type."""
         constants, end = self._framing.words[kind], self._framing.ends[kind]
         size = alike(sizes)
@@ -167,78 +174,16 @@ class Datagrams:
             whole = sizes >= end
             if not whole.all():
                 marked = whole.copy()
-                marked[whole] = self._marked(kind, buffer, starts[whole], sizes[whole])
+                marked[whole] = self._marked(kind, starts[whole], sizes[whole])
                 return marked
         marked = np.ones(len(starts), np.bool_)
-        step = _step(starts)
+        step = step_between(starts)
         for word in constants if len(starts) else ():
             spot, dtype, _, _ = word
-            found = (
-                np.ndarray((len(starts),), dtype, buffer, starts.item(0) + spot, (step,))
+            values = (
+                np.ndarray((len(starts),), dtype, self._buffer, starts.item(0) + spot, (step,))
                 if step
-                else np.ndarray((len(buffer) - spot - dtype.itemsize + 1,), dtype, buffer, spot, (1,))[starts]
+                else np.ndarray((len(self._buffer) - spot - dtype.itemsize + 1,), dtype, self._buffer, spot, (1,))[starts]
             )
-            marked &= equal(found, word)
+            marked &= equal(values, word)
         return marked
-
-
-def evenly(buffer: Bytes1D, starts: Offsets, sizes: Offsets) -> Bytes2D | None:
-    """Datagrams as the rows of an array, where they have one size and stand at one distance, one after another; else None."""
-    count = len(starts)
-    size = sizes.item(0) if count else 0
-    if not size or (alike(sizes) is None and np.count_nonzero(sizes == size) < count):
-        return None
-    step = size if count == 1 else _step(starts)
-    return np.ndarray((count, size), np.uint8, buffer, starts.item(0), (step, 1)) if step >= size else None
-
-
-def _step(starts: Offsets) -> int:
-    """The bytes from each datagram to the next, where they are the same for all; else 0."""
-    steps = starts[1:] - starts[:-1]
-    step = steps.item(0) if len(steps) else 0
-    return step if step > 0 and np.count_nonzero(steps == step) == len(steps) else 0
-
-
-def _same(first: Offsets, second: Offsets) -> bool:
-    one, other = alike(first), alike(second)
-    return bool((first == second).all()) if one is None or other is None else one == other
-
-
-class _Batch:
-    """Some datagrams, judged once for each of the frames that may have been announced."""
-
-    def __init__(self, types: Datagrams, buffer: Bytes1D, starts: Offsets, sizes: Offsets) -> None:
-        self._types, self._framing = types, types._framing
-        self._buffer, self._starts, self._sizes = buffer, starts, sizes
-        self._known: dict[str | None, tuple[int, Offsets, list[int]]] = {}
-
-    def kinds_from(self, position: int, mode: Mode) -> Offsets:
-        """The types from here up to the datagram that changes what is looked for."""
-        if mode.after not in self._known:
-            kinds = self._types.judged(self._buffer, self._starts[position:], self._sizes[position:], mode)
-            switching = (
-                [kind for kind in range(len(self._framing.names)) if self._framing.switches(kind, mode)] if self._framing.named else []
-            )
-            spots = (np.flatnonzero(np.isin(kinds, switching)) + position).tolist() if switching else []
-            self._known[mode.after] = position, kinds, spots
-        first, kinds, spots = self._known[mode.after]
-        index = bisect.bisect_left(spots, position)
-        stop = spots[index] + 1 if index < len(spots) else len(self._starts)
-        found = kinds[position - first : stop - first]
-        if alike(found) is None and len(lost := np.flatnonzero(found < 0)):
-            found = self._rejected(found, lost, position, mode)
-        if len(found) and found[-1] >= 0 and self._framing.switches(int(found[-1]), mode):
-            mode.after = self._framing.names[int(found[-1])]
-        return found
-
-    def _rejected(self, found: Offsets, lost: Offsets, position: int, mode: Mode) -> Offsets:
-        """Count those that are no frames; the types again, up to one that turns out to be a frame that changes what is looked for."""
-        reasons = self._types.refused(self._buffer, self._starts[position + lost], self._sizes[position + lost], mode)
-        for index in lost[reasons == PLUGIN].tolist():
-            start = int(self._starts[position + index])
-            found[index] = self._types.judged_alone(self._buffer[start : start + int(self._sizes[position + index])], mode)
-            if found[index] >= 0 and self._framing.switches(int(found[index]), mode):
-                found = found[: index + 1]
-                break
-        self._types.count(reasons[(reasons != PLUGIN) & (lost < len(found))])
-        return found

@@ -15,16 +15,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.errors import UsageError, refuse_text
-from lidarspec.framing.datagrams import Datagrams, evenly
+from lidarspec.framing.datagrams import sorted_datagrams
 from lidarspec.framing.frame_engine import codec
-from lidarspec.framing.results import Alike, Counters, Found, Spans, packed
+from lidarspec.framing.results import Counters, Found, Frames, Numbers, array_of
 from lidarspec.framing.search import Framing, Mode, Piece
 from lidarspec.framing.weak_frames import cut
 from lidarspec.spec.description import Frame, Spec
 from lidarspec.wire.arrays import alike, repeated
-from lidarspec.wire.layout import Bytes2D, Sums, summed_by
+from lidarspec.wire.layout import Sums
 
-__all__ = ["BACKENDS", "Counters", "Decoder", "Found", "Spans", "backend", "is_stream", "packed", "spans_of"]
+__all__ = ["BACKENDS", "Decoder", "backend", "frames_of", "is_stream"]
 
 #: bytes of a stream looked at in one go: at most, where frames follow one another and where not; and at least.
 LONGEST, PIECE, LEAST = 24 << 16, 6 << 16, 1 << 12
@@ -55,15 +55,14 @@ class Decoder:
         if not incoming:
             raise UsageError(f"{sensor.id} has no frames yet: configure it with its file first")
         self.sensor, self.stream, self.interpreted, self.backend = sensor, stream, interpreted, backend
-        self.stats, self._sums = Counters(), sums
-        self._framing = _framing(tuple(incoming), tuple(incoming.values()), interpreted)
+        self.stats = Counters()
+        self._framing = _framing(tuple(incoming), tuple(incoming.values()), interpreted, sums)
         self._mode = Mode(after=_first_mode(sensor))
         self._pending, self._base, self._need = b"", 0, 0
         self._gap = 0
-        self._fillers, self._names = bytes(sensor.fillers), tuple(incoming)
+        self._fillers = bytes(sensor.fillers)
         self._least = max(LEAST, 2 * self._framing.reach)
         self._size = max(PIECE, self._least)
-        self._datagrams = Datagrams(self._framing)
 
     def feed(self, data: Data, at: int | None = None) -> list[Found]:
         """The frames that these bytes complete, in stream order. Raises on no bytes whatever.
@@ -72,23 +71,23 @@ class Decoder:
             data: the next bytes of the stream, or one datagram.
             at: their arrival time in ns, if known.
         """
-        return [found for spans in self.spans(data, at) for found in spans.found()]
+        return [found for frames in self.frames(data, at) for found in frames.found()]
 
     def idle(self) -> list[Found]:
         """The line fell silent: candidates that wait for bytes are given up, and their bytes looked at again."""
-        return [found for spans in self.rest() for found in spans.found()]
+        return [found for frames in self.rest() for found in frames.found()]
 
     def finish(self) -> list[Found]:
-        """The input ended; the same as `idle`."""
+        """The input ended: candidates that wait for bytes are given up, and their bytes looked at again."""
         return self.idle()
 
-    def spans(self, data: Data, at: int | None = None) -> list[Spans]:
-        """The same as `feed`, as arrays."""
+    def frames(self, data: Data, at: int | None = None) -> list[Frames]:
+        """The frames that these bytes complete, as arrays, in stream order; arguments as those of `feed`."""
         view = np.ascontiguousarray(data).data.cast("B") if isinstance(data, np.ndarray) else memoryview(data).cast("B")
         if not self.stream:
             return [self.datagrams([view], [at])]
         self.stats.bytes_in += len(view)
-        found: list[Spans] = []
+        found: list[Frames] = []
         start, lasting = 0, isinstance(data, bytes)
         if self._pending:
             held = len(self._pending)
@@ -102,66 +101,51 @@ class Decoder:
         self.stats.pending = len(self._pending)
         return found
 
-    def rest(self) -> list[Spans]:
-        """The same as `idle` and `finish`, as arrays."""
-        found: list[Spans] = []
+    def rest(self) -> list[Frames]:
+        """The frames among the bytes that wait for others, as arrays: these will not come."""
+        found: list[Frames] = []
         self._need = 0
         if self._pending:
             self._cut(np.frombuffer(self._pending, np.uint8), None, found, final=True)
         self._pending, self.stats.pending = b"", 0
         return found
 
-    def datagrams(self, data: Sequence[Any] | NDArray[np.uint8], at: Sequence[int | None] | None = None) -> Spans:
-        """Datagrams, each one frame, whole, or none; a list, or the rows of an array."""
+    def datagrams(self, data: Sequence[Any] | NDArray[np.uint8], at: Sequence[int | None] | None = None) -> Frames:
+        """Datagrams, each one frame, whole, or none.
+
+        Args:
+            data: a list of bytes, or the rows of an array.
+            at: their arrival times in ns, None where nobody knows.
+        """
         if isinstance(data, np.ndarray):
             buffer, sizes = data.reshape(-1), repeated(data.shape[1], len(data))
         else:
             buffer, sizes = np.frombuffer(b"".join(data), np.uint8), _sizes(list(map(len, data)))
         times = repeated(-1, len(data)) if at is None else np.array([-1 if one is None else one for one in at], np.int64)
-        rows = buffer.reshape(len(data), -1) if alike(sizes) else None
-        found = None if rows is None else self._alike(buffer, 0, rows, times)
-        return self._sorted(buffer, _starts(sizes), sizes, times) if found is None else found
+        return self.placed(buffer, _places(sizes), sizes, times)
 
-    def placed(self, buffer: NDArray[np.uint8], starts: NDArray[np.intp], sizes: NDArray[np.intp], at: NDArray[np.int64]) -> Spans:
-        """Datagrams that stand in one buffer already; the same as `datagrams`, and nothing is copied.
+    def placed(self, buffer: NDArray[np.uint8], starts: Numbers, sizes: NDArray[np.intp], at: NDArray[np.int64]) -> Frames:
+        """Datagrams that stand in one buffer already, each one frame, whole, or none; nothing is copied.
 
         Args:
             buffer: one-dimensional and contiguous; what stands between the datagrams does not matter.
             starts, sizes: of each datagram, in the order of their arrival.
             at: their arrival times in ns, -1 where nobody knows.
         """
-        rows = evenly(buffer, starts, sizes)
-        found = None if rows is None else self._alike(buffer, starts.item(0), rows, at)
-        return self._sorted(buffer, starts, sizes, at) if found is None else found
-
-    def _alike(self, buffer: NDArray[np.uint8], first: int, rows: Bytes2D, at: NDArray[np.int64]) -> Spans | None:
-        """Datagrams of one size and distance, if all are frames of one layout that change nothing."""
-        with summed_by(self._sums):
-            known = self._datagrams.alike(rows, self._mode)
-        if known is None:
-            return None
-        found = Alike(self._names, buffer, *known, rows, first, self._base, self._gap, at)
-        self.stats.bytes_in += rows.size
-        self._base, self._gap = self._base + rows.size, 0
-        self._count(found.kinds)
-        return found
-
-    def _sorted(self, buffer: NDArray[np.uint8], starts: NDArray[np.intp], sizes: NDArray[np.intp], at: NDArray[np.int64]) -> Spans:
-        """Datagrams of any kinds."""
-        offsets = _starts(sizes, self._base)
-        total = offsets.item(-1) + sizes.item(-1) - self._base if len(offsets) else 0
-        self.stats.bytes_in += total
-        with summed_by(self._sums):
-            kinds = self._datagrams.kinds(buffer, starts, sizes, self._mode)
-        self._rejected(self._datagrams.rejected, self._datagrams.errors)
-        self._base += total
-        gaps, kind = repeated(0, len(starts)), alike(kinds)
-        if self._gap or bool((kinds < 0).any() if kind is None else kind < 0):
-            good = kinds >= 0
-            gaps = self._lost(buffer, starts, sizes, good)
-            kinds, starts, sizes, offsets, at = (array[good] for array in (kinds, starts, sizes, offsets, at))
-        self._count(kinds)
-        return Spans(self._names, buffer, kinds, starts, sizes, offsets, gaps, at)
+        piece = sorted_datagrams(self._framing, buffer, starts, sizes, self._mode)
+        frames, places, size = piece.frames, _places(sizes, self._base), alike(sizes)
+        total = int(sizes.sum()) if size is None else size * len(sizes)
+        self._base, self.stats.bytes_in = self._base + total, self.stats.bytes_in + total
+        self._rejected(piece.rejected, piece.errors)
+        gaps, kind = repeated(0, len(frames)), alike(frames.kinds)
+        is_good = kind >= 0 if kind is not None else not np.count_nonzero(frames.kinds < 0)
+        if self._gap or not is_good:
+            good = frames.kinds >= 0
+            gaps = self._lost(buffer, frames.starts, sizes, good)
+            if not is_good:
+                frames, places, at = frames.only(good), array_of(places)[good], at[good]
+        self._count(frames.kinds)
+        return frames.located(self._framing.names, places, gaps, at)
 
     def _lost(
         self, buffer: NDArray[np.uint8], starts: NDArray[np.intp], sizes: NDArray[np.intp], good: NDArray[np.bool_]
@@ -177,7 +161,7 @@ class Decoder:
         self._gap = int(lost.sum() - before[-1])
         return np.diff(before)
 
-    def _cut(self, buffer: NDArray[np.uint8], at: int | None, found: list[Spans], *, lasting: bool = True, final: bool = False) -> int:
+    def _cut(self, buffer: NDArray[np.uint8], at: int | None, found: list[Frames], *, lasting: bool = True, final: bool = False) -> int:
         """Cut bytes into frames, piece by piece, and add those with frames to what is found.
 
         Args:
@@ -192,43 +176,38 @@ class Decoder:
             part = buffer[start : start + self._size]
             last = start + len(part) == len(buffer)
             part = part if lasting else part.copy()
-            with summed_by(self._sums):
-                piece = cut(self._framing, part, self._mode, base=self._base, final=final and last)
-            spans = self._entered(part, piece, at)
-            found += [spans] if len(spans) else []  # one without frames would keep its bytes
+            piece = cut(self._framing, part, self._mode, base=self._base, final=final and last)
+            frames = self._entered(part, piece, at)
+            found += [frames] if len(frames) else []  # none at all would keep its bytes
             start, self._base = start + piece.end, self._base + piece.end
             self._need = piece.need if piece.waiting and last else 0
             if piece.waiting and last:
                 break
-            most = LONGEST if 2 * (piece.sizes.sum() if piece.rows is None else piece.rows.size) > piece.end else PIECE
+            most = LONGEST if 2 * frames.total > piece.end else PIECE
             self._size = min(max(4 * piece.end, self._least), max(most, self._least))
         return start
 
-    def _entered(self, buffer: NDArray[np.uint8], piece: Piece, at: int | None) -> Spans:
-        """The frames of a piece, with all that was found in it counted."""
-        if piece.layout is not None and piece.rows is not None:
-            times = repeated(-1 if at is None else at, len(piece.rows))
-            found = Alike(self._names, buffer, piece.kinds.item(0), piece.layout, piece.rows, 0, self._base, self._gap, times)
-            self._gap = 0
-            self._count(found.kinds)
-            return found
-        gaps = self._gaps(buffer, piece)
+    def _entered(self, buffer: NDArray[np.uint8], piece: Piece, at: int | None) -> Frames:
+        """The frames of a piece with their place in the input, and all that was found in it counted."""
+        frames, base = piece.frames, self._base
+        gaps = self._gaps(buffer, frames, piece.end)
         self._rejected(piece.rejected, piece.errors)
-        self._count(piece.kinds)
-        starts, offsets = piece.offsets, np.add(piece.offsets, self._base)
-        if piece.rows is not None:
-            buffer, starts = piece.rows.reshape(-1), np.arange(len(piece.rows)) * piece.rows.shape[1]
-        times = repeated(-1 if at is None else at, len(gaps))
-        return Spans(self._names, buffer, piece.kinds, starts, piece.sizes, offsets, gaps, times)
+        self._count(frames.kinds)
+        places = frames.places
+        places = range(places.start + base, places.stop + base, places.step) if isinstance(places, range) else places + base
+        return frames.located(self._framing.names, places, gaps, repeated(-1 if at is None else at, len(frames)))
 
-    def _gaps(self, buffer: NDArray[np.uint8], piece: Piece) -> NDArray[np.int64]:
-        """The bytes skipped before each frame, fillers left out; counts them."""
-        gaps = np.empty(len(piece.offsets) + 1, np.int64)
-        gaps[:-1], gaps[-1] = piece.offsets, piece.end
-        gaps[1:] -= piece.offsets + piece.sizes
+    def _gaps(self, buffer: NDArray[np.uint8], frames: Frames, end: int) -> NDArray[np.int64]:
+        """The bytes skipped before each frame of a piece that ends there, fillers left out; counts them."""
+        places = frames.places
+        if not self._gap and isinstance(places, range) and places.start == 0 and places.stop == end:
+            return repeated(0, len(frames))
+        gaps = np.empty(len(frames) + 1, np.int64)
+        gaps[:-1], gaps[-1] = frames.starts, end
+        gaps[1:] -= frames.starts + frames.sizes
         if self._fillers:
             for index in np.flatnonzero(gaps).tolist():
-                stop = int(piece.offsets[index]) if index < len(piece.offsets) else piece.end
+                stop = int(frames.starts[index]) if index < len(frames) else end
                 gaps[index] -= self._skip(buffer[stop - gaps[index] : stop])
         else:
             self.stats.bytes_skipped += int(gaps.sum())
@@ -254,22 +233,22 @@ class Decoder:
         only = alike(kinds)
         for kind, number in [(only, len(kinds))] if only is not None else enumerate(np.bincount(kinds).tolist() if len(kinds) else ()):
             if number:
-                frames[self._names[kind]] = frames.get(self._names[kind], 0) + number
+                frames[self._framing.names[kind]] = frames.get(self._framing.names[kind], 0) + number
         if len(frames) > known > 0:
-            for name in self._names:  # in their order, however the input was cut
+            for name in self._framing.names:  # in their order, however the input was cut
                 if name in frames:
                     frames[name] = frames.pop(name)
 
 
 @lru_cache(maxsize=256)
-def _framing(names: tuple[str, ...], frames: tuple[Frame, ...], interpreted: bool) -> Framing:
-    return Framing({name: codec(frame, interpreted=interpreted) for name, frame in zip(names, frames, strict=True)})
+def _framing(names: tuple[str, ...], frames: tuple[Frame, ...], interpreted: bool, sums: Sums | None) -> Framing:
+    return Framing({name: codec(frame, interpreted=interpreted) for name, frame in zip(names, frames, strict=True)}, sums)
 
 
-def _starts(sizes: NDArray[np.intp], first: int = 0) -> NDArray[np.intp]:
+def _places(sizes: NDArray[np.intp], first: int = 0) -> Numbers:
     """Where pieces of these sizes begin that stand back to back from `first` on."""
     if size := alike(sizes):
-        return np.arange(first, first + len(sizes) * size, size)
+        return range(first, first + len(sizes) * size, size)
     starts = np.cumsum(sizes)
     starts -= sizes
     starts += first
@@ -303,10 +282,10 @@ def backend(name: str) -> str:
     return name
 
 
-def spans_of(decoder: Decoder, data: Any) -> list[Spans]:
+def frames_of(decoder: Decoder, data: Any) -> list[Frames]:
     """Every frame of a whole input: bytes as a stream, an iterable or (n, size) array as datagrams."""
     if is_stream(data):
-        return decoder.spans(data) + decoder.rest()
+        return decoder.frames(data) + decoder.rest()
     if isinstance(data, np.ndarray):
         everything, step = np.ascontiguousarray(data, np.uint8), min(max(ROW_BYTES // max(data.shape[1], 1), 1), ROWS)
         return [decoder.datagrams(everything[start : start + step]) for start in range(0, len(everything), step)]

@@ -1,33 +1,33 @@
 """One frame type as an engine: which candidates are frames, and frames as columns. Compiled, and interpreted.
 
 Both codecs answer the same questions with the same results; every test runs on both. `CompiledCodec` works by
-layouts on whole batches; `InterpretedCodec` lets construct parse one candidate at a time, for structs that have no
-computable layout and as the reference.
+layouts on whole batches: the header of a candidate is looked at once, when it is judged, and its layout goes with it into the
+columns. `InterpretedCodec` lets construct parse one candidate at a time, for structs that have no computable layout and as
+the reference.
 """
 
 from __future__ import annotations
 
-import contextlib
 import functools
 import io
 import traceback
 from collections.abc import Iterable, Mapping
-from typing import Any, Protocol
+from typing import Protocol
 
 import construct
 import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.errors import SpecError
-from lidarspec.framing.plausibility import CHECKSUM, CONSTANT, LENGTH, PLUGIN, SHORT, VALID, Check, Conditions, Judge, Survey, plausibility
+from lidarspec.framing.plausibility import Check, Conditions, Judge, plausibility
+from lidarspec.framing.results import CHECKSUM, CONSTANT, LENGTH, PLUGIN, SHORT, VALID, Frames, Status
 from lidarspec.spec.construct_layer import Mismatch
 from lidarspec.spec.description import Frame
 from lidarspec.wire.arrays import counted, repeated
 from lidarspec.wire.frame_table import Group, Records, Rows, Table
-from lidarspec.wire.layout import Layout, Marks, marks
-from lidarspec.wire.layout_tree import HeaderTree, NotCompilable, Refused, Unread, Walk, check_compilable, rows_at
+from lidarspec.wire.layout import Layout, Marks, Sums, marks
+from lidarspec.wire.layout_tree import NotCompilable, Refused, frame_layouts, prefix_of, rows_at
 from lidarspec.wire.schema import Schema, schema
-from lidarspec.wire.single_frames import frame_parser
 
 #: bytes of candidates looked at in one go, so that memory stays small on hostile streams.
 BLOCK = 1 << 19
@@ -38,33 +38,40 @@ class Codec(Protocol):
 
     Attributes:
         size: that of all its frames, None where they differ.
+        layout: that of all its frames, None where they differ or construct parses them.
         marks: the constants of `prefix`, whole bytes first, which tell the most.
     """
 
     frame: Frame
     schema: Schema
     size: int | None
+    layout: Layout | None
     marks: Marks
 
     @property
     def prefix(self) -> Mapping[int, tuple[int, int]]:
         """The constants at the start: offset -> (mask, value)."""
 
-    def survey(self, buffer: NDArray[np.uint8], offsets: NDArray[np.intp], *, gathered: bool = True) -> Survey:
-        """Whether the candidates at these offsets are frames; those whose prefix does not match must be left out.
+    def survey(
+        self, buffer: NDArray[np.uint8], offsets: NDArray[np.intp], *, kind: int = 0, gathered: bool = True, sums: Sums | None = None
+    ) -> Frames:
+        """The candidates at these offsets, each with its layout and whether it is a frame.
 
         Args:
-            gathered: whether their bytes are wanted too, see `Survey.rows`.
+            offsets: those whose prefix does not match must be left out.
+            kind: index of this type.
+            gathered: whether their bytes are wanted too, as `Frames.rows`.
+            sums: see `Judge`.
         """
 
-    def alike(self, rows: NDArray[np.uint8]) -> Survey | None:
-        """The same of candidates of one size and one layout, one a row; None where they are to be surveyed."""
+    def survey_rows(self, rows: NDArray[np.uint8], *, sums: Sums | None = None) -> tuple[Layout, Status, tuple[str, ...]] | None:
+        """The layout of candidates of one size, one a row, the status of each, and tracebacks; None where their layouts differ."""
 
     def table(self, frames: Iterable[bytes]) -> Table:
         """Frames known to be of this type, as columns."""
 
-    def gather(self, buffer: NDArray[np.uint8], offsets: NDArray[np.intp], sizes: NDArray[np.intp]) -> Table:
-        """Valid frames at these offsets, as columns."""
+    def gather(self, frames: Frames) -> Table:
+        """Frames that were found, all of this type, as columns."""
 
 
 class CompiledCodec:
@@ -75,102 +82,98 @@ class CompiledCodec:
     """
 
     def __init__(self, frame: Frame) -> None:
-        check_compilable(frame.prepared)
-        self.frame, self.schema = frame, schema(frame.prepared)
-        for info in self.schema.fields.values():
-            if info.dtype is None:
-                wide = f"its {info.bits} bits are more than a column holds"
-                raise NotCompilable(info.path, wide if info.bits > 64 else "its values are not all plain numbers of one kind")
-        self.tree = HeaderTree(frame.prepared, frame.max_length)
+        layouts = frame_layouts(frame)
+        if isinstance(layouts, NotCompilable):
+            raise layouts
+        self.frame, self.schema, self.tree = frame, schema(frame.tree), layouts
         self.prefix, self.size = self.tree.prefix, _size(frame)
         self.marks = marks(self.prefix)
-        #: the Container of one whole, sound frame; None where construct has to look at it
-        self.parse = frame_parser(frame.prepared, self.tree)
+        layout = self.tree.layout(b"")
+        self.layout: Layout | None = layout if isinstance(layout, Layout) else None
         self._conditions: Conditions | None = None
 
-    def survey(self, buffer: NDArray[np.uint8], offsets: NDArray[np.intp], *, gathered: bool = True) -> Survey:
-        errors: list[str] = []
-        groups, _ = self.tree.classify(buffer, offsets)
+    def survey(
+        self, buffer: NDArray[np.uint8], offsets: NDArray[np.intp], *, kind: int = 0, gathered: bool = True, sums: Sums | None = None
+    ) -> Frames:
+        groups = [(self.layout, counted(len(offsets)))] if self.layout is not None else self.tree.classify(buffer, offsets)[0]
         if len(groups) == 1 and len(groups[0][1]) == len(offsets) and isinstance(groups[0][0], Layout):
-            return self._alike(buffer, offsets, groups[0][0], gathered=gathered)
+            return self._surveyed(buffer, offsets, groups[0][0], kind=kind, gathered=gathered, sums=sums)
         status = np.full(len(offsets), SHORT, np.uint8)
-        sizes = np.zeros(len(offsets), np.intp)
+        sizes, forms = np.zeros((2, len(offsets)), np.intp)
+        forms -= 1
+        layouts, errors = list[Layout](), list[str]()
         for layout, which in groups:
             if isinstance(layout, Refused):
                 status[which] = PLUGIN if layout.error else LENGTH
                 errors += [layout.error] * len(which) if layout.error else []
                 continue
-            survey = self._alike(buffer, offsets[which], layout, gathered=gathered)
-            status[which], sizes[which] = survey.status, survey.sizes
-            errors += survey.errors
-        return Survey(status, sizes, tuple(errors))
+            part = self._surveyed(buffer, offsets[which], layout, kind=kind, gathered=gathered, sums=sums)
+            status[which], sizes[which], forms[which] = part.status, part.sizes, len(layouts)
+            layouts.append(layout)
+            errors += part.errors
+        kinds = repeated(kind, len(offsets))
+        return Frames(buffer, kinds, offsets, sizes, layouts=tuple(layouts), forms=forms, status=status, errors=tuple(errors))
 
-    def alike(self, rows: NDArray[np.uint8]) -> Survey | None:
-        layout = self.tree.common(rows)
+    def survey_rows(self, rows: NDArray[np.uint8], *, sums: Sums | None = None) -> tuple[Layout, Status, tuple[str, ...]] | None:
+        layout = self.layout or self.tree.common(rows)
         if layout is None or layout.size != rows.shape[1]:
             return None
         errors: list[str] = []
-        status = self._judge(layout)(rows, errors)
-        return Survey(status, repeated(layout.size, len(rows)), tuple(errors), layout=layout)
+        return layout, self._judge(layout)(rows, errors, sums), tuple(errors)
 
-    def _alike(self, buffer: NDArray[np.uint8], offsets: NDArray[np.intp], layout: Layout, *, gathered: bool) -> Survey:
-        """What candidates of one layout are."""
+    def _surveyed(
+        self, buffer: NDArray[np.uint8], offsets: NDArray[np.intp], layout: Layout, *, kind: int, gathered: bool, sums: Sums | None
+    ) -> Frames:
+        """Candidates of one layout."""
         whole = offsets <= len(buffer) - layout.size
-        count = np.count_nonzero(whole)
-        if count == len(offsets) or (count and whole[:count].all()):
-            lead, cut = slice(0, count), slice(count, len(offsets))
-        else:
-            lead, cut = np.flatnonzero(whole), np.flatnonzero(~whole)  # type: ignore[assignment]
+        count, number = np.count_nonzero(whole), len(offsets)
         errors: list[str] = []
-        status, rows = self._judged(buffer, offsets[lead], layout, errors, gathered=gathered)
-        sizes: NDArray[np.intp] = repeated(layout.size, len(offsets))
-        if count < len(offsets):
-            sizes = sizes.copy()
-            short, sizes[cut] = _partial(buffer, offsets[cut], layout)
-            if isinstance(lead, slice):
-                status = np.concatenate([status, short])
-            else:
-                status, some, rows = np.empty(len(offsets), np.uint8), status, None
-                status[lead], status[cut] = some, short
-        return Survey(status, sizes, tuple(errors), rows)
+        if count == number:
+            status, rows = self._judged(buffer, offsets, layout, errors, gathered=gathered, sums=sums)
+            sizes: NDArray[np.intp] = repeated(layout.size, number)
+        else:
+            is_lead = bool(whole[:count].all())
+            some, rows = self._judged(buffer, offsets[whole], layout, errors, gathered=gathered and is_lead, sums=sums)
+            status, sizes = np.empty(number, np.uint8), np.full(number, layout.size)
+            status[whole] = some
+            status[~whole], sizes[~whole] = _partial(buffer, offsets[~whole], layout)
+        return Frames(buffer, repeated(kind, number), offsets, sizes, layouts=(layout,), status=status, rows=rows, errors=tuple(errors))
 
     def _judged(
-        self, buffer: NDArray[np.uint8], offsets: NDArray[np.intp], layout: Layout, errors: list[str], *, gathered: bool
+        self, buffer: NDArray[np.uint8], offsets: NDArray[np.intp], layout: Layout, errors: list[str], *, gathered: bool, sums: Sums | None
     ) -> tuple[NDArray[np.uint8], NDArray[np.uint8] | None]:
         """The status of whole candidates of one layout; their bytes, one a row, if they are not too many."""
         judge = self._judge(layout)
         step = max(BLOCK // layout.size, 1)
         if len(offsets) <= step or not gathered:
             rows = rows_at(buffer, offsets, layout.size, gathered=gathered)
-            return judge(rows, errors), rows if gathered else None
-        parts = [judge(rows_at(buffer, offsets[start : start + step], layout.size), errors) for start in range(0, len(offsets), step)]
+            return judge(rows, errors, sums), rows if gathered else None
+        parts = [judge(rows_at(buffer, offsets[start : start + step], layout.size), errors, sums) for start in range(0, len(offsets), step)]
         return np.concatenate(parts), None
 
     def table(self, frames: Iterable[bytes]) -> Rows:
         frames = list(frames)
         joined = np.frombuffer(b"".join(frames), np.uint8)
         sizes = np.array([len(frame) for frame in frames], np.intp)
-        return self.gather(joined, np.concatenate([[0], np.cumsum(sizes)])[:-1].astype(np.intp), sizes)
+        return self.gather(Frames(joined, repeated(0, len(frames)), np.cumsum(sizes) - sizes, sizes))
 
-    def gather(self, buffer: NDArray[np.uint8], offsets: NDArray[np.intp], sizes: NDArray[np.intp]) -> Rows:
-        groups, _ = self.tree.classify(buffer, offsets)
-        known = [(layout, which) for layout, which in groups if isinstance(layout, Layout)]
-        return Rows(
-            self.schema,
-            [
-                Group(layout, which, _rows(buffer, offsets if len(which) == len(offsets) else offsets[which], layout.size))
-                for layout, which in known
-            ],
-        )
+    def gather(self, frames: Frames) -> Rows:
+        """Frames that were found, all of this type, as columns: where they stand, if they are at least half of what is kept for them."""
+        if frames.rows is not None and frames.layout is not None:
+            rows = frames.rows if 2 * frames.rows.size >= len(frames.buffer) else np.ascontiguousarray(frames.rows)
+            return Rows(self.schema, [Group(frames.layout, counted(len(rows)), rows)])
+        known = frames.by_layout() if frames.layouts else self._classified(frames)
+        groups = []
+        for layout, which in known:
+            starts = frames.starts if len(which) == len(frames) else frames.starts[which]
+            is_sparse = 2 * len(which) * layout.size < len(frames.buffer)
+            groups.append(Group(layout, which, rows_at(frames.buffer, starts, layout.size, gathered=is_sparse)))
+        return Rows(self.schema, groups)
 
-    def lined(self, layout: Layout, rows: NDArray[np.uint8], *, room: int) -> Rows:
-        """Valid frames of one layout, one a row, as columns.
-
-        Args:
-            room: bytes that would be kept for the rows, if they stayed where they stand.
-        """
-        kept = rows if 2 * rows.size >= room else np.ascontiguousarray(rows)
-        return Rows(self.schema, [Group(layout, counted(len(rows)), kept)])
+    def _classified(self, frames: Frames) -> list[tuple[Layout, NDArray[np.intp]]]:
+        """The layouts of frames that came from elsewhere, and did not bring them."""
+        groups, _ = self.tree.classify(frames.buffer, frames.starts)
+        return [(layout, which) for layout, which in groups if isinstance(layout, Layout)]
 
     def _judge(self, layout: Layout) -> Judge:
         judge = layout.notes.get(Judge)
@@ -187,28 +190,31 @@ class InterpretedCodec:
     """A frame type that construct parses, one candidate at a time; `reason` says why it is not compiled."""
 
     def __init__(self, frame: Frame, reason: str = "") -> None:
-        self.frame, self.reason, self.schema = frame, reason, schema(frame.prepared)
-        self.prefix, self.size = _prefix(frame), _size(frame)
+        self.frame, self.reason, self.schema = frame, reason, schema(frame.tree)
+        self.prefix, self.size = prefix_of(frame.tree, frame.max_length), _size(frame)
         self.marks = marks(self.prefix)
+        self.layout: Layout | None = None
 
-    def survey(self, buffer: NDArray[np.uint8], offsets: NDArray[np.intp], *, gathered: bool = True) -> Survey:
+    def survey(
+        self, buffer: NDArray[np.uint8], offsets: NDArray[np.intp], *, kind: int = 0, gathered: bool = True, sums: Sums | None = None
+    ) -> Frames:
         status = np.zeros(len(offsets), np.uint8)
         sizes = np.zeros(len(offsets), np.intp)
         errors: list[str] = []
         for index, offset in enumerate(offsets):
             data = buffer[offset : offset + self.frame.max_length].tobytes()
             status[index], sizes[index] = self._judge(data, errors)
-        return Survey(status, sizes, tuple(errors))
+        return Frames(buffer, repeated(kind, len(offsets)), offsets, sizes, status=status, errors=tuple(errors))
 
-    def alike(self, rows: NDArray[np.uint8]) -> Survey | None:
+    def survey_rows(self, rows: NDArray[np.uint8], *, sums: Sums | None = None) -> None:
         return None
 
     def table(self, frames: Iterable[bytes]) -> Records:
         frames = list(frames)
         return Records(self.schema, [self.frame.prepared.parse(frame, _verify=False) for frame in frames], frames)
 
-    def gather(self, buffer: NDArray[np.uint8], offsets: NDArray[np.intp], sizes: NDArray[np.intp]) -> Records:
-        return self.table(buffer[offset : offset + size].tobytes() for offset, size in zip(offsets, sizes, strict=True))
+    def gather(self, frames: Frames) -> Records:
+        return self.table(map(frames.data, range(len(frames))))
 
     def _judge(self, data: bytes, errors: list[str]) -> tuple[int, int]:
         stream = io.BytesIO(data)
@@ -246,28 +252,11 @@ def _partial(buffer: NDArray[np.uint8], offsets: NDArray[np.intp], layout: Layou
     return status, sizes
 
 
-def _rows(buffer: NDArray[np.uint8], offsets: NDArray[np.intp], size: int) -> NDArray[np.uint8]:
-    """Frames, one a row, where they stand, if they are at least half of what stands there and would be kept for them; else copied."""
-    return rows_at(buffer, offsets, size, gathered=2 * len(offsets) * size < len(buffer))
-
-
 def _size(frame: Frame) -> int | None:
     try:
         return int(frame.prepared.sizeof())
     except Exception:  # of a part of the struct, which may be anybody's
         return None
-
-
-def _prefix(frame: Frame) -> dict[int, tuple[int, int]]:
-    """The constants at the start of a frame that cannot be compiled as a whole."""
-
-    def stop(leaf: Any) -> int:
-        raise Unread
-
-    state = Walk(stop, frame.max_length)
-    with contextlib.suppress(Exception):  # what comes before counts; the rest is construct's to judge
-        state.run(frame.prepared)
-    return dict(state.constants)
 
 
 @functools.lru_cache(maxsize=2048)

@@ -3,11 +3,9 @@
 The order is that of the counters: a candidate with a wrong constant is none at all, one with a wrong checksum is counted
 as such, and only what is intact is asked whether it is plausible.
 
-A frame's test of plausibility, taken apart: tables by the bytes that each part of it looks at.
-
-`plausible` is traced once. What it combines with ``&`` are conditions of their own, and one that depends on no more than
-two bytes beside each other is evaluated for all that these can hold. Frames are then judged by looking these bytes up, with
-the same answers, without making a column of every field. What cannot be traced is evaluated as it stands (`None`).
+A frame's `plausible` is traced once. What it combines with ``&`` are conditions of their own, and one that depends on no more
+than two bytes beside each other is evaluated for all that these can hold. Frames are then judged by looking these bytes up, with
+the same answers, without making a column of every field. What cannot be traced is evaluated as it stands.
 """
 
 from __future__ import annotations
@@ -15,7 +13,7 @@ from __future__ import annotations
 import functools
 import math
 import traceback
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -23,15 +21,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.columns.columns import Batch, Column, Fields, unpadded
-from lidarspec.columns.graph import Node, Traced, Untraceable, trace
+from lidarspec.columns.graph import Node, Traced, conjuncts, evaluate, fields_beside, sample_of, trace
+from lidarspec.framing.results import CHECKSUM, CONSTANT, IMPLAUSIBLE, PLUGIN, VALID
 from lidarspec.spec.description import Frame
+from lidarspec.spec.tree import FieldInfo
+from lidarspec.wire.arrays import taken
 from lidarspec.wire.frame_table import Group, Rows, Table
-from lidarspec.wire.layout import Bytes2D, Layout, Leaf, Seal, elements, marks, right, words
-from lidarspec.wire.schema import FieldInfo, Schema
+from lidarspec.wire.layout import Bytes2D, Layout, Leaf, Seal, Sums, elements, marks, right, words
+from lidarspec.wire.schema import Schema
 
-VALID, SHORT, LENGTH, CONSTANT, CHECKSUM, IMPLAUSIBLE, PLUGIN = range(7)
+#: values of a few bits that are compared one by one.
+ALLOWED = 2
 
-Status = NDArray[np.uint8]
+Check = Callable[[Bytes2D], NDArray[np.bool_]]
 
 
 class Judge:
@@ -47,31 +49,37 @@ class Judge:
         self._frame, self._schema, self._layout, self._checks = frame, schema, layout, checks
         self._constants = words(marks({spot: known for spot, known in layout.constants.items() if prefix.get(spot) != known}))
 
-    def __call__(self, rows: Bytes2D, errors: list[str]) -> Status:
-        """The status of each candidate, (n,); tracebacks out of plugins go to `errors`."""
+    def __call__(self, rows: Bytes2D, errors: list[str], sums: Sums | None = None) -> NDArray[np.uint8]:
+        """The status of each candidate, (n,).
+
+        Args:
+            rows: the candidates, whole, one a row.
+            errors: tracebacks out of plugins are added to these.
+            sums: what computes checksums; by default their algorithms.
+        """
         status = np.zeros(len(rows), np.uint8)
         held = right(self._constants, rows) if len(rows) else None
         if held is not None:
             status[~held] = CONSTANT
         for seal in self._layout.seals:
-            _among(status, rows, functools.partial(intactness, seal, errors))
+            _among(status, rows, functools.partial(intactness, seal, errors, sums))
         if self._checks is not None:
             self._check(status, rows, self._checks)
         elif self._frame.plausible is not None:
             _among(status, rows, lambda some: self._asked(some, errors))
         return status
 
-    def _check(self, status: Status, rows: Bytes2D, checks: list[Check]) -> None:
+    def _check(self, status: NDArray[np.uint8], rows: Bytes2D, checks: list[Check]) -> None:
         for check in checks:
             held = check(rows)
             if np.count_nonzero(held) < len(held):
                 status[~held & (status == VALID)] = IMPLAUSIBLE
 
-    def _asked(self, rows: Bytes2D, errors: list[str]) -> Status:
+    def _asked(self, rows: Bytes2D, errors: list[str]) -> NDArray[np.uint8]:
         return plausibility(self._frame, Rows(self._schema, [Group(self._layout, np.arange(len(rows)), rows)]), errors)
 
 
-def _among(status: Status, rows: Bytes2D, judge: Callable[[Bytes2D], Status]) -> None:
+def _among(status: NDArray[np.uint8], rows: Bytes2D, judge: Callable[[Bytes2D], NDArray[np.uint8]]) -> None:
     """Judge those that are valid so far."""
     if not np.count_nonzero(status):
         status[:] = judge(rows)
@@ -81,24 +89,17 @@ def _among(status: Status, rows: Bytes2D, judge: Callable[[Bytes2D], Status]) ->
         status[left] = judge(taken(rows, left))
 
 
-def taken(rows: Bytes2D, which: NDArray[np.intp] | NDArray[np.bool_]) -> Bytes2D:
-    """Some of the rows, by index or mask, each copied as one piece."""
-    whole = rows.view(f"V{rows.shape[1]}")[:, 0]
-    some = whole.take(which) if which.dtype != np.bool_ and rows.flags.c_contiguous else whole[which]
-    return some.view(np.uint8).reshape(-1, rows.shape[1])
-
-
-def intactness(seal: Seal, errors: list[str], rows: Bytes2D) -> Status:
+def intactness(seal: Seal, errors: list[str], sums: Sums | None, rows: Bytes2D) -> NDArray[np.uint8]:
     """`VALID`, `CHECKSUM` or `PLUGIN` for each frame, by one of its checksums."""
     try:
-        wrong = ~seal.intact(rows)
+        wrong = ~seal.intact(rows, sums)
         return np.multiply(wrong.view(np.uint8), np.uint8(CHECKSUM))
     except Exception:
         errors += [traceback.format_exc()] * len(rows)
         return np.full(len(rows), PLUGIN, np.uint8)
 
 
-def plausibility(frame: Frame, table: Table, errors: list[str]) -> Status:
+def plausibility(frame: Frame, table: Table, errors: list[str]) -> NDArray[np.uint8]:
     """`VALID`, `IMPLAUSIBLE` or `PLUGIN` for each frame of a table, by the frame's own test."""
     assert frame.plausible is not None
     batch = Batch(table, np.zeros(len(table), np.bool_))
@@ -120,31 +121,6 @@ def _all(array: NDArray[Any], answer: Any, batch: Batch) -> NDArray[np.bool_]:
 
 
 @dataclass(frozen=True, eq=False)
-class Survey:
-    """What candidates are.
-
-    Attributes:
-        status: of each.
-        sizes: of those that are valid; for those short of bytes how many tell more (0: any).
-        errors: tracebacks out of plugins.
-        rows: the bytes of all candidates, one a row, where all have one layout and are whole.
-        layout: that all have, where that is known.
-    """
-
-    status: Status
-    sizes: NDArray[np.intp]
-    errors: tuple[str, ...] = ()
-    rows: Bytes2D | None = None
-    layout: Layout | None = None
-
-
-#: values of a few bits that are compared one by one.
-ALLOWED = 2
-
-Check = Callable[[Bytes2D], NDArray[np.bool_]]
-
-
-@dataclass(frozen=True, eq=False)
 class Condition:
     """A part of the test: a node of the trace, and the fields that it depends on, all in the same arrays."""
 
@@ -154,7 +130,7 @@ class Condition:
     def holds(self, columns: Mapping[str, NDArray[np.float64]]) -> NDArray[np.bool_]:
         """Whether it is true, for columns of the fields in their units, element by element."""
         with np.errstate(all="ignore"):
-            return np.asarray(value_of(self.node, columns, {})).astype(np.bool_)
+            return np.asarray(evaluate(self.node, {}, lambda node: columns.get(node.path))).astype(np.bool_)
 
 
 class Conditions:
@@ -303,51 +279,11 @@ def _window(leaves: Iterable[Leaf]) -> tuple[int, int]:
 
 
 def _parts(plausible: Callable[[Any], Any], schema: Schema, layout: Layout) -> list[Condition] | None:
-    rows = np.zeros((2, layout.size), np.uint8)
-    sample = Batch(Rows(schema, [Group(layout, np.arange(2), rows)]), np.zeros(2, np.bool_))
+    blank = Group(layout, np.zeros(1, np.intp), np.zeros((1, layout.size), np.uint8))
     try:
-        answer, _ = trace(plausible, sample)
+        answer, _ = trace(plausible, sample_of(Batch(Rows(schema, [blank]), np.zeros(1, np.bool_)), blank))
         if not isinstance(answer, Traced):
             return None
-        return [Condition(node, fields_of(node, schema)) for node in _conjuncts(answer.node)]
+        return [Condition(node, fields_beside(node, schema)) for node in conjuncts(answer.node)]
     except Exception:  # the function itself will say so, frame by frame
         return None
-
-
-def _conjuncts(node: Node) -> Iterator[Node]:
-    """The conditions that have to hold together."""
-    both = node.kind == "call" and node.function in (np.bitwise_and, np.logical_and)
-    if both and all(isinstance(arg, Node) and arg.sample.array.dtype == np.bool_ for arg in node.args):
-        for arg in node.args:
-            yield from _conjuncts(arg)
-    else:
-        yield node
-
-
-def fields_of(node: Node, schema: Schema) -> tuple[FieldInfo, ...]:
-    """The fields that a node depends on, each once.
-
-    Raises:
-        Untraceable: if it depends on more than the frame itself, or on fields that do not stand side by side.
-    """
-    found: dict[str, FieldInfo] = {}
-    pending = [node]
-    while pending:
-        node = pending.pop()
-        if node.kind not in ("field", "call") or any(np.size(arg) != 1 for arg in node.args if not isinstance(arg, Node)):
-            raise Untraceable(f"{node.kind} in a test of plausibility")
-        if node.kind == "field":
-            found[node.path] = schema.fields[node.path]
-        pending += [arg for arg in node.args if isinstance(arg, Node)]
-    if len({info.axes for info in found.values()}) != 1:
-        raise Untraceable("fields of different arrays in a test of plausibility")
-    return tuple(found.values())
-
-
-def value_of(node: Node, columns: Mapping[str, NDArray[np.float64]], known: dict[Node, Any]) -> Any:
-    """What a node comes to for columns of the fields."""
-    if node.kind == "field":
-        return columns[node.path]
-    if node not in known:
-        known[node] = node.function(*(value_of(arg, columns, known) if isinstance(arg, Node) else arg for arg in node.args))
-    return known[node]

@@ -1,7 +1,9 @@
-"""What a decoder found and counted: frames as arrays or one by one, and the counters.
+"""What is found in an input: frames as one struct of arrays, one by one, and the counters.
 
-Frames of one layout that stand at one distance, with nothing lost between them, are `Alike`: arrays that follow from a few
-numbers cost more than finding such frames does, and are made only when they are read.
+`Frames` is what every part of the framing passes on to the next: a frame type's engine says which candidates are frames and
+of which layout, the search takes some of them, the decoder adds where in the input they stand and when they came, and packets
+become columns by the layouts that are known by then. Frames of one size at one distance are described by a few numbers:
+arrays that follow from these cost more than finding such frames does, and are made only when they are read.
 """
 
 from __future__ import annotations
@@ -9,13 +11,27 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
 from functools import cached_property
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.wire.arrays import repeated
+from lidarspec.wire.arrays import alike, counted, repeated, some, taken
 from lidarspec.wire.layout import Bytes2D, Layout
+
+Indices = NDArray[np.intp]
+Status = NDArray[np.integer[Any]]
+#: places, or the numbers of a range, which become an array when they are read.
+Numbers = NDArray[np.int64] | range
+
+#: what a candidate is: a frame, one that is short of bytes, or why it is none.
+VALID, SHORT, LENGTH, CONSTANT, CHECKSUM, IMPLAUSIBLE, PLUGIN = range(7)
+
+#: layouts whose frames are found one layout after another sooner than by sorting.
+FEW = 16
+
+#: which counter a rejected candidate raises.
+COUNTED = {SHORT: "bad_length", LENGTH: "bad_length", CHECKSUM: "bad_checksum", IMPLAUSIBLE: "implausible", PLUGIN: "plugin_errors"}
 
 
 @dataclass
@@ -84,39 +100,146 @@ class Found:
     gap: int = 0
 
 
-@dataclass(frozen=True, eq=False)
-class Spans:
-    """Frames of a piece of input as arrays, in stream order.
+class Frames:
+    """Frames, or candidates for frames, in a piece of input, in its order: n of each array.
 
     Attributes:
-        names: the types; `kinds` are indices into them.
-        buffer: the bytes that the frames stand in, at `starts`, `sizes` long.
-        offsets, gaps, at: as in `Found`; `at` is -1 where nobody knows it.
-        layout: that all have; None where they have not, or nobody knows.
+        buffer: the bytes that they stand in, at `starts`, `sizes` long; of a candidate that is short of bytes the size is how
+            many tell more (0: any).
+        names, kinds: the incoming frame types of a sensor, and which of them each is, as an index; -1 where none.
+        layouts, forms: the layouts of compiled frames, and which of them each has, as an index; -1 where nobody knows.
+        status: `VALID`, or why a candidate is no frame.
+        offsets: where each begins in everything fed so far (for datagram links in the payloads, joined).
+        places: the same, as a range where the frames have one size and follow one another.
+        gaps: bytes (other than fillers) skipped before each.
+        at: arrival times in ns, -1 where nobody knows them.
+        rows: the bytes of each, one a row, where all have one layout and somebody gathered them; of candidates, of as many
+            from the first one on as are whole.
+        errors: tracebacks out of plugins.
     """
 
-    names: tuple[str, ...]
-    buffer: NDArray[np.uint8]
-    kinds: NDArray[np.intp]
-    starts: NDArray[np.intp]
-    sizes: NDArray[np.intp]
-    offsets: NDArray[np.int64]
-    gaps: NDArray[np.int64]
-    at: NDArray[np.int64]
-    layout: Layout | None = None
+    def __init__(
+        self,
+        buffer: NDArray[np.uint8],
+        kinds: Indices,
+        starts: Numbers,
+        sizes: Indices,
+        *,
+        layouts: tuple[Layout, ...] = (),
+        forms: Indices | None = None,
+        status: Status | None = None,
+        rows: Bytes2D | None = None,
+        errors: tuple[str, ...] = (),
+    ) -> None:
+        number = len(kinds)
+        self.buffer, self.kinds, self.sizes, self.layouts, self.rows, self.errors = buffer, kinds, sizes, layouts, rows, errors
+        self._starts = self.places = starts
+        self.forms = repeated(0 if layouts else -1, number) if forms is None else forms
+        self.status = repeated(VALID, number) if status is None else status
+        self.names: tuple[str, ...] = ()
+        self.gaps, self.at = repeated(0, number), repeated(-1, number)
+
+    @classmethod
+    def none(cls, buffer: NDArray[np.uint8]) -> Frames:
+        """No frames."""
+        return cls(buffer, repeated(-1, 0), range(0), repeated(0, 0))
+
+    @classmethod
+    def joined(cls, parts: Sequence[Frames]) -> Frames:
+        """Candidates in one buffer, one part after another."""
+        if len(parts) == 1:
+            return parts[0]
+        layouts, firsts = list[Layout](), dict[int, int]()
+        for part in parts:
+            if id(part.layouts) not in firsts:
+                firsts[id(part.layouts)] = len(layouts)
+                layouts += part.layouts
+        return cls(
+            parts[0].buffer,
+            np.concatenate([part.kinds for part in parts]),
+            np.concatenate([part.starts for part in parts]),
+            np.concatenate([part.sizes for part in parts]),
+            layouts=tuple(layouts),
+            forms=np.concatenate([np.where(part.forms < 0, -1, part.forms + firsts[id(part.layouts)]) for part in parts]),
+            status=np.concatenate([part.status for part in parts]),
+            errors=tuple(error for part in parts for error in part.errors),
+        )
 
     def __len__(self) -> int:
         return len(self.kinds)
 
+    @cached_property
+    def starts(self) -> Indices:
+        """Where each begins in the buffer."""
+        return array_of(self._starts)
+
+    @cached_property
+    def offsets(self) -> NDArray[np.int64]:
+        """Where each begins in the input."""
+        return array_of(self.places)
+
+    @property
+    def layout(self) -> Layout | None:
+        """The layout that all have; None where they have not one, or nobody knows."""
+        form = alike(self.forms)
+        return None if form is None or form < 0 else self.layouts[form]
+
+    @property
+    def total(self) -> int:
+        """The bytes of all."""
+        size = alike(self.sizes)
+        return int(self.sizes.sum()) if size is None else size * len(self)
+
+    @cached_property
+    def is_sound(self) -> bool:
+        """Whether all candidates are frames."""
+        return not np.count_nonzero(self.status)
+
+    def only(self, which: NDArray[np.bool_] | Indices | slice) -> Frames:
+        """Some of them: by a mask, by ascending indices, or by a slice."""
+        rows = self.rows
+        if rows is not None:
+            rows = rows[which] if isinstance(which, slice) else taken(rows, which if which.dtype != np.bool_ else which[: len(rows)])
+        chosen = {name: some(getattr(self, name), which) for name in ("kinds", "sizes", "forms", "status", "gaps", "at")}
+        starts = _chosen(self._starts, which)
+        places = starts if self.places is self._starts else _chosen(self.places, which)
+        return self._with(**chosen, rows=rows, _starts=starts, places=places)
+
+    def by_layout(self) -> list[tuple[Layout, Indices]]:
+        """The frames of each layout that is known, as indices."""
+        form = alike(self.forms)
+        if form is not None:
+            return [(self.layouts[form], counted(len(self)))] if form >= 0 else []
+        numbers = np.bincount(self.forms + 1)[1:]
+        present = np.flatnonzero(numbers).tolist()
+        if len(present) <= FEW:
+            return [(self.layouts[form], np.flatnonzero(self.forms == form)) for form in present]
+        order = np.argsort(self.forms, kind="stable")[len(self) - int(numbers.sum()) :]
+        parts = np.split(order, np.cumsum(numbers[present])[:-1])
+        return [(self.layouts[form], which) for form, which in zip(present, parts, strict=True)]
+
+    def located(self, names: tuple[str, ...], places: Numbers, gaps: NDArray[np.int64], at: NDArray[np.int64]) -> Frames:
+        """The same frames with their place in the input; gathered rows stand for the buffer, so that the rest of it can go."""
+        if self.rows is None or isinstance(self._starts, range):
+            return self._with(names=names, places=places, gaps=gaps, at=at)
+        number, size = self.rows.shape
+        starts = range(0, number * size, size)
+        return self._with(names=names, places=places, gaps=gaps, at=at, buffer=self.rows.reshape(-1), _starts=starts)
+
+    def arrived(self, at: NDArray[np.int64]) -> Frames:
+        """The same frames with other times of arrival."""
+        return self._with(at=at)
+
+    def _with(self, **changes: Any) -> Frames:
+        changed = object.__new__(Frames)
+        vars(changed).update(vars(self), **changes)
+        for name in ("starts", "offsets", "is_sound"):
+            vars(changed).pop(name, None)
+        return changed
+
     def data(self, index: int) -> bytes:
         """The bytes of one frame."""
         return self.buffer[self.starts[index] : self.starts[index] + self.sizes[index]].tobytes()
-
-    def arrived(self, at: NDArray[np.int64]) -> Self:
-        """The same frames with other times of arrival."""
-        found = object.__new__(type(self))
-        vars(found).update(vars(self), at=at)
-        return found
 
     def found(self) -> list[Found]:
         """The frames one by one."""
@@ -127,79 +250,7 @@ class Spans:
         ]
 
 
-class Alike(Spans):
-    """Frames of one layout at one distance, one after another in the input: a `Spans` whose arrays are made when they are read.
-
-    Args:
-        kind: index of their type.
-        rows: their bytes, one a row, each contiguous by itself.
-        first: where the first one begins in the buffer.
-        offset: of the first one in the input.
-        gap: bytes skipped before it.
-    """
-
-    def __init__(
-        self,
-        names: tuple[str, ...],
-        buffer: NDArray[np.uint8],
-        kind: int,
-        layout: Layout,
-        rows: Bytes2D,
-        first: int,
-        offset: int,
-        gap: int,
-        at: NDArray[np.int64],
-    ) -> None:
-        vars(self).update(names=names, buffer=buffer, at=at, layout=layout)
-        vars(self).update(kind=kind, rows=rows, first=first, offset=offset, gap=gap)
-
-    kind: int
-    layout: Layout
-    rows: Bytes2D
-    first: int
-    offset: int
-    gap: int
-
-    def __len__(self) -> int:
-        return len(self.rows)
-
-    @cached_property
-    def kinds(self) -> NDArray[np.intp]:
-        """The type of each."""
-        return repeated(self.kind, len(self))
-
-    @cached_property
-    def starts(self) -> NDArray[np.intp]:
-        """Where each begins in the buffer."""
-        return self.first + np.arange(len(self)) * self.rows.strides[0]
-
-    @cached_property
-    def sizes(self) -> NDArray[np.intp]:
-        """The bytes of each."""
-        return repeated(self.rows.shape[1], len(self))
-
-    @cached_property
-    def offsets(self) -> NDArray[np.int64]:
-        """Where each begins in the input."""
-        return np.arange(self.run.start, self.run.stop, self.run.step)
-
-    @property
-    def run(self) -> range:
-        """The same as a range."""
-        size = self.rows.shape[1]
-        return range(self.offset, self.offset + size * len(self), size)
-
-    @cached_property
-    def gaps(self) -> NDArray[np.int64]:
-        """The bytes skipped before each."""
-        if not self.gap:
-            return repeated(0, len(self))
-        gaps = np.zeros(len(self), np.int64)
-        gaps[0] = self.gap
-        return gaps
-
-
-def packed(found: Sequence[Found]) -> Spans:
+def packed(found: Sequence[Found]) -> Frames:
     """Frames given one by one as arrays."""
     names = tuple(dict.fromkeys(item.frame for item in found))
     sizes = np.array([len(item.data) for item in found], np.intp)
@@ -207,4 +258,13 @@ def packed(found: Sequence[Found]) -> Spans:
     offsets, gaps, at = columns or [np.empty(0, np.int64)] * 3
     kinds = np.array([names.index(item.frame) for item in found], np.intp)
     buffer = np.frombuffer(b"".join(item.data for item in found), np.uint8)
-    return Spans(names, buffer, kinds, np.cumsum(sizes) - sizes, sizes, offsets, gaps, at)
+    return Frames(buffer, kinds, np.cumsum(sizes) - sizes, sizes).located(names, offsets, gaps, at)
+
+
+def array_of(numbers: Numbers) -> NDArray[np.int64]:
+    """The numbers as an array."""
+    return np.arange(numbers.start, numbers.stop, numbers.step) if isinstance(numbers, range) else numbers
+
+
+def _chosen(numbers: Numbers, which: NDArray[np.bool_] | Indices | slice) -> Numbers:
+    return numbers[which] if isinstance(which, slice) else array_of(numbers)[which]

@@ -15,60 +15,19 @@ from __future__ import annotations
 import bisect
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.framing.frame_engine import Codec
-from lidarspec.framing.plausibility import CHECKSUM, CONSTANT, IMPLAUSIBLE, LENGTH, PLUGIN, SHORT, VALID, taken
-from lidarspec.wire.arrays import repeated, some
-from lidarspec.wire.layout import Layout, Marks, words
-
-#: which counter a rejected candidate raises.
-COUNTED = {LENGTH: "bad_length", CHECKSUM: "bad_checksum", IMPLAUSIBLE: "implausible", PLUGIN: "plugin_errors"}
+from lidarspec.framing.results import CONSTANT, COUNTED, PLUGIN, SHORT, VALID, Frames, Status
+from lidarspec.wire.layout import Bytes2D, Layout, Marks, Sums, words
 
 #: candidates of one type in a piece; where there are more, the piece is made shorter, so that memory stays small.
 MOST = 1 << 15
 
 Bytes1D = NDArray[np.uint8]
 Offsets = NDArray[np.intp]
-
-
-@dataclass(eq=False)
-class Candidates:
-    """The candidates of one frame type in a piece of a stream, by offset.
-
-    Attributes:
-        kind: index of the type.
-        rows: the bytes of the first ones, as many as it has rows; None where they have not all one layout.
-    """
-
-    kind: int
-    offsets: Offsets
-    status: NDArray[np.uint8]
-    sizes: Offsets
-    errors: tuple[str, ...] = ()
-    rows: NDArray[np.uint8] | None = None
-
-    @classmethod
-    def judged(cls, kind: int, codec: Codec, buffer: Bytes1D, offsets: Offsets) -> Candidates:
-        """Those of the offsets whose constants are right."""
-        survey = codec.survey(buffer, offsets)
-        found = cls(kind, offsets, survey.status, survey.sizes, survey.errors, survey.rows)
-        if found.valid or not (wrong := survey.status == CONSTANT).any():
-            return found
-        return found.only(~wrong)
-
-    @cached_property
-    def valid(self) -> bool:
-        """Whether all of them are valid."""
-        return not self.status.any()
-
-    def only(self, which: NDArray[np.bool_]) -> Candidates:
-        """Some of them."""
-        rows = None if self.rows is None else taken(self.rows, which[: len(self.rows)])
-        return Candidates(self.kind, self.offsets[which], self.status[which], some(self.sizes, which), self.errors, rows)
 
 
 @dataclass
@@ -91,31 +50,25 @@ class Piece:
     """The outcome for one piece.
 
     Attributes:
-        kinds, offsets, sizes: of the frames: index of the type, first byte, number of bytes.
+        frames: those that are taken; their places are those in the piece.
         end: where the rest begins, which has to be looked at again.
         waiting: whether the rest makes sense only together with bytes that follow the piece.
         need: how long the rest has to be at least before that; 0 if unknown.
-        rows: the bytes of the frames, one a row, where all have one layout; None where nobody gathered them.
         rejected: number of rejected candidates by counter.
         errors: tracebacks out of plugins.
-        layout: that all frames have, one after another from the first byte on; None where they have not, or nobody knows.
     """
 
-    kinds: Offsets = field(default_factory=lambda: np.empty(0, np.intp))
-    offsets: Offsets = field(default_factory=lambda: np.empty(0, np.intp))
-    sizes: Offsets = field(default_factory=lambda: np.empty(0, np.intp))
-    end: int = 0
+    frames: Frames
+    end: int
     waiting: bool = False
     need: int = 0
-    rows: NDArray[np.uint8] | None = None
     rejected: dict[str, int] = field(default_factory=dict)
     errors: list[str] = field(default_factory=list)
-    layout: Layout | None = None
 
     def reject(self, numbers: Sequence[int], errors: Sequence[str]) -> None:
         """Count candidates as rejected: how many of each status."""
         for reason, number in enumerate(numbers):
-            name = COUNTED.get(LENGTH if reason == SHORT else reason)
+            name = COUNTED.get(reason)
             if number and name:
                 self.rejected[name] = self.rejected.get(name, 0) + number
                 if reason == PLUGIN:
@@ -127,10 +80,11 @@ class Framing:
 
     Args:
         codecs: those of the incoming frame types, by name, in the order that decides at one offset.
+        sums: what computes checksums; by default their algorithms.
     """
 
-    def __init__(self, codecs: Mapping[str, Codec]) -> None:
-        self.names, self.codecs = list(codecs), list(codecs.values())
+    def __init__(self, codecs: Mapping[str, Codec], sums: Sums | None = None) -> None:
+        self.names, self.codecs, self._sums = tuple(codecs), list(codecs.values()), sums
         self.named = {codec.frame.after for codec in self.codecs} - {None}
         self.marks = [codec.marks for codec in self.codecs]
         self.words = [words(marks) for marks in self.marks]
@@ -156,7 +110,19 @@ class Framing:
         """Whether a frame of this type changes what is looked for."""
         return self.names[kind] in self.named and self.names[kind] != mode.after
 
-    def strong(self, buffer: Bytes1D, mode: Mode) -> tuple[Bytes1D, list[Candidates]]:
+    def switching(self, mode: Mode) -> NDArray[np.bool_]:
+        """Whether a frame of each type changes what is looked for, by its index; False for -1."""
+        return np.array([*(self.switches(kind, mode) for kind in range(len(self.names))), False])
+
+    def survey(self, kind: int, buffer: Bytes1D, offsets: Offsets, *, gathered: bool = True) -> Frames:
+        """The candidates at these offsets, which have the constants of a type; see `Codec.survey`."""
+        return self.codecs[kind].survey(buffer, offsets, kind=kind, gathered=gathered, sums=self._sums)
+
+    def survey_rows(self, kind: int, rows: Bytes2D) -> tuple[Layout, Status, tuple[str, ...]] | None:
+        """Candidates of one size and layout, which have the constants of a type; see `Codec.survey_rows`."""
+        return self.codecs[kind].survey_rows(rows, sums=self._sums)
+
+    def candidates(self, buffer: Bytes1D, mode: Mode) -> tuple[Bytes1D, list[Frames]]:
         """The candidates of each type that is looked for and not weak, in the bytes or, where there are too many, in fewer of them."""
         known: dict[Marks, Offsets] = {}
         spots: dict[int, Offsets] = {}
@@ -170,8 +136,8 @@ class Framing:
         if limit < len(buffer):
             buffer = buffer[: max(limit, self.reach)]
             spots = {kind: offsets[: int(np.searchsorted(offsets, len(buffer)))] for kind, offsets in spots.items()}
-        found = [Candidates.judged(kind, self.codecs[kind], buffer, offsets) for kind, offsets in spots.items() if len(offsets)]
-        return buffer, found
+        surveys = [self.survey(kind, buffer, offsets) for kind, offsets in spots.items() if len(offsets)]
+        return buffer, [own if own.is_sound or (right := own.status != CONSTANT).all() else own.only(right) for own in surveys]
 
 
 def matches(buffer: Bytes1D, constants: Marks) -> Offsets:
@@ -216,75 +182,48 @@ def leftmost(framing: Framing, buffer: Bytes1D, mode: Mode, *, final: bool) -> P
         final: give up candidates that need more bytes than there are.
     """
     whole = len(buffer)
-    buffer, found = framing.strong(buffer, mode)
+    buffer, candidates = framing.candidates(buffer, mode)
     final = final and len(buffer) == whole
-    piece = Piece(end=len(buffer))
-    if not found:
+    piece = Piece(Frames.none(buffer), len(buffer))
+    if not candidates:
         return piece
-    live = merged(found, final=final)
-    chosen = _chain(live.offsets, live.sizes, live.status, len(buffer))
-    count = len(live.offsets) if chosen is None else len(chosen)
+    live = merged(candidates, final=final)
+    chosen = _chain(live, len(buffer))
+    count = len(live) if chosen is None else len(chosen)
     last = -1 if not count else count - 1 if chosen is None else int(chosen[-1])
     if count and live.status[last] == SHORT:
         count -= 1
-        piece.end, piece.waiting, piece.need = int(live.offsets[last]), len(buffer) == whole, int(live.sizes[last])
-    live = live.only(slice(0, count) if chosen is None else chosen[:count])
-    if framing.named:
-        live = _until_switched(framing, live, mode, piece)
-    piece.kinds, piece.offsets, piece.sizes, piece.rows = live.kinds, live.offsets, live.sizes, live.rows
-    if len(live.sizes):
-        mode.size = live.sizes.item(-1)
-        mode.steady = live.offsets.item(-1) - live.offsets.item(0) == mode.size * (len(live.sizes) - 1)
-    count_rejected(piece, found, final=final)
+        piece.end, piece.waiting, piece.need = int(live.starts[last]), len(buffer) == whole, int(live.sizes[last])
+    frames = live.only(slice(0, count) if chosen is None else chosen[:count])
+    piece.frames = frames = _until_switched(framing, frames, mode, piece) if framing.named else frames
+    if len(frames):
+        mode.size = frames.sizes.item(-1)
+        mode.steady = frames.starts.item(-1) - frames.starts.item(0) == mode.size * (len(frames) - 1)
+    count_rejected(piece, candidates, final=final)
     return piece
 
 
-@dataclass(frozen=True, eq=False)
-class Live:
-    """The candidates that are valid or wait for bytes, by offset, one at each.
-
-    Attributes:
-        rows: the bytes of the valid ones, where all have one layout and were gathered.
-    """
-
-    kinds: Offsets
-    offsets: Offsets
-    sizes: Offsets
-    status: NDArray[np.uint8]
-    rows: NDArray[np.uint8] | None = None
-
-    def only(self, which: Offsets | slice) -> Live:
-        """Some of them, in order."""
-        rows = self.rows
-        if rows is not None and (not isinstance(which, slice) or which.stop < len(rows)):
-            rows = rows[which] if isinstance(which, slice) else taken(rows, which)
-        return Live(some(self.kinds, which), self.offsets[which], some(self.sizes, which), self.status[which], rows)
-
-
-def merged(found: Sequence[Candidates], *, final: bool) -> Live:
-    """The live candidates of several types in one order, at each offset those of the type that comes first."""
+def merged(candidates: Sequence[Frames], *, final: bool) -> Frames:
+    """The candidates of several types that are valid or wait for bytes, by offset, at each the one whose type comes first."""
     worst = VALID if final else SHORT
-    live = [one if one.valid or bool((one.status <= worst).all()) else one.only(one.status <= worst) for one in found]
-    if len(live) == 1:
-        one = live[0]
-        return Live(repeated(one.kind, len(one.offsets)), one.offsets, one.sizes, one.status, one.rows)
-    kinds = np.repeat([one.kind for one in live], [len(one.offsets) for one in live])
-    offsets = np.concatenate([one.offsets for one in live])
-    order = np.lexsort((kinds, offsets))
-    order = order[np.diff(offsets[order], prepend=-1) > 0]
-    sizes, status = (np.concatenate([getattr(one, name) for one in live])[order] for name in ("sizes", "status"))
-    return Live(kinds[order], offsets[order], sizes, status)
+    parts = [own if own.is_sound or bool((own.status <= worst).all()) else own.only(own.status <= worst) for own in candidates]
+    live = Frames.joined(parts)
+    if len(parts) == 1:
+        return live
+    order = np.argsort(live.starts, kind="stable")  # at each offset still in the order of the types
+    return live.only(order[np.diff(live.starts[order], prepend=-1) > 0])
 
 
-def _chain(offsets: Offsets, sizes: Offsets, status: NDArray[np.uint8], length: int) -> Offsets | None:
+def _chain(live: Frames, length: int) -> Offsets | None:
     """Indices of the candidates that are taken from left to right, each from the end of the one before; None if all are.
 
     One that waits for bytes takes all that there are.
     """
+    offsets = live.starts
     if len(offsets) < 2:
         return None
-    ends = offsets + sizes
-    ends[status == SHORT] = length + 1
+    ends = offsets + live.sizes
+    ends[live.status == SHORT] = length + 1
     if not bool((offsets[1:] < ends[:-1]).any()):
         return None
     after = np.searchsorted(offsets, ends)
@@ -298,30 +237,30 @@ def _chain(offsets: Offsets, sizes: Offsets, status: NDArray[np.uint8], length: 
     return np.concatenate(runs)
 
 
-def _until_switched(framing: Framing, live: Live, mode: Mode, piece: Piece) -> Live:
+def _until_switched(framing: Framing, frames: Frames, mode: Mode, piece: Piece) -> Frames:
     """The frames up to the first one that changes what is looked for; the piece ends with it."""
-    switching = np.array([framing.switches(kind, mode) for kind in range(len(framing.names))])
-    spots = np.flatnonzero(switching[live.kinds])
+    spots = np.flatnonzero(framing.switching(mode)[frames.kinds])
     if not len(spots):
-        return live
+        return frames
     last = int(spots[0])
-    mode.after = framing.names[int(live.kinds[last])]
-    piece.end, piece.waiting, piece.need = int(live.offsets[last] + live.sizes[last]), False, 0
-    return live.only(slice(0, last + 1))
+    mode.after = framing.names[int(frames.kinds[last])]
+    piece.end, piece.waiting, piece.need = int(frames.starts[last] + frames.sizes[last]), False, 0
+    return frames.only(slice(0, last + 1))
 
 
-def count_rejected(piece: Piece, found: Sequence[Candidates], *, final: bool) -> None:
+def count_rejected(piece: Piece, candidates: Sequence[Frames], *, final: bool) -> None:
     """Count the candidates outside the frames, and at a frame's first byte those of the types that come before its own."""
-    for candidates in found:
-        refused = np.flatnonzero(candidates.status > (VALID if final else SHORT)) if not candidates.valid else ()
+    frames = piece.frames
+    for own in candidates:
+        refused = np.flatnonzero(own.status > (VALID if final else SHORT)) if not own.is_sound else ()
         if not len(refused):
             continue
-        spots = candidates.offsets[refused]
+        spots = own.starts[refused]
         counted = spots < piece.end
-        if len(piece.offsets):
-            before = np.searchsorted(piece.offsets, spots, side="right") - 1
+        if len(frames):
+            before = np.searchsorted(frames.starts, spots, side="right") - 1
             held = np.maximum(before, 0)
-            inside = (before >= 0) & (spots < piece.offsets[held] + piece.sizes[held])
-            counted &= ~inside | ((spots == piece.offsets[held]) & (candidates.kind < piece.kinds[held]))
+            inside = (before >= 0) & (spots < frames.starts[held] + frames.sizes[held])
+            counted &= ~inside | ((spots == frames.starts[held]) & (own.kinds[refused] < frames.kinds[held]))
         if counted.any():
-            piece.reject(np.bincount(candidates.status[refused[counted]]).tolist(), candidates.errors)
+            piece.reject(np.bincount(own.status[refused[counted]]).tolist(), own.errors)

@@ -1,7 +1,9 @@
-"""Frames that follow one another without a byte between, as in a stream that nothing disturbs: found without a search.
+"""Frames at one distance, as the rows of an array: found without a search, in a stream as in datagrams.
 
-Where all of them are frames of one layout, and nothing that comes first in the order stands at their first bytes, the search
-would take the same. So they are judged as rows, which takes a few calls, up to the first that is none; there the search goes on.
+In a stream that nothing disturbs, frames follow one another without a byte between; datagrams of one size stand in a capture
+at one distance, and in an array without one. Where all of them are frames of one layout, and nothing that comes first in the
+order stands at their first bytes, the search would take the same. So they are judged as rows, which takes a few calls: of a
+stream up to the first that is none, where the search goes on; of datagrams all or none.
 """
 
 from __future__ import annotations
@@ -9,15 +11,19 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from lidarspec.framing.results import Frames, Indices, Numbers
 from lidarspec.framing.search import Framing, Mode, Piece
-from lidarspec.wire.arrays import counted, repeated
-from lidarspec.wire.layout import Bytes2D, Layout, Marks, right
+from lidarspec.wire.arrays import alike, repeated
+from lidarspec.wire.layout import Bytes2D, Layout, Marks, exclude, right
 
 #: rows that are looked at before all are; bytes of a piece that is looked at so even after a piece with damaged frames.
 FEW, SMALL = 64, 1 << 16
 
+#: constants that tell the types of most datagrams.
+TOLD = 4
 
-def straight(framing: Framing, buffer: NDArray[np.uint8], mode: Mode) -> Piece | None:
+
+def steady_stream(framing: Framing, buffer: NDArray[np.uint8], mode: Mode) -> Piece | None:
     """The frames of a piece from its first byte on; None where they are to be searched for.
 
     Args:
@@ -29,19 +35,50 @@ def straight(framing: Framing, buffer: NDArray[np.uint8], mode: Mode) -> Piece |
         return None
     rows = buffer[: number * mode.size].reshape(number, mode.size)
     for kind in framing.active(mode):
-        lead = _leading(framing, kind, rows)
+        lead = leading(framing, kind, rows)
         if lead is None:
             continue
-        survey = framing.codecs[kind].alike(rows[:lead]) if 2 * lead > number and not framing.switches(kind, mode) else None
-        if survey is None or survey.layout is None:
+        frames = judged(framing, kind, buffer, rows[:lead], 0) if 2 * lead > number and not framing.switches(kind, mode) else None
+        if frames is None:
             return None
-        valid = int((survey.status != 0).argmax()) if np.count_nonzero(survey.status) else lead
+        valid = lead if frames.is_sound else int((frames.status != 0).argmax())
         mode.steady = 2 * valid > number
-        return _piece(framing, mode, kind, survey.layout, rows[:valid], buffer) if mode.steady else None
+        return _piece(framing, mode, frames.only(slice(0, valid))) if mode.steady else None
     return None
 
 
-def _leading(framing: Framing, kind: int, rows: Bytes2D) -> int | None:
+def steady_datagrams(framing: Framing, buffer: NDArray[np.uint8], starts: Numbers, sizes: Indices, mode: Mode) -> Frames | None:
+    """Datagrams of one size at one distance, judged as frames of one type and layout; None where they may be anything else.
+
+    So they may where they have not all the constants of one type and none of those before it, and where they change what is
+    looked for.
+    """
+    rows = _rows(buffer, starts, sizes)
+    kind = None if rows is None else _likely(framing, rows, mode)
+    if rows is None or kind is None or right(framing.words[kind], rows) is not None or framing.switches(kind, mode):
+        return None
+    return judged(framing, kind, buffer, rows, int(starts[0]))
+
+
+def judged(framing: Framing, kind: int, buffer: NDArray[np.uint8], rows: Bytes2D, first: int) -> Frames | None:
+    """Rows with the constants of a type as candidates of one layout; None where they have not one of their size.
+
+    Args:
+        rows: of the buffer, at one distance.
+        first: where they begin in it.
+    """
+    survey = framing.survey_rows(kind, rows)
+    if survey is None:
+        return None
+    layout, status, errors = survey
+    number, size = rows.shape
+    step = rows.strides[0] if number > 1 else size
+    starts = range(first, first + number * step, step)
+    kinds, sizes = repeated(kind, number), repeated(size, number)
+    return Frames(buffer, kinds, starts, sizes, layouts=(layout,), status=status, rows=rows, errors=errors)
+
+
+def leading(framing: Framing, kind: int, rows: Bytes2D) -> int | None:
     """How many rows from the first on have the constants of a type, as far as the rows go; None where no row has them."""
     told = tuple(word for word in framing.words[kind] if word[0] + word[1].itemsize <= rows.shape[1])
     for some in (rows[:FEW], rows):
@@ -51,13 +88,20 @@ def _leading(framing: Framing, kind: int, rows: Bytes2D) -> int | None:
     return len(rows) if marked is None else None
 
 
-def _piece(framing: Framing, mode: Mode, kind: int, layout: Layout, rows: Bytes2D, buffer: NDArray[np.uint8]) -> Piece:
+def step_between(starts: Indices) -> int:
+    """The bytes from each start to the next, where they are the same for all; else 0."""
+    steps = starts[1:] - starts[:-1]
+    step = steps.item(0) if len(steps) else 0
+    return step if step > 0 and np.count_nonzero(steps == step) == len(steps) else 0
+
+
+def _piece(framing: Framing, mode: Mode, frames: Frames) -> Piece:
     """A piece that ends with these frames, and waits for a next one where that is there in part."""
-    number, size = rows.shape
-    rest = buffer[rows.size :]
-    need = _awaited(framing, mode, kind, layout, rest.tobytes()) if 0 < len(rest) < size else 0
-    spots = counted(number) * size
-    return Piece(repeated(kind, number), spots, repeated(size, number), rows.size, need > 0, need, rows, layout=layout)
+    number, size = len(frames), mode.size
+    rest = frames.buffer[number * size :]
+    kind, layout = frames.kinds.item(0), frames.layout
+    need = _awaited(framing, mode, kind, layout, rest.tobytes()) if layout is not None and 0 < len(rest) < size else 0
+    return Piece(frames, number * size, need > 0, need)
 
 
 def _awaited(framing: Framing, mode: Mode, kind: int, layout: Layout, rest: bytes) -> int:
@@ -76,3 +120,33 @@ def _awaited(framing: Framing, mode: Mode, kind: int, layout: Layout, rest: byte
 
 def _begins(marks: Marks, data: bytes) -> bool:
     return all(spot >= len(data) or data[spot] & mask == value for spot, mask, value in marks)
+
+
+def _rows(buffer: NDArray[np.uint8], starts: Numbers, sizes: Indices) -> Bytes2D | None:
+    """Datagrams as the rows of an array, where they have one size and stand at one distance, one after another; else None."""
+    count = len(sizes)
+    size = sizes.item(0) if count else 0
+    if not size or (alike(sizes) is None and np.count_nonzero(sizes == size) < count):
+        return None
+    step = starts.step if isinstance(starts, range) else size if count == 1 else step_between(starts)
+    return np.ndarray((count, size), np.uint8, buffer, int(starts[0]), (step, 1)) if step >= size else None
+
+
+def _likely(framing: Framing, rows: Bytes2D, mode: Mode) -> int | None:
+    """The type that the first datagram resembles, if none of those with its constants resembles one that comes first; else None."""
+    first, before = rows[0].tobytes(), list[int]()
+    for kind in framing.active(mode):
+        if framing.codecs[kind].size not in (None, len(first)) or framing.ends[kind] > len(first):
+            continue
+        if all(first[spot] & mask == value for spot, mask, value in framing.marks[kind][:TOLD]):
+            return None if any(_resembled(framing, other, kind, rows) for other in before) else kind
+        before.append(kind)
+    return None
+
+
+def _resembled(framing: Framing, kind: int, other: int, rows: Bytes2D) -> bool:
+    """Whether any row with the constants of the other type has those of this type as well."""
+    if exclude(framing.marks[kind], framing.marks[other]):
+        return False
+    marked = right(framing.words[kind], rows)
+    return marked is None or bool(np.count_nonzero(marked))

@@ -13,12 +13,11 @@ import bisect
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.framing.frame_engine import Codec
-from lidarspec.framing.plausibility import CONSTANT, IMPLAUSIBLE, PLUGIN, SHORT, VALID
+from lidarspec.framing.results import CONSTANT, IMPLAUSIBLE, PLUGIN, SHORT, VALID, Frames
 from lidarspec.framing.search import Bytes1D, Framing, Mode, Offsets, Piece, count_rejected, fitting, leftmost, merged
-from lidarspec.framing.steady import straight
+from lidarspec.framing.steady import leading, steady_stream
 from lidarspec.wire.arrays import repeated
-from lidarspec.wire.layout import Marks, right, words
+from lidarspec.wire.layout import Layout
 
 #: strides judged together at first, and at most; and how many are judged sooner as the rows of an array.
 FIRST, LONGEST, FEW = 64, 1 << 14, 8
@@ -46,24 +45,22 @@ def cut(framing: Framing, buffer: Bytes1D, mode: Mode, *, base: int, final: bool
     """
     if any(framing.weak(kind) for kind in framing.active(mode)):
         return _Runs(framing, buffer, mode, base, final=final).cut()
-    found = None if final else straight(framing, buffer, mode)
-    return leftmost(framing, buffer, mode, final=final) if found is None else found
+    piece = None if final else steady_stream(framing, buffer, mode)
+    return leftmost(framing, buffer, mode, final=final) if piece is None else piece
 
 
 class Lane:
     """A weak type in a piece: what stands at each offset, judged when it is asked for.
 
     Args:
-        marks: the constants at its start.
         others: the offsets at which types that come first in the order are live, with whether they wait for bytes; sorted.
         before: the weak types that come first in the order.
     """
 
     def __init__(
         self,
+        framing: Framing,
         kind: int,
-        codec: Codec,
-        marks: Marks,
         buffer: Bytes1D,
         others: dict[int, bool],
         before: list[Lane],
@@ -71,11 +68,14 @@ class Lane:
         final: bool,
     ) -> None:
         self.kind, self._final, self._before = kind, final, before
-        self._codec, self._marks, self._buffer = codec, marks, buffer
+        codec = framing.codecs[kind]
+        self._framing, self._buffer = framing, buffer
         self._others, self._spots = others, list(others)
         self._confirm, self._size = codec.frame.confirm, codec.size
         self._reach = (self._confirm - 1) * codec.frame.max_length
-        self._sizes: dict[int, int] = {}
+        self._sizes = np.zeros(0 if self._size else len(buffer), np.intp)
+        self._forms = np.zeros(0 if codec.layout else len(buffer), np.intp)
+        self.layouts: list[Layout] = [codec.layout] if codec.layout else []
         self.status = np.full(len(buffer), _UNKNOWN, np.uint8)
         self.errors: tuple[str, ...] = ()
         self._start = self._stop = self._end = 0
@@ -126,7 +126,11 @@ class Lane:
 
     def length(self, spot: int) -> int:
         """The size of the valid candidate at an offset."""
-        return self._size or self._sizes[spot]
+        return self._size or int(self._sizes[spot])
+
+    def forms(self, offsets: Offsets) -> Offsets:
+        """Which of its layouts the valid candidates at these offsets have, -1 where nobody knows."""
+        return self._forms[offsets] if len(self._forms) else repeated(0, len(offsets))
 
     def _stands(self, spot: int, *, first: bool) -> int:
         """Whether a frame of this type, of a run or its first, stands at an offset: 1, 0 or `WAIT`."""
@@ -179,12 +183,13 @@ class Lane:
             return 0
         assert self._size
         rows = np.ndarray((number, self._size), np.uint8, self._buffer, spot, (self._size, 1))
-        marked = right(words(self._marks), rows)
-        count = number if marked is None else int(marked.argmin())
-        survey = self._codec.alike(rows[:count]) if count else None
+        count = leading(self._framing, self.kind, rows) or 0
+        survey = self._framing.survey_rows(self.kind, rows[:count]) if count else None
         if survey is not None:
-            self.status[spot : spot + count * self._size : self._size] = survey.status
-            self.errors = survey.errors or self.errors
+            layout, status, errors = survey
+            offsets = slice(spot, spot + count * self._size, self._size)
+            self.status[offsets] = status
+            self._know(offsets, (layout,), repeated(0, count), errors)
         elif count:
             return 0
         if count < number:
@@ -228,14 +233,21 @@ class Lane:
     def _judge(self, offsets: Offsets) -> None:
         """Find out the status at these offsets, which are in order."""
         self.status[offsets] = CONSTANT
-        fit = fitting(self._buffer, offsets, self._marks)
+        fit = fitting(self._buffer, offsets, self._framing.marks[self.kind])
         if not len(fit):
             return
-        survey = self._codec.survey(self._buffer, fit)
+        survey = self._framing.survey(self.kind, self._buffer, fit)
         self.status[fit] = survey.status
-        self.errors = survey.errors or self.errors
         if self._size is None:
-            self._sizes |= dict(zip(fit.tolist(), survey.sizes.tolist(), strict=True))
+            self._sizes[fit] = survey.sizes
+        self._know(fit, survey.layouts, survey.forms, survey.errors)
+
+    def _know(self, offsets: Offsets | slice, layouts: tuple[Layout, ...], forms: Offsets, errors: tuple[str, ...]) -> None:
+        """Remember the layouts of candidates, and tracebacks."""
+        self.errors = errors or self.errors
+        if len(self._forms):
+            self._forms[offsets] = np.where(forms < 0, -1, forms + len(self.layouts))
+            self.layouts += layouts
 
 
 class _Runs:
@@ -244,24 +256,22 @@ class _Runs:
     def __init__(self, framing: Framing, buffer: Bytes1D, mode: Mode, base: int, *, final: bool) -> None:
         self._framing, self._mode, self._base = framing, mode, base
         whole = len(buffer)
-        buffer, self._found = framing.strong(buffer, mode)
-        self._length, self._all = len(buffer), len(buffer) == whole
+        buffer, self._candidates = framing.candidates(buffer, mode)
+        self._buffer, self._length, self._all = buffer, len(buffer), len(buffer) == whole
         self._final = final and self._all
-        self._strong: dict[int, tuple[int, int, bool]] = {}
-        if self._found:
-            live = merged(self._found, final=self._final)
-            rows = zip(live.kinds.tolist(), live.sizes.tolist(), (live.status == SHORT).tolist(), strict=True)
-            self._strong = dict(zip(live.offsets.tolist(), rows, strict=True))
+        self._live = merged(self._candidates, final=self._final) if self._candidates else Frames.none(buffer)
+        facts = zip(self._live.kinds.tolist(), self._live.sizes.tolist(), (self._live.status == SHORT).tolist(), strict=True)
+        self._strong: dict[int, tuple[int, int, bool]] = dict(zip(self._live.starts.tolist(), facts, strict=True))
         self._spots = list(self._strong)
         self._lanes: list[Lane] = []
         for kind in filter(framing.weak, framing.active(mode)):
             others = {spot: short for spot, (other, _, short) in self._strong.items() if other < kind}
             before = list(self._lanes)
-            self._lanes.append(Lane(kind, framing.codecs[kind], framing.marks[kind], buffer, others, before, final=self._final))
+            self._lanes.append(Lane(framing, kind, buffer, others, before, final=self._final))
 
     def cut(self) -> Piece:
         """Take what is valid from left to right, until the end, a frame that changes what is looked for, or one that needs more bytes."""
-        piece, taken, position = Piece(end=self._length), list[tuple[int, int, int, int]](), 0
+        piece, taken, position = Piece(Frames.none(self._buffer), self._length), list[tuple[int, int, int, int]](), 0
         counted = 0
         while position < self._length:
             spot = self._next(position)
@@ -283,8 +293,9 @@ class _Runs:
                 piece.end = position
                 break
         self._count(piece, counted, piece.end)
-        _filled(piece, taken)
-        count_rejected(piece, self._found, final=self._final)
+        if taken:
+            piece.frames = self._frames(taken)
+        count_rejected(piece, self._candidates, final=self._final)
         return piece
 
     def _next(self, position: int) -> int | None:
@@ -332,17 +343,31 @@ class _Runs:
                 numbers[IMPLAUSIBLE] += numbers[VALID]  # but not believed
                 piece.reject(numbers, lane.errors)
 
+    def _frames(self, taken: list[tuple[int, int, int, int]]) -> Frames:
+        """The frames of the runs that were taken: type, first offset, number and size of their frames."""
+        if len(taken) == 1:
+            kind, spot, number, size = taken[0]
+            kinds, sizes = repeated(kind, number), repeated(size, number)
+            starts: Offsets = np.arange(spot, spot + number * size, size)
+        else:
+            all_kinds, spots, numbers, all_sizes = np.array(taken, np.intp).T
+            within = np.arange(int(numbers.sum())) - np.repeat(np.cumsum(numbers) - numbers, numbers)
+            kinds, sizes = np.repeat(all_kinds, numbers), np.repeat(all_sizes, numbers)
+            starts = np.repeat(spots, numbers) + within * sizes
+        layouts, forms = self._layouts(kinds, starts)
+        return Frames(self._buffer, kinds, starts, sizes, layouts=layouts, forms=forms)
 
-def _filled(piece: Piece, taken: list[tuple[int, int, int, int]]) -> None:
-    """Enter the runs that were taken: type, first offset, number and size of their frames."""
-    if not taken:
-        return
-    if len(taken) == 1:
-        kind, spot, number, size = taken[0]
-        piece.kinds, piece.sizes = repeated(kind, number), repeated(size, number)
-        piece.offsets = np.arange(spot, spot + number * size, size)
-        return
-    kinds, spots, numbers, sizes = np.array(taken, np.intp).T
-    within = np.arange(int(numbers.sum())) - np.repeat(np.cumsum(numbers) - numbers, numbers)
-    piece.kinds, piece.sizes = np.repeat(kinds, numbers), np.repeat(sizes, numbers)
-    piece.offsets = np.repeat(spots, numbers) + within * piece.sizes
+    def _layouts(self, kinds: Offsets, starts: Offsets) -> tuple[tuple[Layout, ...], Offsets]:
+        """The layouts of frames that were taken, and which of them each has."""
+        for lane in self._lanes:
+            if np.count_nonzero(kinds == lane.kind) == len(kinds):
+                return tuple(lane.layouts), lane.forms(starts)
+        layouts, forms = list(self._live.layouts), np.full(len(kinds), -1, np.intp)
+        strong = np.isin(kinds, [lane.kind for lane in self._lanes], invert=True)
+        forms[strong] = self._live.forms[self._live.starts.searchsorted(starts[strong])]
+        for lane in self._lanes:
+            own = kinds == lane.kind
+            known = lane.forms(starts[own])
+            forms[own] = np.where(known < 0, -1, known + len(layouts))
+            layouts += lane.layouts
+        return tuple(layouts), forms

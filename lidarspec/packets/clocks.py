@@ -10,14 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.columns.columns import Batch, Fields
-from lidarspec.columns.graph import Node, Untraceable, trace
+from lidarspec.columns.graph import Node, Untraceable, evaluate, fields_beside, sample_of, trace
 from lidarspec.errors import SpecError
-from lidarspec.framing.plausibility import fields_of, value_of
 from lidarspec.spec.description import Spec
 from lidarspec.spec.fields import exact, factor
+from lidarspec.spec.tree import FieldInfo
 from lidarspec.wire.arrays import alike
-from lidarspec.wire.frame_table import Group, Rows, Table
-from lidarspec.wire.schema import FieldInfo, Schema
+from lidarspec.wire.frame_table import Rows, Table
+from lidarspec.wire.schema import Schema
 
 Times = NDArray[np.int64]
 
@@ -110,7 +110,7 @@ class _Reading:
         """The clock in each packet, (n,); None where only the function itself can tell."""
         table = batch.table
         if not self._is_tried and isinstance(table, Rows):
-            self._is_tried, self._terms = True, self._apart(table)
+            self._is_tried, self._terms = True, self._apart(batch, table)
         if self._terms is None:
             return None
         total = np.zeros(len(table), np.int64)
@@ -118,13 +118,11 @@ class _Reading:
             total += term(table)
         return total
 
-    def _apart(self, table: Rows) -> list[_Term] | None:
-        group = table.groups[0]
-        rows = Rows(table.schema, [Group(group.layout, np.arange(2), np.ascontiguousarray(group.rows[[0, 0]]))])
+    def _apart(self, batch: Batch, table: Rows) -> list[_Term] | None:
         try:
-            found, _ = trace(self._function, Batch(rows, np.zeros(2, np.bool_)))
-            terms = found if isinstance(found, tuple | list) else (found,)
-            return [_Term(term.node, fields_of(term.node, table.schema)) for term in terms]
+            traced, _ = trace(self._function, sample_of(batch, table.groups[0]))
+            terms = traced if isinstance(traced, tuple | list) else (traced,)
+            return [_Term(term.node, fields_beside(term.node, table.schema)) for term in terms]
         except Exception:  # the function itself says so, if anything is wrong
             return None
 
@@ -175,7 +173,7 @@ class _Term:
         for info, column in zip(self._fields, columns, strict=True):
             array = column.astype(np.float64)
             found[info.path] = array * info.scale + info.offset if info.scaled else array
-        return _nanoseconds(value_of(self._node, found, {}), len(columns[0]))
+        return _nanoseconds(evaluate(self._node, {}, lambda node: found.get(node.path)), len(columns[0]))
 
 
 @lru_cache(maxsize=256)

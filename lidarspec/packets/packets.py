@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from lidarspec.columns.columns import Batch, physical
 from lidarspec.errors import SpecError, UnknownField
-from lidarspec.framing.decoder import Counters
+from lidarspec.framing.results import Counters, Numbers, array_of
 from lidarspec.spec.description import Spec
 from lidarspec.wire.frame_table import Table
 from lidarspec.wire.schema import Schema
@@ -20,8 +20,6 @@ if TYPE_CHECKING:
     from lidarspec.points.cloud import PointCloud
 
 StateOf = tuple[Table | None, NDArray[np.intp]]
-#: a column, or the numbers of a range, which become one when it is read.
-Numbers = NDArray[np.int64] | range
 
 
 class Packets:
@@ -60,12 +58,12 @@ class Packets:
     @cached_property
     def offset(self) -> NDArray[np.int64]:
         """The first byte of each in the input, (n,)."""
-        return _column(self._offset)
+        return array_of(self._offset)
 
     @cached_property
     def index(self) -> NDArray[np.int64]:
         """The unwrapped sequence number of each, (n,); 0, 1, 2 ... where the sensor has none."""
-        return _column(self._index)
+        return array_of(self._index)
 
     def __len__(self) -> int:
         return len(self.table)
@@ -154,10 +152,6 @@ def joined(parts: Sequence[Packets]) -> Packets:
 def joined_tables(tables: Sequence[Any]) -> Table:
     """Several tables of one frame type, one after another."""
     return type(tables[0]).joined(tables)  # type: ignore[no-any-return]
-
-
-def _column(numbers: Numbers) -> NDArray[np.int64]:
-    return np.arange(numbers.start, numbers.stop, numbers.step) if isinstance(numbers, range) else numbers
 
 
 def _nested(schema: Schema, columns: Mapping[str, NDArray[Any]], prefix: str) -> np.dtype[Any]:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from lidarspec.columns.columns import UNKNOWN, Batch, Watched
 from lidarspec.errors import SpecError
-from lidarspec.framing.decoder import Counters
+from lidarspec.framing.results import Counters
 from lidarspec.packets.packets import Packets, joined
 from lidarspec.spec.timing import Sequence
 

@@ -18,11 +18,10 @@ from numpy.typing import NDArray
 
 from lidarspec.columns.columns import Batch
 from lidarspec.errors import UnknownFrame
-from lidarspec.framing.decoder import Counters, Spans
-from lidarspec.framing.frame_engine import Codec, CompiledCodec, codec
-from lidarspec.framing.results import Alike
+from lidarspec.framing.frame_engine import Codec, codec
+from lidarspec.framing.results import Counters, Frames, Numbers
 from lidarspec.packets.clocks import Unwrapper, clock_ns
-from lidarspec.packets.packets import Numbers, Packets, StateOf, joined_tables
+from lidarspec.packets.packets import Packets, StateOf, joined_tables
 from lidarspec.packets.sequences import SequenceTracker
 from lidarspec.spec.description import Spec
 from lidarspec.wire.arrays import alike, repeated, some
@@ -63,17 +62,17 @@ class PacketStream:
         self._gap, self._number = False, 0
         self._tables: dict[str, tuple[bytes, Table]] = {}
 
-    def add(self, found: Sequence[Spans], *, whole: bool = False) -> Packets:
+    def add(self, found: Sequence[Frames], *, whole: bool = False) -> Packets:
         """The packets among these frames.
 
         Args:
             whole: the frames are a whole input: packets before the first frame of another type see that one as state.
         """
-        parts = [_Part.of(spans, self.frame) for spans in found if len(spans)]
+        parts = [_Part.of(frames, self.frame) for frames in found if len(frames)]
         breaks = _joined([self._breaks(part) for part in parts], np.bool_)
         table = self._table(parts)
         state = self._states(parts, len(table), whole=whole)
-        offset, host = _offsets(parts), _times([part.column("at") for part in parts])
+        offset, host = _offsets(parts), _times([part.column(part.frames.at) for part in parts])
         index: Numbers = range(self._number, self._number + len(table))
         time = host
         self._number += len(table)
@@ -117,8 +116,9 @@ class PacketStream:
     def _breaks(self, part: _Part) -> NDArray[np.bool_]:
         """Whether something was lost before each of our frames, since ours before it."""
         breaks = np.zeros(part.number, np.bool_)
-        if alike(part.spans.gaps) != 0 and part.spans.gaps.any():
-            losses = np.cumsum(part.spans.gaps > 0)
+        gaps = part.frames.gaps
+        if alike(gaps) != 0 and gaps.any():
+            losses = np.cumsum(gaps > 0)
             marks = losses[part.own]
             breaks[:1] = marks[:1] > 0
             breaks[1:] = marks[1:] > marks[:-1]
@@ -131,7 +131,7 @@ class PacketStream:
         return breaks
 
     def _table(self, parts: Sequence[_Part]) -> Table:
-        tables = [part.table(self._codec) for part in parts if part.number]
+        tables = [self._codec.gather(part.frames if part.where is None else part.frames.only(part.own)) for part in parts if part.number]
         if not tables:
             return self._codec.table([])
         return tables[0] if len(tables) == 1 else joined_tables(tables)
@@ -151,12 +151,12 @@ class PacketStream:
         number = 0
         for part in parts:
             if part.where is not None:
-                others = np.ones(len(part.spans), np.bool_)
+                frames, others = part.frames, np.ones(len(part.frames), np.bool_)
                 others[part.own] = False
                 for rank, index in enumerate(np.flatnonzero(others).tolist()):
-                    name = part.spans.names[part.spans.kinds[index]]
+                    name = frames.names[frames.kinds[index]]
                     if name in seen:
-                        seen[name][0].append(part.spans.data(index))
+                        seen[name][0].append(frames.data(index))
                         seen[name][1].append(number + index - rank)
             number += part.number
         return seen
@@ -192,23 +192,19 @@ class PacketStream:
 class _Part:
     """Our frames in a piece of input: indices, or None where all are ours."""
 
-    spans: Spans
+    frames: Frames
     where: NDArray[np.intp] | None
     number: int
 
     @classmethod
-    def of(cls, spans: Spans, frame: str) -> _Part:
+    def of(cls, frames: Frames, name: str) -> _Part:
         """The frames of one type in a piece."""
-        if isinstance(spans, Alike) and spans.names[spans.kind] == frame:
-            return cls(spans, None, len(spans))
-        own, kind = spans.names.index(frame) if frame in spans.names else -1, alike(spans.kinds)
-        if kind is not None and kind == own:
-            return cls(spans, None, len(spans.kinds))
-        mine = spans.kinds == own
-        if mine.all():
-            return cls(spans, None, len(mine))
+        own, kind = frames.names.index(name) if name in frames.names else -1, alike(frames.kinds)
+        mine = None if kind is not None and kind == own else frames.kinds == own
+        if mine is None or mine.all():
+            return cls(frames, None, len(frames))
         where = np.flatnonzero(mine)
-        return cls(spans, where, len(where))
+        return cls(frames, where, len(where))
 
     @cached_property
     def own(self) -> NDArray[np.intp] | slice:
@@ -219,20 +215,12 @@ class _Part:
         first, last = where.item(0), where.item(-1)
         return slice(first, last + 1) if last - first == len(where) - 1 else where
 
-    def column(self, name: str) -> NDArray[Any]:
-        """An array of the spans, for our frames."""
-        array: NDArray[Any] = getattr(self.spans, name)
+    def column(self, array: NDArray[np.int64]) -> NDArray[np.int64]:
+        """An array of the piece, for our frames."""
         return array if self.where is None else some(array, self.own)
 
-    def table(self, codec: Codec) -> Table:
-        """Our frames as columns."""
-        spans = self.spans
-        if isinstance(spans, Alike) and self.where is None and isinstance(codec, CompiledCodec):
-            return codec.lined(spans.layout, spans.rows, room=len(spans.buffer))
-        return codec.gather(spans.buffer, self.column("starts"), self.column("sizes"))
 
-
-def data_frame(sensor: Spec, found: Sequence[Spans]) -> str | None:
+def data_frame(sensor: Spec, found: Sequence[Frames]) -> str | None:
     """The data frame type that an input is read by where none is asked for: the configured one, or the first that arrived.
 
     Returns:
@@ -241,8 +229,8 @@ def data_frame(sensor: Spec, found: Sequence[Spans]) -> str | None:
     names = [name for name, frame in sensor.frames.items() if frame.data]
     if len(names) < 2 or sensor.options.get("answer") in names:
         return sensor.data_frame
-    arrived = ((spans.names, spans.kinds[np.isin(spans.kinds, _kinds(spans, names))]) for spans in found)
-    return next((known[kinds[0]] for known, kinds in arrived if len(kinds)), None)
+    arrived = (frames.names[kind] for frames in found for kind in frames.kinds[np.isin(frames.kinds, _kinds(frames, names))][:1].tolist())
+    return next(arrived, None)
 
 
 def _counted(sensor: Spec, frame: str) -> bool:
@@ -252,17 +240,18 @@ def _counted(sensor: Spec, frame: str) -> bool:
     return frame in having or not having
 
 
-def _kinds(spans: Spans, names: Sequence[str]) -> list[int]:
-    return [index for index, name in enumerate(spans.names) if name in names]
+def _kinds(frames: Frames, names: Sequence[str]) -> list[int]:
+    return [index for index, name in enumerate(frames.names) if name in names]
 
 
 def _offsets(parts: Sequence[_Part]) -> Numbers:
     """Where our frames begin in the input; as a range, where all have one size and follow one another."""
-    runs = [part.spans.run for part in parts if part.where is None and isinstance(part.spans, Alike)]
-    follow = all(before.stop == after.start and before.step == after.step for before, after in pairwise(runs))
-    if runs and len(runs) == len(parts) and follow:
-        return range(runs[0].start, runs[-1].stop, runs[0].step)
-    return _joined([part.column("offsets") for part in parts], np.int64)
+    runs = [part.frames.places for part in parts if part.where is None]
+    ranges = [places for places in runs if isinstance(places, range)]
+    follow = all(before.stop == after.start and before.step == after.step for before, after in pairwise(ranges))
+    if ranges and len(ranges) == len(parts) and follow:
+        return range(ranges[0].start, ranges[-1].stop, ranges[0].step)
+    return _joined([part.column(part.frames.offsets) for part in parts], np.int64)
 
 
 def _times(parts: Sequence[NDArray[np.int64]]) -> NDArray[np.int64]:

@@ -1,21 +1,26 @@
-"""Point clouds: flat arrays in SI units, REP-103 axes and REP-117 ranges.
+"""Point clouds: flat arrays in SI units, REP-103 axes and REP-117 ranges; and how a sensor is mounted, which turns and moves them.
 
-How a sensor is mounted: its clouds turned and moved into the axes of what carries it.
+A `PointCloud` holds its columns. A `LazyCloud` takes each from a `ColumnSource` when it is first read. There is one interface of such
+sources, whatever the points are: those of a batch of packets (`lazy_columns.BatchColumns`), those of a cloud that has its columns
+(`CloudColumns`), and some of other sources one after another (`Stretches`), as slices and scans are. Scans are so cut out of batches
+without a column being made, and a source that can makes the columns of a scan for that scan alone.
+
+Further columns of points (M5) get a place beside the others here and in `conventions`, under their names.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
-from typing import Any, Protocol
+from dataclasses import dataclass, field, fields
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float32]
+from lidarspec.points.conventions import TYPES, Floats, narrowed
 
 #: names of the columns that a cloud can have, in the order in which files list them.
-COLUMNS = ("x", "y", "z", "range", "azimuth", "elevation", "intensity", "time", "ring", "return_index")
+COLUMNS = tuple(TYPES)
 
 #: x y z intensity ring time at PCL's offsets.
 STRUCTURED = np.dtype(
@@ -26,12 +31,6 @@ STRUCTURED = np.dtype(
         "itemsize": 32,
     }
 )
-
-#: largest float32 below pi: azimuths stay in [-pi, pi) in either precision.
-_PI = np.nextafter(np.float32(np.pi), np.float32(0))
-
-#: radians from which on taking off whole turns loses precision.
-_FAR = 1e6
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -91,55 +90,161 @@ class PointCloud:
         picked = {f.name: _pick(getattr(self, f.name), which) for f in fields(self)}
         shape = None
         if self.shape and isinstance(which, slice) and which.step in (None, 1):
-            first, number = which.indices(len(self))[0], len(picked["x"])
-            rows = self.shape[1]
-            shape = (number // rows, rows) if first % rows == 0 and number % rows == 0 else None
+            shape = _organised(len(picked["x"]), _whole_rows(self.shape[1], which.indices(len(self))[0], len(picked["x"])))
         return PointCloud(**{**picked, "shape": shape})
-
-    def times_at(self, indices: NDArray[np.intp]) -> NDArray[np.float64]:
-        """The times of some points, without making the column where it is not made yet."""
-        return self.time[indices]
-
-    def stretch(self, start: int, stop: int) -> PointCloud:
-        """Consecutive points."""
-        return self[start:stop]
 
     def to_structured(self) -> NDArray[Any]:
         """A structured array (N,) with PCL's layout: x y z intensity ring time, itemsize 32; what is missing is 0."""
-        found = np.zeros(len(self), STRUCTURED)
+        structured = np.zeros(len(self), STRUCTURED)
         for name in STRUCTURED.names or ():
             column = getattr(self, name)
             if column is not None:
-                found[name] = column
-        return found
+                structured[name] = column
+        return structured
 
 
 def _pick(value: Any, which: Any) -> Any:
     return value[which] if isinstance(value, np.ndarray) and value.ndim else value
 
 
-class Columns(Protocol):
-    """Where a `LazyCloud` takes its columns from.
+def _whole_rows(rows: int, first: int, number: int) -> int:
+    """The rows of some points of an organised cloud, from the `first` on; 0 where they are not whole columns."""
+    return rows if rows and first % rows == 0 and number % rows == 0 else 0
+
+
+def _organised(number: int, rows: int) -> tuple[int, int] | None:
+    """The shape of a cloud with so many rows."""
+    return (number // rows, rows) if rows else None
+
+
+class ColumnSource:
+    """Where the columns of consecutive points come from.
 
     Attributes:
         size: the number of points.
+        base: the time that their times count from, int64 ns.
+        rows: of an organised cloud; 0 where the points are not organised.
+        nominal: whether a default calibration stood in for the sensor's own.
     """
 
     size: int
+    base: int
+    rows: int = 0
+    nominal: bool = False
 
     def column(self, name: str) -> NDArray[Any] | None:
-        """A column of `PointCloud`; None where the sensor has none."""
+        """A column of `PointCloud`, or "valid"; None where the sensor has none."""
+        raise NotImplementedError
+
+    def holds(self, name: str) -> bool:
+        """Whether a column is made already."""
+        raise NotImplementedError
+
+    def part(self, name: str, start: int, stop: int) -> NDArray[Any] | None:
+        """A column of some of the points."""
+        column = self.column(name)
+        return None if column is None else column[start:stop]
 
     def times_at(self, indices: NDArray[np.intp]) -> NDArray[np.float64]:
         """Some values of the column "time"; the others need not be made for them."""
+        times = self.column("time")
+        assert times is not None  # since every cloud has it
+        return np.asarray(times[indices])
 
-    def stretch(self, start: int, stop: int) -> Columns | None:
-        """Those of consecutive points, which may be made for these alone; None where that is not known."""
+    def together(self, parts: Sequence[Stretch]) -> ColumnSource | None:
+        """What makes the columns of stretches of this and further sources for these points alone; None where nothing does."""
         return None
 
-    def followed(self, others: Sequence[Columns]) -> Columns | None:
-        """These points and others after them as one, made together; None where that is not known."""
-        return None
+
+class CloudColumns(ColumnSource):
+    """The columns of a cloud."""
+
+    def __init__(self, cloud: PointCloud) -> None:
+        self._cloud, self.size, self.base = cloud, len(cloud), cloud.stamp_ns
+        self.rows, self.nominal = cloud.shape[1] if cloud.shape else 0, bool(cloud.nominal)
+
+    def column(self, name: str) -> NDArray[Any] | None:
+        column: NDArray[Any] | None = getattr(self._cloud, name)
+        return column
+
+    def holds(self, name: str) -> bool:
+        return name in vars(self._cloud)
+
+    def times_at(self, indices: NDArray[np.intp]) -> NDArray[np.float64]:
+        if isinstance(self._cloud, LazyCloud) and not self.holds("time"):
+            return self._cloud.source.times_at(indices)
+        return super().times_at(indices)
+
+
+class Stretch(NamedTuple):
+    """Consecutive points of a source."""
+
+    source: ColumnSource
+    start: int
+    stop: int
+
+    @property
+    def size(self) -> int:
+        """The number of points."""
+        return self.stop - self.start
+
+
+class Stretches(ColumnSource):
+    """Stretches of sources, one after another, at least one.
+
+    Args:
+        from_first: times count from the first point; else from where those of the first source do.
+    """
+
+    def __init__(self, parts: Sequence[Stretch], *, from_first: bool = False) -> None:
+        self._parts, self._from_first = parts, from_first
+        self.size, self.base = sum(part.size for part in parts), parts[0].source.base
+        rows = {_whole_rows(part.source.rows, part.start, part.size) for part in parts}
+        self.rows = rows.pop() if len(rows) == 1 else 0
+        self.nominal = any(part.source.nominal for part in parts)
+        self._together = parts[0].source.together(parts)
+
+    def column(self, name: str) -> NDArray[Any] | None:
+        together = self._together
+        if together is not None and (together.holds(name) or not all(part.source.holds(name) for part in self._parts)):
+            column = together.column(name)
+        else:
+            column = self._joined(name)
+        return column - column[0] if name == "time" and self._from_first and column is not None else column
+
+    def holds(self, name: str) -> bool:
+        return False
+
+    def times_at(self, indices: NDArray[np.intp]) -> NDArray[np.float64]:
+        if self._from_first:
+            times = self._times_at(np.concatenate([np.zeros(1, np.intp), indices]))
+            return times[1:] - times[0]
+        return self._times_at(indices)
+
+    def _times_at(self, indices: NDArray[np.intp]) -> NDArray[np.float64]:
+        """Times of some points, which count from where those of the first source do."""
+        times, start = np.empty(len(indices)), 0
+        for part in self._parts:
+            inside = (indices >= start) & (indices < start + part.size)
+            if inside.any():
+                times[inside] = part.source.times_at(indices[inside] - start + part.start) + later(part.source, self.base)
+            start += part.size
+        return times
+
+    def _joined(self, name: str) -> NDArray[Any] | None:
+        """What the sources have, one after another."""
+        columns: list[NDArray[Any]] = []
+        for part in self._parts:
+            column = part.source.part(name, part.start, part.stop)
+            if column is None:
+                return None
+            columns.append(column + later(part.source, self.base) if name == "time" else column)
+        return columns[0] if len(columns) == 1 else np.concatenate(columns)
+
+
+def later(source: ColumnSource, base: int) -> float:
+    """What the times of a source count from, after another time, seconds."""
+    return (source.base - base) * 1e-9
 
 
 class _Unread:
@@ -151,21 +256,22 @@ class _Unread:
     def __get__(self, cloud: Any, owner: Any) -> Any:
         if cloud is None:
             return self
-        cloud.__dict__[self._name] = found = cloud.source.column(self._name)
-        return found
+        cloud.__dict__[self._name] = column = cloud.source.column(self._name)
+        return column
 
 
 class LazyCloud(PointCloud):
     """A cloud whose columns are made when they are first read."""
 
-    source: Columns
+    source: ColumnSource
 
     @classmethod
-    def of(cls, source: Columns, *, stamp_ns: int, shape: tuple[int, int] | None, nominal: np.bool_) -> LazyCloud:
-        """The cloud of these columns."""
-        found = object.__new__(cls)
-        found.__dict__.update(source=source, stamp_ns=stamp_ns, shape=shape, nominal=nominal)
-        return found
+    def of(cls, source: ColumnSource, stamp_ns: int) -> LazyCloud:
+        """The cloud of these columns; `stamp_ns`: the time that theirs count from."""
+        cloud = object.__new__(cls)
+        shape = _organised(source.size, source.rows)
+        cloud.__dict__.update(source=source, stamp_ns=stamp_ns, shape=shape, nominal=np.bool_(source.nominal))
+        return cloud
 
     def __len__(self) -> int:
         return self.source.size
@@ -173,23 +279,8 @@ class LazyCloud(PointCloud):
     def __getitem__(self, which: Any) -> PointCloud:
         if isinstance(which, slice) and which.step in (None, 1):
             first, end, _ = which.indices(len(self))
-            number = max(end - first, 0)
-            return self._part(_Sliced(self, slice(first, first + number), number), first)
+            return LazyCloud.of(Stretches([Stretch(CloudColumns(self), first, max(first, end))]), self.stamp_ns)
         return super().__getitem__(which)
-
-    def stretch(self, start: int, stop: int) -> PointCloud:
-        """Consecutive points; where they are many their columns are made for them alone."""
-        source = self.source.stretch(start, stop) if stop > start else None
-        return self[start:stop] if source is None else self._part(source, start)
-
-    def _part(self, source: Columns, first: int) -> LazyCloud:
-        """The points of a source, of which the first is one of ours."""
-        number, rows = source.size, self.shape[1] if self.shape else 0
-        shape = (number // rows, rows) if rows and first % rows == 0 and number % rows == 0 else None
-        return LazyCloud.of(source, stamp_ns=self.stamp_ns, shape=shape, nominal=self.nominal)
-
-    def times_at(self, indices: NDArray[np.intp]) -> NDArray[np.float64]:
-        return self.time[indices] if "time" in self.__dict__ else self.source.times_at(indices)
 
     def __reduce__(self) -> Any:
         return _cloud, ({f.name: getattr(self, f.name) for f in fields(self)},)
@@ -203,103 +294,9 @@ def _cloud(values: dict[str, Any]) -> PointCloud:
     return PointCloud(**values)
 
 
-@dataclass(eq=False)
-class _Sliced(Columns):
-    """Some points of another cloud, one after another."""
-
-    cloud: PointCloud
-    which: slice
-    size: int
-
-    def column(self, name: str) -> NDArray[Any] | None:
-        found = getattr(self.cloud, name)
-        return None if found is None else found[self.which]
-
-    def times_at(self, indices: NDArray[np.intp]) -> NDArray[np.float64]:
-        return self.cloud.times_at(indices + self.which.start)
-
-
-@dataclass(eq=False)
-class _Joined(Columns):
-    """Several clouds one after another, with times from one stamp."""
-
-    clouds: Sequence[PointCloud]
-    stamp_ns: int
-    size: int
-
-    def column(self, name: str) -> NDArray[Any] | None:
-        if name == "time":
-            return np.concatenate([cloud.time + (cloud.stamp_ns - self.stamp_ns) * 1e-9 for cloud in self.clouds])
-        parts = [getattr(cloud, name) for cloud in self.clouds]
-        return None if any(part is None for part in parts) else np.concatenate(parts)
-
-    def times_at(self, indices: NDArray[np.intp]) -> NDArray[np.float64]:
-        found, start = np.empty(len(indices)), 0
-        for cloud in self.clouds:
-            inside = (indices >= start) & (indices < start + len(cloud))
-            found[inside] = cloud.times_at(indices[inside] - start) + (cloud.stamp_ns - self.stamp_ns) * 1e-9
-            start += len(cloud)
-        return found
-
-
-@dataclass(eq=False)
-class _Restamped(Columns):
-    """Other columns with times counted from the first point."""
-
-    source: Columns
-    size: int
-
-    def column(self, name: str) -> NDArray[Any] | None:
-        found = self.source.column(name)
-        return found - found[0] if name == "time" and found is not None else found
-
-    def times_at(self, indices: NDArray[np.intp]) -> NDArray[np.float64]:
-        return self.source.times_at(indices) - self.source.times_at(np.zeros(1, np.intp))
-
-
-def joined(clouds: Sequence[PointCloud]) -> PointCloud:
-    """Clouds of one sensor, one after another; times count from the first one's stamp."""
-    clouds = [cloud for cloud in clouds if len(cloud)] or list(clouds[:1])
-    if len(clouds) == 1:
-        return clouds[0]
-    rows = {cloud.shape[1] for cloud in clouds if cloud.shape}
-    shape = (
-        (sum(cloud.shape[0] for cloud in clouds if cloud.shape), rows.pop()) if len(rows) == 1 and all(c.shape for c in clouds) else None
-    )
-    sources = [cloud.source for cloud in clouds if isinstance(cloud, LazyCloud)]
-    source = sources[0].followed(sources[1:]) if len(sources) == len(clouds) else None
-    if source is None:
-        source = _Joined(clouds, clouds[0].stamp_ns, sum(map(len, clouds)))
-    return LazyCloud.of(source, stamp_ns=clouds[0].stamp_ns, shape=shape, nominal=np.bool_(any(cloud.nominal for cloud in clouds)))
-
-
-def restamped(cloud: PointCloud, stamp_ns: int) -> PointCloud:
-    """The same points with times counted from the first one, which is at `stamp_ns`."""
-    if not isinstance(cloud, LazyCloud):
-        return replace(cloud, time=cloud.time - cloud.time[0], stamp_ns=stamp_ns)
-    return LazyCloud.of(_Restamped(cloud.source, len(cloud)), stamp_ns=stamp_ns, shape=cloud.shape, nominal=cloud.nominal)
-
-
-#: directions in REP-103: (axis index, sign).
-_DIRECTIONS = {"forward": (0, 1), "back": (0, -1), "left": (1, 1), "right": (1, -1), "up": (2, 1), "down": (2, -1)}
-
-
-def axis_matrix(axes: Sequence[str]) -> NDArray[np.float64]:
-    """The matrix that turns REP-103 coordinates into those of axes named by where x, y and z point."""
-    matrix = np.zeros((3, 3))
-    for row, name in enumerate(axes):
-        column, sign = _DIRECTIONS[name]
-        matrix[row, column] = sign
-    return matrix
-
-
-def narrowed(angle: NDArray[np.float64]) -> Floats:
-    """Radians as float32 in [-pi, pi)."""
-    turned = angle - 2 * np.pi * np.floor((angle + np.pi) / (2 * np.pi))
-    far = np.abs(angle) > _FAR
-    if far.any():
-        turned[far] = np.mod(angle[far] + np.pi, 2 * np.pi) - np.pi  # exact however many turns it is, and slow
-    return np.clip(turned.astype(np.float32), -_PI, _PI)
+def source_of(cloud: PointCloud) -> ColumnSource:
+    """Where the columns of a cloud come from."""
+    return cloud.source if isinstance(cloud, LazyCloud) else CloudColumns(cloud)
 
 
 @dataclass(frozen=True)

@@ -1,28 +1,33 @@
-"""The columns of points, made when they are asked for: of a batch, or of a stretch of the stream over several batches.
+"""The columns of planned points, made when they are asked for: of a batch, or of a scan over several batches.
 
-A batch makes a column for all its points at once, and slices of it share that. A scan of many points is a `Stretches`: its
-columns are made for the packets that it is of and no others, straight into arrays of its own.
+`Share` is the packets of one layout in a batch: their plan, and what is known of them plainly (`Plain`). It has its columns made by what
+a back end compiles from the plan: `points.numpy_plan`, or `points.numba_kernels` where that is asked for or pays.
+
+`BatchColumns` is the source of a batch. A column is made for all its points at once, and slices share it. Scans are stretches of batches
+(`cloud.Stretches`): small ones share the columns of a block of points around them, large ones have theirs made for the packets that they
+are of and no others, straight into arrays of their own, also where these packets are of several batches (`Computed`).
 """
 
 from __future__ import annotations
 
 import bisect
-from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple, cast
+from functools import lru_cache
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.columns.graph import Node
-from lidarspec.packets.packets import Packets
-from lidarspec.points.cloud import Columns, axis_matrix, narrowed
-from lidarspec.points.numba_kernels.kernels import spread_out
-from lidarspec.points.plain import points_function
-
-if TYPE_CHECKING:
-    from lidarspec.points.evaluate import Share
+from lidarspec.columns.columns import Batch, Column, Fields, field_array
+from lidarspec.columns.graph import Node, evaluate
+from lidarspec.errors import UsageError
+from lidarspec.points import numpy_plan
+from lidarspec.points.cloud import ColumnSource, Stretch, later
+from lidarspec.points.conventions import TYPES, narrowed, numbers_of, seconds_since, turned_azimuth, vendor_turn
+from lidarspec.points.plain import PacketBatch
+from lidarspec.points.plan import REMEMBERING, Maker, Plan
+from lidarspec.wire.frame_table import Group
 
 _MAIN = ("x", "y", "z", "intensity")
 
@@ -30,79 +35,250 @@ _MAIN = ("x", "y", "z", "intensity")
 LEAST, SHARED = 1 << 14, 1 << 16
 
 
-class Made(Columns):
-    """Columns by name, each made once."""
+#: bytes; what is freed at the end of the heap is kept up to twice as much.
+_KEPT = 1 << 24
 
-    def __init__(self, packets: Packets, shares: Sequence[Share], size: int) -> None:
-        self.size, self._packets, self._shares = size, packets, shares
-        self._function = points_function(packets.sensor, packets.frame)
-        self._made: dict[str, NDArray[Any]] = {}
-        axes = packets.sensor.vendor_axes if packets.sensor.options.get("frame") == "vendor" else None
-        self._turn = None if axes is None else axis_matrix(axes)
+
+@lru_cache(maxsize=1)
+def _keep_freed_memory() -> None:
+    """Lets the allocator keep freed blocks, 32 MiB of them at most, from the first batch of points on.
+
+    The columns of a batch are blocks of some hundred kilobytes that live for milliseconds. glibc takes such blocks from the system and
+    gives them back, page by page, and fetching the pages anew costs several times what computing the columns costs. It stops doing so for
+    blocks smaller than the largest one that was ever freed, so one is: it is never touched, and takes no memory.
+
+    Source: mallopt(3), M_MMAP_THRESHOLD: the threshold is adjusted dynamically, and M_TRIM_THRESHOLD to twice its value.
+    """
+    np.empty(_KEPT, np.uint8)
+
+
+class Plain:
+    """The plain results of nodes for one batch, each computed once: as columns where axes have to be named, else as arrays."""
+
+    def __init__(self, batch: Batch) -> None:
+        self._fields, self._table = Fields(batch), batch.table
+        self._columns: dict[Node, Any] = {}
+        self._arrays: dict[Node, Any] = {}
+
+    def column(self, node: Node) -> Column:
+        """The result of a node."""
+        if node not in self._columns:
+            with np.errstate(all="ignore"):
+                evaluate(node, self._columns, self._read)
+        return self._columns[node]  # type: ignore[no-any-return]
+
+    def array(self, node: Node) -> NDArray[Any]:
+        """The array of a node's result, (n or 1, ...)."""
+        if node not in self._arrays:
+            with np.errstate(all="ignore"):
+                evaluate(node, self._arrays, self._loaded)
+        return self._arrays[node]  # type: ignore[no-any-return]
+
+    def know(self, node: Node, column: Column) -> None:
+        """Take a result as given."""
+        self._columns[node] = column
+
+    def _read(self, node: Node) -> Any:
+        return node.function(self._fields) if node.kind in ("field", "state") else None
+
+    def _loaded(self, node: Node) -> Any:
+        if node in self._columns:
+            return self._columns[node].array
+        if node.kind == "field":
+            return field_array(self._table.schema.fields[node.path], self._table, self._table.schema.depth())
+        return None if node.kind == "call" else self.column(node).array
+
+
+@dataclass(eq=False)
+class Share:
+    """The packets of one layout in a batch: their plan, the plain results, and where the first point of each goes, -1 for nowhere."""
+
+    plan: Plan
+    group: Group
+    known: Plain
+    batch: Batch
+    first: NDArray[np.intp] | None = None
+
+    def __len__(self) -> int:
+        return len(self.group.where)
+
+    def fill(self, maker: Maker, columns: Mapping[str, NDArray[Any]], first: int, stop: int) -> None:
+        """Fill the columns of the packets from `first` to `stop`."""
+
+        def values(node: Node) -> NDArray[Any]:
+            array = self.known.array(node)
+            return array[first:stop] if len(array) > 1 else array
+
+        if stop - first == len(self):
+            maker.run(self.group.rows, self.known.array, columns)
+        else:
+            maker.run(self.group.rows[first:stop], values, columns)
+
+    def plain(self, name: str) -> NDArray[Any]:
+        """A part of what `points` returned, for every point of the group, evaluated plainly."""
+        part, shape = self.plan.parts[name], (len(self), *self.plan.shape)
+        array = self.known.array(part) if isinstance(part, Node) else np.asarray(part)
+        if isinstance(part, Node):
+            array = array.reshape(*array.shape, *(1,) * (len(shape) - array.ndim))
+        return np.broadcast_to(array, shape)
+
+    def some(self, which: NDArray[np.intp]) -> Share:
+        """The same for some of the packets, by index."""
+        group = Group(self.group.layout, which, self.group.rows[which])
+        batch = self.batch.of(group)
+        known = Plain(batch)
+        for node in self.plan.eager:
+            if node.kind in REMEMBERING:
+                column = self.known.column(node)
+                known.know(node, Column(column.array[which] if len(column.array) > 1 else column.array, column.axes, batch))
+        return Share(self.plan, Group(group.layout, np.arange(len(which)), group.rows), known, batch)
+
+
+def maker_of(plan: Plan, names: tuple[str, ...], backend: str, number: int) -> Maker:
+    """What makes columns of so many frames: by a kernel where `backend` asks for one, or where it is free to and that pays.
+
+    Raises:
+        UsageError: where a kernel is asked for, and Numba is missing.
+    """
+    if backend in ("auto", "jit"):
+        try:
+            from lidarspec.points import numba_kernels
+        except ImportError as error:  # a back end that may be left out
+            if backend == "jit":
+                raise UsageError(f"backend 'jit' is not part of this installation ({error})") from error
+        else:
+            kernel = numba_kernels.compile(plan, names, None if backend == "jit" else number)
+            if kernel is not None:
+                return kernel
+    return numpy_plan.compile(plan, names)
+
+
+class Computed(ColumnSource):
+    """Columns made for these points alone, each once.
+
+    Args:
+        parts: stretches of batches of one plan whose packets are whole but for the first and the last one; or all points of one batch.
+        made: columns made before, to be added to.
+    """
+
+    def __init__(self, parts: Sequence[tuple[BatchColumns, int, int]], made: dict[str, NDArray[Any]]) -> None:
+        self._parts, self._made = parts, made
+        self.size, self.base = sum(stop - start for _, start, stop in parts), parts[0][0].base
+        self._packets, self._shares = parts[0][0].packets, parts[0][0].shares
+        self._turn = vendor_turn(self._packets.sensor)
 
     def column(self, name: str) -> NDArray[Any] | None:
-        """A column of `PointCloud`; None where the sensor has none."""
         if name not in self._made:
             self._made |= self._columns(name)
         return self._made.get(name)
 
-    @abstractmethod
-    def _programmed(self, names: tuple[str, ...]) -> dict[str, NDArray[Any]]:
-        """Columns that programs or kernels make."""
-
-    @abstractmethod
-    def _plain(self, name: str) -> NDArray[Any]:
-        """A part of what `points` returned, evaluated plainly."""
-
-    @abstractmethod
-    def _times(self) -> NDArray[np.float64]:
-        """The column "time"."""
+    def holds(self, name: str) -> bool:
+        return name in self._made
 
     def _columns(self, name: str) -> dict[str, NDArray[Any]]:
-        parts = self._shares[0].plan.parts
+        if name == "intensity" and name not in self._shares[0].plan.parts:
+            return {}
         if name in _MAIN:
-            return self._coordinates(name, parts)
+            return self._main(name)
         if name == "valid":
-            x = self.column("x")
-            assert x is not None
-            return {"valid": ~np.isnan(x)}
+            return {name: ~np.isnan(self._x())}
         if name in ("range", "azimuth"):
-            found = self._programmed(("range", "azimuth") if self._packets.backend == "jit" else (name,))
-            return found | {"azimuth": self._azimuth(found["azimuth"])} if "azimuth" in found else found
+            columns = self._compiled(("range", "azimuth") if self._packets.backend == "jit" else (name,))
+            return columns | {"azimuth": self._azimuth(columns["azimuth"])} if "azimuth" in columns else columns
         if name == "time":
-            return {name: self._times()}
+            times = [batch.times_of(share, *packets) + later(batch, self.base) for batch, share, packets in self._pieces()]
+            return {name: self._joined(times, np.float64)}
+        if name not in self._shares[0].plan.parts:
+            return {}
+        plain = [share.plain(name)[first:stop] for _, share, (first, stop) in self._pieces()]
         if name == "elevation":
-            return {name: self._plain(name).astype(np.float32, copy=False)}
-        types: dict[str, Any] = {"ring": np.uint16, "return_index": np.uint8}
-        return {name: np.nan_to_num(self._plain(name)).astype(types[name], copy=False)} if name in parts else {}
+            return {name: self._joined(plain, np.result_type(*plain)).astype(TYPES[name], copy=False)}
+        return {name: numbers_of(name, self._joined(plain, np.result_type(*plain)))}
 
-    def _coordinates(self, name: str, parts: Mapping[str, Any]) -> dict[str, NDArray[Any]]:
+    def _main(self, name: str) -> dict[str, NDArray[Any]]:
         """The columns that are made together; where all points are level, the height only when it is asked for."""
         level = self._turn is None and all(share.plan.level for share in self._shares)
         if level and name == "z":
-            x = self.column("x")
-            assert x is not None
+            x = self._x()
             return {"z": np.where(np.isnan(x), x, np.float32(0))}
-        return self._turned(self._programmed(tuple(n for n in _MAIN if n in parts or (n in "xyz" and not (level and n == "z")))))
+        columns = self._compiled(tuple(n for n in _MAIN if n in self._shares[0].plan.expressions and not (n == "z" and level)))
+        if self._turn is None:
+            return columns
+        turned = dict(columns)
+        for axis, row in zip("xyz", self._turn, strict=True):  # each is one of REP-103's, or its opposite
+            source = int(np.flatnonzero(row)[0])
+            turned[axis] = columns["xyz"[source]] * np.float32(row[source])
+        return turned
+
+    def _x(self) -> NDArray[Any]:
+        return cast("NDArray[Any]", self.column("x"))
 
     def _azimuth(self, angles: NDArray[Any]) -> NDArray[np.float32]:
         """Azimuths in the axes that are asked for, narrowed where a kernel has not done so."""
         if self._turn is None and angles.dtype == np.float32:
             return angles
-        if self._turn is not None:
-            direction = self._turn[:2, :2] @ np.stack([np.cos(angles), np.sin(angles)])
-            angles = np.arctan2(direction[1], direction[0])
-        return narrowed(angles)
+        return narrowed(angles if self._turn is None else turned_azimuth(angles, self._turn))
 
-    def _turned(self, found: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
-        """Coordinates in the vendor's axes, where those are asked for; each is one of REP-103's, or its opposite."""
-        if self._turn is None:
-            return found
-        made = dict(found)
-        for name, row in zip("xyz", self._turn, strict=True):
-            source = int(np.flatnonzero(row)[0])
-            made[name] = found["xyz"[source]] * np.float32(row[source])
-        return made
+    def _compiled(self, names: tuple[str, ...]) -> dict[str, NDArray[Any]]:
+        """Columns that back ends make."""
+        pieces, backend = self._pieces(), self._packets.backend
+        if not self._is_even:
+            each = []
+            for _, share, (first, stop) in pieces:
+                maker = maker_of(share.plan, names, backend, stop - first)
+                each.append(maker.columns(stop - first))
+                share.fill(maker, each[-1], first, stop)
+            return {name: self._joined([columns[name] for columns in each], each[0][name].dtype) for name in names}
+        plan = self._shares[0].plan
+        number = sum(stop - first for _, _, (first, stop) in pieces)
+        maker = maker_of(plan, names, backend, number)
+        columns, start = maker.columns(number), 0
+        for _, share, (first, stop) in pieces:
+            end = start + (stop - first) * plan.width
+            share.fill(maker, {name: column[start:end] for name, column in columns.items()}, first, stop)
+            start = end
+        return {name: self._trimmed(column) for name, column in columns.items()}
+
+    @property
+    def _is_even(self) -> bool:
+        """Whether the packets all have one layout, and stand in order."""
+        return self._parts[0][0].even is not None
+
+    def _pieces(self) -> list[tuple[BatchColumns, Share, tuple[int, int]]]:
+        """The shares that the points are of, and the packets of each: the first one, and the one after the last."""
+        if not self._is_even:
+            batch = self._parts[0][0]
+            return [(batch, share, (0, len(share))) for share in batch.shares]
+        width = self._shares[0].plan.width
+        return [(batch, batch.shares[0], (start // width, -(-stop // width))) for batch, start, stop in self._parts]
+
+    def _joined(self, parts: Sequence[NDArray[Any]], dtype: Any) -> NDArray[Any]:
+        """What each piece has, in stream order, the points of packets that wait left out."""
+        flat = [part.reshape(-1) for part in parts]
+        if self._is_even:
+            return self._trimmed(flat[0] if len(flat) == 1 else np.concatenate(flat)).astype(dtype, copy=False)
+        column = np.empty(self.size, dtype)
+        for share, values in zip(self._shares, flat, strict=True):
+            assert share.first is not None
+            spread_out(values, share.first, share.plan.width, column)
+        return column
+
+    def _trimmed(self, column: NDArray[Any]) -> NDArray[Any]:
+        """A column of whole packets without the points before and after."""
+        skipped = self._parts[0][1] % self._shares[0].plan.width
+        return column[skipped : skipped + self.size]
+
+
+def spread_out(values: NDArray[Any], first: NDArray[np.intp], width: int, column: NDArray[Any]) -> None:
+    """Write the points of packets, `width` each, to where the first of each packet goes; -1 leaves a packet out."""
+    kept = first >= 0
+    rows, starts = np.ascontiguousarray(values.reshape(len(first), width), column.dtype), first
+    if not kept.all():
+        rows, starts = rows[kept], first[kept]
+    if rows.size:
+        piece = np.dtype((np.void, rows.shape[1] * rows.itemsize))
+        windows: NDArray[Any] = np.ndarray((len(column) - width + 1,), piece, column.data, 0, column.strides)
+        windows[starts] = rows.view(piece).reshape(-1)
 
 
 class Block(NamedTuple):
@@ -113,183 +289,84 @@ class Block(NamedTuple):
     made: dict[str, NDArray[Any]]
 
 
-class Points(Made):
-    """The points of a batch; what a `LazyCloud` reads from.
+class BatchColumns(ColumnSource):
+    """The points of a batch.
 
     Args:
+        packets: of the batch.
+        shares: these, by their layouts.
+        size: the number of points, those of packets that wait left out.
         base: the time that times count from, ns.
+        rows, nominal: as of all sources.
     """
 
-    def __init__(self, packets: Packets, shares: Sequence[Share], size: int, base: int) -> None:
-        super().__init__(packets, shares, size)
-        self.base = base
+    def __init__(self, packets: PacketBatch, shares: Sequence[Share], size: int, base: int, *, rows: int, nominal: bool) -> None:
+        self.packets, self.shares = packets, shares
+        self.size, self.base, self.rows, self.nominal = size, base, rows, nominal
+        self._made: dict[str, NDArray[Any]] = {}
         self._blocks: list[Block] = []
+        _keep_freed_memory()
 
     @property
     def even(self) -> Share | None:
         """The share of all packets, where they have one layout and stand in order."""
-        return self._shares[0] if len(self._shares) == 1 and self._shares[0].first is None else None
+        return self.shares[0] if len(self.shares) == 1 and self.shares[0].first is None else None
 
-    def has(self, name: str) -> bool:
-        """Whether a column is made already."""
+    def column(self, name: str) -> NDArray[Any] | None:
+        return Computed([(self, 0, self.size)], self._made).column(name)
+
+    def holds(self, name: str) -> bool:
         return name in self._made
-
-    def stretch(self, start: int, stop: int) -> Columns:
-        return Stretches([Stretch(self, start, stop)])
 
     def part(self, name: str, start: int, stop: int) -> NDArray[Any] | None:
         """A column of some points; those behind them have it made too, for whoever asks for them next."""
-        if self.even is None or self.has(name) or self.size <= SHARED:
-            column = self.column(name)
-            return None if column is None else column[start:stop]
-        found, at = [], start
+        if self.even is None or self.holds(name) or self.size <= SHARED:
+            return super().part(name, start, stop)
+        pieces: list[NDArray[Any]] = []
+        at = start
         while at < stop:
             first, end, made = self._block(at)
-            column = Stretches([Stretch(self, first, end)], made).column(name)
+            column = Computed([(self, first, end)], made).column(name)
             if column is None:
                 return None
-            found.append(column[at - first : stop - first])
+            pieces.append(column[at - first : stop - first])
             at = end
-        return found[0] if len(found) == 1 else np.concatenate(found)
+        return pieces[0] if len(pieces) == 1 else np.concatenate(pieces)
 
     def _block(self, at: int) -> Block:
         """The points around one that have their columns made together; they are in no other block."""
         index = bisect.bisect(self._blocks, at, key=lambda block: block.start)
         if index and at < self._blocks[index - 1].stop:
             return self._blocks[index - 1]
-        width = self._shares[0].plan.width
+        width = self.shares[0].plan.width
         after = self._blocks[index].start if index < len(self._blocks) else self.size
         start = at // width * width
         block = Block(start, min(start + max(SHARED // width, 1) * width, after), {})
         self._blocks.insert(index, block)
         return block
 
+    def together(self, parts: Sequence[Stretch]) -> ColumnSource | None:
+        """What makes columns for stretches alone: where they are many points, of packets of one layout, in order."""
+        sources = [part.source for part in parts]
+        batches = [source for source in sources if isinstance(source, BatchColumns) and source.even is not None]
+        if len(batches) < len(parts) or sum(part.size for part in parts) < LEAST:
+            return None
+        plan = self.shares[0].plan
+        inner = [*(part.stop for part in parts[:-1]), *(part.start for part in parts[1:])]
+        if any(batch.shares[0].plan is not plan for batch in batches) or any(at % plan.width for at in inner):
+            return None
+        return Computed([(batch, part.start, part.stop) for batch, part in zip(batches, parts, strict=True)], {})
+
     def times_at(self, indices: NDArray[np.intp]) -> NDArray[np.float64]:
         share = self.even
-        if share is None or self.has("time"):
-            return cast("NDArray[np.float64]", self.column("time"))[indices]
-        packets, spots = np.divmod(indices, share.plan.width)
-        after = share.plan.parts["time"]
-        few = share.some(packets).plain(after) if isinstance(after, Node) else share.plain(after)[packets]
-        offsets = (self._packets.time_ns[packets] - self.base) * 1e-9
-        return np.asarray(few.reshape(len(packets), -1)[np.arange(len(packets)), spots] + offsets)
+        if share is None or self.holds("time"):
+            return super().times_at(indices)
+        packets, places = np.divmod(indices, share.plan.width)
+        few = share.some(packets).plain("time") if isinstance(share.plan.parts["time"], Node) else share.plain("time")[packets]
+        offsets = seconds_since(self.packets.time_ns[packets], self.base)
+        return np.asarray(few.reshape(len(packets), -1)[np.arange(len(packets)), places] + offsets)
 
     def times_of(self, share: Share, first: int, stop: int) -> NDArray[np.float64]:
         """The times of all points of some packets of a share, as many axes as those have."""
-        offsets = (self._packets.time_ns[share.group.where[first:stop]] - self.base) * 1e-9
-        return np.asarray(share.plain(share.plan.parts["time"])[first:stop] + offsets.reshape(-1, *(1,) * len(share.plan.shape)))
-
-    def _times(self) -> NDArray[np.float64]:
-        return self._joined([self.times_of(share, 0, len(share.group.where)) for share in self._shares], np.float64)
-
-    def _plain(self, name: str) -> NDArray[Any]:
-        found = [share.plain(share.plan.parts[name]) for share in self._shares]
-        return self._joined(found, np.result_type(*found))
-
-    def _programmed(self, names: tuple[str, ...]) -> dict[str, NDArray[Any]]:
-        found = [share.program(names, self._function, self._packets.backend) for share in self._shares]
-        return {name: self._joined([part[name] for part in found], found[0][name].dtype) for name in names}
-
-    def _joined(self, parts: list[NDArray[Any]], dtype: Any) -> NDArray[Any]:
-        """The points of all layouts in stream order, those of packets that wait left out."""
-        if self.even is not None:
-            flat = parts[0].reshape(-1)[: self.size]
-            return flat.astype(dtype, copy=False)
-        found = np.empty(self.size, dtype)
-        for share, part in zip(self._shares, parts, strict=True):
-            assert share.first is not None
-            spread_out(part.reshape(-1), share.first, share.plan.width, found, compiled=self._packets.backend == "jit")
-        return found
-
-
-@dataclass(frozen=True, eq=False)
-class Stretch:
-    """Consecutive points of a batch."""
-
-    points: Points
-    start: int
-    stop: int
-
-
-class Stretches(Made):
-    """Consecutive points of a stream, each stretch of another batch.
-
-    Args:
-        made: columns made before, to be added to; then all are made for these points alone, however few they are.
-    """
-
-    def __init__(self, parts: Sequence[Stretch], made: dict[str, NDArray[Any]] | None = None) -> None:
-        first = parts[0].points
-        super().__init__(first._packets, first._shares, sum(part.stop - part.start for part in parts))
-        self._parts = parts
-        self._stands_alone = (self.size >= LEAST or made is not None) and self._is_even()
-        self._made = self._made if made is None else made
-
-    def _is_even(self) -> bool:
-        """Whether the packets all have one layout, and are whole but for the first and the last one."""
-        shares = [part.points.even for part in self._parts]
-        width = self._shares[0].plan.width
-        inner = [*(part.stop for part in self._parts[:-1]), *(part.start for part in self._parts[1:])]
-        return all(share is not None and share.plan is self._shares[0].plan for share in shares) and not any(at % width for at in inner)
-
-    def column(self, name: str) -> NDArray[Any] | None:
-        if name in self._made or (self._stands_alone and not all(part.points.has(name) for part in self._parts)):
-            return super().column(name)
-        found = [part.points.part(name, part.start, part.stop) for part in self._parts]
-        if any(column is None for column in found):
-            return None
-        slices = cast("list[NDArray[Any]]", found)
-        if name == "time":
-            slices = [column + self._later(part) for column, part in zip(slices, self._parts, strict=True)]
-        return slices[0] if len(slices) == 1 else np.concatenate(slices)
-
-    def followed(self, others: Sequence[Columns]) -> Columns | None:
-        parts = [*self._parts]
-        for other in others:
-            if not isinstance(other, Stretches):
-                return None
-            parts += other._parts
-        return Stretches(parts)
-
-    def times_at(self, indices: NDArray[np.intp]) -> NDArray[np.float64]:
-        found, start = np.empty(len(indices)), 0
-        for part in self._parts:
-            stop = start + part.stop - part.start
-            inside = (indices >= start) & (indices < stop)
-            if inside.any():
-                found[inside] = part.points.times_at(indices[inside] - start + part.start) + self._later(part)
-            start = stop
-        return found
-
-    def _later(self, part: Stretch) -> float:
-        """What times of a batch count from, after what those of the first one do; seconds."""
-        return (part.points.base - self._parts[0].points.base) * 1e-9
-
-    def _programmed(self, names: tuple[str, ...]) -> dict[str, NDArray[Any]]:
-        head, parts = self._shares[0], self._packets_of()
-        number = sum(stop - first for _, _, first, stop in parts)
-        maker = head.maker(names, self._function, self._packets.backend, number)
-        found, start = maker.columns(number), 0
-        for _, share, first, stop in parts:
-            end = start + (stop - first) * head.plan.width
-            share.fill(maker, {name: column[start:end] for name, column in found.items()}, first, stop)
-            start = end
-        return {name: self._trimmed(column) for name, column in found.items()}
-
-    def _plain(self, name: str) -> NDArray[Any]:
-        found = [share.plain(share.plan.parts[name])[first:stop].reshape(-1) for _, share, first, stop in self._packets_of()]
-        return self._trimmed(np.concatenate(found))
-
-    def _times(self) -> NDArray[np.float64]:
-        found = [part.points.times_of(share, first, stop) + self._later(part) for part, share, first, stop in self._packets_of()]
-        return self._trimmed(np.concatenate([times.reshape(-1) for times in found]))
-
-    def _packets_of(self) -> list[tuple[Stretch, Share, int, int]]:
-        """The first packet of each part, and the one after its last, with their share."""
-        width = self._shares[0].plan.width
-        return [(part, cast("Share", part.points.even), part.start // width, -(-part.stop // width)) for part in self._parts]
-
-    def _trimmed(self, column: NDArray[Any]) -> NDArray[Any]:
-        """A column of whole packets without the points before and after."""
-        skipped = self._parts[0].start % self._shares[0].plan.width
-        return column[skipped : skipped + self.size]
+        offsets = seconds_since(self.packets.time_ns[share.group.where[first:stop]], self.base)
+        return np.asarray(share.plain("time")[first:stop] + offsets.reshape(-1, *(1,) * len(share.plan.shape)))

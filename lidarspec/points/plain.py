@@ -1,25 +1,63 @@
-"""From packets to points: the sensor's `points` function evaluated once per batch, and its result flattened.
+"""From packets to points, plainly: the sensor's `points` function evaluated once per batch with ordinary NumPy, and its result flattened.
 
-The plain evaluation: ordinary NumPy on `Column`s. Masks, coordinates and REP-117 are made here for every sensor.
+This is the reference. It serves where `points` cannot be traced, and the tests as the second engine; plans (`points.plan`) take the
+parts of a result and the meaning of columns from here and from `points.conventions`.
+
+Columns that a sensor adds under names of its own (M5) join `parts_of`; points by coordinates (M2) have a plan when `Cartesian` has one.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.columns.columns import Batch, Carry, Column, Fields, aligned, unpadded
 from lidarspec.errors import SpecError
-from lidarspec.packets.packets import Packets
-from lidarspec.points.cloud import PointCloud, axis_matrix, narrowed
+from lidarspec.framing.results import Counters
+from lidarspec.points.cloud import PointCloud
+from lidarspec.points.conventions import (
+    coordinates,
+    narrowed,
+    numbers_of,
+    rows_of,
+    seconds_since,
+    shown_range,
+    turned_azimuth,
+    vendor_turn,
+)
 from lidarspec.spec.description import Spec
 from lidarspec.spec.results import Cartesian, Points, Polar
+from lidarspec.wire.frame_table import Table
 
 _OPTIONAL = ("intensity", "ring", "return_index")
+
+
+class PacketBatch(Protocol):
+    """What points are made of: packets of one frame type in stream order, as `packets.Packets` are.
+
+    Attributes:
+        sensor, frame: whose, and of which type.
+        table: their raw columns.
+        time_ns: (n,) int64.
+        stats: the counters of the decoder.
+        backend: what makes points of them, "auto", "numpy" or "jit".
+    """
+
+    sensor: Spec
+    frame: str
+    table: Table
+    time_ns: NDArray[np.int64]
+    stats: Counters
+    backend: str
+
+    def __len__(self) -> int: ...
+
+    def batch(self, carry: Carry | None = None) -> Batch:
+        """What `points` is given, see `Fields`; `carry`: what the batch before left."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +93,7 @@ def points_function(sensor: Spec, frame: str) -> Callable[[Any], Points]:
     return function
 
 
-def evaluate(packets: Packets, carry: Carry | None = None, *, final: bool = True, epoch: int | None = None) -> Evaluated:
+def evaluate(packets: PacketBatch, carry: Carry | None = None, *, final: bool = True, epoch: int | None = None) -> Evaluated:
     """The points of a batch.
 
     Args:
@@ -67,26 +105,34 @@ def evaluate(packets: Packets, carry: Carry | None = None, *, final: bool = True
         SpecError: where the plugin's function fails or returns columns that do not fit; the cause is chained.
     """
     batch = packets.batch(carry)
-    found = Fields(batch)
-    place = f"points of {packets.frame}"
     try:
         with np.errstate(all="ignore"):
-            result = points_function(packets.sensor, packets.frame)(found)
+            result = points_function(packets.sensor, packets.frame)(Fields(batch))
             if not isinstance(result, Polar | Cartesian):
                 raise TypeError(f"has to return Polar or Cartesian, not {type(result).__name__}")
-            return _flattened(packets, result, columns_of(result, batch), batch, found, final=final, epoch=epoch)
+            return _flattened(packets, result, batch, stamp_of(packets, epoch), final=final)
     except Exception as error:
-        raise SpecError(f"{type(error).__name__}: {error}", path=place, sensor=packets.sensor.id) from error
+        raise SpecError(f"{type(error).__name__}: {error}", path=f"points of {packets.frame}", sensor=packets.sensor.id) from error
 
 
-def columns_of(result: Points, batch: Batch) -> dict[str, Column]:
-    """The parts of the result as columns; numbers and arrays get the batch's axes."""
+def stamp_of(packets: PacketBatch, epoch: int | None) -> int:
+    """The stamp of a batch's cloud, int64 ns: a given one, else the time of the first packet."""
+    return epoch if epoch is not None else int(packets.time_ns[0]) if len(packets) else 0
+
+
+def parts_of(result: Points) -> dict[str, Any]:
+    """What a `points` function returned, by the names of its parts, as far as the sensor has them; the origin as ox, oy and oz."""
     parts = {f.name: getattr(result, f.name) for f in fields(result) if f.name != "nominal"}
     if isinstance(result, Polar):
         parts |= dict(zip(("ox", "oy", "oz"), parts.pop("origin"), strict=True))
+    return {name: value for name, value in parts.items() if value is not None}
+
+
+def columns_of(parts: dict[str, Any], batch: Batch) -> dict[str, Column]:
+    """The parts of a result as columns; numbers and arrays get the batch's axes."""
     depth = max([batch.table.schema.depth(), *(len(value.axes) for value in parts.values() if isinstance(value, Column))])
     anchor = Column(np.zeros((1,) * (1 + depth)), (None,) * depth, batch)
-    return {name: value if isinstance(value, Column) else _anchored(value, anchor) for name, value in parts.items() if value is not None}
+    return {name: value if isinstance(value, Column) else _anchored(value, anchor) for name, value in parts.items()}
 
 
 def _anchored(value: Any, anchor: Column) -> Column:
@@ -94,27 +140,25 @@ def _anchored(value: Any, anchor: Column) -> Column:
     return Column(array.reshape((1,) * (1 + len(axes) - array.ndim) + array.shape), axes, anchor.batch, ready=ready)
 
 
-def _flattened(
-    packets: Packets, result: Points, columns: dict[str, Column], batch: Batch, found: Fields, *, final: bool, epoch: int | None
-) -> Evaluated:
+def _flattened(packets: PacketBatch, result: Points, batch: Batch, stamp_ns: int, *, final: bool) -> Evaluated:
+    columns = columns_of(parts_of(result), batch)
     arrays, axes, ready = aligned(tuple(columns.values()), batch)
     ready = len(packets) if final else ready
     shape = np.broadcast_shapes((len(packets),) + (1,) * len(axes), *(array.shape for array in arrays))
     mask = unpadded(axes, shape, batch)
     flat = {name: _flat(array, shape, mask, ready) for name, array in zip(columns, arrays, strict=True)}
-    base = epoch if epoch is not None else int(packets.time_ns[0]) if len(packets) else 0
-    offsets = ((packets.time_ns - base) * 1e-9).reshape(-1, *(1,) * len(axes))
+    offsets = seconds_since(packets.time_ns, stamp_ns).reshape(-1, *(1,) * len(axes))
     flat["time"] = flat["time"] + _flat(offsets, shape, mask, ready)
     inside = np.ones(shape, np.bool_) if mask is None else mask.reshape(shape)
-    organised = mask is None and len(axes) >= 2 and shape[-1] > 1
+    rows = rows_of(shape[1:]) if mask is None else 0
     cloud = make_cloud(
         flat,
-        vendor_axes=packets.sensor.vendor_axes if packets.sensor.options.get("frame") == "vendor" else None,
-        stamp_ns=base,
-        shape=(ready * int(np.prod(shape[1:-1])), shape[-1]) if organised else None,
+        vendor_turn(packets.sensor),
+        stamp_ns=stamp_ns,
+        shape=(ready * int(np.prod(shape[1:-1])), rows) if rows else None,
         nominal=np.bool_(batch.nominal or result.nominal),
     )
-    return Evaluated(cloud, ready, batch.carried(ready), inside[:ready].astype(np.intp), found, axes)
+    return Evaluated(cloud, ready, batch.carried(ready), inside[:ready].astype(np.intp), Fields(batch), axes)
 
 
 def _flat(array: NDArray[Any], shape: tuple[int, ...], mask: NDArray[np.bool_] | None, ready: int) -> NDArray[Any]:
@@ -122,25 +166,25 @@ def _flat(array: NDArray[Any], shape: tuple[int, ...], mask: NDArray[np.bool_] |
     return full.reshape(-1) if mask is None else full.reshape(mask[:ready].shape)[mask[:ready]]
 
 
-def make_cloud(flat: dict[str, NDArray[Any]], **extra: Any) -> PointCloud:
-    """A cloud from flat columns of `Polar` (with ox, oy, oz) or `Cartesian`, by the rules of DESIGN 3.1."""
-    vendor_axes = extra.pop("vendor_axes", None)
+def make_cloud(flat: dict[str, NDArray[Any]], turn: NDArray[np.float64] | None = None, **extra: Any) -> PointCloud:
+    """A cloud from flat columns.
+
+    Args:
+        flat: the parts of `Polar` (with ox, oy, oz) or `Cartesian`, (N,) each.
+        turn: the matrix that turns REP-103 coordinates into the axes that are asked for.
+        extra: `stamp_ns`, `shape` and `nominal` of the cloud.
+    """
     with np.errstate(all="ignore"):
         polar = flat if "range" in flat else _polar(flat)
-        distance = np.where(polar["range"] == 0, np.inf, np.where(polar["range"] < 0, np.nan, polar["range"]).astype(np.float64))
-        distance = np.where(flat["invalid"].astype(np.bool_), np.nan, distance)
-        azimuth, elevation = (polar[name].astype(np.float64) for name in ("azimuth", "elevation"))
+        measured, azimuth, elevation = (polar[name].astype(np.float64) for name in ("range", "azimuth", "elevation"))
+        distance = shown_range(measured, flat["invalid"].astype(np.bool_))
         valid = np.isfinite(distance) & np.isfinite(azimuth) & np.isfinite(elevation)
         xyz = _xyz(flat, distance, azimuth, elevation)
         valid &= np.isfinite(xyz).all(axis=0)
-        if vendor_axes is not None:
-            turn = axis_matrix(vendor_axes)
-            xyz = turn @ np.where(valid, xyz, 0)
-            direction = turn @ np.stack([np.cos(azimuth), np.sin(azimuth), np.zeros_like(azimuth)])
-            azimuth = np.arctan2(direction[1], direction[0])
+        if turn is not None:
+            xyz, azimuth = turn @ np.where(valid, xyz, 0), turned_azimuth(azimuth, turn)
         xyz = np.where(valid, xyz, np.nan).astype(np.float32)
-        types = {"intensity": np.float32, "ring": np.uint16, "return_index": np.uint8}
-        optional = {name: np.nan_to_num(flat[name]).astype(types[name]) for name in _OPTIONAL if name in flat}
+        optional: dict[str, Any] = {name: numbers_of(name, flat[name]) for name in _OPTIONAL if name in flat}
         return PointCloud(
             x=xyz[0],
             y=xyz[1],
@@ -158,9 +202,8 @@ def make_cloud(flat: dict[str, NDArray[Any]], **extra: Any) -> PointCloud:
 def _xyz(flat: dict[str, NDArray[Any]], distance: NDArray[Any], azimuth: NDArray[Any], elevation: NDArray[Any]) -> NDArray[np.float64]:
     if "x" in flat:
         return np.stack([flat[name].astype(np.float64) for name in "xyz"])
-    level = distance * np.cos(elevation)
-    parts = (level * np.cos(azimuth), level * np.sin(azimuth), distance * np.sin(elevation))
-    return np.stack([part + flat[name] for part, name in zip(parts, ("ox", "oy", "oz"), strict=True)])
+    places = coordinates(distance, azimuth, elevation, [flat[name] for name in ("ox", "oy", "oz")])
+    return np.stack(places) + 0.0  # no -0.0
 
 
 def _polar(flat: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:

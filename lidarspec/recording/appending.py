@@ -15,9 +15,10 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import Any, Literal, Protocol, Self
 
 from lidarspec.errors import SourceError, UsageError
+from lidarspec.transports.protocol import Chunk
 
 #: when what was put in is written out, and when the disk is asked to keep it.
 FLUSH_BYTES, FLUSH_SECONDS, DISK_SECONDS = 1 << 16, 0.2, 1.0
@@ -85,6 +86,30 @@ class RecordFile:
             self._file.close()
 
 
+class Log(Protocol):
+    """Where everything that arrives and is sent is taken down: a file, or what stands in its place.
+
+    Attributes:
+        error: what went wrong with it, None where nothing did.
+    """
+
+    @property
+    def error(self) -> SourceError | None: ...
+
+    def write(self, chunk: Chunk, direction: Literal["in", "out"] = "in") -> None:
+        """Take what was received, or sent, with its arrival time."""
+
+    def event(self, name: str, at: int | None = None, **details: Any) -> None:
+        """Take down what happened to the line, such as "disconnect" or "reconnect"; now, unless `at` says when."""
+
+    def close(self) -> None:
+        """End it.
+
+        Raises:
+            SourceError: where it could not be written.
+        """
+
+
 class Appender:
     """Takes records for a file, from any thread, and is a context manager; kinds of recordings are made of it.
 
@@ -110,6 +135,13 @@ class Appender:
         self._thread = threading.Thread(target=self._work, name=f"recorder of {path}", daemon=True)
         self._thread.start()
         atexit.register(self._finish)
+
+    def write(self, chunk: Chunk, direction: Literal["in", "out"] = "in") -> None:
+        """Take what was received, or sent, with its arrival time."""
+        raise NotImplementedError
+
+    def event(self, name: str, at: int | None = None, **details: Any) -> None:
+        """Take down what happened to the line, where the format has a place for that."""
 
     def sync(self) -> None:
         """Returns when everything taken so far is on the disk.
@@ -207,7 +239,7 @@ class Appender:
                         self._changed.notify_all()
         except Exception as error:
             with self._changed:
-                reason = getattr(error, "strerror", None) or error
+                reason = (error.strerror if isinstance(error, OSError) else None) or error
                 self.error = SourceError(f"{self.path}: {reason}; the recording is whole up to byte {self._file.size}")
                 self._changed.notify_all()
         finally:

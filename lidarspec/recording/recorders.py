@@ -1,20 +1,31 @@
-"""What a source is recorded in, by the suffix of the file: .lsr holds everything, .pcap packets for Wireshark, .bin the bytes alone."""
+"""Recorders: what arrives over a link, and what is sent, taken at the speed of the capture and brought into a file.
+
+The suffix of the file says which: .lsr holds everything, .pcap packets for Wireshark, .bin the bytes alone. All of them grow by
+whole records, which a thread of their own writes (`appending`).
+"""
 
 from __future__ import annotations
 
 import io
+import json
 import struct
+import time
 from collections.abc import Callable
+from datetime import datetime
 from pathlib import Path
 from typing import Any, Literal
 
-from lidarspec.captures.pcap import NOBODY, USER_LINKS, Datagram, PcapWriter, is_capture
+from lidarspec._version import __version__
+from lidarspec.captures.pcap import NOBODY, USER_LINKS, Datagram, PcapWriter
+from lidarspec.captures.records import is_capture
 from lidarspec.errors import UnknownFormat, UsageError
+from lidarspec.framing.decoder import Decoder
 from lidarspec.framing.results import Found
-from lidarspec.plugins import sensor as named_sensor
-from lidarspec.recording.appending import Appender
-from lidarspec.recording.recordings import Recorder
-from lidarspec.spec.sensor import Sensor
+from lidarspec.plugins import registry, sensor as named_sensor
+from lidarspec.recording.appending import Appender, Log
+from lidarspec.recording.format import DATAGRAM, EVENT, GAP, HEADER, LARGEST, MAGIC, QUIET, RECEIVED, SENT, Header, packed, whole_records
+from lidarspec.spec.description import Spec
+from lidarspec.spec.links import Udp
 from lidarspec.transports.protocol import Chunk, Transport
 
 SUFFIXES = (".lsr", ".pcap", ".bin")
@@ -23,8 +34,67 @@ LARGEST_GAP = 1 << 16
 _HEAD, _RECORD = 24, 16
 
 
+class Recorder(Appender):
+    """Writes an .lsr recording, from any thread; a context manager.
+
+    Nothing that goes wrong with the file is raised by `write`: the capture goes on. It is kept in `error`, and raised once,
+    by the next `sync` or by `close`; the file is then valid to its last whole record.
+
+    Args:
+        path: the file, new unless `overwrite`.
+        sensor: the sensor, or its id; left out for a raw recording.
+        source: the SOURCE that is recorded.
+        datagrams: whether each chunk is a datagram; by default what the sensor's link says.
+        baud: of a serial port.
+
+    Attributes:
+        header: what the recording says of itself.
+        records, bytes: received and sent so far, and the bytes in them.
+        dropped: records and events that came while the disk did not keep up, or after it failed.
+        error: what went wrong with the file, None where nothing did.
+
+    Raises:
+        UsageError: where the file exists, or the sensor is not installed and nothing else says what the link carries.
+        SourceError: where it cannot be made.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        sensor: Spec | str | None = None,
+        source: str | Path = "",
+        *,
+        datagrams: bool | None = None,
+        baud: int | None = None,
+        overwrite: bool = False,
+    ) -> None:
+        self.header = _header(sensor, str(source), datagrams=datagrams, baud=baud)
+        super().__init__(path, _whole, overwrite=overwrite)
+        self._put(MAGIC + packed(HEADER, self.header.to_json(), self.header.wall_ns))
+        try:
+            self.sync()
+        except BaseException:
+            self._finish()
+            raise
+
+    def write(self, chunk: Chunk, direction: Literal["in", "out"] = "in") -> None:
+        """Take what was received or sent, with its arrival time; more than 65,535 bytes of a stream become several records."""
+        kind = RECEIVED if direction == "in" else SENT
+        for start in range(0, len(chunk.data) or 1, LARGEST):
+            data = chunk.data[start : start + LARGEST]
+            flags = DATAGRAM * self.header.datagrams | (GAP * chunk.gap | QUIET * chunk.quiet) * (not start)
+            self._put(packed(kind, data, chunk.at, flags=flags, sender=chunk.sender, receiver=chunk.receiver), len(data))
+
+    def event(self, name: str, at: int | None = None, **details: Any) -> None:
+        """Take down what happened to the line, such as "disconnect" or "reconnect"; now, unless `at` says when."""
+        self._put(_event(name, time.time_ns() if at is None else at, details))
+
+    def _told(self, dropped: int) -> bytes:
+        return _event("dropped", time.time_ns(), {"records": dropped})
+
+
 class PcapRecorder(Appender):
-    """Writes the datagrams that are received as a capture that Wireshark opens; otherwise as a `Recorder`.
+    """Writes the datagrams that are received as a capture that Wireshark opens.
 
     Args:
         path: the file, new unless `overwrite`.
@@ -47,12 +117,9 @@ class PcapRecorder(Appender):
             self._writer.write(Datagram(chunk.data, chunk.at or 0, chunk.sender or NOBODY, chunk.receiver or self._receiver))
             self._put(_taken_out(self._made), len(chunk.data))
 
-    def event(self, name: str, at: int | None = None, **details: Any) -> None:
-        """A capture has no place for events."""
-
 
 class FrameRecorder(Appender):
-    """Writes a byte stream as a capture with one packet for each frame, link type USER0; otherwise as a `Recorder`.
+    """Writes a byte stream as a capture with one packet for each frame, link type USER0.
 
     What is no frame becomes packets too, so that they hold every byte that was received, in order.
 
@@ -61,8 +128,8 @@ class FrameRecorder(Appender):
         sensor: whose frames they are.
     """
 
-    def __init__(self, path: str | Path, sensor: Sensor, *, overwrite: bool = False) -> None:
-        self._made, self._decoder = io.BytesIO(), sensor.decoder(stream=True)
+    def __init__(self, path: str | Path, sensor: Spec, *, overwrite: bool = False) -> None:
+        self._made, self._decoder = io.BytesIO(), Decoder(sensor, stream=True)
         self._held, self._base, self._at = bytearray(), 0, 0
         self._writer = PcapWriter(self._made, USER_LINKS[0])
         super().__init__(path, _whole_packets, overwrite=overwrite)
@@ -76,9 +143,6 @@ class FrameRecorder(Appender):
                 self._cut(self._decoder.idle())
             self._held += chunk.data
             self._cut(self._decoder.feed(chunk.data, self._at))
-
-    def event(self, name: str, at: int | None = None, **details: Any) -> None:
-        """A capture has no place for events."""
 
     def _cut(self, found: list[Found]) -> None:
         """Write the frames found, and what lies before them and is none; keep what waits for more."""
@@ -106,7 +170,7 @@ class FrameRecorder(Appender):
 
 
 class RawRecorder(Appender):
-    """Writes the bytes that are received, and nothing else; otherwise as a `Recorder`."""
+    """Writes the bytes that are received, and nothing else."""
 
     def __init__(self, path: str | Path, *, overwrite: bool = False) -> None:
         super().__init__(path, lambda data, limit: limit, overwrite=overwrite)
@@ -116,13 +180,15 @@ class RawRecorder(Appender):
         if direction == "in":
             self._put(chunk.data, len(chunk.data))
 
-    def event(self, name: str, at: int | None = None, **details: Any) -> None:
-        """Bytes alone have no place for events."""
 
-
-AnyRecorder = Recorder | PcapRecorder | FrameRecorder | RawRecorder
 #: a file, a recorder, or what makes one when the source is open.
-RecordTo = str | Path | AnyRecorder | Callable[[Transport], AnyRecorder]
+RecordTo = str | Path | Appender | Callable[[Transport], Log]
+
+
+def declared_port(sensor: Spec | None) -> int:
+    """The first port that the datagrams of a sensor go to; 0 where nobody knows one."""
+    links = sensor.links.values() if sensor is not None else ()
+    return next((port for link in links if isinstance(link, Udp) for port in link.ports), 0)
 
 
 def check_suffix(path: str | Path) -> str:
@@ -139,14 +205,13 @@ def check_suffix(path: str | Path) -> str:
 
 def recorder(
     path: str | Path,
-    sensor: Sensor | str | None = None,
+    sensor: Spec | str | None = None,
     source: str | Path = "",
     *,
     datagrams: bool,
     baud: int | None = None,
-    port: int = 0,
     overwrite: bool = False,
-) -> AnyRecorder:
+) -> Appender:
     """The recorder for a file, by its suffix; arguments as of `Recorder`, `PcapRecorder` and `FrameRecorder`.
 
     Raises:
@@ -158,19 +223,48 @@ def recorder(
     if suffix == ".pcap" and not datagrams:
         if not sensor:
             raise UsageError(f"{path}: a capture of a byte stream has a packet for each frame: name the sensor with -s, or record an .lsr")
-        return FrameRecorder(path, sensor if isinstance(sensor, Sensor) else named_sensor(sensor), overwrite=overwrite)
+        return FrameRecorder(path, sensor if isinstance(sensor, Spec) else named_sensor(sensor), overwrite=overwrite)
     if suffix == ".bin" and datagrams:
         raise UsageError(f"{path}: bytes alone do not say where a datagram ends: record datagrams in an .lsr or .pcap file")
     if suffix == ".lsr":
         return Recorder(path, sensor, source, datagrams=datagrams, baud=baud, overwrite=overwrite)
+    port = declared_port(sensor if isinstance(sensor, Spec) else None)
     return PcapRecorder(path, port=port, overwrite=overwrite) if suffix == ".pcap" else RawRecorder(path, overwrite=overwrite)
 
 
-def recorder_for(target: RecordTo, sensor: Sensor | str | None, source: str | Path, opened: Transport) -> tuple[AnyRecorder, bool]:
+def recorder_for(target: RecordTo, sensor: Spec | str | None, source: str | Path, opened: Transport) -> tuple[Log, bool]:
     """The recorder that a caller asks for, and whether it was made here, and has to be closed here."""
     if isinstance(target, str | Path):
-        return recorder(target, sensor, source, datagrams=opened.datagrams, baud=getattr(opened, "baud", None)), True
-    return (target, False) if isinstance(target, AnyRecorder) else (target(opened), True)
+        return recorder(target, sensor, source, datagrams=opened.datagrams, baud=opened.baud), True
+    return (target, False) if isinstance(target, Appender) else (target(opened), True)
+
+
+def _header(sensor: Spec | str | None, source: str, *, datagrams: bool | None, baud: int | None) -> Header:
+    known = named_sensor(sensor) if isinstance(sensor, str) and sensor and datagrams is None else sensor
+    name, options, link = (known.id, dict(known.options), known.datagrams) if isinstance(known, Spec) else (known or "", {}, False)
+    homes = {plugin.distribution: plugin.version for plugin in registry().plugins if name in plugin.sensors}
+    return Header(
+        sensor=name,
+        options=options,
+        source=source,
+        datagrams=link if datagrams is None else datagrams,
+        baud=baud,
+        versions={"lidarspec": __version__, **homes},
+        created=datetime.now().astimezone().isoformat(timespec="milliseconds"),
+        wall_ns=time.time_ns(),
+        monotonic_ns=time.monotonic_ns(),
+    )
+
+
+def _event(name: str, at: int, details: dict[str, Any]) -> bytes:
+    return packed(EVENT, json.dumps({"event": name, **details}, default=str).encode(), at)
+
+
+def _whole(data: bytes | bytearray, limit: int) -> int:
+    """How much of a piece of the file can stay; the first begins with the magic bytes."""
+    if data[: len(MAGIC)] != MAGIC:
+        return whole_records(data, limit)
+    return len(MAGIC) + whole_records(data[len(MAGIC) :], limit - len(MAGIC)) if limit >= len(MAGIC) else 0
 
 
 def _taken_out(made: io.BytesIO) -> bytes:

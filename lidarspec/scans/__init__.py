@@ -1,1 +1,7 @@
-"""scans"""
+"""Scans: one revolution or frame period each, cut out of the points of a stream by the sensor's declared rule.
+
+In: batches of packets. Out: `Scan`, and `LaserScan` with ROS's names. Modules in reading order:
+
+* `scans`: `ScanStream`, which takes batches as they come and gives the scans that they complete.
+* `cutter`: before which points a scan ends, by a column that wraps, a field that changes, or time.
+"""

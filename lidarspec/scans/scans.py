@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from lidarspec.columns.columns import Carry
 from lidarspec.packets.packets import Packets, joined as joined_packets
 from lidarspec.packets.sequences import Reorder
-from lidarspec.points.cloud import Mount, PointCloud, joined, restamped
+from lidarspec.points.cloud import ColumnSource, LazyCloud, Mount, PointCloud, Stretch, Stretches, source_of
 from lidarspec.points.evaluate import guarded
 from lidarspec.points.plain import Evaluated
 from lidarspec.scans.cutter import Cutter
@@ -90,17 +90,17 @@ class Scan:
     def _binned(self, n: int, *, centred: bool = False) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         valid = self.points.valid
         turns = (self.points.azimuth[valid].astype(np.float64) + np.pi) / (2 * np.pi) * n
-        spots = (np.rint(turns) if centred else np.floor(turns)).astype(np.intp) % n
+        bins = (np.rint(turns) if centred else np.floor(turns)).astype(np.intp) % n
         ranges = self.points.range[valid]
-        nearest = np.lexsort((ranges, spots))
+        nearest = np.lexsort((ranges, bins))
         first = np.ones(len(nearest), np.bool_)
-        first[1:] = np.diff(spots[nearest]) > 0
+        first[1:] = np.diff(bins[nearest]) > 0
         chosen = nearest[first]
-        found, strength = np.full(n, np.inf, np.float32), np.zeros(n, np.float32)
-        found[spots[chosen]] = ranges[chosen]
+        binned, strength = np.full(n, np.inf, np.float32), np.zeros(n, np.float32)
+        binned[bins[chosen]] = ranges[chosen]
         if self.points.intensity is not None:
-            strength[spots[chosen]] = self.points.intensity[valid][chosen]
-        return found, strength
+            strength[bins[chosen]] = self.points.intensity[valid][chosen]
+        return binned, strength
 
 
 class ScanStream:
@@ -117,7 +117,7 @@ class ScanStream:
         self._cutter = Cutter(sensor.scan)
         self._waiting: Packets | None = None
         self._carry: Carry = {}
-        self._parts: list[PointCloud] = []
+        self._parts: list[Stretch] = []
         self._started = False
         self._epoch: int | None = None
         self._begins: int | None = None  # time of the first point of the scan under way, ns, where it is known
@@ -128,12 +128,12 @@ class ScanStream:
 
     def finish(self) -> list[Scan]:
         """The scans that waited for more, and the piece that is left."""
-        found = [scan for batch in self._reorder.finish() for scan in self._push(batch, final=False)]
+        scans = [scan for batch in self._reorder.finish() for scan in self._push(batch, final=False)]
         if self._waiting is not None and len(self._waiting):
             waiting, self._waiting = self._waiting, None
-            found += self._push(waiting, final=True)
+            scans += self._push(waiting, final=True)
         left = self._close(None, complete=False)
-        return found + ([left] if left else [])
+        return scans + ([left] if left else [])
 
     def _push(self, packets: Packets, *, final: bool) -> list[Scan]:
         if self._waiting is not None and len(self._waiting):
@@ -141,52 +141,51 @@ class ScanStream:
         self._waiting = None
         if self._epoch is None:
             self._epoch = int(packets.time_ns[0])  # one for the whole stream, so that batches do not change a bit of any time
-        found = guarded(packets, self._carry, final=final, epoch=self._epoch)
-        if found is None:
+        points = guarded(packets, self._carry, final=final, epoch=self._epoch)
+        if points is None:
             return []
-        self._carry = found.carry
-        if found.ready < len(packets):
-            self._waiting = packets.take(slice(found.ready, None))
-        return list(self._cut(packets, found))
+        self._carry = points.carry
+        if points.ready < len(packets):
+            self._waiting = packets.take(slice(points.ready, None))
+        return list(self._cut(packets, points))
 
-    def _cut(self, packets: Packets, found: Evaluated) -> Iterator[Scan]:
-        start, cloud, cuts = 0, found.cloud, self._cutter.cuts(packets, found)
-        first, *times = _times_ns(cloud, [0, *cuts])
+    def _cut(self, packets: Packets, points: Evaluated) -> Iterator[Scan]:
+        start, source, cuts = 0, source_of(points.cloud), self._cutter.cuts(packets, points)
+        first, *times = _times_ns(source, [0, *cuts])
         self._begins = first if self._begins is None else self._begins
         for cut, ends in zip(cuts, times, strict=True):
-            self._take(cloud, start, cut)
+            self._take(source, start, cut)
             scan = self._close(ends, complete=self._started)
             self._begins = ends
             if scan is not None:
                 self._started = True
                 yield scan
             start = cut
-        self._take(cloud, start, len(cloud))
+        self._take(source, start, source.size)
 
-    def _take(self, cloud: PointCloud, start: int, stop: int) -> None:
+    def _take(self, source: ColumnSource, start: int, stop: int) -> None:
         if start < stop:
-            self._parts.append(cloud.stretch(start, stop))
+            self._parts.append(Stretch(source, start, stop))
 
     def _close(self, ends: int | None, *, complete: bool) -> Scan | None:
         """The scan of the points so far; `ends`: the time of the first point after it, ns."""
         parts, self._parts = self._parts, []
         if not parts:
             return None
-        cloud = joined(parts)
         begins = self._begins
         assert begins is not None  # since there are points
         period = (ends - begins) * 1e-9 if ends is not None else np.nan
         rate = 1 / period if period > 0 else np.nan
-        cloud = restamped(cloud, begins)
+        cloud: PointCloud = LazyCloud.of(Stretches(parts, from_first=True), begins)
         mounted = cloud if self._mount is None else self._mount.applied(cloud)
         return Scan(mounted, float(rate) if complete else np.nan, complete, self._sensor)
 
 
-def _times_ns(cloud: PointCloud, indices: Sequence[int]) -> list[int | None]:
+def _times_ns(source: ColumnSource, indices: Sequence[int]) -> list[int | None]:
     """The times of some points in order, ns; None for those past the end."""
-    known = [index for index in indices if index < len(cloud)]
-    times = cloud.times_at(np.array(known, np.intp)).tolist() if known else []
-    return [cloud.stamp_ns + round(time * 1e9) for time in times] + [None] * (len(indices) - len(known))
+    known = [index for index in indices if index < source.size]
+    times = source.times_at(np.array(known, np.intp)).tolist() if known else []
+    return [source.base + round(time * 1e9) for time in times] + [None] * (len(indices) - len(known))
 
 
 def scans_of(sensor: Spec, batches: Iterable[Packets]) -> Iterator[Scan]:

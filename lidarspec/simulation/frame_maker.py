@@ -8,27 +8,24 @@ Valid frames with seeded random content, for tests, docs and the REPL.
 
 from __future__ import annotations
 
-import contextlib
 import functools
 import random
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-import construct
 import numpy as np
-from construct import Construct
 from numpy.typing import NDArray
 
 from lidarspec.errors import SpecError, UnknownFrame, UsageError
 from lidarspec.framing.frame_engine import CompiledCodec, InterpretedCodec, codec
-from lidarspec.framing.plausibility import VALID, plausibility
-from lidarspec.spec.construct_layer import clean
+from lidarspec.framing.plausibility import plausibility
+from lidarspec.framing.results import VALID
+from lidarspec.spec.construct_layer import ConstructError, random_value
 from lidarspec.spec.description import Spec
 from lidarspec.wire.build import build
 from lidarspec.wire.frame_table import Group, Rows
 from lidarspec.wire.layout import Layout, Leaf
-from lidarspec.wire.layout_tree import TooLong, walk
-from lidarspec.wire.schema import FieldInfo, peeled
+from lidarspec.wire.layout_tree import TooLong, Unknown, layout_of
 
 Values = Mapping[str, Any]
 
@@ -84,7 +81,11 @@ class FrameMaker:
     def _walked(self, values: Values, asked: list[str]) -> Layout:
         frame, fields = self.engine.frame, self.engine.schema.fields
         try:
-            return walk(frame.prepared, functools.partial(self._read, values, asked), frame.max_length).layout()
+            while True:
+                try:
+                    return layout_of(frame.tree, {path: self._raw(values, path) for path in asked}, frame.max_length)
+                except Unknown as unknown:
+                    asked.append(unknown.leaf.info.path)
         except TooLong as error:
             left_out = [path for path in asked if path not in values and fields[path].const is None]
             given = ", ".join(f"{path} = {values[path]}" for path in asked if path in values)
@@ -104,11 +105,6 @@ class FrameMaker:
             leaf.store(rows, _steps(leaf, [values.get(path, 0) for values in frames]))
         layout.seal(rows)
         return rows
-
-    def _read(self, values: Values, asked: list[str], leaf: Leaf) -> int:
-        if leaf.info.path not in asked:
-            asked.append(leaf.info.path)
-        return self._raw(values, leaf.info.path)
 
     def _raw(self, values: Values, path: str) -> int:
         info = self.engine.schema.fields[path]
@@ -184,8 +180,8 @@ def _interpreted(sensor: Spec, frame: str, engine: InterpretedCodec, source: ran
     """A frame that construct alone can read."""
     for _ in range(BATCH * TRIES):
         try:
-            data = build(sensor, frame, _random(engine.frame.prepared, source, construct.Container(), drawn), {})
-        except (UsageError, construct.ConstructError):  # what was drawn goes not together; something else may
+            data = build(sensor, frame, random_value(engine.frame.prepared, source, drawn), {})
+        except (UsageError, ConstructError):  # what was drawn goes not together; something else may
             continue
         if engine.survey(np.frombuffer(data, np.uint8), np.zeros(1, np.intp)).status[0] == VALID:
             return data
@@ -243,56 +239,3 @@ def _stated(engine: CompiledCodec, values: Mapping[str, Any]) -> Drawn:
 
 def _always(raw: int, _: random.Random) -> int:
     return raw
-
-
-def _random(con: Construct, source: random.Random, scope: Any, drawn: Drawn, path: str = "") -> Any:
-    """A random value for a construct that has no compiled layout; `scope`: what its expressions see."""
-    if path in drawn:
-        return drawn[path](source)
-    con, info = peeled(con, FieldInfo(""))
-    if info.const is not None:
-        return info.seen(info.const)
-    if info.rebuilt is not None:
-        with contextlib.suppress(Exception):  # it may ask for what comes after it, and is evaluated again when the frame is built
-            return info.rebuilt(scope)
-    if isinstance(con, construct.Struct):
-        values = construct.Container(_=scope)
-        for child in con.subcons:
-            if child.name is not None:
-                values[child.name] = _random(child, source, values, drawn, f"{path}.{child.name}" if path else child.name)
-        return values
-    if isinstance(con, construct.Array):
-        return [_random(con.subcon, source, scope, drawn, path) for _ in range(construct.evaluate(con.count, scope))]
-    if isinstance(con, construct.IfThenElse | construct.Switch):
-        return _random(_chosen(con, scope), source, scope, drawn, path)
-    if isinstance(con, construct.NullTerminated) or not isinstance(con, construct.Subconstruct):
-        return info.seen(_leaf(con, source, scope, info)) if info.labels else _leaf(con, source, scope, info)
-    if isinstance(con, construct.Adapter):
-        return clean(con.parse(con.subcon.build(_random(con.subcon, source, scope, drawn, path))))
-    return _random(con.subcon, source, scope, drawn, path)
-
-
-def _chosen(con: Any, scope: Any) -> Construct:
-    """The part of an If or Switch that its fields choose."""
-    if isinstance(con, construct.Switch):
-        return con.cases.get(construct.evaluate(con.keyfunc, scope), con.default)
-    return con.thensubcon if construct.evaluate(con.condfunc, scope) else con.elsesubcon
-
-
-def _leaf(con: Construct, source: random.Random, scope: Any, info: FieldInfo) -> Any:
-    if con is construct.Pass:
-        return None
-    if isinstance(con, construct.NullTerminated):
-        return str(source.randrange(10 ** source.randint(1, 4))).encode()
-    if isinstance(con, construct.Computed):
-        return construct.evaluate(con.func, scope)
-    if con is construct.GreedyBytes:
-        return source.randbytes(source.randint(0, 4))
-    if isinstance(con, construct.Bytes):
-        return source.randbytes(construct.evaluate(con.length, scope))
-    if info.labels and source.random() < 0.5:
-        return source.choice(list(info.labels))
-    if isinstance(con, construct.BitsInteger):
-        value = source.getrandbits(con.length)
-        return value - (1 << con.length) if con.signed and value >> (con.length - 1) else value
-    return con.parse(source.randbytes(con.sizeof()))

@@ -9,9 +9,9 @@ from typing import Any
 from lidarspec.framing.decoder import Decoder
 from lidarspec.framing.frame_engine import codec
 from lidarspec.simulation.frame_maker import FrameMaker
-from lidarspec.spec.description import Answer, Command, with_frames
+from lidarspec.spec.description import Answer, Command, Spec, with_frames
 from lidarspec.spec.links import is_datagram
-from lidarspec.spec.sensor import Sensor
+from lidarspec.wire.parse import parse
 
 #: ns of silence after which half a request is forgotten.
 PATIENCE = 50_000_000
@@ -38,7 +38,7 @@ class Answered:
 class Answering:
     """One sensor's side of the conversation."""
 
-    def __init__(self, sensor: Sensor) -> None:
+    def __init__(self, sensor: Spec) -> None:
         self._sensor = sensor
         self._heard: dict[str, int] = {}
         self._decoders = {
@@ -89,7 +89,7 @@ class Answering:
 
     def _request(self, frame: str, data: bytes, link: str) -> Request | None:
         """The command that a frame is: of several that fit, the one that says most about it."""
-        values = dict(_flat(self._sensor.parse(data, frame)))
+        values = dict(_flat(parse(self._sensor, data, frame=frame)))
         fitting = [
             (name, command)
             for name, command in self._sensor.commands.items()
@@ -101,7 +101,7 @@ class Answering:
         return Request(name, command, values)
 
 
-def _listening(sensor: Sensor, link: str) -> Decoder:
+def _listening(sensor: Spec, link: str) -> Decoder:
     """A decoder of what is sent to the sensor: the outgoing frames, seen from its side."""
     frames = {name: replace(frame, direction="in") for name, frame in sensor.frames.items() if frame.direction == "out"}
     return Decoder(with_frames(sensor, frames), stream=not is_datagram(sensor.links.get(link)))

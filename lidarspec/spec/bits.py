@@ -1,18 +1,16 @@
-"""Bit blocks, found out by probing: which bits of a block of bytes make up each value that construct parses from it.
+"""Bit blocks, found out by probing: which bits of a block of bytes make up each value that is parsed from it.
 
 A block (``BitStruct``, ``ByteSwapped``, ``BitsSwapped``, ``BytesInteger``, in any nesting) is linear in its bits:
 value = sum of bit * weight. Parsing it once with no bit set and once with each single bit set gives the weights;
-random blocks then confirm them. So no rule about bit order stands anywhere but in construct itself.
+random blocks then confirm them. So no rule about bit order stands anywhere but in the parser that is probed.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from functools import cached_property
-from typing import Any
-
-from construct import Adapter, BitsInteger, Bytes, BytesInteger, Construct, Enum, EnumIntegerString, Flag, FormatField, Struct, Subconstruct
+from functools import cached_property, lru_cache
+from typing import Any, Literal
 
 #: random blocks that have to agree before a probed block is believed.
 CONFIRMATIONS = 24
@@ -37,12 +35,14 @@ class BitField:
         segments: its bits.
         width: number of bits.
         signed: whether the top bit counts negative.
+        flag: whether it is parsed as False or True.
     """
 
     keys: tuple[str | int, ...]
     segments: tuple[Segment, ...]
     width: int
     signed: bool
+    flag: bool = False
 
     @cached_property
     def words(self) -> tuple[tuple[str, int, int], ...] | None:
@@ -79,64 +79,37 @@ class BitField:
         return bytes(found)
 
 
-def leaves(parsed: Any, keys: tuple[str | int, ...] = ()) -> Iterator[tuple[tuple[str | int, ...], Any]]:
-    """The values of a parsed object with where they stand in it, private entries left out."""
-    if isinstance(parsed, dict):
-        for name, value in parsed.items():
-            if not name.startswith("_"):
-                yield from leaves(value, (*keys, name))
-    elif isinstance(parsed, list):
-        for index, value in enumerate(parsed):
-            yield from leaves(value, (*keys, index))
-    else:
-        yield keys, int(parsed) if isinstance(parsed, EnumIntegerString) else parsed
+@lru_cache(maxsize=64)
+def whole_bytes(size: int, order: Literal["little", "big"], *, signed: bool) -> BitField:
+    """An integer of so many whole bytes."""
+    targets = [8 * (byte if order == "little" else size - 1 - byte) for byte in range(size)]
+    return BitField((), tuple(Segment(byte, 0xFF, 0, target) for byte, target in enumerate(targets)), 8 * size, signed)
 
 
-def probe(con: Construct, size: int) -> list[BitField] | None:
+#: from a block of bytes to its values, by where the parsed block holds them.
+Parse = Callable[[bytes], Mapping[tuple[str | int, ...], Any]]
+
+
+def probe(parse: Parse, size: int) -> list[BitField] | None:
     """The bit fields of a block of `size` bytes, or None where it is not linear in its bits.
 
-    The block must accept every pattern: constants in it have to be unchecked (``_verify=False`` is passed).
+    Args:
+        parse: gives the values of a block; it must accept every pattern.
     """
-    if not _even(con):
-        return None
-    base = _parse(con, bytes(size))
+    base = parse(bytes(size))
     if any(not isinstance(value, int) or value != 0 for value in base.values()):
         return None
     weights: dict[tuple[str | int, ...], list[tuple[int, int]]] = {keys: [] for keys in base}
     for bit in range(8 * size):
-        for keys, value in _parse(con, (1 << bit).to_bytes(size, "little")).items():
+        for keys, value in parse((1 << bit).to_bytes(size, "little")).items():
             if value:
                 weights[keys].append((bit, int(value)))
-    fields = [_field(keys, pairs) for keys, pairs in weights.items()]
-    if any(field is None for field in fields):
-        return None
+    fields = [_field(keys, pairs, flag=isinstance(base[keys], bool)) for keys, pairs in weights.items()]
     known = [field for field in fields if field is not None]
-    return known if _confirmed(con, size, known) else None
+    return known if len(known) == len(fields) and _confirmed(parse, size, known) else None
 
 
-def _even(con: Construct) -> bool:
-    """Whether every block is read in the same way: what a value decides on shows with few blocks only, and probing could miss it."""
-    if isinstance(con, Struct):
-        return all(map(_even, con.subcons))
-    if isinstance(con, Subconstruct):
-        return (isinstance(con, Enum) or not isinstance(con, Adapter)) and _even(con.subcon)
-    return isinstance(con, BitsInteger | Bytes | BytesInteger | FormatField | type(Flag))
-
-
-def bytes_of(con: Construct, names: Iterable[str]) -> list[int]:
-    """The offsets of the bytes of a block that hold any bit of one of its fields."""
-    keys = tuple(names)
-    for field in probe(con, con.sizeof()) or ():
-        if field.keys == keys:
-            return [segment.byte for segment in field.segments]
-    raise KeyError(".".join(keys))
-
-
-def _parse(con: Construct, block: bytes) -> dict[tuple[str | int, ...], Any]:
-    return dict(leaves(con.parse(block, _verify=False)))
-
-
-def _field(keys: tuple[str | int, ...], pairs: list[tuple[int, int]]) -> BitField | None:
+def _field(keys: tuple[str | int, ...], pairs: list[tuple[int, int]], *, flag: bool) -> BitField | None:
     """A field from (bit of the block, weight); None unless the weights are 1, 2, 4 ... each once."""
     width = len(pairs)
     signed = any(weight < 0 for _, weight in pairs)
@@ -148,7 +121,7 @@ def _field(keys: tuple[str | int, ...], pairs: list[tuple[int, int]]) -> BitFiel
         targets[bit] = magnitude.bit_length() - 1
     if sorted(targets.values()) != list(range(width)) or not width:
         return None
-    return BitField(keys, tuple(_segments(targets)), width, signed)
+    return BitField(keys, tuple(_segments(targets)), width, signed, flag)
 
 
 def _segments(targets: dict[int, int]) -> Iterator[Segment]:
@@ -168,13 +141,13 @@ def _segment(run: list[int], targets: dict[int, int]) -> Segment:
     return Segment(run[0] // 8, ((1 << len(run)) - 1) << low, low, targets[run[0]])
 
 
-def _confirmed(con: Construct, size: int, fields: list[BitField]) -> bool:
+def _confirmed(parse: Parse, size: int, fields: list[BitField]) -> bool:
     import random  # nothing else that finding a sensor imports needs it
 
     source = random.Random(size)
     for _ in range(CONFIRMATIONS):
         block = source.randbytes(size)
-        parsed = _parse(con, block)
+        parsed = parse(block)
         if any(field.value(block) != int(parsed[field.keys]) for field in fields):
             return False
     return True

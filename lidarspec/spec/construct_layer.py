@@ -1,19 +1,28 @@
-"""The thin layer over construct: one struct, made fit for the engine, and construct's errors made ours.
+"""The layer over construct, and the only module that knows its classes: an author's struct made fit for the engine, and read off.
 
-`prepare` copies an author's tree with a few classes replaced, and nothing else changed: structs note where their
-members stand, arrays put the index into error paths, constants can be read unchecked, and a NaN keeps its payload.
+`prepare` copies an author's struct with a few classes replaced, and nothing else changed: structs note where their members stand,
+arrays put the index into error paths, constants can be read unchecked, and a NaN keeps its payload. `frame_tree` reads the same struct
+off as nodes (`lidarspec.spec.tree`): expressions are called with symbols in place of fields and what they do with them is written down,
+and the bits of a bit block are found out by parsing it with construct, so that no rule about bit order stands anywhere else. What no
+node stands for stays a part of construct's, with the reason.
 """
 
 from __future__ import annotations
 
+import contextlib
 import copy
+import functools
 import math
 import operator
 import re
 import struct
-from typing import Any, NamedTuple
+import sys
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import construct
+import numpy as np
 from construct import (
     Array,
     BitsInteger,
@@ -27,6 +36,43 @@ from construct import (
     Struct,
     Subconstruct,
 )
+from construct.expr import BinExpr, ExprMixin, UniExpr
+
+from lidarspec.errors import SpecError
+from lidarspec.spec import tree
+from lidarspec.spec.bits import BitField, probe
+from lidarspec.spec.checksums import Checksum
+from lidarspec.spec.tree import (
+    Blind,
+    Blob,
+    Block,
+    Code,
+    Empty,
+    FieldInfo,
+    Formula,
+    Node,
+    Number,
+    Op,
+    Opaque,
+    Part,
+    Read,
+    Ref,
+    Repeat,
+    Scope,
+    Sealed,
+    Select,
+    Symbol,
+    Untraceable,
+    When,
+    nodes,
+    refs,
+)
+
+if TYPE_CHECKING:
+    import random  # finding a sensor does without it
+
+    #: field path -> what draws its value in place of chance
+    Drawn = Mapping[str, Callable[[random.Random], Any]]
 
 _MISSING = object()
 
@@ -183,6 +229,36 @@ class NamedEnum(construct.Enum):  # type: ignore[misc]
         return self._decode(raw, context, path)
 
 
+class Describing(Subconstruct):  # type: ignore[misc]
+    """A part that only says something of the field below it: parses and builds what that does."""
+
+    def described(self, info: FieldInfo) -> FieldInfo:
+        """What is known of the field, with what this part says of it."""
+        raise NotImplementedError
+
+    def _parse(self, stream: Any, context: Any, path: str) -> Any:
+        return self.subcon._parsereport(stream, context, path)
+
+    def _build(self, obj: Any, stream: Any, context: Any, path: str) -> Any:
+        return self.subcon._build(obj, stream, context, path)
+
+
+class Sealing(Subconstruct):  # type: ignore[misc]
+    """A struct with a checksum.
+
+    Attributes:
+        fields: names of the fields that hold it, low bits first.
+        algorithm: of the checksum, None where a hook has to supply it.
+        over: names of the fields that it covers, in a row; None: all bytes that hold no bit of `fields`.
+        absent: values that mean "not filled".
+    """
+
+    fields: tuple[str, ...]
+    algorithm: Checksum | None
+    over: tuple[str, ...] | None
+    absent: frozenset[int]
+
+
 def verifying(context: Any, *, checksums: bool = False) -> bool:
     """Whether constants, or checksums too, are checked in this parse (``_verify``: True, "constants" or False)."""
     wanted = context._params.get("_verify", True)
@@ -276,3 +352,546 @@ def field_path(path: str | None) -> str:
 
 def _shown(value: object) -> str:
     return value.hex(" ") if isinstance(value, bytes) else f"0x{value:x}" if isinstance(value, int) else repr(value)
+
+
+#: names that `points` and the engine need for themselves.
+RESERVED = frozenset({"state", "on"})
+SHADOWED = frozenset(name for name in dir(Container) if not name.startswith("_"))
+
+#: the rule under which `lidarspec check` explains it, and the reason.
+_REFUSED: dict[type, tuple[str, str]] = {
+    type(construct.Pickled): ("LS110", "Pickled runs code from the wire"),
+    construct.FlagsEnum: ("LS108", "FlagsEnum loses undeclared bits: declare each bit as a field of a BitStruct"),
+    construct.GreedyRange: ("LS111", "GreedyRange has no end of its own on a stream: give a count, or a terminator"),
+    type(construct.GreedyBytes): ("LS111", "GreedyBytes has no end of its own on a stream: give a length, or a terminator"),
+    construct.RawCopy: ("LS109", "RawCopy ignores edits on rebuild: use Checksummed"),
+    construct.Checksum: ("LS109", "construct's Checksum needs RawCopy, which ignores edits on rebuild: use Checksummed"),
+    construct.Padded: ("LS106", "padding loses its bytes on a round trip: declare it as a field, such as 'reserved' / Bytes(n)"),
+    construct.Pointer: ("LS112", "Pointer reads outside the frame"),
+    construct.Seek: ("LS112", "Seek reads outside the frame"),
+    construct.Select: ("LS113", "Select and Optional hide errors in the bytes: use If or Switch on a header field"),
+}
+
+#: what gives a greedy field its end.
+_BOUNDED = (construct.NullTerminated, construct.FixedSized, construct.Prefixed)
+
+
+def check_struct(con: Construct) -> None:
+    """Raise `SpecError` with path and reason if a frame cannot be described by this construct.
+
+    Raises:
+        SpecError: for a shadowed, reserved, duplicate or missing name, or a construct that loses bits or never ends.
+    """
+    for path, part, in_bits in _walk(con, "", in_bits=False):
+        for kind, (rule, reason) in _REFUSED.items():
+            if isinstance(part, kind):
+                raise SpecError(reason, path=path, rule=rule)
+        if isinstance(part, type(construct.Flag)) and not in_bits:
+            raise SpecError("Flag keeps one bit of its byte only: use a BitStruct, or Int8ul", path=path, rule="LS107")
+        if isinstance(part, Struct):
+            _check_names(part, path, in_bits=in_bits)
+    _check_measures(con, "", (1, 0, ""), {})
+
+
+def _check_names(struct: Struct, path: str, *, in_bits: bool) -> None:
+    seen: set[str] = set()
+    for child in struct.subcons:
+        name = child.name
+        place = f"{path}.{name}" if path else str(name)
+        if isinstance(child, construct.Padded):
+            continue  # refused on its own, and with a better reason
+        if name is None:
+            if in_bits or not isinstance(unwrap(child), Const):
+                raise SpecError(f"an unnamed {type(unwrap(child)).__name__} would lose its value: give it a name", path=path, rule="LS105")
+            continue
+        if name in seen:
+            raise SpecError("two fields of this name: the last one would win silently", path=place, rule="LS104")
+        if name in RESERVED:
+            raise SpecError("no field may be called 'state' or 'on'", path=place, rule="LS102")
+        if name in SHADOWED:
+            raise SpecError(f"the name {name!r} is shadowed by a method of construct's Container", path=place, rule="LS101")
+        if name.startswith("_") or not name.isidentifier():
+            raise SpecError("a field name must be a Python identifier without a leading underscore", path=place, rule="LS103")
+        seen.add(name)
+
+
+def _check_measures(con: Construct, path: str, measure: tuple[float, float, str], found: dict[str, tuple[float, float, str]]) -> None:
+    """Refuse a field that branches measure in different steps or units: it is one column, and has one of each."""
+    if isinstance(con, construct.Renamed):
+        path = f"{path}.{con.name}" if path else str(con.name)
+        measure = (1, 0, "")
+    if isinstance(con, Describing):
+        said = con.described(FieldInfo(""))
+        measure = (said.scale, said.offset, said.unit)
+    is_number = isinstance(con, construct.FormatField | construct.BytesInteger | construct.BitsInteger)
+    if is_number and found.setdefault(path, measure) != measure:
+        raise SpecError("its branches have different scales or units: give each a name of its own", path=path)
+    for child in children(con):
+        if not isinstance(con, Struct) or child.name is not None:
+            _check_measures(child, path, measure, found)
+
+
+def _walk(con: Construct, path: str, *, in_bits: bool) -> Iterator[tuple[str, Construct, bool]]:
+    if con.name is not None and isinstance(con, construct.Renamed):
+        path = f"{path}.{con.name}" if path else con.name
+    yield path, con, in_bits
+    if isinstance(con, _BOUNDED) and unwrap(con.subcon) is construct.GreedyBytes:
+        return
+    if isinstance(con, construct.Transformed | construct.Restreamed):
+        in_bits = True
+    for child in children(con):
+        yield from _walk(child, path, in_bits=in_bits)
+
+
+def children(con: Construct) -> list[Construct]:
+    """The constructs directly below one, branches included."""
+    if isinstance(con, Struct):
+        return list(con.subcons)
+    found = [getattr(con, name) for name in ("subcon", "thensubcon", "elsesubcon", "default") if name in vars(con)]
+    return found + (list(con.cases.values()) if "cases" in vars(con) else [])
+
+
+def seals(con: Construct) -> Iterator[Sealing]:
+    """The sealed structs of a struct, outer ones first."""
+    if isinstance(con, Sealing):
+        yield con
+    for child in children(con):
+        yield from seals(child)
+
+
+def random_value(con: Construct, source: random.Random, drawn: Drawn, scope: Any = None, path: str = "") -> Any:
+    """A random value that a construct can build; for parts that have no places and so cannot be filled with random bytes.
+
+    Args:
+        drawn: field path -> what draws its value in place of chance.
+        scope: what its expressions see.
+    """
+    if path in drawn:
+        return drawn[path](source)
+    if isinstance(con, Const):
+        return con.value
+    if isinstance(con, construct.Rebuild):
+        with contextlib.suppress(Exception):  # it may ask for what comes after it, and is evaluated again when the frame is built
+            return con.func(scope)
+    if isinstance(con, Struct):
+        values = Container(_=scope)
+        for child in con.subcons:
+            if child.name is not None:
+                values[child.name] = random_value(child, source, drawn, values, f"{path}.{child.name}" if path else child.name)
+        return values
+    if isinstance(con, Array):
+        return [random_value(con.subcon, source, drawn, scope, path) for _ in range(construct.evaluate(con.count, scope))]
+    if isinstance(con, construct.IfThenElse):
+        return random_value(con.thensubcon if construct.evaluate(con.condfunc, scope) else con.elsesubcon, source, drawn, scope, path)
+    if isinstance(con, construct.Switch):
+        return random_value(con.cases.get(construct.evaluate(con.keyfunc, scope), con.default), source, drawn, scope, path)
+    if isinstance(con, construct.Enum):
+        named = list(con.ksymapping) if not isinstance(unwrap(con), Const) and source.random() < 0.5 else []
+        return con._decode(source.choice(named) if named else random_value(con.subcon, source, drawn, scope, path), None, None)
+    if isinstance(con, construct.NullTerminated) or not isinstance(con, Subconstruct):
+        return _random_leaf(con, source, scope)
+    if isinstance(con, construct.Adapter):
+        return clean(con.parse(con.subcon.build(random_value(con.subcon, source, drawn, scope, path))))
+    return random_value(con.subcon, source, drawn, scope, path)
+
+
+def _random_leaf(con: Construct, source: random.Random, scope: Any) -> Any:
+    if con is construct.Pass:
+        return None
+    if isinstance(con, construct.NullTerminated):
+        return str(source.randrange(10 ** source.randint(1, 4))).encode()
+    if isinstance(con, construct.Computed):
+        return construct.evaluate(con.func, scope)
+    if con is construct.GreedyBytes:
+        return source.randbytes(source.randint(0, 4))
+    if isinstance(con, Bytes):
+        return source.randbytes(construct.evaluate(con.length, scope))
+    if isinstance(con, BitsInteger):
+        value = source.getrandbits(con.length)
+        return value - (1 << con.length) if con.signed and value >> (con.length - 1) else value
+    return con.parse(source.randbytes(con.sizeof()))
+
+
+def frame_tree(con: Construct) -> Node:
+    """The tree of a struct.
+
+    Raises:
+        SpecError: for a constant that its Enum has no value for.
+    """
+    first = _Builder({})
+    root = first.node(con, _Place(FieldInfo(""), None))
+    return _Builder(first.scopes).node(con, _Place(FieldInfo(""), None)) if first.rebuilding else root
+
+
+def _traced(expression: Any, scope: Scope) -> Any:
+    """What an expression comes to; construct's own are walked, since its ``~`` asks for the truth of a value."""
+    if isinstance(expression, BinExpr):
+        return expression.op(_traced(expression.lhs, scope), _traced(expression.rhs, scope))
+    if isinstance(expression, UniExpr):
+        operand = _traced(expression.operand, scope)
+        if expression.op is operator.not_ and isinstance(operand, Symbol):
+            return Symbol(Op("not", (operand.formula,)))
+        return expression.op(operand)
+    return expression(scope) if callable(expression) else expression
+
+
+def _spelled(expression: Any, path: str) -> str:
+    """An expression of the part at `path` as its author wrote it, with fields by their whole paths; "?" for a function."""
+    text = repr(expression)
+    if " at 0x" in text:
+        return "?"
+    return re.sub(r"\bthis(?:\.\w+)+", functools.partial(_whole_path, path), re.sub(r"\['(\w+)'\]", r".\1", text))
+
+
+def _whole_path(path: str, way: re.Match[str]) -> str:
+    """``this.count`` or ``this._.count`` in the part at `path` as the path from the top of the frame."""
+    names = path.split(".")[:-1]
+    for name in way[0].split(".")[1:]:
+        names = [] if name == "_root" else names[:-1] if name == "_" else [*names, name]
+    return ".".join(names)
+
+
+class _Fields:
+    """What an expression sees when it is evaluated: values by name, as construct shows them."""
+
+    def __init__(self, read: Read, paths: tuple[str, ...]) -> None:
+        self._read, self._paths = read, paths
+
+    def __getitem__(self, name: str) -> Any:
+        if name == "_":
+            return _Fields(self._read, self._paths[1:]) if len(self._paths) > 1 else None
+        if name == "_root":
+            return _Fields(self._read, self._paths[-1:])
+        value = self._read(f"{self._paths[0]}.{name}" if self._paths[0] else name)
+        if isinstance(value, str):
+            return _Fields(self._read, (value, *self._paths))
+        return value and seen(*value)
+
+    def __getattr__(self, name: str) -> Any:
+        return self[name]
+
+
+def seen(info: FieldInfo, raw: int) -> Any:
+    """A raw value as the expressions of a struct see it: where construct's Enum has a name for it, that name."""
+    return construct.EnumIntegerString.new(raw, info.labels[raw]) if raw in info.labels else raw
+
+
+def unnamed(raw: int) -> Any:
+    """A raw value that construct's Enum has no name for."""
+    return construct.EnumInteger(raw)
+
+
+def _evaluated(expression: Any, paths: tuple[str, ...], read: Read) -> Any:
+    """The value of an expression in a struct; `paths` of that and of all around it, innermost first."""
+    return expression(_Fields(read, paths)) if callable(expression) else expression
+
+
+@dataclass(frozen=True)
+class _Place:
+    """Where in the tree a construct stands: what is said of it, what its expressions see, and whether it is a part of a bit block."""
+
+    info: FieldInfo
+    scope: Scope | None
+    name: str = ""
+    in_bits: bool = False
+
+    def inside(self, **changes: Any) -> _Place:
+        """The same place with other facts of the field."""
+        return replace(self, info=replace(self.info, **changes))
+
+
+class _Builder:
+    """Makes the nodes of a struct; `scopes`: what was known at the end of each struct, for values that follow from later ones."""
+
+    def __init__(self, known: Mapping[str, Scope]) -> None:
+        self._known, self.scopes, self.rebuilding = known, dict[str, Scope](), False
+        self._asked: list[Ref] = []
+
+    def node(self, con: Construct, place: _Place) -> Node:
+        """The node of a construct, whatever it is."""
+        inner, place = self._peeled(con, place)
+        name, info = place.name, place.info
+        is_block = isinstance(inner, construct.Transformed | construct.Restreamed)
+        if not place.in_bits and (is_block or (isinstance(inner, BytesInteger) and _is_odd(inner))):
+            return self._block(inner, place)
+        if is_block:
+            return self.node(inner.subcon, place)
+        if isinstance(inner, Sealing):
+            return self._sealed(inner, place)
+        if isinstance(inner, Struct):
+            return self._struct(inner, place)
+        if isinstance(inner, Array):
+            axis = axis_path(info)
+            count = self._formula(inner.count, place)
+            return Repeat(name, axis, count, self.node(inner.subcon, place.inside(axes=(*info.axes, axis))))
+        if isinstance(inner, construct.IfThenElse):
+            condition = self._formula(inner.condfunc, place)
+            branches = (self.node(branch, place.inside(optional=True)) for branch in (inner.thensubcon, inner.elsesubcon))
+            return When(name, condition, *branches)
+        if isinstance(inner, construct.Switch):
+            return self._select(inner, place)
+        return Empty(name) if inner is construct.Pass else self._leaf(inner, place)
+
+    def _peeled(self, con: Construct, place: _Place) -> tuple[Construct, _Place]:
+        """What is below the wrappers that only describe (name, unit, labels, constant), and what they say."""
+        while True:
+            if isinstance(con, construct.Renamed):
+                place = place.inside(docs=con.docs or place.info.docs)
+            elif isinstance(con, Describing):
+                place = replace(place, info=con.described(place.info))
+            elif isinstance(con, construct.Enum):
+                place = place.inside(labels={int(value): str(name) for value, name in con.ksymapping.items()})
+            elif isinstance(con, Const):
+                place = place.inside(const=_constant(con))
+            elif isinstance(con, construct.Rebuild):
+                self.rebuilding = True
+                known = None if place.scope is None else self._known.get(place.scope.path)
+                place = place.inside(rebuilt=self._formula(con.func, place, known))
+            elif not isinstance(con, construct.Default):
+                return con, place
+            con = con.subcon
+
+    def _formula(self, expression: Any, place: _Place, known: Scope | None = None, *, is_key: bool = False) -> Formula:
+        """A count, length, condition or key as data, as far as it can be written down."""
+        if isinstance(expression, int):
+            return int(expression)
+        scope = next((scope for scope in (known, place.scope) if scope is not None), Scope(None, "", self._asked))
+        scope.asked.clear()
+        blind = False
+        try:
+            value = _traced(expression, scope)
+            if not isinstance(expression, ExprMixin) and any(ref.info.optional for ref in scope.asked):
+                reason = "a Python function of a field that may be left out"
+            elif isinstance(value, bool | int):
+                return int(value)
+            elif not isinstance(value, Symbol):
+                reason = f"an expression that gives {value!r}"
+            elif not is_key and isinstance(value.formula, Ref) and value.formula.info.labels:
+                reason = "an expression takes the name of a value for a number"
+            else:
+                return value.formula
+        except Untraceable as untraceable:
+            reason, blind = str(untraceable), isinstance(untraceable, Blind)
+        except Exception as error:
+            reason = f"a Python function of other fields ({type(error).__name__}: {error})"
+        return self._code(expression, place, reason, tuple(scope.asked), blind=blind)
+
+    def _code(self, expression: Any, place: _Place, reason: str, asked: tuple[Ref, ...], *, blind: bool = False) -> Code:
+        paths, scope = list[str](), place.scope
+        while scope is not None:
+            paths.append(scope.path)
+            scope = scope.parent
+        function = functools.partial(_evaluated, expression, tuple(paths or [""]))
+        return Code(function, tuple(dict.fromkeys(asked)), f"{place.info.path}: {reason}", _spelled(expression, place.info.path), blind)
+
+    def _select(self, con: construct.Switch, place: _Place) -> Select:
+        key = self._formula(con.keyfunc, place, is_key=True)
+        labels = key.info.labels if isinstance(key, Ref) else {}
+        raw = {name: value for value, name in labels.items()}
+        # construct looks a value that has a name up by that name alone
+        values = {case: raw.get(str(case), case) if isinstance(case, str) else case for case in con.cases if case not in labels}
+        odd = [case for case, value in values.items() if not isinstance(value, int)]
+        if odd and not isinstance(key, Code):
+            named = isinstance(key, Ref) and isinstance(odd[0], str)
+            reason = f"{key.path} has no value named {odd[0]!r}" if named else f"a case for {odd[0]!r}, which is no integer"  # type: ignore[union-attr]
+            key = self._code(con.keyfunc, place, reason, tuple(refs(key)))
+        if isinstance(key, Code):
+            values = {case: case for case in con.cases}
+        cases = tuple((value, self._branch(con.cases[case], place)) for case, value in values.items())
+        return Select(place.name, key, cases, self._branch(con.default, place))
+
+    def _branch(self, con: Construct, place: _Place) -> Node:
+        return self.node(con, place.inside(optional=True))
+
+    def _struct(self, con: Struct, place: _Place) -> tree.Struct:
+        info = place.info
+        scope = Scope(place.scope, info.path, self._asked)
+        if place.name and place.scope is not None:
+            place.scope.add(place.name, scope)
+        members = []
+        for child in con.subcons:
+            path = ".".join(part for part in (info.path, child.name) if part)
+            said = FieldInfo(path, info.axes, docs=info.docs if place.in_bits else "", optional=info.optional)
+            members.append(self.node(child, _Place(said, scope, child.name or "", place.in_bits)))
+        self.scopes[info.path] = scope
+        return tree.Struct(place.name, info.path, tuple(members))
+
+    def _sealed(self, con: Sealing, place: _Place) -> Node:
+        body = self.node(con.subcon, place)
+        if not isinstance(body, tree.Struct):
+            return Opaque(place.name, place.info, type(con).__name__, "a checksum around something that is no struct", (body,))
+        prefix = f"{place.info.path}." if place.info.path else ""
+        over = (prefix + con.over[0], prefix + con.over[-1]) if con.over is not None else None
+        return Sealed(body, tuple(prefix + name for name in con.fields), over, con.algorithm, tuple(sorted(con.absent)))
+
+    def _leaf(self, con: Construct, place: _Place) -> Node:
+        name, info = place.name, _typed(con, place.info)
+        if name and place.scope is not None:
+            place.scope.add(name, Ref(info.path, info))
+        if isinstance(con, FormatField) and con.fmtstr[-1] != "?":
+            kind = "float" if con.fmtstr[-1] in "efd" else "uint" if con.fmtstr[-1].isupper() else "int"
+            big = con.fmtstr[0] in ">!" or (con.fmtstr[0] == "=" and sys.byteorder == "big")
+            node: Node = Number(info, con.length, kind, "big" if big else "little")  # type: ignore[arg-type]
+        elif isinstance(con, BytesInteger) and not _is_odd(con):
+            node = Number(info, con.length, "int" if con.signed else "uint", "little" if con.swapped else "big")
+        elif isinstance(con, Bytes):
+            node = Blob(name, info, self._formula(con.length, place), info.const)
+        else:
+            kind = type(con).__name__
+            size = self._formula(con.length, place) if isinstance(con, construct.FixedSized) else None
+            node = Opaque(name, info, kind, f"{kind} has no fixed place", size=size, form=_form(con))
+        if not name and info.const is not None and not isinstance(node, Opaque):
+            return Blob("", info, con.length, con.build(info.const))
+        return node
+
+    def _block(self, con: Construct, place: _Place) -> Node:
+        """A bit block: the bits of each field come from probing construct itself."""
+        inside = self.node(con, replace(place, in_bits=True))
+        try:
+            size = int(con.sizeof())
+            fields = _probed(con, size)
+        except (ConstructError, LookupError):
+            fields = None
+        if fields is None:
+            reason = "a bit block whose values are not plain bits of it"
+            return Opaque(place.name, place.info, type(con).__name__, reason, (inside,), in_bits=True)
+        infos = {node.info.path: node.info for node in nodes(inside) if isinstance(node, Number | Blob | Opaque)}
+        parts = []
+        for bits in fields:
+            names = tuple(key for key in bits.keys if isinstance(key, str))
+            info = infos[".".join(part for part in (place.info.path, *names) if part)]
+            parts.append(Part(info, bits, names, tuple(key for key in bits.keys if isinstance(key, int))))
+        return Block(place.name, place.info, size, tuple(parts))
+
+
+def axis_path(info: FieldInfo) -> str:
+    """The name of the axis of an array at this place; an array directly in an array gets brackets."""
+    path = info.path
+    while path in info.axes:
+        path += "[]"
+    return path
+
+
+def integer_type(bits: int, *, signed: bool = False) -> np.dtype[Any]:
+    """The smallest integer type of at least so many bits."""
+    size = next(size for size in (1, 2, 4, 8) if bits <= 8 * size)
+    return np.dtype(f"{'i' if signed else 'u'}{size}")
+
+
+def _typed(con: Construct, info: FieldInfo) -> FieldInfo:
+    """What is known of a field, with the type of its values."""
+    if isinstance(con, FormatField):
+        code = con.fmtstr[-1]
+        kind, letter = ("float", "f") if code in "efd" else ("int", "u" if code.isupper() or code == "?" else "i")
+        return replace(info, dtype=np.dtype(f"{letter}{con.length}"), kind=kind, bits=8 * con.length)
+    if isinstance(con, BytesInteger | BitsInteger) and isinstance(con.length, int):
+        bits = con.length * (8 if isinstance(con, BytesInteger) else 1)
+        dtype = integer_type(bits, signed=bool(con.signed)) if bits <= 64 else None
+        return replace(info, dtype=dtype, kind="int" if dtype is not None else "other", bits=bits)
+    if isinstance(con, type(construct.Flag)):
+        return replace(info, dtype=np.dtype("u1"), kind="int", bits=1)
+    if isinstance(con, Bytes):
+        bits = 8 * con.length if isinstance(con.length, int) else 0
+        return replace(info, dtype=np.dtype("u1"), kind="bytes", bits=bits, axes=(*info.axes, axis_path(info)))
+    if _is_text(con):
+        return replace(info, dtype=np.dtype("u1"), kind="bytes", axes=(*info.axes, axis_path(info)))
+    return info
+
+
+def _is_text(con: Construct) -> bool:
+    """Whether it gives the bytes up to a terminator, or as many as are said in front of them."""
+    while isinstance(con, construct.NullTerminated | construct.NullStripped | construct.FixedSized | construct.Prefixed):
+        con = con.subcon
+    return con is construct.GreedyBytes
+
+
+def _form(con: Construct) -> str:
+    """How a field without a size of its own stands on the wire."""
+    below = con
+    while isinstance(below, Subconstruct):
+        if isinstance(below, construct.NullTerminated):
+            return f"text up to {str(below.term)[1:]}"
+        below = below.subcon
+    return type(con).__name__
+
+
+def _constant(con: Const) -> Any:
+    """The raw value of a constant, also where it is given by the name that construct's Enum has for it."""
+    below = con.subcon
+    while isinstance(con.value, str) and isinstance(below, Subconstruct):
+        if isinstance(below, construct.Enum):
+            if con.value not in below.encmapping:
+                raise SpecError(f"the constant {str(con.value)!r} is none of {', '.join(map(str, below.encmapping))}")
+            return int(below.encmapping[con.value])
+        below = below.subcon
+    return con.value
+
+
+def _is_odd(con: BytesInteger) -> bool:
+    """Whether its length or byte order is not plain."""
+    return not isinstance(con.length, int) or con.length > 8 or not isinstance(con.swapped, bool)
+
+
+@functools.lru_cache(maxsize=4096)
+def _probed(con: Construct, size: int) -> list[BitField] | None:
+    """The bit fields of a block; None where construct decides on its bits, or values are no plain integers."""
+    return probe(functools.partial(_values, con), size) if _is_even(con) else None
+
+
+def _values(con: Construct, block: bytes) -> dict[tuple[str | int, ...], Any]:
+    """The values of a block of bytes by where the parsed block holds them; constants are not checked, since every pattern is tried."""
+    return dict(leaves(con.parse(block, _verify=False)))
+
+
+def _is_even(con: Construct) -> bool:
+    """Whether every block is read in the same way: what a value decides on shows with few blocks only, and probing could miss it."""
+    if isinstance(con, Struct):
+        return all(map(_is_even, con.subcons))
+    if isinstance(con, Subconstruct):
+        return (isinstance(con, construct.Enum) or not isinstance(con, construct.Adapter)) and _is_even(con.subcon)
+    return isinstance(con, BitsInteger | Bytes | BytesInteger | FormatField | type(construct.Flag))
+
+
+def bytes_of(con: Construct, names: Iterable[str]) -> list[int]:
+    """The offsets of the bytes of a block that hold any bit of one of its fields."""
+    keys = tuple(names)
+    for field in _probed(con, con.sizeof()) or ():
+        if field.keys == keys:
+            return [segment.byte for segment in field.segments]
+    raise KeyError(".".join(keys))
+
+
+def leaves(parsed: Any, keys: tuple[str | int, ...] = ()) -> Iterator[tuple[tuple[str | int, ...], Any]]:
+    """The values of a parsed object with where they stand in it, private entries left out."""
+    if isinstance(parsed, dict):
+        for name, value in parsed.items():
+            if not name.startswith("_"):
+                yield from leaves(value, (*keys, name))
+    elif isinstance(parsed, list):
+        for index, value in enumerate(parsed):
+            yield from leaves(value, (*keys, index))
+    else:
+        yield keys, int(parsed) if isinstance(parsed, construct.EnumIntegerString) else parsed
+
+
+def peeled(con: Construct, info: FieldInfo) -> tuple[Construct, FieldInfo]:
+    """What is below the wrappers that only describe (name, unit, labels, constant), and what they say."""
+    while True:
+        if isinstance(con, construct.Renamed):
+            info = replace(info, docs=con.docs or info.docs)
+        elif isinstance(con, Describing):
+            info = con.described(info)
+        elif isinstance(con, construct.Enum):
+            info = replace(info, labels={int(value): str(name) for value, name in con.ksymapping.items()})
+        elif isinstance(con, Const):
+            info = replace(info, const=_constant(con))
+        elif isinstance(con, construct.Rebuild):
+            info = replace(info, rebuilt=con.func)
+        elif not isinstance(con, construct.Default):
+            return con, info
+        con = con.subcon
+
+
+def is_expression(value: object) -> bool:
+    """Whether a value is an expression or a part of a struct, where a number is wanted."""
+    return isinstance(value, ExprMixin | Construct)

@@ -16,17 +16,18 @@ from typing import Any, Literal, TypeVar
 from construct import Construct
 
 from lidarspec.errors import SpecError, UnknownFrame
-from lidarspec.spec.construct_layer import fixed_size, prepare
+from lidarspec.spec.construct_layer import check_struct, fixed_size, frame_tree, prepare
 from lidarspec.spec.links import Link, is_datagram
 from lidarspec.spec.results import Points
-from lidarspec.spec.rules import check_struct
 from lidarspec.spec.timing import Clock, Sequence, Split
+from lidarspec.spec.tree import Node
 
 #: version of the plugin interface; the engine reads this one and the one before.
 API = 1
 STATUSES = ("manual", "vectors", "capture", "hardware")
 #: what a field can say of the device itself, in `Spec.info`.
 ROLES = ("serial", "firmware", "model", "temperature")
+#: where an axis can point: along x, y and z of REP-103, each with its opposite.
 DIRECTIONS = ("forward", "back", "left", "right", "up", "down")
 #: what a sensor sends for a command, see `Simulation.answers`.
 Answer = str | tuple[str, Mapping[str, Any]] | bytes | float
@@ -76,7 +77,7 @@ class Frame:
         acknowledged: findings of `lidarspec check` that are true and meant, as "LS204" or "LS205 path.of.a.field" -> the reason.
 
     Raises:
-        SpecError: if the struct cannot describe a frame (see `lidarspec.spec.rules`).
+        SpecError: if the struct cannot describe a frame (see `lidarspec.spec.construct_layer.check_struct`).
     """
 
     struct: Construct
@@ -101,6 +102,15 @@ class Frame:
         check_struct(self.prepared)
         if not self.max_length:
             object.__setattr__(self, "max_length", _whole_length(self.prepared))
+
+    @cached_property
+    def tree(self) -> Node:
+        """The frame as nodes; made when it is first asked for.
+
+        Raises:
+            SpecError: for a constant that its Enum has no value for.
+        """
+        return frame_tree(self.prepared)
 
 
 @dataclass(frozen=True)

@@ -10,14 +10,28 @@ from __future__ import annotations
 import io
 import re
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from fractions import Fraction
 from typing import Any
 
-from construct import Construct, Container, Subconstruct
+from construct import Construct, Container
 
 from lidarspec.errors import UsageError
 from lidarspec.spec.checksums import Checksum
-from lidarspec.spec.construct_layer import MarkedStruct, Mismatch, bit_width, member, note, prepare, unwrap, verifying
+from lidarspec.spec.construct_layer import (
+    Describing,
+    MarkedStruct,
+    Mismatch,
+    Sealing,
+    bit_width,
+    bytes_of,
+    member,
+    note,
+    prepare,
+    unwrap,
+    verifying,
+)
+from lidarspec.spec.tree import FieldInfo
 
 #: unit -> how many of the SI unit it is; only units that someone may type on the command line.
 _FACTORS: dict[str, dict[str, Fraction]] = {
@@ -66,19 +80,19 @@ def _is_number(text: str) -> bool:
 
 
 def duration(text: str) -> float:
-    """Seconds out of "10s", "500ms", "2min", or a bare number of seconds.
+    """Seconds out of "10s", "500ms", "2min" or "2m", "1h", or a bare number of seconds.
 
     Raises:
         UsageError: where it is no duration, or a negative one.
     """
-    for unit, seconds in (("min", 60.0), ("ms", 1e-3), ("us", 1e-6), ("h", 3600.0), ("s", 1.0), ("", 1.0)):
+    for unit, seconds in (("min", 60.0), ("m", 60.0), ("ms", 1e-3), ("us", 1e-6), ("h", 3600.0), ("s", 1.0), ("", 1.0)):
         number = text.strip().removesuffix(unit)
         if text.strip().endswith(unit) and _is_number(number) and 0 <= float(number) < float("inf"):
             return float(number) * seconds
     raise UsageError(f"{text!r} is no duration: a number with ms, s, min or h, such as 10s")
 
 
-class Scaled(Subconstruct):  # type: ignore[misc]
+class Scaled(Describing):
     """A number on the wire with what it measures: ``physical = raw * scale + offset`` in `unit`.
 
     Parses and builds the raw number; the unit is used where physical values are asked for, and never twice.
@@ -94,14 +108,11 @@ class Scaled(Subconstruct):  # type: ignore[misc]
         super().__init__(subcon)
         self.scale, self.unit, self.offset = scale, unit, offset
 
-    def _parse(self, stream: Any, context: Any, path: str) -> Any:
-        return self.subcon._parsereport(stream, context, path)
-
-    def _build(self, obj: Any, stream: Any, context: Any, path: str) -> Any:
-        return self.subcon._build(obj, stream, context, path)
+    def described(self, info: FieldInfo) -> FieldInfo:
+        return replace(info, scale=self.scale, offset=self.offset, unit=self.unit, measured=True)
 
 
-class Checksummed(Subconstruct):  # type: ignore[misc]
+class Checksummed(Sealing):
     """A struct sealed by one of its own fields, wherever in it that field stands. May nest.
 
     Args:
@@ -222,8 +233,6 @@ class Checksummed(Subconstruct):  # type: ignore[misc]
             start, end = obj["_marks"][part]
             con, obj = unwrap(con, bits=False)._subcons[part], obj[part]
             if unwrap(con, bits=False) is not unwrap(con):
-                from lidarspec.spec.bits import bytes_of  # few checksums are bit fields, and every plugin imports this module
-
                 inside = bytes_of(con, parts[depth + 1 :])
                 return start + min(inside), start + max(inside) + 1
         return start, end

@@ -117,10 +117,12 @@ class Sensor(Spec):
             stream: True reads a byte stream, False one datagram for each `feed`; by default what the data link says.
         """
         from lidarspec.framing.decoder import Decoder, backend as checked_backend
-        from lidarspec.points.numba_kernels import checksums
 
-        chosen = checked_backend(backend)
-        sums = checksums.compiled() if chosen == "jit" else None
+        chosen, sums = checked_backend(backend), None
+        if chosen == "jit":
+            from lidarspec.points.numba_kernels import compiled_sums
+
+            sums = compiled_sums()
         stream = not self.datagrams if stream is None else stream
         return Decoder(self, stream=stream, interpreted=chosen == "construct", backend=chosen, sums=sums)
 
@@ -131,10 +133,10 @@ class Sensor(Spec):
             data: bytes (a stream), an iterable of datagrams, or an (n, size) uint8 array of datagrams.
             backend: "auto", "numpy", "jit" or "construct": the same results.
         """
-        from lidarspec.framing.decoder import is_stream, spans_of
+        from lidarspec.framing.decoder import frames_of, is_stream
 
         decoder = self.decoder(stream=is_stream(data), backend=backend)
-        return [found for spans in spans_of(decoder, data) for found in spans.found()]
+        return [found for frames in frames_of(decoder, data) for found in frames.found()]
 
     def decode(self, data: Any, frame: str | None = None, *, backend: str = "auto") -> Packets:
         """The data frames, or those of another type, as columns.
@@ -143,13 +145,13 @@ class Sensor(Spec):
             data: bytes (a stream), an iterable of datagrams, or an (n, size) uint8 array of datagrams.
             backend: "auto", "numpy", "jit" or "construct": the same results.
         """
-        from lidarspec.framing.decoder import is_stream, spans_of
+        from lidarspec.framing.decoder import frames_of, is_stream
         from lidarspec.packets.stream import PacketStream, data_frame
 
         decoder = self.decoder(stream=is_stream(data), backend=backend)
-        spans = spans_of(decoder, data)
-        name = frame or data_frame(self, spans) or self.data_frame
-        return PacketStream(self, name, decoder.stats, interpreted=decoder.interpreted, backend=decoder.backend).add(spans, whole=True)
+        frames = frames_of(decoder, data)
+        name = frame or data_frame(self, frames) or self.data_frame
+        return PacketStream(self, name, decoder.stats, interpreted=decoder.interpreted, backend=decoder.backend).add(frames, whole=True)
 
     def scans(self, data: Any, *, backend: str = "auto") -> Iterator[Scan]:
         """Every scan of the data; the first and last piece are marked ``complete=False``.

@@ -1,4 +1,4 @@
-"""A test kit for sensors: what the engine promises for every sensor, as a class for pytest, and as `lidarspec check`.
+"""A test kit for authors: what a sensor's declaration has to keep, as a class for pytest and as `lidarspec check`.
 
 from lidarspec.testing import SensorConformance
 
@@ -24,7 +24,7 @@ def __getattr__(name: str) -> Any:
         import pytest
     except ImportError as error:
         raise ImportError("the test kit needs pytest and hypothesis: pip install 'lidarspec[testing]'") from error
-    pytest.register_assert_rewrite("lidarspec.testing.comparisons")
+    pytest.register_assert_rewrite("lidarspec.testing.agreement")
     from lidarspec.testing.conformance import SensorConformance
 
     return SensorConformance

@@ -1,10 +1,10 @@
-"""What can be checked: an installed sensor, a file that describes sensors, a distribution with all of its plugins.
+"""`lidarspec check` without the command line: every property and every rule over a sensor, a file or a distribution.
 
-Where in a plugin's text a part of its spec stands: fields, frames, functions, commands and sensors, by file and line.
-
-Mistakes that show in the text of a plugin: what Python accepts, and what then does something else than it says.
-
-`lidarspec check` without the command line: every property and every rule over a sensor, a file or a distribution.
+A name is made a `Target` first: the sensors that it stands for, what kept others from being loaded, and the modules that they are written
+in. The text of these modules is read twice: for mistakes that show in it alone (what Python accepts, and what then does something else
+than it says), and for where fields, frames, functions, commands and sensors stand, so that a finding names file and line (`Places`). Then
+each sensor is held to its declaration and to the properties of `conformance`, in their order, and what it acknowledges is left out of the
+`Report`.
 """
 
 from __future__ import annotations
@@ -40,6 +40,7 @@ SAID = (
     ("that returns a sensor", "LS006"),
     ("definition", "LS004"),
     ("lidarspec_checksum for", "LS010"),
+    ("max_length may be left out", "LS009"),
 )
 
 
@@ -185,8 +186,6 @@ def _loading_rule(error: BaseException, cause: BaseException) -> str:
     functions = [spot.name for spot in traceback.extract_tb(cause.__traceback__)]
     if isinstance(error, SpecError) and error.rule:
         return error.rule
-    if isinstance(cause, TypeError) and "max_length" in str(cause):
-        return "LS009"
     if "sizeof" in functions or "_sizeof" in functions:
         return "LS008"
     if isinstance(cause, SpecError):

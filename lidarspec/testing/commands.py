@@ -6,8 +6,9 @@ from lidarspec.device.session import Reply, Session
 from lidarspec.errors import CommandError, LidarSpecError, OutOfRange
 from lidarspec.framing.frame_engine import codec
 from lidarspec.simulation.device import SimulatedDevice
+from lidarspec.spec.construct_layer import member
 from lidarspec.spec.links import is_datagram
-from lidarspec.testing.comparisons import assert_command
+from lidarspec.spec.sensor import Sensor
 from lidarspec.testing.findings import Violation, require
 from lidarspec.testing.subject import Subject
 
@@ -24,9 +25,27 @@ def a_command_parses_back(subject: Subject, name: str) -> None:
     """The frame of a command has its fixed values, its arguments within half a step, and builds again."""
     for share in (0.0, 0.37, 1.0):
         try:
-            assert_command(subject.sensor, name, arguments(subject, name, share))
+            _parses_back(subject.sensor, name, arguments(subject, name, share))
         except LidarSpecError as error:
             raise Violation("LS601", str(error), f"commands.{name}") from error
+
+
+def _parses_back(sensor: Sensor, name: str, given: dict[str, float]) -> None:
+    """Fail unless the command's frame parses back to its fixed values, and to its arguments within half a step."""
+    command = sensor.commands[name]
+    data = sensor.command(name, **given)
+    if command.frame is None:
+        assert data == b"", "a command without a frame has bytes"
+        return
+    parsed = sensor.parse(data, frame=command.frame)
+    assert sensor.build(command.frame, parsed) == data, "it builds as other bytes"
+    for path, value in command.values.items():
+        assert member(parsed, path) == value, f"{path} is {member(parsed, path)}, and {value} is meant"
+    fields = codec(sensor.frames[command.frame]).schema.fields
+    for argument, value in given.items():
+        info = fields[command.args[argument][0]]
+        read = member(parsed, info.path) * info.scale + info.offset
+        assert abs(read - value) <= abs(info.scale) * 0.5001, f"{argument} is {read:g}, and {value:g} is given"
 
 
 def arguments_are_held_to_their_ranges(subject: Subject, name: str) -> None:

@@ -3,24 +3,22 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
-from construct import Construct, Struct
-from construct.expr import ExprMixin
 
 from lidarspec.columns.columns import Batch, Fields
 from lidarspec.columns.graph import Traced, Untraceable
 from lidarspec.errors import LidarSpecError
 from lidarspec.framing.frame_engine import CompiledCodec, codec
-from lidarspec.spec.construct_layer import unwrap
+from lidarspec.spec.construct_layer import is_expression
 from lidarspec.spec.description import Frame
-from lidarspec.spec.fields import Scaled, factor
+from lidarspec.spec.fields import factor
 from lidarspec.spec.results import Polar
-from lidarspec.spec.rules import children
 from lidarspec.spec.sensor import Sensor
 from lidarspec.spec.timing import Clock
+from lidarspec.spec.tree import Sealed, Struct, infos, nodes
 from lidarspec.testing.findings import Finding
 from lidarspec.testing.geometry import data_frames, field_of, traced, used
 from lidarspec.testing.subject import Subject
@@ -42,18 +40,17 @@ Findings = Iterator[tuple[str, str, str]]
 def declared(subject: Subject) -> list[Finding]:
     """The findings in a declaration, as (code, what, path) made into findings of this sensor."""
     sensor = subject.sensor
-    checks: list[Callable[[], Findings]] = [lambda: _sensor(sensor), lambda: _clock(sensor)]
-    for name, frame in sensor.frames.items():
-        checks += [lambda n=name, f=frame: _frame(subject, n, f)]  # type: ignore[misc]
-    checks += [lambda n=name: _points(subject, n) for name in data_frames(subject)]  # type: ignore[misc]
-    checks += [lambda: _reach(subject)]
-    found: list[Finding] = []
+    checks: list[Findings] = [_sensor(sensor), _clock(sensor)]
+    checks += [_frame(subject, name, frame) for name, frame in sensor.frames.items()]
+    checks += [_points(subject, name) for name in data_frames(subject)]
+    checks += [_reach(subject)]
+    findings: list[Finding] = []
     for check in checks:
         try:
-            found += [Finding(code, what, path, sensor.id) for code, what, path in check()]
+            findings += [Finding(code, what, path, sensor.id) for code, what, path in check]
         except Exception as error:  # out of the plugin's own functions
-            found.append(Finding("LS414", f"{type(error).__name__}: {error}", "", sensor.id))
-    return found
+            findings.append(Finding("LS414", f"{type(error).__name__}: {error}", "", sensor.id))
+    return findings
 
 
 def _sensor(sensor: Sensor) -> Findings:
@@ -87,8 +84,8 @@ def _clock(sensor: Sensor) -> Findings:
 
 def _frame(subject: Subject, name: str, frame: Frame) -> Findings:
     engine = codec(frame)
-    if not isinstance(unwrap(frame.struct, bits=False), Struct):
-        yield "LS114", f"it is a {type(unwrap(frame.struct, bits=False)).__name__}", name
+    if not isinstance(frame.tree, Struct | Sealed):
+        yield "LS114", f"it is a {type(frame.struct).__name__}", name
     if not isinstance(engine, CompiledCodec):
         yield "LS116", getattr(engine, "reason", "its layout cannot be computed"), name
     elif engine.size is not None and engine.size != frame.max_length:
@@ -109,7 +106,7 @@ def _frame(subject: Subject, name: str, frame: Frame) -> Findings:
 
 def _names(subject: Subject, name: str, frame: Frame) -> Findings:
     """Fields whose names stand for a measure, without a unit; `Scaled(..., "")` says that it is a pure number."""
-    pure = set(_explicit(frame.prepared)) | (_multiplied(subject, name) if frame.data else set())
+    pure = _measured(frame) | (_multiplied(subject, name) if frame.data else set())
     for path, info in codec(frame).schema.fields.items():
         if info.name in MEASURES and info.kind in ("int", "float") and not info.unit and not info.labels and path not in pure:
             yield "LS201", f"{info.name!r} is a measure, and no Scaled says its unit", f"{name}.{path}"
@@ -118,22 +115,16 @@ def _names(subject: Subject, name: str, frame: Frame) -> Findings:
 def _multiplied(subject: Subject, name: str) -> set[str]:
     """The fields that make ranges together with another one, which has the unit."""
     try:
-        infos = [field_of(subject, name, node) for node, _ in used(getattr(traced(subject, name), "range", None))]
+        infos = [field_of(subject, name, node) for node in used(getattr(traced(subject, name), "range", None))]
     except Exception:  # said elsewhere
         return set()
     known = any(info is not None and factor(info.unit, "m") is not None for info in infos)
     return {info.path for info in infos if info is not None} if known else set()
 
 
-def _explicit(con: Construct, path: str = "") -> Iterator[str]:
+def _measured(frame: Frame) -> set[str]:
     """The paths of fields that are declared with Scaled."""
-    named = getattr(con, "name", None)
-    if named and type(con).__name__ == "Renamed":
-        path = f"{path}.{named}" if path else named
-    if isinstance(con, Scaled):
-        yield path
-    for child in children(con):
-        yield from _explicit(child, path)
+    return {info.path for node in nodes(frame.tree) for info in infos(node) if info.measured}
 
 
 def _plausible(subject: Subject, name: str, frame: Frame) -> Findings:
@@ -144,7 +135,7 @@ def _plausible(subject: Subject, name: str, frame: Frame) -> Findings:
     except Exception as error:
         yield "LS414", f"plausible: {type(error).__name__}: {error}", f"{name}.plausible"
         return
-    if isinstance(answer, ExprMixin | Construct):
+    if is_expression(answer):
         yield "LS207", f"it returns {answer!r}, an expression of construct", f"{name}.plausible"
     elif isinstance(answer, bool | np.bool_ | str | type(None)):
         yield "LS207", f"it returns {answer!r} whatever the frame is", f"{name}.plausible"
@@ -159,19 +150,19 @@ def _has_example(subject: Subject, name: str) -> bool:
 
 def _covered(name: str, layouts: list[Layout]) -> Findings:
     """Fields of a sealed frame that no checksum of it covers."""
-    told: set[str] = set()
+    reported: set[str] = set()
     for layout in layouts:
         if not layout.seals:
             continue
         under = {byte for seal in layout.seals for start, end in seal.spans for byte in range(start, end)}
         sealing = {leaf.info.path for seal in layout.seals for leaf in seal.leaves}
         for path, leaf in layout.leaves.items():
-            if path in sealing or leaf.info.const is not None or path in told or 0 in leaf.shape:
+            if path in sealing or leaf.info.const is not None or path in reported or 0 in leaf.shape:
                 continue
-            spots = {leaf.offset} if leaf.wire is not None else {leaf.offset + part.byte for part in leaf.elements[0].segments}
-            if not spots <= under:
-                told.add(path)
-                yield "LS205", f"byte {min(spots - under)} is under no checksum of the frame", f"{name}.{path}"
+            own = {leaf.offset} if leaf.wire is not None else {leaf.offset + part.byte for part in leaf.elements[0].segments}
+            if not own <= under:
+                reported.add(path)
+                yield "LS205", f"byte {min(own - under)} is under no checksum of the frame", f"{name}.{path}"
 
 
 def _sync(subject: Subject, name: str, frame: Frame, engine: CompiledCodec) -> Findings:
@@ -185,11 +176,11 @@ def _sync(subject: Subject, name: str, frame: Frame, engine: CompiledCodec) -> F
     reach = max(engine.prefix) + 1
     if len(data) < 4 * reach:
         return
-    places = np.ones(len(data) - reach + 1, np.bool_)
-    for spot, (mask, value) in engine.prefix.items():
-        places &= (data[spot : spot + len(places)] & mask) == value
+    matching = np.ones(len(data) - reach + 1, np.bool_)
+    for offset, (mask, value) in engine.prefix.items():
+        matching &= (data[offset : offset + len(matching)] & mask) == value
     expected = 2.0 ** -sum(mask.bit_count() for mask, _ in engine.prefix.values())
-    share, chance = float(places.mean()), COMMON + 4 * (COMMON / len(places)) ** 0.5  # beyond what chance makes of so few bytes
+    share, chance = float(matching.mean()), COMMON + 4 * (COMMON / len(matching)) ** 0.5  # beyond what chance makes of so few bytes
     share = expected if expected > COMMON else share
     if expected > COMMON or share > chance:
         yield "LS204", f"its constants stand at {share:.1%} of the places in payloads", name
@@ -220,7 +211,7 @@ def _points(subject: Subject, name: str) -> Findings:
     if not isinstance(result, Polar):
         return
     for column, units in (("range", ("m",)), ("azimuth", ("deg", "rad"))):
-        yield from _measured(subject, name, getattr(result, column), column, units)
+        yield from _column(subject, name, getattr(result, column), column, units)
 
 
 def _reach(subject: Subject) -> Findings:
@@ -242,12 +233,12 @@ def _reach(subject: Subject) -> Findings:
         yield "LS210", f"it ends at {furthest:g} m, and range_limits at {subject.sensor.range_limits[1]:g} m", path
 
 
-def _measured(subject: Subject, name: str, value: Any, column: str, units: tuple[str, ...]) -> Findings:
+def _column(subject: Subject, name: str, value: Any, column: str, units: tuple[str, ...]) -> Findings:
     """A column that no field in a unit of its kind goes into."""
-    infos = [field_of(subject, name, node) for node, looked_up in used(value) if not looked_up]
+    infos = [field_of(subject, name, node) for node in used(value, looked_up=False)]
     free = [info for info in infos if info is not None and info.const is None and not info.labels]
     if free and not any(factor(info.unit, unit) is not None for info in infos if info is not None for unit in units):
-        pure = set(_explicit(subject.sensor.frames[name].prepared))
+        pure = _measured(subject.sensor.frames[name])
         bare = [info for info in free if not info.unit and info.path not in pure]
         if bare and len(bare) == len([info for info in free if not info.unit]):
             order = list(codec(subject.sensor.frames[name]).schema.fields)

@@ -12,7 +12,8 @@ from lidarspec.simulation.device import SimulatedDevice
 from lidarspec.simulation.faults import Faults
 from lidarspec.simulation.scenes import Scene
 from lidarspec.spec.sensor import Sensor
-from lidarspec.transports.serving import Served, door
+from lidarspec.transports.outlets import simulated_outlet
+from lidarspec.transports.serving import Served
 
 
 @contextlib.contextmanager
@@ -47,4 +48,4 @@ def virtual_port(
         if to == "pty" and link is None:
             # The system names each pseudo-terminal anew, and may give the old name to somebody else's meanwhile.
             link = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="lidarspec-port-"))) / "port"
-        yield stack.enter_context(Served(device, door(known, to, link)))
+        yield stack.enter_context(Served(device, simulated_outlet(known, to, link)))

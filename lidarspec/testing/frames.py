@@ -1,6 +1,7 @@
-"""What holds for single frames: examples repeat, bytes and values survive both ways, types are told apart.
+"""What holds for single frames: examples repeat, bytes and values survive both ways, edits are read back, types are told apart.
 
-Drawn edits of fields: what is written is what is read back. Hypothesis draws them, and shrinks a failure to the field at fault.
+construct leaves bits out, cuts numbers and takes what does not belong together without a word; each of these shows when a frame is parsed
+and built again. Edits of fields are drawn by Hypothesis, which shrinks a failure to the field at fault.
 """
 
 from __future__ import annotations
@@ -14,15 +15,17 @@ import numpy as np
 
 from lidarspec.errors import SpecError, UsageError, WireError
 from lidarspec.framing.frame_engine import CompiledCodec, codec
-from lidarspec.framing.plausibility import VALID
+from lidarspec.framing.results import VALID
+from lidarspec.spec.tree import FieldInfo
 from lidarspec.testing import subject as material
 from lidarspec.testing.findings import Violation, require
 from lidarspec.testing.subject import Subject
 from lidarspec.wire.layout import Layout
-from lidarspec.wire.schema import FieldInfo
 
 #: values that each byte of a frame is changed to where construct alone reads it.
 CHANGES = 8
+#: example frames that edits begin with, and the most edits at once.
+BASES, MOST = 8, 3
 
 
 def examples_are_valid_and_repeat(subject: Subject, name: str) -> None:
@@ -168,10 +171,6 @@ def acceptable(subject: Subject, name: str, values: Any) -> bytes | None:
         return subject.sensor.build(name, values)
     except UsageError:
         return None
-
-
-#: example frames that edits begin with, and the most edits at once.
-BASES, MOST = 8, 3
 
 
 def values_survive_building_and_parsing(subject: Subject, name: str) -> None:

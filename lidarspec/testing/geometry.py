@@ -1,8 +1,9 @@
-"""Where the points of a frame come from: the fields that `points` uses for each of its columns, and the beams of simulated packets.
+"""Whether the points of a sensor are where its manual has them, as far as that shows without the manual.
 
-Geometry: clouds by the conventions, directions in radians, in order, across the full circle, and for a single point.
-
-What a simulated sensor measures is where the scene is: simulated, decoded, and held against the scene's own surfaces.
+Three things are looked at. Of examples: clouds keep the conventions, and what `points` returns, traced, says which fields each column is
+made of. Of packets along the sensor's `sweep`: directions are radians, go one way from beam to beam, cross the full circle without a
+leap, and exist for a single point; clock and counter run on. Of packets simulated in a room: the points that come back lie on its walls,
+by a geometry of this module's own (`off`), not the simulator's.
 """
 
 from __future__ import annotations
@@ -10,15 +11,14 @@ from __future__ import annotations
 import copy
 import math
 import random
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.columns.columns import Batch, Fields, aligned, unpadded
-from lidarspec.columns.graph import Node, Traced, trace
+from lidarspec.columns.columns import Fields, aligned, unpadded
+from lidarspec.columns.graph import Node, sample_of, trace, traverse
 from lidarspec.errors import LidarSpecError, SpecError, UsageError
 from lidarspec.framing.frame_engine import CompiledCodec, codec
 from lidarspec.packets.packets import Packets
@@ -29,15 +29,28 @@ from lidarspec.simulation.simulator import simulation
 from lidarspec.spec.fields import factor
 from lidarspec.spec.results import Polar
 from lidarspec.spec.timing import OnWrap
+from lidarspec.spec.tree import FieldInfo
+from lidarspec.spec.vocabulary import LookUp
 from lidarspec.testing import subject as material
-from lidarspec.testing.comparisons import assert_well_formed
+from lidarspec.testing.agreement import assert_well_formed
 from lidarspec.testing.findings import Violation, require
 from lidarspec.testing.frames import acceptable
 from lidarspec.testing.subject import Subject
-from lidarspec.wire.frame_table import Group, Rows
-from lidarspec.wire.schema import FieldInfo
+from lidarspec.wire.frame_table import Rows
 
 Floats = NDArray[np.float64]
+
+#: packets along the sweep whose directions are looked at, and packets in the room of a scene.
+PACKETS, SCENE_PACKETS = 400, 200
+#: radians beyond which an azimuth along a sweep, or a drawn one, can only be degrees.
+TURNS, DRAWN = 4 * np.pi, 15 * np.pi
+#: share of the steps that go one way where a sensor rotates, and the step against it that is too much, radians and medians.
+ONE_WAY, BACK, MEDIANS = 0.8, np.deg2rad(1.5), 4
+#: raw steps by which an angle is moved to see whether the points move with it.
+SMALL = 4
+FULL = {"deg": 360.0, "rad": 2 * np.pi}
+#: metres by which a point may be off its surface beyond half a step: float32, and steps that a header or a code word widens.
+EXACT, UNTOLD = 2e-6, 0.004
 
 
 def data_frames(subject: Subject) -> list[str]:
@@ -73,28 +86,17 @@ def traced(subject: Subject, name: str) -> Any:
     packets = read(subject, name, [subject.example(name)] * subject.sensor.frames[name].confirm)
     if not isinstance(packets.table, Rows) or not packets.table.groups:
         return None
-    group = packets.table.groups[0]
-    batch = packets.batch()
-    table = Rows(batch.table.schema, [Group(group.layout, np.arange(2), np.ascontiguousarray(group.rows[[0, 0]]))])
-    state = {key: (frames, which[group.where[[0, 0]]]) for key, (frames, which) in batch.state.items()}
-    return trace(points_function(subject.sensor, name), Batch(table, np.zeros(2, np.bool_), state, batch.defaults))[0]
+    return trace(points_function(subject.sensor, name), sample_of(packets.batch(), packets.table.groups[0]))[0]
 
 
-def used(value: Any) -> Iterator[tuple[Node, bool]]:
-    """The fields that a traced value is made of, and whether each is only looked up in a table."""
-    pending = [(value.node, False)] if isinstance(value, Traced) else []
-    while pending:
-        node, looked_up = pending.pop()
-        if node.kind in ("field", "state"):
-            yield node, looked_up
-        looked_up = looked_up or getattr(node.function, "__qualname__", "").startswith("take.")
-        pending += [(arg, looked_up) for arg in node.args if isinstance(arg, Node)]
+def used(value: Any, *, looked_up: bool = True) -> list[Node]:
+    """The fields that a traced value is made of; with `looked_up` false without those that are only looked up in a table."""
+    nodes = traverse(value, into=lambda node: looked_up or not isinstance(node.function, LookUp))
+    return [node for node in nodes if node.kind in ("field", "state")]
 
 
 def field_of(subject: Subject, name: str, node: Node) -> FieldInfo | None:
     """The field that a node is, of this frame type or of the state that another one leaves."""
-    from lidarspec.framing.frame_engine import codec
-
     frame, path = name, node.path
     if node.kind == "state":
         _, frame, path = node.path.split(".", 2)
@@ -123,17 +125,6 @@ def beams(subject: Subject, name: str, packets: Packets) -> Beams | None:
         np.broadcast_to(np.asarray(array, np.float64), shape).reshape(shape[0], math.prod(shape[1:])) for array in arrays[:2]
     )
     return Beams(azimuth[mask], elevation[mask]) if mask is not None else Beams(azimuth, elevation)
-
-
-#: packets along the sweep whose directions are looked at.
-PACKETS = 400
-#: radians beyond which an azimuth along a sweep, or a drawn one, can only be degrees.
-TURNS, DRAWN = 4 * np.pi, 15 * np.pi
-#: share of the steps that go one way where a sensor rotates, and the step against it that is too much, radians and medians.
-ONE_WAY, BACK, MEDIANS = 0.8, np.deg2rad(1.5), 4
-#: raw steps by which an angle is moved to see whether the points move with it.
-SMALL = 4
-FULL = {"deg": 360.0, "rad": 2 * np.pi}
 
 
 def clouds_keep_the_conventions(subject: Subject, name: str) -> None:
@@ -266,7 +257,6 @@ def counters_run_on(subject: Subject, name: str) -> None:
 
 def _full_circle(info: FieldInfo) -> tuple[int, int] | None:
     """The raw values of no angle and of the full circle; None where the field cannot hold both."""
-
     if info.kind != "int" or info.const is not None or info.unit not in FULL or not info.scale:
         return None
     raw = [(value - info.offset) / info.scale for value in (0.0, FULL[info.unit])]
@@ -286,11 +276,6 @@ def _with(subject: Subject, name: str, path: str, value: int) -> bytes | None:
         return built if built is not None and subject.sensor.parse(built, frame=name) is not None else None
     except LidarSpecError:
         return None
-
-
-SCENE_PACKETS = 200
-#: metres by which a point may be off its surface beyond half a step: float32, and steps that a header or a code word widens.
-EXACT, UNTOLD = 2e-6, 0.004
 
 
 def off(room: Room, xyz: NDArray[np.float64]) -> NDArray[np.float64]:

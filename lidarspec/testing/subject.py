@@ -1,6 +1,7 @@
-"""What the conformance tests are fed: conversations out of a sensor's own examples, their edits, cuts and noise.
+"""A sensor under test, and what it is fed: conversations out of its own examples, their edits, cuts and noise.
 
-A sensor under test: its examples, with the author's own strategies in them, and what was measured along the way.
+A `Subject` has the sensor, its examples (drawn by the author's own strategies where there are some) and what was measured along the way.
+Everything that is drawn is seeded, so that what fails once fails again.
 """
 
 from __future__ import annotations
@@ -17,9 +18,9 @@ from lidarspec.errors import WireError
 from lidarspec.framing.frame_engine import codec
 from lidarspec.plugins import sensor as named_sensor
 from lidarspec.simulation.frame_maker import examples
+from lidarspec.spec.construct_layer import children
 from lidarspec.spec.description import Frame
 from lidarspec.spec.fields import Checksummed
-from lidarspec.spec.rules import children
 from lidarspec.spec.sensor import Sensor
 
 #: frames up to this length are cut at every byte, longer ones at so many places.

@@ -22,11 +22,11 @@ import numpy as np
 from lidarspec.discovery.checksum_search import search
 from lidarspec.errors import LidarSpecError, WireError
 from lidarspec.framing.frame_engine import codec
+from lidarspec.spec.tree import FieldInfo
 from lidarspec.testing.findings import Violation, require
 from lidarspec.testing.frames import leaves
 from lidarspec.testing.geometry import read
 from lidarspec.testing.subject import Subject
-from lidarspec.wire.schema import FieldInfo
 
 #: what a point may differ by: metres and radians as manuals print them.
 NEAR = 2e-4

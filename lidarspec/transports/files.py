@@ -1,6 +1,7 @@
-"""A recording as a transport: what was received, at the times of then.
+"""Files and standard input as transports: recordings, captures, raw bytes, hexadecimal text.
 
-Files and standard input as transports: raw bytes, hex text, captures.
+A file ends, and is read as fast as it is asked for. Recordings and captures give what was received at the times of then, and count
+what they leave out; bytes alone have no times. `open_file` tells them apart by what they hold.
 """
 
 from __future__ import annotations
@@ -13,13 +14,17 @@ from pathlib import Path
 from typing import BinaryIO
 
 from lidarspec.captures.bulk import Batch, CaptureBatches
-from lidarspec.captures.pcap import CaptureReader, CaptureStats, StreamReader, is_capture, is_stream_capture
+from lidarspec.captures.pcap import CaptureReader, CaptureStats, StreamReader, is_stream_capture
+from lidarspec.captures.records import is_capture
 from lidarspec.errors import SourceError, WireError
-from lidarspec.recording.recordings import MAGIC, Header, Record, Recording
-from lidarspec.transports.protocol import Chunk
+from lidarspec.recording.format import MAGIC, Header, Record
+from lidarspec.recording.recordings import Recording
+from lidarspec.transports.protocol import Chunk, Transport
 
 #: events behind which a frame begun earlier does not go on.
 INTERRUPTIONS = frozenset({"disconnect", "reconnect", "dropped"})
+#: bytes read at once.
+BLOCK = 1 << 18
 
 
 def is_recording(head: bytes) -> bool:
@@ -27,7 +32,7 @@ def is_recording(head: bytes) -> bool:
     return head[: len(MAGIC)] == MAGIC
 
 
-class RecordingTransport:
+class RecordingTransport(Transport):
     """What was received, as it arrived; commands that were sent and events are passed over, and leave their gap.
 
     Args:
@@ -36,22 +41,14 @@ class RecordingTransport:
         salvage: go on behind damaged places.
 
     Attributes:
-        datagrams: whether each chunk is one datagram.
-        foreign: datagrams from other addresses.
-        disconnects: interruptions of the line.
-        warnings: what is to be said, such as where the file is damaged.
+        header: what the recording says of itself.
     """
 
     def __init__(self, path: str | Path, *, sender: str | None = None, salvage: bool = False) -> None:
         self._recording = Recording(path, salvage=salvage)
-        self.datagrams, self._sender = self._recording.header.datagrams, sender
-        self.foreign = self.disconnects = 0
+        self.header: Header = self._recording.header
+        self.datagrams, self._sender = self.header.datagrams, sender
         self.warnings: list[str] = []
-
-    @property
-    def header(self) -> Header:
-        """What the recording says of itself."""
-        return self._recording.header
 
     def chunks(self) -> Iterator[Chunk]:
         """What was received, in order, with the arrival times of then."""
@@ -101,14 +98,8 @@ def _damage(recording: Recording) -> str:
     )
 
 
-#: bytes read at once.
-BLOCK = 1 << 18
-
-
-class FileTransport:
+class FileTransport(Transport):
     """The bytes of a file as they are, or standard input for "-"."""
-
-    datagrams = False
 
     def __init__(self, path: str, file: BinaryIO) -> None:
         self._path, self._file = path, file
@@ -150,7 +141,6 @@ class CaptureTransport(FileTransport):
     def __init__(self, path: str, file: BinaryIO, *, sender: str | None = None) -> None:
         super().__init__(path, file)
         self._sender = sender
-        self.foreign = 0
 
     def chunks(self) -> Iterator[Chunk]:
         reader = CaptureReader(self._file)

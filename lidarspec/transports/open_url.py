@@ -5,17 +5,16 @@ from __future__ import annotations
 import importlib
 import re
 from pathlib import Path
-from typing import Any
 from urllib.parse import parse_qs
 
 from lidarspec.device.settings import named
-from lidarspec.errors import UnknownOption, UsageError
+from lidarspec.errors import SpecError, UnknownOption, UsageError
 from lidarspec.plugins import registry
 from lidarspec.spec.links import Link, Tcp, Udp
 from lidarspec.spec.sensor import Sensor
+from lidarspec.transports.base import Address, failure
 from lidarspec.transports.files import open_file
-from lidarspec.transports.live_transport import Address, failure
-from lidarspec.transports.protocol import Transport
+from lidarspec.transports.protocol import LiveTransport, Transport
 
 #: scheme -> the module of lidarspec.transports whose `connect(address, sensor)` opens it.
 SCHEMES = {"serial": "serial", "udp": "udp", "tcp": "tcp", "sim": "simulated"}
@@ -35,12 +34,13 @@ def transport(source: str | Path, sensor: Sensor | None = None) -> Transport:
     Raises:
         UsageError: for a scheme that neither the package nor a plugin knows, and what each kind of source does not take.
         SourceError: where it cannot be opened.
+        SpecError: where a plugin gives something that is no `Transport`.
     """
     device = named(source)
     text = str(source) if device is None else device.source
     address = live_address(text)
     if address is not None:
-        return _live(address, sensor)
+        return _opened(address, sensor)
     path, mark, query = text.rpartition("?")
     if mark and not Path(text).exists():
         options = parse_qs(query, keep_blank_values=True)
@@ -49,6 +49,20 @@ def transport(source: str | Path, sensor: Sensor | None = None) -> Transport:
             raise UnknownOption(min(unknown), ["src"], place=text)
         return open_file(path, sender=options["src"][-1] if "src" in options else None)
     return open_file(text)
+
+
+def live(source: str | Path, sensor: Sensor | None = None) -> LiveTransport:
+    """The open transport for a SOURCE that does not end by itself; arguments as of `transport`.
+
+    Raises:
+        UsageError: for a file too.
+        SourceError: where it cannot be opened.
+    """
+    opened = transport(source, sensor)
+    if isinstance(opened, LiveTransport):
+        return opened
+    opened.close()
+    raise UsageError(f"{source} is a file: nothing can be sent to it")
 
 
 def live_address(source: str | Path) -> Address | None:
@@ -75,7 +89,7 @@ def has_control(source: str | Path) -> bool:
     return address is not None and bool(address.options.get("control"))
 
 
-def control_link(source: str | Path, name: str, link: Link, host: str | None) -> Transport:
+def control_link(source: str | Path, name: str, link: Link, host: str | None) -> LiveTransport:
     """The open transport of a link that commands go over apart from the data.
 
     Args:
@@ -89,11 +103,11 @@ def control_link(source: str | Path, name: str, link: Link, host: str | None) ->
     address = live_address(source)
     said = address.options.get("control", "") if address is not None else ""
     if live_address(said) is not None:
-        return transport(said)
+        return live(said)
     found, port = Address(said, "", said).host_and_port()
     known = found or host
     if isinstance(link, Tcp) and known:
-        return transport(f"tcp://{_bracketed(known)}:{port or link.port}")
+        return live(f"tcp://{_bracketed(known)}:{port or link.port}")
     if isinstance(link, Udp) and known and (port or link.ports):
         from lidarspec.transports.udp import UdpTransport
 
@@ -102,16 +116,18 @@ def control_link(source: str | Path, name: str, link: Link, host: str | None) ->
     raise failure(f"{source}: nobody knows the address of the {name} link", f"the same with ?control=ADDRESS in {source}")
 
 
-def _live(address: Address, sensor: Sensor | None) -> Transport:
+def _opened(address: Address, sensor: Sensor | None) -> Transport:
+    """The open transport of a SOURCE with a scheme, which the package or a plugin knows."""
     if address.scheme in SCHEMES:
         module = importlib.import_module(f"lidarspec.transports.{SCHEMES[address.scheme]}")
         opened: Transport = module.connect(address, sensor)
         return opened
-    found: Any = registry().call("lidarspec_source", url=address.text)
-    if found is None:
+    plugged = registry().call("lidarspec_source", url=address.text)
+    if plugged is None:
         known = ", ".join(f"{scheme}:" for scheme in SCHEMES)
         raise UsageError(f"no transport is installed for {address.scheme!r} sources; known are files, - (standard input), {known}")
-    plugged: Transport = found
+    if not isinstance(plugged, Transport):
+        raise SpecError(f"{address.scheme!r} sources: what a plugin gives has to derive from Transport, and is a {type(plugged).__name__}")
     return plugged
 
 

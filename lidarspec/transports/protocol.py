@@ -1,13 +1,21 @@
-"""What a plugin can add besides sensors: file formats and sources, as values and a protocol."""
+"""What a plugin can add besides sensors: file formats and sources.
+
+A `Transport` is the only place for input and output: it gives `Chunk`s and takes bytes. What it can do is said by its class
+(a `LiveTransport` does not end by itself) and by its attributes, all of which have a default here.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
-from lidarspec.errors import SourceError
+from lidarspec.errors import SourceError, UsageError
+
+#: seconds between two looks at whether somebody wants to stop.
+POLL = 0.05
 
 
 @dataclass(frozen=True)
@@ -50,12 +58,26 @@ class Chunk:
     quiet: bool = False
 
 
-class Transport(Protocol):
-    """Where bytes come from, and go to: the only place for input and output."""
+class Transport(ABC):
+    """Where bytes come from, and go to. A source of one's own derives from it.
 
-    #: whether each chunk is one datagram.
-    datagrams: bool
+    Attributes:
+        datagrams: whether each chunk is one datagram.
+        baud: of a serial line; None for anything else.
+        warnings: what is to be said of it so far, such as where a file is damaged, or that a receive buffer is too small.
+        foreign: datagrams from other senders than the one asked for, so far.
+        kernel_drops: datagrams that the system threw away, so far, since nobody fetched them in time.
+        disconnects: interruptions of the line that a recording tells of, so far.
+    """
 
+    datagrams: bool = False
+    baud: int | None = None
+    warnings: Sequence[str] = ()
+    foreign: int = 0
+    kernel_drops: int = 0
+    disconnects: int = 0
+
+    @abstractmethod
     def chunks(self) -> Iterator[Chunk]:
         """What arrives, until the input ends.
 
@@ -63,6 +85,7 @@ class Transport(Protocol):
             SourceError: where it cannot be read.
         """
 
+    @abstractmethod
     def write(self, data: bytes) -> None:
         """Send bytes to the device.
 
@@ -70,6 +93,7 @@ class Transport(Protocol):
             SourceError: where nothing can be sent.
         """
 
+    @abstractmethod
     def close(self) -> None:
         """Give the port, socket or file back."""
 
@@ -78,34 +102,34 @@ class Disconnected(SourceError):
     """The device behind a live source went away; `LiveTransport.reopen` finds it again when it comes back."""
 
 
-@dataclass
-class Statistics:
-    """What a live transport counts.
+class LiveTransport(Transport):
+    """A transport that does not end by itself: a port, a socket, a simulated device.
 
     Attributes:
-        kernel_drops: datagrams that the system threw away since nobody fetched them in time.
-        foreign: datagrams from other senders than the one asked for.
+        label: how the user called it, for messages.
+        closed: whether it was closed, which ends `chunks`.
+        overflow: what a reader's queue should do when it is full: "drop_oldest", or "block" for a source without a pace of its own.
+        addressed: whether what is written has somewhere to go.
     """
 
-    kernel_drops: int = 0
-    foreign: int = 0
+    label: str = ""
+    closed: bool = False
+    overflow: str = "drop_oldest"
 
+    @property
+    def addressed(self) -> bool:
+        return True
 
-class LiveTransport(Transport, Protocol):
-    """A transport that does not end by itself: a port, a socket, a simulated device."""
-
-    statistics: Statistics
-    #: what is to be said about it, such as a receive buffer that is too small.
-    warnings: list[str]
-
+    @abstractmethod
     def read(self, timeout: float) -> list[Chunk]:
-        """What has arrived; an empty list where nothing did for `timeout` seconds.
+        """What has arrived; an empty list where nothing did for `timeout` seconds, or it was closed.
 
         Raises:
             Disconnected: where the device went away.
             SourceError: where nothing can ever be read again.
         """
 
+    @abstractmethod
     def reopen(self) -> None:
         """Open it again after `Disconnected`.
 
@@ -113,12 +137,19 @@ class LiveTransport(Transport, Protocol):
             SourceError: where it is not there yet.
         """
 
+    def chunks(self) -> Iterator[Chunk]:
+        """What arrives, until the transport is closed or its device goes away."""
+        while not self.closed:
+            yield from self.read(POLL)
+
     def lines(self, *, dtr: bool | None = None, rts: bool | None = None) -> None:
-        """Set control lines; None leaves one as it is.
+        """Set control lines, which only a serial port has; None leaves one as it is.
 
         Raises:
             UsageError: where there are none.
         """
+        raise UsageError(f"{self.label}: only a serial port has control lines")
 
     def peer(self) -> str | None:
         """The host of the device, as far as it is known."""
+        return None

@@ -17,8 +17,8 @@ import serial
 from lidarspec.errors import SourceError, UsageError
 from lidarspec.spec.links import Serial
 from lidarspec.spec.sensor import Sensor
-from lidarspec.transports.live_transport import Address, LiveBase, failure, lost, named, readable, reason
-from lidarspec.transports.protocol import Chunk
+from lidarspec.transports.base import Address, HostClock, failure, lost, named, readable, reason
+from lidarspec.transports.protocol import Chunk, LiveTransport
 
 try:
     from termios import error as TermiosError
@@ -34,7 +34,7 @@ WRITE_TIMEOUT = 2.0
 OPTIONS = ("baud", "dtr", "rts")
 
 
-class SerialTransport(LiveBase):
+class SerialTransport(LiveTransport):
     """A serial port, 8N1.
 
     Args:
@@ -46,8 +46,10 @@ class SerialTransport(LiveBase):
         SourceError: where it cannot be opened: missing, in use, no permission, no such rate.
     """
 
+    baud: int
+
     def __init__(self, port: str, baud: int, *, dtr: bool | None = None, rts: bool | None = None, sensor: Sensor | None = None) -> None:
-        super().__init__()
+        self.clock = HostClock()
         self.label, self.baud = port, baud
         self._levels, self._sensor = {"dtr": dtr, "rts": rts}, sensor
         self._rested = 0.0
@@ -111,7 +113,7 @@ class SerialTransport(LiveBase):
 
     def _refused(self, error: Exception) -> SourceError:
         """Why the port does not open, and what to type."""
-        number, source = getattr(error, "errno", None), f"serial://{self.label}{named(self._sensor)}"
+        number, source = error.errno if isinstance(error, OSError) else None, f"serial://{self.label}{named(self._sensor)}"
         if number == errno.ENOENT or "FileNotFoundError" in str(error):
             return failure(f"{self.label}: no such port", "lidarspec ports")
         if number == errno.EACCES:
@@ -165,19 +167,18 @@ def connect(address: Address, sensor: Sensor | None = None) -> SerialTransport:
         raise UsageError(f"{address.text}: it names no port, as in serial:///dev/ttyUSB0")
     if baud is None:
         raise UsageError(f"{address.text}: how fast is it? Name the sensor with -s, or say {address.text}?baud=115200")
-    levels = {
-        name: level if level is not None else getattr(declared, name, None) for name in ("dtr", "rts") for level in [address.switch(name)]
-    }
+    dtr, rts = (declared.dtr, declared.rts) if declared else (None, None)
+    levels = {name: default if (level := address.switch(name)) is None else level for name, default in (("dtr", dtr), ("rts", rts))}
     return SerialTransport(address.place, baud, sensor=sensor, **levels)
 
 
 def _cause(error: BaseException) -> str:
     """What the system says, where pyserial wraps it in a sentence of its own."""
-    numbers = [one for one in getattr(error, "args", ()) if isinstance(one, int)]
+    numbers = [number for number in error.args if isinstance(number, int)]
     return os.strerror(numbers[0]) if numbers else reason(error) if isinstance(error, OSError) else str(error)
 
 
 def _has_no_lines(error: BaseException) -> bool:
     """Whether the port is of a kind without control lines, such as a pseudo terminal."""
-    numbers = {one for one in getattr(error, "args", ()) if isinstance(one, int)}
+    numbers = {number for number in error.args if isinstance(number, int)}
     return bool(numbers & {errno.ENOTTY, errno.EINVAL})

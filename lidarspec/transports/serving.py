@@ -1,41 +1,49 @@
-"""A simulated sensor served to other programs, or written to a file: the loop that keeps its time."""
+"""What sends through an outlet, by the clock: a simulated sensor, and the replay of a recording.
+
+A simulated device is asked again and again what it sends by now, and told what has arrived. Of a replay every chunk has a deadline
+on the monotonic clock, reckoned from the first one and not from the one before, so that what a wait oversleeps is not added up; a
+chunk that is late goes out at once. Into a file a device is written without waiting: the times in it are the device's own.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import hashlib
 import math
 import queue
 import threading
 import time
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from types import TracebackType
 
-from lidarspec.errors import UsageError
+from lidarspec.errors import UsageError, WireError
 from lidarspec.recording.recorders import recorder
 from lidarspec.simulation.device import SECOND, SimulatedDevice
 from lidarspec.spec.links import Udp
-from lidarspec.spec.sensor import Sensor
-from lidarspec.transports.live_transport import POLL, Address, failure
-from lidarspec.transports.outlets import HERE, Door, TcpDoor, UdpDoor
-from lidarspec.transports.protocol import Chunk
+from lidarspec.transports.open_url import transport
+from lidarspec.transports.outlets import HERE, Outlet
+from lidarspec.transports.protocol import POLL, Chunk, Disconnected
+from lidarspec.wire.build import build_command
 
 #: seconds at least between two sendings.
 PAUSE = 0.001
 #: ns of data that are written to a file between two looks at its health.
 PIECE = SECOND // 100
+#: ns; a chunk of a replay that goes out later than this is worth a word.
+LATE = 20_000_000
 
 
 def serve(
     device: SimulatedDevice,
-    door: Door,
+    outlet: Outlet,
     *,
     seconds: float | None = None,
     stop: threading.Event | None = None,
     turn: Callable[[], None] | None = None,
     patient: bool = False,
 ) -> None:
-    """Let a device live at a door.
+    """Let a device live at an outlet.
 
     Args:
         seconds: how long; for ever where left out.
@@ -46,13 +54,13 @@ def serve(
     Raises:
         SourceError: where nothing can be sent any more.
     """
-    early: list[tuple[str, bytes]] = []
-    while patient and not door.heard and not (stop is not None and stop.is_set()):
-        early = door.receive(POLL)
-    began, present = time.monotonic_ns(), True
+    early: list[bytes] = []
+    while patient and not outlet.heard and not (stop is not None and stop.is_set()):
+        early = outlet.receive(POLL)
+    began, present, endless = time.monotonic_ns(), True, math.isinf(device.rate)
     device.start(began)
-    for link, data in early:
-        device.receive(data, began, link)
+    for data in early:
+        device.receive(data, began)
     end = began + int(seconds * SECOND) if seconds is not None else None
     while not (stop is not None and stop.is_set()):
         if turn is not None:
@@ -60,31 +68,31 @@ def serve(
         now = time.monotonic_ns()
         if end is not None and now >= end:
             break
-        if door.heard or math.isfinite(device.rate):
-            door.send(device.sendings(now), patient=math.isinf(device.rate))
+        if outlet.heard or not endless:
+            outlet.send(_chunks(device, now), patient=endless)
         if device.present != present:
             present = device.present
-            door.plug() if present else door.unplug()
+            outlet.plug() if present else outlet.unplug()
         due = device.deadline
-        pause = PAUSE if math.isfinite(device.rate) or not door.heard else 0.0
+        pause = 0.0 if endless and outlet.heard else PAUSE
         wait = POLL if due is None else min(POLL, max((due - time.monotonic_ns()) / SECOND, pause))
-        for link, data in door.receive(wait):
-            device.receive(data, time.monotonic_ns(), link)
+        for data in outlet.receive(wait):
+            device.receive(data, time.monotonic_ns())
 
 
 class Served:
-    """A simulated sensor at a door, in a thread of its own; a context manager.
+    """A simulated sensor at an outlet, in a thread of its own; a context manager.
 
     Attributes:
         device: what is simulated, with the names of the commands that it `heard`.
-        door: what it is reached through.
+        outlet: what it is reached through.
 
     Args:
         patient: switch it on when somebody listens.
     """
 
-    def __init__(self, device: SimulatedDevice, door: Door, *, patient: bool = False) -> None:
-        self.device, self.door, self._patient = device, door, patient
+    def __init__(self, device: SimulatedDevice, outlet: Outlet, *, patient: bool = False) -> None:
+        self.device, self.outlet, self._patient = device, outlet, patient
         self._stop, self._failure = threading.Event(), list[BaseException]()
         self._orders, self._done = queue.SimpleQueue[Callable[[], None]](), threading.Semaphore(0)
         self._carried = 0
@@ -94,7 +102,7 @@ class Served:
     @property
     def path(self) -> str:
         """What to open."""
-        return self.door.where
+        return self.outlet.place
 
     def unplug(self) -> None:
         """Pull the plug: the port hangs up and is gone."""
@@ -116,7 +124,7 @@ class Served:
             Exception: what went wrong in its thread.
         """
         self.rest()
-        self.door.close()
+        self.outlet.close()
         if self._failure:
             raise self._failure[0]
 
@@ -144,7 +152,7 @@ class Served:
 
     def _run(self) -> None:
         try:
-            serve(self.device, self.door, stop=self._stop, turn=self._turn, patient=self._patient)
+            serve(self.device, self.outlet, stop=self._stop, turn=self._turn, patient=self._patient)
         except BaseException as error:
             self._failure.append(error)
 
@@ -163,56 +171,167 @@ def write_file(device: SimulatedDevice, path: str | Path, seconds: float, *, ove
     """
     sensor, began = device.sensor, time.time_ns()
     device.start(0)
-    link = sensor.links.get("data")
-    ports = link.ports if isinstance(link, Udp) and link.ports else (0,)
-    out = recorder(path, sensor, f"sim:{sensor.id}", datagrams=sensor.datagrams, overwrite=overwrite)
     written, now, opening = 0, 0, [name for name in sensor.on_open if sensor.commands[name].frame]
-    try:
+    with contextlib.closing(recorder(path, sensor, f"sim:{sensor.id}", datagrams=sensor.datagrams, overwrite=overwrite)) as out:
         while now < seconds * SECOND:
             if opening:
                 name = opening.pop(0)
-                out.write(Chunk(sensor.command(name), began + now), "out")
-                device.receive(sensor.command(name), now, sensor.commands[name].link)
+                out.write(Chunk(build_command(sensor, name, {}), began + now), "out")
+                device.receive(build_command(sensor, name, {}), now, sensor.commands[name].link)
             now += PIECE
-            for _, frame, data in device.sendings(now):
-                port = ports[0] if not frame or sensor.frames[frame].data else ports[-1]
-                out.write(Chunk(data, began + now, (HERE, port), (HERE, port)) if sensor.datagrams else Chunk(data, began + now))
-                written += len(data)
+            for chunk in _chunks(device, now, began + now):
+                out.write(chunk)
+                written += len(chunk.data)
             out.keep_up()
-    finally:
-        out.close()
     return written
 
 
-def door(sensor: Sensor, text: str, link: str | Path | None = None) -> Door:
-    """The door that a destination names: "pty", "udp://HOST:PORT" or "tcp://HOST:PORT"; TCP port 0 takes one that is free.
+def _chunks(device: SimulatedDevice, now: int, at: int | None = None) -> list[Chunk]:
+    """What a device sends by now; a datagram with the port that it goes to, which is the sensor's second one if it is no data frame.
 
     Args:
-        link: a path that leads to the pseudo-terminal.
+        at: the arrival time that is noted.
+    """
+    sensor, link = device.sensor, device.sensor.links.get("data")
+    if not sensor.datagrams:
+        return [Chunk(data, at) for _, _, data in device.sendings(now)]
+    ports = link.ports[:2] if isinstance(link, Udp) and link.ports else (0,)
+    ends = {True: (HERE, ports[0]), False: (HERE, ports[-1])}
+    chunks = []
+    for _, frame, data in device.sendings(now):
+        end = ends[not frame or sensor.frames[frame].data]
+        chunks.append(Chunk(data, at, end, end))
+    return chunks
+
+
+class Deadlines:
+    """When each chunk of a replay is due, in ns of the monotonic clock.
+
+    Times that go back a little, as those of datagrams that overtook each other, are due at once; behind a step back of more than
+    a second, as when a clock was set, time is reckoned on from there.
+
+    Args:
+        speed: 2.0 is twice as fast; None as fast as possible.
+        start: when the first one is due.
+    """
+
+    def __init__(self, speed: float | None, start: int) -> None:
+        self._speed, self._start = speed, start
+        self._origin: int | None = None
+        self._latest = 0
+
+    def due(self, at: int | None) -> int:
+        """When something that arrived at this time is due; at once, where nobody knows when that was."""
+        if self._speed is None or at is None:
+            return self._start
+        if self._origin is None:
+            self._origin = self._latest = at
+        elif at < self._latest - SECOND:
+            self._origin, self._latest = self._origin + at - self._latest, at
+        self._latest = max(self._latest, at)
+        return self._start + round((at - self._origin) / self._speed)
+
+
+def replayed(
+    chunks: Iterable[Chunk],
+    outlet: Outlet,
+    *,
+    speed: float | None = 1.0,
+    now: Callable[[], int] = time.monotonic_ns,
+    sleep: Callable[[float], None] = time.sleep,
+) -> Iterator[tuple[Chunk, int]]:
+    """Each chunk once it has been sent, and by how many ns it was late; what listeners send is passed over.
+
+    Args:
+        chunks: with their arrival times.
+        speed: 2.0 is twice as fast; None as fast as possible.
 
     Raises:
-        UsageError: for what is no destination.
-        SourceError: where it cannot be had.
+        Disconnected: where nobody listens any more.
+        SourceError: where it cannot be sent.
     """
-    if text == "pty":
-        try:
-            from lidarspec.transports.outlets import PtyDoor
-        except ImportError:
-            raise failure("this system has no pseudo-terminals", "lidarspec sim SENSOR --to tcp://127.0.0.1:2111") from None
-        return PtyDoor(sensor, link)
-    address = Address.parse(text)
-    if address.scheme not in ("udp", "tcp") or "://" not in text:
-        raise UsageError(f"{text!r} is no destination: pty, udp://HOST:PORT, tcp://HOST:PORT, or a file (.lsr, .pcap, .bin)")
-    if link is not None:
-        raise UsageError("a link leads to a pseudo-terminal: it goes with pty alone")
-    address.check(())
-    free = address.scheme == "tcp" and address.place.endswith(":0")
-    host, port = replace(address, place=address.place[:-2]).host_and_port() if free else address.host_and_port()
-    if address.scheme == "udp":
-        return UdpDoor(sensor, host or HERE, port)
-    return TcpDoor(sensor, host or HERE, 0 if free else port)
+    deadlines: Deadlines | None = None
+    for chunk in chunks:
+        deadlines = deadlines or Deadlines(speed, now())
+        due = deadlines.due(chunk.at)
+        while (left := due - now()) > 0:
+            sleep(left / SECOND)
+        outlet.receive(0.0)
+        if outlet.heard:
+            outlet.send([chunk], patient=True)
+        if not outlet.heard:
+            raise Disconnected(f"{outlet.place}: nobody reads any more")
+        yield chunk, max(-left, 0) if speed is not None else 0
 
 
-def is_file(text: str) -> bool:
-    """Whether a destination is a file, and not a pseudo-terminal or an address."""
-    return text != "pty" and "://" not in text
+class Replay:
+    """What was recorded, sent again byte for byte at the times of then, or faster or slower.
+
+    Args:
+        file: the SOURCE of the recording, capture or raw file.
+        outlet: where it goes; it stays open.
+        speed: 2.0 is twice as fast; None as fast as possible.
+        needs_times: whether a file without times is refused, rather than sent as fast as it is taken.
+        loop: begin again at the end, for every listener from the beginning.
+
+    Attributes:
+        chunks, bytes: sent so far.
+        late: how many chunks went out more than 20 ms late; `latest` by how many ns the latest did.
+        senders: addresses that datagrams came from then.
+        is_timed: whether the file has times.
+        digest: SHA-256 of all bytes.
+        seconds: since the first listener came.
+    """
+
+    def __init__(self, file: str, outlet: Outlet, *, speed: float | None = 1.0, needs_times: bool = False, loop: bool = False) -> None:
+        self._file, self._outlet, self._speed, self._needs_times, self._loop = file, outlet, speed, needs_times, loop
+        self.chunks = self.bytes = self.late = self.latest = 0
+        self.senders, self.is_timed, self.digest = set[str](), True, hashlib.sha256()
+        self._began = time.monotonic()
+
+    @property
+    def seconds(self) -> float:
+        return time.monotonic() - self._began
+
+    def run(self) -> Iterator[str]:
+        """Once through the file, or again and again; after each chunk what is to be said, or "".
+
+        Raises:
+            UsageError: for a file without times, where they are needed.
+            WireError: for a file that holds nothing.
+            SourceError: where it cannot be read, or nothing be sent.
+        """
+        while True:
+            self._outlet.await_listener()
+            if not self.chunks:
+                self._began = time.monotonic()
+            with contextlib.closing(transport(self._file)) as source:
+                try:
+                    for chunk, late in replayed(self._checked(source.chunks()), self._outlet, speed=self._speed):
+                        self._count(chunk, late)
+                        yield ""
+                except Disconnected as gone:
+                    yield str(gone)
+                else:
+                    yield from () if self._loop else source.warnings
+            if not self.chunks:
+                raise WireError(f"{self._file} holds nothing that was received")
+            if not self._loop:
+                return
+
+    def _checked(self, chunks: Iterable[Chunk]) -> Iterator[Chunk]:
+        """What was received; without times there is no speed to keep."""
+        for chunk in chunks:
+            if chunk.at is None and self._speed is not None and self.is_timed:
+                if self._needs_times:
+                    raise UsageError(f"{self._file} does not say when its bytes arrived: only --speed max can be kept")
+                self.is_timed = False
+            yield chunk
+
+    def _count(self, chunk: Chunk, late: int) -> None:
+        self.chunks += 1
+        self.bytes += len(chunk.data)
+        self.digest.update(chunk.data)
+        self.late, self.latest = self.late + (late > LATE), max(self.latest, late)
+        if chunk.sender is not None:
+            self.senders.add(chunk.sender[0])

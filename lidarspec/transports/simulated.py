@@ -14,31 +14,29 @@ from lidarspec.simulation.faults import FAULTS, faults_of
 from lidarspec.simulation.scenes import read_scene
 from lidarspec.spec.links import Serial
 from lidarspec.spec.sensor import Sensor
-from lidarspec.transports.live_transport import Address, LiveBase, failure
-from lidarspec.transports.protocol import Chunk, Disconnected
+from lidarspec.transports.base import Address, HostClock, failure
+from lidarspec.transports.protocol import Chunk, Disconnected, LiveTransport
 
 OPTIONS = ("rate", "scene", "seed", *FAULTS)
 #: ns between two reads, in which a fast sensor gathers some packets.
 PAUSE = 2_000_000
 
 
-class SimulatedTransport(LiveBase):
+class SimulatedTransport(LiveTransport):
     """The data link of a simulated device.
 
     Attributes:
         sensor, device: which is simulated.
         baud: of its serial line, None where it has none.
-        overflow: what a reader's queue should do when it is full: a source without a pace of its own waits for its reader.
     """
 
-    def __init__(self, label: str, device: SimulatedDevice) -> None:
-        super().__init__()
-        self.label, self.device, self.sensor = label, device, device.sensor
+    def __init__(self, label: str, sensor: Sensor, device: SimulatedDevice) -> None:
+        self.label, self.device, self.sensor = label, device, sensor
         link = self.sensor.links.get("data")
         self.datagrams = self.sensor.datagrams
         self.baud = link.baud if isinstance(link, Serial) else None
         self.overflow = "block" if math.isinf(device.rate) else "drop_oldest"
-        self._changed = threading.Condition()
+        self._changed, self._clock = threading.Condition(), HostClock()
         self._rested = 0
         device.start(time.monotonic_ns())
 
@@ -81,7 +79,7 @@ class SimulatedTransport(LiveBase):
         if not self.device.present:
             raise Disconnected(f"{self.label}: the simulated sensor was unplugged")
         self._rested = now + PAUSE if out and math.isfinite(self.device.rate) else now
-        at = self.clock.now()
+        at = self._clock.now()
         return [Chunk(data, at) for data in out]
 
 
@@ -127,7 +125,7 @@ def connect(address: Address, sensor: Sensor | None = None) -> SimulatedTranspor
     named = named_sensor(address.place) if address.place else sensor
     assert named is not None
     simulated = sensor if sensor is not None and sensor.id == named.id else named
-    return SimulatedTransport(address.text, simulated_device(simulated, address.options))
+    return SimulatedTransport(address.text, simulated, simulated_device(simulated, address.options))
 
 
 def _seed(text: str) -> int:

@@ -10,8 +10,8 @@ import time
 from lidarspec.errors import SourceError, UsageError
 from lidarspec.spec.links import Tcp
 from lidarspec.spec.sensor import Sensor
-from lidarspec.transports.live_transport import Address, LiveBase, failure, lost, named, readable, reason
-from lidarspec.transports.protocol import Chunk, Disconnected
+from lidarspec.transports.base import Address, HostClock, failure, lost, named, readable, reason
+from lidarspec.transports.protocol import Chunk, Disconnected, LiveTransport
 
 #: bytes read at once, and seconds between two reads, in which a fast stream gathers some.
 BLOCK, PAUSE = 1 << 18, 0.002
@@ -19,7 +19,7 @@ BLOCK, PAUSE = 1 << 18, 0.002
 PATIENCE, AGAIN = 5.0, 0.5
 
 
-class TcpTransport(LiveBase):
+class TcpTransport(LiveTransport):
     """A connection to a sensor.
 
     Raises:
@@ -27,7 +27,7 @@ class TcpTransport(LiveBase):
     """
 
     def __init__(self, label: str, host: str, port: int, *, sensor: Sensor | None = None) -> None:
-        super().__init__()
+        self.clock = HostClock()
         self.label, self._address, self._sensor = label, (host, port), sensor
         self._rested = 0.0
         self._socket = self._connected(PATIENCE)

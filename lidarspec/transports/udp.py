@@ -30,8 +30,8 @@ from collections.abc import Iterable, Iterator, Sequence
 from lidarspec.errors import SourceError, UsageError
 from lidarspec.spec.links import Udp, is_datagram
 from lidarspec.spec.sensor import Sensor
-from lidarspec.transports.live_transport import Address, LiveBase, failure, lost, named, reason
-from lidarspec.transports.protocol import Chunk, Statistics
+from lidarspec.transports.base import Address, HostClock, failure, lost, named, reason
+from lidarspec.transports.protocol import Chunk, LiveTransport
 
 #: datagrams in one call, and the room for each: memory that is not written to costs nothing.
 MANY, LARGEST = 256, 1 << 16
@@ -158,12 +158,12 @@ PAUSE = 0.002
 #: ns that a datagram may have waited in the kernel, at most; more is a clock that was set.
 LATEST = 60_000_000_000
 #: socket options that Python has no names for (Linux, asm-generic/socket.h).
-SO_TIMESTAMPNS, SO_RXQ_OVFL = 35, 40
+SO_RCVBUFFORCE, SO_TIMESTAMPNS, SO_RXQ_OVFL = 33, 35, 40
 TIME = struct.Struct("qq")
 OPTIONS = ("port", "group", "src")
 
 
-class UdpTransport(LiveBase):
+class UdpTransport(LiveTransport):
     """Datagrams that arrive on some ports.
 
     Args:
@@ -194,12 +194,12 @@ class UdpTransport(LiveBase):
         sensor: Sensor | None = None,
         remote: tuple[str, int] | None = None,
     ) -> None:
-        super().__init__()
+        self.clock = HostClock()
         self.label, self.datagrams = label, datagrams
         self._sender, self._last, self._sensor = sender, remote, sensor
         self._sockets: dict[int, _Socket] = {}
         self._rested = 0.0
-        self._poller = select.poll() if hasattr(select, "poll") else None
+        self._poller = select.poll() if sys.platform != "win32" else None
         slots = _slots()
         try:
             for port in ports:
@@ -209,7 +209,7 @@ class UdpTransport(LiveBase):
             raise
         self.ports = tuple(one.address[1] for one in self._sockets.values())
         smallest = min((one.buffer for one in self._sockets.values()), default=BUFFER)
-        self.warnings += shortfall(BUFFER, smallest)
+        self.warnings = shortfall(BUFFER, smallest)
 
     def read(self, timeout: float) -> list[Chunk]:
         pause = self._rested - time.monotonic()
@@ -219,6 +219,7 @@ class UdpTransport(LiveBase):
         ready = [self._sockets[descriptor] for descriptor in self._ready(timeout)]
         for one in ready:
             self._fetch(one, found)
+        self.kernel_drops = sum(each.drops for each in self._sockets.values())
         gathers = 0 < len(found) < MANY and all(one.is_timed for one in ready)
         self._rested = time.monotonic() + PAUSE if gathers else 0.0
         return found
@@ -256,9 +257,9 @@ class UdpTransport(LiveBase):
         """Everything that waits in a socket, up to a limit that is fair to the others."""
         try:
             own = self._sender
-            for data, sender, at in one.datagrams(self.clock.now(), self.statistics):
+            for data, sender, at in one.datagrams(self.clock.now()):
                 if own is not None and sender[0] != own:
-                    self.statistics.foreign += 1
+                    self.foreign += 1
                     continue
                 self._last = sender
                 found.append(Chunk(data, at, sender, one.address))
@@ -311,10 +312,11 @@ class _Socket:
         address: of its end here.
         buffer: bytes of payload and overhead that the kernel holds for it.
         is_timed: whether the kernel says when each datagram arrived.
+        drops: datagrams that the kernel threw away since nobody fetched them in time.
     """
 
     def __init__(self, found: socket.socket, slots: Slots | None) -> None:
-        self.socket, self._slots, self._drops = found, slots, 0
+        self.socket, self._slots, self.drops = found, slots, 0
         self.address: tuple[str, int] = found.getsockname()[:2]
         self.buffer = _enlarged(found)
         self.is_timed = False
@@ -323,7 +325,7 @@ class _Socket:
                 found.setsockopt(socket.SOL_SOCKET, option, 1)
                 self.is_timed |= option == SO_TIMESTAMPNS
 
-    def datagrams(self, now: int, statistics: Statistics) -> Iterator[tuple[bytes, tuple[str, int], int]]:
+    def datagrams(self, now: int) -> Iterator[tuple[bytes, tuple[str, int], int]]:
         """What waits, with sender and arrival time; counts what the kernel dropped.
 
         Raises:
@@ -341,7 +343,7 @@ class _Socket:
                 if told is not None and told[0] == SO_TIMESTAMPNS:
                     yield data, sender, _carried(told[1], told[2], now, anchor)
                 else:
-                    yield data, sender, self._told(self._slots.said(index), statistics, now, anchor)
+                    yield data, sender, self._told(self._slots.said(index), now, anchor)
             if number < MANY:
                 return
 
@@ -353,7 +355,7 @@ class _Socket:
                 return
             yield data, sender[:2], now
 
-    def _told(self, said: Iterable[tuple[int, memoryview]], statistics: Statistics, now: int, anchor: int) -> int:
+    def _told(self, said: Iterable[tuple[int, memoryview]], now: int, anchor: int) -> int:
         """When the datagram arrived; counts what was dropped before it."""
         at = now
         for kind, data in said:
@@ -362,8 +364,7 @@ class _Socket:
                 at = _carried(seconds, nanoseconds, now, anchor)
             elif kind == SO_RXQ_OVFL and len(data) == 4:
                 drops = int.from_bytes(data, sys.byteorder)
-                statistics.kernel_drops += (drops - self._drops) & 0xFFFFFFFF
-                self._drops = drops
+                self.drops += (drops - self.drops) & 0xFFFFFFFF
         return at
 
 
@@ -415,10 +416,8 @@ def shortfall(asked: int, granted: int) -> list[str]:
 
 def _enlarged(found: socket.socket) -> int:
     """Ask for a larger receive buffer; the bytes that there are in the end. Linux says twice what it gives."""
-    if not hasattr(socket, "SO_RCVBUF"):
-        return BUFFER
-    for option in (socket.SO_RCVBUF, getattr(socket, "SO_RCVBUFFORCE", 33 if sys.platform == "linux" else None)):
-        if option is not None and _granted(found) < BUFFER:
+    for option in (socket.SO_RCVBUF, SO_RCVBUFFORCE) if sys.platform == "linux" else (socket.SO_RCVBUF,):
+        if _granted(found) < BUFFER:
             with contextlib.suppress(OSError):
                 found.setsockopt(socket.SOL_SOCKET, option, BUFFER)
     return _granted(found)

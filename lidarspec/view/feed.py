@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.device.device import Device
-from lidarspec.framing.decoder import Counters
+from lidarspec.framing.results import Counters
 from lidarspec.packets.packets import Packets
 from lidarspec.scans.scans import Scan, ScanStream
 

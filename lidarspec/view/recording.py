@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
-from typing import Any, Literal, cast
+from typing import Any, Literal
 
-from lidarspec.errors import LidarSpecError
-from lidarspec.recording.recorders import AnyRecorder, recorder
+from lidarspec.errors import LidarSpecError, SourceError
+from lidarspec.recording.appending import Appender, Log
+from lidarspec.recording.recorders import recorder
 from lidarspec.transports.protocol import Chunk, Transport
 
 #: names tried for a file before it is given up.
@@ -30,16 +31,16 @@ class Switch:
     def __init__(self, source: str, folder: Path) -> None:
         self._source, self._folder = source, folder
         self._opened: Transport | None = None
-        self._recorder: AnyRecorder | None = None
+        self._recorder: Appender | None = None
         self.sensor_id = ""
         self.name: str | None = None
         self.trouble = ""
         self.written: list[tuple[str, int]] = []
 
-    def attached(self, opened: Transport) -> AnyRecorder:
+    def attached(self, opened: Transport) -> Log:
         """Itself, as the recorder of an open transport: what `open(record=...)` calls."""
         self._opened = opened
-        return cast(AnyRecorder, self)
+        return self
 
     def toggle(self) -> None:
         """Start a file named after the sensor and the time, or end the one that is being written."""
@@ -53,7 +54,7 @@ class Switch:
             self.trouble = str(error)
 
     @property
-    def error(self) -> Exception | None:
+    def error(self) -> SourceError | None:
         """What went wrong with the file that is being written."""
         return self._recorder.error if self._recorder is not None else None
 
@@ -86,6 +87,6 @@ class Switch:
         begin = f"{self.sensor_id}-{time.strftime('%Y%m%d-%H%M%S')}"
         names = (f"{begin}{f'-{number}' if number else ''}.lsr" for number in range(TRIES))
         path = self._folder / next(name for name in names if not (self._folder / name).exists())
-        datagrams, baud = self._opened.datagrams, getattr(self._opened, "baud", None)
-        self._recorder = recorder(path, self.sensor_id, self._source, datagrams=datagrams, baud=baud)
+        opened = self._opened
+        self._recorder = recorder(path, self.sensor_id, self._source, datagrams=opened.datagrams, baud=opened.baud)
         self.name = path.name

@@ -1,4 +1,4 @@
-"""Memory: what is freed is kept for what is asked for next, and an array of one value takes no more than that value."""
+"""Arrays that cost next to nothing: of one value repeated, of consecutive numbers, and some of the rows of another."""
 
 from __future__ import annotations
 
@@ -8,23 +8,8 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-#: bytes; what is freed at the end of the heap is kept up to twice as much.
-KEPT = 1 << 24
 #: numbers that `counted` keeps.
 COUNTED = 1 << 17
-
-
-def keep_freed_memory() -> None:
-    """Lets the allocator keep freed blocks, 32 MiB of them at most; does nothing where it does so already.
-
-    The columns of a batch are blocks of some hundred kilobytes that live for milliseconds. glibc takes such blocks from the
-    system and gives them back, page by page, and fetching the pages anew costs several times what computing the columns
-    costs. It stops doing so for blocks smaller than the largest one that was ever freed, so one is: it is never touched,
-    and takes no memory.
-
-    Source: mallopt(3), M_MMAP_THRESHOLD: the threshold is adjusted dynamically, and M_TRIM_THRESHOLD to twice its value.
-    """
-    np.empty(KEPT, np.uint8)
 
 
 def repeated(value: int, count: int) -> NDArray[np.int64]:
@@ -60,3 +45,10 @@ def _numbers() -> NDArray[np.int64]:
 def alike(values: NDArray[np.int64]) -> int | None:
     """The value that all are, where the array itself says so, as one from `repeated` does; else None."""
     return values.item(0) if values.strides == (0,) and len(values) else None
+
+
+def taken(rows: NDArray[np.uint8], which: NDArray[np.intp] | NDArray[np.bool_]) -> NDArray[np.uint8]:
+    """Some of the rows of bytes, by index or mask, (k, size), each copied as one piece."""
+    whole = rows.view(f"V{rows.shape[1]}")[:, 0]
+    some = whole.take(which) if which.dtype != np.bool_ and rows.flags.c_contiguous else whole[which]
+    return some.view(np.uint8).reshape(-1, rows.shape[1])

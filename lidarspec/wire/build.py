@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import construct
 import numpy as np
-from construct import Construct, Container
+from construct import Container
 
 from lidarspec.errors import LidarSpecError, MissingField, OutOfRange, SpecError, UnknownCommand, UnknownField, UnknownFrame, UsageError
-from lidarspec.spec.construct_layer import Mismatch, WireNaN, field_path, unwrap
+from lidarspec.spec.construct_layer import Mismatch, WireNaN, field_path, seen
 from lidarspec.spec.description import Spec
-from lidarspec.spec.fields import Checksummed
-from lidarspec.spec.rules import children
-from lidarspec.wire.schema import FieldInfo, Schema, schema
+from lidarspec.spec.tree import Blob, FieldInfo, Formula, Node, Number, Read, Sealed, Struct, evaluated, nodes, refs
+from lidarspec.wire.schema import Schema, schema
 
 
 def build(sensor: Spec, frame: str, value: Any, values: Mapping[str, Any], *, units: bool = False) -> bytes:
@@ -24,12 +23,13 @@ def build(sensor: Spec, frame: str, value: Any, values: Mapping[str, Any], *, un
         raise UnknownFrame(frame, sensor.frames, place=sensor.id)
     if value is not None and not isinstance(value, Mapping):
         raise UsageError(f"{sensor.id} {frame}: fields come by name, not as {type(value).__name__}")
-    con, place = sensor.frames[frame].prepared, f"{sensor.id} {frame}"
-    table, known = _fields(con)
+    tree, place = sensor.frames[frame].tree, f"{sensor.id} {frame}"
+    table, known = _fields(tree)
     given = _Values(table, known, place, units=units).checked({**(value or {}), **values}, "")
     try:
-        _fill_counts(con, given, table)
-        return bytes(con.build(_openings(con, given)))
+        _fill_counts(given, table)
+        _open(tree, given, given)
+        return bytes(sensor.frames[frame].prepared.build(given))
     except Mismatch as fault:
         raise _usage(fault, place) from None
     except construct.ConstructError as fault:
@@ -51,21 +51,12 @@ def _usage(fault: Mismatch, place: str) -> UsageError:
 
 
 @functools.lru_cache(maxsize=1024)
-def _fields(con: Construct) -> tuple[Schema, frozenset[str]]:
+def _fields(tree: Node) -> tuple[Schema, frozenset[str]]:
     """The fields of a frame type, and the paths of these and of all that holds them."""
-    table = schema(con)
-    known = set(table.fields) | set(table.arrays) | set(_named(con, ""))
-    parts = [path.split(".") for path in known]
-    return table, frozenset(known | {".".join(names[:depth]) for names in parts for depth in range(len(names))})
-
-
-def _named(con: Construct, path: str) -> Iterator[str]:
-    """The paths of all parts with a name, those without a field too."""
-    if isinstance(con, construct.Renamed):
-        path = f"{path}.{con.name}" if path else str(con.name)
-        yield path
-    for child in children(con):
-        yield from _named(child, path)
+    table = schema(tree)
+    named = {f"{node.path}.{member.name}".strip(".") for node in nodes(tree) if isinstance(node, Struct) for member in node.members}
+    parts = [path.split(".") for path in {*table.fields, *table.arrays, *named}]
+    return table, frozenset(".".join(names[:depth]) for names in parts for depth in range(len(names) + 1))
 
 
 class _Values:
@@ -128,56 +119,41 @@ class _Values:
         return int(value)
 
 
-def _openings(con: Construct, given: Container) -> Container:
-    """The values with the constants, and with a place for each checksum, which fills it in itself."""
-    for name, child in _members(con):
-        inner = unwrap(child, bits=False)
-        if isinstance(inner, construct.Const):
-            given.setdefault(name, inner.value)
-        if isinstance(inner, construct.Struct) and isinstance(given.get(name), dict):
-            _openings(child, given[name])
-    for seal in _seals(con):
-        for dotted in seal.fields:
-            *parents, last = dotted.split(".")
-            target = given
-            for parent in parents:
-                target = target.setdefault(parent, Container())
-            target.setdefault(last, None)
-    return given
+def _open(node: Node, given: Any, values: Container) -> None:
+    """Add to the values of a part (`given`, of all `values`) the constants, and a place for each checksum, which is filled in later."""
+    match node:
+        case Sealed():
+            _open(node.body, given, values)
+            for path in node.fields:
+                *parents, last = path.split(".")
+                target = values
+                for parent in parents:
+                    target = target.setdefault(parent, Container())
+                target.setdefault(last, None)
+        case Struct():
+            for member in node.members:
+                if isinstance(member, Struct | Sealed) and isinstance(given.get(member.name), dict):
+                    _open(member, given[member.name], values)
+                elif isinstance(member, Number | Blob) and member.name and member.info.const is not None:
+                    given.setdefault(member.name, seen(member.info, member.info.const))
 
 
-def _seals(con: Construct) -> Iterator[Checksummed]:
-    while isinstance(con, construct.Subconstruct):
-        if isinstance(con, Checksummed):
-            yield con
-        con = con.subcon
-
-
-def _members(con: Construct) -> list[tuple[str, Construct]]:
-    inner = unwrap(con)
-    return [(child.name, child) for child in inner.subcons if child.name] if isinstance(inner, construct.Struct) else []
-
-
-def _fill_counts(con: Construct, given: Container, table: Schema) -> None:
+def _fill_counts(given: Container, table: Schema) -> None:
     """Set the header fields that arrays take their length from, where the caller left them out."""
-    for axis, expression in table.arrays.items():
-        if not callable(expression) or "[]" in axis:
+    for axis, count in table.arrays.items():
+        if count is None or "[]" in axis:
             continue
         inner, _, name = axis.rpartition(".")
-        scope, asked = _scope(given, inner), _asked_for(expression)
-        if scope is None or not isinstance(scope.get(name), list | bytes) or asked is None:
+        scope, asked = _scope(given, inner), refs(count)
+        if scope is None or not isinstance(scope.get(name), list | bytes) or not asked:
             continue
-        parent = inner
-        while asked[0] == "_":
-            parent, asked = parent.rpartition(".")[0], asked[1:]
-        *levels, field = asked
-        holder = _scope(given, parent)
+        *levels, field = asked[0].path.split(".")
+        holder = given
         for level in levels:
             holder = holder.setdefault(level, Container())
-        if holder.get(field) is None:
-            info = table.fields.get(".".join(part for part in (parent, *asked) if part))
-            context = functools.partial(_context, given, inner)
-            holder[field] = _solved(expression, context, holder, field, len(scope[name]), info, axis)
+        if isinstance(holder, dict) and holder.get(field) is None:
+            read = functools.partial(given_value, given, table.fields)
+            holder[field] = _solved(count, read, holder, field, len(scope[name]), table.fields.get(asked[0].path), axis)
 
 
 def _scope(given: Any, path: str) -> Any:
@@ -186,12 +162,20 @@ def _scope(given: Any, path: str) -> Any:
     return given if isinstance(given, dict) else None
 
 
-def _context(given: Container, path: str) -> Container:
-    """What an expression sees that stands in the struct at `path`: its fields, and under ``_`` those further out."""
-    context = Container(given)
-    for name in path.split(".") if path else ():
-        context = Container(context[name], _=context)
-    return context
+def given_value(given: Mapping[str, Any], fields: Mapping[str, FieldInfo], path: str) -> tuple[FieldInfo, Any] | str | None:
+    """A value that is given for a frame, as formulas read it (see `lidarspec.spec.tree.Read`).
+
+    Raises:
+        LookupError: where there is none.
+    """
+    value: Any = given
+    for name in path.split("."):
+        value = value[name]
+    if isinstance(value, Mapping) or path not in fields:
+        return path
+    info = fields[path]
+    raw = next((raw for raw, name in info.labels.items() if name == value), value) if isinstance(value, str) else value
+    return None if value is None else (info, raw)
 
 
 def build_command(sensor: Spec, name: str, arguments: Mapping[str, Any]) -> bytes:
@@ -213,7 +197,7 @@ def build_command(sensor: Spec, name: str, arguments: Mapping[str, Any]) -> byte
         raise UnknownField(min(unknown), command.args, place=place)
     if command.frame is None:
         return b""
-    fields = schema(sensor.frames[command.frame].prepared).fields
+    fields = schema(sensor.frames[command.frame].tree).fields
     values: dict[str, Any] = {}
     for path, value in command.values.items():
         _put(values, path, value)
@@ -236,74 +220,14 @@ def _put(values: dict[str, Any], path: str, value: Any) -> None:
     values[last] = value
 
 
-class _Asked(Exception):
-    """Carries the path of the first field that an expression asks for."""
-
-
-class _Recorder:
-    """Stands in for a context and notes which field is asked for; arithmetic on it ends the search."""
-
-    def __init__(self, path: tuple[str, ...] = ()) -> None:
-        object.__setattr__(self, "_path", path)
-
-    def __getitem__(self, name: str) -> _Recorder:
-        return _Recorder((*object.__getattribute__(self, "_path"), name))
-
-    def __getattr__(self, name: str) -> Any:
-        return self[name]
-
-
-for _operator in (
-    "add",
-    "sub",
-    "mul",
-    "floordiv",
-    "truediv",
-    "mod",
-    "and",
-    "or",
-    "rshift",
-    "lshift",
-    "radd",
-    "rsub",
-    "rmul",
-    "rand",
-    "int",
-    "index",
-    "eq",
-    "lt",
-    "gt",
-    "le",
-    "ge",
-    "neg",
-):
-
-    def _stop(self: _Recorder, *_: Any) -> Any:
-        raise _Asked(object.__getattribute__(self, "_path"))
-
-    setattr(_Recorder, f"__{_operator}__", _stop)
-
-
-def _asked_for(expression: Any) -> tuple[str, ...] | None:
-    try:
-        found = expression(_Recorder())
-    except _Asked as asked:
-        return tuple(asked.args[0]) or None
-    except Exception:
-        return None
-    return tuple(object.__getattribute__(found, "_path")) if isinstance(found, _Recorder) else None
-
-
-def _solved(
-    expression: Any, context: Callable[[], Container], holder: Container, field: str, length: int, info: FieldInfo | None, axis: str
-) -> int:
+def _solved(count: Formula, read: Read, holder: Container, field: str, length: int, info: FieldInfo | None, axis: str) -> int:
     """The value of the count field that gives this length."""
     top = info.limits[1] if info is not None and info.kind == "int" else 65535
 
     def gives(value: int) -> bool:
         holder[field] = value
         try:
-            return bool(expression(context()) == length)
+            return bool(evaluated(count, read) == length)
         except Exception:
             return False
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.errors import SpecError
-from lidarspec.spec.bits import leaves
+from lidarspec.spec.construct_layer import leaves
 from lidarspec.wire.arrays import counted, is_counted
 from lidarspec.wire.layout import Bytes2D, Layout
 from lidarspec.wire.schema import Schema

@@ -8,7 +8,6 @@ Constants of frames: compared in words of up to eight bytes, for many frames at 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from contextvars import ContextVar
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from typing import Any, Literal
@@ -17,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.spec.bits import BitField
-from lidarspec.spec.checksums import Checksum
-from lidarspec.wire.schema import FieldInfo
+from lidarspec.spec.checksums import Checksum, Single, single
+from lidarspec.spec.tree import FieldInfo, Node
 
 Bytes2D = NDArray[np.uint8]
 
@@ -149,6 +148,10 @@ class Leaf:
         return replace(self, offset=self.offset - offset)
 
 
+#: the checksums of frames by one of their seals, (n,); None where its algorithm is to compute them.
+Sums = Callable[["Seal", Bytes2D], "NDArray[np.uint64] | None"]
+
+
 @dataclass(frozen=True, eq=False)
 class Seal:
     """A checksum of the frame: the fields that hold it, low bits first, and the byte ranges that it covers."""
@@ -174,13 +177,14 @@ class Seal:
             shift += leaf.info.bits
         return total
 
-    def computed(self, rows: Bytes2D) -> NDArray[np.uint64]:
-        """The values that should stand there, (n,)."""
-        sums = _SUMS.get()
-        found = sums(self, rows) if sums is not None else None
-        if found is not None:
-            return found
-        return self.algorithm.over(rows, self.spans or ((0, 0),))
+    def computed(self, rows: Bytes2D, sums: Sums | None = None) -> NDArray[np.uint64]:
+        """The values that should stand there, (n,).
+
+        Args:
+            sums: asked first, before the algorithm.
+        """
+        values = None if sums is None else sums(self, rows)
+        return self.algorithm.over(rows, self.spans or ((0, 0),)) if values is None else values
 
     def fill(self, rows: Bytes2D) -> None:
         """Write the right value into each frame."""
@@ -204,31 +208,17 @@ class Seal:
                 stored |= (leaf.scalar(frame) & ((1 << leaf.info.bits) - 1)) << shift
             shift += leaf.info.bits
         parts = [frame[a:b] for a, b in self.spans]
-        return stored == self.algorithm(parts[0] if len(parts) == 1 else b"".join(parts)) or stored in self.absent
+        return stored == self._single(parts[0] if len(parts) == 1 else b"".join(parts)) or stored in self.absent
 
-    def intact(self, rows: Bytes2D) -> NDArray[np.bool_]:
-        """Which frames carry the right value, or one that means "not filled"."""
+    @cached_property
+    def _single(self) -> Single:
+        return single(self.algorithm)
+
+    def intact(self, rows: Bytes2D, sums: Sums | None = None) -> NDArray[np.bool_]:
+        """Which frames carry the right value, or one that means "not filled", (n,); `sums` as in `computed`."""
         stored = self.stored(rows)
-        right = np.asarray(stored == self.computed(rows))
+        right = np.asarray(stored == self.computed(rows, sums))
         return right | np.isin(stored, np.array(self.absent, np.uint64)) if self.absent else right
-
-
-#: the checksums of frames, (n,); None where the algorithm is to compute them itself.
-Sums = Callable[[Seal, Bytes2D], NDArray[np.uint64] | None]
-_SUMS: ContextVar[Sums | None] = ContextVar("sums", default=None)
-
-
-class summed_by:
-    """As long as it lasts, checksums are computed by this function first."""
-
-    def __init__(self, sums: Sums | None) -> None:
-        self._sums = sums
-
-    def __enter__(self) -> None:
-        self._token = _SUMS.set(self._sums)
-
-    def __exit__(self, *_: object) -> None:
-        _SUMS.reset(self._token)
 
 
 @dataclass(frozen=True, eq=False)
@@ -241,7 +231,7 @@ class Layout:
         constants: offset -> (mask, value).
         seals: its checksums, inner ones first.
         places: byte range of each named part outside arrays.
-        branches: what each If and Switch chose.
+        branches: what each `When` and `Select` chose.
         following: fields whose values follow from this header in a frame that is made, and those; they are not asked of one that comes.
         lengths: of each array, by its axis; 0 in an array without elements.
         notes: what is worked out from the layout and kept with it.
@@ -252,7 +242,7 @@ class Layout:
     constants: Mapping[int, tuple[int, int]]
     seals: tuple[Seal, ...]
     places: Mapping[str, tuple[int, int]]
-    branches: Mapping[str, Any] = field(default_factory=dict)
+    branches: Mapping[Node, Node] = field(default_factory=dict)
     following: tuple[tuple[Leaf, int], ...] = ()
     lengths: Mapping[str, int] = field(default_factory=dict)
     notes: dict[Any, Any] = field(default_factory=dict, repr=False)
@@ -262,11 +252,20 @@ class Layout:
         masks, values = ([self.constants[spot][i] for spot in spots] for i in (0, 1))
         object.__setattr__(self, "_constants", (np.array(spots, np.intp), np.array(masks, np.uint8), np.array(values, np.uint8)))
 
+    @cached_property
+    def _mask(self) -> int:
+        """The bits of a frame that are constant, as one number."""
+        return sum(mask << 8 * spot for spot, (mask, _) in self.constants.items())
+
+    @cached_property
+    def _value(self) -> int:
+        return sum(value << 8 * spot for spot, (_, value) in self.constants.items())
+
     def sound(self, frame: bytes) -> bool:
         """Whether one frame has this size, all constants and the right checksums."""
         return (
             len(frame) == self.size
-            and all(frame[spot] & mask == value for spot, (mask, value) in self.constants.items())
+            and int.from_bytes(frame, "little") & self._mask == self._value
             and all(seal.sound(frame) for seal in self.seals)
         )
 

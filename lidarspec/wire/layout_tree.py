@@ -1,17 +1,12 @@
-"""From a construct tree to a `Layout`: one walk with a cursor.
+"""The layouts of a frame type: where each field stands, for each kind of header.
 
-Where a count, an If or a Switch asks for the value of a header field, a `read` function supplies it: from the bytes
-at hand, or chosen at will to make an example. So one walk gives the layout of one kind of header, and
-`lidarspec.wire.layout_tree` keeps one per distinct header. What has no place that can be computed this way is refused with a
-path and a reason (`NotCompilable`), and is then interpreted by construct.
+Counts, conditions and keys make the layout of a frame depend on some of its own header fields. `layout_of` walks the frame's tree with
+a cursor, for given values of these fields, and says with `Unknown` which further one it needs. A `HeaderTree` keeps what it found: each
+node of it is one field, each branch one of its values, each end a `Layout`, or the reason why there is none. Candidates are sorted
+through it in bulk, by value, so that the frame's tree is walked once for each distinct header. Headers for examples are drawn by chance.
 
-Headers that nobody sent: drawn by chance for examples, and tried out before any frame arrives.
-
-One layout per distinct header, found for a whole batch of candidates at once.
-
-Counts, If and Switch make a frame's layout depend on some of its own header fields. The tree here asks for those
-fields in the order in which the walk of the struct did: each node is one field, each branch one of its values, each
-end a `Layout`, or the reason why there is none. Candidates are sorted through it in bulk, by value.
+What has no computable place, whatever the header, is told by `check_compilable` before any bytes arrive (`NotCompilable`), and the
+frame is then interpreted by construct.
 """
 
 from __future__ import annotations
@@ -26,18 +21,35 @@ from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Any
 
-import construct
 import numpy as np
-from construct import Array, Bytes, BytesInteger, Construct, FormatField, Struct
-from construct.expr import BinExpr, UniExpr
 from numpy.typing import NDArray
 
 from lidarspec.errors import SpecError
-from lidarspec.spec.bits import BitField, probe
-from lidarspec.spec.fields import Checksummed
-from lidarspec.spec.rules import children
+from lidarspec.spec.bits import BitField, whole_bytes
+from lidarspec.spec.description import Frame
+from lidarspec.spec.tree import (
+    Blob,
+    Block,
+    Code,
+    FieldInfo,
+    Formula,
+    Node,
+    Number,
+    Opaque,
+    Ref,
+    Repeat,
+    Sealed,
+    Select,
+    Struct,
+    When,
+    children,
+    evaluated,
+    formulas,
+    nodes,
+    refs,
+)
 from lidarspec.wire.layout import Layout, Leaf, Seal
-from lidarspec.wire.schema import FieldInfo, axis_path, fields_below, peeled
+from lidarspec.wire.schema import schema
 
 
 class NotCompilable(Exception):
@@ -48,304 +60,277 @@ class NotCompilable(Exception):
         super().__init__(f"{path}: {reason}" if path else reason)
 
 
-class Unread(Exception):
-    """The value of a field that the layout depends on is not there."""
+class Unknown(Exception):
+    """The layout depends on a field whose value is not given; attribute `leaf`: where it stands."""
+
+    def __init__(self, leaf: Leaf) -> None:
+        self.leaf = leaf
+        super().__init__(leaf.info.path)
 
 
 class TooLong(Exception):
     """The header claims more than the longest length that the frame declares, or no byte at all."""
 
 
-Read = Callable[[Leaf], int]
+def layout_of(root: Node, values: Mapping[str, int], limit: int) -> Layout:
+    """The layout of the frames whose header fields have these values.
+
+    Args:
+        values: raw, by path, of the fields that the layout depends on.
+        limit: the longest frame, in bytes.
+
+    Raises:
+        Unknown: where the value of a further field decides.
+        TooLong: where the frame would be longer than `limit`, or without a byte.
+        NotCompilable: where construct alone can tell what comes next.
+        Exception: whatever a formula raises on these values.
+    """
+    walk = _Walk(values, limit)
+    walk.visit(root, "")
+    if not walk.cursor:
+        raise TooLong("")
+    return walk.layout()
+
+
+def prefix_of(root: Node, limit: int) -> dict[int, tuple[int, int]]:
+    """The constants whose place depends on no header field: offset -> (mask, value)."""
+    walk = _Walk({}, limit)
+    with contextlib.suppress(Exception):  # what comes before counts
+        walk.visit(root, "")
+    return walk.constants
+
+
+def check_compilable(root: Node) -> None:
+    """Raise `NotCompilable` if any part of a tree has no computable place, whatever the header."""
+    _check(root, "", in_array=False)
+
+
+def _check(node: Node, path: str, *, in_array: bool) -> None:
+    match node:
+        case Opaque():
+            raise NotCompilable(node.info.path, node.reason)
+        case Sealed():
+            if in_array:
+                raise NotCompilable(path, "a checksum inside an array")
+            _ = node.algorithm
+        case Block():
+            for part in node.parts:
+                if len(part.indices) > 1:
+                    raise NotCompilable(part.info.path, "an array of arrays of bits")
+    for formula in formulas(node):
+        if isinstance(formula, Code) and formula.blind:
+            raise NotCompilable(path, formula.reason.partition(": ")[2])
+        for ref in refs(formula):
+            check_control(ref.info)
+    for child in children(node):
+        below = f"{path}.{child.name}".strip(".") if isinstance(node, Struct) else path
+        _check(child, below, in_array=in_array or isinstance(node, Repeat))
+
+
+def check_control(info: FieldInfo) -> None:
+    """Raise `NotCompilable` if a layout cannot be made to depend on a field."""
+    if info.kind == "int" and info.axes and info.axes[-1].strip("[]") != info.path:
+        raise NotCompilable(info.path, "elements of one array differ in layout")
+    if info.axes or info.kind != "int":
+        raise NotCompilable(info.path, "the layout depends on a field that is not one integer")
 
 
 @dataclass
-class Walk:
-    """The state of one walk through a struct: how far it came, what it found, and the values that it asked for."""
+class _Walk:
+    """One walk through a tree: the values of header fields, how far it came, and what it found."""
 
-    read: Read
+    values: Mapping[str, int]
     limit: int
     cursor: int = 0
     leaves: dict[str, Leaf] = field(default_factory=dict)
     constants: dict[int, tuple[int, int]] = field(default_factory=dict)
     seals: list[Seal] = field(default_factory=list)
     places: dict[str, tuple[int, int]] = field(default_factory=dict)
-    branches: dict[Construct, Construct] = field(default_factory=dict)
+    branches: dict[Node, Node] = field(default_factory=dict)
     lengths: dict[str, int] = field(default_factory=dict)
-    asked: dict[str, int] = field(default_factory=dict)
-    rebuilt: list[tuple[Leaf, Scope]] = field(default_factory=list)
-
-    def run(self, con: Construct) -> Walk:
-        """Go through a prepared struct from here."""
-        _visit(self, con, _Place(FieldInfo(""), Scope(self, None, "", element=False)))
-        return self
+    #: what expressions can ask for by now: a field, the path of a struct, None for what the header leaves out.
+    parts: dict[str, Leaf | str | None] = field(default_factory=dict)
 
     def layout(self) -> Layout:
         """What was found, as a value."""
-        seals, following = tuple(self.seals), self._following()
+        seals, following = tuple(self.seals), tuple(self._following())
         return Layout(self.cursor, self.leaves, self.constants, seals, self.places, self.branches, following, self.lengths)
 
-    def value(self, leaf: Leaf) -> int:
-        """The value of a field that the layout depends on."""
-        if leaf.info.path not in self.asked:
-            self.asked[leaf.info.path] = self.read(leaf)
-        return self.asked[leaf.info.path]
+    def read(self, path: str) -> tuple[FieldInfo, int] | str | None:
+        """A field by its path, for formulas; see `lidarspec.spec.tree.Read`."""
+        if path not in self.parts:
+            scope, _, name = path.rpartition(".")
+            raise NotCompilable(scope, f"an expression asks for {name!r}, which is not a field before it")
+        part = self.parts[path]
+        if not isinstance(part, Leaf):
+            return part
+        if path not in self.values:
+            check_control(part.info)
+            raise Unknown(part)
+        return part.info, self.values[path]
 
-    def _following(self) -> tuple[tuple[Leaf, int], ...]:
-        """The values of `Rebuild` fields that follow from constants and from those that the layout depends on, and from no other."""
-        found: list[tuple[Leaf, int]] = []
-        self.read = _unasked
-        for leaf, scope in self.rebuilt:
-            with contextlib.suppress(Exception):  # of the others: construct evaluates them when a frame is built
-                found.append((leaf, operator.index(leaf.info.rebuilt(scope))))
-        return tuple(found)
+    def visit(self, node: Node, path: str, shape: tuple[int, ...] = (), strides: tuple[int, ...] = ()) -> None:
+        """Go through a part; `shape` and `strides` of the arrays that it is in."""
+        start = self.cursor
+        match node:
+            case Struct():
+                self._struct(node, path, shape, strides)
+            case Sealed():
+                self.visit(node.body, path, shape, strides)
+                self._seal(node, start)
+            case Number() | Blob() | Block():
+                self._field(node, path, shape, strides)
+            case Repeat():
+                self._array(node, path, shape, strides)
+            case When():
+                self.branches[node] = node.then if self._value(node.condition) else node.otherwise
+                self.visit(self.branches[node], path, shape, strides)
+            case Select():
+                self.branches[node] = dict(node.cases).get(self._value(node.key), node.default)
+                self.visit(self.branches[node], path, shape, strides)
+            case Opaque():
+                raise NotCompilable(node.info.path, node.reason)
+        if self.cursor > self.limit:
+            raise TooLong(path)
+        if path and not shape:
+            self.places[path] = (start, self.cursor)
 
+    def _struct(self, node: Struct, path: str, shape: tuple[int, ...], strides: tuple[int, ...]) -> None:
+        self.parts.setdefault(path, path)
+        for member in node.members:
+            below = f"{node.path}.{member.name}".strip(".") if member.name else ""
+            self.visit(member, below, shape, strides)
+            self.parts.setdefault(below, None)
 
-@dataclass(frozen=True)
-class _Place:
-    """Where in the nesting of arrays the walk is."""
+    def _array(self, node: Repeat, path: str, shape: tuple[int, ...], strides: tuple[int, ...]) -> None:
+        count, start = self._count(node.count, path), self.cursor
+        self.lengths[node.axis] = 0 if 0 in shape else count
+        if count > self.limit:
+            raise TooLong(path)
+        if count:
+            self.visit(node.element, path, (*shape, count), (*strides, 0))
+        else:
+            self._no_element(node.element, path, (*shape, count), (*strides, 0))
+        size, depth = self.cursor - start, len(strides)
+        if start + size * count > self.limit:
+            raise TooLong(path)
+        for name, leaf in self.leaves.items():
+            if node.axis in leaf.info.axes:
+                self.leaves[name] = replace(leaf, strides=(*leaf.strides[:depth], size, *leaf.strides[depth + 1 :]))
+        for offset in [offset for offset in self.constants if offset >= start]:
+            byte = self.constants.pop(offset)
+            self.constants.update({offset + size * index: byte for index in range(count)})
+        self.cursor = start + size * count
 
-    info: FieldInfo
-    scope: Scope
-    shape: tuple[int, ...] = ()
-    strides: tuple[int, ...] = ()
+    def _no_element(self, node: Node, path: str, shape: tuple[int, ...], strides: tuple[int, ...]) -> None:
+        """Go through an element that the array has none of, for its fields alone: nothing is asked of it."""
+        start, constants = self.cursor, dict(self.constants)
+        try:
+            self.visit(node, path, shape, strides)
+        except Unknown:
+            raise
+        except Exception:
+            pass  # what construct never looks at cannot fail
+        self.cursor, self.constants = start, constants
 
+    def _field(self, node: Number | Blob | Block, path: str, shape: tuple[int, ...], strides: tuple[int, ...]) -> None:
+        match node:
+            case Number(info, size, _, order):
+                is_word = size in (1, 2, 4, 8) and info.dtype is not None
+                wire = np.dtype(f"{'<' if order == 'little' else '>'}{info.dtype.str[1:]}") if is_word else None  # type: ignore[union-attr]
+                elements = () if is_word else (whole_bytes(size, order, signed=node.kind == "int"),)
+                self._add(Leaf(info, self.cursor, shape, strides, size, wire, elements))
+                if info.const is not None:
+                    self._constant(node.encoded(info.const))
+            case Blob():
+                size = self._count(node.size, path)
+                if node.name:
+                    self._add(Leaf(node.info, self.cursor, (*shape, size), (*strides, 1), size, np.dtype("u1")))
+                self._constant(node.const or b"")
+            case Block():
+                size = node.size
+                self._block(node, path, shape, strides)
+        self.cursor += size
 
-class Scope:
-    """What an expression in a struct sees of the fields before it: ``this.count``, ``this._.header.mode``."""
+    def _block(self, node: Block, path: str, shape: tuple[int, ...], strides: tuple[int, ...]) -> None:
+        groups: dict[str, list[BitField]] = {}
+        infos: dict[str, FieldInfo] = {}
+        for part in node.parts:
+            names = ".".join(name for name in (path, *part.names) if name)
+            groups.setdefault(names, []).append(part.bits)
+            infos[names] = part.info
+            for depth in range(len(part.names)):
+                above = ".".join(name for name in (path, *part.names[:depth]) if name)
+                self.parts.setdefault(above, above)
+        for name, elements in groups.items():
+            info = infos[name]
+            inside = len(info.axes) > len(shape)
+            if name:
+                own = (*shape, len(elements)) if inside else shape
+                self._add(Leaf(info, self.cursor, own, strides, node.size, elements=tuple(elements)))
+            if info.const is not None:
+                for element in elements:
+                    self._bit_constant(element, int(info.const))
 
-    def __init__(self, walk: Walk, parent: Scope | None, path: str, *, element: bool) -> None:
-        self._walk, self._parent, self._path, self._element = walk, parent, path, element
-        self._names: dict[str | None, Leaf | Scope | None] = {}
+    def _constant(self, data: bytes) -> None:
+        self.constants.update({self.cursor + index: (0xFF, byte) for index, byte in enumerate(data)})
 
-    def __getitem__(self, name: str) -> Any:
-        if name == "_":
-            return self._parent
-        if name == "_root":
-            return self._parent["_root"] if self._parent else self
-        if name not in self._names:
-            raise NotCompilable(self._path, f"an expression asks for {name!r}, which is not a field before it")
-        found = self._names[name]
-        if isinstance(found, Leaf):
-            if self._element:
-                raise NotCompilable(found.info.path, "elements of one array differ in layout")
-            return found.info.seen(self._walk.value(found))
-        return found
-
-    def __getattr__(self, name: str) -> Any:
-        return self[name]
-
-    def __len__(self) -> int:
-        raise NotCompilable(self._path, "an expression asks for the length of an array")
-
-
-def walk(con: Construct, read: Read, limit: int) -> Walk:
-    """Go through a prepared struct; `read` gives the value of each field that its layout depends on.
-
-    Raises:
-        NotCompilable: where construct alone can tell what comes next.
-        TooLong: where the frame would be longer than `limit`, or without a byte.
-    """
-    state = Walk(read, limit).run(con)
-    if not state.cursor:
-        raise TooLong("")
-    return state
-
-
-def _visit(state: Walk, con: Construct, place: _Place) -> None:
-    start = state.cursor
-    inner, info = peeled(con, place.info)
-    place = replace(place, info=info)
-    if isinstance(inner, construct.Transformed | construct.Restreamed | BytesInteger):
-        _block(state, inner, place)
-    elif isinstance(inner, Checksummed):
-        _visit(state, inner.subcon, place)
-        _seal(state, inner, place, start)
-    elif isinstance(inner, Struct):
-        _struct(state, inner, place)
-    elif isinstance(inner, Array):
-        _array(state, inner, place)
-    elif isinstance(inner, construct.IfThenElse):
-        state.branches[inner] = inner.thensubcon if _value(inner.condfunc, place) else inner.elsesubcon
-        _visit(state, state.branches[inner], place)
-    elif isinstance(inner, construct.Switch):
-        state.branches[inner] = inner.cases.get(_value(inner.keyfunc, place), inner.default)
-        _visit(state, state.branches[inner], place)
-    elif inner is not construct.Pass:
-        _field(state, inner, place)
-    if state.cursor > state.limit:
-        raise TooLong(info.path)
-    if info.path and not place.shape:
-        state.places[info.path] = (start, state.cursor)
-
-
-def _struct(state: Walk, con: Struct, place: _Place) -> None:
-    scope = Scope(state, place.scope, place.info.path, element=bool(place.shape))
-    place.scope._names.setdefault(place.info.name, scope)
-    for child in con.subcons:
-        path = "" if child.name is None else f"{place.info.path}.{child.name}" if place.info.path else child.name
-        _visit(state, child, _Place(FieldInfo(path, place.info.axes), scope, place.shape, place.strides))
-        scope._names.setdefault(child.name, None)
-
-
-def _array(state: Walk, con: Array, place: _Place) -> None:
-    count = _count(con.count, place)
-    axes = (*place.info.axes, axis_path(place.info))
-    state.lengths[axes[-1]] = 0 if 0 in place.shape else count
-    start = state.cursor
-    element = replace(place, info=replace(place.info, axes=axes), shape=(*place.shape, count), strides=(*place.strides, 0))
-    if count:
-        _visit(state, con.subcon, element)
-    else:
-        _visit_none(state, con.subcon, element)
-    size = state.cursor - start
-    if start + max(size, 1) * count > state.limit:
-        raise TooLong(place.info.path)
-    for path, leaf in state.leaves.items():
-        if leaf.info.axes[: len(axes)] == axes:
-            depth = len(place.strides)
-            strides = (*leaf.strides[:depth], size, *leaf.strides[depth + 1 :])
-            state.leaves[path] = replace(leaf, strides=strides)
-    spots = {spot: what for spot, what in state.constants.items() if spot >= start}
-    for spot, what in spots.items():
-        del state.constants[spot]
-        state.constants.update({spot + size * index: what for index in range(count)})
-    state.cursor = start + size * count
-
-
-def _visit_none(state: Walk, con: Construct, place: _Place) -> None:
-    """Go through an element that the array has none of, for its fields alone: nothing is asked of it."""
-    start, constants = state.cursor, dict(state.constants)
-    try:
-        _visit(state, con, place)
-    except Unread:
-        raise
-    except Exception:
-        pass  # what construct never looks at cannot fail
-    state.cursor, state.constants = start, constants
-
-
-def _field(state: Walk, con: Construct, place: _Place) -> None:
-    info = fields_below(con, place.info)[place.info.path] if place.info.path else place.info
-    shape, strides = place.shape, place.strides
-    if isinstance(con, FormatField):
-        size, wire = con.length, info.dtype
-        if wire is not None:
-            wire = wire.newbyteorder(con.fmtstr[0] if con.fmtstr[0] in "<>" else "=")
-    elif isinstance(con, Bytes):
-        size, wire = _count(con.length, place), np.dtype("u1")
-        shape, strides = (*shape, size), (*strides, 1)
-    else:
-        raise NotCompilable(place.info.path, f"{type(con).__name__} has no fixed place")
-    if info.path:
-        _add(state, Leaf(info, state.cursor, shape, strides, size, wire), place)
-    if info.const is not None:
-        for index, byte in enumerate(con.build(info.const)):
-            state.constants[state.cursor + index] = (0xFF, byte)
-    state.cursor += size
-
-
-def _block(state: Walk, con: Construct, place: _Place) -> None:
-    """A bit block: the bits of each field come from probing construct itself."""
-    try:
-        size = int(con.sizeof())
-        found = _probed(con, size)
-    except (construct.ConstructError, LookupError):
-        found = None
-    if found is None:
-        raise NotCompilable(place.info.path, "a bit block whose values are not plain bits of it")
-    infos = fields_below(con, place.info)
-    groups: dict[str, list[BitField]] = {}
-    for bits in found:
-        names = [key for key in bits.keys if isinstance(key, str)]
-        groups.setdefault(".".join(part for part in (place.info.path, *names) if part), []).append(bits)
-    if place.info.path not in groups:
-        scope = Scope(state, place.scope, place.info.path, element=bool(place.shape))
-        place.scope._names[place.info.name] = scope
-        place = replace(place, scope=scope)
-    for path, elements in groups.items():
-        info = infos[path] if path else place.info
-        inside = len(info.axes) > len(place.shape)
-        if len(info.axes) > len(place.shape) + 1:
-            raise NotCompilable(path, "an array of arrays of bits")
-        shape = (*place.shape, len(elements)) if inside else place.shape
-        if path:
-            _add(state, Leaf(info, state.cursor, shape, place.strides, size, elements=tuple(elements)), place)
-        if info.const is not None:
-            _bit_constant(state, elements, int(info.const))
-    state.cursor += size
-
-
-@functools.lru_cache(maxsize=4096)
-def _probed(con: Construct, size: int) -> list[BitField] | None:
-    return probe(con, size)
-
-
-def _bit_constant(state: Walk, elements: list[BitField], value: int) -> None:
-    for element in elements:
+    def _bit_constant(self, element: BitField, value: int) -> None:
         for part in element.segments:
-            spot = state.cursor + part.byte
-            mask, known = state.constants.get(spot, (0, 0))
-            state.constants[spot] = (mask | part.mask, known | (value >> part.target << part.low) & part.mask)
+            mask, known = self.constants.get(self.cursor + part.byte, (0, 0))
+            byte = known | (value >> part.target << part.low) & part.mask
+            self.constants[self.cursor + part.byte] = (mask | part.mask, byte)
+
+    def _add(self, leaf: Leaf) -> None:
+        self.leaves[leaf.info.path] = self.parts[leaf.info.path] = leaf
+        if leaf.shape and len(leaf.shape) > len(leaf.strides) - (leaf.info.kind == "bytes"):  # bytes, or an array within a bit block
+            self.lengths[leaf.info.axes[-1]] = 0 if 0 in leaf.shape[:-1] else leaf.shape[-1]
+
+    def _seal(self, node: Sealed, start: int) -> None:
+        leaves = tuple(self.leaves[path] for path in node.fields)
+        if node.over is not None:
+            spans = [(self.places[node.over[0]][0], self.places[node.over[1]][1])]
+        else:
+            held = sorted(map(_held, leaves))
+            edges = [start, *(edge for span in held for edge in span), self.cursor]
+            spans = [(a, b) for a, b in zip(edges[::2], edges[1::2], strict=True) if b > a]
+        self.seals.append(Seal(leaves, tuple(spans), node.algorithm, node.absent))
+
+    def _following(self) -> Iterator[tuple[Leaf, int]]:
+        """The values of rebuilt fields that follow from constants and from those that the layout depends on, and from no other."""
+        for leaf in self.leaves.values():
+            if leaf.info.rebuilt is not None and not leaf.shape:
+                with contextlib.suppress(Exception):  # of the others: construct evaluates them when a frame is built
+                    yield leaf, operator.index(evaluated(leaf.info.rebuilt, self._read_known))
+
+    def _read_known(self, path: str) -> tuple[FieldInfo, int] | str | None:
+        part = self.parts[path]
+        if isinstance(part, Leaf) and isinstance(part.info.const, int) and path not in self.values:
+            return part.info, part.info.const
+        return self.read(path)
+
+    def _value(self, formula: Formula) -> Any:
+        return evaluated(formula, self.read)
+
+    def _count(self, formula: Formula, path: str) -> int:
+        count = operator.index(self._value(formula))
+        if count < 0:
+            raise TooLong(path)
+        return count
 
 
-def _add(state: Walk, leaf: Leaf, place: _Place) -> None:
-    state.leaves[leaf.info.path] = leaf
-    if len(leaf.shape) > len(place.shape):  # bytes, or an array within a bit block
-        state.lengths[leaf.info.axes[-1]] = 0 if 0 in place.shape else leaf.shape[-1]
-    if leaf.info.rebuilt is not None and not leaf.shape:
-        state.rebuilt.append((leaf, place.scope))
-    place.scope._names[leaf.info.name] = leaf
-
-
-def _seal(state: Walk, con: Checksummed, place: _Place, start: int) -> None:
-    if place.shape:
-        raise NotCompilable(place.info.path, "a checksum inside an array")
-    if con.algorithm is None:
-        raise SpecError("a checksum without algorithm, and no lidarspec_checksum hook supplies one", path=con.fields[0])
-    prefix = f"{place.info.path}." if place.info.path else ""
-    leaves = [state.leaves[prefix + name] for name in con.fields]
-    if con.over is not None:
-        spans = [(state.places[prefix + con.over[0]][0], state.places[prefix + con.over[-1]][1])]
-    else:
-        held = sorted(span for leaf in leaves for span in _held(leaf))
-        edges = [start, *(edge for span in held for edge in span), state.cursor]
-        spans = [(a, b) for a, b in zip(edges[::2], edges[1::2], strict=True) if b > a]
-    state.seals.append(Seal(tuple(leaves), tuple(spans), con.algorithm, tuple(sorted(con.absent))))
-
-
-def _held(leaf: Leaf) -> list[tuple[int, int]]:
-    """The bytes that hold any bit of a field."""
+def _held(leaf: Leaf) -> tuple[int, int]:
+    """From the first to the last byte that holds any bit of a field."""
     if not leaf.elements:
-        return [(leaf.offset, leaf.offset + leaf.size)]
+        return leaf.offset, leaf.offset + leaf.size
     spots = [part.byte for element in leaf.elements for part in element.segments]
-    return [(leaf.offset + min(spots), leaf.offset + max(spots) + 1)]
+    return leaf.offset + min(spots), leaf.offset + max(spots) + 1
 
-
-def _unasked(leaf: Leaf) -> int:
-    if isinstance(leaf.info.const, int):
-        return leaf.info.const
-    raise NotCompilable(leaf.info.path, "the layout does not depend on it")
-
-
-def _value(expression: Any, place: _Place) -> Any:
-    return expression(place.scope) if callable(expression) else expression
-
-
-def _count(expression: Any, place: _Place) -> int:
-    count = operator.index(_value(expression, place))
-    if count < 0:
-        raise TooLong(place.info.path)
-    return count
-
-
-#: headers tried before any arrives.
-TRIED = 64
 
 Draw = Callable[[random.Random], int]
 
 
-def choose(con: Construct, limit: int, source: random.Random, drawn: Mapping[str, Draw]) -> tuple[Layout, dict[str, int]]:
+def choose(root: Node, limit: int, source: random.Random, drawn: Mapping[str, Draw]) -> tuple[Layout, dict[str, int]]:
     """A layout of a header chosen at random, with the values of the fields it depends on, by path.
 
     Args:
@@ -355,51 +340,29 @@ def choose(con: Construct, limit: int, source: random.Random, drawn: Mapping[str
     Raises:
         SpecError: where hundreds of headers give no frame.
     """
-    keys = sorted(_switch_keys(con))
+    keys = sorted(_switch_keys(root))
     for _ in range(400):
-        chosen: dict[str, int] = {}
-
-        def read(leaf: Leaf, chosen: dict[str, int] = chosen) -> int:
-            if leaf.info.path not in chosen:
-                own = drawn.get(leaf.info.path)
-                chosen[leaf.info.path] = own(source) if own else _some_value(source, leaf, keys)
-            return chosen[leaf.info.path]
-
-        try:
-            return walk(con, read, limit).layout(), chosen
-        except (TooLong, ArithmeticError, LookupError, TypeError, ValueError):
-            continue
+        with contextlib.suppress(TooLong, ArithmeticError, LookupError, TypeError, ValueError):
+            return _chosen(root, limit, source, drawn, keys)
     raise SpecError("no header was found that gives a frame within its longest length")
 
 
-def try_headers(con: Construct, limit: int) -> None:
-    """Walk the struct for values at which its expressions may decide otherwise, so that what does not compile is known by now."""
-    keys = sorted({*_switch_keys(con), *_compared(con)})
-    pending: list[dict[str, int]] = [{}]
-    for given in pending:
-        asked: dict[str, list[int]] = {}
-
-        def read(leaf: Leaf, given: dict[str, int] = given, asked: dict[str, list[int]] = asked) -> int:
-            check_control(leaf)
-            values = asked[leaf.info.path] = _edges(leaf, keys)
-            return given.get(leaf.info.path, values[0])
-
+def _chosen(root: Node, limit: int, source: random.Random, drawn: Mapping[str, Draw], keys: list[int]) -> tuple[Layout, dict[str, int]]:
+    values: dict[str, int] = {}
+    while True:
         try:
-            walk(con, read, limit)
-        except (NotCompilable, SpecError):
-            raise
-        except Exception:
-            pass  # a header that leads to no frame; the next one may
-        for path, values in asked.items():
-            if path not in given:
-                further = [{**given, path: value} for value in values[1:]]
-                pending += [one for one in further if one not in pending][: max(TRIED - len(pending), 0)]
+            return layout_of(root, values, limit), values
+        except Unknown as unknown:
+            own = drawn.get(unknown.leaf.info.path)
+            values[unknown.leaf.info.path] = own(source) if own else _some_value(source, unknown.leaf, keys)
 
 
-def check_control(leaf: Leaf) -> None:
-    """Raise `NotCompilable` if a layout cannot be made to depend on a field."""
-    if leaf.shape or leaf.info.kind != "int":
-        raise NotCompilable(leaf.info.path, "the layout depends on a field that is not one integer")
+def _switch_keys(root: Node) -> Iterator[int]:
+    """The values of keys that have no name: fields are known to have those with one."""
+    for node in nodes(root):
+        if isinstance(node, Select):
+            labels = node.key.info.labels if isinstance(node.key, Ref) else ()
+            yield from (key for key, _ in node.cases if isinstance(key, int) and key not in labels)
 
 
 def _some_value(source: random.Random, leaf: Leaf, keys: list[int]) -> int:
@@ -411,36 +374,6 @@ def _some_value(source: random.Random, leaf: Leaf, keys: list[int]) -> int:
     value = source.choice(kinds + named[:16] * (1 if source.random() < 0.7 else 0))
     is_negative = leaf.info.dtype is not None and leaf.info.dtype.kind == "i" and value >> (leaf.info.bits - 1)
     return value - (1 << leaf.info.bits) if is_negative else value
-
-
-def _switch_keys(con: Construct) -> Iterator[int]:
-    if isinstance(con, construct.Switch):
-        yield from (key for key in con.cases if isinstance(key, int))
-    for child in children(con):
-        yield from _switch_keys(child)
-
-
-def _edges(leaf: Leaf, keys: list[int]) -> list[int]:
-    """Values of a field at which a layout may change: a usual one first."""
-    if leaf.info.const is not None:
-        return [int(leaf.info.const)]
-    low, high = leaf.info.limits
-    return [value for value in dict.fromkeys((1, 0, *leaf.info.labels, *keys, 2, high, low)) if low <= value <= high]
-
-
-def _compared(con: Construct) -> Iterator[int]:
-    """The numbers in the expressions of a tree, and those beside them."""
-    pending = [vars(con).get(name) for name in ("count", "length", "condfunc", "keyfunc")]
-    while pending:
-        part = pending.pop()
-        if isinstance(part, BinExpr):
-            pending += [part.lhs, part.rhs]
-        elif isinstance(part, UniExpr):
-            pending.append(part.operand)
-        elif isinstance(part, int):
-            yield from (part - 1, part, part + 1)
-    for child in children(con):
-        yield from _compared(child)
 
 
 #: distinct headers remembered; garbage must not fill the memory with their layouts.
@@ -462,13 +395,6 @@ class _Node:
     leaf: Leaf | None = None
     children: dict[int, _Node] = field(default_factory=dict)
     result: Layout | Refused | None = None
-
-
-class _Short(Unread):
-    """The sample ends before a field that the layout depends on."""
-
-    def __init__(self, leaf: Leaf) -> None:
-        self.leaf = leaf
 
 
 _NONE = np.empty(0, np.intp)
@@ -501,15 +427,14 @@ def rows_at(buffer: NDArray[np.uint8], offsets: NDArray[np.intp], size: int, *, 
 class HeaderTree:
     """All layouts of one frame type.
 
-    Raises:
-        NotCompilable: where some part of the struct has no computable place, whatever the header.
+    Attributes:
+        prefix: the constants whose place depends on no header field: offset -> (mask, value).
     """
 
-    def __init__(self, con: Construct, limit: int) -> None:
-        self._con, self._limit = con, limit
+    def __init__(self, frame: Node, limit: int) -> None:
+        self._frame, self._limit = frame, limit
         self._root, self._size = _Node(), 0
-        self.prefix = self._prefix()
-        try_headers(con, limit)
+        self.prefix = prefix_of(frame, limit)
 
     def classify(self, buffer: NDArray[np.uint8], offsets: NDArray[np.intp]) -> tuple[list[Group], NDArray[np.intp]]:
         """The candidates at `offsets`, sorted by layout.
@@ -566,7 +491,7 @@ class HeaderTree:
         self, source: random.Random, drawn: Mapping[str, Callable[[random.Random], int]] | None = None
     ) -> tuple[Layout, dict[str, int]]:
         """A layout of a header chosen at random, with the values of the fields it depends on, by path; see `choose`."""
-        return choose(self._con, self._limit, source, drawn or {})
+        return choose(self._frame, self._limit, source, drawn or {})
 
     def _branch(
         self,
@@ -600,46 +525,46 @@ class HeaderTree:
             stack.append((node.children.setdefault(int(values[start]), _Node()), which[start:stop]))
 
     def _explore(self, sample: NDArray[np.uint8]) -> None:
-        """Walk the struct along one sample, and add what the walk asked for and found to the tree."""
-        trail: list[tuple[Leaf, int]] = []
+        """Find the layout of one sample, and add the fields that decide it to the tree; as far as the sample goes."""
+        frame, node = sample.tobytes(), self._root
+        values: dict[str, int] = {}
+        while node.result is None:
+            leaf = node.leaf
+            if leaf is None:
+                node.leaf, node.result = self._next(values)
+                self._size += 1
+            elif leaf.offset + leaf.size > len(frame):
+                break
+            else:
+                values[leaf.info.path] = value = leaf.scalar(frame)
+                node = node.children.setdefault(value, _Node())
 
-        def read(leaf: Leaf) -> int:
-            check_control(leaf)
-            if leaf.offset + leaf.size > len(sample):
-                raise _Short(leaf)
-            value = int(leaf.at(leaf.offset).load(sample[None, leaf.offset : leaf.offset + leaf.size].copy())[0])
-            trail.append((leaf, value))
-            return value
-
-        result: Layout | Refused | None = None
-        missing: Leaf | None = None
+    def _next(self, values: Mapping[str, int]) -> tuple[Leaf | None, Layout | Refused | None]:
+        """The field that decides next, or what these values lead to."""
         try:
-            result = walk(self._con, read, self._limit).layout()
-        except _Short as short:
-            missing = short.leaf
+            return None, layout_of(self._frame, values, self._limit)
+        except Unknown as unknown:
+            return unknown.leaf, None
         except TooLong:
-            result = Refused()
+            return None, Refused()
         except SpecError:
             raise
         except Exception:
-            result = Refused(traceback.format_exc())
-        node = self._root
-        for leaf, value in trail:
-            node.leaf = leaf
-            node = node.children.setdefault(value, _Node())
-        node.leaf, node.result = missing, result
-        self._size += 1
+            return None, Refused(traceback.format_exc())
 
-    def _prefix(self) -> dict[int, tuple[int, int]]:
-        """The constants whose place depends on no header field."""
-        state = Walk(_stop, self._limit)
-        try:
-            state.run(self._con)
-        except (NotCompilable, SpecError):
-            raise
-        except Exception:
-            pass  # a field of the header was asked for, or it leads to no frame, which `classify` says
-        return dict(state.constants)
+
+@functools.lru_cache(maxsize=2048)
+def frame_layouts(frame: Frame) -> HeaderTree | NotCompilable:
+    """The layouts of a frame type, or why they cannot be computed."""
+    try:
+        check_compilable(frame.tree)
+        for info in schema(frame.tree).fields.values():
+            if info.dtype is None:
+                wide = f"its {info.bits} bits are more than a column holds"
+                raise NotCompilable(info.path, wide if info.bits > 64 else "its values are not all plain numbers of one kind")
+        return HeaderTree(frame.tree, frame.max_length)
+    except NotCompilable as reason:
+        return reason
 
 
 def _few(values: NDArray[Any]) -> list[int] | None:
@@ -649,45 +574,3 @@ def _few(values: NDArray[Any]) -> list[int] | None:
         found.append(left.item(0))
         left = left[left != left[0]]
     return None if len(left) else sorted(found)
-
-
-class _Stop(Unread):
-    """A field of the header was asked for."""
-
-
-def _stop(leaf: Leaf) -> int:
-    check_control(leaf)
-    raise _Stop
-
-
-def check_compilable(con: Construct) -> None:
-    """Raise `NotCompilable` if any branch of a tree holds a construct without a computable place."""
-    _check(con, "")
-
-
-_PLAIN: tuple[Any, ...] = (
-    construct.FormatField,
-    construct.Bytes,
-    construct.BytesInteger,
-    construct.Transformed,
-    construct.Struct,
-    construct.Array,
-    construct.Const,
-    construct.Renamed,
-    construct.Enum,
-    construct.Default,
-    construct.Rebuild,
-    construct.IfThenElse,
-    construct.Switch,
-    type(construct.Pass),
-)
-
-
-def _check(con: Construct, path: str) -> None:
-    if isinstance(con, construct.Renamed):
-        path = f"{path}.{con.name}" if path else str(con.name)
-    if not isinstance(con, _PLAIN) and type(con).__module__ != "lidarspec.spec.fields":
-        raise NotCompilable(path, f"{type(con).__name__} has no fixed place")
-    if not isinstance(con, construct.Transformed):
-        for child in children(con):
-            _check(child, path)

@@ -1,28 +1,41 @@
-"""The wire table of a frame type, drawn from its struct: where each field stands, how wide it is, what it means.
+"""The wire table of a frame type, drawn from its tree: where each field stands, how wide it is, what it means.
 
-Nothing here knows a frame's bytes, so what depends on a header is a formula of its fields ("10 + 3*i"), and a part
-that only some headers have is marked with the condition.
+Nothing here knows a frame's bytes, so what depends on a header is a formula of its fields ("10 + 3*i"), and a part that only some headers
+have is marked with the condition. `extent` gives the size of any part in this way, and the texts for fields, bits and formulas are those of
+exports and explanations, too.
 """
 
 from __future__ import annotations
 
 import itertools
-import re
-from dataclasses import dataclass, field, replace
-from typing import Any
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 
-import construct
-from construct import Array, Bytes, BytesInteger, Construct, FormatField, Struct
-
-from lidarspec.spec.bits import BitField, probe
-from lidarspec.spec.construct_layer import UNNAMED, unwrap
+from lidarspec.spec.bits import BitField
+from lidarspec.spec.construct_layer import UNNAMED
 from lidarspec.spec.description import Frame
-from lidarspec.spec.fields import Checksummed
-from lidarspec.wire.schema import FieldInfo, fields_below, peeled
+from lidarspec.spec.tree import (
+    Blob,
+    Block,
+    Code,
+    FieldInfo,
+    Formula,
+    Node,
+    Number,
+    Opaque,
+    Part,
+    Ref,
+    Repeat,
+    Sealed,
+    Select,
+    Struct,
+    When,
+    children,
+    nodes,
+    written,
+)
 
 INDICES = "ijklmn"
-_ITEM = re.compile(r"\['(\w+)'\]")
-_FIELD = re.compile(r"\bthis(?:\.\w+)+")
 
 
 @dataclass(frozen=True)
@@ -71,122 +84,120 @@ class Extent:
 
 def wire_table(frame: Frame) -> tuple[WireRow, ...]:
     """The rows of a frame type in the order of the wire."""
-    table = _Table()
-    table.visit(frame.prepared, _Place(FieldInfo("")), Extent())
-    return tuple(table.rows)
+    seals = {path: _sealed(node) for node in nodes(frame.tree) if isinstance(node, Sealed) for path in node.fields}
+    return tuple(_rows(frame.tree, "", Extent(), "", seals))
 
 
 def frame_size(frame: Frame) -> str:
     """The length of a frame in bytes: a number, or a formula of its header fields."""
-    return str(_Table().visit(frame.prepared, _Place(FieldInfo("")), Extent()))
+    return str(extent(frame.tree))
 
 
-@dataclass(frozen=True)
-class _Place:
-    """Where in the tree a construct stands: what is said of it, how it is called, and what it depends on."""
-
-    info: FieldInfo
-    shown: str = ""
-    depth: int = 0
-    condition: str = ""
-
-
-@dataclass
-class _Table:
-    """The rows found so far, and what is to be said of the fields that hold checksums."""
-
-    rows: list[WireRow] = field(default_factory=list)
-    seals: dict[str, str] = field(default_factory=dict)
-
-    def visit(self, con: Construct, place: _Place, start: Extent) -> Extent:
-        """Add the rows of a construct that begins at `start`; its size."""
-        inner, info = peeled(con, place.info)
-        place = replace(place, info=info)
-        if unwrap(inner, bits=False) is not unwrap(inner):
-            return self._block(inner, place, start)
-        if isinstance(inner, Checksummed):
-            for name in inner.fields:
-                self.seals[_joined(info.path, name)] = _sealed(inner)
-            return self.visit(inner.subcon, place, start)
-        if isinstance(inner, Struct):
-            return self._struct(inner, place, start)
-        if isinstance(inner, Array):
-            return self._array(inner, place, start)
-        if isinstance(inner, construct.IfThenElse | construct.Switch):
-            return self._choice(inner, place, start)
-        return Extent() if inner is construct.Pass else self._leaf(inner, place, start)
-
-    def _struct(self, con: Struct, place: _Place, start: Extent) -> Extent:
-        size = Extent()
-        for child in con.subcons:
-            name = child.name or UNNAMED
-            info = FieldInfo(_joined(place.info.path, name), place.info.axes)
-            size = size + self.visit(child, replace(place, info=info, shown=_joined(place.shown, name)), start + size)
-        return size
-
-    def _array(self, con: Array, place: _Place, start: Extent) -> Extent:
-        index = INDICES[place.depth % len(INDICES)]
-        count = con.count if isinstance(con.count, int) else formula(con.count, place.info.path)
-        below = replace(place, depth=place.depth + 1, shown=f"{place.shown}[{index}]")
-        element = _Table().visit(con.subcon, below, Extent())
-        whole = element.times(count)
-        self.rows.append(WireRow(str(start), str(whole), "array", place.shown, "", _text(f"{count} elements of {element}", place, "")))
-        self.visit(con.subcon, below, start + element.times(index))
-        return whole
-
-    def _choice(self, con: Any, place: _Place, start: Extent) -> Extent:
-        if isinstance(con, construct.Switch):
-            key = formula(con.keyfunc, place.info.path)
-            branches = [(f"if {key} == {value!r}", case) for value, case in con.cases.items()] + [
-                (f"for other values of {key}", con.default)
-            ]
-        else:
-            asked = formula(con.condfunc, place.info.path)
-            branches = [(f"if {asked}", con.thensubcon), (f"unless {asked}", con.elsesubcon)]
-        sizes = {self.visit(branch, replace(place, condition=condition), start) for condition, branch in branches}
-        return sizes.pop() if len(sizes) == 1 else Extent(0, (f"size({place.shown})",))
-
-    def _leaf(self, con: Construct, place: _Place, start: Extent) -> Extent:
-        size, kind = _sized(con, place.info.path)
-        info = fields_below(con, place.info).get(place.info.path, place.info)
-        self._add(WireRow(str(start), str(size or "varies"), kind, place.shown), info, place)
-        return size or Extent(0, (f"size({place.shown})",))
-
-    def _block(self, con: Construct, place: _Place, start: Extent) -> Extent:
-        size = int(con.sizeof())
-        infos = fields_below(con, place.info)
-        for bits in probe(con, size) or ():
-            names = ".".join(key for key in bits.keys if isinstance(key, str))
-            indices = "".join(f"[{key}]" for key in bits.keys if isinstance(key, int))
-            row = WireRow(str(start), f"{bits.width} bit{'s' * (bits.width > 1)}", bit_text(bits), _joined(place.shown, names) + indices)
-            self._add(row, infos[_joined(place.info.path, names)], place)
-        return Extent(size)
-
-    def _add(self, row: WireRow, info: FieldInfo, place: _Place) -> None:
-        self.rows.append(replace(row, unit=unit_text(info), meaning=_text(meaning(info), place, self.seals.get(info.path, ""))))
+def extent(node: Node, shown: str = "") -> Extent:
+    """The size of a part; `shown` is how it is called where its size is only known from its bytes: "size(points[i].text)"."""
+    match node:
+        case Number() | Block():
+            return Extent(node.size)
+        case Blob() | Opaque():
+            return _length(node.size, shown)
+        case Struct():
+            return sum((extent(member, _member(shown, member)) for member in node.members), Extent())
+        case Sealed():
+            return extent(node.body, shown)
+        case Repeat():
+            return extent(node.element, _element(shown)[0]).times(_count(node))
+        case When() | Select():
+            sizes = {extent(branch, shown) for branch in children(node)}
+            return sizes.pop() if len(sizes) == 1 else _length(None, shown)
+    return Extent()
 
 
-def formula(expression: Any, path: str = "") -> str:
-    """An expression in the part at `path`, with its fields by their whole paths; "?" for a function that cannot be read."""
-    text = repr(expression)
-    if " at 0x" in text:
-        return "?"
-    text = _FIELD.sub(lambda found: _resolved(found[0], path), _ITEM.sub(r".\1", text))
-    return text[1:-1] if _enclosed(text) else text
+def _length(size: Formula | None, shown: str) -> Extent:
+    """A declared length; None for one that only the bytes tell."""
+    return Extent(size) if isinstance(size, int) else Extent(0, (f"size({shown})" if size is None else phrase(size),))
 
 
-def _enclosed(text: str) -> bool:
+def _count(node: Repeat) -> int | str:
+    return node.count if isinstance(node.count, int) else phrase(node.count)
+
+
+def _member(shown: str, member: Node) -> str:
+    """How a member of what is shown so is shown."""
+    return ".".join(filter(None, (shown, member.name or UNNAMED)))
+
+
+def _element(shown: str) -> tuple[str, str]:
+    """How an element of an array is shown, "points[i]", and its index."""
+    index = INDICES[shown.count("[") % len(INDICES)]
+    return f"{shown}[{index}]", index
+
+
+def _rows(node: Node, shown: str, start: Extent, condition: str, seals: Mapping[str, str]) -> Iterator[WireRow]:
+    """The rows of a part that begins at `start`, and is there under a condition."""
+    match node:
+        case Struct():
+            for member in node.members:
+                below = _member(shown, member)
+                yield from _rows(member, below, start, condition, seals)
+                start = start + extent(member, below)
+        case Sealed():
+            yield from _rows(node.body, shown, start, condition, seals)
+        case Repeat():
+            element, index = _element(shown)
+            size = extent(node.element, element)
+            says = "; ".join(filter(None, (condition, f"{_count(node)} elements of {size}")))
+            yield WireRow(str(start), str(size.times(_count(node))), "array", shown, "", says)
+            yield from _rows(node.element, element, start + size.times(index), condition, seals)
+        case When() | Select():
+            for asked, branch in branches(node):
+                yield from _rows(branch, shown, start, asked, seals)
+        case Block():
+            for part in node.parts:
+                width = f"{part.bits.width} bit{'s' * (part.bits.width > 1)}"
+                yield _row(part.info, str(start), width, bit_text(part.bits), _part(shown, part), condition, seals)
+        case Number() | Blob() | Opaque():
+            length = "varies" if isinstance(node, Opaque) and node.size is None else str(extent(node, shown))
+            yield _row(node.info, str(start), length, _type(node), shown, condition, seals)
+
+
+def _row(info: FieldInfo, offset: str, size: str, kind: str, shown: str, condition: str, seals: Mapping[str, str]) -> WireRow:
+    says = "; ".join(filter(None, (condition, meaning(info), seals.get(info.path, ""))))
+    return WireRow(offset, size, kind, shown, unit_text(info), says)
+
+
+def _part(shown: str, part: Part) -> str:
+    return ".".join(filter(None, (shown, *part.names))) + "".join(f"[{index}]" for index in part.indices)
+
+
+def _type(node: Number | Blob | Opaque) -> str:
+    match node:
+        case Number():
+            return f"{node.kind}{8 * node.size}" + f" {node.order[0]}e" * (node.size > 1)
+        case Opaque():
+            return node.form or node.kind
+    return "bytes"
+
+
+def branches(node: When | Select) -> list[tuple[str, Node]]:
+    """The alternatives of a part, each with its condition in words."""
+    if isinstance(node, When):
+        asked = phrase(node.condition)
+        return [(f"if {asked}", node.then), (f"unless {asked}", node.otherwise)]
+    key, labels = phrase(node.key), node.key.info.labels if isinstance(node.key, Ref) else {}
+    cases = [(f"if {key} == {labels.get(value, value)!r}", case) for value, case in node.cases]
+    return [*cases, (f"for other values of {key}", node.default)]
+
+
+def phrase(formula: Formula) -> str:
+    """A formula as people write it, with its fields by their whole paths; "?" for a function that cannot be read."""
+    text = formula.text if isinstance(formula, Code) else written(formula, lambda ref: ref.path, {})
+    return text[1:-1] if _is_enclosed(text) else text
+
+
+def _is_enclosed(text: str) -> bool:
     """Whether the first bracket of a text closes at its end."""
     depths = list(itertools.accumulate((part == "(") - (part == ")") for part in text))
     return text.startswith("(") and depths.index(0) == len(text) - 1
-
-
-def _resolved(text: str, path: str) -> str:
-    """``this.count`` or ``this._.count`` as the path from the top of the frame."""
-    scope = path.split(".")[:-1]
-    for name in text.split(".")[1:]:
-        scope = [] if name == "_root" else scope[:-1] if name == "_" else [*scope, name]
-    return ".".join(scope)
 
 
 def bit_text(bits: BitField) -> str:
@@ -208,10 +219,10 @@ def unit_text(info: FieldInfo) -> str:
 
 def meaning(info: FieldInfo) -> str:
     """What is said of a field: its constant, what it follows from, its text, the names of its values."""
-    const = hexed(info.const, info.bits) if info.const is not None else ""
+    const = f"always {hexed(info.const, info.bits)}" if info.const is not None else ""
+    follows = phrase(info.rebuilt) if info.rebuilt is not None else "?"
     labels = ", ".join(f"{value} {name}" for value, name in info.labels.items())
-    follows = formula(info.rebuilt, info.path) if info.rebuilt is not None else "?"
-    return "; ".join(part for part in (const and f"always {const}", follows != "?" and f"= {follows}", info.docs, labels) if part)
+    return "; ".join(filter(None, (const, "" if follows == "?" else f"= {follows}", info.docs, labels)))
 
 
 def hexed(value: object, bits: int) -> str:
@@ -221,42 +232,8 @@ def hexed(value: object, bits: int) -> str:
     return f"0x{value:0{-(-bits // 4)}x}" if isinstance(value, int) else repr(value)
 
 
-def _text(known: str, place: _Place, seal: str) -> str:
-    return "; ".join(part for part in (place.condition, known, seal) if part)
-
-
-def _sealed(con: Checksummed) -> str:
-    name = con.algorithm.describe() if con.algorithm else "a checksum that a hook supplies"
-    if con.over is None:
-        return f"{name} over all other bytes"
-    return f"{name} over {con.over[0]}" + (f" to {con.over[-1]}" if len(con.over) > 1 else "")
-
-
-def _joined(path: str, name: str) -> str:
-    return f"{path}.{name}" if path and name else path or name
-
-
-def _sized(con: Construct, path: str) -> tuple[Extent | None, str]:
-    """Size and type of a leaf; no size where only its bytes tell."""
-    if isinstance(con, FormatField):
-        code = con.fmtstr[-1]
-        kind = "float" if code in "efd" else "uint" if code.isupper() else "int"
-        order = {">": " be", "<": " le"}.get(con.fmtstr[0], "") if con.length > 1 else ""
-        return Extent(con.length), f"{kind}{8 * con.length}{order}"
-    if isinstance(con, BytesInteger) and isinstance(con.length, int):
-        kind = "int" if con.signed else "uint"
-        return Extent(con.length), f"{kind}{8 * con.length}{' le' if con.swapped else ' be'}"
-    if isinstance(con, Bytes):
-        size = Extent(con.length) if isinstance(con.length, int) else Extent(0, (formula(con.length, path),))
-        return size, "bytes"
-    return None, _terminated(con)
-
-
-def _terminated(con: Construct) -> str:
-    """The type of a field without a size of its own."""
-    below = con
-    while isinstance(below, construct.Subconstruct):
-        if isinstance(below, construct.NullTerminated):
-            return f"text up to {str(below.term)[1:]}"
-        below = below.subcon
-    return type(con).__name__
+def _sealed(node: Sealed) -> str:
+    """What is said of the fields that hold a checksum."""
+    name = node.declared.describe() if node.declared else "a checksum that a hook supplies"
+    first, last = (path.removeprefix(f"{node.body.path}.") for path in node.over or ("", ""))
+    return f"{name} over " + (f"{first} to {last}" if first != last else first or "all other bytes")

@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 import lidarspec as ls
-from lidarspec.discovery.scaffold import Names
+from lidarspec.discovery.draft import Names
 from lidarspec.exports import EXPORTS, export
 from lidarspec.simulation.simulator import simulate
 from tests.architecture import Module, private_imports
@@ -106,7 +106,7 @@ def test_its_simulation_can_be_viewed_and_recorded(made: Path) -> None:
 def test_it_is_exported_to_every_other_tool(made: Path) -> None:
     sensor = ls.sensor(made / "lidarspec_acme_x1" / "__init__.py")
     for kind in EXPORTS:
-        text = export(kind, sensor)
+        text = export(sensor, kind)
         assert "checksum" in text.lower() or "crc" in text.lower() or kind == "pyi", kind
         assert "distance" in text, kind
 

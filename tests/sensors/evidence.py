@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from lidarspec import Packets, PointCloud, Sensor
-from lidarspec.testing.comparisons import assert_same_points
+from lidarspec.testing.agreement import assert_same_points
 
 _SHARED = Path(__file__).resolve().parents[3] / "shared"
 CAPTURES = Path(os.environ.get("LIDARSPEC_CAPTURES", _SHARED / "captures"))

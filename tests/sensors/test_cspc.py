@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import lidarspec as ls
-from lidarspec.testing.comparisons import assert_same_points
+from lidarspec.testing.agreement import assert_same_points
 from tests.sensors.evidence import assert_points, clockwise, decoded, vector_bytes, vectors
 
 FILE = "vectors_serial2d.json"

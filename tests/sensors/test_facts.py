@@ -1,4 +1,4 @@
-"""What the sensors declare of themselves beside their frames: fields that are there, relatives that know each other, one turn for one scan."""
+"""What the sensors declare of themselves beside their frames: fields that exist, relatives that name each other, turns as simulated."""
 
 from __future__ import annotations
 

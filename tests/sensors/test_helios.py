@@ -12,7 +12,7 @@ import pytest
 import lidarspec as ls
 from lidarspec.captures.pcap import CaptureReader
 from lidarspec.packets.stream import PacketStream
-from lidarspec.testing.comparisons import assert_same_points
+from lidarspec.testing.agreement import assert_same_points
 from tests.sensors.evidence import assert_points, capture, clockwise, decoded, vector_bytes, vectors
 
 FILE = "vectors_udp3d.json"
@@ -203,7 +203,7 @@ def test_packets_before_the_device_information_are_nominal() -> None:
     decoder = SENSOR.decoder()
     stream = PacketStream(SENSOR, "data", decoder.stats)
     parts = [data[:500], data[500:600], data[600:]]
-    before, across, after = (stream.add([spans for datagram in part for spans in decoder.spans(datagram)]).points() for part in parts)
+    before, across, after = (stream.add([spans for datagram in part for spans in decoder.frames(datagram)]).points() for part in parts)
     nominal, known = 15 - 2 * np.arange(3), [14.94, 13.03, 10.92]
     assert [bool(cloud.nominal) for cloud in (before, across, after)] == [True, True, False]
     border = (DIFOP_AT - 500) * at(12, 0)

@@ -13,7 +13,7 @@ import pytest
 
 import lidarspec as ls
 from lidarspec.simulation.simulator import simulate
-from lidarspec.testing.comparisons import assert_same_points
+from lidarspec.testing.agreement import assert_same_points
 from tests.sensors.evidence import PROTOCOLS, assert_points, decoded, vector_bytes, vectors
 
 FILE = "vectors_udp3d.json"

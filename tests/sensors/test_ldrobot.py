@@ -179,7 +179,7 @@ def test_the_clock_runs_on_over_100_wraps() -> None:
 def test_the_clock_runs_on_between_batches() -> None:
     decoder = SENSOR.decoder()
     stream = PacketStream(SENSOR, "data", decoder.stats)
-    times = [stream.add(decoder.spans(frame(seconds=now % 30_000 / 1000))).time_ns for now in range(0, 400_000, 7_000)]
+    times = [stream.add(decoder.frames(frame(seconds=now % 30_000 / 1000))).time_ns for now in range(0, 400_000, 7_000)]
     assert np.concatenate(times).tolist() == [now * 10**6 for now in range(0, 400_000, 7_000)]
 
 

@@ -12,7 +12,7 @@ import pytest
 import lidarspec as ls
 from lidarspec.packets.stream import PacketStream
 from lidarspec.scans.scans import ScanStream
-from lidarspec.testing.comparisons import assert_same_points
+from lidarspec.testing.agreement import assert_same_points
 from tests.sensors.evidence import decoded, vector_bytes, vectors
 
 FILE = "vectors_udp3d.json"
@@ -133,5 +133,5 @@ def test_packets_fed_one_by_one_give_the_same_scans() -> None:
     data = shuffled(frames(2), 4)
     decoder = SENSOR.decoder()
     packets, scans = PacketStream(SENSOR, "data", decoder.stats), ScanStream(SENSOR)
-    found = [scan for item in data for scan in scans.add(packets.add(decoder.spans(item)))]
+    found = [scan for item in data for scan in scans.add(packets.add(decoder.frames(item)))]
     same_scans(found + scans.finish(), list(SENSOR.scans(frames(2))))

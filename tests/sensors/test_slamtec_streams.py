@@ -9,8 +9,9 @@ import pytest
 
 from lidarspec.simulation.simulator import simulate
 from lidarspec.spec import Polar
-from lidarspec.testing.framing import Oracle, damaged
 from lidarspec_slamtec.capsules import ultra_codes
+from tests.engine.oracle import Oracle
+from tests.engine.streams import damaged
 from tests.sensors.evidence import clockwise, decoded
 from tests.sensors.rplidar import A1, ANSWERS, believing, capsule, capsules, nodes_in, turns
 

@@ -32,7 +32,7 @@ class Bench:
         self._packets, self._scans = PacketStream(sensor, "data", self.decoder.stats), ScanStream(sensor)
 
     def feed(self, data: bytes, at: int | None) -> Packets:
-        packets = self._packets.add(self.decoder.spans(data, at))
+        packets = self._packets.add(self.decoder.frames(data, at))
         self.meter.packets(packets)
         for scan in self._scans.add(packets) if len(packets) else []:
             self.meter.scan(scan)

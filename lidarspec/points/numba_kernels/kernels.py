@@ -1,7 +1,7 @@
-"""Kernels at work: compiled by Numba, kept on disk between runs, called by one or several threads.
+"""Kernels at work: compiled by Numba, kept on disk between runs, called by one thread or several; and when that pays.
 
-Nothing here imports Numba before a kernel is wanted. The text of a kernel is a file in the cache folder, since Numba keeps
-compiled code only for functions that come from files; its name is a hash of all that the code depends on.
+Nothing here imports Numba before a kernel is wanted. The text of a kernel is a file in the cache folder, since Numba keeps compiled code
+only for functions that come from files; its name is a hash of all that the code depends on.
 """
 
 from __future__ import annotations
@@ -17,22 +17,31 @@ from collections.abc import Callable, Mapping
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec._version import __version__
-from lidarspec.columns.graph import Node
 from lidarspec.errors import UsageError
-from lidarspec.points.numba_kernels.source import SPREAD, Text
+from lidarspec.points.numba_kernels.source import Text, written
+from lidarspec.points.plan import Plan, PointsFunction, Values
 from lidarspec.wire.layout import Bytes2D, span
-
-Values = Callable[[Node], NDArray[Any]]
 
 CACHE, THREADS = "LIDARSPEC_CACHE", "LIDARSPEC_THREADS"
 
 #: points below which a second thread costs more than it saves.
 SHARE = 1 << 16
+
+#: points of a job that earn loading Numba with a kernel compiled before, and with one to be compiled; about a second's worth each.
+WARM, COLD = 1 << 26, 1 << 28
+#: a count that nothing brings up to them.
+NEVER = -(1 << 62)
+
+#: the size of the frames that were the first to get a kernel.
+_OWN: WeakKeyDictionary[PointsFunction, int] = WeakKeyDictionary()
+#: points made so far, by the names of their columns.
+_MADE: WeakKeyDictionary[PointsFunction, dict[tuple[str, ...], int]] = WeakKeyDictionary()
 
 
 class Kernel:
@@ -67,14 +76,14 @@ class Kernel:
         """The columns of so many frames, to be filled."""
         return {name: np.empty(number * self._width, np.float32) for name in self._text.names}
 
-    def run(self, rows: Bytes2D, values: Values, found: Mapping[str, NDArray[Any]]) -> None:
-        """Fill the columns of all frames; arguments as of `Program.run`."""
+    def run(self, rows: Bytes2D, values: Values, columns: Mapping[str, NDArray[Any]]) -> None:
+        """Fill the columns of all frames; see `plan.Maker`."""
         self.compile()
         count, stride = rows.shape[0], rows.strides[0]
         given: list[Any] = []
         for node in self._text.wanted.nodes:
             given += _flat(values(node), node.shape)
-        rest = (self._numbers, *self._text.wanted.arrays, *given, *(found[name] for name in self._text.names))
+        rest = (self._numbers, *self._text.wanted.arrays, *given, *(columns[name] for name in self._text.names))
         data = span(rows)
         self._shared(count, lambda first, number: self._function(data, stride, first, number, *rest))
 
@@ -99,19 +108,33 @@ def _flat(array: NDArray[Any], shape: tuple[int, ...]) -> tuple[NDArray[np.float
     return np.ascontiguousarray(array, np.float64).reshape(-1), math.prod(shape) if len(array) > 1 else 0
 
 
-def spread_out(values: NDArray[Any], first: NDArray[np.intp], width: int, found: NDArray[Any], *, compiled: bool) -> None:
-    """Write the points of packets, `width` each, to where the first of each packet goes; -1 leaves a packet out."""
-    if compiled and values.dtype == np.float32:
-        function_of(SPREAD)(values, first.astype(np.int64, copy=False), width, found)
-        return
-    kept = first >= 0
-    rows, starts = np.ascontiguousarray(values.reshape(len(first), width), found.dtype), first
-    if not kept.all():
-        rows, starts = rows[kept], first[kept]
-    if rows.size:
-        piece = np.dtype((np.void, rows.shape[1] * rows.itemsize))
-        windows: NDArray[Any] = np.ndarray((len(found) - width + 1,), piece, found.data, 0, found.strides)
-        windows[starts] = rows.view(piece).reshape(-1)
+def kernel_of(plan: Plan, names: tuple[str, ...]) -> Kernel:
+    """The kernel for these columns; one for the layout alone, or one that serves all where there have been several."""
+    kernel = plan.kernels.get(names)
+    if not isinstance(kernel, Kernel):
+        is_own = not plan.varying or _OWN.setdefault(plan.function, plan.layout.size) == plan.layout.size
+        kernel = plan.kernels[names] = Kernel(written(plan, names, set() if is_own else plan.varying), plan.width)
+    return kernel
+
+
+def pays(plan: Plan, names: tuple[str, ...], frames: int) -> bool:
+    """Whether so many points of a `points` function were asked for, these frames included, that its kernel pays; it is compiled then."""
+    made = _MADE.setdefault(plan.function, {})
+    made[names] = made.get(names, 0) + frames * plan.width
+    if made[names] < WARM:
+        return False
+    if not available():
+        made[names] = NEVER
+        return False
+    try:
+        kernel = kernel_of(plan, names)
+        if made[names] < COLD and not kernel.is_compiled:
+            return False
+        kernel.compile()
+    except Exception:  # whatever is wrong with Numba or its cache here, NumPy does without
+        made[names] = NEVER
+        return False
+    return True
 
 
 def threads() -> int:

@@ -1,11 +1,10 @@
 """The source of a kernel: the columns of a plan as one loop over packets, blocks and points, which reads the frames' bytes.
 
-Each value is computed in the loop at which it varies: what a packet has once outside the loop over its blocks, and so on.
-Where sines and cosines of each point's own angle are left, the points of a few packets go through scratch arrays into a
-second, flat loop, which computes several at a time. Lengths and places stand in the text as numbers where all frames have
-the same, else they are arguments, so that one kernel serves all lengths.
-
-The text of a kernel: the loops around what `kernelsource.Writer` has written, and where the columns go.
+Each value is computed in the loop in which it varies: what a packet has once outside the loop over its blocks, and so on
+(`writer.Writer`). `Expressions` writes a traced expression so, in float64 or float32; what has no text of its own is computed by NumPy
+before, and given to the kernel. Where sines and cosines of each point's own angle are left, the points of a few packets go through scratch
+arrays into a second, flat loop, which computes several at a time (`Later`, `Assembly`). Lengths and places stand in the text as numbers
+where all frames have the same, else they are arguments, so that one kernel serves all lengths.
 """
 
 from __future__ import annotations
@@ -15,13 +14,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from lidarspec.columns.graph import Node, is_full, only_field
-from lidarspec.points.numba_kernels.writer import TEMPLATES, Value, Wanted, Writer, is_cheap, line
-from lidarspec.points.numpy_plan.windows import every_value, possible, window
+from lidarspec.columns.graph import FACTORS, Node, is_full, only_field, traverse
+from lidarspec.points.numba_kernels.writer import TEMPLATES, Value, Wanted, Writer, is_cheap, is_number, line
+from lidarspec.points.plan import Plan
+from lidarspec.points.windows import every_value, possible, window
 from lidarspec.spec.vocabulary import LookUp, side_by_side
-from lidarspec.wire.layout import Layout
 
 #: points of which the scratch arrays stay in the fastest cache.
 CHUNK = 2048
@@ -189,9 +187,8 @@ class Expressions(Writer):
     def _sum(self, node: Node, factor: float) -> Value:
         function, args = node.function, node.args
         depth = max(len(arg.shape) for arg in args if isinstance(arg, Node))
-        simple = {np.negative: -1.0, np.positive: 1.0, np.deg2rad: np.pi / 180, np.radians: np.pi / 180}
-        if function in simple:
-            return self.angle(args[0], factor * simple[function], depth)
+        if function in FACTORS:
+            return self.angle(args[0], factor * FACTORS[function], depth)
         if function in (np.add, np.subtract):
             first, second = (self.angle(arg, factor, depth) for arg in args)
             return self.let(max(first.level, second.level), f"{first.text} {'+' if function is np.add else '-'} {second.text}")
@@ -235,20 +232,6 @@ nan, inf = np.nan, np.inf
 
 
 """
-
-#: a kernel that puts the points of packets to where they belong.
-SPREAD = (
-    HEAD
-    + """\
-@njit([(SINGLES, PLACES, INTEGER, MADE_SINGLES)], cache=True, nogil=True)
-def kernel(values, first, width, found):
-    for p in range(len(first)):
-        start = at(first, p)
-        if start >= 0:
-            for i in range(width):
-                put(found, start + i, at(values, p * width + i))
-"""
-)
 
 _TYPES = {"float32": "SINGLES", "float64": "DOUBLES", "int64": "PLACES"}
 
@@ -317,27 +300,21 @@ class Assembly:
         return [f"cos{index}, sin{index} = cos_sin({self._stored(made, 'float64')})" for index, made in enumerate(self.writer.angles)]
 
 
-def written(
-    layout: Layout,
-    shape: tuple[int, ...],
-    expressions: Mapping[str, Any],
-    tables: dict[Any, NDArray[Any]],
-    varying: Set[str],
-    *,
-    together: bool,
-) -> Text:
-    """The kernel of some columns.
+def written(plan: Plan, names: tuple[str, ...], varying: Set[str]) -> Text:
+    """The kernel of some columns of a plan.
 
     Args:
-        layout, shape, tables, varying: see `Writer`.
-        expressions: of the columns, by name.
-        together: where one coordinate is nan, all are.
+        varying: the arrays whose lengths differ from frame to frame, if it is to serve them all.
     """
-    writer = Expressions(layout, shape, tables, varying)
+    expressions = {name: plan.expressions[name] for name in names}
+    writer = Expressions(plan.layout, plan.shape, plan.tables, varying)
     assembly = Assembly(writer)
     writer.both = _both(expressions.values())
     made = {name: _made(writer, name, value) for name, value in expressions.items()}
-    places = {name: value for name, value in made.items() if name in "xyz"} if together else {}
+    directed = [*plan.directed, *(plan.parts[name] for name in ("ox", "oy", "oz"))]
+    places = {}
+    if not all(is_number(value, plan.layout.leaves) for value in directed):  # where one coordinate is nan, all are
+        places = {name: value for name, value in made.items() if name in "xyz"}
     if places:
         assembly.together(places)
     for name, value in made.items():
@@ -349,13 +326,8 @@ def written(
 
 def _both(expressions: Iterable[Any]) -> set[Node]:
     """The angles of which the cosine and the sine are wanted."""
-    seen, waiting = set[Node](), [value for value in expressions if isinstance(value, Node)]
-    while waiting:
-        node = waiting.pop()
-        if node not in seen:
-            seen.add(node)
-            waiting += [arg for arg in node.args if isinstance(arg, Node)]
-    cosines, sines = ({node.args[0] for node in seen if node.function is function} for function in (np.cos, np.sin))
+    nodes = list(traverse(*expressions))
+    cosines, sines = ({node.args[0] for node in nodes if node.function is function} for function in (np.cos, np.sin))
     return {node for node in cosines & sines if isinstance(node, Node)}
 
 
@@ -413,8 +385,3 @@ def _loops(writer: Writer, width: str) -> list[str]:
 def _spot(writer: Writer, width: str) -> list[str]:
     """Where a point stands among those under way, and among all."""
     return [f"k = (p - begin) * {width} + {writer.place(writer.shape)}", "o = start + k"]
-
-
-def empty(names: tuple[str, ...], size: int) -> dict[str, NDArray[np.float32]]:
-    """The columns before a kernel fills them."""
-    return {name: np.empty(size, np.float32) for name in names}

@@ -1,6 +1,9 @@
-"""What the generated kernels know of single fields and functions: bytes to integers, straight lines in tables, NumPy's names.
+"""What the source of a kernel is written with: fields, tables, constants and places as text, each in the loop in which it varies.
 
-What a kernel's source is written with: variables in the loops, arguments, the bytes of fields, tables by them.
+A `Value` is text and the loop at which it varies. `Writer` keeps the lines of each loop, the arguments that the kernel is to be called
+with, and what it has written before, so that nothing is computed twice. A field is an expression of its bytes (`integer`); a function of
+one field is looked up in a table by them, or computed, where the table is a straight line (`Line`). `TEMPLATES` are NumPy's functions of
+numbers.
 """
 
 from __future__ import annotations
@@ -8,13 +11,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Set
 from dataclasses import dataclass, field
+from itertools import islice
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.columns.graph import Node, key, last_axis
-from lidarspec.points.numpy_plan.windows import every_value, possible, raw_values, window
+from lidarspec.columns.graph import Node, key, last_axis, traverse
+from lidarspec.points.windows import every_value, possible, raw_values, window
 from lidarspec.wire.layout import Layout, Leaf
 
 #: how a kernel writes NumPy's functions of numbers; what is not here is computed by NumPy itself.
@@ -66,14 +70,8 @@ _DIVISIONS = {np.true_divide, np.mod}
 
 def is_cheap(node: Node) -> bool:
     """Whether an expression of one field is a few simple operations."""
-    number, waiting = 0, [node]
-    while waiting and number <= FEW:
-        this = waiting.pop()
-        number += 1
-        if this.kind == "call" and this.function not in CHEAP:
-            return False
-        waiting += [arg for arg in this.args if isinstance(arg, Node)]
-    return number <= FEW
+    nodes = list(islice(traverse(node), FEW + 1))
+    return len(nodes) <= FEW and all(this.kind != "call" or this.function in CHEAP for this in nodes)
 
 
 def is_number(value: Any, leaves: Any) -> bool:

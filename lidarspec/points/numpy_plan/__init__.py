@@ -1,1 +1,50 @@
-"""numpy_plan"""
+"""Points by NumPy alone: a back end that compiles the columns of a plan to calls on arrays that stay in the cache.
+
+In: a `points.plan.Plan`. Out: what fills its columns, by `compile`; nobody needs to know more of this package. Modules in reading order:
+
+* `blocks`: frames compacted, so that each field is one long array.
+* `registers`: the memory that is computed in, used again and again.
+* `program`: calls on registers, chunk by chunk.
+* `products`: sums and angles of packets and blocks as matrix products.
+* `compiler`: from expressions to the steps of a program.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from numpy.typing import NDArray
+
+from lidarspec.points.numpy_plan.compiler import Compiler
+from lidarspec.points.plan import Maker, Plan
+
+
+def compile(plan: Plan, names: tuple[str, ...]) -> Maker:
+    """What makes these columns of the plan's points; kept with the plan."""
+    if names not in plan.programs:
+        compiler = Compiler(plan, plan.tables)
+        for name in names:
+            compiler.want(name, plan.expressions[name], "double" if name == "azimuth" else "single")
+        plan.programs[names] = compiler.program
+    return plan.programs[names]
+
+
+def describe(plan: Plan) -> list[str]:
+    """A plan in lines: the shape, what is computed for each packet, and the calls for each chunk."""
+    names = tuple(name for name in ("x", "y", "z", "intensity") if name in plan.expressions and not (name == "z" and plan.level))
+    tables: dict[Any, NDArray[Any]] = {}
+    compiler = Compiler(plan, tables)
+    for name in names:
+        compiler.want(name, plan.expressions[name], "single")
+    program = compiler.program
+    axes = " x ".join(f"{axis} {length}" for axis, length in zip(plan.axes, plan.shape, strict=True))
+    lines = [f"{plan.width} points a packet{': ' if axes else ''}{axes}"]
+    plainly = [node for node in plan.tape.nodes if node in compiler.low or node in plan.eager]
+    lines.append(f"for each packet or block, plainly: {len(plainly)} values")
+    lines += [f"  {node.kind} {node.path}".rstrip() for node in plainly if node.kind != "call"]
+    lines.append(f"for each chunk of {program.chunk} packets, {len(tables)} tables:")
+    outputs = {register: name for name, register in program.outputs.items()}
+    for step in program.steps:
+        output = f"  -> {outputs[step.output]}" if step.output in outputs else ""
+        lines.append(f"  r{step.output:<3} {program.kinds[step.output]:<7} {step.text}{output}")
+    return lines

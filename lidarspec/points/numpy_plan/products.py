@@ -1,15 +1,19 @@
-"""Sums of what packets or blocks have once, times rows that all of them share: matrix products, and angles that are near half a turn.
+"""Sums and angles of packets and blocks as matrix products.
 
-Cosines and sines of angles that lie close together: the one in the middle of a packet or block, turned by a series.
+What packets or blocks have once, times rows that all of them share, summed, is one matrix product (`Product`). Angles that are such a sum
+lie around one of their packet or block: that one alone is reduced to half a turn before they become float32 (`Angles`).
 
-cos(m + d) is a polynomial of d whose coefficients are cosines and sines of m. So the points of a packet or block cost one
-row of a matrix product in float32, and no trigonometry.
+Cosines and sines of angles that lie close together are those of the one in the middle of their packet or block, turned by a series:
+cos(m + d) is a polynomial of d whose coefficients are cosines and sines of m. So the points of a packet or block cost one row of a matrix
+product in float32, and no trigonometry (`Rotation`, `Turns`).
+
+Which sums and angles are so is decided here from their terms; `numpy_plan.compiler` makes steps of them.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -17,10 +21,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.columns.graph import Node, Term
-from lidarspec.points.numpy_plan.registers import Run
+from lidarspec.columns.graph import Node, Term, chosen, split_level, terms
+from lidarspec.points.numpy_plan.program import Run
+from lidarspec.points.windows import possible
+from lidarspec.wire.layout import Leaf
 
 Floats = NDArray[np.float64]
+Singles = NDArray[np.float32]
 
 TURN = 2 * np.pi
 #: radians from which on float32 is too coarse for an angle.
@@ -44,8 +51,11 @@ class Product:
     outer: tuple[int, ...]
 
     @classmethod
-    def of(cls, parts: Sequence[Term], shape: tuple[int, ...], level: int) -> Product:
-        """The product of the parts of a sum that are low, for points of this shape; `level`: axes that the numbers may have."""
+    def of(cls, parts: Sequence[Term], shape: tuple[int, ...]) -> Product | None:
+        """The product of the parts of a sum that are low, for points of this shape; None where their axes cross, or there are none."""
+        level = split_level(parts, len(shape))
+        if level is None or not parts:
+            return None
         inner = math.prod(shape[level:])
         rows = [np.broadcast_to(part.row, shape[level:] if part.row.ndim else (inner,)).reshape(inner) for part in parts]
         return cls([part.low for part in parts], np.stack(rows), shape[:level])
@@ -147,8 +157,6 @@ def multiplied(left: NDArray[Any], right: NDArray[Any], out: NDArray[Any]) -> No
         else:
             target[...] = (part.repeat(2, axis=0) @ right)[:1]
 
-
-Singles = NDArray[np.float32]
 
 #: terms of the series, and radians from the middle up to which what follows them is below 1e-8.
 TERMS, NARROW = 5, 1 / 16
@@ -283,3 +291,41 @@ class Turns:
 
 def _single(rows: Sequence[Floats]) -> Singles:
     return np.stack(rows).astype(np.float32)
+
+
+def split(node: Node, width: int) -> tuple[list[Term], list[Term]]:
+    """The parts of a sum that are low, and those that each of the `width` points of a packet has."""
+    parts = terms(node, width)
+    return [part for part in parts if part.full is None], [part for part in parts if part.full is not None]
+
+
+def product_of(node: Node, shape: tuple[int, ...]) -> Product | None:
+    """What is low in a sum as one product; None where it is none, or what is full is multiplied by a row."""
+    low, full = split(node, math.prod(shape))
+    return None if any(part.row.ndim for part in full) else Product.of(low, shape)
+
+
+def angles_of(node: Node, shape: tuple[int, ...], leaves: Mapping[str, Leaf]) -> Angles | None:
+    """Angles that lie around one of their packet or block; None where they do not, or nobody knows."""
+    product = product_of(node, shape)
+    if product is None:
+        return None
+    reaches = [_reach(part, math.prod(shape), leaves) for part in split(node, math.prod(shape))[1]]
+    return Angles.of(product, (float(sum(low for low, _ in reaches)), float(sum(high for _, high in reaches))))
+
+
+def _reach(part: Term, width: int, leaves: Mapping[str, Leaf]) -> tuple[float, float]:
+    """The least and the most of what is full in a sum; infinite where it is not known."""
+    assert part.full is not None
+    options = chosen(part.full, width)
+    values = np.concatenate([_every(value, leaves) for value in ((part.full,) if options is None else options[1:])])
+    reach = np.outer(values, part.row.reshape(-1))
+    return float(reach.min()), float(reach.max())
+
+
+def _every(value: Any, leaves: Mapping[str, Leaf]) -> Floats:
+    """All values that an expression of one field can have."""
+    if not isinstance(value, Node):
+        return np.array([value])
+    values = possible(value, leaves)
+    return np.array([np.inf]) if values is None else values

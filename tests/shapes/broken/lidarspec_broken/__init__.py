@@ -1,1 +1,1 @@
-"""One module for each way in which a plugin can be broken; see `tests/test_plugins.py`."""
+"""One module for each way in which a plugin can be broken; see `tests/plugins/test_plugins.py`."""

@@ -1,0 +1,256 @@
+"""`record` and `replay`: everything that a source sends into one file, and what was recorded out again, byte for byte and in time."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import os
+import shlex
+
+import click
+
+from lidarspec.cli.failures import INTERRUPTED
+from lidarspec.cli.inputs import nothing_came
+from lidarspec.cli.options import DURATION, SPEED, sensor_option
+from lidarspec.cli.output import Progress, emit_json, note, size
+from lidarspec.device.settings import named
+from lidarspec.device.source_recording import SourceRecording
+from lidarspec.discovery.detect import declared
+from lidarspec.errors import CommandError, LidarSpecError, SourceError, UnknownFormat, UsageError, WireError, suggest
+from lidarspec.plugins import sensor as named_sensor
+from lidarspec.recording.appending import Appender
+from lidarspec.recording.format import Header
+from lidarspec.recording.recorders import SUFFIXES, Recorder, check_suffix, declared_port, recorder
+from lidarspec.spec.sensor import Sensor
+from lidarspec.transports.files import RecordingTransport
+from lidarspec.transports.open_url import live_address, transport
+from lidarspec.transports.outlets import FileOutlet, Outlet, replay_outlet
+from lidarspec.transports.protocol import Transport
+from lidarspec.transports.serving import LATE, Replay
+
+
+@click.command()
+@click.argument("source", metavar="SOURCE")
+@click.option("-o", "--output", "target", metavar="FILE", required=True, help="The file: .lsr, .pcap for Wireshark, .bin for bytes alone.")
+@sensor_option
+@click.option("-t", "--duration", "seconds", type=DURATION, help="How long, such as 10s; until Ctrl-C by default.")
+@click.option("-n", "--count", type=click.IntRange(min=1), help="So many packets at least: the sensor's data packets, or datagrams.")
+@click.option("--no-start", is_flag=True, help="Send the sensor no commands.")
+@click.option("--force", is_flag=True, help="Overwrite FILE.")
+@click.option("--salvage", is_flag=True, help="Go on behind damaged places, where SOURCE is a recording.")
+@click.option("--json", "as_json", is_flag=True, help="Print a summary as JSON.")
+def record(
+    source: str,
+    target: str,
+    sensor_id: str | None,
+    seconds: float | None,
+    count: int | None,
+    no_start: bool,
+    force: bool,
+    salvage: bool,
+    as_json: bool,
+) -> None:
+    """Everything that a source sends, with the time of its arrival, in one file that survives a crash.
+
+    A sensor that is named, with -s or by the source (sim:ID), is started, and what it is stands in the file; without, bytes are
+    recorded as they come.
+    """
+    _check_target(target)
+    path = source.partition("?")[0]
+    if os.path.exists(path) and os.path.exists(target) and os.path.samefile(path, target):
+        raise UsageError(f"{target} is the source: it would be overwritten")
+    known = named(source)
+    is_live = live_address(known.source if known else source) is not None
+    sensor = named_sensor(sensor_id) if sensor_id else declared(source) if is_live else known.configured() if known else None
+    task = SourceRecording(source, target, sensor, seconds=seconds, count=count, start=not no_start, overwrite=force, salvage=salvage)
+    interrupted = False
+    try:
+        _recorded(task)
+    except KeyboardInterrupt:
+        if task.recorder is None:
+            raise
+        interrupted = True
+    except UsageError as error:
+        if task.recorder is None and os.path.exists(target) and not force:
+            suggest(error, "the same with --force, or with another file")
+        raise
+    except SourceError as error:
+        if task.recorder is not None and task.recorder.error is error:
+            suggest(error, _view_of(task.recorder, sensor))
+        raise
+    assert task.recorder is not None
+    try:
+        _sum_up_recording(task, task.recorder, source, sensor, as_json=as_json)
+    except LidarSpecError as error:
+        if not interrupted:
+            raise
+        note(str(error))
+    if interrupted:
+        raise click.exceptions.Exit(INTERRUPTED)
+
+
+def _recorded(task: SourceRecording) -> None:
+    with Progress() as progress, contextlib.closing(task.run()) as remarks:
+        for remark in remarks:
+            if task.recorder is not None:
+                progress(functools.partial(_taken, task, task.recorder))
+            if remark:
+                progress.clear()
+                note(remark)
+
+
+def _taken(task: SourceRecording, kept: Appender) -> str:
+    """What has been recorded, in words."""
+    packets = f"{task.packets} packets, " if task.packets else ""
+    return f"{packets}{kept.records} records, {size(kept.bytes)} in {task.elapsed:.1f} s"
+
+
+def _check_target(target: str) -> None:
+    try:
+        check_suffix(target)
+    except UnknownFormat as error:
+        raise suggest(error, "lidarspec record --help") from None
+
+
+def _sum_up_recording(task: SourceRecording, kept: Appender, source: str, sensor: Sensor | None, *, as_json: bool) -> None:
+    """What was recorded, and what can be done with it; an empty file is not left behind."""
+    device = task.device
+    if not kept.records:
+        with contextlib.suppress(OSError):
+            os.unlink(kept.path)
+        if device is not None:
+            raise nothing_came(device, source, task.elapsed)
+        if live_address(source) is not None:
+            raise suggest(CommandError(f"{source} sent nothing"), f"lidarspec doctor {shlex.quote(source)}")
+        raise suggest(WireError(f"{source} holds nothing that was received"), "lidarspec record --help")
+    stats = device.stats if device is not None else None
+    note(f"{kept.path}: {_taken(task, kept)}{f'; {stats}' if stats else ''}")
+    note(f"next: {_view_of(kept, sensor)}")
+    if as_json:
+        facts = {"output": kept.path, "source": source, "sensor": sensor.id if sensor else None}
+        counts = {"records": kept.records, "bytes": kept.bytes, "packets": task.packets, "seconds": task.elapsed, "dropped": kept.dropped}
+        emit_json({**facts, **counts, "stats": stats.to_dict() if stats else None}, None)
+    if stats is not None and not stats.frames and device is not None:
+        raise nothing_came(device, source, task.elapsed)
+
+
+def _view_of(kept: Appender, sensor: Sensor | None) -> str:
+    """The command that shows what was recorded."""
+    file = shlex.quote(kept.path)
+    if isinstance(kept, Recorder) and kept.header.sensor:
+        return f"lidarspec view {file}"
+    return f"lidarspec view {file} -s {sensor.id}" if sensor else f"lidarspec detect {file}"
+
+
+@click.command()
+@click.argument("file", metavar="FILE")
+@click.option(
+    "--to", "place", default="pty", show_default=True, metavar="PLACE", help="pty, udp://host[:port], tcp://host:port, or a new file."
+)
+@click.option("--speed", type=SPEED, help="1 as it came, 0.5 half as fast, max as fast as possible.  [default: 1; max into a file]")
+@click.option("--loop", is_flag=True, help="Begin again at the end, until Ctrl-C.")
+@click.option("--force", is_flag=True, help="Overwrite a file to play to.")
+@sensor_option
+@click.option("--json", "as_json", is_flag=True, help="Print a summary as JSON, with the SHA-256 of all bytes.")
+def replay(file: str, place: str, speed: float | None, loop: bool, force: bool, sensor_id: str | None, as_json: bool) -> None:
+    """A recording or capture, sent again as it came: bit for bit, and by the clock.
+
+    To a pty or tcp:// it begins when somebody opens it. udp:// without a port uses those of the recording. A new .lsr or .pcap
+    file keeps the times of the recording.
+    """
+    device = named(file)
+    if live_address(file if device is None else device.source) is not None:
+        raise suggest(UsageError(f"{file} is live: only what was recorded can be replayed"), f"lidarspec record {file} -o recording.lsr")
+    is_file = place.endswith(SUFFIXES) and "://" not in place
+    if is_file and loop:
+        raise UsageError("a file cannot take a replay that never ends: leave out --loop")
+    if is_file and os.path.exists(place) and os.path.samefile(file.partition("?")[0], place):
+        raise UsageError(f"{place} is the source: it would be overwritten")
+    with contextlib.closing(transport(file)) as source:
+        sensor = _sensor(source, sensor_id)
+        outlet = (
+            _file(source, file, place, sensor, force=force)
+            if is_file
+            else replay_outlet(place, datagrams=source.datagrams, port=declared_port(sensor))
+        )
+    _announce(file, outlet, sensor)
+    factor = (None if is_file else 1.0) if speed is None else speed or None
+    played = Replay(file, outlet, speed=factor, needs_times=speed is not None, loop=loop)
+    is_interrupted = _run(played, outlet, file)
+    _sum_up(file, outlet, sensor, played, as_json=as_json)
+    if is_interrupted:
+        raise click.exceptions.Exit(INTERRUPTED)
+
+
+def _run(played: Replay, outlet: Outlet, file: str) -> bool:
+    """Whether it was interrupted before its end."""
+    with contextlib.closing(outlet), Progress() as progress:
+        try:
+            for remark in played.run():
+                progress(lambda: _told(played))
+                if remark:
+                    progress.clear()
+                    note(remark)
+        except KeyboardInterrupt:
+            return True
+        except WireError as error:
+            raise suggest(error, f"lidarspec show {file}") from None
+        finally:
+            outlet.finish()
+    return False
+
+
+def _sensor(source: Transport, sensor_id: str | None) -> Sensor | None:
+    """The sensor that is named, or the one of the recording if it is installed; None where nobody knows."""
+    if sensor_id:
+        return named_sensor(sensor_id)
+    with contextlib.suppress(LidarSpecError):
+        return source.header.known_sensor() if isinstance(source, RecordingTransport) else None
+    return None
+
+
+def _file(source: Transport, file: str, place: str, sensor: Sensor | None, *, force: bool) -> FileOutlet:
+    """A new file in the place of the old one's source."""
+    header = source.header if isinstance(source, RecordingTransport) else Header(source=file)
+    try:
+        whose, link = sensor or header.sensor, source.datagrams
+        return FileOutlet(recorder(place, whose, header.source, datagrams=link, baud=header.baud, overwrite=force))
+    except UsageError as error:
+        raise suggest(error, "the same with --force, or with another file") if os.path.exists(place) and not force else error from None
+
+
+def _announce(file: str, outlet: Outlet, sensor: Sensor | None) -> None:
+    """Where it plays to, and what to type there."""
+    if isinstance(outlet, FileOutlet):
+        return
+    place = outlet.place
+    if place.startswith("udp:") and ":" not in place.removeprefix("udp://"):
+        place = "udp://" if sensor else "udp://:PORT"
+    waits = "" if place.startswith("udp:") else ", as soon as it is opened"
+    note(f"playing {file} to {outlet.place}{waits}")
+    note(f"next: lidarspec {_shown(sensor, place)}")
+
+
+def _shown(sensor: Sensor | None, place: str) -> str:
+    """The verb that shows what is there."""
+    return f"view {shlex.quote(place)} -s {sensor.id}" if sensor else f"detect {shlex.quote(place)}"
+
+
+def _told(played: Replay) -> str:
+    return f"{played.chunks} chunks, {size(played.bytes)} in {played.seconds:.1f} s"
+
+
+def _sum_up(file: str, outlet: Outlet, sensor: Sensor | None, played: Replay, *, as_json: bool) -> None:
+    is_file = isinstance(outlet, FileOutlet)
+    note(f"{file} to {outlet.place}: {_told(played)}")
+    if not played.is_timed:
+        note(f"{file} does not say when its bytes arrived: they went out as fast as they were taken")
+    if played.late:
+        note(f"{played.late} chunks went out more than {LATE // 1_000_000} ms late, up to {played.latest / 1e6:.0f} ms")
+    if len(played.senders) > 1 and not is_file:
+        note(f"{len(played.senders)} senders were recorded, and all went out from one address; choose one with '{file}?src=ADDRESS'")
+    if is_file:
+        note(f"next: lidarspec {_shown(sensor, outlet.place)}")
+    if as_json:
+        facts = {"source": file, "to": outlet.place, "chunks": played.chunks, "bytes": played.bytes, "sha256": played.digest.hexdigest()}
+        emit_json({**facts, "seconds": played.seconds, "late": played.late, "latest_ns": played.latest}, None)

@@ -1,0 +1,134 @@
+"""The main job with nothing attached, end to end: a simulated sensor on a real line, asked to start, read, recorded, read again.
+
+A serial sensor stands on a pseudo-terminal, or on a TCP port where the system has none; the others send UDP datagrams on loopback.
+The line does its harm on the way. What was recorded is decoded once more, and has to give the same points.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import socket
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from lidarspec.device.device import Device, open as open_device
+from lidarspec.device.session import Reply
+from lidarspec.errors import SourceError
+from lidarspec.framing.results import Counters
+from lidarspec.scans.scans import Scan
+from lidarspec.simulation.device import SimulatedDevice
+from lidarspec.simulation.faults import Faults
+from lidarspec.spec.sensor import Sensor
+from lidarspec.transports.outlets import HERE, has_terminals, simulated_outlet
+from lidarspec.transports.serving import Served
+
+#: seconds that the scans may take beyond those that they last.
+PATIENCE = 15.0
+#: seconds without a scan after which nothing is on the way any more.
+QUIET = 0.2
+
+
+@dataclass(frozen=True, eq=False)
+class Demonstration:
+    """What the demo saw.
+
+    Attributes:
+        sensor, place: whose, and where it stood.
+        replies: to the commands that opened it.
+        scans: those that came, the last one the last whole one.
+        stats: the decoder's counters.
+        sent, intact: packets that were sent, and that left the line unharmed.
+        digest: SHA-256 of the points of the whole scans.
+        again: the same of the recording.
+        recorded: bytes in the recording.
+    """
+
+    sensor: Sensor
+    place: str
+    replies: tuple[Reply, ...]
+    scans: tuple[Scan, ...]
+    stats: Counters
+    sent: int
+    intact: int
+    digest: str
+    again: str
+    recorded: int
+
+
+def demonstrate(sensor: Sensor, *, turns: int = 5, errors: float = 0.01, seed: int = 1) -> Demonstration:
+    """Let a simulated sensor work until so many whole scans have come.
+
+    Args:
+        turns: whole scans wanted.
+        errors: share of the bytes of a stream that are damaged, or of the datagrams that are lost.
+
+    Raises:
+        SourceError: where no line can be had, or the scans do not come.
+    """
+    faults = Faults(loss=errors) if sensor.datagrams else Faults(errors=errors)
+    simulated = SimulatedDevice(sensor, seed=seed, faults=faults)
+    with tempfile.TemporaryDirectory(prefix="lidarspec-demo-") as folder:
+        path = Path(folder) / "demo.lsr"
+        place, replies, scans, stats = _live(sensor, simulated, path, turns)
+        line, recorded = simulated.lines["data"], path.stat().st_size
+        with open_device(path, sensor) as recording:
+            again = digest(_whole(recording.scans(), turns))
+    digested = digest([scan for scan in scans if scan.complete])
+    return Demonstration(sensor, place, replies, scans, stats, line.sent, line.intact, digested, again, recorded)
+
+
+def digest(scans: Sequence[Scan]) -> str:
+    """SHA-256 of the coordinates, ranges and intensities of scans."""
+    found = hashlib.sha256()
+    for scan in scans:
+        points = scan.points
+        for column in (points.xyz, points.range, points.intensity):
+            found.update(b"" if column is None else column.tobytes())
+    return found.hexdigest()
+
+
+def _live(sensor: Sensor, simulated: SimulatedDevice, path: Path, turns: int) -> tuple[str, tuple[Reply, ...], tuple[Scan, ...], Counters]:
+    """The place of the sensor, its replies, its scans and the counters; everything that came is recorded."""
+    if sensor.datagrams:
+        port = _free_port()
+        at = f"udp://{HERE}:{port}"
+        with open_device(at, sensor, start=False, record=path) as device, Served(simulated, simulated_outlet(sensor, at)) as served:
+            return at, *_read(device, served, turns)
+    to = "pty" if has_terminals() else f"tcp://{HERE}:0"
+    with (
+        Served(simulated, simulated_outlet(sensor, to), patient=True) as served,
+        open_device(served.path, sensor, start=False, record=path) as device,
+    ):
+        return served.path, *_read(device, served, turns)
+
+
+def _read(device: Device, served: Served, turns: int) -> tuple[tuple[Reply, ...], tuple[Scan, ...], Counters]:
+    replies = tuple(device.send(name) for name in device.sensor.on_open)
+    limit = time.monotonic() + PATIENCE + turns
+    scans: list[Scan] = []
+    for scan in device.scans(wait=0.1):
+        scans += [scan] if scan is not None else []
+        if sum(one.complete for one in scans) >= turns:
+            served.rest()
+            while device.newest(QUIET) is not None:
+                pass  # what is still on the way counts as sent, so it is read too
+            return replies, tuple(scans), device.stats
+        if time.monotonic() > limit:
+            break
+    raise SourceError(
+        f"the simulated {device.sensor.id} gave {len(scans)} scans in {PATIENCE + turns:g} s, and not {turns}: {device.stats}"
+    )
+
+
+def _whole(scans: Iterator[Scan], number: int) -> list[Scan]:
+    return list(itertools.islice((scan for scan in scans if scan.complete), number))
+
+
+def _free_port() -> int:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind((HERE, 0))
+        return int(probe.getsockname()[1])

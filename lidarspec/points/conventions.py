@@ -1,0 +1,120 @@
+"""What the columns of points mean, whichever way they are computed: REP-103 axes, REP-117 ranges, coordinates, types, organised shapes.
+
+The formulas take arrays (the plain evaluation) and traced columns (plans) alike, so that each is written once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarspec.columns.graph import Traced
+from lidarspec.spec.description import DIRECTIONS, Spec
+
+Floats = NDArray[np.float32]
+
+#: names of the columns that a cloud can have, in the order in which files list them, and their types.
+TYPES: Mapping[str, Any] = {
+    "x": np.float32,
+    "y": np.float32,
+    "z": np.float32,
+    "range": np.float32,
+    "azimuth": np.float32,
+    "elevation": np.float32,
+    "intensity": np.float32,
+    "time": np.float64,
+    "ring": np.uint16,
+    "return_index": np.uint8,
+}
+
+#: largest float32 below pi: azimuths stay in [-pi, pi) in either precision.
+_PI = np.nextafter(np.float32(np.pi), np.float32(0))
+
+#: radians from which on taking off whole turns loses precision.
+_FAR = 1e6
+
+
+def shown_range(measured: Any, invalid: Any) -> Any:
+    """The range that a cloud shows, metres: inf where nothing came back, nan where the sensor marks a point as wrong (REP-117)."""
+    return marked(np.where(measured == 0, np.inf, np.where(measured < 0, np.nan, measured)), invalid)
+
+
+def returned_range(measured: Any) -> Any:
+    """The range of a return, metres; nan where nothing came back."""
+    return np.where((measured > 0) & (measured < np.inf), measured, np.nan)
+
+
+def marked(measured: Any, invalid: Any) -> Any:
+    """Ranges, nan where the sensor marks a point as wrong."""
+    return np.where(invalid, np.nan, measured) if isinstance(invalid, Traced) or np.any(invalid) else measured
+
+
+def coordinates(distance: Any, azimuth: Any, elevation: Any, origin: Sequence[Any]) -> tuple[Any, Any, Any]:
+    """x, y and z of points, metres, from where their beams start.
+
+    Args:
+        distance: metres along the beam.
+        azimuth, elevation: radians.
+        origin: x, y and z of where the beam starts.
+    """
+    level = _product(distance, np.cos(elevation))
+    places = _product(level, np.cos(azimuth)), _product(level, np.sin(azimuth)), distance * np.sin(elevation)
+    x, y, z = (place if is_zero(start) else place + start for place, start in zip(places, origin, strict=True))
+    return x, y, z
+
+
+def _product(first: Any, second: Any) -> Any:
+    return first if not isinstance(second, Traced) and np.size(second) == 1 and np.all(second == 1) else first * second
+
+
+def is_zero(value: Any) -> bool:
+    """Whether a number or an array, which no data decides, is 0."""
+    return not isinstance(value, Traced) and bool(np.all(np.asarray(value) == 0))
+
+
+def seconds_since(time_ns: NDArray[np.int64], base: int) -> NDArray[np.float64]:
+    """The times of packets, (n,) nanoseconds, as seconds since one of them."""
+    return np.multiply(time_ns - base, 1e-9, dtype=np.float64)
+
+
+def rows_of(shape: Sequence[int]) -> int:
+    """The rows of an organised cloud whose packets all have points of this shape; 0 where such points are not organised."""
+    return shape[-1] if len(shape) >= 2 and shape[-1] > 1 else 0
+
+
+def numbers_of(name: str, values: NDArray[Any]) -> NDArray[Any]:
+    """A column of numbers that sensors may leave out: intensity, ring or return, in its type; nan is 0."""
+    return np.asarray(np.nan_to_num(values), TYPES[name])
+
+
+def axis_matrix(axes: Sequence[str]) -> NDArray[np.float64]:
+    """The matrix that turns REP-103 coordinates into those of axes named by where x, y and z point."""
+    matrix = np.zeros((3, 3))
+    for row, name in enumerate(axes):
+        axis, is_opposite = divmod(DIRECTIONS.index(name), 2)
+        matrix[row, axis] = -1 if is_opposite else 1
+    return matrix
+
+
+def vendor_turn(sensor: Spec) -> NDArray[np.float64] | None:
+    """The matrix that turns REP-103 coordinates into the axes that were asked for; None where these are REP-103's own."""
+    wanted = sensor.options.get("frame") == "vendor" and sensor.vendor_axes is not None
+    return axis_matrix(sensor.vendor_axes) if wanted and sensor.vendor_axes is not None else None
+
+
+def turned_azimuth(angles: NDArray[Any], turn: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Azimuths in other axes, radians."""
+    direction = turn[:2, :2] @ np.stack([np.cos(angles), np.sin(angles)])
+    return np.asarray(np.arctan2(direction[1], direction[0]))
+
+
+def narrowed(angle: NDArray[np.float64]) -> Floats:
+    """Radians as float32 in [-pi, pi)."""
+    turned = angle - 2 * np.pi * np.floor((angle + np.pi) / (2 * np.pi))
+    far = np.abs(angle) > _FAR
+    if far.any():
+        turned[far] = np.mod(angle[far] + np.pi, 2 * np.pi) - np.pi  # exact however many turns it is, and slow
+    return np.clip(turned.astype(np.float32), -_PI, _PI)

@@ -1,0 +1,86 @@
+"""Frames compacted before anything is computed: the innermost arrays of a chunk of packets, without what stands between them.
+
+Each field is then one long array with one distance from element to element, which NumPy reads several times as fast as a view with a
+distance for each level. Where elements follow each other at one distance from frame to frame as they stand, nothing is copied.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarspec.points.windows import Window
+from lidarspec.wire.layout import Bytes2D, Leaf, elements
+
+
+class Blocks:
+    """The innermost arrays of frames, without what stands between them, a chunk of packets at a time.
+
+    Args:
+        leaves: the fields wanted; all of the same arrays.
+        size: of a frame in bytes.
+
+    Attributes:
+        is_flat: whether nothing stands between them, if the frames stand back to back, as they then have to.
+        room: bytes that they take for each packet when they are compacted.
+    """
+
+    def __init__(self, leaves: list[Leaf], size: int) -> None:
+        first = leaves[0]
+        self.shape, strides = first.shape[: len(first.strides)], first.strides
+        self.stride = strides[-1] if strides else size
+        count = self.shape[-1] if self.shape else 1
+        self.is_flat = self._regular(size, strides)
+        self._length = count * self.stride
+        self._base = 0 if self.is_flat else max(min(*(leaf.offset for leaf in leaves), size - self._length), 0)
+        self._strides, self._size = strides[:-1], size
+        self.room = 0 if self.is_flat else math.prod(self.shape[:-1]) * self._length
+
+    def _regular(self, size: int, strides: tuple[int, ...]) -> bool:
+        """Whether elements follow each other at one distance from frame to frame too."""
+        expected = size
+        for length, stride in zip(self.shape, strides, strict=True):
+            if stride * length != expected:
+                return False
+            expected = stride
+        return True
+
+    def loading(self, rows: Bytes2D, room: NDArray[np.uint8]) -> Loading:
+        """Their fields, compacted in this room."""
+        if self.is_flat:
+            return Loading(rows, None, 0, self._size, self.stride)
+        block = np.dtype(f"V{self._length}")
+        source = elements(rows, block, self._base, self.shape[:-1], self._strides)
+        return Loading(source, room.view(block).reshape(-1, *self.shape[:-1]), self._base, 0, self.stride)
+
+    def holds(self, seen: Window) -> bool:
+        """Whether a window lies in the elements that are kept."""
+        return self.is_flat or 0 <= seen.offset - self._base <= self.stride - seen.size
+
+
+class Loading:
+    """The fields of some frames, a chunk of packets at a time.
+
+    Args:
+        source: the frames, or their blocks.
+        compact: what the blocks of a chunk are copied to; None where the frames are looked at themselves.
+        base: where a block begins in its frame.
+        size: bytes from packet to packet in the source, where that is looked at.
+        stride: bytes from element to element.
+    """
+
+    def __init__(self, source: NDArray[Any], compact: NDArray[Any] | None, base: int, size: int, stride: int) -> None:
+        self._source, self._compact, self._base, self._size, self._stride = source, compact, base, size, stride
+        self._start = -1
+
+    def column(self, seen: Window, start: int, stop: int, width: int) -> NDArray[Any]:
+        """A window of each of `width` elements of the packets from `start` to `stop`."""
+        if self._compact is None:
+            return np.ndarray(((stop - start) * width,), seen.dtype, self._source.data, start * self._size + seen.offset, (self._stride,))
+        if self._start != start:
+            np.copyto(self._compact[: stop - start], self._source[start:stop])
+            self._start = start
+        return np.ndarray(((stop - start) * width,), seen.dtype, self._compact.data, seen.offset - self._base, (self._stride,))

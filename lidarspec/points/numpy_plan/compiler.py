@@ -1,0 +1,378 @@
+"""From a plan's expressions to the steps of a program.
+
+What depends on one field of two bytes or less is a table by its raw value, or its bits as they stand (`points.windows`). Sums, and the
+sines and cosines of angles that are near each other, are matrix products where they can be (`products`); only what is left is computed in
+full, angles reduced to half a turn before they become float32. Everything else is ordinary NumPy, and what is not full is known before.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarspec.columns.graph import Node, Term, chosen, is_full, key, last_axis, only_field
+from lidarspec.points.numpy_plan.blocks import Blocks
+from lidarspec.points.numpy_plan.products import (
+    TURN,
+    Angles,
+    Rotation,
+    Turns,
+    angles_of,
+    multiplied,
+    product_of,
+    reduced,
+    split,
+)
+from lidarspec.points.numpy_plan.program import Number, Program, Read, Run, deep
+from lidarspec.points.numpy_plan.registers import TYPES
+from lidarspec.points.plan import Plan
+from lidarspec.points.windows import Window, every_value, shift_of, window
+from lidarspec.wire.layout import Leaf
+
+
+class Compiler:
+    """Appends the steps of expressions to a program; each method gives the register of its result.
+
+    Attributes:
+        program: with the columns that were wanted.
+        low: the nodes whose plain results it needs.
+    """
+
+    def __init__(self, plan: Plan, tables: dict[Any, NDArray[Any]]) -> None:
+        self.program, self.low = Program(plan.width, plan.safe), list[Node]()
+        self._layout, self._shape, self._width, self._tables = plan.layout, plan.shape, plan.width, tables
+        self._registers: dict[Any, int] = {}
+        self._shifts: dict[tuple[str, Window], tuple[int, int] | None] = {}
+        self._angles_of: dict[Node, Angles | None] = {}
+        self._rotations: dict[Node, Rotation | None] = {}
+
+    def want(self, name: str, value: Any, kind: str) -> None:
+        """Make a column of this name; `kind` is "single" or "double"."""
+        self.program.outputs[name] = self._single(value) if kind == "single" else self._double(value)
+
+    def _once(self, name: Any, make: Callable[[], int]) -> int:
+        if name not in self._registers:
+            self._registers[name] = make()
+        return self._registers[name]
+
+    def _single(self, value: Any) -> int:
+        """An expression in float32; only products and tables are computed in that precision."""
+        if not is_full(value, self._width):
+            return self._spread(value, "single")
+        return self._once(("single", value), lambda: self._full_single(value))
+
+    def _full_single(self, node: Node) -> int:
+        register = self._of_field(node, "single")
+        if register is not None:
+            return register
+        if node.kind == "call" and node.function is np.multiply:
+            first, second = (self._factor(arg) for arg in node.args)
+            return self.program.call("multiply", "single", np.multiply, first, second)
+        if node.kind == "call" and node.function in (np.cos, np.sin):
+            return self._direction(node)
+        if node.kind == "call" and node.function is np.add and any(not isinstance(arg, Node) for arg in node.args):
+            first, second = (self._factor(arg) for arg in node.args)
+            return self.program.call("add", "single", np.add, first, second)
+        read = Read(self._double(node))
+        return self.program.step("as float32", "single", lambda run, out: np.copyto(out, read(run), casting="same_kind"), read)
+
+    def _double(self, value: Any) -> int:
+        """An expression in float64, or a condition."""
+        if not is_full(value, self._width):
+            return self._spread(value, "double")
+        return self._once(("double", value), lambda: self._full_double(value))
+
+    def _full_double(self, node: Node) -> int:
+        kind = "flag" if node.sample.array.dtype.kind == "b" else "double"
+        register = self._of_field(node, kind)
+        if register is None and node.kind == "call":
+            register = self._sum(node)
+        if register is None and node.kind == "call":
+            register = self._plain(node, kind)
+        return register if register is not None else self._spread(node, kind)
+
+    def _of_field(self, node: Node, kind: str, factor: float = 1.0) -> int | None:
+        """An expression of one field, times a number: loaded as it is, or looked up by its window; None where it is neither."""
+        source = only_field(node)
+        leaf = self._layout.leaves.get(source.path) if source is not None and is_full(source, self._width) else None
+        seen = window(leaf) if leaf is not None else None
+        if leaf is None or source is None or seen is None:
+            return None
+        shift = self._shift(leaf, seen)
+        if node is source and factor == 1 and not leaf.info.scaled:
+            if shift is not None:
+                return self._shifted(leaf, seen, *shift, kind)
+            if leaf.wire is not None:
+                return self._load(leaf, seen, leaf.wire, kind)
+        index = self._once(("index", seen), lambda: self._load(leaf, seen, seen.dtype, "index"))
+        if shift is not None and seen.size > 1:  # a smaller table stays nearer
+            whole = Read(index)
+            index = self._once(("index", seen, shift), lambda: self._cut(leaf, seen, *shift, whole))
+        table = self._table(node, leaf, seen, kind, factor)
+        text = f"{node.path or source.path}: table of {len(table)} by {(len(table) - 1).bit_length()} bits"
+        read = Read(index)
+        return self.program.step(text, kind, lambda run, out: table.take(read(run), out=out, mode="wrap"), read)
+
+    def _shift(self, leaf: Leaf, seen: Window) -> tuple[int, int] | None:
+        """How a field that shares its window with others is cut out of it; see `shift_of`."""
+        if leaf.wire is not None:
+            return None
+        if (leaf.info.path, seen) not in self._shifts:
+            self._shifts[leaf.info.path, seen] = shift_of(leaf, seen)
+        return self._shifts[leaf.info.path, seen]
+
+    def _table(self, node: Node, leaf: Leaf, seen: Window, kind: str, factor: float) -> NDArray[Any]:
+        shift = self._shift(leaf, seen)
+        name = (kind, seen.offset - leaf.offset, seen.size, leaf.size, shift, factor, key(node))
+        if name not in self._tables:
+            values = np.asarray(every_value(node, leaf))
+            if shift is not None and seen.size > 1:
+                values = values[np.arange(shift[1] + 1) << shift[0]]
+            self._tables[name] = np.ascontiguousarray(values if factor == 1 else values * factor, TYPES[kind])
+        return self._tables[name]
+
+    def _load(self, leaf: Leaf, seen: Window, dtype: np.dtype[Any], kind: str) -> int:
+        """A window of every element as it stands."""
+        blocks, width = self._blocks(leaf, seen), self._width
+
+        def run(execution: Run, out: NDArray[Any]) -> None:
+            column = execution.prepared[blocks].column(seen, execution.start, execution.stop, width)
+            np.copyto(out, column if column.dtype == dtype else column.view(dtype), casting="unsafe")
+
+        return self.program.step(f"{leaf.info.path}: {dtype} at byte {seen.offset}", kind, run)
+
+    def _shifted(self, leaf: Leaf, seen: Window, shift: int, mask: int, kind: str) -> int:
+        """Some bits of a window of every element."""
+        words = f"u{seen.size}"
+        word = Read(self._once((words, seen), lambda: self._load(leaf, seen, seen.dtype, words)))
+        read = Read(self._cut(leaf, seen, shift, mask, word))
+        return self.program.step(f"{leaf.info.path} as it stands", kind, lambda run, out: np.copyto(out, read(run), casting="unsafe"), read)
+
+    def _cut(self, leaf: Leaf, seen: Window, shift: int, mask: int, word: Read) -> int:
+        """Some bits of words, as words."""
+        is_masked = mask < (1 << 8 * seen.size) - 1 >> shift
+
+        def run(execution: Run, out: NDArray[Any]) -> None:
+            np.right_shift(word(execution), shift, out=out)
+            if is_masked:
+                np.bitwise_and(out, mask, out=out)
+
+        text = f"{leaf.info.path}: {mask.bit_length()} bits from bit {shift} on"
+        return self.program.step(text, self.program.kinds[word.register], run, word)
+
+    def _blocks(self, leaf: Leaf, seen: Window) -> Blocks:
+        """The blocks that a window of a field is loaded from."""
+        for blocks in self.program.blocks:
+            if blocks.shape == leaf.shape and blocks.holds(seen):
+                return blocks
+        beside = [other for other in self._layout.leaves.values() if other.shape == leaf.shape and other.strides == leaf.strides]
+        self.program.blocks.append(Blocks(beside, self._layout.size))
+        return self.program.blocks[-1]
+
+    def _plain(self, node: Node, kind: str) -> int:
+        """Any other function of arrays, as NumPy evaluates it."""
+        depth = max(len(arg.shape) for arg in node.args if isinstance(arg, Node))
+        reads = [self._argument(arg, depth) for arg in node.args]
+        used = [Read(self._double(arg)) for arg in node.args if is_full(arg, self._width)]
+        function, shape = node.function, node.shape
+
+        def run(execution: Run, out: NDArray[Any]) -> None:
+            out.reshape(-1, *shape)[...] = function(*(read(execution) for read in reads))
+
+        return self.program.step(f"{getattr(function, '__name__', 'function')} as it stands", kind, run, *used)
+
+    def _argument(self, value: Any, depth: int) -> Callable[[Run], Any]:
+        if not isinstance(value, Node):
+            return lambda run: value
+        if is_full(value, self._width):
+            read, shape = Read(self._double(value)), (*value.shape, *(1,) * (depth - len(value.shape)))
+            return lambda run: read(run).reshape(-1, *shape)
+        self.low.append(value)
+        return lambda run: deep(run.part(run.values(value)), depth)
+
+    def _factor(self, value: Any) -> Callable[[Run], Any]:
+        """A factor of a float32 product: a register, a number, or a row repeated for the whole chunk."""
+        if is_full(value, self._width):
+            return Read(self._single(value))
+        if not isinstance(value, Node) and np.size(value) == 1:
+            number = np.float32(np.asarray(value).reshape(()))
+            return lambda run: number
+        return Read(self._once(("row", id(value)), lambda: self._spread(value, "single")))
+
+    def _spread(self, value: Any, kind: str) -> int:
+        """What is not full, for every point."""
+        if not isinstance(value, Node):
+            return self.program.tiled(np.broadcast_to(np.asarray(value, TYPES[kind]), self._shape).reshape(-1), kind)
+        self.low.append(value)
+        if value.width == math.prod(self._shape[: last_axis(value.shape)]):
+            return self.program.repeated("computed plainly before", kind, lambda run: run.values(value))
+        shape, depth = self._shape, len(self._shape)
+
+        def run(execution: Run, out: NDArray[Any]) -> None:
+            out.reshape(-1, *shape)[...] = deep(execution.part(execution.values(value)), depth)
+
+        return self.program.step("computed plainly before", kind, run)
+
+    def _direction(self, node: Node) -> int:
+        """A cosine or sine; where all points of a packet or block have the same or nearly so, it is computed once for them."""
+        value, function = node.args[0], node.function
+        angles = self._angles(value)
+        if angles is not None and angles.all_alike:
+            name = f"{function.__name__} of each block"
+            return self.program.repeated(name, "single", lambda run: function(_shared_by(angles, run)))
+        rotation = self._rotation(value)
+        if rotation is not None:
+            return self._turned(function, rotation, self._once(("wide", value), lambda: self._wide(rotation)))
+        angle = self._once(("angle", value), lambda: self._angle(value))
+        return self.program.call(function.__name__, "single", function, Read(angle))
+
+    def _rotation(self, value: Node) -> Rotation | None:
+        if value not in self._rotations:
+            angles = self._angles(value)
+            self._rotations[value] = None if angles is None else Rotation.of(angles)
+        return self._rotations[value]
+
+    def _wide(self, rotation: Rotation) -> int:
+        """The angles of those packets or blocks whose points are too far apart for one rotation, within half a turn."""
+
+        def run(execution: Run, out: NDArray[Any]) -> None:
+            if rotation not in execution.prepared:
+                execution.prepared[rotation] = rotation.turns(execution)
+            turns: Turns = execution.prepared[rotation]
+            turns.move(execution.start, execution.stop)
+            if turns.some_wide:
+                out.reshape(-1, rotation.inner)[turns.wide] = turns.angles()
+
+        return self.program.step("angles of what is wide", "single", run)
+
+    def _turned(self, function: Any, rotation: Rotation, wide: int) -> int:
+        """Cosines or sines of angles that are turned a little from the one in their middle: a matrix product of series."""
+        read, which = Read(wide), 0 if function is np.cos else 1
+
+        def run(execution: Run, out: NDArray[Any]) -> None:
+            turns: Turns = execution.prepared[rotation]
+            rows = out.reshape(-1, rotation.inner)
+            if not turns.all_wide:
+                multiplied(turns.left[which], rotation.rows[which], rows)
+            if turns.some_wide:
+                rows[turns.wide] = function(read(execution).reshape(-1, rotation.inner)[turns.wide])
+
+        return self.program.step(f"{function.__name__} by {len(rotation.rows[0])} products", "single", run, read)
+
+    def _angle(self, value: Node) -> int:
+        """An angle in float32, reduced to half a turn either way before it loses precision."""
+        angles = self._angles(value)
+        if angles is not None:
+            return self._near(value, angles)
+        angle, turns = self._double(value), self.program.register("double")
+        read = Read(angle)
+
+        def run(execution: Run, out: NDArray[Any]) -> None:
+            radians, whole = read(execution), execution.views[turns]
+            np.multiply(radians, 1 / TURN, out=whole)
+            np.rint(whole, out=whole)
+            np.multiply(whole, TURN, out=whole)
+            np.subtract(radians, whole, out=whole)
+            np.copyto(out, whole, casting="same_kind")
+
+        return self.program.step("reduce to half a turn", "single", run, read, Read(turns))
+
+    def _near(self, value: Node, angles: Angles) -> int:
+        """Angles that lie around one of their packet or block, reduced so: most of them need no reduction of their own."""
+        read = Read(self._added(angles.around.rows, angles.left, angles, split(value, self._width)[1]))
+
+        def run(execution: Run, out: NDArray[Any]) -> None:
+            radians, (numbers, far) = read(execution), execution.prepared[angles]
+            places = np.flatnonzero(far[_rows(execution, numbers)])
+            if len(places):
+                rows = radians.reshape(-1, angles.around.inner)
+                rows[places] = reduced(rows[places])
+            np.copyto(out, radians, casting="same_kind")
+
+        return self.program.step("reduce what is far from half a turn", "single", run, read)
+
+    def _angles(self, value: Node) -> Angles | None:
+        """Angles that lie around one of their packet or block; None where they do not, or nobody knows."""
+        if value not in self._angles_of:
+            angles = self._angles_of[value] = angles_of(value, self._shape, self._layout.leaves)
+            self.low += [] if angles is None else angles.nodes
+        return self._angles_of[value]
+
+    def _sum(self, node: Node) -> int | None:
+        """A sum: one matrix product for what is low, and what is full added to it."""
+        product = product_of(node, self._shape)
+        if product is None:
+            return None
+        self.low += product.nodes
+        return self._added(product.rows, lambda run: (product.left(run),), product, split(node, self._width)[1])
+
+    def _added(self, rows: NDArray[Any], left: Callable[[Run], tuple[Any, ...]], place: Any, full: list[Term]) -> int:
+        """A matrix product of numbers and rows; what is full is added to it.
+
+        Args:
+            left: makes the numbers, for the batch at its first chunk.
+            place: where they are kept for the other chunks.
+        """
+        inner = rows.shape[1]
+
+        def run(execution: Run, out: NDArray[Any]) -> None:
+            if place not in execution.prepared:
+                execution.prepared[place] = left(execution)
+            numbers = execution.prepared[place][0]
+            multiplied(numbers[:, _rows(execution, numbers)].T, rows, out.reshape(-1, inner))
+
+        register = self.program.step(f"sum of {len(rows)} products", "double", run)
+        for part in full:
+            register = self._plus(register, part)
+        return register
+
+    def _plus(self, sum_: int, part: Term) -> int:
+        """A sum and what is full."""
+        assert part.full is not None
+        factor, options = float(part.row), chosen(part.full, self._width)
+        if options is None:
+            return self.program.call("add", "double", np.add, Read(sum_), Read(self._scaled(part.full, factor)))
+        condition, *values = options
+        first, second = (Read(self._scaled(value, factor)) if isinstance(value, Node) else Number(value * factor) for value in values)
+        self.low.append(condition)
+        shape, depth, before = self._shape, len(self._shape), Read(sum_)
+
+        def run(execution: Run, out: NDArray[Any]) -> None:
+            flags = execution.part(execution.values(condition)).astype(np.bool_)
+            if flags.all() or not flags.any():
+                np.add(before(execution), (first if flags.any() else second)(execution), out=out)
+                return
+            either = (np.asarray(read(execution)) for read in (first, second))
+            added = np.where(deep(flags, depth), *(array.reshape(-1, *shape) if array.ndim else array for array in either))
+            np.add(before(execution), added.reshape(-1), out=out)
+
+        return self.program.step("add one of two", "double", run, before, first, second)
+
+    def _scaled(self, node: Node, factor: float) -> int:
+        """What is full times a number, in float64; the number is part of the table where there is one."""
+        register = self._of_field(node, "double", factor)
+        if register is not None:
+            return register
+        read = Read(self._double(node))
+        if factor == 1:
+            return read.register
+        return self.program.step(f"times {factor:.6g}", "double", lambda run, out: np.multiply(read(run), factor, out=out), read)
+
+
+def _rows(run: Run, numbers: NDArray[Any]) -> slice:
+    """The columns of a left side that belong to the chunk: one for each packet, or several."""
+    each = numbers.shape[1] // len(run.rows)
+    return slice(run.start * each, run.stop * each)
+
+
+def _shared_by(angles: Angles, run: Run) -> NDArray[np.float32]:
+    """The angle that all points of each packet or block have."""
+    name = ("alike", angles)
+    if name not in run.prepared:
+        run.prepared[name] = angles.left(run)[0][0].astype(np.float32)
+    shared: NDArray[np.float32] = run.prepared[name]
+    return shared

@@ -1,0 +1,82 @@
+"""Fields by the one or two bytes that they stand in: their windows, and what expressions of one field come to for all that these can hold.
+
+An expression of one such field is a table of at most 65,536 entries by the raw value of its window, made by evaluating the expression for
+every value: byte order, bits, scale, "0 is no return", sines and cosines then cost nothing while decoding, and need no rule each. Both
+compilers of points use these tables, and the plan asks them whether an expression can be anything but a number.
+
+Text and other wire forms (M4) have no windows of their own: their slots do.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarspec.columns.graph import Node, evaluate, only_field
+from lidarspec.wire.layout import Leaf
+
+
+@dataclass(frozen=True)
+class Window:
+    """The bytes of a field in its element: from `offset` of the frame, `size` (1 or 2) bytes, little-endian."""
+
+    offset: int
+    size: int
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """The type it is loaded as."""
+        return np.dtype("u1") if self.size == 1 else np.dtype("<u2")
+
+
+def window(leaf: Leaf) -> Window | None:
+    """The window of a field; None where it takes more than two bytes, or stands inside a bit block as an array."""
+    if leaf.wire is not None:
+        return Window(leaf.offset, leaf.wire.itemsize) if leaf.wire.itemsize <= 2 and leaf.wire.kind in "iu" else None
+    if len(leaf.shape) > len(leaf.strides):
+        return None
+    held = [segment.byte for segment in leaf.elements[0].segments]
+    low, high = min(held), max(held)
+    return Window(leaf.offset + low, high - low + 1) if high - low < 2 else None
+
+
+def raw_values(leaf: Leaf, seen: Window) -> NDArray[Any]:
+    """The raw values of a field for every value of its window: (256,) or (65536,)."""
+    codes = np.arange(1 << (8 * seen.size)).astype(seen.dtype)
+    frames = np.zeros((len(codes), leaf.size), np.uint8)
+    start = seen.offset - leaf.offset
+    frames[:, start : start + seen.size] = codes.view(np.uint8).reshape(len(codes), seen.size)
+    single = Leaf(leaf.info, 0, (), (), leaf.size, leaf.wire, leaf.elements)
+    return single.load(frames)
+
+
+def shift_of(leaf: Leaf, seen: Window) -> tuple[int, int] | None:
+    """By how much a window is shifted right, and what is masked then, to give the raw value of a field; None where that is not all."""
+    raw = raw_values(leaf, seen).astype(np.int64)
+    ones = np.flatnonzero(raw[1 << np.arange(8 * seen.size)] == 1)
+    if not len(ones):
+        return None
+    shift, mask = int(ones[0]), int(raw[-1])
+    return (shift, mask) if np.array_equal(np.arange(len(raw)) >> shift & mask, raw) else None
+
+
+def every_value(node: Node, leaf: Leaf) -> NDArray[Any] | None:
+    """An expression of one field for every value of the field's window, in its order; None where it has no window."""
+    seen = window(leaf)
+    if seen is None:
+        return None
+    raw = raw_values(leaf, seen).astype(np.float64)
+    physical = raw * leaf.info.scale + leaf.info.offset if leaf.info.scaled else raw
+    with np.errstate(all="ignore"):
+        return np.asarray(evaluate(node, {}, lambda source: physical if source.kind == "field" else None)).reshape(raw.shape)
+
+
+def possible(node: Node, leaves: Mapping[str, Leaf]) -> NDArray[Any] | None:
+    """All values that an expression can have, whatever the bytes are; None where it is not of one field, or nobody knows."""
+    source = only_field(node)
+    leaf = leaves.get(source.path) if source is not None else None
+    return every_value(node, leaf) if leaf is not None else None

@@ -1,0 +1,566 @@
+"""A frame type as a tree of nodes: what stands on the wire, in order, with formulas where fields of the header decide.
+
+`lidarspec.spec.construct_layer` makes it from an author's struct, once for each frame; schema, layouts, examples, wire tables, explain
+and exports walk it (`children`, `nodes`) and know nothing of construct. Everything here is immutable. A node says what it is
+(`FieldInfo` for what carries a value) and how it is stored; where it begins is the sum of what stands before it.
+
+    Struct          members in a row
+    Sealed          a Struct with a checksum
+    Number          an integer or float of whole bytes
+    Blob            plain bytes; a constant without name is one with name ""
+    Block           so many bytes whose bits make up one or more integers (`Part`)
+    Repeat          one element so many times
+    When            a part that a condition decides on
+    Select          a part that a key decides on
+    Empty           nothing
+    Opaque          what construct alone can read
+
+Counts, lengths, conditions and keys are formulas: numbers, references to fields (`Ref`) and operations on both (`Op`). What only Python
+can calculate is `Code`, which can be evaluated, but not be written down in another language.
+
+Room for what is to come: parts that are frames in themselves (chains, tags with their own length) are a node beside `Repeat`, with
+formulas for count and size; the length of a part in bytes is a formula beside `Ref`, of the path of that part; an axis has its name in
+`Repeat.axis` and `FieldInfo.axes`; one element of an array is an index in `Ref`; a wire form, which recodes the bytes before they have
+places, is a value of the frame, beside its tree.
+"""
+
+from __future__ import annotations
+
+import operator
+import struct
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+
+from lidarspec.errors import SpecError
+from lidarspec.spec.bits import BitField
+from lidarspec.spec.checksums import Checksum
+
+
+@dataclass(frozen=True, eq=False)
+class FieldInfo:
+    """One field of a frame.
+
+    Attributes:
+        path: dotted, without indices: "points.distance".
+        axes: paths of the arrays it is in, outermost first; a bytes field adds its own path.
+        dtype: type of the raw value in native byte order; None where construct alone knows it.
+        kind: "int", "float", "bytes" or "other".
+        scale, offset, unit: ``physical = raw * scale + offset``.
+        bits: width in bits; 0 where not fixed.
+        const: the value it must have, None where free.
+        rebuilt: what its value in a frame that is made follows from, None where it is given (construct's Rebuild).
+        labels: meanings of raw values (construct's Enum).
+        optional: whether some headers leave it out.
+        measured: whether the author says what it measures, with a unit or as a pure number.
+    """
+
+    path: str
+    axes: tuple[str, ...] = ()
+    dtype: np.dtype[Any] | None = None
+    kind: str = "other"
+    scale: float = 1
+    offset: float = 0
+    unit: str = ""
+    docs: str = ""
+    bits: int = 0
+    const: Any = None
+    rebuilt: Formula | None = None
+    labels: Mapping[int, str] = field(default_factory=dict)
+    optional: bool = False
+    measured: bool = False
+
+    @property
+    def name(self) -> str:
+        """The last part of the path."""
+        return self.path.rpartition(".")[2]
+
+    @property
+    def scaled(self) -> bool:
+        """Whether the physical value is another number than the raw one."""
+        return self.scale != 1 or self.offset != 0
+
+    @property
+    def limits(self) -> tuple[int, int]:
+        """The lowest and highest raw value of an integer field."""
+        signed = self.dtype is not None and self.dtype.kind == "i"
+        return (-(1 << (self.bits - 1)), (1 << (self.bits - 1)) - 1) if signed else (0, (1 << self.bits) - 1)
+
+
+@dataclass(frozen=True)
+class Ref:
+    """The raw value of a field that stands before the formula.
+
+    Attributes:
+        path: from the top of the frame, dotted, without indices; within an array it is the field of the same element.
+        info: the field.
+    """
+
+    path: str
+    info: FieldInfo
+
+
+@dataclass(frozen=True)
+class Op:
+    """An operation on integers as Python does it: ``//`` and ``%`` round down, comparisons give 1 or 0.
+
+    Attributes:
+        symbol: + - * // % & | ^ << >> == != < <= > >= with two arguments; - and not with one.
+    """
+
+    symbol: str
+    args: tuple[Formula, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Code:
+    """A formula that only Python can calculate.
+
+    Attributes:
+        function: from what reads a field (see `Read`) to the value.
+        refs: fields that it is known to ask for; which others depends on their values.
+        reason: why it cannot be written down, with the path of the part that it belongs to.
+        text: as the author wrote it, with fields by their whole paths; "?" where that cannot be read.
+        blind: whether it asks for something that is no field before it, which construct alone may know.
+    """
+
+    function: Callable[[Read], Any]
+    refs: tuple[Ref, ...]
+    reason: str
+    text: str
+    blind: bool
+
+
+Formula = int | Ref | Op | Code
+#: from the path of a field to what it is and its raw value; to its path for a struct, to None for a part that the header leaves out.
+Read = Callable[[str], "tuple[FieldInfo, int] | str | None"]
+
+_OPERATIONS: dict[str, Callable[..., Any]] = {
+    **{"+": operator.add, "*": operator.mul, "//": operator.floordiv, "%": operator.mod, "&": operator.and_, "|": operator.or_},
+    **{"^": operator.xor, "<<": operator.lshift, ">>": operator.rshift, "not": operator.not_},
+    **{"==": operator.eq, "!=": operator.ne, "<": operator.lt, "<=": operator.le, ">": operator.gt, ">=": operator.ge},
+    "-": lambda first, *second: first - second[0] if second else -first,
+}
+
+
+def calculated(symbol: str, *args: Formula) -> Formula:
+    """An operation, done at once where it is a sum or product of numbers."""
+    if all(isinstance(arg, int) for arg in args) and symbol in ("+", "-", "*"):
+        return int(_OPERATIONS[symbol](*args))
+    return Op(symbol, args)
+
+
+def evaluated(formula: Formula, read: Read) -> Any:
+    """The value of a formula.
+
+    Args:
+        read: what gives the values of fields; a field that the header leaves out counts as None, as in construct.
+
+    Raises:
+        Exception: whatever the operation or the author's function raises on these values.
+    """
+    match formula:
+        case Ref():
+            value = read(formula.path)
+            return value[1] if isinstance(value, tuple) else value
+        case Op():
+            return _OPERATIONS[formula.symbol](*(evaluated(arg, read) for arg in formula.args))
+        case Code():
+            return formula.function(read)
+    return formula
+
+
+#: operations that give 1 or 0.
+COMPARISONS = frozenset({"==", "!=", "<", "<=", ">", ">="})
+
+
+def written(formula: Formula, named: Callable[[Ref], str], operations: Mapping[str, str]) -> str:
+    """A formula, without `Code` in it, as an expression of another language.
+
+    Args:
+        named: what gives the text of a field.
+        operations: symbol -> text with "{}" for each argument, where the language says it in another way than Python.
+    """
+    match formula:
+        case Ref():
+            return named(formula)
+        case Op("-", (operand,)):
+            return f"(-{written(operand, named, operations)})"
+        case Op(symbol, args):
+            text = operations.get(symbol, "(not {})" if symbol == "not" else f"({{}} {symbol} {{}})")
+            return text.format(*(written(arg, named, operations) for arg in args))
+        case Code():
+            raise ValueError(formula.reason)
+    return f"({formula})" if formula < 0 else str(formula)
+
+
+def refs(formula: Formula) -> tuple[Ref, ...]:
+    """The fields that a formula depends on, in the order in which it names them, each once."""
+    match formula:
+        case Op():
+            return tuple(dict.fromkeys(ref for arg in formula.args for ref in refs(arg)))
+        case Ref():
+            return (formula,)
+        case Code():
+            return formula.refs
+    return ()
+
+
+@dataclass(frozen=True, eq=False)
+class Number:
+    """An integer or float of whole bytes.
+
+    Attributes:
+        info: the field; `info.const` is the value that it must have.
+        size: in bytes.
+        kind: "uint", "int" or "float".
+        order: byte order.
+    """
+
+    info: FieldInfo
+    size: int
+    kind: Literal["uint", "int", "float"]
+    order: Literal["little", "big"]
+
+    @property
+    def name(self) -> str:
+        """The field's own name."""
+        return self.info.name
+
+    def encoded(self, value: float) -> bytes:
+        """The bytes that a raw value is on the wire."""
+        if self.kind == "float":
+            order, code = "<" if self.order == "little" else ">", {2: "e", 4: "f", 8: "d"}[self.size]
+            return struct.pack(order + code, value)
+        return int(value).to_bytes(self.size, self.order, signed=self.kind == "int")
+
+
+@dataclass(frozen=True, eq=False)
+class Blob:
+    """Plain bytes; `const`: what they must be, None where free. Without a name only as a constant."""
+
+    name: str
+    info: FieldInfo
+    size: Formula
+    const: bytes | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """One integer of a block.
+
+    Attributes:
+        info: the field.
+        bits: which bits of the block make it up: `bits.segments`, `bits.width`, `bits.signed`.
+        names: from the block down to it: (), ("distance",).
+        indices: which element it is, for each array inside the block.
+    """
+
+    info: FieldInfo
+    bits: BitField
+    names: tuple[str, ...]
+    indices: tuple[int, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Block:
+    """So many bytes whose bits make up its parts; a block of one part without names is a plain field of odd width or order."""
+
+    name: str
+    info: FieldInfo
+    size: int
+    parts: tuple[Part, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Struct:
+    """Members in a row; `path` is "" for the frame itself."""
+
+    name: str
+    path: str
+    members: tuple[Node, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Sealed:
+    """A struct with a checksum.
+
+    Attributes:
+        body: the struct.
+        fields: paths of what holds the checksum, low bits first.
+        over: paths of the first and last member that it covers; None: all bytes of the body that hold no bit of `fields`.
+        declared: the algorithm, None where a hook has to supply it.
+        absent: values that mean "not filled", and pass.
+    """
+
+    body: Struct
+    fields: tuple[str, ...]
+    over: tuple[str, str] | None
+    declared: Checksum | None
+    absent: tuple[int, ...]
+
+    @property
+    def algorithm(self) -> Checksum:
+        """The algorithm of the checksum.
+
+        Raises:
+            SpecError: where there is none.
+        """
+        if self.declared is None:
+            raise SpecError("a checksum without algorithm, and no lidarspec_checksum hook supplies one", path=self.fields[0])
+        return self.declared
+
+    @property
+    def name(self) -> str:
+        """The name of the struct."""
+        return self.body.name
+
+
+@dataclass(frozen=True, eq=False)
+class Repeat:
+    """One element `count` times; `axis` is the name of the array, its path, with brackets where it is directly in an array."""
+
+    name: str
+    axis: str
+    count: Formula
+    element: Node
+
+
+@dataclass(frozen=True, eq=False)
+class When:
+    """`then` where the condition is not 0, else `otherwise`."""
+
+    name: str
+    condition: Formula
+    then: Node
+    otherwise: Node
+
+
+@dataclass(frozen=True, eq=False)
+class Select:
+    """What stands there for each value of the key, and for all others; integers, unless the key is `Code`."""
+
+    name: str
+    key: Formula
+    cases: tuple[tuple[Any, Node], ...]
+    default: Node
+
+
+@dataclass(frozen=True, eq=False)
+class Empty:
+    """Nothing."""
+
+    name: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class Opaque:
+    """What construct alone can read.
+
+    Attributes:
+        info: the field, where it is one.
+        kind: the name of construct's class, or of the author's.
+        reason: why no node stands for it.
+        inside: the parts of a bit block, or of a struct, that cannot be read as one; they have no places.
+        size: in bytes, None where only the bytes themselves tell.
+        form: how a field stands on the wire: "text up to" its terminator, else its kind.
+        in_bits: whether it is a bit block.
+    """
+
+    name: str
+    info: FieldInfo
+    kind: str
+    reason: str
+    inside: tuple[Node, ...] = ()
+    size: Formula | None = None
+    form: str = ""
+    in_bits: bool = False
+
+
+Node = Number | Blob | Block | Struct | Sealed | Repeat | When | Select | Empty | Opaque
+
+
+def children(node: Node) -> tuple[Node, ...]:
+    """The nodes directly below one."""
+    match node:
+        case Struct():
+            return node.members
+        case Sealed():
+            return (node.body,)
+        case Repeat():
+            return (node.element,)
+        case When():
+            return (node.then, node.otherwise)
+        case Select():
+            return (*(case for _, case in node.cases), node.default)
+        case Opaque():
+            return node.inside
+        case _:
+            return ()
+
+
+def nodes(node: Node) -> Iterator[Node]:
+    """A node and all below it, in the order of the wire."""
+    yield node
+    for child in children(node):
+        yield from nodes(child)
+
+
+def formulas(node: Node) -> tuple[Formula, ...]:
+    """The formulas of a node, those of its parts left out."""
+    match node:
+        case Blob():
+            return (node.size,)
+        case Repeat():
+            return (node.count,)
+        case When():
+            return (node.condition,)
+        case Select():
+            return (node.key,)
+    return ()
+
+
+def infos(node: Node) -> tuple[FieldInfo, ...]:
+    """The fields that a node is: one, or those of the parts of a block; none for a struct, an array or a choice."""
+    match node:
+        case Number() | Blob() | Opaque():
+            return (node.info,)
+        case Block():
+            return tuple(part.info for part in node.parts)
+    return ()
+
+
+class Scope:
+    """What an expression of a struct sees of the fields before it, as symbols, so that what it does with them can be written down.
+
+    Args:
+        asked: to which the fields are added that an expression asks for.
+    """
+
+    def __init__(self, parent: Scope | None, path: str, asked: list[Ref]) -> None:
+        self.parent, self.path, self.asked = parent, path, asked
+        self.names: dict[str, Ref | Scope] = {}
+        #: names of parts that branches have in different forms.
+        self.several: set[str] = set()
+
+    def add(self, name: str, part: Ref | Scope) -> None:
+        """Make a field or struct known from here on."""
+        known = self.names.get(name)
+        if known is not None and not (isinstance(known, Ref) and isinstance(part, Ref) and known.info.labels == part.info.labels):
+            self.several.add(name)
+        self.names[name] = part
+
+    def __getitem__(self, name: str) -> Any:
+        if name == "_":
+            return self.parent
+        if name == "_root":
+            return self.parent["_root"] if self.parent is not None else self
+        if name not in self.names:
+            raise Blind(f"an expression asks for {name!r}, which is not a field before it")
+        part = self.names[name]
+        if isinstance(part, Scope):
+            return part
+        self.asked.append(part)
+        if name in self.several:
+            raise Untraceable(f"an expression asks for {name!r}, which has several forms")
+        return Symbol(part)
+
+    def __getattr__(self, name: str) -> Any:
+        return self[name]
+
+    def __len__(self) -> int:
+        raise Blind("an expression asks for the length of an array")
+
+
+class Untraceable(Exception):
+    """Why an expression cannot be written down as data."""
+
+
+class Blind(Untraceable):
+    """What an expression asks for that construct alone may know."""
+
+
+class Symbol:
+    """A value that is not known yet; what is done with it is kept."""
+
+    __hash__ = None  # type: ignore[assignment]
+
+    def __init__(self, formula: Formula) -> None:
+        self.formula = formula
+
+    def __bool__(self) -> bool:
+        raise Untraceable("a Python function decides on the values of fields")
+
+    __index__ = __int__ = __float__ = __len__ = __iter__ = __bool__
+
+    def __invert__(self) -> Symbol:
+        return Symbol(Op("-", (Op("+", (self.formula, 1)),)))
+
+    def __neg__(self) -> Symbol:
+        return Symbol(Op("-", (self.formula,)))
+
+    def __pos__(self) -> Symbol:
+        return self
+
+    def __getattr__(self, name: str) -> Any:
+        raise Untraceable(f"an expression asks for {name!r} of a number")
+
+    def __getitem__(self, key: object) -> Any:
+        raise Untraceable("an expression takes an element of an array, or a byte")
+
+
+def _traced_operation(symbol: str, left: Any, right: Any) -> Symbol:
+    pair: list[Any] = [part.formula if isinstance(part, Symbol) else part for part in (left, right)]
+    for one, other in ((0, 1), (1, 0)):
+        known = pair[other]
+        if not isinstance(known, Ref) or not known.info.labels:
+            continue
+        if symbol not in ("==", "!=") or not isinstance(pair[one], int | str):
+            raise Untraceable("an expression takes the name of a value for a number")
+        if pair[one] in known.info.labels:  # construct has the name in place of such a number
+            return Symbol(int(symbol == "!="))
+        pair[one] = _labelled(known, pair[one]) if isinstance(pair[one], str) else pair[one]
+    wrong = next((part for part in pair if not isinstance(part, int | Ref | Op)), None)
+    if wrong is not None:
+        raise Untraceable(f"an expression with {wrong!r}")
+    return Symbol(calculated(symbol, *(int(part) if isinstance(part, bool) else part for part in pair)))
+
+
+def _no_integer(sign: str) -> Any:
+    raise Untraceable(f"an expression with {sign!r}, which need not give an integer")
+
+
+def _operators() -> None:
+    both = {
+        "add": "+",
+        "sub": "-",
+        "mul": "*",
+        "floordiv": "//",
+        "mod": "%",
+        "and": "&",
+        "or": "|",
+        "xor": "^",
+        "lshift": "<<",
+        "rshift": ">>",
+    }
+    for name, symbol in both.items():
+        setattr(Symbol, f"__{name}__", lambda self, other, symbol=symbol: _traced_operation(symbol, self, other))
+        setattr(Symbol, f"__r{name}__", lambda self, other, symbol=symbol: _traced_operation(symbol, other, self))
+    for name, symbol in {"eq": "==", "ne": "!=", "lt": "<", "le": "<=", "gt": ">", "ge": ">="}.items():
+        setattr(Symbol, f"__{name}__", lambda self, other, symbol=symbol: _traced_operation(symbol, self, other))
+    for name, sign in {"truediv": "/", "pow": "**", "divmod": "divmod", "matmul": "@"}.items():
+        for full in (f"__{name}__", f"__r{name}__"):
+            setattr(Symbol, full, lambda self, other, sign=sign: _no_integer(sign))
+
+
+_operators()
+
+
+def _labelled(ref: Ref, label: str) -> int:
+    """The raw value that a name of construct's Enum stands for."""
+    for value, name in ref.info.labels.items():
+        if name == str(label):
+            return value
+    raise Untraceable(f"{ref.path} has no value named {label!r}")

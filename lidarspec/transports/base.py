@@ -1,0 +1,125 @@
+"""What transports share: addresses with options, the host's clock, waiting for a descriptor, failures with the next command."""
+
+from __future__ import annotations
+
+import os
+import re
+import select
+import sys
+import time
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field
+from urllib.parse import parse_qs
+
+from lidarspec.errors import SourceError, UnknownOption, UsageError, suggest
+from lidarspec.spec.sensor import Sensor
+from lidarspec.transports.protocol import Disconnected
+
+#: options that every live SOURCE takes: the address of the link that commands go over, where it is not that of the data.
+COMMON = frozenset({"control"})
+_SWITCH = {"0": False, "1": True, "false": False, "true": True, "off": False, "on": True}
+
+
+@dataclass(frozen=True)
+class Address:
+    """A live SOURCE taken apart.
+
+    Attributes:
+        text: as it was given.
+        scheme: "serial", "udp", "tcp" and so on.
+        place: a path, or host and port.
+        options: what stands behind the question mark; of an option that is given twice, the last.
+    """
+
+    text: str
+    scheme: str
+    place: str
+    options: Mapping[str, str] = field(default_factory=dict)
+
+    @classmethod
+    def parse(cls, text: str, *, scheme: str = "") -> Address:
+        """The address that a text stands for.
+
+        Args:
+            text: "udp://:2368?src=10.0.0.5", or a port's name with options, where `scheme` says what it is.
+        """
+        begin, mark, rest = text.partition("://") if "://" in text else text.partition(":") if not scheme else (scheme, "", text)
+        place, _, query = (rest if mark else text).partition("?")
+        return cls(text, scheme or begin, place, {name: values[-1] for name, values in parse_qs(query, keep_blank_values=True).items()})
+
+    def check(self, known: Collection[str]) -> None:
+        """Refuse options that the source does not take.
+
+        Raises:
+            UnknownOption: for the first of them.
+        """
+        for name in sorted(set(self.options) - set(known) - COMMON):
+            raise UnknownOption(name, [*known, *COMMON], place=self.text)
+
+    def number(self, name: str, low: int, high: int) -> int | None:
+        """A whole number among the options, None where it is not given."""
+        text = self.options.get(name)
+        if text is None:
+            return None
+        if not text.isdecimal() or not low <= int(text) <= high:
+            raise UsageError(f"{self.text}: {name} is a number from {low} to {high}, not {text!r}")
+        return int(text)
+
+    def switch(self, name: str) -> bool | None:
+        """Something on or off among the options, None where it is not given."""
+        text = self.options.get(name)
+        if text is not None and text.lower() not in _SWITCH:
+            raise UsageError(f"{self.text}: {name} is 0 or 1, not {text!r}")
+        return None if text is None else _SWITCH[text.lower()]
+
+    def host_and_port(self) -> tuple[str, int | None]:
+        """Host and port of the place, "" and None where they are left out; an IPv6 host stands in brackets."""
+        found = re.fullmatch(r"(?:\[([^\]]+)\]|([^:/]*))(?::(\d*))?/?", self.place)
+        if found is None:
+            raise UsageError(f"{self.text}: {self.place!r} is no host:port")
+        port = int(found[3]) if found[3] else None
+        if port is not None and not 0 < port < 65536:
+            raise UsageError(f"{self.text}: a port is a number from 1 to 65535, not {port}")
+        return found[1] or found[2] or "", port
+
+
+class HostClock:
+    """Wall-clock times that the monotonic clock carries on: no interval between two of them jumps when the clock is set."""
+
+    def __init__(self) -> None:
+        self._offset = time.time_ns() - time.monotonic_ns()
+
+    def now(self) -> int:
+        """Nanoseconds since 1970."""
+        return time.monotonic_ns() + self._offset
+
+
+def readable(descriptor: int, timeout: float) -> bool:
+    """Whether there is something to read, or the other side has hung up, within so many seconds."""
+    if sys.platform == "win32":  # which has no poll
+        return bool(select.select([descriptor], [], [], timeout)[0])
+    poller = select.poll()
+    poller.register(descriptor, select.POLLIN)
+    return bool(poller.poll(timeout * 1000))
+
+
+def failure(text: str, following: str) -> SourceError:
+    """A SourceError with the next command to type."""
+    return suggest(SourceError(text), following)
+
+
+def lost(label: str, error: Exception | str) -> Disconnected:
+    """The device behind a source went away."""
+    return Disconnected(f"{label}: the connection was lost: {reason(error)}")
+
+
+def reason(error: Exception | str) -> str:
+    """What the system says, in its own words."""
+    if isinstance(error, OSError) and error.errno:
+        return os.strerror(error.errno)
+    return str(error)
+
+
+def named(sensor: Sensor | None) -> str:
+    """The option that names a sensor in a command to type."""
+    return f" -s {sensor.id}" if sensor is not None else ""

@@ -1,0 +1,309 @@
+"""Commands over live lines: started on opening, stopped on closing, whatever ends the program; a control link of its own."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import itertools
+import os
+import select
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import lidarspec as ls
+from lidarspec.errors import CommandError, OutOfRange, ReplyTimeout, SourceError
+from lidarspec.recording.recordings import Recording
+from lidarspec.spec import Tcp, Udp
+from tests.lines import SLACK, Port, free_port, port, turning, udp, until, working
+from tests.shapes import SHAPES
+
+pytestmark = pytest.mark.skipif(os.name != "posix", reason="pseudo terminals are POSIX")
+
+SENSOR = SHAPES["shape-commands"]
+START, STOP, SPEED = 1, 2, 3
+ROOT = Path(__file__).parents[2]
+
+
+class Obedient:
+    """A device on a port that sends data between start and stop, and acknowledges."""
+
+    def __init__(self, line: Port, *, deaf: bool = False, streaming: bool = False) -> None:
+        self.line, self.deaf, self.streaming = line, deaf, streaming
+        self.heard: list[int] = []
+        self._frames, self._sent, self._rest = turning(SENSOR, 200), 0, b""
+
+    def work(self, stop: threading.Event) -> None:
+        while not stop.is_set():
+            with contextlib.suppress(OSError, ValueError):
+                self._turn()
+
+    def _turn(self) -> None:
+        master = self.line._master
+        if select.select([master], [], [], 0.002)[0]:
+            self._rest += os.read(master, 100)
+        while len(self._rest) >= 6:
+            order, self._rest = self._rest[:6], self._rest[6:]
+            self._obey(SENSOR.parse(order, "order").code)
+        if self.streaming:
+            self.line.send(self._frames[self._sent % 200])
+            self._sent += 1
+
+    def _obey(self, code: int) -> None:
+        self.heard.append(code)
+        if self.deaf:
+            return
+        self.streaming = code != STOP and (self.streaming or code == START)
+        if code != STOP:
+            self.line.send(b"\xff\x17" + SENSOR.build("ack", code=code, result=0))
+
+
+@pytest.fixture
+def line(tmp_path: Path) -> Iterator[Port]:
+    with port(tmp_path) as made:
+        yield made
+
+
+def test_started_on_opening_and_stopped_on_closing(line: Port) -> None:
+    device = Obedient(line)
+    with working(device.work):
+        with ls.open(f"serial://{line.name}", SENSOR) as opened:
+            assert device.heard == [START]
+            assert opened.latest(SLACK).complete
+        until(lambda: device.heard == [START, STOP])
+        assert not device.streaming
+
+
+def test_without_start_nothing_is_sent(line: Port) -> None:
+    device = Obedient(line, streaming=True)
+    with working(device.work), ls.open(f"serial://{line.name}", SENSOR, start=False) as opened:
+        opened.latest(SLACK)
+    assert device.heard == []
+
+
+def test_what_was_started_by_hand_is_stopped(line: Port) -> None:
+    device = Obedient(line)
+    with working(device.work):
+        with ls.open(f"serial://{line.name}", SENSOR, start=False) as opened:
+            assert opened.send("start").confirmed
+        until(lambda: device.heard == [START, STOP])
+
+
+def test_a_reply_among_data_and_the_data_go_on(line: Port, tmp_path: Path) -> None:
+    device = Obedient(line)
+    path = tmp_path / "all.lsr"
+    with working(device.work), ls.open(f"serial://{line.name}", SENSOR, record=path) as opened:
+        reply = opened.send("speed", rate=10.0, trim=1.0)
+        assert (reply.confirmed, reply.values.code, reply.frame) == (True, SPEED, "ack")
+        with pytest.raises(OutOfRange):
+            opened.send("speed", rate=100.0, trim=0.0)
+        assert opened.send("spin").confirmed is False
+        angles = np.concatenate([batch["angle"] for batch, _ in zip(opened.packets(), range(3), strict=False)])
+        assert len(angles) > 3
+        assert set(np.diff(angles) % 360) == {20.0}, "nothing is missing"
+    assert opened.stats.bytes_skipped == opened.stats.bytes_filler + 2 * opened.stats.frames["ack"]
+    with Recording(path) as recording:
+        sent = [record.data for record in recording if record.direction == "out"]
+    assert [SENSOR.parse(data, "order").code for data in sent] == [START, SPEED, STOP]
+
+
+def test_a_command_from_another_thread_while_scans_are_read(line: Port) -> None:
+    device = Obedient(line)
+    with working(device.work), ls.open(f"serial://{line.name}", SENSOR) as opened:
+        replies = []
+        thread = threading.Thread(target=lambda: replies.append(opened.send("speed", rate=10.0, trim=0.0)))
+        for number, _ in enumerate(opened.scans()):
+            if number == 1:
+                thread.start()
+            if replies:
+                break
+        thread.join()
+    assert replies[0].confirmed
+
+
+def test_a_device_that_does_not_answer_does_not_open(line: Port) -> None:
+    device = Obedient(line, deaf=True)
+    with working(device.work):
+        with pytest.raises(ReplyTimeout, match="no ack frame came") as caught:
+            ls.open(f"serial://{line.name}", SENSOR)
+        assert caught.value.__notes__[0].startswith("next: lidarspec doctor")
+        until(lambda: device.heard == [START, STOP])
+    ls.open(f"serial://{line.name}", SENSOR, start=False).close()
+
+
+def test_a_device_that_was_left_streaming_opens_all_the_same(line: Port) -> None:
+    device = Obedient(line, deaf=True, streaming=True)
+    with working(device.work), ls.open(f"serial://{line.name}", SENSOR) as opened:
+        assert any("data come all the same" in warning for warning in opened.warnings)
+        opened.latest(SLACK)
+
+
+def test_started_again_after_it_was_unplugged(line: Port) -> None:
+    device = Obedient(line)
+    with working(device.work):
+        with ls.open(f"serial://{line.name}", SENSOR) as opened:
+            opened.latest(SLACK)
+            device.streaming = False
+            line.unplug()
+            until(lambda: opened.newest(0.01) or opened.state == "disconnected")
+            line.plug()
+            until(lambda: opened.newest(0.01))
+        until(lambda: device.heard == [START, START, STOP])
+
+
+def test_a_command_to_a_device_that_is_gone_fails_at_once(line: Port) -> None:
+    device = Obedient(line)
+    with working(device.work), ls.open(f"serial://{line.name}", SENSOR) as opened:
+        line.unplug()
+        until(lambda: opened.newest(0.01) or opened.state == "disconnected")
+        began = time.monotonic()
+        with pytest.raises(CommandError, match="connection was lost"):
+            opened.send("speed", rate=10.0, trim=0.0)
+        assert time.monotonic() - began < 0.5
+
+
+def test_a_command_under_way_fails_when_the_device_goes_away(line: Port) -> None:
+    device = Obedient(line, deaf=True)
+    with working(device.work), ls.open(f"serial://{line.name}", SENSOR, start=False) as opened:
+        timer = threading.Timer(0.1, line.unplug)
+        timer.start()
+        began = time.monotonic()
+        with pytest.raises(CommandError, match="connection was lost"):
+            opened.send("speed", rate=10.0, trim=0.0, timeout=10 * SLACK)
+        assert time.monotonic() - began < SLACK
+        timer.join()
+
+
+def test_closing_without_a_device_is_quick(line: Port) -> None:
+    device = Obedient(line)
+    with working(device.work):
+        with ls.open(f"serial://{line.name}", SENSOR) as opened:
+            line.unplug()
+            until(lambda: opened.newest(0.01) or opened.state == "disconnected")
+            began = time.monotonic()
+        assert time.monotonic() - began < 1.0 * SLACK
+
+
+PROGRAM = """
+import signal
+import sys
+import lidarspec as ls
+from tests.shapes import SHAPES
+signal.signal(signal.SIGINT, signal.default_int_handler)
+device = ls.open("serial://" + sys.argv[1], SHAPES["shape-commands"])
+print("open", flush=True)
+{rest}
+"""
+
+
+@pytest.mark.parametrize(
+    "rest",
+    ["with device: list(device.scans())", "with device: 1 / 0", "1 / 0", "del device", "list(device.scans())", "sys.exit(3)"],
+    ids=["interrupt in with", "exception in with", "exception", "garbage", "interrupt", "exit"],
+)
+def test_stopped_whatever_ends_the_program(line: Port, rest: str) -> None:
+    device = Obedient(line)
+    with working(device.work):
+        with subprocess.Popen(
+            [sys.executable, "-c", PROGRAM.format(rest=rest), str(line.name)],
+            cwd=ROOT,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+        ) as program:
+            assert program.stdout is not None
+            assert program.stdout.readline() == b"open\n"
+            if "scans" in rest:
+                time.sleep(0.2)
+                program.send_signal(signal.SIGINT)
+            program.wait(SLACK * 2)
+        until(lambda: device.heard == [START, STOP])
+
+
+@pytest.fixture
+def server() -> Iterator[socket.socket]:
+    with socket.create_server(("127.0.0.1", 0)) as made:
+        made.settimeout(SLACK)
+        yield made
+
+
+@pytest.mark.parametrize("named", ["src=127.0.0.1", "control=127.0.0.1:{port}", "control=tcp://127.0.0.1:{port}"])
+def test_commands_over_a_link_of_their_own(server: socket.socket, named: str) -> None:
+    number, data = server.getsockname()[1], free_port()
+    commands = {name: dataclasses.replace(command, link="control") for name, command in SENSOR.commands.items() if name != "spin"}
+    sensor = dataclasses.replace(SENSOR, links={"data": Udp(data), "control": Tcp(number)}, commands=commands)
+    heard: list[int] = []
+
+    def obey(stop: threading.Event) -> None:
+        peer = server.accept()[0]
+        with peer:
+            while order := peer.recv(6, socket.MSG_WAITALL):
+                heard.append(SENSOR.parse(order, "order").code)
+                if heard[-1] != STOP:
+                    peer.sendall(SENSOR.build("ack", code=heard[-1], result=0))
+
+    with working(obey):
+        with ls.open(f"udp://127.0.0.1:{data}?{named.format(port=number)}", sensor) as opened, udp() as sender:
+            assert heard == [START]
+            for frame in turning(SENSOR, 3):
+                sender.sendto(frame, ("127.0.0.1", data))
+            assert sum(len(batch) for batch, _ in zip(opened.packets(wait=0.3), range(1), strict=False)) > 0
+            assert opened.send("speed", rate=10.0, trim=0.0).confirmed
+        until(lambda: heard == [START, SPEED, STOP])
+
+
+@contextlib.contextmanager
+def silent_at_first(number: int, seconds: float, heard: list[str]) -> Iterator[None]:
+    """A device that sends datagrams to a port, the first one after some seconds, and answers whoever sends it an order."""
+
+    def work(stop: threading.Event) -> None:
+        with udp() as own:
+            own.settimeout(0.02)
+            stop.wait(seconds)
+            for frame in itertools.cycle(turning(SENSOR, 30)):
+                if stop.is_set():
+                    return
+                own.sendto(frame, ("127.0.0.1", number))
+                with contextlib.suppress(TimeoutError):
+                    order, sender = own.recvfrom(100)
+                    heard.append("order")
+                    own.sendto(SENSOR.build("ack", code=SENSOR.parse(order, "order").code, result=0), sender)
+
+    with working(work):
+        yield
+
+
+def datagram_sensor(number: int) -> ls.Sensor:
+    return dataclasses.replace(SENSOR, links={"data": Udp(number)}, on_open=(), on_close=())
+
+
+def test_a_command_waits_for_the_first_datagram_that_says_where_the_sensor_is() -> None:
+    number, heard = free_port(), list[str]()
+    with silent_at_first(number, 0.3, heard), ls.open(f"udp://127.0.0.1:{number}", datagram_sensor(number), start=False) as opened:
+        assert opened.send("speed", rate=10.0, trim=0.0, timeout=SLACK).confirmed
+        assert heard
+        assert sum(len(batch) for batch, _ in zip(opened.packets(wait=0.3), range(3), strict=False)) > 0
+
+
+def test_a_sensor_that_nothing_was_heard_of_cannot_be_sent_to() -> None:
+    number = free_port()
+    with ls.open(f"udp://127.0.0.1:{number}", datagram_sensor(number), start=False) as opened:
+        began = time.monotonic()
+        with pytest.raises(CommandError, match="nothing has arrived yet, so nobody knows the sensor's address"):
+            opened.send("speed", rate=10.0, trim=0.0, timeout=0.2)
+        assert 0.2 <= time.monotonic() - began < 0.2 + SLACK
+
+
+def test_an_unknown_control_address_is_asked_for() -> None:
+    commands = {"start": dataclasses.replace(SENSOR.commands["start"], link="control")}
+    links: dict[str, Udp | Tcp] = {"data": Udp(7009), "control": Tcp(7010)}
+    sensor = dataclasses.replace(SENSOR, links=links, commands=commands, on_close=())
+    with pytest.raises((SourceError, CommandError), match="nobody knows the address of the control link"):
+        ls.open(f"udp://127.0.0.1:{free_port()}", sensor)

@@ -1,0 +1,355 @@
+"""`Session`: whose answer a frame is, when something is sent, and when one gives up. The clock is the test's own."""
+
+from __future__ import annotations
+
+import dataclasses
+import heapq
+import random
+from collections.abc import Sequence
+
+import pytest
+
+import lidarspec as ls
+from lidarspec import CommandError, Sensor, Session, UsageError
+from lidarspec.errors import OutOfRange, ReplyTimeout, UnknownCommand, UnknownField
+from lidarspec.framing.results import Found
+from lidarspec.spec import Command, Udp
+from tests.shapes.commands import SENSOR
+
+SECOND = 1_000_000_000
+
+
+def with_commands(sensor: Sensor = SENSOR, **commands: Command) -> Sensor:
+    return dataclasses.replace(sensor, commands={**sensor.commands, **commands})
+
+
+def ack(code: int, result: int = 0) -> Found:
+    return Found("ack", 0, SENSOR.build("ack", code=code, result=result))
+
+
+def sent(session: Session) -> list[str]:
+    """What is sent now, each by its hexadecimal bytes."""
+    return [one.data.hex() for one in session.outgoing()]
+
+
+def received(sensor: Sensor, session: Session, data: bytes, now: int) -> None:
+    decoder = sensor.decoder()
+    session.receive(decoder.feed(data) + decoder.idle(), now)
+
+
+def test_the_reply_is_found_among_data_and_fillers_and_has_its_values() -> None:
+    sensor = ls.sensor("cspc-m1c1-mini")
+    session = Session(sensor)
+    pending = session.request("start", 0)
+    assert sent(session) == ["aa55f00f"]
+    assert not pending.done
+    received(sensor, session, b"\xfe\xff\xfe" + sensor.example("data") + b"\xff" + sensor.example("info"), 10)
+    assert not pending.done
+    received(sensor, session, b"\xfe" + bytes.fromhex("a55a500703000000000000ab") + sensor.example("data"), 20)
+    reply = pending.result()
+    assert (reply.command, reply.frame, reply.confirmed, reply.at) == ("start", "ack", True, 20)
+    assert (reply.values.firmware, reply["firmware"], reply["mode"]) == (3, 3, 0x50)
+    assert repr(reply) == f"Reply(start, ack: mode 80, firmware 3, reserved {bytes(6)!r}, checksum 171)"
+    with pytest.raises(UnknownField):
+        reply["firmwar"]
+    assert session.deadline is None
+
+
+def test_an_answer_in_units_and_in_arrays() -> None:
+    sensor = ls.sensor("slamtec-rplidar-a1")
+    session = Session(sensor)
+    pending = session.request("get_us_per_sample", 0, mode=1)
+    answer = sensor.build("config", {"descriptor": {"length": 8}, "key": 0x71, "value": {"us_per_sample": 127 * 256}})
+    session.receive([Found("config", 0, answer)], 1)
+    assert (pending.result()["value.us_per_sample"], pending.result().values.value.us_per_sample) == (127.0, 32512)
+
+
+def test_what_is_not_documented_is_not_confirmed() -> None:
+    session = Session(SENSOR)
+    reply = session.request("stop", 5).result()
+    assert (reply.confirmed, reply.frame, reply.values, reply.at) == (False, None, None, 5)
+    assert len(session.outgoing()) == 1
+    assert session.outgoing() == []
+
+
+def test_lines_are_moved_without_a_byte() -> None:
+    session = Session(SENSOR)
+    assert not session.request("spin", 0).result().confirmed
+    (out,) = session.outgoing()
+    assert (out.link, out.data, dict(out.lines)) == ("data", b"", {"dtr": True})
+
+
+def test_a_wrong_request_sends_nothing() -> None:
+    session = Session(SENSOR)
+    with pytest.raises(OutOfRange):
+        session.request("speed", 0, rate=20.1, trim=0)
+    with pytest.raises(UnknownField):
+        session.request("speed", 0, rate=10, trim=0, turbo=1)
+    with pytest.raises(UnknownCommand):
+        session.request("spede", 0)
+    assert session.outgoing() == []
+    assert session.deadline is None
+    assert not session.busy
+
+
+def test_requests_go_out_one_at_a_time_and_after_the_settling() -> None:
+    session = Session(SENSOR)
+    first, second, third = session.request("start", 0), session.request("stop", 0), session.request("speed", 0, rate=10.0, trim=0)
+    assert len(session.outgoing()) == 1
+    session.receive([ack(1)], 300)
+    assert first.done
+    assert second.done
+    assert len(session.outgoing()) == 1
+    assert session.deadline == 300 + SECOND // 10  # stop settles for 0.1 s
+    session.tick(session.deadline - 1)
+    assert session.outgoing() == []
+    session.tick(session.deadline)
+    assert len(session.outgoing()) == 1
+    session.receive([ack(3)], session.deadline or 0)
+    assert third.result()["code"] == 3
+
+
+def test_silence_ends_in_a_timeout_and_the_link_goes_on() -> None:
+    session = Session(SENSOR)
+    first = session.request("start", 0)
+    second = session.request("stop", 0)
+    assert session.deadline == SECOND
+    session.tick(SECOND - 1)
+    assert not first.done
+    with pytest.raises(UsageError, match="not answered yet"):
+        first.result()
+    session.tick(SECOND)
+    with pytest.raises(ReplyTimeout, match=r"shape-commands start: no ack frame came within 1 s"):
+        first.result()
+    assert second.done
+    assert session.started is False
+
+
+def test_the_caller_can_wait_longer_or_shorter() -> None:
+    session = Session(SENSOR)
+    session.request("start", 0, timeout=0.25)
+    assert session.deadline == SECOND // 4
+    session = Session(with_commands(ask=Command("order", SENSOR.commands["start"].values, reply="ack", timeout=0.1, retries=2)))
+    session.request("ask", 0, timeout=0.15)
+    session.tick(SECOND // 10)
+    assert len(session.outgoing()) == 2
+    assert session.deadline == 150_000_000  # not sent a third time
+
+
+def test_what_may_be_repeated_is_sent_again_and_then_given_up() -> None:
+    session = Session(with_commands(ask=Command("order", SENSOR.commands["start"].values, reply="ack", timeout=0.1, retries=2)))
+    pending = session.request("ask", 0)
+    for now in (0, 100_000_000, 200_000_000):
+        session.tick(now)
+        assert len(session.outgoing()) == 1
+    session.tick(300_000_000)
+    with pytest.raises(ReplyTimeout, match=r"within 0\.3 s, sent 3 times"):
+        pending.result()
+    assert session.outgoing() == []
+
+
+def test_a_late_answer_is_not_the_next_ones() -> None:
+    session = Session(SENSOR)
+    session.request("start", 0)
+    session.tick(SECOND)
+    again = session.request("start", SECOND + 1)
+    assert len(session.outgoing()) == 1  # the second one is held back: the answer to the first would be taken for its own
+    session.receive([ack(1)], SECOND + 2)
+    assert not again.done
+    assert session.late == 1
+    assert len(session.outgoing()) == 1
+    session.receive([ack(1)], SECOND + 3)
+    assert again.result().at == SECOND + 3
+    assert session.late == 1
+
+
+def test_an_answer_that_never_comes_holds_the_next_one_back_no_longer_than_it_could_take() -> None:
+    session = Session(SENSOR)
+    session.request("start", 0)
+    session.tick(SECOND)
+    again = session.request("start", SECOND)
+    session.outgoing()
+    assert session.deadline == 2 * SECOND
+    session.tick(2 * SECOND)
+    assert len(session.outgoing()) == 1
+    session.receive([ack(1)], 2 * SECOND + 1)
+    assert again.done
+    assert session.late == 0
+
+
+def test_an_answer_that_can_be_told_apart_holds_nothing_back() -> None:
+    session = Session(SENSOR)
+    session.request("start", 0)
+    session.tick(SECOND)
+    other = session.request("speed", SECOND, rate=10.0, trim=0.0)
+    assert len(session.outgoing()) == 2
+    session.receive([ack(1)], SECOND + 1)
+    assert session.late == 1
+    assert not other.done
+    session.receive([ack(3)], SECOND + 2)
+    assert other.done
+
+
+def test_the_second_answer_to_what_was_sent_twice_is_nobodys() -> None:
+    session = Session(with_commands(ask=Command("order", SENSOR.commands["start"].values, reply="ack", retries=1)))
+    first = session.request("ask", 0)
+    session.tick(SECOND)
+    session.receive([ack(1, result=1)], SECOND + 1)
+    assert first.result()["result"] == 1
+    second = session.request("ask", SECOND + 2)
+    session.receive([ack(1, result=2)], SECOND + 3)
+    assert not second.done
+    session.receive([ack(1, result=3)], SECOND + 4)
+    assert second.result()["result"] == 3
+    assert session.late == 1
+
+
+def test_a_frame_that_came_before_the_request_is_no_answer_to_it() -> None:
+    session = Session(SENSOR)
+    session.receive([ack(1)], 90)
+    pending = session.request("start", 100)
+    session.receive([ack(1)], 99)
+    assert not pending.done
+    session.receive([ack(1)], 101)
+    assert pending.done
+
+
+def test_another_answer_than_expected_is_told() -> None:
+    session = Session(SENSOR)
+    pending = session.request("speed", 0, rate=10.0, trim=0.0)
+    session.receive([ack(3, result=7)], 1)
+    session.tick(SECOND)
+    with pytest.raises(CommandError, match=r"the device answered with ack with result 7 instead of 0") as error:
+        pending.result()
+    assert not isinstance(error.value, ReplyTimeout)
+
+
+def test_links_do_not_wait_for_each_other() -> None:
+    sensor = dataclasses.replace(
+        SENSOR,
+        links={**SENSOR.links, "control": Udp(7000)},
+        commands={**SENSOR.commands, "ask": Command("order", SENSOR.commands["start"].values, reply="ack", link="control")},
+    )
+    session = Session(sensor)
+    start, ask = session.request("start", 0), session.request("ask", 0)
+    assert [out.link for out in session.outgoing()] == ["data", "control"]
+    assert (session.awaited(), session.awaited("control"), session.awaited("none")) == (frozenset({"ack"}), frozenset({"ack"}), frozenset())
+    session.receive([ack(1)], 1, link="control")
+    assert (start.done, ask.done) == (False, True)
+    session.receive([ack(1)], 2)
+    assert start.done
+
+
+def test_one_of_several_frames_may_answer() -> None:
+    sensor = ls.sensor("slamtec-rplidar-s2")
+    session = Session(sensor)
+    pending = session.request("express_scan", 0, mode=2)
+    session.receive([Found("dense_descriptor", 0, sensor.build("dense_descriptor"))], 1)
+    assert pending.result().frame == "dense_descriptor"
+
+
+def test_what_the_reply_repeats_of_the_request_tells_answers_apart() -> None:
+    sensor = ls.sensor("slamtec-rplidar-a1")
+    session = Session(sensor)
+    session.request("get_config", 0, key=0x70, timeout=1)
+    session.tick(SECOND)
+    pending = session.request("get_config", SECOND, key=0x7C)
+    assert len(session.outgoing()) == 2  # the answer to another key is no danger
+    for key, name in ((0x70, "mode_count"), (0x7C, "typical_mode")):
+        answer = sensor.build("config", {"descriptor": {"length": 6}, "key": key, "value": {name: 3}})
+        session.receive([Found("config", 0, answer)], SECOND + key)
+    assert pending.result()["value.typical_mode"] == 3
+    assert session.late == 1
+
+
+def test_a_heartbeat_goes_on_until_it_is_abandoned() -> None:
+    session = Session(with_commands(beat=Command("order", SENSOR.commands["start"].values, every=1.0)))
+    session.request("beat", 0)
+    for second in (1, 2, 3):
+        assert session.deadline == second * SECOND
+        session.outgoing()
+        session.tick(second * SECOND)
+        assert len(session.outgoing()) == 1
+    session.abandon("closed")
+    session.tick(9 * SECOND)
+    assert session.outgoing() == []
+    assert session.deadline is None
+
+
+def test_a_heartbeat_without_an_answer_does_not_pile_up() -> None:
+    values = SENSOR.commands["start"].values
+    session = Session(with_commands(beat=Command("order", values, reply="ack", matches={"code": 1}, every=0.1)))
+    first = session.request("beat", 0)
+    for step in range(1, 10):
+        session.tick(step * SECOND // 10)
+    assert len(session.outgoing()) == 1
+    assert not first.done
+
+
+def test_abandoning_frees_the_link_at_once() -> None:
+    session = Session(SENSOR)
+    first, second = session.request("start", 0), session.request("start", 0)
+    session.abandon("the link was lost")
+    for pending in (first, second):
+        with pytest.raises(CommandError, match="the link was lost"):
+            pending.result()
+    assert len(session.outgoing()) == 1
+    assert session.request("stop", 1).done
+    assert not session.busy
+
+
+def test_it_is_known_whether_the_sensor_was_started() -> None:
+    session = Session(SENSOR)
+    session.request("start", 0)
+    assert session.started
+    session.receive([ack(1)], 1)
+    session.request("stop", 2)
+    assert not session.started
+
+
+def test_an_argument_cannot_be_called_like_the_time_to_wait() -> None:
+    with pytest.raises(ls.SpecError, match="timeout"):
+        with_commands(ask=Command("order", {"code": 1}, args={"timeout": ("motor.speed", 0, 1)}))
+
+
+@pytest.mark.parametrize("seed", range(30))
+def test_however_late_and_lossy_the_device_each_reply_is_the_requests_own(seed: int) -> None:
+    """The device numbers the requests that it has seen in its answers, so that a wrong pairing shows."""
+    source = random.Random(seed)
+    values = SENSOR.commands["start"].values
+    sensor = with_commands(
+        once=Command("order", values, reply="ack", timeout=0.1),
+        twice=Command("order", values, reply="ack", timeout=0.1, retries=1),
+        other=Command("order", {**values, "code": 2}, reply="ack", matches={"code": 2}, timeout=0.1),
+    )
+    session = Session(sensor)
+    coming: list[tuple[int, int, int]] = []
+    now, right = 0, 0
+    for number in range(60):
+        name = source.choice(("once", "twice", "other"))
+        pending = session.request(name, now)
+        while not pending.done:
+            for out in session.outgoing():
+                if source.random() < 0.8:
+                    delay = source.choice((10, 90, 110, 150, 199)) * SECOND // 1000
+                    heapq.heappush(coming, (now + delay, number, sensor.parse(out.data, "order").code))
+            now, due = _next_event(session, coming, now)
+            session.receive([ack(code, result=asked) for _, asked, code in due], now)
+            session.tick(now)
+        try:
+            assert pending.result()["result"] == number
+            right += 1
+        except ReplyTimeout:
+            pass
+    assert right > 20
+    assert session.late > 0
+
+
+def _next_event(session: Session, coming: list[tuple[int, int, int]], now: int) -> tuple[int, Sequence[tuple[int, int, int]]]:
+    """The time of the next answer or deadline, and the answers of that time."""
+    times = [time for time in (session.deadline, coming[0][0] if coming else None) if time is not None]
+    now = max(now, min(times))
+    due = []
+    while coming and coming[0][0] <= now:
+        due.append(heapq.heappop(coming))
+    return now, due

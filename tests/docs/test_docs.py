@@ -1,0 +1,126 @@
+"""The pages say what is true: blocks run, and every hook, error and verb has its heading."""
+
+from __future__ import annotations
+
+import doctest
+import importlib
+import inspect
+import os
+import re
+from pathlib import Path
+
+import pytest
+
+import lidarspec as ls
+from lidarspec import errors, plugins as hookspecs, spec
+from lidarspec.cli.root import VERBS
+from lidarspec.spec import Checksummed, Clock, Command, Frame, Polar, Scaled, Sequence
+from tests.docs import pages
+from tests.docs.pages import DOCS
+
+PAGES = sorted(path.relative_to(DOCS).as_posix() for path in DOCS.rglob("*.md"))
+MANUAL = bytes.fromhex(
+    "542c6808ab7ee000e4dc00e2d900e5d500e3d300e4d000e9cd00e4ca00e2c700e9c500e5c200e5c000e5be823a1a50"
+)  # STL-27L development manual, section 3.3
+
+
+def headings(page: str) -> set[str]:
+    return set(re.findall(r"^## (\S+)$", (DOCS / page).read_text(encoding="utf-8"), flags=re.MULTILINE))
+
+
+#: pages with something to run.
+FOLLOWED = [page for page in PAGES if any(block.language in ("sh", "python") for block in pages.blocks(page))]
+
+
+@pytest.mark.skipif(os.name == "nt", reason="shell blocks are for bash, and some use a pseudo-terminal")
+@pytest.mark.parametrize("page", FOLLOWED)
+def test_a_page_can_be_followed_to_its_end(page: str, tmp_path: Path) -> None:
+    (tmp_path / "here").mkdir()
+    assert pages.follow(page, tmp_path / "here", pages.clean_environment(tmp_path / "environment"))
+
+
+def test_a_page_that_is_wrong_is_found(tmp_path: Path) -> None:
+    def block(language: str, text: str, title: str = "") -> pages.Block:
+        return pages.Block(language, title, text, "invented.md", 7)
+
+    with pytest.raises(AssertionError, match=r"invented.md:7: exit code 3"):
+        pages.shell(block("sh", "(exit 3) | cat"), tmp_path)
+    with pytest.raises(ZeroDivisionError):
+        pages.python(block("python", "1 / 0"), tmp_path, {})
+    pages.assert_printed(block("text", "a ... d\ne\n", pages.OUTPUT), "a b c d  \ne\n")
+    with pytest.raises(AssertionError, match="the page says"):
+        pages.assert_printed(block("text", "a\n", pages.OUTPUT), "a\nb\n")
+
+
+def test_the_plugin_of_the_tutorial_decodes_the_manuals_frame(tmp_path: Path) -> None:
+    (plugin,) = [block for block in pages.blocks("tutorial/first-sensor.md") if block.title == "stl27l.py"]
+    (tmp_path / plugin.title).write_text(plugin.text, encoding="utf-8")
+    packets = ls.sensor(tmp_path / plugin.title).decode(MANUAL)
+    assert packets["start_angle"].tolist() == [pytest.approx(324.27)]
+    assert packets.raw["points"]["distance"][0].tolist() == [224, 220, 217, 213, 211, 208, 205, 202, 199, 197, 194, 192]
+    cloud = packets.points()
+    assert cloud.x[0] == pytest.approx(0.224 * 0.81186, abs=1e-4)  # cos 324.27 deg
+    assert cloud.y[0] == pytest.approx(0.224 * 0.58384, abs=1e-4)  # 35.73 deg to the left
+
+
+def test_the_readme_says_what_is_printed() -> None:
+    done = doctest.testfile(str(DOCS.parent / "README.md"), module_relative=False)
+    assert done.attempted
+    assert not done.failed
+
+
+HOOKS = {name: function for name, function in vars(hookspecs).items() if name.startswith("lidarspec_")}
+
+
+def test_every_hook_has_its_heading() -> None:
+    assert set(HOOKS) <= headings("reference/hooks.md")
+
+
+@pytest.mark.parametrize("name", HOOKS)
+def test_every_hook_is_written_with_its_arguments(name: str) -> None:
+    found = re.search(rf"^`{name}\((.*?)\) -> .+?`", (DOCS / "reference/hooks.md").read_text(encoding="utf-8"), flags=re.MULTILINE)
+    assert found
+    assert re.findall(r"(\w+):", found[1]) == list(inspect.signature(HOOKS[name]).parameters)
+
+
+def test_every_public_name_is_on_the_pages_of_the_python_interface() -> None:
+    listed = (DOCS / "reference/python.md").read_text(encoding="utf-8").partition("## Every name")[2]
+    public = {*ls.__all__, *spec.__all__, *public_errors()}
+    assert set(re.findall(r"`([A-Za-z]\w+)`", listed)) - {"lidarspec"} == public
+    shown = re.findall(r"^::: (lidarspec[\w.]*)\.(\w+)$", (DOCS / "reference/api.md").read_text(encoding="utf-8"), re.MULTILINE)
+    assert sorted(name for _, name in shown) == sorted(public)
+    assert all(hasattr(importlib.import_module(module), name) for module, name in shown)
+
+
+def public_errors() -> set[str]:
+    classes = {name for name, value in vars(errors).items() if isinstance(value, type) and issubclass(value, errors.LidarSpecError)}
+    return classes - {"UnknownName"}
+
+
+@pytest.mark.parametrize("value", [ls.Sensor, Frame, Command, Scaled, Checksummed, Clock, Sequence, Polar])
+def test_what_authors_write_says_what_each_argument_is(value: type) -> None:
+    arguments = (inspect.getdoc(value) or "").partition("Args:")[2]
+    named = set(re.findall(r"\w+", " ".join(re.findall(r"^ +([\w, ]+):", arguments, re.MULTILINE))))
+    assert set(inspect.signature(value).parameters) <= named
+
+
+def test_every_public_error_has_its_heading() -> None:
+    assert public_errors() - {"LidarSpecError"} == headings("reference/errors.md")
+
+
+def test_every_verb_has_its_heading() -> None:
+    assert set(VERBS) <= headings("reference/command-line.md")
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_links_between_pages_lead_somewhere(page: str) -> None:
+    path = DOCS / page
+    for target in re.findall(r"\]\(([^)#:]+\.md)", path.read_text(encoding="utf-8")):
+        assert (path.parent / target).is_file(), target
+
+
+def test_every_page_is_in_the_contents_of_the_site() -> None:
+    contents = (DOCS.parent / "mkdocs.yml").read_text(encoding="utf-8").partition("\nnav:")[2]
+    listed = re.findall(r": (\S+\.md)$", contents, re.MULTILINE)
+    sensors = "reference/sensors/"
+    assert sorted(listed) == [page for page in PAGES if not page.startswith(sensors) or page == f"{sensors}index.md"]

@@ -1,0 +1,183 @@
+"""Whether construct's own parse of an author's struct and ours agree: frame by frame, and as columns on both paths.
+
+The judge here is construct itself with the tree as the author wrote it; nothing of the engine takes part in what is expected.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import io
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import construct
+import numpy as np
+import pytest
+from construct import Construct
+
+from lidarspec import Packets, Sensor, SpecError, WireError
+from lidarspec.spec import Every, Fields, Frame, Polar, Udp
+from lidarspec.spec.construct_layer import frame_tree
+from lidarspec.wire.schema import schema
+
+BACKENDS = ("auto", "construct")
+#: what puts every 16-bit number among the ranges that are returns.
+AWAY = 100_000
+
+
+def points(f: Fields) -> Polar:
+    return Polar(range=1, azimuth=0)
+
+
+def sensor(struct: Construct, *, max_length: int = 200) -> Sensor:
+    """A sensor whose datagrams are such structs."""
+    return Sensor(
+        "test-alike",
+        vendor="Test",
+        model="Alike",
+        frames={"data": Frame(struct, data=True, max_length=max_length)},
+        points=points,
+        scan=Every(0.1),
+        links={"data": Udp(7000)},
+        range_limits=(0.1, 10.0),
+        status="manual",
+        source="invented for the tests",
+    )
+
+
+def expected(struct: Construct, data: bytes, *, max_length: int = 200) -> Any:
+    """What construct reads from the author's struct; None where it does not read exactly these bytes."""
+    stream = io.BytesIO(data)
+    try:
+        parsed = struct.parse_stream(stream)
+    except construct.ConstructError:
+        return None
+    return plain(parsed) if stream.tell() == len(data) <= max_length else None
+
+
+def plain(value: Any) -> Any:
+    """A parsed value as dicts, lists, numbers and bytes."""
+    if isinstance(value, dict):
+        return {name: plain(part) for name, part in value.items() if not name.startswith("_")}
+    if isinstance(value, list):
+        return [plain(part) for part in value]
+    return value
+
+
+def agree(struct: Construct, frames: Iterable[bytes], *, max_length: int = 200, kept: bool = True) -> int:
+    """Assert that every engine reads these bytes as construct does; the number of those that are frames.
+
+    Args:
+        kept: whether what is built of what was read has to be the same bytes, as it is not where `Rebuild` fills in another value.
+    """
+    ours, whole = sensor(struct, max_length=max_length), list[tuple[bytes, Any]]()
+    for data in frames:
+        wanted = expected(struct, data, max_length=max_length)
+        if wanted is None:
+            with pytest.raises(WireError):
+                ours.parse(data)
+            for backend in BACKENDS:
+                assert len(ours.decode([data], backend=backend)) == 0, data.hex()
+            continue
+        if not data:
+            continue  # a frame without a byte has no place in any input
+        whole.append((data, wanted))
+        found = ours.parse(data)
+        assert repr(plain(found)) == repr(wanted), data.hex()
+        if kept:
+            assert ours.build("data", found) == data
+    for backend in BACKENDS:
+        packets = ours.decode([data for data, _ in whole], backend=backend)
+        assert len(packets) == len(whole), backend
+        assert packets.stats.plugin_errors == 0, packets.stats.tracebacks
+        for path in packets.table.schema.fields:
+            column = column_of(packets, path)
+            for one, (data, wanted) in zip(column, whole, strict=len(column) > 0):
+                same(one, at(wanted, path.split(".")), f"{backend} {path} {data.hex()}")
+    return len(whole)
+
+
+def column_of(packets: Packets, path: str) -> Sequence[Any]:
+    """The raw values of a field; none where its branches go not together in a column, which is said."""
+    try:
+        return packets.table.raw(path)
+    except SpecError as error:
+        if error.path != path:
+            raise
+        return ()
+
+
+def has_raw_form(packets: Packets) -> bool:
+    """Whether every name is the same kind of part in all branches that have it."""
+    try:
+        return packets.raw is not None
+    except SpecError:
+        return False
+
+
+def clouds_agree(struct: Construct, frames: Iterable[bytes], *, max_length: int = 200, backends: Sequence[str] = BACKENDS) -> int:
+    """Assert that a cloud has the values of a field of all elements in order, and no padding; the number of fields tried.
+
+    Of those of the deepest arrays, whose lengths differ from frame to frame but not within one.
+    """
+    plain_sensor = sensor(struct, max_length=max_length)
+    whole = [(data, expected(struct, data, max_length=max_length)) for data in frames]
+    kept = [(data, wanted) for data, wanted in whole if wanted is not None]
+    if not has_raw_form(plain_sensor.decode([data for data, _ in kept])):
+        return 0  # what is an array in one branch alone has no length in the others
+    table, tried = schema(frame_tree(struct)), 0
+    for path, info in table.fields.items():
+        is_small = info.kind == "int" and info.bits <= 16 and not info.scaled
+        if not is_small or not info.axes or info.axes != table.chain() or any(path.startswith(f"{other}.") for other in table.fields):
+            continue
+        ours = dataclasses.replace(plain_sensor, points=functools.partial(_ranges, path=path))
+        values = [value for _, wanted in kept for value in flat(at(wanted, path.split(".")), len(info.axes))]
+        for backend in backends:
+            cloud = ours.decode([data for data, _ in kept], backend=backend).points()
+            np.testing.assert_array_equal(cloud.range, np.array(values, np.float32) + AWAY, err_msg=f"{backend} {path}")
+        tried += 1
+    return tried
+
+
+def _ranges(f: Fields, path: str) -> Polar:
+    return Polar(range=functools.reduce(getattr, path.split("."), f) + AWAY, azimuth=0)
+
+
+def flat(value: Any, depth: int) -> Iterable[float]:
+    """The numbers in nested lists; nan for what is not there."""
+    if isinstance(value, list):
+        for part in value:
+            yield from flat(part, depth - 1)
+    elif value is not None or depth == 0:
+        yield np.nan if value is None else int(value)
+
+
+def at(value: Any, names: Sequence[str]) -> Any:
+    """The value under a path, nested lists of them where arrays are passed; None where there is none."""
+    if isinstance(value, list):
+        return [at(part, names) for part in value]
+    if not names:
+        return list(value) if isinstance(value, bytes) else None if isinstance(value, dict) else value
+    return at(value.get(names[0]), names[1:]) if isinstance(value, dict) else None
+
+
+def same(column: Any, wanted: Any, where: str) -> None:
+    """Assert that a padded column holds the value: what is not there is 0."""
+    if is_nothing(wanted):
+        assert not np.any(column), where
+    elif isinstance(wanted, list):
+        assert np.shape(column), where
+        assert is_nothing(wanted[len(column) :]), where
+        for one, part in zip(column, wanted, strict=False):
+            same(one, part, where)
+        assert not np.any(column[len(wanted) :]), where
+    else:
+        number = int(wanted) if isinstance(wanted, construct.EnumIntegerString) else wanted
+        assert not np.shape(column), where
+        assert column == number or (column != column and number != number) or column == float(number), where
+
+
+def is_nothing(wanted: Any) -> bool:
+    """Whether there is no value, nor one in lists of them."""
+    return all(map(is_nothing, wanted)) if isinstance(wanted, list) else wanted is None

@@ -1,0 +1,210 @@
+"""Parsers as vendors write them, in the place of the engine's decoder: one that is right, and one for each mistake put in on purpose."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+from lidarspec import Counters, Found, Sensor, WireError
+from lidarspec.framing.results import packed
+from tests.broken import sound
+
+HEADERS = {b"\xaa\x55\xc3": "data", b"\x17\x71\x44": "ack"}
+COUNT = 12  # where the count stands
+LONGEST = 87
+SOUND = sound.sensor()
+
+
+class Parser:
+    """Bytes in, frames out; frames are looked for byte by byte."""
+
+    def __init__(self, sensor: Sensor) -> None:
+        self.sensor, self.stats, self.interpreted = sensor, Counters(), False
+        self.buffer, self.base = b"", 0
+
+    def feed(self, data: bytes, at: int | None = None) -> list[Found]:
+        """The frames that these bytes complete."""
+        self.stats.bytes_in += len(data)
+        self.buffer += bytes(data)
+        return self.cut(final=False)
+
+    def idle(self) -> list[Found]:
+        """The frames in what waits, which is given up."""
+        return self.cut(final=True)
+
+    def finish(self) -> list[Found]:
+        """The frames in what waits at the end of the input."""
+        return self.idle()
+
+    def spans(self, data: bytes, at: int | None = None) -> list[Any]:
+        """The frames that these bytes complete, as the engine asks for them."""
+        return [packed(self.feed(data, at))]
+
+    def rest(self) -> list[Any]:
+        """The frames in what waits, as the engine asks for them."""
+        return [packed(self.idle())]
+
+    def cut(self, *, final: bool) -> list[Found]:
+        """The frames in the buffer."""
+        found, spot = list[Found](), 0
+        while spot < len(self.buffer):
+            size = self.size(self.buffer[spot : spot + LONGEST])
+            if size is None and not final:
+                break
+            name = self.frame(self.buffer[spot : spot + size]) if size and spot + size <= len(self.buffer) else ""
+            if name and size:
+                found.append(Found(name, self.base + spot, self.buffer[spot : spot + size]))
+                self.stats.frames[name] = self.stats.frames.get(name, 0) + 1
+                spot += size
+            else:
+                step = min(self.step(spot, size or 0), len(self.buffer) - spot)
+                self.stats.bytes_skipped += step
+                spot += step
+        self.drop(spot)
+        return found
+
+    def drop(self, number: int) -> None:
+        """Forget what was looked at."""
+        self.buffer, self.base = self.buffer[number:], self.base + number
+        self.stats.pending = len(self.buffer)
+
+    def size(self, data: bytes) -> int | None:
+        """The length of the frame that these bytes begin with; 0 where none does, None where more are needed."""
+        for header, name in HEADERS.items():
+            if data.startswith(header):
+                size = 5 if name == "ack" else 15 + 3 * data[COUNT] if len(data) > COUNT else None
+                if size is not None and self.too_long(size):
+                    return 0
+                return None if size is None or len(data) < size else size
+            if header.startswith(data):
+                return None
+        return 0
+
+    def too_long(self, size: int) -> bool:
+        """Whether no frame is so long."""
+        return size > LONGEST
+
+    def frame(self, data: bytes) -> str:
+        """The type of a frame, "" where it is none."""
+        found = SOUND.split(data)
+        return found[0].frame if len(found) == 1 and found[0].data == data else ""
+
+    def step(self, spot: int, size: int) -> int:
+        """How far to go on where there is no frame; `size`: of one whose checksum is wrong."""
+        return 1
+
+
+class PartialHeaderDropped(Parser):
+    """A partial header at the end of a chunk is dropped."""
+
+    def feed(self, data: bytes, at: int | None = None) -> list[Found]:
+        found = super().feed(data, at)
+        if len(self.buffer) < 3:
+            self.stats.bytes_skipped += len(self.buffer)
+            self.drop(len(self.buffer))
+        return found
+
+
+class ClaimedLengthSkipped(Parser):
+    """The length that a frame claims is skipped where its checksum is wrong."""
+
+    def step(self, spot: int, size: int) -> int:
+        return max(size, 1)
+
+
+class MismatchingByteLost(Parser):
+    """The byte that does not match a header is not looked at again."""
+
+    def step(self, spot: int, size: int) -> int:
+        return 2 if self.buffer[spot] == 0xAA and self.buffer[spot + 1 : spot + 2] != b"\x55" else 1
+
+
+class LongestRefused(Parser):
+    """>= stands where > is meant, at the longest length."""
+
+    def too_long(self, size: int) -> bool:
+        return size >= LONGEST
+
+
+class BufferOfTheClass(Parser):
+    """All decoders share one buffer."""
+
+    held = bytearray()
+
+    def feed(self, data: bytes, at: int | None = None) -> list[Found]:
+        self.stats.bytes_in += len(data)
+        self.held.extend(data)
+        self.buffer = bytes(self.held)
+        return self.cut(final=False)
+
+    def drop(self, number: int) -> None:
+        super().drop(number)
+        del self.held[:number]
+
+
+class HeldOverSilence(Parser):
+    """What is held is not given up when the line falls silent."""
+
+    def idle(self) -> list[Found]:
+        return []
+
+
+class ExceptionSwallowed(Parser):
+    """An exception is swallowed, and what it cost is not counted."""
+
+    def feed(self, data: bytes, at: int | None = None) -> list[Found]:
+        try:
+            return super().feed(data, at)
+        except Exception:
+            return []
+
+    def cut(self, *, final: bool) -> list[Found]:
+        if len(self.buffer) % 7 == 3:
+            self.buffer = b""
+            raise IndexError("bytearray index out of range")
+        return super().cut(final=final)
+
+
+class BufferCopied(Parser):
+    """The buffer is copied for each byte: buf = buf[1:]."""
+
+    def cut(self, *, final: bool) -> list[Found]:
+        found = []
+        while self.buffer[:1] not in (b"", b"\xaa", b"\x17"):
+            self.buffer = self.buffer[1:]
+            self.base += 1
+            self.stats.bytes_skipped += 1
+        if self.buffer:
+            found = super().cut(final=final)
+        self.stats.pending = len(self.buffer)
+        return found
+
+    def step(self, spot: int, size: int) -> int:
+        self.buffer = self.buffer[:spot] + self.buffer[spot:]  # as above, after a header that was none
+        return 1
+
+
+class Own(Sensor):
+    """A sensor that is read by a parser of its own."""
+
+    parser: type[Any] = Parser
+
+    def decoder(self, *, stream: bool | None = None, backend: str = "auto") -> Any:
+        """The parser in the place of the engine's."""
+        return type(self).parser(self)
+
+
+class Indexless(Sensor):
+    """A sensor whose errors do not say which element of an array they were in."""
+
+    def parse(self, data: Any, frame: str | None = None, *, verify: bool = True) -> Any:
+        try:
+            return super().parse(data, frame, verify=verify)
+        except WireError as error:
+            path = re.sub(r"\[[0-9]+\]", "", error.path)
+            raise WireError(error.reason, sensor=self.id, frame=error.frame, offset=error.offset, path=path) from error
+
+
+def read_by(parser: type[Parser]) -> Sensor:
+    """The sound sensor, read by a parser of its own."""
+    return sound.sensor(kind=type(parser.__name__, (Own,), {"parser": parser}))

@@ -1,0 +1,83 @@
+"""What the framing rule of the documentation says, byte by byte and by brute force; it shares no code with the engine's framing.
+
+construct parses the author's own struct at one offset, the frame's own test of plausibility judges what came out, and nothing is done in
+bulk, so that the engine's bulk work has something to be held against.
+"""
+
+from __future__ import annotations
+
+import io
+from typing import Any
+
+import numpy as np
+from construct import ConstructError
+
+from lidarspec import Sensor
+from lidarspec.columns.columns import Batch, Fields
+from lidarspec.framing.frame_engine import InterpretedCodec
+from lidarspec.spec import Frame
+
+#: (name, offset, bytes) of a frame.
+Cut = tuple[str, int, bytes]
+
+
+class Oracle:
+    """The frames of one stream, found by trying every type at every offset."""
+
+    def __init__(self, sensor: Sensor, data: bytes) -> None:
+        self._frames = {name: frame for name, frame in sensor.frames.items() if frame.direction == "in"}
+        self._codecs = {name: InterpretedCodec(frame) for name, frame in self._frames.items()}
+        self._named = {frame.after for frame in self._frames.values()} - {None}
+        answer = sensor.options.get("answer")
+        self._mode = self._frames[answer].after if answer else None
+        self._data = data
+        self._known: dict[tuple[str, int], int] = {}
+
+    def frames(self) -> list[Cut]:
+        """The leftmost valid candidate, then on after its last byte; one byte further where there is none."""
+        found: list[Cut] = []
+        spot, run = 0, ("", -1)
+        while spot < len(self._data):
+            name = next((name for name in self._frames if self._accepted(name, spot, run)), None)
+            if name is None:
+                spot += 1
+                continue
+            size = self._valid(name, spot)
+            found.append((name, spot, self._data[spot : spot + size]))
+            self._mode = name if name in self._named else self._mode
+            spot += size
+            run = (name, spot)
+        return found
+
+    def _accepted(self, name: str, spot: int, run: tuple[str, int]) -> bool:
+        """Whether a type stands here: valid, and if it is weak, within a long enough run of its kind."""
+        for _ in range(1 if run == (name, spot) else self._frames[name].confirm):
+            if not self._valid(name, spot) or self._earlier(name, spot, run):
+                return False
+            spot += self._valid(name, spot)
+        return True
+
+    def _earlier(self, name: str, spot: int, run: tuple[str, int]) -> bool:
+        before = list(self._frames)[: list(self._frames).index(name)]
+        return any(self._accepted(other, spot, run) for other in before)
+
+    def _valid(self, name: str, spot: int) -> int:
+        """The size of the valid candidate of this type at this offset, 0 if there is none."""
+        if self._frames[name].after not in (None, self._mode):
+            return 0
+        if (name, spot) not in self._known:
+            self._known[name, spot] = self._size(name, self._frames[name], spot)
+        return self._known[name, spot]
+
+    def _size(self, name: str, frame: Frame, spot: int) -> int:
+        stream = io.BytesIO(self._data[spot : spot + frame.max_length])
+        try:
+            frame.prepared.parse_stream(stream)
+        except ConstructError:
+            return 0
+        size = stream.tell()
+        return size if frame.plausible is None or self._sensible(name, frame.plausible, self._data[spot : spot + size]) else 0
+
+    def _sensible(self, name: str, plausible: Any, data: bytes) -> bool:
+        with np.errstate(all="ignore"):
+            return bool(np.all(np.asarray(plausible(Fields(Batch(self._codecs[name].table([data]), np.zeros(1, np.bool_)))))))

@@ -1,0 +1,95 @@
+"""Streams that the framing is held to, damaged by seed or made of false headers, and decoders whose books are kept."""
+
+from __future__ import annotations
+
+import contextlib
+import random
+
+from lidarspec import Counters, Sensor, SpecError
+from lidarspec.framing.frame_engine import CompiledCodec, codec
+from lidarspec.simulation.frame_maker import examples
+from lidarspec.testing import subject as material
+from lidarspec.testing.agreement import cuts
+from lidarspec.testing.subject import Subject
+from tests.engine.oracle import Cut
+
+#: about so many bytes to a stream: the oracle takes its time.
+LENGTH = 2500
+
+
+def damaged(data: bytes, rate: float, seed: int, *, burst: int = 1) -> bytes:
+    """The stream with about this share of its bytes damaged, in runs of `burst`; at least one run, unless the rate is 0."""
+    if not rate:
+        return data
+    source = random.Random(f"{seed} {rate} {burst}")
+    number = max(1, round(len(data) * rate / burst))
+    found = bytearray(data)
+    for _ in range(number):
+        spot = source.randrange(len(found) + 1)
+        kind = source.choice(("drop", "flip", "insert"))
+        noise = source.randbytes(burst)
+        if kind == "drop":
+            del found[spot : spot + burst]
+        elif kind == "insert":
+            found[spot:spot] = noise
+        else:
+            found[spot : spot + burst] = bytes(a ^ (1 << b % 8) for a, b in zip(found[spot : spot + burst], noise, strict=False))
+    return bytes(found)
+
+
+def worst(sensor: Sensor, length: int) -> bytes:
+    """Headers that claim the longest frame, and two random bytes: candidates without end, as long as they can be."""
+    source = random.Random(sensor.id)
+    longest = max((sensor.example(sensor.data_frame, seed=seed) for seed in range(40)), key=len)
+    unit = b"".join(longest[: source.randint(3, 8)] + source.randbytes(2) for _ in range(64))
+    return (unit * (length // len(unit) + 1))[:length]
+
+
+def clean(subject: Subject, *, seed: int = 0, length: int = LENGTH) -> bytes:
+    """A conversation of about this length, at least one round."""
+    rounds = max(length // max(len(subject.stream(rounds=1)), 1), 1)
+    return subject.stream(seed=seed, rounds=rounds)
+
+
+def longest_example(subject: Subject, name: str) -> bytes:
+    """The longest of many examples, and of the longest header among many."""
+    found = [subject.example(name, seed=seed) for seed in range(20)]
+    engine, source = codec(subject.sensor.frames[name]), subject.source(f"longest {name}")
+    if isinstance(engine, CompiledCodec) and engine.size is None:
+        with contextlib.suppress(SpecError):
+            _, header = max((engine.tree.choose(source, subject.drawers(name)) for _ in range(200)), key=lambda chosen: chosen[0].size)
+            drawn = {path: (lambda _, value=value: value) for path, value in header.items()}
+            found += examples(subject.sensor, name, source, subject.drawers(name) | drawn)
+    return max(found, key=len)
+
+
+class Books:
+    """A decoder whose books are checked after every call: each byte is in a frame, skipped or pending."""
+
+    def __init__(self, sensor: Sensor, *, backend: str = "auto") -> None:
+        self.decoder = sensor.decoder(backend=backend)
+        self.found: list[Cut] = []
+
+    def feed(self, chunk: bytes) -> Books:
+        """Enter what a chunk brings."""
+        return self._entered(cuts(self.decoder.feed(chunk)))
+
+    def finish(self) -> list[Cut]:
+        """All frames, after the end of the input."""
+        return self._entered(cuts(self.decoder.finish())).found
+
+    def _entered(self, found: list[Cut]) -> Books:
+        self.found += found
+        stats: Counters = self.decoder.stats
+        known = sum(len(data) for _, _, data in self.found)
+        assert stats.bytes_in == known + stats.bytes_skipped + stats.pending
+        assert sum(stats.frames.values()) == len(self.found)
+        return self
+
+
+def decoded(sensor: Sensor, data: bytes) -> list[Cut]:
+    """The frames of a stream that comes in chunks of random sizes."""
+    books = Books(sensor)
+    for chunk in material.pieces(data, random.Random(len(data))):
+        books.feed(chunk)
+    return books.finish()

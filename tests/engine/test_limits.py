@@ -1,0 +1,96 @@
+"""Bounds that hold on any input: memory, and how long a frame is kept back."""
+
+from __future__ import annotations
+
+import gc
+import random
+import tracemalloc
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+import lidarspec
+from lidarspec import Sensor
+from lidarspec.framing.frame_engine import CompiledCodec, codec
+from lidarspec.testing import subject as material
+from tests.engine.streams import worst
+from tests.shapes import SHAPES
+
+EVERY = {**lidarspec.sensors(), **SHAPES}
+#: one of each family on a byte stream: relatives that share their frames are cut alike.
+STREAMS = {
+    sensor.id: sensor
+    for sensor in {tuple(map(id, sensor.frames.values())): sensor for sensor in EVERY.values() if not sensor.datagrams}.values()
+}
+COMPILED = {name: sensor for name, sensor in STREAMS.items() if isinstance(codec(sensor.frames[sensor.data_frame]), CompiledCodec)}
+MEGABYTE = 1 << 20
+
+each_stream = pytest.mark.parametrize("sensor", STREAMS.values(), ids=STREAMS)
+
+
+def garbage(length: int, seed: int = 0) -> bytes:
+    return np.random.default_rng(seed).bytes(length)
+
+
+def peak(task: Callable[[], object]) -> int:
+    """Bytes that a task holds at most beyond those held before."""
+    gc.collect()
+    tracemalloc.start()
+    try:
+        before = tracemalloc.get_traced_memory()[0]
+        tracemalloc.reset_peak()
+        task()
+        return tracemalloc.get_traced_memory()[1] - before
+    finally:
+        tracemalloc.stop()
+
+
+def fed(sensor: Sensor, data: bytes, times: int = 1, chunk: int = 4096) -> None:
+    decoder = sensor.decoder()
+    for _ in range(times):
+        for start in range(0, len(data), chunk):
+            decoder.feed(data[start : start + chunk])
+    decoder.finish()
+
+
+@each_stream
+def test_a_decoder_holds_less_than_its_longest_frame(sensor: Sensor) -> None:
+    bound = max(frame.max_length * frame.confirm for frame in sensor.frames.values() if frame.direction == "in")
+    for data in (garbage(20_000), worst(sensor, 20_000), material.stream(sensor)):
+        decoder, source = sensor.decoder(), random.Random(1)
+        for chunk in material.pieces(data, source):
+            decoder.feed(chunk)
+            assert decoder.stats.pending < bound
+
+
+@each_stream
+def test_garbage_takes_no_memory(sensor: Sensor) -> None:
+    data = garbage(MEGABYTE // 4)
+    fed(sensor, data[:8192])
+    assert peak(lambda: fed(sensor, data)) < MEGABYTE
+
+
+@pytest.mark.parametrize("sensor", [lidarspec.sensor("ldrobot-stl27l"), SHAPES["shape-count"]], ids=lambda sensor: sensor.id)
+def test_fifty_megabytes_of_garbage_take_no_memory(sensor: Sensor) -> None:
+    data = garbage(MEGABYTE)
+    assert peak(lambda: fed(sensor, data, times=50, chunk=MEGABYTE)) < MEGABYTE
+
+
+@pytest.mark.parametrize("sensor", COMPILED.values(), ids=COMPILED)
+def test_the_worst_stream_takes_little_memory(sensor: Sensor) -> None:
+    data = worst(sensor, MEGABYTE // 8)
+    fed(sensor, data[:8192])
+    assert peak(lambda: fed(sensor, data)) < 2 * MEGABYTE
+
+
+@each_stream
+def test_a_frame_is_out_before_one_longest_frame_more_has_come(sensor: Sensor) -> None:
+    """The first frame found by an endless stream, byte by byte: how many bytes after its own last one."""
+    frames = material.conversation(sensor, rounds=3)
+    data = b"".join(part for _, part in frames)
+    bound = max(frame.max_length * frame.confirm for frame in sensor.frames.values() if frame.direction == "in")
+    decoder = sensor.decoder()
+    for spot in range(len(data)):
+        for found in decoder.feed(data[spot : spot + 1]):
+            assert spot + 1 - (found.offset + len(found.data)) < bound

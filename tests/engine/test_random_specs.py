@@ -1,0 +1,119 @@
+"""Random specs: what construct itself reads is what we read, frame by frame and in bulk, compiled and interpreted."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.util
+import io
+from collections.abc import Sequence
+from random import Random
+
+import construct
+import pytest
+from construct import Construct
+
+from lidarspec import Sensor, SpecError
+from lidarspec.framing.frame_engine import CompiledCodec, codec
+from tests.engine.against_construct import BACKENDS, agree, clouds_agree, expected, sensor
+from tests.engine.random_specs import made, spec
+
+LONGEST = 150
+#: what compiles points, where it is installed.
+JIT = ("jit",) if importlib.util.find_spec("numba") else ()
+
+
+def frames(ours: Sensor, struct: Construct, number: int) -> list[bytes]:
+    """Bytes to try a spec on: its examples, damaged ones, and what construct reads from random bytes."""
+    source, found = Random(number), [b""]
+    for seed in range(4):
+        try:
+            example = ours.example("data", seed=seed)
+        except SpecError:
+            break
+        found += [example, example[:-1], example + b"\0"]
+        for _ in range(3):
+            damaged = bytearray(example or b"\0")
+            damaged[source.randrange(len(damaged))] = source.choice((0, 1, 2, 7, 255, source.randrange(256)))
+            found.append(bytes(damaged))
+    for _ in range(12):
+        stream = io.BytesIO(bytes(source.choice((0, 1, 2, 7, source.randrange(256))) for _ in range(LONGEST + 10)))
+        try:
+            struct.parse_stream(stream)
+        except construct.ConstructError:
+            continue
+        found.append(stream.getvalue()[: stream.tell()])
+    return found
+
+
+def declared(struct: Construct) -> Sensor | None:
+    """A sensor of a spec; None where one name has several units in it, which is refused."""
+    try:
+        return sensor(struct, max_length=LONGEST)
+    except SpecError as error:
+        if "different scales" not in error.reason:
+            raise
+        return None
+
+
+def tried(number: int, *, interpreted: bool = False, backends: Sequence[str] = ("numpy", "construct")) -> None:
+    """Try a spec, and put its text before what fails."""
+    text = spec(number, interpreted=interpreted)
+    struct = made(text)
+    with contextlib.suppress(construct.SizeofError, KeyError):
+        if struct.sizeof() == 0:
+            return
+    ours = declared(struct)
+    if ours is None:
+        return
+    try:
+        some = frames(ours, struct, number)
+        agree(struct, some, max_length=LONGEST, kept="Rebuild" not in text)
+        if isinstance(codec(ours.frames["data"]), CompiledCodec):
+            clouds_agree(struct, some, max_length=LONGEST, backends=backends)
+    except BaseException as error:
+        error.add_note(text)
+        raise
+
+
+@pytest.mark.parametrize("number", range(35))
+def test_what_construct_reads_is_what_we_read(number: int) -> None:
+    tried(number)
+
+
+@pytest.mark.parametrize("number", range(15))
+def test_what_construct_alone_can_read_is_read_alike(number: int) -> None:
+    tried(number, interpreted=True)
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("block", range(20))
+def test_many_more_are_read_alike(block: int) -> None:
+    for number in range(100 * block, 100 * block + 100):
+        tried(number, backends=("numpy", "construct", *JIT))
+        tried(number, interpreted=True)
+
+
+def test_most_random_specs_are_compiled_and_have_frames() -> None:
+    """Else the tests above would try little."""
+    structs = [struct for struct in (made(spec(number)) for number in range(65)) if declared(struct) is not None]
+    sensors = [sensor(struct, max_length=LONGEST) for struct in structs]
+    assert sum(isinstance(codec(one.frames["data"]), CompiledCodec) for one in sensors) > 50
+    valid = [
+        sum(expected(struct, data) is not None for data in frames(one, struct, 0)) for one, struct in zip(sensors, structs, strict=True)
+    ]
+    assert sum(number > 5 for number in valid) > 50
+
+
+@pytest.mark.parametrize("part", ["FlagsEnum(Int8ub, a=1, b=2)", "Padded(4, Int8ub)", "Padding(3)", "GreedyBytes", "RawCopy(Int8ub)"])
+def test_what_loses_bits_is_refused_and_not_drawn(part: str) -> None:
+    with pytest.raises(SpecError):
+        sensor(made(f'Struct("a" / Int8ub, "b" / {part})'))
+
+
+@pytest.mark.parametrize(
+    "text", ['Struct("a" / Array(0, Int8ub))', 'Struct("a" / Array(0, Struct("n" / Int8ub, "x" / Bytes(this.n))))', "Struct()"]
+)
+def test_a_frame_without_a_byte_is_never_found(text: str) -> None:
+    ours = sensor(made(text))
+    for backend in BACKENDS:
+        assert len(ours.decode([b"", b"\0"], backend=backend)) == 0

@@ -1,0 +1,161 @@
+"""Listings: nested parts indented, bit fields drawn, damage told to the bit, differences between frames, colours on a terminal alone."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+
+import lidarspec as ls
+from lidarspec.explaining.explanation import Flip, explain, flips
+from lidarspec.explaining.listing import folded, parents, text, told
+from lidarspec.explaining.wording import Span, bit_picture
+from tests.cli.running import EXAMPLE, printed, process, ran
+from tests.shapes import SHAPES
+
+STL = ls.sensor("ldrobot-stl27l")
+SENSORS = {**ls.sensors(), **SHAPES}
+FRAMES = [(sensor, frame) for sensor, value in SENSORS.items() for frame in value.frames]
+M1C1 = bytes.fromhex("aa55 00 02 0105 0106 0000 2c2b0a 38570a".replace(" ", ""))
+DAMAGED = EXAMPLE[:-1] + b"\x51"
+
+
+def lines(sensor: str, data: bytes, frame: str | None = None) -> list[str]:
+    return str(explain(data, SENSORS[sensor], frame)).splitlines()
+
+
+def test_parts_are_indented_below_what_holds_them() -> None:
+    data = ls.sensor("robosense-m1").example("data", seed=1)
+    found = [re.sub(r"^([0-9a-f]{4})  .{23}  ", r"\1 ", line).split("  ")[0:3] for line in lines("robosense-m1", data)]
+    assert ["0020 blocks[0]"] in found
+    heads = [line for line in lines("robosense-m1", data) if line.endswith("blocks[1]")]
+    assert heads == [f"004f  {'':23}  blocks[1]"]
+    assert parents("a[0].b.c") == ["a[0]", "a[0].b"]
+
+
+def test_bit_fields_are_drawn_in_the_first_element_and_on_request_in_all() -> None:
+    found = explain(M1C1, ls.sensor("cspc-m1c1-mini"), "data")
+    listed = [text(line) for line in found.lines()]
+    told = {" ".join(line.split()) for line in listed}
+    assert "000a .. 001010.. 00001010 distance 0.650 m (byte 2 bits 7-0, byte 1 bits 7-2); 0: no return" in told
+    assert "000a ......00 .. .. exposure 0; 1 high, 2 low" in told
+    assert not any(line.startswith("000d  ..") for line in listed)
+    assert sum(text(line).startswith("000d") for line in found.lines(every=True)) == 4
+
+
+@pytest.mark.parametrize(("sensor", "frame"), FRAMES)
+def test_pictures_show_every_bit_of_a_block_once(sensor: str, frame: str) -> None:
+    for row in explain(SENSORS[sensor].example(frame), SENSORS[sensor], frame).rows:
+        shown = [bytearray(len(row.data)) for _ in range(2)]
+        for value in row.values:
+            assert value.masks or value.raw == b""
+            for place, mask in enumerate(value.masks, value.start - row.offset):
+                assert not shown[0][place] & mask
+                shown[0][place] |= mask
+        assert shown[0] == b"\xff" * len(row.data)
+
+
+def test_a_picture_has_dots_for_other_bits() -> None:
+    assert bit_picture(b"\xa5\xff\x81", b"\xf0\x00\xff") == "1010.... .. 10000001"
+
+
+def test_the_flipped_bit_of_a_damaged_frame_is_found() -> None:
+    data = STL.example("data", seed=4)
+    for offset, bit in ((0, 3), (7, 6), (20, 0), (46, 1)):
+        damaged = Flip(offset, bit).mended(data)
+        assert Flip(offset, bit) in flips(STL, "data", damaged)
+        for flip in flips(STL, "data", damaged):
+            STL.parse(flip.mended(damaged))
+
+
+@pytest.mark.parametrize(("sensor", "frame"), [place for place in FRAMES if place[1] == "data" and place[0].startswith("shape-")])
+def test_what_a_flip_is_said_to_mend_is_mended(sensor: str, frame: str) -> None:
+    value = SENSORS[sensor]
+    data = value.example(frame)
+    for flip in flips(value, frame, Flip(len(data) // 2, 2).mended(data)):
+        value.parse(flip.mended(Flip(len(data) // 2, 2).mended(data)), frame)
+
+
+def test_damage_that_one_bit_explains_is_told_with_the_field() -> None:
+    notes = explain(Flip(46, 0).mended(EXAMPLE), STL).notes
+    assert "a flipped bit would explain it: byte 46 bit 0, crc 81, sent as 80" in notes
+    assert "a flipped bit would explain it: byte 15 bit 7, points[3].distance 0.213 m, sent as 0.085 m" in notes
+    assert explain(EXAMPLE[:20], STL).notes == ()
+
+
+def test_where_any_bit_may_have_flipped_only_that_is_told() -> None:
+    sensor = ls.sensor("cspc-m1c1-mini")
+    data = sensor.example("data", seed=2)
+    (note,) = explain(Flip(20, 2).mended(data), sensor, "data").notes
+    assert re.fullmatch(r"one flipped bit would explain it, but in any of \d+ places, so that nothing can be said of where", note)
+
+
+def test_differences_are_told_field_by_field_and_to_the_bit() -> None:
+    other = STL.build("data", {**STL.parse(EXAMPLE), "end_angle": 0x82BF})
+    first, second = explain(EXAMPLE, STL), explain(other, STL)
+    found = first.differences(second)
+    assert [part.path for part in found] == ["end_angle", "crc"]
+    assert [text(line) for line in told(found, (47, 47))][:3] == [
+        "002a  end_angle  334.70 deg -> 334.71 deg (+0.01 deg)",
+        "      - be 82        .......0 ..",
+        "      + bf 82        .......1 ..",
+    ]
+    assert text(list(told(first.differences(first), (47, 47)))[-1]) == "47 bytes, all alike"
+
+
+def test_fields_that_one_frame_alone_has_are_told_together() -> None:
+    sensor = ls.sensor("cspc-m1c1-mini")
+    samples = [dict(distance=1000, intensity=9, exposure=2)] * 3
+    head = dict(mt=dict(frequency=0, start=0), fsa=dict(angle=64), lsa=dict(angle=640))
+    parts = [explain(sensor.build("data", **head, samples=samples[:count]), sensor) for count in (1, 3)]
+    shown = [text(line) for line in told(parts[0].differences(parts[1]), (len(parts[0].data), len(parts[1].data)))]
+    assert "      samples[1].distance to samples[2].exposure  in the second frame alone" in shown
+
+
+@pytest.mark.parametrize(("sensor", "frame"), FRAMES)
+def test_differences_count_every_bit_of_frames_of_one_layout(sensor: str, frame: str) -> None:
+    data = SENSORS[sensor].example(frame, seed=3)
+    other = bytearray(data)
+    other[-1] ^= 0x41
+    first, second = (explain(bytes(part), SENSORS[sensor], frame) for part in (data, other))
+    if second.rows[-1].values and [row.path for row in first.rows] == [row.path for row in second.rows]:
+        assert sum(mask.bit_count() for part in first.differences(second) for mask in part.masks) == 2
+
+
+def test_the_verb_compares_with_another_frame_or_the_next() -> None:
+    other = STL.build("data", {**STL.parse(EXAMPLE), "speed": 2153})
+    said = ran("explain", EXAMPLE.hex(), "--diff", other.hex(), "-s", STL.id).stdout
+    assert "0002  speed  2152 deg/s = 6.0 Hz -> 2153 deg/s = 6.0 Hz (+1 deg/s)" in said
+    assert ran("explain", (EXAMPLE + other).hex(), "--diff", "next", "-s", STL.id).stdout == said
+    listed = printed("explain", EXAMPLE.hex(), "--diff", other.hex(), "-s", STL.id)["differences"]
+    assert [part["path"] for part in listed] == ["speed", "crc"]
+    assert "no second data frame" in ran("explain", EXAMPLE.hex(), "--diff", "next", "-s", STL.id, code=2).stderr
+
+
+def test_damaged_frames_in_a_stream_are_explained_beside_the_others() -> None:
+    frames = printed("explain", (b"\x01" + DAMAGED + EXAMPLE + EXAMPLE[:9]).hex(), "-s", STL.id)["frames"]
+    assert [(part["frame"], part["offset"], part["fault"] is None) for part in frames] == [
+        ("", 0, True),
+        ("data", 1, False),
+        ("data", 48, True),
+        ("data", 95, False),
+    ]
+
+
+def test_long_lines_are_folded_below_their_text() -> None:
+    line = (Span("0000  "), Span("aa  "), Span("name  "), Span("some words that are too many for it"))
+    assert text(folded(line, 44)) == "0000  aa  name  some words that are too many\n                for it"
+    assert folded(line, 20) == line
+
+
+def test_colours_are_for_terminals_and_not_with_no_color() -> None:
+    terminal = pytest.importorskip("tests.view.terminal", reason="no pseudo-terminals on this system")
+    words = ("explain", DAMAGED.hex(), "-s", STL.id)
+    assert b"\x1b[" not in process(*words).stdout
+    shown = {}
+    for colour in ("", "1"):
+        with terminal.Terminal(*words, columns=120, lines=60, NO_COLOR=colour) as window:
+            assert window.ended() == 4
+            shown[colour] = window.raw
+    assert re.search(r"\x1b\[[0-9;]*3[1-7]m", shown[""])
+    assert not re.search(r"\x1b\[[0-9;]*3[1-7]m", shown["1"])

@@ -1,0 +1,87 @@
+"""The Kaitai compiler, where it is installed, and frames read by what it makes."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pytest
+
+from lidarspec import Sensor
+from lidarspec.exports import export
+from lidarspec.exports.ksy import identifier
+
+HERE = Path(__file__).parent
+#: the compiler of Kaitai's own packages, by path or on PATH; without it the npm package is looked for, as node does (NODE_PATH).
+COMPILER = os.environ.get("LIDARSPEC_KSC", "kaitai-struct-compiler")
+
+
+def compile_all(sensors: Iterable[Sensor], folder: Path) -> None:
+    """A Python module for the export of each sensor; the test is skipped where there is no compiler."""
+    specs = []
+    for sensor in sensors:
+        specs.append(folder / f"{sensor.id}.ksy")
+        specs[-1].write_text(export(sensor, "ksy"), encoding="utf-8")
+    if shutil.which(COMPILER):
+        command = [COMPILER, "--target", "python", "--outdir", str(folder), *map(str, specs)]
+    elif _has_packages():
+        command = ["node", str(HERE / "compile_ksy.js"), str(folder), *map(str, specs)]
+    else:
+        pytest.skip("no Kaitai compiler: npm install kaitai-struct-compiler js-yaml, and name its node_modules in NODE_PATH")
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=300)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def _has_packages() -> bool:
+    if not shutil.which("node"):
+        return False
+    script = "require.resolve('kaitai-struct-compiler'); require.resolve('js-yaml')"
+    return subprocess.run(["node", "-e", script], capture_output=True, check=False, timeout=60).returncode == 0
+
+
+def module(sensor: Sensor, folder: Path) -> ModuleType:
+    """The compiled module of a sensor."""
+    name = identifier(sensor.id)
+    spec = importlib.util.spec_from_file_location(name, folder / f"{name}.py")
+    assert spec is not None
+    assert spec.loader is not None
+    found = importlib.util.module_from_spec(spec)
+    sys.modules[name] = found
+    spec.loader.exec_module(found)
+    return found
+
+
+def reader(found: ModuleType, sensor: Sensor, frame: str) -> Any:
+    """The class of a frame type."""
+    return getattr(getattr(found, camel(identifier(sensor.id))), camel(identifier(frame)))
+
+
+def camel(name: str) -> str:
+    """A name as Kaitai's classes have it."""
+    return "".join(part.capitalize() for part in re.split("_+", name) if part)
+
+
+def differences(parsed: Any, read: Any, path: str = "") -> list[str]:
+    """Where what construct parsed is not what Kaitai's class read; blocks and arrays inside it by their flattened names."""
+    if isinstance(parsed, Mapping):
+        return [place for name, value in parsed.items() for place in differences(value, _member(read, name), f"{path}.{name}")]
+    if isinstance(parsed, list):
+        read = getattr(read, "value", read)
+        if len(parsed) != len(read):
+            return [f"{path}: {len(parsed)} elements, and {len(read)} in Kaitai"]
+        return [place for index, value in enumerate(parsed) for place in differences(value, read[index], f"{path}[{index}]")]
+    value = getattr(read, "value", read)
+    same = parsed == value or (parsed != parsed and value != value)
+    return [] if same else [f"{path}: {parsed!r}, and {value!r} in Kaitai"]
+
+
+def _member(read: Any, name: str) -> Any:
+    return getattr(read, identifier(name), None)

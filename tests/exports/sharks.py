@@ -1,0 +1,64 @@
+"""tshark, for tests: what it reads in a capture, with dissectors that were exported."""
+
+from __future__ import annotations
+
+import functools
+import shutil
+import subprocess
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+
+import pytest
+
+from lidarspec import Sensor
+from lidarspec.captures.pcap import USER_LINKS, Datagram, PcapWriter
+from lidarspec.exports import export
+from lidarspec.spec import Udp
+
+TSHARK = shutil.which("tshark")
+needs_tshark = pytest.mark.skipif(TSHARK is None, reason="tshark is not installed")
+
+
+def tshark(capture: Path, *arguments: str, scripts: Iterable[Path] = ()) -> str:
+    """What tshark prints; it must complain of nothing but being root."""
+    assert TSHARK is not None
+    loaded = [option for script in scripts for option in ("-X", f"lua_script:{script}")]
+    done = subprocess.run([TSHARK, *loaded, "-r", capture, *arguments], check=False, capture_output=True, text=True)
+    complaints = [line for line in done.stderr.splitlines() if line.strip() and "Running as user" not in line]
+    assert not done.returncode and not complaints, "\n".join(complaints)[:2000]  # noqa: PT018
+    return done.stdout
+
+
+def columns(capture: Path, script: Path, names: Sequence[str], *arguments: str) -> Iterator[list[list[str]]]:
+    """For each packet the values of each of these fields, in the order in which they stand in it."""
+    wanted = [option for name in names for option in ("-e", name)]
+    printed = tshark(capture, "-T", "fields", "-E", "separator=/t", "-E", "aggregator=;", *wanted, *arguments, scripts=[script])
+    for line in printed.splitlines():
+        yield [column.split(";") if column else [] for column in line.split("\t")]
+
+
+@functools.cache
+def dissector(sensor: Sensor) -> str:
+    """The dissector of a sensor, made once."""
+    return export(sensor, "wireshark")
+
+
+def written(sensor: Sensor, folder: Path) -> Path:
+    """The dissector of a sensor in a file."""
+    script = folder / f"{sensor.id}.lua"
+    script.write_text(dissector(sensor))
+    return script
+
+
+def captured(sensor: Sensor, frames: Iterable[bytes], path: Path) -> Path:
+    """A capture of these frames, one to a packet, as the sensor's data link carries them."""
+    link = sensor.links["data"]
+    with path.open("wb") as file:
+        writer = PcapWriter(file) if sensor.datagrams else PcapWriter(file, USER_LINKS[0])
+        for number, frame in enumerate(frames):
+            if isinstance(link, Udp) and sensor.datagrams:
+                port = link.ports[0] if link.ports else 9
+                writer.write(Datagram(frame, number * 1_000_000, ("192.0.2.1", port), ("192.0.2.2", port)))
+            else:
+                writer.packet(frame, number * 1_000_000)
+    return path

@@ -1,0 +1,167 @@
+"""The exports md, svg, json and pyi, and the verb: they say what the spec says, and their tools take them."""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import pytest
+
+import lidarspec as ls
+from lidarspec.exports import EXPORTS, Refused, UnknownExport, export, narrowed
+from lidarspec.exports.diagram import BIT, BITS, LEFT
+from lidarspec.wire.schema import schema
+from tests.cli.running import ran
+from tests.exports.json_decoder import Decoder
+from tests.shapes import SHAPES
+
+SENSORS = {**ls.sensors(), **{name: sensor for name, sensor in SHAPES.items() if sensor.frames}}
+SPOKEN = [name for name in SENSORS if name != "shape-text"]
+PAGE = Path(__file__).parents[2] / "docs" / "reference" / "spec-json.md"
+#: keys below which names stand that each spec chooses.
+NAMED = {"links", "frames", "commands", "values", "args", "matches", "lines", "labels"}
+
+
+@pytest.mark.parametrize("name", SPOKEN)
+def test_json_is_enough_to_decode_frames(name: str) -> None:
+    sensor, spec = SENSORS[name], json.loads(export(SENSORS[name], "json"))
+    for frame, said in spec["frames"].items():
+        for seed in range(3):
+            data = sensor.example(frame, seed=seed)
+            decoder = Decoder(data)
+            assert same(decoder.read(said["layout"]), sensor.parse(data, frame))
+            assert decoder.at == len(data)
+
+
+def same(one: Any, other: Any) -> bool:
+    if isinstance(other, dict):
+        return set(one) == set(other) and all(same(one[name], value) for name, value in other.items())
+    if isinstance(other, list):
+        return len(one) == len(other) and all(map(same, one, other))
+    return one == other or (one != one and other != other)
+
+
+def keys(value: Any, above: str = "") -> Iterator[str]:
+    if isinstance(value, dict):
+        for key, part in value.items():
+            if above not in NAMED:
+                yield key
+            yield from keys(part, key if above not in NAMED else "")
+    elif isinstance(value, list):
+        for part in value:
+            yield from keys(part)
+
+
+def test_every_key_of_the_json_is_documented() -> None:
+    page = PAGE.read_text(encoding="utf-8")
+    used = {key for name in SPOKEN for key in keys(json.loads(export(SENSORS[name], "json")))}
+    assert used - set(re.findall(r"`(\w+)`", page)) == set()
+
+
+@pytest.mark.parametrize("name", SPOKEN)
+def test_diagrams_name_every_field_and_stay_within_their_rows(name: str) -> None:
+    root = ElementTree.fromstring(export(SENSORS[name], "svg"))
+    says = {title.text or "" for title in root.iter("{http://www.w3.org/2000/svg}title")}
+    for frame in SENSORS[name].frames.values():
+        for path in schema(frame.tree).fields:
+            assert any(said.split("; ")[0] == path for said in says), path
+    boxes = [box for group in root.iter("{http://www.w3.org/2000/svg}g") for box in group.iter("{http://www.w3.org/2000/svg}rect")]
+    for box in boxes:
+        assert LEFT <= float(box.get("x", "0")) <= float(box.get("x", "0")) + float(box.get("width", "0")) <= LEFT + BITS * BIT
+
+
+def test_boxes_do_not_overlap_and_fill_their_bits() -> None:
+    root = ElementTree.fromstring(export(narrowed(ls.sensor("cspc-m1c1-mini"), "info"), "svg"))
+    seen: set[tuple[float, float]] = set()
+    for box in root.iter("{http://www.w3.org/2000/svg}rect"):
+        if "x" in box.attrib:
+            columns = {(float(box.attrib["y"]), float(box.attrib["x"]) + bit * BIT) for bit in range(int(float(box.attrib["width"]) / BIT))}
+            assert not seen & columns
+            seen |= columns
+    assert len(seen) == 8 * 27
+
+
+@pytest.mark.parametrize("name", list(SENSORS))
+def test_pages_have_every_frame_command_and_field(name: str) -> None:
+    sensor, text = SENSORS[name], export(SENSORS[name], "md")
+    for frame, value in sensor.frames.items():
+        assert f"## `{frame}`: " in text
+        for field in schema(value.tree).fields.values():
+            assert re.search(rf"`(\w+(\[\w\])*\.)*{field.name}(\[\w\])*`", text), field.path
+    assert all(f"| `{command}` |" in text for command in sensor.commands)
+    for table in re.findall(r"(?:^\|.*\n)+", text, flags=re.MULTILINE):
+        assert len({len(re.findall(r"(?<!\\)\|", line)) for line in table.splitlines()}) == 1
+
+
+def test_a_page_says_what_a_user_looks_for() -> None:
+    text = export(ls.sensor("cspc-m1c1-mini"), "md")
+    assert "| link `data` | serial, 150 000 or 115 200 baud, 8N1" in text
+    assert "| `start` | `aa 55 f0 0f` | `ack` | starts the data; sent on opening |" in text
+    assert "| 15 | 15.000 deg |" in export(ls.sensor("velodyne-vlp16"), "md")
+
+
+SNIPPET = """
+from typing import cast
+import lidarspec as ls
+from cspc_m1c1_mini import CspcM1c1Mini, Data
+from ldrobot_stl27l import LdrobotStl27l
+
+mini = cast(CspcM1c1Mini, ls.sensor("cspc-m1c1-mini"))
+frame: Data = mini.parse(b"", "data")
+reveal_type(frame.samples[0].distance)
+reveal_type(mini.parse(b"", "info").model)
+reveal_type(mini.command("start"))
+reveal_type(cast(LdrobotStl27l, ls.sensor("ldrobot-stl27l")).build("data", speed=3600))
+frame.smaples
+mini.command("strat").nothing
+"""
+
+
+def test_a_type_checker_takes_the_stubs_and_finds_misspelt_fields(tmp_path: Path) -> None:
+    for name in SPOKEN:
+        (tmp_path / f"{name.replace('-', '_')}.pyi").write_text(export(SENSORS[name], "pyi"), encoding="utf-8")
+    (tmp_path / "snippet.py").write_text(SNIPPET, encoding="utf-8")
+    stubs = [f"{name.replace('-', '_')}.pyi" for name in SPOKEN]
+    command = [sys.executable, "-m", "mypy", "--strict", "--follow-imports=silent", "snippet.py", *stubs]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False, timeout=300)
+    shown = [line.partition(": ")[2] for line in done.stdout.splitlines()]
+    assert [line.partition('"')[2].strip('"') for line in shown if line.startswith("note: Revealed")] == ["int", "bytes", "bytes", "bytes"]
+    errors = [line for line in shown if line.startswith("error")]
+    assert any('"Data" has no attribute "smaples"' in line for line in errors)
+    assert any('"bytes" has no attribute "nothing"' in line for line in errors)
+    assert len(errors) == 2, done.stdout
+
+
+@pytest.mark.parametrize("kind", ["ksy", "svg", "json", "pyi"])
+def test_python_code_is_refused_with_the_reason(kind: str) -> None:
+    with pytest.raises(Refused, match="shape-text data: angle: Decimal is Python code"):
+        export(SHAPES["shape-text"], kind)
+
+
+def test_an_unknown_kind_is_told() -> None:
+    with pytest.raises(UnknownExport, match="did you mean 'json'"):
+        export(ls.sensor("ldrobot-stl27l"), "jsn")
+
+
+@pytest.mark.parametrize("kind", ["ksy", "md", "svg", "json", "pyi"])
+def test_the_verb_prints_and_writes_every_kind(kind: str, tmp_path: Path) -> None:
+    assert kind in EXPORTS
+    printed = ran("export", kind, "robosense-m1").stdout
+    assert printed == export(ls.sensor("robosense-m1"), kind)
+    ran("export", kind, "robosense-m1", "-o", tmp_path / "out", "--frame", "difop")
+    alone = (tmp_path / "out").read_text(encoding="utf-8")
+    assert alone == export(narrowed(ls.sensor("robosense-m1"), "difop"), kind)
+    assert "return_seq" not in alone
+
+
+def test_the_verb_says_what_is_wrong() -> None:
+    result = ran("export", "json", Path(__file__).parents[1] / "shapes" / "stranger" / "acme_lidars.py", code=0)
+    assert json.loads(result.stdout)["vendor"]
+    assert "unknown frame 'dta'; did you mean 'data'?" in ran("export", "svg", "ldrobot-ld06", "--frame", "dta", code=2).stderr
+    assert "did you mean 'ldrobot-ld06'" in ran("export", "svg", "ldrobot-ld60", code=2).stderr

@@ -1,0 +1,115 @@
+"""Kaitai specs compile with Kaitai's own compiler, and what it makes reads the values that lidarspec reads."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+from construct import Array, Bytes, BytesInteger, Const, Float16b, If, IfThenElse, Int8ul, Int16ul, Int24sb, Struct, this
+
+import lidarspec as ls
+from lidarspec import Sensor
+from lidarspec.exports import Refused, export
+from lidarspec.exports.ksy import yaml
+from lidarspec.spec import Every, Frame, Polar, Serial
+from tests.exports import kaitai
+from tests.shapes import SHAPES
+
+SENSORS = {**ls.sensors(), **SHAPES}
+#: what Kaitai cannot say, and why.
+REFUSED = {"shape-text": "Decimal is Python code"}
+SPOKEN = [name for name, sensor in SENSORS.items() if name not in REFUSED and sensor.frames]
+
+
+def made(*fields: Any, case: str = "odd") -> Sensor:
+    """A sensor of this one frame."""
+    frame = Frame(Struct("sync" / Const(b"\x01\x02"), *fields), data=True, max_length=64)
+    return Sensor(
+        f"acme-{case.replace('_', '-')}",
+        vendor="Acme",
+        model="Odd",
+        frames={"data": frame},
+        points=lambda f: Polar(range=0, azimuth=0),
+        scan=Every(1.0),
+        links={"data": Serial(9600)},
+        range_limits=(0, 1),
+        status="manual",
+        source="the tests",
+    )
+
+
+ODD = {
+    "alternatives": ("kind" / Int8ul, "value" / IfThenElse(this.kind > 128, Int16ul, Struct("low" / Int8ul, "high" / Int8ul))),
+    "arrays_of_arrays": ("count" / Int8ul, "grid" / Array(2, Array(3, Int16ul))),
+    "odd_integers": ("wide" / BytesInteger(5, swapped=True), "many" / Array(2, Int24sb), "plain" / Array(2, BytesInteger(3))),
+    "parts_of_arrays": ("flags" / Array(3, Struct("on_" / Int8ul, "more" / If(this.on_ > 100, Bytes(2)))), "end" / Int8ul),
+}
+
+
+PARTS = bytes([1, 2, 200, 11, 12, 3, 150, 13, 14, 9])
+UNUSUAL = {case: made(*fields, case=case) for case, fields in ODD.items()}
+
+
+@pytest.fixture(scope="module")
+def compiled(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    pytest.importorskip("kaitaistruct", reason="Kaitai's runtime is not installed: pip install kaitaistruct")
+    folder = tmp_path_factory.mktemp("ksy")
+    kaitai.compile_all([*(SENSORS[name] for name in SPOKEN), *UNUSUAL.values()], folder)
+    return folder
+
+
+@pytest.mark.parametrize("name", SPOKEN)
+def test_kaitai_reads_the_values_that_lidarspec_reads(compiled: Path, name: str) -> None:
+    sensor = SENSORS[name]
+    found = kaitai.module(sensor, compiled)
+    for frame in sensor.frames:
+        for seed in range(4):
+            data = sensor.example(frame, seed=seed)
+            read = kaitai.reader(found, sensor, frame).from_bytes(data)
+            assert kaitai.differences(sensor.parse(data, frame), read) == []
+            assert read._io.is_eof()
+
+
+def test_physical_values_are_instances(compiled: Path) -> None:
+    sensor = SENSORS["ldrobot-stl27l"]
+    data = sensor.example("data", seed=1)
+    read = kaitai.reader(kaitai.module(sensor, compiled), sensor, "data").from_bytes(data)
+    assert read.start_angle_deg == pytest.approx(sensor.decode(data)["start_angle"][0])
+    assert read.points[3].distance_m == pytest.approx(sensor.decode(data)["points.distance"][0, 3])
+
+
+def test_wrong_constants_are_noticed(compiled: Path) -> None:
+    sensor = SENSORS["ldrobot-stl27l"]
+    data = sensor.example("data")
+    with pytest.raises(Exception, match="not equal"):
+        kaitai.reader(kaitai.module(sensor, compiled), sensor, "data").from_bytes(b"\x00" + data[1:])
+
+
+@pytest.mark.parametrize("case", list(UNUSUAL))
+def test_unusual_structs_are_read_alike(compiled: Path, case: str) -> None:
+    sensor = UNUSUAL[case]
+    found = kaitai.module(sensor, compiled)
+    for seed in range(6):
+        data = PARTS if case == "parts_of_arrays" else sensor.example("data", seed=seed)
+        assert kaitai.differences(sensor.parse(data), kaitai.reader(found, sensor, "data").from_bytes(data)) == []
+
+
+@pytest.mark.parametrize("name", list(REFUSED))
+def test_what_kaitai_cannot_say_is_refused_with_the_reason(name: str) -> None:
+    with pytest.raises(Refused, match=REFUSED[name]):
+        export(SENSORS[name], "ksy")
+
+
+def test_other_refusals_have_reasons_too() -> None:
+    with pytest.raises(Refused, match="a float of 2 bytes"):
+        export(made("half" / Float16b), "ksy")
+    with pytest.raises(Refused, match="two members that are called 'speed'"):
+        export(made("speed" / Int8ul, "Speed" / Int8ul), "ksy")
+    with pytest.raises(Refused, match="Python function decides"):
+        export(made("count" / Int8ul, "items_" / Array(lambda this: 2 if this.count > 3 else 1, Int8ul)), "ksy")
+
+
+def test_yaml_quotes_what_would_mean_something_else() -> None:
+    value = {"a": "yes", "b": "x: y", "c": [1, 2], "d": {"e": "", "f": [{"g": True}]}, "h": "#1", "i": "10", "j": []}
+    assert yaml(value) == 'a: "yes"\nb: "x: y"\nc: [1, 2]\nd:\n  e: ""\n  f:\n    - g: true\nh: "#1"\ni: "10"\nj: []\n'

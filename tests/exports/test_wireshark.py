@@ -1,0 +1,188 @@
+"""Wireshark dissectors from specs, run in tshark: what it shows of each frame is what lidarspec parses."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import lidarspec
+from lidarspec import Sensor
+from lidarspec.captures.pcap import CaptureReader
+from lidarspec.exports import Refused, export
+from lidarspec.framing.frame_engine import codec
+from lidarspec.testing import subject as material
+from tests import made_captures as made
+from tests.exports.sharks import captured, columns, dissector, needs_tshark, tshark, written
+from tests.exports.trees import DISTINCT, EVERY, values
+
+#: what Wireshark cannot be told, with the reason.
+REFUSED = {"shape-text": "Decimal is Python code"}
+#: what every run tries; the other shapes, and sensors that share the frames of one of these, are for the long one.
+FEW = {*lidarspec.sensors(), "shape-oddities", "shape-options"} & set(DISTINCT)
+SENSORS = [
+    pytest.param(sensor, id=name, marks=() if name in FEW else pytest.mark.soak) for name, sensor in EVERY.items() if name not in REFUSED
+]
+
+CAPTURES = [
+    ("velodyne-vlp16", "velodyne/vlp16_old_firmware/vlp-16-test-90deg-1-50-frames.pcap"),
+    ("velodyne-hdl32e", "velodyne/hdl32e/sample_velodyne_hdl32.pcap"),
+    ("hesai-xt32", "hesai/xt32/packets.derived.pcap"),
+    ("hesai-qt64", "hesai/qt64/packets.derived.pcap"),
+    ("hesai-pandar40p", "hesai/40p_20hz/lidar_20Hz.pcapng"),
+]
+
+LATER, LONG = {"velodyne-hdl32e", "hesai-xt32", "hesai-qt64"}, pytest.mark.soak
+
+pytestmark = needs_tshark
+
+
+def test_what_only_python_can_decide_is_refused_with_the_reason() -> None:
+    for name, reason in REFUSED.items():
+        with pytest.raises(Refused, match=reason):
+            export(EVERY[name], "wireshark")
+
+
+@pytest.mark.parametrize("sensor", SENSORS)
+def test_every_field_reads_as_lidarspec_reads_it(sensor: Sensor, tmp_path: Path) -> None:
+    outgoing = [
+        (name, sensor.example(name, seed=seed)) for seed in range(3) for name in sensor.frames if name not in material.incoming(sensor)
+    ]
+    frames = [*material.conversation(sensor), *outgoing]
+    capture = captured(sensor, [data for _, data in frames], tmp_path / "frames.pcap")
+    script = written(sensor, tmp_path)
+    assert_shown(sensor, capture, script, frames)
+
+
+def assert_shown(sensor: Sensor, capture: Path, script: Path, frames: Sequence[tuple[str, bytes]], *arguments: str) -> None:
+    """Fail unless tshark shows each packet as this frame, with the values that lidarspec parses, and has nothing to say against it."""
+    prefix = sensor.id.replace("-", "_")
+    paths = [(name, path) for name in dict.fromkeys(name for name, _ in frames) for path in codec(sensor.frames[name]).schema.fields]
+    wanted_names = ["_ws.expert.message", f"{prefix}.frame", *(f"{prefix}.{name}.{path}" for name, path in paths)]
+    shown = list(columns(capture, script, wanted_names, *arguments))
+    assert [kind for _, kind, *_ in shown] == [[name] for name, _ in frames]
+    assert not any(message for message, *_ in shown)
+    for (name, data), (_, _, *found) in zip(frames, shown, strict=True):
+        parsed = values(sensor.parse(data, frame=name, verify=False))
+        for (other, path), printed in zip(paths, found, strict=True):
+            wanted = parsed.get(path, []) if other == name else []
+            full = [value for value in wanted if value != b""]
+            assert len([text for text in printed if text != "<MISSING>"]) == len(full), f"{name}.{path}"
+            assert all(_same(text, value) for text, value in zip(printed, full, strict=False)), f"{name}.{path}: {printed} is not {full}"
+
+
+def _same(text: str, value: Any) -> bool:
+    if isinstance(value, bytes):
+        return text == value.hex()
+    if isinstance(value, float):
+        return float(text) == pytest.approx(value, rel=1e-5, nan_ok=True)
+    return int(text, 0) == int(value)
+
+
+def test_physical_values_are_fields_too(tmp_path: Path) -> None:
+    sensor = lidarspec.sensor("ldrobot-stl27l")
+    frame = sensor.build("data", sensor.parse(sensor.example("data")), units=False, start_angle=32427)
+    capture, script = captured(sensor, [frame], tmp_path / "it.pcap"), written(sensor, tmp_path)
+    (row,) = columns(capture, script, ["ldrobot_stl27l.data.start_angle", "ldrobot_stl27l.data.start_angle.physical"])
+    assert row == [["32427"], ["324.27"]]
+    assert tshark(capture, "-Y", "ldrobot_stl27l.data.start_angle.physical > 324", scripts=[script])
+    assert not tshark(capture, "-Y", "ldrobot_stl27l.data.start_angle.physical > 325", scripts=[script])
+    assert "start_angle: 32427 (324.27 deg)" in tshark(capture, "-V", scripts=[script])
+
+
+@pytest.mark.parametrize("name", ["ldrobot-stl27l", "shape-nested", "shape-nibbles", "shape-oddities"])
+def test_a_wrong_checksum_is_marked(name: str, tmp_path: Path) -> None:
+    sensor = EVERY[name]
+    sealed = [kind for kind in material.incoming(sensor) if material.seals(sensor, kind, sensor.example(kind))]
+    frames = []
+    for kind in sealed:
+        good = sensor.example(kind, seed=3)
+        place = next(spot for spot in reversed(range(len(good))) if _only_the_checksum(sensor, kind, _flipped(good, spot)))
+        frames += [good, _flipped(good, place)]
+    capture, script = captured(sensor, frames, tmp_path / "it.pcap"), written(sensor, tmp_path)
+    prefix = name.replace("-", "_")
+    rows = list(columns(capture, script, [f"{prefix}.frame", f"{prefix}.checksum.status", f"{prefix}.checksum.bad"]))
+    assert [kind for kind, _, _ in rows] == [[kind] for kind in sealed for _ in range(2)]
+    for number, (_, status, bad) in enumerate(rows):
+        assert ("0" in status) == bool(bad) == bool(number % 2), f"packet {number + 1}"
+
+
+def _flipped(data: bytes, spot: int) -> bytes:
+    return bytes([*data[:spot], data[spot] ^ 0x01, *data[spot + 1 :]])
+
+
+def _only_the_checksum(sensor: Sensor, kind: str, data: bytes) -> bool:
+    try:
+        sensor.parse(data, frame=kind)
+    except lidarspec.WireError as error:
+        return "checksum" in str(error)
+    return False
+
+
+def test_frames_one_after_another_and_bytes_between_them(tmp_path: Path) -> None:
+    sensor = lidarspec.sensor("ldrobot-stl27l")
+    frames = [sensor.example("data", seed=seed) for seed in range(3)]
+    packet = b"\x01\x02\x54" + frames[0] + frames[1] + _flipped(frames[2], 20) + b"\x54\x2c\x99"
+    capture, script = captured(sensor, [packet, bytes(40)], tmp_path / "it.pcap"), written(sensor, tmp_path)
+    names = ["frame", "checksum.status", "skipped", "cut_off", "data.end_angle"]
+    first, second = columns(capture, script, [f"ldrobot_stl27l.{name}" for name in names])
+    angles = [sensor.parse(frame).end_angle for frame in frames]
+    assert (first[0], first[1], len(first[2]), len(first[3])) == (["data"] * 4, ["1", "1", "0"], 1, 1)
+    assert first[4] == [str(angle) for angle in angles]
+    assert second == [[]] * 5
+
+
+def test_a_frame_that_waits_for_another_is_told_by_it(tmp_path: Path) -> None:
+    sensor = EVERY["shape-modes"]
+    frames = [(name, sensor.example(name, seed=1)) for name in ("begin_express", "express", "express", "begin_plain", "plain")]
+    capture, script = captured(sensor, [data for _, data in frames], tmp_path / "it.pcap"), written(sensor, tmp_path)
+    assert_shown(sensor, capture, script, frames)
+    run = captured(sensor, [b"".join(data for _, data in frames)], tmp_path / "run.pcap")
+    ((kinds,),) = columns(run, script, ["shape_modes.frame"])
+    assert kinds == [name for name, _ in frames]
+
+
+def test_two_dissectors_share_ports_and_link_types(tmp_path: Path) -> None:
+    sensors = [lidarspec.sensor(name) for name in ("velodyne-vlp16", "hesai-xt32", "ldrobot-stl27l", "cspc-m1c1-mini")]
+    scripts = [written(sensor, tmp_path) for sensor in sensors]
+    for sensor in sensors:
+        capture = captured(sensor, [sensor.example(sensor.data_frame)], tmp_path / f"{sensor.id}.pcap")
+        assert f"{sensor.vendor} {sensor.model}" in tshark(capture, "-T", "fields", "-e", "_ws.col.Protocol", scripts=scripts)
+
+
+@pytest.mark.parametrize(("name", "path"), [pytest.param(*case, id=case[0], marks=LONG if case[0] in LATER else ()) for case in CAPTURES])
+def test_real_captures(name: str, path: str, tmp_path: Path) -> None:
+    capture = made.CAPTURES / path
+    if not os.path.exists(capture):
+        pytest.skip(f"no capture {path} in {made.CAPTURES} (set LIDARSPEC_CAPTURES)")
+    sensor = lidarspec.sensor(name)
+    with CaptureReader(capture) as reader:
+        datagrams = [datagram.data for datagram, _ in zip(reader, range(12), strict=False)]
+    frames = [(found[0].frame, data) for data in datagrams if (found := sensor.split([data]))]
+    assert frames
+    script = written(sensor, tmp_path)
+    again = captured(sensor, [data for _, data in frames], tmp_path / "again.pcap")
+    assert_shown(sensor, again, script, frames)
+    shown = tshark(capture, "-c", "12", "-T", "fields", "-e", f"{name.replace('-', '_')}.frame", scripts=[script])
+    assert {name for name, _ in frames} <= set(shown.split())
+
+
+@pytest.mark.parametrize(("name", "path"), [("ldrobot-ld06", "ldrobot/ld06_3_consecutive_frames.bin")])
+def test_a_real_serial_recording(name: str, path: str, tmp_path: Path) -> None:
+    source = made.CAPTURES / path
+    if not source.exists():
+        pytest.skip(f"no capture {path} in {made.CAPTURES} (set LIDARSPEC_CAPTURES)")
+    sensor = lidarspec.sensor(name)
+    frames = [(found.frame, found.data) for found in sensor.split(source.read_bytes())]
+    capture = captured(sensor, [source.read_bytes()], tmp_path / "it.pcap")
+    ((kinds, angles),) = columns(capture, written(sensor, tmp_path), ["ldrobot_ld06.frame", "ldrobot_ld06.data.end_angle"])
+    assert kinds == [kind for kind, _ in frames]
+    assert angles == [str(sensor.parse(data).end_angle) for _, data in frames]
+
+
+def test_a_dissector_is_lua_that_names_its_source() -> None:
+    sensor = lidarspec.sensor("ldrobot-stl27l")
+    assert sensor.source in dissector(sensor).splitlines()[1]

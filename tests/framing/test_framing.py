@@ -1,0 +1,173 @@
+"""Framing: inputs that have broken other parsers, and single mechanisms; what holds for every sensor is in the test kit."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+
+import lidarspec
+from lidarspec import Sensor
+from lidarspec.testing import subject as material
+from lidarspec.testing.agreement import assert_backends_agree
+from tests.engine.oracle import Oracle
+from tests.engine.streams import Books, damaged, decoded
+from tests.shapes import SHAPES
+
+EVERY = {**lidarspec.sensors(), **SHAPES}
+#: one of each family on a byte stream: relatives that share their frames are cut alike.
+STREAMS = {
+    sensor.id: sensor
+    for sensor in {tuple(map(id, sensor.frames.values())): sensor for sensor in EVERY.values() if not sensor.datagrams}.values()
+}
+#: about so many bytes to a stream: the oracle takes its time.
+LENGTH = 2500
+
+each_stream = pytest.mark.parametrize("sensor", STREAMS.values(), ids=STREAMS)
+
+
+def conversation(sensor: Sensor, *, seed: int = 0, length: int = LENGTH) -> bytes:
+    rounds = max(length // len(material.stream(sensor, rounds=1)), 1)
+    return material.stream(sensor, seed=seed, rounds=rounds)
+
+
+@pytest.mark.parametrize("sensor", EVERY.values(), ids=EVERY)
+def test_datagrams_of_any_size_raise_on_nothing(sensor: Sensor) -> None:
+    frame = sensor.example(sensor.data_frame, seed=3)
+    data = [b"", frame[:1], frame[:-1], frame, frame + b"\x00", bytes(65507), b"\xff" * 65507, frame, b"\x00" * len(frame)]
+    assert_backends_agree(sensor, data)
+    decoder = sensor.decoder(stream=False)
+    found = [item for datagram in data for item in decoder.feed(datagram)] + decoder.finish()
+    stats = decoder.stats
+    assert stats.bytes_in == sum(map(len, data)) == sum(len(item.data) for item in found) + stats.bytes_skipped
+    if sensor.frames[sensor.data_frame].after is None and sensor.frames[sensor.data_frame].confirm == 1:
+        assert [item.data for item in found].count(frame) == 2
+
+
+@each_stream
+def test_idle_between_chunks_is_the_rule_on_each_part(sensor: Sensor) -> None:
+    """Between two calls of `idle` the rule holds, and nothing that was given up comes back."""
+    if any(frame.confirm > 1 or frame.after for frame in sensor.frames.values()):
+        pytest.skip("what this sensor sends depends on what came before")
+    data = conversation(sensor, seed=2, length=600)
+    parts = [data[:200], data[200:350], data[350:]]
+    books, expected, base = Books(sensor), [], 0
+    for part in parts:
+        books.feed(part).finish()
+        expected += [(name, base + offset, frame) for name, offset, frame in Oracle(sensor, part).frames()]
+        base += len(part)
+    assert books.found == expected
+
+
+def test_decoders_in_threads_do_not_know_of_each_other() -> None:
+    work = [(sensor, damaged(conversation(sensor, seed=seed), 1e-3, seed)) for seed in range(4) for sensor in STREAMS.values()]
+    alone = [decoded(*item) for item in work]
+    with ThreadPoolExecutor(8) as pool:
+        assert list(pool.map(lambda item: decoded(*item), work)) == alone
+
+
+def test_a_frame_inside_a_frame_belongs_to_it() -> None:
+    sensor = SHAPES["shape-options"]
+    inner = sensor.build(
+        "data", options=dict(extended=0, coarse=0, kind=0), rows=0, columns=0, angle=0, distances=[], extension=None, extra=None
+    )
+    words = [int.from_bytes(inner[spot : spot + 2].ljust(2, b"\0"), "little") for spot in range(0, len(inner), 2)]
+    options = dict(extended=0, coarse=0, kind=0)
+    outer = sensor.build("data", options=options, rows=1, columns=len(words), angle=100, distances=words, extension=None, extra=None)
+    assert inner[:8] in outer
+    assert [data for _, _, data in decoded(sensor, outer + inner)] == [outer, inner]
+    broken = outer[:-1] + bytes([outer[-1] ^ 1])
+    assert [data for _, _, data in decoded(sensor, broken)] == [inner]
+
+
+def test_a_false_header_whose_length_swallows_good_frames_gives_them_back() -> None:
+    sensor = SHAPES["shape-count"]
+    frames = [sensor.build("data", count=2, first=0, last=100, samples=[dict(distance=0x1234, quality=1)] * 2) for _ in range(5)]
+    data = b"\xaa\x55\x28" + b"".join(frames)
+    books = Books(sensor).feed(data)
+    assert books.found == []
+    assert [frame for _, _, frame in books.finish()] == frames
+
+
+def test_a_claim_beyond_the_longest_length_is_not_waited_for() -> None:
+    sensor = SHAPES["shape-count"]
+    frame = sensor.example("data", seed=1)
+    books = Books(sensor).feed(b"\xaa\x55\xff" + frame)
+    assert [data for _, _, data in books.found] == [frame]
+    assert books.decoder.stats.bad_length == 1
+
+
+def test_the_longest_length_itself_is_allowed() -> None:
+    sensor = SHAPES["shape-count"]
+    samples = [dict(distance=index, quality=7) for index in range(40)]
+    frame = sensor.build("data", first=0, last=100, samples=samples)
+    assert len(frame) == sensor.frames["data"].max_length
+    assert [data for _, _, data in decoded(sensor, frame)] == [frame]
+    longer = sensor.build("data", first=0, last=100, samples=[*samples, samples[0]])
+    assert decoded(sensor, longer) == []
+
+
+def test_rejections_are_counted_by_their_reason() -> None:
+    sensor = SHAPES["shape-count"]
+    good = sensor.build("data", first=0, last=100, samples=[dict(distance=0x1234, quality=1)])
+    far = sensor.build("data", first=36000, last=100, samples=[dict(distance=0x1234, quality=1)])
+    wrong = good[:-1] + bytes([good[-1] ^ 0xFF])
+    stats = sensor.decode(good + far + wrong + good[:5] + good).stats
+    assert (stats.frames, stats.implausible, stats.bad_checksum) == ({"data": 2}, 1, 2)
+    assert stats.bytes_skipped == len(far) + len(wrong) + 5
+
+
+def test_fillers_are_skipped_bytes_with_a_count_of_their_own() -> None:
+    sensor = SHAPES["shape-middle"]
+    frame = sensor.example("data", seed=1)
+    found = sensor.split(b"\xfe\xff" + frame + b"\xfe" + frame + b"\xfe\x01\xff" + frame)
+    assert [item.gap for item in found] == [0, 0, 1]
+    stats = sensor.decode(b"\xfe\xff" + frame + b"\xfe" + frame + b"\xfe\x01\xff" + frame).stats
+    assert (stats.bytes_skipped, stats.bytes_filler) == (6, 5)
+
+
+def test_what_a_descriptor_announces_is_what_is_looked_for() -> None:
+    sensor = SHAPES["shape-modes"]
+    plain, express = sensor.example("plain", seed=1), sensor.example("express", seed=1)
+    begin_plain, begin_express = sensor.example("begin_plain"), sensor.example("begin_express")
+    data = plain + begin_plain + plain + plain + express + begin_express + express + plain + begin_plain + plain
+    assert decoded(sensor, data) == Oracle(sensor, data).frames()
+    assert [found.frame for found in sensor.split(begin_plain + plain + begin_express + express)] == [
+        "begin_plain",
+        "plain",
+        "begin_express",
+        "express",
+    ]
+    assert sensor.split(plain) == []
+    chosen = sensor.configure(answer="express")
+    assert [found.frame for found in chosen.split(express + plain)] == ["express"]
+    assert len(chosen.decode(express).points()) == 4
+
+
+def test_runs_of_weak_frames_count_whole_or_not_at_all() -> None:
+    sensor = SHAPES["shape-weak"]
+    frames = [sensor.example("data", seed=seed) for seed in range(6)]
+    for number in range(7):
+        data = b"\x00" * 7 + b"".join(frames[:number]) + b"\x00" * 7
+        assert [data for _, _, data in decoded(sensor, data)] == (frames[:number] if number >= 3 else [])
+        assert decoded(sensor, data) == Oracle(sensor, data).frames()
+
+
+def test_a_frame_that_comes_first_in_the_order_ends_a_run() -> None:
+    sensor = SHAPES["shape-weak"]
+    node, info = sensor.example("data", seed=1), sensor.build("info", revision=0x12, temperature=0x34)
+    assert sensor.parse(info, frame="data")
+    for before in range(5):
+        data = node * before + info + node * 2 + info + node * 3
+        assert decoded(sensor, data) == Oracle(sensor, data).frames()
+        assert [name for name, _, _ in decoded(sensor, data)] == ["data"] * (before if before >= 3 else 0) + ["info", "info"] + ["data"] * 3
+
+
+@pytest.mark.parametrize("name", ["shape-count", "shape-options", "shape-state", "shape-modes", "shape-text", "shape-commands"])
+def test_a_frame_is_out_with_its_last_byte(name: str) -> None:
+    data = material.stream(SHAPES[name])
+    decoder = SHAPES[name].decoder()
+    for spot in range(len(data)):
+        for found in decoder.feed(data[spot : spot + 1]):
+            assert found.offset + len(found.data) == spot + 1
+    assert decoder.stats.pending == 0

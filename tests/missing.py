@@ -1,0 +1,39 @@
+"""What tests are skipped for that can be had: tools, packages, captures. The reasons of the skips are matched to where it is had."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter, defaultdict
+from collections.abc import Iterable
+
+#: a pattern in the reason of a skip -> what is missing, and how to get it.
+MISSING = (
+    (r"tshark", "tshark", "apt-get install tshark"),
+    (r"g\+\+ is not", "g++", "apt-get install g++"),
+    (r"gcc", "gcc", "apt-get install gcc"),
+    (r"Kaitai compiler", "Kaitai's compiler", "npm install kaitai-struct-compiler js-yaml, with NODE_PATH as its node_modules"),
+    (r"kaitaistruct|crccheck|velodyne.decoder|[Nn]umba", "Python packages", "pip install -e '.[dev]'"),
+    (
+        r"LIDARSPEC_CAPTURES|protocol vectors",
+        "captures and vectors",
+        "LIDARSPEC_CAPTURES=FOLDER, with protocols beside it",
+    ),
+)
+
+
+def told(skipped: Iterable[tuple[str, str]]) -> list[str]:
+    """A line for each thing that is missing: how many tests were skipped for it, in which files, and how to get it.
+
+    Args:
+        skipped: (node id, reason) of each test that was skipped.
+    """
+    files: dict[tuple[str, str], Counter[str]] = defaultdict(Counter)
+    for node, reason in skipped:
+        for pattern, what, remedy in MISSING:
+            if re.search(pattern, reason):
+                files[what, remedy][node.partition("::")[0].removeprefix("tests/")] += 1
+                break
+    return [
+        f"not run without {what}: {count.total()} tests ({', '.join(sorted(count))}); to have them: {remedy}"
+        for (what, remedy), count in files.items()
+    ]

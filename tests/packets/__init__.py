@@ -1,0 +1,1 @@
+"""Frames of one type, in order, in time."""

@@ -1,0 +1,1 @@
+"""How sensors come in: entry points, hooks, strangers' distributions."""

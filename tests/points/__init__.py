@@ -1,0 +1,1 @@
+"""Points, by every way to compute them."""

@@ -1,0 +1,195 @@
+"""The fused back end gives the points of the plain evaluation: same masks, coordinates within six units in the last place."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import lidarspec
+from lidarspec import UsageError
+from lidarspec.packets.packets import Packets
+from lidarspec.points.evaluate import evaluated
+from lidarspec.points.numba_kernels import checksums as kernelsums
+from lidarspec.points.plain import evaluate, points_function
+from lidarspec.points.plan import Plan, plan_for
+from lidarspec.simulation.simulator import opening, simulate
+from lidarspec.spec import Checksum, Crc, Fields, Polar, WordXor, Xor
+from lidarspec.spec.links import is_datagram
+from lidarspec.testing import subject as material
+from lidarspec.testing.agreement import assert_same_points
+from lidarspec.wire.frame_table import Rows
+from lidarspec.wire.layout import Seal
+from tests.shapes import SHAPES
+
+pytest.importorskip("numba", reason="the fused back end needs Numba: pip install 'lidarspec[jit]'")
+
+SENSORS = {**lidarspec.sensors(), **{name: sensor for name, sensor in SHAPES.items() if sensor.frames}}
+ULPS = 6
+MANY = 16
+
+
+@functools.cache
+def frames_of(name: str) -> list[bytes]:
+    sensor = SENSORS[name]
+    return [sensor.example(sensor.data_frame, seed=seed) for seed in range(MANY)]
+
+
+def packets_of(name: str, number: int) -> Packets:
+    sensor, frames = SENSORS[name], frames_of(name)[:number]
+    data: Any = frames if is_datagram(sensor.links.get("data")) else b"".join(frames)
+    return sensor.decode(data, backend="jit")
+
+
+@pytest.mark.parametrize("name", [name for name, sensor in SHAPES.items() if sensor.frames])
+def test_kernels_give_what_the_plain_evaluation_gives(name: str) -> None:
+    for number in (1, 7, MANY):
+        packets = packets_of(name, number)
+        if len(packets):
+            assert_same_points(evaluated(packets).cloud, evaluate(packets).cloud, ulps=ULPS)
+            one, other = evaluated(packets, final=False, epoch=5), evaluate(packets, final=False, epoch=5)
+            assert_same_points(one.cloud, other.cloud, ulps=ULPS)
+
+
+@pytest.mark.parametrize("name", list(SENSORS))
+def test_every_column_of_damaged_and_mixed_streams(name: str) -> None:
+    sensor = SENSORS[name]
+    packets = sensor.decode(material.stream(sensor), backend="jit")
+    if len(packets):
+        assert_same_points(evaluated(packets).cloud, evaluate(packets).cloud, ulps=ULPS)
+
+
+ANSWERS = [(name, answer) for name, sensor in lidarspec.sensors().items() for answer in sensor.frames if sensor.frames[answer].data]
+
+
+@pytest.mark.parametrize(("name", "answer"), ANSWERS)
+def test_all_sensors_of_this_repository_have_a_kernel(name: str, answer: str) -> None:
+    sensor = SENSORS[name] if answer == SENSORS[name].data_frame else SENSORS[name].configure(answer=answer)
+    frames = simulate(sensor, 2 * MANY)
+    packets = sensor.decode(frames if is_datagram(sensor.links.get("data")) else opening(sensor) + b"".join(frames), backend="jit")
+    cloud = packets.points()
+    assert_same_points(cloud, evaluate(packets).cloud, ulps=ULPS)
+    assert cloud.valid.any()
+    assert plan(packets).kernels
+
+
+def plan(packets: Packets) -> Plan:
+    assert isinstance(packets.table, Rows)
+    found = plan_for(points_function(packets.sensor, packets.frame), packets.batch(), packets.table.groups[0])
+    assert isinstance(found, Plan), str(found)
+    return found
+
+
+def test_any_number_of_threads_gives_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    sensor = SENSORS["velodyne-vlp16"]
+    rows = np.tile(np.frombuffer(b"".join(frames_of("velodyne-vlp16")), np.uint8).reshape(MANY, -1), (40, 1))
+    alone = sensor.decode(rows, backend="jit").points()
+    for number in ("2", "3"):
+        monkeypatch.setenv("LIDARSPEC_THREADS", number)
+        cloud = sensor.decode(rows, backend="jit").points()
+        for name, column in alone.columns.items():
+            np.testing.assert_array_equal(cloud.columns[name], column)
+    monkeypatch.setenv("LIDARSPEC_THREADS", "many")
+    with pytest.raises(UsageError, match="LIDARSPEC_THREADS is a number"):
+        len(sensor.decode(rows, backend="jit").points().x)
+
+
+@pytest.mark.parametrize("compiled", [False, True])
+def test_it_is_chosen_by_itself_once_enough_points_were_made(compiled: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    sensor = dataclasses.replace(SENSORS["ldrobot-stl27l"], points=functools.partial(points_of_another_kind))
+    packets = sensor.decode(b"".join(frames_of("ldrobot-stl27l")))
+    enough = 3 * 12 * len(packets)
+    monkeypatch.setattr("lidarspec.points.numba_kernels.kernels.WARM", enough if compiled else 0)
+    monkeypatch.setattr("lidarspec.points.numba_kernels.kernels.COLD", 10 * enough if compiled else enough)
+    monkeypatch.setattr("lidarspec.points.numba_kernels.kernels.compiled_before", lambda source: compiled)
+    used = []
+    for _ in range(4):
+        cloud = packets.points()
+        assert_same_points(cloud, evaluate(packets).cloud, ulps=ULPS)
+        used.append(any(kernel.is_ready for kernel in plan(packets).kernels.values()))
+    assert used == [False, False, True, True]
+
+
+def points_of_another_kind(f: Fields) -> Polar:
+    return Polar(range=f.points.distance, azimuth=np.deg2rad(f.start_angle + 2 * np.arange(12)), intensity=f.points.intensity)
+
+
+def run(code: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env={**os.environ, **environment}, check=False)
+
+
+DECODING = """
+import sys, lidarspec as ls
+sensor = ls.sensor("ldrobot-stl27l")
+x = sensor.decode(sensor.example("data") * 3).points().x
+print(bool(sys.modules.get("numba")), len(x))
+"""
+
+
+def test_the_environment_names_the_default_and_nothing_else_imports_numba() -> None:
+    assert run(DECODING).stdout.split() == ["False", "36"]
+    assert run(DECODING, LIDARSPEC_BACKEND="jit").stdout.split() == ["True", "36"]
+    wrong = run(DECODING, LIDARSPEC_BACKEND="fast")
+    assert "LIDARSPEC_BACKEND is one of auto, numpy, jit, construct, not 'fast'" in wrong.stderr
+
+
+def test_kernels_are_kept_between_runs_and_done_without_where_they_cannot_be(tmp_path: Path) -> None:
+    code = DECODING + "from lidarspec.points.numba_kernels.kernels import function_of; print(function_of.cache_info().misses)"
+    for _ in range(2):
+        done = run(code, LIDARSPEC_BACKEND="jit", LIDARSPEC_CACHE=str(tmp_path / "kept"), NUMBA_DEBUG_CACHE="1")
+        assert done.stdout.splitlines()[-2:] == ["True 36", "1"], done.stderr
+    assert "index loaded" in done.stdout
+    assert "data loaded" in done.stdout
+    occupied = tmp_path / "file"
+    occupied.write_text("not a folder")
+    done = run(DECODING, LIDARSPEC_BACKEND="jit", LIDARSPEC_CACHE=str(occupied))
+    assert done.stdout.split() == ["True", "36"], done.stderr
+
+
+def test_without_numba_asking_for_it_is_an_error_and_nothing_else_is() -> None:
+    hidden = "import sys; sys.modules['numba'] = None\n"
+    assert run(hidden + DECODING).stdout.split() == ["False", "36"]
+    asked = run(hidden + DECODING.replace("* 3)", "* 3, backend='jit')"))
+    assert "UsageError: backend 'jit' needs Numba: pip install 'lidarspec[jit]' (" in asked.stderr
+
+
+@pytest.mark.parametrize(
+    "algorithm", [Crc(8, 0x4D), Crc(16, 0x1021, init=0xFFFF), Crc(13, 0x1CF5, refin=True, refout=True), Xor(), WordXor(8, (1, 2))]
+)
+@pytest.mark.parametrize("spans", [((0, 46),), ((0, 8), (10, 45))])
+def test_compiled_checksums_are_those_of_the_algorithm(algorithm: Checksum, spans: tuple[tuple[int, int], ...]) -> None:
+    rows = np.random.default_rng(1).integers(0, 256, (kernelsums.EARNED, 50), dtype=np.uint8)
+    seal = Seal((), spans, algorithm, ())
+    found = kernelsums.checksums(seal, rows)
+    assert found is not None
+    covered = np.concatenate([rows[:, start:stop] for start, stop in spans], axis=1)
+    np.testing.assert_array_equal(found, algorithm.batch(covered), strict=True)
+
+
+def test_checksums_are_compiled_for_the_decoder_that_asks_and_no_other(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[int] = []
+    monkeypatch.setattr(kernelsums, "checksums", lambda seal, rows: asked.append(len(rows)))
+    for name in ("ldrobot-stl27l", "shape-count"):
+        data = b"".join(frames_of(name))
+        compiled, plain = (SENSORS[name].decoder(backend=backend) for backend in ("jit", "numpy"))
+        before = len(asked)
+        assert compiled.feed(data)
+        assert len(asked) > before
+        before = len(asked)
+        assert plain.feed(data)
+        assert len(asked) == before
+
+
+def test_streams_are_cut_alike() -> None:
+    sensor = SENSORS["ldrobot-stl27l"]
+    data = b"".join(b"".join(frames_of("ldrobot-stl27l")) + b"T,T" for _ in range(400))
+    one, other = (sensor.decode(data, backend=backend) for backend in ("numpy", "jit"))
+    np.testing.assert_array_equal(one.offset, other.offset)
+    assert one.stats == other.stats

@@ -1,0 +1,132 @@
+"""The plan gives the points of the plain evaluation: same masks, coordinates within four units in the last place."""
+
+from __future__ import annotations
+
+import dataclasses
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import numpy as np
+import pytest
+
+import lidarspec
+from lidarspec import Sensor
+from lidarspec.packets.packets import Packets
+from lidarspec.points.evaluate import evaluated
+from lidarspec.points.plain import evaluate, points_function
+from lidarspec.points.plan import Plan, plan_for
+from lidarspec.spec import Fields, Polar
+from lidarspec.spec.links import is_datagram
+from lidarspec.testing import subject as material
+from lidarspec.testing.agreement import assert_same_points
+from lidarspec.wire.frame_table import Rows
+from tests.shapes import SHAPES
+
+SENSORS = {**lidarspec.sensors(), **{name: sensor for name, sensor in SHAPES.items() if sensor.frames}}
+
+#: what is evaluated plainly, and a word of the reason.
+PLAIN = {"shape-numbers": "floating-point", "shape-text": "compiled"}
+
+
+def plan(packets: Packets) -> Any:
+    assert isinstance(packets.table, Rows)
+    return plan_for(points_function(packets.sensor, packets.frame), packets.batch(), packets.table.groups[0])
+
+
+def packets_of(sensor: Sensor, number: int) -> Packets:
+    random = np.random.default_rng(number)
+    frames = [sensor.example(sensor.data_frame, seed=int(seed)) for seed in random.integers(0, 1000, number)]
+    return sensor.decode(frames if is_datagram(sensor.links.get("data")) else b"".join(frames))
+
+
+@pytest.mark.parametrize("number", [1, 2, 7, 64])
+@pytest.mark.parametrize("name", list(SENSORS))
+def test_the_plan_gives_what_the_plain_evaluation_gives(name: str, number: int) -> None:
+    packets = packets_of(SENSORS[name], number)
+    if len(packets):
+        assert_same_points(evaluated(packets).cloud, evaluate(packets).cloud)
+        one, other = evaluated(packets, final=False, epoch=5), evaluate(packets, final=False, epoch=5)
+        assert one.ready == other.ready
+        assert_same_points(one.cloud, other.cloud)
+        np.testing.assert_array_equal(one.counts, other.counts)
+        assert one.carry.keys() == other.carry.keys()
+        for slot, values in one.carry.items():
+            np.testing.assert_array_equal(values, other.carry[slot])
+
+
+@pytest.mark.parametrize("name", list(SENSORS))
+def test_every_column_of_damaged_and_mixed_streams(name: str) -> None:
+    sensor = SENSORS[name]
+    packets = sensor.decode(material.stream(sensor))
+    if len(packets):
+        assert_same_points(evaluated(packets).cloud, evaluate(packets).cloud)
+
+
+@pytest.mark.parametrize("name", list(lidarspec.sensors()))
+def test_all_sensors_of_this_repository_have_a_plan(name: str) -> None:
+    packets = packets_of(SENSORS[name], 3)
+    if len(packets):
+        assert isinstance(plan(packets), Plan), str(plan(packets))
+
+
+@pytest.mark.parametrize("frame", ["rep103", "vendor"])
+def test_the_vendors_axes(frame: str) -> None:
+    packets = packets_of(lidarspec.sensor("velodyne-vlp16").configure(frame=frame), 9)
+    assert_same_points(evaluated(packets).cloud, evaluate(packets).cloud)
+
+
+def branching(f: Fields) -> Polar:
+    far = f.points.distance * 2 if (f.start_angle > 100).array.all() else f.points.distance
+    return Polar(range=far, azimuth=f.start_angle)
+
+
+def reducing(f: Fields) -> Polar:
+    return Polar(range=f.points.distance, azimuth=np.add.reduce(f.start_angle))
+
+
+def indexing(f: Fields) -> Polar:
+    return Polar(range=np.asarray(f.points.distance) * 1.0, azimuth=0)
+
+
+@pytest.mark.parametrize(("points", "reason"), [(branching, ".array"), (reducing, "np.add.reduce"), (indexing, "made an array")])
+def test_what_cannot_be_traced_says_so_and_runs_all_the_same(points: Any, reason: str) -> None:
+    sensor = dataclasses.replace(lidarspec.sensor("ldrobot-stl27l"), points=points)
+    packets = sensor.decode(b"".join(sensor.example("data", seed=seed) for seed in range(4)))
+    found = plan(packets)
+    assert not isinstance(found, Plan)
+    assert reason in str(found)
+    assert_same_points(evaluated(packets).cloud, evaluate(packets).cloud)
+
+
+def test_a_factor_that_is_zero_or_negative_leaves_no_point_behind() -> None:
+    sensor = lidarspec.sensor("hesai-xt32")
+    frames = []
+    for unit in (4, 0, 4):
+        parsed = sensor.parse(sensor.example("data", seed=unit + 1))
+        parsed.dis_unit = unit
+        frames.append(sensor.build("data", parsed))
+    table = sensor.decode(frames)
+    assert_same_points(evaluated(table).cloud, evaluate(table).cloud)
+
+
+def test_columns_are_made_once_and_slices_share_them() -> None:
+    packets = packets_of(lidarspec.sensor("robosense-m1"), 5)
+    cloud = packets.points()
+    assert cloud.x is cloud.x
+    part = cloud[125:250]
+    assert part.x.base is cloud.x or part.x.base is cloud.x.base
+    assert part.shape == (25, 5)
+    assert isinstance(packets.batch().table, Rows)
+
+
+def test_threads_that_decode_with_one_sensor_do_not_meet() -> None:
+    sensor = lidarspec.sensor("robosense-m1")
+    some = np.stack([np.frombuffer(sensor.example("data", seed=seed), np.uint8) for seed in range(40)])
+    inputs = [np.tile(some[:20], (50, 1)), np.tile(some[20:], (50, 1))]
+    wanted = [sensor.decode(rows).points().x for rows in inputs]
+
+    def same(index: int) -> bool:
+        return all(np.array_equal(sensor.decode(inputs[index]).points().x, wanted[index], equal_nan=True) for _ in range(15))
+
+    with ThreadPoolExecutor(2) as pool:
+        assert all(pool.map(same, [0, 1]))

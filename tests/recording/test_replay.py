@@ -1,0 +1,301 @@
+"""Replays: bit for bit and by the clock, to pseudo terminals, sockets and files."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import os
+import socket
+import sys
+import threading
+import time
+import tty
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import lidarspec as ls
+from lidarspec.errors import SourceError, UsageError
+from lidarspec.recording.recorders import Recorder, recorder
+from lidarspec.transports.open_url import transport
+from lidarspec.transports.outlets import FileOutlet, Outlet, PtyOutlet, TcpOutlet, UdpOutlet, replay_outlet
+from lidarspec.transports.protocol import Chunk, Disconnected
+from lidarspec.transports.serving import Deadlines, replayed
+from tests.lines import SLACK
+
+STREAM, DATAGRAMS = "ldrobot-stl27l", "velodyne-vlp16"
+MS, SECOND = 1_000_000, 1_000_000_000
+#: seconds that the recordings of these tests take.
+LASTS = 0.25
+posix = pytest.mark.skipif(not hasattr(os, "openpty"), reason="needs pseudo terminals")
+
+
+@pytest.fixture
+def stream(tmp_path: Path) -> Path:
+    """A serial recording of 200 frames in pieces that do not end where frames do."""
+    sensor = ls.sensor(STREAM)
+    data = b"".join(sensor.example("data", seed=seed) for seed in range(200))
+    pieces = [data[start : start + 100] for start in range(0, len(data), 100)]
+    path = tmp_path / "stream.lsr"
+    with Recorder(path, STREAM) as kept:
+        for number, piece in enumerate(pieces):
+            kept.write(Chunk(piece, 10**18 + int(number * LASTS * SECOND / (len(pieces) - 1))))
+        kept.write(Chunk(b"a command", 10**18), "out")
+    return path
+
+
+@pytest.fixture
+def datagrams(tmp_path: Path) -> Path:
+    """A recording of 100 datagrams to two ports."""
+    sensor = ls.sensor(DATAGRAMS)
+    frames = [sensor.example("data", seed=seed) for seed in range(8)]
+    path = tmp_path / "datagrams.lsr"
+    with Recorder(path, DATAGRAMS) as kept:
+        for number in range(100):
+            data = frames[number % 8] if number % 9 else b""
+            at = 10**18 + int(number * LASTS * SECOND / 99)
+            kept.write(Chunk(data, at, ("192.168.1.201", 2368), ("192.168.1.10", 2368)))
+    return path
+
+
+@contextlib.contextmanager
+def playing(path: Path, target: Outlet, *, speed: float | None, began: list[float] | None = None) -> Iterator[list[BaseException]]:
+    """A replay in a thread of its own; what went wrong there, and by `began` when it began."""
+    failed: list[BaseException] = []
+
+    def run() -> None:
+        try:
+            target.await_listener()
+            if began is not None:
+                began.append(time.monotonic())
+            with contextlib.closing(transport(path)) as source:
+                for _ in replayed(source.chunks(), target, speed=speed):
+                    pass
+        except BaseException as error:
+            failed.append(error)
+        finally:
+            target.finish()
+            target.close()
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    try:
+        yield failed
+    finally:
+        thread.join(30)
+        assert not thread.is_alive()
+
+
+def content(path: Path) -> bytes:
+    with contextlib.closing(transport(path)) as source:
+        return b"".join(chunk.data for chunk in source.chunks())
+
+
+def from_pty(place: str) -> bytes:
+    descriptor = os.open(place, os.O_RDWR | os.O_NOCTTY)
+    try:
+        tty.setraw(descriptor)
+        os.write(descriptor, b"start")
+        return b"".join(until_the_end(lambda: os.read(descriptor, 997)))
+    finally:
+        os.close(descriptor)
+
+
+def from_tcp(place: str) -> bytes:
+    host, port = place.removeprefix("tcp://").split(":")
+    with socket.create_connection((host, int(port))) as connection:
+        connection.sendall(b"start")
+        return b"".join(until_the_end(lambda: connection.recv(997)))
+
+
+def until_the_end(read: Callable[[], bytes]) -> Iterator[bytes]:
+    with contextlib.suppress(OSError):  # a terminal that was hung up
+        while data := read():
+            yield data
+
+
+@pytest.mark.parametrize("speed", [0.5, 1.0, 10.0, None])
+@pytest.mark.parametrize("kind", [pytest.param("pty", marks=posix), "tcp"])
+def test_a_stream_comes_out_as_it_went_in_at_every_speed(stream: Path, kind: str, speed: float | None) -> None:
+    target = PtyOutlet() if kind == "pty" else TcpOutlet("127.0.0.1", 0, sole=True)
+    with playing(stream, target, speed=speed) as failed:
+        received = (from_pty if kind == "pty" else from_tcp)(target.place)
+    assert not failed
+    assert hashlib.sha256(received).hexdigest() == hashlib.sha256(content(stream)).hexdigest()
+    sensor = ls.sensor(STREAM)
+    assert sensor.decode(received).raw.tobytes() == sensor.decode(content(stream)).raw.tobytes()
+
+
+@pytest.mark.parametrize("speed", [0.5, 1.0, 10.0, None])
+def test_datagrams_come_out_as_they_went_in_at_every_speed(datagrams: Path, speed: float | None) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
+        receiver.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 20)
+        receiver.bind(("127.0.0.1", 0))
+        receiver.settimeout(SLACK * LASTS * 2)
+        with playing(datagrams, UdpOutlet(ports=receiver.getsockname()[1:]), speed=speed) as failed:
+            received = [receiver.recv(65536) for _ in range(100)]
+    assert not failed
+    with contextlib.closing(transport(datagrams)) as source:
+        sent = [chunk.data for chunk in source.chunks()]
+    assert received == sent
+    sensor = ls.sensor(DATAGRAMS)
+    assert sensor.decode(received).raw.tobytes() == sensor.decode(sent).raw.tobytes()
+
+
+@pytest.mark.parametrize("suffix", [".lsr", ".pcap"])
+def test_into_a_file_datagrams_keep_their_times_and_addresses(datagrams: Path, tmp_path: Path, suffix: str) -> None:
+    copy = tmp_path / f"copy{suffix}"
+    with playing(datagrams, FileOutlet(recorder(copy, DATAGRAMS, datagrams=True)), speed=None) as failed:
+        pass
+    assert not failed
+    with contextlib.closing(transport(datagrams)) as before, contextlib.closing(transport(copy)) as after:
+        assert list(after.chunks()) == list(before.chunks())
+    with ls.open(datagrams) as one, ls.open(copy, DATAGRAMS) as other:
+        expected, found = ([p.points().xyz for p in device.packets()] for device in (one, other))
+    np.testing.assert_array_equal(np.concatenate(expected), np.concatenate(found))
+
+
+def test_datagrams_go_to_the_ports_of_then(datagrams: Path) -> None:
+    with contextlib.ExitStack() as stack:
+        receivers = [stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) for _ in range(2)]
+        for receiver in receivers:
+            receiver.bind(("127.0.0.1", 0))
+            receiver.settimeout(SLACK)
+        target = stack.enter_context(contextlib.closing(UdpOutlet()))
+        for number, receiver in enumerate(receivers):
+            target.send([Chunk(bytes([number]), receiver=("10.0.0.1", receiver.getsockname()[1]))], patient=True)
+            assert receiver.recv(9) == bytes([number])
+        with pytest.raises(UsageError, match="which port"):
+            target.send([Chunk(b"nowhere")], patient=True)
+
+
+@posix
+@pytest.mark.parametrize("speed", [1.0, 2.0])
+def test_arrivals_keep_the_times_of_then(stream: Path, speed: float) -> None:
+    target, began, arrived = PtyOutlet(), list[float](), list[tuple[float, int]]()
+    with playing(stream, target, speed=speed, began=began):
+        descriptor, total = os.open(target.place, os.O_RDWR | os.O_NOCTTY), 0
+        with contextlib.suppress(OSError):
+            while data := os.read(descriptor, 4096):
+                total += len(data)
+                arrived.append((time.monotonic(), total))
+        os.close(descriptor)
+    assert total == len(content(stream))
+    due = [(size - 100) / (total - 100) * LASTS / speed for _, size in arrived[:-1]]
+    late = [at - began[0] - when for (at, _), when in zip(arrived[:-1], due, strict=True)]
+    assert min(late) >= 0  # nothing before its time; how late, depends on the machine
+    assert arrived[-1][0] - began[0] < LASTS / speed * SLACK
+
+
+class Clock:
+    """A clock that a sleeper oversleeps on, by more than the time between two chunks."""
+
+    def __init__(self) -> None:
+        self.time = 5 * SECOND
+
+    def now(self) -> int:
+        return self.time
+
+    def sleep(self, seconds: float) -> None:
+        self.time += round(seconds * SECOND) + 3 * MS
+
+
+class Listener(Outlet):
+    """Remembers when each chunk came."""
+
+    def __init__(self, clock: Clock) -> None:
+        self.clock, self.times = clock, list[int]()
+
+    def receive(self, wait: float) -> list[bytes]:
+        return []
+
+    def send(self, chunks: Sequence[Chunk], *, patient: bool) -> None:
+        self.times.append(self.clock.now())
+
+    def close(self) -> None: ...
+
+
+@pytest.mark.parametrize("speed", [0.25, 1.0, 3.0])
+def test_oversleeping_does_not_add_up(speed: float) -> None:
+    clock = Clock()
+    listener = Listener(clock)
+    chunks = [Chunk(b"x", 10**18 + number * MS) for number in range(10_000)]
+    late = [late for _, late in replayed(chunks, listener, speed=speed, now=clock.now, sleep=clock.sleep)]
+    due = [round(number * MS / speed) for number in range(10_000)]
+    errors = [at - listener.times[0] - when for at, when in zip(listener.times, due, strict=True)]
+    assert 0 <= min(errors) <= max(errors) <= 3 * MS
+    assert late == errors
+
+
+def test_as_fast_as_possible_never_waits() -> None:
+    clock = Clock()
+    listener = Listener(clock)
+    assert len(list(replayed([Chunk(b"", SECOND * n) for n in range(9)], listener, speed=None, now=clock.now, sleep=clock.sleep))) == 9
+    assert set(listener.times) == {5 * SECOND}
+
+
+def test_times_that_go_back_hold_nothing_up() -> None:
+    deadlines = Deadlines(1.0, 0)
+    overtaken = [deadlines.due(10**18 + at * MS) for at in (0, 10, 5, 20, 12, 30)]
+    assert overtaken == [0, 10 * MS, 5 * MS, 20 * MS, 12 * MS, 30 * MS]
+    set_back = [deadlines.due(at * MS) for at in (0, 10, 20)]
+    assert set_back == [30 * MS, 40 * MS, 50 * MS]
+    assert deadlines.due(None) == 0
+
+
+@posix
+def test_a_reader_that_leaves_is_noticed(stream: Path) -> None:
+    target = PtyOutlet()
+    with playing(stream, target, speed=1.0) as failed:
+        descriptor = os.open(target.place, os.O_RDWR | os.O_NOCTTY)
+        os.read(descriptor, 1)
+        os.close(descriptor)
+    assert [type(error) for error in failed] == [Disconnected]
+    server = TcpOutlet("127.0.0.1", 0, sole=True)
+    with playing(stream, server, speed=1.0) as failed, socket.create_connection(("127.0.0.1", int(server.place.split(":")[2]))) as reader:
+        reader.recv(1)
+    assert [type(error) for error in failed] == [Disconnected]
+
+
+@posix
+def test_the_last_bytes_reach_a_slow_reader(stream: Path) -> None:
+    target = PtyOutlet()
+    received = bytearray()
+    with playing(stream, target, speed=None):
+        descriptor = os.open(target.place, os.O_RDWR | os.O_NOCTTY)
+        time.sleep(0.4)
+        for data in until_the_end(lambda: os.read(descriptor, 4096)):
+            received += data
+            time.sleep(0.02)
+        os.close(descriptor)
+    assert received == content(stream)
+
+
+@pytest.mark.parametrize(
+    ("place", "holds_datagrams", "reason"),
+    [
+        ("pty", True, "datagrams were recorded"),
+        ("tcp://127.0.0.1:0", True, "datagrams were recorded"),
+        ("udp://127.0.0.1:9", False, "a byte stream was recorded"),
+        ("nonsense", False, "a replay goes to"),
+        ("tcp://127.0.0.1", False, "name the port"),
+    ],
+)
+def test_places_that_cannot_take_it_say_why(place: str, *, holds_datagrams: bool, reason: str) -> None:
+    with pytest.raises(UsageError, match=reason):
+        replay_outlet(place, datagrams=holds_datagrams)
+
+
+def test_an_address_in_use_is_told() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken, pytest.raises(SourceError, match="in use"):
+        TcpOutlet("127.0.0.1", taken.getsockname()[1])
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="counts descriptors in /proc")
+def test_players_give_everything_back(stream: Path) -> None:
+    before = len(os.listdir("/proc/self/fd"))
+    for made in (PtyOutlet(), TcpOutlet("127.0.0.1", 0, sole=True), UdpOutlet(ports=[9])):
+        made.close()
+    assert len(os.listdir("/proc/self/fd")) == before

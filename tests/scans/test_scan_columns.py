@@ -1,0 +1,196 @@
+"""The columns of scans: those of all points in a row, cut, whether they are made for one scan or shared by several."""
+
+from __future__ import annotations
+
+import gc
+import itertools
+import weakref
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import lidarspec as ls
+from lidarspec import Sensor
+from lidarspec.captures.pcap import Datagram, PcapWriter
+from lidarspec.framing.decoder import Decoder
+from lidarspec.packets.packets import Packets
+from lidarspec.packets.stream import PacketStream
+from lidarspec.points import lazy_columns
+from lidarspec.points.cloud import COLUMNS, PointCloud
+from lidarspec.scans.scans import Scan, scans_of
+from lidarspec.simulation.simulator import simulate
+from lidarspec.spec import OnChange, OnWrap
+from lidarspec.wire.frame_table import Rows
+from tests.shapes import SHAPES
+
+BACKENDS = ["numpy", "jit"]
+SENSORS = {**ls.sensors(), **{name: sensor for name, sensor in SHAPES.items() if sensor.frames}}
+
+
+def packets_of(name: str, number: int, backend: str) -> Packets:
+    if backend == "jit":
+        pytest.importorskip("numba")
+    return ls.sensor(name).decode(simulate(ls.sensor(name), number), backend=backend)
+
+
+def batches(packets: Packets, *sizes: int) -> list[Packets]:
+    edges = [0, *itertools.accumulate(sizes), len(packets)]
+    return [packets.take(slice(start, stop)) for start, stop in itertools.pairwise(edges)]
+
+
+def assert_cut_from(scans: list[Scan], whole: PointCloud, names: tuple[str, ...] = (*COLUMNS, "valid")) -> None:
+    start = 0
+    for scan in scans:
+        stop = start + len(scan)
+        for name in names:
+            found, wanted = getattr(scan.points, name), getattr(whole, name)
+            if name == "time":
+                assert abs(found + (scan.stamp_ns - whole.stamp_ns) * 1e-9 - wanted[start:stop]).max(initial=0) < 2e-9
+            elif wanted is None:
+                assert found is None
+            else:
+                np.testing.assert_array_equal(found, wanted[start:stop], err_msg=name)
+                assert found.dtype == wanted.dtype
+        start = stop
+    assert start == len(whole)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("least", [0, 1 << 14, 1 << 30])
+@pytest.mark.parametrize("name", ["velodyne-vlp16", "robosense-m1", "hesai-xt32"])
+def test_scans_are_the_points_of_the_whole_cut(name: str, least: int, backend: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(lazy_columns, "LEAST", least)
+    monkeypatch.setattr(lazy_columns, "SHARED", 5000)
+    packets = packets_of(name, 700, backend)
+    scans = list(scans_of(packets.sensor, batches(packets, 1, 300, 2, 333)))
+    assert len(scans) > 1
+    assert_cut_from(scans, packets.points())
+
+
+@pytest.mark.parametrize("order", [("time", "z", "valid"), ("azimuth", "x"), ("ring", "range", "y", "azimuth")])
+def test_columns_do_not_depend_on_the_order_in_which_they_are_read(order: tuple[str, ...]) -> None:
+    packets = packets_of("velodyne-vlp16", 200, "numpy")
+    assert_cut_from(list(scans_of(packets.sensor, batches(packets, 90))), packets.points(), order)
+
+
+def test_the_vendors_axes_hold_for_scans_too() -> None:
+    sensor = ls.sensor("hesai-xt32").configure(frame="vendor")
+    packets = sensor.decode(simulate(sensor, 400))
+    assert_cut_from(list(scans_of(sensor, batches(packets, 123))), packets.points())
+
+
+def test_large_scans_are_computed_without_the_rest_of_their_batch() -> None:
+    packets = packets_of("robosense-m1", 2000, "numpy")
+    scans = list(scans_of(packets.sensor, [packets]))
+    middle = scans[1].points
+    assert middle.x.base is not None
+    assert len(middle.x.base) < len(packets.points()) / 2
+    assert middle.x is middle.x
+
+
+def test_small_scans_share_what_is_computed() -> None:
+    sensor = small_scans()
+    packets = sensor.decode(simulate(ls.sensor("velodyne-vlp16"), 700))
+    scans = list(scans_of(sensor, [packets]))
+    bases = {id(scan.points.x.base) for scan in scans}
+    assert len(scans) > 300
+    assert len(bases) < 20
+    assert_cut_from(scans, packets.points())
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_small_scans_may_be_read_in_any_order(seed: int) -> None:
+    sensor = small_scans()
+    packets = sensor.decode(simulate(ls.sensor("velodyne-vlp16"), 400))
+    scans = list(scans_of(sensor, batches(packets, 190)))
+    for index in np.random.default_rng(seed).permutation(len(scans))[:100]:
+        assert scans[index].points.x is not None
+    assert_cut_from(scans, packets.points())
+
+
+def small_scans() -> Sensor:
+    """A sensor whose every packet is a scan of its own."""
+    vlp16 = ls.sensor("velodyne-vlp16")
+    return Sensor(
+        "test-small",
+        vendor="Test",
+        model="Small",
+        frames={"data": vlp16.frames["data"]},
+        points=vlp16.points,
+        scan=OnChange("timestamp"),
+        links=vlp16.links,
+        clock=vlp16.clock,
+        range_limits=vlp16.range_limits,
+        status="manual",
+        source="none",
+    )
+
+
+@pytest.mark.parametrize("sensor", [ls.sensor("velodyne-vlp16"), small_scans()], ids=["large", "small"])
+def test_packets_go_with_the_last_scan_that_is_made_of_them(sensor: Sensor) -> None:
+    waiting = batches(sensor.decode(simulate(ls.sensor("velodyne-vlp16"), 700)), 350)
+    known = [weakref.ref(packets) for packets in waiting]
+    gc.collect()
+    gc.disable()
+    try:
+        for scan in scans_of(sensor, (waiting.pop(0) for _ in range(2))):
+            assert len(scan.points.x) == len(scan.points.time) == len(scan)
+        del scan
+        assert not any(packets() for packets in known)
+    finally:
+        gc.enable()
+
+
+@pytest.mark.parametrize("opened", [False, True], ids=["packets", "capture"])
+def test_a_scan_is_forgotten_once_it_was_given(opened: bool, tmp_path: Path) -> None:
+    sensor, path = ls.sensor("velodyne-vlp16"), tmp_path / "some.pcap"
+    frames = simulate(sensor, 700)
+    with path.open("wb") as file:
+        writer = PcapWriter(file)
+        for frame in frames:
+            writer.write(Datagram(frame, 10**18, ("192.168.1.200", 2368), ("192.168.1.102", 2368)))
+    given = list[weakref.ref[Scan]]()
+    with ls.open(path, sensor) as device:
+        for scan in device.scans() if opened else scans_of(sensor, [sensor.decode(frames)]):
+            given.append(weakref.ref(scan))
+            assert len(scan.points.x) == len(scan)
+            assert sum(known() is not None for known in given) <= 2
+    assert len(given) > 5
+
+
+def test_a_sensor_that_turns_back_and_forth_is_cut_alike_in_any_batches() -> None:
+    sensor = ls.sensor("velodyne-vlp16")
+    assert isinstance(sensor.scan, OnWrap)
+    frames = simulate(sensor, 300)
+    packets = sensor.decode([*frames, *frames[::-1], *frames])
+    whole = [len(scan) for scan in scans_of(sensor, [packets])]
+    assert len(whole) > 8
+    for sizes in ((1, 7, 250), (310, 280), tuple([20] * 44)):
+        assert [len(scan) for scan in scans_of(sensor, batches(packets, *sizes))] == whole
+
+
+@pytest.mark.parametrize(("name", "backend"), [*((name, "numpy") for name in SENSORS), ("robosense-m1", "jit"), ("velodyne-vlp16", "jit")])
+def test_packets_that_stay_where_they_were_read_give_the_same_points(name: str, backend: str) -> None:
+    if backend == "jit":
+        pytest.importorskip("numba")
+    sensor = SENSORS[name]
+    frames = [sensor.example(sensor.data_frame, seed=seed) for seed in range(8)]
+    size = Counter(map(len, frames)).most_common(1)[0][0]
+    rows = np.stack([np.frombuffer(frame, np.uint8) for frame in frames if len(frame) == size])
+    apart = np.full((len(rows), size + 1), 0xFF, np.uint8)
+    apart[:, :size] = rows
+    starts, sizes = np.arange(len(rows)) * (size + 1), np.full(len(rows), size)
+    unknown = np.full(len(rows), -1)
+    found = []
+    for buffer, places in ((rows.reshape(-1), np.arange(len(rows)) * size), (apart.reshape(-1), starts)):
+        decoder = Decoder(sensor, stream=False, backend=backend)
+        stream = PacketStream(sensor, sensor.data_frame, decoder.stats, backend=backend)
+        found.append(stream.add([decoder.placed(buffer, places, sizes, unknown)]))
+    together, separate = found
+    assert len(together) == len(separate)
+    if isinstance(separate.table, Rows) and len(separate):
+        if len(separate.table.groups[0].where) == len(rows) > 1:
+            assert separate.table.groups[0].rows.strides[0] == size + (size > 1)
+        assert_cut_from([Scan(separate.points(), 0.0, True, sensor)], together.points())

@@ -1,0 +1,298 @@
+"""Simulated sensors on real lines: as a source of this process, on pseudo terminals, UDP, TCP and in files."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import os
+import re
+import socket
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import lidarspec as ls
+from lidarspec import SourceError, UsageError
+from lidarspec.errors import UnknownFormat
+from lidarspec.simulation.device import SimulatedDevice
+from lidarspec.simulation.faults import Faults
+from lidarspec.simulation.scenes import Room, read_scene
+from lidarspec.spec import Udp
+from lidarspec.testing.fixtures import virtual_port
+from lidarspec.transports.outlets import simulated_outlet
+from lidarspec.transports.serving import Served, write_file
+from tests.lines import SLACK, free_port
+from tests.simulation.test_simulator import off
+
+posix = pytest.mark.skipif(os.name != "posix", reason="pseudo terminals are POSIX")
+STL, VLP = ls.sensor("ldrobot-stl27l"), ls.sensor("velodyne-vlp16")
+
+
+def scans(device: ls.Device, number: int) -> list[ls.Scan]:
+    """So many whole scans; fails where they do not come."""
+    found: list[ls.Scan] = []
+    deadline = time.monotonic() + SLACK * 3
+    for scan in device.scans(wait=0.05):
+        found += [scan] if scan is not None and scan.complete else []
+        if len(found) >= number:
+            return found
+        assert time.monotonic() < deadline, f"{device} {device.warnings}"
+    raise AssertionError("the device ended")
+
+
+@pytest.mark.parametrize("name", ["ldrobot-stl27l", "cspc-m1c1-mini", "slamtec-rplidar-a1", "robosense-helios16p", "hesai-qt64"])
+def test_a_simulated_sensor_is_a_source_that_needs_no_other_word(name: str) -> None:
+    with ls.open(f"sim:{name}?rate=4") as device:
+        assert device.sensor.id == name
+        found = scans(device, 3)
+        assert device.stats.bad_checksum == device.stats.lost == device.stats.queue_dropped == 0
+    assert all(scan.points.valid.mean() > 0.95 for scan in found)
+
+
+def test_a_sensor_that_is_not_started_keeps_silent() -> None:
+    with ls.open("sim:slamtec-rplidar-a1", start=False) as device:
+        assert next(iter(device.packets(wait=0.3))).stats.bytes_in == 0
+        assert device.send("get_info").values.hardware == 7
+        assert device.send("scan").confirmed
+        assert scans(device, 1)
+
+
+def test_an_rplidar_is_opened_in_the_scan_mode_that_it_is_configured_for() -> None:
+    with ls.open("sim:slamtec-rplidar-a1?rate=4", ls.sensor("slamtec-rplidar-a1").configure(mode=3)) as device:
+        assert scans(device, 2)
+        assert set(device.stats.frames) == {"ultra", "ultra_descriptor"}
+
+
+def test_faults_of_a_source_are_seen_and_counted() -> None:
+    with ls.open("sim:velodyne-vlp16?rate=5&loss=0.05&seed=3") as device:
+        found = scans(device, 3)
+    assert sum(map(len, found)) < 0.99 * 3 * 75.35 * 384
+    with ls.open("sim:hesai-xt32?rate=2&loss=0.02&reorder=4") as device:
+        scans(device, 3)
+        assert device.stats.lost > 0
+        assert device.stats.late > 0
+    with ls.open("sim:ldrobot-stl27l?rate=3&errors=0.005") as device:
+        scans(device, 3)
+        assert device.stats.bad_checksum > 0
+
+
+def test_as_fast_as_possible_nothing_is_dropped_and_two_runs_are_the_same() -> None:
+    runs = []
+    for _ in range(2):
+        with ls.open("sim:robosense-m1?rate=max&seed=2") as device:
+            runs.append(list(itertools.islice(device.scans(), 4)))
+            assert device.stats.queue_dropped == device.stats.lost == 0
+    for first, second in zip(*runs, strict=True):
+        assert np.array_equal(first.points.xyz, second.points.xyz, equal_nan=True)
+
+
+def test_an_unplugged_source_comes_back() -> None:
+    with ls.open("sim:cspc-m1c1-mini?rate=3&unplug=1s&absent=200ms") as device:
+        scans(device, 2)
+        deadline = time.monotonic() + SLACK
+        while device.stats.disconnects == 0:
+            assert time.monotonic() < deadline
+            next(iter(device.packets(wait=0.05)))
+        assert scans(device, 1)
+        assert device.stats.frames["ack"] >= 2
+
+
+def test_a_scene_is_seen(tmp_path: Path) -> None:
+    path = tmp_path / "box.toml"
+    path.write_text("[[box]]\nlow = [2, -1, -1]\nhigh = [3, 1, 1]\n")
+    with ls.open(f"sim:ldrobot-stl27l?rate=4&scene={path}") as device:
+        points = scans(device, 1)[0].points
+    assert points.x[points.valid].min() == pytest.approx(2, abs=0.001)
+    assert 0.1 < points.valid.mean() < 0.2
+
+
+@pytest.mark.parametrize(
+    ("source", "said"),
+    [
+        ("sim:ldrobot-stl27", "did you mean 'ldrobot-stl27l'"),
+        ("sim:", "name the sensor"),
+        ("sim:ldrobot-stl27l?error=0.1", "did you mean 'errors'"),
+        ("sim:ldrobot-stl27l?rate=-1", "rate is a number above 0"),
+        ("sim:ldrobot-stl27l?rate=nan", "rate is a number above 0"),
+        ("sim:ldrobot-stl27l?seed=x", "seed is a whole number"),
+        ("sim:ldrobot-stl27l?reorder=3", "keep their order"),
+        ("sim:ldrobot-stl27l?errors=2", "errors = 2.0 is outside"),
+    ],
+)
+def test_a_wrong_source_says_what_is_wrong(source: str, said: str) -> None:
+    with pytest.raises(UsageError, match=said):
+        ls.open(source)
+
+
+@posix
+@pytest.mark.parametrize("name", ["ldrobot-stl27l", "cspc-m1c1-mini", "slamtec-rplidar-c1"])
+def test_on_a_serial_port_nothing_is_lost_and_every_command_is_answered(name: str) -> None:
+    sensor, room = ls.sensor(name), Room()
+    with virtual_port(sensor, scene=room) as port:
+        with ls.open(port.path, sensor) as device:
+            found = scans(device, 2)
+            assert device.stats.bad_checksum == 0
+            assert device.stats.bytes_skipped == device.stats.bytes_filler
+        deadline = time.monotonic() + SLACK
+        wanted = [command for command in (*sensor.on_open, *sensor.on_close) if sensor.commands[command].frame]
+        while port.device.heard != wanted and time.monotonic() < deadline:
+            time.sleep(0.01)
+        assert port.device.heard == wanted
+    for scan in found:
+        assert scan.points.valid.mean() > 0.98
+        assert off(room, scan.points.xyz[scan.points.valid].astype(np.float64)).max() < 0.0006
+
+
+@posix
+def test_what_is_sent_while_nobody_listens_is_lost_as_on_a_wire() -> None:
+    with virtual_port(STL) as port:
+        for _ in range(3):
+            with ls.open(port.path, STL) as device:
+                first = next(packets for packets in device.packets() if len(packets))
+                sent = port.device.sent["data"]
+                assert abs(int(first["timestamp"][0] * 1800) - sent) < 0.5 * 1800
+            time.sleep(0.2)
+        assert port.outlet.unsent > 0.3 * 84_600
+
+
+@posix
+def test_the_port_goes_away_with_its_plug_and_the_link_leads_to_the_new_one(tmp_path: Path) -> None:
+    link = tmp_path / "ttyLIDAR"
+    with virtual_port(STL, link=link) as port:
+        before = os.readlink(link)
+        with ls.open(str(link), STL) as device:
+            scans(device, 1)
+            port.unplug()
+            assert not link.is_symlink()
+            port.plug()
+            assert link.is_symlink()
+            assert os.readlink(link).startswith(os.path.dirname(before))
+            scans(device, 2)
+            assert device.stats.disconnects == 1
+    assert not link.is_symlink()
+
+
+@posix
+def test_a_link_stands_on_no_file_of_somebody_else(tmp_path: Path) -> None:
+    taken = tmp_path / "notes"
+    taken.write_text("mine")
+    with pytest.raises(SourceError, match="File exists"):
+        simulated_outlet(STL, "pty", taken)
+    assert taken.read_text() == "mine"
+    stale = tmp_path / "ttyOLD"
+    stale.symlink_to("/dev/pts/does-not-exist")
+    simulated_outlet(STL, "pty", stale).close()
+    assert not stale.is_symlink()
+
+
+def test_datagrams_go_to_the_declared_ports_by_their_kind_unless_one_is_named() -> None:
+    receivers = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(2)]
+    for receiver in receivers:
+        receiver.bind(("127.0.0.1", 0))
+        receiver.settimeout(SLACK)
+    ports = [receiver.getsockname()[1] for receiver in receivers]
+    sensor = dataclasses.replace(VLP, links={"data": Udp(*ports)})
+    with virtual_port(sensor, to="udp://") as port:
+        assert port.path == f"udp://127.0.0.1?port={ports[0]},{ports[1]}"
+        assert [{len(receiver.recv(2000)) for _ in range(20)} for receiver in receivers] == [{1206}, {512}]
+    with virtual_port(sensor, to=f"udp://127.0.0.1:{ports[1]}"):
+        assert {len(receivers[1].recv(2000)) for _ in range(60)} == {1206, 512}
+    for receiver in receivers:
+        receiver.close()
+
+
+def test_over_udp_all_packets_arrive() -> None:
+    number = free_port()
+    with ls.open(f"udp://127.0.0.1:{number}", "robosense-m1") as device, virtual_port("robosense-m1", to=f"udp://127.0.0.1:{number}"):
+        scans(device, 3)
+        assert device.stats.lost == 0
+
+
+def test_over_tcp_several_listen_and_a_slow_one_holds_nobody_up() -> None:
+    with virtual_port(STL, to="tcp://127.0.0.1:0") as port:
+        address = port.path.removeprefix("tcp://").split(":")
+        with socket.create_connection((address[0], int(address[1]))), ls.open(port.path, STL) as device, ls.open(port.path, STL) as other:
+            assert scans(device, 2)
+            assert scans(other, 2)
+        with pytest.raises(SourceError, match="in use"):
+            simulated_outlet(STL, port.path)
+        port.unplug()
+        with pytest.raises(SourceError):
+            ls.open(port.path, STL)
+        port.plug()
+        with ls.open(port.path, STL) as device:
+            assert scans(device, 1)
+
+
+@pytest.mark.parametrize(
+    ("name", "suffix"), [("ldrobot-stl27l", "bin"), ("cspc-m1c1-mini", "lsr"), ("slamtec-rplidar-a1", "bin"), ("robosense-m1", "pcap")]
+)
+def test_a_file_holds_what_the_sensor_would_have_sent(name: str, suffix: str, tmp_path: Path) -> None:
+    path, device = tmp_path / f"made.{suffix}", SimulatedDevice(ls.sensor(name), scene=Room())
+    written = write_file(device, path, 1.5)
+    assert written > 3000
+    with ls.open(path, name) as opened:
+        number = sum(map(len, opened.packets()))
+        assert opened.stats.frames == dict(device.sent)
+    assert number == device.sent.most_common(1)[0][1]
+    again = SimulatedDevice(ls.sensor(name), scene=Room())
+    write_file(again, tmp_path / f"again.{suffix}", 1.5)
+    if suffix == "bin":
+        assert path.read_bytes() == (tmp_path / f"again.{suffix}").read_bytes()
+
+
+def test_a_destination_that_cannot_carry_the_sensor_is_refused(tmp_path: Path) -> None:
+    for sensor, place, said in (
+        (STL, "udp://", "no datagrams"),
+        (VLP, "pty", "datagrams, which a serial port cannot carry"),
+        (VLP, "tcp://", "declares no TCP port"),
+        (STL, "http://localhost", "no destination"),
+        (VLP, "udp://?rate=3", "unknown option"),
+        (VLP, "udp://127.0.0.1:99999", "a port is a number"),
+    ):
+        with pytest.raises(UsageError, match=said):
+            simulated_outlet(sensor, place)
+    with pytest.raises(UsageError, match="goes with pty alone"):
+        simulated_outlet(VLP, "udp://", tmp_path / "link")
+    with pytest.raises(UnknownFormat):
+        write_file(SimulatedDevice(STL), tmp_path / "made.csv", 1)
+    with pytest.raises(SourceError):
+        simulated_outlet(VLP, "udp://no-such-host.invalid")
+
+
+@posix
+def test_what_goes_wrong_in_the_thread_of_a_port_is_raised_at_its_end() -> None:
+    tried = threading.Event()
+
+    class Broken(SimulatedDevice):
+        def sendings(self, now: int) -> list[tuple[str, str, bytes]]:
+            tried.set()
+            raise ZeroDivisionError
+
+    port = Served(Broken(STL, faults=Faults()), simulated_outlet(STL, "pty"))
+    assert tried.wait(10)
+    with pytest.raises(ZeroDivisionError):
+        port.close()
+
+
+PAGE = (Path(__file__).parents[2] / "docs" / "how-to" / "simulate.md").read_text(encoding="utf-8")
+
+
+@posix
+@pytest.mark.parametrize("block", re.findall(r"```python\n(.*?)```", PAGE, flags=re.DOTALL))
+def test_the_programs_on_the_page_run_as_they_stand(block: str) -> None:
+    done = subprocess.run([sys.executable, "-c", block], capture_output=True, text=True, check=False, timeout=120)
+    assert done.returncode == 0, done.stderr
+
+
+def test_the_scene_on_the_page_is_one(tmp_path: Path) -> None:
+    (text,) = re.findall(r"```toml\n(.*?)```", PAGE, flags=re.DOTALL)
+    (tmp_path / "hall.toml").write_text(text)
+    scene = read_scene(tmp_path / "hall.toml")
+    assert scene.walls == Room().walls
+    assert (len(scene.boxes), len(scene.movers)) == (1, 1)

@@ -1,0 +1,319 @@
+"""Checksums against catalogue check values, an oracle that works bit by bit, another library, and frames from manuals and captures."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import pickle
+import random
+import re
+import tracemalloc
+import zlib
+from itertools import product
+from operator import methodcaller
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from lidarspec.spec.checksums import Checksum, Crc, Fold15, Sum, WordXor, Xor, ZeroPadded
+
+VECTORS = Path(__file__).parents[3] / "shared" / "protocols" / "vectors_serial2d.json"
+
+CRC8_LDROBOT = Crc(8, 0x4D)
+CRC16_MODBUS = Crc(16, 0x8005, init=0xFFFF, refin=True, refout=True)
+CRC32 = Crc(32, 0x04C11DB7, init=0xFFFFFFFF, refin=True, refout=True, xorout=0xFFFFFFFF)
+M1C1 = WordXor(head=8, groups=(1, 2))
+
+# The checksum of b"123456789", as catalogues print it.
+CHECK_VALUES = [
+    (CRC8_LDROBOT, 0xC3),
+    (CRC16_MODBUS, 0x4B37),
+    (Crc(16, 0x1021, init=0xFFFF), 0x29B1),  # CCITT-FALSE
+    (Crc(32, 0x04C11DB7, init=0xFFFFFFFF), 0x0376E6E7),  # MPEG-2, Hesai
+    (CRC32, 0xCBF43926),
+    (Crc(32, 0xF4ACFB13, init=0xFFFFFFFF, refin=True, refout=True, xorout=0xFFFFFFFF), 0x1697D06A),  # AUTOSAR P4
+    (Crc(64, 0x42F0E1EBA9EA3693, init=2**64 - 1, refin=True, refout=True, xorout=2**64 - 1), 0x995DC9BBDF1939FA),  # XZ
+    (Crc(24, 0x864CFB, init=0xB704CE), 0x21CF02),  # OpenPGP
+    (Crc(12, 0x80F, refout=True), 0xDAF),  # UMTS
+    (Crc(5, 0x05, init=0x1F, refin=True, refout=True, xorout=0x1F), 0x19),  # USB
+    (Crc(3, 0x3, xorout=0x7), 0x4),  # GSM
+]
+ALGORITHMS: list[Checksum] = [
+    *(crc for crc, _ in CHECK_VALUES),
+    Crc(12, 0x80F, init=0x5A3, refin=True, xorout=0x0F1),
+    Crc(1, 1, init=1),
+    Crc(40, 0x0004820009, init=0x123456789A, refin=True),
+    Xor(),
+    *(Sum(width) for width in (1, 7, 8, 16, 20, 64)),
+    *(WordXor(head, groups) for head, groups in [(0, (2,)), (0, (1,)), (8, (1, 2)), (3, (2, 1)), (5, (1, 2, 2, 1))]),
+    Fold15(),
+    *(ZeroPadded(inner, to) for inner, to in [(CRC32, 4), (Crc(16, 0x1021, order="big"), 3), (Fold15(), 8)]),
+]
+name_of = methodcaller("describe")
+
+
+def bitwise_crc(crc: Crc, data: bytes) -> int:
+    """The CRC by its definition: one bit after the other through a shift register."""
+    register = crc.init
+    for byte in data:
+        for bit in range(8) if crc.refin else range(7, -1, -1):
+            feedback = register >> (crc.width - 1) & 1 ^ byte >> bit & 1
+            register = register << 1 & (1 << crc.width) - 1
+            if feedback:
+                register ^= crc.poly
+    if crc.refout:
+        register = sum((register >> bit & 1) << (crc.width - 1 - bit) for bit in range(crc.width))
+    return register ^ crc.xorout
+
+
+def random_rows(count: int, length: int, seed: int = 0) -> NDArray[np.uint8]:
+    rows = np.random.default_rng((seed, count, length)).integers(0, 256, (count, length), np.uint8)
+    rows.setflags(write=False)
+    return rows
+
+
+def singly(algorithm: Checksum, rows: NDArray[np.uint8]) -> list[int]:
+    return [algorithm(row.tobytes()) for row in rows]
+
+
+@pytest.mark.parametrize(("crc", "check"), CHECK_VALUES, ids=str)
+def test_catalogue_check_values(crc: Crc, check: int) -> None:
+    assert crc(b"123456789") == bitwise_crc(crc, b"123456789") == check  # the oracle is held to them too
+    rows = np.tile(np.frombuffer(b"123456789", np.uint8), (1000, 1))
+    assert crc.batch(rows).tolist() == [check] * 1000
+
+
+@pytest.mark.parametrize("length", [0, 1, 46, 1040, 5000, 300_001])
+def test_crc32_is_that_of_zlib(length: int) -> None:
+    data = random_rows(1, length).tobytes()
+    assert CRC32(data) == zlib.crc32(data)
+
+
+@pytest.mark.parametrize("width", range(1, 65))
+def test_every_width_agrees_with_the_bitwise_oracle(width: int) -> None:
+    rng, top = random.Random(width), 2**width - 1
+    for refin, refout in product((False, True), repeat=2):
+        crc = Crc(width, rng.randint(1, top), rng.randint(0, top), refin, refout, rng.randint(0, top))
+        for data in (rng.randbytes(length) for length in (0, 1, 2, 3, 7, 8, 9, rng.randint(10, 100), 2500)):
+            assert crc(data) == bitwise_crc(crc, data), (crc, len(data))
+        shapes = [(2100, 1), (450, 5), (270, 8), (30, 77), (5, rng.randint(500, 700)), (1024, 17), (1030, rng.randint(20, 90))]
+        for count, length in shapes:
+            rows = random_rows(count, length, seed=width)
+            values = crc.batch(rows)
+            for row in (0, count // 2, count - 1):
+                assert values[row] == bitwise_crc(crc, rows[row].tobytes()), (crc, length)
+
+
+def test_agrees_with_crccheck() -> None:
+    others = [other for other in pytest.importorskip("crccheck.crc").ALLCRCCLASSES if other._width <= 64]
+    assert len(others) > 100
+    rng = random.Random(1)
+    for other in others:
+        crc = Crc(other._width, other._poly, other._initvalue, other._reflect_input, other._reflect_output, other._xor_output)
+        assert crc(b"123456789") == other._check_result, other
+        for length in (*range(20), 300):
+            data = rng.randbytes(length)
+            assert crc(data) == other.calc(data), (other, length)
+        rows = random_rows(90, 31)
+        assert crc.batch(rows).tolist() == [other.calc(row.tobytes()) for row in rows], other
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS, ids=name_of)
+class TestBatch:
+    """A batch gives what its rows give one by one, whichever way it is computed."""
+
+    def test_every_short_length(self, algorithm: Checksum) -> None:
+        for length in range(71):
+            for count in (0, 3, 2048 // max(1, length) + 2):  # the last is past the point where CRCs leave the loop over bytes
+                values = algorithm.batch(random_rows(count, length))
+                assert values.dtype == np.uint64
+                assert values.tolist() == singly(algorithm, random_rows(count, length)), (count, length)
+
+    @pytest.mark.parametrize(("count", "length"), [(3, 1039), (40, 128), (9, 1210), (2, 24_832), (300, 1217), (11_000, 48)])
+    def test_long_rows_and_several_blocks(self, algorithm: Checksum, count: int, length: int) -> None:
+        rows = random_rows(count, length)
+        values = algorithm.batch(rows)
+        for row in {*range(0, count, 211), count - 1}:
+            data = rows[row].tobytes()  # of this length, a single CRC is a batch of one: the oracle has to judge
+            assert values[row] == (bitwise_crc(algorithm, data) if isinstance(algorithm, Crc) and length > 2000 else algorithm(data))
+
+    def test_bytes_anywhere_in_the_rows(self, algorithm: Checksum) -> None:
+        for spans in [((0, 8), (10, 85)), ((3, 5),), ((1, 2), (4, 9), (9, 30)), ((5, 5), (7, 7)), ((80, 88), (0, 3)), ((2, 3), (85, 88))]:
+            for count in (3, 300 if spans[0] == (0, 8) else 60):
+                rows = random_rows(count, 88)
+                joined = np.concatenate([rows[:, start:stop] for start, stop in spans], axis=1)
+                assert algorithm.over(rows, spans).tolist() == singly(algorithm, joined), (spans, count)
+        short = random_rows(400, 5)
+        assert algorithm.over(short, ((0, 1), (3, 5))).tolist() == singly(algorithm, short[:, [0, 3, 4]])
+
+    def test_any_strides(self, algorithm: Checksum) -> None:
+        for length in (13, 46):
+            buffer = random_rows(400, 3 * length)
+            for rows in (buffer[::2, 5 : 5 + length], buffer[::-1, ::3], buffer[:, length::-1], np.asfortranarray(buffer[:, :length])):
+                assert not rows.flags.c_contiguous
+                assert algorithm.batch(rows).tolist() == singly(algorithm, rows)
+
+
+@pytest.mark.parametrize("algorithm", [CRC8_LDROBOT, CRC32, Xor(), Sum(), Sum(64), M1C1, Fold15()], ids=name_of)
+def test_temporary_memory_is_bounded(algorithm: Checksum) -> None:
+    rows = random_rows(200_000, 47)
+    algorithm.batch(rows[:100])  # tables are not temporary
+    tracemalloc.start()
+    algorithm.batch(rows)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 4 * 8 * len(rows) + 3_000_000  # a few columns as long as the answer, and one block
+
+
+def test_sums_and_xors_by_hand() -> None:
+    data = bytes([0x12, 0x34, 0xFF, 0x80, 0x07])
+    assert Xor()(data) == WordXor(groups=(1,))(data) == 0x12 ^ 0x34 ^ 0xFF ^ 0x80 ^ 0x07
+    assert Sum()(data) == 0xCC
+    assert Sum(16)(data) == Sum(16, "big")(data) == 0x01CC
+    assert Sum(16)(b"\xff" * 258) == 258 * 255 - 65536
+    assert WordXor(groups=(1, 2))(data) == 0x0012 ^ 0xFF34 ^ 0x0080 ^ 0x0007  # the last word is cut short
+    assert WordXor(head=3, groups=(2, 1))(data) == 0x3412 ^ 0x00FF ^ 0x0780  # so is the head's
+    assert WordXor()(data) == WordXor(head=8, groups=(1,))(data) == 0x3412 ^ 0x80FF ^ 0x0007
+
+
+@pytest.mark.parametrize("length", [5, 58, 60, 61, 63, 64, 99, 3000])
+def test_fold15_by_its_formula_in_whole_numbers(length: int) -> None:
+    data, total = random_rows(1, length).tobytes(), 0
+    for at in range(0, length, 2):
+        total = (total << 1) + int.from_bytes(data[at : at + 2], "little")
+    assert Fold15()(data) == ((total & 0x7FFF) + (total >> 15)) & 0x7FFF
+
+
+@pytest.mark.parametrize("algorithm", [CRC8_LDROBOT, CRC32, Xor(), Sum(), M1C1], ids=name_of)
+def test_every_single_bit_error_is_seen(algorithm: Checksum) -> None:
+    frame = random_rows(1, 46)
+    flipped = frame ^ np.packbits(np.eye(8 * 46, dtype=np.uint8), axis=1)
+    assert not np.any(algorithm.batch(flipped) == algorithm(frame.tobytes()))
+    assert algorithm(frame.tobytes()) not in singly(algorithm, flipped)
+
+
+# Algorithm, where the field stands that holds the checksum of all other bytes, and the frames.
+OWN_FRAMES = [
+    (Xor(), -1, "AA 55 F0 0F"),
+    (M1C1, 8, "AA 55 6F 01 41 00 41 00 37 53 21 D3 07"),
+    (M1C1, 8, "AA 55 00 05 81 B1 81 02 59 CD 92 01 00 92 A1 0F 92 41 1F 92 01 00 92 81 3E"),
+    (Sum(16), 4, "A5 5A 00 00 80 01 81"),
+    (Fold15(), -2, "FA A0 00 4B E8 03 64 00 D0 47 0A 00 35 80 00 00 B8 0B 2C 01 1C 19"),
+]
+VECTOR_FRAMES = [
+    (Xor(), -1, "cspc_cmd_stop cspc_ack_start cspc_v11_ack_stop coin_d4_ack_capture"),
+    (Sum(16), 4, "cspc_info_corrected cspc_scan_start"),
+    (M1C1, 8, "cspc_start_packet_synth yd_tmini_16pt"),
+    (WordXor(), 8, "yd_40pt_wrap_capture yd_tg15_capture"),
+    (CRC8_LDROBOT, -1, "ld_manual_example ld_stl27l_10hz_synth ld14p_start ld06_capture_1 ld20_capture"),
+    (Fold15(), -2, "camsense_x1_capture camsense_x1_wrap_capture neato_synth lds08rr_capture_1 lds08rr_capture_2"),
+    (Sum(16, order="big"), -2, "delta_2a_data_capture"),
+    (Sum(), -1, "lslidar_n10_synth tfmini_frame_synth tfmini_set_rate_1000"),
+    (CRC16_MODBUS, -2, "wt53r_read wt53r_answer"),
+]
+
+
+def vectors() -> dict[str, bytes]:
+    if not VECTORS.exists():
+        pytest.skip("the protocol vectors are not beside the project: ../shared/protocols/vectors_serial2d.json")
+    return {entry["id"]: bytes.fromhex(entry["hex"]) for entry in json.loads(VECTORS.read_text(encoding="utf-8"))}
+
+
+def stored_and_computed(algorithm: Checksum, at: int, frame: bytes) -> tuple[int, int]:
+    start = at % len(frame)
+    end = start + (algorithm.width + 7) // 8
+    return int.from_bytes(frame[start:end], algorithm.order), algorithm(frame[:start] + frame[end:])
+
+
+def test_frames_of_the_fact_sheets() -> None:
+    for algorithm, at, frame in OWN_FRAMES:
+        stored, computed = stored_and_computed(algorithm, at, bytes.fromhex(frame))
+        assert computed == stored, frame
+
+
+def test_frames_of_the_vectors() -> None:
+    frames = vectors()
+    for algorithm, at, names in VECTOR_FRAMES:
+        for name in names.split():
+            stored, computed = stored_and_computed(algorithm, at, frames[name])
+            assert computed == stored, name
+    misprints = (Sum(16), 4, frames["cspc_info_as_printed"]), (CRC8_LDROBOT, -1, frames["ld_manual_table_variant"])
+    assert [stored_and_computed(*misprint) for misprint in misprints] == [(0x0402, 0x0403), (0x50, 0xD0)]
+
+
+def test_coin_d4_packets_of_a_capture() -> None:
+    packets = np.frombuffer(vectors()["coin_d4_startup_capture"][62:], np.uint8).reshape(2, 85)
+    stored, covered = packets[:, 8] + 256 * packets[:, 9].astype(int), np.delete(packets, [8, 9], axis=1)
+    assert M1C1.batch(covered).tolist() == stored.tolist() != WordXor().batch(covered).tolist()
+
+
+def test_algorithms_are_equal_and_hashed_by_their_parameters() -> None:
+    assert len(set(ALGORITHMS)) == len(ALGORITHMS)
+    assert {Crc(8, 0x4D), Crc(width=8, poly=0x4D, init=0), Xor(), Xor(), Sum(), Sum(8)} == {CRC8_LDROBOT, Xor(), Sum(8)}
+    assert Sum(16) != Sum(16, "big")
+    assert [(each.width, each.order) for each in (Xor(), M1C1, Fold15())] == [(8, "little"), (16, "little"), (15, "little")]
+    with pytest.raises(AttributeError):
+        CRC8_LDROBOT.poly = 0x07  # type: ignore[misc]
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS, ids=name_of)
+def test_takes_every_kind_of_bytes_and_pickles(algorithm: Checksum) -> None:
+    for data in (random_rows(1, length).tobytes() for length in (46, 47, 3000)):
+        assert algorithm(bytearray(data)) == algorithm(memoryview(data[::-1])[::-1]) == algorithm(data)
+        copy = pickle.loads(pickle.dumps(algorithm))
+        assert (copy, hash(copy), copy(data)) == (algorithm, hash(algorithm), algorithm(data))
+
+
+def test_padding_with_zeros_to_whole_words() -> None:
+    for data in (b"", b"1", b"1234", b"123456789"):
+        assert ZeroPadded(CRC32, 4)(data) == CRC32(data.ljust(-(-len(data) // 4) * 4, b"\0"))
+    padded = ZeroPadded(Crc(16, 0x1021, order="big"), 4)
+    assert (padded.width, padded.order) == (16, "big")
+
+
+def test_describe() -> None:
+    assert CRC8_LDROBOT.describe() == "CRC-8 poly 0x4d"
+    assert CRC16_MODBUS.describe() == "CRC-16 poly 0x8005 init 0xffff reflected"
+    assert Crc(12, 0x80F, refout=True, xorout=1).describe() == "CRC-12 poly 0x80f xorout 0x001 refout"
+    assert (Xor().describe(), Sum(16).describe(), Fold15().describe()) == ("XOR-8", "16-bit sum", "15-bit folded sum")
+    assert ZeroPadded(Xor(), 4).describe() == "XOR-8 of the bytes padded with zeros to a multiple of 4"
+    assert M1C1.describe() == "XOR-16 of 1+2-byte words after a head of 8 bytes"
+
+
+@pytest.mark.parametrize(
+    ("right", "name", "wrong_values"),
+    [
+        (CRC8_LDROBOT, "width", [0, 65, -8, 8.0, True, "8"]),
+        (CRC8_LDROBOT, "poly", [0, 0x14D, -1, None]),
+        (CRC8_LDROBOT, "init", [-1, 256, 1.0]),
+        (CRC8_LDROBOT, "xorout", [-1, 256]),
+        (CRC8_LDROBOT, "refin", [1, None]),
+        (CRC8_LDROBOT, "refout", [0, "yes"]),
+        (CRC8_LDROBOT, "order", ["middle", None]),
+        (Sum(), "width", [0, 65, 8.0]),
+        (Sum(), "order", [">"]),
+        (M1C1, "head", [-1, 1.0]),
+        (M1C1, "groups", [(), [1, 2], (1, 3), (0,), (1.0, 2), 2, None]),
+    ],
+)
+def test_wrong_parameters_are_refused(right: Any, name: str, wrong_values: list[object]) -> None:
+    for value in wrong_values:
+        with pytest.raises(ValueError, match=rf"^{type(right).__name__}: {name} must be .*, not {re.escape(repr(value))}$"):
+            dataclasses.replace(right, **{name: value})
+
+
+def test_an_algorithm_of_a_plugin_gets_its_batch_for_free() -> None:
+    class Scip(Checksum):
+        width = 7
+
+        def __call__(self, data: bytes | bytearray | memoryview) -> int:
+            return (sum(data) & 0x3F) + 0x30
+
+        def describe(self) -> str:
+            return "the sum that Hokuyo sends as one printable character"
+
+    rows = np.frombuffer(b"00P99b0Ee", np.uint8).reshape(3, 3)[:, :2]
+    assert bytes(Scip().batch(rows).tolist()) == b"Pbe"

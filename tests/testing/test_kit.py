@@ -1,0 +1,156 @@
+"""The test kit's own promises: strategies, shrinking, acknowledgements, vectors, and the fixtures in a pytest run of an author's."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from construct import Const, Int8ul, Int16ul, Struct
+from hypothesis import strategies as st
+
+from lidarspec import Sensor
+from lidarspec.spec import Checksummed, Fields, Frame, Polar, Sum, take
+from lidarspec.testing.check import Target, reports
+from lidarspec.testing.declared import declared
+from lidarspec.testing.findings import Violation, left_over
+from lidarspec.testing.frames import values_survive_building_and_parsing
+from lidarspec.testing.subject import Subject
+from lidarspec.testing.vectors import vectors_hold
+from tests.broken import sound
+
+AUTHOR = """
+import lidarspec as ls
+from lidarspec import errors
+import pytest
+from lidarspec.testing import SensorConformance
+
+class TestMine(SensorConformance):
+    sensor = {sensor!r}
+    examples = 4
+
+    def test_a_test_of_my_own(self, sensor):
+        assert sensor.id == "acme-x1"
+
+@pytest.mark.lidarspec("ldrobot-stl27l")
+def test_a_port(sensor, virtual_port):
+    with ls.open(virtual_port().path, sensor) as device:
+        assert len(next(device.scans())) > 100
+
+def test_nothing_is_installed(bare_registry):
+    assert ls.sensors() == {{}}
+    with pytest.raises(errors.UnknownSensor):
+        ls.sensor("ldrobot-stl27l")
+
+def test_all_is_installed_again():
+    assert ls.sensors()
+
+def test_which_sensor(sensor):
+    pass
+"""
+STRANGER = Path(__file__).resolve().parents[1] / "shapes" / "stranger" / "acme_lidars.py"
+
+
+def run(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, *words]
+    return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False, timeout=300)
+
+
+def codes(sensor: Sensor) -> set[str]:
+    return {finding.code for report in reports(Target([sensor]), sensor.id, examples=6) for finding in report.findings}
+
+
+def test_an_authors_tests_run_with_the_kits_fixtures(tmp_path: Path) -> None:
+    (tmp_path / "test_mine.py").write_text(AUTHOR.format(sensor=str(STRANGER)), encoding="utf-8")
+    done = run(tmp_path, "-m", "pytest", "-q", "-rs", "-p", "no:cacheprovider", "--strict-markers", ".")
+    assert "which sensor? mark the test with" in done.stdout
+    assert "there is no file of golden vectors" in done.stdout
+    assert "it has no commands with a documented reply" in done.stdout
+    assert "1 error" in done.stdout, done.stdout
+    assert "failed" not in done.stdout, done.stdout
+
+
+def test_the_plugin_loads_nothing_of_the_engine(tmp_path: Path) -> None:
+    (tmp_path / "test_other.py").write_text(
+        "import sys\n\ndef test_light():\n"
+        "    assert 'lidarspec.testing.plugin' in sys.modules\n"
+        "    heavy = {'numpy', 'construct', 'hypothesis', 'lidarspec.spec.description', 'lidarspec.plugins'}\n"
+        "    assert not heavy & sys.modules.keys()\n",
+        encoding="utf-8",
+    )
+    done = run(tmp_path, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-p", "no:hypothesispytest", ".")
+    assert done.returncode == 0, done.stdout
+
+
+def rare(f: object) -> object:
+    return f.key == 0xBEEF  # type: ignore[attr-defined]
+
+
+INFO = Checksummed(Struct("header" / Const(b"\x18\x81\x55"), "key" / Int16ul, "check" / Int8ul), field="check", algorithm=Sum(8))
+
+
+@pytest.mark.parametrize("how", [st.just(0xBEEF), lambda source: 0xBEEF], ids=["strategy", "function"])
+def test_what_cannot_be_derived_is_asked_for_by_name(how: object) -> None:
+    plain = sound.sensor()
+    sensor = replace(plain, frames={**plain.frames, "info": Frame(INFO, max_length=6, plausible=rare)})
+    assert codes(sensor) == {"LS301"}
+    subject = Subject(sensor, 6, strategies={"info.key": how})
+    assert {sensor.parse(subject.example("info", seed=seed)).key for seed in range(5)} == {0xBEEF}
+    values_survive_building_and_parsing(subject, "info")
+
+
+class Lossy(Sensor):
+    """It forgets the sign of the tilt."""
+
+    def build(self, frame, value=None, /, *, units=False, **values):  # type: ignore[no-untyped-def]
+        if frame == "data" and value is not None and value.get("tilt", 0) < -100:
+            value = {**value, "tilt": -value["tilt"]}
+        return super().build(frame, value, units=units, **values)
+
+
+def test_a_failing_edit_shrinks_to_the_field_at_fault() -> None:
+    with pytest.raises(Violation) as found:
+        values_survive_building_and_parsing(Subject(sound.sensor(kind=Lossy), 200), "data")
+    assert (found.value.code, found.value.path) == ("LS305", "data.tilt")
+    assert found.value.what == "-101 is written, and 101 is read"
+
+
+def left(sensor: Sensor) -> set[str]:
+    """What its declaration leaves over."""
+    return {finding.code for finding in left_over(declared(Subject(sensor)), sensor, whole=True)}
+
+
+def test_what_is_meant_is_acknowledged_with_a_reason() -> None:
+    far = sound.sensor(range_limits=(0.05, 100.0))
+    assert left(far) == {"LS210"}
+    assert left(replace(far, acknowledged={"LS210": "the next model reaches so far"})) == set()
+    assert left(replace(far, acknowledged={"LS210 data.samples.distance": "the next model reaches so far"})) == set()
+    assert left(replace(far, acknowledged={"LS210": " "})) == {"LS209", "LS210"}
+    assert left(replace(far, acknowledged={"LS210 data.tilt": "no"})) == {"LS209", "LS210"}
+
+
+def test_what_only_looks_up_a_table_needs_no_unit() -> None:
+    def points(f: Fields) -> Polar:
+        return Polar(f.samples.distance, take(np.linspace(0, 1, 256), f.number))
+
+    assert left(sound.sensor(points=points)) == set()
+    assert left(sound.sensor(points=lambda f: Polar(f.samples.distance, f.number / 256))) == {"LS201"}
+
+
+def test_vectors_that_prove_nothing_are_findings(tmp_path: Path) -> None:
+    file = tmp_path / "vectors.json"
+    for text, code in {
+        "{": "LS702",
+        "{}": "LS702",
+        '[{"frame": "none", "hex": "", "source": "x"}]': "LS702",
+        '[{"frame": "data", "hex": "zz", "source": "x"}]': "LS702",
+        '[{"frame": "data", "hex": "", "value": {}, "source": "x"}]': "LS702",
+        f'[{{"frame": "data", "hex": "{sound.sensor().example("data").hex()}", "source": " "}}]': "LS701",
+    }.items():
+        file.write_text(text, encoding="utf-8")
+        with pytest.raises(Violation) as found:
+            vectors_hold(Subject(sound.sensor(), vectors=file))
+        assert found.value.code == code, text

@@ -1,0 +1,185 @@
+"""UDP, on real sockets of the loopback interface."""
+
+from __future__ import annotations
+
+import socket
+import sys
+import time
+
+import pytest
+
+import lidarspec as ls
+from lidarspec.errors import SourceError, UsageError
+from lidarspec.transports.open_url import transport
+from lidarspec.transports.protocol import Chunk
+from lidarspec.transports.udp import BUFFER, UdpTransport, _Socket, shortfall
+from tests.lines import free_port, udp, until
+from tests.shapes import SHAPES
+
+LINUX = pytest.mark.skipif(sys.platform != "linux", reason="only Linux tells")
+
+
+def opened(source: str, sensor: ls.Sensor | None = None) -> UdpTransport:
+    made = transport(source, sensor)
+    assert isinstance(made, UdpTransport)
+    return made
+
+
+def read(one: UdpTransport, number: int) -> list[Chunk]:
+    found: list[Chunk] = []
+    until(lambda: found.extend(one.read(0.1)) or len(found) >= number)
+    return found
+
+
+def test_datagrams_of_several_ports_with_their_senders_and_times() -> None:
+    ports = free_port(), free_port()
+    one = opened(f"udp://?port={ports[0]},{ports[1]}")
+    with udp() as sender:
+        for index, port in enumerate(ports):
+            sender.sendto(bytes([index]), ("127.0.0.1", port))
+        sender.sendto(b"", ("127.0.0.1", ports[0]))
+        sender.sendto(bytes(65_507), ("127.0.0.1", ports[0]))
+        found = read(one, 4)
+        assert sorted(len(chunk.data) for chunk in found) == [0, 1, 1, 65_507]
+        assert {chunk.sender for chunk in found} == {sender.getsockname()}
+        assert {chunk.receiver[1] for chunk in found if chunk.receiver} == set(ports)
+        assert all(abs((chunk.at or 0) - time.time_ns()) < 5e9 for chunk in found)
+        one.write(b"hello")
+        assert sender.recv(16) == b"hello"
+    assert one.peer() == "127.0.0.1"
+    one.close()
+    one.close()
+
+
+def test_the_sensor_says_the_ports() -> None:
+    one = opened("udp://127.0.0.1", SHAPES["shape-datagrams"])
+    assert one.ports == (7001, 7002)
+    one.close()
+
+
+def test_a_host_binds_that_interface_alone() -> None:
+    port = free_port()
+    one = opened(f"udp://127.0.0.1:{port}")
+    with udp("127.0.0.2") as sender:
+        sender.sendto(b"wrong", ("127.0.0.2", port))
+        sender.sendto(b"right", ("127.0.0.1", port))
+    assert [chunk.data for chunk in read(one, 1)] == [b"right"]
+    one.close()
+
+
+def test_other_senders_are_foreign_where_one_is_asked_for() -> None:
+    port = free_port()
+    one = opened(f"udp://:{port}?src=127.0.0.2")
+    with udp("127.0.0.2") as wanted, udp("127.0.0.3") as other:
+        for sender in (other, wanted, other):
+            sender.sendto(sender.getsockname()[0].encode(), ("127.0.0.1", port))
+        until(lambda: one.foreign == 2 or one.read(0.01) or True)
+        time.sleep(0.05)
+        one.read(0.0)
+    assert one.foreign == 2
+    assert one.peer() == "127.0.0.2"
+    one.close()
+
+
+def test_without_recvmmsg_datagrams_come_one_by_one() -> None:
+    with udp() as sender, udp() as receiver:
+        receiver.setblocking(False)
+        one = _Socket(receiver, None)
+        assert list(one.datagrams(7)) == []
+        for data in (b"a", b"", bytes(65_507)):
+            sender.sendto(data, receiver.getsockname())
+        assert list(one.datagrams(7)) == [(data, sender.getsockname(), 7) for data in (b"a", b"", bytes(65_507))]
+
+
+@LINUX
+def test_many_datagrams_in_one_call() -> None:
+    number = free_port()
+    one = opened(f"udp://127.0.0.1:{number}")
+    with udp() as sender, udp("127.0.0.2") as other:
+        sent = [bytes([index % 256]) * (index % 1400) for index in range(700)]
+        for index, data in enumerate(sent):
+            (sender if index % 3 else other).sendto(data, ("127.0.0.1", number))
+        found = read(one, 700)
+        assert [chunk.data for chunk in found] == sent
+        assert [chunk.sender for chunk in found] == [(sender if index % 3 else other).getsockname() for index in range(700)]
+    assert [chunk.at for chunk in found] == sorted(chunk.at or 0 for chunk in found)
+    one.close()
+
+
+@LINUX
+def test_the_kernel_says_when_a_datagram_came() -> None:
+    port = free_port()
+    one = opened(f"udp://127.0.0.1:{port}")
+    with udp() as sender:
+        sender.sendto(b"early", ("127.0.0.1", port))
+        time.sleep(0.5)
+        (chunk,) = one.read(1.0)
+    assert one.clock.now() - (chunk.at or 0) >= 400_000_000
+    one.close()
+
+
+@LINUX
+def test_what_the_kernel_drops_is_counted_exactly() -> None:
+    port = free_port()
+    one = opened(f"udp://127.0.0.1:{port}")
+    (inner,) = one._sockets.values()
+    inner.socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 20_000)
+    with udp() as sender:
+        found = 0
+        for _ in range(2):
+            for _ in range(100):
+                sender.sendto(bytes(1000), ("127.0.0.1", port))
+            found += len(read(one, 1))
+            sender.sendto(b"last", ("127.0.0.1", port))
+            found += len(read(one, 1))
+    assert one.kernel_drops > 0
+    assert found + one.kernel_drops == 202
+    one.close()
+
+
+def test_a_multicast_group_is_joined() -> None:
+    port = free_port()
+    one = opened(f"udp://127.0.0.1:{port}?group=239.255.77.1")
+    second = opened(f"udp://127.0.0.1:{port}?group=239.255.77.1")
+    with udp() as sender:
+        sender.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, socket.inet_aton("127.0.0.1"))
+        sender.sendto(b"to all", ("239.255.77.1", port))
+    assert [read(each, 1)[0].data for each in (one, second)] == [b"to all", b"to all"]
+    one.close()
+    second.close()
+
+
+def test_a_buffer_that_is_too_small_is_told_with_the_line_that_mends_it() -> None:
+    assert shortfall(BUFFER, BUFFER) == []
+    (text,) = shortfall(8 << 20, 212_992)
+    assert text.endswith("next: sudo sysctl -w net.core.rmem_max=8388608")
+    assert "208 KiB of 8192" in text
+
+
+def test_the_buffer_is_read_back() -> None:
+    one = opened(f"udp://127.0.0.1:{free_port()}")
+    (inner,) = one._sockets.values()
+    kernel = inner.socket.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
+    assert inner.buffer == kernel // (2 if sys.platform == "linux" else 1)
+    assert bool(one.warnings) == (inner.buffer < BUFFER)
+    one.close()
+
+
+@pytest.mark.parametrize(
+    ("source", "error", "text", "following"),
+    [
+        ("udp://:{busy}", SourceError, "UDP port {busy} is in use by another program", "lidarspec doctor 'udp://:{busy}'"),
+        ("udp://192.0.2.1:{free}", SourceError, "192.0.2.1 is no address of this computer", "lidarspec doctor udp://:{free}"),
+        ("udp://", UsageError, "which port", ""),
+        ("udp://:2368?group=10.0.0.1", UsageError, "no multicast group", ""),
+        ("udp://?port=1,x", UsageError, "port is one number", ""),
+        ("udp://:99999", UsageError, "from 1 to 65535", ""),
+        ("udp://:2368?source=10.0.0.1", UsageError, "unknown option 'source'", ""),
+    ],
+)
+def test_what_cannot_be_opened_says_why(source: str, error: type[Exception], text: str, following: str) -> None:
+    with udp() as busy:
+        names = {"busy": busy.getsockname()[1], "free": free_port()}
+        with pytest.raises(error, match=text.format(**names)) as caught:
+            transport(source.format(**names))
+    assert not following or caught.value.__notes__ == [f"next: {following.format(**names)}"]

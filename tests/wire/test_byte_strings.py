@@ -1,0 +1,197 @@
+"""Byte strings in arrays and up to a terminator, elements that differ, and what is found out about a struct before bytes arrive."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from construct import (
+    Array,
+    BitsInteger,
+    BitStruct,
+    Bytes,
+    Computed,
+    Const,
+    CString,
+    FixedSized,
+    GreedyBytes,
+    If,
+    Int8sb,
+    Int8ub,
+    Int16ub,
+    NullTerminated,
+    Prefixed,
+    Struct,
+    Switch,
+    len_,
+    this,
+)
+
+from lidarspec import SpecError, UsageError, WireError
+from lidarspec.framing.frame_engine import CompiledCodec, InterpretedCodec, codec
+from lidarspec.testing.conformance import PROPERTIES
+from lidarspec.testing.subject import Subject
+from tests.engine.against_construct import BACKENDS, agree, sensor
+from tests.engine.engines import clean_and_damaged_input_read_alike, values_at_the_edges_read_alike
+
+TEXT = NullTerminated(GreedyBytes)
+COUNTED = [bytes([count, *range(1, 1 + size)]) for count in range(4) for size in range(15)]
+
+COMPILED: dict[str, Any] = {
+    "counted": Array(this.k, Bytes(3)),
+    "fixed": Array(2, Bytes(2)),
+    "nested": Array(2, Array(this.k, Bytes(2))),
+    "of a length": Array(2, Bytes(this.k)),
+    "in a struct": Array(this.k, Struct("a" / Bytes(1), "b" / Array(2, Bytes(1)))),
+    "empty elements": Array(this.k, Struct("x" / If(this._.k > 2, Int8ub))),
+    "of what is not there": If(lambda found: found.y is None, Int8ub),
+}
+INTERPRETED: dict[str, Any] = {
+    "terminated": TEXT,
+    "terminated ones": Array(this.k, TEXT),
+    "prefixed": Array(this.k, Prefixed(Int8ub, GreedyBytes)),
+    "of a fixed size": FixedSized(3, GreedyBytes),
+    "elements of several lengths": Array(this.k, Struct("n" / Int8ub, "x" / Bytes(this.n % 3))),
+    "arrays of several lengths": Array(this.k, Struct("n" / Int8ub, "x" / Array(this.n % 3, Int16ub))),
+    "a part of some elements": Array(this.k, Struct("n" / Int8ub, "x" / If(this.n % 2, Int16ub))),
+    "behind a condition": If(this.k == 3, Array(2, Struct("n" / Int8ub, "x" / Bytes(this.n)))),
+    "behind a case": Switch(this.k, {3: Array(2, Struct("n" / Int8ub, "x" / Int8ub, "y" / If(this.n == 9, Int8ub)))}),
+    "the length of an array": Struct("a" / Array(this._.k, Struct("b" / Int8ub)), "c" / Array(len_(this.a), Int8ub)),
+}
+
+
+#: the promises that are about reading and building single frames, and frames in bulk.
+HELD = {
+    "examples_are_valid_and_repeat",
+    "bytes_survive_parsing_and_building",
+    "values_in_units_build_the_same_bytes",
+    "a_truncated_frame_is_a_wire_error",
+    "single_packets_equal_a_batch",
+    "parse_decode_and_any_cutting_agree",
+}
+
+
+def frames() -> list[bytes]:
+    """Counts with numbers after them, and with terminated texts."""
+    return [
+        *COUNTED,
+        b"\x01ab\0",
+        b"\x02\0abc\0",
+        b"\x02abc\0x\0",
+        b"\x03a\0\0ccc\0",
+        b"\x03\0\0\0",
+        b"\x00\0",
+        b"\x01\0",
+        b"\x02ab\0",
+        b"\x07abc",
+    ]
+
+
+@pytest.mark.parametrize("name", [*COMPILED, *INTERPRETED])
+def test_they_are_read_and_built_as_in_construct(name: str) -> None:
+    struct = Struct("k" / Int8ub, "y" / If(this.k > 2, Int8ub), "v" / {**COMPILED, **INTERPRETED}[name])
+    found = codec(sensor(struct).frames["data"])
+    assert isinstance(found, CompiledCodec if name in COMPILED else InterpretedCodec), getattr(found, "reason", "")
+    assert agree(struct, frames()) >= 3
+
+
+@pytest.mark.parametrize("name", [*COMPILED, *INTERPRETED])
+def test_such_a_frame_keeps_every_promise(name: str) -> None:
+    fields: Any = {**COMPILED, **INTERPRETED}[name]
+    inner = Struct("magic" / Const(b"\xf1\x5a"), "k" / Int8ub, "y" / If(this.k > 2, Int8ub), "v" / fields, "end" / Const(b"\xe1\x77"))
+    subject = Subject(sensor(inner))
+    found = [finding for one in PROPERTIES if one.name in HELD and not one.lacks(subject) for finding in one.findings(subject)]
+    assert not found, found
+    values_at_the_edges_read_alike(subject.sensor)
+    clean_and_damaged_input_read_alike(subject.sensor)
+
+
+def test_numbers_are_taken_for_a_byte_string_and_nothing_else() -> None:
+    ours = sensor(Struct("k" / Int8ub, "v" / Array(this.k, Bytes(2))))
+    wanted = b"\x02abcd"
+    for value in ([b"ab", b"cd"], [[97, 98], [99, 100]], np.array([[97, 98], [99, 100]], np.uint8), [b"ab", [99, 100]]):
+        assert ours.build("data", v=value) == wanted
+    assert ours.build("data", v=[]) == b"\0"
+    for wrong in ([[97, 300]], [[97, "b"]], [b"abc"]):
+        with pytest.raises(UsageError, match="v"):
+            ours.build("data", v=wrong)
+
+
+@pytest.mark.parametrize("value", [None, 1.5])
+def test_what_is_no_list_and_no_bytes_is_the_callers_fault(value: Any) -> None:
+    for part in (Array(this.k, Int8ub), Bytes(this.k), Bytes(2)):
+        with pytest.raises(UsageError, match="v"):
+            sensor(Struct("k" / Int8ub, "v" / part)).build("data", k=2, v=value)
+
+
+def test_a_name_that_is_an_array_in_one_branch_alone_has_no_raw_form_and_its_columns_do() -> None:
+    forms = {1: Struct("x" / Int8ub), 2: Array(2, Struct("y" / Int8ub))}
+    packets = sensor(Struct("k" / Int8ub, "v" / Switch(this.k, forms))).decode([b"\1\5", b"\2\6\7"])
+    np.testing.assert_array_equal(packets["v.x"], [5, np.nan])
+    np.testing.assert_array_equal(packets["v.y"], [[np.nan, np.nan], [6, 7]])
+    with pytest.raises(SpecError, match="v: a value, a struct or an array by turns"):
+        _ = packets.raw
+
+
+def test_an_element_without_a_field_has_no_number_in_its_unit() -> None:
+    ours = sensor(Struct("v" / Array(3, Struct("n" / Int8ub, "x" / If(this.n == 1, Int8ub)))))
+    packets = ours.decode([b"\0\1\5\0", b"\1\7\1\7\1\7", b"\0\0\0"])
+    np.testing.assert_array_equal(packets["v.x"], [[np.nan, 5, np.nan], [7, 7, 7], [np.nan, np.nan, np.nan]])
+
+
+def test_there_is_no_one_length_of_arrays_that_differ() -> None:
+    ours = sensor(Struct("v" / Array(2, Struct("n" / Int8ub, "x" / Array(this.n, Int8ub)))))
+    packets = ours.decode([b"\0\0", b"\1\5\2\6\7"])
+    assert packets.raw["v"]["x"].tolist() == [[[0, 0], [0, 0]], [[5, 0], [6, 7]]]
+    with pytest.raises(SpecError, match=r"v\.x: its length differs"):
+        packets.count("v.x")
+
+
+def test_a_column_of_text_is_refused_by_name() -> None:
+    ours = sensor(Struct("a" / Int8ub, "v" / CString("ascii")))
+    assert ours.parse(b"\1ab\0").v == "ab"
+    assert ours.decode([b"\1ab\0"])["a"].tolist() == [1]
+    with pytest.raises(SpecError, match="v: its values are no numbers"):
+        ours.decode([b"\1ab\0"])["v"]
+
+
+def test_branches_that_no_column_can_hold_are_told() -> None:
+    struct = Struct(
+        "k" / Int8ub, "v" / Switch(this.k, {1: Int8ub, 2: Bytes(3)}), "w" / Switch(this.k, {1: Int8ub, 2: Struct("x" / Int8ub)})
+    )
+    packets = sensor(struct).decode([b"\1\2\3", b"\2\3\4\5\6"])
+    assert packets["k"].tolist() == [1, 2]
+    with pytest.raises(SpecError, match="v: its branches give values of different shapes"):
+        packets["v"]
+    packets = sensor(Struct("k" / Int8ub, "w" / struct.w)).decode([b"\1\3", b"\2\6"])
+    np.testing.assert_array_equal(packets["w.x"], [np.nan, 6])
+    with pytest.raises(SpecError, match="w: a value, a struct or an array by turns"):
+        _ = packets.raw
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_length_that_is_no_number_is_the_plugins_fault_and_a_negative_one_is_the_bytes(backend: str) -> None:
+    for part in (Array(this.k / 2, Int8ub), Bytes(this.k / 2)):
+        stats = sensor(Struct("k" / Int8ub, "v" / part)).decode([b"\2\1"], backend=backend).stats
+        assert (stats.plugin_errors, stats.bad_length) == (1, 0)
+    for part in (Array(this.k, Int8ub), Bytes(this.k)):
+        ours = sensor(Struct("k" / Int8sb, "v" / part))
+        stats = ours.decode([b"\xff\1"], backend=backend).stats
+        assert (stats.plugin_errors, stats.bad_length) == (0, 1)
+        with pytest.raises(WireError):
+            ours.parse(b"\xff\1")
+
+
+@pytest.mark.parametrize(
+    ("part", "reason"),
+    [
+        (Computed(this.a + 1), "Computed has no fixed place"),
+        (BitStruct("n" / BitsInteger(8), "x" / Switch(this.n, {77: BitsInteger(8)}, default=BitStruct("y" / BitsInteger(8)))), "b"),
+        (BitStruct("wide" / BitsInteger(72)), "its 72 bits are more than a column holds"),
+    ],
+)
+def test_the_reason_why_a_frame_is_not_compiled_is_true(part: Any, reason: str) -> None:
+    found = codec(sensor(Struct("a" / Int8ub, "b" / part)).frames["data"])
+    assert isinstance(found, InterpretedCodec)
+    assert reason in found.reason

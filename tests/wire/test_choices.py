@@ -1,0 +1,111 @@
+"""Parts that a named value chooses: construct looks an Enum's values up by their names, and so does every engine."""
+
+from __future__ import annotations
+
+import random
+from typing import Any
+
+import pytest
+from construct import (
+    Array,
+    BitsInteger,
+    BitStruct,
+    Const,
+    Enum,
+    If,
+    IfThenElse,
+    Int8ub,
+    Int16ub,
+    Int24ub,
+    Int32ub,
+    Rebuild,
+    Struct,
+    Switch,
+    this,
+)
+
+from lidarspec import SpecError
+from lidarspec.exports.messages import messages
+from lidarspec.framing.frame_engine import CompiledCodec, codec
+from lidarspec.spec import Scaled
+from lidarspec.spec.tree import Select, nodes
+from tests.engine.against_construct import BACKENDS, agree, sensor
+
+KIND = Enum(Int8ub, idle=1, busy=2, lost=7)
+FLAGS = BitStruct("low" / BitsInteger(5), "kind" / Enum(BitsInteger(3), idle=1, busy=2))
+
+CHOICES: dict[str, Any] = {
+    "names": Struct("kind" / KIND, "body" / Switch(this.kind, {"idle": Int8ub, "busy": Int16ub}, default=Int32ub)),
+    "numbers": Struct("kind" / KIND, "body" / Switch(this.kind, {1: Int8ub, 2: Int16ub, 3: Int16ub}, default=Int32ub)),
+    "names and numbers": Struct("kind" / KIND, "body" / Switch(this.kind, {2: Int8ub, "busy": Int16ub, 3: Int24ub}, default=Int32ub)),
+    "no default": Struct("kind" / KIND, "body" / Switch(this.kind, {"idle": Struct("a" / Int8ub)})),
+    "a condition": Struct("kind" / KIND, "body" / IfThenElse(this.kind == "busy", Int8ub, Int16ub)),
+    "a function": Struct("kind" / KIND, "body" / If(lambda found: found.kind in ("idle", "lost"), Int8ub)),
+    "its number": Struct("kind" / KIND, "body" / Array(lambda found: int(found.kind) % 4, Int8ub)),
+    "bits": Struct("flags" / FLAGS, "body" / Switch(this.flags.kind, {"idle": Int8ub, "busy": Int16ub}, default=Int32ub)),
+    "an array": Struct(
+        "kind" / KIND,
+        "rows" / Array(2, Struct("x" / Int8ub, "y" / Switch(this._.kind, {"busy": Int16ub}, default=Int8ub))),
+    ),
+    "further out": Struct("head" / Struct("kind" / KIND), "body" / Struct("x" / Switch(this._.head.kind, {"lost": Int8ub}))),
+    "a constant": Struct("kind" / Const("busy", KIND), "body" / Switch(this.kind, {"busy": Int16ub}, default=Int8ub)),
+    "a constant inside": Struct("x" / Int8ub, "kind" / Enum(Const(2, Int8ub), idle=1, busy=2), "y" / If(this.kind == "busy", Int8ub)),
+    "constant bits": Struct("x" / Int8ub, "f" / BitStruct("low" / BitsInteger(4), "kind" / Const("b", Enum(BitsInteger(4), a=1, b=2)))),
+}
+
+
+@pytest.mark.parametrize("name", CHOICES)
+def test_named_values_choose_as_in_construct(name: str) -> None:
+    struct, source = CHOICES[name], random.Random(name)
+    ours = sensor(struct)
+    assert isinstance(codec(ours.frames["data"]), CompiledCodec)
+    frames = {bytes([head, *source.randbytes(size)]) for head in (*range(10), 0x21, 0x22, 255) for size in range(1, 6) for _ in range(8)}
+    examples = {ours.example("data", seed=seed) for seed in range(20)}
+    assert agree(struct, sorted(frames | examples)) > len(examples) / 2
+
+
+def test_a_number_is_built_as_its_name_is() -> None:
+    ours = sensor(CHOICES["names"])
+    assert [ours.build("data", kind=kind, body=3) for kind in (1, "idle", 2, 4)] == [b"\1\3", b"\1\3", b"\2\0\3", b"\4\0\0\0\3"]
+
+
+@pytest.mark.parametrize("inside", [False, True])
+def test_what_build_fills_in_is_not_asked_of_a_frame_that_comes(inside: bool) -> None:
+    """`Rebuild` says what is written; single parse and both decoders take any value, and keep it."""
+    length = "length" / Rebuild(Int8ub, this._.size + 1 if inside else this.size + 1)
+    head = "head" / Struct(length) if inside else length
+    ours = sensor(Struct("size" / Int8ub, head, "data" / Array(this.size, Int8ub)))
+    right, wrong = b"\2\3\7\7", b"\2\x09\7\7"
+    assert ours.build("data", ours.parse(right)) == ours.build("data", ours.parse(wrong)) == right
+    for backend in BACKENDS:
+        found = ours.decode([right, wrong], backend=backend)
+        assert found["head.length" if inside else "length"].tolist() == [3, 9]
+    assert [ours.parse(data).head.length if inside else ours.parse(data).length for data in (right, wrong)] == [3, 9]
+
+
+def test_examples_are_of_every_name() -> None:
+    ours = sensor(CHOICES["names"])
+    assert {len(ours.example("data", seed=seed)) for seed in range(40)} == {2, 3, 5}
+
+
+def test_a_constant_is_one_of_the_names() -> None:
+    with pytest.raises(SpecError, match="'bsuy' is none of idle, busy"):
+        codec(sensor(Struct("kind" / Const("bsuy", KIND))).frames["data"])
+
+
+def test_one_field_has_one_unit() -> None:
+    """Else the column would have that of the branch that stands first."""
+    fine, coarse = Scaled(Int16ub, 0.001, "m"), Scaled(Int16ub, 0.002, "m")
+    for other in (coarse, Scaled(Int16ub, 0.001, "deg"), Scaled(Int16ub, 0.001, "m", offset=1), Int16ub):
+        rows = [Array(2, Struct("far" / part)) for part in (fine, other)]
+        with pytest.raises(SpecError, match=r"rows\.far: its branches have different scales or units"):
+            sensor(Struct("kind" / KIND, "rows" / Switch(this.kind, {"idle": rows[0], "busy": rows[1]})))
+    kept = sensor(Struct("kind" / KIND, "far" / Switch(this.kind, {"idle": fine, "busy": Scaled(Int32ub, 0.001, "m")})))
+    assert kept.decode([b"\1\0\5", b"\2\0\1\0\0"])["far"].tolist() == [0.005, 65.536]
+
+
+def test_exports_leave_out_what_is_never_chosen() -> None:
+    (found,) = [node for node in nodes(messages(sensor(CHOICES["names and numbers"]))[0].root) if isinstance(node, Select)]
+    assert [key for key, _ in found.cases] == [2, 3]
+    (found,) = [node for node in nodes(messages(sensor(CHOICES["numbers"]))[0].root) if isinstance(node, Select)]
+    assert [key for key, _ in found.cases] == [3]

@@ -1,0 +1,148 @@
+"""`parse` by layouts gives the very Container that construct gives."""
+
+from __future__ import annotations
+
+import random
+from typing import Any
+
+import construct
+import numpy as np
+import pytest
+from construct import (
+    Array,
+    BitsInteger,
+    BitStruct,
+    Bytes,
+    BytesInteger,
+    Const,
+    Enum,
+    Float32l,
+    Int8ub,
+    Int16sb,
+    Int16ub,
+    Int16ul,
+    Int24ul,
+    Struct,
+    Switch,
+    this,
+)
+
+import lidarspec as ls
+from lidarspec.framing.frame_engine import CompiledCodec, codec
+from lidarspec.spec import Frame
+from lidarspec.spec.construct_layer import clean
+from lidarspec.spec.sensor import Sensor
+from lidarspec.wire import layout_tree
+from lidarspec.wire.layout import Layout
+from lidarspec.wire.layout_tree import HeaderTree, frame_layouts
+from lidarspec.wire.parse import unpacked
+from tests.shapes import SHAPES
+
+EVERY = {**ls.sensors(), **SHAPES}
+CASES = [(sensor, name) for sensor in EVERY.values() for name, frame in sensor.frames.items() if isinstance(codec(frame), CompiledCodec)]
+
+
+def same(one: Any, other: Any) -> None:
+    """Equal values of equal types in equal order, NaNs by their bits."""
+    assert type(one) is type(other)
+    if isinstance(one, dict):
+        assert list(one) == list(other)
+        for name in one:
+            same(one[name], other[name])
+    elif isinstance(one, list):
+        assert len(one) == len(other)
+        for left, right in zip(one, other, strict=True):
+            same(left, right)
+    elif isinstance(one, float) and one != one:
+        assert getattr(one, "raw", b"") == getattr(other, "raw", b"")
+    else:
+        assert one == other
+
+
+def unpack(frame: Frame, data: bytes) -> Any:
+    """What the layout of a frame gives, None where it is left to construct."""
+    layouts = frame_layouts(frame)
+    assert isinstance(layouts, HeaderTree)
+    layout = layouts.layout(data)
+    return unpacked(frame.tree, layout, data) if isinstance(layout, Layout) and layout.sound(data) else None
+
+
+@pytest.mark.parametrize(("sensor", "name"), CASES, ids=[f"{sensor.id} {name}" for sensor, name in CASES])
+def test_every_frame_type_unpacks_to_what_construct_parses(sensor: Sensor, name: str) -> None:
+    for seed in range(12):
+        data = sensor.example(name, seed=seed)
+        found = unpack(sensor.frames[name], data)
+        assert found is not None, "left to construct"
+        same(found, clean(sensor.frames[name].prepared.parse(data)))
+
+
+@pytest.mark.parametrize(("sensor", "name"), CASES, ids=[f"{sensor.id} {name}" for sensor, name in CASES])
+def test_damaged_frames_are_left_to_construct(sensor: Sensor, name: str) -> None:
+    data = bytearray(sensor.example(name))
+    for spot in range(min(len(data), 60)):
+        data[spot] ^= 0x41
+        found = unpack(sensor.frames[name], bytes(data))
+        try:
+            expected = clean(sensor.frames[name].prepared.parse(bytes(data)))
+        except construct.ConstructError:
+            assert found is None
+        else:
+            if found is not None:
+                same(found, expected)
+        data[spot] ^= 0x41
+
+
+TRIPLE = Struct(
+    "a" / BytesInteger(3, signed=True), "b" / Const(b"\x07"), "c" / Bytes(2), "d" / BitStruct("x" / BitsInteger(3), "y" / BitsInteger(5))
+)
+
+#: arrays of every kind, written out and as loops, and loops in loops.
+ARRAYS = {
+    "written out": Array(6, TRIPLE),
+    "a loop": Array(30, TRIPLE),
+    "loops in loops": Array(3, Struct("rows" / Array(4, Array(5, Int24ul)), "end" / Int8ub)),
+    "numbers": Array(40, Int16sb),
+    "few numbers": Array(3, Int16ul),
+    "numbers in a loop": Array(20, Struct("low" / Array(4, Int16sb), "high" / Array(40, Int8ub))),
+    "floats": Array(40, Float32l),
+    "bytes": Array(40, Bytes(3)),
+    "blocks": Array(40, BitStruct("p" / BitsInteger(2), "q" / Array(3, BitsInteger(2)))),
+    "constants": Array(40, Const(5, Int8ub)),
+    "constants in structs": Array(40, Struct("mark" / Const(b"ab"))),
+    "none": Array(0, TRIPLE),
+    "labels": Array(40, Enum(Int8ub, idle=1, busy=2)),
+}
+
+
+@pytest.mark.parametrize("name", ARRAYS)
+def test_arrays_of_all_kinds(name: str) -> None:
+    frame = Frame(Struct("head" / Const(b"\x5a"), "inside" / ARRAYS[name], "tail" / Int16ul), max_length=1 << 20)
+    size = frame.prepared.sizeof()
+    layouts = frame_layouts(frame)
+    assert isinstance(layouts, HeaderTree)
+    layout = layouts.layout(bytes(size))
+    assert isinstance(layout, Layout)
+    rows = np.frombuffer(random.Random(name).randbytes(3 * size), np.uint8).reshape(3, size).copy()
+    layout.seal(rows)
+    for data in map(np.ndarray.tobytes, rows):
+        found = unpack(frame, data)
+        assert found is not None
+        same(found, clean(frame.prepared.parse(data)))
+        assert unpack(frame, data + b"\0") is None
+        assert unpack(frame, data[:-1]) is None
+
+
+def test_headers_lead_to_their_own_layout_also_after_some_were_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(layout_tree, "REMEMBERED", 20)
+    kinds = Switch(this.kind, {1: Int8ub, 2: Int16ub}, default=Int24ul)
+    rows = Array(this.count, Int16ul)
+    struct = Struct("head" / Const(b"\x5a"), "kind" / Int8ub, "count" / Int8ub, "rows" / rows, "more" / kinds, "end" / Int8ub)
+    frame = Frame(struct, max_length=700)
+    for count in [*range(60), *range(60), 3, 3]:
+        for kind in range(4):
+            data = bytes([0x5A, kind, count]) + random.Random(count).randbytes(2 * count + {1: 1, 2: 2}.get(kind, 3) + 1)
+            same(unpack(frame, data), clean(frame.prepared.parse(data)))
+            assert unpack(frame, data[:-1]) is None
+            assert unpack(frame, b"\x5b" + data[1:]) is None
+    assert unpack(frame, b"\x5a\x02") is None
+    assert unpack(frame, b"") is None
