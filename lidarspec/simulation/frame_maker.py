@@ -20,7 +20,7 @@ from lidarspec.errors import SpecError, UnknownFrame, UsageError
 from lidarspec.framing.frame_engine import CompiledCodec, InterpretedCodec, codec
 from lidarspec.framing.plausibility import plausibility
 from lidarspec.framing.results import VALID
-from lidarspec.spec.construct_layer import ConstructError, random_value
+from lidarspec.spec.construct_layer import Fault, random_value
 from lidarspec.spec.description import Spec
 from lidarspec.wire.build import build
 from lidarspec.wire.frame_table import Group, Rows
@@ -109,7 +109,7 @@ class FrameMaker:
     def _raw(self, values: Values, path: str) -> int:
         info = self.engine.schema.fields[path]
         if path in values:
-            return round((float(values[path]) - info.offset) / info.scale)
+            return int(info.raw(float(values[path])))
         return int(info.const) if isinstance(info.const, int) else 0
 
 
@@ -131,8 +131,7 @@ def _steps(leaf: Leaf, given: Sequence[Any]) -> NDArray[Any]:
         given = [_padded(value, leaf.shape[-1]) if isinstance(value, bytes) else value for value in given]
     values = np.array([np.asarray(value, np.float64) for value in given])
     values = values.reshape(*values.shape, *(1,) * (1 + len(leaf.shape) - values.ndim))
-    raw = (values - info.offset) / info.scale
-    return raw if info.kind == "float" else np.rint(raw).astype(np.int64)
+    return np.asarray(info.raw(values))
 
 
 def _padded(value: bytes, size: int) -> list[int]:
@@ -181,7 +180,7 @@ def _interpreted(sensor: Spec, frame: str, engine: InterpretedCodec, source: ran
     for _ in range(BATCH * TRIES):
         try:
             data = build(sensor, frame, random_value(engine.frame.prepared, source, drawn), {})
-        except (UsageError, ConstructError):  # what was drawn goes not together; something else may
+        except (UsageError, Fault):  # what was drawn goes not together; something else may
             continue
         if engine.survey(np.frombuffer(data, np.uint8), np.zeros(1, np.intp)).status[0] == VALID:
             return data
@@ -219,7 +218,7 @@ def _swept(sensor: Spec, frame: str, engine: CompiledCodec, source: random.Rando
         for path, value in values.items():
             leaf = layout.leaves.get(path)
             if leaf is not None and path not in chosen:
-                leaf.store(rows, np.rint((np.asarray(value, np.float64) - leaf.info.offset) / leaf.info.scale).astype(np.int64))
+                leaf.store(rows, leaf.info.raw(np.asarray(value, np.float64)))
         found = _plausible(sensor, frame, layout, _headed(rows, layout, chosen))
         if found:
             return found[0]
@@ -232,8 +231,7 @@ def _stated(engine: CompiledCodec, values: Mapping[str, Any]) -> Drawn:
     found: dict[str, Callable[[random.Random], Any]] = {}
     for path, value in values.items():
         if path in fields and np.ndim(value) == 0 and not isinstance(value, bytes):
-            raw = round((float(value) - fields[path].offset) / fields[path].scale)
-            found[path] = functools.partial(_always, raw)
+            found[path] = functools.partial(_always, fields[path].raw(float(value)))
     return found
 
 

@@ -154,7 +154,7 @@ class Measurement:
             if factor(info.unit, "m") is None or not any(path in group.layout.leaves for group in table.groups):
                 continue
             (answer,) = self._answers(table, path, PROBE)
-            expected = PROBE * info.scale + info.offset
+            expected = info.physical(PROBE)
             inner = [spot for spot in self._inner(table, answer) if np.isclose(_part(answer, spot), expected).any()]
             found += [Target(path, spot, info.scale, info.offset) for spot in inner]
         found = found or self._linear(table)

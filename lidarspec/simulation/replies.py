@@ -85,7 +85,7 @@ class Answering:
         """The physical values that tie a reply to its request."""
         fields = codec(self._sensor.frames[name]).schema.fields
         raw = {path: request.values[path] for path in request.command.echoes if path in request.values} | dict(request.command.matches)
-        return {path: value * fields[path].scale + fields[path].offset for path, value in raw.items() if path in fields}
+        return {path: fields[path].physical(value) for path, value in raw.items() if path in fields}
 
     def _request(self, frame: str, data: bytes, link: str) -> Request | None:
         """The command that a frame is: of several that fit, the one that says most about it."""

@@ -24,8 +24,8 @@ from lidarspec.simulation.frame_maker import FrameMaker, example, sealed
 from lidarspec.simulation.measuring import Beams, Measurement
 from lidarspec.simulation.scenes import Room, Scene
 from lidarspec.spec.description import Spec
-from lidarspec.spec.fields import exact
 from lidarspec.spec.links import Serial
+from lidarspec.spec.tree import exact
 from lidarspec.wire.frame_table import Rows
 
 Times = NDArray[np.int64]

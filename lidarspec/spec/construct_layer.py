@@ -80,6 +80,10 @@ _MISSING = object()
 UNNAMED = "(constant)"
 
 
+#: what construct raises where bytes or values do not fit a struct.
+Fault = ConstructError
+
+
 class Mismatch(ConstructError):  # type: ignore[misc]
     """A value on the wire that is not what the spec asks for; made a `WireError` by the engine."""
 
@@ -872,24 +876,6 @@ def leaves(parsed: Any, keys: tuple[str | int, ...] = ()) -> Iterator[tuple[tupl
             yield from leaves(value, (*keys, index))
     else:
         yield keys, int(parsed) if isinstance(parsed, construct.EnumIntegerString) else parsed
-
-
-def peeled(con: Construct, info: FieldInfo) -> tuple[Construct, FieldInfo]:
-    """What is below the wrappers that only describe (name, unit, labels, constant), and what they say."""
-    while True:
-        if isinstance(con, construct.Renamed):
-            info = replace(info, docs=con.docs or info.docs)
-        elif isinstance(con, Describing):
-            info = con.described(info)
-        elif isinstance(con, construct.Enum):
-            info = replace(info, labels={int(value): str(name) for value, name in con.ksymapping.items()})
-        elif isinstance(con, Const):
-            info = replace(info, const=_constant(con))
-        elif isinstance(con, construct.Rebuild):
-            info = replace(info, rebuilt=con.func)
-        elif not isinstance(con, construct.Default):
-            return con, info
-        con = con.subcon
 
 
 def is_expression(value: object) -> bool:

@@ -30,6 +30,7 @@ import operator
 import struct
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
+from fractions import Fraction
 from typing import Any, Literal
 
 import numpy as np
@@ -37,6 +38,11 @@ import numpy as np
 from lidarspec.errors import SpecError
 from lidarspec.spec.bits import BitField
 from lidarspec.spec.checksums import Checksum
+
+
+def exact(number: float | int) -> Fraction:
+    """The decimal number that was written, not the binary one nearest to it: 0.001 is 1/1000."""
+    return Fraction(repr(float(number))) if isinstance(number, float) else Fraction(number)
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,6 +87,38 @@ class FieldInfo:
     def scaled(self) -> bool:
         """Whether the physical value is another number than the raw one."""
         return self.scale != 1 or self.offset != 0
+
+    def physical(self, raw: Any) -> Any:
+        """Raw values in the field's unit.
+
+        Args:
+            raw: a number, or an array of any shape.
+
+        Returns:
+            The same kind of thing; raw values themselves where no scale is declared. A Fraction is scaled exactly.
+        """
+        if not self.scaled:
+            return raw
+        if isinstance(raw, Fraction):
+            return raw * exact(self.scale) + exact(self.offset)
+        return raw * self.scale + self.offset
+
+    def raw(self, physical: Any) -> Any:
+        """The raw values nearest to physical ones, halfway to the even one; of a float field those that are equal.
+
+        Args:
+            physical: a number in the field's unit, or an array of any shape.
+
+        Returns:
+            An int, or int64 of the same shape; floats for a float field. They may be beyond the field's limits.
+        """
+        if isinstance(physical, Fraction):
+            steps: Any = (physical - exact(self.offset)) / exact(self.scale)
+        else:
+            steps = (physical - self.offset) / self.scale if self.scaled else physical
+        if self.kind == "float":
+            return float(steps) if isinstance(steps, Fraction) else steps
+        return np.rint(steps).astype(np.int64) if isinstance(steps, np.ndarray) else round(steps)
 
     @property
     def limits(self) -> tuple[int, int]:

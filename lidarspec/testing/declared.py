@@ -227,7 +227,7 @@ def _reach(subject: Subject) -> Findings:
         metres = factor(info.unit, "m") if info is not None and info.kind == "int" else None
         if info is None or metres is None:
             return
-        reach.append(((info.limits[1] * info.scale + info.offset) * float(metres), f"{name}.{info.path}"))
+        reach.append((info.physical(info.limits[1]) * float(metres), f"{name}.{info.path}"))
     furthest, path = max(reach, default=(np.inf, ""))
     if subject.sensor.range_limits[1] > furthest * 1.001:
         yield "LS210", f"it ends at {furthest:g} m, and range_limits at {subject.sensor.range_limits[1]:g} m", path
