@@ -17,6 +17,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from lidarspec.errors import UnknownFrame, UnknownName, UsageError
+from lidarspec.spec.description import with_frames
 
 if TYPE_CHECKING:
     from lidarspec.spec.sensor import Sensor
@@ -51,8 +52,7 @@ def narrowed(sensor: Sensor, frame: str) -> Sensor:
     """
     if frame not in sensor.frames:
         raise UnknownFrame(frame, sensor.frames, place=sensor.id)
-    alone = {frame: replace(sensor.frames[frame], after=None)}
-    return replace(sensor, frames=alone, commands={}, state={}, on_open=(), on_close=())
+    return with_frames(sensor, {frame: replace(sensor.frames[frame], after=None)})
 
 
 def export(sensor: Sensor, kind: str) -> str:

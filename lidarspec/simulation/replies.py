@@ -9,7 +9,7 @@ from typing import Any
 from lidarspec.framing.decoder import Decoder
 from lidarspec.framing.frame_engine import codec
 from lidarspec.simulation.frame_maker import FrameMaker
-from lidarspec.spec.description import Answer, Command, Spec
+from lidarspec.spec.description import Answer, Command, Spec, with_frames
 from lidarspec.spec.links import is_datagram
 from lidarspec.wire.parse import parse
 
@@ -104,8 +104,7 @@ class Answering:
 def _listening(sensor: Spec, link: str) -> Decoder:
     """A decoder of what is sent to the sensor: the outgoing frames, seen from its side."""
     frames = {name: replace(frame, direction="in") for name, frame in sensor.frames.items() if frame.direction == "out"}
-    mirrored = replace(sensor, frames=frames, commands={}, state={}, on_open=(), on_close=())
-    return Decoder(mirrored, stream=not is_datagram(sensor.links.get(link)))
+    return Decoder(with_frames(sensor, frames), stream=not is_datagram(sensor.links.get(link)))
 
 
 def _flat(values: Mapping[str, Any], prefix: str = "") -> Iterable[tuple[str, Any]]:

@@ -9,10 +9,10 @@ from __future__ import annotations
 import re
 import sys
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from types import MappingProxyType
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 from construct import Construct
 
@@ -246,6 +246,14 @@ class Spec:
     def __repr__(self) -> str:
         options = "".join(f", {name}={value!r}" for name, value in self.options.items())
         return f"Sensor({self.id}, {self.vendor} {self.model}, frames: {', '.join(self.frames) or 'none yet'}{options})"
+
+
+_AnySpec = TypeVar("_AnySpec", bound=Spec)
+
+
+def with_frames(sensor: _AnySpec, frames: Mapping[str, Frame]) -> _AnySpec:
+    """A sensor with these frame types alone, and without what names others: commands, state, what frames say of the device."""
+    return replace(sensor, frames=frames, commands={}, state={}, info={}, on_open=(), on_close=())
 
 
 def _freeze(value: object, *names: str) -> None:

@@ -10,6 +10,7 @@ each sensor is held to its declaration and to the properties of `conformance`, i
 from __future__ import annotations
 
 import ast
+import functools
 import importlib.util
 import inspect
 import re
@@ -255,9 +256,15 @@ class Places:
     def _function(self, frame: str, name: str, sensor: Sensor | None) -> Spot | None:
         if sensor is None or frame not in sensor.frames:
             return None
-        function = getattr(sensor.frames[frame], name, None) or getattr(sensor, name, None)
-        code = getattr(function, "__code__", None)
-        return (code.co_filename, code.co_firstlineno) if code is not None else None
+        functions = {
+            "points": sensor.points_of(frame),
+            "plausible": sensor.frames[frame].plausible,
+            "sweep": sensor.simulation_of(frame).sweep,
+        }
+        function = functions[name]
+        while isinstance(function, functools.partial):
+            function = function.func
+        return (function.__code__.co_filename, function.__code__.co_firstlineno) if inspect.isfunction(function) else None
 
     def _field(self, parts: tuple[str, ...]) -> Spot | None:
         """The field whose names in the text are the longest end of the path."""

@@ -103,6 +103,7 @@ LINES = {
     "this_decides": "this.count == 1",
     "swallowed_in_plausible": "except Exception",
     "degrees": "def points",
+    "sweep_of_nothing": "def sweep",
     "not_importable": "import a_library",
     "no_longest_length": "Frame(sealed()",
     "bare_const": '"order": Frame(',

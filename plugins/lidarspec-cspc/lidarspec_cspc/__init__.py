@@ -14,13 +14,14 @@ for the announced switch between 5.5 and 7 Hz. Besides the fillers FE and FF, a 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
+from functools import partial
 from typing import Any
 
 import numpy as np
 from construct import Array, BitsInteger, BitStruct, Bytes, ByteSwapped, Const, Construct, Int8ul, Int16ul, Struct, this
 
-from lidarspec import Sensor, UsageError
+from lidarspec import UsageError
 from lidarspec.spec import (
     Checksummed,
     Command,
@@ -29,6 +30,7 @@ from lidarspec.spec import (
     OnFlag,
     Polar,
     Scaled,
+    Sensor,
     Serial,
     Simulation,
     Sum,
@@ -149,23 +151,19 @@ def correction(distance: Any) -> Any:
     return np.where(distance > 0, np.rad2deg(np.arctan(19.16 * (mm - 90.15) / (90.15 * mm))), 0)
 
 
-def points_from(zero: str) -> Callable[[Fields], Polar]:
-    """The points function with angles counted from the zero of the data, or from the one marked on the housing."""
-
-    def points(f: Fields) -> Polar:
-        raw = spread(f.fsa.angle, f.lsa.angle, f.lsn, full=360.0)  # degrees, (n, LSN)
-        clockwise = raw - np.where(f.state.info.correction == 1, correction(f.samples.distance), 0)
-        if zero == "housing":
-            clockwise = clockwise + f.state.info.zero_angle
-        rate = last(f.mt.frequency, where=(f.mt.start == 1) & (f.mt.frequency > 0)) * 360  # degrees per second
-        return Polar(
-            range=f.samples.distance,
-            azimuth=-np.deg2rad(clockwise),  # clockwise (manual, section 1a)
-            intensity=f.samples.intensity,
-            time=np.nan_to_num((raw - f.fsa.angle) / rate),
-        )
-
-    return points
+def points(f: Fields, zero: str = "data") -> Polar:
+    """Even steps from FSA to LSA, corrected (manual 2.2.3), from the zero of the data or from the one marked on the housing."""
+    raw = spread(f.fsa.angle, f.lsa.angle, f.lsn, full=360.0)  # degrees, (n, LSN)
+    clockwise = raw - np.where(f.state.info.correction == 1, correction(f.samples.distance), 0)
+    if zero == "housing":
+        clockwise = clockwise + f.state.info.zero_angle
+    rate = last(f.mt.frequency, where=(f.mt.start == 1) & (f.mt.frequency > 0)) * 360  # degrees per second
+    return Polar(
+        range=f.samples.distance,
+        azimuth=-np.deg2rad(clockwise),  # clockwise (manual, section 1a)
+        intensity=f.samples.intensity,
+        time=np.nan_to_num((raw - f.fsa.angle) / rate),
+    )
 
 
 def configure(sensor: Sensor, *, zero: str = "data") -> Sensor:
@@ -178,7 +176,7 @@ def configure(sensor: Sensor, *, zero: str = "data") -> Sensor:
     """
     if zero not in ("data", "housing"):
         raise UsageError(f"{sensor.id}: zero is 'data' or 'housing', not {zero!r}")
-    return dataclasses.replace(sensor, points=points_from(zero))
+    return dataclasses.replace(sensor, points=partial(points, zero=zero))
 
 
 def sweep(i: int) -> dict[str, float]:
@@ -213,13 +211,13 @@ M1C1_MINI = Sensor(
     vendor="CSPC",
     model="M1C1_Mini",
     frames={
-        "ack": Frame(ACK, max_length=12, plausible=ack_plausible),
-        "info": Frame(INFO, max_length=27),
-        "scan_start": Frame(SCAN_START, max_length=7),
+        "ack": Frame(ACK, plausible=ack_plausible),
+        "info": Frame(INFO),
+        "scan_start": Frame(SCAN_START),
         "data": Frame(DATA, data=True, max_length=10 + 3 * 255, plausible=plausible),
-        "command": Frame(COMMAND, direction="out", max_length=4),
+        "command": Frame(COMMAND, direction="out"),
     },
-    points=points_from("data"),
+    points=points,
     scan=OnFlag("mt.start"),
     # 150 000 for this 3-byte format and DTR low: the SDK; 115 200: v1.1, for the older 2-byte format.
     links={"data": Serial(150_000, 115_200, dtr=False)},
@@ -238,6 +236,9 @@ M1C1_MINI = Sensor(
     on_close=("stop",),
     range_limits=(0.001, 16.383),  # what the field can hold; the manual gives none
     vendor_axes=("forward", "right", "up"),
+    turn=(LOW_SPEED, 7.0),  # manual 1c
+    relatives={"cspc-coin-d4": "info.model"},
+    info={"model": "info.model", "firmware": "info.revision"},  # ack.firmware is 0 but in the answer to start (manual 2.1.3)
     status="vectors",
     source="CSPC M1C1_Mini development manual (3-byte samples), sections 1 and 2; baud rate and FC from the vendor's SDK",
 )
@@ -249,6 +250,8 @@ COIN_D4 = dataclasses.replace(
     links={"data": Serial(230_400, dtr=False)},
     simulation=Simulation(sweep, answers={"start": started(1, b"COIN-D4", 1, b"\xfa\xfa"), "get_version": VERSION}),
     state={"info": {"correction": 0, "zero_angle": 0}},  # the device information of a live unit
+    turn=None,  # the manual's two speeds are the M1C1_Mini's
+    relatives={"cspc-m1c1-mini": "info.model"},
     status="capture",
     source="the M1C1_Mini's manual; baud rate from the vendor's SDK; a captured start-up of a COIN-D4",
 )

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from lidarspec import Sensor
-from lidarspec.spec import hookimpl
+from lidarspec.spec import Sensor, hookimpl
 from lidarspec_hesai.pandar40p import PANDAR40P
 from lidarspec_hesai.qt64 import QT64
 from lidarspec_hesai.xt import XT16, XT32

@@ -10,14 +10,14 @@ import dataclasses
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec import Sensor, UsageError
-from lidarspec.spec import Points
+from lidarspec import UsageError
+from lidarspec.spec import Points, Sensor
 
 Table = NDArray[np.float64]
 
@@ -46,29 +46,33 @@ def nominal(elevation: Iterable[float], azimuth: Iterable[float], firing_us: Ite
     return Calibration(np.array(list(elevation)), np.array(list(azimuth)), np.array(list(firing_us)) * 1e-6)
 
 
-def configuring(table: Calibration, points_with: Callable[[Calibration], Callable[[Any], Points]]) -> Callable[..., Sensor]:
-    """The `configure` function of a model: its points with the tables of one unit's files."""
+def configure(
+    points: Callable[..., Points],
+    table: Calibration,
+    sensor: Sensor,
+    /,
+    *,
+    calibration: str | Path | None = None,
+    firing_times: str | Path | None = None,
+) -> Sensor:
+    """The sensor with a unit's own tables in place of the model's; a file named in an earlier `configure` stays.
 
-    def configure(sensor: Sensor, *, calibration: str | Path | None = None, firing_times: str | Path | None = None) -> Sensor:
-        """The sensor with a unit's own tables; a file named in an earlier `configure` stays.
+    Args:
+        points: the model's function of `Fields` and the channels' `Calibration`.
+        table: the model's channels.
+        calibration: CSV of channel, elevation and azimuth in degrees.
+        firing_times: CSV of channel and firing time in microseconds.
 
-        Args:
-            calibration: CSV of channel, elevation and azimuth in degrees.
-            firing_times: CSV of channel and firing time in microseconds.
-
-        Raises:
-            UsageError: for a file that cannot be read, or does not list the channels of this model.
-        """
-        angles, times = calibration or sensor.options.get("calibration"), firing_times or sensor.options.get("firing_times")
-        found = table
-        if angles:
-            elevation, azimuth = columns(angles, len(table), 2)
-            found = dataclasses.replace(found, elevation=elevation, azimuth=azimuth, nominal=False)
-        if times:
-            found = dataclasses.replace(found, firing=columns(times, len(table), 1)[0] * 1e-6)
-        return dataclasses.replace(sensor, points=points_with(found))
-
-    return configure
+    Raises:
+        UsageError: for a file that cannot be read, or does not list the channels of this model.
+    """
+    angles, times = calibration or sensor.options.get("calibration"), firing_times or sensor.options.get("firing_times")
+    if angles:
+        elevation, azimuth = columns(angles, len(table), 2)
+        table = dataclasses.replace(table, elevation=elevation, azimuth=azimuth, nominal=False)
+    if times:
+        table = dataclasses.replace(table, firing=columns(times, len(table), 1)[0] * 1e-6)
+    return dataclasses.replace(sensor, points=partial(points, channels=table))
 
 
 def columns(path: str | Path, channels: int, number: int) -> list[Table]:

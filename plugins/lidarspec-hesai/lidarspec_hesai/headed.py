@@ -7,15 +7,12 @@ Source: HesaiLidar_SDK_2.0 (udp_protocol_header.h, udp_protocol_v3_1.h, udp_prot
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
 from construct import Array, BitsInteger, BitStruct, Bytes, Const, Construct, If, Int8ul, Int16ul, Int32ul, Struct, this
 
-from lidarspec.spec import Fields, Polar, Scaled
-from lidarspec_hesai.calibration import Calibration
-from lidarspec_hesai.parts import beams
+from lidarspec.spec import Fields, Scaled
 
 #: the unit of distances that every known firmware states, in millimetres; used for simulation only.
 USUAL_UNIT = 4
@@ -51,35 +48,16 @@ def plausible(f: Fields) -> Any:
     return (f.dis_unit >= 1) & (f.return_count >= 1) & (f.return_count <= 3) & (f.blocks.azimuth < 360)
 
 
-def points_by(fired: Callable[[Any, Any, Any], Any]) -> Callable[[Calibration], Callable[[Fields], Polar]]:
-    """The points of a model, for each calibration.
+def distance(f: Fields) -> Any:
+    """Metres, (n, blocks, lasers), by the unit that the header states."""
+    return f.blocks.channels.distance * (f.dis_unit * 0.001)
 
-    Args:
-        fired: function of the number of the block, the number of blocks and the returns of a shot: seconds from the packet's time.
-    """
 
-    def points_with(channels: Calibration) -> Callable[[Fields], Polar]:
-        def points(f: Fields) -> Polar:
-            block = f.block_count.steps()[:, None]
-            return beams(
-                f,
-                channels,
-                distance=f.blocks.channels.distance * (f.dis_unit * 0.001),
-                block=block,
-                returns=f.return_count,
-                fired=fired(block, f.block_count, f.return_count),
-            )
-
-        return points
-
-    return points_with
+def block_numbers(f: Fields) -> Any:
+    """The number of each block in its packet, from 0, (n, blocks, 1)."""
+    return f.block_count.steps()[:, None]
 
 
 def header(blocks: int) -> dict[str, Any]:
     """The header of a simulated packet with single return."""
     return {"block_count": blocks, "first_return": 1, "dis_unit": USUAL_UNIT, "return_count": 1, "flags.sequence": 1}
-
-
-def channel_times(first: float, step: float, channels: int) -> Any:
-    """Firing times at even steps, all in microseconds."""
-    return first + step * np.arange(channels)

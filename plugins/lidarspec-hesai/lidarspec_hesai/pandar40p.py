@@ -10,16 +10,15 @@ Source: HesaiLidar_SDK_2.0 (udp_protocol_p40.h; angle and firing-time files of a
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
 from construct import Array, Bytes, Const, Int8ul, Int16ul, Int32ul, Struct
 
-from lidarspec import Sensor
-from lidarspec.spec import Clock, Fields, Frame, OnWrap, Polar, Scaled, Sequence, Simulation, Udp
-from lidarspec_hesai.calibration import Calibration, configuring, nominal
-from lidarspec_hesai.parts import FACTORY, RETURN_MODES, UTC, beams, clock, turning
+from lidarspec.spec import Clock, Fields, Frame, OnWrap, Polar, Scaled, Sensor, Sequence, Simulation, Udp
+from lidarspec_hesai.calibration import Calibration, configure, nominal
+from lidarspec_hesai.parts import FACTORY, RETURN_MODES, TURN, UTC, beams, clock, turning
 
 BLOCKS, CHANNELS = 10, 40
 PER_TURN = 1800  # blocks in a turn at 10 Hz and single return: 0.2 degrees
@@ -70,17 +69,13 @@ def plausible(f: Fields) -> Any:
     return (f.blocks.azimuth < 360) & ((f.factory == 0x42) | (f.factory == 0x43))
 
 
-def points_with(channels: Calibration) -> Callable[[Fields], Polar]:
-    """The points by a calibration; with dual return, pairs of blocks are one shot."""
-
-    def points(f: Fields) -> Polar:
-        block = np.arange(BLOCKS)[:, None]
-        mode = f.return_mode
-        returns = np.where((mode == 0x39) | (mode == 0x3B) | (mode == 0x3C), 2, 1)
-        fired = LAST_SHOT - SHOT * ((BLOCKS - 1 - block) // returns)
-        return beams(f, channels, distance=f.blocks.channels.distance, block=block, returns=returns, fired=fired)
-
-    return points
+def points(f: Fields, channels: Calibration) -> Polar:
+    """Shots before the packet's time (HesaiLidar_SDK_2.0); with dual return, pairs of blocks are one shot."""
+    block = np.arange(BLOCKS)[:, None]
+    mode = f.return_mode
+    returns = np.where((mode == 0x39) | (mode == 0x3B) | (mode == 0x3C), 2, 1)
+    fired = LAST_SHOT - SHOT * ((BLOCKS - 1 - block) // returns)
+    return beams(f, channels, distance=f.blocks.channels.distance, block=block, returns=returns, fired=fired)
 
 
 def sweep(i: int) -> dict[str, Any]:
@@ -95,18 +90,19 @@ PANDAR40P = Sensor(
     vendor="Hesai",
     model="Pandar40P",
     frames={
-        "data": Frame(PLAIN, data=True, max_length=1262, plausible=plausible),
-        "data_sequence": Frame(COUNTED, data=True, max_length=1266, plausible=plausible),
+        "data": Frame(PLAIN, data=True, plausible=plausible),
+        "data_sequence": Frame(COUNTED, data=True, plausible=plausible),
     },
-    points=points_with(TABLE),
+    points=partial(points, channels=TABLE),
     scan=OnWrap("blocks.azimuth"),
     links={"data": Udp(2368)},
     clock=Clock(clock),
     sequence=Sequence("sequence"),
     simulation=Simulation(sweep),
-    configure=configuring(TABLE, points_with),
+    configure=partial(configure, points, TABLE),
     range_limits=(0.3, 200.0),
     vendor_axes=("right", "forward", "up"),
+    turn=TURN,
     status="capture",
     source="HesaiLidar_SDK_2.0 (udp_protocol_p40.h, Pandar40P correction files); captures of tier4/nebula and velocity.report",
 )

@@ -17,6 +17,7 @@ from lidarspec_hesai.calibration import Calibration
 RETURN_MODES = "33 first, 34 second, 37 strongest, 38 last, 39 last and strongest, 3b first and last, 3c first and strongest, 3d three"
 FACTORY = "42 or 43"
 EPOCH = datetime.datetime(2024, 1, 1)  # of simulated packets
+TURN = (5.0, 20.0)  # turns a second, slowest and fastest: 300 to 1200 rpm (tier4/nebula, rotation_speed of all models)
 
 UTC = Struct(
     "year" / Int8ul * "from 70 on since 1900, below since 2000; 0: the last five bytes are Unix seconds, big-endian",
@@ -49,8 +50,9 @@ def beams(f: Fields, channels: Calibration, *, distance: Any, block: Any, return
     """The points of a packet.
 
     Args:
+        channels: what each channel adds to its block.
         distance: metres, (n, blocks, channels).
-        block: the number of each block, (blocks, 1).
+        block: the number of each block, (blocks, 1) or (n, blocks, 1).
         returns: how many blocks in a row are echoes of one shot.
         fired: seconds from the packet's time to the shot of each block.
     """

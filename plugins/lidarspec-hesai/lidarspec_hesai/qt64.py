@@ -5,15 +5,15 @@ Source: HesaiLidar_SDK_2.0 (udp_protocol_v3_1.h; angle and firing-time files of 
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 from construct import Bytes, Int8ul, Int16ul, Int32ul
 
-from lidarspec import Sensor
-from lidarspec.spec import Clock, Frame, OnWrap, Scaled, Sequence, Simulation, Udp, take
-from lidarspec_hesai.calibration import configuring, nominal
-from lidarspec_hesai.headed import header, longest, packet, plausible, points_by
-from lidarspec_hesai.parts import FACTORY, RETURN_MODES, UTC, clock, turning
+from lidarspec.spec import Clock, Fields, Frame, OnWrap, Polar, Scaled, Sensor, Sequence, Simulation, Udp, take
+from lidarspec_hesai.calibration import Calibration, configure, nominal
+from lidarspec_hesai.headed import block_numbers, distance, header, longest, packet, plausible
+from lidarspec_hesai.parts import FACTORY, RETURN_MODES, TURN, UTC, beams, clock, turning
 
 BLOCKS, CHANNELS = 4, 64
 PER_TURN = 600  # blocks in a turn at 10 Hz and single return: 0.6 degrees
@@ -51,9 +51,11 @@ TAIL = (
 )
 
 
-def fired(block: Any, blocks: Any, returns: Any) -> Any:
-    """Seconds from the packet's time to the shot of a block."""
-    return FIRST_SHOT + take(SHOTS, block // returns)
+def points(f: Fields, channels: Calibration) -> Polar:
+    """Four shots, or two with dual return, after the packet's time (HesaiLidar_SDK_2.0)."""
+    block, returns = block_numbers(f), f.return_count
+    fired = FIRST_SHOT + take(SHOTS, block // returns)
+    return beams(f, channels, distance=distance(f), block=block, returns=returns, fired=fired)
 
 
 def sweep(i: int) -> dict[str, Any]:
@@ -61,7 +63,6 @@ def sweep(i: int) -> dict[str, Any]:
     return {**header(BLOCKS), **turning(i, BLOCKS, PER_TURN)}
 
 
-points_with = points_by(fired)
 TABLE = nominal(ELEVATION, AZIMUTH, FIRING_US)
 
 QT64 = Sensor(
@@ -69,15 +70,16 @@ QT64 = Sensor(
     vendor="Hesai",
     model="PandarQT64",
     frames={"data": Frame(packet(3, 1, CHANNELS, TAIL), data=True, max_length=longest(CHANNELS, BLOCKS), plausible=plausible)},
-    points=points_with(TABLE),
+    points=partial(points, channels=TABLE),
     scan=OnWrap("blocks.azimuth"),
     links={"data": Udp(2368)},
     clock=Clock(clock),
     sequence=Sequence("sequence"),
     simulation=Simulation(sweep),
-    configure=configuring(TABLE, points_with),
+    configure=partial(configure, points, TABLE),
     range_limits=(0.1, 60.0),
     vendor_axes=("right", "forward", "up"),
+    turn=TURN,
     status="capture",
     source="HesaiLidar_SDK_2.0 (udp_protocol_v3_1.h, PandarQT correction files); capture of tier4/nebula",
 )

@@ -6,16 +6,16 @@ Source: HesaiLidar_SDK_2.0 (udp_protocol_v6_1.h; correction files of the models,
 from __future__ import annotations
 
 import dataclasses
+from functools import partial
 from typing import Any
 
 import numpy as np
 from construct import Bytes, Int8ul, Int16ul, Int32ul
 
-from lidarspec import Sensor
-from lidarspec.spec import Clock, Frame, OnWrap, Scaled, Sequence, Simulation, Udp
-from lidarspec_hesai.calibration import configuring, nominal
-from lidarspec_hesai.headed import channel_times, header, longest, packet, plausible, points_by
-from lidarspec_hesai.parts import FACTORY, RETURN_MODES, UTC, clock, turning
+from lidarspec.spec import Clock, Fields, Frame, OnWrap, Polar, Scaled, Sensor, Sequence, Simulation, Udp
+from lidarspec_hesai.calibration import Calibration, configure, nominal
+from lidarspec_hesai.headed import block_numbers, distance, header, longest, packet, plausible
+from lidarspec_hesai.parts import FACTORY, RETURN_MODES, TURN, UTC, beams, clock, turning
 
 BLOCKS = 8
 PER_TURN = 2000  # blocks in a turn at 10 Hz and single return: 0.18 degrees
@@ -31,9 +31,11 @@ TAIL = (
 )
 
 
-def fired(block: Any, blocks: Any, returns: Any) -> Any:
-    """Seconds from the packet's time to the shot of a block."""
-    return -SHOT * ((blocks - 1 - block) // returns)
+def points(f: Fields, channels: Calibration) -> Polar:
+    """Shots up to the packet's time (HesaiLidar_SDK_2.0)."""
+    block, returns = block_numbers(f), f.return_count
+    fired = -SHOT * ((f.block_count - 1 - block) // returns)
+    return beams(f, channels, distance=distance(f), block=block, returns=returns, fired=fired)
 
 
 def sweep(i: int) -> dict[str, Any]:
@@ -41,24 +43,24 @@ def sweep(i: int) -> dict[str, Any]:
     return {**header(BLOCKS), **turning(i, BLOCKS, PER_TURN)}
 
 
-points_with = points_by(fired)
-TABLE_32 = nominal(15.0 - np.arange(32), np.zeros(32), channel_times(6.0, 1.512, 32))
-TABLE_16 = nominal(15.0 - 2.0 * np.arange(16), np.zeros(16), channel_times(6.0, 3.024, 16))
+TABLE_32 = nominal(15.0 - np.arange(32), np.zeros(32), 6.0 + 1.512 * np.arange(32))
+TABLE_16 = nominal(15.0 - 2.0 * np.arange(16), np.zeros(16), 6.0 + 3.024 * np.arange(16))
 
 XT32 = Sensor(
     "hesai-xt32",
     vendor="Hesai",
     model="PandarXT-32",
     frames={"data": Frame(packet(6, 1, 32, TAIL), data=True, max_length=longest(32, BLOCKS), plausible=plausible)},
-    points=points_with(TABLE_32),
+    points=partial(points, channels=TABLE_32),
     scan=OnWrap("blocks.azimuth"),
     links={"data": Udp(2368)},
     clock=Clock(clock),
     sequence=Sequence("sequence"),
     simulation=Simulation(sweep),
-    configure=configuring(TABLE_32, points_with),
+    configure=partial(configure, points, TABLE_32),
     range_limits=(0.05, 120.0),
     vendor_axes=("right", "forward", "up"),
+    turn=TURN,
     status="capture",
     source="HesaiLidar_SDK_2.0 (udp_protocol_v6_1.h, PandarXT correction files); capture of tier4/nebula",
 )
@@ -68,8 +70,8 @@ XT16 = dataclasses.replace(
     id="hesai-xt16",
     model="PandarXT-16",
     frames={"data": Frame(packet(6, 1, 16, TAIL), data=True, max_length=longest(16, BLOCKS), plausible=plausible)},
-    points=points_with(TABLE_16),
-    configure=configuring(TABLE_16, points_with),
+    points=partial(points, channels=TABLE_16),
+    configure=partial(configure, points, TABLE_16),
     status="vectors",
     source="HesaiLidar_SDK_2.0 (udp_protocol_v6_1.h, PandarXT-16 correction files); one captured packet of tier4/nebula",
 )

@@ -9,13 +9,13 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterable
+from functools import partial
 from typing import Any
 
 import numpy as np
 from construct import Array, Const, Int8ul, Int16ul, Struct
 
-from lidarspec import Sensor
-from lidarspec.spec import Checksummed, Clock, Crc, Fields, Frame, OnWrap, Polar, Scaled, Serial, Simulation, hookimpl, spread
+from lidarspec.spec import Checksummed, Clock, Crc, Fields, Frame, OnWrap, Polar, Scaled, Sensor, Serial, Simulation, hookimpl, spread
 
 POINTS = 12
 RATE_STL27L = 21_600  # points per second (STL-27L manual, section 1)
@@ -48,44 +48,38 @@ def plausible(f: Fields) -> Any:
     return (f.start_angle < 360) & (f.end_angle < 360) & (f.timestamp <= 30)
 
 
-def points_at(rate: int) -> Any:
-    """The points function of a model with so many points per second."""
-
-    def points(f: Fields) -> Polar:
-        clockwise = spread(f.start_angle, f.end_angle, POINTS, full=360.0)  # degrees, (n, 12)
-        return Polar(
-            range=f.points.distance,
-            azimuth=-np.deg2rad(clockwise),  # left-handed, clockwise (manual, section 4)
-            intensity=f.points.intensity,
-            time=np.arange(POINTS) / rate,
-        )
-
-    return points
+def points(f: Fields, rate: int) -> Polar:
+    """Even steps from the start angle to the end angle (manual 3.2), at `rate` points per second."""
+    clockwise = spread(f.start_angle, f.end_angle, POINTS, full=360.0)  # degrees, (n, 12)
+    return Polar(
+        range=f.points.distance,
+        azimuth=-np.deg2rad(clockwise),  # left-handed, clockwise (manual, section 4)
+        intensity=f.points.intensity,
+        time=np.arange(POINTS) / rate,
+    )
 
 
-def sweep_at(rate: int) -> Any:
-    """The sweep of a model with so many points per second at 10 turns a second."""
-
-    def sweep(i: int) -> dict[str, float]:
-        step = 360.0 * 10 / rate
-        start = i * POINTS * step % 360
-        return dict(speed=3600, start_angle=start, end_angle=(start + (POINTS - 1) * step) % 360, timestamp=i * POINTS / rate % 30)
-
-    return sweep
+def sweep(i: int, rate: int) -> dict[str, float]:
+    """Frame i at 10 turns and `rate` points per second."""
+    step = 360.0 * 10 / rate
+    start = i * POINTS * step % 360
+    return dict(speed=3600, start_angle=start, end_angle=(start + (POINTS - 1) * step) % 360, timestamp=i * POINTS / rate % 30)
 
 
 STL27L = Sensor(
     "ldrobot-stl27l",
     vendor="LDROBOT",
     model="STL-27L",
-    frames={"data": Frame(DATA, data=True, max_length=47, plausible=plausible)},
-    points=points_at(RATE_STL27L),
+    frames={"data": Frame(DATA, data=True, plausible=plausible)},
+    points=partial(points, rate=RATE_STL27L),
     scan=OnWrap("azimuth"),
     links={"data": Serial(921_600)},
     clock=Clock("timestamp", wraps_at=30.0),
-    simulation=Simulation(sweep_at(RATE_STL27L)),
+    simulation=Simulation(partial(sweep, rate=RATE_STL27L)),
     range_limits=(0.03, 25.0),
     vendor_axes=("forward", "right", "up"),
+    turn=(9.9, 10.1),  # by its own control (manual, section 1); no limits are given for control by PWM
+    relatives={"ldrobot-ld06": "frames come 1800 to the second, an LD06's 375"},
     status="vectors",
     source="STL-27L development manual, sections 1 to 4",
 )
@@ -94,10 +88,12 @@ LD06 = dataclasses.replace(
     STL27L,
     id="ldrobot-ld06",
     model="LD06",
-    points=points_at(RATE_LD06),
-    simulation=Simulation(sweep_at(RATE_LD06)),
+    points=partial(points, rate=RATE_LD06),
+    simulation=Simulation(partial(sweep, rate=RATE_LD06)),
     links={"data": Serial(230_400)},
     range_limits=(0.02, 12.0),
+    turn=(5.0, 13.0),  # inno-maker's page of the LD06; by PWM, as for the LD19
+    relatives={"ldrobot-stl27l": "frames come 375 to the second, an STL-27L's 1800"},
     status="capture",
     source="LD06 and LD19 development manual v2.5 (the STL-27L's frame); three consecutive captured frames",
 )

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from lidarspec import Sensor
-from lidarspec.spec import hookimpl
+from lidarspec.spec import Sensor, hookimpl
 from lidarspec_robosense.helios import HELIOS_16P
 from lidarspec_robosense.m1 import M1
 

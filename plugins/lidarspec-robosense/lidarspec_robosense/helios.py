@@ -23,8 +23,7 @@ from typing import Any
 import numpy as np
 from construct import Array, BitsInteger, BitStruct, Bytes, BytesInteger, ByteSwapped, Const, Construct, Int8ub, Int16ub, Int32ub, Struct
 
-from lidarspec import Sensor
-from lidarspec.spec import Clock, Fields, Frame, OnWrap, Polar, Scaled, Sequence, Simulation, Udp, following, previous, wrap
+from lidarspec.spec import Clock, Fields, Frame, OnWrap, Polar, Scaled, Sensor, Sequence, Simulation, Udp, following, previous, wrap
 
 BLOCKS, GROUPS, LASERS = 12, 2, 16
 DUAL, STRONGEST = 0, 4  # return modes (manual 5.4.2)
@@ -212,12 +211,8 @@ HELIOS_16P = Sensor(
     vendor="RoboSense",
     model="RS-Helios-16P",
     frames={
-        "data": Frame(DATA, data=True, max_length=1248, plausible=plausible),
-        "difop": Frame(
-            DIFOP,
-            max_length=1248,
-            simulation=Simulation(sweep_difop, rate=1),
-        ),  # the rate: assumed, the M1's
+        "data": Frame(DATA, data=True, plausible=plausible),
+        "difop": Frame(DIFOP, simulation=Simulation(sweep_difop, rate=1)),  # the rate: assumed, the M1's
     },
     points=points,
     scan=OnWrap("blocks.azimuth"),
@@ -237,6 +232,9 @@ HELIOS_16P = Sensor(
     simulation=Simulation(sweep),
     range_limits=(0.1, 180.0),  # rs_driver's limits for this model
     vendor_axes=("forward", "left", "up"),
+    turn=(TURNS, 20.0),  # 600 and 1200 rpm (manual B.1)
+    # firmware: the first of three boards in Table 11; the temperature has its sign in a field of its own
+    info={"serial": "difop.serial_number", "firmware": "difop.top_firmware", "model": "data.lidar_type"},
     status="capture",
     source="RS-Helios-16P user manual, 5.4, 6.2, 6.3 and appendix B; rs_driver; nebula's capture and point clouds",
 )

@@ -18,8 +18,7 @@ from typing import Any
 import numpy as np
 from construct import Array, Bytes, BytesInteger, Const, Int8ub, Int16ub, Int32ub, Struct
 
-from lidarspec import Sensor
-from lidarspec.spec import Clock, Fields, Frame, OnRewind, Polar, Scaled, Sequence, Simulation, Udp
+from lidarspec.spec import Clock, Fields, Frame, OnRewind, Polar, Scaled, Sensor, Sequence, Simulation, Udp
 
 BLOCKS, CHANNELS = 25, 5
 SINGLE, DUAL = 630, 1260  # packets of a frame (rs_driver; M1P user guide: the counter restarts with each frame)
@@ -142,12 +141,8 @@ M1 = Sensor(
     vendor="RoboSense",
     model="RS-LiDAR-M1",
     frames={
-        "data": Frame(DATA, data=True, max_length=1210, plausible=plausible),
-        "difop": Frame(
-            DIFOP,
-            max_length=256,
-            simulation=Simulation(sweep_difop, rate=1),
-        ),  # M1 user guide; the M1P's: 10 a second
+        "data": Frame(DATA, data=True, plausible=plausible),
+        "difop": Frame(DIFOP, simulation=Simulation(sweep_difop, rate=1)),  # M1 user guide; the M1P's: 10 a second
     },
     points=points,
     scan=OnRewind("pkt_psn"),
@@ -157,6 +152,8 @@ M1 = Sensor(
     simulation=Simulation(sweep),
     range_limits=(0.2, 200.0),  # rs_driver's limits for this model
     vendor_axes=("forward", "left", "up"),
+    turn=(FRAME_RATE, FRAME_RATE),
+    info={"model": "data.lidar_type"},
     status="vectors",
     source="RS-LiDAR-M1 user guide 2.1.2 (Table 5); RS-LiDAR-M1P user guide, pages 9 to 14; rs_driver",
 )

@@ -23,9 +23,10 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterable, Mapping
+from functools import partial
 
-from lidarspec import Sensor, UsageError
-from lidarspec.spec import Command, Frame, OnWrap, Serial, Simulation, hookimpl
+from lidarspec import UsageError
+from lidarspec.spec import Command, Frame, OnWrap, Sensor, Serial, Simulation, hookimpl
 from lidarspec_slamtec import capsules, nodes, units
 from lidarspec_slamtec.answers import ANSWERS, DESCRIPTORS
 from lidarspec_slamtec.commands import BY_DTR, BY_PWM, BY_SPEED, COMMANDS, express
@@ -36,73 +37,63 @@ CODED = "a code word says itself how many millimetres one of its steps is (SDK, 
 #: why asking for any key is not always answered.
 KEYS = "a unit answers for the keys that it knows (answers.py)"
 DTHETA = ("unsigned", "signed")
-
-EXPRESS = Frame(
-    capsules.EXPRESS,
-    data=True,
-    points=capsules.express_points(),
-    simulation=Simulation(capsules.sweep_by(capsules.EXPRESS_STEP), rate=capsules.EXPRESS_RATE),
-    max_length=84,
-    plausible=capsules.plausible,
-    after="express_descriptor",
-)
-ULTRA = Frame(
-    capsules.ULTRA,
-    data=True,
-    points=capsules.ultra_points,
-    simulation=Simulation(capsules.sweep_by(capsules.ULTRA_STEP), encode=capsules.ultra_codes, rate=capsules.ULTRA_RATE),
-    max_length=132,
-    plausible=capsules.plausible,
-    after="ultra_descriptor",
-    acknowledged={"LS201 cabins.predict2": CODED},
-)
-DENSE = Frame(
-    capsules.DENSE,
-    data=True,
-    points=capsules.dense_points,
-    simulation=Simulation(capsules.sweep_by(capsules.DENSE_STEP), rate=capsules.DENSE_RATE),
-    max_length=84,
-    plausible=capsules.plausible,
-    after="dense_descriptor",
-)
-ULTRA_DENSE = Frame(
-    capsules.ULTRA_DENSE,
-    data=True,
-    points=capsules.ultra_dense_points,
-    simulation=Simulation(capsules.sweep_by(capsules.ULTRA_DENSE_STEP), encode=capsules.ultra_dense_codes, rate=capsules.ULTRA_DENSE_RATE),
-    max_length=170,
-    plausible=capsules.plausible,
-    after="ultra_dense_descriptor",
-    acknowledged={"LS201 cabins.second_high": CODED},
-)
-HQ = Frame(
-    nodes.HQ,
-    data=True,
-    points=nodes.hq_points,
-    simulation=Simulation(nodes.hq_sweep, rate=nodes.HQ_RATE),
-    max_length=781,
-    after="hq_descriptor",
-)
-NODE = Frame(
-    nodes.NODE,
-    data=True,
-    points=nodes.node_points,
-    simulation=Simulation(nodes.node_sweep, rate=nodes.RATE),
-    max_length=5,
-    plausible=nodes.plausible,
-    after="scan_descriptor",
-    confirm=nodes.CONFIRM,
-)
+MODELS = ("A1", "A3", "S2", "C1")
 
 FRAMES = {
     **DESCRIPTORS,
     **ANSWERS,
-    "node": NODE,
-    "express": EXPRESS,
-    "ultra": ULTRA,
-    "dense": DENSE,
-    "ultra_dense": ULTRA_DENSE,
-    "hq": HQ,
+    "node": Frame(
+        nodes.NODE,
+        data=True,
+        points=nodes.node_points,
+        simulation=Simulation(nodes.node_sweep, rate=nodes.RATE),
+        plausible=nodes.plausible,
+        after="scan_descriptor",
+        confirm=nodes.CONFIRM,
+    ),
+    "express": Frame(
+        capsules.EXPRESS,
+        data=True,
+        points=capsules.express_points,
+        simulation=Simulation(partial(capsules.sweep, degrees=capsules.EXPRESS_STEP), rate=capsules.EXPRESS_RATE),
+        plausible=capsules.plausible,
+        after="express_descriptor",
+    ),
+    "ultra": Frame(
+        capsules.ULTRA,
+        data=True,
+        points=capsules.ultra_points,
+        simulation=Simulation(partial(capsules.sweep, degrees=capsules.ULTRA_STEP), capsules.ultra_codes, capsules.ULTRA_RATE),
+        plausible=capsules.plausible,
+        after="ultra_descriptor",
+        acknowledged={"LS201 cabins.predict2": CODED},
+    ),
+    "dense": Frame(
+        capsules.DENSE,
+        data=True,
+        points=capsules.dense_points,
+        simulation=Simulation(partial(capsules.sweep, degrees=capsules.DENSE_STEP), rate=capsules.DENSE_RATE),
+        plausible=capsules.plausible,
+        after="dense_descriptor",
+    ),
+    "ultra_dense": Frame(
+        capsules.ULTRA_DENSE,
+        data=True,
+        points=capsules.ultra_dense_points,
+        simulation=Simulation(
+            partial(capsules.sweep, degrees=capsules.ULTRA_DENSE_STEP), capsules.ultra_dense_codes, capsules.ULTRA_DENSE_RATE
+        ),
+        plausible=capsules.plausible,
+        after="ultra_dense_descriptor",
+        acknowledged={"LS201 cabins.second_high": CODED},
+    ),
+    "hq": Frame(
+        nodes.HQ,
+        data=True,
+        points=nodes.hq_points,
+        simulation=Simulation(nodes.hq_sweep, rate=nodes.HQ_RATE),
+        after="hq_descriptor",
+    ),
     **REQUESTS,
 }
 
@@ -120,7 +111,7 @@ def configure(sensor: Sensor, *, dtheta: str | None = None, mode: int | None = N
     if dtheta is not None:
         if dtheta not in DTHETA:
             raise UsageError(f"{sensor.id}: dtheta is one of {', '.join(DTHETA)}, not {dtheta!r}")
-        changed = dataclasses.replace(sensor.frames["express"], points=capsules.express_points(signed=dtheta == "signed"))
+        changed = dataclasses.replace(sensor.frames["express"], points=partial(capsules.express_points, signed=dtheta == "signed"))
         sensor = dataclasses.replace(sensor, frames={**sensor.frames, "express": changed})
     if mode is not None:
         if mode not in range(0x100):
@@ -136,9 +127,18 @@ def configure(sensor: Sensor, *, dtheta: str | None = None, mode: int | None = N
 
 
 def rplidar(
-    name: str, *, baud: int, motor: Mapping[str, Command], unit: units.Unit, range_limits: tuple[float, float], status: str, source: str
+    name: str,
+    *,
+    baud: int,
+    motor: Mapping[str, Command],
+    unit: units.Unit,
+    range_limits: tuple[float, float],
+    turn: tuple[float, float] | None = None,
+    status: str,
+    source: str,
 ) -> Sensor:
     """One model of the family; simulated, it is this unit."""
+    commands = {**COMMANDS, **motor}
     return Sensor(
         f"slamtec-rplidar-{name.lower()}",
         vendor="Slamtec",
@@ -147,14 +147,17 @@ def rplidar(
         points=None,
         scan=OnWrap("azimuth"),
         links={"data": Serial(baud)},
-        commands={**COMMANDS, **motor},
-        simulation=Simulation(answers=unit.answers({**COMMANDS, **motor})),
+        commands=commands,
+        simulation=Simulation(answers={name: answer for name, answer in unit.answers().items() if name in commands}),
         configure=configure,
         on_open=("stop", "start_motor", "scan"),
         on_close=("stop", "stop_motor"),
         acknowledged=dict.fromkeys(("LS604 commands.get_config", "LS604 commands.get_mode_config"), KEYS),
         range_limits=range_limits,
         vendor_axes=("forward", "right", "up"),
+        turn=turn,
+        relatives={f"slamtec-rplidar-{model.lower()}": "info.model" for model in MODELS if model != name},
+        info={"serial": "info.serial", "model": "info.model"},  # the firmware stands in two fields, major and minor
         status=status,
         source=f"RPLIDAR interface protocol and SDK; {source}",
         aliases=(f"rplidar-{name.lower()}",),
@@ -167,6 +170,7 @@ A1 = rplidar(
     motor=BY_DTR,
     unit=units.A1,
     range_limits=(0.15, 12.0),
+    turn=(1.0, 10.0),  # A1M8 data sheet, scan rate
     status="vectors",
     source="A1M8 data sheet; an A1's exchange",
 )

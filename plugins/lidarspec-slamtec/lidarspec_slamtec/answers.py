@@ -23,15 +23,16 @@ LONGEST_NAME = 64  # bytes of the name of a scan mode (SDK, LidarScanMode)
 #: keys of configuration values; the first two are of the sensor, the others of one of its scan modes.
 MODE_COUNT, TYPICAL_MODE, US_PER_SAMPLE, MAX_DISTANCE, ANSWER_TYPE, MODE_NAME = 0x70, 0x7C, 0x71, 0x74, 0x75, 0x7F
 
-_VALUES: dict[int, tuple[int, Construct]] = {
-    MODE_COUNT: (2, "mode_count" / Int16ul),
-    TYPICAL_MODE: (2, "typical_mode" / Int16ul),
-    US_PER_SAMPLE: (4, "us_per_sample" / Scaled(Int32ul, 1 / 256, "us")),
-    MAX_DISTANCE: (4, "max_distance" / Scaled(Int32ul, 1 / 256, "m")),
-    ANSWER_TYPE: (1, "answer_type" / Int8ul * "type of the descriptor that announces the mode's data frames"),
+#: the values of fixed width.
+VALUES: dict[int, Construct] = {
+    MODE_COUNT: "mode_count" / Int16ul,
+    TYPICAL_MODE: "typical_mode" / Int16ul,
+    US_PER_SAMPLE: "us_per_sample" / Scaled(Int32ul, 1 / 256, "us"),
+    MAX_DISTANCE: "max_distance" / Scaled(Int32ul, 1 / 256, "m"),
+    ANSWER_TYPE: "answer_type" / Int8ul * "type of the descriptor that announces the mode's data frames",
 }
 _SIZES = np.full(MODE_NAME + 1, np.nan)
-_SIZES[list(_VALUES)] = [size for size, _ in _VALUES.values()]
+_SIZES[list(VALUES)] = [value.sizeof() for value in VALUES.values()]
 
 
 def descriptor(kind: int, mode: int, length: Construct) -> tuple[Construct, ...]:
@@ -42,12 +43,12 @@ def descriptor(kind: int, mode: int, length: Construct) -> tuple[Construct, ...]
 
 def single(kind: int, size: int, *fields: Construct) -> Frame:
     """A single answer of `size` bytes behind its descriptor."""
-    return Frame(Struct(*descriptor(kind, SINGLE, Const(size, BitsInteger(30))), *fields), max_length=7 + size)
+    return Frame(Struct(*descriptor(kind, SINGLE, Const(size, BitsInteger(30))), *fields))
 
 
 def announcing(kind: int, size: int) -> Frame:
     """The descriptor of an endless stream of data frames of `size` bytes."""
-    return Frame(Struct(*descriptor(kind, STREAM, Const(size, BitsInteger(30)))), max_length=7)
+    return Frame(Struct(*descriptor(kind, STREAM, Const(size, BitsInteger(30)))))
 
 
 def config_plausible(f: Fields) -> Any:
@@ -56,13 +57,20 @@ def config_plausible(f: Fields) -> Any:
     return np.isnan(size) | (f.descriptor.length == 4 + size)
 
 
+def config(key: int, value: Any) -> tuple[str, dict[str, Any]]:
+    """The answer that holds a configuration value in its unit, or its bytes where its width is not fixed: the frame and its values."""
+    known = VALUES.get(key)
+    name, size = (known.name, known.sizeof()) if known else ("data", len(value))
+    return "config", {"descriptor.length": 4 + size, "key": key, f"value.{name}": value}
+
+
 CONFIG = Struct(
     *descriptor(0x20, SINGLE, BitsInteger(30)),
     "key" / Int32ul,
     "value"
     / Switch(
         this.key,
-        {key: Struct(field) for key, (_, field) in _VALUES.items()},
+        {key: Struct(value) for key, value in VALUES.items()},
         default=Struct("data" / Bytes(this._.descriptor.length - 4) * "7F: the mode's name, ends with 00"),
     ),
 )

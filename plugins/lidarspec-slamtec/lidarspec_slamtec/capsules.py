@@ -12,7 +12,7 @@ of an ultra-dense capsule that differ by up to 2 mm; that is a filter, and is le
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -126,18 +126,14 @@ def headings(f: Fields, cabins: int, points: int) -> Any:
     return stack(*(f.start.angle + between * np.arange(place, count, points) for place in range(points)))
 
 
-def express_points(*, signed: bool = False) -> Callable[[Fields], Polar]:
-    """The points function of express capsules with dtheta read as unsigned (SDK) or signed (protocol)."""
-
-    def points(f: Fields) -> Polar:
-        first, second, low = f.cabins.first, f.cabins.second, f.cabins.dtheta_low
-        eighths = stack(first.dtheta_high * 16 + low.first, second.dtheta_high * 16 + low.second)
-        if signed:
-            eighths = np.where(eighths >= SIGNED, eighths - 2 * SIGNED, eighths)
-        clockwise = headings(f, EXPRESS_CABINS, 2) - eighths / 8
-        return Polar(range=stack(first.distance, second.distance), azimuth=-np.deg2rad(clockwise))
-
-    return points
+def express_points(f: Fields, *, signed: bool = False) -> Polar:
+    """32 points a capsule, with dtheta read as unsigned (SDK) or signed (protocol)."""
+    first, second, low = f.cabins.first, f.cabins.second, f.cabins.dtheta_low
+    eighths = stack(first.dtheta_high * 16 + low.first, second.dtheta_high * 16 + low.second)
+    if signed:
+        eighths = np.where(eighths >= SIGNED, eighths - 2 * SIGNED, eighths)
+    clockwise = headings(f, EXPRESS_CABINS, 2) - eighths / 8
+    return Polar(range=stack(first.distance, second.distance), azimuth=-np.deg2rad(clockwise))
 
 
 def dense_points(f: Fields) -> Polar:
@@ -216,13 +212,13 @@ def ultra_dense_codes(polar: Polar) -> Mapping[str, Any]:
     scale = np.searchsorted(SCALES, mm, side="right") - 1
     steps = np.rint((mm - SCALES[scale]) / (2 + scale)).astype(np.int64)
     code = np.where(mm > 0, steps + ((QUALITY >> scale) << (10 + scale)), 0)
-    found: dict[str, Any] = {}
+    fields: dict[str, Any] = {}
     for place, name in enumerate(("first", "second")):
         own = code[..., place]
-        found |= {f"cabins.{name}_low": own & 0x3FFF, f"cabins.{name}_high": own >> 14, f"cabins.{name}_scale": scale[..., place]}
-    return found
+        fields |= {f"cabins.{name}_low": own & 0x3FFF, f"cabins.{name}_high": own >> 14, f"cabins.{name}_scale": scale[..., place]}
+    return fields
 
 
-def sweep_by(degrees: float) -> Callable[[int], Mapping[str, Any]]:
-    """The sweep of capsules that are so many degrees apart."""
-    return lambda i: {"start.angle": i * degrees % 360, "start.sync": int(i == 0)}
+def sweep(i: int, degrees: float) -> Mapping[str, Any]:
+    """Capsule i of capsules that are so many degrees apart."""
+    return {"start.angle": i * degrees % 360, "start.sync": int(i == 0)}

@@ -19,8 +19,7 @@ def sealed(*fields: Construct) -> Checksummed:
 
 def asking(cmd: int, size: int, *payload: Construct) -> Frame:
     """The request of one command with a payload of `size` bytes."""
-    fields = ("cmd" / Const(cmd, Int8ul), "size" / Const(size, Int8ul), *payload)
-    return Frame(sealed(*fields), direction="out", max_length=4 + size)
+    return Frame(sealed("cmd" / Const(cmd, Int8ul), "size" / Const(size, Int8ul), *payload), direction="out")
 
 
 PLAIN = Struct(
@@ -30,7 +29,7 @@ PLAIN = Struct(
 PAYLOAD = sealed("cmd" / Int8ul * "80 and above", "size" / Int8ul * "of the payload", "payload" / Bytes(this.size))
 
 REQUESTS = {
-    "request": Frame(PLAIN, direction="out", max_length=2),
+    "request": Frame(PLAIN, direction="out"),
     "express_request": asking(
         0x82,
         5,

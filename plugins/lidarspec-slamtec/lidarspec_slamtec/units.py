@@ -6,17 +6,17 @@ other modes are those that the vendor's SDK prints for such models, and only the
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from lidarspec.spec import Command
 from lidarspec_slamtec import answers
 
 NODE, EXPRESS, ULTRA, DENSE = 0x81, 0x82, 0x84, 0x85
 DESCRIPTOR = {NODE: "scan_descriptor", EXPRESS: "express_descriptor", ULTRA: "ultra_descriptor", DENSE: "dense_descriptor"}
-
-Answered = Iterable[tuple[str, Mapping[str, Any]]]
+#: what asks for configuration values, of the sensor and of one of its scan modes.
+OF_SENSOR = ("get_config", "get_mode_count", "get_typical_mode")
+OF_MODE = ("get_mode_config", "get_us_per_sample", "get_max_distance", "get_answer_type", "get_mode_name")
 
 
 @dataclass(frozen=True)
@@ -36,44 +36,40 @@ class Unit:
     model: int
     modes: tuple[Mode, ...]
 
-    def config(self, request: Mapping[str, Any]) -> Answered:
-        """The answer to a request for a configuration value; none for a key or mode that it does not have."""
-        key, number = request["key"], request.get("mode", 0)
-        if number >= len(self.modes):
-            return []
-        mode = self.modes[number]
-        known = {
-            answers.MODE_COUNT: (2, "mode_count", len(self.modes)),
-            answers.TYPICAL_MODE: (2, "typical_mode", len(self.modes) - 1),
-            answers.US_PER_SAMPLE: (4, "us_per_sample", mode.us_per_sample),
-            answers.MAX_DISTANCE: (4, "max_distance", mode.reach),
-            answers.ANSWER_TYPE: (1, "answer_type", mode.kind),
-            answers.MODE_NAME: (len(mode.name) + 1, "data", mode.name.encode()),
-        }
-        if key not in known:
-            return []
-        size, field, value = known[key]
-        return [("config", {"descriptor.length": 4 + size, "key": key, f"value.{field}": value})]
-
-    def capsules(self, request: Mapping[str, Any]) -> Answered:
-        """The descriptor of the scan mode that is asked for; mode 0 of an express request is the plain express scan."""
-        number = request["mode"]
-        if number >= len(self.modes):
-            return []
-        return [(DESCRIPTOR[self.modes[number].kind if number else EXPRESS], {})]
-
-    def answers(self, commands: Mapping[str, Command]) -> dict[str, Any]:
+    def answers(self) -> dict[str, Any]:
         """What this unit answers, by command, where that is more than the reply as it stands."""
         information = {"model": self.model, "firmware_minor": 29, "firmware_major": 1, "hardware": 7, "serial": bytes(range(1, 17))}
         times = {"standard": round(self.modes[0].us_per_sample), "express": round(self.modes[-1].us_per_sample)}
-        by_reply = {
-            "info": (("info", information),),
-            "sample_rate": (("sample_rate", times),),
-            "accessory": (("accessory", {"flags": 1}),),
+        return {
+            "get_info": (("info", information),),
+            "get_samplerate": (("sample_rate", times),),
+            "get_accessory": (("accessory", {"flags": 1}),),
+            "express_scan": self.descriptor,
+            **dict.fromkeys((*OF_SENSOR, *OF_MODE), self.config),
         }
-        by_request = {"config_request": self.config, "mode_config_request": self.config, "express_request": self.capsules}
-        answers = {name: by_request.get(str(command.frame)) or by_reply.get(str(command.reply)) for name, command in commands.items()}
-        return {name: answer for name, answer in answers.items() if answer}
+
+    def config(self, request: Mapping[str, Any]) -> tuple[tuple[str, Mapping[str, Any]], ...]:
+        """The answer to a request for a configuration value; none for a key or mode that it does not have."""
+        key, number = request["key"], request.get("mode", 0)
+        if number >= len(self.modes):
+            return ()
+        mode = self.modes[number]
+        values = {
+            answers.MODE_COUNT: len(self.modes),
+            answers.TYPICAL_MODE: len(self.modes) - 1,
+            answers.US_PER_SAMPLE: mode.us_per_sample,
+            answers.MAX_DISTANCE: mode.reach,
+            answers.ANSWER_TYPE: mode.kind,
+            answers.MODE_NAME: mode.name.encode() + b"\0",
+        }
+        return (answers.config(key, values[key]),) if key in values else ()
+
+    def descriptor(self, request: Mapping[str, Any]) -> tuple[str, ...]:
+        """The descriptor of the scan mode that is asked for; mode 0 of an express request is the plain express scan."""
+        number = request["mode"]
+        if number >= len(self.modes):
+            return ()
+        return (DESCRIPTOR[self.modes[number].kind if number else EXPRESS],)
 
 
 A1 = Unit(

@@ -8,14 +8,15 @@ differs by up to 11 mm (VLP-16) and 17 mm (HDL-32E).
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterable
+from functools import partial
 
 import numpy as np
 
-from lidarspec import Sensor
-from lidarspec.spec import Clock, OnWrap, Simulation, Udp, hookimpl
-from lidarspec_velodyne.firings import Firings, configuring, points_of, sweep_of
-from lidarspec_velodyne.frames import FRAMES, HOUR, SLOTS
+from lidarspec.spec import Clock, OnWrap, Sensor, Simulation, Udp, hookimpl
+from lidarspec_velodyne.firings import Firings, configure, points, sweep
+from lidarspec_velodyne.frames import FRAMES, HOUR, SLOTS, TURN
 
 SLOT = np.arange(SLOTS)
 
@@ -41,39 +42,37 @@ HDL32E_FIRINGS = Firings(
 )
 
 
-def _sensor(name: str, model: str, firings: Firings, range_limits: tuple[float, float], source: str) -> Sensor:
-    return Sensor(
-        name,
-        vendor="Velodyne",
-        model=model,
-        frames=FRAMES,
-        points=points_of(firings),
-        scan=OnWrap("blocks.azimuth"),
-        links={"data": Udp(2368, 8308)},
-        clock=Clock("timestamp", wraps_at=HOUR),
-        simulation=Simulation(sweep_of(firings)),
-        configure=configuring(firings),
-        range_limits=range_limits,
-        vendor_axes=("right", "forward", "up"),
-        status="capture",
-        source=source,
-    )
-
-
-# range limits: the defaults of ros-drivers/velodyne for these models
-VLP16 = _sensor(
+VLP16 = Sensor(
     "velodyne-vlp16",
-    "VLP-16",
-    VLP16_FIRINGS,
-    (0.4, 130.0),
-    "velodyne_decoder and ros-drivers/velodyne, citing the VLP-16 user manual; three captures",
+    vendor="Velodyne",
+    model="VLP-16",
+    frames=FRAMES,
+    points=partial(points, model=VLP16_FIRINGS),
+    scan=OnWrap("blocks.azimuth"),
+    links={"data": Udp(2368, 8308)},
+    clock=Clock("timestamp", wraps_at=HOUR),
+    simulation=Simulation(partial(sweep, model=VLP16_FIRINGS)),
+    configure=partial(configure, VLP16_FIRINGS),
+    range_limits=(0.4, 130.0),  # the default of ros-drivers/velodyne for this model
+    vendor_axes=("right", "forward", "up"),
+    turn=TURN,
+    # 12 blocks, or 6 shots: periods of 110.592 and 46.080 us
+    relatives={"velodyne-hdl32e": "timestamp: a packet each 1327 us, with dual return 664 us; an HDL-32E's 553 and 276 us"},
+    info={"temperature": "position.top_board_temperature"},  # the product byte is not to be trusted
+    status="capture",
+    source="velodyne_decoder and ros-drivers/velodyne, citing the VLP-16 user manual; three captures",
 )
-HDL32E = _sensor(
-    "velodyne-hdl32e",
-    "HDL-32E",
-    HDL32E_FIRINGS,
-    (0.9, 130.0),
-    "velodyne_decoder and ros-drivers/velodyne, citing the HDL-32E user manual; one capture",
+
+HDL32E = dataclasses.replace(
+    VLP16,
+    id="velodyne-hdl32e",
+    model="HDL-32E",
+    points=partial(points, model=HDL32E_FIRINGS),
+    simulation=Simulation(partial(sweep, model=HDL32E_FIRINGS)),
+    configure=partial(configure, HDL32E_FIRINGS),
+    range_limits=(0.9, 130.0),  # likewise
+    relatives={"velodyne-vlp16": "timestamp: a packet each 553 us, with dual return 276 us; a VLP-16's 1327 and 664 us"},
+    source="velodyne_decoder and ros-drivers/velodyne, citing the HDL-32E user manual; one capture",
 )
 
 

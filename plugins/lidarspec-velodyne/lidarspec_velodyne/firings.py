@@ -18,19 +18,19 @@ vertical offset of the lasers).
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec import Sensor, UsageError
-from lidarspec.spec import Fields, Points, Polar, following, previous, wrap
-from lidarspec_velodyne.frames import BLOCKS, DUAL, HOUR, STRONGEST
+from lidarspec import UsageError
+from lidarspec.spec import Fields, Polar, Sensor, following, previous, wrap
+from lidarspec_velodyne.frames import BLOCKS, DUAL, HOUR, STRONGEST, TURN
 
 LAST_BLOCK = ("previous", "invalid")
-FASTEST = 20 * 360.0  # degrees per second (data sheets: 5 to 20 Hz)
+FASTEST = TURN[1] * 360  # degrees per second
 JITTER = 1.25  # azimuths are encoder readings; steps of the captures vary by 5 %
 
 BLOCK = np.arange(BLOCKS)[:, None]
@@ -65,25 +65,20 @@ class Firings:
         return -self.focal_distance * np.tan(np.deg2rad(self.elevation))
 
 
-def points_of(model: Firings, last_block: str = "previous") -> Callable[[Fields], Points]:
-    """The points function of a model, with a rule for the last block."""
-
-    def points(f: Fields) -> Polar:
-        """The sensor turns clockwise from its forward axis; heights are along the axis of rotation."""
-        dual = f.return_mode == DUAL
-        clockwise = f.blocks.azimuth + _step(f, dual, model.period, last_block) * (model.delay / model.period)
-        return Polar(
-            range=f.blocks.channels.distance,
-            azimuth=-np.deg2rad(clockwise),
-            elevation=np.deg2rad(model.elevation),
-            intensity=f.blocks.channels.intensity,
-            time=np.where(dual, BLOCK // 2, BLOCK) * model.period + model.delay,
-            ring=model.ring,
-            return_index=np.where(dual, BLOCK % 2, 0),
-            origin=(0, 0, model.height),
-        )
-
-    return points
+def points(f: Fields, model: Firings, last_block: str = "previous") -> Polar:
+    """The sensor turns clockwise from its forward axis; heights are along the axis of rotation."""
+    dual = f.return_mode == DUAL
+    clockwise = f.blocks.azimuth + _step(f, dual, model.period, last_block) * (model.delay / model.period)
+    return Polar(
+        range=f.blocks.channels.distance,
+        azimuth=-np.deg2rad(clockwise),
+        elevation=np.deg2rad(model.elevation),
+        intensity=f.blocks.channels.intensity,
+        time=np.where(dual, BLOCK // 2, BLOCK) * model.period + model.delay,
+        ring=model.ring,
+        return_index=np.where(dual, BLOCK % 2, 0),
+        origin=(0, 0, model.height),
+    )
 
 
 def _step(f: Fields, dual: Any, period: float, last_block: str) -> Any:
@@ -101,25 +96,20 @@ def _difference(start: Any, end: Any) -> Any:
     return wrap(end - start + 180, 360) - 180
 
 
-def configuring(model: Firings) -> Callable[..., Sensor]:
-    """The `configure` function of a model."""
+def configure(model: Firings, sensor: Sensor, /, *, last_block: str) -> Sensor:
+    """The sensor with another rule for the last block, "previous" or "invalid" (see the module's text).
 
-    def configure(sensor: Sensor, *, last_block: str) -> Sensor:
-        """The sensor with another rule for the last block, "previous" or "invalid" (see the module's text)."""
-        if last_block not in LAST_BLOCK:
-            raise UsageError(f"{sensor.id}: last_block is one of {', '.join(LAST_BLOCK)}, not {last_block!r}")
-        return dataclasses.replace(sensor, points=points_of(model, last_block))
+    Raises:
+        UsageError: for another rule.
+    """
+    if last_block not in LAST_BLOCK:
+        raise UsageError(f"{sensor.id}: last_block is one of {', '.join(LAST_BLOCK)}, not {last_block!r}")
+    return dataclasses.replace(sensor, points=partial(points, model=model, last_block=last_block))
 
-    return configure
 
-
-def sweep_of(model: Firings, rate: float = 10.0) -> Callable[[int], dict[str, Any]]:
-    """The sweep of a model with single return that turns so many times a second."""
-
-    def sweep(i: int) -> dict[str, Any]:
-        block = i * BLOCKS + np.arange(BLOCKS)
-        azimuth = np.round(block * model.period * rate * 360, 2) % 360
-        timestamp = i * BLOCKS * model.period % HOUR
-        return {"blocks.azimuth": azimuth, "timestamp": timestamp, "return_mode": STRONGEST, "product": model.product}
-
-    return sweep
+def sweep(i: int, model: Firings) -> dict[str, Any]:
+    """Packet i with single return, at 10 turns a second."""
+    block = i * BLOCKS + np.arange(BLOCKS)
+    azimuth = np.round(block * model.period * 10 * 360, 2) % 360
+    timestamp = i * BLOCKS * model.period % HOUR
+    return {"blocks.azimuth": azimuth, "timestamp": timestamp, "return_mode": STRONGEST, "product": model.product}

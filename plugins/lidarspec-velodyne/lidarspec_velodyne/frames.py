@@ -16,6 +16,7 @@ from lidarspec.spec import Fields, Frame, Scaled, Simulation
 BLOCKS, SLOTS = 12, 32
 STRONGEST, DUAL = 0x37, 0x39
 HOUR = 3600.0  # seconds after which the clock starts again
+TURN = (5.0, 20.0)  # turns a second, slowest and fastest (data sheets)
 POSITIONS = 144  # position packets a second, about
 NMEA = 128  # bytes that a sentence may have (velodyne_decoder)
 
@@ -87,10 +88,9 @@ def sweep_position(i: int) -> dict[str, Any]:
 
 
 FRAMES = {
-    "data": Frame(DATA, data=True, max_length=1206, plausible=plausible),
+    "data": Frame(DATA, data=True, plausible=plausible),
     "position": Frame(
         POSITION,
-        max_length=512,
         plausible=plausible_position,
         simulation=Simulation(sweep_position, rate=POSITIONS),
         acknowledged={"LS201 inertial.temperature": "signed in the low 12 bits from an HDL-32E, and no number at all from a VLP-16"},

@@ -1,0 +1,43 @@
+"""What the sensors declare of themselves beside their frames: fields that exist, relatives that name each other, turns as simulated."""
+
+from __future__ import annotations
+
+import pytest
+
+import lidarspec as ls
+from lidarspec.simulation.simulator import simulate
+from lidarspec.wire.schema import schema
+
+SENSORS = ls.sensors()
+
+
+@pytest.mark.parametrize("sensor", SENSORS.values(), ids=SENSORS)
+def test_what_frames_say_of_the_device_is_a_field_of_an_incoming_frame(sensor: ls.Sensor) -> None:
+    for role, path in sensor.info.items():
+        name, _, field = path.partition(".")
+        assert name in sensor.incoming, f"{role}: {path}"
+        assert field in schema(sensor.frames[name].tree).fields, f"{role}: {path}"
+
+
+@pytest.mark.parametrize("sensor", SENSORS.values(), ids=SENSORS)
+def test_relatives_are_other_sensors_that_name_this_one_too(sensor: ls.Sensor) -> None:
+    for relative, difference in sensor.relatives.items():
+        assert relative in SENSORS.keys() - {sensor.id}
+        assert sensor.id in SENSORS[relative].relatives
+        assert difference
+
+
+@pytest.mark.parametrize("sensor", SENSORS.values(), ids=SENSORS)
+def test_who_has_the_same_incoming_frames_is_a_relative(sensor: ls.Sensor) -> None:
+    alike = {other.id for other in SENSORS.values() if other is not sensor and dict(other.incoming) == dict(sensor.incoming)}
+    assert alike == set(sensor.relatives)
+
+
+@pytest.mark.parametrize("name", [name for name, sensor in SENSORS.items() if sensor.turn and sensor.clock])
+def test_simulated_it_turns_no_slower_and_no_faster(name: str) -> None:
+    sensor, packets = SENSORS[name], 3 * 630  # three frames of the M1, which takes the most
+    frames = simulate(sensor, packets)
+    rates = [scan.rate_hz for scan in sensor.scans(frames if sensor.datagrams else b"".join(frames)) if scan.complete]
+    slowest, fastest = sensor.turn or (0, 0)
+    assert rates
+    assert slowest - 0.01 <= min(rates) <= max(rates) <= fastest + 0.01
