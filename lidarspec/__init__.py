@@ -35,12 +35,16 @@ if TYPE_CHECKING:
         UsageError as UsageError,
         WireError as WireError,
     )
+    from lidarspec.explaining.explanation import explain as explain
+    from lidarspec.exports import export as export
     from lidarspec.framing.decoder import Decoder as Decoder
     from lidarspec.framing.results import Counters as Counters, Found as Found
     from lidarspec.packets.packets import Packets as Packets
     from lidarspec.plugins import sensor as sensor, sensors as sensors
     from lidarspec.points.cloud import PointCloud as PointCloud
+    from lidarspec.recording.recorders import Recorder as Recorder
     from lidarspec.scans.scans import LaserScan as LaserScan, Scan as Scan
+    from lidarspec.simulation.simulator import simulate as simulate
     from lidarspec.spec.sensor import Sensor as Sensor
 
 _NAMES = {
@@ -54,6 +58,10 @@ _NAMES = {
     "packets.packets": ("Packets",),
     "points.cloud": ("PointCloud",),
     "scans.scans": ("Scan", "LaserScan"),
+    "explaining.explanation": ("explain",),
+    "exports": ("export",),
+    "simulation.simulator": ("simulate",),
+    "recording.recorders": ("Recorder",),
     "errors": ("LidarSpecError", "SpecError", "WireError", "UsageError", "SourceError", "CommandError"),
 }
 _HOMES = {name: module for module, names in _NAMES.items() for name in names}
