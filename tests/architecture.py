@@ -14,57 +14,56 @@ from functools import cached_property
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
+#: the stations on the way of a byte, bottom to top; a module that is named stands on its own floor, else on that of its package. Imports
+#: go down or stay, wherever in a module they stand and for types alike.
 FLOORS = (
-    "_version abilities errors allocation lanes checksums catalogue angles fields units bits construction",
-    "spec hookspecs geometry links rules splits files searching",
-    "frames framing straight runs installed plugins",
-    "found datagrams decoder packets streams clocks sequences clouds points plans cuts reorder mounting",
-    "session replies scans simulation explaining parsing building examples engine wiretable",
-    "device async_device inputs detection transports recording captures sources settings drafts",
-    "testing formats export view demo scaffold",
+    "_version errors",
+    "transports.protocol",  # what a source is, as values that plugins give too
+    "spec",
+    "wire",
+    "columns",
+    "framing",
+    "points",  # functions of a batch of packets: `Packets.points` hands over to them
+    "packets",
+    "scans",
+    "simulation",
+    "spec.sensor",  # a `Spec` with all of the above as methods
+    "plugins",
+    "spec.__init__ captures recording",  # the names of authors
+    "device.settings device.session",
+    "transports",
+    "discovery",
+    "device",
+    "explaining exports formats view",
+    "testing",
     "cli",
-    "__main__",
+    "__main__ __init__",
 )
 FLOOR_OF = {name: floor for floor, names in enumerate(FLOORS) for name in names.split()}
-IO_FLOOR = FLOOR_OF["transports"]
+IO_FLOOR = FLOOR_OF["plugins"]
+#: packages with a face above their modules.
+PACKAGES = {name.removesuffix(".__init__") for name in FLOOR_OF if name.endswith(".__init__")}
 TOP = len(FLOORS) - 1
 
 IO = {"asyncio", "logging", "serial", "socket", "threading", "time"}
-CONSTRUCT = {
-    "bits",
-    "construction",
-    "fields",
-    "rules",
-    "frames.schema",
-    "spec",
-    "frames.walk",
-    "frames.choices",
-    "frames.headers",
-    "frames.codecs",
-    "parsing",
-    "building",
-    "examples",
-    "frames.unpacking",
-    "frames.dispatch",
-    "wiretable",
-    "explaining.explain",
-    "export.messages",
-    "testing.declared",
-    "testing.oracle",
-    "export.formulas",
-}
+#: who may import a library; whoever is not named here may not.
 CONFINED = {
-    "numba": {"plans.kernelmath"},
-    "llvmlite": {"plans.kernelmath"},
-    "construct": CONSTRUCT,
-    "pluggy": {"hookspecs", "plugins"},
+    "numba": {"points.numba_kernels.arithmetic"},
+    "llvmlite": {"points.numba_kernels.arithmetic"},
+    "construct": {"spec.construct_layer", "spec.fields", "spec.description", "framing.frame_engine", "wire.parse", "wire.build"},
+    "pluggy": {"plugins"},
     "serial": {"transports.serial", "transports.ports"},
+    "click": {"cli"},
+    "rich": {"cli", "view"},
+    "hypothesis": {"testing"},
+    "pytest": {"testing"},
 }
+#: the one module that asks which of construct's classes something is.
+CONSTRUCT_LAYER = "lidarspec.spec.construct_layer"
 
 TYPE_CHECKING = {"TYPE_CHECKING", "typing.TYPE_CHECKING"}
 PLUGINS_MAY_IMPORT = {"construct", "numpy"} | sys.stdlib_module_names
-FILE_LINES = 350
-FUNCTION_LINES = 60
+FACES = ("lidarspec", "lidarspec.spec")
 
 
 @dataclass(frozen=True)
@@ -129,20 +128,24 @@ def resolve(name: str, modules: Mapping[str, Module]) -> str | None:
 
 
 def floor(name: str) -> int | None:
-    """The floor of a module by dotted name; a subpackage stands on one floor as a whole."""
-    _, *inside = name.split(".")
-    return FLOOR_OF.get(inside[0]) if inside else TOP
+    """The floor of a module by dotted name: its own, else that of its package; None where neither has one."""
+    inside = name.partition(".")[2] or "__init__"
+    if inside in PACKAGES:
+        inside = f"{inside}.__init__" if f"{inside}.__init__" in FLOOR_OF else inside
+    while inside not in FLOOR_OF and "." in inside:
+        inside = inside.rpartition(".")[0]
+    return FLOOR_OF.get(inside)
 
 
 def climbing(modules: Mapping[str, Module]) -> list[str]:
-    """Modules without a floor, imports that go up, and the first circle."""
+    """Modules without a floor, imports that go up, and the first circle; imports for types count as all others."""
     complaints = [f"{name} stands on no floor: add it to FLOORS" for name in modules if floor(name) is None]
     graph: dict[str, set[str]] = {name: set() for name in modules}
     for module in modules.values():
         here = floor(module.name)
-        for line, imported in imports(module):
+        for line, imported in imports(module, typing=True):
             target = resolve(imported, modules)
-            if target is None:
+            if target is None or target == module.name:
                 continue
             graph[module.name].add(target)
             there = floor(target)
@@ -165,23 +168,45 @@ def misplaced_imports(modules: Mapping[str, Module]) -> list[str]:
             library = imported.partition(".")[0]
             if library in IO and here is not None and here < IO_FLOOR:
                 complaints.append(f"{module.name}:{line} imports {library} below floor {IO_FLOOR}")
-            if library in CONFINED and inside not in CONFINED[library]:
-                complaints.append(f"{module.name}:{line} imports {library}, which is for {', '.join(sorted(CONFINED[library]))}")
+            allowed = CONFINED.get(library)
+            if allowed is not None and not any(inside == name or inside.startswith(f"{name}.") for name in allowed):
+                complaints.append(f"{module.name}:{line} imports {library}, which is for {', '.join(sorted(allowed))}")
     return complaints
 
 
-def private_imports(modules: Mapping[str, Module], public: Collection[str]) -> list[str]:
-    """What a plugin takes that is not a public name of lidarspec, and not numpy, construct or the standard library."""
+def construct_asked(modules: Mapping[str, Module]) -> list[str]:
+    """Places outside construct's layer that ask whether something is of a class of construct's."""
+    complaints = []
+    for module in modules.values():
+        froms = [node for node in ast.walk(module.tree) if isinstance(node, ast.ImportFrom) and node.module == "construct"]
+        names = {alias.asname or alias.name for node in froms for alias in node.names}
+        for node in ast.walk(module.tree):
+            if module.name == CONSTRUCT_LAYER or not isinstance(node, ast.Call) or ast.unparse(node.func) != "isinstance":
+                continue
+            asked = {ast.unparse(part) for part in ast.walk(node.args[1]) if isinstance(part, ast.Name | ast.Attribute)}
+            if asked & names or any(name.startswith("construct.") for name in asked):
+                complaints.append(f"{module.name}:{node.lineno} asks for a class of construct's")
+    return complaints
+
+
+def private_imports(modules: Mapping[str, Module], public: Mapping[str, Collection[str]]) -> list[str]:
+    """What a plugin takes that is no public name of `lidarspec` or `lidarspec.spec`, and not numpy, construct or the standard library.
+
+    Args:
+        public: the names of each of these two.
+    """
+    known = {*public, *(f"{face}.{name}" for face, names in public.items() for name in names)}
     complaints = []
     for module in modules.values():
         own = module.name.partition(".")[0]
         for line, imported in imports(module, typing=True):
-            library, _, rest = imported.partition(".")
-            if library == "lidarspec" and rest and rest not in public:
+            library = imported.partition(".")[0]
+            if library == "lidarspec" and imported not in known:
                 complaints.append(f"{module.name}:{line} imports {imported}, which is not public")
             elif library not in PLUGINS_MAY_IMPORT | {own, "lidarspec"}:
                 complaints.append(f"{module.name}:{line} imports {library}")
-        complaints += [f"{module.name}:{line} uses {name}, which is not public" for line, name in attributes(module) if name not in public]
+        used = [(line, name) for line, name in attributes(module) if name not in public["lidarspec"]]
+        complaints += [f"{module.name}:{line} uses {name}, which is not public" for line, name in used]
     return complaints
 
 
@@ -193,21 +218,6 @@ def attributes(module: Module) -> Iterator[tuple[int, str]]:
     for node in nodes:
         if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id in bound:
             yield node.lineno, node.attr
-
-
-def oversized(modules: Mapping[str, Module]) -> list[str]:
-    """Files and functions that cannot be read in one sitting."""
-    complaints = []
-    for module in modules.values():
-        lines = len(module.text.splitlines())
-        if lines > FILE_LINES:
-            complaints.append(f"{module.name} has {lines} lines")
-        for node in ast.walk(module.tree):
-            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef) and node.end_lineno is not None:
-                lines = node.end_lineno - node.lineno + 1
-                if lines > FUNCTION_LINES:
-                    complaints.append(f"{module.name}:{node.lineno} {node.name} has {lines} lines")
-    return complaints
 
 
 def word(name: str) -> re.Pattern[str]:

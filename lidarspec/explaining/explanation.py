@@ -305,7 +305,7 @@ def _blocks(node: Node, path: str) -> Iterator[tuple[str, Mapping[Keys, BitField
     """The bits of each field of each bit block, by the path of the block, arrays in it with "[]"."""
     match node:
         case Block():
-            yield path, {part.bits.keys: part.bits for part in node.parts}
+            yield path, {part.bits.keys: part.bits for part in node.parts if part.info.dtype is not None}
         case Opaque(in_bits=True):
             yield path, {}
         case Struct():

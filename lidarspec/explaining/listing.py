@@ -30,18 +30,18 @@ def text(line: Line) -> str:
 
 
 def folded(line: Line, width: int) -> Line:
-    """The same line with line breaks where it is wider than `width`; what goes on stands below the first piece of its text."""
+    """A line with line breaks where it is wider than `width`; what goes on stands below the first piece of its text."""
     indent = sum(len(span.text) for span in line[:FIXED])
     if len(text(line)) <= width or indent + FOLDED > width:
         return line
-    found, column = list(line[:FIXED]), indent
+    spans, column = list(line[:FIXED]), indent
     for span in line[FIXED:]:
         for word in re.findall(r"\s*\S+", span.text):
             breaks = column + len(word) > width and column > indent
             part = f"\n{' ' * indent}{word.lstrip()}" if breaks else word
-            found.append(Span(part, span.role))
+            spans.append(Span(part, span.role))
             column = len(part) - 1 if breaks else column + len(part)
-    return tuple(found)
+    return tuple(spans)
 
 
 def parents(path: str) -> list[str]:

@@ -130,7 +130,7 @@ class Row:
         return "".join(text for text, _ in self.spans())
 
     def spans(self, *, drawn: bool = False) -> list[Span]:
-        """The same in parts with their roles; with `drawn`, without the values, which stand bit by bit below the row."""
+        """The meaning in pieces with their roles; with `drawn`, without the values, which stand bit by bit below the row."""
         alone = len(self.values) == 1 and not self.values[0].bits
         values = [] if drawn else self._values(alone=alone)
         verdict = "good" if self.right else "bad"
@@ -160,9 +160,9 @@ class Row:
 
     def to_dict(self) -> dict[str, Any]:
         """The row for JSON."""
-        found = {"offset": self.offset, "hex": self.data.hex(" "), "path": self.path, "meaning": self.meaning, "right": self.right}
+        facts = {"offset": self.offset, "hex": self.data.hex(" "), "path": self.path, "meaning": self.meaning, "right": self.right}
         points = [{name: number(value) for name, value in point._asdict().items()} for point in self.points]
-        return {**found, "values": [value.to_dict() for value in self.values]} | ({"points": points} if points else {})
+        return {**facts, "values": [value.to_dict() for value in self.values]} | ({"points": points} if points else {})
 
 
 def _named(value: Value, name: str, *, plain: bool, bits: bool) -> str:
@@ -246,14 +246,14 @@ def hexdump(error: WireError) -> str:
     first = min(error.offset, len(error.data)) // DUMPED * DUMPED
     if error.offset == len(error.data) and first == len(error.data) and first:
         first -= DUMPED
-    found = ["  ..."] * (first > BEFORE * DUMPED)
+    lines = ["  ..."] * (first > BEFORE * DUMPED)
     for start in range(max(first - BEFORE * DUMPED, 0), first + 1, DUMPED):
         left, right = (error.data[start + half : start + half + 8].hex(" ") for half in (0, 8))
-        found.append(f"  {start:04x}  {left:<23}  {right}".rstrip())
+        lines.append(f"  {start:04x}  {left:<23}  {right}".rstrip())
     place = error.offset - first
     columns = [8 + 3 * index + (index >= 8) for index in (place, min(place + size, DUMPED) - 1)]
     marks = "^" * (max(columns[1], columns[0]) + 2 - columns[0])
-    return "\n".join([*found, f"{' ' * columns[0]}{marks} {error.path}".rstrip()]) if error.data else ""
+    return "\n".join([*lines, f"{' ' * columns[0]}{marks} {error.path}".rstrip()]) if error.data else ""
 
 
 def _marked(error: WireError) -> int:

@@ -13,7 +13,6 @@ import random
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-import construct
 import numpy as np
 from numpy.typing import NDArray
 
@@ -21,7 +20,7 @@ from lidarspec.errors import SpecError, UnknownFrame, UsageError
 from lidarspec.framing.frame_engine import CompiledCodec, InterpretedCodec, codec
 from lidarspec.framing.plausibility import plausibility
 from lidarspec.framing.results import VALID
-from lidarspec.spec.construct_layer import random_value
+from lidarspec.spec.construct_layer import Fault, random_value
 from lidarspec.spec.description import Spec
 from lidarspec.wire.build import build
 from lidarspec.wire.frame_table import Group, Rows
@@ -181,7 +180,7 @@ def _interpreted(sensor: Spec, frame: str, engine: InterpretedCodec, source: ran
     for _ in range(BATCH * TRIES):
         try:
             data = build(sensor, frame, random_value(engine.frame.prepared, source, drawn), {})
-        except (UsageError, construct.ConstructError):  # what was drawn goes not together; something else may
+        except (UsageError, Fault):  # what was drawn goes not together; something else may
             continue
         if engine.survey(np.frombuffer(data, np.uint8), np.zeros(1, np.intp)).status[0] == VALID:
             return data

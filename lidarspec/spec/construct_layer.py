@@ -80,6 +80,10 @@ _MISSING = object()
 UNNAMED = "(constant)"
 
 
+#: what construct raises where bytes or values do not fit a struct.
+Fault = ConstructError
+
+
 class Mismatch(ConstructError):  # type: ignore[misc]
     """A value on the wire that is not what the spec asks for; made a `WireError` by the engine."""
 
@@ -723,7 +727,7 @@ class _Builder:
             said = FieldInfo(path, info.axes, docs=info.docs if place.in_bits else "", optional=info.optional)
             members.append(self.node(child, _Place(said, scope, child.name or "", place.in_bits)))
         self.scopes[info.path] = scope
-        return tree.Struct(place.name, info.path, tuple(members))
+        return tree.Struct(place.name, info.path, tuple(members), info.docs)
 
     def _sealed(self, con: Sealing, place: _Place) -> Node:
         body = self.node(con.subcon, place)

@@ -314,11 +314,12 @@ class Block:
 
 @dataclass(frozen=True, eq=False)
 class Struct:
-    """Members in a row; `path` is "" for the frame itself."""
+    """Members in a row; `path` is "" for the frame itself, `docs` is the author's text on all of them."""
 
     name: str
     path: str
     members: tuple[Node, ...]
+    docs: str = ""
 
 
 @dataclass(frozen=True, eq=False)

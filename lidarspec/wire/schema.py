@@ -12,7 +12,7 @@ from functools import cached_property
 
 import numpy as np
 
-from lidarspec.spec.tree import Blob, Block, FieldInfo, Formula, Node, Number, Op, Opaque, Repeat, Select, When, children
+from lidarspec.spec.tree import Blob, Block, FieldInfo, Formula, Node, Number, Op, Opaque, Repeat, Select, Struct, When, children, nodes
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +43,17 @@ def schema(root: Node) -> Schema:
     fields: dict[str, FieldInfo] = {}
     arrays: dict[str, Formula | None] = {}
     _walk(root, fields, arrays, optional=False)
-    return Schema(fields, arrays)
+    structs = {node.path: node.docs for node in nodes(root) if isinstance(node, Struct) and node.docs}
+    return Schema({path: replace(info, docs=info.docs or _docs_around(path, structs)) for path, info in fields.items()}, arrays)
+
+
+def _docs_around(path: str, structs: Mapping[str, str]) -> str:
+    """What the author says of the innermost struct around a field of which nothing is said."""
+    while path and structs:
+        path = path.rpartition(".")[0]
+        if path in structs:
+            return structs[path]
+    return ""
 
 
 def _walk(node: Node, fields: dict[str, FieldInfo], arrays: dict[str, Formula | None], *, optional: bool) -> None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from lidarspec.spec.bits import BitField
 from lidarspec.spec.construct_layer import UNNAMED
@@ -22,6 +22,7 @@ from lidarspec.spec.tree import (
     Formula,
     Node,
     Number,
+    Op,
     Opaque,
     Part,
     Ref,
@@ -153,11 +154,11 @@ def _rows(node: Node, shown: str, start: Extent, condition: str, seals: Mapping[
                 yield from _rows(branch, shown, start, asked, seals)
         case Block():
             for part in node.parts:
-                width = f"{part.bits.width} bit{'s' * (part.bits.width > 1)}"
-                yield _row(part.info, str(start), width, bit_text(part.bits), _part(shown, part), condition, seals)
+                yield _row(part.info, str(start), *_bits(part), _part(shown, part), condition, seals)
         case Number() | Blob() | Opaque():
             length = "varies" if isinstance(node, Opaque) and node.size is None else str(extent(node, shown))
-            yield _row(node.info, str(start), length, _type(node), shown, condition, seals)
+            info = replace(node.info, const=node.const) if isinstance(node, Blob) else node.info
+            yield _row(info, str(start), length, _type(node), shown, condition, seals)
 
 
 def _row(info: FieldInfo, offset: str, size: str, kind: str, shown: str, condition: str, seals: Mapping[str, str]) -> WireRow:
@@ -167,6 +168,14 @@ def _row(info: FieldInfo, offset: str, size: str, kind: str, shown: str, conditi
 
 def _part(shown: str, part: Part) -> str:
     return ".".join(filter(None, (shown, *part.names))) + "".join(f"[{index}]" for index in part.indices)
+
+
+def _bits(part: Part) -> tuple[str, str]:
+    """Size and type of a part of a block: bits, or bytes for an integer that is wider than any number."""
+    if part.info.dtype is None and part.bits.run is not None:
+        order, _, size = part.bits.run
+        return str(size), f"{'int' if part.bits.signed else 'uint'}{8 * size} {'be' if order == '>' else 'le'}"
+    return f"{part.bits.width} bit{'s' * (part.bits.width > 1)}", bit_text(part.bits)
 
 
 def _type(node: Number | Blob | Opaque) -> str:
@@ -190,6 +199,9 @@ def branches(node: When | Select) -> list[tuple[str, Node]]:
 
 def phrase(formula: Formula) -> str:
     """A formula as people write it, with its fields by their whole paths; "?" for a function that cannot be read."""
+    match formula:
+        case Op("==" | "!=" as symbol, (Ref() as ref, int() as value)) if value in ref.info.labels:
+            return f"{ref.path} {symbol} {ref.info.labels[value]!r}"
     text = formula.text if isinstance(formula, Code) else written(formula, lambda ref: ref.path, {})
     return text[1:-1] if _is_enclosed(text) else text
 

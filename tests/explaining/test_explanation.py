@@ -9,7 +9,7 @@ import re
 
 import numpy as np
 import pytest
-from construct import Array, Const, Enum, Int8ul, Int16ub, Int16ul, Struct
+from construct import Array, BitsInteger, BitStruct, Const, Enum, IfThenElse, Int8ul, Int16ub, Int16ul, Nibble, Struct, this
 
 import lidarspec as ls
 from lidarspec import Sensor, WireError
@@ -217,6 +217,24 @@ def test_constants_without_a_name_and_documented_elements_keep_their_places() ->
     sensor = variant(Const(b"\x77"), "far" / Scaled(Int16ul, 0.01, "m"), "pairs" / Array(2, Struct("a" / Int8ul) * "one"), "check" / Int8ul)
     found = explain(sensor.build("data", far=1, pairs=[{"a": 3}, {"a": 4}]), sensor)
     assert [(row.offset, row.path) for row in found.rows] == [(0, "(constant)"), (1, "far"), (3, "pairs[0]"), (4, "pairs[1]"), (5, "check")]
+
+
+def test_bit_blocks_in_arrays_of_arrays_have_rows_of_their_own_and_groups_give_their_text() -> None:
+    grid = Array(2, Array(2, BitStruct("high" / Nibble, "low" / Nibble)))
+    sensor = variant("far" / Int8ul, "grid" / grid, "group" / Struct("a" / Int8ul * "its own", "b" / Int8ul) * "both", "check" / Int8ul)
+    found = explain(bytes([1, 0x12, 0x34, 0x56, 0x78, 5, 6, 2 ^ 0x12 ^ 0x34 ^ 0x56 ^ 0x78]), sensor)
+    assert found.verdict == "valid"
+    assert [row.path for row in found.rows[1:5]] == ["grid[0][0]", "grid[0][1]", "grid[1][0]", "grid[1][1]"]
+    assert [(value.raw, value.bits) for value in found.rows[4].values] == [(7, "byte 0 bits 7-4"), (8, "byte 0 bits 3-0")]
+    assert [found.fields[path].docs for path in ("group.a", "group.b")] == ["its own", "both"]
+
+
+def test_a_bit_block_that_decides_on_its_bits_is_explained_without_them() -> None:
+    block = BitStruct("kind" / Nibble, "value" / IfThenElse(this.kind == 1, Nibble, BitsInteger(4, signed=True)))
+    sensor = variant("far" / Int8ul, "block" / block, "check" / Int8ul)
+    found = explain(bytes([1, 0x2F, 1 ^ 0x2F]), sensor, "data")
+    assert [(row.offset, row.path) for row in found.rows[:2]] == [(0, "far"), (1, "block")]
+    assert [(value.path, value.raw, value.bits) for value in found.rows[1].values] == [("block.kind", 2, ""), ("block.value", -1, "")]
 
 
 def test_a_checksum_within_a_frame_is_judged_over_its_own_bytes() -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 
 import pytest
-from construct import Struct
+from construct import Bytes, BytesInteger, Enum, If, Int8ul, Struct, this
 
 import lidarspec as ls
 from lidarspec.framing.frame_engine import CompiledCodec, codec
@@ -110,3 +110,15 @@ def test_extents_multiply(extent: Extent, factor: int | str, text: str) -> None:
 
 def test_an_empty_struct_has_no_rows() -> None:
     assert wire_table(Frame(Struct(), max_length=1)) == ()
+
+
+def test_wide_integers_are_bytes_and_conditions_have_names() -> None:
+    struct = Struct("kind" / Enum(Int8ul, plain=1), "more" / If(this.kind == "plain", Int8ul), "wide" / BytesInteger(10))
+    rows = {row.field: row for row in wire_table(Frame(struct, max_length=12))}
+    assert rows["more"].meaning == "if kind == 'plain'"
+    assert (rows["wide"].offset, rows["wide"].size, rows["wide"].type) == ("1 + size(more)", "10", "uint80 be")
+
+
+def test_lengths_that_python_alone_calculates_are_said_as_written() -> None:
+    struct = Struct("a" / Int8ul, "inner" / Struct("x" / Bytes(this._.a / 2), "y" / Bytes(lambda c: 1 if c.x else 2)))
+    assert [row.size for row in wire_table(Frame(struct, max_length=600))] == ["1", "a / 2", "?"]
