@@ -1,8 +1,7 @@
 """Where each field of a frame stands, as data: offsets, strides, bits, constants, checksums; and loading by it.
 
-A `Layout` holds for frames of one kind of header; `lidarspec.wire.layout_tree` makes it from the construct tree.
-
-Constants of frames: compared in words of up to eight bytes, for many frames at a time.
+A `Layout` holds for frames of one kind of header; `lidarspec.wire.layout_tree` makes it from the frame's tree. Its constants are
+compared in words of up to eight bytes, for many frames at a time.
 """
 
 from __future__ import annotations
