@@ -111,7 +111,7 @@ def _rule(port: str) -> str:
     """A udev rule that lets every user open ports of this kind."""
     kind = os.path.basename(port).rstrip("0123456789")
     rule = f'KERNEL=="{kind}[0-9]*", MODE="0666"'
-    return f"echo '{rule}' | sudo tee /etc/udev/rules.d/99-lidarspec.spec.rules && sudo udevadm trigger"
+    return f"echo '{rule}' | sudo tee /etc/udev/rules.d/99-lidarspec.rules && sudo udevadm trigger"
 
 
 def _in_use(port: str) -> Iterator[Finding]:

@@ -1,9 +1,8 @@
 """Frames made of physical values by path: everything else is 0, constants and checksums are in place.
 
 This is `build` for many frames at once, and without asking for every field: what a sensor sends is declared by the values that
-matter (a `sweep`, an answer to a command), and counts and options in the header decide the layout as they do for a decoder.
-
-Valid frames with seeded random content, for tests, docs and the REPL.
+matter (a `sweep`, an answer to a command), and counts and options in the header decide the layout as they do for a decoder. Examples,
+for tests, docs and the REPL, are valid frames with seeded random content in the same layouts.
 """
 
 from __future__ import annotations

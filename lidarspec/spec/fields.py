@@ -1,8 +1,7 @@
-"""Units of physical values, by name, and exact conversions of the few that the engine itself needs.
+"""What a struct needs beyond construct: a unit on a field, and a checksum that seals a struct.
 
-What a struct needs beyond construct: a unit on a field, and a checksum that seals a struct.
-
-Both are ordinary construct classes, so that they nest in anything; neither changes the raw integers of the wire.
+Both are ordinary parts of a struct, so that they nest in anything; neither changes the raw integers of the wire. Units go by name, and
+those few that someone may type are converted exactly.
 """
 
 from __future__ import annotations

@@ -87,6 +87,10 @@ def _nothing(count: int, frame: bytes) -> Sequence[None]:
 
 def _containers(members: Sequence[tuple[str, Reader]], count: int, frame: bytes) -> Sequence[Container]:
     containers = [Container() for _ in range(count)]  # made empty and filled by name, which takes half the time
+    if count == 1:
+        for name, reader in members:
+            containers[0][name] = reader(frame)[0]
+        return containers
     for name, reader in members:
         for container, value in zip(containers, reader(frame), strict=True):
             container[name] = value
