@@ -1,6 +1,6 @@
 """``python -m lidarspec``."""
 
-from lidarspec.cli import main
+from lidarspec.cli.root import main
 
 if __name__ == "__main__":
     main()

@@ -34,11 +34,9 @@ import pluggy
 
 from lidarspec.errors import LidarSpecError, SourceError, SpecError, UnknownSensor, UsageError
 from lidarspec.spec.checksums import Checksum
-from lidarspec.spec.construct_layer import prepare
+from lidarspec.spec.construct_layer import prepare, seals
 from lidarspec.spec.description import Frame
-from lidarspec.spec.fields import Checksummed
 from lidarspec.spec.results import Points
-from lidarspec.spec.rules import children
 from lidarspec.spec.sensor import Sensor
 
 if TYPE_CHECKING:
@@ -371,16 +369,11 @@ def _loaded(entry: EntryPoint, names: str, add: Callable[[Any], list[str]]) -> P
         return replace(plugin, error=reason, traceback=traceback.format_exc())
 
 
-def _seals(con: Any) -> list[Checksummed]:
-    found = [con] if isinstance(con, Checksummed) else []
-    return found + [seal for child in children(con) for seal in _seals(child)]
-
-
 def _resealed(frame: Frame, algorithm: Any) -> Frame:
     if not isinstance(algorithm, Checksum):
         raise SpecError(f"returns a Checksum or None, not {type(algorithm).__name__}")
     struct = prepare(frame.struct)
-    seal = next(iter(_seals(struct)), None)
+    seal = next(seals(struct), None)
     if seal is None:
         raise SpecError("answers for a frame without a checksum")
     seal.algorithm = algorithm

@@ -15,8 +15,7 @@ import click
 
 from lidarspec.cli.failures import FINDINGS
 from lidarspec.cli.output import Progress, emit, emit_json, note
-from lidarspec.discovery.draft import draft
-from lidarspec.discovery.scaffold import Link, Names, captured, invented, write
+from lidarspec.discovery.draft import Link, Names, captured, draft, invented, write
 from lidarspec.errors import UsageError, WireError, suggest
 from lidarspec.exports import EXPORTS, Refused, export as exported, narrowed
 from lidarspec.plugins import sensor as named_sensor, sensors

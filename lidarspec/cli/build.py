@@ -11,10 +11,11 @@ from typing import Any
 
 import click
 
-from lidarspec.cli.output import emit, emit_json, output_options
+from lidarspec.cli.options import output_options
+from lidarspec.cli.output import emit, emit_json
 from lidarspec.errors import LidarSpecError, OutOfRange, SourceError, UnknownField, UnknownFrame, UsageError, suggest
 from lidarspec.plugins import sensor as named_sensor
-from lidarspec.spec.fields import exact, factor, split_unit
+from lidarspec.spec.fields import factor, split_unit
 from lidarspec.spec.tree import FieldInfo, evaluated
 from lidarspec.wire.build import given_value
 from lidarspec.wire.schema import Schema, schema
@@ -119,14 +120,14 @@ def _steps(info: FieldInfo, number: Fraction, unit: str, path: str, place: str) 
     per_unit = factor(unit, info.unit)
     if per_unit is None:
         raise UsageError(f"{place}: {path} is in {info.unit or 'no unit'}, and {unit!r} cannot be turned into that")
-    raw = (number * per_unit - exact(info.offset)) / exact(info.scale)
+    raw: int | float = info.raw(number * per_unit)
     if info.kind != "int":
         return float(raw)
     low, high = info.limits
-    if not low <= round(raw) <= high:
-        edges = [float(edge * exact(info.scale) + exact(info.offset)) for edge in (low, high)]
+    if not low <= raw <= high:
+        edges = [float(info.physical(Fraction(edge))) for edge in (low, high)]
         raise OutOfRange(path, float(number * per_unit), *edges, unit=info.unit, place=place)
-    return round(raw)
+    return raw
 
 
 def _put(target: dict[str, Any], steps: Steps, value: Any, length: Callable[[str], int], above: str) -> None:

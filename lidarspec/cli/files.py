@@ -13,9 +13,9 @@ from pathlib import Path
 
 import click
 
-from lidarspec.cli.inputs import Input, nearest, no_frame
-from lidarspec.cli.output import emit, emit_json, note, sensor_option
-from lidarspec.cli.streams import nothing_came, scans_of
+from lidarspec.cli.inputs import Input, nearest_fault, no_frame, nothing_came, scans_of
+from lidarspec.cli.options import sensor_option
+from lidarspec.cli.output import emit, emit_json, note
 from lidarspec.device.device import Device, open as open_device
 from lidarspec.discovery.detect import detected, scores
 from lidarspec.errors import LidarSpecError, UsageError, WireError, suggest
@@ -81,7 +81,7 @@ def _detected(source: str, target: str) -> Sensor:
         raise suggest(error, f"lidarspec convert {source} {target} -s ID") from None
     except WireError as error:
         given = _again(source)
-        raise error if given is None else nearest(given) from None
+        raise error if given is None else nearest_fault(given) from None
 
 
 def _sum_up(device: Device, target: str, written: Written, *, as_json: bool) -> None:

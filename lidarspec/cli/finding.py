@@ -18,8 +18,8 @@ import click
 
 from lidarspec.cli.failures import DEVICE, FINDINGS, NO_DATA
 from lidarspec.cli.inputs import read
-from lidarspec.cli.output import emit, emit_json, note, output_options, sensor_option, table
-from lidarspec.cli.streams import DURATION
+from lidarspec.cli.options import DURATION, output_options, sensor_option
+from lidarspec.cli.output import emit, emit_json, note, table
 from lidarspec.device.settings import named
 from lidarspec.discovery.checksum_search import search
 from lidarspec.discovery.detect import Score, Verdict, verdict, verdicts

@@ -7,8 +7,10 @@ from typing import Any
 
 import click
 
-from lidarspec.cli.inputs import Input, Piece, fitting, likely_starts, nearest, no_frame, pieces, read
-from lidarspec.cli.output import emit, emit_json, emit_lines, note, output_options, sensor_option, table
+from lidarspec.cli.inputs import Input, nearest_fault, no_frame, read
+from lidarspec.cli.options import output_options, sensor_option
+from lidarspec.cli.output import emit, emit_json, emit_lines, note, table
+from lidarspec.discovery.identify import Piece, fitting, likely_starts, pieces
 from lidarspec.errors import UsageError, WireError, suggest
 from lidarspec.explaining.explanation import Explanation, explain as explained
 from lidarspec.explaining.listing import LINED, Line, told
@@ -98,7 +100,8 @@ def _compare(sensor: Sensor, given: Input, found: list[Piece], diff: str, frame:
         other = same[0]
     else:
         data = read([diff])
-        rest = [Piece(0, data.data, frame)] if frame else [piece for piece in pieces(sensor, data) if piece.frame]
+        whole = [Piece(0, data.data, frame)] if frame else pieces(sensor, data.chunks, datagrams=data.datagrams)
+        rest = [piece for piece in whole if piece.frame]
         other = next((piece for piece in rest if piece.frame == frames[0].frame), Piece(0, data.data, frames[0].frame))
     first, second = _explained(sensor, frames[0]), _explained(sensor, other)
     differing = first.differences(second)
@@ -118,7 +121,7 @@ def _found(
     """
     given = read(words)
     sensor, fits = _sensor(given, sensor_id, damaged=damaged)
-    found = [Piece(0, given.data, frame)] if frame else pieces(sensor, given)
+    found = [Piece(0, given.data, frame)] if frame else pieces(sensor, given.chunks, datagrams=given.datagrams)
     places = [place for place, piece in enumerate(found) if piece.frame]
     if count is not None and len(places) >= count:
         found = found[: places[count - 1] + 1]
@@ -129,12 +132,12 @@ def _sensor(given: Input, sensor_id: str | None, *, damaged: bool) -> tuple[Sens
     """The sensor named, or the one whose bytes these are, and the ids of all whose bytes they could be."""
     if sensor_id is not None:
         return named_sensor(sensor_id), []
-    found = fitting(given)
+    found = fitting(given.chunks, datagrams=given.datagrams)
     if found:
         fits = [sensor.id for sensor in found]
         note(f"these bytes fit {fits[0]}" + (f"; so do {', '.join(fits[1:])}: choose with -s" if fits[1:] else ""))
         return found[0], fits
-    fault = nearest(given)
+    fault = nearest_fault(given)
     if not damaged or not fault.sensor:
         raise fault
     note(f"these bytes fit no sensor; they come nearest to {fault.sensor}")

@@ -1,32 +1,31 @@
-"""What `parse` and `explain` are given: hexadecimal text, a file or standard input; and whose bytes they are."""
+"""What verbs are given: bytes as text, files, live sources; and what is said where nothing of use comes."""
 
 from __future__ import annotations
 
 import os
 import re
 import sys
-from collections.abc import Sequence
+import time
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from shlex import quote
 
-import numpy as np
-
+from lidarspec.device.device import Device
 from lidarspec.device.settings import devices
-from lidarspec.discovery.detect import scores
-from lidarspec.errors import LidarSpecError, SourceError, UsageError, WireError, suggest
-from lidarspec.framing.frame_engine import codec
-from lidarspec.framing.results import VALID
+from lidarspec.discovery.identify import nearest
+from lidarspec.errors import CommandError, LidarSpecError, SourceError, UsageError, WireError, suggest
 from lidarspec.plugins import sensors
+from lidarspec.scans.scans import Scan
 from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.open_url import is_port, live_address, transport
 from lidarspec.wire.parse import parse_typed
 
 #: longest hexadecimal text that is repeated in the next command, and of other text in a message.
 REPEATED, QUOTED = 400, 64
-#: sensors whose share of the bytes is this close to the best fit as well.
-AS_GOOD = 0.01
-#: constant bits that make bytes look like a frame, and constant bytes that do so in the midst of others.
-ALIKE, SYNC = 8, 2
+#: seconds that a device is given for its first frame.
+PATIENCE = 10.0
+#: seconds between two looks at a source that sends nothing.
+LOOK = 0.1
 
 
 @dataclass(frozen=True)
@@ -41,15 +40,6 @@ class Input:
     def data(self) -> bytes:
         """All bytes in order."""
         return b"".join(self.chunks)
-
-
-@dataclass(frozen=True)
-class Piece:
-    """A frame in the input, or with `frame` "" bytes that are in none."""
-
-    offset: int
-    data: bytes
-    frame: str
 
 
 def read(words: Sequence[str]) -> Input:
@@ -77,47 +67,6 @@ def read(words: Sequence[str]) -> Input:
         raise UsageError(f"{text[:QUOTED]!r} is no file, and not hexadecimal: {error}") from None
 
 
-def fitting(given: Input) -> list[Sensor]:
-    """The installed sensors whose bytes these are, the best first; those with a type of exactly this frame before all others."""
-    known = list(sensors().values())
-    whole = [sensor for sensor in known if any(_is_frame(sensor, name, given.data) for name in sensor.frames)]
-    if whole:
-        return whole
-    found = scores(list(given.chunks), datagrams=given.datagrams) if given.data else []
-    return [score.sensor for score in found if score.share >= found[0].share - AS_GOOD]
-
-
-def pieces(sensor: Sensor, given: Input) -> list[Piece]:
-    """The frames of the input in order, and the bytes between them; empty where there is no frame."""
-    data = given.data
-    try:
-        return [Piece(0, data, parse_typed(sensor, data)[0])]
-    except LidarSpecError:
-        frames = sensor.split(list(given.chunks) if given.datagrams else data)
-    if not frames:
-        return []
-    found: list[Piece] = []
-    end = 0
-    for frame in frames:
-        if frame.offset > end:
-            found.append(Piece(end, data[end : frame.offset], ""))
-        found.append(Piece(frame.offset, frame.data, frame.frame))
-        end = frame.offset + len(frame.data)
-    return found + ([Piece(end, data[end:], "")] if end < len(data) else [])
-
-
-def likely_starts(sensor: Sensor, data: bytes) -> list[int]:
-    """Where bytes begin like an incoming frame: with two constant bytes or more, and any other; in ascending order."""
-    starts: set[int] = set()
-    for frame in sensor.frames.values():
-        prefix = codec(frame).prefix
-        size = next((spot for spot in range(len(prefix) + 1) if prefix.get(spot, (0, 0))[0] != 0xFF), 0)
-        if frame.direction == "in" and size >= SYNC:
-            magic = bytes(prefix[spot][1] for spot in range(size))
-            starts |= {found.start() for found in re.finditer(re.escape(magic) + b"(?=.)", data, re.DOTALL)}
-    return sorted(starts)
-
-
 def no_frame(sensor: Sensor, given: Input) -> WireError:
     """Why there is no frame of this sensor in the input, with the next command."""
     data = given.data
@@ -135,23 +84,58 @@ def no_frame(sensor: Sensor, given: Input) -> WireError:
     return suggest(WireError("the bytes are not plausible", sensor=sensor.id, data=data), command)
 
 
-def nearest(given: Input) -> WireError:
+def nearest_fault(given: Input) -> WireError:
     """No sensor fits: what the one that came farthest says, with its id, or that none came far."""
     if not given.data:
         return suggest(WireError(f"{given.name} holds no bytes"), "lidarspec sensors")
-    known = sensors().values()
-    faults = []
-    for sensor in known:
-        try:
-            parse_typed(sensor, given.data)
-        except WireError as fault:
-            faults.append(fault)
-        except LidarSpecError:
-            continue
-    best = max((fault for fault in faults if _begins_alike(fault)), key=lambda fault: fault.offset, default=None)
+    best = nearest(given.data)
     if best is None:
-        return suggest(WireError(f"no frame of any of the {len(known)} installed sensors", data=given.data[:QUOTED]), "lidarspec sensors")
+        text = f"no frame of any of the {len(sensors())} installed sensors"
+        return suggest(WireError(text, data=given.data[:QUOTED]), "lidarspec sensors")
     return suggest(best, f"lidarspec explain {given.name} -s {best.sensor}")
+
+
+def nothing_came(device: Device, source: str, seconds: float | None = None) -> LidarSpecError:
+    """Why there is nothing to show: no data frame in a file, a silent device, or one whose bytes are no frames."""
+    sensor, stats = device.sensor, device.stats
+    if not device.is_live:
+        what = "holds no bytes" if stats.bytes_in == 0 else f"has no data frame: {stats}"
+        return suggest(WireError(f"{source} {what}", sensor=sensor.id), f"lidarspec explain {source} -s {sensor.id}")
+    waited = "" if seconds is None else f" within {seconds:.1f} s".replace(".0 s", " s")
+    if stats.bytes_in == 0:
+        return suggest(CommandError(f"{sensor.id} on {source} sent nothing{waited}"), f"lidarspec doctor {source} -s {sensor.id}")
+    error = WireError(f"{source}: {stats.bytes_in} bytes{waited}, and not a scan of data frames among them: {stats}", sensor=sensor.id)
+    return suggest(error, f"lidarspec detect {source}")
+
+
+class Patience:
+    """The time in which a live source has to send its first frame."""
+
+    def __init__(self, device: Device, source: str) -> None:
+        self._device, self._source, self._began = device, source, time.monotonic()
+
+    def check(self) -> None:
+        """Nothing, while there is hope.
+
+        Raises:
+            CommandError, WireError: where the device has sent nothing, or nothing of the sensor's, for too long.
+        """
+        waited = time.monotonic() - self._began
+        if waited > PATIENCE and self._device.is_live and not self._device.stats.frames:
+            raise nothing_came(self._device, self._source, waited)
+
+
+def scans_of(device: Device, source: str) -> Iterator[Scan]:
+    """The scans of a device, which has to send its first frame in time.
+
+    Raises:
+        CommandError, WireError: see `Patience`.
+    """
+    patience = Patience(device, source)
+    for scan in device.scans(wait=LOOK):
+        if scan is not None:
+            yield scan
+        patience.check()
 
 
 def _file(path: str) -> Input:
@@ -182,24 +166,3 @@ def _unhexed(data: bytes) -> bytes | None:
         return _bytes(data.decode("ascii"))
     except ValueError:
         return None
-
-
-def _is_frame(sensor: Sensor, name: str, data: bytes) -> bool:
-    """Whether the bytes are exactly one valid and plausible frame of a type."""
-    frame = sensor.frames[name]
-    if not 0 < len(data) <= frame.max_length:
-        return False
-    engine = codec(frame)
-    if any(spot >= len(data) or data[spot] & mask != value for spot, (mask, value) in engine.prefix.items()):
-        return False
-    survey = engine.survey(np.frombuffer(data, np.uint8), np.zeros(1, np.intp))
-    return bool(survey.status[0] == VALID and survey.sizes[0] == len(data))
-
-
-def _begins_alike(fault: WireError) -> bool:
-    """Whether the bytes have the constants that the frame type begins with, and those are enough not to be chance."""
-    if not fault.frame:
-        return False
-    prefix = codec(sensors()[fault.sensor].frames[fault.frame]).prefix
-    there = [(fault.data[spot], mask, value) for spot, (mask, value) in prefix.items() if spot < len(fault.data)]
-    return all(byte & mask == value for byte, mask, value in there) and sum(mask.bit_count() for _, mask, _ in there) >= ALIKE

@@ -1,7 +1,4 @@
-"""One line on a terminal that says how far a verb is; elsewhere nothing.
-
-What verbs print: text or JSON, on standard output or into a file.
-"""
+"""What verbs print: text, tables or JSON, on standard output or into a file; and one line on a terminal that says how far a verb is."""
 
 from __future__ import annotations
 
@@ -13,7 +10,7 @@ import sys
 import time
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import click
 from rich.console import Console
@@ -78,19 +75,6 @@ STYLES = {
     "point": "magenta",
     "note": "bold yellow",
 }
-
-Function = TypeVar("Function", bound=Callable[..., Any])
-
-
-def sensor_option(function: Function) -> Function:
-    """``-s/--sensor``."""
-    return click.option("-s", "--sensor", "sensor_id", metavar="ID", help="The sensor: an id, an alias, or a file ./mysensor.py.")(function)
-
-
-def output_options(function: Function) -> Function:
-    """``--json`` and ``-o/--output``, for verbs that print."""
-    function = click.option("-o", "--output", metavar="FILE", help="Write to a file instead of standard output.")(function)
-    return click.option("--json", "as_json", is_flag=True, help="Print JSON.")(function)
 
 
 def emit(text: str, output: str | None) -> None:

@@ -1,7 +1,4 @@
-"""`read`: what a sensor sends, as rows.
-
-`stats`: how a sensor is doing, a line at a time.
-"""
+"""`read` and `stats`: what a sensor sends, as rows; and how it is doing, a line at a time."""
 
 from __future__ import annotations
 
@@ -18,8 +15,9 @@ import click
 import numpy as np
 
 from lidarspec.cli.failures import FINDINGS
-from lidarspec.cli.output import note, sensor_option
-from lidarspec.cli.streams import DURATION, SHARE, Patience, nothing_came
+from lidarspec.cli.inputs import Patience, nothing_came
+from lidarspec.cli.options import DURATION, SHARE, sensor_option
+from lidarspec.cli.output import note
 from lidarspec.device.device import Device, open as open_device
 from lidarspec.errors import UnknownFrame
 from lidarspec.packets.packets import Packets
@@ -173,6 +171,8 @@ def _plain(value: Any) -> Any:
 
 #: lines after which the names of the columns are said again.
 AGAIN = 20
+#: seconds by which sums of intervals may be off.
+ROUNDED = 1e-6
 #: name and unit of each figure, the width of its column (0: only in the summary), and its text.
 FIGURES: tuple[tuple[str, str, int, Callable[[Reading], str]], ...] = (
     ("speed", "Hz", 6, lambda r: _number(r.speed_hz, ".2f")),
@@ -279,7 +279,7 @@ class _Live:
         """Print until the end."""
         edge = last = self._start
         end = self._start + self._end
-        while edge < end and not self._feed.ended:
+        while end - edge > ROUNDED and not self._feed.ended:
             edge = min(edge + self._interval, end)
             self._feed.pump(edge)
             self._patience.check()

@@ -10,8 +10,8 @@ from typing import Any
 import click
 
 from lidarspec.cli.frames import plain
-from lidarspec.cli.output import emit, emit_json, output_options, sensor_option, table
-from lidarspec.cli.streams import DURATION
+from lidarspec.cli.options import DURATION, output_options, sensor_option
+from lidarspec.cli.output import emit, emit_json, table
 from lidarspec.device.device import Device, open as open_device
 from lidarspec.device.session import Reply
 from lidarspec.errors import CommandError, UnknownCommand, UnknownField, UsageError, suggest

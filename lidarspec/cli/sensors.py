@@ -8,7 +8,8 @@ from typing import Any
 import click
 import numpy as np
 
-from lidarspec.cli.output import emit, emit_json, note, output_options, table
+from lidarspec.cli.options import output_options
+from lidarspec.cli.output import emit, emit_json, note, table
 from lidarspec.columns.columns import Batch
 from lidarspec.errors import SpecError
 from lidarspec.plugins import registry, sensor as named_sensor

@@ -9,8 +9,9 @@ from pathlib import Path
 
 import click
 
-from lidarspec.cli.output import drawn, note, sensor_option
-from lidarspec.cli.streams import DURATION, PATIENCE, nothing_came
+from lidarspec.cli.inputs import PATIENCE, nothing_came
+from lidarspec.cli.options import DURATION, sensor_option
+from lidarspec.cli.output import drawn, note
 from lidarspec.device.device import Device, open as open_device
 from lidarspec.device.settings import named
 from lidarspec.transports.open_url import live_address

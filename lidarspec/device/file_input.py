@@ -15,7 +15,6 @@ from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.files import CaptureTransport
 from lidarspec.transports.open_url import transport
 from lidarspec.transports.protocol import Chunk, Transport
-from lidarspec.wire.arrays import keep_freed_memory
 
 #: bytes or datagrams decoded together.
 BATCH_BYTES, BATCH_CHUNKS = 1 << 18, 1024
@@ -33,7 +32,6 @@ class FileInput:
     is_live = False
 
     def __init__(self, source: str | Path, sensor: Sensor, opened: Transport, *, backend: str) -> None:
-        keep_freed_memory()
         self._source, self._sensor, self._transport = source, sensor, opened
         self.decoder: Decoder = sensor.decoder(stream=not opened.datagrams, backend=backend)
         self._senders = Senders(source, sensor)

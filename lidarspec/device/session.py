@@ -163,7 +163,7 @@ def found_at(values: Any, path: str) -> Any:
 def _physical(info: FieldInfo, value: Any) -> Any:
     if isinstance(value, list):
         return [_physical(info, element) for element in value]
-    return value * info.scale + info.offset if info.scaled and isinstance(value, int | float) else value
+    return info.physical(value) if isinstance(value, int | float) else value
 
 
 SECOND = 1_000_000_000

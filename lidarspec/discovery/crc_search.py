@@ -1,14 +1,11 @@
-"""Polynomials over GF(2) as integers, bit k the coefficient of x**k: what a search for the polynomial of a CRC needs.
+"""The search for a CRC of 8, 16 or 32 bits: every polynomial at once, by division instead of by trial.
 
-A CRC is the remainder of a message by its polynomial. So the polynomial divides the message with its checksum behind it, and
-of two frames of one length it divides the XOR of both, whatever register the CRC begins with and whatever is XORed onto it.
-
-The search for a CRC of 8, 16 or 32 bits: every polynomial at once, by division instead of by trial.
-
-Frames of one length give multiples of the polynomial whatever the start value and the final XOR are (see `polynomials`); their
-greatest common divisor is it. Start value and final XOR then follow: where frames differ in length they are the solution of
-linear equations; where all have one length, many pairs say the same, and the most usual of them is taken. Where no two frames
-have one length, or there are few, the usual pairs are assumed first, so that every frame counts by itself.
+Polynomials over GF(2) are integers here, bit k the coefficient of x**k. A CRC is the remainder of a message by its polynomial. So the
+polynomial divides the message with its checksum behind it, and of two frames of one length it divides the XOR of both, whatever
+register the CRC begins with and whatever is XORed onto it: the greatest common divisor of such pairs is it. Start value and final XOR
+then follow: where frames differ in length they are the solution of linear equations; where all have one length, many pairs say the
+same, and the most usual of them is taken. Where no two frames have one length, or there are few, the usual pairs are assumed first,
+so that every frame counts by itself.
 """
 
 from __future__ import annotations
@@ -289,7 +286,6 @@ def pasted(crc: Crc) -> str:
     """A CRC as a plugin writes it."""
     digits = crc.width // 4
     parts = [f"width={crc.width}", f"poly=0x{crc.poly:0{digits}X}"]
-    parts += [f"{name}=0x{getattr(crc, name):0{digits}X}" for name in ("init",) if getattr(crc, name)]
-    parts += [f"{name}=True" for name in ("refin", "refout") if getattr(crc, name)]
+    parts += [f"init=0x{crc.init:0{digits}X}"] * bool(crc.init) + ["refin=True"] * crc.refin + ["refout=True"] * crc.refout
     parts += [f"xorout=0x{crc.xorout:0{digits}X}"] * bool(crc.xorout)
     return f"Crc({', '.join(parts)})"

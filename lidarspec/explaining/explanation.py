@@ -26,9 +26,9 @@ from lidarspec.points.plain import evaluate
 from lidarspec.spec.bits import BitField
 from lidarspec.spec.construct_layer import UNNAMED, Seen, field_path, leaves
 from lidarspec.spec.description import Frame
-from lidarspec.spec.fields import Checksummed, exact
+from lidarspec.spec.fields import Checksummed
 from lidarspec.spec.sensor import Sensor
-from lidarspec.spec.tree import Block, FieldInfo, Node, Opaque, Repeat, Struct, children
+from lidarspec.spec.tree import Block, FieldInfo, Node, Opaque, Repeat, Struct, children, exact
 from lidarspec.wire.parse import parse_typed
 from lidarspec.wire.schema import schema
 from lidarspec.wire.wire_table import bit_text, hexed
@@ -277,7 +277,7 @@ class _Trail:
         unknown = FieldInfo(plain(path), docs="constant" if path.endswith(UNNAMED) else "")
         info = self._schema.fields.get(plain(path), unknown)
         bits = self._blocks.get(kind(part), {}).get(keys)
-        physical = float(raw * info.scale + info.offset) if isinstance(raw, int | float) else None
+        physical = float(info.physical(raw)) if isinstance(raw, int | float) else None
         label = info.labels.get(raw, "") if isinstance(raw, int) else ""
         digits = None if info.kind == "float" else _digits(info)
         masks = bits.masks(seen.end - seen.start) if bits else b"\xff" * (seen.end - seen.start)

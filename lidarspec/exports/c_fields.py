@@ -21,6 +21,7 @@ from lidarspec.spec.tree import (
     COMPARISONS,
     Blob,
     Block,
+    Code,
     Empty,
     FieldInfo,
     Formula,
@@ -35,6 +36,7 @@ from lidarspec.spec.tree import (
     Struct,
     When,
     formulas,
+    infos,
     nodes,
     refs,
     written,
@@ -96,6 +98,8 @@ def bits(value: Formula) -> int:
         return value.info.bits
     if isinstance(value, int):
         return value.bit_length()
+    if isinstance(value, Code):
+        raise Refused(value.reason)
     args = [bits(arg) for arg in value.args]
     match value.symbol:
         case "+" | "-":
@@ -112,13 +116,13 @@ def bits(value: Formula) -> int:
     return 1 if value.symbol in COMPARISONS else max(args)
 
 
-def number_type(infos: Sequence[FieldInfo]) -> str:
+def number_type(fields: Sequence[FieldInfo]) -> str:
     """The C type that holds what any of these fields holds."""
-    if any(info.kind == "float" for info in infos):
-        return "double" if max(info.bits for info in infos) > 32 or any(info.kind != "float" for info in infos) else "float"
-    signed = any(info.dtype is not None and info.dtype.kind == "i" for info in infos)
-    mixed = signed and any(info.dtype is not None and info.dtype.kind == "u" for info in infos)
-    width = next(size for size in (8, 16, 32, 64) if max(info.bits for info in infos) + mixed <= size or size == 64)
+    if any(info.kind == "float" for info in fields):
+        return "double" if max(info.bits for info in fields) > 32 or any(info.kind != "float" for info in fields) else "float"
+    signed = any(info.dtype is not None and info.dtype.kind == "i" for info in fields)
+    mixed = signed and any(info.dtype is not None and info.dtype.kind == "u" for info in fields)
+    width = next(size for size in (8, 16, 32, 64) if max(info.bits for info in fields) + mixed <= size or size == 64)
     return f"{'int' if signed else 'uint'}{width}_t"
 
 
@@ -162,13 +166,6 @@ class Entry:
     loops: tuple[str, ...] = ()
 
     @property
-    def paths(self) -> tuple[str, ...]:
-        """The fields that it holds: one, or those of a bit block; none for what is no field."""
-        if isinstance(self.node, Block):
-            return tuple(part.info.path for part in self.node.parts)
-        return (self.path,) if isinstance(self.node, Number | Blob) else ()
-
-    @property
     def where(self) -> str:
         """The conditions as one; "" for none."""
         return " && ".join(condition.text for condition in self.conditions)
@@ -205,7 +202,7 @@ class CLayout:
 
     def named(self, path: str) -> list[Entry]:
         """Every entry of the numbers, bytes or bits at a path: one, unless alternatives have it each."""
-        return [entry for entry in self.entries if path in entry.paths]
+        return [entry for entry in self.entries if any(info.path == path for info in infos(entry.node))]
 
     def whole(self, path: str) -> Entry:
         """The entry of the part at a path, of whatever kind: all of an array, all alternatives."""
@@ -333,8 +330,7 @@ class Access:
     @property
     def info(self) -> FieldInfo:
         """The field."""
-        assert self.part is not None or isinstance(self.entry.node, Number | Blob)
-        return self.part.info if self.part is not None else self.entry.node.info  # type: ignore[union-attr]
+        return self.part.info if self.part is not None else infos(self.entry.node)[0]
 
     @property
     def expression(self) -> str:
@@ -453,7 +449,7 @@ def _count(layout: CLayout, axis: str) -> Iterator[str]:
 def _field(layout: CLayout, path: str) -> Iterator[str]:
     """The functions of a field: what it holds, whether it is there, its scaling; and the names of its values."""
     ways = accesses(layout, path)
-    infos, name, first = [access.info for access in ways], layout.name(path, ""), ways[0]
+    name, first = layout.name(path, ""), ways[0]
     depth = first.entry.depth + (len(first.part.indices) if first.part else 0)
     yield from (f"#define {name.upper()}_{identifier(label).upper()} {value}" for value, label in first.info.labels.items())
     yield comment(unit_text(first.info), meaning(first.info))
@@ -463,7 +459,7 @@ def _field(layout: CLayout, path: str) -> Iterator[str]:
         yield _function("size_t", layout.name(path, "size"), depth, sizes)
         yield _function("const uint8_t *", name, depth, [(access.entry.where, f"p + ({access.entry.start})") for access in ways])
     else:
-        kind = number_type(infos)
+        kind = number_type([access.info for access in ways])
         yield _function(kind, name, depth, [(access.condition, f"({kind}){_grouped(access.expression)}") for access in ways])
     if any(access.entry.conditions for access in ways):
         places = dict.fromkeys(access.entry.where or "1" for access in ways)

@@ -16,7 +16,6 @@ from lidarspec.spec.sensor import Sensor
 from lidarspec.spec.tree import (
     Blob,
     Block,
-    Empty,
     FieldInfo,
     Node,
     Number,
@@ -28,7 +27,7 @@ from lidarspec.spec.tree import (
     When,
     nodes,
 )
-from lidarspec.wire.wire_table import INDICES, Extent, bit_text, frame_size, meaning, phrase, unit_text
+from lidarspec.wire.wire_table import INDICES, Extent, bit_text, branches, extent, frame_size, meaning, phrase, unit_text
 
 
 @dataclass(frozen=True)
@@ -63,7 +62,7 @@ Item = Cell | Group
 
 def cells(message: Message) -> tuple[Item, ...]:
     """The items of a frame type."""
-    return _Cells(message.seals, mixed=not byte_order(message)).visit(message.root, Extent(), 0)[0]
+    return _Cells(message.seals, mixed=not byte_order(message)).visit(message.root, Extent(), 0)
 
 
 def byte_order(message: Message) -> str:
@@ -84,35 +83,32 @@ class _Cells:
     seals: Mapping[str, Sealed]
     mixed: bool
 
-    def visit(self, node: Node, start: Extent, depth: int) -> tuple[tuple[Item, ...], Extent]:
-        """The items of a part that begins at `start`, and its size."""
+    def visit(self, node: Node, start: Extent, depth: int) -> tuple[Item, ...]:
+        """The items of a part that begins at `start`."""
         match node:
             case Sealed():
                 return self.visit(node.body, start, depth)
             case Struct():
-                return self._struct(node, start, depth)
+                return tuple(self._struct(node, start, depth))
             case Number():
-                return (self._number(node, start),), Extent(node.size)
-            case Blob():
-                return self._blob(node, start)
+                return (self._number(node, start),)
+            case Blob() if node.size != 0:
+                return (self._blob(node, start),)
             case Block():
-                return tuple(self._block(node, start)), Extent(node.size)
+                return tuple(self._block(node, start))
             case Repeat():
-                return self._repeat(node, start, depth)
+                return (self._repeat(node, start, depth),)
             case When() | Select():
-                return self._choice(node, start, depth)
-            case Empty():
-                return (), Extent()
+                parts = ((label, self.visit(branch, start, depth)) for label, branch in branches(node))
+                return tuple(Group(label, items, optional=True) for label, items in parts if items)
+        return ()
 
-    def _struct(self, node: Struct, start: Extent, depth: int) -> tuple[tuple[Item, ...], Extent]:
-        items: list[Item] = []
-        size = Extent()
+    def _struct(self, node: Struct, start: Extent, depth: int) -> Iterator[Item]:
         for member in node.members:
-            inside, more = self.visit(member, start + size, depth)
             named = isinstance(member, Struct | Sealed) or (isinstance(member, Block) and member.parts[0].names)
-            items += [replace(item, name=f"{member.name}.{item.name}") if named and isinstance(item, Cell) else item for item in inside]
-            size = size + more
-        return tuple(items), size
+            for item in self.visit(member, start, depth):
+                yield replace(item, name=f"{member.name}.{item.name}") if named and isinstance(item, Cell) else item
+            start = start + extent(member, member.name)
 
     def _number(self, node: Number, start: Extent) -> Cell:
         width, is_long = 8 * node.size, node.size > 1
@@ -122,12 +118,10 @@ class _Cells:
             detail = f"{node.info.const:#0{2 * node.size + 2}x}" if isinstance(node.info.const, int) else str(node.info.const)
         return self._cell(node.info, node.name, width, detail, f"{node.kind}{width}{f' {node.order}' * is_long}", start)
 
-    def _blob(self, node: Blob, start: Extent) -> tuple[tuple[Item, ...], Extent]:
-        size = Extent(node.size) if isinstance(node.size, int) else Extent(0, (phrase(node.size),))
-        if node.size == 0:
-            return (), size
+    def _blob(self, node: Blob, start: Extent) -> Cell:
+        size = extent(node)
         detail = node.const.hex(" ") if node.const is not None and len(node.const) <= 8 else f"{size} byte{'s' * (str(size) != '1')}"
-        return (self._cell(node.info, node.name, 8 * size.number, detail, "bytes", start),), size
+        return self._cell(node.info, node.name, 8 * size.number, detail, "bytes", start)
 
     def _block(self, node: Block, start: Extent) -> list[Cell]:
         """A box for each run of bits of one value, in the order of the wire, the highest bit of each byte first."""
@@ -155,24 +149,10 @@ class _Cells:
         said = (info.path, kind, unit_text(info), meaning(info), seal.algorithm.describe() if seal else "")
         return Cell(name or "(constant)", bits, detail, "; ".join(filter(None, said)), role, start)
 
-    def _repeat(self, node: Repeat, start: Extent, depth: int) -> tuple[tuple[Item, ...], Extent]:
-        index = INDICES[depth % len(INDICES)]
+    def _repeat(self, node: Repeat, start: Extent, depth: int) -> Group:
+        step = extent(node.element, node.name).times(INDICES[depth % len(INDICES)])
         count = node.count if isinstance(node.count, int) else phrase(node.count)
-        _, element = self.visit(node.element, Extent(), depth + 1)
-        items, _ = self.visit(node.element, start + element.times(index), depth + 1)
-        return (Group(f"{node.name} \u00d7\u00a0{count}", items),), element.times(count)
-
-    def _choice(self, node: When | Select, start: Extent, depth: int) -> tuple[tuple[Item, ...], Extent]:
-        if isinstance(node, When):
-            asked = phrase(node.condition)
-            branches = [(f"if {asked}", node.then), (f"unless {asked}", node.otherwise)]
-        else:
-            key = phrase(node.key)
-            branches = [*((f"if {key} == {value}", case) for value, case in node.cases), (f"for other {key}", node.default)]
-        parts = [(label, *self.visit(branch, start, depth)) for label, branch in branches]
-        sizes = {size for _, _, size in parts}
-        groups = tuple(Group(label, items, optional=True) for label, items, _ in parts if items)
-        return groups, sizes.pop() if len(sizes) == 1 else Extent(0, (f"size({node.name})",))
+        return Group(f"{node.name} \u00d7\u00a0{count}", self.visit(node.element, start + step, depth + 1))
 
 
 def _is_spare(name: str) -> bool:

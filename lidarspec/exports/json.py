@@ -15,7 +15,24 @@ from lidarspec.spec.checksums import Checksum
 from lidarspec.spec.description import Command
 from lidarspec.spec.links import Link, Serial, Tcp, Udp
 from lidarspec.spec.sensor import Sensor
-from lidarspec.spec.tree import Blob, Block, Empty, FieldInfo, Formula, Node, Number, Op, Part, Ref, Repeat, Sealed, Select, Struct, When
+from lidarspec.spec.tree import (
+    Blob,
+    Block,
+    Empty,
+    FieldInfo,
+    Formula,
+    Node,
+    Number,
+    Op,
+    Opaque,
+    Part,
+    Ref,
+    Repeat,
+    Sealed,
+    Select,
+    Struct,
+    When,
+)
 from lidarspec.wire.wire_table import frame_size
 
 #: raised whenever a key changes its meaning or goes.
@@ -130,7 +147,7 @@ def node_data(node: Node) -> dict[str, Any]:
         case Select():
             cases = [{"value": value, "part": node_data(case)} for value, case in node.cases]
             return {"kind": "switch", "name": node.name, "key": formula_data(node.key), "cases": cases, "default": node_data(node.default)}
-        case Empty():
+        case Empty() | Opaque():
             return {"kind": "nothing", "name": node.name}
 
 

@@ -19,7 +19,7 @@ from lidarspec.exports import Refused
 from lidarspec.exports.messages import Message, messages
 from lidarspec.spec.description import Command
 from lidarspec.spec.sensor import Sensor
-from lidarspec.spec.tree import Blob, Block, Empty, FieldInfo, Node, Number, Repeat, Sealed, Select, Struct, When
+from lidarspec.spec.tree import Blob, Block, Empty, FieldInfo, Node, Number, Opaque, Repeat, Sealed, Select, Struct, When
 from lidarspec.wire.schema import schema
 from lidarspec.wire.wire_table import meaning, unit_text
 
@@ -105,7 +105,7 @@ class _Classes:
                 return self._either(owner, name, [node.then, node.otherwise])
             case Select():
                 return self._either(owner, name, [*(case for _, case in node.cases), node.default])
-            case Empty():
+            case Empty() | Opaque():
                 return "None"
 
     def _either(self, owner: str, name: str, branches: list[Node]) -> str:

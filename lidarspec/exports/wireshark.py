@@ -9,7 +9,7 @@ Formulas are Lua functions of the values kept so far. Lua counts in floats there
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from importlib import resources
 from typing import Any
@@ -31,6 +31,7 @@ from lidarspec.spec.tree import (
     Formula,
     Node,
     Number,
+    Opaque,
     Part,
     Repeat,
     Sealed,
@@ -38,6 +39,7 @@ from lidarspec.spec.tree import (
     Struct,
     When,
     formulas,
+    infos,
     nodes,
     refs,
     written,
@@ -158,7 +160,7 @@ class _Writer:
                 cases = {value: self.node(case, path) for value, case in node.cases}
                 default = self.node(node.default, path)
                 return {"kind": "select", "name": node.name, "key": _function(node.key), "cases": cases, "default": default}
-            case Empty():
+            case Empty() | Opaque():
                 return {"kind": "empty", "skip": 0}
 
     def _number(self, node: Number) -> Table:
@@ -255,7 +257,7 @@ class _Writer:
         return None if info.path in self.kept or info.const is not None else size
 
     def _seal(self, node: Sealed) -> Table:
-        widths = dict(_widths(node))
+        widths = {info.path: info.bits for below in nodes(node) for info in infos(below)}
         return {
             **_algorithm(node.algorithm),
             "fields": [{"path": path, "width": widths[path]} for path in node.fields],
@@ -265,15 +267,6 @@ class _Writer:
             "is_wide": (len(node.fields) == 1 and widths[node.fields[0]] > 32) or None,
             "absent": dict.fromkeys(node.absent, True),
         }
-
-
-def _widths(node: Sealed) -> Iterator[tuple[str, int]]:
-    """The fields of a struct and how many bits each has."""
-    for below in nodes(node):
-        if isinstance(below, Block):
-            yield from ((part.info.path, part.bits.width) for part in below.parts)
-        elif isinstance(below, Number | Blob):
-            yield below.info.path, below.info.bits
 
 
 def _algorithm(algorithm: Checksum) -> Table:

@@ -265,7 +265,7 @@ def _physical(part: Condition, leaves: Mapping[str, Leaf], rows: Bytes2D) -> dic
     for info in part.fields:
         leaf = leaves.get(info.path)
         array = np.full(len(rows), np.nan) if leaf is None else leaf.load(rows).astype(np.float64)
-        found[info.path] = array * info.scale + info.offset if info.scaled else array
+        found[info.path] = info.physical(array)
     return found
 
 

@@ -13,8 +13,8 @@ from lidarspec.columns.columns import Batch, Fields
 from lidarspec.columns.graph import Node, Untraceable, evaluate, fields_beside, sample_of, trace
 from lidarspec.errors import SpecError
 from lidarspec.spec.description import Spec
-from lidarspec.spec.fields import exact, factor
-from lidarspec.spec.tree import FieldInfo
+from lidarspec.spec.fields import factor
+from lidarspec.spec.tree import FieldInfo, exact
 from lidarspec.wire.arrays import alike
 from lidarspec.wire.frame_table import Rows, Table
 from lidarspec.wire.schema import Schema
@@ -171,8 +171,7 @@ class _Term:
     def _computed(self, columns: list[NDArray[Any]]) -> Times:
         found = {}
         for info, column in zip(self._fields, columns, strict=True):
-            array = column.astype(np.float64)
-            found[info.path] = array * info.scale + info.offset if info.scaled else array
+            found[info.path] = info.physical(column.astype(np.float64))
         return _nanoseconds(evaluate(self._node, {}, lambda node: found.get(node.path)), len(columns[0]))
 
 

@@ -104,8 +104,9 @@ class Packets:
 
     def points(self) -> PointCloud:
         """The points of all packets in stream order; see `PointCloud`."""
-        cloud: PointCloud = self.sensor.cloud_of(self)
-        return cloud
+        from lidarspec.points.evaluate import cloud_of
+
+        return cloud_of(self)
 
     def take(self, which: Any) -> Packets:
         """Some of the packets: by indices, a mask or a slice."""

@@ -218,7 +218,7 @@ class Stretches(ColumnSource):
     def times_at(self, indices: NDArray[np.intp]) -> NDArray[np.float64]:
         if self._from_first:
             times = self._times_at(np.concatenate([np.zeros(1, np.intp), indices]))
-            return times[1:] - times[0]
+            return np.asarray(times[1:] - times[0])
         return self._times_at(indices)
 
     def _times_at(self, indices: NDArray[np.intp]) -> NDArray[np.float64]:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.columns.graph import Traced
-from lidarspec.spec.description import Spec
+from lidarspec.spec.description import DIRECTIONS, Spec
 
 Floats = NDArray[np.float32]
 
@@ -35,9 +35,6 @@ _PI = np.nextafter(np.float32(np.pi), np.float32(0))
 
 #: radians from which on taking off whole turns loses precision.
 _FAR = 1e6
-
-#: directions in REP-103: (axis index, sign).
-_DIRECTIONS = {"forward": (0, 1), "back": (0, -1), "left": (1, 1), "right": (1, -1), "up": (2, 1), "down": (2, -1)}
 
 
 def shown_range(measured: Any, invalid: Any) -> Any:
@@ -97,8 +94,8 @@ def axis_matrix(axes: Sequence[str]) -> NDArray[np.float64]:
     """The matrix that turns REP-103 coordinates into those of axes named by where x, y and z point."""
     matrix = np.zeros((3, 3))
     for row, name in enumerate(axes):
-        column, sign = _DIRECTIONS[name]
-        matrix[row, column] = sign
+        axis, is_opposite = divmod(DIRECTIONS.index(name), 2)
+        matrix[row, axis] = -1 if is_opposite else 1
     return matrix
 
 

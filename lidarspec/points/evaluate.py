@@ -14,16 +14,15 @@ from numpy.typing import NDArray
 
 from lidarspec.columns.columns import Batch, Carry, Column, Fields
 from lidarspec.errors import SpecError
-from lidarspec.packets.packets import Packets
 from lidarspec.points.cloud import LazyCloud, PointCloud
 from lidarspec.points.conventions import rows_of
 from lidarspec.points.lazy_columns import BatchColumns, Plain, Share
-from lidarspec.points.plain import Evaluated, evaluate, points_function, stamp_of
+from lidarspec.points.plain import Evaluated, PacketBatch, evaluate, points_function, stamp_of
 from lidarspec.points.plan import REMEMBERING, Plan, plan_for
 from lidarspec.wire.frame_table import Group, Rows, ascends
 
 
-def evaluated(packets: Packets, carry: Carry | None = None, *, final: bool = True, epoch: int | None = None) -> Evaluated:
+def evaluated(packets: PacketBatch, carry: Carry | None = None, *, final: bool = True, epoch: int | None = None) -> Evaluated:
     """The points of a batch, quickly where that can be; the columns are those of `plain.evaluate`, within a few units in the last place.
 
     Args:
@@ -38,7 +37,7 @@ def evaluated(packets: Packets, carry: Carry | None = None, *, final: bool = Tru
     return planned if planned is not None else evaluate(packets, carry, final=final, epoch=epoch)
 
 
-def _planned(packets: Packets, carry: Carry | None, *, final: bool, epoch: int | None, alone: bool = False) -> Evaluated | None:
+def _planned(packets: PacketBatch, carry: Carry | None, *, final: bool, epoch: int | None, alone: bool = False) -> Evaluated | None:
     """The points of a batch by plans; None where there is none for these packets.
 
     Args:
@@ -71,7 +70,7 @@ def _planned(packets: Packets, carry: Carry | None, *, final: bool, epoch: int |
     return Evaluated(cloud, ready, batch.carried(ready), counts, Fields(batch), plans[0].axes)
 
 
-def _share(packets: Packets, batch: Batch, plan: Plan, group: Group, whole: Plain, remembered: dict[int, Column]) -> Share:
+def _share(packets: PacketBatch, batch: Batch, plan: Plan, group: Group, whole: Plain, remembered: dict[int, Column]) -> Share:
     """A group with its plain results; those that remember other packets are of the whole batch."""
     if len(group.where) == len(packets) and ascends(group.where):
         return Share(plan, group, whole, batch)
@@ -93,7 +92,7 @@ def _holds(share: Share) -> bool:
     return all(bool(((low > 0) & np.isfinite(low)).all()) for low in lows)
 
 
-def _cloud_of(packets: Packets, shares: list[Share], batch: Batch, ready: int, stamp_ns: int) -> LazyCloud:
+def _cloud_of(packets: PacketBatch, shares: list[Share], batch: Batch, ready: int, stamp_ns: int) -> LazyCloud:
     """The cloud of the first `ready` packets."""
     plan = shares[0].plan
     size = ready * plan.width
@@ -121,7 +120,7 @@ def _counts(shares: list[Share], number: int) -> NDArray[Any]:
     return counts
 
 
-def guarded(packets: Packets, carry: Carry | None = None, *, final: bool, epoch: int) -> Evaluated | None:
+def guarded(packets: PacketBatch, carry: Carry | None = None, *, final: bool, epoch: int) -> Evaluated | None:
     """The points of a batch of a stream, which raises on nothing: a failing plugin is counted and gives None; see `evaluated`."""
     try:
         return evaluated(packets, carry, final=final, epoch=epoch)
@@ -130,6 +129,7 @@ def guarded(packets: Packets, carry: Carry | None = None, *, final: bool, epoch:
         return None
 
 
-def cloud_of(packets: Packets) -> PointCloud:
+def cloud_of(packets: PacketBatch) -> PointCloud:
+    """The points of packets that stand alone."""
     planned = _planned(packets, None, final=True, epoch=None, alone=True)
     return (planned if planned is not None else evaluate(packets)).cloud

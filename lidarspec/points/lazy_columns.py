@@ -21,10 +21,10 @@ from numpy.typing import NDArray
 from lidarspec.columns.columns import Batch, Column, Fields, field_array
 from lidarspec.columns.graph import Node, evaluate
 from lidarspec.errors import UsageError
-from lidarspec.packets.packets import Packets
 from lidarspec.points import numpy_plan
 from lidarspec.points.cloud import ColumnSource, Stretch, later
 from lidarspec.points.conventions import TYPES, narrowed, numbers_of, seconds_since, turned_azimuth, vendor_turn
+from lidarspec.points.plain import PacketBatch
 from lidarspec.points.plan import REMEMBERING, Maker, Plan
 from lidarspec.wire.arrays import keep_freed_memory
 from lidarspec.wire.frame_table import Group
@@ -283,7 +283,7 @@ class BatchColumns(ColumnSource):
         rows, nominal: as of all sources.
     """
 
-    def __init__(self, packets: Packets, shares: Sequence[Share], size: int, base: int, *, rows: int, nominal: bool) -> None:
+    def __init__(self, packets: PacketBatch, shares: Sequence[Share], size: int, base: int, *, rows: int, nominal: bool) -> None:
         self.packets, self.shares = packets, shares
         self.size, self.base, self.rows, self.nominal = size, base, rows, nominal
         self._made: dict[str, NDArray[Any]] = {}

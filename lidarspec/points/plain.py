@@ -10,14 +10,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.columns.columns import Batch, Carry, Column, Fields, aligned, unpadded
 from lidarspec.errors import SpecError
-from lidarspec.packets.packets import Packets
+from lidarspec.framing.results import Counters
 from lidarspec.points.cloud import PointCloud
 from lidarspec.points.conventions import (
     coordinates,
@@ -31,8 +31,33 @@ from lidarspec.points.conventions import (
 )
 from lidarspec.spec.description import Spec
 from lidarspec.spec.results import Cartesian, Points, Polar
+from lidarspec.wire.frame_table import Table
 
 _OPTIONAL = ("intensity", "ring", "return_index")
+
+
+class PacketBatch(Protocol):
+    """What points are made of: packets of one frame type in stream order, as `packets.Packets` are.
+
+    Attributes:
+        sensor, frame: whose, and of which type.
+        table: their raw columns.
+        time_ns: (n,) int64.
+        stats: the counters of the decoder.
+        backend: what makes points of them, "auto", "numpy" or "jit".
+    """
+
+    sensor: Spec
+    frame: str
+    table: Table
+    time_ns: NDArray[np.int64]
+    stats: Counters
+    backend: str
+
+    def __len__(self) -> int: ...
+
+    def batch(self, carry: Carry | None = None) -> Batch:
+        """What `points` is given, see `Fields`; `carry`: what the batch before left."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +93,7 @@ def points_function(sensor: Spec, frame: str) -> Callable[[Any], Points]:
     return function
 
 
-def evaluate(packets: Packets, carry: Carry | None = None, *, final: bool = True, epoch: int | None = None) -> Evaluated:
+def evaluate(packets: PacketBatch, carry: Carry | None = None, *, final: bool = True, epoch: int | None = None) -> Evaluated:
     """The points of a batch.
 
     Args:
@@ -90,7 +115,7 @@ def evaluate(packets: Packets, carry: Carry | None = None, *, final: bool = True
         raise SpecError(f"{type(error).__name__}: {error}", path=f"points of {packets.frame}", sensor=packets.sensor.id) from error
 
 
-def stamp_of(packets: Packets, epoch: int | None) -> int:
+def stamp_of(packets: PacketBatch, epoch: int | None) -> int:
     """The stamp of a batch's cloud, int64 ns: a given one, else the time of the first packet."""
     return epoch if epoch is not None else int(packets.time_ns[0]) if len(packets) else 0
 
@@ -115,7 +140,7 @@ def _anchored(value: Any, anchor: Column) -> Column:
     return Column(array.reshape((1,) * (1 + len(axes) - array.ndim) + array.shape), axes, anchor.batch, ready=ready)
 
 
-def _flattened(packets: Packets, result: Points, batch: Batch, stamp_ns: int, *, final: bool) -> Evaluated:
+def _flattened(packets: PacketBatch, result: Points, batch: Batch, stamp_ns: int, *, final: bool) -> Evaluated:
     columns = columns_of(parts_of(result), batch)
     arrays, axes, ready = aligned(tuple(columns.values()), batch)
     ready = len(packets) if final else ready

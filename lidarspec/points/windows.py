@@ -70,7 +70,7 @@ def every_value(node: Node, leaf: Leaf) -> NDArray[Any] | None:
     if seen is None:
         return None
     raw = raw_values(leaf, seen).astype(np.float64)
-    physical = raw * leaf.info.scale + leaf.info.offset if leaf.info.scaled else raw
+    physical = leaf.info.physical(raw)
     with np.errstate(all="ignore"):
         return np.asarray(evaluate(node, {}, lambda source: physical if source.kind == "field" else None)).reshape(raw.shape)
 

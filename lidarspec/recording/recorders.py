@@ -16,14 +16,16 @@ from pathlib import Path
 from typing import Any, Literal
 
 from lidarspec._version import __version__
-from lidarspec.captures.pcap import NOBODY, USER_LINKS, Datagram, PcapWriter, is_capture
+from lidarspec.captures.pcap import NOBODY, USER_LINKS, Datagram, PcapWriter
+from lidarspec.captures.records import is_capture
 from lidarspec.errors import UnknownFormat, UsageError
+from lidarspec.framing.decoder import Decoder
 from lidarspec.framing.results import Found
 from lidarspec.plugins import registry, sensor as named_sensor
 from lidarspec.recording.appending import Appender, Log
 from lidarspec.recording.format import DATAGRAM, EVENT, GAP, HEADER, LARGEST, MAGIC, QUIET, RECEIVED, SENT, Header, packed, whole_records
+from lidarspec.spec.description import Spec
 from lidarspec.spec.links import Udp
-from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.protocol import Chunk, Transport
 
 SUFFIXES = (".lsr", ".pcap", ".bin")
@@ -59,7 +61,7 @@ class Recorder(Appender):
     def __init__(
         self,
         path: str | Path,
-        sensor: Sensor | str | None = None,
+        sensor: Spec | str | None = None,
         source: str | Path = "",
         *,
         datagrams: bool | None = None,
@@ -126,8 +128,8 @@ class FrameRecorder(Appender):
         sensor: whose frames they are.
     """
 
-    def __init__(self, path: str | Path, sensor: Sensor, *, overwrite: bool = False) -> None:
-        self._made, self._decoder = io.BytesIO(), sensor.decoder(stream=True)
+    def __init__(self, path: str | Path, sensor: Spec, *, overwrite: bool = False) -> None:
+        self._made, self._decoder = io.BytesIO(), Decoder(sensor, stream=True)
         self._held, self._base, self._at = bytearray(), 0, 0
         self._writer = PcapWriter(self._made, USER_LINKS[0])
         super().__init__(path, _whole_packets, overwrite=overwrite)
@@ -183,7 +185,7 @@ class RawRecorder(Appender):
 RecordTo = str | Path | Appender | Callable[[Transport], Log]
 
 
-def declared_port(sensor: Sensor | None) -> int:
+def declared_port(sensor: Spec | None) -> int:
     """The first port that the datagrams of a sensor go to; 0 where nobody knows one."""
     links = sensor.links.values() if sensor is not None else ()
     return next((port for link in links if isinstance(link, Udp) for port in link.ports), 0)
@@ -203,7 +205,7 @@ def check_suffix(path: str | Path) -> str:
 
 def recorder(
     path: str | Path,
-    sensor: Sensor | str | None = None,
+    sensor: Spec | str | None = None,
     source: str | Path = "",
     *,
     datagrams: bool,
@@ -221,25 +223,25 @@ def recorder(
     if suffix == ".pcap" and not datagrams:
         if not sensor:
             raise UsageError(f"{path}: a capture of a byte stream has a packet for each frame: name the sensor with -s, or record an .lsr")
-        return FrameRecorder(path, sensor if isinstance(sensor, Sensor) else named_sensor(sensor), overwrite=overwrite)
+        return FrameRecorder(path, sensor if isinstance(sensor, Spec) else named_sensor(sensor), overwrite=overwrite)
     if suffix == ".bin" and datagrams:
         raise UsageError(f"{path}: bytes alone do not say where a datagram ends: record datagrams in an .lsr or .pcap file")
     if suffix == ".lsr":
         return Recorder(path, sensor, source, datagrams=datagrams, baud=baud, overwrite=overwrite)
-    port = declared_port(sensor if isinstance(sensor, Sensor) else None)
+    port = declared_port(sensor if isinstance(sensor, Spec) else None)
     return PcapRecorder(path, port=port, overwrite=overwrite) if suffix == ".pcap" else RawRecorder(path, overwrite=overwrite)
 
 
-def recorder_for(target: RecordTo, sensor: Sensor | str | None, source: str | Path, opened: Transport) -> tuple[Log, bool]:
+def recorder_for(target: RecordTo, sensor: Spec | str | None, source: str | Path, opened: Transport) -> tuple[Log, bool]:
     """The recorder that a caller asks for, and whether it was made here, and has to be closed here."""
     if isinstance(target, str | Path):
         return recorder(target, sensor, source, datagrams=opened.datagrams, baud=opened.baud), True
     return (target, False) if isinstance(target, Appender) else (target(opened), True)
 
 
-def _header(sensor: Sensor | str | None, source: str, *, datagrams: bool | None, baud: int | None) -> Header:
+def _header(sensor: Spec | str | None, source: str, *, datagrams: bool | None, baud: int | None) -> Header:
     known = named_sensor(sensor) if isinstance(sensor, str) and sensor and datagrams is None else sensor
-    name, options, link = (known.id, dict(known.options), known.datagrams) if isinstance(known, Sensor) else (known or "", {}, False)
+    name, options, link = (known.id, dict(known.options), known.datagrams) if isinstance(known, Spec) else (known or "", {}, False)
     homes = {plugin.distribution: plugin.version for plugin in registry().plugins if name in plugin.sensors}
     return Header(
         sensor=name,

@@ -20,8 +20,8 @@ from lidarspec.simulation.faults import Faults, Line
 from lidarspec.simulation.replies import Answering, Request
 from lidarspec.simulation.scenes import Scene, furnished
 from lidarspec.simulation.simulator import Simulation, simulation
+from lidarspec.spec.description import Spec
 from lidarspec.spec.links import is_datagram
-from lidarspec.spec.sensor import Sensor
 
 SECOND = 1_000_000_000
 #: ns of the device's time for which data is made in one go, and the most packets.
@@ -100,9 +100,7 @@ class SimulatedDevice:
         SpecError: where nothing says how fast it sends.
     """
 
-    def __init__(
-        self, sensor: Sensor, *, scene: Scene | None = None, seed: int = 0, rate: float = 1.0, faults: Faults | None = None
-    ) -> None:
+    def __init__(self, sensor: Spec, *, scene: Scene | None = None, seed: int = 0, rate: float = 1.0, faults: Faults | None = None) -> None:
         self.sensor, self.rate, self.faults = sensor, rate, faults or Faults()
         self.present, self.heard, self.sent = True, list[str](), Counter[str]()
         self.lines = {name: Line(self.faults, seed=seed, stream=not is_datagram(link)) for name, link in sensor.links.items()}

@@ -8,24 +8,20 @@ Valid frames with seeded random content, for tests, docs and the REPL.
 
 from __future__ import annotations
 
-import contextlib
 import functools
 import random
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-import construct
 import numpy as np
-from construct import Construct
 from numpy.typing import NDArray
 
 from lidarspec.errors import SpecError, UnknownFrame, UsageError
 from lidarspec.framing.frame_engine import CompiledCodec, InterpretedCodec, codec
 from lidarspec.framing.plausibility import plausibility
 from lidarspec.framing.results import VALID
-from lidarspec.spec.construct_layer import clean, peeled, seen
+from lidarspec.spec.construct_layer import Fault, random_value
 from lidarspec.spec.description import Spec
-from lidarspec.spec.tree import FieldInfo
 from lidarspec.wire.build import build
 from lidarspec.wire.frame_table import Group, Rows
 from lidarspec.wire.layout import Layout, Leaf
@@ -113,7 +109,7 @@ class FrameMaker:
     def _raw(self, values: Values, path: str) -> int:
         info = self.engine.schema.fields[path]
         if path in values:
-            return round((float(values[path]) - info.offset) / info.scale)
+            return int(info.raw(float(values[path])))
         return int(info.const) if isinstance(info.const, int) else 0
 
 
@@ -135,8 +131,7 @@ def _steps(leaf: Leaf, given: Sequence[Any]) -> NDArray[Any]:
         given = [_padded(value, leaf.shape[-1]) if isinstance(value, bytes) else value for value in given]
     values = np.array([np.asarray(value, np.float64) for value in given])
     values = values.reshape(*values.shape, *(1,) * (1 + len(leaf.shape) - values.ndim))
-    raw = (values - info.offset) / info.scale
-    return raw if info.kind == "float" else np.rint(raw).astype(np.int64)
+    return np.asarray(info.raw(values))
 
 
 def _padded(value: bytes, size: int) -> list[int]:
@@ -184,8 +179,8 @@ def _interpreted(sensor: Spec, frame: str, engine: InterpretedCodec, source: ran
     """A frame that construct alone can read."""
     for _ in range(BATCH * TRIES):
         try:
-            data = build(sensor, frame, _random(engine.frame.prepared, source, construct.Container(), drawn), {})
-        except (UsageError, construct.ConstructError):  # what was drawn goes not together; something else may
+            data = build(sensor, frame, random_value(engine.frame.prepared, source, drawn), {})
+        except (UsageError, Fault):  # what was drawn goes not together; something else may
             continue
         if engine.survey(np.frombuffer(data, np.uint8), np.zeros(1, np.intp)).status[0] == VALID:
             return data
@@ -223,7 +218,7 @@ def _swept(sensor: Spec, frame: str, engine: CompiledCodec, source: random.Rando
         for path, value in values.items():
             leaf = layout.leaves.get(path)
             if leaf is not None and path not in chosen:
-                leaf.store(rows, np.rint((np.asarray(value, np.float64) - leaf.info.offset) / leaf.info.scale).astype(np.int64))
+                leaf.store(rows, leaf.info.raw(np.asarray(value, np.float64)))
         found = _plausible(sensor, frame, layout, _headed(rows, layout, chosen))
         if found:
             return found[0]
@@ -236,63 +231,9 @@ def _stated(engine: CompiledCodec, values: Mapping[str, Any]) -> Drawn:
     found: dict[str, Callable[[random.Random], Any]] = {}
     for path, value in values.items():
         if path in fields and np.ndim(value) == 0 and not isinstance(value, bytes):
-            raw = round((float(value) - fields[path].offset) / fields[path].scale)
-            found[path] = functools.partial(_always, raw)
+            found[path] = functools.partial(_always, fields[path].raw(float(value)))
     return found
 
 
 def _always(raw: int, _: random.Random) -> int:
     return raw
-
-
-def _random(con: Construct, source: random.Random, scope: Any, drawn: Drawn, path: str = "") -> Any:
-    """A random value for a construct that has no compiled layout; `scope`: what its expressions see."""
-    if path in drawn:
-        return drawn[path](source)
-    con, info = peeled(con, FieldInfo(""))
-    if info.const is not None:
-        return seen(info, info.const)
-    if info.rebuilt is not None:
-        with contextlib.suppress(Exception):  # it may ask for what comes after it, and is evaluated again when the frame is built
-            return info.rebuilt(scope)
-    if isinstance(con, construct.Struct):
-        values = construct.Container(_=scope)
-        for child in con.subcons:
-            if child.name is not None:
-                values[child.name] = _random(child, source, values, drawn, f"{path}.{child.name}" if path else child.name)
-        return values
-    if isinstance(con, construct.Array):
-        return [_random(con.subcon, source, scope, drawn, path) for _ in range(construct.evaluate(con.count, scope))]
-    if isinstance(con, construct.IfThenElse | construct.Switch):
-        return _random(_chosen(con, scope), source, scope, drawn, path)
-    if isinstance(con, construct.NullTerminated) or not isinstance(con, construct.Subconstruct):
-        return seen(info, _leaf(con, source, scope, info)) if info.labels else _leaf(con, source, scope, info)
-    if isinstance(con, construct.Adapter):
-        return clean(con.parse(con.subcon.build(_random(con.subcon, source, scope, drawn, path))))
-    return _random(con.subcon, source, scope, drawn, path)
-
-
-def _chosen(con: Any, scope: Any) -> Construct:
-    """The part of an If or Switch that its fields choose."""
-    if isinstance(con, construct.Switch):
-        return con.cases.get(construct.evaluate(con.keyfunc, scope), con.default)
-    return con.thensubcon if construct.evaluate(con.condfunc, scope) else con.elsesubcon
-
-
-def _leaf(con: Construct, source: random.Random, scope: Any, info: FieldInfo) -> Any:
-    if con is construct.Pass:
-        return None
-    if isinstance(con, construct.NullTerminated):
-        return str(source.randrange(10 ** source.randint(1, 4))).encode()
-    if isinstance(con, construct.Computed):
-        return construct.evaluate(con.func, scope)
-    if con is construct.GreedyBytes:
-        return source.randbytes(source.randint(0, 4))
-    if isinstance(con, construct.Bytes):
-        return source.randbytes(construct.evaluate(con.length, scope))
-    if info.labels and source.random() < 0.5:
-        return source.choice(list(info.labels))
-    if isinstance(con, construct.BitsInteger):
-        value = source.getrandbits(con.length)
-        return value - (1 << con.length) if con.signed and value >> (con.length - 1) else value
-    return con.parse(source.randbytes(con.sizeof()))

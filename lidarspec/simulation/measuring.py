@@ -18,9 +18,9 @@ from lidarspec.columns.columns import Batch, Column, Fields, aligned
 from lidarspec.errors import SpecError
 from lidarspec.points.plain import points_function
 from lidarspec.simulation.scenes import Scene
+from lidarspec.spec.description import Spec
 from lidarspec.spec.fields import factor
 from lidarspec.spec.results import Polar
-from lidarspec.spec.sensor import Sensor
 from lidarspec.wire.frame_table import Rows
 
 Floats = NDArray[np.float64]
@@ -72,7 +72,7 @@ class Measurement:
         SpecError: where ranges cannot be traced back to fields and there is no `encode`.
     """
 
-    def __init__(self, sensor: Sensor, frame: str, table: Rows) -> None:
+    def __init__(self, sensor: Spec, frame: str, table: Rows) -> None:
         self._sensor = sensor
         self._points = points_function(sensor, frame)
         self._encode: Callable[[Polar], Mapping[str, Any]] | None = sensor.simulation_of(frame).encode
@@ -154,7 +154,7 @@ class Measurement:
             if factor(info.unit, "m") is None or not any(path in group.layout.leaves for group in table.groups):
                 continue
             (answer,) = self._answers(table, path, PROBE)
-            expected = PROBE * info.scale + info.offset
+            expected = info.physical(PROBE)
             inner = [spot for spot in self._inner(table, answer) if np.isclose(_part(answer, spot), expected).any()]
             found += [Target(path, spot, info.scale, info.offset) for spot in inner]
         found = found or self._linear(table)

@@ -9,9 +9,9 @@ from typing import Any
 from lidarspec.framing.decoder import Decoder
 from lidarspec.framing.frame_engine import codec
 from lidarspec.simulation.frame_maker import FrameMaker
-from lidarspec.spec.description import Answer, Command
+from lidarspec.spec.description import Answer, Command, Spec
 from lidarspec.spec.links import is_datagram
-from lidarspec.spec.sensor import Sensor
+from lidarspec.wire.parse import parse
 
 #: ns of silence after which half a request is forgotten.
 PATIENCE = 50_000_000
@@ -38,7 +38,7 @@ class Answered:
 class Answering:
     """One sensor's side of the conversation."""
 
-    def __init__(self, sensor: Sensor) -> None:
+    def __init__(self, sensor: Spec) -> None:
         self._sensor = sensor
         self._heard: dict[str, int] = {}
         self._decoders = {
@@ -85,11 +85,11 @@ class Answering:
         """The physical values that tie a reply to its request."""
         fields = codec(self._sensor.frames[name]).schema.fields
         raw = {path: request.values[path] for path in request.command.echoes if path in request.values} | dict(request.command.matches)
-        return {path: value * fields[path].scale + fields[path].offset for path, value in raw.items() if path in fields}
+        return {path: fields[path].physical(value) for path, value in raw.items() if path in fields}
 
     def _request(self, frame: str, data: bytes, link: str) -> Request | None:
         """The command that a frame is: of several that fit, the one that says most about it."""
-        values = dict(_flat(self._sensor.parse(data, frame)))
+        values = dict(_flat(parse(self._sensor, data, frame=frame)))
         fitting = [
             (name, command)
             for name, command in self._sensor.commands.items()
@@ -101,7 +101,7 @@ class Answering:
         return Request(name, command, values)
 
 
-def _listening(sensor: Sensor, link: str) -> Decoder:
+def _listening(sensor: Spec, link: str) -> Decoder:
     """A decoder of what is sent to the sensor: the outgoing frames, seen from its side."""
     frames = {name: replace(frame, direction="in") for name, frame in sensor.frames.items() if frame.direction == "out"}
     mirrored = replace(sensor, frames=frames, commands={}, state={}, on_open=(), on_close=())

@@ -1,12 +1,10 @@
-"""When a simulated sensor sends each packet, from what its spec says of time.
-
-In this order: the rate that the frame type declares; the sensor's clock, which its `sweep` sets; the times of the points, which say
-how long one takes; the speed of its serial line, which no sensor outruns.
-
-Frames that a sensor would send from a scene, made from its own spec, and when it would send them.
+"""Frames that a sensor would send from a scene, made from its own spec, and when it would send them.
 
 The sensor's `sweep` says what is not measured (angles, counters, time). The packets are filled with that, `points` says where the
 beams go, the scene says how far, and the ranges go back through the scale of the fields that they come from (`measuring`).
+
+When each packet is sent follows from what the spec says of time, in this order: the rate that is declared; the sensor's clock, which
+its `sweep` sets; the times of the points, which say how long one takes; the speed of its serial line, which no sensor outruns.
 """
 
 from __future__ import annotations
@@ -22,12 +20,12 @@ from numpy.typing import NDArray
 from lidarspec.columns.columns import Batch
 from lidarspec.errors import UsageError
 from lidarspec.packets.clocks import clock_ns
-from lidarspec.simulation.frame_maker import FrameMaker, sealed
+from lidarspec.simulation.frame_maker import FrameMaker, example, sealed
 from lidarspec.simulation.measuring import Beams, Measurement
 from lidarspec.simulation.scenes import Room, Scene
-from lidarspec.spec.fields import exact
+from lidarspec.spec.description import Spec
 from lidarspec.spec.links import Serial
-from lidarspec.spec.sensor import Sensor
+from lidarspec.spec.tree import exact
 from lidarspec.wire.frame_table import Rows
 
 Times = NDArray[np.int64]
@@ -47,7 +45,7 @@ class Pace:
         interval: ns from one packet to the next, on average; 0 where the spec says nothing of time.
     """
 
-    def __init__(self, sensor: Sensor, frame: str, table: Rows, beams: Beams) -> None:
+    def __init__(self, sensor: Spec, frame: str, table: Rows, beams: Beams) -> None:
         self._sensor, self._rate = sensor, sensor.simulation_of(frame).rate
         self._point = _seconds_per_point(beams)
         self._baud = next((link.baud for link in (sensor.links.get("data"),) if isinstance(link, Serial)), 0)
@@ -119,7 +117,7 @@ class Simulation:
         SpecError: where its ranges cannot be traced back to fields.
     """
 
-    def __init__(self, sensor: Sensor, frame: str) -> None:
+    def __init__(self, sensor: Spec, frame: str) -> None:
         sweep = sensor.simulation_of(frame).sweep
         if sweep is None:
             raise UsageError(f"{sensor.id} declares no sweep for {frame!r} frames, and cannot be simulated")
@@ -143,13 +141,18 @@ class Simulation:
 
 
 @functools.lru_cache(maxsize=64)
-def simulation(sensor: Sensor, frame: str) -> Simulation:
+def simulation(sensor: Spec, frame: str) -> Simulation:
     """The simulation of a data frame type; kept, since it takes a while to find out how a sensor carries its ranges."""
     return Simulation(sensor, frame)
 
 
-def simulate(sensor: Sensor, packets: int, *, start: int = 0, scene: Scene | None = None) -> list[bytes]:
-    """The data frames numbered `start` to ``start + packets`` of a sensor standing in a scene.
+def simulate(sensor: Spec, packets: int = 100, *, start: int = 0, scene: Scene | None = None) -> list[bytes]:
+    """The data frames that a sensor standing in a scene sends, one after another.
+
+    Args:
+        packets: how many.
+        start: the number of the first one since the sensor was switched on.
+        scene: what it sees, such as `read_scene` reads from a file; a room where left out.
 
     Raises:
         UsageError: where the sensor declares no `sweep`.
@@ -159,7 +162,7 @@ def simulate(sensor: Sensor, packets: int, *, start: int = 0, scene: Scene | Non
     return made.block(start, packets, scene or Room(), start * made.interval / 1e9).frames
 
 
-def opening(sensor: Sensor) -> bytes:
+def opening(sensor: Spec) -> bytes:
     """What the sensor sends before its data frames: the frame that they come after; empty where they need none."""
     after = sensor.frames[sensor.data_frame].after
-    return b"" if after is None else sensor.example(after)
+    return b"" if after is None else example(sensor, after)

@@ -9,6 +9,7 @@ node stands for stays a part of construct's, with the reason.
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import functools
 import math
@@ -16,9 +17,9 @@ import operator
 import re
 import struct
 import sys
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import construct
 import numpy as np
@@ -42,6 +43,7 @@ from lidarspec.spec import tree
 from lidarspec.spec.bits import BitField, probe
 from lidarspec.spec.checksums import Checksum
 from lidarspec.spec.tree import (
+    Blind,
     Blob,
     Block,
     Code,
@@ -56,18 +58,30 @@ from lidarspec.spec.tree import (
     Read,
     Ref,
     Repeat,
+    Scope,
     Sealed,
     Select,
+    Symbol,
+    Untraceable,
     When,
-    calculated,
     nodes,
     refs,
 )
+
+if TYPE_CHECKING:
+    import random  # finding a sensor does without it
+
+    #: field path -> what draws its value in place of chance
+    Drawn = Mapping[str, Callable[[random.Random], Any]]
 
 _MISSING = object()
 
 #: what a constant without a name is called.
 UNNAMED = "(constant)"
+
+
+#: what construct raises where bytes or values do not fit a struct.
+Fault = ConstructError
 
 
 class Mismatch(ConstructError):  # type: ignore[misc]
@@ -219,6 +233,36 @@ class NamedEnum(construct.Enum):  # type: ignore[misc]
         return self._decode(raw, context, path)
 
 
+class Describing(Subconstruct):  # type: ignore[misc]
+    """A part that only says something of the field below it: parses and builds what that does."""
+
+    def described(self, info: FieldInfo) -> FieldInfo:
+        """What is known of the field, with what this part says of it."""
+        raise NotImplementedError
+
+    def _parse(self, stream: Any, context: Any, path: str) -> Any:
+        return self.subcon._parsereport(stream, context, path)
+
+    def _build(self, obj: Any, stream: Any, context: Any, path: str) -> Any:
+        return self.subcon._build(obj, stream, context, path)
+
+
+class Sealing(Subconstruct):  # type: ignore[misc]
+    """A struct with a checksum.
+
+    Attributes:
+        fields: names of the fields that hold it, low bits first.
+        algorithm: of the checksum, None where a hook has to supply it.
+        over: names of the fields that it covers, in a row; None: all bytes that hold no bit of `fields`.
+        absent: values that mean "not filled".
+    """
+
+    fields: tuple[str, ...]
+    algorithm: Checksum | None
+    over: tuple[str, ...] | None
+    absent: frozenset[int]
+
+
 def verifying(context: Any, *, checksums: bool = False) -> bool:
     """Whether constants, or checksums too, are checked in this parse (``_verify``: True, "constants" or False)."""
     wanted = context._params.get("_verify", True)
@@ -314,34 +358,162 @@ def _shown(value: object) -> str:
     return value.hex(" ") if isinstance(value, bytes) else f"0x{value:x}" if isinstance(value, int) else repr(value)
 
 
-class Describing(Subconstruct):  # type: ignore[misc]
-    """A part that only says something of the field below it: parses and builds what that does."""
+#: names that `points` and the engine need for themselves.
+RESERVED = frozenset({"state", "on"})
+SHADOWED = frozenset(name for name in dir(Container) if not name.startswith("_"))
 
-    def described(self, info: FieldInfo) -> FieldInfo:
-        """What is known of the field, with what this part says of it."""
-        raise NotImplementedError
+#: the rule under which `lidarspec check` explains it, and the reason.
+_REFUSED: dict[type, tuple[str, str]] = {
+    type(construct.Pickled): ("LS110", "Pickled runs code from the wire"),
+    construct.FlagsEnum: ("LS108", "FlagsEnum loses undeclared bits: declare each bit as a field of a BitStruct"),
+    construct.GreedyRange: ("LS111", "GreedyRange has no end of its own on a stream: give a count, or a terminator"),
+    type(construct.GreedyBytes): ("LS111", "GreedyBytes has no end of its own on a stream: give a length, or a terminator"),
+    construct.RawCopy: ("LS109", "RawCopy ignores edits on rebuild: use Checksummed"),
+    construct.Checksum: ("LS109", "construct's Checksum needs RawCopy, which ignores edits on rebuild: use Checksummed"),
+    construct.Padded: ("LS106", "padding loses its bytes on a round trip: declare it as a field, such as 'reserved' / Bytes(n)"),
+    construct.Pointer: ("LS112", "Pointer reads outside the frame"),
+    construct.Seek: ("LS112", "Seek reads outside the frame"),
+    construct.Select: ("LS113", "Select and Optional hide errors in the bytes: use If or Switch on a header field"),
+}
 
-    def _parse(self, stream: Any, context: Any, path: str) -> Any:
-        return self.subcon._parsereport(stream, context, path)
-
-    def _build(self, obj: Any, stream: Any, context: Any, path: str) -> Any:
-        return self.subcon._build(obj, stream, context, path)
+#: what gives a greedy field its end.
+_BOUNDED = (construct.NullTerminated, construct.FixedSized, construct.Prefixed)
 
 
-class Sealing(Subconstruct):  # type: ignore[misc]
-    """A struct with a checksum.
+def check_struct(con: Construct) -> None:
+    """Raise `SpecError` with path and reason if a frame cannot be described by this construct.
 
-    Attributes:
-        fields: names of the fields that hold it, low bits first.
-        algorithm: of the checksum, None where a hook has to supply it.
-        over: names of the fields that it covers, in a row; None: all bytes that hold no bit of `fields`.
-        absent: values that mean "not filled".
+    Raises:
+        SpecError: for a shadowed, reserved, duplicate or missing name, or a construct that loses bits or never ends.
     """
+    for path, part, in_bits in _walk(con, "", in_bits=False):
+        for kind, (rule, reason) in _REFUSED.items():
+            if isinstance(part, kind):
+                raise SpecError(reason, path=path, rule=rule)
+        if isinstance(part, type(construct.Flag)) and not in_bits:
+            raise SpecError("Flag keeps one bit of its byte only: use a BitStruct, or Int8ul", path=path, rule="LS107")
+        if isinstance(part, Struct):
+            _check_names(part, path, in_bits=in_bits)
+    _check_measures(con, "", (1, 0, ""), {})
 
-    fields: tuple[str, ...]
-    algorithm: Checksum | None
-    over: tuple[str, ...] | None
-    absent: frozenset[int]
+
+def _check_names(struct: Struct, path: str, *, in_bits: bool) -> None:
+    seen: set[str] = set()
+    for child in struct.subcons:
+        name = child.name
+        place = f"{path}.{name}" if path else str(name)
+        if isinstance(child, construct.Padded):
+            continue  # refused on its own, and with a better reason
+        if name is None:
+            if in_bits or not isinstance(unwrap(child), Const):
+                raise SpecError(f"an unnamed {type(unwrap(child)).__name__} would lose its value: give it a name", path=path, rule="LS105")
+            continue
+        if name in seen:
+            raise SpecError("two fields of this name: the last one would win silently", path=place, rule="LS104")
+        if name in RESERVED:
+            raise SpecError("no field may be called 'state' or 'on'", path=place, rule="LS102")
+        if name in SHADOWED:
+            raise SpecError(f"the name {name!r} is shadowed by a method of construct's Container", path=place, rule="LS101")
+        if name.startswith("_") or not name.isidentifier():
+            raise SpecError("a field name must be a Python identifier without a leading underscore", path=place, rule="LS103")
+        seen.add(name)
+
+
+def _check_measures(con: Construct, path: str, measure: tuple[float, float, str], found: dict[str, tuple[float, float, str]]) -> None:
+    """Refuse a field that branches measure in different steps or units: it is one column, and has one of each."""
+    if isinstance(con, construct.Renamed):
+        path = f"{path}.{con.name}" if path else str(con.name)
+        measure = (1, 0, "")
+    if isinstance(con, Describing):
+        said = con.described(FieldInfo(""))
+        measure = (said.scale, said.offset, said.unit)
+    is_number = isinstance(con, construct.FormatField | construct.BytesInteger | construct.BitsInteger)
+    if is_number and found.setdefault(path, measure) != measure:
+        raise SpecError("its branches have different scales or units: give each a name of its own", path=path)
+    for child in children(con):
+        if not isinstance(con, Struct) or child.name is not None:
+            _check_measures(child, path, measure, found)
+
+
+def _walk(con: Construct, path: str, *, in_bits: bool) -> Iterator[tuple[str, Construct, bool]]:
+    if con.name is not None and isinstance(con, construct.Renamed):
+        path = f"{path}.{con.name}" if path else con.name
+    yield path, con, in_bits
+    if isinstance(con, _BOUNDED) and unwrap(con.subcon) is construct.GreedyBytes:
+        return
+    if isinstance(con, construct.Transformed | construct.Restreamed):
+        in_bits = True
+    for child in children(con):
+        yield from _walk(child, path, in_bits=in_bits)
+
+
+def children(con: Construct) -> list[Construct]:
+    """The constructs directly below one, branches included."""
+    if isinstance(con, Struct):
+        return list(con.subcons)
+    found = [getattr(con, name) for name in ("subcon", "thensubcon", "elsesubcon", "default") if name in vars(con)]
+    return found + (list(con.cases.values()) if "cases" in vars(con) else [])
+
+
+def seals(con: Construct) -> Iterator[Sealing]:
+    """The sealed structs of a struct, outer ones first."""
+    if isinstance(con, Sealing):
+        yield con
+    for child in children(con):
+        yield from seals(child)
+
+
+def random_value(con: Construct, source: random.Random, drawn: Drawn, scope: Any = None, path: str = "") -> Any:
+    """A random value that a construct can build; for parts that have no places and so cannot be filled with random bytes.
+
+    Args:
+        drawn: field path -> what draws its value in place of chance.
+        scope: what its expressions see.
+    """
+    if path in drawn:
+        return drawn[path](source)
+    if isinstance(con, Const):
+        return con.value
+    if isinstance(con, construct.Rebuild):
+        with contextlib.suppress(Exception):  # it may ask for what comes after it, and is evaluated again when the frame is built
+            return con.func(scope)
+    if isinstance(con, Struct):
+        values = Container(_=scope)
+        for child in con.subcons:
+            if child.name is not None:
+                values[child.name] = random_value(child, source, drawn, values, f"{path}.{child.name}" if path else child.name)
+        return values
+    if isinstance(con, Array):
+        return [random_value(con.subcon, source, drawn, scope, path) for _ in range(construct.evaluate(con.count, scope))]
+    if isinstance(con, construct.IfThenElse):
+        return random_value(con.thensubcon if construct.evaluate(con.condfunc, scope) else con.elsesubcon, source, drawn, scope, path)
+    if isinstance(con, construct.Switch):
+        return random_value(con.cases.get(construct.evaluate(con.keyfunc, scope), con.default), source, drawn, scope, path)
+    if isinstance(con, construct.Enum):
+        named = list(con.ksymapping) if not isinstance(unwrap(con), Const) and source.random() < 0.5 else []
+        return con._decode(source.choice(named) if named else random_value(con.subcon, source, drawn, scope, path), None, None)
+    if isinstance(con, construct.NullTerminated) or not isinstance(con, Subconstruct):
+        return _random_leaf(con, source, scope)
+    if isinstance(con, construct.Adapter):
+        return clean(con.parse(con.subcon.build(random_value(con.subcon, source, drawn, scope, path))))
+    return random_value(con.subcon, source, drawn, scope, path)
+
+
+def _random_leaf(con: Construct, source: random.Random, scope: Any) -> Any:
+    if con is construct.Pass:
+        return None
+    if isinstance(con, construct.NullTerminated):
+        return str(source.randrange(10 ** source.randint(1, 4))).encode()
+    if isinstance(con, construct.Computed):
+        return construct.evaluate(con.func, scope)
+    if con is construct.GreedyBytes:
+        return source.randbytes(source.randint(0, 4))
+    if isinstance(con, Bytes):
+        return source.randbytes(construct.evaluate(con.length, scope))
+    if isinstance(con, BitsInteger):
+        value = source.getrandbits(con.length)
+        return value - (1 << con.length) if con.signed and value >> (con.length - 1) else value
+    return con.parse(source.randbytes(con.sizeof()))
 
 
 def frame_tree(con: Construct) -> Node:
@@ -355,146 +527,32 @@ def frame_tree(con: Construct) -> Node:
     return _Builder(first.scopes).node(con, _Place(FieldInfo(""), None)) if first.rebuilding else root
 
 
-class _Scope:
-    """What an expression of a struct sees of the fields before it, as symbols."""
-
-    def __init__(self, parent: _Scope | None, path: str, asked: list[Ref]) -> None:
-        self.parent, self.path, self.asked = parent, path, asked
-        self.names: dict[str, Ref | _Scope] = {}
-        #: names of parts that branches have in different forms.
-        self.several: set[str] = set()
-
-    def add(self, name: str, part: Ref | _Scope) -> None:
-        """Make a field or struct known from here on."""
-        known = self.names.get(name)
-        if known is not None and not (isinstance(known, Ref) and isinstance(part, Ref) and known.info.labels == part.info.labels):
-            self.several.add(name)
-        self.names[name] = part
-
-    def __getitem__(self, name: str) -> Any:
-        if name == "_":
-            return self.parent
-        if name == "_root":
-            return self.parent["_root"] if self.parent is not None else self
-        if name not in self.names:
-            raise _Blind(f"an expression asks for {name!r}, which is not a field before it")
-        part = self.names[name]
-        if isinstance(part, _Scope):
-            return part
-        self.asked.append(part)
-        if name in self.several:
-            raise _Untraceable(f"an expression asks for {name!r}, which has several forms")
-        return _Symbol(part)
-
-    def __getattr__(self, name: str) -> Any:
-        return self[name]
-
-    def __len__(self) -> int:
-        raise _Blind("an expression asks for the length of an array")
-
-
-class _Untraceable(Exception):
-    """Why an expression cannot be written down as data."""
-
-
-class _Blind(_Untraceable):
-    """What an expression asks for that construct alone may know."""
-
-
-class _Symbol:
-    """A value that is not known yet; what is done with it is kept."""
-
-    __hash__ = None  # type: ignore[assignment]
-
-    def __init__(self, formula: Formula) -> None:
-        self.formula = formula
-
-    def __bool__(self) -> bool:
-        raise _Untraceable("a Python function decides on the values of fields")
-
-    __index__ = __int__ = __float__ = __len__ = __iter__ = __bool__
-
-    def __invert__(self) -> _Symbol:
-        return _Symbol(Op("-", (Op("+", (self.formula, 1)),)))
-
-    def __neg__(self) -> _Symbol:
-        return _Symbol(Op("-", (self.formula,)))
-
-    def __pos__(self) -> _Symbol:
-        return self
-
-    def __getattr__(self, name: str) -> Any:
-        raise _Untraceable(f"an expression asks for {name!r} of a number")
-
-    def __getitem__(self, key: object) -> Any:
-        raise _Untraceable("an expression takes an element of an array, or a byte")
-
-
-def _traced_operation(symbol: str, left: Any, right: Any) -> _Symbol:
-    pair: list[Any] = [part.formula if isinstance(part, _Symbol) else part for part in (left, right)]
-    for one, other in ((0, 1), (1, 0)):
-        known = pair[other]
-        if not isinstance(known, Ref) or not known.info.labels:
-            continue
-        if symbol not in ("==", "!=") or not isinstance(pair[one], int | str):
-            raise _Untraceable("an expression takes the name of a value for a number")
-        if pair[one] in known.info.labels:  # construct has the name in place of such a number
-            return _Symbol(int(symbol == "!="))
-        pair[one] = _labelled(known, pair[one]) if isinstance(pair[one], str) else pair[one]
-    wrong = next((part for part in pair if not isinstance(part, int | Ref | Op)), None)
-    if wrong is not None:
-        raise _Untraceable(f"an expression with {wrong!r}")
-    return _Symbol(calculated(symbol, *(int(part) if isinstance(part, bool) else part for part in pair)))
-
-
-def _no_integer(sign: str) -> Any:
-    raise _Untraceable(f"an expression with {sign!r}, which need not give an integer")
-
-
-def _operators() -> None:
-    both = {
-        "add": "+",
-        "sub": "-",
-        "mul": "*",
-        "floordiv": "//",
-        "mod": "%",
-        "and": "&",
-        "or": "|",
-        "xor": "^",
-        "lshift": "<<",
-        "rshift": ">>",
-    }
-    for name, symbol in both.items():
-        setattr(_Symbol, f"__{name}__", lambda self, other, symbol=symbol: _traced_operation(symbol, self, other))
-        setattr(_Symbol, f"__r{name}__", lambda self, other, symbol=symbol: _traced_operation(symbol, other, self))
-    for name, symbol in {"eq": "==", "ne": "!=", "lt": "<", "le": "<=", "gt": ">", "ge": ">="}.items():
-        setattr(_Symbol, f"__{name}__", lambda self, other, symbol=symbol: _traced_operation(symbol, self, other))
-    for name, sign in {"truediv": "/", "pow": "**", "divmod": "divmod", "matmul": "@"}.items():
-        for full in (f"__{name}__", f"__r{name}__"):
-            setattr(_Symbol, full, lambda self, other, sign=sign: _no_integer(sign))
-
-
-_operators()
-
-
-def _labelled(ref: Ref, label: str) -> int:
-    """The raw value that a name of construct's Enum stands for."""
-    for value, name in ref.info.labels.items():
-        if name == str(label):
-            return value
-    raise _Untraceable(f"{ref.path} has no value named {label!r}")
-
-
-def _traced(expression: Any, scope: _Scope) -> Any:
+def _traced(expression: Any, scope: Scope) -> Any:
     """What an expression comes to; construct's own are walked, since its ``~`` asks for the truth of a value."""
     if isinstance(expression, BinExpr):
         return expression.op(_traced(expression.lhs, scope), _traced(expression.rhs, scope))
     if isinstance(expression, UniExpr):
         operand = _traced(expression.operand, scope)
-        if expression.op is operator.not_ and isinstance(operand, _Symbol):
-            return _Symbol(Op("not", (operand.formula,)))
+        if expression.op is operator.not_ and isinstance(operand, Symbol):
+            return Symbol(Op("not", (operand.formula,)))
         return expression.op(operand)
     return expression(scope) if callable(expression) else expression
+
+
+def _spelled(expression: Any, path: str) -> str:
+    """An expression of the part at `path` as its author wrote it, with fields by their whole paths; "?" for a function."""
+    text = repr(expression)
+    if " at 0x" in text:
+        return "?"
+    return re.sub(r"\bthis(?:\.\w+)+", functools.partial(_whole_path, path), re.sub(r"\['(\w+)'\]", r".\1", text))
+
+
+def _whole_path(path: str, way: re.Match[str]) -> str:
+    """``this.count`` or ``this._.count`` in the part at `path` as the path from the top of the frame."""
+    names = path.split(".")[:-1]
+    for name in way[0].split(".")[1:]:
+        names = [] if name == "_root" else names[:-1] if name == "_" else [*names, name]
+    return ".".join(names)
 
 
 class _Fields:
@@ -537,7 +595,7 @@ class _Place:
     """Where in the tree a construct stands: what is said of it, what its expressions see, and whether it is a part of a bit block."""
 
     info: FieldInfo
-    scope: _Scope | None
+    scope: Scope | None
     name: str = ""
     in_bits: bool = False
 
@@ -549,8 +607,8 @@ class _Place:
 class _Builder:
     """Makes the nodes of a struct; `scopes`: what was known at the end of each struct, for values that follow from later ones."""
 
-    def __init__(self, known: Mapping[str, _Scope]) -> None:
-        self._known, self.scopes, self.rebuilding = known, dict[str, _Scope](), False
+    def __init__(self, known: Mapping[str, Scope]) -> None:
+        self._known, self.scopes, self.rebuilding = known, dict[str, Scope](), False
         self._asked: list[Ref] = []
 
     def node(self, con: Construct, place: _Place) -> Node:
@@ -597,11 +655,11 @@ class _Builder:
                 return con, place
             con = con.subcon
 
-    def _formula(self, expression: Any, place: _Place, known: _Scope | None = None, *, is_key: bool = False) -> Formula:
+    def _formula(self, expression: Any, place: _Place, known: Scope | None = None, *, is_key: bool = False) -> Formula:
         """A count, length, condition or key as data, as far as it can be written down."""
         if isinstance(expression, int):
             return int(expression)
-        scope = next((scope for scope in (known, place.scope) if scope is not None), _Scope(None, "", self._asked))
+        scope = next((scope for scope in (known, place.scope) if scope is not None), Scope(None, "", self._asked))
         scope.asked.clear()
         blind = False
         try:
@@ -610,14 +668,14 @@ class _Builder:
                 reason = "a Python function of a field that may be left out"
             elif isinstance(value, bool | int):
                 return int(value)
-            elif not isinstance(value, _Symbol):
+            elif not isinstance(value, Symbol):
                 reason = f"an expression that gives {value!r}"
             elif not is_key and isinstance(value.formula, Ref) and value.formula.info.labels:
                 reason = "an expression takes the name of a value for a number"
             else:
                 return value.formula
-        except _Untraceable as untraceable:
-            reason, blind = str(untraceable), isinstance(untraceable, _Blind)
+        except Untraceable as untraceable:
+            reason, blind = str(untraceable), isinstance(untraceable, Blind)
         except Exception as error:
             reason = f"a Python function of other fields ({type(error).__name__}: {error})"
         return self._code(expression, place, reason, tuple(scope.asked), blind=blind)
@@ -627,9 +685,8 @@ class _Builder:
         while scope is not None:
             paths.append(scope.path)
             scope = scope.parent
-        text = repr(expression)
         function = functools.partial(_evaluated, expression, tuple(paths or [""]))
-        return Code(function, tuple(dict.fromkeys(asked)), f"{place.info.path}: {reason}", "?" if " at 0x" in text else text, blind)
+        return Code(function, tuple(dict.fromkeys(asked)), f"{place.info.path}: {reason}", _spelled(expression, place.info.path), blind)
 
     def _select(self, con: construct.Switch, place: _Place) -> Select:
         key = self._formula(con.keyfunc, place, is_key=True)
@@ -652,7 +709,7 @@ class _Builder:
 
     def _struct(self, con: Struct, place: _Place) -> tree.Struct:
         info = place.info
-        scope = _Scope(place.scope, info.path, self._asked)
+        scope = Scope(place.scope, info.path, self._asked)
         if place.name and place.scope is not None:
             place.scope.add(place.name, scope)
         members = []
@@ -819,37 +876,6 @@ def leaves(parsed: Any, keys: tuple[str | int, ...] = ()) -> Iterator[tuple[tupl
             yield from leaves(value, (*keys, index))
     else:
         yield keys, int(parsed) if isinstance(parsed, construct.EnumIntegerString) else parsed
-
-
-def peeled(con: Construct, info: FieldInfo) -> tuple[Construct, FieldInfo]:
-    """What is below the wrappers that only describe (name, unit, labels, constant), and what they say."""
-    while True:
-        if isinstance(con, construct.Renamed):
-            info = replace(info, docs=con.docs or info.docs)
-        elif isinstance(con, Describing):
-            info = con.described(info)
-        elif isinstance(con, construct.Enum):
-            info = replace(info, labels={int(value): str(name) for value, name in con.ksymapping.items()})
-        elif isinstance(con, Const):
-            info = replace(info, const=_constant(con))
-        elif isinstance(con, construct.Rebuild):
-            info = replace(info, rebuilt=con.func)
-        elif not isinstance(con, construct.Default):
-            return con, info
-        con = con.subcon
-
-
-def fields_below(con: Construct, info: FieldInfo) -> dict[str, FieldInfo]:
-    """The fields of a part of a struct, by path; `info` says where it stands."""
-    found = _Builder({}).node(con, _Place(info, None, info.name))
-    infos = [part.info for node in nodes(found) if isinstance(node, Block) for part in node.parts]
-    infos += [node.info for node in nodes(found) if isinstance(node, Number | Blob | Opaque)]
-    return {info.path: info for info in infos if info.path}
-
-
-def probed(con: Construct, size: int) -> list[BitField] | None:
-    """The bit fields of a block; None where construct decides on its bits, or values are no plain integers."""
-    return _probed(con, size)
 
 
 def is_expression(value: object) -> bool:

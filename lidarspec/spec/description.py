@@ -16,10 +16,9 @@ from typing import Any, Literal
 from construct import Construct
 
 from lidarspec.errors import SpecError, UnknownFrame
-from lidarspec.spec.construct_layer import fixed_size, frame_tree, prepare
+from lidarspec.spec.construct_layer import check_struct, fixed_size, frame_tree, prepare
 from lidarspec.spec.links import Link, is_datagram
 from lidarspec.spec.results import Points
-from lidarspec.spec.rules import check_struct
 from lidarspec.spec.timing import Clock, Sequence, Split
 from lidarspec.spec.tree import Node
 
@@ -28,6 +27,7 @@ API = 1
 STATUSES = ("manual", "vectors", "capture", "hardware")
 #: what a field can say of the device itself, in `Spec.info`.
 ROLES = ("serial", "firmware", "model", "temperature")
+#: where an axis can point: along x, y and z of REP-103, each with its opposite.
 DIRECTIONS = ("forward", "back", "left", "right", "up", "down")
 #: what a sensor sends for a command, see `Simulation.answers`.
 Answer = str | tuple[str, Mapping[str, Any]] | bytes | float
@@ -77,7 +77,7 @@ class Frame:
         acknowledged: findings of `lidarspec check` that are true and meant, as "LS204" or "LS205 path.of.a.field" -> the reason.
 
     Raises:
-        SpecError: if the struct cannot describe a frame (see `lidarspec.spec.rules`).
+        SpecError: if the struct cannot describe a frame (see `lidarspec.spec.construct_layer.check_struct`).
     """
 
     struct: Construct
@@ -241,10 +241,6 @@ class Spec:
     def datagrams(self) -> bool:
         """Whether frames come one to a datagram."""
         return is_datagram(self.links.get("data"))
-
-    def cloud_of(self, packets: Any) -> Any:
-        """The points of some of its packets, in stream order, as a `PointCloud`: known to `Sensor`, not to its description alone."""
-        raise NotImplementedError
 
     def __repr__(self) -> str:
         options = "".join(f", {name}={value!r}" for name, value in self.options.items())

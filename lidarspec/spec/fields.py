@@ -45,11 +45,6 @@ _FACTORS: dict[str, dict[str, Fraction]] = {
 }
 
 
-def exact(number: float | int) -> Fraction:
-    """The decimal number that was written, not the binary one nearest to it: 0.001 is 1/1000."""
-    return Fraction(repr(float(number))) if isinstance(number, float) else Fraction(number)
-
-
 def factor(unit: str, target: str) -> Fraction | None:
     """How many `target` one `unit` is, or None where the two measure different things."""
     if unit == target:

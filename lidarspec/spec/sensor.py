@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from lidarspec.framing.decoder import Decoder
     from lidarspec.framing.results import Found
     from lidarspec.packets.packets import Packets
-    from lidarspec.points.cloud import PointCloud
     from lidarspec.scans.scans import Scan
 
 #: options that every sensor has.
@@ -118,10 +117,12 @@ class Sensor(Spec):
             stream: True reads a byte stream, False one datagram for each `feed`; by default what the data link says.
         """
         from lidarspec.framing.decoder import Decoder, backend as checked_backend
-        from lidarspec.points.numba_kernels import compiled_sums
 
-        chosen = checked_backend(backend)
-        sums = compiled_sums() if chosen == "jit" else None
+        chosen, sums = checked_backend(backend), None
+        if chosen == "jit":
+            from lidarspec.points.numba_kernels import compiled_sums
+
+            sums = compiled_sums()
         stream = not self.datagrams if stream is None else stream
         return Decoder(self, stream=stream, interpreted=chosen == "construct", backend=chosen, sums=sums)
 
@@ -151,12 +152,6 @@ class Sensor(Spec):
         frames = frames_of(decoder, data)
         name = frame or data_frame(self, frames) or self.data_frame
         return PacketStream(self, name, decoder.stats, interpreted=decoder.interpreted, backend=decoder.backend).add(frames, whole=True)
-
-    def cloud_of(self, packets: Packets) -> PointCloud:
-        """The points of some of its packets, in stream order; what ``packets.points()`` returns."""
-        from lidarspec.points.evaluate import cloud_of
-
-        return cloud_of(packets)
 
     def scans(self, data: Any, *, backend: str = "auto") -> Iterator[Scan]:
         """Every scan of the data; the first and last piece are marked ``complete=False``.

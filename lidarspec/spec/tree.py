@@ -30,6 +30,7 @@ import operator
 import struct
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
+from fractions import Fraction
 from typing import Any, Literal
 
 import numpy as np
@@ -37,6 +38,11 @@ import numpy as np
 from lidarspec.errors import SpecError
 from lidarspec.spec.bits import BitField
 from lidarspec.spec.checksums import Checksum
+
+
+def exact(number: float | int) -> Fraction:
+    """The decimal number that was written, not the binary one nearest to it: 0.001 is 1/1000."""
+    return Fraction(repr(float(number))) if isinstance(number, float) else Fraction(number)
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,6 +88,38 @@ class FieldInfo:
         """Whether the physical value is another number than the raw one."""
         return self.scale != 1 or self.offset != 0
 
+    def physical(self, raw: Any) -> Any:
+        """Raw values in the field's unit.
+
+        Args:
+            raw: a number, or an array of any shape.
+
+        Returns:
+            The same kind of thing; raw values themselves where no scale is declared. A Fraction is scaled exactly.
+        """
+        if not self.scaled:
+            return raw
+        if isinstance(raw, Fraction):
+            return raw * exact(self.scale) + exact(self.offset)
+        return raw * self.scale + self.offset
+
+    def raw(self, physical: Any) -> Any:
+        """The raw values nearest to physical ones, halfway to the even one; of a float field those that are equal.
+
+        Args:
+            physical: a number in the field's unit, or an array of any shape.
+
+        Returns:
+            An int, or int64 of the same shape; floats for a float field. They may be beyond the field's limits.
+        """
+        if isinstance(physical, Fraction):
+            steps: Any = (physical - exact(self.offset)) / exact(self.scale)
+        else:
+            steps = (physical - self.offset) / self.scale if self.scaled else physical
+        if self.kind == "float":
+            return float(steps) if isinstance(steps, Fraction) else steps
+        return np.rint(steps).astype(np.int64) if isinstance(steps, np.ndarray) else round(steps)
+
     @property
     def limits(self) -> tuple[int, int]:
         """The lowest and highest raw value of an integer field."""
@@ -122,7 +160,7 @@ class Code:
         function: from what reads a field (see `Read`) to the value.
         refs: fields that it is known to ask for; which others depends on their values.
         reason: why it cannot be written down, with the path of the part that it belongs to.
-        text: as the author wrote it, "?" where that cannot be read.
+        text: as the author wrote it, with fields by their whole paths; "?" where that cannot be read.
         blind: whether it asks for something that is no field before it, which construct alone may know.
     """
 
@@ -430,3 +468,137 @@ def infos(node: Node) -> tuple[FieldInfo, ...]:
         case Block():
             return tuple(part.info for part in node.parts)
     return ()
+
+
+class Scope:
+    """What an expression of a struct sees of the fields before it, as symbols, so that what it does with them can be written down.
+
+    Args:
+        asked: to which the fields are added that an expression asks for.
+    """
+
+    def __init__(self, parent: Scope | None, path: str, asked: list[Ref]) -> None:
+        self.parent, self.path, self.asked = parent, path, asked
+        self.names: dict[str, Ref | Scope] = {}
+        #: names of parts that branches have in different forms.
+        self.several: set[str] = set()
+
+    def add(self, name: str, part: Ref | Scope) -> None:
+        """Make a field or struct known from here on."""
+        known = self.names.get(name)
+        if known is not None and not (isinstance(known, Ref) and isinstance(part, Ref) and known.info.labels == part.info.labels):
+            self.several.add(name)
+        self.names[name] = part
+
+    def __getitem__(self, name: str) -> Any:
+        if name == "_":
+            return self.parent
+        if name == "_root":
+            return self.parent["_root"] if self.parent is not None else self
+        if name not in self.names:
+            raise Blind(f"an expression asks for {name!r}, which is not a field before it")
+        part = self.names[name]
+        if isinstance(part, Scope):
+            return part
+        self.asked.append(part)
+        if name in self.several:
+            raise Untraceable(f"an expression asks for {name!r}, which has several forms")
+        return Symbol(part)
+
+    def __getattr__(self, name: str) -> Any:
+        return self[name]
+
+    def __len__(self) -> int:
+        raise Blind("an expression asks for the length of an array")
+
+
+class Untraceable(Exception):
+    """Why an expression cannot be written down as data."""
+
+
+class Blind(Untraceable):
+    """What an expression asks for that construct alone may know."""
+
+
+class Symbol:
+    """A value that is not known yet; what is done with it is kept."""
+
+    __hash__ = None  # type: ignore[assignment]
+
+    def __init__(self, formula: Formula) -> None:
+        self.formula = formula
+
+    def __bool__(self) -> bool:
+        raise Untraceable("a Python function decides on the values of fields")
+
+    __index__ = __int__ = __float__ = __len__ = __iter__ = __bool__
+
+    def __invert__(self) -> Symbol:
+        return Symbol(Op("-", (Op("+", (self.formula, 1)),)))
+
+    def __neg__(self) -> Symbol:
+        return Symbol(Op("-", (self.formula,)))
+
+    def __pos__(self) -> Symbol:
+        return self
+
+    def __getattr__(self, name: str) -> Any:
+        raise Untraceable(f"an expression asks for {name!r} of a number")
+
+    def __getitem__(self, key: object) -> Any:
+        raise Untraceable("an expression takes an element of an array, or a byte")
+
+
+def _traced_operation(symbol: str, left: Any, right: Any) -> Symbol:
+    pair: list[Any] = [part.formula if isinstance(part, Symbol) else part for part in (left, right)]
+    for one, other in ((0, 1), (1, 0)):
+        known = pair[other]
+        if not isinstance(known, Ref) or not known.info.labels:
+            continue
+        if symbol not in ("==", "!=") or not isinstance(pair[one], int | str):
+            raise Untraceable("an expression takes the name of a value for a number")
+        if pair[one] in known.info.labels:  # construct has the name in place of such a number
+            return Symbol(int(symbol == "!="))
+        pair[one] = _labelled(known, pair[one]) if isinstance(pair[one], str) else pair[one]
+    wrong = next((part for part in pair if not isinstance(part, int | Ref | Op)), None)
+    if wrong is not None:
+        raise Untraceable(f"an expression with {wrong!r}")
+    return Symbol(calculated(symbol, *(int(part) if isinstance(part, bool) else part for part in pair)))
+
+
+def _no_integer(sign: str) -> Any:
+    raise Untraceable(f"an expression with {sign!r}, which need not give an integer")
+
+
+def _operators() -> None:
+    both = {
+        "add": "+",
+        "sub": "-",
+        "mul": "*",
+        "floordiv": "//",
+        "mod": "%",
+        "and": "&",
+        "or": "|",
+        "xor": "^",
+        "lshift": "<<",
+        "rshift": ">>",
+    }
+    for name, symbol in both.items():
+        setattr(Symbol, f"__{name}__", lambda self, other, symbol=symbol: _traced_operation(symbol, self, other))
+        setattr(Symbol, f"__r{name}__", lambda self, other, symbol=symbol: _traced_operation(symbol, other, self))
+    for name, symbol in {"eq": "==", "ne": "!=", "lt": "<", "le": "<=", "gt": ">", "ge": ">="}.items():
+        setattr(Symbol, f"__{name}__", lambda self, other, symbol=symbol: _traced_operation(symbol, self, other))
+    for name, sign in {"truediv": "/", "pow": "**", "divmod": "divmod", "matmul": "@"}.items():
+        for full in (f"__{name}__", f"__r{name}__"):
+            setattr(Symbol, full, lambda self, other, sign=sign: _no_integer(sign))
+
+
+_operators()
+
+
+def _labelled(ref: Ref, label: str) -> int:
+    """The raw value that a name of construct's Enum stands for."""
+    for value, name in ref.info.labels.items():
+        if name == str(label):
+            return value
+    raise Untraceable(f"{ref.path} has no value named {label!r}")

@@ -132,7 +132,7 @@ def assert_backends_agree(sensor: Sensor, data: Any) -> None:
     """
     decoders = [sensor.decoder(stream=is_stream(data), backend=backend) for backend in ("auto", "construct")]
     found = [frames_of(decoder, data) for decoder in decoders]
-    split = [cuts(frame for spans in each for frame in spans.found()) for each in found]
+    split = [cuts(frame for frames in each for frame in frames.found()) for each in found]
     assert split[0] == split[1]
     for name in dict.fromkeys((sensor.data_frame, *(name for name, _, _ in split[0]))):
         compiled, interpreted = (_packets(decoder, name, each) for decoder, each in zip(decoders, found, strict=True))

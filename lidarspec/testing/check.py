@@ -39,6 +39,7 @@ SAID = (
     ("that returns a sensor", "LS006"),
     ("definition", "LS004"),
     ("lidarspec_checksum for", "LS010"),
+    ("max_length may be left out", "LS009"),
 )
 
 
@@ -184,8 +185,6 @@ def _loading_rule(error: BaseException, cause: BaseException) -> str:
     functions = [spot.name for spot in traceback.extract_tb(cause.__traceback__)]
     if isinstance(error, SpecError) and error.rule:
         return error.rule
-    if isinstance(cause, TypeError) and "max_length" in str(cause):
-        return "LS009"
     if "sizeof" in functions or "_sizeof" in functions:
         return "LS008"
     if isinstance(cause, SpecError):

@@ -44,7 +44,7 @@ def _parses_back(sensor: Sensor, name: str, given: dict[str, float]) -> None:
     fields = codec(sensor.frames[command.frame]).schema.fields
     for argument, value in given.items():
         info = fields[command.args[argument][0]]
-        read = member(parsed, info.path) * info.scale + info.offset
+        read = info.physical(member(parsed, info.path))
         assert abs(read - value) <= abs(info.scale) * 0.5001, f"{argument} is {read:g}, and {value:g} is given"
 
 

@@ -115,7 +115,7 @@ def _names(subject: Subject, name: str, frame: Frame) -> Findings:
 def _multiplied(subject: Subject, name: str) -> set[str]:
     """The fields that make ranges together with another one, which has the unit."""
     try:
-        infos = [field_of(subject, name, node) for node, _ in used(getattr(traced(subject, name), "range", None))]
+        infos = [field_of(subject, name, node) for node in used(getattr(traced(subject, name), "range", None))]
     except Exception:  # said elsewhere
         return set()
     known = any(info is not None and factor(info.unit, "m") is not None for info in infos)
@@ -227,7 +227,7 @@ def _reach(subject: Subject) -> Findings:
         metres = factor(info.unit, "m") if info is not None and info.kind == "int" else None
         if info is None or metres is None:
             return
-        reach.append(((info.limits[1] * info.scale + info.offset) * float(metres), f"{name}.{info.path}"))
+        reach.append((info.physical(info.limits[1]) * float(metres), f"{name}.{info.path}"))
     furthest, path = max(reach, default=(np.inf, ""))
     if subject.sensor.range_limits[1] > furthest * 1.001:
         yield "LS210", f"it ends at {furthest:g} m, and range_limits at {subject.sensor.range_limits[1]:g} m", path
@@ -235,7 +235,7 @@ def _reach(subject: Subject) -> Findings:
 
 def _column(subject: Subject, name: str, value: Any, column: str, units: tuple[str, ...]) -> Findings:
     """A column that no field in a unit of its kind goes into."""
-    infos = [field_of(subject, name, node) for node, looked_up in used(value) if not looked_up]
+    infos = [field_of(subject, name, node) for node in used(value, looked_up=False)]
     free = [info for info in infos if info is not None and info.const is None and not info.labels]
     if free and not any(factor(info.unit, unit) is not None for info in infos if info is not None for unit in units):
         pure = _measured(subject.sensor.frames[name])

@@ -11,15 +11,14 @@ from __future__ import annotations
 import copy
 import math
 import random
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.columns.columns import Batch, Fields, aligned, unpadded
-from lidarspec.columns.graph import Node, Traced, trace
+from lidarspec.columns.columns import Fields, aligned, unpadded
+from lidarspec.columns.graph import Node, sample_of, trace, traverse
 from lidarspec.errors import LidarSpecError, SpecError, UsageError
 from lidarspec.framing.frame_engine import CompiledCodec, codec
 from lidarspec.packets.packets import Packets
@@ -37,7 +36,7 @@ from lidarspec.testing.agreement import assert_well_formed
 from lidarspec.testing.findings import Violation, require
 from lidarspec.testing.frames import acceptable
 from lidarspec.testing.subject import Subject
-from lidarspec.wire.frame_table import Group, Rows
+from lidarspec.wire.frame_table import Rows
 
 Floats = NDArray[np.float64]
 
@@ -87,22 +86,13 @@ def traced(subject: Subject, name: str) -> Any:
     packets = read(subject, name, [subject.example(name)] * subject.sensor.frames[name].confirm)
     if not isinstance(packets.table, Rows) or not packets.table.groups:
         return None
-    group = packets.table.groups[0]
-    batch = packets.batch()
-    table = Rows(batch.table.schema, [Group(group.layout, np.arange(2), np.ascontiguousarray(group.rows[[0, 0]]))])
-    state = {key: (frames, which[group.where[[0, 0]]]) for key, (frames, which) in batch.state.items()}
-    return trace(points_function(subject.sensor, name), Batch(table, np.zeros(2, np.bool_), state, batch.defaults))[0]
+    return trace(points_function(subject.sensor, name), sample_of(packets.batch(), packets.table.groups[0]))[0]
 
 
-def used(value: Any) -> Iterator[tuple[Node, bool]]:
-    """The fields that a traced value is made of, and whether each is only looked up in a table."""
-    pending = [(value.node, False)] if isinstance(value, Traced) else []
-    while pending:
-        node, looked_up = pending.pop()
-        if node.kind in ("field", "state"):
-            yield node, looked_up
-        looked_up = looked_up or isinstance(node.function, LookUp)
-        pending += [(arg, looked_up) for arg in node.args if isinstance(arg, Node)]
+def used(value: Any, *, looked_up: bool = True) -> list[Node]:
+    """The fields that a traced value is made of; with `looked_up` false without those that are only looked up in a table."""
+    nodes = traverse(value, into=lambda node: looked_up or not isinstance(node.function, LookUp))
+    return [node for node in nodes if node.kind in ("field", "state")]
 
 
 def field_of(subject: Subject, name: str, node: Node) -> FieldInfo | None:

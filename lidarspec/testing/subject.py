@@ -19,9 +19,8 @@ from lidarspec.framing.frame_engine import codec
 from lidarspec.plugins import sensor as named_sensor
 from lidarspec.simulation.frame_maker import examples
 from lidarspec.spec.description import Frame
-from lidarspec.spec.fields import Checksummed
-from lidarspec.spec.rules import children
 from lidarspec.spec.sensor import Sensor
+from lidarspec.spec.tree import Sealed, nodes
 
 #: frames up to this length are cut at every byte, longer ones at so many places.
 SHORT = 300
@@ -116,7 +115,7 @@ def physical(sensor: Sensor, name: str, data: bytes) -> Any:
         if info is not None and info.scaled and info.kind == "int":
             if info.bits > 48:
                 return None
-            holder[key] = holder[key] * info.scale + info.offset
+            holder[key] = info.physical(holder[key])
     return parsed
 
 
@@ -124,19 +123,9 @@ def seals(sensor: Sensor, name: str, data: bytes) -> set[str]:
     """The fields of a frame that hold a checksum, and so are not the caller's."""
     layout = getattr(codec(sensor.frames[name]), "tree", None)
     if layout is None:
-        return set(_sealing(sensor.frames[name].prepared))
+        return {path for node in nodes(sensor.frames[name].tree) if isinstance(node, Sealed) for path in node.fields}
     found = layout.layout(data)
     return {leaf.info.path for seal in getattr(found, "seals", ()) for leaf in seal.leaves}
-
-
-def _sealing(con: Any, path: str = "") -> Iterator[str]:
-    """The paths of the fields that hold checksums, read off a construct tree."""
-    if type(con).__name__ == "Renamed":
-        path = f"{path}.{con.name}" if path else con.name
-    if isinstance(con, Checksummed):
-        yield from (f"{path}.{field}" if path else field for field in con.fields)
-    for child in children(con):
-        yield from _sealing(child, path)
 
 
 def fitting(sensor: Sensor, data: bytes) -> list[str]:

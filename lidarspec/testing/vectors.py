@@ -97,11 +97,11 @@ def _values(subject: Subject, name: str, data: bytes, parsed: Any, vector: Mappi
     for path, value, in_units in wanted:
         require(path in found, "LS702", f"the frame has no field {path!r}", f"{place} {name}")
         info, raw = fields.get(re.sub(r"\[\d+\]", "", path)), found[path]
-        shown: Any = raw.hex(" ") if isinstance(raw, bytes) else raw * info.scale + info.offset if in_units and info is not None else raw
+        shown: Any = raw.hex(" ") if isinstance(raw, bytes) else info.physical(raw) if in_units and info is not None else raw
         near = abs(info.scale) * 0.5001 if in_units and info is not None else 0
         if shown == value or (isinstance(value, int | float) and isinstance(shown, int | float) and abs(shown - value) <= near):
             continue
-        expected = round((value - info.offset) / info.scale) if in_units and info is not None else value
+        expected = info.raw(value) if in_units and info is not None else value
         raise Violation(_reading(info, raw, expected), f"{shown} is read, and {value} is printed", f"{place} {name}.{path}")
 
 

@@ -14,7 +14,8 @@ from pathlib import Path
 from typing import BinaryIO
 
 from lidarspec.captures.bulk import Batch, CaptureBatches
-from lidarspec.captures.pcap import CaptureReader, CaptureStats, StreamReader, is_capture, is_stream_capture
+from lidarspec.captures.pcap import CaptureReader, CaptureStats, StreamReader, is_stream_capture
+from lidarspec.captures.records import is_capture
 from lidarspec.errors import SourceError, WireError
 from lidarspec.recording.format import MAGIC, Header, Record
 from lidarspec.recording.recordings import Recording

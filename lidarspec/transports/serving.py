@@ -24,6 +24,7 @@ from lidarspec.spec.links import Udp
 from lidarspec.transports.open_url import transport
 from lidarspec.transports.outlets import HERE, Outlet
 from lidarspec.transports.protocol import POLL, Chunk, Disconnected
+from lidarspec.wire.build import build_command
 
 #: seconds at least between two sendings.
 PAUSE = 0.001
@@ -175,8 +176,8 @@ def write_file(device: SimulatedDevice, path: str | Path, seconds: float, *, ove
         while now < seconds * SECOND:
             if opening:
                 name = opening.pop(0)
-                out.write(Chunk(sensor.command(name), began + now), "out")
-                device.receive(sensor.command(name), now, sensor.commands[name].link)
+                out.write(Chunk(build_command(sensor, name, {}), began + now), "out")
+                device.receive(build_command(sensor, name, {}), now, sensor.commands[name].link)
             now += PIECE
             for chunk in _chunks(device, now, began + now):
                 out.write(chunk)

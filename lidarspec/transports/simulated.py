@@ -30,8 +30,8 @@ class SimulatedTransport(LiveTransport):
         baud: of its serial line, None where it has none.
     """
 
-    def __init__(self, label: str, device: SimulatedDevice) -> None:
-        self.label, self.device, self.sensor = label, device, device.sensor
+    def __init__(self, label: str, sensor: Sensor, device: SimulatedDevice) -> None:
+        self.label, self.device, self.sensor = label, device, sensor
         link = self.sensor.links.get("data")
         self.datagrams = self.sensor.datagrams
         self.baud = link.baud if isinstance(link, Serial) else None
@@ -125,7 +125,7 @@ def connect(address: Address, sensor: Sensor | None = None) -> SimulatedTranspor
     named = named_sensor(address.place) if address.place else sensor
     assert named is not None
     simulated = sensor if sensor is not None and sensor.id == named.id else named
-    return SimulatedTransport(address.text, simulated_device(simulated, address.options))
+    return SimulatedTransport(address.text, simulated, simulated_device(simulated, address.options))
 
 
 def _seed(text: str) -> int:

@@ -103,20 +103,17 @@ class _Values:
             value = value.item()
         if isinstance(value, str | WireNaN | bytes) or info.kind not in ("int", "float"):
             return value
-        if self._units and info.scaled:
-            value = (value - info.offset) / info.scale
         if info.kind == "float":
-            return value if isinstance(value, int) else float(value)
-        if isinstance(value, float):
-            if not np.isfinite(value) or (not self._units and value != int(value)):
-                raise UsageError(f"{self._place}: {shown} = {value} is not a raw integer; pass units=True for physical values")
-            value = round(value)
+            raw = info.raw(value) if self._units else value
+            return raw if isinstance(raw, int) else float(raw)
+        if isinstance(value, float) and (not np.isfinite(value) or (not self._units and value != int(value))):
+            raise UsageError(f"{self._place}: {shown} = {value} is not a raw integer; pass units=True for physical values")
+        raw = info.raw(value) if self._units else int(value)
         low, high = info.limits
-        if not low <= value <= high:
-            edges = (low * info.scale + info.offset, high * info.scale + info.offset) if self._units else (low, high)
-            shown_value = value * info.scale + info.offset if self._units else value
-            raise OutOfRange(shown, shown_value, *edges, unit=info.unit if self._units else "", place=self._place)
-        return int(value)
+        if not low <= raw <= high:
+            told = [info.physical(part) if self._units else part for part in (raw, low, high)]
+            raise OutOfRange(shown, *told, unit=info.unit if self._units else "", place=self._place)
+        return int(raw)
 
 
 def _open(node: Node, given: Any, values: Container) -> None:
@@ -207,8 +204,8 @@ def build_command(sensor: Spec, name: str, arguments: Mapping[str, Any]) -> byte
         value = arguments[argument]
         if not low <= value <= high:
             raise OutOfRange(argument, value, low, high, unit=fields[path].unit, place=place)
-        raw = round((value - fields[path].offset) / fields[path].scale)
-        bottom, top = fields[path].limits
+        raw = fields[path].raw(value)
+        bottom, top = fields[path].limits if fields[path].kind == "int" else (raw, raw)
         _put(values, path, min(max(raw, bottom), top))
     return build(sensor, command.frame, None, values)
 

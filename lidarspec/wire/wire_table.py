@@ -156,8 +156,8 @@ def _rows(node: Node, shown: str, start: Extent, condition: str, seals: Mapping[
                 width = f"{part.bits.width} bit{'s' * (part.bits.width > 1)}"
                 yield _row(part.info, str(start), width, bit_text(part.bits), _part(shown, part), condition, seals)
         case Number() | Blob() | Opaque():
-            size = "varies" if isinstance(node, Opaque) and node.size is None else str(extent(node, shown))
-            yield _row(node.info, str(start), size, _type(node), shown, condition, seals)
+            length = "varies" if isinstance(node, Opaque) and node.size is None else str(extent(node, shown))
+            yield _row(node.info, str(start), length, _type(node), shown, condition, seals)
 
 
 def _row(info: FieldInfo, offset: str, size: str, kind: str, shown: str, condition: str, seals: Mapping[str, str]) -> WireRow:

@@ -12,7 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from lidarspec.captures.pcap import CaptureReader, CaptureStats, Datagram, is_capture
+from lidarspec.captures.pcap import CaptureReader, CaptureStats, Datagram
+from lidarspec.captures.records import is_capture
 from lidarspec.errors import SourceError
 from tests import made_captures as made
 

@@ -13,7 +13,8 @@ from typing import Any, BinaryIO
 
 import pytest
 
-from lidarspec.captures.pcap import CaptureReader, CaptureStats, is_capture
+from lidarspec.captures.pcap import CaptureReader, CaptureStats
+from lidarspec.captures.records import is_capture
 from lidarspec.errors import SourceError
 from tests import made_captures as made
 

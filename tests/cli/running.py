@@ -10,7 +10,7 @@ from typing import Any
 
 from click.testing import CliRunner, Result
 
-from lidarspec.cli import main
+from lidarspec.cli.root import main
 
 LD06, COIN_D4 = "ldrobot/ld06_3_consecutive_frames.bin", "cspc/coin_d4_ludovatech_issue2_partial.bin"
 #: one frame of the STL-27L's format, so that tests need no capture: the example of the vendor's manual.

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from lidarspec.cli import streams
+from lidarspec.cli import inputs
 from tests.cli.places import babbling, busy, forbidden, nothing, refused, silent, taken
 from tests.cli.running import EXAMPLE, ran
 from tests.lines import free_port
@@ -52,7 +52,7 @@ BROKEN: tuple[tuple[Place, int, str], ...] = (
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(streams, "PATIENCE", 0.2)
+    monkeypatch.setattr(inputs, "PATIENCE", 0.2)
     return tmp_path
 
 

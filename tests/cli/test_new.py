@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 import lidarspec as ls
-from lidarspec.discovery.scaffold import Names
+from lidarspec.discovery.draft import Names
 from lidarspec.exports import EXPORTS, export
 from lidarspec.simulation.simulator import simulate
 from tests.architecture import Module, private_imports

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 import lidarspec
-from lidarspec.discovery.checksum_search import search
+import lidarspec.spec
+from lidarspec.discovery.checksum_search import Changed, WordSum, search
 from lidarspec.discovery.crc_search import common_divisor, divisors, quotient, remainder, solve
 from lidarspec.discovery.samples import Match, Place
-from lidarspec.discovery.sum_search import Changed, WordSum
 from lidarspec.simulation.simulator import simulate
 from lidarspec.spec import Checksum, Crc, Fold15, Sum, WordXor, Xor
 from lidarspec.spec.checksums import CRCS, name_of
@@ -108,7 +108,7 @@ def test_plain_checksums(checksum: Checksum) -> None:
 def test_what_is_pasted_computes_the_same(checksum: Checksum) -> None:
     frames = sealed(checksum, 40, 27)
     match = found(frames)
-    scope: dict[str, Any] = vars(lidarspec) | {name: getattr(lidarspec, name) for name in ("Checksum", "Xor", "WordXor")}
+    scope: dict[str, Any] = vars(lidarspec) | {name: getattr(lidarspec.spec, name) for name in ("Checksum", "Xor", "WordXor")}
     exec(match.paste, scope)
     pasted = scope["Check"]()
     for frame in frames:

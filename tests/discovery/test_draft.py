@@ -13,11 +13,10 @@ import pytest
 import lidarspec as ls
 from lidarspec import UsageError, WireError
 from lidarspec.columns.columns import aligned
-from lidarspec.discovery.draft import Draft, draft
+from lidarspec.discovery.checksum_search import Changed
+from lidarspec.discovery.draft import Draft, Names, draft
 from lidarspec.discovery.periods import candidates
 from lidarspec.discovery.samples import Place
-from lidarspec.discovery.scaffold import Names
-from lidarspec.discovery.sum_search import Changed
 from lidarspec.simulation.simulator import simulate
 from lidarspec.spec import Checksum, Crc, Fold15, Sequence, Sum, WordXor, Xor
 from lidarspec.transports.open_url import transport

@@ -11,10 +11,10 @@ from typing import Any
 
 import construct
 
-import lidarspec
+from lidarspec import spec as vocabulary
 
 #: what the text may name.
-NAMES: dict[str, Any] = {**vars(construct), **{name: getattr(lidarspec, name) for name in ("Scaled", "Checksummed", "Xor", "Sum", "Crc")}}
+NAMES: dict[str, Any] = {**vars(construct), **{name: getattr(vocabulary, name) for name in ("Scaled", "Checksummed", "Xor", "Sum", "Crc")}}
 
 WORDS = ("Int8ub", "Int8sb", "Int16ub", "Int16ul", "Int16sl", "Int24ub", "Int24ul", "Int24sl", "Int32ub", "Int32sl", "Int64ub", "Int64sl")
 ODD = ("BytesInteger(5)", "BytesInteger(3, signed=True)", "BytesInteger(7, swapped=True)", "BytesInteger(2, signed=True, swapped=True)")

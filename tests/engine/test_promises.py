@@ -17,7 +17,7 @@ import pytest
 import lidarspec as ls
 from lidarspec.device.capture_thread import BoundedQueue
 from lidarspec.formats import write
-from lidarspec.packets.stream import Unwrapper
+from lidarspec.packets.clocks import Unwrapper
 from lidarspec.scans.scans import Scan
 from lidarspec.simulation.simulator import simulate
 from lidarspec.transports.protocol import Chunk

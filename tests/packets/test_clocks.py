@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lidarspec.packets.stream import Unwrapper
+from lidarspec.packets.clocks import Unwrapper
 
 SECOND = 10**9
 NOW = 1_700_000_000 * SECOND

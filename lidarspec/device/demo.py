@@ -2,15 +2,12 @@
 
 A serial sensor stands on a pseudo-terminal, or on a TCP port where the system has none; the others send UDP datagrams on loopback.
 The line does its harm on the way. What was recorded is decoded once more, and has to give the same points.
-
-`demo`: the main job with nothing attached.
 """
 
 from __future__ import annotations
 
 import hashlib
 import itertools
-import shutil
 import socket
 import tempfile
 import time
@@ -18,25 +15,16 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import click
-import numpy as np
-from rich.text import Text
-
-from lidarspec.cli.failures import FINDINGS
-from lidarspec.cli.output import drawn, emit_json, sensor_option, size
-from lidarspec.cli.sensors import NO_SENSORS
 from lidarspec.device.device import Device, open as open_device
 from lidarspec.device.session import Reply
-from lidarspec.errors import SourceError, UsageError
+from lidarspec.errors import SourceError
 from lidarspec.framing.results import Counters
-from lidarspec.plugins import registry, sensor as named_sensor
 from lidarspec.scans.scans import Scan
 from lidarspec.simulation.device import SimulatedDevice
 from lidarspec.simulation.faults import Faults
 from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.outlets import HERE, has_terminals, simulated_outlet
 from lidarspec.transports.serving import Served
-from lidarspec.view.polar import look, picture
 
 #: seconds that the scans may take beyond those that they last.
 PATIENCE = 15.0
@@ -45,7 +33,7 @@ QUIET = 0.2
 
 
 @dataclass(frozen=True, eq=False)
-class DemoResult:
+class Demonstration:
     """What the demo saw.
 
     Attributes:
@@ -71,7 +59,7 @@ class DemoResult:
     recorded: int
 
 
-def run(sensor: Sensor, *, turns: int = 5, errors: float = 0.01, seed: int = 1) -> DemoResult:
+def demonstrate(sensor: Sensor, *, turns: int = 5, errors: float = 0.01, seed: int = 1) -> Demonstration:
     """Let a simulated sensor work until so many whole scans have come.
 
     Args:
@@ -85,12 +73,12 @@ def run(sensor: Sensor, *, turns: int = 5, errors: float = 0.01, seed: int = 1) 
     simulated = SimulatedDevice(sensor, seed=seed, faults=faults)
     with tempfile.TemporaryDirectory(prefix="lidarspec-demo-") as folder:
         path = Path(folder) / "demo.lsr"
-        place, replies, scans, stats = _live(simulated, path, turns)
+        place, replies, scans, stats = _live(sensor, simulated, path, turns)
         line, recorded = simulated.lines["data"], path.stat().st_size
         with open_device(path, sensor) as recording:
             again = digest(_whole(recording.scans(), turns))
     digested = digest([scan for scan in scans if scan.complete])
-    return DemoResult(sensor, place, replies, scans, stats, line.sent, line.intact, digested, again, recorded)
+    return Demonstration(sensor, place, replies, scans, stats, line.sent, line.intact, digested, again, recorded)
 
 
 def digest(scans: Sequence[Scan]) -> str:
@@ -103,9 +91,8 @@ def digest(scans: Sequence[Scan]) -> str:
     return found.hexdigest()
 
 
-def _live(simulated: SimulatedDevice, path: Path, turns: int) -> tuple[str, tuple[Reply, ...], tuple[Scan, ...], Counters]:
+def _live(sensor: Sensor, simulated: SimulatedDevice, path: Path, turns: int) -> tuple[str, tuple[Reply, ...], tuple[Scan, ...], Counters]:
     """The place of the sensor, its replies, its scans and the counters; everything that came is recorded."""
-    sensor = simulated.sensor
     if sensor.datagrams:
         port = _free_port()
         at = f"udp://{HERE}:{port}"
@@ -145,71 +132,3 @@ def _free_port() -> int:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.bind((HERE, 0))
         return int(probe.getsockname()[1])
-
-
-#: cells of the picture at most, and lines that are kept for the summary.
-WIDEST, HIGHEST, SUMMARY = 100, 42, 8
-
-
-@click.command()
-@sensor_option
-@click.option("-n", "--count", type=click.IntRange(min=1), default=5, show_default=True, help="Whole scans to wait for.")
-@click.option("--errors", type=click.FloatRange(0, 1), default=0.01, show_default=True, help="Share of the bytes that the line damages.")
-@click.option("--json", "as_json", is_flag=True, help="Print the summary as JSON.")
-def demo(sensor_id: str | None, count: int, errors: float, as_json: bool) -> None:
-    """A simulated sensor on a port: started, read through a bad line, recorded, read again, drawn."""
-    simulated = (one for one in registry().sensors().values() if any(one.simulation_of(name).sweep for name in one.data_frames))
-    sensor = named_sensor(sensor_id) if sensor_id else next(simulated, None)
-    if sensor is None:
-        raise UsageError(NO_SENSORS)
-    result = run(sensor, turns=count, errors=errors)
-    whole = [scan for scan in result.scans if scan.complete]
-    if as_json:
-        emit_json(_facts(result, whole), None)
-    else:
-        click.echo("\n".join([drawn(_picture(whole[-1])), *_summary(result, whole, errors)]))
-    if result.digest != result.again:
-        click.get_current_context().exit(FINDINGS)
-
-
-def _picture(scan: Scan) -> Text:
-    columns, lines = shutil.get_terminal_size((80, HIGHEST))
-    width, height = min(columns, WIDEST), max(min(lines - SUMMARY, HIGHEST), 12)
-    return picture(scan.points, width=width, height=height, look=look(scan.points)).text()
-
-
-def _summary(result: DemoResult, whole: list[Scan], errors: float) -> list[str]:
-    stats, name = result.stats, result.sensor.id
-    frames = sum(stats.frames.values())
-    harm = "of the datagrams lost" if result.sensor.datagrams else "of the bytes damaged"
-    where = result.place if result.sensor.datagrams or has_terminals() else f"{result.place}, since this system has no pseudo-terminals"
-    passed = f"{errors:.1%} {harm}, {result.intact} came through unharmed"
-    told = [
-        f"{name}, simulated on {where}: {result.sent} frames sent, {passed}",
-        *(str(reply) for reply in result.replies if reply.confirmed),
-        f"{frames} frames decoded, {stats.bad_checksum} checksum errors, {stats.bytes_skipped} of {stats.bytes_in} bytes skipped",
-    ]
-    facts = _facts(result, whole)
-    rate = f" at {facts['rate_hz']:.1f} Hz" if facts["rate_hz"] else ""
-    told.append(f"{len(whole)} whole scan{'s' * (len(whole) != 1)}{rate}, {facts['points']} points; the last one: {whole[-1]}")
-    same = "the same points" if result.digest == result.again else "OTHER points"
-    told.append(f"recorded ({size(result.recorded)}) and read again: {same}, SHA-256 {result.again[:16]}...")
-    return [*told, f"next: lidarspec view sim:{name}"]
-
-
-def _facts(result: DemoResult, whole: list[Scan]) -> dict[str, object]:
-    rates = [scan.rate_hz for scan in whole if np.isfinite(scan.rate_hz)]
-    return {
-        "sensor": result.sensor.id,
-        "sent": result.sent,
-        "intact": result.intact,
-        "scans": len(whole),
-        "rate_hz": float(np.mean(rates)) if rates else None,
-        "place": result.place,
-        "replies": [reply.command for reply in result.replies if reply.confirmed],
-        "recorded": result.recorded,
-        "sha256": result.digest,
-        "same_when_replayed": result.digest == result.again,
-        "points": sum(int(scan.points.valid.sum()) for scan in whole),
-        "stats": result.stats.to_dict(),
-    }

@@ -1,27 +1,145 @@
-"""`replay`: what was recorded goes out again, byte for byte and in time."""
+"""`record` and `replay`: everything that a source sends into one file, and what was recorded out again, byte for byte and in time."""
 
 from __future__ import annotations
 
 import contextlib
+import functools
 import os
 import shlex
 
 import click
 
 from lidarspec.cli.failures import INTERRUPTED
-from lidarspec.cli.output import Progress, emit_json, note, sensor_option, size
-from lidarspec.cli.streams import SPEED
+from lidarspec.cli.inputs import nothing_came
+from lidarspec.cli.options import DURATION, SPEED, sensor_option
+from lidarspec.cli.output import Progress, emit_json, note, size
 from lidarspec.device.settings import named
-from lidarspec.errors import LidarSpecError, UsageError, WireError, suggest
+from lidarspec.device.source_recording import SourceRecording
+from lidarspec.discovery.detect import declared
+from lidarspec.errors import CommandError, LidarSpecError, SourceError, UnknownFormat, UsageError, WireError, suggest
 from lidarspec.plugins import sensor as named_sensor
+from lidarspec.recording.appending import Appender
 from lidarspec.recording.format import Header
-from lidarspec.recording.recorders import SUFFIXES, declared_port, recorder
+from lidarspec.recording.recorders import SUFFIXES, Recorder, check_suffix, declared_port, recorder
 from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.files import RecordingTransport
 from lidarspec.transports.open_url import live_address, transport
 from lidarspec.transports.outlets import FileOutlet, Outlet, replay_outlet
 from lidarspec.transports.protocol import Transport
 from lidarspec.transports.serving import LATE, Replay
+
+
+@click.command()
+@click.argument("source", metavar="SOURCE")
+@click.option("-o", "--output", "target", metavar="FILE", required=True, help="The file: .lsr, .pcap for Wireshark, .bin for bytes alone.")
+@sensor_option
+@click.option("-t", "--duration", "seconds", type=DURATION, help="How long, such as 10s; until Ctrl-C by default.")
+@click.option("-n", "--count", type=click.IntRange(min=1), help="So many packets at least: the sensor's data packets, or datagrams.")
+@click.option("--no-start", is_flag=True, help="Send the sensor no commands.")
+@click.option("--force", is_flag=True, help="Overwrite FILE.")
+@click.option("--salvage", is_flag=True, help="Go on behind damaged places, where SOURCE is a recording.")
+@click.option("--json", "as_json", is_flag=True, help="Print a summary as JSON.")
+def record(
+    source: str,
+    target: str,
+    sensor_id: str | None,
+    seconds: float | None,
+    count: int | None,
+    no_start: bool,
+    force: bool,
+    salvage: bool,
+    as_json: bool,
+) -> None:
+    """Everything that a source sends, with the time of its arrival, in one file that survives a crash.
+
+    A sensor that is named, with -s or by the source (sim:ID), is started, and what it is stands in the file; without, bytes are
+    recorded as they come.
+    """
+    _check_target(target)
+    path = source.partition("?")[0]
+    if os.path.exists(path) and os.path.exists(target) and os.path.samefile(path, target):
+        raise UsageError(f"{target} is the source: it would be overwritten")
+    known = named(source)
+    is_live = live_address(known.source if known else source) is not None
+    sensor = named_sensor(sensor_id) if sensor_id else declared(source) if is_live else known.configured() if known else None
+    task = SourceRecording(source, target, sensor, seconds=seconds, count=count, start=not no_start, overwrite=force, salvage=salvage)
+    interrupted = False
+    try:
+        _recorded(task)
+    except KeyboardInterrupt:
+        if task.recorder is None:
+            raise
+        interrupted = True
+    except UsageError as error:
+        if task.recorder is None and os.path.exists(target) and not force:
+            suggest(error, "the same with --force, or with another file")
+        raise
+    except SourceError as error:
+        if task.recorder is not None and task.recorder.error is error:
+            suggest(error, _view_of(task.recorder, sensor))
+        raise
+    assert task.recorder is not None
+    try:
+        _sum_up_recording(task, task.recorder, source, sensor, as_json=as_json)
+    except LidarSpecError as error:
+        if not interrupted:
+            raise
+        note(str(error))
+    if interrupted:
+        raise click.exceptions.Exit(INTERRUPTED)
+
+
+def _recorded(task: SourceRecording) -> None:
+    with Progress() as progress, contextlib.closing(task.run()) as remarks:
+        for remark in remarks:
+            if task.recorder is not None:
+                progress(functools.partial(_taken, task, task.recorder))
+            if remark:
+                progress.clear()
+                note(remark)
+
+
+def _taken(task: SourceRecording, kept: Appender) -> str:
+    """What has been recorded, in words."""
+    packets = f"{task.packets} packets, " if task.packets else ""
+    return f"{packets}{kept.records} records, {size(kept.bytes)} in {task.elapsed:.1f} s"
+
+
+def _check_target(target: str) -> None:
+    try:
+        check_suffix(target)
+    except UnknownFormat as error:
+        raise suggest(error, "lidarspec record --help") from None
+
+
+def _sum_up_recording(task: SourceRecording, kept: Appender, source: str, sensor: Sensor | None, *, as_json: bool) -> None:
+    """What was recorded, and what can be done with it; an empty file is not left behind."""
+    device = task.device
+    if not kept.records:
+        with contextlib.suppress(OSError):
+            os.unlink(kept.path)
+        if device is not None:
+            raise nothing_came(device, source, task.elapsed)
+        if live_address(source) is not None:
+            raise suggest(CommandError(f"{source} sent nothing"), f"lidarspec doctor {shlex.quote(source)}")
+        raise suggest(WireError(f"{source} holds nothing that was received"), "lidarspec record --help")
+    stats = device.stats if device is not None else None
+    note(f"{kept.path}: {_taken(task, kept)}{f'; {stats}' if stats else ''}")
+    note(f"next: {_view_of(kept, sensor)}")
+    if as_json:
+        facts = {"output": kept.path, "source": source, "sensor": sensor.id if sensor else None}
+        counts = {"records": kept.records, "bytes": kept.bytes, "packets": task.packets, "seconds": task.elapsed, "dropped": kept.dropped}
+        emit_json({**facts, **counts, "stats": stats.to_dict() if stats else None}, None)
+    if stats is not None and not stats.frames and device is not None:
+        raise nothing_came(device, source, task.elapsed)
+
+
+def _view_of(kept: Appender, sensor: Sensor | None) -> str:
+    """The command that shows what was recorded."""
+    file = shlex.quote(kept.path)
+    if isinstance(kept, Recorder) and kept.header.sensor:
+        return f"lidarspec view {file}"
+    return f"lidarspec view {file} -s {sensor.id}" if sensor else f"lidarspec detect {file}"
 
 
 @click.command()

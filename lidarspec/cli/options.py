@@ -1,0 +1,76 @@
+"""The options and the kinds of numbers that verbs share."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+import click
+
+from lidarspec.errors import UsageError
+from lidarspec.spec.fields import duration
+
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+
+def sensor_option(function: Function) -> Function:
+    """``-s/--sensor``."""
+    return click.option("-s", "--sensor", "sensor_id", metavar="ID", help="The sensor: an id, an alias, or a file ./mysensor.py.")(function)
+
+
+def output_options(function: Function) -> Function:
+    """``--json`` and ``-o/--output``, for verbs that print."""
+    function = click.option("-o", "--output", metavar="FILE", help="Write to a file instead of standard output.")(function)
+    return click.option("--json", "as_json", is_flag=True, help="Print JSON.")(function)
+
+
+class Number(click.ParamType):  # type: ignore[type-arg]  # older versions of click have no types
+    """A number that is written in a way of its own.
+
+    Args:
+        name: what it is, for help pages.
+        parse: the number of a text; a text that is none is a ValueError or UsageError.
+        form: how it looks, for messages.
+    """
+
+    def __init__(self, name: str, parse: Callable[[str], float], form: str) -> None:
+        self.name, self._parse, self._form = name, parse, form
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
+        """The number."""
+        if isinstance(value, float | int):
+            return float(value)
+        try:
+            return self._parse(value)
+        except (ValueError, UsageError):
+            self.fail(f"{value!r} is no {self._form}", param, ctx)
+
+
+def _duration(text: str) -> float:
+    seconds = duration(text)
+    if seconds <= 0:
+        raise ValueError(text)
+    return seconds
+
+
+def _share(text: str) -> float:
+    share = float(text.removesuffix("%")) / (100 if text.endswith("%") else 1)
+    if not 0 <= share <= 1:
+        raise ValueError(text)
+    return share
+
+
+def _speed(text: str) -> float:
+    speed = 0.0 if text == "max" else float(text.removesuffix("x"))
+    if text != "max" and not 0 < speed < math.inf:
+        raise ValueError(text)
+    return speed
+
+
+#: seconds from "10s", "500ms", "2min", "1h" or a bare number.
+DURATION = Number("duration", _duration, "duration above 0, such as 10s, 500ms, 2min or 1h")
+#: a number from 0 to 1, from "1%" or "0.01".
+SHARE = Number("share", _share, "share, such as 1% or 0.01")
+#: a factor above 0; 0 for "max".
+SPEED = Number("speed", _speed, "speed: a factor such as 1, 0.5 or 10, or max")

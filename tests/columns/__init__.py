@@ -1,0 +1,1 @@
+"""Points cut into turns."""
