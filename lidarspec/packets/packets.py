@@ -105,6 +105,8 @@ class Packets:
 
     def points(self) -> PointCloud:
         """The points of all packets in stream order; see `PointCloud`."""
+        from lidarspec.points.evaluate import cloud_of
+
         return cloud_of(self)
 
     def take(self, which: Any) -> Packets:
