@@ -105,7 +105,6 @@ class Packets:
 
     def points(self) -> PointCloud:
         """The points of all packets in stream order; see `PointCloud`."""
-        from lidarspec.points.evaluate import cloud_of
 
         return cloud_of(self)
 
