@@ -19,8 +19,9 @@ from numpy.typing import NDArray
 
 from lidarspec.columns.columns import Batch
 from lidarspec.errors import UsageError
+from lidarspec.framing.examples import example
 from lidarspec.packets.clocks import clock_ns
-from lidarspec.simulation.frame_maker import FrameMaker, example, sealed
+from lidarspec.simulation.frame_maker import FrameMaker, sealed
 from lidarspec.simulation.measuring import Beams, Measurement
 from lidarspec.simulation.scenes import Room, Scene
 from lidarspec.spec.description import Spec
