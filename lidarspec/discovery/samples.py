@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.spec.checksums import ByteOrder, Checksum
+from lidarspec.wire.row_checksums import batch
 
 Part = Literal["all", "before", "behind"]
 
@@ -160,7 +161,7 @@ class Samples:
 
     def computed(self, algorithm: Checksum, place: Place, span: Span) -> NDArray[np.uint64]:
         """The checksum of each frame, shape (n,)."""
-        return np.concatenate([algorithm.batch(np.ascontiguousarray(rows)) for rows in self.covered(place, span)])
+        return np.concatenate([batch(algorithm, np.ascontiguousarray(rows)) for rows in self.covered(place, span)])
 
     def right(self, algorithm: Checksum, place: Place, span: Span, order: ByteOrder) -> int:
         """How many frames a checksum is right for."""

@@ -30,8 +30,7 @@ from lidarspec.exports.c_fields import (
     word,
 )
 from lidarspec.exports.messages import Message, messages
-from lidarspec.spec.checksums import Checksum, Crc, Fold15, Sum, WordXor, Xor, ZeroPadded
-from lidarspec.spec.row_checksums import byte_table, mirrored_bytes, reflected
+from lidarspec.spec.checksums import Checksum, Crc, Fold15, Sum, WordXor, Xor, ZeroPadded, byte_table, mirrored_bytes, reflected
 from lidarspec.spec.sensor import Sensor
 from lidarspec.spec.tree import Blob, Block, Formula, Number, Op, Repeat, Sealed, formulas, refs
 from lidarspec.wire.wire_table import Extent
