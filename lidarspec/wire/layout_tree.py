@@ -310,35 +310,6 @@ def _held(leaf: Leaf) -> tuple[int, int]:
 Draw = Callable[[random.Random], int]
 
 
-def choose(root: tree.Node, limit: int, source: random.Random, drawn: Mapping[str, Draw]) -> tuple[Layout, dict[str, int]]:
-    """A layout of a header chosen at random, with the values of the fields it depends on, by path.
-
-    Args:
-        limit: the longest frame, in bytes.
-        drawn: field path -> what draws its value in place of chance.
-
-    Raises:
-        SpecError: where hundreds of headers give no frame.
-    """
-    keys = sorted(_switch_keys(root))
-    for _ in range(400):
-        with contextlib.suppress(TooLong, ArithmeticError, LookupError, TypeError, ValueError):
-            return _chosen(root, limit, source, drawn, keys)
-    raise SpecError("no header was found that gives a frame within its longest length")
-
-
-def _chosen(
-    root: tree.Node, limit: int, source: random.Random, drawn: Mapping[str, Draw], keys: list[int]
-) -> tuple[Layout, dict[str, int]]:
-    values: dict[str, int] = {}
-    while True:
-        try:
-            return layout_of(root, values, limit), values
-        except Unknown as unknown:
-            own = drawn.get(unknown.leaf.info.path)
-            values[unknown.leaf.info.path] = own(source) if own else _some_value(source, unknown.leaf, keys)
-
-
 def _switch_keys(root: tree.Node) -> Iterator[int]:
     """The values of keys that have no name: fields are known to have those with one."""
     for node in tree.nodes(root):
@@ -379,7 +350,6 @@ class _Node:
     result: Layout | Refused | None = None
 
 
-_NONE = np.empty(0, np.intp)
 Group = tuple[Layout | Refused, NDArray[np.intp]]
 
 
@@ -418,19 +388,13 @@ class HeaderTree:
         self._root, self._size = _Node(), 0
         self.prefix = prefix_of(frame, limit)
 
-    def classify(self, buffer: NDArray[np.uint8], offsets: NDArray[np.intp]) -> tuple[list[Group], NDArray[np.intp]]:
-        """The candidates at `offsets`, sorted by layout.
-
-        Returns:
-            (layout or refusal, indices into `offsets`) for each kind; and the indices of those whose header is not
-            all there.
-        """
+    def classify(self, buffer: NDArray[np.uint8], offsets: NDArray[np.intp]) -> list[Group]:
+        """The candidates at `offsets`, sorted by layout: (layout or refusal, indices) for each, without those whose header is cut off."""
         if self._size > REMEMBERED:
             self._root, self._size = _Node(), 0
         if isinstance(self._root.result, Layout) and len(offsets):
-            return [(self._root.result, np.arange(len(offsets)))], _NONE
+            return [(self._root.result, np.arange(len(offsets)))]
         groups: list[Group] = []
-        short: list[NDArray[np.intp]] = []
         stack = [(self._root, np.arange(len(offsets)))] if len(offsets) else []
         while stack:
             node, which = stack.pop()
@@ -439,8 +403,8 @@ class HeaderTree:
             if node.result is not None:
                 groups.append((node.result, which))
             elif node.leaf is not None:
-                self._branch(node, node.leaf, buffer, offsets, which, stack, short)
-        return groups, np.concatenate(short) if short else _NONE
+                stack += self._branched(node, node.leaf, buffer, offsets, which)
+        return groups
 
     def common(self, rows: NDArray[np.uint8]) -> Layout | None:
         """The layout of candidates, one a row, if they have one and the fields that decide it are the same in all; else None."""
@@ -458,7 +422,7 @@ class HeaderTree:
             node = node.children.get(node.leaf.scalar(frame))
         if node is not None and node.result is not None:
             return node.result
-        groups, _ = self.classify(np.frombuffer(frame, np.uint8), np.zeros(1, np.intp))
+        groups = self.classify(np.frombuffer(frame, np.uint8), np.zeros(1, np.intp))
         return groups[0][0] if groups else None
 
     def asked(self, frame: bytes) -> list[Leaf]:
@@ -469,42 +433,49 @@ class HeaderTree:
             node = node.children[node.leaf.scalar(frame)]
         return found
 
-    def choose(
-        self, source: random.Random, drawn: Mapping[str, Callable[[random.Random], int]] | None = None
-    ) -> tuple[Layout, dict[str, int]]:
-        """A layout of a header chosen at random, with the values of the fields it depends on, by path; see `choose`."""
-        return choose(self._frame, self._limit, source, drawn or {})
+    def choose(self, source: random.Random, drawn: Mapping[str, Draw] | None = None) -> tuple[Layout, dict[str, int]]:
+        """A layout of a header chosen at random, with the values of the fields it depends on, by path.
 
-    def _branch(
-        self,
-        node: _Node,
-        leaf: Leaf,
-        buffer: NDArray[np.uint8],
-        offsets: NDArray[np.intp],
-        which: NDArray[np.intp],
-        stack: list[tuple[_Node, NDArray[np.intp]]],
-        short: list[NDArray[np.intp]],
-    ) -> None:
+        Args:
+            drawn: field path -> what draws its value in place of chance.
+
+        Raises:
+            SpecError: where hundreds of headers give no frame.
+        """
+        keys = sorted(_switch_keys(self._frame))
+        for _ in range(400):
+            with contextlib.suppress(TooLong, ArithmeticError, LookupError, TypeError, ValueError):
+                return self._chosen(source, drawn or {}, keys)
+        raise SpecError("no header was found that gives a frame within its longest length")
+
+    def _chosen(self, source: random.Random, drawn: Mapping[str, Draw], keys: list[int]) -> tuple[Layout, dict[str, int]]:
+        values: dict[str, int] = {}
+        while True:
+            try:
+                return layout_of(self._frame, values, self._limit), values
+            except Unknown as unknown:
+                own = drawn.get(unknown.leaf.info.path)
+                values[unknown.leaf.info.path] = own(source) if own else _some_value(source, unknown.leaf, keys)
+
+    def _branched(
+        self, node: _Node, leaf: Leaf, buffer: NDArray[np.uint8], offsets: NDArray[np.intp], which: NDArray[np.intp]
+    ) -> list[tuple[_Node, NDArray[np.intp]]]:
+        """The branches below a node, each with those of the candidates that have its value."""
         there = offsets[which] + leaf.offset + leaf.size <= len(buffer)
-        if not there.all():
-            short.append(which[~there])
-            which = which[there]
+        which = which if there.all() else which[there]
         if not len(which):
-            return
+            return []
         values = leaf.at(leaf.offset).load(rows_at(buffer, offsets[which] + leaf.offset, leaf.size))
         if np.count_nonzero(values == values[0]) == len(values):
-            stack.append((node.children.setdefault(values.item(0), _Node()), which))
-            return
+            return [(node.children.setdefault(values.item(0), _Node()), which)]
         few = _few(values)
         if few is not None:
-            stack.extend((node.children.setdefault(value, _Node()), which[values == value]) for value in few)
-            return
+            return [(node.children.setdefault(value, _Node()), which[values == value]) for value in few]
         order = np.argsort(values, kind="stable")
         values = values[order]
         edges = [0, *(np.flatnonzero(values[1:] != values[:-1]) + 1).tolist(), len(values)]
         which = which[order]
-        for start, stop in pairwise(edges):
-            stack.append((node.children.setdefault(int(values[start]), _Node()), which[start:stop]))
+        return [(node.children.setdefault(int(values[start]), _Node()), which[start:stop]) for start, stop in pairwise(edges)]
 
     def _explore(self, sample: NDArray[np.uint8]) -> None:
         """Find the layout of one sample, and add the fields that decide it to the tree; as far as the sample goes."""
