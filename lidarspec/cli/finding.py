@@ -13,7 +13,6 @@ from lidarspec.cli.failures import DEVICE, FINDINGS, NO_DATA
 from lidarspec.cli.inputs import read
 from lidarspec.cli.options import DURATION, output_options, sensor_option
 from lidarspec.cli.output import emit, emit_json, note, table
-from lidarspec.device.settings import named
 from lidarspec.discovery.checksum_search import search
 from lidarspec.discovery.detect import Score, Verdict, verdict, verdicts
 from lidarspec.discovery.doctor import Finding, computer, examined
@@ -24,7 +23,8 @@ from lidarspec.errors import SourceError, UsageError, suggest
 from lidarspec.plugins import sensor as named_sensor, sensors
 from lidarspec.spec.checksums import CRCS, Crc
 from lidarspec.spec.links import Serial, Udp
-from lidarspec.transports.open_url import live_address
+from lidarspec.transports.base import with_option
+from lidarspec.transports.open_url import live_address, resolved
 from lidarspec.transports.ports import SerialPort, User, serial_ports, udp_users
 
 #: doubt below which a match may well be chance.
@@ -187,8 +187,7 @@ def detect(source: str | None, duration: float, start: bool, as_json: bool, outp
     """
     if source == "-":
         raise suggest(UsageError("standard input can be read only once: write it to a file first"), "lidarspec detect FILE")
-    device = None if source is None else named(source)
-    source = source if device is None else device.source
+    source = None if source is None else resolved(source)
     found = list(_everywhere(duration, start=start)) if source is None else _one(source, duration, start=start)
     fitting = [one for one in found if one.scores]
     unknown = None if fitting else _unknown(found)
@@ -301,9 +300,9 @@ def _again(one: Verdict) -> str:
     source, heard = one.heard.source, one.heard
     link = one.sensor.links.get("data") if one.sensor is not None else None
     if heard.baud is not None and "baud=" not in source and not (isinstance(link, Serial) and link.baud == heard.baud):
-        source += f"{'&' if '?' in source else '?'}baud={heard.baud}"
+        source = with_option(source, "baud", heard.baud)
     if heard.sender and "src=" not in source:
-        source += f"{'&' if '?' in source else '?'}src={heard.sender}"
+        source = with_option(source, "src", heard.sender)
     return quote(source)
 
 

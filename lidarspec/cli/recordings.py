@@ -23,7 +23,7 @@ from lidarspec.recording.format import Header
 from lidarspec.recording.recorders import SUFFIXES, Recorder, check_suffix, declared_port, recorder
 from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.files import RecordingTransport
-from lidarspec.transports.open_url import live_address, transport
+from lidarspec.transports.open_url import is_live, live_address, transport
 from lidarspec.transports.outlets import FileOutlet, Outlet, replay_outlet
 from lidarspec.transports.protocol import Transport
 from lidarspec.transports.serving import LATE, Replay
@@ -60,8 +60,7 @@ def record(
     if os.path.exists(path) and os.path.exists(target) and os.path.samefile(path, target):
         raise UsageError(f"{target} is the source: it would be overwritten")
     known = named(source)
-    is_live = live_address(known.source if known else source) is not None
-    sensor = named_sensor(sensor_id) if sensor_id else declared(source) if is_live else known.configured() if known else None
+    sensor = named_sensor(sensor_id) if sensor_id else declared(source) if is_live(source) else known.configured() if known else None
     task = SourceRecording(source, target, sensor, seconds=seconds, count=count, start=not no_start, overwrite=force, salvage=salvage)
     interrupted = False
     try:
@@ -158,8 +157,7 @@ def replay(file: str, place: str, speed: float | None, loop: bool, force: bool, 
     To a pty or tcp:// it begins when somebody opens it. udp:// without a port uses those of the recording. A new .lsr or .pcap
     file keeps the times of the recording.
     """
-    device = named(file)
-    if live_address(file if device is None else device.source) is not None:
+    if is_live(file):
         raise suggest(UsageError(f"{file} is live: only what was recorded can be replayed"), f"lidarspec record {file} -o recording.lsr")
     is_file = place.endswith(SUFFIXES) and "://" not in place
     if is_file and loop:

@@ -14,14 +14,13 @@ from dataclasses import replace
 
 from lidarspec.device.capture_thread import BoundedQueue, Capture, Mark
 from lidarspec.device.device import Device
-from lidarspec.device.settings import named
 from lidarspec.errors import UsageError
 from lidarspec.recording.appending import Appender
 from lidarspec.recording.format import Header
 from lidarspec.recording.recorders import recorder
 from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.files import RecordingTransport
-from lidarspec.transports.open_url import live_address, transport
+from lidarspec.transports.open_url import is_live, transport
 from lidarspec.transports.protocol import Chunk, LiveTransport, Transport
 
 #: seconds between two looks at the time and at the disk.
@@ -72,9 +71,7 @@ class SourceRecording:
             UsageError: for a file that exists, or cannot hold what the source gives.
             SourceError: where the source cannot be read, or the file not be written.
         """
-        known = named(self._source)
-        is_live = live_address(known.source if known else self._source) is not None
-        return self._driven(self._sensor) if is_live and self._sensor is not None else self._received()
+        return self._driven(self._sensor) if self._sensor is not None and is_live(self._source) else self._received()
 
     def _driven(self, sensor: Sensor) -> Generator[str, None, None]:
         state = ""

@@ -9,15 +9,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from shlex import quote
 
-from lidarspec.device.settings import named
 from lidarspec.discovery.detect import Verdict, verdict, verdicts
 from lidarspec.discovery.listen import LISTEN, Heard, bauds, has_no_baud, started_first, udp_ports
 from lidarspec.errors import LidarSpecError, UsageError, suggestion
 from lidarspec.spec.links import Serial, Udp
 from lidarspec.spec.sensor import Sensor
 from lidarspec.transports import ports
-from lidarspec.transports.base import Address
-from lidarspec.transports.open_url import live_address, transport
+from lidarspec.transports.base import Address, with_option
+from lidarspec.transports.open_url import live_address, resolved, transport
 from lidarspec.transports.protocol import LiveTransport
 from lidarspec.transports.udp import BUFFER, shortfall
 
@@ -48,8 +47,7 @@ def examined(source: str | Path, sensor: Sensor | None = None, *, seconds: float
         sensor: whose bytes are expected; found out where left out.
         seconds: to listen for.
     """
-    device = named(source)
-    text = str(source if device is None else device.source)
+    text = resolved(source)
     address = live_address(text)
     if address is None:
         yield from _file(text)
@@ -231,7 +229,7 @@ def _verdict(source: str, found: Verdict, sensor: Sensor | None) -> Finding:
     score = next(score for score in found.scores if score.sensor.id == name)
     link = score.sensor.links.get("data")
     if heard.baud is not None and isinstance(link, Serial) and heard.baud not in link.bauds:
-        again = quote(f"{source}{'&' if '?' in source else '?'}baud={heard.baud}")
+        again = quote(with_option(source, "baud", heard.baud))
         return Finding(False, f"{name} sends{at}, and {link.baud} is declared", f"lidarspec view {again} -s {name}")
     if 1 - score.share > BAD and heard.size > 4096:
         return Finding(False, f"{name} sends{at}, and {1 - score.share:.0%} of the bytes are in no frame: cable, ground or baud rate")

@@ -9,6 +9,7 @@ import sys
 import time
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from urllib.parse import parse_qs
 
 from lidarspec.errors import SourceError, UnknownOption, UsageError, suggest
@@ -81,6 +82,11 @@ class Address:
         if port is not None and not 0 < port < 65536:
             raise UsageError(f"{self.text}: a port is a number from 1 to 65535, not {port}")
         return found[1] or found[2] or "", port
+
+
+def with_option(source: str | Path, name: str, value: object) -> str:
+    """A SOURCE with an option more behind its question mark."""
+    return f"{source}{'&' if '?' in str(source) else '?'}{name}={value}"
 
 
 class HostClock:
