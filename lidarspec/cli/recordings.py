@@ -14,13 +14,12 @@ from lidarspec.cli.inputs import nothing_came
 from lidarspec.cli.options import DURATION, SPEED, sensor_option
 from lidarspec.cli.output import Progress, emit_json, note, size
 from lidarspec.device.settings import named
-from lidarspec.device.source_recording import SourceRecording
+from lidarspec.device.source_recording import SourceRecording, recorder_like
 from lidarspec.discovery.detect import declared
 from lidarspec.errors import CommandError, LidarSpecError, SourceError, UnknownFormat, UsageError, WireError, suggest
 from lidarspec.plugins import sensor as named_sensor
 from lidarspec.recording.appending import Appender
-from lidarspec.recording.format import Header
-from lidarspec.recording.recorders import SUFFIXES, Recorder, check_suffix, declared_port, recorder
+from lidarspec.recording.recorders import SUFFIXES, Recorder, check_suffix, declared_port
 from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.files import RecordingTransport
 from lidarspec.transports.open_url import is_live, live_address, transport
@@ -55,7 +54,10 @@ def record(
     A sensor that is named, with -s or by the source (sim:ID), is started, and what it is stands in the file; without, bytes are
     recorded as they come.
     """
-    _check_target(target)
+    try:
+        check_suffix(target)
+    except UnknownFormat as error:
+        raise suggest(error, "lidarspec record --help") from None
     path = source.partition("?")[0]
     if os.path.exists(path) and os.path.exists(target) and os.path.samefile(path, target):
         raise UsageError(f"{target} is the source: it would be overwritten")
@@ -102,13 +104,6 @@ def _taken(task: SourceRecording, kept: Appender) -> str:
     """What has been recorded, in words."""
     packets = f"{task.packets} packets, " if task.packets else ""
     return f"{packets}{kept.records} records, {size(kept.bytes)} in {task.elapsed:.1f} s"
-
-
-def _check_target(target: str) -> None:
-    try:
-        check_suffix(target)
-    except UnknownFormat as error:
-        raise suggest(error, "lidarspec record --help") from None
 
 
 def _sum_up_recording(task: SourceRecording, kept: Appender, source: str, sensor: Sensor | None, *, as_json: bool) -> None:
@@ -209,10 +204,8 @@ def _sensor(source: Transport, sensor_id: str | None) -> Sensor | None:
 
 def _file(source: Transport, file: str, place: str, sensor: Sensor | None, *, force: bool) -> FileOutlet:
     """A new file in the place of the old one's source."""
-    header = source.header if isinstance(source, RecordingTransport) else Header(source=file)
     try:
-        whose, link = sensor or header.sensor, source.datagrams
-        return FileOutlet(recorder(place, whose, header.source, datagrams=link, baud=header.baud, overwrite=force))
+        return FileOutlet(recorder_like(source, file, place, sensor, overwrite=force))
     except UsageError as error:
         raise suggest(error, "the same with --force, or with another file") if os.path.exists(place) and not force else error from None
 

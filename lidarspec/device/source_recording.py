@@ -27,6 +27,17 @@ from lidarspec.transports.protocol import Chunk, LiveTransport, Transport
 TURN = 0.1
 
 
+def recorder_like(opened: Transport, source: str, target: str, sensor: Sensor | None, *, overwrite: bool) -> Appender:
+    """The recorder of a new file in the place of an open source: of a recording its sensor, source and baud rate are taken over.
+
+    Raises:
+        UnknownFormat, UsageError, SourceError: as `recorder`.
+    """
+    header = opened.header if isinstance(opened, RecordingTransport) else Header(source=source, baud=opened.baud)
+    whose, link = sensor or header.sensor, opened.datagrams
+    return recorder(target, whose, header.source, datagrams=link, baud=header.baud, overwrite=overwrite)
+
+
 class SourceRecording:
     """Everything that a source sends, brought into one file.
 
@@ -122,9 +133,7 @@ class SourceRecording:
         counts = source.datagrams or (self._sensor is not None and isinstance(source, LiveTransport))
         if self._count is not None and not counts:
             raise UsageError(f"-n counts packets, and {self._source} is a byte stream: name the sensor with -s, or give a time with -t")
-        header = source.header if isinstance(source, RecordingTransport) else Header(source=self._source, baud=source.baud)
-        whose, link = self._sensor or header.sensor, source.datagrams
-        self.recorder = recorder(self._target, whose, header.source, datagrams=link, baud=header.baud, overwrite=self._overwrite)
+        self.recorder = recorder_like(source, self._source, self._target, self._sensor, overwrite=self._overwrite)
         self._began = time.monotonic()
         return self.recorder
 

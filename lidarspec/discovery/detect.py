@@ -30,6 +30,7 @@ from lidarspec.simulation.simulator import simulate
 from lidarspec.spec.links import Serial
 from lidarspec.spec.sensor import Sensor
 from lidarspec.spec.tree import FieldInfo
+from lidarspec.transports.base import data_link
 from lidarspec.transports.files import RecordingTransport
 from lidarspec.transports.open_url import live_address, resolved, transport
 from lidarspec.transports.simulated import SimulatedTransport
@@ -215,8 +216,8 @@ def verdict(heard: Heard) -> Verdict:
         alike = [replace(score, why=reasons[score.sensor.id]) for score in best if score.sensor.id in reasons] or best
         if len(alike) > 1 and heard.baud is not None:
             why = f"it runs at {heard.baud} baud"
-            declared = [replace(score, why=why) for score in alike if heard.baud in _bauds(score.sensor)]
-            alike = declared or alike
+            links = [(score, data_link(score.sensor, Serial)) for score in alike]
+            alike = [replace(score, why=why) for score, link in links if link and heard.baud in link.bauds] or alike
     others = [score for score in fitting if score.sensor.id not in {one.sensor.id for one in alike}]
     return Verdict(heard, (*alike, *others), tuple(alike))
 
@@ -233,8 +234,13 @@ def verdicts(source: str | Path, *, seconds: float | None = None) -> list[Verdic
         if heard.baud is not None and tried[-1].is_clear:
             break
     if len({one.heard.baud for one in tried}) > 1:
-        return [max(tried, key=lambda one: (one.scores[0].share if one.scores else 0.0, one.heard.size))]
+        return [best(tried)]
     return tried
+
+
+def best(tried: Sequence[Verdict]) -> Verdict:
+    """The verdict whose first sensor has the most of the bytes in its frames; of those without a sensor, the one on most bytes."""
+    return max(tried, key=lambda one: (one.scores[0].share if one.scores else 0.0, one.heard.size))
 
 
 def detected(source: str | Path) -> Sensor:
@@ -289,11 +295,6 @@ def _nothing(source: str, found: Sequence[Verdict]) -> Exception:
         return WireError(f"{source}: it holds no bytes")
     error = CommandError(f"{source}: nothing comes; a sensor that has to be started first is named with -s")
     return suggest(error, f"lidarspec doctor {source}")
-
-
-def _bauds(sensor: Sensor) -> tuple[int, ...]:
-    link = sensor.links.get("data")
-    return link.bauds if isinstance(link, Serial) else ()
 
 
 #: constant bits that make bytes look like a frame, and constant bytes that do so in the midst of others.

@@ -15,7 +15,7 @@ from lidarspec.errors import LidarSpecError, UsageError, suggestion
 from lidarspec.spec.links import Serial, Udp
 from lidarspec.spec.sensor import Sensor
 from lidarspec.transports import ports
-from lidarspec.transports.base import Address, with_option
+from lidarspec.transports.base import Address, data_link, with_option
 from lidarspec.transports.open_url import live_address, resolved, transport
 from lidarspec.transports.protocol import LiveTransport
 from lidarspec.transports.udp import BUFFER, shortfall
@@ -136,8 +136,8 @@ def _udp_numbers(address: Address, sensor: Sensor | None) -> list[int]:
     port, given = address.host_and_port()[1], address.options.get("port", "")
     if given:
         return [int(part) for part in given.split(",") if part.isdecimal()]
-    link = sensor.links.get("data") if sensor is not None else None
-    return [port] if port else list(link.ports) if isinstance(link, Udp) else udp_ports()
+    link = data_link(sensor, Udp)
+    return [port] if port else list(link.ports) if link else udp_ports()
 
 
 def _port_in_use(number: int) -> Iterator[Finding]:
@@ -188,12 +188,9 @@ def _heard(source: str, sensor: Sensor | None, seconds: float) -> Iterator[Findi
         if found is None or not found.scores:
             tried = [*([found] if found is not None else []), *verdicts(source, seconds=seconds)]
             found = max(tried, key=lambda one: (bool(one.scores), one.heard.size))
-    except UsageError as error:
-        yield Finding(False, str(error), suggestion(error))
-        return
     except LidarSpecError as error:
         command = suggestion(error)
-        yield Finding(False, str(error), "" if "doctor" in command else command)
+        yield Finding(False, str(error), "" if "doctor" in command and not isinstance(error, UsageError) else command)
         return
     yield _verdict(source, found, sensor)
 
@@ -227,8 +224,8 @@ def _verdict(source: str, found: Verdict, sensor: Sensor | None) -> Finding:
         return Finding(False, f"it sends frames of {ids[0]}{at}, not of {sensor.id}", f"lidarspec view {quoted} -s {ids[0]}")
     name = sensor.id if sensor is not None else ids[0]
     score = next(score for score in found.scores if score.sensor.id == name)
-    link = score.sensor.links.get("data")
-    if heard.baud is not None and isinstance(link, Serial) and heard.baud not in link.bauds:
+    link = data_link(score.sensor, Serial)
+    if heard.baud is not None and link and heard.baud not in link.bauds:
         again = quote(with_option(source, "baud", heard.baud))
         return Finding(False, f"{name} sends{at}, and {link.baud} is declared", f"lidarspec view {again} -s {name}")
     if 1 - score.share > BAD and heard.size > 4096:

@@ -23,8 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.discovery.checksum_search import search
-from lidarspec.discovery.periods import CIRCLES, FEW, FRONT, STEADY, Candidate, Length, candidates, follows, structure, values
-from lidarspec.discovery.samples import Match, Place
+from lidarspec.discovery.periods import CIRCLES, FEW, FRONT, STEADY, Candidate, Length, candidates, follows, structure
+from lidarspec.discovery.samples import Match, Place, values
 from lidarspec.errors import SourceError, UsageError, WireError
 from lidarspec.spec.checksums import ByteOrder
 

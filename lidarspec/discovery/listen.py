@@ -19,7 +19,7 @@ from lidarspec.framing.decoder import Decoder
 from lidarspec.plugins import sensors
 from lidarspec.spec.links import Serial, Udp
 from lidarspec.spec.sensor import Sensor
-from lidarspec.transports.base import with_option
+from lidarspec.transports.base import data_link, with_option
 from lidarspec.transports.open_url import live, live_address, transport
 from lidarspec.transports.protocol import Chunk, Disconnected, LiveTransport, Transport
 
@@ -74,8 +74,8 @@ def bauds() -> list[int]:
 
 def udp_ports() -> list[int]:
     """The UDP ports that data of installed sensors come to."""
-    links = (sensor.links.get("data") for sensor in sensors().values())
-    return sorted({port for link in links if isinstance(link, Udp) for port in link.ports})
+    links = (data_link(sensor, Udp) for sensor in sensors().values())
+    return sorted({port for link in links if link for port in link.ports})
 
 
 def hear(source: str | Path, *, seconds: float = LISTEN) -> Iterator[Heard]:
@@ -147,7 +147,7 @@ def everywhere(ports: list[str], *, seconds: float = LISTEN) -> Iterator[Heard]:
 
 def started_first() -> list[Sensor]:
     """The installed sensors on a serial port that send nothing before they are told to."""
-    return [sensor for sensor in sensors().values() if _starts(sensor) and isinstance(sensor.links.get("data"), Serial)]
+    return [sensor for sensor in sensors().values() if _starts(sensor) and data_link(sensor, Serial)]
 
 
 def probe(source: str | Path) -> Iterator[Heard]:
@@ -161,8 +161,8 @@ def probe(source: str | Path) -> Iterator[Heard]:
         return
     plain = has_no_baud(address.place)
     for sensor in started_first():
-        link = sensor.links["data"]
-        for baud in link.bauds if isinstance(link, Serial) else ():
+        link = data_link(sensor, Serial)
+        for baud in link.bauds if link else ():
             asked = (None if plain else baud, *(sensor.command(name) for name in sensor.on_open))
             if asked in tried or address.options.get("baud", str(baud)) != str(baud):
                 continue

@@ -131,22 +131,6 @@ class Switch:
 
 
 @dataclass(frozen=True)
-class Title:
-    """The line above the picture.
-
-    Attributes:
-        sensor, source: what is seen.
-        state: "live", "paused" and so on.
-        ink: of the state.
-    """
-
-    sensor: str
-    source: str
-    state: str
-    ink: int = GOOD
-
-
-@dataclass(frozen=True)
 class Layout:
     """Where things are: the picture's size, and whether the figures stand beside or below it."""
 
@@ -161,16 +145,9 @@ class Layout:
         return cls(columns - BESIDE - 1 if beside else columns, max(lines - (1 if beside else 2), 1), beside)
 
 
-def composed(columns: int, lines: int, title: Title, drawn: Cells, figures: Sequence[Figure], look: Look) -> Cells:
-    """The whole window; `drawn` has the size that `Layout.of` gives the picture."""
-    layout = Layout.of(columns, lines)
-    whole = Cells.blank(columns, lines)
-    _write_title(whole, title)
-    whole.paste(1, 0, drawn)
-    if not layout.beside:
-        _write_line(whole, figures)
-        return whole
-    left = layout.width
+def _write_beside(whole: Cells, left: int, figures: Sequence[Figure], look: Look) -> None:
+    """What stands beside the picture: figures, the meaning of the colours, keys."""
+    columns, lines = whole.size
     for row in range(1, lines):
         whole.write(row, left, "│", FAINT)
     for row, (name, value, ink) in enumerate(figures[: lines - 1], start=1):
@@ -182,32 +159,6 @@ def composed(columns: int, lines: int, title: Title, drawn: Cells, figures: Sequ
     if row + 2 <= lines - len(_HINTS) - 1:
         for place, (first, second) in enumerate(_HINTS):
             whole.write(lines - len(_HINTS) + place, left + 2, f"{first:<13}{second}", FAINT)
-    return whole
-
-
-def figures_of(reading: Reading | None, *, points: int, valid: int, near: float | None, lost: int, queue: str | None) -> list[Figure]:
-    """The figures to show, each with its ink.
-
-    Args:
-        reading: of the last moments; None before the first.
-        points, valid, near: of the scan that is shown: its points, those with a return, and metres to the nearest.
-        lost: packets missing since the beginning.
-        queue: how full the queue is, where there is one.
-    """
-    known = NOTHING if reading is None else reading
-    found = [
-        ("speed", _told(known.speed_hz, "{:.1f} Hz"), STRONG),
-        ("packets", _told(known.packet_rate_hz, "{:.0f} /s"), PLAIN),
-        ("input", _told(known.bytes_per_s, "{:.1f} kB/s", 1e-3), PLAIN),
-        ("points", str(points), PLAIN),
-        ("valid", f"{valid / points:.1%}".replace("%", " %") if points else "-", PLAIN),
-        ("nearest", _told(near, "{:.2f} m"), PLAIN),
-        _rate("errors", known.error_rate if reading else None),
-        _rate("skipped", known.skipped_rate if reading else None),
-        ("lost", str(lost) if lost or known.loss_rate is not None else "-", ALARM if lost else PLAIN),
-        ("jitter", _told(known.jitter_s, "{:.2f} ms", 1e3), PLAIN),
-    ]
-    return found if queue is None else [*found, ("queue", queue, PLAIN)]
 
 
 def help_page(columns: int, lines: int) -> Cells:
@@ -232,13 +183,12 @@ def message(columns: int, text: str) -> Cells:
     return found
 
 
-def _write_title(whole: Cells, title: Title) -> None:
-    columns = whole.size[0]
-    whole.write(0, 1, title.sensor, STRONG)
-    room = columns - len(title.sensor) - len(title.state) - 6
-    source = title.source if len(title.source) <= room else "..." + title.source[len(title.source) - room + 3 :] if room > 8 else ""
-    whole.write(0, len(title.sensor) + 3, source, LABEL)
-    whole.write(0, columns - len(title.state) - 1, title.state, title.ink)
+def _write_title(whole: Cells, sensor: str, source: str, state: str, ink: int) -> None:
+    room = whole.size[0] - len(sensor) - len(state) - 6
+    shown = source if len(source) <= room else "..." + source[len(source) - room + 3 :] if room > 8 else ""
+    whole.write(0, 1, sensor, STRONG)
+    whole.write(0, len(sensor) + 3, shown, LABEL)
+    whole.write(0, whole.size[0] - len(state) - 1, state, ink)
 
 
 def _write_line(whole: Cells, figures: Sequence[Figure]) -> None:
@@ -377,7 +327,13 @@ class Window:
         if told:
             note = message(layout.width, told)
             drawn.paste(max((layout.height - note.size[1]) // 2, 0), (layout.width - note.size[0]) // 2, note)
-        whole = composed(columns, lines, self._title(), drawn, self._figures(), found)
+        whole = Cells.blank(columns, lines)
+        _write_title(whole, self._feed.device.sensor.id, self._source, *self._state())
+        whole.paste(1, 0, drawn)
+        if layout.beside:
+            _write_beside(whole, layout.width, self._figures(), found)
+        else:
+            _write_line(whole, self._figures())
         if self.choice.helped:
             page = help_page(columns, lines)
             whole.paste(max((lines - page.size[1]) // 2, 0), max((columns - page.size[0]) // 2, 0), page)
@@ -414,31 +370,37 @@ class Window:
             self.choice = replace(self.choice, ramp=found.ramp)
         return replace(self._look, reach=self._look.reach / self.choice.zoom, middle=self.choice.middle)
 
-    def _title(self) -> Title:
-        device, choice = self._feed.device, self.choice
+    def _state(self) -> tuple[str, int]:
+        """What is going on, in a word, and the ink of it."""
+        device = self._feed.device
         if self._record is not None and self._record.name is not None:
-            state, ink = f"● {self._record.name}", ALARM
-        elif choice.paused:
-            state, ink = "‖ paused", STRONG
-        elif not self._live:
-            state, ink = ("end", STRONG) if self._feed.ended else ("▶ playing", GOOD)
-        else:
-            state, ink = ("● live", GOOD) if device.state == "streaming" else (device.state, ALARM)
-        return Title(device.sensor.id, self._source, state, ink)
+            return f"● {self._record.name}", ALARM
+        if self.choice.paused:
+            return "‖ paused", STRONG
+        if not self._live:
+            return ("end", STRONG) if self._feed.ended else ("▶ playing", GOOD)
+        return ("● live", GOOD) if device.state == "streaming" else (device.state, ALARM)
 
     def _figures(self) -> list[Figure]:
-        device = self._feed.device
-        points = self._scan.points if self._scan is not None else None
-        valid = points.range[points.valid] if points is not None else np.empty(0)
-        near = float(valid.min()) if len(valid) else None
-        return figures_of(
-            self._reading,
-            points=0 if points is None else len(points),
-            valid=len(valid),
-            near=near if near is not None and math.isfinite(near) else None,
-            lost=device.stats.lost,
-            queue=None if device.queued is None else str(device.queued),
-        )
+        """The figures of the last moments and of the scan that is shown, each with its ink."""
+        device, reading = self._feed.device, self._reading or NOTHING
+        points = len(self._scan) if self._scan is not None else 0
+        valid = self._scan.points.range[self._scan.points.valid] if self._scan is not None else np.empty(0)
+        near = float(valid.min()) if len(valid) else math.nan
+        lost = device.stats.lost
+        figures = [
+            ("speed", _told(reading.speed_hz, "{:.1f} Hz"), STRONG),
+            ("packets", _told(reading.packet_rate_hz, "{:.0f} /s"), PLAIN),
+            ("input", _told(reading.bytes_per_s, "{:.1f} kB/s", 1e-3), PLAIN),
+            ("points", str(points), PLAIN),
+            ("valid", f"{len(valid) / points:.1%}".replace("%", " %") if points else "-", PLAIN),
+            ("nearest", _told(near if math.isfinite(near) else None, "{:.2f} m"), PLAIN),
+            _rate("errors", reading.error_rate if self._reading else None),
+            _rate("skipped", reading.skipped_rate if self._reading else None),
+            ("lost", str(lost) if lost or reading.loss_rate is not None else "-", ALARM if lost else PLAIN),
+            ("jitter", _told(reading.jitter_s, "{:.2f} ms", 1e3), PLAIN),
+        ]
+        return figures if device.queued is None else [*figures, ("queue", str(device.queued), PLAIN)]
 
     def _complaint(self) -> str:
         """What is to be said in place of points."""
