@@ -130,10 +130,9 @@ def _sum_up_recording(task: SourceRecording, kept: Appender, source: str, sensor
 
 def _view_of(kept: Appender, sensor: Sensor | None) -> str:
     """The command that shows what was recorded."""
-    file = shlex.quote(kept.path)
     if isinstance(kept, Recorder) and kept.header.sensor:
-        return f"lidarspec view {file}"
-    return f"lidarspec view {file} -s {sensor.id}" if sensor else f"lidarspec detect {file}"
+        return f"lidarspec view {shlex.quote(kept.path)}"
+    return f"lidarspec {_shown(sensor, kept.path)}"
 
 
 @click.command()

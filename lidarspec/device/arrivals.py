@@ -5,7 +5,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+import contextlib
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import accumulate
 from pathlib import Path
@@ -132,21 +133,18 @@ class Senders:
         hosts = [chunk.sender[0] if chunk.sender else None for chunk in chunks]
         sizes = np.array([len(chunk.data) for chunk in chunks])
         places = np.searchsorted(np.cumsum(sizes) - sizes, found.starts, side="right") - 1
-        for kind, place in zip(found.kinds.tolist(), places.tolist(), strict=True):
-            host = hosts[place]
-            if host is not None and self._first.setdefault(found.names[kind], host) != host:
-                raise self._several(self._first[found.names[kind]], host, f"{found.names[kind]} frames")
+        sent = [(found.names[kind], hosts[place]) for kind, place in zip(found.kinds.tolist(), places.tolist(), strict=True)]
+        self.see((name, host) for name, host in sent if host is not None)
 
-    def see(self, hosts: Mapping[str, Sequence[str]]) -> None:
-        """Look who sent the frames of each type.
+    def see(self, sent: Iterable[tuple[str, str]]) -> None:
+        """Look who sent frames: the type of each, and the address.
 
         Raises:
             UsageError: where two addresses send frames of one type.
         """
-        for name, senders in hosts.items():
-            for host in senders:
-                if self._first.setdefault(name, host) != host:
-                    raise self._several(self._first[name], host, f"{name} frames")
+        for name, host in sent:
+            if self._first.setdefault(name, host) != host:
+                raise self._several(self._first[name], host, f"{name} frames")
 
     def ours(self, chunks: Sequence[Chunk], main: Decoder) -> list[Chunk]:
         """Those pieces of a stream in datagrams that come from the sender which is listened to, the first that sends frames.
@@ -277,9 +275,8 @@ class FileInput:
         if not wanted or not Path(str(self._source).partition("?")[0]).is_file():
             return {}
         first: dict[str, bytes] = {}
-        source = transport(self._source)
-        decoder = self._sensor.decoder(stream=not source.datagrams)
-        try:
+        with contextlib.closing(transport(self._source)) as source:
+            decoder = self._sensor.decoder(stream=not source.datagrams)
             if isinstance(source, CaptureTransport):
                 return first_frames(decoder, source.batches(), wanted)
             for chunk in source.chunks():
@@ -288,8 +285,6 @@ class FileInput:
                         first.setdefault(item.frame, item.data)
                 if len(first) == len(wanted):
                     break
-        finally:
-            source.close()
         return first
 
     def _read(self) -> Iterator[Arrival]:
@@ -297,7 +292,7 @@ class FileInput:
         if isinstance(self._transport, CaptureTransport) and not self.decoder.stream:
             for datagrams in self._transport.batches():
                 spans = self.decoder.placed(datagrams.buffer, datagrams.starts, datagrams.sizes, datagrams.at)
-                self._senders.see(datagrams.hosts(spans))
+                self._senders.see((name, host) for name, hosts in datagrams.hosts(spans).items() for host in hosts)
                 yield Arrival([spans])
             return
         for batch in _batches(self._transport.chunks()):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import time
 from collections.abc import Iterator
@@ -197,16 +198,13 @@ def _heard(source: str, sensor: Sensor | None, seconds: float) -> Iterator[Findi
 
 def _as_expected(source: str, sensor: Sensor, seconds: float) -> Verdict | None:
     """What comes over a source that is opened as the sensor declares."""
-    opened = transport(source, sensor)
-    try:
+    with contextlib.closing(transport(source, sensor)) as opened:
         end, chunks = time.monotonic() + seconds, list[bytes]()
         while (left := end - time.monotonic()) > 0 and isinstance(opened, LiveTransport):
             chunks += [chunk.data for chunk in opened.read(min(left, 0.1))]
         address = live_address(source)
         plain = address is not None and has_no_baud(address.place)
         datagrams, baud = opened.datagrams, None if plain else opened.baud
-    finally:
-        opened.close()
     return verdict(Heard(source, tuple(chunks), datagrams, baud)) if chunks else None
 
 

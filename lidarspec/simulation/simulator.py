@@ -1,7 +1,10 @@
 """Frames that a sensor would send from a scene, made from its own spec, and when it would send them.
 
 The sensor's `sweep` says what is not measured (angles, counters, time). The packets are filled with that, `points` says where the
-beams go, the scene says how far, and the ranges go back through the scale of the fields that they come from (`measuring`).
+beams go, the scene says how far, and the ranges go back through the scale of the fields that they come from (`Measurement`): no inverse of
+`points` is written anywhere, but by giving each field in metres a probing value it is found out which points answer to it. Where
+direction depends on range the measurement is repeated; a beam that finds no fixed point is a no-return. A frame type with an `encode` of
+its own is given the measured points and returns the values of its fields.
 
 When each packet is sent follows from what the spec says of time, in this order: the rate that is declared; the sensor's clock, which
 its `sweep` sets; the times of the points, which say how long one takes; the speed of its serial line, which no sensor outruns.
@@ -20,7 +23,6 @@ from numpy.typing import NDArray
 from lidarspec.columns.columns import Batch, Column, Fields, aligned
 from lidarspec.errors import SpecError, UsageError
 from lidarspec.packets.clocks import clock_ns
-from lidarspec.points.plain import points_function
 from lidarspec.simulation.frame_maker import FrameMaker, example, sealed
 from lidarspec.simulation.scenes import Room, Scene
 from lidarspec.spec.description import Spec
@@ -90,7 +92,7 @@ class Measurement:
 
     def __init__(self, sensor: Spec, frame: str, table: Rows) -> None:
         self._sensor = sensor
-        self._points = points_function(sensor, frame)
+        self._points = sensor.points_of(frame)
         self._encode: Callable[[Polar], Mapping[str, Any]] | None = sensor.simulation_of(frame).encode
         self._targets = () if self._encode else self._traced(table)
         self._intensity = self.beams(table).intensity
