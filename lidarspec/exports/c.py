@@ -14,7 +14,7 @@ from importlib import resources
 from typing import Any
 
 from lidarspec._version import __version__
-from lidarspec.exports import Refused
+from lidarspec.exports import Message, Refused, messages
 from lidarspec.exports.c_fields import (
     Access,
     CLayout,
@@ -29,7 +29,6 @@ from lidarspec.exports.c_fields import (
     quoted,
     word,
 )
-from lidarspec.exports.messages import Message, messages
 from lidarspec.spec.checksums import Checksum, Crc, Fold15, Sum, WordXor, Xor, ZeroPadded
 from lidarspec.spec.row_checksums import byte_table, mirrored_bytes, reflected
 from lidarspec.spec.sensor import Sensor

@@ -10,29 +10,12 @@ import dataclasses
 import json
 from typing import Any
 
-from lidarspec.exports.messages import Message, messages
+from lidarspec.exports import Message, messages
+from lidarspec.spec import tree
 from lidarspec.spec.checksums import Checksum
 from lidarspec.spec.description import Command
 from lidarspec.spec.links import Link, Serial, Tcp, Udp
 from lidarspec.spec.sensor import Sensor
-from lidarspec.spec.tree import (
-    Blob,
-    Block,
-    Empty,
-    FieldInfo,
-    Formula,
-    Node,
-    Number,
-    Op,
-    Opaque,
-    Part,
-    Ref,
-    Repeat,
-    Sealed,
-    Select,
-    Struct,
-    When,
-)
 from lidarspec.wire.wire_table import frame_size
 
 #: raised whenever a key changes its meaning or goes.
@@ -126,55 +109,55 @@ def _command(command: Command) -> dict[str, Any]:
     }
 
 
-def node_data(node: Node) -> dict[str, Any]:
+def node_data(node: tree.Node) -> dict[str, Any]:
     """A part of a frame as data: "kind" says which keys follow."""
     match node:
-        case Struct():
+        case tree.Struct():
             return {"kind": "struct", "name": node.name, "members": [node_data(member) for member in node.members]}
-        case Sealed():
+        case tree.Sealed():
             return node_data(node.body) | {"checksum": _seal(node)}
-        case Number():
+        case tree.Number():
             return {"kind": node.kind, "name": node.name, "bytes": node.size, "order": node.order} | _info(node.info)
-        case Blob():
+        case tree.Blob():
             return {"kind": "bytes", "name": node.name, "bytes": formula_data(node.size)} | _info(node.info)
-        case Block():
+        case tree.Block():
             return {"kind": "block", "name": node.name, "bytes": node.size, "parts": [_part(part) for part in node.parts]}
-        case Repeat():
+        case tree.Repeat():
             return {"kind": "array", "name": node.name, "count": formula_data(node.count), "element": node_data(node.element)}
-        case When():
+        case tree.When():
             branches = {"then": node_data(node.then), "else": node_data(node.otherwise)}
             return {"kind": "if", "name": node.name, "condition": formula_data(node.condition)} | branches
-        case Select():
+        case tree.Select():
             cases = [{"value": value, "part": node_data(case)} for value, case in node.cases]
             return {"kind": "switch", "name": node.name, "key": formula_data(node.key), "cases": cases, "default": node_data(node.default)}
-        case Empty() | Opaque():
+        case tree.Empty() | tree.Opaque():
             return {"kind": "nothing", "name": node.name}
 
 
-def formula_data(formula: Formula) -> Any:
+def formula_data(formula: tree.Formula) -> Any:
     """A number as it is, a field as {"field": path}, an operation as {"op": symbol, "args": [...]}."""
     match formula:
-        case Ref():
+        case tree.Ref():
             return {"field": formula.path}
-        case Op(symbol, args):
+        case tree.Op(symbol, args):
             return {"op": symbol, "args": [formula_data(arg) for arg in args]}
         case _:
             return formula
 
 
-def _info(info: FieldInfo) -> dict[str, Any]:
+def _info(info: tree.FieldInfo) -> dict[str, Any]:
     const = info.const.hex() if isinstance(info.const, bytes | bytearray) else info.const
     facts = {"path": info.path, "unit": info.unit, "scale": info.scale, "offset": info.offset, "const": const, "docs": info.docs}
     return {**facts, "labels": {str(value): name for value, name in info.labels.items()}}
 
 
-def _part(part: Part) -> dict[str, Any]:
+def _part(part: tree.Part) -> dict[str, Any]:
     runs = [{"byte": run.byte, "low": run.low, "width": run.mask.bit_count(), "target": run.target} for run in part.bits.segments]
     head = {"name": ".".join(part.names), "indices": list(part.indices), "width": part.bits.width, "signed": part.bits.signed}
     return {**head, "runs": runs} | _info(part.info)
 
 
-def _seal(node: Sealed) -> dict[str, Any]:
+def _seal(node: tree.Sealed) -> dict[str, Any]:
     return {
         "fields": list(node.fields),
         "over": list(node.over) if node.over else None,

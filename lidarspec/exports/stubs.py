@@ -15,8 +15,7 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
-from lidarspec.exports import Refused
-from lidarspec.exports.messages import Message, messages
+from lidarspec.exports import Message, Refused, messages
 from lidarspec.spec.description import Command
 from lidarspec.spec.sensor import Sensor
 from lidarspec.spec.tree import Blob, Block, Empty, FieldInfo, Node, Number, Opaque, Repeat, Sealed, Select, Struct, When
