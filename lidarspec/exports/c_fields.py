@@ -26,8 +26,6 @@ _OPERATIONS = {
     **{"//": "lidarspec_floor_div({}, {})", "%": "lidarspec_floor_mod({}, {})", "not": "(int64_t)!{}"},
     **{symbol: f"(lidarspec_int({{}}) {symbol} {{}})" for symbol in tree.COMPARISONS},
 }
-#: (path, ending) -> the C name of a function.
-Name = Callable[[str, str], str]
 _INDICES = "ijklmnoq"
 
 
@@ -49,23 +47,6 @@ def arguments(depth: int) -> str:
 def identifier(text: str) -> str:
     """A text as a part of a C name."""
     return re.sub(r"\W", "_", text.replace("[]", "_inner"), flags=re.ASCII)
-
-
-def formula(value: tree.Formula, name: Name) -> str:
-    """A formula as a C expression of type int64_t; `name` gives the functions of a path.
-
-    Raises:
-        Refused: where 64-bit integers cannot hold what it may come to.
-    """
-    if bits(value) > MOST_BITS:
-        raise Refused("a formula that may pass what a 64-bit integer holds")
-    return tree.written(value, lambda ref: f"(int64_t){name(ref.path, '')}({arguments(len(ref.info.axes))})", _OPERATIONS)
-
-
-def truth(value: tree.Formula, name: Name) -> str:
-    """A formula as a C condition; raises as `formula`."""
-    text = formula(value, name)
-    return text[1:-1] if isinstance(value, tree.Op) and value.symbol in tree.COMPARISONS else f"{text} != 0"
 
 
 def bits(value: tree.Formula) -> int:
@@ -185,8 +166,14 @@ class CLayout:
         return next(entry for entry in self.entries if entry.path == path)
 
     def formula(self, value: tree.Formula) -> str:
-        """A formula as C."""
-        return formula(value, self.name)
+        """A formula as a C expression of type int64_t.
+
+        Raises:
+            Refused: where 64-bit integers cannot hold what it may come to.
+        """
+        if bits(value) > MOST_BITS:
+            raise Refused("a formula that may pass what a 64-bit integer holds")
+        return tree.written(value, lambda ref: f"(int64_t){self.name(ref.path, '')}({arguments(len(ref.info.axes))})", _OPERATIONS)
 
     def length(self, value: tree.Formula) -> str:
         """A number of elements or bytes as C."""
@@ -268,7 +255,8 @@ class CLayout:
         node = entry.node
         is_fixed = not any(ref.info.axes for value in tree.formulas(node) for ref in tree.refs(value))
         if isinstance(node, tree.When):
-            asked = truth(node.condition, self.name)
+            asked = self.formula(node.condition)
+            asked = asked[1:-1] if isinstance(node.condition, tree.Op) and node.condition.symbol in tree.COMPARISONS else f"{asked} != 0"
             cases = [(asked, node.then), (f"!({asked})", node.otherwise)]
         else:
             assert isinstance(node, tree.Select)

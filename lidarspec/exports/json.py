@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from collections.abc import Mapping
 from typing import Any
 
 from lidarspec.exports import Message, messages
 from lidarspec.spec import tree
-from lidarspec.spec.checksums import Checksum
 from lidarspec.spec.description import Command
 from lidarspec.spec.links import Link, Serial, Tcp, Udp
 from lidarspec.spec.sensor import Sensor
@@ -35,30 +35,26 @@ def spec(sensor: Sensor) -> dict[str, Any]:
     """The spec as plain data; see `text`."""
     return {
         "lidarspec": VERSION,
-        "id": sensor.id,
-        "vendor": sensor.vendor,
-        "model": sensor.model,
-        "aliases": list(sensor.aliases),
-        "status": sensor.status,
-        "source": sensor.source,
-        "range_limits": list(sensor.range_limits),
-        "vendor_axes": list(sensor.vendor_axes) if sensor.vendor_axes else None,
-        "links": {name: link_data(link) for name, link in sensor.links.items()},
+        **_facts(sensor, "id", "vendor", "model", "aliases", "status", "source", "range_limits", "vendor_axes"),
+        "links": {name: _link(link) for name, link in sensor.links.items()},
         "scan": {"rule": type(sensor.scan).__name__, **dataclasses.asdict(sensor.scan)},
         "clock": _clock(sensor),
         "sequence": _sequence(sensor),
         "fillers": sensor.fillers.hex(),
         "frames": {message.name: _frame(message) for message in messages(sensor)},
         "commands": {name: _command(command) for name, command in sensor.commands.items()},
-        "on_open": list(sensor.on_open),
-        "on_close": list(sensor.on_close),
+        **_facts(sensor, "on_open", "on_close"),
     }
 
 
-def link_data(link: Link) -> dict[str, Any]:
-    """A link as data."""
-    kind = {Serial: "serial", Udp: "udp", Tcp: "tcp"}[type(link)]
-    return {"kind": kind, **{name: list(value) if isinstance(value, tuple) else value for name, value in vars(link).items()}}
+def _facts(value: object, *names: str) -> dict[str, Any]:
+    """Some attributes of a value as data: tuples as lists, mappings as objects."""
+    facts = ((name, getattr(value, name)) for name in names)
+    return {name: list(fact) if isinstance(fact, tuple) else dict(fact) if isinstance(fact, Mapping) else fact for name, fact in facts}
+
+
+def _link(link: Link) -> dict[str, Any]:
+    return {"kind": {Serial: "serial", Udp: "udp", Tcp: "tcp"}[type(link)], **_facts(link, *vars(link))}
 
 
 def _clock(sensor: Sensor) -> dict[str, Any] | None:
@@ -79,12 +75,9 @@ def _sequence(sensor: Sensor) -> dict[str, Any] | None:
 def _frame(message: Message) -> dict[str, Any]:
     frame = message.frame
     return {
-        "direction": frame.direction,
-        "data": frame.data,
+        **_facts(frame, "direction", "data"),
         "size": frame_size(frame),
-        "max_length": frame.max_length,
-        "after": frame.after,
-        "confirm": frame.confirm,
+        **_facts(frame, "max_length", "after", "confirm"),
         "plausible": frame.plausible is not None,
         "layout": node_data(message.root),
     }
@@ -92,20 +85,9 @@ def _frame(message: Message) -> dict[str, Any]:
 
 def _command(command: Command) -> dict[str, Any]:
     return {
-        "frame": command.frame,
-        "values": dict(command.values),
+        **_facts(command, "frame", "values"),
         "args": {name: {"field": path, "low": low, "high": high} for name, (path, low, high) in command.args.items()},
-        "replies": list(command.replies),
-        "matches": dict(command.matches),
-        "echoes": list(command.echoes),
-        "timeout": command.timeout,
-        "retries": command.retries,
-        "settle": command.settle,
-        "link": command.link,
-        "lines": dict(command.lines),
-        "starts": command.starts,
-        "stops": command.stops,
-        "every": command.every,
+        **_facts(command, "replies", "matches", "echoes", "timeout", "retries", "settle", "link", "lines", "starts", "stops", "every"),
     }
 
 
@@ -158,15 +140,8 @@ def _part(part: tree.Part) -> dict[str, Any]:
 
 
 def _seal(node: tree.Sealed) -> dict[str, Any]:
-    return {
-        "fields": list(node.fields),
-        "over": list(node.over) if node.over else None,
-        "absent": list(node.absent),
-        "algorithm": _algorithm(node.algorithm),
-    }
-
-
-def _algorithm(algorithm: Checksum) -> dict[str, Any]:
+    algorithm = node.algorithm
     own: dict[str, Any] = dataclasses.asdict(algorithm) if dataclasses.is_dataclass(algorithm) else {}
     known = {name: value for name, value in own.items() if isinstance(value, int | str | bool | tuple)}
-    return {"kind": type(algorithm).__name__, "width": algorithm.width, "describe": algorithm.describe(), **known}
+    kind = {"kind": type(algorithm).__name__, "width": algorithm.width, "describe": algorithm.describe()}
+    return {**_facts(node, "fields", "over", "absent"), "algorithm": {**kind, **known}}

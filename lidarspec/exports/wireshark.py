@@ -8,8 +8,8 @@ Formulas are Lua functions of the values kept so far. Lua counts in floats there
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterable, Mapping
+import json
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from importlib import resources
 from typing import Any
@@ -55,24 +55,17 @@ def lua(value: Any, indent: str = "") -> str:
         return str(value)
     if isinstance(value, str):
         return quoted(value)
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    if isinstance(value, float) and not math.isfinite(value):
-        raise ValueError(f"{value!r} has no Lua literal")
-    if isinstance(value, int | float):
-        return repr(value)
-    entries = _entries(value, indent + "  ")
+    if isinstance(value, bool | int | float):
+        return json.dumps(value, allow_nan=False)
+    deeper = indent + "  "
+    if isinstance(value, Mapping):
+        entries = [f"{_key(key)} = {lua(item, deeper)}" for key, item in value.items() if item is not None]
+    else:
+        entries = [lua(item, deeper) for item in value]
     line = "{" + ", ".join(entries) + "}"
     if len(indent) + len(line) <= WIDTH and "\n" not in line:
         return line
     return "{\n" + "".join(f"{indent}  {entry},\n" for entry in entries) + indent + "}"
-
-
-def _entries(value: Any, indent: str) -> list[str]:
-    if isinstance(value, Mapping):
-        return [f"{_key(key)} = {lua(item, indent)}" for key, item in value.items() if item is not None]
-    assert isinstance(value, Iterable)
-    return [lua(item, indent) for item in value]
 
 
 def _key(key: object) -> str:
@@ -90,16 +83,12 @@ SUMMED = 4
 Table = dict[str, Any]
 
 
-def tables(message: Message, prefix: str) -> Table:
-    """The root of a frame type as a table; `prefix` begins the names of its fields in Wireshark's filters."""
-    return _Writer(message, prefix).node(message.root)
-
-
 @dataclass
 class _Writer:
     """Writes the tables of one frame type.
 
     Attributes:
+        prefix: that the names of its fields in Wireshark's filters begin with.
         kept: paths of the fields whose values are asked for later.
         marked: paths of the parts at which what a checksum covers begins or ends.
         types: name of a field of Wireshark -> family of its type.
@@ -176,7 +165,7 @@ class _Writer:
         letters = "INT" if part.bits.signed else "UINT"
         is_masked = order is not None and part.bits.width < 8 * block.size
         kind = f"{letters}{8 * block.size if is_masked else _width(part.bits.width)}"
-        mask = _mask(part.bits, block.size, order) if is_masked and order is not None else None
+        mask = ((1 << part.bits.width) - 1) << (_run(part.bits, block.size, order) or 0) if is_masked and order else None
         label = ".".join(part.names) + "".join(f"[{index}]" for index in part.indices)
         return {
             "name": part.info.name,
@@ -283,12 +272,8 @@ def _width(bits: int) -> int:
 
 def _word_order(block: tree.Block) -> str | None:
     """The byte order by which all parts are runs of bits of one word, which Wireshark can draw; None where there is none."""
-    if block.size > 4:
-        return None
-    for order in ("big", "little"):
-        if all(_run(part.bits, block.size, order) is not None for part in block.parts):
-            return order
-    return None
+    orders = (order for order in ("big", "little") if all(_run(part.bits, block.size, order) is not None for part in block.parts))
+    return next(orders, None) if block.size <= 4 else None
 
 
 def _run(bits: BitField, size: int, order: str) -> int | None:
@@ -297,10 +282,6 @@ def _run(bits: BitField, size: int, order: str) -> int | None:
         8 * (segment.byte if order == "little" else size - 1 - segment.byte) + segment.low - segment.target for segment in bits.segments
     }
     return starts.pop() if len(starts) == 1 else None
-
-
-def _mask(bits: BitField, size: int, order: str) -> int:
-    return ((1 << bits.width) - 1) << (_run(bits, size, order) or 0)
 
 
 #: the link types that captures keep for private use, USER0 to USER15, by the numbers that Wireshark's wtap gives them.
@@ -379,7 +360,7 @@ def _frame(message: Message, name: str) -> dict[str, Any]:
         "longest": message.frame.max_length,
         "after": message.frame.after,
         "magic": [[offset, mask, value] for offset, (mask, value) in sorted(prefix.items())],
-        "root": tables(message, f"{name}.{message.name}"),
+        "root": _Writer(message, f"{name}.{message.name}").node(message.root),
     }
 
 
