@@ -15,21 +15,8 @@ from importlib import resources
 from typing import Any
 
 from lidarspec._version import __version__
-from lidarspec.exports import Message, Refused, messages
-from lidarspec.exports.c_fields import (
-    Access,
-    CLayout,
-    Entry,
-    accesses,
-    arguments,
-    comment,
-    fields,
-    identifier,
-    index,
-    parameters,
-    quoted,
-    word,
-)
+from lidarspec.exports import Message, Refused, c_fields, messages
+from lidarspec.exports.c_fields import Access, CLayout, Entry, accesses, arguments, comment, identifier, parameters, quoted, word
 from lidarspec.spec.checksums import Checksum, Crc, Fold15, Sum, WordXor, Xor, ZeroPadded
 from lidarspec.spec.row_checksums import byte_table, mirrored_bytes, reflected
 from lidarspec.spec.sensor import Sensor
@@ -291,7 +278,7 @@ def _number(value: Any) -> str:
 def _unless(entry: Entry, wrong: str) -> str:
     """A statement that ends with 0 where something is wrong, for every element of the arrays that it is in."""
     where = " && ".join(filter(None, (entry.where, wrong)))
-    names = [(index(level), count) for level, count in enumerate(entry.loops)]
+    names = [(c_fields.index(level), count) for level, count in enumerate(entry.loops)]
     loops = "".join(f"for (size_t {name} = 0; {name} < (size_t)({count}); ++{name}) " for name, count in names)
     return f"{loops}if ({where}) return 0;"
 
@@ -360,7 +347,7 @@ def _message(message: Message, prefix: str, given: dict[str, tuple[str, str, str
     layout = CLayout(message, name)
     yield comment(f"---- {message.name}: {'from' if message.frame.direction == 'in' else 'to'} the sensor ----")
     yield f"#define {prefix.upper()}_{identifier(message.name).upper()}_MAX_LENGTH {message.frame.max_length}"
-    yield from (text for text in fields(layout) if text)
+    yield from (text for text in c_fields.fields(layout) if text)
     yield ""
     yield from _frame(layout, algorithms)
 

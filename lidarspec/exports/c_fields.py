@@ -128,9 +128,14 @@ class Entry:
         return " && ".join(condition.text for condition in self.conditions)
 
 
+def asked(node: tree.Node) -> list[tree.Ref]:
+    """The fields that the formulas of a node and of what is in it ask for."""
+    return [ref for below in tree.nodes(node) for value in tree.formulas(below) for ref in tree.refs(value)]
+
+
 def given(node: tree.Node, depth: int) -> str:
     """The arguments by which a size is asked for in so many arrays; where it is the same for all elements, it is that of the first."""
-    is_own = any(ref.info.axes for below in tree.nodes(node) for value in tree.formulas(below) for ref in tree.refs(value))
+    is_own = any(ref.info.axes for ref in asked(node))
     return arguments(depth) if is_own else ", ".join(["p", *["0"] * depth])
 
 
@@ -245,8 +250,7 @@ class CLayout:
 
     def _element(self, entry: Entry, node: tree.Repeat) -> Extent:
         size = self.extent(replace(entry, node=node.element, depth=entry.depth + 1))
-        used = [ref for below in tree.nodes(node.element) for value in tree.formulas(below) for ref in tree.refs(value)]
-        if size.terms and any(node.axis in ref.info.axes for ref in used):
+        if size.terms and any(node.axis in ref.info.axes for ref in asked(node.element)):
             raise Refused(f"{node.axis}: its elements differ in size, so that none has a place of its own without reading those before it")
         return size
 

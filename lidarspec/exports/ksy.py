@@ -210,12 +210,8 @@ def _in_order(block: tree.Block) -> tuple[list[tree.Part], str] | None:
 
 def _starts(bits: BitField, suffix: str) -> set[int]:
     """Where reading would have begun for each bit to stand where it does; one number if the bits follow each other."""
-    starts = set()
-    for segment in bits.segments:
-        for step in range(segment.mask.bit_count()):
-            bit, target = segment.low + step, segment.target + step
-            starts.add(8 * segment.byte + (bit - target if suffix == "le" else 8 - bit - bits.width + target))
-    return starts
+    ahead = ((segment, segment.low - segment.target) for segment in bits.segments)
+    return {8 * segment.byte + (bits_ahead if suffix == "le" else 8 - bits.width - bits_ahead) for segment, bits_ahead in ahead}
 
 
 def _assembled(part: tree.Part, raw: str) -> str:

@@ -18,7 +18,7 @@ from dataclasses import dataclass, field
 from lidarspec.exports import Message, Refused, messages
 from lidarspec.spec.description import Command
 from lidarspec.spec.sensor import Sensor
-from lidarspec.spec.tree import Blob, Block, Empty, FieldInfo, Node, Number, Opaque, Repeat, Sealed, Select, Struct, When
+from lidarspec.spec.tree import Blob, Block, Empty, FieldInfo, Node, Number, Opaque, Repeat, Sealed, Select, Struct, When, children
 from lidarspec.wire.schema import schema
 from lidarspec.wire.wire_table import meaning, unit_text
 
@@ -100,15 +100,10 @@ class _Classes:
                 return self.add(node, owner + camel(name), f"`{name}` of `{owner}`.")
             case Repeat():
                 return f"list[{self._type(owner, name, node.element)}]"
-            case When():
-                return self._either(owner, name, [node.then, node.otherwise])
-            case Select():
-                return self._either(owner, name, [*(case for _, case in node.cases), node.default])
+            case When() | Select():
+                return " | ".join(dict.fromkeys(self._type(owner, name, branch) for branch in children(node)))
             case Empty() | Opaque():
                 return "None"
-
-    def _either(self, owner: str, name: str, branches: list[Node]) -> str:
-        return " | ".join(dict.fromkeys(self._type(owner, name, branch) for branch in branches))
 
 
 def _sensor(sensor: Sensor, frames: tuple[Message, ...], names: dict[str, str]) -> str:

@@ -343,11 +343,7 @@ def dissector(sensor: Sensor) -> str:
         "frames": [_frame(message, name) for message in by_direction],
     }
     head = _HEAD.format(
-        title=title,
-        version=__version__,
-        source=" ".join(sensor.source.split()),
-        name=quoted(name),
-        title_quoted=quoted(title),
+        title=title, version=__version__, source=" ".join(sensor.source.split()), name=quoted(name), title_quoted=quoted(title)
     )
     walker = resources.files("lidarspec.exports").joinpath("wireshark.lua").read_text(encoding="utf-8")
     return "\n".join([head, f"local sensor = {lua(about)}", _REGISTERED, walker])
