@@ -24,11 +24,9 @@ from lidarspec.framing.frame_engine import Codec, CompiledCodec, codec
 from lidarspec.framing.results import IMPLAUSIBLE, VALID, Counters, Found, packed
 from lidarspec.packets.stream import PacketStream
 from lidarspec.points.plain import evaluate
+from lidarspec.spec import Checksummed, Frame, Sensor
 from lidarspec.spec.bits import BitField
 from lidarspec.spec.construct_layer import UNNAMED, Seen, field_path, leaves
-from lidarspec.spec.description import Frame
-from lidarspec.spec.fields import Checksummed
-from lidarspec.spec.sensor import Sensor
 from lidarspec.spec.tree import Block, FieldInfo, Node, Opaque, Repeat, Struct, children, exact
 from lidarspec.wire.parse import parse_typed
 from lidarspec.wire.schema import schema

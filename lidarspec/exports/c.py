@@ -17,9 +17,8 @@ from typing import Any
 from lidarspec._version import __version__
 from lidarspec.exports import Message, Refused, c_fields, messages
 from lidarspec.exports.c_fields import Access, CLayout, Entry, accesses, arguments, comment, identifier, parameters, quoted, word
-from lidarspec.spec.checksums import Checksum, Crc, Fold15, Sum, WordXor, Xor, ZeroPadded
+from lidarspec.spec import Checksum, Crc, Fold15, Sensor, Sum, WordXor, Xor, ZeroPadded
 from lidarspec.spec.row_checksums import byte_table, mirrored_bytes, reflected
-from lidarspec.spec.sensor import Sensor
 from lidarspec.spec.tree import Blob, Block, Formula, Number, Op, Repeat, Sealed, formulas, refs
 from lidarspec.wire.wire_table import Extent
 

@@ -12,8 +12,7 @@ from dataclasses import dataclass, field, replace
 from xml.sax.saxutils import escape, quoteattr
 
 from lidarspec.exports import Message, messages
-from lidarspec.spec import tree
-from lidarspec.spec.sensor import Sensor
+from lidarspec.spec import Sensor, tree
 from lidarspec.wire.wire_table import INDICES, Extent, bit_text, branches, extent, frame_size, meaning, phrase, unit_text
 
 

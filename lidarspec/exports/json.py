@@ -12,10 +12,8 @@ from collections.abc import Mapping
 from typing import Any
 
 from lidarspec.exports import Message, messages
-from lidarspec.spec import tree
-from lidarspec.spec.description import Command
+from lidarspec.spec import Command, Sensor, tree
 from lidarspec.spec.links import Link, Serial, Tcp, Udp
-from lidarspec.spec.sensor import Sensor
 from lidarspec.wire.wire_table import frame_size
 
 #: raised whenever a key changes its meaning or goes.

@@ -16,10 +16,9 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from lidarspec.exports import Message, Refused, messages
-from lidarspec.spec import tree
+from lidarspec.spec import Sensor, tree
 from lidarspec.spec.bits import BitField, Segment
 from lidarspec.spec.fields import slug
-from lidarspec.spec.sensor import Sensor
 from lidarspec.wire.wire_table import meaning, unit_text
 
 #: a string that means the same without quotes.

@@ -16,8 +16,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 from lidarspec.exports import Message, Refused, messages
-from lidarspec.spec.description import Command
-from lidarspec.spec.sensor import Sensor
+from lidarspec.spec import Command, Sensor
 from lidarspec.spec.tree import Blob, Block, Empty, FieldInfo, Node, Number, Opaque, Repeat, Sealed, Select, Struct, When, children
 from lidarspec.wire.schema import schema
 from lidarspec.wire.wire_table import meaning, unit_text

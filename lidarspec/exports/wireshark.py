@@ -17,11 +17,8 @@ from typing import Any
 from lidarspec._version import __version__
 from lidarspec.exports import Message, Refused, messages
 from lidarspec.framing.frame_engine import codec
-from lidarspec.spec import tree
+from lidarspec.spec import Checksum, Crc, Fold15, Sensor, Sum, Tcp, Udp, WordXor, Xor, ZeroPadded, tree
 from lidarspec.spec.bits import BitField
-from lidarspec.spec.checksums import Checksum, Crc, Fold15, Sum, WordXor, Xor, ZeroPadded
-from lidarspec.spec.links import Tcp, Udp
-from lidarspec.spec.sensor import Sensor
 
 WIDTH = 140
 

@@ -12,12 +12,9 @@ from lidarspec.columns.columns import Batch, Fields
 from lidarspec.columns.graph import Traced, Untraceable
 from lidarspec.errors import LidarSpecError
 from lidarspec.framing.frame_engine import CompiledCodec, codec
+from lidarspec.spec import Clock, Frame, Polar, Sensor
 from lidarspec.spec.construct_layer import is_expression
-from lidarspec.spec.description import Frame
 from lidarspec.spec.fields import factor
-from lidarspec.spec.results import Polar
-from lidarspec.spec.sensor import Sensor
-from lidarspec.spec.timing import Clock
 from lidarspec.spec.tree import Sealed, Struct, infos, nodes
 from lidarspec.testing.findings import Finding
 from lidarspec.testing.geometry import data_frames, field_of, traced, used

@@ -25,9 +25,8 @@ from lidarspec.points.plain import evaluate, points_function
 from lidarspec.simulation.frame_maker import FrameMaker, examples, sealed
 from lidarspec.simulation.scenes import Room, furnished
 from lidarspec.simulation.simulator import simulation
+from lidarspec.spec import OnWrap, Polar
 from lidarspec.spec.fields import factor
-from lidarspec.spec.results import Polar
-from lidarspec.spec.timing import OnWrap
 from lidarspec.spec.tree import FieldInfo
 from lidarspec.spec.vocabulary import LookUp
 from lidarspec.testing import subject as material

@@ -17,8 +17,7 @@ from typing import Any
 from lidarspec.errors import WireError
 from lidarspec.framing.frame_engine import codec
 from lidarspec.simulation.frame_maker import examples
-from lidarspec.spec.description import Frame
-from lidarspec.spec.sensor import Sensor
+from lidarspec.spec import Frame, Sensor
 from lidarspec.spec.tree import FieldInfo, Sealed, nodes
 
 #: frames up to this length are cut at every byte, longer ones at so many places.
