@@ -94,12 +94,10 @@ def messages(sensor: Sensor) -> tuple[Message, ...]:
     """
     if not sensor.frames:
         raise Refused(f"{sensor.id}: has no frames yet: configure it first")
-    return tuple(message(sensor, name) for name in sensor.frames)
+    return tuple(_message(sensor, name, frame) for name, frame in sensor.frames.items())
 
 
-def message(sensor: Sensor, name: str) -> Message:
-    """One frame type of a sensor; raises as `messages`."""
-    frame = sensor.frames[name]
+def _message(sensor: Sensor, name: str, frame: Frame) -> Message:
     try:
         root = frame.tree
         for node in tree.nodes(root):

@@ -300,14 +300,6 @@ _HEAD = """\
  */
 #ifndef {guard}
 #define {guard}
-
-#include <stddef.h>
-#include <stdint.h>
-#include <string.h>
-
-#ifdef __cplusplus
-extern "C" {{
-#endif
 """
 
 _TAIL = """\

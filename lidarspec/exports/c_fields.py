@@ -259,9 +259,9 @@ class CLayout:
         node = entry.node
         is_fixed = not any(ref.info.axes for value in tree.formulas(node) for ref in tree.refs(value))
         if isinstance(node, tree.When):
-            asked = self.formula(node.condition)
-            asked = asked[1:-1] if isinstance(node.condition, tree.Op) and node.condition.symbol in tree.COMPARISONS else f"{asked} != 0"
-            cases = [(asked, node.then), (f"!({asked})", node.otherwise)]
+            holds = self.formula(node.condition)
+            holds = holds[1:-1] if isinstance(node.condition, tree.Op) and node.condition.symbol in tree.COMPARISONS else f"{holds} != 0"
+            cases = [(holds, node.then), (f"!({holds})", node.otherwise)]
         else:
             assert isinstance(node, tree.Select)
             key = self.formula(node.key)

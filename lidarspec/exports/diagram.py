@@ -15,6 +15,9 @@ from lidarspec.exports import Message, messages
 from lidarspec.spec import Sensor, tree
 from lidarspec.wire.wire_table import INDICES, Extent, bit_text, branches, extent, frame_size, meaning, phrase, unit_text
 
+#: how the names of fields begin that are there for nothing yet, in manuals.
+SPARE = ("reserved", "unused", "spare", "zeros", "padding")
+
 
 @dataclass(frozen=True)
 class Cell:
@@ -131,7 +134,7 @@ class _Cells:
 
     def _cell(self, info: tree.FieldInfo, name: str, bits: int, detail: str, kind: str, start: Extent) -> Cell:
         seal = self.seals.get(info.path)
-        role = "sum" if seal else "const" if info.const is not None else "spare" if _is_spare(name) else ""
+        role = "sum" if seal else "const" if info.const is not None else "spare" if name.startswith(SPARE) else ""
         said = (info.path, kind, unit_text(info), meaning(info), seal.algorithm.describe() if seal else "")
         return Cell(name or "(constant)", bits, detail, "; ".join(filter(None, said)), role, start)
 
@@ -139,11 +142,6 @@ class _Cells:
         step = extent(node.element, node.name).times(INDICES[depth % len(INDICES)])
         count = node.count if isinstance(node.count, int) else phrase(node.count)
         return Group(f"{node.name} \u00d7\u00a0{count}", self.visit(node.element, start + step, depth + 1))
-
-
-def _is_spare(name: str) -> bool:
-    """Whether a field is there for nothing yet, by the names that manuals give such fields."""
-    return name.startswith(("reserved", "unused", "spare", "zeros", "padding"))
 
 
 #: bits in a row, pixels of a bit and of a row, of the offsets at the left, of a level of brackets, and around everything.

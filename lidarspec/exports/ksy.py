@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -53,27 +53,20 @@ def _lines(value: Any, indent: str) -> Iterator[str]:
 
 
 def _entry(head: str, part: Any, indent: str) -> Iterator[str]:
-    if (isinstance(part, Mapping) and part) or (_is_list(part) and any(isinstance(item, Mapping | list) for item in part)):
+    if (isinstance(part, Mapping) and part) or (isinstance(part, list) and any(isinstance(item, Mapping | list) for item in part)):
         yield head
         yield from _lines(part, indent)
     elif isinstance(part, Mapping):
         yield f"{head} {{}}"
-    elif _is_list(part):
+    elif isinstance(part, list):
         yield f"{head} [{', '.join(_scalar(item) for item in part)}]"
     else:
         yield f"{head} {_scalar(part)}"
 
 
-def _is_list(value: Any) -> bool:
-    return isinstance(value, Sequence) and not isinstance(value, str)
-
-
 def _scalar(value: Any) -> str:
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    if isinstance(value, str):
-        return value if _PLAIN.fullmatch(value) and value.lower() not in _WORDS else json.dumps(value, ensure_ascii=False)
-    return repr(value)
+    plain = isinstance(value, str) and _PLAIN.fullmatch(value) and value.lower() not in _WORDS
+    return value if plain else json.dumps(value, ensure_ascii=False) if isinstance(value, str | bool) else repr(value)
 
 
 def identifier(name: str) -> str:

@@ -115,7 +115,8 @@ def _sensor(sensor: Sensor, frames: tuple[Message, ...], names: dict[str, str]) 
     commands = "\n".join(_command(name, command) for name, command in sensor.commands.items())
     rest = "    @overload\n    def command(self, name: str, **arguments: Any) -> bytes: ..." if len(sensor.commands) > 0 else ""
     literals = ", ".join(f'"{name}"' for name in names)
-    fields = ", ".join(f'"{path}"' for path in _paths(sensor))
+    data = next((message.frame for message in frames if message.frame.data), frames[0].frame)
+    fields = ", ".join(f'"{path}"' for path in schema(data.tree).fields)
     return f'''FrameName = Literal[{literals}]
 FieldPath = Literal[{fields}]
 
@@ -149,12 +150,6 @@ def _build(message: Message) -> str:
 def _command(name: str, command: Command) -> str:
     args = "".join(f", {arg}: float" for arg in command.args)
     return f'    @overload\n    def command(self, name: Literal["{name}"]{", *" * bool(args)}{args}) -> bytes: ...'
-
-
-def _paths(sensor: Sensor) -> list[str]:
-    """The fields of the data frame, as packets name them."""
-    frame = next((frame for frame in sensor.frames.values() if frame.data), None) or next(iter(sensor.frames.values()))
-    return list(schema(frame.tree).fields)
 
 
 def _quoted(said: str) -> str:

@@ -316,13 +316,6 @@ local marks = {{
 }}
 """
 
-_REGISTERED = """
-local listed = {}
-for _, field in pairs(fields) do table.insert(listed, field) end
-proto.fields = listed
-proto.experts = {marks.checksum, marks.constant, marks.short, marks.skipped}
-"""
-
 
 def dissector(sensor: Sensor) -> str:
     """A Lua dissector for Wireshark: of the sensor's UDP and TCP ports, and of captures of a serial line.
@@ -343,7 +336,7 @@ def dissector(sensor: Sensor) -> str:
         title=title, version=__version__, source=" ".join(sensor.source.split()), name=quoted(name), title_quoted=quoted(title)
     )
     walker = resources.files("lidarspec.exports").joinpath("wireshark.lua").read_text(encoding="utf-8")
-    return "\n".join([head, f"local sensor = {lua(about)}", _REGISTERED, walker])
+    return "\n".join([head, f"local sensor = {lua(about)}\n", walker])
 
 
 def _frame(message: Message, name: str) -> dict[str, Any]:

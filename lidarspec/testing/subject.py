@@ -6,7 +6,6 @@ Everything that is drawn is seeded, so that what fails once fails again.
 
 from __future__ import annotations
 
-import contextlib
 import os
 import random
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -14,7 +13,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from lidarspec.errors import WireError
 from lidarspec.framing.frame_engine import codec
 from lidarspec.simulation.frame_maker import examples
 from lidarspec.spec import Frame, Sensor
@@ -101,16 +99,6 @@ def seals(sensor: Sensor, name: str, data: bytes) -> set[str]:
         return {path for node in nodes(sensor.frames[name].tree) if isinstance(node, Sealed) for path in node.fields}
     found = layout.layout(data)
     return {leaf.info.path for seal in getattr(found, "seals", ()) for leaf in seal.leaves}
-
-
-def fitting(sensor: Sensor, data: bytes) -> list[str]:
-    """The frame types that these bytes can be."""
-    found = []
-    for name in sensor.frames:
-        with contextlib.suppress(WireError):
-            sensor.parse(data, frame=name)
-            found.append(name)
-    return found
 
 
 #: examples of each frame type that a property tries.
