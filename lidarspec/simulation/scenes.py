@@ -3,19 +3,19 @@
 Everything is upright boxes in the sensor's axes: x forward, y left, z up, metres, the sensor at the origin. Beams may begin beside
 the origin, and what moves stands elsewhere at another time, so both can be given for each beam. A scene is read from a small TOML file:
 
-[room]                                  # walls, floor and ceiling; left out: in the open
-low = [-3.0, -2.2, -1.2]                # metres, in the sensor's axes: x forward, y left, z up
-high = [4.6, 3.1, 1.6]
+    [room]                                  # walls, floor and ceiling; left out: in the open
+    low = [-3.0, -2.2, -1.2]                # metres, in the sensor's axes: x forward, y left, z up
+    high = [4.6, 3.1, 1.6]
 
-[[box]]
-low = [2.0, 0.8, -1.2]
-high = [2.7, 1.6, 0.9]
+    [[box]]
+    low = [2.0, 0.8, -1.2]
+    high = [2.7, 1.6, 0.9]
 
-[[mover]]                               # goes along its path and back again
-size = [0.4, 0.5, 1.7]
-path = [[1.4, -1.5], [0.8, 1.9]]
-speed = 0.8                             # metres a second
-floor = -1.2
+    [[mover]]                               # goes along its path and back again
+    size = [0.4, 0.5, 1.7]
+    path = [[1.4, -1.5], [0.8, 1.9]]
+    speed = 0.8                             # metres a second
+    floor = -1.2
 """
 
 from __future__ import annotations

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import doctest
 import importlib
 import inspect
@@ -124,3 +125,15 @@ def test_every_page_is_in_the_contents_of_the_site() -> None:
     listed = re.findall(r": (\S+\.md)$", contents, re.MULTILINE)
     sensors = "reference/sensors/"
     assert sorted(listed) == [page for page in PAGES if not page.startswith(sensors) or page == f"{sensors}index.md"]
+
+
+HOUSE = Path(ls.__file__).parent
+
+
+@pytest.mark.parametrize("package", sorted(path.parent.relative_to(HOUSE).as_posix() for path in HOUSE.glob("*/**/__init__.py")))
+def test_a_package_says_what_comes_in_and_out_and_names_its_modules(package: str) -> None:
+    text = ast.get_docstring(ast.parse((HOUSE / package / "__init__.py").read_text(encoding="utf-8"))) or ""
+    assert "In: " in text
+    assert "Out: " in text
+    modules = {path.stem for path in (HOUSE / package).iterdir() if path.suffix == ".py" or (path / "__init__.py").is_file()}
+    assert modules - {"__init__"} <= set(re.findall(r"`(\w+)`", text))
