@@ -76,7 +76,7 @@ _Failure = TypeVar("_Failure", bound=BaseException)
 
 
 def suggest(error: _Failure, command: str) -> _Failure:
-    """The same error with the next command to type, as a note; one that it has already stays."""
+    """The error that is given, with the next command to type as a note; one that it has already stays."""
     if not suggestion(error):
         error.add_note(_NEXT + command)
     return error

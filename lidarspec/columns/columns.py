@@ -118,7 +118,11 @@ class Column(NDArrayOperatorsMixin):
         return Column(array, names, self.batch, ready=ready)
 
     def on(self, *axes: str) -> Column:
-        """The same values on other axes, by the names of arrays; its own axes go to the last of those named."""
+        """The column's values on other axes, by the names of arrays; its own axes go to the last of those named.
+
+        Raises:
+            SpecError: for fewer axes than the column has, or an array that the frame does not have.
+        """
         chain = self.batch.table.schema.chain()
         own = [index for index, name in enumerate(self.axes) if name is not None]
         if len(axes) < len(own):
@@ -134,7 +138,7 @@ class Column(NDArrayOperatorsMixin):
         return np.arange(int(np.nanmax(self.array, initial=0)))
 
     def shifted(self, step: int) -> Column:
-        """The values `step` places later (earlier if negative) in stream order; see `spec.vocabulary.following`."""
+        """The values `step` places later (earlier if negative) in stream order, on the same axes; nan across a loss and at the end."""
         row = RowOfValues(self)
         size = abs(step)
         slot = len(self.batch.left)
@@ -155,7 +159,11 @@ class Column(NDArrayOperatorsMixin):
         return Column(row.spread(shifted[len(carried) :]), self.axes, self.batch, ready=max(ready, 0))
 
     def latest(self, where: Any = None) -> Column:
-        """The most recent value at which `where` was true; see `spec.vocabulary.last`."""
+        """The most recent value at which `where` was true, this one included; nan before the first.
+
+        Args:
+            where: a condition that lines up with the column; by default where its value is finite.
+        """
         (values, flags), axes, ready = aligned((self, np.isfinite(self) if where is None else where), self.batch)
         shape = np.broadcast_shapes(values.shape, flags.shape)
         both = [Column(np.broadcast_to(array, shape), axes, self.batch, ready=ready) for array in (values, flags)]

@@ -83,7 +83,7 @@ class Match:
         remarks: what else is to be said.
         name: what a catalogue calls it.
         open: whether other parameters fit these frames as well.
-        varied: how much that byte of its place varies that varies least, see `Samples.varied`.
+        varied: how much that byte of its place varies that varies least, as `Samples.varied` has it.
     """
 
     algorithm: Checksum
@@ -224,7 +224,14 @@ def spans(place: Place, samples: Samples) -> Iterator[Span]:
 
 
 def doubt(width: int, values: NDArray[np.uint64], fitted: int, tried: int) -> float:
-    """See `Match`; `fitted` of the distinct values were used up to find the parameters, and `tried` checksums were looked at."""
+    """How many bits of doubt a match leaves: of 2**doubt wrong checksums one would fit as well by chance.
+
+    Args:
+        width: of the checksum, bits.
+        values: what the frames hold in its place, (n,).
+        fitted: how many distinct values were used up to find the parameters.
+        tried: checksums that were looked at.
+    """
     return width * (len(np.unique(values)) - fitted) - float(np.log2(max(tried, 1)))
 
 

@@ -346,7 +346,7 @@ class Access:
 
     @property
     def span(self) -> tuple[int, Extent]:
-        """Its first byte, and the end of its last, from the start of the entry."""
+        """The first byte of the word and the end of its last, from the start of the entry."""
         if self.part is None:
             return 0, self.entry.size
         offsets = [segment.byte for segment in self.part.bits.segments]

@@ -61,7 +61,7 @@ class Codec(Protocol):
             offsets: those whose prefix does not match must be left out.
             kind: index of this type.
             gathered: whether their bytes are wanted too, as `Frames.rows`.
-            sums: see `Judge`.
+            sums: what computes checksums; by default their algorithms.
         """
 
     def survey_rows(self, rows: NDArray[np.uint8], *, sums: Sums | None = None) -> tuple[Layout, Status, tuple[str, ...]] | None:

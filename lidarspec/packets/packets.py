@@ -104,12 +104,15 @@ class Packets:
         return self.table.counts(array)
 
     def points(self) -> PointCloud:
-        """The points of all packets in stream order; see `PointCloud`."""
+        """The points of all packets in stream order, flat; columns are made when they are read.
 
+        Raises:
+            SpecError: where the sensor's `points` function fails, or returns columns that do not fit.
+        """
         return cloud_of(self)
 
     def take(self, which: Any) -> Packets:
-        """Some of the packets: by indices, a mask or a slice."""
+        """The packets that indices, a mask or a slice pick, with their times, offsets and state."""
         indices = np.arange(len(self))[which]
         return Packets(
             self.sensor,
@@ -126,7 +129,7 @@ class Packets:
         )
 
     def batch(self, carry: dict[int, NDArray[np.float64]] | None = None) -> Batch:
-        """What `points` and `plausible` functions are given, see `Fields`."""
+        """The packets as a plugin's functions are given them, through `Fields`; `carry`: what the batch before left."""
         return Batch(self.table, self.breaks, self.state, self.sensor.state, dict(carry or {}))
 
 

@@ -35,7 +35,7 @@ class PacketStream:
         sensor, frame: whose, and of which type.
         stats: the decoder's counters; lost, duplicate and late packets are added to them.
         interpreted: parse with construct.
-        backend: see `Decoder`.
+        backend: what makes points of the packets, "auto", "numpy", "jit" or "construct".
         state: frames of other types, by name, that count as seen before the first packet.
     """
 

@@ -86,7 +86,7 @@ class PointCloud:
         return np.stack([self.x, self.y, self.z], axis=1)
 
     def __getitem__(self, which: Any) -> PointCloud:
-        """Some of the points, by mask, indices or slice; organised only if the slice holds whole columns."""
+        """The points that a mask, indices or a slice pick; organised only if a slice holds whole columns."""
         picked = {f.name: _pick(getattr(self, f.name), which) for f in fields(self)}
         shape = None
         if self.shape and isinstance(which, slice) and which.step in (None, 1):
@@ -330,7 +330,7 @@ class Mount:
         return np.asarray(about_z @ about_y @ about_x)
 
     def applied(self, cloud: PointCloud) -> PointCloud:
-        """The same points in the carrier's axes.
+        """A cloud, given in the sensor's axes, in those of the carrier.
 
         Returns:
             x y z from the carrier's origin; azimuth and elevation of the beams in its axes. `range` stays what the sensor

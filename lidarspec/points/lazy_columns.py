@@ -105,7 +105,7 @@ class Share:
         return np.broadcast_to(array, shape)
 
     def some(self, which: NDArray[np.intp]) -> Share:
-        """The same for some of the packets, by index."""
+        """The share of some of the packets, by index, with what is known of them plainly."""
         group = Group(self.group.layout, which, self.group.rows[which])
         batch = self.batch.of(group)
         known = Plain(batch)

@@ -3,6 +3,8 @@
 No inverse of `points` is written anywhere: `points` says where the beams go, and by giving each field in metres a probing value it is
 found out which points answer to it. Where direction depends on range the measurement is repeated; a beam that finds no fixed point is a
 no-return. A frame type with an `encode` of its own is given the measured points and returns the values of its fields.
+
+Points by coordinates (M2) are linear in the range: with the directions declared in `Simulation`, each coordinate is written back here.
 """
 
 from __future__ import annotations

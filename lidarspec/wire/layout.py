@@ -144,7 +144,7 @@ class Leaf:
         return total
 
     def at(self, offset: int) -> Leaf:
-        """This field with its place counted from `offset`."""
+        """The field with its place counted from `offset`."""
         return replace(self, offset=self.offset - offset)
 
 
@@ -215,7 +215,7 @@ class Seal:
         return single(self.algorithm)
 
     def intact(self, rows: Bytes2D, sums: Sums | None = None) -> NDArray[np.bool_]:
-        """Which frames carry the right value, or one that means "not filled", (n,); `sums` as in `computed`."""
+        """Which frames carry the right value, or one that means "not filled", (n,); `sums` computes it, by default the algorithm."""
         stored = self.stored(rows)
         right = np.asarray(stored == self.computed(rows, sums))
         return right | np.isin(stored, np.array(self.absent, np.uint64)) if self.absent else right

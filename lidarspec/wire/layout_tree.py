@@ -490,7 +490,7 @@ class HeaderTree:
     def choose(
         self, source: random.Random, drawn: Mapping[str, Callable[[random.Random], int]] | None = None
     ) -> tuple[Layout, dict[str, int]]:
-        """A layout of a header chosen at random, with the values of the fields it depends on, by path; see `choose`."""
+        """A layout of a header chosen at random, with the raw values of the fields it depends on, by path."""
         return choose(self._frame, self._limit, source, drawn or {})
 
     def _branch(

@@ -77,7 +77,13 @@ class Kernel:
         return {name: np.empty(number * self._width, np.float32) for name in self._text.names}
 
     def run(self, rows: Bytes2D, values: Values, columns: Mapping[str, NDArray[Any]]) -> None:
-        """Fill the columns of all frames; see `plan.Maker`."""
+        """Fill the columns of all frames.
+
+        Args:
+            rows: the frames, at one distance from each other.
+            values: the plain result of a node for these frames, shape (n or 1, ...).
+            columns: flat, contiguous and as long as `columns` makes them.
+        """
         self.compile()
         count, stride = rows.shape[0], rows.strides[0]
         given: list[Any] = []

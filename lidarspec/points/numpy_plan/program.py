@@ -140,7 +140,13 @@ class Program:
         return {name: np.empty(number * self.width, TYPES[self.kinds[register]]) for name, register in self.outputs.items()}
 
     def run(self, rows: Bytes2D, values: Values, columns: Mapping[str, NDArray[Any]]) -> None:
-        """Fill the columns of all frames; see `plan.Maker`."""
+        """Fill the columns of all frames.
+
+        Args:
+            rows: the frames, at one distance from each other.
+            values: the plain result of a node for these frames, shape (n or 1, ...).
+            columns: flat, contiguous and as long as `columns` makes them.
+        """
         number = len(rows)
         if not number:
             return
