@@ -89,7 +89,11 @@ def suggestion(error: BaseException) -> str:
 
 
 def refuse_text(data: object) -> None:
-    """Raise `UsageError` for a text or a path where the bytes themselves are taken."""
+    """Nothing, where bytes are given.
+
+    Raises:
+        UsageError: for a text or a path where the bytes themselves are taken.
+    """
     if isinstance(data, str | os.PathLike):
         raise UsageError(
             f"bytes are taken, not {type(data).__name__}: bytes.fromhex(...) of hexadecimal text, lidarspec.open(...) of a file"

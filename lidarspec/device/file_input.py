@@ -75,7 +75,11 @@ class FileInput:
         return 0
 
     def send(self, name: str, *, timeout: float | None = None, **arguments: object) -> Reply:
-        """Nothing can be sent to a file."""
+        """Never a reply, since there is no device behind a file.
+
+        Raises:
+            CommandError: always.
+        """
         raise CommandError(f"{self._sensor.id} {name}: {self._source} is a file, there is no device to send it to")
 
     def close(self) -> None:

@@ -93,7 +93,11 @@ def truth(value: Formula, name: Name) -> str:
 
 
 def bits(value: Formula) -> int:
-    """How many bits, besides a sign, a formula takes at most."""
+    """How many bits, besides a sign, a formula takes at most.
+
+    Raises:
+        Refused: for one that is Python code.
+    """
     if isinstance(value, Ref):
         return value.info.bits
     if isinstance(value, int):

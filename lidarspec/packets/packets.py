@@ -98,7 +98,11 @@ class Packets:
         return found
 
     def count(self, array: str) -> NDArray[np.intp]:
-        """The length of an array in each packet, (n,)."""
+        """The length of an array in each packet, (n,).
+
+        Raises:
+            UnknownField: for an array that the frame does not have.
+        """
         if array not in self.table.schema.arrays:
             raise UnknownField(array, self.table.schema.arrays, place=f"{self.sensor.id} {self.frame}")
         return self.table.counts(array)

@@ -110,7 +110,11 @@ class Measurement:
             store(table, self._intensity, np.where(first > 0, 40 + first % 160, 0))
 
     def beams(self, table: Rows) -> Beams:
-        """Where the beams of a table go as it stands."""
+        """Where the beams of a table of n packets go as it stands.
+
+        Raises:
+            SpecError: where `points` gives no `Polar` whose range depends on a field.
+        """
         number = len(table)
         state = {name: (None, np.full(number, -1, np.intp)) for name in self._sensor.state}
         batch = Batch(table, np.zeros(number, np.bool_), state, self._sensor.state)

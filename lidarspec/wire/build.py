@@ -168,7 +168,7 @@ def _scope(given: Any, path: str) -> Any:
 
 
 def given_value(given: Mapping[str, Any], fields: Mapping[str, FieldInfo], path: str) -> tuple[FieldInfo, Any] | str | None:
-    """A value that is given for a frame, as formulas read it (see `lidarspec.spec.tree.Read`).
+    """A value that is given for a frame, as formulas read it (`lidarspec.spec.tree.Read`).
 
     Raises:
         LookupError: where there is none.

@@ -157,7 +157,12 @@ class _Walk:
         return Layout(self.cursor, self.leaves, self.constants, seals, self.places, self.branches, following, self.lengths)
 
     def read(self, path: str) -> tuple[FieldInfo, int] | str | None:
-        """A field by its path, for formulas; see `lidarspec.spec.tree.Read`."""
+        """What a formula reads by a path: a field and its raw value, the path of a struct, or None for what the header leaves out.
+
+        Raises:
+            NotCompilable: for what is no field before the formula, or not one integer.
+            Unknown: for a field whose value is not given.
+        """
         if path not in self.parts:
             scope, _, name = path.rpartition(".")
             raise NotCompilable(scope, f"an expression asks for {name!r}, which is not a field before it")

@@ -214,7 +214,12 @@ def _joined(field: BitField, columns: Mapping[int, Reader], frame: bytes) -> Seq
 
 
 def parse_typed(sensor: Spec, data: bytes, *, frame: str | None = None, verify: bool = True) -> tuple[str, Any]:
-    """The name of the frame type, and the parsed frame."""
+    """The name of the frame type, and the frame as construct parses it.
+
+    Raises:
+        WireError: for bytes that are no such frame.
+        UnknownFrame: for a type that the sensor does not have.
+    """
     if not isinstance(data, bytes):
         refuse_text(data)
         data = bytes(data)
