@@ -14,7 +14,6 @@ from lidarspec.columns.columns import Batch
 from lidarspec.errors import SpecError
 from lidarspec.plugins import registry, sensor as named_sensor
 from lidarspec.points.numpy_plan import describe
-from lidarspec.points.plain import points_function
 from lidarspec.points.plan import Plan, plan_for
 from lidarspec.simulation.frame_maker import FrameMaker
 from lidarspec.spec.description import Command, Frame
@@ -53,7 +52,7 @@ def show(sensor_id: str, as_plan: bool, as_json: bool, output: str | None) -> No
     """What a sensor is, and the wire table of each of its frames."""
     sensor = named_sensor(sensor_id)
     if as_plan:
-        plans = {name: _plan(sensor, name) for name, frame in sensor.frames.items() if frame.data}
+        plans = {name: _plan(sensor, name) for name in sensor.data_frames}
         emit_json(plans, output) if as_json else emit("\n".join(line for name in plans for line in (f"{name}:", *plans[name])), output)
         return
     if as_json:
@@ -85,7 +84,7 @@ def _plan(sensor: Sensor, frame: str) -> list[str]:
     table = made.table([sweep(index) for index in range(PACKETS)]) if sweep else made.engine.table([sensor.example(frame)])
     state = {name: (None, np.full(len(table), -1, np.intp)) for name in sensor.state}
     largest = max(table.groups, key=lambda group: group.layout.size)
-    found = plan_for(points_function(sensor, frame), Batch(table, np.zeros(len(table), np.bool_), state, sensor.state), largest)
+    found = plan_for(sensor.points_of(frame), Batch(table, np.zeros(len(table), np.bool_), state, sensor.state), largest)
     return describe(found) if isinstance(found, Plan) else [f"plain evaluation: {found}"]
 
 

@@ -188,13 +188,13 @@ def _each(known: Sequence[Sensor], scored: Callable[[Sensor], Score | None]) -> 
 def _score(sensor: Sensor, chunks: Sequence[bytes], *, datagrams: bool) -> Score | None:
     decoder = sensor.decoder(stream=not datagrams)
     items = [item for chunk in chunks for item in decoder.feed(chunk)] + decoder.finish()
-    number = sum(decoder.stats.frames.get(name, 0) for name, frame in sensor.frames.items() if frame.data)
+    number = sum(decoder.stats.frames.get(name, 0) for name in sensor.data_frames)
     return Score(sensor, 1 - decoder.stats.bytes_skipped / decoder.stats.bytes_in, number, tuple(items)) if number else None
 
 
 def _from_the_middle(sensor: Sensor, chunks: Sequence[bytes], *, datagrams: bool) -> Score | None:
     """The best score of a sensor whose data frames come after others, as if one of those had been seen before."""
-    answers = [name for name, frame in sensor.frames.items() if frame.data and frame.after is not None]
+    answers = [name for name in sensor.data_frames if sensor.frames[name].after is not None]
     scored = [_score(sensor.configure(answer=name), chunks, datagrams=datagrams) for name in answers]
     best = max((score for score in scored if score is not None), key=lambda score: score.share, default=None)
     return None if best is None else replace(best, sensor=sensor)

@@ -21,7 +21,7 @@ from lidarspec.framing.results import Counters, Found, Frames, Numbers, array_of
 from lidarspec.framing.search import Framing, Mode, Piece
 from lidarspec.framing.weak_frames import cut
 from lidarspec.spec.description import Frame, Spec
-from lidarspec.wire.arrays import alike, repeated
+from lidarspec.wire.arrays import alike, keep_freed_memory, repeated
 from lidarspec.wire.layout import Sums
 
 __all__ = ["BACKENDS", "Decoder", "backend", "frames_of", "is_stream"]
@@ -51,11 +51,12 @@ class Decoder:
     """
 
     def __init__(self, sensor: Spec, *, stream: bool, interpreted: bool = False, backend: str = "auto", sums: Sums | None = None) -> None:
-        incoming = {name: frame for name, frame in sensor.frames.items() if frame.direction == "in"}
+        incoming = sensor.incoming
         if not incoming:
             raise UsageError(f"{sensor.id} has no frames yet: configure it with its file first")
         self.sensor, self.stream, self.interpreted, self.backend = sensor, stream, interpreted, backend
         self.stats = Counters()
+        keep_freed_memory()
         self._framing = _framing(tuple(incoming), tuple(incoming.values()), interpreted, sums)
         self._mode = Mode(after=_first_mode(sensor))
         self._pending, self._base, self._need = b"", 0, 0

@@ -226,7 +226,7 @@ def data_frame(sensor: Spec, found: Sequence[Frames]) -> str | None:
     Returns:
         None where the sensor has several, none is configured, and none has arrived yet.
     """
-    names = [name for name, frame in sensor.frames.items() if frame.data]
+    names = sensor.data_frames
     if len(names) < 2 or sensor.options.get("answer") in names:
         return sensor.data_frame
     arrived = (frames.names[kind] for frames in found for kind in frames.kinds[np.isin(frames.kinds, _kinds(frames, names))][:1].tolist())

@@ -17,7 +17,7 @@ from lidarspec.errors import SpecError
 from lidarspec.points.cloud import LazyCloud, PointCloud
 from lidarspec.points.conventions import rows_of
 from lidarspec.points.lazy_columns import BatchColumns, Plain, Share
-from lidarspec.points.plain import Evaluated, PacketBatch, evaluate, points_function, stamp_of
+from lidarspec.points.plain import Evaluated, PacketBatch, evaluate, stamp_of
 from lidarspec.points.plan import REMEMBERING, Plan, plan_for
 from lidarspec.wire.frame_table import Group, Rows, ascends
 
@@ -50,7 +50,7 @@ def _planned(packets: PacketBatch, carry: Carry | None, *, final: bool, epoch: i
     if not isinstance(table, Rows) or not table.groups:
         return None
     batch = packets.batch(carry)
-    function = points_function(packets.sensor, packets.frame)
+    function = packets.sensor.points_of(packets.frame)
     try:
         plans = [plan for group in table.groups if isinstance(plan := plan_for(function, batch, group), Plan)]
     except Exception:

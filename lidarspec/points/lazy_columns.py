@@ -25,7 +25,6 @@ from lidarspec.points.cloud import ColumnSource, Stretch, later
 from lidarspec.points.conventions import TYPES, narrowed, numbers_of, seconds_since, turned_azimuth, vendor_turn
 from lidarspec.points.plain import PacketBatch
 from lidarspec.points.plan import REMEMBERING, Maker, Plan
-from lidarspec.wire.arrays import keep_freed_memory
 from lidarspec.wire.frame_table import Group
 
 _MAIN = ("x", "y", "z", "intensity")
@@ -283,7 +282,6 @@ class BatchColumns(ColumnSource):
         self.size, self.base, self.rows, self.nominal = size, base, rows, nominal
         self._made: dict[str, NDArray[Any]] = {}
         self._blocks: list[Block] = []
-        keep_freed_memory()
 
     @property
     def even(self) -> Share | None:

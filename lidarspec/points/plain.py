@@ -8,7 +8,6 @@ Columns that a sensor adds under names of its own (M5) join `parts_of`; points b
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, fields
 from typing import Any, Protocol
 
@@ -81,18 +80,6 @@ class Evaluated:
     axes: tuple[str | None, ...]
 
 
-def points_function(sensor: Spec, frame: str) -> Callable[[Any], Points]:
-    """The function that makes points of this frame type.
-
-    Raises:
-        SpecError: where the frame type has no points.
-    """
-    function = sensor.frames[frame].points or (sensor.points if sensor.frames[frame].data else None)
-    if function is None:
-        raise SpecError("this frame type has no points", path=frame, sensor=sensor.id)
-    return function
-
-
 def evaluate(packets: PacketBatch, carry: Carry | None = None, *, final: bool = True, epoch: int | None = None) -> Evaluated:
     """The points of a batch.
 
@@ -107,7 +94,7 @@ def evaluate(packets: PacketBatch, carry: Carry | None = None, *, final: bool = 
     batch = packets.batch(carry)
     try:
         with np.errstate(all="ignore"):
-            result = points_function(packets.sensor, packets.frame)(Fields(batch))
+            result = packets.sensor.points_of(packets.frame)(Fields(batch))
             if not isinstance(result, Polar | Cartesian):
                 raise TypeError(f"has to return Polar or Cartesian, not {type(result).__name__}")
             return _flattened(packets, result, batch, stamp_of(packets, epoch), final=final)

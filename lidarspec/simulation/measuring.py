@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 
 from lidarspec.columns.columns import Batch, Column, Fields, aligned
 from lidarspec.errors import SpecError
-from lidarspec.points.plain import points_function
 from lidarspec.simulation.scenes import Scene
 from lidarspec.spec.description import Spec
 from lidarspec.spec.fields import factor
@@ -76,7 +75,7 @@ class Measurement:
 
     def __init__(self, sensor: Spec, frame: str, table: Rows) -> None:
         self._sensor = sensor
-        self._points = points_function(sensor, frame)
+        self._points = sensor.points_of(frame)
         self._encode: Callable[[Polar], Mapping[str, Any]] | None = sensor.simulation_of(frame).encode
         self._targets = () if self._encode else self._traced(table)
         self._intensity = self.beams(table).intensity

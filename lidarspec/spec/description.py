@@ -229,9 +229,16 @@ class Spec:
         """The names of the frame types that carry points."""
         return tuple(name for name, frame in self.frames.items() if frame.data)
 
-    def points_of(self, frame: str) -> Callable[[Any], Points] | None:
-        """The `points` function of a frame type: its own, or the sensor's."""
-        return self.frames[frame].points or self.points
+    def points_of(self, frame: str) -> Callable[[Any], Points]:
+        """The `points` function of a frame type: its own, or for data the sensor's.
+
+        Raises:
+            SpecError: where the frame type has no points.
+        """
+        function = self.frames[frame].points or (self.points if self.frames[frame].data else None)
+        if function is None:
+            raise SpecError("this frame type has no points", path=frame, sensor=self.id)
+        return function
 
     def simulation_of(self, frame: str) -> Simulation:
         """What a simulation of one frame type needs: the frame's own, and for data the sensor's where the frame has none."""

@@ -257,7 +257,7 @@ class Places:
         if sensor is None or frame not in sensor.frames:
             return None
         functions = {
-            "points": sensor.points_of(frame),
+            "points": sensor.frames[frame].points or sensor.points,
             "plausible": sensor.frames[frame].plausible,
             "sweep": sensor.simulation_of(frame).sweep,
         }

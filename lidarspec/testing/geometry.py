@@ -22,7 +22,7 @@ from lidarspec.columns.graph import Node, sample_of, trace, traverse
 from lidarspec.errors import LidarSpecError, SpecError, UsageError
 from lidarspec.framing.frame_engine import CompiledCodec, codec
 from lidarspec.packets.packets import Packets
-from lidarspec.points.plain import evaluate, points_function
+from lidarspec.points.plain import evaluate
 from lidarspec.simulation.frame_maker import FrameMaker, examples, sealed
 from lidarspec.simulation.scenes import Room, furnished
 from lidarspec.simulation.simulator import simulation
@@ -86,7 +86,7 @@ def traced(subject: Subject, name: str) -> Any:
     packets = read(subject, name, [subject.example(name)] * subject.sensor.frames[name].confirm)
     if not isinstance(packets.table, Rows) or not packets.table.groups:
         return None
-    return trace(points_function(subject.sensor, name), sample_of(packets.batch(), packets.table.groups[0]))[0]
+    return trace(subject.sensor.points_of(name), sample_of(packets.batch(), packets.table.groups[0]))[0]
 
 
 def used(value: Any, *, looked_up: bool = True) -> list[Node]:
@@ -115,7 +115,7 @@ def beams(subject: Subject, name: str, packets: Packets) -> Beams | None:
     """The directions of the points of some packets; None where they are not polar."""
     batch = packets.batch()
     with np.errstate(all="ignore"):
-        polar = points_function(subject.sensor, name)(Fields(batch))
+        polar = subject.sensor.points_of(name)(Fields(batch))
         if not isinstance(polar, Polar):
             return None
         arrays, axes, _ = aligned((polar.azimuth, polar.elevation, polar.range), batch)

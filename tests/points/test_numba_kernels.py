@@ -17,7 +17,7 @@ import lidarspec
 from lidarspec import Packets, UsageError
 from lidarspec.points.evaluate import evaluated
 from lidarspec.points.numba_kernels import checksums as kernelsums
-from lidarspec.points.plain import evaluate, points_function
+from lidarspec.points.plain import evaluate
 from lidarspec.points.plan import Plan, plan_for
 from lidarspec.simulation.simulator import opening, simulate
 from lidarspec.spec import Checksum, Crc, Fields, Polar, WordXor, Xor
@@ -81,7 +81,7 @@ def test_all_sensors_of_this_repository_have_a_kernel(name: str, answer: str) ->
 
 def plan(packets: Packets) -> Plan:
     assert isinstance(packets.table, Rows)
-    found = plan_for(points_function(packets.sensor, packets.frame), packets.batch(), packets.table.groups[0])
+    found = plan_for(packets.sensor.points_of(packets.frame), packets.batch(), packets.table.groups[0])
     assert isinstance(found, Plan), str(found)
     return found
 

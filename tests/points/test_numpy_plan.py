@@ -12,7 +12,7 @@ import pytest
 import lidarspec
 from lidarspec import Packets, Sensor
 from lidarspec.points.evaluate import evaluated
-from lidarspec.points.plain import evaluate, points_function
+from lidarspec.points.plain import evaluate
 from lidarspec.points.plan import Plan, plan_for
 from lidarspec.spec import Fields, Polar
 from lidarspec.spec.links import is_datagram
@@ -29,7 +29,7 @@ PLAIN = {"shape-numbers": "floating-point", "shape-text": "compiled"}
 
 def plan(packets: Packets) -> Any:
     assert isinstance(packets.table, Rows)
-    return plan_for(points_function(packets.sensor, packets.frame), packets.batch(), packets.table.groups[0])
+    return plan_for(packets.sensor.points_of(packets.frame), packets.batch(), packets.table.groups[0])
 
 
 def packets_of(sensor: Sensor, number: int) -> Packets:

@@ -13,7 +13,7 @@ import pytest
 import lidarspec
 from lidarspec import Packets, Sensor
 from lidarspec.points.evaluate import evaluated
-from lidarspec.points.plain import evaluate, points_function
+from lidarspec.points.plain import evaluate
 from lidarspec.points.plan import Plan, plan_for
 from lidarspec.simulation.simulator import simulate
 from lidarspec.spec import Fields, Polar, following, previous, spread, take, wrap
@@ -119,7 +119,7 @@ def packets_of(name: str, seed: int, backend: str) -> Packets:
 @pytest.mark.parametrize("seed", range(60))
 def test_the_plan(name: str, seed: int) -> None:
     packets = packets_of(name, seed, "numpy")
-    found = plan_for(points_function(packets.sensor, "data"), packets.batch(), packets.table.groups[0])  # type: ignore[attr-defined]
+    found = plan_for(packets.sensor.points_of("data"), packets.batch(), packets.table.groups[0])  # type: ignore[attr-defined]
     assert isinstance(found, Plan), found
     assert_same_points(evaluated(packets).cloud, evaluate(packets).cloud)
 

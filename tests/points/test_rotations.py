@@ -14,7 +14,7 @@ from lidarspec import Sensor
 from lidarspec.columns.columns import remainder
 from lidarspec.points.evaluate import evaluated
 from lidarspec.points.numpy_plan import describe
-from lidarspec.points.plain import evaluate, points_function
+from lidarspec.points.plain import evaluate
 from lidarspec.points.plan import Plan, plan_for
 from lidarspec.simulation.simulator import simulate
 from lidarspec.spec import Fields, Polar, spread
@@ -28,7 +28,7 @@ def steps_in(azimuth: Callable[[Fields], Any]) -> tuple[Sensor, list[str]]:
     """A sensor with another direction, and the steps of its plan."""
     sensor = dataclasses.replace(STL27L, points=lambda f: Polar(range=f.points.distance, azimuth=azimuth(f)))
     packets = sensor.decode(b"".join(simulate(STL27L, 3)))
-    plan = plan_for(points_function(sensor, "data"), packets.batch(), packets.table.groups[0])  # type: ignore[attr-defined]
+    plan = plan_for(sensor.points_of("data"), packets.batch(), packets.table.groups[0])  # type: ignore[attr-defined]
     assert isinstance(plan, Plan)
     return sensor, describe(plan)
 
