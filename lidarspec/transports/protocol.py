@@ -118,6 +118,7 @@ class LiveTransport(Transport):
 
     @property
     def addressed(self) -> bool:
+        """Whether what is written has somewhere to go: always, but for datagrams before the first one has come."""
         return True
 
     @abstractmethod
