@@ -72,7 +72,7 @@ class Alike:
     def find(
         self, storage: NDArray[np.uint8], starts: NDArray[np.intp], lengths: NDArray[np.intp]
     ) -> tuple[NDArray[np.bool_] | None, NDArray[np.int64]]:
-        """Which of these records are like it, None where all are, and their times; 128 bytes behind each start can be read."""
+        """Which of these records are like it, (n,), or None where all are, and their times, (n,) ns; 128 bytes behind each can be read."""
         same = lengths == self.length
         if not same.all():
             found = np.zeros(len(starts), np.bool_)
@@ -191,7 +191,7 @@ class Batch:
         return Batch(self.buffer, self.starts[wanted], self.sizes[wanted], self.at[wanted], self.senders[wanted], self.names)
 
     def by_sender(self) -> dict[Sender, NDArray[np.intp]]:
-        """Which datagrams came from each sender, as indices."""
+        """Which datagrams came from each sender, as indices, (k,) each."""
         if len(self.names) == 1:
             return {self.names[0]: np.arange(len(self))}
         parts = {name: np.flatnonzero(self.senders == index) for index, name in enumerate(self.names)}

@@ -134,7 +134,7 @@ class Column(NDArrayOperatorsMixin):
         return Column(self.array.reshape(self.array.shape[0], *shape), tuple(names), self.batch, ready=self.ready)
 
     def steps(self) -> NDArray[np.intp]:
-        """0, 1, 2 ... up to the largest value: the indices of an array of which this is the count."""
+        """0, 1, 2 ... up to the largest value, (m,): the indices of an array of which this column is the count."""
         return np.arange(int(np.nanmax(self.array, initial=0)))
 
     def shifted(self, step: int) -> Column:
@@ -261,7 +261,7 @@ def _only_numbers_beside(values: tuple[Any, ...]) -> bool:
 
 
 def called(function: Callable[..., Any], arrays: Sequence[Any]) -> NDArray[Any]:
-    """What a function makes of arrays that are lined up."""
+    """What a function makes of arrays that are lined up, of the shape that they broadcast to."""
     return np.asarray(remainder(*arrays) if function is np.remainder else function(*arrays))
 
 
@@ -302,7 +302,7 @@ def field_column(info: FieldInfo, table: Table, depth: int, batch: Batch, which:
 
 
 def field_array(info: FieldInfo, table: Table, depth: int) -> NDArray[np.float64]:
-    """A field in its unit, with `depth` array axes at least."""
+    """A field in its unit, (n, ...), with `depth` axes behind the first at least, of length 1 where the field has none."""
     array = physical(info, table)
     return array.reshape(*array.shape, *(1,) * (depth + 1 - array.ndim))
 

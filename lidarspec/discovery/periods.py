@@ -123,7 +123,7 @@ def candidates(rows: NDArray[np.uint8]) -> list[Candidate]:
 
 
 def values(rows: NDArray[np.uint8], offset: int, size: int, order: ByteOrder) -> NDArray[np.int64]:
-    """What stands at a place in each row."""
+    """The unsigned number at a place in each row, (n,)."""
     columns = rows[:, offset : offset + size].astype(np.int64)
     shifts = 8 * np.arange(size, dtype=np.int64)
     total: NDArray[np.int64] = (columns << (shifts if order == "little" else shifts[::-1])).sum(axis=1)

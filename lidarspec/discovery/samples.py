@@ -155,7 +155,7 @@ class Samples:
         return np.concatenate(found)
 
     def covered(self, place: Place, span: Span) -> list[NDArray[np.uint8]]:
-        """The bytes that a span covers, group by group."""
+        """The bytes that a span covers, group by group: (frames, bytes) each."""
         return [np.concatenate([group[:, a:b] for a, b in span.ranges(place, group.shape[1])], axis=1) for group in self.groups]
 
     def computed(self, algorithm: Checksum, place: Place, span: Span) -> NDArray[np.uint64]:

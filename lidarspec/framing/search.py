@@ -111,7 +111,7 @@ class Framing:
         return self.names[kind] in self.named and self.names[kind] != mode.after
 
     def switching(self, mode: Mode) -> NDArray[np.bool_]:
-        """Whether a frame of each type changes what is looked for, by its index; False for -1."""
+        """Whether a frame of each type changes what is looked for, (types + 1,), by its index; the last, for -1, is False."""
         return np.array([*(self.switches(kind, mode) for kind in range(len(self.names))), False])
 
     def survey(self, kind: int, buffer: Bytes1D, offsets: Offsets, *, gathered: bool = True) -> Frames:
@@ -141,7 +141,7 @@ class Framing:
 
 
 def matches(buffer: Bytes1D, constants: Marks) -> Offsets:
-    """Where the constants are right as far as the bytes go."""
+    """The offsets where the constants are right as far as the bytes go, (k,), ascending."""
     if not constants:
         return np.arange(len(buffer))
     length = len(buffer)

@@ -216,7 +216,7 @@ class _Part:
         return slice(first, last + 1) if last - first == len(where) - 1 else where
 
     def column(self, array: NDArray[np.int64]) -> NDArray[np.int64]:
-        """An array of the piece, for our frames."""
+        """What an array of the piece, (n,), holds for our frames."""
         return array if self.where is None else some(array, self.own)
 
 

@@ -133,7 +133,7 @@ class ColumnSource:
     nominal: bool = False
 
     def column(self, name: str) -> NDArray[Any] | None:
-        """A column of `PointCloud`, or "valid"; None where the sensor has none."""
+        """A column of `PointCloud`, (size,), or "valid"; None where the sensor has none."""
         raise NotImplementedError
 
     def holds(self, name: str) -> bool:
@@ -141,12 +141,12 @@ class ColumnSource:
         raise NotImplementedError
 
     def part(self, name: str, start: int, stop: int) -> NDArray[Any] | None:
-        """A column of some of the points."""
+        """A column of the points from `start` to `stop`, (stop - start,); None where the sensor has none."""
         column = self.column(name)
         return None if column is None else column[start:stop]
 
     def times_at(self, indices: NDArray[np.intp]) -> NDArray[np.float64]:
-        """Some values of the column "time"; the others need not be made for them."""
+        """The column "time" at some indices, of their shape, seconds since `base`; the others need not be made for them."""
         times = self.column("time")
         assert times is not None  # since every cloud has it
         picked: NDArray[np.float64] = times[indices]

@@ -54,7 +54,7 @@ class Maker(Protocol):
     """Makes some columns of the points of frames of one layout."""
 
     def columns(self, number: int) -> dict[str, NDArray[Any]]:
-        """The columns of so many frames, to be filled."""
+        """The columns of so many frames, by name, to be filled: (number * width,) each."""
 
     def run(self, rows: Bytes2D, values: Values, columns: Mapping[str, NDArray[Any]]) -> None:
         """Fill the columns of all frames.

@@ -279,7 +279,7 @@ class Layout:
             seal.fill(rows)
 
     def constant(self, rows: Bytes2D) -> NDArray[np.bool_]:
-        """Which frames have all constants in place."""
+        """Which frames have all constants in place, (n,)."""
         spots, masks, values = self._constants  # type: ignore[attr-defined]
         return np.asarray(((rows[:, spots] & masks) == values).all(axis=1))
 
@@ -319,13 +319,13 @@ def exclude(some: Marks, others: Marks) -> bool:
 
 
 def equal(found: NDArray[Any], word: Word) -> NDArray[np.bool_]:
-    """Where the right constants stand, of what stands at their place."""
+    """Whether a constant is right, for what stands at its place in each frame, of that shape."""
     _, _, mask, value = word
     return np.asarray((found if mask is None else found & mask) == value)
 
 
 def right(constants: tuple[Word, ...], rows: Bytes2D) -> NDArray[np.bool_] | None:
-    """Which rows have all constants; None where all have."""
+    """Which rows have all constants, (n,); None where all have."""
     held: NDArray[np.bool_] | None = None
     for word in constants:
         spot, dtype, _, _ = word

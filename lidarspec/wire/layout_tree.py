@@ -407,7 +407,7 @@ Group = tuple[Layout | Refused, NDArray[np.intp]]
 
 
 def rows_at(buffer: NDArray[np.uint8], offsets: NDArray[np.intp], size: int, *, gathered: bool = True) -> NDArray[np.uint8]:
-    """As many bytes from each of these offsets, one a row; no copy where they stand back to back.
+    """`size` bytes from each of these offsets on, one a row, (n, size); no copy where they stand back to back.
 
     Args:
         gathered: C-contiguous; else no copy either where they stand at one distance, and each row is contiguous by itself.

@@ -73,7 +73,7 @@ class Kernel:
         self._function = self._function or function_of(self._text.source)
 
     def columns(self, number: int) -> dict[str, NDArray[Any]]:
-        """The columns of so many frames, to be filled."""
+        """The columns of so many frames, by name, to be filled: (number * width,) each."""
         return {name: np.empty(number * self._width, np.float32) for name in self._text.names}
 
     def run(self, rows: Bytes2D, values: Values, columns: Mapping[str, NDArray[Any]]) -> None:
