@@ -7,7 +7,7 @@ order:
 * `options`, `inputs`: words as arguments: what verbs share, and where bytes come from.
 * `output`, `failures`: results as text, tables or JSON; failures as one message and an exit code.
 * `sensors`, `frames`, `build`: what is installed, what a frame says, a frame out of values.
-* `read`, `view`, `send`: a sensor at work: rows and figures, a picture, a command.
+* `read`, `view`: a sensor at work: rows and figures, a picture.
 * `recordings`, `files`: into a file and out again; from file to file.
 * `sim`: a simulated sensor on a port or in a file.
 * `finding`: which sensor, why nothing comes, which checksum.

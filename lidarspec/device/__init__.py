@@ -3,8 +3,7 @@
 In: a SOURCE and a sensor. Out: packets and scans as they come, replies to commands, counters, warnings. Modules in reading order:
 
 * `device`: `Device`, which users hold: packets and scans out of what its input gives.
-* `arrivals`: what an input is, live or not; who may have sent what arrived.
-* `file_input`: frames out of a file, as fast as they are asked for.
+* `arrivals`: what an input is, live or not, and that of a file; who may have sent what arrived.
 * `live_input`: frames as they come, decoded every few milliseconds; how the source is doing.
 * `capture_thread`: the thread behind it, which reads, records and queues.
 * `session`: commands and their replies, sans-IO.

@@ -4,8 +4,7 @@ In: a SOURCE, or bytes. Out: a verdict, findings with the command that mends the
 reading order:
 
 * `listen`: some bytes out of any source.
-* `detect`: which installed sensor sent them.
-* `identify`: whose single frames are, of a text or file that was given to be looked at.
+* `detect`: which installed sensor sent them, and whose single frames are.
 * `doctor`: why nothing comes, or nothing that can be used.
 * `samples`: frames of an unknown format, and where a checksum could stand and what it could cover.
 * `checksum_search`: which checksum seals them, plain ones by trial.

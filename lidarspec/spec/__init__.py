@@ -8,7 +8,7 @@ other package is a function. Nothing in this package reads bytes of a stream. Mo
 * `description`: `Spec`, `Frame`, `Command`, `Simulation`: what must fit together.
 * `sensor`: a `Spec` with everything that can be done with it as methods; it stands above the stations that do it.
 * `fields`: units and seals, as parts of a struct.
-* `checksums`, `row_checksums`: algorithms as values, and what they compute with where there are many frames.
+* `checksums`: algorithms as values; of one message.
 * `links`: how a sensor is connected.
 * `timing`: clocks, counters, where scans end.
 * `results`, `vocabulary`: what a `points` function returns, and what it is written with.

@@ -100,7 +100,7 @@ class Sensor(Spec):
         Raises:
             UnknownFrame: for a frame type that the sensor does not have.
         """
-        from lidarspec.simulation.frame_maker import example
+        from lidarspec.framing.examples import example
 
         return example(self, frame, seed=seed)
 

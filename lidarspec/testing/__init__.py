@@ -11,7 +11,7 @@ In: a sensor. Out: passed tests, or findings with place, reason and what to writ
 * `findings`: the rules, and how a property says that it does not hold.
 * `subject`: a sensor under test, and what it is fed.
 * `declared`: what shows in the declaration alone.
-* `frames`, `hostile`: single frames, sound and damaged.
+* `frames`: single frames, sound and damaged.
 * `geometry`: whether points are where the manual has them.
 * `commands`: requests, replies, and the simulated sensor's answers.
 * `agreement`: two ways to the same result.

@@ -2,11 +2,10 @@
 
 In: a device, or points. Out: pictures. Modules in reading order:
 
-* `live`: the window that shows a sensor at work: keys in, pictures out.
+* `live`: the window that shows a sensor at work: keys in, pictures and figures out, a recording switched on and off.
 * `feed`: what the device delivers, taken in and counted between two pictures.
-* `polar`, `panel`: points as seen from above and from the side; the figures around them.
+* `polar`: points as seen from above and from the side.
 * `canvas`: pictures in character cells, and their inks.
 * `screen`: the terminal: cells that changed, single keys.
-* `recording`: recording that is switched on and off.
 * `svg`: one scan as a file.
 """
