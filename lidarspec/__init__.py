@@ -8,12 +8,19 @@
 Here are the names of those who read a lidar; those who write a sensor find theirs in `lidarspec.spec`, and every error is in
 `lidarspec.errors`. They are imported when they are first used, so that ``lidarspec --help`` is quick.
 
-The packages are stations on the way of a byte, and import each other in one direction:
+The packages are stations on the way of a byte, and import each other in one direction; each says what comes in and what goes out:
 
     spec        what a sensor is               packets     frames of one type, in order, in time
     wire        a frame and its bytes          points      packets as point clouds
     columns     what plugins compute with      scans       where one turn ends
     framing     where frames are in bytes      device      a sensor on a source
+
+    transports  where bytes come from, go to   simulation  a sensor that is not there, from its spec
+    captures    pcap files of other tools      recording   all that came over a link, with its time
+    explaining  a frame, byte by byte          discovery   which sensor, what is wrong, a draft
+    exports     a spec for other tools         formats     scans as files
+    view        scans drawn                    testing     the test kit for authors
+    cli         the command line, on top       plugins     what is installed, and its hooks
 """
 
 from __future__ import annotations

@@ -77,7 +77,7 @@ _Failure = TypeVar("_Failure", bound=BaseException)
 
 
 def suggest(error: _Failure, command: str) -> _Failure:
-    """The same error with the next command to type, as a note; one that it has already stays."""
+    """The error that is given, with the next command to type as a note; one that it has already stays."""
     if not suggestion(error):
         error.add_note(_NEXT + command)
     return error
@@ -90,7 +90,11 @@ def suggestion(error: BaseException) -> str:
 
 
 def refuse_text(data: object) -> None:
-    """Raise `UsageError` for a text or a path where the bytes themselves are taken."""
+    """Nothing, where bytes are given.
+
+    Raises:
+        UsageError: for a text or a path where the bytes themselves are taken.
+    """
     if isinstance(data, str | os.PathLike):
         raise UsageError(
             f"bytes are taken, not {type(data).__name__}: bytes.fromhex(...) of hexadecimal text, lidarspec.open(...) of a file"

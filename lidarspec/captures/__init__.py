@@ -1,5 +1,10 @@
-"""Captures of other tools. In: a pcap or pcapng file or pipe. Out: UDP datagrams, or frames of a byte stream, with times and addresses.
+"""Captures of other tools: what stands in pcap and pcapng files.
 
-`records` knows the two file formats, `ip` what is in a captured frame; `pcap` joins the two and writes captures, and `bulk` gives
-datagrams by the hundred, as arrays.
+In: a capture, as a file or a pipe. Out: UDP datagrams with times and addresses, one by one or by the hundred; of a captured byte stream,
+its pieces. Whatever gives no datagram is counted, and no bytes raise past the first four. Modules in reading order:
+
+* `records`: the two file formats: their records, one by one and many alike.
+* `ip`: from a captured frame to the payload of a datagram: link layers, IP, fragments.
+* `pcap`: both joined: a reader that gives datagrams, and a writer.
+* `bulk`: the datagrams of a capture as arrays, where they stand in a buffer.
 """

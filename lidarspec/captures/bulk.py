@@ -72,7 +72,7 @@ class Alike:
     def find(
         self, storage: NDArray[np.uint8], starts: NDArray[np.intp], lengths: NDArray[np.intp]
     ) -> tuple[NDArray[np.bool_] | None, NDArray[np.int64]]:
-        """Which of these records are like it, None where all are, and their times; 128 bytes behind each start can be read."""
+        """Which of these records are like it, (n,), or None where all are, and their times, (n,) ns; 128 bytes behind each can be read."""
         same = lengths == self.length
         if not same.all():
             found = np.zeros(len(starts), np.bool_)
@@ -184,14 +184,14 @@ class Batch:
         return self.buffer[self.starts[index] : self.starts[index] + self.sizes[index]].tobytes()
 
     def of(self, host: str) -> Batch:
-        """Those that come from this address."""
+        """The datagrams of the batch that come from one address."""
         if all(name[0] == host for name in self.names):
             return self
         wanted = np.array([name[0] == host for name in self.names], np.bool_)[self.senders]
         return Batch(self.buffer, self.starts[wanted], self.sizes[wanted], self.at[wanted], self.senders[wanted], self.names)
 
     def by_sender(self) -> dict[Sender, NDArray[np.intp]]:
-        """Which datagrams came from each sender, as indices."""
+        """Which datagrams came from each sender, as indices, (k,) each."""
         if len(self.names) == 1:
             return {self.names[0]: np.arange(len(self))}
         parts = {name: np.flatnonzero(self.senders == index) for index, name in enumerate(self.names)}
@@ -226,7 +226,7 @@ def first_frames(decoder: Decoder, batches: Iterable[Batch], wanted: Collection[
 
 
 class CaptureBatches(CaptureReader):
-    """The same datagrams as `CaptureReader`'s, in batches; to be read either way, not both."""
+    """The datagrams of a capture in batches of arrays, which say of each what `CaptureReader` says; read either way, not both."""
 
     def _reading(self, file: BinaryIO) -> Source:
         return Source(file, largest=LARGEST)
@@ -315,7 +315,7 @@ class _Records:
         return Batch(buffer, columns[0], columns[1], columns[2], columns[3], tuple(names))
 
     def _uniform(self, kind: Alike) -> Batch:
-        """The same where all records are of one kind."""
+        """What was read at once, as a batch, where all records are of one kind; columns are of shape (n,)."""
         number = len(self._at)
         self._reader.stats.packets += number - self._counted
         sizes, senders = (np.broadcast_to(np.intp(fact), number) for fact in (kind.size, 0))

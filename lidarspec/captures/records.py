@@ -150,7 +150,7 @@ class Source:
         return self._has(len(self._data) - self.at + 1)
 
     def lent(self) -> NDArray[np.uint8]:
-        """What is in the buffer, read-only: not written to again while this array or a view of it is alive."""
+        """The bytes in the buffer, (n,), read-only: not written to again while this array or a view of it is alive."""
         array = np.frombuffer(self._view[: len(self._data)], np.uint8)
         array.flags.writeable = False
         self._lent = weakref.ref(array)
@@ -253,7 +253,7 @@ class Times:
         return self.ticks <= 9 * _SECOND and abs(self.offset) < 1 << 62
 
     def ns(self, heads: NDArray[np.uint8]) -> tuple[NDArray[np.int64], NDArray[np.bool_] | None]:
-        """Times of records in ns since 1970, and which of them are right; None where all are."""
+        """Times of n records, (n,) ns since 1970, and which of them are right, (n,); None where all are."""
         words = heads.view(self.word)
         high, low = words[:, self.high].astype(np.int64), words[:, self.low]
         if self.is_split:

@@ -1,7 +1,17 @@
-"""The command line. In: the words of a command. Out: text or JSON, an exit code, and one message with the next command where it fails.
+"""The command line: a verb is a public function of a package, called with what was typed.
 
-`root` has the verbs and loads the module of one when it is asked for; `main` is the entry point. What a verb can do is a public function
-of a package: the modules here turn words into its arguments (`options`, `inputs`) and what it gives into text (`output`, `failures`).
+In: the words of a command. Out: text or JSON, an exit code, and one message with the next command where it fails. Modules in reading
+order:
+
+* `root`: the verbs, each loaded when it is asked for; `main`, the entry point.
+* `options`, `inputs`: words as arguments: what verbs share, and where bytes come from.
+* `output`, `failures`: results as text, tables or JSON; failures as one message and an exit code.
+* `sensors`, `frames`, `build`: what is installed, what a frame says, a frame out of values.
+* `read`, `view`: a sensor at work: rows and figures, a picture.
+* `recordings`, `files`: into a file and out again; from file to file.
+* `sim`: a simulated sensor on a port or in a file.
+* `finding`: which sensor, why nothing comes, which checksum.
+* `authors`: for those who write a sensor: a new one, its check, its exports.
 """
 
 from lidarspec.cli.root import main

@@ -116,7 +116,7 @@ def scans_of(device: Device, source: str) -> Iterator[Scan]:
     """The scans of a device, which has to send its first frame in time.
 
     Raises:
-        CommandError, WireError: see `Patience`.
+        CommandError, WireError: where the device has sent nothing, or nothing of the sensor's, for too long.
     """
     patience = Patience(device, source)
     for scan in device.scans(wait=LOOK):

@@ -118,7 +118,11 @@ class Column(NDArrayOperatorsMixin):
         return Column(array, names, self.batch, ready=ready)
 
     def on(self, *axes: str) -> Column:
-        """The same values on other axes, by the names of arrays; its own axes go to the last of those named."""
+        """The column's values on other axes, by the names of arrays; its own axes go to the last of those named.
+
+        Raises:
+            SpecError: for fewer axes than the column has, or an array that the frame does not have.
+        """
         chain = self.batch.table.schema.chain()
         own = [index for index, name in enumerate(self.axes) if name is not None]
         if len(axes) < len(own):
@@ -130,11 +134,11 @@ class Column(NDArrayOperatorsMixin):
         return Column(self.array.reshape(self.array.shape[0], *shape), tuple(names), self.batch, ready=self.ready)
 
     def steps(self) -> NDArray[np.intp]:
-        """0, 1, 2 ... up to the largest value: the indices of an array of which this is the count."""
+        """0, 1, 2 ... up to the largest value, (m,): the indices of an array of which this column is the count."""
         return np.arange(int(np.nanmax(self.array, initial=0)))
 
     def shifted(self, step: int) -> Column:
-        """The values `step` places later (earlier if negative) in stream order; see `spec.vocabulary.following`."""
+        """The values `step` places later (earlier if negative) in stream order, on the same axes; nan across a loss and at the end."""
         row = RowOfValues(self)
         size = abs(step)
         slot = len(self.batch.left)
@@ -155,7 +159,11 @@ class Column(NDArrayOperatorsMixin):
         return Column(row.spread(shifted[len(carried) :]), self.axes, self.batch, ready=max(ready, 0))
 
     def latest(self, where: Any = None) -> Column:
-        """The most recent value at which `where` was true; see `spec.vocabulary.last`."""
+        """The most recent value at which `where` was true, this one included; nan before the first.
+
+        Args:
+            where: a condition that lines up with the column; by default where its value is finite.
+        """
         (values, flags), axes, ready = aligned((self, np.isfinite(self) if where is None else where), self.batch)
         shape = np.broadcast_shapes(values.shape, flags.shape)
         both = [Column(np.broadcast_to(array, shape), axes, self.batch, ready=ready) for array in (values, flags)]
@@ -253,7 +261,7 @@ def _only_numbers_beside(values: tuple[Any, ...]) -> bool:
 
 
 def called(function: Callable[..., Any], arrays: Sequence[Any]) -> NDArray[Any]:
-    """What a function makes of arrays that are lined up."""
+    """What a function makes of arrays that are lined up, of the shape that they broadcast to."""
     return np.asarray(remainder(*arrays) if function is np.remainder else function(*arrays))
 
 
@@ -294,7 +302,7 @@ def field_column(info: FieldInfo, table: Table, depth: int, batch: Batch, which:
 
 
 def field_array(info: FieldInfo, table: Table, depth: int) -> NDArray[np.float64]:
-    """A field in its unit, with `depth` array axes at least."""
+    """A field in its unit, (n, ...), with `depth` axes behind the first at least, of length 1 where the field has none."""
     array = physical(info, table)
     return array.reshape(*array.shape, *(1,) * (depth + 1 - array.ndim))
 

@@ -155,7 +155,7 @@ class Traced(NDArrayOperatorsMixin):
         return self._called((lambda *arrays: function(*arrays, **kwargs)) if kwargs else function, args)
 
     def applied(self, function: Callable[..., Any], *values: Any) -> Traced:
-        """See `Column.applied`."""
+        """What a function of arrays makes of the values, noted down."""
         return self._called(function, values)
 
     def _called(self, function: Callable[..., Any], values: tuple[Any, ...]) -> Traced:
@@ -163,21 +163,21 @@ class Traced(NDArrayOperatorsMixin):
         return self._tape.add("call", function, tuple(values), self.node.sample.applied(function, *samples))
 
     def on(self, *axes: str) -> Traced:
-        """See `Column.on`."""
+        """The value on other axes, by the names of arrays, noted down."""
         return self._tape.add("on", lambda column: column.on(*axes), (self,), self.node.sample.on(*axes))
 
     def steps(self) -> NDArray[np.intp]:
-        """See `Column.steps`."""
+        """0, 1, 2 ... up to the largest value in the sample; the tape remembers how many these were."""
         found = self.node.sample.steps()
         self._tape.steps.append((self.node, len(found)))
         return found
 
     def shifted(self, step: int) -> Traced:
-        """See `Column.shifted`."""
+        """The value `step` places later (earlier if negative) in stream order, noted down."""
         return self._tape.add("shift", lambda column: column.shifted(step), (self,), self.node.sample.shifted(step))
 
     def latest(self, where: Any = None) -> Traced:
-        """See `Column.latest`."""
+        """The most recent value at which `where` was true, noted down."""
         condition = where.node.sample if isinstance(where, Traced) else where
         return self._tape.add("latest", lambda column, flags=None: column.latest(flags), (self, where), self.node.sample.latest(condition))
 
@@ -319,7 +319,7 @@ class Term:
     full: Node | None = None
 
     def times(self, factor: Any) -> Term:
-        """The same, multiplied by a number or row."""
+        """The term multiplied by a number, or by a row of numbers."""
         return Term(self.row * factor, self.low, self.full)
 
 

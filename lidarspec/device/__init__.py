@@ -1,7 +1,14 @@
-"""A sensor on a source. In: a SOURCE and a sensor. Out: packets and scans as they come, replies to commands, counters, warnings.
+"""A sensor on a source: what `open` gives.
 
-`device` is what users hold, `async_device` the same with waits that are awaited, `settings` the devices that have a name. A device reads
-from a `file_input` or a `live_input`, which hand on `arrivals`; behind the latter a `capture_thread` fetches what comes, and a `session`
-keeps commands and replies apart. `source_recording` brings a source into a file without decoding more than is counted, and `demo` runs
-all of it against a simulated sensor.
+In: a SOURCE and a sensor. Out: packets and scans as they come, replies to commands, counters, warnings. Modules in reading order:
+
+* `device`: `Device`, which users hold: packets and scans out of what its input gives.
+* `arrivals`: what an input is, live or not, and that of a file; who may have sent what arrived.
+* `live_input`: frames as they come, decoded every few milliseconds; how the source is doing.
+* `capture_thread`: the thread behind it, which reads, records and queues.
+* `session`: commands and their replies, sans-IO.
+* `async_device`: a device whose waits are awaited.
+* `settings`: devices by name, from `lidarspec.toml`.
+* `source_recording`: a source into a file, decoded no further than to be counted.
+* `demo`: all of it against a simulated sensor.
 """

@@ -57,12 +57,12 @@ class AsyncDevice:
 
     @property
     def sensor(self) -> Sensor:
-        """The sensor."""
+        """The sensor, given or detected."""
         return self.device.sensor
 
     @property
     def stats(self) -> Counters:
-        """The counters."""
+        """The counters of everything read so far."""
         return self.device.stats
 
     @property
@@ -72,24 +72,39 @@ class AsyncDevice:
 
     @property
     def state(self) -> str:
-        """How the source is doing; see `Device.state`."""
+        """How the source is doing: "streaming", "waiting", "silent", "no frames", "disconnected", "ended" or "closed"."""
         return self.device.state
 
     async def packets(self, frame: str | None = None) -> AsyncIterator[Packets]:
-        """The packets of the data frame, or of another type, in batches, until the input ends or the device is closed."""
+        """The packets of the data frame, or of another type, in batches, until the input ends or the device is closed.
+
+        Raises:
+            SourceError: where a file has been read to its end before.
+        """
         feed = self._packets.setdefault(frame, _Feed(self.device.packets(frame, wait=STEP), lambda packets: not len(packets)))
         async for packets in self._drained(feed):
             yield packets
 
     async def scans(self) -> AsyncIterator[Scan]:
-        """Every scan; see `Device.scans`."""
+        """Every scan; the first and last piece, and those before and after an interruption, are marked ``complete=False``.
+
+        Raises:
+            SourceError: where a file has been read to its end before.
+        """
         if self._scans is None:
             self._scans = _Feed(self.device.scans(wait=STEP), lambda scan: scan is None)
         async for scan in self._drained(self._scans):
             yield scan
 
     async def latest(self, timeout: float | None = None) -> Scan:
-        """The newest complete scan; see `Device.latest`."""
+        """The newest complete scan, newer than the one that the last call gave; from a file the next.
+
+        Args:
+            timeout: seconds to wait.
+
+        Raises:
+            SourceError: where none comes in time, the input has ended or the device was closed.
+        """
         deadline = None if timeout is None else time.monotonic() + timeout
         while True:
             if self._newest is None:
@@ -99,7 +114,17 @@ class AsyncDevice:
                 return newest
 
     async def send(self, name: str, *, timeout: float | None = None, **arguments: Any) -> Reply:
-        """The reply to a command; see `Device.send`."""
+        """The reply to a command; at once with ``confirmed=False`` where none is documented.
+
+        Args:
+            name: of the command.
+            timeout: seconds to wait for the reply; by default what the sensor declares.
+            arguments: by name, in units.
+
+        Raises:
+            UnknownCommand, UnknownField, MissingField, OutOfRange: for what the sensor does not take; nothing is sent.
+            CommandError: where the device refuses, or the connection is lost; ReplyTimeout where it keeps silent.
+        """
         return await self._run(self._sender, partial(self.device.send, name, timeout=timeout, **arguments))
 
     async def close(self) -> None:

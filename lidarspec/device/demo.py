@@ -43,7 +43,7 @@ class Demonstration:
         stats: the decoder's counters.
         sent, intact: packets that were sent, and that left the line unharmed.
         digest: SHA-256 of the points of the whole scans.
-        again: the same of the recording.
+        again: SHA-256 of the points of the recording, decoded once more.
         recorded: bytes in the recording.
     """
 

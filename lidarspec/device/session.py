@@ -8,6 +8,9 @@ time that it may take has passed since. While one is owed that could be the repl
 in common, and no field in which the two have to differ), that request is held back; an owed answer that does come is counted
 in `late` and frees it. A frame that arrived before a request was sent is no answer to it. An answer that is later still can be
 told from the next one's only by what the command `matches` or `echoes`.
+
+A conversation that learns (M6) belongs here: counters in `Command.values` are filled in where a request is made, texts and addresses
+among its `args` by `wire.build.build_command`, and what a reply teaches is handed to the owner of the session, who configures the sensor.
 """
 
 from __future__ import annotations

@@ -1,6 +1,14 @@
-"""What is not known yet. In: a SOURCE, or bytes. Out: which sensor it is, why nothing comes, which checksum it is, the draft of a spec.
+"""What is not known yet: which sensor, what is wrong, which checksum, which format.
 
-`listen` hears a source, `detect` says whose bytes they are, `identify` the same of single frames, `doctor` what is wrong with a port.
-Of frames that nobody knows, `periods` finds their structure and `checksum_search` their seal, over `samples` and with `crc_search`;
-`draft` writes the distribution of a new sensor from all of that.
+In: a SOURCE, or bytes. Out: a verdict, findings with the command that mends them, checksums that fit, the draft of a spec. Modules in
+reading order:
+
+* `listen`: some bytes out of any source.
+* `detect`: which installed sensor sent them, and whose single frames are.
+* `doctor`: why nothing comes, or nothing that can be used.
+* `samples`: frames of an unknown format, and where a checksum could stand and what it could cover.
+* `checksum_search`: which checksum seals them, plain ones by trial.
+* `crc_search`: CRCs, without trial.
+* `periods`: what unknown bytes are made of: frames, lengths, fields that change steadily.
+* `draft`: the distribution of a new sensor, written from all of that.
 """

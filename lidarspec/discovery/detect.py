@@ -269,7 +269,12 @@ def detected(source: str | Path) -> Sensor:
 
 
 def declared(source: str | Path) -> Sensor | None:
-    """The sensor that a source names itself: a device of `lidarspec.toml`, a recording, a simulated sensor; None for any other."""
+    """The sensor that a source names itself: a device of `lidarspec.toml`, a recording, a simulated sensor; None for any other.
+
+    Raises:
+        UsageError: for standard input.
+        SourceError: for a file that cannot be opened.
+    """
     device = named(source)
     configured = device.configured() if device is not None else None
     if configured is not None:

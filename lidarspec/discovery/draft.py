@@ -348,7 +348,7 @@ def _fields(draft: Draft) -> Iterator[Field]:
 
 
 def _known(draft: Draft) -> list[Field]:
-    """Those that something is known of, without overlaps."""
+    """The fields that something is known of, without overlaps."""
     found = list(_header(draft))
     if draft.length is not None:
         told = sorted({len(frame) for _, frame in draft.frames})

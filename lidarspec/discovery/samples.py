@@ -84,7 +84,7 @@ class Match:
         remarks: what else is to be said.
         name: what a catalogue calls it.
         open: whether other parameters fit these frames as well.
-        varied: how much that byte of its place varies that varies least, see `Samples.varied`.
+        varied: how much that byte of its place varies that varies least, as `Samples.varied` has it.
     """
 
     algorithm: Checksum
@@ -158,7 +158,7 @@ class Samples:
         return np.concatenate([values(group, place.start(group.shape[1]), place.size, order) for group in self.groups]).view(np.uint64)
 
     def covered(self, place: Place, span: Span) -> list[NDArray[np.uint8]]:
-        """The bytes that a span covers, group by group."""
+        """The bytes that a span covers, group by group: (frames, bytes) each."""
         return [np.concatenate([group[:, a:b] for a, b in span.ranges(place, group.shape[1])], axis=1) for group in self.groups]
 
     def computed(self, algorithm: Checksum, place: Place, span: Span) -> NDArray[np.uint64]:
@@ -227,7 +227,14 @@ def spans(place: Place, samples: Samples) -> Iterator[Span]:
 
 
 def doubt(width: int, values: NDArray[np.uint64], fitted: int, tried: int) -> float:
-    """See `Match`; `fitted` of the distinct values were used up to find the parameters, and `tried` checksums were looked at."""
+    """How many bits of doubt a match leaves: of 2**doubt wrong checksums one would fit as well by chance.
+
+    Args:
+        width: of the checksum, bits.
+        values: what the frames hold in its place, (n,).
+        fitted: how many distinct values were used up to find the parameters.
+        tried: checksums that were looked at.
+    """
     return width * (len(np.unique(values)) - fitted) - float(np.log2(max(tried, 1)))
 
 

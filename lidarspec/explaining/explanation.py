@@ -158,7 +158,7 @@ def flips(sensor: Sensor, name: str, data: bytes) -> list[Flip]:
 
 
 def _mending(tried: list[Flip], data: bytes, engine: Codec) -> list[Flip]:
-    """Those of some flips after which the bytes are one valid and plausible frame."""
+    """The flips after which the bytes are one valid and plausible frame."""
     rows = np.tile(np.frombuffer(data, np.uint8), (len(tried), 1))
     rows[np.arange(len(tried)), [flip.offset for flip in tried]] ^= np.array([1 << flip.bit for flip in tried], np.uint8)
     fits = np.ones(len(tried), np.bool_)

@@ -1,12 +1,12 @@
 """What a spec says, in the languages of other tools: kinds of exports by name.
 
-An export is a function from a `Sensor` to a text, and `export` calls it by its name. It walks the frame trees (`lidarspec.spec.tree`) that
-`messages` hands out, and is refused, with the reason, where they hold Python code or its target cannot say what the spec says.
+In: a sensor. Out: a text, by `export`. An export walks the frame trees (`lidarspec.spec.tree`) that `messages` hands out, and is refused,
+with the reason, where they hold Python code or its target cannot say what the spec says. Modules in reading order:
 
-    json, stubs              the spec as data, and as types for an editor
-    reference, diagram       a page in Markdown, and packet diagrams in SVG
-    wireshark, ksy           a dissector in Lua, and a Kaitai Struct format
-    c, c_fields              a header in C: the whole of it, and what reads the fields
+* `json`, `stubs`: the spec as data, and as types for an editor.
+* `reference`, `diagram`: a page in Markdown, and packet diagrams in SVG.
+* `ksy`, `wireshark`: a Kaitai Struct format, and a dissector in Lua.
+* `c`, `c_fields`: a header in C: the whole of it, and what reads the fields.
 """
 
 from __future__ import annotations

@@ -50,7 +50,11 @@ def identifier(text: str) -> str:
 
 
 def bits(value: tree.Formula) -> int:
-    """How many bits, besides a sign, a formula takes at most."""
+    """How many bits, besides a sign, a formula takes at most.
+
+    Raises:
+        Refused: for one that is Python code.
+    """
     if isinstance(value, tree.Ref):
         return value.info.bits
     if isinstance(value, int):
@@ -315,7 +319,7 @@ class Access:
 
     @property
     def span(self) -> tuple[int, Extent]:
-        """Its first byte, and the end of its last, from the start of the entry."""
+        """The first byte of the word and the end of its last, from the start of the entry."""
         if self.part is None:
             return 0, self.entry.size
         offsets = [segment.byte for segment in self.part.bits.segments]

@@ -30,7 +30,11 @@ def text(sensor: Sensor) -> str:
 
 
 def spec(sensor: Sensor) -> dict[str, Any]:
-    """The spec as plain data; see `text`."""
+    """The spec as plain data: dicts, lists, numbers, texts.
+
+    Raises:
+        Refused: where a frame holds Python code that no data can stand for.
+    """
     return {
         "lidarspec": VERSION,
         **_facts(sensor, "id", "vendor", "model", "aliases", "status", "source", "range_limits", "vendor_axes"),

@@ -1,4 +1,11 @@
-"""File formats by suffix: scans to files. A file appears under its name only when it is whole."""
+"""File formats of scans, by the suffix of the file.
+
+In: scans. Out: a file, which appears under its name only when it is whole. `write` is all that is asked for; `formats` knows the plugins'
+formats, too. Modules in reading order:
+
+* `text`: .csv, a row a point.
+* `arrays`: .npz, an array a column.
+"""
 
 from __future__ import annotations
 

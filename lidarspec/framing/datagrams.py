@@ -4,6 +4,9 @@ The rule of streams, without the search: at the first byte of a datagram the ord
 with `after` only counts while it is announced, and a frame has to be as long as its datagram. Datagrams that are all alike
 are judged as rows (`lidarspec.framing.steady`); of others each type judges those that no type before it has taken. Only what
 makes a plugin fail is judged alone, so that one datagram does not cost the others.
+
+A message in several datagrams (M9) is joined before this: by a step of `Decoder.datagrams` that remembers parts by their key, and hands
+on whole messages as datagrams, each with the arrival time of its last part.
 """
 
 from __future__ import annotations

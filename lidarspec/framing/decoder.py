@@ -82,7 +82,12 @@ class Decoder:
         return self.idle()
 
     def frames(self, data: Data, at: int | None = None) -> list[Frames]:
-        """The frames that these bytes complete, as arrays, in stream order; arguments as those of `feed`."""
+        """The frames that these bytes complete, in stream order, as structs of arrays. Raises on no bytes whatever.
+
+        Args:
+            data: the next bytes of the stream, or one datagram.
+            at: their arrival time in ns, if known.
+        """
         view = np.ascontiguousarray(data).data.cast("B") if isinstance(data, np.ndarray) else memoryview(data).cast("B")
         if not self.stream:
             return [self.datagrams([view], [at])]

@@ -4,6 +4,8 @@ Both codecs answer the same questions with the same results; every test runs on 
 layouts on whole batches: the header of a candidate is looked at once, when it is judged, and its layout goes with it into the
 columns. `InterpretedCodec` lets construct parse one candidate at a time, for structs that have no computable layout and as
 the reference.
+
+A wire form (M4), text or escaped bytes, is a third one: it finds candidates by marks of its own, and gives rows of slots that have layouts.
 """
 
 from __future__ import annotations
@@ -61,7 +63,7 @@ class Codec(Protocol):
             offsets: those whose prefix does not match must be left out.
             kind: index of this type.
             gathered: whether their bytes are wanted too, as `Frames.rows`.
-            sums: see `Judge`.
+            sums: what computes checksums; by default their algorithms.
         """
 
     def survey_rows(self, rows: NDArray[np.uint8], *, sums: Sums | None = None) -> tuple[Layout, Status, tuple[str, ...]] | None:

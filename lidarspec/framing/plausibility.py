@@ -90,7 +90,7 @@ def _among(status: NDArray[np.uint8], rows: Bytes2D, judge: Callable[[Bytes2D], 
 
 
 def intactness(seal: Seal, errors: list[str], sums: Sums | None, rows: Bytes2D) -> NDArray[np.uint8]:
-    """`VALID`, `CHECKSUM` or `PLUGIN` for each frame, by one of its checksums."""
+    """`VALID`, `CHECKSUM` or `PLUGIN` for each frame, (n,), by one of its checksums."""
     try:
         wrong = ~seal.intact(rows, sums)
         return np.multiply(wrong.view(np.uint8), np.uint8(CHECKSUM))
@@ -100,7 +100,7 @@ def intactness(seal: Seal, errors: list[str], sums: Sums | None, rows: Bytes2D) 
 
 
 def plausibility(frame: Frame, table: Table, errors: list[str]) -> NDArray[np.uint8]:
-    """`VALID`, `IMPLAUSIBLE` or `PLUGIN` for each frame of a table, by the frame's own test."""
+    """`VALID`, `IMPLAUSIBLE` or `PLUGIN` for each frame of a table, (n,), by the frame's own test."""
     assert frame.plausible is not None
     batch = Batch(table, np.zeros(len(table), np.bool_))
     try:
@@ -128,7 +128,7 @@ class Condition:
     fields: tuple[FieldInfo, ...]
 
     def holds(self, columns: Mapping[str, NDArray[np.float64]]) -> NDArray[np.bool_]:
-        """Whether it is true, for columns of the fields in their units, element by element."""
+        """Whether the condition is true, for columns of the fields in their units, element by element."""
         with np.errstate(all="ignore"):
             return np.asarray(evaluate(self.node, {}, lambda node: columns.get(node.path))).astype(np.bool_)
 
@@ -199,7 +199,7 @@ class _Table:
     bits: tuple[int, tuple[int, ...]] | None = None
 
     def holds(self, values: NDArray[Any]) -> NDArray[np.bool_]:
-        """Whether it holds for each of the values."""
+        """Whether the condition holds for each of the values, of their shape."""
         if self.limits is not None:
             low, high = self.limits
             held = values <= high

@@ -166,33 +166,33 @@ class Frames:
 
     @cached_property
     def starts(self) -> Indices:
-        """Where each begins in the buffer."""
+        """Where each frame begins in the buffer, (n,)."""
         return array_of(self._starts)
 
     @cached_property
     def offsets(self) -> NDArray[np.int64]:
-        """Where each begins in the input."""
+        """Where each frame begins in the input, (n,)."""
         return array_of(self.places)
 
     @cached_property
     def gaps(self) -> NDArray[np.int64]:
-        """The bytes (other than fillers) skipped before each; 0 until the decoder says otherwise."""
+        """The bytes (other than fillers) skipped before each frame, (n,); 0 until the decoder says otherwise."""
         return repeated(0, len(self))
 
     @cached_property
     def at(self) -> NDArray[np.int64]:
-        """The arrival time of each in ns, -1 where nobody knows it."""
+        """The arrival time of each frame, (n,) ns, -1 where nobody knows it."""
         return repeated(-1, len(self))
 
     @property
     def layout(self) -> Layout | None:
-        """The layout that all have; None where they have not one, or nobody knows."""
+        """The layout that all frames have; None where they differ, or nobody knows."""
         form = alike(self.forms)
         return None if form is None or form < 0 else self.layouts[form]
 
     @property
     def total(self) -> int:
-        """The bytes of all."""
+        """The bytes of all frames together."""
         size = alike(self.sizes)
         return int(self.sizes.sum()) if size is None else size * len(self)
 
@@ -215,7 +215,7 @@ class Frames:
         return self._with(**chosen, rows=rows, _starts=starts, places=places)
 
     def by_layout(self) -> list[tuple[Layout, Indices]]:
-        """The frames of each layout that is known, as indices."""
+        """Each layout that is known, with the indices of its frames, (k,)."""
         form = alike(self.forms)
         if form is not None:
             return [(self.layouts[form], counted(len(self)))] if form >= 0 else []
@@ -271,7 +271,7 @@ def packed(found: Sequence[Found]) -> Frames:
 
 
 def array_of(numbers: Numbers) -> NDArray[np.int64]:
-    """The numbers as an array."""
+    """The numbers as an array, (n,)."""
     return np.arange(numbers.start, numbers.stop, numbers.step) if isinstance(numbers, range) else numbers
 
 

@@ -111,15 +111,15 @@ class Framing:
         return self.names[kind] in self.named and self.names[kind] != mode.after
 
     def switching(self, mode: Mode) -> NDArray[np.bool_]:
-        """Whether a frame of each type changes what is looked for, by its index; False for -1."""
+        """Whether a frame of each type changes what is looked for, (types + 1,), by its index; the last, for -1, is False."""
         return np.array([*(self.switches(kind, mode) for kind in range(len(self.names))), False])
 
     def survey(self, kind: int, buffer: Bytes1D, offsets: Offsets, *, gathered: bool = True) -> Frames:
-        """The candidates at these offsets, which have the constants of a type; see `Codec.survey`."""
+        """The candidates of a type at these offsets, which have its constants, each with its layout and whether it is a frame."""
         return self.codecs[kind].survey(buffer, offsets, kind=kind, gathered=gathered, sums=self._sums)
 
     def survey_rows(self, kind: int, rows: Bytes2D) -> tuple[Layout, Status, tuple[str, ...]] | None:
-        """Candidates of one size and layout, which have the constants of a type; see `Codec.survey_rows`."""
+        """The layout of candidates of a type, one a row, the status of each, (n,), and tracebacks; None where their layouts differ."""
         return self.codecs[kind].survey_rows(rows, sums=self._sums)
 
     def candidates(self, buffer: Bytes1D, mode: Mode) -> tuple[Bytes1D, list[Frames]]:
@@ -141,7 +141,7 @@ class Framing:
 
 
 def matches(buffer: Bytes1D, constants: Marks) -> Offsets:
-    """Where the constants are right as far as the bytes go."""
+    """The offsets where the constants are right as far as the bytes go, (k,), ascending."""
     if not constants:
         return np.arange(len(buffer))
     length = len(buffer)
@@ -163,7 +163,7 @@ def _right(buffer: Bytes1D, spot: int, mask: int, value: int) -> NDArray[np.bool
 
 
 def fitting(buffer: Bytes1D, offsets: Offsets, constants: Marks) -> Offsets:
-    """Those of the offsets, in order, where the constants are right as far as the bytes go."""
+    """The offsets, in order, where the constants are right as far as the bytes go, (k,)."""
     for spot, mask, value in constants if len(offsets) else ():
         inside = int(offsets.searchsorted(len(buffer) - spot))
         found = buffer.take(offsets[:inside] + spot)

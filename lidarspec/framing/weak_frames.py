@@ -120,7 +120,7 @@ class Lane:
         return self._size or int(self._sizes[spot])
 
     def forms(self, offsets: Offsets) -> Offsets:
-        """Which of its layouts the valid candidates at these offsets have, -1 where nobody knows."""
+        """Which of its layouts the valid candidates at these offsets have, (k,); -1 where nobody knows."""
         return self._forms[offsets] if len(self._forms) else repeated(0, len(offsets))
 
     def _stands(self, spot: int, *, first: bool) -> int:

@@ -98,17 +98,25 @@ class Packets:
         return found
 
     def count(self, array: str) -> NDArray[np.intp]:
-        """The length of an array in each packet, (n,)."""
+        """The length of an array in each packet, (n,).
+
+        Raises:
+            UnknownField: for an array that the frame does not have.
+        """
         if array not in self.table.schema.arrays:
             raise UnknownField(array, self.table.schema.arrays, place=f"{self.sensor.id} {self.frame}")
         return self.table.counts(array)
 
     def points(self) -> PointCloud:
-        """The points of all packets in stream order; see `PointCloud`."""
+        """The points of all packets in stream order, flat; columns are made when they are read.
+
+        Raises:
+            SpecError: where the sensor's `points` function fails, or returns columns that do not fit.
+        """
         return cloud_of(self)
 
     def take(self, which: Any) -> Packets:
-        """Some of the packets: by indices, a mask or a slice."""
+        """The packets that indices, a mask or a slice pick, with their times, offsets and state."""
         indices = np.arange(len(self))[which]
         return Packets(
             self.sensor,
@@ -125,7 +133,7 @@ class Packets:
         )
 
     def batch(self, carry: dict[int, NDArray[np.float64]] | None = None) -> Batch:
-        """What `points` and `plausible` functions are given, see `Fields`."""
+        """The packets as a plugin's functions are given them, through `Fields`; `carry`: what the batch before left."""
         return Batch(self.table, self.breaks, self.state, self.sensor.state, dict(carry or {}))
 
 

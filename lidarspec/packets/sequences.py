@@ -87,7 +87,11 @@ class SequenceTracker:
         self._highest = Remembered()
 
     def push(self, batch: Batch) -> tuple[NDArray[np.int64], NDArray[np.bool_] | None]:
-        """The index of each packet, and True where packets are missing before it; None where nowhere."""
+        """The index of each packet, (n,), and True where packets are missing before it, (n,); None where nowhere.
+
+        Raises:
+            SpecError: where the counter is no field of the header.
+        """
         info = batch.table.schema.fields.get(self._rule.field)
         if info is None or info.axes:
             raise SpecError("a sequence is a field of the header", path=self._rule.field)

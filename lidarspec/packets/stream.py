@@ -35,7 +35,7 @@ class PacketStream:
         sensor, frame: whose, and of which type.
         stats: the decoder's counters; lost, duplicate and late packets are added to them.
         interpreted: parse with construct.
-        backend: see `Decoder`.
+        backend: what makes points of the packets, "auto", "numpy", "jit" or "construct".
         state: frames of other types, by name, that count as seen before the first packet.
     """
 
@@ -216,7 +216,7 @@ class _Part:
         return slice(first, last + 1) if last - first == len(where) - 1 else where
 
     def column(self, array: NDArray[np.int64]) -> NDArray[np.int64]:
-        """An array of the piece, for our frames."""
+        """What an array of the piece, (n,), holds for our frames."""
         return array if self.where is None else some(array, self.own)
 
 

@@ -86,7 +86,7 @@ class PointCloud:
         return np.stack([self.x, self.y, self.z], axis=1)
 
     def __getitem__(self, which: Any) -> PointCloud:
-        """Some of the points, by mask, indices or slice; organised only if the slice holds whole columns."""
+        """The points that a mask, indices or a slice pick; organised only if a slice holds whole columns."""
         picked = {f.name: _pick(getattr(self, f.name), which) for f in fields(self)}
         shape = None
         if self.shape and isinstance(which, slice) and which.step in (None, 1):
@@ -133,7 +133,7 @@ class ColumnSource:
     nominal: bool = False
 
     def column(self, name: str) -> NDArray[Any] | None:
-        """A column of `PointCloud`, or "valid"; None where the sensor has none."""
+        """A column of `PointCloud`, (size,), or "valid"; None where the sensor has none."""
         raise NotImplementedError
 
     def holds(self, name: str) -> bool:
@@ -141,12 +141,12 @@ class ColumnSource:
         raise NotImplementedError
 
     def part(self, name: str, start: int, stop: int) -> NDArray[Any] | None:
-        """A column of some of the points."""
+        """A column of the points from `start` to `stop`, (stop - start,); None where the sensor has none."""
         column = self.column(name)
         return None if column is None else column[start:stop]
 
     def times_at(self, indices: NDArray[np.intp]) -> NDArray[np.float64]:
-        """Some values of the column "time"; the others need not be made for them."""
+        """The column "time" at some indices, of their shape, seconds since `base`; the others need not be made for them."""
         times = self.column("time")
         assert times is not None  # since every cloud has it
         picked: NDArray[np.float64] = times[indices]
@@ -330,7 +330,7 @@ class Mount:
         return np.asarray(about_z @ about_y @ about_x)
 
     def applied(self, cloud: PointCloud) -> PointCloud:
-        """The same points in the carrier's axes.
+        """A cloud, given in the sensor's axes, in those of the carrier.
 
         Returns:
             x y z from the carrier's origin; azimuth and elevation of the beams in its axes. `range` stays what the sensor

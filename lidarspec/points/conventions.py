@@ -86,12 +86,12 @@ def rows_of(shape: Sequence[int]) -> int:
 
 
 def numbers_of(name: str, values: NDArray[Any]) -> NDArray[Any]:
-    """A column of numbers that sensors may leave out: intensity, ring or return, in its type; nan is 0."""
+    """A column of numbers that sensors may leave out: intensity, ring or return, in its type and of the same shape; nan is 0."""
     return np.asarray(np.nan_to_num(values), TYPES[name])
 
 
 def axis_matrix(axes: Sequence[str]) -> NDArray[np.float64]:
-    """The matrix that turns REP-103 coordinates into those of axes named by where x, y and z point."""
+    """The (3, 3) matrix that turns REP-103 coordinates into those of axes named by where x, y and z point."""
     matrix = np.zeros((3, 3))
     for row, name in enumerate(axes):
         axis, is_opposite = divmod(DIRECTIONS.index(name), 2)
@@ -100,19 +100,19 @@ def axis_matrix(axes: Sequence[str]) -> NDArray[np.float64]:
 
 
 def vendor_turn(sensor: Spec) -> NDArray[np.float64] | None:
-    """The matrix that turns REP-103 coordinates into the axes that were asked for; None where these are REP-103's own."""
+    """The (3, 3) matrix that turns REP-103 coordinates into the axes that were asked for; None where these are REP-103's own."""
     wanted = sensor.options.get("frame") == "vendor" and sensor.vendor_axes is not None
     return axis_matrix(sensor.vendor_axes) if wanted and sensor.vendor_axes is not None else None
 
 
 def turned_azimuth(angles: NDArray[Any], turn: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Azimuths in other axes, radians."""
+    """Azimuths of the same directions in turned axes, radians in [-pi, pi], the shape of `angles`; `turn` is (3, 3)."""
     direction = turn[:2, :2] @ np.stack([np.cos(angles), np.sin(angles)])
     return np.asarray(np.arctan2(direction[1], direction[0]))
 
 
 def narrowed(angle: NDArray[np.float64]) -> Floats:
-    """Radians as float32 in [-pi, pi)."""
+    """Angles in radians as float32 in [-pi, pi), of the same shape."""
     turned = angle - 2 * np.pi * np.floor((angle + np.pi) / (2 * np.pi))
     far = np.abs(angle) > _FAR
     if far.any():

@@ -41,7 +41,9 @@ def _planned(packets: PacketBatch, carry: Carry | None, *, final: bool, epoch: i
     """The points of a batch by plans; None where there is none for these packets.
 
     Args:
-        carry, final, epoch: as of `evaluated`.
+        carry: what the batch before left.
+        final: nothing follows, so that no packet waits.
+        epoch: the time that the cloud's stamp is, int64 ns; by default that of the first packet.
         alone: no batch follows that needs `Evaluated.carry`, and nobody asks for the counts.
     """
     table = packets.table
@@ -121,7 +123,13 @@ def _counts(shares: list[Share], number: int) -> NDArray[Any]:
 
 
 def guarded(packets: PacketBatch, carry: Carry | None = None, *, final: bool, epoch: int) -> Evaluated | None:
-    """The points of a batch of a stream, which raises on nothing: a failing plugin is counted and gives None; see `evaluated`."""
+    """The points of a batch of a stream, which raises on nothing: a failing plugin is counted in its `Counters`, and gives None.
+
+    Args:
+        carry: what the batch before left.
+        final: nothing follows, so that no packet waits.
+        epoch: the time that the cloud's stamp is, int64 ns.
+    """
     try:
         return evaluated(packets, carry, final=final, epoch=epoch)
     except SpecError:

@@ -96,7 +96,7 @@ class Share:
             maker.run(self.group.rows[first:stop], values, columns)
 
     def plain(self, name: str) -> NDArray[Any]:
-        """A part of what `points` returned, for every point of the group, evaluated plainly."""
+        """A part of what `points` returned, for every point of the group, evaluated plainly: (packets, *shape of the plan)."""
         part, shape = self.plan.parts[name], (len(self), *self.plan.shape)
         array = self.known.array(part) if isinstance(part, Node) else np.asarray(part)
         if isinstance(part, Node):
@@ -104,7 +104,7 @@ class Share:
         return np.broadcast_to(array, shape)
 
     def some(self, which: NDArray[np.intp]) -> Share:
-        """The same for some of the packets, by index."""
+        """The share of some of the packets, by index, with what is known of them plainly."""
         group = Group(self.group.layout, which, self.group.rows[which])
         batch = self.batch.of(group)
         known = Plain(batch)
@@ -345,6 +345,6 @@ class BatchColumns(ColumnSource):
         return np.asarray(few.reshape(len(packets), -1)[np.arange(len(packets)), places] + offsets)
 
     def times_of(self, share: Share, first: int, stop: int) -> NDArray[np.float64]:
-        """The times of all points of some packets of a share, as many axes as those have."""
+        """The times of all points of some packets of a share, seconds since `base`: (packets, *shape of the plan)."""
         offsets = seconds_since(self.packets.time_ns[share.group.where[first:stop]], self.base)
         return np.asarray(share.plain("time")[first:stop] + offsets.reshape(-1, *(1,) * len(share.plan.shape)))

@@ -47,7 +47,7 @@ class PacketBatch(Protocol):
     def __len__(self) -> int: ...
 
     def batch(self, carry: Carry | None = None) -> Batch:
-        """What `points` is given, see `Fields`; `carry`: what the batch before left."""
+        """The packets as a plugin's functions are given them, through `Fields`; `carry`: what the batch before left."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -42,7 +42,7 @@ class Maker(Protocol):
     """Makes some columns of the points of frames of one layout."""
 
     def columns(self, number: int) -> dict[str, NDArray[Any]]:
-        """The columns of so many frames, to be filled."""
+        """The columns of so many frames, by name, to be filled: (number * width,) each."""
 
     def run(self, rows: Bytes2D, values: Values, columns: Mapping[str, NDArray[Any]]) -> None:
         """Fill the columns of all frames.
@@ -63,7 +63,7 @@ class Plan:
         tape: what `points` computes.
         parts: what it returned, by name, as nodes or as what no data decides.
         shape: of the points of a packet, one length for each axis in `axes`.
-        expressions: the columns that back ends make, by name, likewise.
+        expressions: the columns that back ends make, by name, as nodes or as what no data decides.
         positive: nodes whose values have to be positive numbers, or the plan does not hold.
         nominal: whether a default calibration stands in for the sensor's own.
         varying: the arrays whose lengths differ from frame to frame.

@@ -65,7 +65,7 @@ def shift_of(leaf: Leaf, seen: Window) -> tuple[int, int] | None:
 
 
 def every_value(node: Node, leaf: Leaf) -> NDArray[Any] | None:
-    """An expression of one field for every value of the field's window, in its order; None where it has no window."""
+    """An expression of one field for every value of the field's window, (256,) or (65536,); None where it has no window."""
     seen = window(leaf)
     if seen is None:
         return None
@@ -76,7 +76,7 @@ def every_value(node: Node, leaf: Leaf) -> NDArray[Any] | None:
 
 
 def possible(node: Node, leaves: Mapping[str, Leaf]) -> NDArray[Any] | None:
-    """All values that an expression can have, whatever the bytes are; None where it is not of one field, or nobody knows."""
+    """All values that an expression can have, whatever the bytes are: (256,) or (65536,); None where it is not of one such field."""
     source = only_field(node)
     leaf = leaves.get(source.path) if source is not None else None
     return every_value(node, leaf) if leaf is not None else None

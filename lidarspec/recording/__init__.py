@@ -1,5 +1,8 @@
-"""Everything that came over a link, with its time. In: chunks, or an .lsr file. Out: a file that survives a crash, or its records.
+"""Recordings: everything that came over a link, with its time.
 
-`recorders` take what arrives, by the suffix of the file; `appending` writes it in a thread of its own; `format` are the bytes of an .lsr
-file; `recordings` reads them again.
+In: chunks as they arrive. Out: a file that survives a crash; and of a file, its records. Modules in reading order:
+
+* `format`: the bytes of an .lsr file, packed and found again; a recording read, up to its damage or past it.
+* `recorders`: `Recorder` and others, by the suffix of the file: everything, packets for Wireshark, the bytes alone.
+* `appending`: the thread that writes whole records, so that a slow disk holds nothing up.
 """

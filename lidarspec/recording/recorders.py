@@ -210,10 +210,18 @@ def recorder(
     baud: int | None = None,
     overwrite: bool = False,
 ) -> Appender:
-    """The recorder for a file, by its suffix; arguments as of `Recorder`, `PcapRecorder` and `FrameRecorder`.
+    """The open recorder for a file, by its suffix: .lsr, .pcap or .bin.
+
+    Args:
+        path: the new file.
+        sensor: whose bytes these are, as far as it is known; a .pcap of a byte stream needs it.
+        source: where they come from, for the header of an .lsr.
+        datagrams: whether chunks are datagrams, or pieces of a stream.
+        baud: of a serial line, for the header of an .lsr.
+        overwrite: take the place of a file that exists.
 
     Raises:
-        UnknownFormat: for a suffix that is none of them.
+        UnknownFormat: for another suffix.
         UsageError: where the file exists, or cannot hold what the source gives.
         SourceError: where it cannot be made.
     """

@@ -129,7 +129,7 @@ class Cutter:
         return np.array(found, np.intp) if known is None else known[np.array(found, np.intp)]
 
     def _armed_at(self, passed: NDArray[np.intp], turned: NDArray[np.float64], full: float) -> list[int]:
-        """Those of the places where an angle passes that come after it was far away."""
+        """The places, of those where an angle passes, that come after it was far away."""
         found: list[int] = []
         since = 0
         for spot in passed.tolist():
@@ -197,7 +197,7 @@ def _was_far(angles: NDArray[np.float64], full: float) -> bool:
 
 
 def _folded(angles: NDArray[np.float64], full: float) -> NDArray[np.float64]:
-    """Angles in [0, full), which are not to be written to; the same as `np.mod`, and several times as fast."""
+    """Angles in [0, full), the results of `np.mod` in a fraction of its time; not to be written to."""
     outside = np.flatnonzero((angles < 0) | (angles >= full))
     if not len(outside):
         return angles

@@ -1,6 +1,10 @@
-"""A sensor that is not there, made from its spec. In: the facts of a sensor, a scene, commands. Out: the bytes that it would send, in time.
+"""A sensor that is not there, made from its spec.
 
-`scenes` says what a beam meets, `frame_maker` fills frames with values, `measuring` writes ranges into them, and `simulator` gives the
-packets and when they are sent. `device` is all of that as something to talk to: `replies` answers commands, and `faults` does what goes
-wrong on the way. No I/O, no clock, no thread.
+In: a sensor, a scene, commands. Out: the bytes that it would send, and when. No port, clock or thread in here. Modules in reading order:
+
+* `scenes`: what a beam meets, and how far away.
+* `frame_maker`: frames out of physical values.
+* `simulator`: `simulate`: ranges measured in a scene, packets out of them, and when each is sent.
+* `device`: all of that as something to talk to, which answers commands.
+* `faults`: what goes wrong on the way to the reader.
 """

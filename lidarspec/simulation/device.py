@@ -246,7 +246,7 @@ class SimulatedDevice:
         return [(link, data) for link, _, data in self.sendings(now)]
 
     def sendings(self, now: int) -> list[tuple[str, str, bytes]]:
-        """The same with the type of each frame: (link, type, bytes); of a byte stream all in one, without a type."""
+        """What leaves the device by now, with its type: (link, type, bytes) a datagram; of a byte stream all in one, without a type."""
         self._plugged(now)
         if not self.present:
             return []

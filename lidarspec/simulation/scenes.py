@@ -3,19 +3,19 @@
 Everything is upright boxes in the sensor's axes: x forward, y left, z up, metres, the sensor at the origin. Beams may begin beside
 the origin, and what moves stands elsewhere at another time, so both can be given for each beam. A scene is read from a small TOML file:
 
-[room]                                  # walls, floor and ceiling; left out: in the open
-low = [-3.0, -2.2, -1.2]                # metres, in the sensor's axes: x forward, y left, z up
-high = [4.6, 3.1, 1.6]
+    [room]                                  # walls, floor and ceiling; left out: in the open
+    low = [-3.0, -2.2, -1.2]                # metres, in the sensor's axes: x forward, y left, z up
+    high = [4.6, 3.1, 1.6]
 
-[[box]]
-low = [2.0, 0.8, -1.2]
-high = [2.7, 1.6, 0.9]
+    [[box]]
+    low = [2.0, 0.8, -1.2]
+    high = [2.7, 1.6, 0.9]
 
-[[mover]]                               # goes along its path and back again
-size = [0.4, 0.5, 1.7]
-path = [[1.4, -1.5], [0.8, 1.9]]
-speed = 0.8                             # metres a second
-floor = -1.2
+    [[mover]]                               # goes along its path and back again
+    size = [0.4, 0.5, 1.7]
+    path = [[1.4, -1.5], [0.8, 1.9]]
+    speed = 0.8                             # metres a second
+    floor = -1.2
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ class Scene(Protocol):
         Args:
             azimuth, elevation: radians, of shapes that broadcast.
             origin: where the beams begin, metres; each of the three broadcasts against the beams.
-            time: seconds since the scene began; broadcasts likewise.
+            time: seconds since the scene began; broadcasts against the beams.
         """
 
 
@@ -60,7 +60,7 @@ class Box:
     high: tuple[float, float, float]
 
     def at(self, time: Value) -> tuple[Vector, Vector]:
-        """Its corners at a time; it stands still."""
+        """The corners of the box at a time, metres: always the same ones."""
         return self.low, self.high
 
     @property
@@ -86,7 +86,7 @@ class Mover:
     floor: float = -1.2
 
     def at(self, time: Value) -> tuple[Vector, Vector]:
-        """Its corners at a time."""
+        """The lowest and highest corner at a time, metres; x and y of the shape of `time`."""
         places = np.array(self.path, np.float64)
         along = np.concatenate([[0], np.cumsum(np.hypot(*np.diff(places, axis=0).T))])
         whole = along[-1]
@@ -116,7 +116,13 @@ class Room:
     movers: tuple[Mover, ...] = ()
 
     def measure(self, azimuth: Floats, elevation: Floats, origin: Vector = ORIGIN, time: Value = 0.0) -> Floats:
-        """See `Scene.measure`."""
+        """Metres along each beam to what it meets, inf where it meets nothing.
+
+        Args:
+            azimuth, elevation: radians, of shapes that broadcast.
+            origin: where the beams begin, metres; each of the three broadcasts against the beams.
+            time: seconds since the scene began; broadcasts against the beams.
+        """
         level = np.cos(elevation)
         beams = (level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation))
         shape = np.broadcast_shapes(*(np.shape(part) for part in (*beams, *origin, time)))

@@ -8,6 +8,8 @@ its own is given the measured points and returns the values of its fields.
 
 When each packet is sent follows from what the spec says of time, in this order: the rate that is declared; the sensor's clock, which
 its `sweep` sets; the times of the points, which say how long one takes; the speed of its serial line, which no sensor outruns.
+
+Points by coordinates (M2) are linear in the range: with the directions declared in the spec, `Measurement` writes each coordinate back.
 """
 
 from __future__ import annotations

@@ -2,10 +2,18 @@
 
     from lidarspec.spec import Checksummed, Clock, Crc, Fields, Frame, OnWrap, Polar, Scaled, Sensor, Serial, Simulation, hookimpl, spread
 
-A plugin imports from here and from `lidarspec` alone. The modules, in reading order: description (`Spec`, `Frame`, `Command`,
-`Simulation`: what must fit together), sensor (a `Spec` with everything that can be done with it), fields (units and seals), checksums,
-links, timing (clocks, counters, where scans end), results (what a `points` function returns), vocabulary (what it is written with), and
-below them what knows construct: construct_layer. Nothing in this package reads bytes of a stream.
+A plugin imports from here and from `lidarspec` alone. In: a manual, as values. Out: a `Sensor`, checked as it is made, of which every
+other package is a function. Nothing in this package reads bytes of a stream. Modules in reading order:
+
+* `description`: `Spec`, `Frame`, `Command`, `Simulation`: what must fit together.
+* `sensor`: a `Spec` with everything that can be done with it as methods; it stands above the stations that do it.
+* `fields`: units and seals, as parts of a struct.
+* `checksums`: algorithms as values; of one message.
+* `links`: how a sensor is connected.
+* `timing`: clocks, counters, where scans end.
+* `results`, `vocabulary`: what a `points` function returns, and what it is written with.
+* `tree`: a frame type as nodes, which all others walk.
+* `construct_layer`, `bits`: from construct to the tree; the bits of bit blocks, found by probing.
 """
 
 from __future__ import annotations

@@ -198,12 +198,12 @@ class ZeroPadded(Checksum):
 
     @property
     def width(self) -> int:  # type: ignore[override]
-        """That of the other algorithm, in bits."""
+        """The width of the algorithm that is padded for, in bits."""
         return self.algorithm.width
 
     @property
     def order(self) -> ByteOrder:  # type: ignore[override]
-        """That of the other algorithm."""
+        """The byte order of the algorithm that is padded for."""
         return self.algorithm.order
 
     def __call__(self, data: Bytes) -> int:

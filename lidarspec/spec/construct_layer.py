@@ -572,7 +572,7 @@ class _Place:
     in_bits: bool = False
 
     def inside(self, **changes: Any) -> _Place:
-        """The same place with other facts of the field."""
+        """The place with some facts of the field changed."""
         return replace(self, info=replace(self.info, **changes))
 
 

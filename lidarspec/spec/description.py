@@ -78,7 +78,7 @@ class Frame:
         acknowledged: findings of `lidarspec check` that are true and meant, as "LS204" or "LS205 path.of.a.field" -> the reason.
 
     Raises:
-        SpecError: if the struct cannot describe a frame (see `lidarspec.spec.construct_layer.check_struct`).
+        SpecError: if the struct cannot describe a frame: a part without an end, with bytes that are lost, or names that clash.
     """
 
     struct: Construct

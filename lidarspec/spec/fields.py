@@ -228,7 +228,7 @@ def _replaced(obj: Any, name: str, value: object) -> Any:
 
 
 def _unverified(context: Any) -> Any:
-    """The same context for parsing back what was just built, with checks off."""
+    """A context for parsing back what was just built: what is known stays, checks are off."""
     copy = Container(context)
     copy["_params"] = Container(_verify=False)
     return copy

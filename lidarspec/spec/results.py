@@ -45,7 +45,17 @@ class Polar:
 
 @dataclass(frozen=True, eq=False)
 class Cartesian:
-    """Points given by coordinates in metres, x forward, y left, z up; all three 0 is no return. The rest as in `Polar`."""
+    """Points given by coordinates.
+
+    Args:
+        x, y, z: metres, x forward, y left, z up; all three 0 is no return.
+        intensity: the wire's number; None where the sensor has none.
+        time: seconds after the packet's clock.
+        ring: number of the laser or channel, None where there is none.
+        return_index: 0 for the first or only return, 1 for the second ...; None where there is one.
+        invalid: True where the sensor marks a point as wrong (becomes nan).
+        nominal: True where a default calibration stands in for the sensor's own, which the cloud then says.
+    """
 
     x: Array
     y: Array

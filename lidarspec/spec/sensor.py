@@ -95,7 +95,11 @@ class Sensor(Spec):
         return build(self, frame, value, values, units=units)
 
     def example(self, frame: str, *, seed: int = 0) -> bytes:
-        """The bytes of a valid frame with seeded random content."""
+        """The bytes of a valid frame with seeded random content.
+
+        Raises:
+            UnknownFrame: for a frame type that the sensor does not have.
+        """
         from lidarspec.framing.examples import example
 
         return example(self, frame, seed=seed)
@@ -115,6 +119,10 @@ class Sensor(Spec):
 
         Args:
             stream: True reads a byte stream, False one datagram for each `feed`; by default what the data link says.
+            backend: "auto", "numpy", "jit" or "construct": the same results.
+
+        Raises:
+            UsageError: for an unknown back end, or a sensor that has no frames before it is configured.
         """
         from lidarspec.framing.decoder import Decoder, backend as checked_backend
 
@@ -127,11 +135,14 @@ class Sensor(Spec):
         return Decoder(self, stream=stream, interpreted=chosen == "construct", backend=chosen, sums=sums)
 
     def split(self, data: Any, *, backend: str = "auto") -> list[Found]:
-        """Every incoming frame of all types, in stream order.
+        """Every incoming frame of all types, in stream order. Raises on no bytes whatever.
 
         Args:
             data: bytes (a stream), an iterable of datagrams, or an (n, size) uint8 array of datagrams.
             backend: "auto", "numpy", "jit" or "construct": the same results.
+
+        Raises:
+            UsageError: for a text or a path, an unknown back end, or a sensor that has no frames before it is configured.
         """
         from lidarspec.framing.decoder import frames_of, is_stream
 
@@ -139,11 +150,16 @@ class Sensor(Spec):
         return [found for frames in frames_of(decoder, data) for found in frames.found()]
 
     def decode(self, data: Any, frame: str | None = None, *, backend: str = "auto") -> Packets:
-        """The data frames, or those of another type, as columns.
+        """The data frames, or those of another type, as columns. Raises on no bytes whatever.
 
         Args:
             data: bytes (a stream), an iterable of datagrams, or an (n, size) uint8 array of datagrams.
+            frame: the name of a frame type; of several data frames, the first that arrives where left out.
             backend: "auto", "numpy", "jit" or "construct": the same results.
+
+        Raises:
+            UnknownFrame: for a frame type that the sensor does not have.
+            UsageError: for a text or a path, an unknown back end, or a sensor that has no frames before it is configured.
         """
         from lidarspec.framing.decoder import frames_of, is_stream
         from lidarspec.packets.stream import PacketStream, data_frame
@@ -159,6 +175,9 @@ class Sensor(Spec):
         Args:
             data: bytes (a stream), an iterable of datagrams, or an (n, size) uint8 array of datagrams.
             backend: "auto", "numpy", "jit" or "construct": the same results.
+
+        Raises:
+            UsageError: for a text or a path, an unknown back end, or a sensor that has no frames before it is configured.
         """
         from lidarspec.scans.scans import scans_of
 

@@ -18,10 +18,11 @@ and exports walk it (`children`, `nodes`) and know nothing of construct. Everyth
 Counts, lengths, conditions and keys are formulas: numbers, references to fields (`Ref`) and operations on both (`Op`). What only Python
 can calculate is `Code`, which can be evaluated, but not be written down in another language.
 
-Room for what is to come: parts that are frames in themselves (chains, tags with their own length) are a node beside `Repeat`, with
-formulas for count and size; the length of a part in bytes is a formula beside `Ref`, of the path of that part; an axis has its name in
-`Repeat.axis` and `FieldInfo.axes`; one element of an array is an index in `Ref`; a wire form, which recodes the bytes before they have
-places, is a value of the frame, beside its tree.
+Room for what is to come. Parts that are frames in themselves, chains and tags with a length of their own (M1), are a node beside
+`Repeat`, with formulas for count and size. The length of a part in bytes (M7) is a formula beside `Ref`, of the path of that part;
+`wire.build` fills it in, and `wire.layout_tree` holds arriving frames to it. An axis (M3) has its name in `Repeat.axis` and
+`FieldInfo.axes`. One element of an array (M8) is an index in `Ref`. A wire form (M4), which recodes the bytes before they have places, is
+a value of the `Frame`, beside its tree.
 """
 
 from __future__ import annotations

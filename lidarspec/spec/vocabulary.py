@@ -33,7 +33,7 @@ def spread(start: Array, end: Array, count: Array, *, full: float) -> Array:
 
 
 def wrap(a: Array, full: float) -> Array:
-    """The same angles within [0, full)."""
+    """Angles within [0, full), float64, the shape of `a`; `full` is the whole circle in the unit of `a`."""
     turned = np.mod(a, full)
     return np.where(turned >= full, 0.0, turned)
 
@@ -48,15 +48,22 @@ def following(a: Array, step: int = 1) -> Array:
 
 
 def previous(a: Array, step: int = 1) -> Array:
-    """The value `step` places earlier in stream order; nan across a loss and at the beginning. See `following`."""
+    """The value `step` places earlier in stream order, over packet borders, padding left out.
+
+    Returns:
+        float64, the shape of `a`; nan across a loss (a jump of the sequence, skipped bytes) and at the beginning.
+    """
     return _shifted(a, -step)
 
 
 def last(a: Array, where: Array | None = None) -> Array:
-    """The most recent value, this one included, at which `where` was true; nan before the first.
+    """The most recent value, this one included, at which `where` was true.
 
     Args:
         where: a condition of the shape of `a`; by default where `a` is a number.
+
+    Returns:
+        float64, the shape of `a`; nan before the first.
     """
     if hasattr(a, "latest"):
         return a.latest(where)
@@ -79,7 +86,7 @@ def side_by_side(*arrays: Any) -> Any:
 
 
 def take(table: Array, index: Array) -> Array:
-    """The entries of a table, shape (m,), at `index`; nan where the index is not in it."""
+    """The entries of a table, shape (m,), at `index`: float64, the shape of `index`; nan where the index is not in the table."""
     return _applied(LookUp(np.asarray(table, np.float64)), index)
 
 

@@ -1,9 +1,23 @@
 """A test kit for authors: what a sensor's declaration has to keep, as a class for pytest and as `lidarspec check`.
 
-from lidarspec.testing import SensorConformance
+    from lidarspec.testing import SensorConformance
 
-class TestMine(SensorConformance):
-    sensor = "acme-x1"        # an id, a Sensor value, or a file such as "./acme.py"
+    class TestMine(SensorConformance):
+        sensor = "acme-x1"        # an id, a Sensor value, or a file such as "./acme.py"
+
+In: a sensor. Out: passed tests, or findings with place, reason and what to write. Modules in reading order:
+
+* `conformance`: every property that a sensor is held to, in one table.
+* `findings`: the rules, and how a property says that it does not hold.
+* `subject`: a sensor under test, and what it is fed.
+* `declared`: what shows in the declaration alone.
+* `frames`: single frames, sound and damaged.
+* `geometry`: whether points are where the manual has them.
+* `commands`: requests, replies, and the simulated sensor's answers.
+* `agreement`: two ways to the same result.
+* `vectors`: golden frames out of a manual or capture.
+* `check`: all of it without pytest, for a name, file, distribution or folder.
+* `plugin`, `fixtures`: fixtures for pytest; simulated sensors on real ports.
 """
 
 from __future__ import annotations

@@ -67,7 +67,7 @@ class Property:
 
     @property
     def name(self) -> str:
-        """Its name: that of the function."""
+        """The name of the property: that of its function."""
         return self.function.__name__
 
     def cases(self, subject: Subject) -> Iterable[tuple[str, ...]]:

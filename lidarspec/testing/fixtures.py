@@ -34,7 +34,10 @@ def virtual_port(
         to: "pty", "udp://127.0.0.1:PORT" or "tcp://127.0.0.1:PORT"; TCP port 0 takes one that is free.
         link: a symbolic link that leads to the pseudo-terminal, also after it was unplugged and came back; by default one in a folder
             of its own.
-        scene, seed, rate, faults: as of `SimulatedDevice`.
+        scene: what it sees; by default a room of the seed's, in which somebody walks.
+        seed: of the scene, the faults and the fillers.
+        rate: how many times faster than in reality; inf: as fast as it is asked.
+        faults: what goes wrong on its links.
 
     Yields:
         What has a `path` to open, the `device` with the names of the commands that it `heard`, `unplug` and `plug`.

@@ -261,7 +261,7 @@ def _with(subject: Subject, name: str, path: str, value: int) -> bytes | None:
 
 
 def off(room: Room, xyz: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Metres from points to the nearest surface of a room: nothing of the simulator's own geometry is used."""
+    """Metres from points, (n, 3), to the nearest surface of a room, (n,): nothing of the simulator's own geometry is used."""
     found = np.full(len(xyz), np.inf)
     for body in (room.walls, *room.boxes):
         if body is None:

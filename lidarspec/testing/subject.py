@@ -15,6 +15,7 @@ from typing import Any
 
 from lidarspec.framing.examples import examples
 from lidarspec.framing.frame_engine import codec
+from lidarspec.spec import Frame, Sensor
 from lidarspec.spec.description import Frame
 from lidarspec.spec.sensor import Sensor
 from lidarspec.spec.tree import FieldInfo, Sealed, nodes

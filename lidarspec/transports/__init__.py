@@ -1,9 +1,17 @@
-"""Where bytes come from, and go to. In: a SOURCE as text. Out: an open `Transport` that gives `Chunk`s and takes bytes to send.
+"""Where bytes come from, and go to.
 
-`protocol` says what a transport is, live or not; `open_url` makes one of a SOURCE: `files` (recordings, captures, raw bytes, standard
-input), `serial`, `udp`, `tcp`, and `simulated` for a sensor that is not there. They share `base`: addresses, the clock, failures with the
-next command. `ports` lists what this computer has.
+In: a SOURCE as text. Out: an open `Transport`, which gives `Chunk`s and takes bytes to send. Modules in reading order:
 
-The other way round, `outlets` stand in the place of a sensor: a pseudo-terminal, UDP, TCP, a file; `serving` sends a simulated sensor or
-a recording through one, by the clock.
+* `protocol`: what a transport is, live or not; plugins derive from it.
+* `open_url`: from a SOURCE to the transport that opens it.
+* `base`: what they share: addresses, the clock, failures with the next command.
+* `serial`, `udp`, `tcp`: live sources.
+* `simulated`: `sim:`, a sensor that is not there.
+* `files`: recordings, captures, raw bytes, standard input.
+* `ports`: which serial and UDP ports this computer has, and who holds them.
+
+The other way round, for what stands in the place of a sensor:
+
+* `outlets`: a pseudo-terminal, datagrams, TCP connections, a file.
+* `serving`: a simulated sensor, or a recording, sent through an outlet by the clock.
 """

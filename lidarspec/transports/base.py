@@ -62,7 +62,11 @@ class Address:
             raise UnknownOption(name, [*known, *COMMON], place=self.text)
 
     def number(self, name: str, low: int, high: int) -> int | None:
-        """A whole number among the options, None where it is not given."""
+        """A whole number among the options, None where it is not given.
+
+        Raises:
+            UsageError: where it is no number from `low` to `high`.
+        """
         text = self.options.get(name)
         if text is None:
             return None
@@ -71,14 +75,22 @@ class Address:
         return int(text)
 
     def switch(self, name: str) -> bool | None:
-        """Something on or off among the options, None where it is not given."""
+        """Something on or off among the options, None where it is not given.
+
+        Raises:
+            UsageError: for any other word.
+        """
         text = self.options.get(name)
         if text is not None and text.lower() not in _SWITCH:
             raise UsageError(f"{self.text}: {name} is 0 or 1, not {text!r}")
         return None if text is None else _SWITCH[text.lower()]
 
     def host_and_port(self) -> tuple[str, int | None]:
-        """Host and port of the place, "" and None where they are left out; an IPv6 host stands in brackets."""
+        """Host and port of the place, "" and None where they are left out; an IPv6 host stands in brackets.
+
+        Raises:
+            UsageError: where the place is no host and port.
+        """
         found = re.fullmatch(r"(?:\[([^\]]+)\]|([^:/]*))(?::(\d*))?/?", self.place)
         if found is None:
             raise UsageError(f"{self.text}: {self.place!r} is no host:port")

@@ -144,7 +144,7 @@ class CaptureTransport(FileTransport):
         self._warn(reader.stats)
 
     def batches(self) -> Iterator[Batch]:
-        """The same datagrams as those of `chunks`, many at a time.
+        """The datagrams of the capture, many at a time, as arrays.
 
         Raises:
             SourceError: where the file cannot be read.

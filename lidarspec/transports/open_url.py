@@ -51,10 +51,13 @@ def transport(source: str | Path, sensor: Sensor | None = None) -> Transport:
 
 
 def live(source: str | Path, sensor: Sensor | None = None) -> LiveTransport:
-    """The open transport for a SOURCE that does not end by itself; arguments as of `transport`.
+    """The open transport for a SOURCE that does not end by itself.
+
+    Args:
+        sensor: whose declared link says what the source leaves out: baud rate, control lines, ports.
 
     Raises:
-        UsageError: for a file too.
+        UsageError: for a file, a scheme that nobody knows, and what its kind of source does not take.
         SourceError: where it cannot be opened.
     """
     opened = transport(source, sensor)

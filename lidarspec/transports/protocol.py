@@ -133,6 +133,7 @@ class LiveTransport(Transport):
 
     @property
     def addressed(self) -> bool:
+        """Whether what is written has somewhere to go: always, but for datagrams before the first one has come."""
         return True
 
     @abstractmethod

@@ -1,5 +1,11 @@
-"""Scans drawn. In: a device, or points. Out: pictures in a terminal, or as SVG.
+"""Scans drawn, in a terminal or as SVG.
 
-`feed` takes what a device delivers and counts it; `polar` and `panel` draw points and figures on a `canvas` of character cells; `screen`
-is the terminal; `live` the window with its keys, and `recording` the switch that records what is seen. `svg` writes one scan as a file.
+In: a device, or points. Out: pictures. Modules in reading order:
+
+* `live`: the window that shows a sensor at work: keys in, pictures and figures out, a recording switched on and off.
+* `feed`: what the device delivers, taken in and counted between two pictures.
+* `polar`: points as seen from above and from the side.
+* `canvas`: pictures in character cells, and their inks.
+* `screen`: the terminal: cells that changed, single keys.
+* `svg`: one scan as a file.
 """

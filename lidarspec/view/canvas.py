@@ -88,7 +88,7 @@ def sgr(ink: int, depth: Depth) -> str:
 
 
 def style(ink: int) -> str:
-    """The same as a style of rich."""
+    """An ink as a style of rich."""
     chosen = INKS[ink]
     colour = "" if chosen.rgb is None else "#" + "".join(f"{part:02x}" for part in chosen.rgb)
     return " ".join(part for part in ("bold" if chosen.bold else "", colour) if part)
@@ -111,7 +111,7 @@ class Cells:
 
     Attributes:
         codes: (height, width) int32, the characters as code points.
-        inks: (height, width) int16, their colours, see `palette`.
+        inks: (height, width) int16, their colours, as indices of `INKS`.
     """
 
     codes: NDArray[np.int32]
@@ -162,7 +162,7 @@ class Cells:
         return found
 
     def ascii(self) -> Cells:
-        """The same for terminals that show nothing else."""
+        """The picture in ASCII alone, for terminals that show nothing else."""
         codes = self.codes.copy()
         for character in set(np.unique(codes).tolist()):
             if character > 0x7E:

@@ -105,7 +105,7 @@ def _scale(width: int, height: int, reach: float) -> float:
 
 
 def shade(cloud: PointCloud, look: Look) -> NDArray[np.float64]:
-    """How far along the ramp each point is, from 0."""
+    """How far along the ramp of inks each point is, (n,), from 0."""
     if look.ramp == "intensity" and cloud.intensity is not None:
         return cloud.intensity.astype(np.float64) / look.full
     return np.hypot(cloud.x, cloud.y).astype(np.float64) / look.full

@@ -15,12 +15,12 @@ KEPT = 1 << 24
 
 
 def repeated(value: int, count: int) -> NDArray[np.int64]:
-    """The same value so many times, (count,), read-only; as `np.broadcast_to`, at a tenth of its cost."""
+    """One value so many times, (count,), read-only; what `np.broadcast_to` gives, at a tenth of its cost."""
     return np.ndarray((count,), np.int64, value.to_bytes(8, sys.byteorder, signed=True), 0, (0,))
 
 
 def some(values: NDArray[np.int64], which: NDArray[np.bool_] | NDArray[np.intp] | slice) -> NDArray[np.int64]:
-    """Some of the values, by mask, indices or slice; of equal ones as `repeated` has them."""
+    """The values, (k,), that a mask, indices or a slice pick; equal ones stay `repeated`."""
     value = alike(values)
     if value is None or isinstance(which, slice):
         return values[which]
@@ -50,7 +50,7 @@ def alike(values: NDArray[np.int64]) -> int | None:
 
 
 def taken(rows: NDArray[np.uint8], which: NDArray[np.intp] | NDArray[np.bool_]) -> NDArray[np.uint8]:
-    """Some of the rows of bytes, by index or mask, (k, size), each copied as one piece."""
+    """The rows of bytes that indices or a mask pick, (k, size), each copied as one piece."""
     whole = rows.view(f"V{rows.shape[1]}")[:, 0]
     some = whole.take(which) if which.dtype != np.bool_ and rows.flags.c_contiguous else whole[which]
     return some.view(np.uint8).reshape(-1, rows.shape[1])

@@ -18,7 +18,15 @@ from lidarspec.wire.schema import Schema, schema
 
 
 def build(sensor: Spec, frame: str, value: Any, values: Mapping[str, Any], *, units: bool = False) -> bytes:
-    """See `Sensor.build`."""
+    """The bytes of one frame; constants, counts and the checksum are filled in.
+
+    Args:
+        value: a mapping of all fields, such as what `parse` returned, or None; `values` override it.
+        units: take physical values, and round them to the wire's steps.
+
+    Raises:
+        UsageError: for a missing or unknown field, or a value that its field cannot hold.
+    """
     if frame not in sensor.frames:
         raise UnknownFrame(frame, sensor.frames, place=sensor.id)
     if value is not None and not isinstance(value, Mapping):
@@ -154,7 +162,7 @@ def _scope(given: Any, path: str) -> Any:
 
 
 def given_value(given: Mapping[str, Any], fields: Mapping[str, FieldInfo], path: str) -> tuple[FieldInfo, Any] | str | None:
-    """A value that is given for a frame, as formulas read it (see `lidarspec.spec.tree.Read`).
+    """A value that is given for a frame, as formulas read it (`lidarspec.spec.tree.Read`).
 
     Raises:
         LookupError: where there is none.

@@ -2,6 +2,8 @@
 
 Two kinds with one behaviour: `Rows` loads fields from bytes by their layout, `Records` collects them from what
 construct parsed. Arrays of variable length are padded to the longest with zeros; `counts` has the lengths.
+
+Parts that are frames in themselves (M1) become a table of their own, without padding, with the row of their frame for each.
 """
 
 from __future__ import annotations
@@ -39,7 +41,7 @@ class Table(Protocol):
         """The bytes of one frame."""
 
     def take(self, which: NDArray[np.intp]) -> Table:
-        """Some of the frames, in the order given."""
+        """A table of the frames that indices pick, in their order."""
 
 
 @dataclass(frozen=True, eq=False)

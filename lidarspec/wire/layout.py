@@ -145,7 +145,7 @@ class Leaf:
         return total
 
     def at(self, offset: int) -> Leaf:
-        """This field with its place counted from `offset`."""
+        """The field with its place counted from `offset`."""
         return replace(self, offset=self.offset - offset)
 
 
@@ -216,7 +216,7 @@ class Seal:
         return single(self.algorithm)
 
     def intact(self, rows: Bytes2D, sums: Sums | None = None) -> NDArray[np.bool_]:
-        """Which frames carry the right value, or one that means "not filled", (n,); `sums` as in `computed`."""
+        """Which frames carry the right value, or one that means "not filled", (n,); `sums` computes it, by default the algorithm."""
         stored = self.stored(rows)
         right = np.asarray(stored == self.computed(rows, sums))
         return right | np.isin(stored, np.array(self.absent, np.uint64)) if self.absent else right
@@ -280,7 +280,7 @@ class Layout:
             seal.fill(rows)
 
     def constant(self, rows: Bytes2D) -> NDArray[np.bool_]:
-        """Which frames have all constants in place."""
+        """Which frames have all constants in place, (n,)."""
         spots, masks, values = self._constants  # type: ignore[attr-defined]
         return np.asarray(((rows[:, spots] & masks) == values).all(axis=1))
 
@@ -320,13 +320,13 @@ def exclude(some: Marks, others: Marks) -> bool:
 
 
 def equal(found: NDArray[Any], word: Word) -> NDArray[np.bool_]:
-    """Where the right constants stand, of what stands at their place."""
+    """Whether a constant is right, for what stands at its place in each frame, of that shape."""
     _, _, mask, value = word
     return np.asarray((found if mask is None else found & mask) == value)
 
 
 def right(constants: tuple[Word, ...], rows: Bytes2D) -> NDArray[np.bool_] | None:
-    """Which rows have all constants; None where all have."""
+    """Which rows have all constants, (n,); None where all have."""
     held: NDArray[np.bool_] | None = None
     for word in constants:
         spot, dtype, _, _ = word

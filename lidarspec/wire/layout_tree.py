@@ -137,7 +137,12 @@ class _Walk:
         return Layout(self.cursor, self.leaves, self.constants, seals, self.places, self.branches, following, self.lengths)
 
     def read(self, path: str) -> tuple[tree.FieldInfo, int] | str | None:
-        """A field by its path, for formulas; see `lidarspec.spec.tree.Read`."""
+        """What a formula reads by a path: a field and its raw value, the path of a struct, or None for what the header leaves out.
+
+        Raises:
+            NotCompilable: for what is no field before the formula, or not one integer.
+            Unknown: for a field whose value is not given.
+        """
         if path not in self.parts:
             scope, _, name = path.rpartition(".")
             raise NotCompilable(scope, f"an expression asks for {name!r}, which is not a field before it")
@@ -354,7 +359,7 @@ Group = tuple[Layout | Refused, NDArray[np.intp]]
 
 
 def rows_at(buffer: NDArray[np.uint8], offsets: NDArray[np.intp], size: int, *, gathered: bool = True) -> NDArray[np.uint8]:
-    """As many bytes from each of these offsets, one a row; no copy where they stand back to back.
+    """`size` bytes from each of these offsets on, one a row, (n, size); no copy where they stand back to back.
 
     Args:
         gathered: C-contiguous; else no copy either where they stand at one distance, and each row is contiguous by itself.

@@ -26,7 +26,16 @@ from lidarspec.wire.layout_tree import NotCompilable, Refused, frame_layouts, pr
 
 
 def parse(sensor: Spec, data: bytes, *, frame: str | None = None, verify: bool = True) -> Any:
-    """See `Sensor.parse`."""
+    """The Container of raw values of one frame, exactly.
+
+    Args:
+        frame: its type; found out where left out.
+        verify: False accepts wrong constants, a wrong checksum and trailing bytes.
+
+    Raises:
+        WireError: for bytes that are no such frame.
+        UnknownFrame: for a type that the sensor does not have.
+    """
     if not isinstance(data, bytes):
         refuse_text(data)
         data = bytes(data)
@@ -206,7 +215,12 @@ def _joined(field: BitField, columns: Mapping[int, Reader], frame: bytes) -> Seq
 
 
 def parse_typed(sensor: Spec, data: bytes, *, frame: str | None = None, verify: bool = True) -> tuple[str, Any]:
-    """The name of the frame type, and the parsed frame."""
+    """The name of the frame type, and the frame as construct parses it.
+
+    Raises:
+        WireError: for bytes that are no such frame.
+        UnknownFrame: for a type that the sensor does not have.
+    """
     if not isinstance(data, bytes):
         refuse_text(data)
         data = bytes(data)

@@ -217,7 +217,7 @@ def registers(rows: NDArray[np.uint8], spans: Spans, start: int, width: int, pol
 
 
 def cut(rows: NDArray[np.uint8], spans: Spans) -> NDArray[np.uint8]:
-    """The bytes of each row that some spans cover, one span after another."""
+    """The bytes of each row that some spans cover, one span after another, (n, bytes)."""
     parts = [rows[:, start:stop] for start, stop in spans]
     return parts[0] if len(parts) == 1 else np.concatenate(parts, axis=1)
 

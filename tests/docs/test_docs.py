@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import ast
 import doctest
 import importlib
 import inspect
+import itertools
+import operator
 import os
 import re
+import sys
+import threading
 from pathlib import Path
+from types import FrameType
 
 import pytest
 
@@ -15,6 +21,7 @@ import lidarspec as ls
 from lidarspec import errors, plugins as hookspecs, spec
 from lidarspec.cli.root import VERBS
 from lidarspec.spec import Checksummed, Clock, Command, Frame, Polar, Scaled, Sequence
+from lidarspec.testing.fixtures import virtual_port
 from tests.docs import pages
 from tests.docs.pages import DOCS
 
@@ -124,3 +131,61 @@ def test_every_page_is_in_the_contents_of_the_site() -> None:
     listed = re.findall(r": (\S+\.md)$", contents, re.MULTILINE)
     sensors = "reference/sensors/"
     assert sorted(listed) == [page for page in PAGES if not page.startswith(sensors) or page == f"{sensors}index.md"]
+
+
+HOUSE = Path(ls.__file__).parent
+
+
+@pytest.mark.parametrize("package", sorted(path.parent.relative_to(HOUSE).as_posix() for path in HOUSE.glob("*/**/__init__.py")))
+def test_a_package_says_what_comes_in_and_out_and_names_its_modules(package: str) -> None:
+    text = ast.get_docstring(ast.parse((HOUSE / package / "__init__.py").read_text(encoding="utf-8"))) or ""
+    assert "In: " in text
+    assert "Out: " in text
+    modules = {path.stem for path in (HOUSE / package).iterdir() if path.suffix == ".py" or (path / "__init__.py").is_file()}
+    listed = {name for line in re.findall(r"^\* (.*?): ", text, re.MULTILINE) for name in re.findall(r"`(\w+)`", line)}
+    assert listed == modules - {"__init__"}
+
+
+CONTRIBUTING = (DOCS.parent / "CONTRIBUTING.md").read_text(encoding="utf-8")
+
+
+def opened(section: str) -> list[tuple[str, str]]:
+    """Module and name of everything that a table of CONTRIBUTING says to open; a name belongs to the module that was named last."""
+    text = CONTRIBUTING.partition(f"## {section}\n")[2].partition("\n## ")[0]
+    named = []
+    for row in re.findall(r"^\|.*`.*\|$", text, re.MULTILINE):
+        module = ""
+        _, _, module_cell, names, *_ = row.split("|")
+        for word in re.findall(r"`([\w.]+)`", module_cell + names):
+            place = HOUSE / word.replace(".", "/")
+            if place.is_dir() or place.with_suffix(".py").is_file():
+                module = word
+            elif module:
+                named.append((module, word))
+    return named
+
+
+@pytest.mark.parametrize(("module", "name"), [*opened("Where things are"), *opened("The way of a byte")])
+def test_what_contributing_says_to_open_is_there(module: str, name: str) -> None:
+    assert operator.attrgetter(name)(importlib.import_module(f"lidarspec.{module}"))
+
+
+@pytest.mark.skipif(os.name == "nt", reason="there are no pseudo-terminals")
+def test_a_byte_goes_the_way_that_contributing_says() -> None:
+    passed: set[tuple[str, str]] = set()
+
+    def profile(frame: FrameType, event: str, _: object) -> None:
+        if event == "call":
+            passed.add((frame.f_globals.get("__name__", "").removeprefix("lidarspec."), frame.f_code.co_qualname))
+
+    threading.setprofile(profile)
+    sys.setprofile(profile)
+    try:
+        with virtual_port("ldrobot-stl27l") as port, ls.open(port.path, "ldrobot-stl27l") as device:
+            assert [len(scan.points.x) > 100 for scan in itertools.islice(device.scans(), 3)][-1]
+    finally:
+        sys.setprofile(None)
+        threading.setprofile(None)
+    stops = opened("The way of a byte")
+    assert {module for module, _ in stops} <= {module for module, _ in passed}
+    assert {(module, name) for module, name in stops if "." in name} <= passed

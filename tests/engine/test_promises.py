@@ -30,11 +30,11 @@ TURNING = SHAPES["shape-commands"]
 #: readings of the wall clock, and where they are allowed: as a stamp, or once beside the monotonic clock that carries them on.
 WALL = {"time.time", "time.time_ns", "datetime.now", "datetime.utcnow"}
 STAMPED = {
-    ("cli/record.py", "time.time_ns"),
-    ("inputs/live.py", "time.time_ns"),
-    ("recording/recordings.py", "datetime.now"),
-    ("recording/recordings.py", "time.time_ns"),
-    ("transports/live.py", "time.time_ns"),
+    ("device/live_input.py", "time.time_ns"),
+    ("device/source_recording.py", "time.time_ns"),
+    ("recording/recorders.py", "datetime.now"),
+    ("recording/recorders.py", "time.time_ns"),
+    ("transports/base.py", "time.time_ns"),
     ("transports/serving.py", "time.time_ns"),
     ("transports/udp.py", "time.time_ns"),
 }

@@ -73,11 +73,17 @@ class Kernel:
         self._function = self._function or function_of(self._text.source)
 
     def columns(self, number: int) -> dict[str, NDArray[Any]]:
-        """The columns of so many frames, to be filled."""
+        """The columns of so many frames, by name, to be filled: (number * width,) each."""
         return {name: np.empty(number * self._width, np.float32) for name in self._text.names}
 
     def run(self, rows: Bytes2D, values: Values, columns: Mapping[str, NDArray[Any]]) -> None:
-        """Fill the columns of all frames; see `plan.Maker`."""
+        """Fill the columns of all frames.
+
+        Args:
+            rows: the frames, at one distance from each other.
+            values: the plain result of a node for these frames, shape (n or 1, ...).
+            columns: flat, contiguous and as long as `columns` makes them.
+        """
         self.compile()
         count, stride = rows.shape[0], rows.strides[0]
         given: list[Any] = []

@@ -237,7 +237,7 @@ class Writer:
         return self.strided(shape, tuple(self.number(math.prod(shape[axis + 1 :])) for axis in range(len(shape))))
 
     def strided(self, shape: tuple[int, ...], strides: tuple[str, ...]) -> str:
-        """The same with steps along each axis."""
+        """The index of an element in the loops, of an array with these steps along each axis."""
         parts = [
             f"i{axis}" if stride == "1" else f"i{axis} * {stride}"
             for axis, (length, stride) in enumerate(zip(shape, strides, strict=True))

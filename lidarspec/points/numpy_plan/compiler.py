@@ -108,7 +108,7 @@ class Compiler:
         return self.program.step(text, kind, lambda run, out: table.take(read(run), out=out, mode="wrap"), read)
 
     def _shift(self, leaf: Leaf, seen: Window) -> tuple[int, int] | None:
-        """How a field that shares its window with others is cut out of it; see `shift_of`."""
+        """How a field that shares its window with others is cut out of it: shift and mask, or None where that takes a table."""
         if leaf.wire is not None:
             return None
         if (leaf.info.path, seen) not in self._shifts:

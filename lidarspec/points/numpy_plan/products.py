@@ -140,7 +140,7 @@ class Angles:
 
 
 def reduced(angles: Floats) -> Floats:
-    """Radians without whole turns: within half a turn either way."""
+    """Angles in radians without whole turns, within half a turn either way, of the same shape."""
     return angles - np.rint(angles / TURN) * TURN
 
 

@@ -72,7 +72,7 @@ class Number:
 
 
 def deep(array: NDArray[Any], depth: int) -> NDArray[Any]:
-    """Values of packets with as many axes as the points have."""
+    """Values of packets, (n, ...), with axes of length 1 behind them, up to `depth` of the points."""
     return array.reshape(*array.shape, *(1,) * (1 + depth - array.ndim))
 
 
@@ -136,11 +136,17 @@ class Program:
         return register
 
     def columns(self, number: int) -> dict[str, NDArray[Any]]:
-        """The columns of so many frames, to be filled."""
+        """The columns of so many frames, by name, to be filled: (number * width,) each."""
         return {name: np.empty(number * self.width, TYPES[self.kinds[register]]) for name, register in self.outputs.items()}
 
     def run(self, rows: Bytes2D, values: Values, columns: Mapping[str, NDArray[Any]]) -> None:
-        """Fill the columns of all frames; see `plan.Maker`."""
+        """Fill the columns of all frames.
+
+        Args:
+            rows: the frames, at one distance from each other.
+            values: the plain result of a node for these frames, shape (n or 1, ...).
+            columns: flat, contiguous and as long as `columns` makes them.
+        """
         number = len(rows)
         if not number:
             return
