@@ -9,6 +9,7 @@ flipped and tried, through the engine itself, for the one that would make it who
 from __future__ import annotations
 
 import io
+import itertools
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -17,17 +18,15 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from lidarspec.errors import LidarSpecError, WireError
-from lidarspec.explaining.listing import Line, listed, text
+from lidarspec.explaining.listing import Line, Listing, text
 from lidarspec.explaining.wording import Difference, Point, Row, Span, Value
 from lidarspec.framing.frame_engine import Codec, CompiledCodec, codec
 from lidarspec.framing.results import IMPLAUSIBLE, VALID, Counters, Found, packed
 from lidarspec.packets.stream import PacketStream
 from lidarspec.points.plain import evaluate
+from lidarspec.spec import Checksummed, Frame, Sensor
 from lidarspec.spec.bits import BitField
 from lidarspec.spec.construct_layer import UNNAMED, Seen, field_path, leaves
-from lidarspec.spec.description import Frame
-from lidarspec.spec.fields import Checksummed
-from lidarspec.spec.sensor import Sensor
 from lidarspec.spec.tree import Block, FieldInfo, Node, Opaque, Repeat, Struct, children, exact
 from lidarspec.wire.parse import parse_typed
 from lidarspec.wire.schema import schema
@@ -77,7 +76,7 @@ class Explanation:
 
     def lines(self, *, every: bool = False) -> list[Line]:
         """The listing in pieces; `every` draws the bits of all elements of an array, and not of the first alone."""
-        return [*listed(self.rows, every=every), *((Span("note: ", "note"), Span(note)) for note in self.notes)]
+        return [*Listing(self.rows, every=every).lines(), *((Span("note: ", "note"), Span(note)) for note in self.notes)]
 
     def differences(self, other: Explanation) -> list[Difference]:
         """The fields that another frame does not have alike, in the order of the wire."""
@@ -115,17 +114,15 @@ def explain(data: bytes, sensor: Sensor, frame: str | None = None) -> Explanatio
             raise
     trail = _Trail(sensor.frames[name], data)
     rows = (*trail.rows(), *trail.rest(fault))
-    if not _is_valid(sensor, name, data[: trail.end], fault):
+    if fault is not None and not fits(sensor, data[: trail.end], name):
         return Explanation(sensor.id, name, data, rows, fault, tuple(_flipped(sensor, name, data, trail)))
     points, notes = _points(sensor, name, data[: trail.end], rows)
     rows = tuple(replace(row, points=given) for row, given in zip(rows, points, strict=True))
     return Explanation(sensor.id, name, data, rows, fault, notes)
 
 
-def _is_valid(sensor: Sensor, name: str, data: bytes, fault: WireError | None) -> bool:
-    """Whether the bytes without what follows them are a valid frame."""
-    if fault is None:
-        return True
+def fits(sensor: Sensor, data: bytes, name: str) -> bool:
+    """Whether bytes are one valid frame of a type."""
     try:
         parse_typed(sensor, data, frame=name)
     except WireError:
@@ -209,17 +206,8 @@ class _Trail:
 
     def rows(self) -> Iterator[Row]:
         """A row for each part; the parts of an element of an array in one, if it holds no further array."""
-        group: list[tuple[str, Seen]] = []
-        last = ""
-        for path, seen in self._leaves():
-            element = self._element(path)
-            if group and element != last:
-                yield self._row(last, group)
-                group = []
-            group.append((path, seen))
-            last = element
-        if group:
-            yield self._row(last, group)
+        for element, group in itertools.groupby(self._leaves(), lambda leaf: self._element(leaf[0])):
+            yield self._row(element, list(group))
 
     def values(self) -> dict[str, Value]:
         """Every value by its path."""

@@ -50,13 +50,8 @@ def parents(path: str) -> list[str]:
     return [".".join(parts[:depth]) for depth in range(1, len(parts))]
 
 
-def listed(rows: Sequence[Row], *, every: bool = False) -> Iterator[Line]:
-    """The lines of the rows of a frame; `every` draws the bits of all elements of an array, and not of the first alone."""
-    return _Listing(rows, every=every).lines()
-
-
-class _Listing:
-    """The lines of some rows, in columns of one width."""
+class Listing:
+    """The lines of the rows of a frame, in columns; `every` draws the bits of all elements of an array, and not of the first alone."""
 
     def __init__(self, rows: Sequence[Row], *, every: bool) -> None:
         self._rows = rows
@@ -67,6 +62,7 @@ class _Listing:
         self._paths = min(max((len(name) for index in range(len(rows)) for name in self._names(index)), default=0), NAMES)
 
     def lines(self) -> Iterator[Line]:
+        """The lines, those of structs and elements before what is in them."""
         above: list[str] = []
         for index, row in enumerate(self._rows):
             around = parents(row.path)

@@ -3,7 +3,6 @@
 An export is a function from a `Sensor` to a text, and `export` calls it by its name. It walks the frame trees (`lidarspec.spec.tree`) that
 `messages` hands out, and is refused, with the reason, where they hold Python code or its target cannot say what the spec says.
 
-    messages                 the frame types with their trees
     json, stubs              the spec as data, and as types for an editor
     reference, diagram       a page in Markdown, and packet diagrams in SVG
     wireshark, ksy           a dissector in Lua, and a Kaitai Struct format
@@ -13,11 +12,12 @@ An export is a function from a `Sensor` to a text, and `export` calls it by its 
 from __future__ import annotations
 
 import importlib
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from lidarspec.errors import UnknownFrame, UnknownName, UsageError
-from lidarspec.spec.description import with_frames
+from lidarspec.errors import SpecError, UnknownFrame, UnknownName, UsageError
+from lidarspec.spec import tree
+from lidarspec.spec.description import Frame, with_frames
 
 if TYPE_CHECKING:
     from lidarspec.spec.sensor import Sensor
@@ -70,3 +70,51 @@ def export(sensor: Sensor, kind: str) -> str:
     module, _, function = EXPORTS[kind].partition(":")
     text: str = getattr(importlib.import_module(module), function)(sensor)
     return text
+
+
+@dataclass(frozen=True, eq=False)
+class Message:
+    """One frame type: its name, what the sensor says of it, and its tree."""
+
+    name: str
+    frame: Frame
+    root: tree.Struct | tree.Sealed
+
+    @property
+    def seals(self) -> dict[str, tree.Sealed]:
+        """The checksums, by the path of each field that holds one or a part of it."""
+        return {path: node for node in tree.nodes(self.root) if isinstance(node, tree.Sealed) for path in node.fields}
+
+
+def messages(sensor: Sensor) -> tuple[Message, ...]:
+    """All frame types of a sensor, in their order.
+
+    Raises:
+        Refused: if it has none yet, or one holds a part that only Python code can decide.
+    """
+    if not sensor.frames:
+        raise Refused(f"{sensor.id}: has no frames yet: configure it first")
+    return tuple(_message(sensor, name, frame) for name, frame in sensor.frames.items())
+
+
+def _message(sensor: Sensor, name: str, frame: Frame) -> Message:
+    try:
+        root = frame.tree
+        for node in tree.nodes(root):
+            _check(node)
+    except (Refused, SpecError) as refused:
+        raise Refused(f"{sensor.id} {name}: {refused}") from None
+    if not isinstance(root, tree.Struct | tree.Sealed):
+        raise Refused(f"{sensor.id} {name}: the frame is no struct")
+    return Message(name, frame, root)
+
+
+def _check(node: tree.Node) -> None:
+    """Refuse what no other language can say."""
+    for formula in tree.formulas(node):
+        if isinstance(formula, tree.Code):
+            raise Refused(formula.reason)
+    if isinstance(node, tree.Opaque):
+        raise Refused(f"{node.info.path}: {node.reason if node.inside else f'{node.kind} is Python code, which no other language runs'}")
+    if isinstance(node, tree.Sealed):
+        _ = node.algorithm

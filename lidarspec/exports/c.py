@@ -8,30 +8,17 @@ ranges that it covers, so that one serves every frame; `frame_length` looks at n
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+import functools
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from importlib import resources
 from typing import Any
 
 from lidarspec._version import __version__
-from lidarspec.exports import Refused
-from lidarspec.exports.c_fields import (
-    Access,
-    CLayout,
-    Entry,
-    accesses,
-    arguments,
-    comment,
-    fields,
-    identifier,
-    index,
-    parameters,
-    quoted,
-    word,
-)
-from lidarspec.exports.messages import Message, messages
-from lidarspec.spec.checksums import Checksum, Crc, Fold15, Sum, WordXor, Xor, ZeroPadded, byte_table, mirrored_bytes, reflected
-from lidarspec.spec.sensor import Sensor
+from lidarspec.exports import Message, Refused, c_fields, messages
+from lidarspec.exports.c_fields import Access, CLayout, Entry, accesses, arguments, comment, identifier, parameters, quoted, word
+from lidarspec.spec import Checksum, Crc, Fold15, Sensor, Sum, WordXor, Xor, ZeroPadded
+from lidarspec.spec.checksums import byte_table, mirrored_bytes, reflected
 from lidarspec.spec.tree import Blob, Block, Formula, Number, Op, Repeat, Sealed, formulas, refs
 from lidarspec.wire.wire_table import Extent
 
@@ -176,15 +163,15 @@ static inline int {name}(const uint8_t *p, size_t n)
 """
 
 
-def frame(layout: CLayout, algorithm: Callable[[Sealed], str]) -> Iterator[str]:
-    """The functions of a frame type that are about the whole of it; `algorithm` gives the name of a checksum's function."""
+def _frame(layout: CLayout, algorithms: Mapping[Checksum, str]) -> Iterator[str]:
+    """The functions of a frame type that are about the whole of it; `algorithms` are the names of the checksums' functions."""
     length, longest = layout.name("", "frame_length"), layout.message.frame.max_length
     checks = _lines(_needs(layout))
     unused = "" if checks else "    (void)p;\n    (void)n;\n"
     yield _LENGTH.format(name=length, unused=unused, checks=checks, size=layout.size, longest=longest)
     seals = [(entry, entry.node) for entry in layout.entries if isinstance(entry.node, Sealed)]
     for entry, seal in seals:
-        yield _checksum(layout, entry, seal, algorithm)
+        yield _checksum(layout, entry, seal, algorithms[seal.algorithm])
     sealed = [_unless(entry, f"!{layout.name(entry.path, 'checksum_ok')}({arguments(entry.depth)})") for entry, _ in seals]
     yield _IS_FRAME.format(name=layout.name("", "is_frame"), length=length, checks=_lines([*_constants(layout), *sealed]))
 
@@ -218,7 +205,7 @@ def _divisors(value: Formula) -> Iterator[Formula]:
             yield value.args[1]
 
 
-def _checksum(layout: CLayout, entry: Entry, seal: Sealed, algorithm: Callable[[Sealed], str]) -> str:
+def _checksum(layout: CLayout, entry: Entry, seal: Sealed, algorithm: str) -> str:
     held = [access for path in seal.fields for access in accesses(layout, path)]
     for path in seal.fields:
         if [access.entry.depth for access in held if access.info.path == path] != [entry.depth]:
@@ -228,7 +215,7 @@ def _checksum(layout: CLayout, entry: Entry, seal: Sealed, algorithm: Callable[[
         parameters=parameters(entry.depth),
         arguments=arguments(entry.depth),
         spans=", ".join(f"{{{start}, {end}}}" for start, end in _spans(layout, entry, seal, held)),
-        algorithm=algorithm(seal),
+        algorithm=algorithm,
         stored=_stored(held, seal.algorithm.order),
         absent="".join(f"stored == UINT64_C({value}) || " for value in seal.absent),
     )
@@ -290,7 +277,7 @@ def _number(value: Any) -> str:
 def _unless(entry: Entry, wrong: str) -> str:
     """A statement that ends with 0 where something is wrong, for every element of the arrays that it is in."""
     where = " && ".join(filter(None, (entry.where, wrong)))
-    names = [(index(level), count) for level, count in enumerate(entry.loops)]
+    names = [(c_fields.index(level), count) for level, count in enumerate(entry.loops)]
     loops = "".join(f"for (size_t {name} = 0; {name} < (size_t)({count}); ++{name}) " for name, count in names)
     return f"{loops}if ({where}) return 0;"
 
@@ -313,14 +300,6 @@ _HEAD = """\
  */
 #ifndef {guard}
 #define {guard}
-
-#include <stddef.h>
-#include <stdint.h>
-#include <string.h>
-
-#ifdef __cplusplus
-extern "C" {{
-#endif
 """
 
 _TAIL = """\
@@ -341,54 +320,32 @@ def header(sensor: Sensor) -> str:
     """
     prefix = identifier(sensor.id if sensor.id[0].isalpha() else f"lidar_{sensor.id}")
     title, source = f"{sensor.vendor} {sensor.model}", " ".join(sensor.source.split()).replace("*/", "* /")
-    names, algorithms = _Names(prefix), _Algorithms(prefix)
-    frames = ["\n".join(_frame(message, names, algorithms)) for message in messages(sensor)]
+    found = messages(sensor)
+    algorithms = dict.fromkeys(seal.algorithm for message in found for seal in message.seals.values())
+    names = {algorithm: f"{prefix}_checksum_{number}" for number, algorithm in enumerate(algorithms, 1)}
+    given: dict[str, tuple[str, str, str]] = {}
+    frames = [text for message in found for text in _message(message, prefix, given, names)]
     head = _HEAD.format(title=title, version=__version__, source=source, prefix=prefix, guard=f"{prefix.upper()}_H")
     helpers = resources.files("lidarspec.exports").joinpath("c_bytes.h").read_text(encoding="utf-8")
-    return "\n".join([head, helpers, *algorithms.texts, *frames, _TAIL])
+    return "\n".join([head, helpers, *(checksum(algorithm, name) for algorithm, name in names.items()), *frames, _TAIL])
 
 
-def _frame(message: Message, names: _Names, algorithms: _Algorithms) -> Iterator[str]:
-    layout = CLayout(message, names.of(message))
-    longest = f"#define {names.prefix.upper()}_{identifier(message.name).upper()}_MAX_LENGTH {message.frame.max_length}"
+def _message(message: Message, prefix: str, given: dict[str, tuple[str, str, str]], algorithms: Mapping[Checksum, str]) -> Iterator[str]:
+    """All of a frame type; `given` are the names that are taken, and what has them."""
+    name = functools.partial(_name, given, prefix, message.name)
+    for own in _OWN:
+        name("", own)
+    layout = CLayout(message, name)
     yield comment(f"---- {message.name}: {'from' if message.frame.direction == 'in' else 'to'} the sensor ----")
-    yield longest
-    yield from (text for text in fields(layout) if text)
+    yield f"#define {prefix.upper()}_{identifier(message.name).upper()}_MAX_LENGTH {message.frame.max_length}"
+    yield from (text for text in c_fields.fields(layout) if text)
     yield ""
-    yield from frame(layout, algorithms.of)
+    yield from _frame(layout, algorithms)
 
 
-class _Names:
-    """C names of what stands in frames, each given once."""
-
-    def __init__(self, prefix: str) -> None:
-        self.prefix = prefix
-        self._given: dict[str, tuple[str, str, str]] = {}
-
-    def of(self, message: Message) -> Callable[[str, str], str]:
-        """The names in one frame type: (path, ending) -> name."""
-        for own in _OWN:
-            self._name(message.name, "", own)
-        return lambda path, ending: self._name(message.name, path, ending)
-
-    def _name(self, frame: str, path: str, ending: str) -> str:
-        name = "_".join(identifier(part) for part in (self.prefix, frame, path, ending) if part)
-        while self._given.setdefault(name, (frame, path, ending)) != (frame, path, ending):
-            name += "_"
-        return name
-
-
-class _Algorithms:
-    """The checksum functions that are needed, each once."""
-
-    def __init__(self, prefix: str) -> None:
-        self._prefix, self._names = prefix, dict[Checksum, str]()
-        self.texts: list[str] = []
-
-    def of(self, node: Sealed) -> str:
-        """The name of the function for a seal."""
-        if node.algorithm not in self._names:
-            name = f"{self._prefix}_checksum_{len(self._names) + 1}"
-            self.texts.append(checksum(node.algorithm, name))
-            self._names[node.algorithm] = name
-        return self._names[node.algorithm]
+def _name(given: dict[str, tuple[str, str, str]], prefix: str, frame: str, path: str, ending: str) -> str:
+    """The C name of what stands at a path of a frame, with an ending; each is given once."""
+    name = "_".join(identifier(part) for part in (prefix, frame, path, ending) if part)
+    while given.setdefault(name, (frame, path, ending)) != (frame, path, ending):
+        name += "_"
+    return name

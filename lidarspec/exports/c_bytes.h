@@ -1,3 +1,11 @@
+#include <stddef.h>
+#include <stdint.h>
+#include <string.h>
+
+#ifdef __cplusplus
+extern "C" {
+#endif
+
 #ifndef LIDARSPEC_BYTES
 #define LIDARSPEC_BYTES
 static inline uint64_t lidarspec_le(const uint8_t *p, int size)

@@ -15,32 +15,8 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
-from lidarspec.exports import Refused
-from lidarspec.exports.messages import Message
-from lidarspec.spec.tree import (
-    COMPARISONS,
-    Blob,
-    Block,
-    Code,
-    Empty,
-    FieldInfo,
-    Formula,
-    Node,
-    Number,
-    Op,
-    Part,
-    Ref,
-    Repeat,
-    Sealed,
-    Select,
-    Struct,
-    When,
-    formulas,
-    infos,
-    nodes,
-    refs,
-    written,
-)
+from lidarspec.exports import Message, Refused
+from lidarspec.spec import tree
 from lidarspec.wire.wire_table import Extent, meaning, unit_text
 
 #: bits of a value that a formula in 64-bit integers may reach.
@@ -48,10 +24,8 @@ MOST_BITS = 62
 #: comparisons go through a function: compilers warn of what a narrow number can never be.
 _OPERATIONS = {
     **{"//": "lidarspec_floor_div({}, {})", "%": "lidarspec_floor_mod({}, {})", "not": "(int64_t)!{}"},
-    **{symbol: f"(lidarspec_int({{}}) {symbol} {{}})" for symbol in COMPARISONS},
+    **{symbol: f"(lidarspec_int({{}}) {symbol} {{}})" for symbol in tree.COMPARISONS},
 }
-#: (path, ending) -> the C name of a function.
-Name = Callable[[str, str], str]
 _INDICES = "ijklmnoq"
 
 
@@ -75,30 +49,13 @@ def identifier(text: str) -> str:
     return re.sub(r"\W", "_", text.replace("[]", "_inner"), flags=re.ASCII)
 
 
-def formula(value: Formula, name: Name) -> str:
-    """A formula as a C expression of type int64_t; `name` gives the functions of a path.
-
-    Raises:
-        Refused: where 64-bit integers cannot hold what it may come to.
-    """
-    if bits(value) > MOST_BITS:
-        raise Refused("a formula that may pass what a 64-bit integer holds")
-    return written(value, lambda ref: f"(int64_t){name(ref.path, '')}({arguments(len(ref.info.axes))})", _OPERATIONS)
-
-
-def truth(value: Formula, name: Name) -> str:
-    """A formula as a C condition; raises as `formula`."""
-    text = formula(value, name)
-    return text[1:-1] if isinstance(value, Op) and value.symbol in COMPARISONS else f"{text} != 0"
-
-
-def bits(value: Formula) -> int:
+def bits(value: tree.Formula) -> int:
     """How many bits, besides a sign, a formula takes at most."""
-    if isinstance(value, Ref):
+    if isinstance(value, tree.Ref):
         return value.info.bits
     if isinstance(value, int):
         return value.bit_length()
-    if isinstance(value, Code):
+    if isinstance(value, tree.Code):
         raise Refused(value.reason)
     args = [bits(arg) for arg in value.args]
     match value.symbol:
@@ -113,10 +70,10 @@ def bits(value: Formula) -> int:
             return args[0] + 1
         case "not":
             return 1
-    return 1 if value.symbol in COMPARISONS else max(args)
+    return 1 if value.symbol in tree.COMPARISONS else max(args)
 
 
-def number_type(fields: Sequence[FieldInfo]) -> str:
+def number_type(fields: Sequence[tree.FieldInfo]) -> str:
     """The C type that holds what any of these fields holds."""
     if any(info.kind == "float" for info in fields):
         return "double" if max(info.bits for info in fields) > 32 or any(info.kind != "float" for info in fields) else "float"
@@ -158,7 +115,7 @@ class Entry:
     """
 
     path: str
-    node: Node
+    node: tree.Node
     start: Extent
     size: Extent
     depth: int = 0
@@ -171,9 +128,14 @@ class Entry:
         return " && ".join(condition.text for condition in self.conditions)
 
 
-def given(node: Node, depth: int) -> str:
+def asked(node: tree.Node) -> list[tree.Ref]:
+    """The fields that the formulas of a node and of what is in it ask for."""
+    return [ref for below in tree.nodes(node) for value in tree.formulas(below) for ref in tree.refs(value)]
+
+
+def given(node: tree.Node, depth: int) -> str:
     """The arguments by which a size is asked for in so many arrays; where it is the same for all elements, it is that of the first."""
-    is_own = any(ref.info.axes for below in nodes(node) for value in formulas(below) for ref in refs(value))
+    is_own = any(ref.info.axes for ref in asked(node))
     return arguments(depth) if is_own else ", ".join(["p", *["0"] * depth])
 
 
@@ -202,21 +164,27 @@ class CLayout:
 
     def named(self, path: str) -> list[Entry]:
         """Every entry of the numbers, bytes or bits at a path: one, unless alternatives have it each."""
-        return [entry for entry in self.entries if any(info.path == path for info in infos(entry.node))]
+        return [entry for entry in self.entries if any(info.path == path for info in tree.infos(entry.node))]
 
     def whole(self, path: str) -> Entry:
         """The entry of the part at a path, of whatever kind: all of an array, all alternatives."""
         return next(entry for entry in self.entries if entry.path == path)
 
-    def formula(self, value: Formula) -> str:
-        """A formula as C."""
-        return formula(value, self.name)
+    def formula(self, value: tree.Formula) -> str:
+        """A formula as a C expression of type int64_t.
 
-    def length(self, value: Formula) -> str:
+        Raises:
+            Refused: where 64-bit integers cannot hold what it may come to.
+        """
+        if bits(value) > MOST_BITS:
+            raise Refused("a formula that may pass what a 64-bit integer holds")
+        return tree.written(value, lambda ref: f"(int64_t){self.name(ref.path, '')}({arguments(len(ref.info.axes))})", _OPERATIONS)
+
+    def length(self, value: tree.Formula) -> str:
         """A number of elements or bytes as C."""
         return str(value) if isinstance(value, int) else f"(size_t)({self.formula(value)})"
 
-    def count(self, node: Repeat, depth: int) -> int | str:
+    def count(self, node: tree.Repeat, depth: int) -> int | str:
         """The number of elements of an array in so many others: a number, or C."""
         if isinstance(node.count, int):
             return node.count
@@ -225,26 +193,27 @@ class CLayout:
     def extent(self, entry: Entry) -> Extent:
         """The size of what stands somewhere."""
         match entry.node:
-            case Number() | Block():
+            case tree.Number() | tree.Block():
                 return Extent(entry.node.size)
-            case Blob(size=int() as size):
+            case tree.Blob(size=int() as size):
                 return Extent(size)
-            case Blob():
+            case tree.Blob():
                 return Extent(0, (f"(int64_t){self.name(entry.path, 'size')}({given(entry.node, entry.depth)})",))
-            case Repeat():
+            case tree.Repeat():
                 return self._element(entry, entry.node).times(self.count(entry.node, entry.depth))
-            case When() | Select():
+            case tree.When() | tree.Select():
                 sizes = self.sizes(entry)
                 if len({str(size) for _, size in sizes}) == 1:
                     return sizes[0][1]
                 return Extent(0, (f"(int64_t){self.extent_name(entry)}({given(entry.node, entry.depth)})",))
-            case Empty():
+            case tree.Empty():
                 return Extent()
         return sum((self.extent(below) for below in self._below(entry)), Extent())
 
     def extent_name(self, entry: Entry) -> str:
         """The function that gives the size of a part with alternatives; one of these may be the alternative of another."""
-        alike = [id(node) for node in nodes(self.message.root) if isinstance(node, When | Select) and node.name == entry.node.name]
+        choices = [node for node in tree.nodes(self.message.root) if isinstance(node, tree.When | tree.Select)]
+        alike = [id(node) for node in choices if node.name == entry.node.name]
         return self.name(entry.path, f"extent{alike.index(id(entry.node)) or ''}")
 
     def sizes(self, entry: Entry) -> list[tuple[str, Extent]]:
@@ -254,14 +223,14 @@ class CLayout:
     def _visit(self, entry: Entry) -> None:
         """Note an entry and all in it."""
         node = entry.node
-        if not isinstance(node, Empty):
-            path = node.axis if isinstance(node, Repeat) else entry.path
+        if not isinstance(node, tree.Empty):
+            path = node.axis if isinstance(node, tree.Repeat) else entry.path
             self.entries.append(replace(entry, path=path, size=self.extent(entry)))
-        if isinstance(node, Repeat):
+        if isinstance(node, tree.Repeat):
             step = self._element(entry, node).times(f"(int64_t){index(entry.depth)}")
             loops = (*entry.loops, str(self.count(node, entry.depth)))
             self._visit(replace(entry, node=node.element, start=entry.start + step, depth=entry.depth + 1, loops=loops))
-        elif isinstance(node, When | Select):
+        elif isinstance(node, tree.When | tree.Select):
             for condition, below in self._cases(entry):
                 self._visit(replace(below, conditions=(*entry.conditions, condition)))
         else:
@@ -273,28 +242,28 @@ class CLayout:
     def _below(self, entry: Entry) -> Iterator[Entry]:
         """The members of a struct, all at its own start."""
         node = entry.node
-        if isinstance(node, Sealed):
+        if isinstance(node, tree.Sealed):
             yield replace(entry, node=node.body)
-        elif isinstance(node, Struct):
+        elif isinstance(node, tree.Struct):
             for member in node.members:
                 yield replace(entry, node=member, path=".".join(filter(None, (node.path, member.name))))
 
-    def _element(self, entry: Entry, node: Repeat) -> Extent:
+    def _element(self, entry: Entry, node: tree.Repeat) -> Extent:
         size = self.extent(replace(entry, node=node.element, depth=entry.depth + 1))
-        used = [ref for below in nodes(node.element) for value in formulas(below) for ref in refs(value)]
-        if size.terms and any(node.axis in ref.info.axes for ref in used):
+        if size.terms and any(node.axis in ref.info.axes for ref in asked(node.element)):
             raise Refused(f"{node.axis}: its elements differ in size, so that none has a place of its own without reading those before it")
         return size
 
     def _cases(self, entry: Entry) -> list[tuple[Condition, Entry]]:
         """The alternatives of a part, each with its condition."""
         node = entry.node
-        is_fixed = not any(ref.info.axes for value in formulas(node) for ref in refs(value))
-        if isinstance(node, When):
-            asked = truth(node.condition, self.name)
-            cases = [(asked, node.then), (f"!({asked})", node.otherwise)]
+        is_fixed = not any(ref.info.axes for value in tree.formulas(node) for ref in tree.refs(value))
+        if isinstance(node, tree.When):
+            holds = self.formula(node.condition)
+            holds = holds[1:-1] if isinstance(node.condition, tree.Op) and node.condition.symbol in tree.COMPARISONS else f"{holds} != 0"
+            cases = [(holds, node.then), (f"!({holds})", node.otherwise)]
         else:
-            assert isinstance(node, Select)
+            assert isinstance(node, tree.Select)
             key = self.formula(node.key)
             others = " && ".join(f"{key} != {value}" for value, _ in node.cases) or "1"
             cases = [*((f"{key} == {value}", case) for value, case in node.cases), (others, node.default)]
@@ -325,12 +294,12 @@ class Access:
     """One way to read a field: in one entry, and of a bit block one of its parts."""
 
     entry: Entry
-    part: Part | None = None
+    part: tree.Part | None = None
 
     @property
-    def info(self) -> FieldInfo:
+    def info(self) -> tree.FieldInfo:
         """The field."""
-        return self.part.info if self.part is not None else infos(self.entry.node)[0]
+        return self.part.info if self.part is not None else tree.infos(self.entry.node)[0]
 
     @property
     def expression(self) -> str:
@@ -338,7 +307,7 @@ class Access:
         node, entry = self.entry.node, self.entry
         if self.part is not None:
             return _bits(self.part, entry)
-        assert isinstance(node, Number)
+        assert isinstance(node, tree.Number)
         raw = f"p[{entry.start}]" if node.size == 1 else word(entry.start, node.size, node.order)
         if node.kind == "float":
             return f"{FLOATS[node.size]}({raw})"
@@ -365,7 +334,7 @@ def word(start: Extent, size: int, order: str) -> str:
     return f"lidarspec_{'le' if order == 'little' else 'be'}(p + {start}, {size})"
 
 
-def _bits(part: Part, entry: Entry) -> str:
+def _bits(part: tree.Part, entry: Entry) -> str:
     wide = "uint64_t" if part.bits.width > 32 else "uint32_t"
     terms = []
     for segment in part.bits.segments:
@@ -381,7 +350,7 @@ def accesses(layout: CLayout, path: str) -> list[Access]:
     """All ways to read a field."""
     ways: list[Access] = []
     for entry in layout.named(path):
-        parts = entry.node.parts if isinstance(entry.node, Block) else (None,)
+        parts = entry.node.parts if isinstance(entry.node, tree.Block) else (None,)
         ways += [Access(entry, part) for part in parts if part is None or part.info.path == path]
     return ways
 
@@ -405,34 +374,34 @@ Writer = Callable[[CLayout, str], Iterator[str]]
 
 def _functions(entry: Entry) -> Iterator[tuple[Writer, str]]:
     """What is written for an entry, and the path of what it is about."""
-    if isinstance(entry.node, Block):
+    if isinstance(entry.node, tree.Block):
         for part in entry.node.parts:
             yield from ((_inner_count, axis) for axis in _inner(part))
             yield _field, part.info.path
-    elif isinstance(entry.node, Number) or (isinstance(entry.node, Blob) and entry.node.name):
+    elif isinstance(entry.node, tree.Number) or (isinstance(entry.node, tree.Blob) and entry.node.name):
         yield _field, entry.path
-    elif isinstance(entry.node, Repeat):
+    elif isinstance(entry.node, tree.Repeat):
         yield _count, entry.path
 
 
 def _extents(layout: CLayout) -> Iterator[str]:
     """The sizes of parts that have alternatives of several sizes."""
     for entry in layout.entries:
-        if isinstance(entry.node, When | Select):
+        if isinstance(entry.node, tree.When | tree.Select):
             sizes = layout.sizes(entry)
             if len({str(size) for _, size in sizes}) > 1:
                 ways = [*((condition, f"(size_t)({size})") for condition, size in sizes[:-1]), ("", f"(size_t)({sizes[-1][1]})")]
                 yield _function("size_t", layout.extent_name(entry), entry.depth, ways)
 
 
-def _inner(part: Part) -> tuple[str, ...]:
+def _inner(part: tree.Part) -> tuple[str, ...]:
     """The arrays inside a bit block that a part of it is in."""
     return part.info.axes[len(part.info.axes) - len(part.indices) :]
 
 
 def _inner_count(layout: CLayout, axis: str) -> Iterator[str]:
     """The number of elements of an array inside a bit block."""
-    blocks = [(entry, entry.node.parts) for entry in layout.entries if isinstance(entry.node, Block)]
+    blocks = [(entry, entry.node.parts) for entry in layout.entries if isinstance(entry.node, tree.Block)]
     inside = [(entry, part) for entry, parts in blocks for part in parts if axis in _inner(part)]
     entry, part = inside[0]
     level = _inner(part).index(axis)
@@ -441,7 +410,7 @@ def _inner_count(layout: CLayout, axis: str) -> Iterator[str]:
 
 
 def _count(layout: CLayout, axis: str) -> Iterator[str]:
-    arrays = [(entry, entry.node.count) for entry in layout.entries if entry.path == axis and isinstance(entry.node, Repeat)]
+    arrays = [(entry, entry.node.count) for entry in layout.entries if entry.path == axis and isinstance(entry.node, tree.Repeat)]
     ways = [(entry.where, layout.length(count)) for entry, count in arrays]
     yield _function("size_t", layout.name(axis, "count"), arrays[0][0].depth, ways)
 
@@ -453,9 +422,9 @@ def _field(layout: CLayout, path: str) -> Iterator[str]:
     depth = first.entry.depth + (len(first.part.indices) if first.part else 0)
     yield from (f"#define {name.upper()}_{identifier(label).upper()} {value}" for value, label in first.info.labels.items())
     yield comment(unit_text(first.info), meaning(first.info))
-    if isinstance(first.entry.node, Blob):
+    if isinstance(first.entry.node, tree.Blob):
         kind = ""
-        sizes = [(access.entry.where, layout.length(access.entry.node.size)) for access in ways if isinstance(access.entry.node, Blob)]
+        sizes = [(access.entry.where, layout.length(access.entry.node.size)) for access in ways if isinstance(access.entry.node, tree.Blob)]
         yield _function("size_t", layout.name(path, "size"), depth, sizes)
         yield _function("const uint8_t *", name, depth, [(access.entry.where, f"p + ({access.entry.start})") for access in ways])
     else:
@@ -482,7 +451,7 @@ def _grouped(expression: str) -> str:
     return f"({expression})" if " " in expression and not expression.startswith(("lidarspec_", "p[")) else expression
 
 
-def _scaling(info: FieldInfo, name: str, kind: str) -> Iterator[str]:
+def _scaling(info: tree.FieldInfo, name: str, kind: str) -> Iterator[str]:
     """From the raw number to the field's unit, and to the SI unit where that is another one."""
     yield _conversion(f"{name}_to_{_unit_name(info.unit)}", kind, info.scale, info.offset)
     if info.unit in SI:

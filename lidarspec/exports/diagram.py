@@ -11,23 +11,12 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from xml.sax.saxutils import escape, quoteattr
 
-from lidarspec.exports.messages import Message, messages
-from lidarspec.spec.sensor import Sensor
-from lidarspec.spec.tree import (
-    Blob,
-    Block,
-    FieldInfo,
-    Node,
-    Number,
-    Part,
-    Repeat,
-    Sealed,
-    Select,
-    Struct,
-    When,
-    nodes,
-)
+from lidarspec.exports import Message, messages
+from lidarspec.spec import Sensor, tree
 from lidarspec.wire.wire_table import INDICES, Extent, bit_text, branches, extent, frame_size, meaning, phrase, unit_text
+
+#: how the names of fields begin that are there for nothing yet, in manuals.
+SPARE = ("reserved", "unused", "spare", "zeros", "padding")
 
 
 @dataclass(frozen=True)
@@ -67,7 +56,7 @@ def cells(message: Message) -> tuple[Item, ...]:
 
 def byte_order(message: Message) -> str:
     """The byte order of all numbers of a frame type, "" where they differ or there are none of several bytes."""
-    orders = {node.order for node in nodes(message.root) if isinstance(node, Number) and node.size > 1}
+    orders = {node.order for node in tree.nodes(message.root) if isinstance(node, tree.Number) and node.size > 1}
     return orders.pop() if len(orders) == 1 else ""
 
 
@@ -80,37 +69,37 @@ class _Cells:
         mixed: whether its numbers have several byte orders, so that each says its own.
     """
 
-    seals: Mapping[str, Sealed]
+    seals: Mapping[str, tree.Sealed]
     mixed: bool
 
-    def visit(self, node: Node, start: Extent, depth: int) -> tuple[Item, ...]:
+    def visit(self, node: tree.Node, start: Extent, depth: int) -> tuple[Item, ...]:
         """The items of a part that begins at `start`."""
         match node:
-            case Sealed():
+            case tree.Sealed():
                 return self.visit(node.body, start, depth)
-            case Struct():
+            case tree.Struct():
                 return tuple(self._struct(node, start, depth))
-            case Number():
+            case tree.Number():
                 return (self._number(node, start),)
-            case Blob() if node.size != 0:
+            case tree.Blob() if node.size != 0:
                 return (self._blob(node, start),)
-            case Block():
+            case tree.Block():
                 return tuple(self._block(node, start))
-            case Repeat():
+            case tree.Repeat():
                 return (self._repeat(node, start, depth),)
-            case When() | Select():
+            case tree.When() | tree.Select():
                 parts = ((label, self.visit(branch, start, depth)) for label, branch in branches(node))
                 return tuple(Group(label, items, optional=True) for label, items in parts if items)
         return ()
 
-    def _struct(self, node: Struct, start: Extent, depth: int) -> Iterator[Item]:
+    def _struct(self, node: tree.Struct, start: Extent, depth: int) -> Iterator[Item]:
         for member in node.members:
-            named = isinstance(member, Struct | Sealed) or (isinstance(member, Block) and member.parts[0].names)
+            named = isinstance(member, tree.Struct | tree.Sealed) or (isinstance(member, tree.Block) and member.parts[0].names)
             for item in self.visit(member, start, depth):
                 yield replace(item, name=f"{member.name}.{item.name}") if named and isinstance(item, Cell) else item
             start = start + extent(member, member.name)
 
-    def _number(self, node: Number, start: Extent) -> Cell:
+    def _number(self, node: tree.Number, start: Extent) -> Cell:
         width, is_long = 8 * node.size, node.size > 1
         short = {"uint": "u", "int": "s", "float": "float "}[node.kind] + f"{width}{f' {node.order[0]}e' * (self.mixed and is_long)}"
         detail = " ".join(filter(None, (short, unit_text(node.info))))
@@ -118,15 +107,15 @@ class _Cells:
             detail = f"{node.info.const:#0{2 * node.size + 2}x}" if isinstance(node.info.const, int) else str(node.info.const)
         return self._cell(node.info, node.name, width, detail, f"{node.kind}{width}{f' {node.order}' * is_long}", start)
 
-    def _blob(self, node: Blob, start: Extent) -> Cell:
+    def _blob(self, node: tree.Blob, start: Extent) -> Cell:
         size = extent(node)
         detail = node.const.hex(" ") if node.const is not None and len(node.const) <= 8 else f"{size} byte{'s' * (str(size) != '1')}"
         return self._cell(node.info, node.name, 8 * size.number, detail, "bytes", start)
 
-    def _block(self, node: Block, start: Extent) -> list[Cell]:
+    def _block(self, node: tree.Block, start: Extent) -> list[Cell]:
         """A box for each run of bits of one value, in the order of the wire, the highest bit of each byte first."""
         segments = [(run.byte, run.low + run.mask.bit_count() - 1, run, part) for part in node.parts for run in part.bits.segments]
-        runs: list[tuple[Part, int, int, int]] = []
+        runs: list[tuple[tree.Part, int, int, int]] = []
         for byte, _, run, part in sorted(segments, key=lambda entry: (entry[0], -entry[1])):
             low, high = run.target, run.target + run.mask.bit_count() - 1
             if runs and runs[-1][0] is part and runs[-1][1] == high + 1:
@@ -135,7 +124,7 @@ class _Cells:
                 runs.append((part, low, high, byte))
         return [self._run(node, part, low, high, start + Extent(byte)) for part, low, high, byte in runs]
 
-    def _run(self, node: Block, part: Part, low: int, high: int, start: Extent) -> Cell:
+    def _run(self, node: tree.Block, part: tree.Part, low: int, high: int, start: Extent) -> Cell:
         """The box of some bits of a value, with their numbers where it has others, too."""
         width = high - low + 1
         name = (".".join(part.names) or node.name) + "".join(f"[{index}]" for index in part.indices)
@@ -143,21 +132,16 @@ class _Cells:
         detail = unit_text(part.info) if width == part.bits.width else numbers
         return self._cell(part.info, name, width, detail, bit_text(part.bits), start)
 
-    def _cell(self, info: FieldInfo, name: str, bits: int, detail: str, kind: str, start: Extent) -> Cell:
+    def _cell(self, info: tree.FieldInfo, name: str, bits: int, detail: str, kind: str, start: Extent) -> Cell:
         seal = self.seals.get(info.path)
-        role = "sum" if seal else "const" if info.const is not None else "spare" if _is_spare(name) else ""
+        role = "sum" if seal else "const" if info.const is not None else "spare" if name.startswith(SPARE) else ""
         said = (info.path, kind, unit_text(info), meaning(info), seal.algorithm.describe() if seal else "")
         return Cell(name or "(constant)", bits, detail, "; ".join(filter(None, said)), role, start)
 
-    def _repeat(self, node: Repeat, start: Extent, depth: int) -> Group:
+    def _repeat(self, node: tree.Repeat, start: Extent, depth: int) -> Group:
         step = extent(node.element, node.name).times(INDICES[depth % len(INDICES)])
         count = node.count if isinstance(node.count, int) else phrase(node.count)
         return Group(f"{node.name} \u00d7\u00a0{count}", self.visit(node.element, start + step, depth + 1))
-
-
-def _is_spare(name: str) -> bool:
-    """Whether a field is there for nothing yet, by the names that manuals give such fields."""
-    return name.startswith(("reserved", "unused", "spare", "zeros", "padding"))
 
 
 #: bits in a row, pixels of a bit and of a row, of the offsets at the left, of a level of brackets, and around everything.

@@ -8,31 +8,12 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from collections.abc import Mapping
 from typing import Any
 
-from lidarspec.exports.messages import Message, messages
-from lidarspec.spec.checksums import Checksum
-from lidarspec.spec.description import Command
+from lidarspec.exports import Message, messages
+from lidarspec.spec import Command, Sensor, tree
 from lidarspec.spec.links import Link, Serial, Tcp, Udp
-from lidarspec.spec.sensor import Sensor
-from lidarspec.spec.tree import (
-    Blob,
-    Block,
-    Empty,
-    FieldInfo,
-    Formula,
-    Node,
-    Number,
-    Op,
-    Opaque,
-    Part,
-    Ref,
-    Repeat,
-    Sealed,
-    Select,
-    Struct,
-    When,
-)
 from lidarspec.wire.wire_table import frame_size
 
 #: raised whenever a key changes its meaning or goes.
@@ -52,30 +33,26 @@ def spec(sensor: Sensor) -> dict[str, Any]:
     """The spec as plain data; see `text`."""
     return {
         "lidarspec": VERSION,
-        "id": sensor.id,
-        "vendor": sensor.vendor,
-        "model": sensor.model,
-        "aliases": list(sensor.aliases),
-        "status": sensor.status,
-        "source": sensor.source,
-        "range_limits": list(sensor.range_limits),
-        "vendor_axes": list(sensor.vendor_axes) if sensor.vendor_axes else None,
-        "links": {name: link_data(link) for name, link in sensor.links.items()},
+        **_facts(sensor, "id", "vendor", "model", "aliases", "status", "source", "range_limits", "vendor_axes"),
+        "links": {name: _link(link) for name, link in sensor.links.items()},
         "scan": {"rule": type(sensor.scan).__name__, **dataclasses.asdict(sensor.scan)},
         "clock": _clock(sensor),
         "sequence": _sequence(sensor),
         "fillers": sensor.fillers.hex(),
         "frames": {message.name: _frame(message) for message in messages(sensor)},
         "commands": {name: _command(command) for name, command in sensor.commands.items()},
-        "on_open": list(sensor.on_open),
-        "on_close": list(sensor.on_close),
+        **_facts(sensor, "on_open", "on_close"),
     }
 
 
-def link_data(link: Link) -> dict[str, Any]:
-    """A link as data."""
-    kind = {Serial: "serial", Udp: "udp", Tcp: "tcp"}[type(link)]
-    return {"kind": kind, **{name: list(value) if isinstance(value, tuple) else value for name, value in vars(link).items()}}
+def _facts(value: object, *names: str) -> dict[str, Any]:
+    """Some attributes of a value as data: tuples as lists, mappings as objects."""
+    facts = ((name, getattr(value, name)) for name in names)
+    return {name: list(fact) if isinstance(fact, tuple) else dict(fact) if isinstance(fact, Mapping) else fact for name, fact in facts}
+
+
+def _link(link: Link) -> dict[str, Any]:
+    return {"kind": {Serial: "serial", Udp: "udp", Tcp: "tcp"}[type(link)], **_facts(link, *vars(link))}
 
 
 def _clock(sensor: Sensor) -> dict[str, Any] | None:
@@ -96,12 +73,9 @@ def _sequence(sensor: Sensor) -> dict[str, Any] | None:
 def _frame(message: Message) -> dict[str, Any]:
     frame = message.frame
     return {
-        "direction": frame.direction,
-        "data": frame.data,
+        **_facts(frame, "direction", "data"),
         "size": frame_size(frame),
-        "max_length": frame.max_length,
-        "after": frame.after,
-        "confirm": frame.confirm,
+        **_facts(frame, "max_length", "after", "confirm"),
         "plausible": frame.plausible is not None,
         "layout": node_data(message.root),
     }
@@ -109,81 +83,63 @@ def _frame(message: Message) -> dict[str, Any]:
 
 def _command(command: Command) -> dict[str, Any]:
     return {
-        "frame": command.frame,
-        "values": dict(command.values),
+        **_facts(command, "frame", "values"),
         "args": {name: {"field": path, "low": low, "high": high} for name, (path, low, high) in command.args.items()},
-        "replies": list(command.replies),
-        "matches": dict(command.matches),
-        "echoes": list(command.echoes),
-        "timeout": command.timeout,
-        "retries": command.retries,
-        "settle": command.settle,
-        "link": command.link,
-        "lines": dict(command.lines),
-        "starts": command.starts,
-        "stops": command.stops,
-        "every": command.every,
+        **_facts(command, "replies", "matches", "echoes", "timeout", "retries", "settle", "link", "lines", "starts", "stops", "every"),
     }
 
 
-def node_data(node: Node) -> dict[str, Any]:
+def node_data(node: tree.Node) -> dict[str, Any]:
     """A part of a frame as data: "kind" says which keys follow."""
     match node:
-        case Struct():
+        case tree.Struct():
             return {"kind": "struct", "name": node.name, "members": [node_data(member) for member in node.members]}
-        case Sealed():
+        case tree.Sealed():
             return node_data(node.body) | {"checksum": _seal(node)}
-        case Number():
+        case tree.Number():
             return {"kind": node.kind, "name": node.name, "bytes": node.size, "order": node.order} | _info(node.info)
-        case Blob():
+        case tree.Blob():
             return {"kind": "bytes", "name": node.name, "bytes": formula_data(node.size)} | _info(node.info)
-        case Block():
+        case tree.Block():
             return {"kind": "block", "name": node.name, "bytes": node.size, "parts": [_part(part) for part in node.parts]}
-        case Repeat():
+        case tree.Repeat():
             return {"kind": "array", "name": node.name, "count": formula_data(node.count), "element": node_data(node.element)}
-        case When():
+        case tree.When():
             branches = {"then": node_data(node.then), "else": node_data(node.otherwise)}
             return {"kind": "if", "name": node.name, "condition": formula_data(node.condition)} | branches
-        case Select():
+        case tree.Select():
             cases = [{"value": value, "part": node_data(case)} for value, case in node.cases]
             return {"kind": "switch", "name": node.name, "key": formula_data(node.key), "cases": cases, "default": node_data(node.default)}
-        case Empty() | Opaque():
+        case tree.Empty() | tree.Opaque():
             return {"kind": "nothing", "name": node.name}
 
 
-def formula_data(formula: Formula) -> Any:
+def formula_data(formula: tree.Formula) -> Any:
     """A number as it is, a field as {"field": path}, an operation as {"op": symbol, "args": [...]}."""
     match formula:
-        case Ref():
+        case tree.Ref():
             return {"field": formula.path}
-        case Op(symbol, args):
+        case tree.Op(symbol, args):
             return {"op": symbol, "args": [formula_data(arg) for arg in args]}
         case _:
             return formula
 
 
-def _info(info: FieldInfo) -> dict[str, Any]:
+def _info(info: tree.FieldInfo) -> dict[str, Any]:
     const = info.const.hex() if isinstance(info.const, bytes | bytearray) else info.const
     facts = {"path": info.path, "unit": info.unit, "scale": info.scale, "offset": info.offset, "const": const, "docs": info.docs}
     return {**facts, "labels": {str(value): name for value, name in info.labels.items()}}
 
 
-def _part(part: Part) -> dict[str, Any]:
+def _part(part: tree.Part) -> dict[str, Any]:
     runs = [{"byte": run.byte, "low": run.low, "width": run.mask.bit_count(), "target": run.target} for run in part.bits.segments]
     head = {"name": ".".join(part.names), "indices": list(part.indices), "width": part.bits.width, "signed": part.bits.signed}
     return {**head, "runs": runs} | _info(part.info)
 
 
-def _seal(node: Sealed) -> dict[str, Any]:
-    return {
-        "fields": list(node.fields),
-        "over": list(node.over) if node.over else None,
-        "absent": list(node.absent),
-        "algorithm": _algorithm(node.algorithm),
-    }
-
-
-def _algorithm(algorithm: Checksum) -> dict[str, Any]:
+def _seal(node: tree.Sealed) -> dict[str, Any]:
+    algorithm = node.algorithm
     own: dict[str, Any] = dataclasses.asdict(algorithm) if dataclasses.is_dataclass(algorithm) else {}
     known = {name: value for name, value in own.items() if isinstance(value, int | str | bool | tuple)}
-    return {"kind": type(algorithm).__name__, "width": algorithm.width, "describe": algorithm.describe(), **known}
+    kind = {"kind": type(algorithm).__name__, "width": algorithm.width, "describe": algorithm.describe()}
+    return {**_facts(node, "fields", "over", "absent"), "algorithm": {**kind, **known}}

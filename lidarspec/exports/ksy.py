@@ -11,34 +11,14 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from lidarspec.exports import Refused
-from lidarspec.exports.messages import Message, messages
+from lidarspec.exports import Message, Refused, messages
+from lidarspec.spec import Sensor, tree
 from lidarspec.spec.bits import BitField, Segment
 from lidarspec.spec.fields import slug
-from lidarspec.spec.sensor import Sensor
-from lidarspec.spec.tree import (
-    COMPARISONS,
-    Blob,
-    Block,
-    Empty,
-    FieldInfo,
-    Formula,
-    Node,
-    Number,
-    Op,
-    Part,
-    Ref,
-    Repeat,
-    Sealed,
-    Select,
-    Struct,
-    When,
-    written,
-)
 from lidarspec.wire.wire_table import meaning, unit_text
 
 #: a string that means the same without quotes.
@@ -73,27 +53,20 @@ def _lines(value: Any, indent: str) -> Iterator[str]:
 
 
 def _entry(head: str, part: Any, indent: str) -> Iterator[str]:
-    if (isinstance(part, Mapping) and part) or (_is_list(part) and any(isinstance(item, Mapping | list) for item in part)):
+    if (isinstance(part, Mapping) and part) or (isinstance(part, list) and any(isinstance(item, Mapping | list) for item in part)):
         yield head
         yield from _lines(part, indent)
     elif isinstance(part, Mapping):
         yield f"{head} {{}}"
-    elif _is_list(part):
+    elif isinstance(part, list):
         yield f"{head} [{', '.join(_scalar(item) for item in part)}]"
     else:
         yield f"{head} {_scalar(part)}"
 
 
-def _is_list(value: Any) -> bool:
-    return isinstance(value, Sequence) and not isinstance(value, str)
-
-
 def _scalar(value: Any) -> str:
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    if isinstance(value, str):
-        return value if _PLAIN.fullmatch(value) and value.lower() not in _WORDS else json.dumps(value, ensure_ascii=False)
-    return repr(value)
+    plain = isinstance(value, str) and _PLAIN.fullmatch(value) and value.lower() not in _WORDS
+    return value if plain else json.dumps(value, ensure_ascii=False) if isinstance(value, str | bool) else repr(value)
 
 
 def identifier(name: str) -> str:
@@ -111,7 +84,7 @@ class Scope:
         """In the type of the struct at a path, or with None in one that holds a single part."""
         return Scope((*self.levels, path))
 
-    def field(self, ref: Ref) -> str:
+    def field(self, ref: tree.Ref) -> str:
         """A field as an integer, by its way from here.
 
         Raises:
@@ -124,20 +97,20 @@ class Scope:
         raise Refused(f"{ref.path} cannot be reached in Kaitai")
 
 
-_OPERATIONS = {"//": "({} / {})", "not": "({} == 0 ? 1 : 0)", **{symbol: f"({{}} {symbol} {{}} ? 1 : 0)" for symbol in COMPARISONS}}
+_OPERATIONS = {"//": "({} / {})", "not": "({} == 0 ? 1 : 0)", **{symbol: f"({{}} {symbol} {{}} ? 1 : 0)" for symbol in tree.COMPARISONS}}
 
 
-def number(formula: Formula, scope: Scope) -> str:
+def number(formula: tree.Formula, scope: Scope) -> str:
     """A formula as an integer."""
-    return written(formula, scope.field, _OPERATIONS)
+    return tree.written(formula, scope.field, _OPERATIONS)
 
 
-def truth(formula: Formula, scope: Scope) -> str:
+def truth(formula: tree.Formula, scope: Scope) -> str:
     """A formula as a condition: not 0."""
     match formula:
-        case Op("not", (operand,)):
+        case tree.Op("not", (operand,)):
             return f"not ({truth(operand, scope)})"
-        case Op(symbol, (left, right)) if symbol in COMPARISONS:
+        case tree.Op(symbol, (left, right)) if symbol in tree.COMPARISONS:
             return f"{number(left, scope)} {symbol} {number(right, scope)}"
         case int():
             return "true" if formula else "false"
@@ -150,7 +123,7 @@ Attribute = dict[str, Any]
 WIDEST, INTEGERS, FLOATS = 64, (1, 2, 4, 8), (4, 8)
 
 
-def block_type(block: Block, doc: Callable[[FieldInfo], Attribute]) -> tuple[list[Attribute], dict[str, Attribute]]:
+def block_type(block: tree.Block, doc: Callable[[tree.FieldInfo], Attribute]) -> tuple[list[Attribute], dict[str, Attribute]]:
     """The attributes and the instances of the type of a block, with what is said of each part.
 
     Raises:
@@ -175,7 +148,7 @@ def block_type(block: Block, doc: Callable[[FieldInfo], Attribute]) -> tuple[lis
     return seq, instances
 
 
-def inline(block: Block, more: Mapping[str, Any]) -> tuple[Attribute, dict[str, Attribute]] | None:
+def inline(block: tree.Block, more: Mapping[str, Any]) -> tuple[Attribute, dict[str, Attribute]] | None:
     """The attribute and the instances of a block that is one plain integer; None for any other block."""
     if len(block.parts) != 1 or block.parts[0].names or block.parts[0].indices or not block.name:
         return None
@@ -187,21 +160,22 @@ def inline(block: Block, more: Mapping[str, Any]) -> tuple[Attribute, dict[str, 
     return {"id": f"{name}_raw", "size": block.size, **more}, {name: {"value": _assembled(part, f"{name}_raw")} | _condition(more)}
 
 
-def odd(node: Node) -> Node:
+def odd(node: tree.Node) -> tree.Node:
     """A node, or where it is an integer of a size that Kaitai has no type for, the block of one part that says the same."""
-    if not isinstance(node, Number) or node.kind == "float" or node.size in INTEGERS:
+    if not isinstance(node, tree.Number) or node.kind == "float" or node.size in INTEGERS:
         return node
     targets = [8 * (byte if node.order == "little" else node.size - 1 - byte) for byte in range(node.size)]
     segments = tuple(Segment(byte, 0xFF, 0, target) for byte, target in enumerate(targets))
-    return Block(node.name, node.info, node.size, (Part(node.info, BitField((), segments, 8 * node.size, node.kind == "int"), (), ()),))
+    part = tree.Part(node.info, BitField((), segments, 8 * node.size, node.kind == "int"), (), ())
+    return tree.Block(node.name, node.info, node.size, (part,))
 
 
-def _name(part: Part) -> str:
+def _name(part: tree.Part) -> str:
     """What a part is called in the type of its block."""
     return identifier("_".join([*(part.names or ("value",)), *map(str, part.indices)]))
 
 
-def _valid(part: Part) -> Attribute:
+def _valid(part: tree.Part) -> Attribute:
     if part.info.const is None:
         return {}
     return {"valid": bool(part.info.const) if part.bits.width == 1 else part.info.const}
@@ -212,7 +186,7 @@ def _condition(more: Mapping[str, Any]) -> Attribute:
     return {"if": more["if"]} if "if" in more else {}
 
 
-def _in_order(block: Block) -> tuple[list[Part], str] | None:
+def _in_order(block: tree.Block) -> tuple[list[tree.Part], str] | None:
     """The parts as one of Kaitai's bit orders meets them, and its suffix; None where they do not fill the block in either.
 
     "be" reads each byte from its highest bit on and fills integers from the top, "le" does both from the lowest bit on.
@@ -228,15 +202,11 @@ def _in_order(block: Block) -> tuple[list[Part], str] | None:
 
 def _starts(bits: BitField, suffix: str) -> set[int]:
     """Where reading would have begun for each bit to stand where it does; one number if the bits follow each other."""
-    starts = set()
-    for segment in bits.segments:
-        for step in range(segment.mask.bit_count()):
-            bit, target = segment.low + step, segment.target + step
-            starts.add(8 * segment.byte + (bit - target if suffix == "le" else 8 - bit - bits.width + target))
-    return starts
+    ahead = ((segment, segment.low - segment.target) for segment in bits.segments)
+    return {8 * segment.byte + (bits_ahead if suffix == "le" else 8 - bits.width - bits_ahead) for segment, bits_ahead in ahead}
 
 
-def _assembled(part: Part, raw: str) -> str:
+def _assembled(part: tree.Part, raw: str) -> str:
     """A part as an expression of the block's bytes."""
     terms = []
     for segment in part.bits.segments:
@@ -302,54 +272,54 @@ class _Type:
 class _Types:
     """Writes the types of one frame; `seals`: path of a field that holds a checksum -> its seal."""
 
-    seals: Mapping[str, Sealed]
+    seals: Mapping[str, tree.Sealed]
 
-    def struct(self, node: Struct | Sealed, scope: Scope) -> Attribute:
+    def struct(self, node: tree.Struct | tree.Sealed, scope: Scope) -> Attribute:
         """The type of a struct; `scope` says which types it stands in."""
-        body = node.body if isinstance(node, Sealed) else node
+        body = node.body if isinstance(node, tree.Sealed) else node
         kaitai = _Type()
         for member in body.members:
             self._member(kaitai, member, scope.inside(body.path))
         return kaitai.done(body.path)
 
-    def _member(self, kaitai: _Type, node: Node, scope: Scope, **more: Any) -> None:
+    def _member(self, kaitai: _Type, node: tree.Node, scope: Scope, **more: Any) -> None:
         """Add a part to a type, with what else is said of its attribute."""
         node = odd(node)
         match node:
-            case Empty():
+            case tree.Empty():
                 return
-            case When(otherwise=Empty()):
+            case tree.When(otherwise=tree.Empty()):
                 self._member(kaitai, node.then, scope, **more, **{"if": truth(node.condition, scope)})
-            case When():
+            case tree.When():
                 cases = {"1": node.then, "0": node.otherwise}
                 self._switch(kaitai, node.name, f"{truth(node.condition, scope)} ? 1 : 0", cases, scope, **more)
-            case Select():
+            case tree.Select():
                 cases = {str(value): case for value, case in node.cases} | {"_": node.default}
                 self._switch(kaitai, node.name, number(node.key, scope), cases, scope, **more)
-            case Repeat():
+            case tree.Repeat():
                 self._repeat(kaitai, node, scope, **more)
-            case Block() if (plain := inline(node, more)) is not None:
+            case tree.Block() if (plain := inline(node, more)) is not None:
                 kaitai.seq.append(plain[0] | self._doc(node.info))
                 kaitai.instances |= plain[1]
                 self._physical(kaitai, node.info, more)
-            case Number() | Blob():
+            case tree.Number() | tree.Blob():
                 kaitai.seq.append(self._plain(node, scope) | more)
                 self._physical(kaitai, node.info, more)
             case _:
                 self._typed(kaitai, node.name, node, scope, **more)
 
-    def _typed(self, kaitai: _Type, name: str, node: Node, scope: Scope, **more: Any) -> None:
+    def _typed(self, kaitai: _Type, name: str, node: tree.Node, scope: Scope, **more: Any) -> None:
         """Add an attribute whose type is one of its own."""
         name = identifier(name)
         kaitai.types[name] = self._type(node, scope)
         kaitai.seq.append({"id": name, "type": name, **more})
 
-    def _type(self, node: Node, scope: Scope) -> Attribute:
+    def _type(self, node: tree.Node, scope: Scope) -> Attribute:
         """A type for any part: its own, or one that holds it as `value`."""
-        if isinstance(node, Struct | Sealed):
+        if isinstance(node, tree.Struct | tree.Sealed):
             return self.struct(node, scope)
         kaitai = _Type()
-        if isinstance(node, Block):
+        if isinstance(node, tree.Block):
             kaitai.seq, kaitai.instances = block_type(node, self._doc)
             for part in node.parts:
                 if not part.indices:
@@ -358,29 +328,29 @@ class _Types:
         self._member(kaitai, _value(node), scope.inside(None))
         return kaitai.done(node.name)
 
-    def _repeat(self, kaitai: _Type, node: Repeat, scope: Scope, **more: Any) -> None:
+    def _repeat(self, kaitai: _Type, node: tree.Repeat, scope: Scope, **more: Any) -> None:
         more |= {"repeat": "expr", "repeat-expr": _size(node.count, scope)}
         element = odd(node.element)
-        if isinstance(element, Number | Blob):
+        if isinstance(element, tree.Number | tree.Blob):
             kaitai.seq.append(self._plain(element, scope) | {"id": identifier(node.name)} | more)
-        elif isinstance(element, Block) and (plain := inline(element, more)) is not None:
+        elif isinstance(element, tree.Block) and (plain := inline(element, more)) is not None:
             kaitai.seq.append(plain[0] | self._doc(element.info))
         else:
             self._typed(kaitai, node.name, element, scope, **more)
 
-    def _switch(self, kaitai: _Type, name: str, key: str, cases: Mapping[str, Node], scope: Scope, **more: Any) -> None:
+    def _switch(self, kaitai: _Type, name: str, key: str, cases: Mapping[str, tree.Node], scope: Scope, **more: Any) -> None:
         types = {}
         for value, case in cases.items():
-            if value == "_" and isinstance(case, Empty):
+            if value == "_" and isinstance(case, tree.Empty):
                 continue
             types[value] = identifier(f"{name}_{'other' if value == '_' else value.replace('-', 'minus_')}")
-            kaitai.types[types[value]] = {"seq": []} if isinstance(case, Empty) else self._type(case, scope)
+            kaitai.types[types[value]] = {"seq": []} if isinstance(case, tree.Empty) else self._type(case, scope)
         kaitai.seq.append({"id": identifier(name), "type": {"switch-on": key, "cases": types}, **more})
 
-    def _plain(self, node: Number | Blob, scope: Scope) -> Attribute:
+    def _plain(self, node: tree.Number | tree.Blob, scope: Scope) -> Attribute:
         """The attribute of a number or of bytes."""
         head = {"id": identifier(node.name)} if node.name else {}
-        if isinstance(node, Blob):
+        if isinstance(node, tree.Blob):
             size = _size(node.size, scope)
             kind: Attribute = {"size": size} if node.const is None else {"contents": [Byte(byte) for byte in node.const]}
             return head | kind | self._doc(node.info)
@@ -391,13 +361,13 @@ class _Types:
         const = {} if node.info.const is None else {"valid": node.info.const}
         return head | {"type": f"{letter}{node.size}{order}"} | const | self._doc(node.info)
 
-    def _doc(self, info: FieldInfo) -> Attribute:
+    def _doc(self, info: tree.FieldInfo) -> Attribute:
         seal = self.seals.get(info.path)
         sealed = "" if seal is None else f"{seal.algorithm.describe()} over {_span(seal)}; not checked here"
         text = "; ".join(filter(None, (unit_text(info), meaning(info), sealed)))
         return {"doc": text} if text else {}
 
-    def _physical(self, kaitai: _Type, info: FieldInfo, more: Mapping[str, Any], *, name: str = "") -> None:
+    def _physical(self, kaitai: _Type, info: tree.FieldInfo, more: Mapping[str, Any], *, name: str = "") -> None:
         """An instance with the physical value of a field that has a scale."""
         own = identifier(name or info.name)
         if info.scaled and own:
@@ -405,20 +375,20 @@ class _Types:
             kaitai.instances[f"{own}_{slug(info.unit) or 'physical'}"] = {"value": value.replace("+ -", "- "), **_condition(more)}
 
 
-def _size(formula: Formula, scope: Scope) -> int | str:
+def _size(formula: tree.Formula, scope: Scope) -> int | str:
     """A number of bytes or elements."""
     return formula if isinstance(formula, int) else number(formula, scope)
 
 
-def _value(node: Node) -> Node:
+def _value(node: tree.Node) -> tree.Node:
     """The part of an array or a choice as the one member of a type of its own."""
-    if isinstance(node, Number):
+    if isinstance(node, tree.Number):
         parent = node.info.path.rpartition(".")[0]
         return replace(node, info=replace(node.info, path=f"{parent}.value" if parent else "value"))
-    return node if isinstance(node, Sealed) else replace(node, name="value")
+    return node if isinstance(node, tree.Sealed) else replace(node, name="value")
 
 
-def _span(seal: Sealed) -> str:
+def _span(seal: tree.Sealed) -> str:
     if seal.over is None:
         return "all other bytes"
     first, last = (path.rpartition(".")[2] for path in seal.over)

@@ -15,9 +15,8 @@ from lidarspec.framing.results import Counters, Found, packed
 from lidarspec.packets.stream import PacketStream
 from lidarspec.points.cloud import PointCloud
 from lidarspec.points.plain import evaluate
-from lidarspec.spec.description import Command, Frame
+from lidarspec.spec import Command, Frame, Sensor
 from lidarspec.spec.links import Link, Serial, Udp
-from lidarspec.spec.sensor import Sensor
 from lidarspec.spec.timing import Clock, Every, Split
 from lidarspec.wire.wire_table import frame_size, wire_table
 

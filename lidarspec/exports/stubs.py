@@ -15,11 +15,9 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
-from lidarspec.exports import Refused
-from lidarspec.exports.messages import Message, messages
-from lidarspec.spec.description import Command
-from lidarspec.spec.sensor import Sensor
-from lidarspec.spec.tree import Blob, Block, Empty, FieldInfo, Node, Number, Opaque, Repeat, Sealed, Select, Struct, When
+from lidarspec.exports import Message, Refused, messages
+from lidarspec.spec import Command, Sensor
+from lidarspec.spec.tree import Blob, Block, Empty, FieldInfo, Node, Number, Opaque, Repeat, Sealed, Select, Struct, When, children
 from lidarspec.wire.schema import schema
 from lidarspec.wire.wire_table import meaning, unit_text
 
@@ -101,15 +99,10 @@ class _Classes:
                 return self.add(node, owner + camel(name), f"`{name}` of `{owner}`.")
             case Repeat():
                 return f"list[{self._type(owner, name, node.element)}]"
-            case When():
-                return self._either(owner, name, [node.then, node.otherwise])
-            case Select():
-                return self._either(owner, name, [*(case for _, case in node.cases), node.default])
+            case When() | Select():
+                return " | ".join(dict.fromkeys(self._type(owner, name, branch) for branch in children(node)))
             case Empty() | Opaque():
                 return "None"
-
-    def _either(self, owner: str, name: str, branches: list[Node]) -> str:
-        return " | ".join(dict.fromkeys(self._type(owner, name, branch) for branch in branches))
 
 
 def _sensor(sensor: Sensor, frames: tuple[Message, ...], names: dict[str, str]) -> str:
@@ -122,7 +115,8 @@ def _sensor(sensor: Sensor, frames: tuple[Message, ...], names: dict[str, str]) 
     commands = "\n".join(_command(name, command) for name, command in sensor.commands.items())
     rest = "    @overload\n    def command(self, name: str, **arguments: Any) -> bytes: ..." if len(sensor.commands) > 0 else ""
     literals = ", ".join(f'"{name}"' for name in names)
-    fields = ", ".join(f'"{path}"' for path in _paths(sensor))
+    data = next((message.frame for message in frames if message.frame.data), frames[0].frame)
+    fields = ", ".join(f'"{path}"' for path in schema(data.tree).fields)
     return f'''FrameName = Literal[{literals}]
 FieldPath = Literal[{fields}]
 
@@ -156,12 +150,6 @@ def _build(message: Message) -> str:
 def _command(name: str, command: Command) -> str:
     args = "".join(f", {arg}: float" for arg in command.args)
     return f'    @overload\n    def command(self, name: Literal["{name}"]{", *" * bool(args)}{args}) -> bytes: ...'
-
-
-def _paths(sensor: Sensor) -> list[str]:
-    """The fields of the data frame, as packets name them."""
-    frame = next((frame for frame in sensor.frames.values() if frame.data), None) or next(iter(sensor.frames.values()))
-    return list(schema(frame.tree).fields)
 
 
 def _quoted(said: str) -> str:

@@ -1,3 +1,8 @@
+local listed = {}
+for _, field in pairs(fields) do table.insert(listed, field) end
+proto.fields = listed
+proto.experts = {marks.checksum, marks.constant, marks.short, marks.skipped}
+
 -- From here on nothing depends on the sensor: `sensor`, above, says what its frames are made of.
 
 local TWO32 = 4294967296

@@ -8,42 +8,17 @@ Formulas are Lua functions of the values kept so far. Lua counts in floats there
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterable, Mapping
+import json
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from importlib import resources
 from typing import Any
 
 from lidarspec._version import __version__
-from lidarspec.exports import Refused
-from lidarspec.exports.messages import Message, messages
+from lidarspec.exports import Message, Refused, messages
 from lidarspec.framing.frame_engine import codec
+from lidarspec.spec import Checksum, Crc, Fold15, Sensor, Sum, Tcp, Udp, WordXor, Xor, ZeroPadded, tree
 from lidarspec.spec.bits import BitField
-from lidarspec.spec.checksums import Checksum, Crc, Fold15, Sum, WordXor, Xor, ZeroPadded
-from lidarspec.spec.links import Tcp, Udp
-from lidarspec.spec.sensor import Sensor
-from lidarspec.spec.tree import (
-    COMPARISONS,
-    Blob,
-    Block,
-    Empty,
-    FieldInfo,
-    Formula,
-    Node,
-    Number,
-    Opaque,
-    Part,
-    Repeat,
-    Sealed,
-    Select,
-    Struct,
-    When,
-    formulas,
-    infos,
-    nodes,
-    refs,
-    written,
-)
 
 WIDTH = 140
 
@@ -56,19 +31,19 @@ _OPERATIONS = {
     "<<": "({} * 2 ^ {})",
     ">>": "int.div({}, 2 ^ {})",
     **{"//": "int.div({}, {})", "%": "int.mod({}, {})", "&": "int.band({}, {})", "|": "int.bor({}, {})", "^": "int.bxor({}, {})"},
-    **{symbol: f"int.truth({{}} {'~=' if symbol == '!=' else symbol} {{}})" for symbol in COMPARISONS},
+    **{symbol: f"int.truth({{}} {'~=' if symbol == '!=' else symbol} {{}})" for symbol in tree.COMPARISONS},
     "not": "int.truth({} == 0)",
 }
 
 
-def formula(value: Formula) -> Code:
+def formula(value: tree.Formula) -> Code:
     """A formula as a number, or as a function of the values of fields."""
     return Code(str(value)) if isinstance(value, int) else _function(value)
 
 
-def _function(value: Formula) -> Code:
+def _function(value: tree.Formula) -> Code:
     """A formula as a function of the values of fields."""
-    return Code(f"function(v) return {written(value, lambda ref: f'v[{quoted(ref.path)}]', _OPERATIONS)} end")
+    return Code(f"function(v) return {tree.written(value, lambda ref: f'v[{quoted(ref.path)}]', _OPERATIONS)} end")
 
 
 def lua(value: Any, indent: str = "") -> str:
@@ -77,24 +52,17 @@ def lua(value: Any, indent: str = "") -> str:
         return str(value)
     if isinstance(value, str):
         return quoted(value)
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    if isinstance(value, float) and not math.isfinite(value):
-        raise ValueError(f"{value!r} has no Lua literal")
-    if isinstance(value, int | float):
-        return repr(value)
-    entries = _entries(value, indent + "  ")
+    if isinstance(value, bool | int | float):
+        return json.dumps(value, allow_nan=False)
+    deeper = indent + "  "
+    if isinstance(value, Mapping):
+        entries = [f"{_key(key)} = {lua(item, deeper)}" for key, item in value.items() if item is not None]
+    else:
+        entries = [lua(item, deeper) for item in value]
     line = "{" + ", ".join(entries) + "}"
     if len(indent) + len(line) <= WIDTH and "\n" not in line:
         return line
     return "{\n" + "".join(f"{indent}  {entry},\n" for entry in entries) + indent + "}"
-
-
-def _entries(value: Any, indent: str) -> list[str]:
-    if isinstance(value, Mapping):
-        return [f"{_key(key)} = {lua(item, indent)}" for key, item in value.items() if item is not None]
-    assert isinstance(value, Iterable)
-    return [lua(item, indent) for item in value]
 
 
 def _key(key: object) -> str:
@@ -112,16 +80,12 @@ SUMMED = 4
 Table = dict[str, Any]
 
 
-def tables(message: Message, prefix: str) -> Table:
-    """The root of a frame type as a table; `prefix` begins the names of its fields in Wireshark's filters."""
-    return _Writer(message, prefix).node(message.root)
-
-
 @dataclass
 class _Writer:
     """Writes the tables of one frame type.
 
     Attributes:
+        prefix: that the names of its fields in Wireshark's filters begin with.
         kept: paths of the fields whose values are asked for later.
         marked: paths of the parts at which what a checksum covers begins or ends.
         types: name of a field of Wireshark -> family of its type.
@@ -134,36 +98,36 @@ class _Writer:
     types: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        asked = {ref.path for node in nodes(self.message.root) for value in formulas(node) for ref in refs(value)}
+        asked = {ref.path for node in tree.nodes(self.message.root) for value in tree.formulas(node) for ref in tree.refs(value)}
         self.kept = asked | self.message.seals.keys()
         self.marked = {path for seal in self.message.seals.values() for path in seal.over or ()}
 
-    def node(self, node: Node, path: str = "") -> Table:
+    def node(self, node: tree.Node, path: str = "") -> Table:
         """A node as a table; `skip` says how many bytes it takes where it need not be looked at to measure the frame."""
         match node:
-            case Number():
+            case tree.Number():
                 return self._number(node)
-            case Blob():
+            case tree.Blob():
                 return self._blob(node)
-            case Block():
+            case tree.Block():
                 return self._block(node)
-            case Struct():
+            case tree.Struct():
                 return self._struct(node)
-            case Sealed():
+            case tree.Sealed():
                 return {"kind": "sealed", "name": node.name or None, "body": self.node(node.body), "seal": self._seal(node)}
-            case Repeat():
+            case tree.Repeat():
                 return self._repeat(node, path)
-            case When():
+            case tree.When():
                 then, otherwise = self.node(node.then, path), self.node(node.otherwise, path)
                 return {"kind": "when", "name": node.name, "condition": _function(node.condition), "yes": then, "no": otherwise}
-            case Select():
+            case tree.Select():
                 cases = {value: self.node(case, path) for value, case in node.cases}
                 default = self.node(node.default, path)
                 return {"kind": "select", "name": node.name, "key": _function(node.key), "cases": cases, "default": default}
-            case Empty() | Opaque():
+            case tree.Empty() | tree.Opaque():
                 return {"kind": "empty", "skip": 0}
 
-    def _number(self, node: Number) -> Table:
+    def _number(self, node: tree.Number) -> Table:
         kind = {"uint": "UINT", "int": "INT", "float": "FLOAT"}[node.kind] + ("" if node.kind == "float" else str(_width(8 * node.size)))
         if node.kind == "float" and node.size == 8:
             kind = "DOUBLE"
@@ -171,7 +135,7 @@ class _Writer:
         table |= {"le": (node.order == "little" and node.size > 1) or None, **self._described(node.info, kind)}
         return table | {"skip": self._skip(node.info, node.size)}
 
-    def _blob(self, node: Blob) -> Table:
+    def _blob(self, node: tree.Blob) -> Table:
         name = node.name or "constant"
         path = node.info.path if node.name else ".".join(filter(None, (node.info.path, name)))
         new = self._new("BYTES", path, name, node.info.docs, "NONE")
@@ -179,7 +143,7 @@ class _Writer:
         table["const"] = Code(quoted(node.const)) if node.const is not None else None
         return table | {"skip": self._skip(node.info, node.size) if isinstance(node.size, int) and node.const is None else None}
 
-    def _block(self, node: Block) -> Table:
+    def _block(self, node: tree.Block) -> Table:
         order = _word_order(node)
         parts = [self._part(node, part, order) for part in node.parts]
         looked_at = any(part["keep"] is not None or part["const"] is not None for part in parts)
@@ -193,12 +157,12 @@ class _Writer:
             "parts": parts,
         }
 
-    def _part(self, block: Block, part: Part, order: str | None) -> Table:
+    def _part(self, block: tree.Block, part: tree.Part, order: str | None) -> Table:
         offsets = [segment.byte for segment in part.bits.segments]
         letters = "INT" if part.bits.signed else "UINT"
         is_masked = order is not None and part.bits.width < 8 * block.size
         kind = f"{letters}{8 * block.size if is_masked else _width(part.bits.width)}"
-        mask = _mask(part.bits, block.size, order) if is_masked and order is not None else None
+        mask = ((1 << part.bits.width) - 1) << (_run(part.bits, block.size, order) or 0) if is_masked and order else None
         label = ".".join(part.names) + "".join(f"[{index}]" for index in part.indices)
         return {
             "name": part.info.name,
@@ -212,7 +176,7 @@ class _Writer:
             **self._described(part.info, kind, mask),
         }
 
-    def _struct(self, node: Struct) -> Table:
+    def _struct(self, node: tree.Struct) -> Table:
         members = []
         for member in node.members:
             path = ".".join(filter(None, (node.path, member.name)))
@@ -222,15 +186,15 @@ class _Writer:
         total = None if None in sizes else sum(filter(None, sizes))
         return {"kind": "struct", "name": node.name or None, "skip": total, "members": members}
 
-    def _repeat(self, node: Repeat, path: str) -> Table:
+    def _repeat(self, node: tree.Repeat, path: str) -> Table:
         element = self.node(node.element, path)
         size = element.get("skip")
         whole = size * node.count if isinstance(node.count, int) and size is not None else None
-        few = isinstance(node.element, Block) or (isinstance(node.element, Struct) and len(_leaves(node.element)) <= SUMMED)
+        few = isinstance(node.element, tree.Block) or (isinstance(node.element, tree.Struct) and len(_leaves(node.element)) <= SUMMED)
         summed = (few and bool(_leaves(node.element))) or None
         return {"kind": "repeat", "name": node.name, "count": formula(node.count), "summed": summed, "skip": whole, "element": element}
 
-    def _described(self, info: FieldInfo, kind: str, mask: int | None = None) -> Table:
+    def _described(self, info: tree.FieldInfo, kind: str, mask: int | None = None) -> Table:
         """What a number says of itself, and its fields in Wireshark."""
         is_hex = (info.path in self.message.seals or info.const is not None) and kind.startswith("UINT")
         shown = "HEX" if is_hex else "NONE" if kind in ("FLOAT", "DOUBLE") else "DEC"
@@ -253,11 +217,11 @@ class _Writer:
     def _keep(self, path: str) -> str | None:
         return path if path in self.kept else None
 
-    def _skip(self, info: FieldInfo, size: int) -> int | None:
+    def _skip(self, info: tree.FieldInfo, size: int) -> int | None:
         return None if info.path in self.kept or info.const is not None else size
 
-    def _seal(self, node: Sealed) -> Table:
-        widths = {info.path: info.bits for below in nodes(node) for info in infos(below)}
+    def _seal(self, node: tree.Sealed) -> Table:
+        widths = {info.path: info.bits for below in tree.nodes(node) for info in tree.infos(below)}
         return {
             **_algorithm(node.algorithm),
             "fields": [{"path": path, "width": widths[path]} for path in node.fields],
@@ -290,26 +254,23 @@ def _algorithm(algorithm: Checksum) -> Table:
     raise Refused(f"the checksum {type(algorithm).__name__} is Python code, which Wireshark does not run")
 
 
-def _leaves(node: Node) -> list[Node | Part]:
+def _leaves(node: tree.Node) -> list[tree.Node | tree.Part]:
     """The numbers in a node; none where it holds arrays or parts that come and go."""
-    below = list(nodes(node))
-    if any(isinstance(part, Repeat | When | Select) for part in below):
+    below = list(tree.nodes(node))
+    if any(isinstance(part, tree.Repeat | tree.When | tree.Select) for part in below):
         return []
-    return [leaf for part in below for leaf in (part.parts if isinstance(part, Block) else (part,) if isinstance(part, Number) else ())]
+    numbers = (part for part in below if isinstance(part, tree.Block | tree.Number))
+    return [leaf for part in numbers for leaf in (part.parts if isinstance(part, tree.Block) else (part,))]
 
 
 def _width(bits: int) -> int:
     return next(width for width in (8, 16, 24, 32, 64) if bits <= width)
 
 
-def _word_order(block: Block) -> str | None:
+def _word_order(block: tree.Block) -> str | None:
     """The byte order by which all parts are runs of bits of one word, which Wireshark can draw; None where there is none."""
-    if block.size > 4:
-        return None
-    for order in ("big", "little"):
-        if all(_run(part.bits, block.size, order) is not None for part in block.parts):
-            return order
-    return None
+    orders = (order for order in ("big", "little") if all(_run(part.bits, block.size, order) is not None for part in block.parts))
+    return next(orders, None) if block.size <= 4 else None
 
 
 def _run(bits: BitField, size: int, order: str) -> int | None:
@@ -318,10 +279,6 @@ def _run(bits: BitField, size: int, order: str) -> int | None:
         8 * (segment.byte if order == "little" else size - 1 - segment.byte) + segment.low - segment.target for segment in bits.segments
     }
     return starts.pop() if len(starts) == 1 else None
-
-
-def _mask(bits: BitField, size: int, order: str) -> int:
-    return ((1 << bits.width) - 1) << (_run(bits, size, order) or 0)
 
 
 #: the link types that captures keep for private use, USER0 to USER15, by the numbers that Wireshark's wtap gives them.
@@ -359,13 +316,6 @@ local marks = {{
 }}
 """
 
-_REGISTERED = """
-local listed = {}
-for _, field in pairs(fields) do table.insert(listed, field) end
-proto.fields = listed
-proto.experts = {marks.checksum, marks.constant, marks.short, marks.skipped}
-"""
-
 
 def dissector(sensor: Sensor) -> str:
     """A Lua dissector for Wireshark: of the sensor's UDP and TCP ports, and of captures of a serial line.
@@ -383,14 +333,10 @@ def dissector(sensor: Sensor) -> str:
         "frames": [_frame(message, name) for message in by_direction],
     }
     head = _HEAD.format(
-        title=title,
-        version=__version__,
-        source=" ".join(sensor.source.split()),
-        name=quoted(name),
-        title_quoted=quoted(title),
+        title=title, version=__version__, source=" ".join(sensor.source.split()), name=quoted(name), title_quoted=quoted(title)
     )
     walker = resources.files("lidarspec.exports").joinpath("wireshark.lua").read_text(encoding="utf-8")
-    return "\n".join([head, f"local sensor = {lua(about)}", _REGISTERED, walker])
+    return "\n".join([head, f"local sensor = {lua(about)}\n", walker])
 
 
 def _frame(message: Message, name: str) -> dict[str, Any]:
@@ -400,7 +346,7 @@ def _frame(message: Message, name: str) -> dict[str, Any]:
         "longest": message.frame.max_length,
         "after": message.frame.after,
         "magic": [[offset, mask, value] for offset, (mask, value) in sorted(prefix.items())],
-        "root": tables(message, f"{name}.{message.name}"),
+        "root": _Writer(message, f"{name}.{message.name}").node(message.root),
     }
 
 

@@ -82,13 +82,12 @@ def assert_same_places(one: PointCloud, other: PointCloud, *, ulps: int = ULPS) 
     for name in one.columns.keys() - {"time"}:
         first, second = one.columns[name], other.columns[name]
         if name in ("x", "y", "z", "range"):
-            assert _close(first, second, ulps * np.spacing(np.minimum(reach, np.abs(one.range)) if name == "range" else reach)), (
-                f"{name} differs"
-            )
+            near = _close(first, second, ulps * np.spacing(np.minimum(reach, np.abs(one.range)) if name == "range" else reach))
         elif name in ("azimuth", "elevation"):
-            assert _close(first, second, ulps * np.spacing(np.float32(np.pi)), full=2 * np.pi), f"{name} differs"
+            near = _close(first, second, ulps * np.spacing(np.float32(np.pi)), full=2 * np.pi)
         else:
-            assert same(first, second), f"{name} differs"
+            near = same(first, second)
+        assert near, f"{name} differs"
     assert one.time.shape == other.time.shape
     assert np.allclose(one.time, other.time, rtol=1e-12, atol=1e-6, equal_nan=True)
     assert abs(one.stamp_ns - other.stamp_ns) <= 1000

@@ -125,14 +125,13 @@ def _distribution(entries: list[EntryPoint]) -> Target:
     found = Target()
     known = registry().sensors()
     for entry in entries:
-        value = entry.value
         try:
-            sensors = _added(entry.load(), value)
+            sensors = _added(entry.load(), entry.value)
         except (Exception, SystemExit) as error:
-            finding = loading(error, module_files(value))
-            found.findings.append(replace(finding, path=finding.path or f"{entry.name} = {value}"))
+            finding = loading(error, module_files(entry.value))
+            found.findings.append(replace(finding, path=finding.path or f"{entry.name} = {entry.value}"))
             continue
-        found.files += [file for file in module_files(value) if file not in found.files]
+        found.files += [file for file in module_files(entry.value) if file not in found.files]
         found.sensors += [known.get(sensor.id, sensor) for sensor in sensors if sensor.id not in {one.id for one in found.sensors}]
     names = {_normal(entry.distribution) for entry in entries}
     told = [(plugin, _said(plugin.error)) for plugin in registry().plugins if _normal(plugin.distribution) in names and plugin.error]
@@ -156,15 +155,10 @@ def _added(plugin: Any, name: str) -> list[Sensor]:
         for frame in sensor.frames.values():
             given = {"sensor": sensor, "frame": frame}
             try:
-                _asked(hook, given)
+                hook(**{key: given[key] for key in inspect.signature(hook).parameters})
             except Exception as error:
                 raise SpecError(f"lidarspec_checksum for {sensor.id}: {type(error).__name__}: {error}", rule="LS010") from error
     return [registry().hooked(sensor) for sensor in sensors]
-
-
-def _asked(hook: Callable[..., Any], given: dict[str, Any]) -> None:
-    """Call a hook with those of the arguments that it wants."""
-    hook(**{key: given[key] for key in inspect.signature(hook).parameters})
 
 
 def loading(error: BaseException, files: list[Path]) -> Finding:
@@ -318,7 +312,7 @@ def _mistakes(tree: ast.Module) -> Iterator[tuple[str, str, ast.expr | ast.stmt 
     sockets = any(isinstance(node, ast.Import | ast.ImportFrom) and "socket" in ast.unparse(node) for node in ast.walk(tree))
     for node in ast.walk(tree):
         match node:
-            case ast.ExceptHandler() if _broad(node.type) and _silent(node.body):
+            case ast.ExceptHandler() if (node.type is None or _names(node.type) & BROAD) and _silent(node.body):
                 yield "LS801", f"except {ast.unparse(node.type) if node.type else ''}: {ast.unparse(node.body[0])}", node
             case ast.Call() if ast.unparse(node.func) in WALL_CLOCKS:
                 yield "LS802", f"{ast.unparse(node.func)}()", node
@@ -351,24 +345,21 @@ def _tests(node: ast.AST) -> list[ast.expr]:
 
 def _is_expression(test: ast.expr, names: set[str]) -> bool:
     """Whether a test is an expression of construct: made of `this`, and no call."""
-    if isinstance(test, ast.BoolOp | ast.Call):
-        return False
-    return any(isinstance(node, ast.Name) and node.id in names for node in ast.walk(test))
+    return not isinstance(test, ast.BoolOp | ast.Call) and bool(_names(test) & names)
 
 
-def _broad(kind: ast.expr | None) -> bool:
-    return kind is None or any(isinstance(node, ast.Name) and node.id in BROAD for node in ast.walk(kind))
+def _names(tree: ast.AST) -> set[str]:
+    return {node.id for node in ast.walk(tree) if isinstance(node, ast.Name)}
 
 
 def _silent(body: list[ast.stmt]) -> bool:
     """Whether a handler does nothing with what it caught."""
-    only = body[0]
-    if len(body) > 1:
-        return False
-    constant = isinstance(only, ast.Return) and (
-        only.value is None or isinstance(only.value, ast.Constant | ast.List | ast.Dict | ast.Tuple)
-    )
-    return constant or isinstance(only, ast.Pass | ast.Continue) or (isinstance(only, ast.Expr) and isinstance(only.value, ast.Constant))
+    match body:
+        case [ast.Pass() | ast.Continue() | ast.Expr(value=ast.Constant())]:
+            return True
+        case [ast.Return(value=None | ast.Constant() | ast.List() | ast.Dict() | ast.Tuple())]:
+            return True
+    return False
 
 
 def _short_write(call: ast.Call, *, sockets: bool) -> bool:
@@ -438,7 +429,8 @@ def _report(subject: Subject, places: Places, mistakes: list[Finding], watch: Ca
     watch(f"{sensor.id}: declaration")
     report.findings += declared(subject)
     for one in PROPERTIES:
-        reason = one.lacks(subject) or _in_vain(one.unless, report.findings)
+        known = sorted({finding.code for finding in report.findings} & set(one.unless))
+        reason = one.lacks(subject) or (f"{', '.join(known)} is found already" if known else "")
         if reason:
             report.skipped[one.name] = reason
             continue
@@ -454,9 +446,3 @@ def _report(subject: Subject, places: Places, mistakes: list[Finding], watch: Ca
     report.findings = [places.placed(finding, sensor) for finding in left]
     report.measured = subject.measured
     return report
-
-
-def _in_vain(unless: tuple[str, ...], findings: list[Finding]) -> str:
-    """Why a property would only say again what was found."""
-    found = sorted({finding.code for finding in findings} & set(unless))
-    return f"{', '.join(found)} is found already" if found else ""

@@ -62,7 +62,7 @@ def arguments_are_held_to_their_ranges(subject: Subject, name: str) -> None:
 def replies_can_match(subject: Subject, name: str) -> None:
     """Every field that a reply is told by is a field of one of the replies."""
     command = subject.sensor.commands[name]
-    answers = [codec(subject.sensor.frames[reply]).schema.fields for reply in command.replies]
+    answers = [subject.fields(reply) for reply in command.replies]
     for path in (*command.matches, *command.echoes) if answers else ():
         require(any(path in fields for fields in answers), "LS603", f"no reply has a field {path!r}", f"commands.{name}")
 

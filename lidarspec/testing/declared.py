@@ -12,12 +12,9 @@ from lidarspec.columns.columns import Batch, Fields
 from lidarspec.columns.graph import Traced, Untraceable
 from lidarspec.errors import LidarSpecError
 from lidarspec.framing.frame_engine import CompiledCodec, codec
+from lidarspec.spec import Clock, Frame, Polar, Sensor
 from lidarspec.spec.construct_layer import is_expression
-from lidarspec.spec.description import Frame
 from lidarspec.spec.fields import factor
-from lidarspec.spec.results import Polar
-from lidarspec.spec.sensor import Sensor
-from lidarspec.spec.timing import Clock
 from lidarspec.spec.tree import Sealed, Struct, infos, nodes
 from lidarspec.testing.findings import Finding
 from lidarspec.testing.geometry import data_frames, field_of, traced, used
@@ -95,13 +92,14 @@ def _frame(subject: Subject, name: str, frame: Frame) -> Findings:
         yield from _plausible(subject, name, frame)
     if isinstance(engine, CompiledCodec):
         try:
-            layouts = [(data, engine.tree.layout(data)) for data in (subject.example(name, seed=seed) for seed in range(3))]
+            found = [engine.tree.layout(subject.example(name, seed=seed)) for seed in range(3)]
         except LidarSpecError:
             return
-        yield from _covered(name, [layout for _, layout in layouts if isinstance(layout, Layout)])
+        layouts = [layout for layout in found if isinstance(layout, Layout)]
+        yield from _covered(name, layouts)
         if frame.direction == "in":
             yield from _sync(subject, name, frame, engine)
-            yield from _strength(subject, name, frame, [layout for _, layout in layouts if isinstance(layout, Layout)])
+            yield from _strength(subject, name, frame, layouts)
 
 
 def _names(subject: Subject, name: str, frame: Frame) -> Findings:
@@ -128,7 +126,10 @@ def _measured(frame: Frame) -> set[str]:
 
 
 def _plausible(subject: Subject, name: str, frame: Frame) -> Findings:
-    table = codec(frame).table([subject.example(name)] if _has_example(subject, name) else [])
+    try:
+        table = codec(frame).table([subject.example(name)])
+    except LidarSpecError:
+        table = codec(frame).table([])
     try:
         with np.errstate(all="ignore"):
             answer = frame.plausible(Fields(Batch(table, np.zeros(len(table), np.bool_))))  # type: ignore[misc]
@@ -139,13 +140,6 @@ def _plausible(subject: Subject, name: str, frame: Frame) -> Findings:
         yield "LS207", f"it returns {answer!r}, an expression of construct", f"{name}.plausible"
     elif isinstance(answer, bool | np.bool_ | str | type(None)):
         yield "LS207", f"it returns {answer!r} whatever the frame is", f"{name}.plausible"
-
-
-def _has_example(subject: Subject, name: str) -> bool:
-    try:
-        return bool(subject.example(name))
-    except LidarSpecError:
-        return False
 
 
 def _covered(name: str, layouts: list[Layout]) -> Findings:
@@ -190,13 +184,11 @@ def _strength(subject: Subject, name: str, frame: Frame, layouts: list[Layout]) 
     """Whether constants and checksums alone keep noise out."""
     if frame.plausible is not None or frame.confirm > 1 or not layouts:
         return
-    weakest = min(sum(mask.bit_count() for mask, _ in layout.constants.values()) + _checked(layout) for layout in layouts)
+    checked = [sum(leaf.info.bits for seal in layout.seals for leaf in seal.leaves) for layout in layouts]
+    constant = [sum(mask.bit_count() for mask, _ in layout.constants.values()) for layout in layouts]
+    weakest = min(map(sum, zip(checked, constant, strict=True)))
     if weakest <= (WEAK_DATAGRAM if subject.sensor.datagrams else WEAK):
         yield "LS206", f"its constants and checksums have {weakest} bits, and it declares neither plausible nor confirm", name
-
-
-def _checked(layout: Layout) -> int:
-    return sum(sum(leaf.info.bits for leaf in seal.leaves) for seal in layout.seals)
 
 
 def _points(subject: Subject, name: str) -> Findings:
@@ -241,6 +233,6 @@ def _column(subject: Subject, name: str, value: Any, column: str, units: tuple[s
         pure = _measured(subject.sensor.frames[name])
         bare = [info for info in free if not info.unit and info.path not in pure]
         if bare and len(bare) == len([info for info in free if not info.unit]):
-            order = list(codec(subject.sensor.frames[name]).schema.fields)
+            order = list(subject.fields(name))
             first = min(bare, key=lambda info: (-len(info.axes), order.index(info.path) if info.path in order else len(order)))
             yield "LS201", f"the {column} of points comes from it, and it has no unit", f"{name}.{first.path}"

@@ -1,12 +1,14 @@
 """What holds for single frames: examples repeat, bytes and values survive both ways, edits are read back, types are told apart.
 
 construct leaves bits out, cuts numbers and takes what does not belong together without a word; each of these shows when a frame is parsed
-and built again. Edits of fields are drawn by Hypothesis, which shrinks a failure to the field at fault.
+and built again. Edits of fields are drawn by Hypothesis, which shrinks a failure to the field at fault. A damaged frame may be a
+`WireError`, or pass with a bit that no checksum covers, which is measured.
 """
 
 from __future__ import annotations
 
 import copy
+import itertools
 import re
 from collections.abc import Iterator
 from typing import Any
@@ -14,18 +16,21 @@ from typing import Any
 import numpy as np
 
 from lidarspec.errors import SpecError, UsageError, WireError
+from lidarspec.explaining.explanation import fits, flips
 from lidarspec.framing.frame_engine import CompiledCodec, codec
 from lidarspec.framing.results import VALID
 from lidarspec.spec.tree import FieldInfo
 from lidarspec.testing import subject as material
 from lidarspec.testing.findings import Violation, require
-from lidarspec.testing.subject import Subject
+from lidarspec.testing.subject import MANY, Subject
 from lidarspec.wire.layout import Layout
 
 #: values that each byte of a frame is changed to where construct alone reads it.
 CHANGES = 8
 #: example frames that edits begin with, and the most edits at once.
 BASES, MOST = 8, 3
+#: frames of which every bit is flipped.
+SAMPLES = 3
 
 
 def examples_are_valid_and_repeat(subject: Subject, name: str) -> None:
@@ -34,9 +39,8 @@ def examples_are_valid_and_repeat(subject: Subject, name: str) -> None:
     try:
         found = [subject.example(name, seed=seed) for seed in subject.seeds(frame)]
     except SpecError as error:
-        raise Violation(
-            "LS301", error.reason, error.path if error.path.startswith(name) else f"{name}.{error.path}" if error.path else name
-        ) from error
+        path = error.path if error.path.startswith(name) else f"{name}.{error.path}" if error.path else name
+        raise Violation("LS301", error.reason, path) from error
     again = [subject.sensor.example(name, seed=seed) for seed in range(3)] if not subject.drawers(name) else found[:3]
     require(found[:3] == again, "LS311", "two examples of one seed differ", name)
     longest = max(map(len, found))
@@ -125,7 +129,7 @@ def values_in_units_build_the_same_bytes(subject: Subject, name: str) -> None:
 def parse_finds_out_the_type(subject: Subject, name: str) -> None:
     """Parsing without a type gives what parsing as one of the fitting types gives."""
     data = subject.example(name, seed=1)
-    fitting = material.fitting(subject.sensor, data)
+    fitting = [other for other in subject.sensor.frames if fits(subject.sensor, data, other)]
     require(name in fitting, "LS306", "its own example is not parsed as such a frame", name)
     read = [subject.sensor.parse(data, frame=other) for other in fitting]
     require(any(same(subject.sensor.parse(data), one) for one in read), "LS306", "the type is found out wrongly", name)
@@ -177,22 +181,17 @@ def values_survive_building_and_parsing(subject: Subject, name: str) -> None:
     """A few drawn fields of a frame, set to drawn values, are read back as they were written."""
     from hypothesis import HealthCheck, given, seed, settings, strategies as st
 
-    sensor, fields = subject.sensor, codec(subject.sensor.frames[name]).schema.fields
+    sensor, fields = subject.sensor, subject.fields(name)
     bases = [sensor.parse(subject.example(name, seed=number), frame=name) for number in range(BASES)]
     if not any(free(fields.get(path)) for base in bases for _, _, path in material.integers(base)):
         return
     values = {path: _values(info, subject.strategies.get(f"{name}.{path}"), st) for path, info in fields.items() if free(info)}
 
+    number = len(subject.seeds(sensor.frames[name]))
+    quiet: dict[str, Any] = {"deadline": None, "database": None, "print_blob": False, "suppress_health_check": list(HealthCheck)}
+
     @seed(0)
-    @settings(
-        max_examples=len(subject.seeds(sensor.frames[name])),
-        deadline=None,
-        database=None,
-        derandomize=False,
-        report_multiple_bugs=False,
-        print_blob=False,
-        suppress_health_check=list(HealthCheck),
-    )
+    @settings(max_examples=number, derandomize=False, report_multiple_bugs=False, **quiet)
     @given(st.data())
     def edited(data: Any) -> None:
         number = data.draw(st.integers(0, len(bases) - 1))
@@ -249,3 +248,65 @@ def _values(info: FieldInfo, own: Any, st: Any) -> Any:
 
 def free(info: FieldInfo | None) -> bool:
     return info is not None and info.kind == "int" and info.const is None and info.rebuilt is None
+
+
+def a_truncated_frame_is_a_wire_error(subject: Subject, name: str) -> None:
+    """A frame that is cut short at any byte is a `WireError` with its place."""
+    data = subject.example(name, seed=2)
+    for end in material.places(len(data), subject.source("cut")):
+        try:
+            subject.sensor.parse(data[:end], frame=name)
+        except WireError as error:
+            require(0 <= error.offset <= end, "LS307", f"cut at byte {end}, and the fault is told at byte {error.offset}", name)
+        except Exception as error:
+            raise _undocumented(error, f"cut at byte {end} of {len(data)}", name) from error
+        else:
+            raise Violation("LS307", f"cut at byte {end} of {len(data)}, and it passes", name)
+
+
+def a_damaged_frame_is_at_worst_a_wire_error(subject: Subject, name: str) -> None:
+    """Hostile mutations of a frame parse, or are a `WireError`, whether or not they are verified."""
+    sensor, source = subject.sensor, subject.source(f"mutations {name}")
+    types = (name, None) if len(sensor.frames) <= MANY else (name,)
+    for seed in subject.seeds(sensor.frames[name], share=4):
+        data = material.mutated(subject.example(name, seed=seed % 8), source)
+        for kind, verify in itertools.product(types, (True, False)):
+            try:
+                sensor.parse(data, frame=kind, verify=verify)
+            except WireError:
+                continue
+            except Exception as error:
+                raise _undocumented(error, f"parsing {data.hex(' ')[:200]}", name) from error
+
+
+def every_single_bit_error_is_seen(subject: Subject, name: str) -> None:
+    """Every flipped bit under a checksum makes the frame invalid; how many of the others pass is measured."""
+    engine = codec(subject.sensor.frames[name])
+    if not isinstance(engine, CompiledCodec):
+        return
+    tried = passed = 0
+    sealed = False
+    for seed in range(SAMPLES):
+        data = subject.example(name, seed=seed)
+        layout = engine.tree.layout(data)
+        assert isinstance(layout, Layout)
+        row = np.frombuffer(data, np.uint8).reshape(1, -1)
+        if any(int(seal.stored(row)[0]) in seal.absent for seal in layout.seals):
+            continue
+        sealed = bool(layout.seals)
+        passing = flips(subject.sensor, name, data)
+        tried, passed = tried + 8 * len(data), passed + len(passing)
+        covered = {byte for seal in layout.seals if not seal.absent for start, end in seal.spans for byte in range(start, end)}
+        for byte, bit in passing:
+            field = next((path for path, (start, end) in layout.places.items() if start <= byte < end), "")
+            require(
+                byte not in covered, "LS310", f"bit {bit} of byte {byte} is flipped, and the frame passes", f"{name}.{field}".rstrip(".")
+            )
+    if tried:
+        kind = "under a checksum" if sealed else "without a checksum"
+        subject.measured[f"{name}, {kind}: single-bit errors that pass"] = f"{100 * passed / tried:.3g} %"
+
+
+def _undocumented(error: Exception, what: str, name: str) -> Violation:
+    code = "LS115" if isinstance(error, SpecError) else "LS308"
+    return Violation(code, f"{what}: {type(error).__name__}: {str(error).splitlines()[0] if str(error) else ''}", name)

@@ -11,7 +11,6 @@ from __future__ import annotations
 import copy
 import math
 import random
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -27,9 +26,8 @@ from lidarspec.points.plain import evaluate
 from lidarspec.simulation.frame_maker import FrameMaker, sealed
 from lidarspec.simulation.scenes import Room, furnished
 from lidarspec.simulation.simulator import simulation
+from lidarspec.spec import OnWrap, Polar
 from lidarspec.spec.fields import factor
-from lidarspec.spec.results import Polar
-from lidarspec.spec.timing import OnWrap
 from lidarspec.spec.tree import FieldInfo
 from lidarspec.spec.vocabulary import LookUp
 from lidarspec.testing import subject as material
@@ -38,8 +36,6 @@ from lidarspec.testing.findings import Violation, require
 from lidarspec.testing.frames import acceptable
 from lidarspec.testing.subject import Subject
 from lidarspec.wire.frame_table import Rows
-
-Floats = NDArray[np.float64]
 
 #: packets along the sweep whose directions are looked at, and packets in the room of a scene.
 PACKETS, SCENE_PACKETS = 400, 200
@@ -101,19 +97,11 @@ def field_of(subject: Subject, name: str, node: Node) -> FieldInfo | None:
     frame, path = name, node.path
     if node.kind == "state":
         _, frame, path = node.path.split(".", 2)
-    return codec(subject.sensor.frames[frame]).schema.fields.get(path)
+    return subject.fields(frame).get(path)
 
 
-@dataclass(frozen=True, eq=False)
-class Beams:
-    """Directions of points as `points` gives them, before they are folded, padding left out."""
-
-    azimuth: Floats
-    elevation: Floats
-
-
-def beams(subject: Subject, name: str, packets: Packets) -> Beams | None:
-    """The directions of the points of some packets; None where they are not polar."""
+def directions(subject: Subject, name: str, packets: Packets) -> list[NDArray[np.float64]] | None:
+    """Azimuths and elevations of points as `points` gives them, before they are folded, padding left out; None where it is not polar."""
     batch = packets.batch()
     with np.errstate(all="ignore"):
         polar = subject.sensor.points_of(name)(Fields(batch))
@@ -122,10 +110,8 @@ def beams(subject: Subject, name: str, packets: Packets) -> Beams | None:
         arrays, axes, _ = aligned((polar.azimuth, polar.elevation, polar.range), batch)
     shape = np.broadcast_shapes((len(packets), *(1,) * len(axes)), *(array.shape for array in arrays))
     mask = unpadded(axes, shape, batch)
-    azimuth, elevation = (
-        np.broadcast_to(np.asarray(array, np.float64), shape).reshape(shape[0], math.prod(shape[1:])) for array in arrays[:2]
-    )
-    return Beams(azimuth[mask], elevation[mask]) if mask is not None else Beams(azimuth, elevation)
+    whole = [np.broadcast_to(np.asarray(array, np.float64), shape).reshape(shape[0], math.prod(shape[1:])) for array in arrays[:2]]
+    return whole if mask is None else [angles[mask] for angles in whole]
 
 
 def clouds_keep_the_conventions(subject: Subject, name: str) -> None:
@@ -146,14 +132,14 @@ def clouds_keep_the_conventions(subject: Subject, name: str) -> None:
 
 def directions_are_radians(subject: Subject, name: str) -> None:
     """No direction is so large that it can only be degrees."""
-    if any(info.kind == "float" for info in codec(subject.sensor.frames[name]).schema.fields.values()):
+    if any(info.kind == "float" for info in subject.fields(name).values()):
         return  # which may hold any number
     along = swept(subject, name, 64)
     frames = along or [subject.example(name, seed=seed) for seed in range(16)]
-    found = beams(subject, name, read(subject, name, frames))
-    if found is None:
+    angles = directions(subject, name, read(subject, name, frames))
+    if angles is None:
         return
-    azimuth, elevation = (float(np.nanmax(np.abs(part), initial=0)) for part in (found.azimuth, found.elevation))
+    azimuth, elevation = (float(np.nanmax(np.abs(part), initial=0)) for part in angles)
     require(azimuth <= (TURNS if along else DRAWN), "LS502", f"an azimuth of {azimuth:.4g} rad", f"{name}.points")
     require(not along or elevation <= np.pi / 2 + 1e-6, "LS502", f"an elevation of {elevation:.4g} rad", f"{name}.points")
 
@@ -180,7 +166,7 @@ def a_single_point_has_a_direction(subject: Subject, name: str) -> None:
 
 def the_full_circle_is_the_same_as_none(subject: Subject, name: str) -> None:
     """A frame with an angle of exactly 360 degrees, where it is plausible, has the points of the one with 0."""
-    for path, info in codec(subject.sensor.frames[name]).schema.fields.items():
+    for path, info in subject.fields(name).items():
         full = _full_circle(info)
         if full is None:
             continue
@@ -226,18 +212,13 @@ def angles_are_in_order(subject: Subject, name: str) -> None:
         one_way = float((np.sign(steps[moving]) == np.sign(median)).mean())
         back = steps * np.sign(median) < -max(BACK, MEDIANS * abs(median))
         if one_way < ONE_WAY:
-            wraps = isinstance(subject.sensor.scan, OnWrap)
-            require(
-                not wraps, "LS506", f"only {one_way:.0%} of the steps go the same way, and scans are cut where it wraps", f"{name}.points"
-            )
-            continue
-        if back.any():
+            said = f"only {one_way:.0%} of the steps go the same way, and scans are cut where it wraps"
+            require(not isinstance(subject.sensor.scan, OnWrap), "LS506", said, f"{name}.points")
+        elif back.any():
             spot = int(np.flatnonzero(back)[0])
-            said = (
-                f"from {np.rad2deg(angle[spot]):.1f} to {np.rad2deg(angle[spot + 1]):.1f} degrees in packet {number[spot + 1]} of the sweep"
-            )
-            inside = number[spot] == number[spot + 1]
-            raise Violation("LS504" if inside else "LS506", said, f"{name}.points")
+            before, after = np.rad2deg(angle[spot : spot + 2])
+            said = f"from {before:.1f} to {after:.1f} degrees in packet {number[spot + 1]} of the sweep"
+            raise Violation("LS504" if number[spot] == number[spot + 1] else "LS506", said, f"{name}.points")
 
 
 def counters_run_on(subject: Subject, name: str) -> None:
@@ -294,7 +275,7 @@ def off(room: Room, xyz: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def half_step(subject: Subject, name: str) -> float:
     """Half a step of the coarsest range field, at least what a header or a code word may widen it to."""
-    fields = codec(subject.sensor.frames[name]).schema.fields.values()
+    fields = subject.fields(name).values()
     metres = [abs(info.scale) * float(factor(info.unit, "m") or 0) for info in fields if factor(info.unit, "m") is not None]
     return max([UNTOLD, *metres]) / 2 if max(metres, default=0) > UNTOLD else UNTOLD
 
@@ -316,9 +297,8 @@ def a_simulated_scene_comes_back(subject: Subject, name: str) -> None:
     require(share > 0.5, "LS507", f"{share:.0%} of the beams in a closed room return", f"{name}.points")
     apart = off(room, cloud.xyz[:known][valid].astype(np.float64))
     worst = float(apart.max(initial=0))
-    require(
-        worst < half_step(subject, name) + EXACT, "LS507", f"a point lies {worst:.4f} m from every surface of the scene", f"{name}.points"
-    )
+    near_enough = worst < half_step(subject, name) + EXACT
+    require(near_enough, "LS507", f"a point lies {worst:.4f} m from every surface of the scene", f"{name}.points")
     near, far = subject.sensor.range_limits
     ranges = cloud.range[:known][valid]
     inside = not len(ranges) or (ranges.min() >= near - UNTOLD and ranges.max() <= far + UNTOLD)

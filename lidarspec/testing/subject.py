@@ -6,7 +6,6 @@ Everything that is drawn is seeded, so that what fails once fails again.
 
 from __future__ import annotations
 
-import contextlib
 import os
 import random
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -21,6 +20,9 @@ from lidarspec.plugins import sensor as named_sensor
 from lidarspec.spec.description import Frame
 from lidarspec.spec.sensor import Sensor
 from lidarspec.spec.tree import Sealed, nodes
+from lidarspec.simulation.frame_maker import examples
+from lidarspec.spec import Frame, Sensor
+from lidarspec.spec.tree import FieldInfo, Sealed, nodes
 
 #: frames up to this length are cut at every byte, longer ones at so many places.
 SHORT = 300
@@ -29,29 +31,6 @@ SHORT = 300
 def incoming(sensor: Sensor) -> list[str]:
     """The names of the frame types that the sensor sends."""
     return [name for name, frame in sensor.frames.items() if frame.direction == "in"]
-
-
-def conversation(sensor: Sensor, *, seed: int = 0, rounds: int = 3, example: Callable[..., bytes] | None = None) -> list[tuple[str, bytes]]:
-    """Frames of all incoming types as the sensor could send them: (type, bytes), each where it is looked for and believed.
-
-    Args:
-        example: what makes a valid frame of a type and a seed; by default the sensor's own.
-    """
-    example = example or sensor.example
-    found: list[tuple[str, bytes]] = []
-    for turn in range(rounds):
-        for name in incoming(sensor):
-            frame, first = sensor.frames[name], seed * 1000 + turn * 10
-            if frame.after is not None:
-                found.append((frame.after, example(frame.after, seed=first)))
-            number = frame.confirm + 2 if frame.data or frame.confirm > 1 else 1
-            found += [(name, example(name, seed=first + index)) for index in range(number)]
-    return found
-
-
-def stream(sensor: Sensor, *, seed: int = 0, rounds: int = 3) -> bytes:
-    """The bytes of a conversation."""
-    return b"".join(data for _, data in conversation(sensor, seed=seed, rounds=rounds))
 
 
 def delivery(sensor: Sensor, frames: list[tuple[str, bytes]]) -> Any:
@@ -128,16 +107,6 @@ def seals(sensor: Sensor, name: str, data: bytes) -> set[str]:
     return {leaf.info.path for seal in getattr(found, "seals", ()) for leaf in seal.leaves}
 
 
-def fitting(sensor: Sensor, data: bytes) -> list[str]:
-    """The frame types that these bytes can be."""
-    found = []
-    for name in sensor.frames:
-        with contextlib.suppress(WireError):
-            sensor.parse(data, frame=name)
-            found.append(name)
-    return found
-
-
 #: examples of each frame type that a property tries.
 EXAMPLES = int(os.environ.get("LIDARSPEC_EXAMPLES", "40"))
 #: sensors with more frame types than this are tried with less of each.
@@ -166,10 +135,9 @@ class Subject:
     _known: dict[tuple[str, int], bytes] = field(default_factory=dict, repr=False)
     _drawers: dict[str, dict[str, Callable[[random.Random], int]]] = field(default_factory=dict, repr=False)
 
-    @classmethod
-    def of(cls, sensor: str | Path | Sensor, **more: Any) -> Subject:
-        """The sensor of an id, a file, or itself."""
-        return cls(sensor if isinstance(sensor, Sensor) else named_sensor(sensor), **more)
+    def fields(self, frame: str) -> Mapping[str, FieldInfo]:
+        """The fields of a frame type, by path."""
+        return codec(self.sensor.frames[frame]).schema.fields
 
     def source(self, purpose: str = "") -> random.Random:
         """Random numbers of this sensor's own for one purpose, the same in every run."""
@@ -184,30 +152,33 @@ class Subject:
     def example(self, frame: str, *, seed: int = 0) -> bytes:
         """The bytes of a valid frame with seeded content, drawn by the author's strategies where there are some."""
         if (frame, seed) not in self._known:
-            drawn = self.drawers(frame)
-            source = random.Random(f"{self.sensor.id} {frame} {seed}")
-            made = examples(self.sensor, frame, source, drawn)[0] if drawn else self.sensor.example(frame, seed=seed)
-            self._known[frame, seed] = made
+            drawn, source = self.drawers(frame), random.Random(f"{self.sensor.id} {frame} {seed}")
+            example = examples(self.sensor, frame, source, drawn)[0] if drawn else self.sensor.example(frame, seed=seed)
+            self._known[frame, seed] = example
         return self._known[frame, seed]
 
     def drawers(self, frame: str) -> dict[str, Callable[[random.Random], int]]:
         """How raw values of fields of this frame are drawn, by path, where the author says so."""
         if frame not in self._drawers:
-            mine = {path.partition(".")[2]: how for path, how in self.strategies.items() if path.partition(".")[0] == frame}
-            self._drawers[frame] = {path: how if _is_function(how) else _pooled(how) for path, how in mine.items()}
+            mine = {path.removeprefix(f"{frame}."): how for path, how in self.strategies.items() if path.partition(".")[0] == frame}
+            self._drawers[frame] = {path: _pooled(how) if hasattr(how, "example") else how for path, how in mine.items()}
         return self._drawers[frame]
 
     def conversation(self, *, seed: int = 0, rounds: int = 3) -> list[tuple[str, bytes]]:
         """Frames of all incoming types as the sensor could send them: (type, bytes), each where it is looked for and believed."""
-        return conversation(self.sensor, seed=seed, rounds=rounds, example=self.example)
+        frames: list[tuple[str, bytes]] = []
+        for turn in range(rounds):
+            for name in incoming(self.sensor):
+                frame, first = self.sensor.frames[name], seed * 1000 + turn * 10
+                if frame.after is not None:
+                    frames.append((frame.after, self.example(frame.after, seed=first)))
+                number = frame.confirm + 2 if frame.data or frame.confirm > 1 else 1
+                frames += [(name, self.example(name, seed=first + index)) for index in range(number)]
+        return frames
 
     def stream(self, *, seed: int = 0, rounds: int = 3) -> bytes:
         """The bytes of a conversation."""
         return b"".join(data for _, data in self.conversation(seed=seed, rounds=rounds))
-
-
-def _is_function(how: Any) -> bool:
-    return callable(how) and not hasattr(how, "example")
 
 
 def _pooled(strategy: Any) -> Callable[[random.Random], int]:
@@ -215,10 +186,9 @@ def _pooled(strategy: Any) -> Callable[[random.Random], int]:
     from hypothesis import HealthCheck, Phase, given, settings
 
     pool: list[int] = []
+    quiet: dict[str, Any] = {"database": None, "deadline": None, "suppress_health_check": list(HealthCheck)}
 
-    @settings(
-        max_examples=POOL, derandomize=True, database=None, deadline=None, phases=[Phase.generate], suppress_health_check=list(HealthCheck)
-    )
+    @settings(max_examples=POOL, derandomize=True, phases=[Phase.generate], **quiet)
     @given(strategy)
     def collect(value: int) -> None:
         pool.append(value)

@@ -21,7 +21,6 @@ import numpy as np
 
 from lidarspec.discovery.checksum_search import search
 from lidarspec.errors import LidarSpecError, WireError
-from lidarspec.framing.frame_engine import codec
 from lidarspec.spec.tree import FieldInfo
 from lidarspec.testing.findings import Violation, require
 from lidarspec.testing.frames import leaves
@@ -91,7 +90,7 @@ def _parsed(subject: Subject, name: str, data: bytes, place: str) -> Any:
 
 def _values(subject: Subject, name: str, data: bytes, parsed: Any, vector: Mapping[str, Any], place: str) -> None:
     """Hold the fields of a vector to its values, raw and in units."""
-    fields, found = codec(subject.sensor.frames[name]).schema.fields, dict(leaves(parsed))
+    fields, found = subject.fields(name), dict(leaves(parsed))
     wanted = [(path, value, False) for path, value in vector.get("values", {}).items()]
     wanted += [(path, value, True) for path, value in vector.get("units", {}).items()]
     for path, value, in_units in wanted:

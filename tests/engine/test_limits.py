@@ -14,6 +14,7 @@ import lidarspec
 from lidarspec import Sensor
 from lidarspec.framing.frame_engine import CompiledCodec, codec
 from lidarspec.testing import subject as material
+from lidarspec.testing.subject import Subject
 from tests.all_sensors import STREAMS
 from tests.engine.streams import worst
 from tests.shapes import SHAPES
@@ -52,7 +53,7 @@ def fed(sensor: Sensor, data: bytes, times: int = 1, chunk: int = 4096) -> None:
 @each_stream
 def test_a_decoder_holds_less_than_its_longest_frame(sensor: Sensor) -> None:
     bound = max(frame.max_length * frame.confirm for frame in sensor.frames.values() if frame.direction == "in")
-    for data in (garbage(20_000), worst(sensor, 20_000), material.stream(sensor)):
+    for data in (garbage(20_000), worst(sensor, 20_000), Subject(sensor).stream()):
         decoder, source = sensor.decoder(), random.Random(1)
         for chunk in material.pieces(data, source):
             decoder.feed(chunk)
@@ -82,7 +83,7 @@ def test_the_worst_stream_takes_little_memory(sensor: Sensor) -> None:
 @each_stream
 def test_a_frame_is_out_before_one_longest_frame_more_has_come(sensor: Sensor) -> None:
     """The first frame found by an endless stream, byte by byte: how many bytes after its own last one."""
-    frames = material.conversation(sensor, rounds=3)
+    frames = Subject(sensor).conversation(rounds=3)
     data = b"".join(part for _, part in frames)
     bound = max(frame.max_length * frame.confirm for frame in sensor.frames.values() if frame.direction == "in")
     decoder = sensor.decoder()

@@ -9,8 +9,7 @@ import pytest
 from construct import Array, Bytes, Const, Int8ub, Int16ub, Struct, Switch, this
 
 from lidarspec import Sensor, UsageError
-from lidarspec.exports import Refused, UnknownExport, export
-from lidarspec.exports.messages import messages
+from lidarspec.exports import Refused, UnknownExport, export, messages
 from lidarspec.spec import Checksum, Checksummed, Frame
 from lidarspec.spec.tree import Op, Ref, Repeat, nodes
 from tests.exports.oddities import SENSOR

@@ -15,6 +15,7 @@ from lidarspec.captures.pcap import CaptureReader
 from lidarspec.exports import Refused, export
 from lidarspec.framing.frame_engine import codec
 from lidarspec.testing import subject as material
+from lidarspec.testing.subject import Subject
 from tests import made_captures as made
 from tests.exports.sharks import captured, columns, dissector, needs_tshark, tshark, written
 from tests.exports.trees import DISTINCT, EVERY, values
@@ -51,7 +52,7 @@ def test_every_field_reads_as_lidarspec_reads_it(sensor: Sensor, tmp_path: Path)
     outgoing = [
         (name, sensor.example(name, seed=seed)) for seed in range(3) for name in sensor.frames if name not in material.incoming(sensor)
     ]
-    frames = [*material.conversation(sensor), *outgoing]
+    frames = [*Subject(sensor).conversation(), *outgoing]
     capture = captured(sensor, [data for _, data in frames], tmp_path / "frames.pcap")
     script = written(sensor, tmp_path)
     assert_shown(sensor, capture, script, frames)

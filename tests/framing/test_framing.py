@@ -7,8 +7,8 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 
 from lidarspec import Sensor
-from lidarspec.testing import subject as material
 from lidarspec.testing.agreement import assert_backends_agree
+from lidarspec.testing.subject import Subject
 from tests.all_sensors import streams
 from tests.engine.oracle import Oracle
 from tests.engine.streams import Books, damaged, decoded
@@ -22,8 +22,8 @@ each_stream = pytest.mark.parametrize("sensor", STREAMS.values(), ids=STREAMS)
 
 
 def conversation(sensor: Sensor, *, seed: int = 0, length: int = LENGTH) -> bytes:
-    rounds = max(length // len(material.stream(sensor, rounds=1)), 1)
-    return material.stream(sensor, seed=seed, rounds=rounds)
+    rounds = max(length // len(Subject(sensor).stream(rounds=1)), 1)
+    return Subject(sensor).stream(seed=seed, rounds=rounds)
 
 
 @pytest.mark.parametrize("sensor", SHAPES.values(), ids=SHAPES)
@@ -160,7 +160,7 @@ def test_a_frame_that_comes_first_in_the_order_ends_a_run() -> None:
 
 @pytest.mark.parametrize("name", ["shape-count", "shape-options", "shape-state", "shape-modes", "shape-text", "shape-commands"])
 def test_a_frame_is_out_with_its_last_byte(name: str) -> None:
-    data = material.stream(SHAPES[name])
+    data = Subject(SHAPES[name]).stream()
     decoder = SHAPES[name].decoder()
     for spot in range(len(data)):
         for found in decoder.feed(data[spot : spot + 1]):

@@ -15,6 +15,8 @@ from lidarspec.framing.steady import SMALL
 from lidarspec.spec import Checksummed, Frame, Xor
 from lidarspec.testing import subject as material
 from lidarspec.wire.row_checksums import FEW, SHORT, registers
+from lidarspec.spec.row_checksums import FEW, SHORT, registers
+from lidarspec.testing.subject import Subject
 from tests.all_sensors import streams
 from tests.engine.streams import Books, damaged
 from tests.shapes import SHAPES
@@ -46,7 +48,7 @@ def test_pieces_of_a_few_frames_give_what_the_whole_gives(sensor: Sensor, rate: 
     frames = [frame for name, frame in sensor.frames.items() if frame.direction == "in"]
     size = min(frame.max_length for frame in frames)
     for seed in range(3):
-        other = material.stream(sensor, seed=seed, rounds=1)
+        other = Subject(sensor).stream(seed=seed, rounds=1)
         train = sensor.example(sensor.data_frame, seed=seed) * 12 + other
         train += b"".join(sensor.example(sensor.data_frame, seed=number) for number in range(20)) + other
         data = damaged(train, rate, seed)

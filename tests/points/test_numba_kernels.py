@@ -22,8 +22,8 @@ from lidarspec.points.plan import Plan, plan_for
 from lidarspec.simulation.simulator import opening, simulate
 from lidarspec.spec import Checksum, Crc, Fields, Polar, WordXor, Xor
 from lidarspec.spec.links import is_datagram
-from lidarspec.testing import subject as material
 from lidarspec.testing.agreement import assert_same_points
+from lidarspec.testing.subject import Subject
 from lidarspec.wire.frame_table import Rows
 from lidarspec.wire.layout import Seal
 from lidarspec.wire.row_checksums import batch
@@ -61,7 +61,7 @@ def test_kernels_give_what_the_plain_evaluation_gives(name: str) -> None:
 @pytest.mark.parametrize("name", list(SENSORS))
 def test_every_column_of_damaged_and_mixed_streams(name: str) -> None:
     sensor = SENSORS[name]
-    packets = sensor.decode(material.stream(sensor), backend="jit")
+    packets = sensor.decode(Subject(sensor).stream(), backend="jit")
     if len(packets):
         assert_same_points(evaluated(packets).cloud, evaluate(packets).cloud, ulps=ULPS)
 

@@ -16,8 +16,8 @@ from lidarspec.points.plain import evaluate
 from lidarspec.points.plan import Plan, plan_for
 from lidarspec.spec import Fields, Polar
 from lidarspec.spec.links import is_datagram
-from lidarspec.testing import subject as material
 from lidarspec.testing.agreement import assert_same_points
+from lidarspec.testing.subject import Subject
 from lidarspec.wire.frame_table import Rows
 from tests.shapes import SHAPES
 
@@ -56,7 +56,7 @@ def test_the_plan_gives_what_the_plain_evaluation_gives(name: str, number: int) 
 @pytest.mark.parametrize("name", list(SENSORS))
 def test_every_column_of_damaged_and_mixed_streams(name: str) -> None:
     sensor = SENSORS[name]
-    packets = sensor.decode(material.stream(sensor))
+    packets = sensor.decode(Subject(sensor).stream())
     if len(packets):
         assert_same_points(evaluated(packets).cloud, evaluate(packets).cloud)
 

@@ -27,7 +27,7 @@ from construct import (
 )
 
 from lidarspec import SpecError
-from lidarspec.exports.messages import messages
+from lidarspec.exports import messages
 from lidarspec.framing.frame_engine import CompiledCodec, codec
 from lidarspec.spec import Scaled
 from lidarspec.spec.tree import Select, nodes
