@@ -20,15 +20,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.columns.columns import Batch
-from lidarspec.errors import UsageError
+from lidarspec.columns.columns import Batch, Column, Fields, aligned
+from lidarspec.errors import SpecError, UsageError
 from lidarspec.framing.examples import example
 from lidarspec.packets.clocks import clock_ns
 from lidarspec.simulation.frame_maker import FrameMaker, sealed
-from lidarspec.simulation.measuring import Beams, Measurement
-from lidarspec.columns.columns import Batch, Column, Fields, aligned
-from lidarspec.errors import SpecError, UsageError
-from lidarspec.simulation.frame_maker import FrameMaker, example, sealed
 from lidarspec.simulation.scenes import Room, Scene
 from lidarspec.spec.description import Spec
 from lidarspec.spec.fields import factor
