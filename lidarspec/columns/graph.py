@@ -300,14 +300,8 @@ def conjuncts(node: Node) -> Iterator[Node]:
 
 
 #: one-argument functions that are a multiplication.
-FACTORS = {
-    np.negative: -1.0,
-    np.positive: 1.0,
-    np.deg2rad: np.pi / 180,
-    np.radians: np.pi / 180,
-    np.rad2deg: 180 / np.pi,
-    np.degrees: 180 / np.pi,
-}
+FACTORS = {np.negative: -1.0, np.positive: 1.0, np.deg2rad: np.pi / 180, np.radians: np.pi / 180}
+FACTORS |= {np.rad2deg: 180 / np.pi, np.degrees: 180 / np.pi}
 
 
 @dataclass(frozen=True, eq=False)

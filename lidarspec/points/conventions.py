@@ -18,16 +18,8 @@ Floats = NDArray[np.float32]
 
 #: names of the columns that a cloud can have, in the order in which files list them, and their types.
 TYPES: Mapping[str, Any] = {
-    "x": np.float32,
-    "y": np.float32,
-    "z": np.float32,
-    "range": np.float32,
-    "azimuth": np.float32,
-    "elevation": np.float32,
-    "intensity": np.float32,
-    "time": np.float64,
-    "ring": np.uint16,
-    "return_index": np.uint8,
+    **dict.fromkeys(("x", "y", "z", "range", "azimuth", "elevation", "intensity"), np.float32),
+    **{"time": np.float64, "ring": np.uint16, "return_index": np.uint8},
 }
 
 #: largest float32 below pi: azimuths stay in [-pi, pi) in either precision.

@@ -337,10 +337,14 @@ def _single_crc(algorithm: Crc) -> Single:
     table = byte_table(algorithm.width, algorithm.poly, algorithm.refin)
     if algorithm.width > 8:
         return functools.partial(_wide_crc, algorithm, table, algorithm.start)
-    return functools.partial(_narrow_crc, table, algorithm.start, tuple(map(algorithm.left, range(256))))
+    spare = 8 - algorithm.width
+    leaving = [register if algorithm.refin else register >> spare for register in range(256)]
+    if algorithm.refin != algorithm.refout:
+        leaving = [MIRROR[register] >> spare for register in leaving]
+    return functools.partial(_narrow_crc, table, algorithm.start, bytes(register ^ algorithm.xorout for register in leaving))
 
 
-def _narrow_crc(table: tuple[int, ...], register: int, leaving: tuple[int, ...], data: bytes) -> int:
+def _narrow_crc(table: tuple[int, ...], register: int, leaving: bytes, data: bytes) -> int:
     for byte in data:
         register = table[register ^ byte]
     return leaving[register]

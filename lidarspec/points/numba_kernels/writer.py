@@ -17,47 +17,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.columns.graph import Node, key, last_axis, traverse
+from lidarspec.columns.graph import FACTORS, Node, key, last_axis, traverse
 from lidarspec.points.windows import every_value, possible, raw_values, window
 from lidarspec.wire.layout import Layout, Leaf
 
+_SIGNS = {np.add: "+", np.subtract: "-", np.multiply: "*", np.true_divide: "/", np.equal: "==", np.not_equal: "!="}
+_SIGNS |= {np.less: "<", np.less_equal: "<=", np.greater: ">", np.greater_equal: ">="}
+
 #: how a kernel writes NumPy's functions of numbers; what is not here is computed by NumPy itself.
 TEMPLATES: dict[Any, str] = {
-    np.add: "({} + {})",
-    np.subtract: "({} - {})",
-    np.multiply: "({} * {})",
-    np.true_divide: "({} / {})",
-    np.negative: "(-{})",
-    np.positive: "{}",
-    np.absolute: "abs({})",
-    np.deg2rad: f"({{}} * {np.pi / 180!r})",
-    np.radians: f"({{}} * {np.pi / 180!r})",
-    np.rad2deg: f"({{}} * {180 / np.pi!r})",
-    np.degrees: f"({{}} * {180 / np.pi!r})",
-    np.minimum: "smaller({}, {})",
-    np.maximum: "larger({}, {})",
-    np.less: "({} < {})",
-    np.less_equal: "({} <= {})",
-    np.greater: "({} > {})",
-    np.greater_equal: "({} >= {})",
-    np.equal: "({} == {})",
-    np.not_equal: "({} != {})",
-    np.floor: "np.floor({})",
-    np.ceil: "np.ceil({})",
-    np.trunc: "np.trunc({})",
-    np.rint: "np.rint({})",
-    np.mod: "modulo({}, {})",
-    np.sqrt: "np.sqrt({})",
-    np.sin: "math.sin({})",
-    np.cos: "math.cos({})",
-    np.tan: "math.tan({})",
-    np.arctan: "math.atan({})",
-    np.arctan2: "math.atan2({}, {})",
-    np.exp: "math.exp({})",
-    np.exp2: "np.exp2({})",
-    np.isfinite: "math.isfinite({})",
-    np.isnan: "math.isnan({})",
-    np.nan_to_num: "number({})",
+    **{function: f"({{}} {sign} {{}})" for function, sign in _SIGNS.items()},
+    **{function: f"({{}} * {FACTORS[function]!r})" for function in (np.deg2rad, np.radians, np.rad2deg, np.degrees)},
+    **{function: f"np.{function.__name__}({{}})" for function in (np.floor, np.ceil, np.trunc, np.rint, np.sqrt, np.exp2)},
+    **{function: f"math.{function.__name__}({{}})" for function in (np.sin, np.cos, np.tan, np.exp, np.isfinite, np.isnan)},
+    **{np.arctan: "math.atan({})", np.arctan2: "math.atan2({}, {})", np.mod: "modulo({}, {})", np.nan_to_num: "number({})"},
+    **{np.minimum: "smaller({}, {})", np.maximum: "larger({}, {})"},
+    **{np.negative: "(-{})", np.positive: "{}", np.absolute: "abs({})"},
 }
 
 #: what costs hardly more than looking its result up; with these, whatever is made of numbers stays a number.

@@ -75,14 +75,8 @@ def given_back(scratch: Scratch) -> None:
         _KEPT.append(scratch)
 
 
-TYPES: dict[str, np.dtype[Any]] = {
-    "single": np.dtype(np.float32),
-    "double": np.dtype(np.float64),
-    "index": np.dtype(np.intp),
-    "flag": np.dtype(np.bool_),
-    "u1": np.dtype("u1"),
-    "u2": np.dtype("u2"),
-}
+_CODES = {"single": "f4", "double": "f8", "index": "intp", "flag": "?", "u1": "u1", "u2": "u2"}
+TYPES: dict[str, np.dtype[Any]] = {kind: np.dtype(code) for kind, code in _CODES.items()}
 
 
 def slots_of(uses: Sequence[Collection[int]], kinds: Sequence[str], own: Collection[int]) -> list[int]:
