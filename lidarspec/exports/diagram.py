@@ -163,7 +163,6 @@ def svg(sensor: Sensor) -> str:
         order = byte_order(message)
         detail = f"{size} byte{'s' * (size != '1')}" + (f", integers {order}-endian" if order else "")
         sheet.title(f"{sensor.vendor} {sensor.model}: {message.name}", detail)
-        sheet.ruler()
         sheet.items(_Cells(message.seals, mixed=not order).visit(message.root, Extent(), 0), 0)
         sheet.close()
     return sheet.document(f"{sensor.id}: packet diagrams")
@@ -183,13 +182,10 @@ class _Sheet:
     deepest: int = 0
 
     def title(self, text: str, detail: str) -> None:
-        """The name of a frame type above its rows."""
+        """The name of a frame type above its rows, then bytes and bits above the first of them."""
         self.parts.append(_text(EDGE, self.top + 14, text, 15, weight="bold"))
         self.parts.append(_text(EDGE, self.top + 31, detail, 11.5, fill=FAINT))
         self.top += 48
-
-    def ruler(self) -> None:
-        """Bytes and bits above the first row."""
         for byte in range(BITS // 8):
             self.parts.append(_text(LEFT + (8 * byte + 4) * BIT, self.top, f"byte {byte}", 10.5, fill=FAINT, anchor="middle"))
         for bit in range(BITS):

@@ -128,9 +128,8 @@ class _Writer:
                 return {"kind": "empty", "skip": 0}
 
     def _number(self, node: tree.Number) -> Table:
-        kind = {"uint": "UINT", "int": "INT", "float": "FLOAT"}[node.kind] + ("" if node.kind == "float" else str(_width(8 * node.size)))
-        if node.kind == "float" and node.size == 8:
-            kind = "DOUBLE"
+        width = _width(8 * node.size)
+        kind = {"uint": f"UINT{width}", "int": f"INT{width}", "float": "DOUBLE" if node.size == 8 else "FLOAT"}[node.kind]
         table: Table = {"kind": "number", "name": node.name, "type": node.kind, "size": node.size}
         table |= {"le": (node.order == "little" and node.size > 1) or None, **self._described(node.info, kind)}
         return table | {"skip": self._skip(node.info, node.size)}
