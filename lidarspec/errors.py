@@ -8,7 +8,8 @@ own text from typed arguments, so that the place of a fault can be read from the
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import TypeVar
 
 
@@ -175,3 +176,12 @@ class CommandError(LidarSpecError):
 
 class ReplyTimeout(CommandError):
     """The device gave no answer to a command within its time."""
+
+
+@contextmanager
+def system_errors(place: object) -> Iterator[None]:
+    """What the system refuses within, an OSError, as the `SourceError` of a place, such as a path."""
+    try:
+        yield
+    except OSError as error:
+        raise SourceError(f"{place}: {error.strerror or error}") from None

@@ -14,8 +14,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
-from types import TracebackType
-from typing import BinaryIO, Self
+from typing import BinaryIO
 
 from lidarspec.captures.ip import ETHERNET, LARGEST_PAYLOAD, Reassembly, Refused, address, ip_packet, udp, udp_frame
 from lidarspec.captures.records import (
@@ -29,7 +28,8 @@ from lidarspec.captures.records import (
     is_capture,
     records,
 )
-from lidarspec.errors import SourceError, UsageError
+from lidarspec.errors import SourceError, UsageError, system_errors
+from lidarspec.transports.protocol import Closing
 
 __all__ = ["CaptureReader", "CaptureStats", "Datagram", "PcapWriter", "StreamReader", "is_capture", "is_stream_capture"]
 
@@ -83,7 +83,7 @@ class CaptureStats:
     stopped_at: int | None = None
 
 
-class CaptureReader:
+class CaptureReader(Closing):
     """The UDP datagrams of a capture, in file order, each once: an iterator goes on where the last one stopped.
 
     Args:
@@ -100,7 +100,8 @@ class CaptureReader:
         self.stats = CaptureStats()
         self._owned: BinaryIO | None = None
         if isinstance(file, str | os.PathLike):
-            file = self._owned = _open(file)
+            with system_errors(os.fspath(file)):
+                file = self._owned = open(file, "rb")  # noqa: SIM115  closed by `close`
         self._source = self._reading(file)
         self._fragments = Reassembly()
         self._datagrams: Iterator[Datagram] | None = None
@@ -117,12 +118,6 @@ class CaptureReader:
         if self._datagrams is None:  # and not before: it holds the reader, which would live on until the garbage is collected
             self._datagrams = self._walk()
         return self._datagrams
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        self.close()
 
     def close(self) -> None:
         """Closes the file, if it was given as a path."""
@@ -272,13 +267,6 @@ class PcapWriter:
 def is_stream_capture(head: bytes) -> bool:
     """Whether the first 24 bytes of a file are those of a pcap capture of a byte stream."""
     return is_capture(head) and len(head) >= 24 and int.from_bytes(head[20:22], "little") in USER_LINKS and head[0] in b"\x4d\xd4"
-
-
-def _open(path: str | os.PathLike[str]) -> BinaryIO:
-    try:
-        return open(path, "rb")
-    except OSError as error:
-        raise SourceError(f"{os.fspath(path)}: {error.strerror}") from error
 
 
 @lru_cache(maxsize=256)

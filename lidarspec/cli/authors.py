@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
 from pathlib import Path
 from shlex import quote
@@ -11,6 +12,7 @@ import click
 from lidarspec.cli.failures import FINDINGS
 from lidarspec.cli.output import Progress, emit, emit_json, note
 from lidarspec.discovery.draft import Link, Names, captured, draft, invented, write
+from lidarspec.discovery.listen import beginning
 from lidarspec.errors import UsageError, WireError, suggest
 from lidarspec.exports import EXPORTS, Refused, export as exported, narrowed
 from lidarspec.plugins import sensor as named_sensor, sensors
@@ -51,19 +53,12 @@ def new(sensor_id: str, into: str, link: str | None, capture: str | None) -> Non
 
 def _drafted(names: Names, link: str | None, capture: str) -> dict[str, str]:
     """The files with a draft of the capture's frames: of several senders and ports, those that the most bytes come from and go to."""
-    opened = transport(capture)
     groups: dict[object, list[Chunk]] = {}
-    size = 0
-    try:
-        for chunk in opened.chunks():
+    with contextlib.closing(transport(capture)) as opened:
+        for chunk in beginning(opened, MOST):
             groups.setdefault((chunk.sender and chunk.sender[0], chunk.receiver and chunk.receiver[1]), []).append(chunk)
-            size += len(chunk.data)
-            if size >= MOST:
-                break
-    finally:
-        opened.close()
     chunks = max(groups.values(), key=lambda group: sum(len(chunk.data) for chunk in group), default=[])
-    if not size:
+    if not any(chunk.data for chunk in chunks):
         raise WireError(f"{capture} holds no bytes")
     found = draft([chunk.data for chunk in chunks], datagrams=opened.datagrams)
     note(f"{capture}: {len(found.frames)} frames, {found.share:.1%} of {found.bytes_in} bytes")

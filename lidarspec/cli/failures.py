@@ -12,22 +12,16 @@ from lidarspec import errors
 FINDINGS, USAGE, SOURCE, NO_DATA, DEVICE, INTERRUPTED = 1, 2, 3, 4, 5, 130
 
 #: error class -> exit code and the next command; the first that fits, "{sensor}" and "{verb}" filled in.
-CODES: tuple[tuple[type[Exception], int, str], ...] = (
+CODES: tuple[tuple[type[Exception] | tuple[type[Exception], ...], int, str], ...] = (
     (errors.UnknownSensor, USAGE, "lidarspec sensors"),
     (errors.UnknownFormat, USAGE, "lidarspec convert --help"),
-    (errors.UnknownFrame, USAGE, "lidarspec show {sensor}"),
-    (errors.UnknownField, USAGE, "lidarspec show {sensor}"),
-    (errors.MissingField, USAGE, "lidarspec show {sensor}"),
-    (errors.OutOfRange, USAGE, "lidarspec show {sensor}"),
-    (errors.UsageError, USAGE, "lidarspec {verb} --help"),
-    (errors.SourceError, SOURCE, "lidarspec {verb} --help"),
+    ((errors.UnknownFrame, errors.UnknownField, errors.MissingField, errors.OutOfRange), USAGE, "lidarspec show {sensor}"),
+    ((errors.UsageError, click.ClickException), USAGE, "lidarspec {verb} --help"),
+    ((errors.SourceError, OSError), SOURCE, "lidarspec {verb} --help"),
     (errors.WireError, NO_DATA, "lidarspec show {sensor}"),
     (errors.CommandError, DEVICE, "lidarspec show {sensor}"),
     (errors.SpecError, FINDINGS, "lidarspec check {sensor}"),
     (errors.LidarSpecError, FINDINGS, "lidarspec plugins"),
-    (click.UsageError, USAGE, "lidarspec {verb} --help"),
-    (click.ClickException, USAGE, "lidarspec {verb} --help"),
-    (OSError, SOURCE, "lidarspec {verb} --help"),
 )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import os
 from collections.abc import Iterable, Iterator
@@ -10,11 +11,12 @@ from pathlib import Path
 
 import click
 
-from lidarspec.cli.inputs import Input, nearest_fault, no_frame, nothing_came, scans_of
+from lidarspec.cli.inputs import nearest_fault, no_frame, nothing_came, scans_of
 from lidarspec.cli.options import sensor_option
 from lidarspec.cli.output import emit, emit_json, note
 from lidarspec.device.device import Device, open as open_device
 from lidarspec.discovery.detect import detected, scores
+from lidarspec.discovery.listen import Heard, beginning
 from lidarspec.errors import LidarSpecError, UsageError, WireError, suggest
 from lidarspec.formats import format_of, write
 from lidarspec.plugins import sensor as named_sensor
@@ -110,22 +112,15 @@ def _no_data(device: Device, source: str, target: str) -> Exception:
     return suggest(WireError(f"no data frame in {source}: {stats}", sensor=sensor.id), f"lidarspec explain {source} -s {sensor.id}")
 
 
-def _again(source: str) -> Input | None:
+def _again(source: str) -> Heard | None:
     """The beginning of a file once more; None for what can be read only once."""
     if not Path(source.partition("?")[0]).is_file():
         return None
-    opened = transport(source)
-    chunks: list[bytes] = []
-    try:
-        for chunk in opened.chunks():
-            chunks.append(chunk.data[:LOOKED_AT])
-            if sum(map(len, chunks)) >= LOOKED_AT:
-                break
-    except LidarSpecError:
-        return None
-    finally:
-        opened.close()
-    return Input(source, tuple(chunks), opened.datagrams)
+    with contextlib.closing(transport(source)) as opened:
+        try:
+            return Heard(source, tuple(chunk.data for chunk in beginning(opened, LOOKED_AT)), opened.datagrams)
+        except LidarSpecError:
+            return None
 
 
 @click.command()

@@ -13,9 +13,8 @@ from lidarspec.cli.failures import DEVICE, FINDINGS, NO_DATA
 from lidarspec.cli.inputs import read
 from lidarspec.cli.options import DURATION, output_options, sensor_option
 from lidarspec.cli.output import emit, emit_json, note, table
-from lidarspec.device.settings import named
 from lidarspec.discovery.checksum_search import search
-from lidarspec.discovery.detect import Score, Verdict, verdict, verdicts
+from lidarspec.discovery.detect import Score, Verdict, best, verdict, verdicts
 from lidarspec.discovery.doctor import Finding, computer, examined
 from lidarspec.discovery.listen import LISTEN, Heard, everywhere, hear, probe, started_first, udp_ports
 from lidarspec.discovery.periods import Structure, cut, structure
@@ -24,7 +23,8 @@ from lidarspec.errors import SourceError, UsageError, suggest
 from lidarspec.plugins import sensor as named_sensor, sensors
 from lidarspec.spec.checksums import CRCS, Crc
 from lidarspec.spec.links import Serial, Udp
-from lidarspec.transports.open_url import live_address
+from lidarspec.transports.base import data_link, with_option
+from lidarspec.transports.open_url import live_address, resolved
 from lidarspec.transports.ports import SerialPort, User, serial_ports, udp_users
 
 #: doubt below which a match may well be chance.
@@ -54,12 +54,7 @@ def ports(as_json: bool, output: str | None) -> None:
 
 def _senders(port: int) -> list[str]:
     """The installed sensors whose data come to a UDP port."""
-    found = []
-    for sensor in sensors().values():
-        link = sensor.links.get("data")
-        if isinstance(link, Udp) and port in link.ports:
-            found.append(sensor.id)
-    return found
+    return [sensor.id for sensor in sensors().values() if (link := data_link(sensor, Udp)) and port in link.ports]
 
 
 def _state(port: SerialPort) -> str:
@@ -69,9 +64,7 @@ def _state(port: SerialPort) -> str:
 
 
 def _udp_state(users: tuple[User, ...] | None) -> str:
-    if users is None:
-        return "free"
-    return f"in use by {', '.join(map(str, users)) or 'another user'}"
+    return "free" if users is None else f"in use by {', '.join(map(str, users)) or 'another user'}"
 
 
 def _serial(port: SerialPort) -> dict[str, Any]:
@@ -187,8 +180,7 @@ def detect(source: str | None, duration: float, start: bool, as_json: bool, outp
     """
     if source == "-":
         raise suggest(UsageError("standard input can be read only once: write it to a file first"), "lidarspec detect FILE")
-    device = None if source is None else named(source)
-    source = source if device is None else device.source
+    source = None if source is None else resolved(source)
     found = list(_everywhere(duration, start=start)) if source is None else _one(source, duration, start=start)
     fitting = [one for one in found if one.scores]
     unknown = None if fitting else _unknown(found)
@@ -214,7 +206,7 @@ def _one(source: str, duration: float, *, start: bool) -> list[Verdict]:
     found = verdicts(source, seconds=duration)
     if start and not any(one.scores for one in found):
         for heard in probe(source):
-            found = [_best([*found, verdict(heard)])]
+            found = [best([*found, verdict(heard)])]
             if found[0].is_clear:
                 break
     return found
@@ -230,10 +222,6 @@ def _everywhere(duration: float, *, start: bool) -> Iterator[Verdict]:
             yield Verdict(Heard(port, failure=error), (), ())
     for heard in everywhere([], seconds=duration):
         yield verdict(heard)
-
-
-def _best(found: Sequence[Verdict]) -> Verdict:
-    return max(found, key=lambda one: (one.scores[0].share if one.scores else 0.0, one.heard.size))
 
 
 def _unknown(found: Sequence[Verdict]) -> Structure | None:
@@ -299,11 +287,11 @@ def _following(source: str | None, unknown: Structure | None) -> str:
 def _again(one: Verdict) -> str:
     """The source as it has to be opened for the sensor that was found."""
     source, heard = one.heard.source, one.heard
-    link = one.sensor.links.get("data") if one.sensor is not None else None
-    if heard.baud is not None and "baud=" not in source and not (isinstance(link, Serial) and link.baud == heard.baud):
-        source += f"{'&' if '?' in source else '?'}baud={heard.baud}"
+    link = data_link(one.sensor, Serial)
+    if heard.baud is not None and "baud=" not in source and not (link and link.baud == heard.baud):
+        source = with_option(source, "baud", heard.baud)
     if heard.sender and "src=" not in source:
-        source += f"{'&' if '?' in source else '?'}src={heard.sender}"
+        source = with_option(source, "src", heard.sender)
     return quote(source)
 
 

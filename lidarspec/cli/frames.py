@@ -7,10 +7,11 @@ from typing import Any
 
 import click
 
-from lidarspec.cli.inputs import Input, nearest_fault, no_frame, read
+from lidarspec.cli.inputs import nearest_fault, no_frame, read
 from lidarspec.cli.options import output_options, sensor_option
 from lidarspec.cli.output import emit, emit_json, emit_lines, note, table
-from lidarspec.discovery.identify import Piece, fitting, likely_starts, pieces
+from lidarspec.discovery.detect import Piece, fitting, likely_starts, pieces
+from lidarspec.discovery.listen import Heard
 from lidarspec.errors import UsageError, WireError, suggest
 from lidarspec.explaining.explanation import Explanation, explain as explained
 from lidarspec.explaining.listing import LINED, Line, told
@@ -90,7 +91,7 @@ def explain(
         raise suggest(next(part.fault for _, part in parts if part.fault), f"lidarspec show {sensor.id}")
 
 
-def _compare(sensor: Sensor, given: Input, found: list[Piece], diff: str, frame: str | None, *, as_json: bool, output: str | None) -> None:
+def _compare(sensor: Sensor, given: Heard, found: list[Piece], diff: str, frame: str | None, *, as_json: bool, output: str | None) -> None:
     """Print what differs between the first frame of the input and another one."""
     frames = [piece for piece in found if piece.frame] or [Piece(0, given.data, "?")]
     if diff == "next":
@@ -113,7 +114,7 @@ def _compare(sensor: Sensor, given: Input, found: list[Piece], diff: str, frame:
 
 def _found(
     words: Sequence[str], sensor_id: str | None, count: int | None, frame: str | None = None, *, damaged: bool = False
-) -> tuple[Input, Sensor, list[str], list[Piece]]:
+) -> tuple[Heard, Sensor, list[str], list[Piece]]:
     """The input, its sensor, the ids of all that fit, and what is in it up to frame number `count`.
 
     Raises:
@@ -128,7 +129,7 @@ def _found(
     return given, sensor, fits, found
 
 
-def _sensor(given: Input, sensor_id: str | None, *, damaged: bool) -> tuple[Sensor, list[str]]:
+def _sensor(given: Heard, sensor_id: str | None, *, damaged: bool) -> tuple[Sensor, list[str]]:
     """The sensor named, or the one whose bytes these are, and the ids of all whose bytes they could be."""
     if sensor_id is not None:
         return named_sensor(sensor_id), []

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 import sys
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from shlex import quote
 
 from lidarspec.device.device import Device
 from lidarspec.device.settings import devices
-from lidarspec.discovery.identify import nearest
-from lidarspec.errors import CommandError, LidarSpecError, SourceError, UsageError, WireError, suggest
+from lidarspec.discovery.detect import nearest
+from lidarspec.discovery.listen import Heard
+from lidarspec.errors import CommandError, LidarSpecError, SourceError, UsageError, WireError, suggest, system_errors
 from lidarspec.plugins import sensors
 from lidarspec.scans.scans import Scan
 from lidarspec.spec.sensor import Sensor
@@ -28,21 +29,7 @@ PATIENCE = 10.0
 LOOK = 0.1
 
 
-@dataclass(frozen=True)
-class Input:
-    """Bytes to look at: datagrams, or pieces of one stream; `name` is how to ask for them again."""
-
-    name: str
-    chunks: tuple[bytes, ...]
-    datagrams: bool = False
-
-    @property
-    def data(self) -> bytes:
-        """All bytes in order."""
-        return b"".join(self.chunks)
-
-
-def read(words: Sequence[str]) -> Input:
+def read(words: Sequence[str]) -> Heard:
     """The input that the words of a command line stand for.
 
     Raises:
@@ -52,11 +39,11 @@ def read(words: Sequence[str]) -> Input:
     text = " ".join(words)
     if text == "-":
         data = sys.stdin.buffer.read()
-        return Input("-", (_unhexed(data) or data,))
+        return Heard("-", (_unhexed(data) or data,))
     if len(words) == 1 and os.path.exists(text) and not is_port(text):
         return _file(text)
     try:
-        return Input(text if len(text) <= REPEATED else "-", (_bytes(text),))
+        return Heard(text if len(text) <= REPEATED else "-", (_bytes(text),))
     except ValueError as error:
         if text in (known := devices()):
             return read([known[text].source])
@@ -67,13 +54,13 @@ def read(words: Sequence[str]) -> Input:
         raise UsageError(f"{text[:QUOTED]!r} is no file, and not hexadecimal: {error}") from None
 
 
-def no_frame(sensor: Sensor, given: Input) -> WireError:
+def no_frame(sensor: Sensor, given: Heard) -> WireError:
     """Why there is no frame of this sensor in the input, with the next command."""
     data = given.data
     longest = max((frame.max_length for frame in sensor.frames.values()), default=0)
-    command = f"lidarspec explain {given.name} -s {sensor.id}"
+    command = f"lidarspec explain {given.source} -s {sensor.id}"
     if not data:
-        return suggest(WireError(f"{given.name} holds no bytes", sensor=sensor.id), f"lidarspec build {sensor.id} --help")
+        return suggest(WireError(f"{given.source} holds no bytes", sensor=sensor.id), f"lidarspec build {sensor.id} --help")
     if len(data) > longest:
         error = WireError(f"no frame in {len(data)} bytes", sensor=sensor.id, expected="a frame", data=data[:longest])
         return suggest(error, "lidarspec sensors")
@@ -84,15 +71,15 @@ def no_frame(sensor: Sensor, given: Input) -> WireError:
     return suggest(WireError("the bytes are not plausible", sensor=sensor.id, data=data), command)
 
 
-def nearest_fault(given: Input) -> WireError:
+def nearest_fault(given: Heard) -> WireError:
     """No sensor fits: what the one that came farthest says, with its id, or that none came far."""
     if not given.data:
-        return suggest(WireError(f"{given.name} holds no bytes"), "lidarspec sensors")
+        return suggest(WireError(f"{given.source} holds no bytes"), "lidarspec sensors")
     best = nearest(given.data)
     if best is None:
         text = f"no frame of any of the {len(sensors())} installed sensors"
         return suggest(WireError(text, data=given.data[:QUOTED]), "lidarspec sensors")
-    return suggest(best, f"lidarspec explain {given.name} -s {best.sensor}")
+    return suggest(best, f"lidarspec explain {given.source} -s {best.sensor}")
 
 
 def nothing_came(device: Device, source: str, seconds: float | None = None) -> LidarSpecError:
@@ -138,15 +125,9 @@ def scans_of(device: Device, source: str) -> Iterator[Scan]:
         patience.check()
 
 
-def _file(path: str) -> Input:
-    opened = transport(path)
-    try:
-        chunks = tuple(chunk.data for chunk in opened.chunks())
-    except OSError as error:
-        raise SourceError(f"{path}: {error.strerror or error}") from None
-    finally:
-        opened.close()
-    return Input(path, chunks, opened.datagrams)
+def _file(path: str) -> Heard:
+    with system_errors(path), contextlib.closing(transport(path)) as opened:
+        return Heard(path, tuple(chunk.data for chunk in opened.chunks()), opened.datagrams)
 
 
 def _bytes(text: str) -> bytes:

@@ -20,7 +20,6 @@ from lidarspec.cli.options import DURATION, SHARE, sensor_option
 from lidarspec.cli.output import note
 from lidarspec.device.device import Device, open as open_device
 from lidarspec.errors import UnknownFrame
-from lidarspec.packets.packets import Packets
 from lidarspec.scans.scans import Scan
 from lidarspec.view.feed import LOOK, Feed, Reading
 
@@ -117,13 +116,11 @@ def _points(device: Device, until: float, patience: Patience, *, every_point: bo
 
 
 def _scans(device: Device, until: float, patience: Patience) -> Iterator[Scan]:
-    waiting: list[Scan] = []
-    feed = Feed(device, seen=waiting.append)
+    feed = Feed(device)
     while not feed.ended and time.monotonic() < until:
         feed.pump(0.0)
         patience.check()
-        yield from waiting
-        waiting.clear()
+        yield from feed.scans
 
 
 def _packets(device: Device, frame: str | None, until: float, patience: Patience) -> Iterator[tuple[Units, Row]]:
@@ -247,15 +244,17 @@ def stats(
     there an interval can be longer than asked for.
     """
     with open_device(source, sensor_id, period=LOOK) as device:
-        lines = Lines(device, as_json)
-        end = min(duration or math.inf, interval * count if count else math.inf)
-        run = _Live(device, lines, interval, end, Patience(device, source)) if device.is_live else _File(device, lines, interval, end)
+        lines, feed, start = Lines(device, as_json), Feed(device), time.monotonic()
+        lasting = min(duration or math.inf, interval * count if count else math.inf)
         try:
-            run.run()
+            if device.is_live:
+                _by_the_clock(feed, lines, interval, start, lasting, Patience(device, source))
+            else:
+                _by_the_packets(feed, lines, interval, lasting)
         except KeyboardInterrupt:
-            lines.summary(run.summary())
+            lines.summary(_summary(feed, start))
             raise
-        found = run.summary()
+        found = _summary(feed, start)
         if found.packets == 0:
             raise nothing_came(device, source, found.seconds)
         for warning in device.warnings:
@@ -267,58 +266,38 @@ def stats(
             click.get_current_context().exit(FINDINGS)
 
 
-class _Live:
-    """A line for each interval of the clock."""
-
-    def __init__(self, device: Device, lines: Lines, interval: float, end: float, patience: Patience) -> None:
-        self._device, self._lines, self._interval, self._end, self._patience = device, lines, interval, end, patience
-        self._feed = Feed(device)
-        self._start = time.monotonic()
-
-    def run(self) -> None:
-        """Print until the end."""
-        edge = last = self._start
-        end = self._start + self._end
-        while end - edge > ROUNDED and not self._feed.ended:
-            edge = min(edge + self._interval, end)
-            self._feed.pump(edge)
-            self._patience.check()
-            now = time.monotonic()
-            self._lines.interval(round(now - self._start, 3), self._feed.meter.reading(self._device.stats, now - last))
-            last = now
-
-    def summary(self) -> Reading:
-        """The figures of everything."""
-        return self._feed.meter.summary(self._device.stats, time.monotonic() - self._start)
+def _summary(feed: Feed, start: float) -> Reading:
+    """The figures of everything, since a time of `time.monotonic` where the source is live."""
+    return feed.meter.summary(feed.device.stats, time.monotonic() - start if feed.device.is_live else None)
 
 
-class _File:
-    """A line for each interval of the packets' own time, where they have one; as long as a batch at least."""
+def _by_the_clock(feed: Feed, lines: Lines, interval: float, start: float, lasting: float, patience: Patience) -> None:
+    """Print a line for each interval of the clock."""
+    edge = last = start
+    end = start + lasting
+    while end - edge > ROUNDED and not feed.ended:
+        edge = min(edge + interval, end)
+        feed.pump(edge)
+        patience.check()
+        now = time.monotonic()
+        lines.interval(round(now - start, 3), feed.meter.reading(feed.device.stats, now - last))
+        last = now
 
-    def __init__(self, device: Device, lines: Lines, interval: float, end: float) -> None:
-        self._device, self._lines, self._interval, self._end = device, lines, interval, end
-        self._feed = Feed(device, each=self._count)
-        self._start: int | None = None
-        self._edges = 0
-        self._enough = False
 
-    def run(self) -> None:
-        """Print until the end."""
-        while not (self._feed.ended or self._enough):
-            self._feed.pump(0.0)
-
-    def summary(self) -> Reading:
-        """The figures of everything."""
-        return self._feed.meter.summary(self._device.stats)
-
-    def _count(self, packets: Packets) -> None:
-        times = packets.host_ns if packets.host_ns.any() else packets.time_ns
-        self._start = int(times[0]) if self._start is None else self._start
-        passed = (int(times[-1]) - self._start) * 1e-9
-        if passed >= (self._edges + 1) * self._interval:
-            self._edges = int(passed / self._interval)
-            self._lines.interval(round(passed, 3), self._feed.meter.reading(self._device.stats))
-        self._enough = passed >= self._end
+def _by_the_packets(feed: Feed, lines: Lines, interval: float, lasting: float) -> None:
+    """Print a line for each interval of the packets' own time, where they have one; as long as a batch at least."""
+    start: int | None = None
+    edges, passed = 0, 0.0
+    while not feed.ended and passed < lasting:
+        feed.pump(0.0)
+        if not feed.packets:
+            continue
+        times = feed.packets.host_ns if feed.packets.host_ns.any() else feed.packets.time_ns
+        start = int(times[0]) if start is None else start
+        passed = (int(times[-1]) - start) * 1e-9
+        if passed >= (edges + 1) * interval:
+            edges = int(passed / interval)
+            lines.interval(round(passed, 3), feed.meter.reading(feed.device.stats))
 
 
 def _row(texts: list[str]) -> str:

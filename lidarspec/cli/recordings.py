@@ -14,16 +14,15 @@ from lidarspec.cli.inputs import nothing_came
 from lidarspec.cli.options import DURATION, SPEED, sensor_option
 from lidarspec.cli.output import Progress, emit_json, note, size
 from lidarspec.device.settings import named
-from lidarspec.device.source_recording import SourceRecording
+from lidarspec.device.source_recording import SourceRecording, recorder_like
 from lidarspec.discovery.detect import declared
 from lidarspec.errors import CommandError, LidarSpecError, SourceError, UnknownFormat, UsageError, WireError, suggest
 from lidarspec.plugins import sensor as named_sensor
 from lidarspec.recording.appending import Appender
-from lidarspec.recording.format import Header
-from lidarspec.recording.recorders import SUFFIXES, Recorder, check_suffix, declared_port, recorder
+from lidarspec.recording.recorders import SUFFIXES, Recorder, check_suffix, declared_port
 from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.files import RecordingTransport
-from lidarspec.transports.open_url import live_address, transport
+from lidarspec.transports.open_url import is_live, live_address, transport
 from lidarspec.transports.outlets import FileOutlet, Outlet, replay_outlet
 from lidarspec.transports.protocol import Transport
 from lidarspec.transports.serving import LATE, Replay
@@ -55,13 +54,15 @@ def record(
     A sensor that is named, with -s or by the source (sim:ID), is started, and what it is stands in the file; without, bytes are
     recorded as they come.
     """
-    _check_target(target)
+    try:
+        check_suffix(target)
+    except UnknownFormat as error:
+        raise suggest(error, "lidarspec record --help") from None
     path = source.partition("?")[0]
     if os.path.exists(path) and os.path.exists(target) and os.path.samefile(path, target):
         raise UsageError(f"{target} is the source: it would be overwritten")
     known = named(source)
-    is_live = live_address(known.source if known else source) is not None
-    sensor = named_sensor(sensor_id) if sensor_id else declared(source) if is_live else known.configured() if known else None
+    sensor = named_sensor(sensor_id) if sensor_id else declared(source) if is_live(source) else known.configured() if known else None
     task = SourceRecording(source, target, sensor, seconds=seconds, count=count, start=not no_start, overwrite=force, salvage=salvage)
     interrupted = False
     try:
@@ -105,13 +106,6 @@ def _taken(task: SourceRecording, kept: Appender) -> str:
     return f"{packets}{kept.records} records, {size(kept.bytes)} in {task.elapsed:.1f} s"
 
 
-def _check_target(target: str) -> None:
-    try:
-        check_suffix(target)
-    except UnknownFormat as error:
-        raise suggest(error, "lidarspec record --help") from None
-
-
 def _sum_up_recording(task: SourceRecording, kept: Appender, source: str, sensor: Sensor | None, *, as_json: bool) -> None:
     """What was recorded, and what can be done with it; an empty file is not left behind."""
     device = task.device
@@ -136,10 +130,9 @@ def _sum_up_recording(task: SourceRecording, kept: Appender, source: str, sensor
 
 def _view_of(kept: Appender, sensor: Sensor | None) -> str:
     """The command that shows what was recorded."""
-    file = shlex.quote(kept.path)
     if isinstance(kept, Recorder) and kept.header.sensor:
-        return f"lidarspec view {file}"
-    return f"lidarspec view {file} -s {sensor.id}" if sensor else f"lidarspec detect {file}"
+        return f"lidarspec view {shlex.quote(kept.path)}"
+    return f"lidarspec {_shown(sensor, kept.path)}"
 
 
 @click.command()
@@ -158,8 +151,7 @@ def replay(file: str, place: str, speed: float | None, loop: bool, force: bool, 
     To a pty or tcp:// it begins when somebody opens it. udp:// without a port uses those of the recording. A new .lsr or .pcap
     file keeps the times of the recording.
     """
-    device = named(file)
-    if live_address(file if device is None else device.source) is not None:
+    if is_live(file):
         raise suggest(UsageError(f"{file} is live: only what was recorded can be replayed"), f"lidarspec record {file} -o recording.lsr")
     is_file = place.endswith(SUFFIXES) and "://" not in place
     if is_file and loop:
@@ -211,10 +203,8 @@ def _sensor(source: Transport, sensor_id: str | None) -> Sensor | None:
 
 def _file(source: Transport, file: str, place: str, sensor: Sensor | None, *, force: bool) -> FileOutlet:
     """A new file in the place of the old one's source."""
-    header = source.header if isinstance(source, RecordingTransport) else Header(source=file)
     try:
-        whose, link = sensor or header.sensor, source.datagrams
-        return FileOutlet(recorder(place, whose, header.source, datagrams=link, baud=header.baud, overwrite=force))
+        return FileOutlet(recorder_like(source, file, place, sensor, overwrite=force))
     except UsageError as error:
         raise suggest(error, "the same with --force, or with another file") if os.path.exists(place) and not force else error from None
 

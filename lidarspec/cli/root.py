@@ -35,7 +35,7 @@ GROUPS = {
         "record": ("recordings", "Everything that a source sends, with the time of its arrival, in one file that survives a crash."),
         "replay": ("recordings", "A recording or capture, sent again as it came: bit for bit, and by the clock."),
         "sim": ("sim", "A simulated sensor on a serial port, UDP, TCP or in a file."),
-        "send": ("send", "Send a command to a sensor, and print its reply."),
+        "send": ("build", "Send a command to a sensor, and print its reply."),
         "stats": ("read", "How a sensor is doing: speed, rates, errors, loss, jitter, queue."),
     },
     "files": {

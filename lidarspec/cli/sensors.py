@@ -16,7 +16,7 @@ from lidarspec.plugins import registry, sensor as named_sensor
 from lidarspec.points.numpy_plan import describe
 from lidarspec.points.plan import Plan, plan_for
 from lidarspec.simulation.frame_maker import FrameMaker
-from lidarspec.spec.description import Command, Frame
+from lidarspec.spec.description import Frame
 from lidarspec.spec.links import Link, Serial, Tcp, Udp
 from lidarspec.spec.sensor import Sensor
 from lidarspec.wire.wire_table import frame_size, wire_table
@@ -57,7 +57,7 @@ def show(sensor_id: str, as_plan: bool, as_json: bool, output: str | None) -> No
         return
     if as_json:
         frames = {name: _frame(frame) | {"rows": [vars(row) for row in wire_table(frame)]} for name, frame in sensor.frames.items()}
-        commands = {name: _command(sensor, command) for name, command in sensor.commands.items()}
+        commands = {name: _command(sensor, name) for name in sensor.commands}
         emit_json({**_facts(sensor), "frames": frames, "commands": commands}, output)
         return
     low, high = sensor.range_limits
@@ -65,8 +65,7 @@ def show(sensor_id: str, as_plan: bool, as_json: bool, output: str | None) -> No
         f"{sensor.id}: {sensor.vendor} {sensor.model}",
         f"  link    {_links(sensor)}\n  range   {low:g} .. {high:g} m\n  status  {sensor.status}\n  source  {sensor.source}",
     ]
-    for name, command in sensor.commands.items():
-        parts.append(f"  command {name}{_command_text(_command(sensor, command))}")
+    parts += [f"  command {name}{_command_text(_command(sensor, name))}" for name in sensor.commands]
     for name, frame in sensor.frames.items():
         rows = [[row.offset, row.size, row.type, row.field, row.unit, row.meaning] for row in wire_table(frame)]
         kind = " (to the sensor)" if frame.direction == "out" else " (points)" if frame.data else ""
@@ -103,11 +102,7 @@ def plugins(as_json: bool, output: str | None) -> None:
 def _facts(sensor: Sensor) -> dict[str, Any]:
     """What is known of a sensor, for JSON."""
     return {
-        "id": sensor.id,
-        "vendor": sensor.vendor,
-        "model": sensor.model,
-        "status": sensor.status,
-        "source": sensor.source,
+        **{name: getattr(sensor, name) for name in ("id", "vendor", "model", "status", "source")},
         "aliases": list(sensor.aliases),
         "links": {name: _link(link) for name, link in sensor.links.items()},
         "frames": list(sensor.frames),
@@ -120,26 +115,16 @@ def _frame(frame: Frame) -> dict[str, Any]:
     return {"direction": frame.direction, "data": frame.data, "size": frame_size(frame), "max_length": frame.max_length}
 
 
-def _command(sensor: Sensor, command: Command) -> Mapping[str, Any]:
+def _command(sensor: Sensor, name: str) -> Mapping[str, Any]:
+    command = sensor.commands[name]
     args = {name: {"field": path, "low": low, "high": high} for name, (path, low, high) in command.args.items()}
-    frame = "" if command.frame is None or args else sensor.build(command.frame, _nested(command.values)).hex(" ")
+    frame = "" if command.frame is None or args else sensor.command(name).hex(" ")
     return {"frame": command.frame, "arguments": args, "hex": frame, "reply": " or ".join(command.replies) or None}
 
 
 def _command_text(command: Mapping[str, Any]) -> str:
     args = "".join(f" {name}={limits['low']:g}..{limits['high']:g}" for name, limits in command["arguments"].items())
     return f"{args}{': ' if command['hex'] else ''}{command['hex']}{', answered by ' + command['reply'] if command['reply'] else ''}"
-
-
-def _nested(values: Mapping[str, Any]) -> dict[str, Any]:
-    found: dict[str, Any] = {}
-    for path, value in values.items():
-        *parents, last = path.split(".")
-        place = found
-        for parent in parents:
-            place = place.setdefault(parent, {})
-        place[last] = value
-    return found
 
 
 def _links(sensor: Sensor) -> str:

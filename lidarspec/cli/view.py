@@ -13,13 +13,11 @@ from lidarspec.cli.inputs import PATIENCE, nothing_came
 from lidarspec.cli.options import DURATION, sensor_option
 from lidarspec.cli.output import drawn, note
 from lidarspec.device.device import Device, open as open_device
-from lidarspec.device.settings import named
-from lidarspec.transports.open_url import live_address
+from lidarspec.transports.open_url import is_live
 from lidarspec.view.canvas import Cells
 from lidarspec.view.feed import LOOK, Feed
-from lidarspec.view.live import Window
+from lidarspec.view.live import Switch, Window
 from lidarspec.view.polar import look, picture
-from lidarspec.view.recording import Switch
 from lidarspec.view.screen import Screen, Terminated, encodable, interactive, keyboard
 
 
@@ -43,19 +41,13 @@ def view(source: str, sensor_id: str | None, duration: float | None, once: bool,
             for warning in device.warnings:
                 note(warning)
         return
-    switch = Switch(source, Path.cwd()) if _is_live(source) else None
+    switch = Switch(source, Path.cwd()) if is_live(source) else None
     with open_device(source, sensor_id, record=switch.attached if switch else None, period=LOOK) as device:
         if switch is not None:
             switch.sensor_id = device.sensor.id
         _show(device, Window(Feed(device, played=True), source, ramp=ramp, record=switch, duration=duration), taken=source == "-")
     for path, size in switch.written if switch else ():
         note(f"recorded {size} bytes; next: lidarspec view {Path(path).name}")
-
-
-def _is_live(source: str) -> bool:
-    """Whether a source goes on by itself, and can be recorded."""
-    device = named(source)
-    return live_address(source if device is None else device.source) is not None
 
 
 def _show(device: Device, window: Window, *, taken: bool) -> None:

@@ -11,11 +11,9 @@ import weakref
 from collections import deque
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from types import TracebackType
 from typing import Any, overload
 
-from lidarspec.device.arrivals import Arrival, Input
-from lidarspec.device.file_input import FileInput
+from lidarspec.device.arrivals import Arrival, FileInput, Input
 from lidarspec.device.live_input import PERIOD, LiveInput
 from lidarspec.device.session import Reply
 from lidarspec.device.settings import named
@@ -32,7 +30,7 @@ from lidarspec.recording.recorders import RecordTo, recorder_for
 from lidarspec.scans.scans import Scan, ScanStream, handed_out
 from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.open_url import transport
-from lidarspec.transports.protocol import LiveTransport, Transport
+from lidarspec.transports.protocol import Closing, LiveTransport, Transport
 
 #: batches kept while nobody knows yet which data frame the sensor answers in.
 UNDECIDED = 256
@@ -94,7 +92,7 @@ class PacketReader:
         return PacketStream(self._sensor, name, decoder.stats, interpreted=decoder.interpreted, backend=decoder.backend, state=self._state)
 
 
-class Device:
+class Device(Closing):
     """A sensor read from a source; a context manager.
 
     Attributes:
@@ -271,12 +269,6 @@ class Device:
     def close(self) -> None:
         """Stop the sensor where it was started, and give the source back; a second call does nothing."""
         self._finalizer()
-
-    def __enter__(self) -> Device:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None) -> None:
-        self.close()
 
     def __repr__(self) -> str:
         return f"Device({self.sensor.id} on {self._source}, {self.state}: {self.stats})"

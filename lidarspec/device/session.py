@@ -18,11 +18,11 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from lidarspec.errors import CommandError, ReplyTimeout, UnknownField, UsageError
+from lidarspec.framing.frame_engine import codec
 from lidarspec.framing.results import Found
 from lidarspec.spec.description import Command
 from lidarspec.spec.sensor import Sensor
 from lidarspec.spec.tree import FieldInfo
-from lidarspec.wire.schema import schema
 
 #: fields that a reply's repr shows.
 SHOWN = 6
@@ -245,7 +245,6 @@ class Session:
         self._lines: dict[str, _Line] = {}
         self._beats: dict[str, _Beat] = {}
         self._out: list[Outgoing] = []
-        self._tables: dict[str, dict[str, FieldInfo]] = {}
 
     def request(self, name: str, now: int, /, *, timeout: float | None = None, **arguments: Any) -> Pending:
         """The promise of a command's reply; the command is sent as soon as its link is free.
@@ -266,7 +265,7 @@ class Session:
         wait = _ns(command.timeout) * (1 + command.retries) if timeout is None else _ns(timeout)
         pending = Pending(f"{self.sensor.id} {name}")
         expected = Expected.of(command, tables, request) if tables else None
-        self._line(command.link).queue.append(_Request(name, command, data, expected, wait, pending))
+        self._lines.setdefault(command.link, _Line()).queue.append(_Request(name, command, data, expected, wait, pending))
         if command.every:
             self._beats[name] = _Beat(arguments, now + _ns(command.every), pending)
         self._advance(command.link, now)
@@ -338,13 +337,8 @@ class Session:
             for request in waiting:
                 request.pending.settle(CommandError(f"{self.sensor.id} {request.name}: {reason}"))
 
-    def _line(self, link: str) -> _Line:
-        return self._lines.setdefault(link, _Line())
-
-    def _table(self, frame: str) -> dict[str, FieldInfo]:
-        if frame not in self._tables:
-            self._tables[frame] = dict(schema(self.sensor.frames[frame].tree).fields)
-        return self._tables[frame]
+    def _table(self, frame: str) -> Mapping[str, FieldInfo]:
+        return codec(self.sensor.frames[frame]).schema.fields
 
     def _advance(self, link: str, now: int) -> None:
         """Send what the queue has, up to the first request that is answered or held back."""

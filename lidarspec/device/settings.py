@@ -20,7 +20,7 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
-from lidarspec.errors import SourceError, UsageError, did_you_mean
+from lidarspec.errors import UsageError, did_you_mean, system_errors
 from lidarspec.plugins import sensor as named_sensor
 from lidarspec.points.cloud import Mount
 from lidarspec.spec.sensor import Sensor
@@ -115,9 +115,8 @@ def read(path: Path) -> dict[str, Named]:
         SourceError: where it cannot be read.
     """
     try:
-        content = tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise SourceError(f"{path}: {error.strerror or error}") from None
+        with system_errors(path):
+            content = tomllib.loads(path.read_text(encoding="utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise UsageError(f"{path}: not TOML: {error}") from None
     _check_keys(path, "", content, ["device"])

@@ -14,18 +14,28 @@ from dataclasses import replace
 
 from lidarspec.device.capture_thread import BoundedQueue, Capture, Mark
 from lidarspec.device.device import Device
-from lidarspec.device.settings import named
 from lidarspec.errors import UsageError
 from lidarspec.recording.appending import Appender
 from lidarspec.recording.format import Header
 from lidarspec.recording.recorders import recorder
 from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.files import RecordingTransport
-from lidarspec.transports.open_url import live_address, transport
+from lidarspec.transports.open_url import is_live, transport
 from lidarspec.transports.protocol import Chunk, LiveTransport, Transport
 
 #: seconds between two looks at the time and at the disk.
 TURN = 0.1
+
+
+def recorder_like(opened: Transport, source: str, target: str, sensor: Sensor | None, *, overwrite: bool) -> Appender:
+    """The recorder of a new file in the place of an open source: of a recording its sensor, source and baud rate are taken over.
+
+    Raises:
+        UnknownFormat, UsageError, SourceError: as `recorder`.
+    """
+    header = opened.header if isinstance(opened, RecordingTransport) else Header(source=source, baud=opened.baud)
+    whose, link = sensor or header.sensor, opened.datagrams
+    return recorder(target, whose, header.source, datagrams=link, baud=header.baud, overwrite=overwrite)
 
 
 class SourceRecording:
@@ -72,9 +82,7 @@ class SourceRecording:
             UsageError: for a file that exists, or cannot hold what the source gives.
             SourceError: where the source cannot be read, or the file not be written.
         """
-        known = named(self._source)
-        is_live = live_address(known.source if known else self._source) is not None
-        return self._driven(self._sensor) if is_live and self._sensor is not None else self._received()
+        return self._driven(self._sensor) if self._sensor is not None and is_live(self._source) else self._received()
 
     def _driven(self, sensor: Sensor) -> Generator[str, None, None]:
         state = ""
@@ -125,9 +133,7 @@ class SourceRecording:
         counts = source.datagrams or (self._sensor is not None and isinstance(source, LiveTransport))
         if self._count is not None and not counts:
             raise UsageError(f"-n counts packets, and {self._source} is a byte stream: name the sensor with -s, or give a time with -t")
-        header = source.header if isinstance(source, RecordingTransport) else Header(source=self._source, baud=source.baud)
-        whose, link = self._sensor or header.sensor, source.datagrams
-        self.recorder = recorder(self._target, whose, header.source, datagrams=link, baud=header.baud, overwrite=self._overwrite)
+        self.recorder = recorder_like(source, self._source, self._target, self._sensor, overwrite=self._overwrite)
         self._began = time.monotonic()
         return self.recorder
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from lidarspec.discovery.crc_search import crc_matches
 from lidarspec.discovery.samples import Match, Place, Samples, Span, best_first, doubt, enough, spans
 from lidarspec.spec.checksums import ByteOrder, Bytes, Checksum, Fold15, Sum, Values, WordXor, Xor
+from lidarspec.wire.row_checksums import batch
 
 #: matches that are told.
 TOLD = 8
@@ -72,7 +73,7 @@ class Changed(Checksum):
         return f"{self.of.describe()}, {'taken from' if self.negative else 'and'} 0x{self.constant:0{digits}x}"
 
     def batch(self, rows: NDArray[np.uint8]) -> Values:
-        return self._changed(self.of.batch(rows))
+        return self._changed(batch(self.of, rows))
 
     @property
     def _mask(self) -> int:

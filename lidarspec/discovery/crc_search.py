@@ -167,12 +167,9 @@ def _random(samples: Samples, place: Place) -> bool:
     """Whether every byte of a place varies as those of a CRC do."""
     if len(samples) < 2:
         return True
-    wanted = min(len(samples), 64) // 2
-    for spot in range(place.size):
-        values = samples.fields(Place(place.offset + spot, 1), "little")
-        if len(np.unique(values)) < min(wanted, 24) or len(np.unique(values)) < 2:
-            return False
-    return True
+    wanted = max(min(len(samples) // 2, 24), 2)
+    columns = (samples.fields(Place(place.offset + spot, 1), "little") for spot in range(place.size))
+    return all(len(np.unique(column)) >= wanted for column in columns)
 
 
 def _codewords(samples: Samples, place: Place, span: Span, reading: _Reading) -> Codewords:

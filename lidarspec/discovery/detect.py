@@ -3,6 +3,9 @@
 Sensors with the same frames are told apart by how fast their clocks run, and by the names that their frames hold. A clock that advances
 from packet to packet as the sensor's own `sweep` says tells models apart that differ in speed. A name is what a field of text holds, or
 what the author's remark calls the value of a field ("0x22 NAME"). The clock comes first: bytes that name a model are not always true.
+
+Bytes that were given to be looked at, frame by frame, and are exactly one frame of a sensor are that sensor's (`fitting`). Where no
+sensor fits, the one whose frame they begin like is said to be nearest.
 """
 
 from __future__ import annotations
@@ -20,15 +23,18 @@ from numpy.typing import NDArray
 from lidarspec.device.settings import named
 from lidarspec.discovery.listen import Heard, hear
 from lidarspec.errors import CommandError, LidarSpecError, UsageError, WireError, suggest
-from lidarspec.framing.results import Found
+from lidarspec.framing.frame_engine import codec
+from lidarspec.framing.results import VALID, Found
 from lidarspec.plugins import sensors
 from lidarspec.simulation.simulator import simulate
 from lidarspec.spec.links import Serial
 from lidarspec.spec.sensor import Sensor
 from lidarspec.spec.tree import FieldInfo
+from lidarspec.transports.base import data_link
 from lidarspec.transports.files import RecordingTransport
-from lidarspec.transports.open_url import live_address, transport
+from lidarspec.transports.open_url import live_address, resolved, transport
 from lidarspec.transports.simulated import SimulatedTransport
+from lidarspec.wire.parse import parse_typed
 from lidarspec.wire.schema import schema
 
 #: share by which the pace of a clock may be off, frames of a type that are looked into for names, and packets simulated.
@@ -210,8 +216,8 @@ def verdict(heard: Heard) -> Verdict:
         alike = [replace(score, why=reasons[score.sensor.id]) for score in best if score.sensor.id in reasons] or best
         if len(alike) > 1 and heard.baud is not None:
             why = f"it runs at {heard.baud} baud"
-            declared = [replace(score, why=why) for score in alike if heard.baud in _bauds(score.sensor)]
-            alike = declared or alike
+            links = [(score, data_link(score.sensor, Serial)) for score in alike]
+            alike = [replace(score, why=why) for score, link in links if link and heard.baud in link.bauds] or alike
     others = [score for score in fitting if score.sensor.id not in {one.sensor.id for one in alike}]
     return Verdict(heard, (*alike, *others), tuple(alike))
 
@@ -228,8 +234,13 @@ def verdicts(source: str | Path, *, seconds: float | None = None) -> list[Verdic
         if heard.baud is not None and tried[-1].is_clear:
             break
     if len({one.heard.baud for one in tried}) > 1:
-        return [max(tried, key=lambda one: (one.scores[0].share if one.scores else 0.0, one.heard.size))]
+        return [best(tried)]
     return tried
+
+
+def best(tried: Sequence[Verdict]) -> Verdict:
+    """The verdict whose first sensor has the most of the bytes in its frames; of those without a sensor, the one on most bytes."""
+    return max(tried, key=lambda one: (one.scores[0].share if one.scores else 0.0, one.heard.size))
 
 
 def detected(source: str | Path) -> Sensor:
@@ -244,9 +255,7 @@ def detected(source: str | Path) -> Sensor:
     told = declared(source)
     if told is not None:
         return told
-    device = named(source)
-    place = source if device is None else device.source
-    found = verdicts(place)
+    found = verdicts(resolved(source))
     fitting = [one for one in found if one.scores]
     if not fitting:
         raise _nothing(str(source), found)
@@ -288,6 +297,90 @@ def _nothing(source: str, found: Sequence[Verdict]) -> Exception:
     return suggest(error, f"lidarspec doctor {source}")
 
 
-def _bauds(sensor: Sensor) -> tuple[int, ...]:
-    link = sensor.links.get("data")
-    return link.bauds if isinstance(link, Serial) else ()
+#: constant bits that make bytes look like a frame, and constant bytes that do so in the midst of others.
+ALIKE, SYNC = 8, 2
+
+
+@dataclass(frozen=True)
+class Piece:
+    """A frame in the input, or with `frame` "" bytes that are in none."""
+
+    offset: int
+    data: bytes
+    frame: str
+
+
+def fitting(chunks: Sequence[bytes], *, datagrams: bool) -> list[Sensor]:
+    """The installed sensors whose bytes these are, the best first; those with a type of exactly this frame before all others."""
+    known = list(sensors().values())
+    data = b"".join(chunks)
+    whole = [sensor for sensor in known if any(_is_frame(sensor, name, data) for name in sensor.frames)]
+    if whole:
+        return whole
+    found = scores(chunks, datagrams=datagrams) if data else []
+    return [score.sensor for score in found if score.share >= found[0].share - AS_GOOD]
+
+
+def pieces(sensor: Sensor, chunks: Sequence[bytes], *, datagrams: bool) -> list[Piece]:
+    """The frames of the input in order, and the bytes between them; empty where there is no frame."""
+    data = b"".join(chunks)
+    try:
+        return [Piece(0, data, parse_typed(sensor, data)[0])]
+    except LidarSpecError:
+        frames = sensor.split(list(chunks) if datagrams else data)
+    if not frames:
+        return []
+    found: list[Piece] = []
+    end = 0
+    for frame in frames:
+        if frame.offset > end:
+            found.append(Piece(end, data[end : frame.offset], ""))
+        found.append(Piece(frame.offset, frame.data, frame.frame))
+        end = frame.offset + len(frame.data)
+    return found + ([Piece(end, data[end:], "")] if end < len(data) else [])
+
+
+def likely_starts(sensor: Sensor, data: bytes) -> list[int]:
+    """Where bytes begin like an incoming frame: with two constant bytes or more, and any other; in ascending order."""
+    starts: set[int] = set()
+    for frame in sensor.frames.values():
+        prefix = codec(frame).prefix
+        size = next((spot for spot in range(len(prefix) + 1) if prefix.get(spot, (0, 0))[0] != 0xFF), 0)
+        if frame.direction == "in" and size >= SYNC:
+            magic = bytes(prefix[spot][1] for spot in range(size))
+            starts |= {found.start() for found in re.finditer(re.escape(magic) + b"(?=.)", data, re.DOTALL)}
+    return sorted(starts)
+
+
+def nearest(data: bytes) -> WireError | None:
+    """What the installed sensor that came farthest with some bytes says of them, with its id; None where none came far."""
+    faults = []
+    for sensor in sensors().values():
+        try:
+            parse_typed(sensor, data)
+        except WireError as fault:
+            faults.append(fault)
+        except LidarSpecError:
+            continue
+    return max((fault for fault in faults if _begins_alike(fault)), key=lambda fault: fault.offset, default=None)
+
+
+def _is_frame(sensor: Sensor, name: str, data: bytes) -> bool:
+    """Whether the bytes are exactly one valid and plausible frame of a type."""
+    frame = sensor.frames[name]
+    if not 0 < len(data) <= frame.max_length:
+        return False
+    engine = codec(frame)
+    if any(spot >= len(data) or data[spot] & mask != value for spot, (mask, value) in engine.prefix.items()):
+        return False
+    survey = engine.survey(np.frombuffer(data, np.uint8), np.zeros(1, np.intp))
+    return bool(survey.status[0] == VALID and survey.sizes[0] == len(data))
+
+
+def _begins_alike(fault: WireError) -> bool:
+    """Whether the bytes have the constants that the frame type begins with, and those are enough not to be chance."""
+    if not fault.frame:
+        return False
+    prefix = codec(sensors()[fault.sensor].frames[fault.frame]).prefix
+    there = [(fault.data[spot], mask, value) for spot, (mask, value) in prefix.items() if spot < len(fault.data)]
+    return all(byte & mask == value for byte, mask, value in there) and sum(mask.bit_count() for _, mask, _ in there) >= ALIKE

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import time
 from collections.abc import Iterator
@@ -9,15 +10,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from shlex import quote
 
-from lidarspec.device.settings import named
 from lidarspec.discovery.detect import Verdict, verdict, verdicts
 from lidarspec.discovery.listen import LISTEN, Heard, bauds, has_no_baud, started_first, udp_ports
 from lidarspec.errors import LidarSpecError, UsageError, suggestion
 from lidarspec.spec.links import Serial, Udp
 from lidarspec.spec.sensor import Sensor
 from lidarspec.transports import ports
-from lidarspec.transports.base import Address
-from lidarspec.transports.open_url import live_address, transport
+from lidarspec.transports.base import Address, data_link, with_option
+from lidarspec.transports.open_url import live_address, resolved, transport
 from lidarspec.transports.protocol import LiveTransport
 from lidarspec.transports.udp import BUFFER, shortfall
 
@@ -48,8 +48,7 @@ def examined(source: str | Path, sensor: Sensor | None = None, *, seconds: float
         sensor: whose bytes are expected; found out where left out.
         seconds: to listen for.
     """
-    device = named(source)
-    text = str(source if device is None else device.source)
+    text = resolved(source)
     address = live_address(text)
     if address is None:
         yield from _file(text)
@@ -138,8 +137,8 @@ def _udp_numbers(address: Address, sensor: Sensor | None) -> list[int]:
     port, given = address.host_and_port()[1], address.options.get("port", "")
     if given:
         return [int(part) for part in given.split(",") if part.isdecimal()]
-    link = sensor.links.get("data") if sensor is not None else None
-    return [port] if port else list(link.ports) if isinstance(link, Udp) else udp_ports()
+    link = data_link(sensor, Udp)
+    return [port] if port else list(link.ports) if link else udp_ports()
 
 
 def _port_in_use(number: int) -> Iterator[Finding]:
@@ -190,28 +189,22 @@ def _heard(source: str, sensor: Sensor | None, seconds: float) -> Iterator[Findi
         if found is None or not found.scores:
             tried = [*([found] if found is not None else []), *verdicts(source, seconds=seconds)]
             found = max(tried, key=lambda one: (bool(one.scores), one.heard.size))
-    except UsageError as error:
-        yield Finding(False, str(error), suggestion(error))
-        return
     except LidarSpecError as error:
         command = suggestion(error)
-        yield Finding(False, str(error), "" if "doctor" in command else command)
+        yield Finding(False, str(error), "" if "doctor" in command and not isinstance(error, UsageError) else command)
         return
     yield _verdict(source, found, sensor)
 
 
 def _as_expected(source: str, sensor: Sensor, seconds: float) -> Verdict | None:
     """What comes over a source that is opened as the sensor declares."""
-    opened = transport(source, sensor)
-    try:
+    with contextlib.closing(transport(source, sensor)) as opened:
         end, chunks = time.monotonic() + seconds, list[bytes]()
         while (left := end - time.monotonic()) > 0 and isinstance(opened, LiveTransport):
             chunks += [chunk.data for chunk in opened.read(min(left, 0.1))]
         address = live_address(source)
         plain = address is not None and has_no_baud(address.place)
         datagrams, baud = opened.datagrams, None if plain else opened.baud
-    finally:
-        opened.close()
     return verdict(Heard(source, tuple(chunks), datagrams, baud)) if chunks else None
 
 
@@ -229,9 +222,9 @@ def _verdict(source: str, found: Verdict, sensor: Sensor | None) -> Finding:
         return Finding(False, f"it sends frames of {ids[0]}{at}, not of {sensor.id}", f"lidarspec view {quoted} -s {ids[0]}")
     name = sensor.id if sensor is not None else ids[0]
     score = next(score for score in found.scores if score.sensor.id == name)
-    link = score.sensor.links.get("data")
-    if heard.baud is not None and isinstance(link, Serial) and heard.baud not in link.bauds:
-        again = quote(f"{source}{'&' if '?' in source else '?'}baud={heard.baud}")
+    link = data_link(score.sensor, Serial)
+    if heard.baud is not None and link and heard.baud not in link.bauds:
+        again = quote(with_option(source, "baud", heard.baud))
         return Finding(False, f"{name} sends{at}, and {link.baud} is declared", f"lidarspec view {again} -s {name}")
     if 1 - score.share > BAD and heard.size > 4096:
         return Finding(False, f"{name} sends{at}, and {1 - score.share:.0%} of the bytes are in no frame: cable, ground or baud rate")

@@ -23,8 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.discovery.checksum_search import search
-from lidarspec.discovery.periods import CIRCLES, FEW, FRONT, STEADY, Candidate, Length, candidates, follows, structure, values
-from lidarspec.discovery.samples import Match, Place
+from lidarspec.discovery.periods import CIRCLES, FEW, FRONT, STEADY, Candidate, Length, candidates, follows, structure
+from lidarspec.discovery.samples import Match, Place, values
 from lidarspec.errors import SourceError, UsageError, WireError
 from lidarspec.spec.checksums import ByteOrder
 
@@ -602,30 +602,13 @@ class Names:
 
     def values(self) -> dict[str, str]:
         """Everything for the templates."""
-        return {
-            "id": self.id,
-            "vendor": self.vendor,
-            "model": self.model,
-            "constant": self.constant,
-            "distribution": self.distribution,
-            "module": self.module,
-        }
+        return {name: getattr(self, name) for name in ("id", "vendor", "model", "constant", "distribution", "module")}
 
 
 def invented(names: Names, link: Link) -> dict[str, str]:
     """The files of a distribution with an invented sensor that has everything, by path."""
-    values = {
-        **names.values(),
-        "speed_remark": ", with code 3; else 0" if link == "serial" else "",
-    }
-    return {
-        "pyproject.toml": filled("pyproject.toml", values, link),
-        "README.md": filled("README.md", values, link),
-        "vectors.json": filled("vectors.json", values, link),
-        f"{names.module}/__init__.py": filled("module.py", values, link),
-        f"{names.module}/py.typed": "",
-        f"tests/test_{names.id.replace('-', '_')}.py": filled("test_module.py", values, link),
-    }
+    values = {**names.values(), "speed_remark": ", with code 3; else 0" if link == "serial" else ""}
+    return _files(names, link, values, filled("vectors.json", values, link), ("README.md", "module.py", "test_module.py"))
 
 
 def captured(names: Names, link: Link, draft: Draft, *, origin: str, port: int | None) -> dict[str, str]:
@@ -641,13 +624,19 @@ def captured(names: Names, link: Link, draft: Draft, *, origin: str, port: int |
     frames = [
         {"frame": "data", "hex": data.hex(" "), "values": {}, "source": f"{origin}, at byte {at}"} for at, data in draft.frames[:VECTORS]
     ]
+    return _files(names, link, values, json.dumps(frames, indent=2) + "\n", ("README_draft.md", "draft.py", "test_draft.py"))
+
+
+def _files(names: Names, link: Link, values: Mapping[str, str], vectors: str, templates: tuple[str, str, str]) -> dict[str, str]:
+    """The files of a distribution by path; the templates are those of its README, its module and its tests."""
+    readme, module, tests = (filled(template, values, link) for template in templates)
     return {
         "pyproject.toml": filled("pyproject.toml", values, link),
-        "README.md": filled("README_draft.md", values, link),
-        "vectors.json": json.dumps(frames, indent=2) + "\n",
-        f"{names.module}/__init__.py": filled("draft.py", values, link),
+        "README.md": readme,
+        "vectors.json": vectors,
+        f"{names.module}/__init__.py": module,
         f"{names.module}/py.typed": "",
-        f"tests/test_{names.id.replace('-', '_')}.py": filled("test_draft.py", values, link),
+        f"tests/test_{names.id.replace('-', '_')}.py": tests,
     }
 
 

@@ -5,11 +5,12 @@ Some sensors keep silent until they are started: `probe` sends their start comma
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import os
 import time
-from collections.abc import Iterator
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from lidarspec.device.session import Pending, Session
@@ -18,6 +19,7 @@ from lidarspec.framing.decoder import Decoder
 from lidarspec.plugins import sensors
 from lidarspec.spec.links import Serial, Udp
 from lidarspec.spec.sensor import Sensor
+from lidarspec.transports.base import data_link, with_option
 from lidarspec.transports.open_url import live, live_address, transport
 from lidarspec.transports.protocol import Chunk, Disconnected, LiveTransport, Transport
 
@@ -58,6 +60,11 @@ class Heard:
         """The number of bytes."""
         return sum(map(len, self.chunks))
 
+    @property
+    def data(self) -> bytes:
+        """All bytes in order."""
+        return b"".join(self.chunks)
+
 
 def bauds() -> list[int]:
     """The baud rates that installed sensors declare, those of the most sensors first."""
@@ -67,8 +74,8 @@ def bauds() -> list[int]:
 
 def udp_ports() -> list[int]:
     """The UDP ports that data of installed sensors come to."""
-    links = (sensor.links.get("data") for sensor in sensors().values())
-    return sorted({port for link in links if isinstance(link, Udp) for port in link.ports})
+    links = (data_link(sensor, Udp) for sensor in sensors().values())
+    return sorted({port for link in links if link for port in link.ports})
 
 
 def hear(source: str | Path, *, seconds: float = LISTEN) -> Iterator[Heard]:
@@ -82,12 +89,11 @@ def hear(source: str | Path, *, seconds: float = LISTEN) -> Iterator[Heard]:
     """
     text, address = str(source), live_address(source)
     if address is not None and address.scheme == "serial" and "baud" not in address.options:
-        mark = "&" if "?" in text else "?"
-        for baud in bauds()[: 1 if has_no_baud(address.place) else None]:
-            yield from _heard(f"{text}{mark}baud={baud}", seconds, None if has_no_baud(address.place) else baud, text)
+        plain = has_no_baud(address.place)
+        for baud in bauds()[: 1 if plain else None]:
+            yield from _heard(with_option(text, "baud", baud), seconds, None if plain else baud, text)
     elif address is not None and address.scheme == "udp" and not address.host_and_port()[1] and "port" not in address.options:
-        mark = "&" if "?" in text else "?"
-        yield from _heard(f"{text}{mark}port={','.join(map(str, udp_ports()))}", seconds, None, text)
+        yield from _heard(with_option(text, "port", ",".join(map(str, udp_ports()))), seconds, None, text)
     else:
         yield from _heard(text, seconds, int(address.options["baud"]) if address is not None and "baud" in address.options else None, text)
 
@@ -98,11 +104,9 @@ def has_no_baud(port: str) -> bool:
 
 
 def _heard(source: str, seconds: float, baud: int | None, name: str) -> Iterator[Heard]:
-    opened = transport(source)
-    try:
-        chunks = _listened(opened, seconds) if isinstance(opened, LiveTransport) else _begun(opened)
-    finally:
-        opened.close()
+    with contextlib.closing(transport(source)) as opened:
+        number = DATAGRAMS if opened.datagrams else None
+        chunks = _listened(opened, seconds) if isinstance(opened, LiveTransport) else beginning(opened, LOOKED_AT, number=number)
     by_sender: dict[str, list[bytes]] = {}
     for chunk in chunks:
         by_sender.setdefault(chunk.sender[0] if chunk.sender else "", []).append(chunk.data)
@@ -110,30 +114,26 @@ def _heard(source: str, seconds: float, baud: int | None, name: str) -> Iterator
         yield Heard(name, tuple(data), opened.datagrams, baud, sender if len(by_sender) > 1 else "")
 
 
-def _begun(opened: Transport) -> list[Chunk]:
-    """The beginning of a file."""
-    found: list[Chunk] = []
+def beginning(opened: Transport, most: int, *, number: int | None = None) -> list[Chunk]:
+    """The beginning of a file: what holds `most` bytes, or `number` chunks if these are fewer."""
+    chunks: list[Chunk] = []
     size = 0
-    for chunk in itertools.islice(opened.chunks(), DATAGRAMS if opened.datagrams else None):
-        found.append(Chunk(chunk.data[:LOOKED_AT], chunk.at, chunk.sender))
-        size += len(found[-1].data)
-        if size >= LOOKED_AT:
+    for chunk in itertools.islice(opened.chunks(), number):
+        chunks.append(replace(chunk, data=chunk.data[:most]))
+        size += len(chunk.data)
+        if size >= most:
             break
-    return found
+    return chunks
 
 
 def _listened(opened: LiveTransport, seconds: float) -> list[Chunk]:
     """What comes within some seconds, or as soon as it is plenty."""
-    found: list[Chunk] = []
-    end, size = time.monotonic() + seconds, 0
-    while (left := end - time.monotonic()) > 0 and size < PLENTY:
-        try:
-            chunks = opened.read(min(left, LOOK))
-        except Disconnected:
-            break
-        found += chunks
-        size += sum(len(chunk.data) for chunk in chunks)
-    return found
+    chunks: list[Chunk] = []
+    end = time.monotonic() + seconds
+    with contextlib.suppress(Disconnected):
+        while (left := end - time.monotonic()) > 0 and sum(len(chunk.data) for chunk in chunks) < PLENTY:
+            chunks += opened.read(min(left, LOOK))
+    return chunks
 
 
 def everywhere(ports: list[str], *, seconds: float = LISTEN) -> Iterator[Heard]:
@@ -147,7 +147,7 @@ def everywhere(ports: list[str], *, seconds: float = LISTEN) -> Iterator[Heard]:
 
 def started_first() -> list[Sensor]:
     """The installed sensors on a serial port that send nothing before they are told to."""
-    return [sensor for sensor in sensors().values() if _starts(sensor) and isinstance(sensor.links.get("data"), Serial)]
+    return [sensor for sensor in sensors().values() if _starts(sensor) and data_link(sensor, Serial)]
 
 
 def probe(source: str | Path) -> Iterator[Heard]:
@@ -159,20 +159,17 @@ def probe(source: str | Path) -> Iterator[Heard]:
     address, tried = live_address(source), set[object]()
     if address is None or address.scheme != "serial":
         return
-    mark, plain = "&" if "?" in str(source) else "?", has_no_baud(address.place)
+    plain = has_no_baud(address.place)
     for sensor in started_first():
-        link = sensor.links["data"]
-        for baud in link.bauds if isinstance(link, Serial) else ():
+        link = data_link(sensor, Serial)
+        for baud in link.bauds if link else ():
             asked = (None if plain else baud, *(sensor.command(name) for name in sensor.on_open))
             if asked in tried or address.options.get("baud", str(baud)) != str(baud):
                 continue
             tried.add(asked)
-            given = str(source) if "baud" in address.options else f"{source}{mark}baud={baud}"
-            opened = live(given, sensor)
-            try:
+            given = str(source) if "baud" in address.options else with_option(source, "baud", baud)
+            with contextlib.closing(live(given, sensor)) as opened:
                 chunks = _Probe(sensor, opened).run()
-            finally:
-                opened.close()
             yield Heard(str(source), tuple(chunks), baud=None if plain else baud)
 
 
@@ -205,9 +202,8 @@ class _Probe:
         self._session.abandon("asked for something else")
         return [self._session.request(name, time.monotonic_ns()) for name in names]
 
-    def _turns(self, done: object, seconds: float) -> None:
+    def _turns(self, done: Callable[[], bool], seconds: float) -> None:
         """Send, listen and keep time until something is so, or the time is up."""
-        assert callable(done)
         end = time.monotonic() + seconds
         while not done() and time.monotonic() < end:
             self._session.tick(time.monotonic_ns())

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.discovery.checksum_search import search
-from lidarspec.discovery.samples import Match
+from lidarspec.discovery.samples import Match, values
 from lidarspec.spec.checksums import ByteOrder
 
 Kind = Literal["counter", "angle", "rising"]
@@ -120,14 +120,6 @@ def candidates(rows: NDArray[np.uint8]) -> list[Candidate]:
         if all(one.end <= other.offset or one.offset >= other.end for other in chosen):
             chosen.append(one)
     return sorted(chosen, key=lambda one: one.offset)
-
-
-def values(rows: NDArray[np.uint8], offset: int, size: int, order: ByteOrder) -> NDArray[np.int64]:
-    """What stands at a place in each row."""
-    columns = rows[:, offset : offset + size].astype(np.int64)
-    shifts = 8 * np.arange(size, dtype=np.int64)
-    total: NDArray[np.int64] = (columns << (shifts if order == "little" else shifts[::-1])).sum(axis=1)
-    return total
 
 
 def follows(first: NDArray[np.int64], last: NDArray[np.int64], circle: int) -> float:
@@ -384,9 +376,9 @@ def _explained(data: NDArray[np.uint8], starts: NDArray[np.intp], sync: bytes) -
     kinds: tuple[tuple[int, ByteOrder], ...] = ((1, "little"), (2, "little"), (2, "big"))
     for place in range(2, HEADER):
         low, high = data[starts[:-1] + place].astype(np.int64), data[starts[:-1] + place + 1].astype(np.int64)
-        for (size, order), values in zip(kinds, (low, low | high << 8, high | low << 8), strict=True):
+        for (size, order), numbers in zip(kinds, (low, low | high << 8, high | low << 8), strict=True):
             for unit in range(1, UNIT + 1):
-                rest = steps - unit * values
+                rest = steps - unit * numbers
                 usual, number = _commonest(rest)
                 told = rest == usual
                 distinct = len(np.unique(steps[told]))
@@ -401,6 +393,6 @@ def _explained(data: NDArray[np.uint8], starts: NDArray[np.intp], sync: bytes) -
     return Structure(sync, None, length, share, tuple(frames), ())
 
 
-def _commonest(values: NDArray[np.int64]) -> tuple[int, int]:
-    found, counts = np.unique(values, return_counts=True)
+def _commonest(numbers: NDArray[np.int64]) -> tuple[int, int]:
+    found, counts = np.unique(numbers, return_counts=True)
     return int(found[counts.argmax()]), int(counts.max())

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.spec.checksums import ByteOrder, Checksum
+from lidarspec.wire.row_checksums import batch
 
 Part = Literal["all", "before", "behind"]
 
@@ -111,6 +112,14 @@ class Match:
         return self.doubt >= SURE and not self.open and ((self.span.part, self.span.tail) == ("all", 0) or at_end)
 
 
+def values(rows: NDArray[np.uint8], offset: int, size: int, order: ByteOrder) -> NDArray[np.int64]:
+    """What stands at a place in each row, (n,); at most 7 bytes."""
+    columns = rows[:, offset : offset + size].astype(np.int64)
+    shifts = 8 * np.arange(size, dtype=np.int64)
+    total: NDArray[np.int64] = (columns << (shifts if order == "little" else shifts[::-1])).sum(axis=1)
+    return total
+
+
 class Samples:
     """Distinct frames, those of one length together."""
 
@@ -146,13 +155,7 @@ class Samples:
 
     def fields(self, place: Place, order: ByteOrder) -> NDArray[np.uint64]:
         """What stands at a place in each frame, shape (n,)."""
-        found = []
-        for group in self.groups:
-            start = place.start(group.shape[1])
-            columns = group[:, start : start + place.size].astype(np.uint64)
-            shifts = 8 * np.arange(place.size, dtype=np.uint64)
-            found.append((columns << (shifts if order == "little" else shifts[::-1])).sum(axis=1, dtype=np.uint64))
-        return np.concatenate(found)
+        return np.concatenate([values(group, place.start(group.shape[1]), place.size, order) for group in self.groups]).view(np.uint64)
 
     def covered(self, place: Place, span: Span) -> list[NDArray[np.uint8]]:
         """The bytes that a span covers, group by group."""
@@ -160,7 +163,7 @@ class Samples:
 
     def computed(self, algorithm: Checksum, place: Place, span: Span) -> NDArray[np.uint64]:
         """The checksum of each frame, shape (n,)."""
-        return np.concatenate([algorithm.batch(np.ascontiguousarray(rows)) for rows in self.covered(place, span)])
+        return np.concatenate([batch(algorithm, np.ascontiguousarray(rows)) for rows in self.covered(place, span)])
 
     def right(self, algorithm: Checksum, place: Place, span: Span, order: ByteOrder) -> int:
         """How many frames a checksum is right for."""
@@ -195,13 +198,13 @@ class Samples:
         The usual place, at the end, needs a little less.
         """
         columns = [self.fields(Place(place.offset + spot, 1), "little") for spot in range(place.size)]
-        distinct = min(len(np.unique(values)) for values in columns) / min(len(self), 256)
-        apart = min(int(np.ptp(values)) for values in columns) >= APART
+        distinct = min(len(np.unique(column)) for column in columns) / min(len(self), 256)
+        apart = min(int(np.ptp(column)) for column in columns) >= APART
         return 2 * apart + min(1.0, distinct * (USUAL if place.offset == -place.size else 1))
 
     def _varies(self, place: Place) -> bool:
-        values = self.fields(place, "little")
-        return len(values) < 2 or len(np.unique(values)) > len(values) // 8 + 1
+        there = self.fields(place, "little")
+        return len(there) < 2 or len(np.unique(there)) > len(there) // 8 + 1
 
 
 def spans(place: Place, samples: Samples) -> Iterator[Span]:

@@ -19,7 +19,7 @@ from lidarspec._version import __version__
 from lidarspec.exports import Message, Refused, c_fields, messages
 from lidarspec.exports.c_fields import Access, CLayout, Entry, accesses, arguments, comment, identifier, parameters, quoted, word
 from lidarspec.spec import Checksum, Crc, Fold15, Sensor, Sum, WordXor, Xor, ZeroPadded
-from lidarspec.spec.row_checksums import byte_table, mirrored_bytes, reflected
+from lidarspec.spec.checksums import byte_table, mirrored_bytes, reflected
 from lidarspec.spec.tree import Blob, Block, Formula, Number, Op, Repeat, Sealed, formulas, refs
 from lidarspec.wire.wire_table import Extent
 

@@ -11,4 +11,5 @@ every other byte. No clock, port or thread in here, and no exception for any byt
 * `weak_frames`: types that are believed in runs alone.
 * `datagrams`: datagrams of several types.
 * `decoder`: all of it, incrementally: what is undecided is looked at again with the next bytes.
+* `examples`: valid frames with random content.
 """

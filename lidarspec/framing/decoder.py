@@ -21,7 +21,7 @@ from lidarspec.framing.results import Counters, Found, Frames, Numbers, array_of
 from lidarspec.framing.search import Framing, Mode, Piece
 from lidarspec.framing.weak_frames import cut
 from lidarspec.spec.description import Frame, Spec
-from lidarspec.wire.arrays import alike, keep_freed_memory, repeated
+from lidarspec.wire.arrays import alike, repeated
 from lidarspec.wire.layout import Sums
 
 __all__ = ["BACKENDS", "Decoder", "backend", "frames_of", "is_stream"]
@@ -51,14 +51,13 @@ class Decoder:
     """
 
     def __init__(self, sensor: Spec, *, stream: bool, interpreted: bool = False, backend: str = "auto", sums: Sums | None = None) -> None:
-        incoming = sensor.incoming
-        if not incoming:
+        if not sensor.incoming:
             raise UsageError(f"{sensor.id} has no frames yet: configure it with its file first")
         self.sensor, self.stream, self.interpreted, self.backend = sensor, stream, interpreted, backend
         self.stats = Counters()
-        keep_freed_memory()
-        self._framing = _framing(tuple(incoming), tuple(incoming.values()), interpreted, sums)
-        self._mode = Mode(after=_first_mode(sensor))
+        self._framing = _framing(tuple(sensor.incoming), tuple(sensor.incoming.values()), interpreted, sums)
+        answer = sensor.options.get("answer", "")  # as if the frame that the answer comes after had been seen
+        self._mode = Mode(after=sensor.frames[answer].after if answer in sensor.frames else None)
         self._pending, self._base, self._need = b"", 0, 0
         self._gap = 0
         self._fillers = bytes(sensor.fillers)
@@ -121,7 +120,9 @@ class Decoder:
         if isinstance(data, np.ndarray):
             buffer, sizes = data.reshape(-1), repeated(data.shape[1], len(data))
         else:
-            buffer, sizes = np.frombuffer(b"".join(data), np.uint8), _sizes(list(map(len, data)))
+            buffer, lengths = np.frombuffer(b"".join(data), np.uint8), list(map(len, data))
+            is_one_size = bool(lengths) and lengths.count(lengths[0]) == len(lengths)
+            sizes = repeated(lengths[0], len(lengths)) if is_one_size else np.array(lengths, np.intp)
         times = repeated(-1, len(data)) if at is None else np.array([-1 if one is None else one for one in at], np.int64)
         return self.placed(buffer, _places(sizes), sizes, times)
 
@@ -218,7 +219,7 @@ class Decoder:
 
     def _skip(self, skipped: NDArray[np.uint8]) -> int:
         """Count skipped bytes; the number of fillers among them."""
-        fillers = len(skipped) - len(skipped.tobytes().translate(None, self._fillers)) if self._fillers else 0
+        fillers = len(skipped) - len(skipped.tobytes().translate(None, self._fillers))
         self.stats.bytes_skipped += len(skipped)
         self.stats.bytes_filler += fillers
         return fillers
@@ -254,19 +255,6 @@ def _places(sizes: NDArray[np.intp], first: int = 0) -> Numbers:
     starts -= sizes
     starts += first
     return starts
-
-
-def _sizes(lengths: list[int]) -> NDArray[np.intp]:
-    """Sizes as an array."""
-    if lengths and lengths.count(lengths[0]) == len(lengths):
-        return repeated(lengths[0], len(lengths))
-    return np.array(lengths, np.intp)
-
-
-def _first_mode(sensor: Spec) -> str | None:
-    """`configure(answer=...)` starts as if the frame that the answer comes after had been seen."""
-    answer = sensor.options.get("answer")
-    return sensor.frames[answer].after if isinstance(answer, str) and answer in sensor.frames else None
 
 
 def backend(name: str) -> str:

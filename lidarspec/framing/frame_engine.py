@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from lidarspec.errors import SpecError
 from lidarspec.framing.plausibility import Check, Conditions, Judge, plausibility
 from lidarspec.framing.results import CHECKSUM, CONSTANT, LENGTH, PLUGIN, SHORT, VALID, Frames, Status
-from lidarspec.spec.construct_layer import Mismatch
+from lidarspec.spec.construct_layer import Mismatch, fixed_size
 from lidarspec.spec.description import Frame
 from lidarspec.wire.arrays import alike, counted, repeated
 from lidarspec.wire.frame_table import Group, Records, Rows, Table
@@ -86,7 +86,7 @@ class CompiledCodec:
         if isinstance(layouts, NotCompilable):
             raise layouts
         self.frame, self.schema, self.tree = frame, schema(frame.tree), layouts
-        self.prefix, self.size = self.tree.prefix, _size(frame)
+        self.prefix, self.size = self.tree.prefix, fixed_size(frame.prepared) or None
         self.marks = marks(self.prefix)
         layout = self.tree.layout(b"")
         self.layout: Layout | None = layout if isinstance(layout, Layout) else None
@@ -95,7 +95,7 @@ class CompiledCodec:
     def survey(
         self, buffer: NDArray[np.uint8], offsets: NDArray[np.intp], *, kind: int = 0, gathered: bool = True, sums: Sums | None = None
     ) -> Frames:
-        groups = [(self.layout, counted(len(offsets)))] if self.layout is not None else self.tree.classify(buffer, offsets)[0]
+        groups = [(self.layout, counted(len(offsets)))] if self.layout is not None else self.tree.classify(buffer, offsets)
         kinds, errors = repeated(kind, len(offsets)), list[str]()
         if len(groups) == 1 and len(groups[0][1]) == len(offsets) and isinstance(only := groups[0][0], Layout):
             status, sizes, rows = self._judged(buffer, offsets, only, errors, gathered=gathered, sums=sums)
@@ -167,18 +167,15 @@ class CompiledCodec:
         if frames.rows is not None and frames.layout is not None:
             rows = frames.rows if 2 * frames.rows.size >= len(frames.buffer) else np.ascontiguousarray(frames.rows)
             return Rows(self.schema, [Group(frames.layout, counted(len(rows)), rows)])
-        known = frames.by_layout() if frames.layouts else self._classified(frames)
+        known = frames.by_layout() if frames.layouts else self.tree.classify(frames.buffer, frames.starts)
         groups = []
         for layout, which in known:
+            if isinstance(layout, Refused):
+                continue
             starts = frames.starts if len(which) == len(frames) else frames.starts[which]
             is_sparse = 2 * len(which) * layout.size < len(frames.buffer)
             groups.append(Group(layout, which, rows_at(frames.buffer, starts, layout.size, gathered=is_sparse)))
         return Rows(self.schema, groups)
-
-    def _classified(self, frames: Frames) -> list[tuple[Layout, NDArray[np.intp]]]:
-        """The layouts of frames that came from elsewhere, and did not bring them."""
-        groups, _ = self.tree.classify(frames.buffer, frames.starts)
-        return [(layout, which) for layout, which in groups if isinstance(layout, Layout)]
 
     def _judge(self, layout: Layout) -> Judge:
         judge = layout.notes.get(Judge)
@@ -196,7 +193,7 @@ class InterpretedCodec:
 
     def __init__(self, frame: Frame, reason: str = "") -> None:
         self.frame, self.reason, self.schema = frame, reason, schema(frame.tree)
-        self.prefix, self.size = prefix_of(frame.tree, frame.max_length), _size(frame)
+        self.prefix, self.size = prefix_of(frame.tree, frame.max_length), fixed_size(frame.prepared) or None
         self.marks = marks(self.prefix)
         self.layout: Layout | None = None
 
@@ -255,13 +252,6 @@ def _partial(buffer: NDArray[np.uint8], offsets: NDArray[np.intp], layout: Layou
         status[there] = np.where(buffer[offsets[there] + spot] & mask == value, status[there], CONSTANT)
         sizes[~there] = spot + 1
     return status, sizes
-
-
-def _size(frame: Frame) -> int | None:
-    try:
-        return int(frame.prepared.sizeof())
-    except Exception:  # of a part of the struct, which may be anybody's
-        return None
 
 
 @functools.lru_cache(maxsize=2048)

@@ -57,16 +57,7 @@ class Lane:
         before: the weak types that come first in the order.
     """
 
-    def __init__(
-        self,
-        framing: Framing,
-        kind: int,
-        buffer: Bytes1D,
-        others: dict[int, bool],
-        before: list[Lane],
-        *,
-        final: bool,
-    ) -> None:
+    def __init__(self, framing: Framing, kind: int, buffer: Bytes1D, others: dict[int, bool], before: list[Lane], *, final: bool) -> None:
         self.kind, self._final, self._before = kind, final, before
         codec = framing.codecs[kind]
         self._framing, self._buffer = framing, buffer

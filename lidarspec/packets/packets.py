@@ -105,7 +105,6 @@ class Packets:
 
     def points(self) -> PointCloud:
         """The points of all packets in stream order; see `PointCloud`."""
-
         return cloud_of(self)
 
     def take(self, which: Any) -> Packets:

@@ -54,7 +54,7 @@ class PacketStream:
         self.sensor, self.frame, self.stats, self._interpreted = sensor, frame, stats, interpreted
         self._backend = backend
         self._codec: Codec = codec(sensor.frames[frame], interpreted=interpreted)
-        self._others = [name for name, other in sensor.frames.items() if other.direction == "in" and not other.data and name != frame]
+        self._others = [name for name, other in sensor.incoming.items() if not other.data and name != frame]
         self._state: dict[str, bytes] = dict(state or {})
         data = sensor.frames[frame].data
         self._sequence = SequenceTracker(sensor.sequence, stats) if sensor.sequence and data and _counted(sensor, frame) else None
@@ -229,19 +229,19 @@ def data_frame(sensor: Spec, found: Sequence[Frames]) -> str | None:
     names = sensor.data_frames
     if len(names) < 2 or sensor.options.get("answer") in names:
         return sensor.data_frame
-    arrived = (frames.names[kind] for frames in found for kind in frames.kinds[np.isin(frames.kinds, _kinds(frames, names))][:1].tolist())
-    return next(arrived, None)
+    for frames in found:
+        kinds = [kind for kind, name in enumerate(frames.names) if name in names]
+        own = frames.kinds[np.isin(frames.kinds, kinds)]
+        if len(own):
+            return frames.names[own.item(0)]
+    return None
 
 
 def _counted(sensor: Spec, frame: str) -> bool:
     """Whether packets of this type are counted: not, if only other data frames have the counter."""
     assert sensor.sequence is not None
-    having = [name for name, other in sensor.frames.items() if other.data and sensor.sequence.field in codec(other).schema.fields]
+    having = [name for name in sensor.data_frames if sensor.sequence.field in codec(sensor.frames[name]).schema.fields]
     return frame in having or not having
-
-
-def _kinds(frames: Frames, names: Sequence[str]) -> list[int]:
-    return [index for index, name in enumerate(frames.names) if name in names]
 
 
 def _offsets(parts: Sequence[_Part]) -> Numbers:

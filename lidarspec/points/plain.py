@@ -17,17 +17,8 @@ from numpy.typing import NDArray
 from lidarspec.columns.columns import Batch, Carry, Column, Fields, aligned, unpadded
 from lidarspec.errors import SpecError
 from lidarspec.framing.results import Counters
+from lidarspec.points import conventions
 from lidarspec.points.cloud import PointCloud
-from lidarspec.points.conventions import (
-    coordinates,
-    narrowed,
-    numbers_of,
-    rows_of,
-    seconds_since,
-    shown_range,
-    turned_azimuth,
-    vendor_turn,
-)
 from lidarspec.spec.description import Spec
 from lidarspec.spec.results import Cartesian, Points, Polar
 from lidarspec.wire.frame_table import Table
@@ -134,13 +125,13 @@ def _flattened(packets: PacketBatch, result: Points, batch: Batch, stamp_ns: int
     shape = np.broadcast_shapes((len(packets),) + (1,) * len(axes), *(array.shape for array in arrays))
     mask = unpadded(axes, shape, batch)
     flat = {name: _flat(array, shape, mask, ready) for name, array in zip(columns, arrays, strict=True)}
-    offsets = seconds_since(packets.time_ns, stamp_ns).reshape(-1, *(1,) * len(axes))
+    offsets = conventions.seconds_since(packets.time_ns, stamp_ns).reshape(-1, *(1,) * len(axes))
     flat["time"] = flat["time"] + _flat(offsets, shape, mask, ready)
     inside = np.ones(shape, np.bool_) if mask is None else mask.reshape(shape)
-    rows = rows_of(shape[1:]) if mask is None else 0
+    rows = conventions.rows_of(shape[1:]) if mask is None else 0
     cloud = make_cloud(
         flat,
-        vendor_turn(packets.sensor),
+        conventions.vendor_turn(packets.sensor),
         stamp_ns=stamp_ns,
         shape=(ready * int(np.prod(shape[1:-1])), rows) if rows else None,
         nominal=np.bool_(batch.nominal or result.nominal),
@@ -164,20 +155,20 @@ def make_cloud(flat: dict[str, NDArray[Any]], turn: NDArray[np.float64] | None =
     with np.errstate(all="ignore"):
         polar = flat if "range" in flat else _polar(flat)
         measured, azimuth, elevation = (polar[name].astype(np.float64) for name in ("range", "azimuth", "elevation"))
-        distance = shown_range(measured, flat["invalid"].astype(np.bool_))
+        distance = conventions.shown_range(measured, flat["invalid"].astype(np.bool_))
         valid = np.isfinite(distance) & np.isfinite(azimuth) & np.isfinite(elevation)
         xyz = _xyz(flat, distance, azimuth, elevation)
         valid &= np.isfinite(xyz).all(axis=0)
         if turn is not None:
-            xyz, azimuth = turn @ np.where(valid, xyz, 0), turned_azimuth(azimuth, turn)
+            xyz, azimuth = turn @ np.where(valid, xyz, 0), conventions.turned_azimuth(azimuth, turn)
         xyz = np.where(valid, xyz, np.nan).astype(np.float32)
-        optional: dict[str, Any] = {name: numbers_of(name, flat[name]) for name in _OPTIONAL if name in flat}
+        optional: dict[str, Any] = {name: conventions.numbers_of(name, flat[name]) for name in _OPTIONAL if name in flat}
         return PointCloud(
             x=xyz[0],
             y=xyz[1],
             z=xyz[2],
             range=distance.astype(np.float32),
-            azimuth=narrowed(azimuth),
+            azimuth=conventions.narrowed(azimuth),
             elevation=elevation.astype(np.float32),
             time=np.array(flat["time"], np.float64),
             valid=valid,
@@ -189,7 +180,7 @@ def make_cloud(flat: dict[str, NDArray[Any]], turn: NDArray[np.float64] | None =
 def _xyz(flat: dict[str, NDArray[Any]], distance: NDArray[Any], azimuth: NDArray[Any], elevation: NDArray[Any]) -> NDArray[np.float64]:
     if "x" in flat:
         return np.stack([flat[name].astype(np.float64) for name in "xyz"])
-    places = coordinates(distance, azimuth, elevation, [flat[name] for name in ("ox", "oy", "oz")])
+    places = conventions.coordinates(distance, azimuth, elevation, [flat[name] for name in ("ox", "oy", "oz")])
     return np.stack(places) + 0.0  # no -0.0
 
 

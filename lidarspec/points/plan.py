@@ -19,21 +19,9 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from numpy.typing import NDArray
 
+from lidarspec.columns import graph
 from lidarspec.columns.columns import Batch, aligned
-from lidarspec.columns.graph import (
-    Node,
-    Term,
-    Traced,
-    Untraceable,
-    chosen,
-    is_full,
-    node_of,
-    only_field,
-    sample_of,
-    terms,
-    trace,
-    traverse,
-)
+from lidarspec.columns.graph import Node, Traced, Untraceable, is_full, only_field
 from lidarspec.points.conventions import coordinates, is_zero, marked, returned_range, shown_range
 from lidarspec.points.plain import columns_of, parts_of
 from lidarspec.points.windows import possible
@@ -87,7 +75,7 @@ class Plan:
     """
 
     def __init__(self, function: PointsFunction, sample: Batch, layout: Layout) -> None:
-        result, self.tape = trace(function, sample)
+        result, self.tape = graph.trace(function, sample)
         schema = sample.table.schema
         for node in self.tape.nodes:
             if node.kind == "field" and schema.fields[node.path].kind == "float":
@@ -95,7 +83,7 @@ class Plan:
         if not isinstance(result, Polar):
             raise Untraceable(f"{type(result).__name__} points are evaluated plainly")
         self.function, self.layout, self.nominal = function, layout, result.nominal
-        self.parts = {name: node_of(value) for name, value in parts_of(result).items()}
+        self.parts = {name: graph.node_of(value) for name, value in parts_of(result).items()}
         columns = columns_of({name: part.sample if isinstance(part, Node) else part for name, part in self.parts.items()}, sample)
         arrays, self.axes, _ = aligned(tuple(columns.values()), sample)
         self.shape = np.broadcast_shapes((2,) + (1,) * len(self.axes), *(array.shape for array in arrays))[1:]
@@ -125,7 +113,7 @@ class Plan:
         """What has to be computed for every batch: whatever remembers something between batches, and what that needs."""
         wanted = [node for node in self.tape.nodes if node.kind in REMEMBERING]
         wanted += [node for node, _ in self.tape.steps] + self.positive
-        return sorted(traverse(*wanted), key=lambda node: node.number)
+        return sorted(graph.traverse(*wanted), key=lambda node: node.number)
 
     def _expressions(self, result: Polar, measured: Traced) -> dict[str, Any]:
         """The columns that back ends make."""
@@ -134,7 +122,7 @@ class Plan:
         columns = dict(zip("xyz", places, strict=True)) | {"range": shown_range(measured, result.invalid), "azimuth": result.azimuth}
         if result.intensity is not None:
             columns["intensity"] = result.intensity
-        return {name: node_of(value) for name, value in columns.items()}
+        return {name: graph.node_of(value) for name, value in columns.items()}
 
     def _distance(self, measured: Traced) -> Any:
         """The distance of a return, nan where there is none; where a low value only scales it, that value has to be positive."""
@@ -161,8 +149,8 @@ class Plan:
         return [term.low for term in self._directions if term.low is not None]
 
     @cached_property
-    def _directions(self) -> list[Term]:
-        return [term for node in self.directed for term in terms(node, self.width)]
+    def _directions(self) -> list[graph.Term]:
+        return [term for node in self.directed for term in graph.terms(node, self.width)]
 
     @property
     def directed(self) -> list[Node]:
@@ -175,7 +163,7 @@ class Plan:
 
     def _finite(self, node: Node) -> bool:
         """Whether an expression is a number for every value that its field can have."""
-        options = chosen(node, self.width)
+        options = graph.chosen(node, self.width)
         if options is not None:
             return all(self._finite(option) if isinstance(option, Node) else bool(np.isfinite(option)) for option in options[1:])
         values = possible(node, self.layout.leaves)
@@ -196,6 +184,6 @@ def plan_for(function: PointsFunction, batch: Batch, group: Group) -> Plan | Unt
 
 def _planned(function: PointsFunction, batch: Batch, group: Group) -> Plan | Untraceable:
     try:
-        return Plan(function, sample_of(batch, group), group.layout)
+        return Plan(function, graph.sample_of(batch, group), group.layout)
     except Untraceable as reason:
         return reason

@@ -12,11 +12,14 @@
     17+a+n  4     CRC-32 (zlib) of everything before
 
 Theory of operation: a length is at most what its one or two bytes can say, so no record claims more than 66 kB, and none is
-believed before its checksum passes. The reader keeps a window of the file that holds one record and what was read with it.
+believed before its checksum passes. The reader keeps a window of the file that holds one record and what was read with it. It stops at
+the first damaged record, or salvages what lies behind it; what a killed process leaves behind is whole records and at most one that is
+not.
 """
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import re
@@ -25,11 +28,13 @@ import zlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, fields
 from functools import lru_cache
+from pathlib import Path
 from typing import Any, BinaryIO, Literal
 
-from lidarspec.errors import UsageError, WireError
+from lidarspec.errors import SourceError, UsageError, WireError, suggest, system_errors
 from lidarspec.plugins import sensor as named_sensor
 from lidarspec.spec.sensor import Sensor
+from lidarspec.transports.protocol import Closing
 
 VERSION = 1
 _ID = re.compile(r"[a-z0-9]+(-[a-z0-9]+)*")
@@ -194,26 +199,31 @@ def whole_records(buffer: bytes | bytearray | memoryview, limit: int) -> int:
     return end
 
 
-class RecordReader:
+class RecordReader(Closing):
     """The records of an open file, from behind its magic bytes on; memory is bounded by a block and a record.
 
     Args:
         salvage: look for the next good record behind a damaged place, instead of stopping there.
 
     Attributes:
-        records: good records so far.
-        damaged: places that hold no good record; `leftover` the bytes in them.
-        is_cut: whether the last of them is a record that the file ends in.
+        records: good records so far, the header and events among them.
+        damaged: places so far that hold no good record; a record that is not whole at the end is one.
+        leftover: bytes in damaged places; without `salvage` all that are behind the last good record.
+        is_cut: whether the last damaged place is a record that the file ends in.
         offset: file offset of the next record, or of the damage that ended the reading.
     """
 
     def __init__(self, file: BinaryIO, *, salvage: bool = False) -> None:
-        self._file, self._salvage = file, salvage
+        self._file, self.salvage = file, salvage
         self._window, self._place = b"", 0
         self.records = self.damaged = self.leftover = 0
         self.is_cut, self.offset = False, len(MAGIC)
 
-    def __iter__(self) -> Iterator[tuple[int, Record]]:
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+    def pairs(self) -> Iterator[tuple[int, Record]]:
         """Kind and content of every good record."""
         while self._holds(1):
             if (size := self._good()) > 0:
@@ -223,7 +233,7 @@ class RecordReader:
                 yield kind, record
                 continue
             self.damaged += 1
-            if not self._salvage:
+            if not self.salvage:
                 self.leftover += self._rest()
                 return
             self.leftover += self._next_mark()
@@ -320,3 +330,56 @@ def _endpoints(data: bytes) -> tuple[Address | None, Address | None]:
         found.append((host, _PORT.unpack_from(data, place + 1 + length)[0]) if length else None)
         place += 1 + length + 2 * bool(length)
     return found[0], found[1]
+
+
+class Recording(RecordReader):
+    """A recording, read in order: an iterable of `Record`s that goes on where the last loop stopped, and a context manager.
+
+    Args:
+        path: the file.
+        salvage: go on behind damaged places, even where the header is one.
+
+    Attributes:
+        header: what it says of itself; the others are those of `RecordReader`.
+
+    Raises:
+        SourceError: where the file cannot be opened, is no recording, or one of a later format.
+        WireError: where its header is damaged, and `salvage` is not asked for.
+    """
+
+    def __init__(self, path: str | Path, *, salvage: bool = False) -> None:
+        self.path = str(path)
+        with system_errors(path):
+            super().__init__(open(path, "rb"), salvage=salvage)  # noqa: SIM115  closed by `close`
+        try:
+            self._records = self._begin()
+        except BaseException:
+            self.close()
+            raise
+
+    def __iter__(self) -> Iterator[Record]:
+        return self._records
+
+    def _begin(self) -> Iterator[Record]:
+        """Read the header; the records behind it."""
+        with system_errors(self.path):
+            magic = self._file.read(len(MAGIC))
+            if magic != MAGIC:
+                seen = f"it begins with {magic.hex(' ')}" if magic else "it is empty"
+                raise SourceError(f"{self.path}: not an .lsr recording: {seen}")
+            pairs = self.pairs()
+            first = next(pairs, None)
+        if first is not None and first[0] == HEADER:
+            self.header = read_header(first[1].data)
+            if self.header.version > VERSION:
+                raise SourceError(f"{self.path}: written in format {self.header.version}, and this lidarspec knows {VERSION}")
+            return self._known(pairs)
+        if not self.salvage:
+            damage = WireError(f"{self.path}: the header of the recording is damaged or cut off")
+            raise suggest(damage, f"lidarspec record {self.path} --salvage -o mended.lsr")
+        self.header = Header()
+        return self._known(itertools.chain([] if first is None else [first], pairs))
+
+    def _known(self, pairs: Iterator[tuple[int, Record]]) -> Iterator[Record]:
+        with system_errors(self.path):
+            yield from (record for kind, record in pairs if kind in DIRECTIONS)

@@ -30,7 +30,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.errors import SourceError, UsageError, did_you_mean
+from lidarspec.errors import UsageError, did_you_mean, system_errors
 
 Floats = NDArray[np.float64]
 #: what broadcasts against the beams: an array, or one number for all.
@@ -185,13 +185,10 @@ def read_scene(path: str | Path) -> Room:
         UsageError: where it is no TOML, or says something that is no scene: the key is named.
     """
     try:
-        text = Path(path).read_text(encoding="utf-8")
-    except OSError as error:
-        raise SourceError(f"{path}: {error.strerror or error}") from None
+        with system_errors(path):
+            return scene_of(tomllib.loads(Path(path).read_text(encoding="utf-8")), str(path))
     except UnicodeDecodeError:
         raise UsageError(f"{path}: no TOML, since it is no text in UTF-8") from None
-    try:
-        return scene_of(tomllib.loads(text), str(path))
     except tomllib.TOMLDecodeError as error:
         raise UsageError(f"{path}: {error}") from None
 

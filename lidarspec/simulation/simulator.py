@@ -1,7 +1,10 @@
 """Frames that a sensor would send from a scene, made from its own spec, and when it would send them.
 
 The sensor's `sweep` says what is not measured (angles, counters, time). The packets are filled with that, `points` says where the
-beams go, the scene says how far, and the ranges go back through the scale of the fields that they come from (`measuring`).
+beams go, the scene says how far, and the ranges go back through the scale of the fields that they come from (`Measurement`): no inverse of
+`points` is written anywhere, but by giving each field in metres a probing value it is found out which points answer to it. Where
+direction depends on range the measurement is repeated; a beam that finds no fixed point is a no-return. A frame type with an `encode` of
+its own is given the measured points and returns the values of its fields.
 
 When each packet is sent follows from what the spec says of time, in this order: the rate that is declared; the sensor's clock, which
 its `sweep` sets; the times of the points, which say how long one takes; the speed of its serial line, which no sensor outruns.
@@ -19,12 +22,18 @@ from numpy.typing import NDArray
 
 from lidarspec.columns.columns import Batch
 from lidarspec.errors import UsageError
+from lidarspec.framing.examples import example
 from lidarspec.packets.clocks import clock_ns
-from lidarspec.simulation.frame_maker import FrameMaker, example, sealed
+from lidarspec.simulation.frame_maker import FrameMaker, sealed
 from lidarspec.simulation.measuring import Beams, Measurement
+from lidarspec.columns.columns import Batch, Column, Fields, aligned
+from lidarspec.errors import SpecError, UsageError
+from lidarspec.simulation.frame_maker import FrameMaker, example, sealed
 from lidarspec.simulation.scenes import Room, Scene
 from lidarspec.spec.description import Spec
+from lidarspec.spec.fields import factor
 from lidarspec.spec.links import Serial
+from lidarspec.spec.results import Polar
 from lidarspec.spec.tree import exact
 from lidarspec.wire.frame_table import Rows
 
@@ -37,6 +46,221 @@ COARSE = 1_000_000
 AHEAD = 1
 #: packets on which it is found out how a sensor carries its ranges, and how fast it is.
 PROBED = 256
+Floats = NDArray[np.float64]
+#: how often ranges are measured again while directions still move.
+ROUNDS = 8
+#: raw value that a range field is given to see which points answer to it.
+PROBE = 100
+
+
+@dataclass(frozen=True, eq=False)
+class Target:
+    """A field that ranges come from.
+
+    Attributes:
+        path: of the field.
+        inner: index of the innermost axes of the points that belongs to it.
+        step, zero: metres of one raw step and of raw 0; no step where packets have their own, such as the header's or a calibration's.
+    """
+
+    path: str
+    inner: tuple[int, ...]
+    step: float | None
+    zero: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Beams:
+    """Where the beams of a table go: arrays that broadcast, the first axis for the packets.
+
+    Attributes:
+        range, azimuth, elevation, time, origin: as in `Polar`, directions that nobody knows nan.
+        counts: (n,) points of each packet.
+        intensity: path of the field that it comes from, "" where it is none.
+    """
+
+    range: Floats
+    azimuth: Floats
+    elevation: Floats
+    time: Floats
+    origin: tuple[Floats, Floats, Floats]
+    counts: NDArray[np.intp]
+    intensity: str
+
+
+class Measurement:
+    """How one frame type of a sensor carries its ranges; found out once, on a table of its frames.
+
+    Raises:
+        SpecError: where ranges cannot be traced back to fields and there is no `encode`.
+    """
+
+    def __init__(self, sensor: Spec, frame: str, table: Rows) -> None:
+        self._sensor = sensor
+        self._points = sensor.points_of(frame)
+        self._encode: Callable[[Polar], Mapping[str, Any]] | None = sensor.simulation_of(frame).encode
+        self._targets = () if self._encode else self._traced(table)
+        self._intensity = self.beams(table).intensity
+        self._coupled = self._encode is not None or self._turning(table)
+
+    def fill(self, table: Rows, scene: Scene, times: Floats) -> None:
+        """Measure a table's ranges in the scene, and write them.
+
+        Args:
+            times: (n,) seconds since the scene began, of each packet.
+        """
+        steps = [self._step(table, target) for target in self._targets]
+        before, blind = np.zeros(1), np.zeros(1, np.bool_)
+        known: dict[str, NDArray[Any]] = {}
+        for attempt in range(ROUNDS):
+            beams = self.beams(table)
+            ranges = self._measured(beams, scene, times)
+            if attempt == ROUNDS - 2:
+                blind = ~np.isclose(ranges, before)
+            before, ranges = ranges, np.where(blind, 0, ranges)
+            values = self._values(table, beams, ranges, steps)
+            if known and all(np.array_equal(known[path], raw) for path, raw in values.items()):
+                break
+            known = values
+            for path, raw in values.items():
+                store(table, path, raw)
+            if not self._coupled or attempt >= ROUNDS - 2:
+                break
+        if self._intensity and not self._encode:
+            first = known[self._targets[0].path]
+            store(table, self._intensity, np.where(first > 0, 40 + first % 160, 0))
+
+    def beams(self, table: Rows) -> Beams:
+        """Where the beams of a table go as it stands."""
+        number = len(table)
+        state = {name: (None, np.full(number, -1, np.intp)) for name in self._sensor.state}
+        batch = Batch(table, np.zeros(number, np.bool_), state, self._sensor.state)
+        with np.errstate(all="ignore"):
+            polar = self._points(Fields(batch))
+            if not isinstance(polar, Polar) or not isinstance(polar.range, Column):
+                raise SpecError("only polar points can be simulated", path="points", sensor=self._sensor.id)
+            parts = (polar.range, polar.azimuth, polar.elevation, polar.time, *polar.origin)
+            arrays = [np.asarray(array, np.float64) for array in aligned(parts, batch)[0]]
+        depth = max(array.ndim for array in arrays)
+        full = [array.reshape(*(1,) * (depth - array.ndim), *array.shape) for array in arrays]
+        intensity = polar.intensity.source if isinstance(polar.intensity, Column) else ""
+        return Beams(full[0], full[1], full[2], np.nan_to_num(full[3]), (full[4], full[5], full[6]), _counts(polar.range, batch), intensity)
+
+    def _measured(self, beams: Beams, scene: Scene, times: Floats) -> Floats:
+        """Metres along each beam; 0 where the sensor does not reach, or nobody knows where the beam goes."""
+        known = np.isfinite(beams.azimuth) & np.isfinite(beams.elevation)
+        at = times.reshape(-1, *(1,) * (beams.range.ndim - 1)) + beams.time
+        metres = scene.measure(np.nan_to_num(beams.azimuth), np.nan_to_num(beams.elevation), beams.origin, at)
+        near, far = self._sensor.range_limits
+        metres = np.where(known & (metres >= near) & (metres <= far), metres, 0)
+        return np.asarray(np.broadcast_to(metres, np.broadcast_shapes(metres.shape, beams.range.shape)))
+
+    def _values(self, table: Rows, beams: Beams, ranges: Floats, steps: list[Any]) -> dict[str, NDArray[Any]]:
+        """The raw values of the fields that carry these ranges."""
+        if self._encode is not None:
+            polar = Polar(ranges, np.broadcast_to(beams.azimuth, ranges.shape), np.broadcast_to(beams.elevation, ranges.shape))
+            return {path: np.asarray(values) for path, values in self._encode(polar).items()}
+        found: dict[str, NDArray[Any]] = {}
+        for target, (step, zero) in zip(self._targets, steps, strict=True):
+            info = table.schema.fields[target.path]
+            part = _part(ranges, target.inner)
+            with np.errstate(all="ignore"):
+                raw = np.rint((part - zero) / step)
+            top = float((1 << info.bits) - 1) if info.kind == "int" else np.inf
+            found[target.path] = np.where((part > 0) & (raw > 0) & (raw <= top), raw, 0)
+        return found
+
+    def _traced(self, table: Rows) -> tuple[Target, ...]:
+        """The fields in metres that the ranges of the points answer to."""
+        found: list[Target] = []
+        for path, info in table.schema.fields.items():
+            if factor(info.unit, "m") is None or not any(path in group.layout.leaves for group in table.groups):
+                continue
+            (answer,) = self._answers(table, path, PROBE)
+            expected = info.physical(PROBE)
+            inner = [spot for spot in self._inner(table, answer) if np.isclose(_part(answer, spot), expected).any()]
+            found += [Target(path, spot, info.scale, info.offset) for spot in inner]
+        found = found or self._linear(table)
+        if not found:
+            reason = "no field in metres makes the range of a point: the sensor has to give `encode`"
+            raise SpecError(reason, path="points", sensor=self._sensor.id)
+        return tuple(found)
+
+    def _linear(self, table: Rows) -> list[Target]:
+        """The fields that ranges are linear in, not by their own scale: those in metres, shifted or stretched by a correction; and
+        the elements of arrays without a unit to which ranges are in proportion, since the header has the unit."""
+        found = []
+        for path, info in table.schema.fields.items():
+            metres = factor(info.unit, "m") is not None
+            if not metres and (info.unit or info.kind != "int" or not info.axes):
+                continue
+            answers = self._answers(table, path, PROBE, 2 * PROBE, 3 * PROBE)
+            for spot in self._inner(table, answers[0]):
+                once, twice, thrice = (_part(answer, spot) for answer in answers)
+                even = np.isclose(thrice - twice, twice - once) & (twice > once) & (once > 0)
+                if (even & (metres | np.isclose(twice, 2 * once))).any():
+                    found.append(Target(path, spot, None))
+        return found
+
+    def _answers(self, table: Rows, path: str, *probes: int) -> list[Floats]:
+        """The ranges while a field has one value and another; the table is left as it was."""
+        before, answers = table.raw(path), []
+        for probe in probes:
+            store(table, path, np.array(probe))
+            answers.append(self.beams(table).range)
+        store(table, path, before)
+        return answers
+
+    def _step(self, table: Rows, target: Target) -> tuple[Any, Any]:
+        """Metres of one raw step and of raw 0, numbers or for each point."""
+        if target.step is not None:
+            return target.step, target.zero
+        once, twice = (_part(answer, target.inner) for answer in self._answers(table, target.path, PROBE, 2 * PROBE))
+        return (twice - once) / PROBE, 2 * once - twice
+
+    def _inner(self, table: Rows, answer: Floats) -> list[tuple[int, ...]]:
+        """The indices of the axes of the points that are further in than those of the fields."""
+        extra = answer.ndim - 1 - table.schema.depth()
+        return list(np.ndindex(*answer.shape[answer.ndim - extra :])) if extra > 0 else [()]
+
+    def _turning(self, table: Rows) -> bool:
+        """Whether directions depend on ranges."""
+        directions: list[Beams] = []
+        before = {target.path: table.raw(target.path) for target in self._targets}
+        for probe in (PROBE, 2 * PROBE):
+            for path in before:
+                store(table, path, np.array(probe))
+            directions.append(self.beams(table))
+        for path, raw in before.items():
+            store(table, path, raw)
+        first, second = directions
+        same = (np.array_equal(getattr(first, name), getattr(second, name), equal_nan=True) for name in ("azimuth", "elevation"))
+        return not all(same)
+
+
+def store(table: Rows, path: str, values: NDArray[Any]) -> None:
+    """Write raw values, (n, ...) or one for all, into every frame that has the field."""
+    for group in table.groups:
+        leaf = group.layout.leaves.get(path)
+        if leaf is None:
+            continue
+        own = values if values.ndim == 0 else values[group.where]
+        if own.ndim:
+            own = own.reshape(own.shape[: 1 + len(leaf.shape)])[(slice(None), *(slice(0, length) for length in leaf.shape))]
+        leaf.store(group.rows, own)
+
+
+def _part(array: Floats, inner: tuple[int, ...]) -> Floats:
+    corner: Any = (..., *inner)
+    return np.asarray(array[corner])
+
+
+def _counts(column: Column, batch: Batch) -> NDArray[np.intp]:
+    """How many points each packet has."""
+    counts = np.ones(len(batch), np.intp)
+    for length, name in zip(column.shape[1:], column.axes, strict=True):
+        counts = counts * (length if name is None or name.startswith("<") else batch.table.counts(name))
+    return counts
 
 
 class Pace:

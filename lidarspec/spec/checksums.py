@@ -1,33 +1,35 @@
-"""Checksum algorithms as values: of one message, or of every frame of a batch at once; and the CRCs in common use by their names.
+"""Checksum algorithms as values, each a function of one message; and the CRCs in common use by their names.
 
-An algorithm is immutable, hashable and equal to another by its parameters. `Checksum.batch` gives what calls one by one would give; the
-arithmetic on rows of bytes side by side is that of `lidarspec.spec.row_checksums`. `CRCS` has the names that catalogues give.
+An algorithm is immutable, hashable and equal to another by its parameters. `single` is its function by itself, made once and called for one
+message after another; `lidarspec.wire.row_checksums` computes those of many frames at once. `CRCS` has the names that catalogues give.
+
+A CRC's register is kept in wire order, where the low byte is the one that meets the next data byte: for `refin` the usual reflected
+register, otherwise the usual register aligned left with its bytes swapped. One formula serves both.
 """
 
 from __future__ import annotations
 
 import binascii
+import functools
 import struct
 import zlib
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import Any, Literal, TypeAlias
+from typing import Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
-
-from lidarspec.spec import row_checksums
 
 ByteOrder: TypeAlias = Literal["little", "big"]
 Bytes: TypeAlias = bytes | bytearray | memoryview
 Values: TypeAlias = NDArray[np.uint64]
 
-_LOOP_BYTES = 2048  # below this, a Python loop over bytes is done before NumPy's calls have started
-_NARROW_LOOP_BYTES = 256  # the same where the register is a byte
-_FEW = 4  # rows that are done one by one sooner than together
-_BLOCK_BYTES = 1 << 20  # rows of a batch taken at a time: few enough for the caches, and many enough to hide NumPy's cost per call
+Single: TypeAlias = Callable[[bytes], int]
+
+REGISTER_BYTES = [2] * 17 + [4] * 16 + [8] * 32  # that a register is kept in, by its width
+MIRROR = bytes(int(f"{byte:08b}"[::-1], 2) for byte in range(256))
 
 
 class Checksum(ABC):
@@ -48,36 +50,12 @@ class Checksum(ABC):
         """A short phrase for people, such as "XOR-8"."""
 
     def batch(self, rows: NDArray[np.uint8]) -> Values:
-        """The checksum of each row, shape (n,), for frames of one length, shape (n, m), contiguous or not."""
+        """The checksum of each row, shape (n,), for frames of one length, shape (n, m); one by one, unless overridden."""
         return np.fromiter((self(row.tobytes()) for row in rows), np.uint64, len(rows))
-
-    def over(self, rows: NDArray[np.uint8], spans: row_checksums.Spans) -> Values:
-        """The checksum of some bytes of each row, shape (n,): from one place to another, one span after another."""
-        return self.batch(row_checksums.cut(rows, spans))
-
-
-class _Worded(Checksum):
-    """An algorithm that works on words of many rows side by side, wherever in the rows the bytes stand."""
-
-    def batch(self, rows: NDArray[np.uint8]) -> Values:
-        return self.over(rows, ((0, rows.shape[1]),))
-
-    def over(self, rows: NDArray[np.uint8], spans: row_checksums.Spans) -> Values:
-        if self._are_few(rows, spans):
-            return super().batch(row_checksums.cut(rows, spans))
-        return _in_blocks(lambda block: self._values(block, spans), rows)
-
-    def _are_few(self, rows: NDArray[np.uint8], spans: row_checksums.Spans) -> bool:
-        """Whether the rows are done one by one sooner than together."""
-        return len(rows) < _FEW
-
-    @abstractmethod
-    def _values(self, rows: NDArray[np.uint8], spans: row_checksums.Spans) -> Values:
-        """The checksums of a block of rows."""
 
 
 @dataclass(frozen=True)
-class Crc(_Worded):
+class Crc(Checksum):
     """A cyclic redundancy check, its parameters as CRC catalogues print them; a wrong one raises ValueError.
 
     Args:
@@ -101,65 +79,42 @@ class Crc(_Worded):
         _require(self, refin=(False, True), refout=(False, True), order=("little", "big"))
 
     def __call__(self, data: Bytes) -> int:
-        data = bytes(data)
-        if len(data) >= _LOOP_BYTES:
-            return int(self.batch(np.frombuffer(data, np.uint8).reshape(1, -1))[0])
-        table, register, size = self._loop
-        if self.width <= 8:
-            for byte in data:
-                register = table[register ^ byte]
-        else:
-            for byte in data:
-                register = table[(register ^ byte) & 0xFF] ^ register >> 8
-        if not self.refin:
-            register = int.from_bytes(register.to_bytes(size, "little"), "big") >> 8 * size - self.width
-        return (register if self.refin == self.refout else row_checksums.reflected(register, self.width)) ^ self.xorout
+        return _single_crc(self)(bytes(data))
 
     def describe(self) -> str:
         digits, order = -(-self.width // 4), ("", " refin", " refout", " reflected")[self.refin + 2 * self.refout]
         values = (f" {name} 0x{getattr(self, name):0{digits}x}" for name in ("poly", "init", "xorout") if getattr(self, name))
         return f"CRC-{self.width}{''.join(values)}{order}"
 
-    def _are_few(self, rows: NDArray[np.uint8], spans: row_checksums.Spans) -> bool:
-        length = sum(stop - start for start, stop in spans)
-        return len(rows) * length < (_NARROW_LOOP_BYTES if self.width <= 8 else _LOOP_BYTES)
+    @property
+    def start(self) -> int:
+        """The register before the first byte, in wire order."""
+        start = reflected(self.init, self.width)
+        return start if self.refin else mirrored_bytes(start)
 
-    def _values(self, rows: NDArray[np.uint8], spans: row_checksums.Spans) -> Values:
-        registers = row_checksums.registers(rows, spans, self._loop[1], self.width, self.poly, self.refin)
+    def left(self, register: int) -> int:
+        """What leaves the register, in wire order, after the last byte."""
         if not self.refin:
-            registers = registers.byteswap() >> 8 * registers.itemsize - self.width
-        values = registers.astype(np.uint64)
-        if self.refin != self.refout:
-            mirrored = np.frombuffer(row_checksums.MIRROR, np.uint8).take(values.byteswap().view(np.uint8))
-            values = mirrored.view(np.uint64) >> np.uint64(64 - self.width)
-        return values ^ np.uint64(self.xorout) if self.xorout else values
-
-    @cached_property
-    def _loop(self) -> tuple[tuple[int, ...], int, int]:
-        """What a loop over bytes needs: its table, the register that it starts with, and the bytes of a register."""
-        table, start = row_checksums.byte_table(self.width, self.poly, self.refin), row_checksums.reflected(self.init, self.width)
-        return table, start if self.refin else row_checksums.mirrored_bytes(start), row_checksums.REGISTER_BYTES[self.width]
+            size = REGISTER_BYTES[self.width]
+            register = int.from_bytes(register.to_bytes(size, "little"), "big") >> 8 * size - self.width
+        return (register if self.refin == self.refout else reflected(register, self.width)) ^ self.xorout
 
 
 @dataclass(frozen=True)
-class Xor(_Worded):
+class Xor(Checksum):
     """The XOR of all bytes."""
 
     width = 8
 
     def __call__(self, data: Bytes) -> int:
-        return _xor(bytes(data))
+        return _xor(data)
 
     def describe(self) -> str:
         return "XOR-8"
 
-    def _values(self, rows: NDArray[np.uint8], spans: row_checksums.Spans) -> Values:
-        columns = row_checksums.words(rows, spans=spans)
-        return row_checksums.folded_xor(row_checksums.xor(columns, range(len(columns))))
-
 
 @dataclass(frozen=True)
-class Sum(_Worded):
+class Sum(Checksum):
     """The sum of all bytes modulo 2**width; a width outside 1 to 64 raises ValueError."""
 
     width: int = 8
@@ -174,12 +129,9 @@ class Sum(_Worded):
     def describe(self) -> str:
         return f"{self.width}-bit sum"
 
-    def _values(self, rows: NDArray[np.uint8], spans: row_checksums.Spans) -> Values:
-        return row_checksums.byte_sums(row_checksums.words(rows, spans=spans)) & np.uint64((1 << self.width) - 1)
-
 
 @dataclass(frozen=True)
-class WordXor(_Worded):
+class WordXor(Checksum):
     """The XOR of words of one or two bytes, low byte first, extended to 16 bits by zeros; wrong sizes raise ValueError.
 
     Args:
@@ -197,21 +149,10 @@ class WordXor(_Worded):
             raise ValueError(f"WordXor: groups must be a tuple of sizes, each 1 or 2, not {self.groups!r}")
 
     def __call__(self, data: Bytes) -> int:
-        data = bytes(data)
-        low, high = (_xor(b"".join([data[part] for part in half])) for half in self.halves)
-        return low | high << 8
+        return _single_word_xor(self)(bytes(data))
 
     def describe(self) -> str:
         return f"XOR-16 of {'+'.join(map(str, self.groups))}-byte words" + (f" after a head of {self.head} bytes" if self.head else "")
-
-    def _values(self, rows: NDArray[np.uint8], spans: row_checksums.Spans) -> Values:
-        columns = row_checksums.words(rows, spans=spans)
-        low, high, part = np.zeros((3, len(rows)), np.uint64)
-        for which, masks in _word_masks(self, len(columns)):
-            alike = row_checksums.xor(columns, which)
-            np.bitwise_xor(low, np.bitwise_and(alike, masks[0], out=part), out=low)
-            np.bitwise_xor(high, np.bitwise_and(alike, masks[1], out=part), out=high)
-        return row_checksums.folded_xor(low) | row_checksums.folded_xor(high) << np.uint64(8)
 
     @cached_property
     def halves(self) -> tuple[list[slice], list[slice]]:
@@ -244,13 +185,6 @@ class Fold15(Checksum):
     def describe(self) -> str:
         return "15-bit folded sum"
 
-    def batch(self, rows: NDArray[np.uint8]) -> Values:
-        tail, total = rows[:, rows.shape[1] % 2 - 60 :], np.zeros(len(rows), np.uint64)
-        last = (tail.shape[1] - 1) // 2
-        for place, byte in enumerate(tail.T):
-            total += byte.astype(np.uint64) << np.uint64(last - place // 2 + 8 * (place % 2))
-        return (total & np.uint64(0x7FFF)) + (total >> np.uint64(15)) & np.uint64(0x7FFF)
-
 
 @dataclass(frozen=True)
 class ZeroPadded(Checksum):
@@ -278,30 +212,6 @@ class ZeroPadded(Checksum):
     def describe(self) -> str:
         return f"{self.algorithm.describe()} of the bytes padded with zeros to a multiple of {self.to}"
 
-    def batch(self, rows: NDArray[np.uint8]) -> Values:
-        return self.algorithm.batch(np.pad(rows, ((0, 0), (0, -rows.shape[1] % self.to))))
-
-
-@lru_cache(maxsize=512)
-def _word_masks(algorithm: WordXor, number: int) -> list[tuple[list[int], tuple[np.uint64, np.uint64]]]:
-    """Where the low and the high bytes stand in so many words of `row_checksums.words`, as masks; with the words that have the same."""
-    masks = np.zeros((2, 8 * number), np.uint8)
-    for mask, half in zip(masks, algorithm.halves, strict=True):
-        for part in half:
-            mask[part] = 0xFF
-    found: dict[tuple[np.uint64, np.uint64], list[int]] = {}
-    for word, (low, high) in enumerate(masks.view("<u8").T):
-        found.setdefault((low, high), []).append(word)
-    return [(which, both) for both, which in found.items()]
-
-
-def _in_blocks(values: Callable[[NDArray[np.uint8]], NDArray[Any]], rows: NDArray[np.uint8]) -> NDArray[Any]:
-    """What a function makes of each row, asked for as many rows at a time as stay in the cache."""
-    step = max(1, _BLOCK_BYTES // max(rows.shape[1], 1))
-    if len(rows) <= step:
-        return values(rows)
-    return np.concatenate([values(rows[first : first + step]) for first in range(0, len(rows), step)])
-
 
 def _require(checksum: Checksum, **allowed: range | tuple[object, ...]) -> None:
     for name, values in allowed.items():
@@ -310,12 +220,37 @@ def _require(checksum: Checksum, **allowed: range | tuple[object, ...]) -> None:
             raise ValueError(f"{type(checksum).__name__}: {name} must be in {values}, not {value!r}")
 
 
-def _xor(data: bytes) -> int:
+def _xor(data: Bytes) -> int:
     """The XOR of all bytes: one large integer, folded in halves down to its low byte."""
     value = int.from_bytes(data, "little")
-    for power in range((8 * len(data) - 1).bit_length() - 1, 2, -1):
-        value ^= value >> (1 << power)
+    for power in _powers(8, len(data)):
+        value ^= value >> power
     return value & 0xFF
+
+
+@lru_cache(maxsize=4096)
+def _powers(bits: int, count: int) -> tuple[int, ...]:
+    """By how much an integer is shifted and XORed onto itself until its lowest part is the XOR of so many parts."""
+    return tuple(bits << power for power in reversed(range(max(count - 1, 0).bit_length())))
+
+
+def reflected(value: int, width: int) -> int:
+    """The value with its bits in the opposite order."""
+    return int(f"{value:0{width}b}"[::-1], 2)
+
+
+def mirrored_bytes(register: int) -> int:
+    """The register with the bits of each byte mirrored, which leads from one bit order to the other."""
+    return int.from_bytes(register.to_bytes(8, "little").translate(MIRROR), "little")
+
+
+@lru_cache(maxsize=256)
+def byte_table(width: int, poly: int, refin: bool) -> tuple[int, ...]:
+    """The register after one byte, by the XOR of that byte and the register's low byte."""
+    table, feedback = list(range(256)), reflected(poly, width)
+    for _ in range(8):
+        table = [register >> 1 ^ (feedback if register & 1 else 0) for register in table]
+    return tuple(table if refin else (mirrored_bytes(table[byte]) for byte in MIRROR))
 
 
 def _crc(width: int, poly: int, init: int = 0, *, reflected: bool = False, xorout: int = 0) -> Crc:
@@ -380,21 +315,15 @@ def name_of(crc: Crc) -> str:
     return _NAMES.get(crc, "")
 
 
-Single = Callable[[bytes], int]
-
-
 def single(algorithm: Checksum) -> Single:
-    """A function from bytes to their checksum, made for one frame at a time; of other algorithms the algorithm itself."""
-    if type(algorithm) is Crc:
-        return _single_crc(algorithm)
-    if type(algorithm) is Xor:
-        return _single_xor
-    if type(algorithm) is Sum:
+    """A function from bytes to their checksum, made for one frame at a time."""
+    kind = type(algorithm)  # what derives from one of these may compute something else
+    if kind is Xor:
+        return _xor
+    if kind is Sum:
         mask = (1 << algorithm.width) - 1
         return lambda data: sum(data) & mask
-    if type(algorithm) is WordXor:
-        return _single_word_xor(algorithm)
-    return algorithm
+    return _single_crc(algorithm) if kind is Crc else _single_word_xor(algorithm) if kind is WordXor else algorithm
 
 
 @lru_cache(maxsize=256)
@@ -405,55 +334,41 @@ def _single_crc(algorithm: Crc) -> Single:
     if (algorithm.width, algorithm.poly, algorithm.refin, algorithm.refout) == (32, 0x04C11DB7, True, True):
         start, end = int(f"{init:032b}"[::-1], 2) ^ 0xFFFFFFFF, xorout ^ 0xFFFFFFFF
         return lambda data: zlib.crc32(data, start) ^ end
-    if algorithm.width != 8:
-        return algorithm
-    # One byte more changes the register by a table, whichever bit comes first; `refout` and `xorout` apply at the end.
-    plain = Crc(8, algorithm.poly, refin=algorithm.refin, refout=algorithm.refin)
-    table = tuple(plain(bytes([byte])) for byte in range(256))
-    first = int(f"{init:08b}"[::-1], 2) if algorithm.refin else init
-    mirrored = algorithm.refin != algorithm.refout
-    leaving = bytes((int(f"{value:08b}"[::-1], 2) if mirrored else value) ^ xorout for value in range(256))
-
-    def crc8(data: bytes, table: tuple[int, ...] = table) -> int:
-        register = first
-        for byte in data:
-            register = table[register ^ byte]
-        return leaving[register]
-
-    return crc8
+    table = byte_table(algorithm.width, algorithm.poly, algorithm.refin)
+    if algorithm.width > 8:
+        return functools.partial(_wide_crc, algorithm, table, algorithm.start)
+    return functools.partial(_narrow_crc, table, algorithm.start, tuple(map(algorithm.left, range(256))))
 
 
-def _single_xor(data: bytes) -> int:
-    value = int.from_bytes(data, "little")
-    for power in _powers(8, len(data)):
-        value ^= value >> power
-    return value & 0xFF
+def _narrow_crc(table: tuple[int, ...], register: int, leaving: tuple[int, ...], data: bytes) -> int:
+    for byte in data:
+        register = table[register ^ byte]
+    return leaving[register]
 
 
+def _wide_crc(algorithm: Crc, table: tuple[int, ...], register: int, data: bytes) -> int:
+    for byte in data:
+        register = table[(register ^ byte) & 0xFF] ^ register >> 8
+    return algorithm.left(register)
+
+
+@lru_cache(maxsize=256)
 def _single_word_xor(algorithm: WordXor) -> Single:
     """Groups of words are XORed as a whole, whatever their sizes, and only their XOR is taken apart."""
     head, groups = algorithm.head, algorithm.groups
-    size = sum(groups)
-    starts = [8 * sum(groups[:number]) for number in range(len(groups))]
-    head_powers = _powers(16, head + 1 >> 1)
-    words = [(start, (1 << 8 * width) - 1) for start, width in zip(starts, groups, strict=True)]
+    size, head_powers = sum(groups), _powers(16, head + 1 >> 1)
+    words = [(8 * sum(groups[:number]), (1 << 8 * width) - 1) for number, width in enumerate(groups)]
 
     def word_xor(data: bytes) -> int:
-        found = int.from_bytes(data[:head], "little")
+        total = int.from_bytes(data[:head], "little")
         for power in head_powers:
-            found ^= found >> power
-        found &= 0xFFFF
+            total ^= total >> power
+        total &= 0xFFFF
         value = int.from_bytes(data[head:], "little")
         for power in _powers(8 * size, -((head - len(data)) // size)):
             value ^= value >> power
         for start, mask in words:
-            found ^= value >> start & mask
-        return found
+            total ^= value >> start & mask
+        return total
 
     return word_xor
-
-
-@lru_cache(maxsize=4096)
-def _powers(bits: int, count: int) -> tuple[int, ...]:
-    """By how much an integer is shifted and XORed onto itself until its lowest part is the XOR of so many parts."""
-    return tuple(bits << power for power in reversed(range(max(count - 1, 0).bit_length())))

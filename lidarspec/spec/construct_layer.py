@@ -23,50 +23,13 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import construct
 import numpy as np
-from construct import (
-    Array,
-    BitsInteger,
-    Bytes,
-    BytesInteger,
-    Const,
-    Construct,
-    ConstructError,
-    Container,
-    FormatField,
-    Struct,
-    Subconstruct,
-)
+from construct import Array, BitsInteger, Bytes, BytesInteger, Const, Construct, Container, FormatField, Struct, Subconstruct
 from construct.expr import BinExpr, ExprMixin, UniExpr
 
 from lidarspec.errors import SpecError
 from lidarspec.spec import tree
 from lidarspec.spec.bits import BitField, probe
 from lidarspec.spec.checksums import Checksum
-from lidarspec.spec.tree import (
-    Blind,
-    Blob,
-    Block,
-    Code,
-    Empty,
-    FieldInfo,
-    Formula,
-    Node,
-    Number,
-    Op,
-    Opaque,
-    Part,
-    Read,
-    Ref,
-    Repeat,
-    Scope,
-    Sealed,
-    Select,
-    Symbol,
-    Untraceable,
-    When,
-    nodes,
-    refs,
-)
 
 if TYPE_CHECKING:
     import random  # finding a sensor does without it
@@ -81,10 +44,10 @@ UNNAMED = "(constant)"
 
 
 #: what construct raises where bytes or values do not fit a struct.
-Fault = ConstructError
+Fault = construct.ConstructError
 
 
-class Mismatch(ConstructError):  # type: ignore[misc]
+class Mismatch(construct.ConstructError):  # type: ignore[misc]
     """A value on the wire that is not what the spec asks for; made a `WireError` by the engine."""
 
     def __init__(self, path: str, offset: int, expected: object, got: object, reason: str) -> None:
@@ -240,7 +203,7 @@ class NamedEnum(construct.Enum):  # type: ignore[misc]
 class Describing(Subconstruct):  # type: ignore[misc]
     """A part that only says something of the field below it: parses and builds what that does."""
 
-    def described(self, info: FieldInfo) -> FieldInfo:
+    def described(self, info: tree.FieldInfo) -> tree.FieldInfo:
         """What is known of the field, with what this part says of it."""
         raise NotImplementedError
 
@@ -434,7 +397,7 @@ def _check_measures(con: Construct, path: str, measure: tuple[float, float, str]
         path = f"{path}.{con.name}" if path else str(con.name)
         measure = (1, 0, "")
     if isinstance(con, Describing):
-        said = con.described(FieldInfo(""))
+        said = con.described(tree.FieldInfo(""))
         measure = (said.scale, said.offset, said.unit)
     is_number = isinstance(con, construct.FormatField | construct.BytesInteger | construct.BitsInteger)
     if is_number and found.setdefault(path, measure) != measure:
@@ -525,25 +488,25 @@ def _random_leaf(con: Construct, source: random.Random, scope: Any) -> Any:
     return con.parse(source.randbytes(con.sizeof()))
 
 
-def frame_tree(con: Construct) -> Node:
+def frame_tree(con: Construct) -> tree.Node:
     """The tree of a struct.
 
     Raises:
         SpecError: for a constant that its Enum has no value for.
     """
     first = _Builder({})
-    root = first.node(con, _Place(FieldInfo(""), None))
-    return _Builder(first.scopes).node(con, _Place(FieldInfo(""), None)) if first.rebuilding else root
+    root = first.node(con, _Place(tree.FieldInfo(""), None))
+    return _Builder(first.scopes).node(con, _Place(tree.FieldInfo(""), None)) if first.rebuilding else root
 
 
-def _traced(expression: Any, scope: Scope) -> Any:
+def _traced(expression: Any, scope: tree.Scope) -> Any:
     """What an expression comes to; construct's own are walked, since its ``~`` asks for the truth of a value."""
     if isinstance(expression, BinExpr):
         return expression.op(_traced(expression.lhs, scope), _traced(expression.rhs, scope))
     if isinstance(expression, UniExpr):
         operand = _traced(expression.operand, scope)
-        if expression.op is operator.not_ and isinstance(operand, Symbol):
-            return Symbol(Op("not", (operand.formula,)))
+        if expression.op is operator.not_ and isinstance(operand, tree.Symbol):
+            return tree.Symbol(tree.Op("not", (operand.formula,)))
         return expression.op(operand)
     return expression(scope) if callable(expression) else expression
 
@@ -567,7 +530,7 @@ def _whole_path(path: str, way: re.Match[str]) -> str:
 class _Fields:
     """What an expression sees when it is evaluated: values by name, as construct shows them."""
 
-    def __init__(self, read: Read, paths: tuple[str, ...]) -> None:
+    def __init__(self, read: tree.Read, paths: tuple[str, ...]) -> None:
         self._read, self._paths = read, paths
 
     def __getitem__(self, name: str) -> Any:
@@ -584,7 +547,7 @@ class _Fields:
         return self[name]
 
 
-def seen(info: FieldInfo, raw: int) -> Any:
+def seen(info: tree.FieldInfo, raw: int) -> Any:
     """A raw value as the expressions of a struct see it: where construct's Enum has a name for it, that name."""
     return construct.EnumIntegerString.new(raw, info.labels[raw]) if raw in info.labels else raw
 
@@ -594,7 +557,7 @@ def unnamed(raw: int) -> Any:
     return construct.EnumInteger(raw)
 
 
-def _evaluated(expression: Any, paths: tuple[str, ...], read: Read) -> Any:
+def _evaluated(expression: Any, paths: tuple[str, ...], read: tree.Read) -> Any:
     """The value of an expression in a struct; `paths` of that and of all around it, innermost first."""
     return expression(_Fields(read, paths)) if callable(expression) else expression
 
@@ -603,8 +566,8 @@ def _evaluated(expression: Any, paths: tuple[str, ...], read: Read) -> Any:
 class _Place:
     """Where in the tree a construct stands: what is said of it, what its expressions see, and whether it is a part of a bit block."""
 
-    info: FieldInfo
-    scope: Scope | None
+    info: tree.FieldInfo
+    scope: tree.Scope | None
     name: str = ""
     in_bits: bool = False
 
@@ -616,11 +579,11 @@ class _Place:
 class _Builder:
     """Makes the nodes of a struct; `scopes`: what was known at the end of each struct, for values that follow from later ones."""
 
-    def __init__(self, known: Mapping[str, Scope]) -> None:
-        self._known, self.scopes, self.rebuilding = known, dict[str, Scope](), False
-        self._asked: list[Ref] = []
+    def __init__(self, known: Mapping[str, tree.Scope]) -> None:
+        self._known, self.scopes, self.rebuilding = known, dict[str, tree.Scope](), False
+        self._asked: list[tree.Ref] = []
 
-    def node(self, con: Construct, place: _Place) -> Node:
+    def node(self, con: Construct, place: _Place) -> tree.Node:
         """The node of a construct, whatever it is."""
         inner, place = self._peeled(con, place)
         name, info = place.name, place.info
@@ -636,14 +599,14 @@ class _Builder:
         if isinstance(inner, Array):
             axis = axis_path(info)
             count = self._formula(inner.count, place)
-            return Repeat(name, axis, count, self.node(inner.subcon, place.inside(axes=(*info.axes, axis))))
+            return tree.Repeat(name, axis, count, self.node(inner.subcon, place.inside(axes=(*info.axes, axis))))
         if isinstance(inner, construct.IfThenElse):
             condition = self._formula(inner.condfunc, place)
             branches = (self.node(branch, place.inside(optional=True)) for branch in (inner.thensubcon, inner.elsesubcon))
-            return When(name, condition, *branches)
+            return tree.When(name, condition, *branches)
         if isinstance(inner, construct.Switch):
             return self._select(inner, place)
-        return Empty(name) if inner is construct.Pass else self._leaf(inner, place)
+        return tree.Empty(name) if inner is construct.Pass else self._leaf(inner, place)
 
     def _peeled(self, con: Construct, place: _Place) -> tuple[Construct, _Place]:
         """What is below the wrappers that only describe (name, unit, labels, constant), and what they say."""
@@ -664,11 +627,11 @@ class _Builder:
                 return con, place
             con = con.subcon
 
-    def _formula(self, expression: Any, place: _Place, known: Scope | None = None, *, is_key: bool = False) -> Formula:
+    def _formula(self, expression: Any, place: _Place, known: tree.Scope | None = None, *, is_key: bool = False) -> tree.Formula:
         """A count, length, condition or key as data, as far as it can be written down."""
         if isinstance(expression, int):
             return int(expression)
-        scope = next((scope for scope in (known, place.scope) if scope is not None), Scope(None, "", self._asked))
+        scope = next((scope for scope in (known, place.scope) if scope is not None), tree.Scope(None, "", self._asked))
         scope.asked.clear()
         blind = False
         try:
@@ -677,107 +640,108 @@ class _Builder:
                 reason = "a Python function of a field that may be left out"
             elif isinstance(value, bool | int):
                 return int(value)
-            elif not isinstance(value, Symbol):
+            elif not isinstance(value, tree.Symbol):
                 reason = f"an expression that gives {value!r}"
-            elif not is_key and isinstance(value.formula, Ref) and value.formula.info.labels:
+            elif not is_key and isinstance(value.formula, tree.Ref) and value.formula.info.labels:
                 reason = "an expression takes the name of a value for a number"
             else:
                 return value.formula
-        except Untraceable as untraceable:
-            reason, blind = str(untraceable), isinstance(untraceable, Blind)
+        except tree.Untraceable as untraceable:
+            reason, blind = str(untraceable), isinstance(untraceable, tree.Blind)
         except Exception as error:
             reason = f"a Python function of other fields ({type(error).__name__}: {error})"
         return self._code(expression, place, reason, tuple(scope.asked), blind=blind)
 
-    def _code(self, expression: Any, place: _Place, reason: str, asked: tuple[Ref, ...], *, blind: bool = False) -> Code:
+    def _code(self, expression: Any, place: _Place, reason: str, asked: tuple[tree.Ref, ...], *, blind: bool = False) -> tree.Code:
         paths, scope = list[str](), place.scope
         while scope is not None:
             paths.append(scope.path)
             scope = scope.parent
         function = functools.partial(_evaluated, expression, tuple(paths or [""]))
-        return Code(function, tuple(dict.fromkeys(asked)), f"{place.info.path}: {reason}", _spelled(expression, place.info.path), blind)
+        path = place.info.path
+        return tree.Code(function, tuple(dict.fromkeys(asked)), f"{path}: {reason}", _spelled(expression, path), blind)
 
-    def _select(self, con: construct.Switch, place: _Place) -> Select:
+    def _select(self, con: construct.Switch, place: _Place) -> tree.Select:
         key = self._formula(con.keyfunc, place, is_key=True)
-        labels = key.info.labels if isinstance(key, Ref) else {}
+        labels = key.info.labels if isinstance(key, tree.Ref) else {}
         raw = {name: value for value, name in labels.items()}
         # construct looks a value that has a name up by that name alone
         values = {case: raw.get(str(case), case) if isinstance(case, str) else case for case in con.cases if case not in labels}
         odd = [case for case, value in values.items() if not isinstance(value, int)]
-        if odd and not isinstance(key, Code):
-            named = isinstance(key, Ref) and isinstance(odd[0], str)
+        if odd and not isinstance(key, tree.Code):
+            named = isinstance(key, tree.Ref) and isinstance(odd[0], str)
             reason = f"{key.path} has no value named {odd[0]!r}" if named else f"a case for {odd[0]!r}, which is no integer"  # type: ignore[union-attr]
-            key = self._code(con.keyfunc, place, reason, tuple(refs(key)))
-        if isinstance(key, Code):
+            key = self._code(con.keyfunc, place, reason, tuple(tree.refs(key)))
+        if isinstance(key, tree.Code):
             values = {case: case for case in con.cases}
         cases = tuple((value, self._branch(con.cases[case], place)) for case, value in values.items())
-        return Select(place.name, key, cases, self._branch(con.default, place))
+        return tree.Select(place.name, key, cases, self._branch(con.default, place))
 
-    def _branch(self, con: Construct, place: _Place) -> Node:
+    def _branch(self, con: Construct, place: _Place) -> tree.Node:
         return self.node(con, place.inside(optional=True))
 
     def _struct(self, con: Struct, place: _Place) -> tree.Struct:
         info = place.info
-        scope = Scope(place.scope, info.path, self._asked)
+        scope = tree.Scope(place.scope, info.path, self._asked)
         if place.name and place.scope is not None:
             place.scope.add(place.name, scope)
         members = []
         for child in con.subcons:
             path = ".".join(part for part in (info.path, child.name) if part)
-            said = FieldInfo(path, info.axes, docs=info.docs if place.in_bits else "", optional=info.optional)
+            said = tree.FieldInfo(path, info.axes, docs=info.docs if place.in_bits else "", optional=info.optional)
             members.append(self.node(child, _Place(said, scope, child.name or "", place.in_bits)))
         self.scopes[info.path] = scope
         return tree.Struct(place.name, info.path, tuple(members), info.docs)
 
-    def _sealed(self, con: Sealing, place: _Place) -> Node:
+    def _sealed(self, con: Sealing, place: _Place) -> tree.Node:
         body = self.node(con.subcon, place)
         if not isinstance(body, tree.Struct):
-            return Opaque(place.name, place.info, type(con).__name__, "a checksum around something that is no struct", (body,))
+            return tree.Opaque(place.name, place.info, type(con).__name__, "a checksum around something that is no struct", (body,))
         prefix = f"{place.info.path}." if place.info.path else ""
         over = (prefix + con.over[0], prefix + con.over[-1]) if con.over is not None else None
-        return Sealed(body, tuple(prefix + name for name in con.fields), over, con.algorithm, tuple(sorted(con.absent)))
+        return tree.Sealed(body, tuple(prefix + name for name in con.fields), over, con.algorithm, tuple(sorted(con.absent)))
 
-    def _leaf(self, con: Construct, place: _Place) -> Node:
+    def _leaf(self, con: Construct, place: _Place) -> tree.Node:
         name, info = place.name, _typed(con, place.info)
         if name and place.scope is not None:
-            place.scope.add(name, Ref(info.path, info))
+            place.scope.add(name, tree.Ref(info.path, info))
         if isinstance(con, FormatField) and con.fmtstr[-1] != "?":
             kind = "float" if con.fmtstr[-1] in "efd" else "uint" if con.fmtstr[-1].isupper() else "int"
             big = con.fmtstr[0] in ">!" or (con.fmtstr[0] == "=" and sys.byteorder == "big")
-            node: Node = Number(info, con.length, kind, "big" if big else "little")  # type: ignore[arg-type]
+            node: tree.Node = tree.Number(info, con.length, kind, "big" if big else "little")  # type: ignore[arg-type]
         elif isinstance(con, BytesInteger) and not _is_odd(con):
-            node = Number(info, con.length, "int" if con.signed else "uint", "little" if con.swapped else "big")
+            node = tree.Number(info, con.length, "int" if con.signed else "uint", "little" if con.swapped else "big")
         elif isinstance(con, Bytes):
-            node = Blob(name, info, self._formula(con.length, place), info.const)
+            node = tree.Blob(name, info, self._formula(con.length, place), info.const)
         else:
             kind = type(con).__name__
             size = self._formula(con.length, place) if isinstance(con, construct.FixedSized) else None
-            node = Opaque(name, info, kind, f"{kind} has no fixed place", size=size, form=_form(con))
-        if not name and info.const is not None and not isinstance(node, Opaque):
-            return Blob("", info, con.length, con.build(info.const))
+            node = tree.Opaque(name, info, kind, f"{kind} has no fixed place", size=size, form=_form(con))
+        if not name and info.const is not None and not isinstance(node, tree.Opaque):
+            return tree.Blob("", info, con.length, con.build(info.const))
         return node
 
-    def _block(self, con: Construct, place: _Place) -> Node:
+    def _block(self, con: Construct, place: _Place) -> tree.Node:
         """A bit block: the bits of each field come from probing construct itself."""
         inside = self.node(con, replace(place, in_bits=True))
         try:
             size = int(con.sizeof())
             fields = _probed(con, size)
-        except (ConstructError, LookupError):
+        except (construct.ConstructError, LookupError):
             fields = None
         if fields is None:
             reason = "a bit block whose values are not plain bits of it"
-            return Opaque(place.name, place.info, type(con).__name__, reason, (inside,), in_bits=True)
-        infos = {node.info.path: node.info for node in nodes(inside) if isinstance(node, Number | Blob | Opaque)}
+            return tree.Opaque(place.name, place.info, type(con).__name__, reason, (inside,), in_bits=True)
+        infos = {node.info.path: node.info for node in tree.nodes(inside) if isinstance(node, tree.Number | tree.Blob | tree.Opaque)}
         parts = []
         for bits in fields:
             names = tuple(key for key in bits.keys if isinstance(key, str))
             info = infos[".".join(part for part in (place.info.path, *names) if part)]
-            parts.append(Part(info, bits, names, tuple(key for key in bits.keys if isinstance(key, int))))
-        return Block(place.name, place.info, size, tuple(parts))
+            parts.append(tree.Part(info, bits, names, tuple(key for key in bits.keys if isinstance(key, int))))
+        return tree.Block(place.name, place.info, size, tuple(parts))
 
 
-def axis_path(info: FieldInfo) -> str:
+def axis_path(info: tree.FieldInfo) -> str:
     """The name of the axis of an array at this place; an array directly in an array gets brackets."""
     path = info.path
     while path in info.axes:
@@ -791,7 +755,7 @@ def integer_type(bits: int, *, signed: bool = False) -> np.dtype[Any]:
     return np.dtype(f"{'i' if signed else 'u'}{size}")
 
 
-def _typed(con: Construct, info: FieldInfo) -> FieldInfo:
+def _typed(con: Construct, info: tree.FieldInfo) -> tree.FieldInfo:
     """What is known of a field, with the type of its values."""
     if isinstance(con, FormatField):
         code = con.fmtstr[-1]

@@ -16,20 +16,8 @@ from typing import Any
 from construct import Construct, Container
 
 from lidarspec.errors import UsageError
+from lidarspec.spec import construct_layer as layer
 from lidarspec.spec.checksums import Checksum
-from lidarspec.spec.construct_layer import (
-    Describing,
-    MarkedStruct,
-    Mismatch,
-    Sealing,
-    bit_width,
-    bytes_of,
-    member,
-    note,
-    prepare,
-    unwrap,
-    verifying,
-)
 from lidarspec.spec.tree import FieldInfo
 
 #: unit -> how many of the SI unit it is; only units that someone may type on the command line.
@@ -86,7 +74,7 @@ def duration(text: str) -> float:
     raise UsageError(f"{text!r} is no duration: a number with ms, s, min or h, such as 10s")
 
 
-class Scaled(Describing):
+class Scaled(layer.Describing):
     """A number on the wire with what it measures: ``physical = raw * scale + offset`` in `unit`.
 
     Parses and builds the raw number; the unit is used where physical values are asked for, and never twice.
@@ -106,7 +94,7 @@ class Scaled(Describing):
         return replace(info, scale=self.scale, offset=self.offset, unit=self.unit, measured=True)
 
 
-class Checksummed(Sealing):
+class Checksummed(layer.Sealing):
     """A struct sealed by one of its own fields, wherever in it that field stands. May nest.
 
     Args:
@@ -136,8 +124,8 @@ class Checksummed(Sealing):
         start = stream.tell()
         obj = self._marked._parsereport(stream, context, path)
         end = stream.tell()
-        note(context, path, start, end, obj, self)
-        if not verifying(context, checksums=True):
+        layer.note(context, path, start, end, obj, self)
+        if not layer.verifying(context, checksums=True):
             return obj
         stream.seek(start)
         data = stream.read(end - start)
@@ -147,11 +135,11 @@ class Checksummed(Sealing):
             width = (self._width() + 3) // 4
             expected, got = (f"0x{value:0{width}x}" for value in (computed, stored))
             reason = "checksum"
-            raise Mismatch(f"{path} -> {name.replace('.', ' -> ')}", self._span(obj, name)[0], expected, got, reason)
+            raise layer.Mismatch(f"{path} -> {name.replace('.', ' -> ')}", self._span(obj, name)[0], expected, got, reason)
         return obj
 
     def _build(self, obj: Any, stream: Any, context: Any, path: str) -> Any:
-        given = [member(obj, name, None) for name in self.fields]
+        given = [layer.member(obj, name, None) for name in self.fields]
         blank = obj
         for name, value in zip(self.fields, given, strict=True):
             blank = _replaced(blank, name, self._zero(name) if value is None else value)
@@ -166,7 +154,7 @@ class Checksummed(Sealing):
     @property
     def _marked(self) -> Construct:
         """The struct as a frame has it, which notes where its members stand; an author may also parse with it alone."""
-        return self.subcon if isinstance(unwrap(self.subcon), MarkedStruct) else prepare(self.subcon)
+        return self.subcon if isinstance(layer.unwrap(self.subcon), layer.MarkedStruct) else layer.prepare(self.subcon)
 
     def verdict(self, data: bytes, obj: Any, base: int = 0) -> tuple[int, int]:
         """The checksum that stands in one parsed struct and the one that should, for its bytes, which began at `base`."""
@@ -183,23 +171,23 @@ class Checksummed(Sealing):
 
     def _computed(self, data: bytes, obj: Any, base: int) -> int:
         if self.algorithm is None:
-            raise Mismatch("", 0, "a checksum algorithm", "none; a lidarspec_checksum hook has to supply it", "checksum")
+            raise layer.Mismatch("", 0, "a checksum algorithm", "none; a lidarspec_checksum hook has to supply it", "checksum")
         return self.algorithm(b"".join(data[a:b] for a, b in self.covered(obj, len(data), base)))
 
     def _stored(self, obj: Any) -> int:
         value = shift = 0
         for name in self.fields:
-            part = member(obj, name)
+            part = layer.member(obj, name)
             if isinstance(part, bytes):
                 part = int.from_bytes(part, self.algorithm.order if self.algorithm else "little")
             value |= int(part) << shift
-            shift += bit_width(self._field(name))
+            shift += layer.bit_width(self._field(name))
         return value
 
     def _filled(self, obj: Any, value: int) -> Any:
         for name in self.fields:
             con = self._field(name)
-            width = bit_width(con)
+            width = layer.bit_width(con)
             part: int | bytes = value & ((1 << width) - 1)
             if isinstance(self._zero(name), bytes):
                 assert self.algorithm is not None
@@ -209,25 +197,25 @@ class Checksummed(Sealing):
         return obj
 
     def _width(self) -> int:
-        return sum(bit_width(self._field(name)) for name in self.fields)
+        return sum(layer.bit_width(self._field(name)) for name in self.fields)
 
     def _field(self, name: str) -> Construct:
         con = self.subcon
         for part in name.split("."):
-            con = unwrap(unwrap(con)._subcons[part])
+            con = layer.unwrap(layer.unwrap(con)._subcons[part])
         return con
 
     def _zero(self, name: str) -> int | bytes:
-        return self._field(name).parse(bytes(8 * bit_width(self._field(name))))  # type: ignore[no-any-return]
+        return self._field(name).parse(bytes(8 * layer.bit_width(self._field(name))))  # type: ignore[no-any-return]
 
     def _span(self, obj: Any, name: str) -> tuple[int, int]:
         """Where a dotted field stands, in bytes of the stream that was parsed; a bit field by the bytes that hold it."""
         con, parts = self._marked, name.split(".")
         for depth, part in enumerate(parts):
             start, end = obj["_marks"][part]
-            con, obj = unwrap(con, bits=False)._subcons[part], obj[part]
-            if unwrap(con, bits=False) is not unwrap(con):
-                inside = bytes_of(con, parts[depth + 1 :])
+            con, obj = layer.unwrap(con, bits=False)._subcons[part], obj[part]
+            if layer.unwrap(con, bits=False) is not layer.unwrap(con):
+                inside = layer.bytes_of(con, parts[depth + 1 :])
                 return start + min(inside), start + max(inside) + 1
         return start, end
 

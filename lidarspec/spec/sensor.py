@@ -96,7 +96,7 @@ class Sensor(Spec):
 
     def example(self, frame: str, *, seed: int = 0) -> bytes:
         """The bytes of a valid frame with seeded random content."""
-        from lidarspec.simulation.frame_maker import example
+        from lidarspec.framing.examples import example
 
         return example(self, frame, seed=seed)
 

@@ -571,30 +571,17 @@ def _no_integer(sign: str) -> Any:
     raise Untraceable(f"an expression with {sign!r}, which need not give an integer")
 
 
-def _operators() -> None:
-    both = {
-        "add": "+",
-        "sub": "-",
-        "mul": "*",
-        "floordiv": "//",
-        "mod": "%",
-        "and": "&",
-        "or": "|",
-        "xor": "^",
-        "lshift": "<<",
-        "rshift": ">>",
-    }
-    for name, symbol in both.items():
-        setattr(Symbol, f"__{name}__", lambda self, other, symbol=symbol: _traced_operation(symbol, self, other))
-        setattr(Symbol, f"__r{name}__", lambda self, other, symbol=symbol: _traced_operation(symbol, other, self))
-    for name, symbol in {"eq": "==", "ne": "!=", "lt": "<", "le": "<=", "gt": ">", "ge": ">="}.items():
-        setattr(Symbol, f"__{name}__", lambda self, other, symbol=symbol: _traced_operation(symbol, self, other))
-    for name, sign in {"truediv": "/", "pow": "**", "divmod": "divmod", "matmul": "@"}.items():
-        for full in (f"__{name}__", f"__r{name}__"):
-            setattr(Symbol, full, lambda self, other, sign=sign: _no_integer(sign))
-
-
-_operators()
+_SYMBOLS = {
+    **{"add": "+", "sub": "-", "mul": "*", "floordiv": "//", "mod": "%", "and": "&", "or": "|", "xor": "^", "lshift": "<<", "rshift": ">>"},
+    **{"eq": "==", "ne": "!=", "lt": "<", "le": "<=", "gt": ">", "ge": ">="},
+}
+for _name, _symbol in _SYMBOLS.items():
+    setattr(Symbol, f"__{_name}__", lambda self, other, symbol=_symbol: _traced_operation(symbol, self, other))
+    if _symbol not in COMPARISONS:
+        setattr(Symbol, f"__r{_name}__", lambda self, other, symbol=_symbol: _traced_operation(symbol, other, self))
+for _name, _symbol in {"truediv": "/", "pow": "**", "divmod": "divmod", "matmul": "@"}.items():
+    for _full in (f"__{_name}__", f"__r{_name}__"):
+        setattr(Symbol, _full, lambda self, other, sign=_symbol: _no_integer(sign))
 
 
 def _labelled(ref: Ref, label: str) -> int:

@@ -19,10 +19,11 @@ from numpy.typing import NDArray
 from lidarspec.columns.columns import Fields, aligned, unpadded
 from lidarspec.columns.graph import Node, sample_of, trace, traverse
 from lidarspec.errors import LidarSpecError, SpecError, UsageError
+from lidarspec.framing.examples import examples
 from lidarspec.framing.frame_engine import CompiledCodec, codec
 from lidarspec.packets.packets import Packets
 from lidarspec.points.plain import evaluate
-from lidarspec.simulation.frame_maker import FrameMaker, examples, sealed
+from lidarspec.simulation.frame_maker import FrameMaker, sealed
 from lidarspec.simulation.scenes import Room, furnished
 from lidarspec.simulation.simulator import simulation
 from lidarspec.spec import OnWrap, Polar

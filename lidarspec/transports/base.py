@@ -9,14 +9,19 @@ import sys
 import time
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TypeVar
 from urllib.parse import parse_qs
 
 from lidarspec.errors import SourceError, UnknownOption, UsageError, suggest
+from lidarspec.spec.description import Spec
+from lidarspec.spec.links import Link
 from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.protocol import Disconnected
 
 #: options that every live SOURCE takes: the address of the link that commands go over, where it is not that of the data.
 COMMON = frozenset({"control"})
+L = TypeVar("L", bound=Link)
 _SWITCH = {"0": False, "1": True, "false": False, "true": True, "off": False, "on": True}
 
 
@@ -83,6 +88,11 @@ class Address:
         return found[1] or found[2] or "", port
 
 
+def with_option(source: str | Path, name: str, value: object) -> str:
+    """A SOURCE with an option more behind its question mark."""
+    return f"{source}{'&' if '?' in str(source) else '?'}{name}={value}"
+
+
 class HostClock:
     """Wall-clock times that the monotonic clock carries on: no interval between two of them jumps when the clock is set."""
 
@@ -118,6 +128,12 @@ def reason(error: Exception | str) -> str:
     if isinstance(error, OSError) and error.errno:
         return os.strerror(error.errno)
     return str(error)
+
+
+def data_link(sensor: Spec | None, kind: type[L]) -> L | None:
+    """The data link of a sensor, where it is of this kind."""
+    link = sensor.links.get("data") if sensor is not None else None
+    return link if isinstance(link, kind) else None
 
 
 def named(sensor: Sensor | None) -> str:

@@ -16,20 +16,14 @@ from typing import BinaryIO
 from lidarspec.captures.bulk import Batch, CaptureBatches
 from lidarspec.captures.pcap import CaptureReader, CaptureStats, StreamReader, is_stream_capture
 from lidarspec.captures.records import is_capture
-from lidarspec.errors import SourceError, WireError
-from lidarspec.recording.format import MAGIC, Header, Record
-from lidarspec.recording.recordings import Recording
+from lidarspec.errors import SourceError, WireError, system_errors
+from lidarspec.recording.format import MAGIC, Header, Record, Recording
 from lidarspec.transports.protocol import Chunk, Transport
 
 #: events behind which a frame begun earlier does not go on.
 INTERRUPTIONS = frozenset({"disconnect", "reconnect", "dropped"})
 #: bytes read at once.
 BLOCK = 1 << 18
-
-
-def is_recording(head: bytes) -> bool:
-    """Whether a file that begins so is a recording."""
-    return head[: len(MAGIC)] == MAGIC
 
 
 class RecordingTransport(Transport):
@@ -106,11 +100,9 @@ class FileTransport(Transport):
         self.warnings: list[str] = []
 
     def chunks(self) -> Iterator[Chunk]:
-        try:
+        with system_errors(self._path):
             while block := self._file.read(BLOCK):
                 yield Chunk(block)
-        except OSError as error:
-            raise SourceError(f"{self._path}: {error.strerror or error}") from None
 
     def write(self, data: bytes) -> None:
         raise SourceError(f"{self._path} is a file: nothing can be sent to it")
@@ -177,8 +169,7 @@ class StreamCaptureTransport(FileTransport):
 
     def chunks(self) -> Iterator[Chunk]:
         reader = StreamReader(self._file)
-        for packet in reader:
-            yield Chunk(packet.data, packet.at or None)
+        yield from (Chunk(packet.data, packet.at or None) for packet in reader)
         if reader.stats.truncated_tail:
             self.warnings.append(f"{self._path} is cut off in its last record; everything before it was read")
 
@@ -191,15 +182,11 @@ def open_file(path: str, *, sender: str | None = None) -> FileTransport | Record
     """
     if path == "-":
         return FileTransport("standard input", sys.stdin.buffer)
-    with contextlib.ExitStack() as undo:
-        try:
-            file = open(path, "rb")  # noqa: SIM115  the transport closes it
-            undo.callback(file.close)
-            head = file.peek(24)[:24]
-        except OSError as error:
-            raise SourceError(f"{path}: {error.strerror or error}") from None
-        undo.pop_all()
-    if is_recording(head):
+    with system_errors(path), contextlib.ExitStack() as undo:
+        file = undo.enter_context(open(path, "rb"))
+        head = file.peek(24)[:24]
+        undo.pop_all()  # the transport closes it
+    if head.startswith(MAGIC):
         file.close()
         return RecordingTransport(path, sender=sender)
     if is_stream_capture(head):

@@ -36,8 +36,7 @@ def transport(source: str | Path, sensor: Sensor | None = None) -> Transport:
         SourceError: where it cannot be opened.
         SpecError: where a plugin gives something that is no `Transport`.
     """
-    device = named(source)
-    text = str(source) if device is None else device.source
+    text = resolved(source)
     address = live_address(text)
     if address is not None:
         return _opened(address, sensor)
@@ -63,6 +62,17 @@ def live(source: str | Path, sensor: Sensor | None = None) -> LiveTransport:
         return opened
     opened.close()
     raise UsageError(f"{source} is a file: nothing can be sent to it")
+
+
+def resolved(source: str | Path) -> str:
+    """The SOURCE itself: that of the device where it is the name of one in `lidarspec.toml`."""
+    device = named(source)
+    return str(source) if device is None else device.source
+
+
+def is_live(source: str | Path) -> bool:
+    """Whether a SOURCE, or the device of this name, goes on by itself."""
+    return live_address(resolved(source)) is not None
 
 
 def live_address(source: str | Path) -> Address | None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -106,9 +106,8 @@ def udp_users(port: int) -> tuple[User, ...] | None:
     return tuple(sorted(set(_holding(inodes.__contains__)), key=lambda user: user.pid)) if inodes else None
 
 
-def _holding(wanted: object) -> Iterator[User]:
+def _holding(wanted: Callable[[str], bool]) -> Iterator[User]:
     """The programs of which an open file leads to what is wanted."""
-    assert callable(wanted)
     for process in _PROCESSES.glob("[0-9]*") if _PROCESSES.is_dir() else ():
         if int(process.name) == os.getpid():
             continue

@@ -10,7 +10,8 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from types import TracebackType
+from typing import Any, Self
 
 from lidarspec.errors import SourceError, UsageError
 
@@ -56,6 +57,20 @@ class Chunk:
     receiver: tuple[str, int] | None = None
     gap: bool = False
     quiet: bool = False
+
+
+class Closing:
+    """A context manager that is closed at the end."""
+
+    def close(self) -> None:
+        """Give everything back."""
+        raise NotImplementedError
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self.close()
 
 
 class Transport(ABC):

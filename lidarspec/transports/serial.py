@@ -17,7 +17,7 @@ import serial
 from lidarspec.errors import SourceError, UsageError
 from lidarspec.spec.links import Serial
 from lidarspec.spec.sensor import Sensor
-from lidarspec.transports.base import Address, HostClock, failure, lost, named, readable, reason
+from lidarspec.transports.base import Address, HostClock, data_link, failure, lost, named, readable, reason
 from lidarspec.transports.protocol import Chunk, LiveTransport
 
 try:
@@ -160,8 +160,7 @@ def connect(address: Address, sensor: Sensor | None = None) -> SerialTransport:
         SourceError: where it cannot be opened.
     """
     address.check(OPTIONS)
-    link = sensor.links.get("data") if sensor is not None else None
-    declared = link if isinstance(link, Serial) else None
+    declared = data_link(sensor, Serial)
     baud = address.number("baud", 50, 20_000_000) or (declared.baud if declared else None)
     if not address.place:
         raise UsageError(f"{address.text}: it names no port, as in serial:///dev/ttyUSB0")

@@ -15,7 +15,6 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from types import TracebackType
 
 from lidarspec.errors import UsageError, WireError
 from lidarspec.recording.recorders import recorder
@@ -23,7 +22,7 @@ from lidarspec.simulation.device import SECOND, SimulatedDevice
 from lidarspec.spec.links import Udp
 from lidarspec.transports.open_url import transport
 from lidarspec.transports.outlets import HERE, Outlet
-from lidarspec.transports.protocol import POLL, Chunk, Disconnected
+from lidarspec.transports.protocol import POLL, Chunk, Closing, Disconnected
 from lidarspec.wire.build import build_command
 
 #: seconds at least between two sendings.
@@ -80,7 +79,7 @@ def serve(
             device.receive(data, time.monotonic_ns())
 
 
-class Served:
+class Served(Closing):
     """A simulated sensor at an outlet, in a thread of its own; a context manager.
 
     Attributes:
@@ -127,12 +126,6 @@ class Served:
         self.outlet.close()
         if self._failure:
             raise self._failure[0]
-
-    def __enter__(self) -> Served:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None) -> None:
-        self.close()
 
     def _order(self, order: Callable[[], None]) -> None:
         """Have something done between two turns of the thread, and wait until it has taken effect."""

@@ -14,7 +14,7 @@ from lidarspec.simulation.faults import FAULTS, faults_of
 from lidarspec.simulation.scenes import read_scene
 from lidarspec.spec.links import Serial
 from lidarspec.spec.sensor import Sensor
-from lidarspec.transports.base import Address, HostClock, failure
+from lidarspec.transports.base import Address, HostClock, data_link, failure
 from lidarspec.transports.protocol import Chunk, Disconnected, LiveTransport
 
 OPTIONS = ("rate", "scene", "seed", *FAULTS)
@@ -32,9 +32,9 @@ class SimulatedTransport(LiveTransport):
 
     def __init__(self, label: str, sensor: Sensor, device: SimulatedDevice) -> None:
         self.label, self.device, self.sensor = label, device, sensor
-        link = self.sensor.links.get("data")
+        link = data_link(sensor, Serial)
         self.datagrams = self.sensor.datagrams
-        self.baud = link.baud if isinstance(link, Serial) else None
+        self.baud = link.baud if link else None
         self.overflow = "block" if math.isinf(device.rate) else "drop_oldest"
         self._changed, self._clock = threading.Condition(), HostClock()
         self._rested = 0
@@ -92,7 +92,10 @@ def simulated_device(sensor: Sensor, options: Mapping[str, str]) -> SimulatedDev
     """
     scene = read_scene(options["scene"]) if "scene" in options else None
     faults = faults_of({name: text for name, text in options.items() if name in FAULTS})
-    return SimulatedDevice(sensor, scene=scene, seed=_seed(options.get("seed", "0")), rate=rate_of(options.get("rate", "1")), faults=faults)
+    seed = options.get("seed", "0")
+    if not seed.isdecimal():
+        raise UsageError(f"seed is a whole number, not {seed!r}")
+    return SimulatedDevice(sensor, scene=scene, seed=int(seed), rate=rate_of(options.get("rate", "1")), faults=faults)
 
 
 def rate_of(text: str) -> float:
@@ -126,9 +129,3 @@ def connect(address: Address, sensor: Sensor | None = None) -> SimulatedTranspor
     assert named is not None
     simulated = sensor if sensor is not None and sensor.id == named.id else named
     return SimulatedTransport(address.text, simulated, simulated_device(simulated, address.options))
-
-
-def _seed(text: str) -> int:
-    if not text.isdecimal():
-        raise UsageError(f"seed is a whole number, not {text!r}")
-    return int(text)

@@ -10,7 +10,7 @@ import time
 from lidarspec.errors import SourceError, UsageError
 from lidarspec.spec.links import Tcp
 from lidarspec.spec.sensor import Sensor
-from lidarspec.transports.base import Address, HostClock, failure, lost, named, readable, reason
+from lidarspec.transports.base import Address, HostClock, data_link, failure, lost, named, readable, reason
 from lidarspec.transports.protocol import Chunk, Disconnected, LiveTransport
 
 #: bytes read at once, and seconds between two reads, in which a fast stream gathers some.
@@ -101,8 +101,8 @@ def connect(address: Address, sensor: Sensor | None = None) -> TcpTransport:
     """
     address.check(())
     host, port = address.host_and_port()
-    link = sensor.links.get("data") if sensor is not None else None
-    port = port or (link.port if isinstance(link, Tcp) else None)
+    link = data_link(sensor, Tcp)
+    port = port or (link.port if link else None)
     if not host or port is None:
         raise UsageError(f"{address.text}: host and port are needed, as in tcp://192.168.1.200:2111")
     return TcpTransport(address.text, host, port, sensor=sensor)

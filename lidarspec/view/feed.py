@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -187,29 +187,24 @@ class Feed:
     Args:
         device: open; stays so.
         played: scans of a file come at the times that they bear; else as fast as they are read.
-        each: called with each batch of packets.
-        seen: called with each scan and piece of one.
 
     Attributes:
+        packets: the batch that the last look took in, None where it took none.
+        scans: the scans, and pieces of one, that the last `pump` gave.
         scan: the newest one; the first piece stands in until there is a whole one.
         number: how many scans have come.
         ended: whether the input has.
         meter: the figures.
     """
 
-    def __init__(
-        self,
-        device: Device,
-        *,
-        played: bool = False,
-        each: Callable[[Packets], None] | None = None,
-        seen: Callable[[Scan], None] | None = None,
-    ) -> None:
+    def __init__(self, device: Device, *, played: bool = False) -> None:
         self.device, self.number = device, 0
         self.scan: Scan | None = None
+        self.packets: Packets | None = None
+        self.scans: list[Scan] = []
         self.meter = Meter(device.stats, sequenced=device.sensor.sequence is not None)
-        self._played, self._each, self._seen = played and not device.is_live, each, seen
-        self._packets, self._stream = device.packets(wait=LOOK), ScanStream(device.sensor, device.mount)
+        self._played = played and not device.is_live
+        self._batches, self._stream = device.packets(wait=LOOK), ScanStream(device.sensor, device.mount)
         self._waiting: deque[Scan] = deque()
         self._disconnects, self._read_out = 0, False
         self._due: float | None = None
@@ -226,6 +221,7 @@ class Feed:
         Raises:
             LidarSpecError: where the source fails.
         """
+        self.scans = []
         while not self.ended:
             if self._waiting:
                 self._show_due(until)
@@ -240,7 +236,7 @@ class Feed:
 
     def _take(self) -> None:
         """The next batch, or the end."""
-        packets = next(self._packets, None)
+        self.packets = packets = next(self._batches, None)
         if packets is None:
             self._read_out = True
             self._keep(self._stream.finish())
@@ -252,8 +248,6 @@ class Feed:
         if len(packets):
             self.meter.packets(packets)
             self._keep(self._stream.add(packets))
-            if self._each is not None:
-                self._each(packets)
 
     def _keep(self, scans: list[Scan]) -> None:
         if self._played:
@@ -264,8 +258,7 @@ class Feed:
 
     def _show(self, scan: Scan) -> None:
         self.meter.scan(scan)
-        if self._seen is not None:
-            self._seen(scan)
+        self.scans.append(scan)
         if scan.complete or self.scan is None or not self.scan.complete:
             self.scan = scan
             self.number += 1

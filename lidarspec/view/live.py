@@ -1,19 +1,28 @@
-"""The window that shows a sensor at work: keys in, pictures out, a dozen times a second at most."""
+"""The window that shows a sensor at work: keys in, pictures out, a dozen times a second at most.
+
+Around the picture stand title, figures, the meaning of the colours and the keys. A `Switch` records the source while it is on.
+"""
 
 from __future__ import annotations
 
 import math
+import textwrap
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
 
+from lidarspec.errors import LidarSpecError, SourceError
+from lidarspec.recording.appending import Appender, Log
+from lidarspec.recording.recorders import recorder
 from lidarspec.scans.scans import Scan
-from lidarspec.view.canvas import ALARM, GOOD, STRONG, Cells
-from lidarspec.view.feed import Feed, Reading
-from lidarspec.view.panel import Figure, Layout, Title, composed, figures_of, help_page, message
+from lidarspec.transports.protocol import Chunk, Transport
+from lidarspec.view.canvas import ALARM, FAINT, GOOD, LABEL, PLAIN, RAMPS, STEPS, STRONG, Cells
+from lidarspec.view.feed import NOTHING, Feed, Reading
 from lidarspec.view.polar import Look, look, picture
-from lidarspec.view.recording import Switch
 from lidarspec.view.screen import Screen
 
 #: seconds from picture to picture at least, and between two readings of the figures.
@@ -23,6 +32,196 @@ ZOOM, MOVE = 1.25, 0.2
 #: a picture that is found to need less than this share of its reach is drawn larger.
 ROOMY = 0.7
 _MOVES = {"up": (1, 0), "down": (-1, 0), "left": (0, 1), "right": (0, -1)}
+#: cells of the figures beside the picture, and of the narrowest picture that has them there.
+BESIDE, NARROWEST = 25, 36
+#: from what error or loss rate on a figure is an alarm.
+ALARMING = 0.01
+KEYS = (
+    ("space", "pause and go on"),
+    ("c", "colour by range or intensity"),
+    ("+ -", "zoom in and out"),
+    ("arrows", "move what is in the middle"),
+    ("0", "all of it again"),
+    ("r", "record to a file, and stop; not of files"),
+    ("q", "quit"),
+    ("?", "this page"),
+)
+_HINTS = (("space pause", "c colour"), ("+ - zoom", "0 all"), ("? help", "q quit"))
+
+Figure = tuple[str, str, int]
+#: names tried for a file before it is given up.
+TRIES = 100
+
+
+class Switch:
+    """Stands where a recorder does, and hands on to a new one for each time that it is switched on.
+
+    Args:
+        source: as the user called it.
+        folder: where the files go.
+
+    Attributes:
+        name: of the file that is being written, None while it is off.
+        trouble: why it could not be switched on, "" where it could.
+        written: files and the bytes of the wire in them, those that are closed.
+    """
+
+    def __init__(self, source: str, folder: Path) -> None:
+        self._source, self._folder = source, folder
+        self._opened: Transport | None = None
+        self._recorder: Appender | None = None
+        self.sensor_id = ""
+        self.name: str | None = None
+        self.trouble = ""
+        self.written: list[tuple[str, int]] = []
+
+    def attached(self, opened: Transport) -> Log:
+        """Itself, as the recorder of an open transport: what `open(record=...)` calls."""
+        self._opened = opened
+        return self
+
+    def toggle(self) -> None:
+        """Start a file named after the sensor and the time, or end the one that is being written."""
+        self.trouble = ""
+        try:
+            if self._recorder is None:
+                self._begin()
+            else:
+                self.close()
+        except LidarSpecError as error:
+            self.trouble = str(error)
+
+    @property
+    def error(self) -> SourceError | None:
+        """What went wrong with the file that is being written."""
+        return self._recorder.error if self._recorder is not None else None
+
+    def write(self, chunk: Chunk, direction: Literal["in", "out"] = "in") -> None:
+        """Record what arrived or was sent, while it is on."""
+        current = self._recorder
+        if current is not None:
+            current.write(chunk, direction)
+
+    def event(self, name: str, at: int | None = None, **details: Any) -> None:
+        """Record that something happened, while it is on."""
+        current = self._recorder
+        if current is not None:
+            current.event(name, at, **details)
+
+    def close(self) -> None:
+        """End the file that is being written.
+
+        Raises:
+            SourceError: where it could not be written.
+        """
+        current, self._recorder = self._recorder, None
+        if current is not None:
+            self.written.append((current.path, current.bytes))
+            self.name = None
+            current.close()
+
+    def _begin(self) -> None:
+        assert self._opened is not None
+        begin = f"{self.sensor_id}-{time.strftime('%Y%m%d-%H%M%S')}"
+        names = (f"{begin}{f'-{number}' if number else ''}.lsr" for number in range(TRIES))
+        path = self._folder / next(name for name in names if not (self._folder / name).exists())
+        opened = self._opened
+        self._recorder = recorder(path, self.sensor_id, self._source, datagrams=opened.datagrams, baud=opened.baud)
+        self.name = path.name
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Where things are: the picture's size, and whether the figures stand beside or below it."""
+
+    width: int
+    height: int
+    beside: bool
+
+    @classmethod
+    def of(cls, columns: int, lines: int) -> Layout:
+        """For a window; a narrow one has one line of figures below."""
+        beside = columns >= NARROWEST + BESIDE + 1 and lines >= 14
+        return cls(columns - BESIDE - 1 if beside else columns, max(lines - (1 if beside else 2), 1), beside)
+
+
+def _write_beside(whole: Cells, left: int, figures: Sequence[Figure], look: Look) -> None:
+    """What stands beside the picture: figures, the meaning of the colours, keys."""
+    columns, lines = whole.size
+    for row in range(1, lines):
+        whole.write(row, left, "│", FAINT)
+    for row, (name, value, ink) in enumerate(figures[: lines - 1], start=1):
+        whole.write(row, left + 2, name, LABEL)
+        whole.write(row, columns - 1 - len(value), value, ink)
+    row = len(figures) + 2
+    if row + 2 <= lines - len(_HINTS):
+        _write_ramp(whole, row, left + 2, look)
+    if row + 2 <= lines - len(_HINTS) - 1:
+        for place, (first, second) in enumerate(_HINTS):
+            whole.write(lines - len(_HINTS) + place, left + 2, f"{first:<13}{second}", FAINT)
+
+
+def help_page(columns: int, lines: int) -> Cells:
+    """The keys, in a box, for the middle of a window."""
+    width = min(max(len(text) for _, text in KEYS) + 14, columns)
+    page = Cells.blank(width, min(len(KEYS) + 4, lines))
+    page.write(0, 0, "─" * width, FAINT)
+    page.write(0, 2, " keys ", LABEL)
+    for row, (key, text) in enumerate(KEYS, start=2):
+        page.write(row, 3, key, STRONG)
+        page.write(row, 11, text)
+    page.write(page.size[1] - 1, 0, "─" * width, FAINT)
+    return page
+
+
+def message(columns: int, text: str) -> Cells:
+    """Some lines of text for the middle of a picture."""
+    lines = textwrap.wrap(text, max(columns - 4, 1))
+    found = Cells.blank(min(max(map(len, lines)) + 4, columns), len(lines) + 2)
+    for row, line in enumerate(lines, start=1):
+        found.write(row, 2, line, ALARM)
+    return found
+
+
+def _write_title(whole: Cells, sensor: str, source: str, state: str, ink: int) -> None:
+    room = whole.size[0] - len(sensor) - len(state) - 6
+    shown = source if len(source) <= room else "..." + source[len(source) - room + 3 :] if room > 8 else ""
+    whole.write(0, 1, sensor, STRONG)
+    whole.write(0, len(sensor) + 3, shown, LABEL)
+    whole.write(0, whole.size[0] - len(state) - 1, state, ink)
+
+
+def _write_line(whole: Cells, figures: Sequence[Figure]) -> None:
+    columns, lines = whole.size
+    column = 1
+    for name, value, ink in figures:
+        if value == "-":
+            continue
+        if column + len(name) + len(value) + 1 >= columns:
+            break
+        whole.write(lines - 1, column, name, LABEL)
+        whole.write(lines - 1, column + len(name) + 1, value, ink)
+        column += len(name) + len(value) + 3
+
+
+def _write_ramp(whole: Cells, row: int, column: int, look: Look) -> None:
+    """What the colours mean: a bar of the ramp, and the values at its ends."""
+    for step in range(STEPS):
+        whole.write(row, column + step, "━", RAMPS[look.ramp] + step)
+    end = f"{look.full:g} m" if look.ramp == "range" else f"{look.full:g}"
+    whole.write(row + 1, column, "0", LABEL)
+    whole.write(row + 1, column + (STEPS - len(look.ramp)) // 2, look.ramp, LABEL)
+    whole.write(row + 1, column + STEPS - len(end), end, LABEL)
+
+
+def _rate(name: str, rate: float | None) -> Figure:
+    if rate is None:
+        return name, "-", PLAIN
+    return name, f"{rate:.2%}".replace("%", " %"), ALARM if rate >= ALARMING else PLAIN
+
+
+def _told(value: float | None, form: str, times: float = 1.0) -> str:
+    return "-" if value is None else form.format(value * times)
 
 
 @dataclass(frozen=True)
@@ -128,7 +327,13 @@ class Window:
         if told:
             note = message(layout.width, told)
             drawn.paste(max((layout.height - note.size[1]) // 2, 0), (layout.width - note.size[0]) // 2, note)
-        whole = composed(columns, lines, self._title(), drawn, self._figures(), found)
+        whole = Cells.blank(columns, lines)
+        _write_title(whole, self._feed.device.sensor.id, self._source, *self._state())
+        whole.paste(1, 0, drawn)
+        if layout.beside:
+            _write_beside(whole, layout.width, self._figures(), found)
+        else:
+            _write_line(whole, self._figures())
         if self.choice.helped:
             page = help_page(columns, lines)
             whole.paste(max((lines - page.size[1]) // 2, 0), max((columns - page.size[0]) // 2, 0), page)
@@ -165,31 +370,37 @@ class Window:
             self.choice = replace(self.choice, ramp=found.ramp)
         return replace(self._look, reach=self._look.reach / self.choice.zoom, middle=self.choice.middle)
 
-    def _title(self) -> Title:
-        device, choice = self._feed.device, self.choice
+    def _state(self) -> tuple[str, int]:
+        """What is going on, in a word, and the ink of it."""
+        device = self._feed.device
         if self._record is not None and self._record.name is not None:
-            state, ink = f"● {self._record.name}", ALARM
-        elif choice.paused:
-            state, ink = "‖ paused", STRONG
-        elif not self._live:
-            state, ink = ("end", STRONG) if self._feed.ended else ("▶ playing", GOOD)
-        else:
-            state, ink = ("● live", GOOD) if device.state == "streaming" else (device.state, ALARM)
-        return Title(device.sensor.id, self._source, state, ink)
+            return f"● {self._record.name}", ALARM
+        if self.choice.paused:
+            return "‖ paused", STRONG
+        if not self._live:
+            return ("end", STRONG) if self._feed.ended else ("▶ playing", GOOD)
+        return ("● live", GOOD) if device.state == "streaming" else (device.state, ALARM)
 
     def _figures(self) -> list[Figure]:
-        device = self._feed.device
-        points = self._scan.points if self._scan is not None else None
-        valid = points.range[points.valid] if points is not None else np.empty(0)
-        near = float(valid.min()) if len(valid) else None
-        return figures_of(
-            self._reading,
-            points=0 if points is None else len(points),
-            valid=len(valid),
-            near=near if near is not None and math.isfinite(near) else None,
-            lost=device.stats.lost,
-            queue=None if device.queued is None else str(device.queued),
-        )
+        """The figures of the last moments and of the scan that is shown, each with its ink."""
+        device, reading = self._feed.device, self._reading or NOTHING
+        points = len(self._scan) if self._scan is not None else 0
+        valid = self._scan.points.range[self._scan.points.valid] if self._scan is not None else np.empty(0)
+        near = float(valid.min()) if len(valid) else math.nan
+        lost = device.stats.lost
+        figures = [
+            ("speed", _told(reading.speed_hz, "{:.1f} Hz"), STRONG),
+            ("packets", _told(reading.packet_rate_hz, "{:.0f} /s"), PLAIN),
+            ("input", _told(reading.bytes_per_s, "{:.1f} kB/s", 1e-3), PLAIN),
+            ("points", str(points), PLAIN),
+            ("valid", f"{len(valid) / points:.1%}".replace("%", " %") if points else "-", PLAIN),
+            ("nearest", _told(near if math.isfinite(near) else None, "{:.2f} m"), PLAIN),
+            _rate("errors", reading.error_rate if self._reading else None),
+            _rate("skipped", reading.skipped_rate if self._reading else None),
+            ("lost", str(lost) if lost or reading.loss_rate is not None else "-", ALARM if lost else PLAIN),
+            ("jitter", _told(reading.jitter_s, "{:.2f} ms", 1e3), PLAIN),
+        ]
+        return figures if device.queued is None else [*figures, ("queue", str(device.queued), PLAIN)]
 
     def _complaint(self) -> str:
         """What is to be said in place of points."""

@@ -12,7 +12,7 @@ import signal
 import sys
 import time
 from types import FrameType, TracebackType
-from typing import Any, Protocol, TextIO
+from typing import Any, Self, TextIO
 
 import numpy as np
 from rich.console import Console
@@ -32,29 +32,19 @@ BEGIN, END = "\x1b[?2026h", "\x1b[?2026l"
 BRIDGED = 4
 
 
-class Keys(Protocol):
-    """A keyboard: a context manager that gives the terminal back as it was."""
+class Keys:
+    """A keyboard: a context manager that gives the terminal back as it was. This one has no keys, but time passes."""
 
     def read(self, timeout: float) -> list[str]:
         """The keys that came within some seconds: characters, "up" "down" "left" "right", "escape"; empty where none did."""
-
-    def __enter__(self) -> Keys: ...
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None) -> None: ...
-
-
-class NoKeys:
-    """Where there is no keyboard, time still passes."""
-
-    def read(self, timeout: float) -> list[str]:
         time.sleep(timeout)
         return []
 
-    def __enter__(self) -> NoKeys:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None) -> None:
-        pass
+        """Give the terminal back."""
 
 
 def decoded(text: str) -> list[str]:
@@ -79,7 +69,7 @@ def decoded(text: str) -> list[str]:
 if sys.platform == "win32":
     import msvcrt
 
-    class Keyboard:
+    class Keyboard(Keys):
         """The console's keyboard."""
 
         def read(self, timeout: float) -> list[str]:
@@ -95,22 +85,16 @@ if sys.platform == "win32":
                 raise KeyboardInterrupt
             return [key for key in found if key]
 
-        def __enter__(self) -> Keyboard:
-            return self
-
-        def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None) -> None:
-            pass
-
     def keyboard(*, taken: bool = False) -> Keys:
         """The keyboard of the console; one without keys where there is none."""
-        return Keyboard() if sys.stdin.isatty() and not taken else NoKeys()
+        return Keyboard() if sys.stdin.isatty() and not taken else Keys()
 
 else:
     import select
     import termios
     import tty
 
-    class Keyboard:
+    class Keyboard(Keys):
         """A terminal whose keys come one by one and unseen; Ctrl-C and Ctrl-Z stay signals."""
 
         def __init__(self, descriptor: int) -> None:
@@ -127,7 +111,7 @@ else:
                 raise EOFError("the terminal was closed")
             return decoded(data.decode("utf-8", "replace"))
 
-        def __enter__(self) -> Keyboard:
+        def __enter__(self) -> Self:
             tty.setcbreak(self._descriptor, termios.TCSANOW)
             return self
 
@@ -144,7 +128,7 @@ else:
         try:
             return Keyboard(sys.stdin.fileno()) if sys.stdin.isatty() and not taken else Keyboard(os.open("/dev/tty", os.O_RDONLY))
         except (OSError, ValueError, termios.error):
-            return NoKeys()
+            return Keys()
 
 
 class Terminated(BaseException):

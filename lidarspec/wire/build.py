@@ -122,11 +122,8 @@ def _open(node: Node, given: Any, values: Container) -> None:
         case Sealed():
             _open(node.body, given, values)
             for path in node.fields:
-                *parents, last = path.split(".")
-                target = values
-                for parent in parents:
-                    target = target.setdefault(parent, Container())
-                target.setdefault(last, None)
+                holder, name = _place(values, path)
+                holder.setdefault(name, None)
         case Struct():
             for member in node.members:
                 if isinstance(member, Struct | Sealed) and isinstance(given.get(member.name), dict):
@@ -144,10 +141,7 @@ def _fill_counts(given: Container, table: Schema) -> None:
         scope, asked = _scope(given, inner), refs(count)
         if scope is None or not isinstance(scope.get(name), list | bytes) or not asked:
             continue
-        *levels, field = asked[0].path.split(".")
-        holder = given
-        for level in levels:
-            holder = holder.setdefault(level, Container())
+        holder, field = _place(given, asked[0].path)
         if isinstance(holder, dict) and holder.get(field) is None:
             read = functools.partial(given_value, given, table.fields)
             holder[field] = _solved(count, read, holder, field, len(scope[name]), table.fields.get(asked[0].path), axis)
@@ -195,9 +189,10 @@ def build_command(sensor: Spec, name: str, arguments: Mapping[str, Any]) -> byte
     if command.frame is None:
         return b""
     fields = schema(sensor.frames[command.frame].tree).fields
-    values: dict[str, Any] = {}
+    values = Container()
     for path, value in command.values.items():
-        _put(values, path, value)
+        holder, name = _place(values, path)
+        holder[name] = value
     for argument, (path, low, high) in command.args.items():
         if argument not in arguments:
             raise MissingField(argument, place=place)
@@ -206,15 +201,17 @@ def build_command(sensor: Spec, name: str, arguments: Mapping[str, Any]) -> byte
             raise OutOfRange(argument, value, low, high, unit=fields[path].unit, place=place)
         raw = fields[path].raw(value)
         bottom, top = fields[path].limits if fields[path].kind == "int" else (raw, raw)
-        _put(values, path, min(max(raw, bottom), top))
+        holder, name = _place(values, path)
+        holder[name] = min(max(raw, bottom), top)
     return build(sensor, command.frame, None, values)
 
 
-def _put(values: dict[str, Any], path: str, value: Any) -> None:
+def _place(values: Any, path: str) -> tuple[Any, str]:
+    """Which of nested mappings holds a field, and under which name; those on the way are made where they are not there."""
     *parents, last = path.split(".")
     for parent in parents:
-        values = values.setdefault(parent, {})
-    values[last] = value
+        values = values.setdefault(parent, Container())
+    return values, last
 
 
 def _solved(count: Formula, read: Read, holder: Container, field: str, length: int, info: FieldInfo | None, axis: str) -> int:

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from lidarspec.spec.bits import BitField
 from lidarspec.spec.checksums import Checksum, Single, single
 from lidarspec.spec.tree import FieldInfo, Node
+from lidarspec.wire.row_checksums import over
 
 Bytes2D = NDArray[np.uint8]
 
@@ -184,7 +185,7 @@ class Seal:
             sums: asked first, before the algorithm.
         """
         values = None if sums is None else sums(self, rows)
-        return self.algorithm.over(rows, self.spans or ((0, 0),)) if values is None else values
+        return over(self.algorithm, rows, self.spans or ((0, 0),)) if values is None else values
 
     def fill(self, rows: Bytes2D) -> None:
         """Write the right value into each frame."""

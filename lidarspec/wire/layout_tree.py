@@ -25,29 +25,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.errors import SpecError
+from lidarspec.spec import tree
 from lidarspec.spec.bits import BitField, whole_bytes
 from lidarspec.spec.description import Frame
-from lidarspec.spec.tree import (
-    Blob,
-    Block,
-    Code,
-    FieldInfo,
-    Formula,
-    Node,
-    Number,
-    Opaque,
-    Ref,
-    Repeat,
-    Sealed,
-    Select,
-    Struct,
-    When,
-    children,
-    evaluated,
-    formulas,
-    nodes,
-    refs,
-)
 from lidarspec.wire.layout import Layout, Leaf, Seal
 from lidarspec.wire.schema import schema
 
@@ -72,7 +52,7 @@ class TooLong(Exception):
     """The header claims more than the longest length that the frame declares, or no byte at all."""
 
 
-def layout_of(root: Node, values: Mapping[str, int], limit: int) -> Layout:
+def layout_of(root: tree.Node, values: Mapping[str, int], limit: int) -> Layout:
     """The layout of the frames whose header fields have these values.
 
     Args:
@@ -92,7 +72,7 @@ def layout_of(root: Node, values: Mapping[str, int], limit: int) -> Layout:
     return walk.layout()
 
 
-def prefix_of(root: Node, limit: int) -> dict[int, tuple[int, int]]:
+def prefix_of(root: tree.Node, limit: int) -> dict[int, tuple[int, int]]:
     """The constants whose place depends on no header field: offset -> (mask, value)."""
     walk = _Walk({}, limit)
     with contextlib.suppress(Exception):  # what comes before counts
@@ -100,34 +80,34 @@ def prefix_of(root: Node, limit: int) -> dict[int, tuple[int, int]]:
     return walk.constants
 
 
-def check_compilable(root: Node) -> None:
+def check_compilable(root: tree.Node) -> None:
     """Raise `NotCompilable` if any part of a tree has no computable place, whatever the header."""
     _check(root, "", in_array=False)
 
 
-def _check(node: Node, path: str, *, in_array: bool) -> None:
+def _check(node: tree.Node, path: str, *, in_array: bool) -> None:
     match node:
-        case Opaque():
+        case tree.Opaque():
             raise NotCompilable(node.info.path, node.reason)
-        case Sealed():
+        case tree.Sealed():
             if in_array:
                 raise NotCompilable(path, "a checksum inside an array")
             _ = node.algorithm
-        case Block():
+        case tree.Block():
             for part in node.parts:
                 if len(part.indices) > 1:
                     raise NotCompilable(part.info.path, "an array of arrays of bits")
-    for formula in formulas(node):
-        if isinstance(formula, Code) and formula.blind:
+    for formula in tree.formulas(node):
+        if isinstance(formula, tree.Code) and formula.blind:
             raise NotCompilable(path, formula.reason.partition(": ")[2])
-        for ref in refs(formula):
+        for ref in tree.refs(formula):
             check_control(ref.info)
-    for child in children(node):
-        below = f"{path}.{child.name}".strip(".") if isinstance(node, Struct) else path
-        _check(child, below, in_array=in_array or isinstance(node, Repeat))
+    for child in tree.children(node):
+        below = f"{path}.{child.name}".strip(".") if isinstance(node, tree.Struct) else path
+        _check(child, below, in_array=in_array or isinstance(node, tree.Repeat))
 
 
-def check_control(info: FieldInfo) -> None:
+def check_control(info: tree.FieldInfo) -> None:
     """Raise `NotCompilable` if a layout cannot be made to depend on a field."""
     if info.kind == "int" and info.axes and info.axes[-1].strip("[]") != info.path:
         raise NotCompilable(info.path, "elements of one array differ in layout")
@@ -146,7 +126,7 @@ class _Walk:
     constants: dict[int, tuple[int, int]] = field(default_factory=dict)
     seals: list[Seal] = field(default_factory=list)
     places: dict[str, tuple[int, int]] = field(default_factory=dict)
-    branches: dict[Node, Node] = field(default_factory=dict)
+    branches: dict[tree.Node, tree.Node] = field(default_factory=dict)
     lengths: dict[str, int] = field(default_factory=dict)
     #: what expressions can ask for by now: a field, the path of a struct, None for what the header leaves out.
     parts: dict[str, Leaf | str | None] = field(default_factory=dict)
@@ -156,7 +136,7 @@ class _Walk:
         seals, following = tuple(self.seals), tuple(self._following())
         return Layout(self.cursor, self.leaves, self.constants, seals, self.places, self.branches, following, self.lengths)
 
-    def read(self, path: str) -> tuple[FieldInfo, int] | str | None:
+    def read(self, path: str) -> tuple[tree.FieldInfo, int] | str | None:
         """A field by its path, for formulas; see `lidarspec.spec.tree.Read`."""
         if path not in self.parts:
             scope, _, name = path.rpartition(".")
@@ -169,40 +149,40 @@ class _Walk:
             raise Unknown(part)
         return part.info, self.values[path]
 
-    def visit(self, node: Node, path: str, shape: tuple[int, ...] = (), strides: tuple[int, ...] = ()) -> None:
+    def visit(self, node: tree.Node, path: str, shape: tuple[int, ...] = (), strides: tuple[int, ...] = ()) -> None:
         """Go through a part; `shape` and `strides` of the arrays that it is in."""
         start = self.cursor
         match node:
-            case Struct():
+            case tree.Struct():
                 self._struct(node, path, shape, strides)
-            case Sealed():
+            case tree.Sealed():
                 self.visit(node.body, path, shape, strides)
                 self._seal(node, start)
-            case Number() | Blob() | Block():
+            case tree.Number() | tree.Blob() | tree.Block():
                 self._field(node, path, shape, strides)
-            case Repeat():
+            case tree.Repeat():
                 self._array(node, path, shape, strides)
-            case When():
+            case tree.When():
                 self.branches[node] = node.then if self._value(node.condition) else node.otherwise
                 self.visit(self.branches[node], path, shape, strides)
-            case Select():
+            case tree.Select():
                 self.branches[node] = dict(node.cases).get(self._value(node.key), node.default)
                 self.visit(self.branches[node], path, shape, strides)
-            case Opaque():
+            case tree.Opaque():
                 raise NotCompilable(node.info.path, node.reason)
         if self.cursor > self.limit:
             raise TooLong(path)
         if path and not shape:
             self.places[path] = (start, self.cursor)
 
-    def _struct(self, node: Struct, path: str, shape: tuple[int, ...], strides: tuple[int, ...]) -> None:
+    def _struct(self, node: tree.Struct, path: str, shape: tuple[int, ...], strides: tuple[int, ...]) -> None:
         self.parts.setdefault(path, path)
         for member in node.members:
             below = f"{node.path}.{member.name}".strip(".") if member.name else ""
             self.visit(member, below, shape, strides)
             self.parts.setdefault(below, None)
 
-    def _array(self, node: Repeat, path: str, shape: tuple[int, ...], strides: tuple[int, ...]) -> None:
+    def _array(self, node: tree.Repeat, path: str, shape: tuple[int, ...], strides: tuple[int, ...]) -> None:
         count, start = self._count(node.count, path), self.cursor
         self.lengths[node.axis] = 0 if 0 in shape else count
         if count > self.limit:
@@ -222,7 +202,7 @@ class _Walk:
             self.constants.update({offset + size * index: byte for index in range(count)})
         self.cursor = start + size * count
 
-    def _no_element(self, node: Node, path: str, shape: tuple[int, ...], strides: tuple[int, ...]) -> None:
+    def _no_element(self, node: tree.Node, path: str, shape: tuple[int, ...], strides: tuple[int, ...]) -> None:
         """Go through an element that the array has none of, for its fields alone: nothing is asked of it."""
         start, constants = self.cursor, dict(self.constants)
         try:
@@ -233,28 +213,28 @@ class _Walk:
             pass  # what construct never looks at cannot fail
         self.cursor, self.constants = start, constants
 
-    def _field(self, node: Number | Blob | Block, path: str, shape: tuple[int, ...], strides: tuple[int, ...]) -> None:
+    def _field(self, node: tree.Number | tree.Blob | tree.Block, path: str, shape: tuple[int, ...], strides: tuple[int, ...]) -> None:
         match node:
-            case Number(info, size, _, order):
+            case tree.Number(info, size, _, order):
                 is_word = size in (1, 2, 4, 8) and info.dtype is not None
                 wire = np.dtype(f"{'<' if order == 'little' else '>'}{info.dtype.str[1:]}") if is_word else None  # type: ignore[union-attr]
                 elements = () if is_word else (whole_bytes(size, order, signed=node.kind == "int"),)
                 self._add(Leaf(info, self.cursor, shape, strides, size, wire, elements))
                 if info.const is not None:
                     self._constant(node.encoded(info.const))
-            case Blob():
+            case tree.Blob():
                 size = self._count(node.size, path)
                 if node.name:
                     self._add(Leaf(node.info, self.cursor, (*shape, size), (*strides, 1), size, np.dtype("u1")))
                 self._constant(node.const or b"")
-            case Block():
+            case tree.Block():
                 size = node.size
                 self._block(node, path, shape, strides)
         self.cursor += size
 
-    def _block(self, node: Block, path: str, shape: tuple[int, ...], strides: tuple[int, ...]) -> None:
+    def _block(self, node: tree.Block, path: str, shape: tuple[int, ...], strides: tuple[int, ...]) -> None:
         groups: dict[str, list[BitField]] = {}
-        infos: dict[str, FieldInfo] = {}
+        infos: dict[str, tree.FieldInfo] = {}
         for part in node.parts:
             names = ".".join(name for name in (path, *part.names) if name)
             groups.setdefault(names, []).append(part.bits)
@@ -286,7 +266,7 @@ class _Walk:
         if leaf.shape and len(leaf.shape) > len(leaf.strides) - (leaf.info.kind == "bytes"):  # bytes, or an array within a bit block
             self.lengths[leaf.info.axes[-1]] = 0 if 0 in leaf.shape[:-1] else leaf.shape[-1]
 
-    def _seal(self, node: Sealed, start: int) -> None:
+    def _seal(self, node: tree.Sealed, start: int) -> None:
         leaves = tuple(self.leaves[path] for path in node.fields)
         if node.over is not None:
             spans = [(self.places[node.over[0]][0], self.places[node.over[1]][1])]
@@ -301,18 +281,18 @@ class _Walk:
         for leaf in self.leaves.values():
             if leaf.info.rebuilt is not None and not leaf.shape:
                 with contextlib.suppress(Exception):  # of the others: construct evaluates them when a frame is built
-                    yield leaf, operator.index(evaluated(leaf.info.rebuilt, self._read_known))
+                    yield leaf, operator.index(tree.evaluated(leaf.info.rebuilt, self._read_known))
 
-    def _read_known(self, path: str) -> tuple[FieldInfo, int] | str | None:
+    def _read_known(self, path: str) -> tuple[tree.FieldInfo, int] | str | None:
         part = self.parts[path]
         if isinstance(part, Leaf) and isinstance(part.info.const, int) and path not in self.values:
             return part.info, part.info.const
         return self.read(path)
 
-    def _value(self, formula: Formula) -> Any:
-        return evaluated(formula, self.read)
+    def _value(self, formula: tree.Formula) -> Any:
+        return tree.evaluated(formula, self.read)
 
-    def _count(self, formula: Formula, path: str) -> int:
+    def _count(self, formula: tree.Formula, path: str) -> int:
         count = operator.index(self._value(formula))
         if count < 0:
             raise TooLong(path)
@@ -330,38 +310,11 @@ def _held(leaf: Leaf) -> tuple[int, int]:
 Draw = Callable[[random.Random], int]
 
 
-def choose(root: Node, limit: int, source: random.Random, drawn: Mapping[str, Draw]) -> tuple[Layout, dict[str, int]]:
-    """A layout of a header chosen at random, with the values of the fields it depends on, by path.
-
-    Args:
-        limit: the longest frame, in bytes.
-        drawn: field path -> what draws its value in place of chance.
-
-    Raises:
-        SpecError: where hundreds of headers give no frame.
-    """
-    keys = sorted(_switch_keys(root))
-    for _ in range(400):
-        with contextlib.suppress(TooLong, ArithmeticError, LookupError, TypeError, ValueError):
-            return _chosen(root, limit, source, drawn, keys)
-    raise SpecError("no header was found that gives a frame within its longest length")
-
-
-def _chosen(root: Node, limit: int, source: random.Random, drawn: Mapping[str, Draw], keys: list[int]) -> tuple[Layout, dict[str, int]]:
-    values: dict[str, int] = {}
-    while True:
-        try:
-            return layout_of(root, values, limit), values
-        except Unknown as unknown:
-            own = drawn.get(unknown.leaf.info.path)
-            values[unknown.leaf.info.path] = own(source) if own else _some_value(source, unknown.leaf, keys)
-
-
-def _switch_keys(root: Node) -> Iterator[int]:
+def _switch_keys(root: tree.Node) -> Iterator[int]:
     """The values of keys that have no name: fields are known to have those with one."""
-    for node in nodes(root):
-        if isinstance(node, Select):
-            labels = node.key.info.labels if isinstance(node.key, Ref) else ()
+    for node in tree.nodes(root):
+        if isinstance(node, tree.Select):
+            labels = node.key.info.labels if isinstance(node.key, tree.Ref) else ()
             yield from (key for key, _ in node.cases if isinstance(key, int) and key not in labels)
 
 
@@ -397,7 +350,6 @@ class _Node:
     result: Layout | Refused | None = None
 
 
-_NONE = np.empty(0, np.intp)
 Group = tuple[Layout | Refused, NDArray[np.intp]]
 
 
@@ -431,24 +383,18 @@ class HeaderTree:
         prefix: the constants whose place depends on no header field: offset -> (mask, value).
     """
 
-    def __init__(self, frame: Node, limit: int) -> None:
+    def __init__(self, frame: tree.Node, limit: int) -> None:
         self._frame, self._limit = frame, limit
         self._root, self._size = _Node(), 0
         self.prefix = prefix_of(frame, limit)
 
-    def classify(self, buffer: NDArray[np.uint8], offsets: NDArray[np.intp]) -> tuple[list[Group], NDArray[np.intp]]:
-        """The candidates at `offsets`, sorted by layout.
-
-        Returns:
-            (layout or refusal, indices into `offsets`) for each kind; and the indices of those whose header is not
-            all there.
-        """
+    def classify(self, buffer: NDArray[np.uint8], offsets: NDArray[np.intp]) -> list[Group]:
+        """The candidates at `offsets`, sorted by layout: (layout or refusal, indices) for each, without those whose header is cut off."""
         if self._size > REMEMBERED:
             self._root, self._size = _Node(), 0
         if isinstance(self._root.result, Layout) and len(offsets):
-            return [(self._root.result, np.arange(len(offsets)))], _NONE
+            return [(self._root.result, np.arange(len(offsets)))]
         groups: list[Group] = []
-        short: list[NDArray[np.intp]] = []
         stack = [(self._root, np.arange(len(offsets)))] if len(offsets) else []
         while stack:
             node, which = stack.pop()
@@ -457,8 +403,8 @@ class HeaderTree:
             if node.result is not None:
                 groups.append((node.result, which))
             elif node.leaf is not None:
-                self._branch(node, node.leaf, buffer, offsets, which, stack, short)
-        return groups, np.concatenate(short) if short else _NONE
+                stack += self._branched(node, node.leaf, buffer, offsets, which)
+        return groups
 
     def common(self, rows: NDArray[np.uint8]) -> Layout | None:
         """The layout of candidates, one a row, if they have one and the fields that decide it are the same in all; else None."""
@@ -476,7 +422,7 @@ class HeaderTree:
             node = node.children.get(node.leaf.scalar(frame))
         if node is not None and node.result is not None:
             return node.result
-        groups, _ = self.classify(np.frombuffer(frame, np.uint8), np.zeros(1, np.intp))
+        groups = self.classify(np.frombuffer(frame, np.uint8), np.zeros(1, np.intp))
         return groups[0][0] if groups else None
 
     def asked(self, frame: bytes) -> list[Leaf]:
@@ -487,42 +433,49 @@ class HeaderTree:
             node = node.children[node.leaf.scalar(frame)]
         return found
 
-    def choose(
-        self, source: random.Random, drawn: Mapping[str, Callable[[random.Random], int]] | None = None
-    ) -> tuple[Layout, dict[str, int]]:
-        """A layout of a header chosen at random, with the values of the fields it depends on, by path; see `choose`."""
-        return choose(self._frame, self._limit, source, drawn or {})
+    def choose(self, source: random.Random, drawn: Mapping[str, Draw] | None = None) -> tuple[Layout, dict[str, int]]:
+        """A layout of a header chosen at random, with the values of the fields it depends on, by path.
 
-    def _branch(
-        self,
-        node: _Node,
-        leaf: Leaf,
-        buffer: NDArray[np.uint8],
-        offsets: NDArray[np.intp],
-        which: NDArray[np.intp],
-        stack: list[tuple[_Node, NDArray[np.intp]]],
-        short: list[NDArray[np.intp]],
-    ) -> None:
+        Args:
+            drawn: field path -> what draws its value in place of chance.
+
+        Raises:
+            SpecError: where hundreds of headers give no frame.
+        """
+        keys = sorted(_switch_keys(self._frame))
+        for _ in range(400):
+            with contextlib.suppress(TooLong, ArithmeticError, LookupError, TypeError, ValueError):
+                return self._chosen(source, drawn or {}, keys)
+        raise SpecError("no header was found that gives a frame within its longest length")
+
+    def _chosen(self, source: random.Random, drawn: Mapping[str, Draw], keys: list[int]) -> tuple[Layout, dict[str, int]]:
+        values: dict[str, int] = {}
+        while True:
+            try:
+                return layout_of(self._frame, values, self._limit), values
+            except Unknown as unknown:
+                own = drawn.get(unknown.leaf.info.path)
+                values[unknown.leaf.info.path] = own(source) if own else _some_value(source, unknown.leaf, keys)
+
+    def _branched(
+        self, node: _Node, leaf: Leaf, buffer: NDArray[np.uint8], offsets: NDArray[np.intp], which: NDArray[np.intp]
+    ) -> list[tuple[_Node, NDArray[np.intp]]]:
+        """The branches below a node, each with those of the candidates that have its value."""
         there = offsets[which] + leaf.offset + leaf.size <= len(buffer)
-        if not there.all():
-            short.append(which[~there])
-            which = which[there]
+        which = which if there.all() else which[there]
         if not len(which):
-            return
+            return []
         values = leaf.at(leaf.offset).load(rows_at(buffer, offsets[which] + leaf.offset, leaf.size))
         if np.count_nonzero(values == values[0]) == len(values):
-            stack.append((node.children.setdefault(values.item(0), _Node()), which))
-            return
+            return [(node.children.setdefault(values.item(0), _Node()), which)]
         few = _few(values)
         if few is not None:
-            stack.extend((node.children.setdefault(value, _Node()), which[values == value]) for value in few)
-            return
+            return [(node.children.setdefault(value, _Node()), which[values == value]) for value in few]
         order = np.argsort(values, kind="stable")
         values = values[order]
         edges = [0, *(np.flatnonzero(values[1:] != values[:-1]) + 1).tolist(), len(values)]
         which = which[order]
-        for start, stop in pairwise(edges):
-            stack.append((node.children.setdefault(int(values[start]), _Node()), which[start:stop]))
+        return [(node.children.setdefault(int(values[start]), _Node()), which[start:stop]) for start, stop in pairwise(edges)]
 
     def _explore(self, sample: NDArray[np.uint8]) -> None:
         """Find the layout of one sample, and add the fields that decide it to the tree; as far as the sample goes."""

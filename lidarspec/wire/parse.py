@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import functools
 import io
+import re
 import struct
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal
@@ -268,7 +269,7 @@ def _parse_as(sensor: Spec, name: str, data: bytes, *, verify: bool) -> Any:
 def _first_byte(sensor: Spec, name: str, data: bytes, path: str, offset: int) -> int:
     """Where a field begins; within a bit block construct counts bits, and the layout knows the byte."""
     layout = layout_of(sensor, name, data)
-    leaf = layout.leaves.get("".join(_without_indices(path))) if isinstance(layout, Layout) else None
+    leaf = layout.leaves.get(_without_indices(path)) if isinstance(layout, Layout) else None
     if leaf is None or leaf.wire is not None or not leaf.elements:
         return offset
     indices = [int(part.partition("]")[0]) for part in path.split("[")[1:]]
@@ -292,21 +293,16 @@ def _truncated(sensor: Spec, name: str, data: bytes, path: str) -> WireError:
 
 def _at_end(layout: Layout, path: str, end: int) -> tuple[int, int]:
     """Size and start of the element that the end of the data falls into or precedes."""
-    plain = "".join(part for part in _without_indices(path))
+    plain = _without_indices(path)
     for known, leaf in layout.leaves.items():
         if known == plain or known.startswith(f"{plain}."):
-            starts, arrays = [leaf.offset], len(leaf.shape) - (leaf.info.kind == "bytes")
-            for length, stride in list(zip(leaf.shape, leaf.strides, strict=False))[:arrays]:
-                starts = [start + stride * index for start in starts for index in range(length)]
-            inside = [start for start in starts if start + leaf.size > end]
-            size = leaf.size
-            return (size, inside[0]) if inside and inside[0] <= end else (size, min(inside[0] if inside else end, end))
+            starts = _offsets(leaf, leaf.shape[: len(leaf.shape) - (leaf.info.kind == "bytes")])
+            return leaf.size, min(next((start for start in starts if start + leaf.size > end), end), end)
     return 0, end
 
 
 def _without_indices(path: str) -> str:
-    parts = path.split("[")
-    return parts[0] + "".join(part.partition("]")[2] for part in parts[1:])
+    return re.sub(r"\[\d+\]", "", path)
 
 
 def layout_of(sensor: Spec, name: str, data: bytes) -> Layout | Refused | None:
@@ -334,9 +330,5 @@ def _likeliest(sensor: Spec, data: bytes, faults: list[WireError]) -> WireError:
         starts.append(f"{name} {bytes(run).hex(' ')}".strip())
     begins = f"begins with {data[:4].hex(' ')}" if data else "is empty"
     return WireError(
-        f"no frame type fits: the data {begins}, expected {', '.join(starts)}",
-        sensor=sensor.id,
-        expected=starts,
-        got=data[:4],
-        data=data,
+        f"no frame type fits: the data {begins}, expected {', '.join(starts)}", sensor=sensor.id, expected=starts, got=data[:4], data=data
     )

@@ -11,30 +11,10 @@ import itertools
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 
+from lidarspec.spec import tree
 from lidarspec.spec.bits import BitField
 from lidarspec.spec.construct_layer import UNNAMED
 from lidarspec.spec.description import Frame
-from lidarspec.spec.tree import (
-    Blob,
-    Block,
-    Code,
-    FieldInfo,
-    Formula,
-    Node,
-    Number,
-    Op,
-    Opaque,
-    Part,
-    Ref,
-    Repeat,
-    Sealed,
-    Select,
-    Struct,
-    When,
-    children,
-    nodes,
-    written,
-)
 
 INDICES = "ijklmn"
 
@@ -85,7 +65,7 @@ class Extent:
 
 def wire_table(frame: Frame) -> tuple[WireRow, ...]:
     """The rows of a frame type in the order of the wire."""
-    seals = {path: _sealed(node) for node in nodes(frame.tree) if isinstance(node, Sealed) for path in node.fields}
+    seals = {path: _sealed(node) for node in tree.nodes(frame.tree) if isinstance(node, tree.Sealed) for path in node.fields}
     return tuple(_rows(frame.tree, "", Extent(), "", seals))
 
 
@@ -94,35 +74,35 @@ def frame_size(frame: Frame) -> str:
     return str(extent(frame.tree))
 
 
-def extent(node: Node, shown: str = "") -> Extent:
+def extent(node: tree.Node, shown: str = "") -> Extent:
     """The size of a part; `shown` is how it is called where its size is only known from its bytes: "size(points[i].text)"."""
     match node:
-        case Number() | Block():
+        case tree.Number() | tree.Block():
             return Extent(node.size)
-        case Blob() | Opaque():
+        case tree.Blob() | tree.Opaque():
             return _length(node.size, shown)
-        case Struct():
+        case tree.Struct():
             return sum((extent(member, _member(shown, member)) for member in node.members), Extent())
-        case Sealed():
+        case tree.Sealed():
             return extent(node.body, shown)
-        case Repeat():
+        case tree.Repeat():
             return extent(node.element, _element(shown)[0]).times(_count(node))
-        case When() | Select():
-            sizes = {extent(branch, shown) for branch in children(node)}
+        case tree.When() | tree.Select():
+            sizes = {extent(branch, shown) for branch in tree.children(node)}
             return sizes.pop() if len(sizes) == 1 else _length(None, shown)
     return Extent()
 
 
-def _length(size: Formula | None, shown: str) -> Extent:
+def _length(size: tree.Formula | None, shown: str) -> Extent:
     """A declared length; None for one that only the bytes tell."""
     return Extent(size) if isinstance(size, int) else Extent(0, (f"size({shown})" if size is None else phrase(size),))
 
 
-def _count(node: Repeat) -> int | str:
+def _count(node: tree.Repeat) -> int | str:
     return node.count if isinstance(node.count, int) else phrase(node.count)
 
 
-def _member(shown: str, member: Node) -> str:
+def _member(shown: str, member: tree.Node) -> str:
     """How a member of what is shown so is shown."""
     return ".".join(filter(None, (shown, member.name or UNNAMED)))
 
@@ -133,44 +113,44 @@ def _element(shown: str) -> tuple[str, str]:
     return f"{shown}[{index}]", index
 
 
-def _rows(node: Node, shown: str, start: Extent, condition: str, seals: Mapping[str, str]) -> Iterator[WireRow]:
+def _rows(node: tree.Node, shown: str, start: Extent, condition: str, seals: Mapping[str, str]) -> Iterator[WireRow]:
     """The rows of a part that begins at `start`, and is there under a condition."""
     match node:
-        case Struct():
+        case tree.Struct():
             for member in node.members:
                 below = _member(shown, member)
                 yield from _rows(member, below, start, condition, seals)
                 start = start + extent(member, below)
-        case Sealed():
+        case tree.Sealed():
             yield from _rows(node.body, shown, start, condition, seals)
-        case Repeat():
+        case tree.Repeat():
             element, index = _element(shown)
             size = extent(node.element, element)
             says = "; ".join(filter(None, (condition, f"{_count(node)} elements of {size}")))
             yield WireRow(str(start), str(size.times(_count(node))), "array", shown, "", says)
             yield from _rows(node.element, element, start + size.times(index), condition, seals)
-        case When() | Select():
+        case tree.When() | tree.Select():
             for asked, branch in branches(node):
                 yield from _rows(branch, shown, start, asked, seals)
-        case Block():
+        case tree.Block():
             for part in node.parts:
                 yield _row(part.info, str(start), *_bits(part), _part(shown, part), condition, seals)
-        case Number() | Blob() | Opaque():
-            length = "varies" if isinstance(node, Opaque) and node.size is None else str(extent(node, shown))
-            info = replace(node.info, const=node.const) if isinstance(node, Blob) else node.info
+        case tree.Number() | tree.Blob() | tree.Opaque():
+            length = "varies" if isinstance(node, tree.Opaque) and node.size is None else str(extent(node, shown))
+            info = replace(node.info, const=node.const) if isinstance(node, tree.Blob) else node.info
             yield _row(info, str(start), length, _type(node), shown, condition, seals)
 
 
-def _row(info: FieldInfo, offset: str, size: str, kind: str, shown: str, condition: str, seals: Mapping[str, str]) -> WireRow:
+def _row(info: tree.FieldInfo, offset: str, size: str, kind: str, shown: str, condition: str, seals: Mapping[str, str]) -> WireRow:
     says = "; ".join(filter(None, (condition, meaning(info), seals.get(info.path, ""))))
     return WireRow(offset, size, kind, shown, unit_text(info), says)
 
 
-def _part(shown: str, part: Part) -> str:
+def _part(shown: str, part: tree.Part) -> str:
     return ".".join(filter(None, (shown, *part.names))) + "".join(f"[{index}]" for index in part.indices)
 
 
-def _bits(part: Part) -> tuple[str, str]:
+def _bits(part: tree.Part) -> tuple[str, str]:
     """Size and type of a part of a block: bits, or bytes for an integer that is wider than any number."""
     if part.info.dtype is None and part.bits.run is not None:
         order, _, size = part.bits.run
@@ -178,31 +158,31 @@ def _bits(part: Part) -> tuple[str, str]:
     return f"{part.bits.width} bit{'s' * (part.bits.width > 1)}", bit_text(part.bits)
 
 
-def _type(node: Number | Blob | Opaque) -> str:
+def _type(node: tree.Number | tree.Blob | tree.Opaque) -> str:
     match node:
-        case Number():
+        case tree.Number():
             return f"{node.kind}{8 * node.size}" + f" {node.order[0]}e" * (node.size > 1)
-        case Opaque():
+        case tree.Opaque():
             return node.form or node.kind
     return "bytes"
 
 
-def branches(node: When | Select) -> list[tuple[str, Node]]:
+def branches(node: tree.When | tree.Select) -> list[tuple[str, tree.Node]]:
     """The alternatives of a part, each with its condition in words."""
-    if isinstance(node, When):
+    if isinstance(node, tree.When):
         asked = phrase(node.condition)
         return [(f"if {asked}", node.then), (f"unless {asked}", node.otherwise)]
-    key, labels = phrase(node.key), node.key.info.labels if isinstance(node.key, Ref) else {}
+    key, labels = phrase(node.key), node.key.info.labels if isinstance(node.key, tree.Ref) else {}
     cases = [(f"if {key} == {labels.get(value, value)!r}", case) for value, case in node.cases]
     return [*cases, (f"for other values of {key}", node.default)]
 
 
-def phrase(formula: Formula) -> str:
+def phrase(formula: tree.Formula) -> str:
     """A formula as people write it, with its fields by their whole paths; "?" for a function that cannot be read."""
     match formula:
-        case Op("==" | "!=" as symbol, (Ref() as ref, int() as value)) if value in ref.info.labels:
+        case tree.Op("==" | "!=" as symbol, (tree.Ref() as ref, int() as value)) if value in ref.info.labels:
             return f"{ref.path} {symbol} {ref.info.labels[value]!r}"
-    text = formula.text if isinstance(formula, Code) else written(formula, lambda ref: ref.path, {})
+    text = formula.text if isinstance(formula, tree.Code) else tree.written(formula, lambda ref: ref.path, {})
     return text[1:-1] if _is_enclosed(text) else text
 
 
@@ -221,7 +201,7 @@ def bit_text(bits: BitField) -> str:
     return ("signed, " if bits.signed else "") + ", ".join(parts)
 
 
-def unit_text(info: FieldInfo) -> str:
+def unit_text(info: tree.FieldInfo) -> str:
     """Unit and scale of a field: "0.01 deg", "0.01 deg - 327.68"."""
     if not info.scaled:
         return info.unit
@@ -229,7 +209,7 @@ def unit_text(info: FieldInfo) -> str:
     return f"{info.scale:.10g} {info.unit}".strip() + shift
 
 
-def meaning(info: FieldInfo) -> str:
+def meaning(info: tree.FieldInfo) -> str:
     """What is said of a field: its constant, what it follows from, its text, the names of its values."""
     const = f"always {hexed(info.const, info.bits)}" if info.const is not None else ""
     follows = phrase(info.rebuilt) if info.rebuilt is not None else "?"
@@ -244,7 +224,7 @@ def hexed(value: object, bits: int) -> str:
     return f"0x{value:0{-(-bits // 4)}x}" if isinstance(value, int) else repr(value)
 
 
-def _sealed(node: Sealed) -> str:
+def _sealed(node: tree.Sealed) -> str:
     """What is said of the fields that hold a checksum."""
     name = node.declared.describe() if node.declared else "a checksum that a hook supplies"
     first, last = (path.removeprefix(f"{node.body.path}.") for path in node.over or ("", ""))

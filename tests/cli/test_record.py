@@ -19,8 +19,8 @@ from pathlib import Path
 import pytest
 
 import lidarspec as ls
+from lidarspec.recording.format import Recording
 from lidarspec.recording.recorders import Recorder
-from lidarspec.recording.recordings import Recording
 from lidarspec.spec import Chunk
 from tests.cli.running import printed, process, ran
 from tests.lines import SLACK, port

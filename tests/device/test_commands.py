@@ -21,7 +21,7 @@ import pytest
 
 import lidarspec as ls
 from lidarspec.errors import CommandError, OutOfRange, ReplyTimeout, SourceError
-from lidarspec.recording.recordings import Recording
+from lidarspec.recording.format import Recording
 from lidarspec.spec import Tcp, Udp
 from tests.lines import SLACK, Port, free_port, port, turning, udp, until, working
 from tests.shapes import SHAPES

@@ -16,7 +16,7 @@ import pytest
 import lidarspec as ls
 from lidarspec.device.arrivals import fed
 from lidarspec.errors import SourceError, UsageError
-from lidarspec.recording.recordings import Recording
+from lidarspec.recording.format import Recording
 from lidarspec.spec import Chunk, Udp
 from tests.lines import SLACK, Port, free_port, paced, port, turning, udp, until, working
 from tests.shapes import SHAPES

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 import lidarspec as ls
-from lidarspec.recording.recordings import Recording
+from lidarspec.recording.format import Recording
 from lidarspec.simulation.simulator import simulate
 from lidarspec.transports.udp import BUFFER
 from tests.lines import Port, free_port, port

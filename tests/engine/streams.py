@@ -6,8 +6,8 @@ import contextlib
 import random
 
 from lidarspec import Counters, Sensor, SpecError
+from lidarspec.framing.examples import examples
 from lidarspec.framing.frame_engine import CompiledCodec, codec
-from lidarspec.simulation.frame_maker import examples
 from lidarspec.testing import subject as material
 from lidarspec.testing.agreement import cuts
 from lidarspec.testing.subject import Subject

@@ -13,6 +13,8 @@ from lidarspec import Sensor
 from lidarspec.framing.results import Frames
 from lidarspec.framing.steady import SMALL
 from lidarspec.spec import Checksummed, Frame, Xor
+from lidarspec.testing import subject as material
+from lidarspec.wire.row_checksums import FEW, SHORT, registers
 from lidarspec.spec.row_checksums import FEW, SHORT, registers
 from lidarspec.testing.subject import Subject
 from tests.all_sensors import streams

@@ -22,9 +22,8 @@ import pytest
 import lidarspec as ls
 from lidarspec.errors import SourceError, UsageError, WireError
 from lidarspec.recording import appending
-from lidarspec.recording.format import _HEAD, HEADER, LARGEST, MAGIC, Record, packed, read_header
+from lidarspec.recording.format import _HEAD, HEADER, LARGEST, MAGIC, Record, Recording, packed, read_header
 from lidarspec.recording.recorders import Recorder
-from lidarspec.recording.recordings import Recording
 from lidarspec.spec import Chunk
 from lidarspec.transports.open_url import transport
 from tests.sensors.evidence import capture

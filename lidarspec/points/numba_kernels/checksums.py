@@ -16,6 +16,7 @@ from lidarspec.points.numba_kernels.kernels import function_of, require
 from lidarspec.points.numba_kernels.source import HEAD
 from lidarspec.spec.checksums import Crc, WordXor, Xor
 from lidarspec.wire.layout import Bytes2D, Seal, Sums
+from lidarspec.wire.row_checksums import batch
 
 #: frames of a layout that earn its tables, and that a batch has to have.
 EARNED, FEW = 4096, 64
@@ -79,7 +80,7 @@ class _Shares:
         places = self._places.tolist()
         rows = np.zeros((len(places), 256, len(places)), np.uint8)
         rows[np.arange(len(places)), :, np.arange(len(places))] = np.arange(256)
-        values = self._seal.algorithm.batch(rows.reshape(-1, len(places))).astype(np.uint16)
+        values = batch(self._seal.algorithm, rows.reshape(-1, len(places))).astype(np.uint16)
         shares = dict(zip(places, (values ^ values[0]).reshape(-1, 256), strict=True))
         words: list[int] = []
         for place in sorted(shares):

@@ -15,18 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.columns.graph import Node, Term, chosen, is_full, key, last_axis, only_field
+from lidarspec.points.numpy_plan import products
 from lidarspec.points.numpy_plan.blocks import Blocks
-from lidarspec.points.numpy_plan.products import (
-    TURN,
-    Angles,
-    Rotation,
-    Turns,
-    angles_of,
-    multiplied,
-    product_of,
-    reduced,
-    split,
-)
 from lidarspec.points.numpy_plan.program import Number, Program, Read, Run, deep
 from lidarspec.points.numpy_plan.registers import TYPES
 from lidarspec.points.plan import Plan
@@ -47,8 +37,8 @@ class Compiler:
         self._layout, self._shape, self._width, self._tables = plan.layout, plan.shape, plan.width, tables
         self._registers: dict[Any, int] = {}
         self._shifts: dict[tuple[str, Window], tuple[int, int] | None] = {}
-        self._angles_of: dict[Node, Angles | None] = {}
-        self._rotations: dict[Node, Rotation | None] = {}
+        self._angles_of: dict[Node, products.Angles | None] = {}
+        self._rotations: dict[Node, products.Rotation | None] = {}
 
     def want(self, name: str, value: Any, kind: str) -> None:
         """Make a column of this name; `kind` is "single" or "double"."""
@@ -230,34 +220,34 @@ class Compiler:
         angle = self._once(("angle", value), lambda: self._angle(value))
         return self.program.call(function.__name__, "single", function, Read(angle))
 
-    def _rotation(self, value: Node) -> Rotation | None:
+    def _rotation(self, value: Node) -> products.Rotation | None:
         if value not in self._rotations:
             angles = self._angles(value)
-            self._rotations[value] = None if angles is None else Rotation.of(angles)
+            self._rotations[value] = None if angles is None else products.Rotation.of(angles)
         return self._rotations[value]
 
-    def _wide(self, rotation: Rotation) -> int:
+    def _wide(self, rotation: products.Rotation) -> int:
         """The angles of those packets or blocks whose points are too far apart for one rotation, within half a turn."""
 
         def run(execution: Run, out: NDArray[Any]) -> None:
             if rotation not in execution.prepared:
                 execution.prepared[rotation] = rotation.turns(execution)
-            turns: Turns = execution.prepared[rotation]
+            turns: products.Turns = execution.prepared[rotation]
             turns.move(execution.start, execution.stop)
             if turns.some_wide:
                 out.reshape(-1, rotation.inner)[turns.wide] = turns.angles()
 
         return self.program.step("angles of what is wide", "single", run)
 
-    def _turned(self, function: Any, rotation: Rotation, wide: int) -> int:
+    def _turned(self, function: Any, rotation: products.Rotation, wide: int) -> int:
         """Cosines or sines of angles that are turned a little from the one in their middle: a matrix product of series."""
         read, which = Read(wide), 0 if function is np.cos else 1
 
         def run(execution: Run, out: NDArray[Any]) -> None:
-            turns: Turns = execution.prepared[rotation]
+            turns: products.Turns = execution.prepared[rotation]
             rows = out.reshape(-1, rotation.inner)
             if not turns.all_wide:
-                multiplied(turns.left[which], rotation.rows[which], rows)
+                products.multiplied(turns.left[which], rotation.rows[which], rows)
             if turns.some_wide:
                 rows[turns.wide] = function(read(execution).reshape(-1, rotation.inner)[turns.wide])
 
@@ -273,42 +263,42 @@ class Compiler:
 
         def run(execution: Run, out: NDArray[Any]) -> None:
             radians, whole = read(execution), execution.views[turns]
-            np.multiply(radians, 1 / TURN, out=whole)
+            np.multiply(radians, 1 / products.TURN, out=whole)
             np.rint(whole, out=whole)
-            np.multiply(whole, TURN, out=whole)
+            np.multiply(whole, products.TURN, out=whole)
             np.subtract(radians, whole, out=whole)
             np.copyto(out, whole, casting="same_kind")
 
         return self.program.step("reduce to half a turn", "single", run, read, Read(turns))
 
-    def _near(self, value: Node, angles: Angles) -> int:
+    def _near(self, value: Node, angles: products.Angles) -> int:
         """Angles that lie around one of their packet or block, reduced so: most of them need no reduction of their own."""
-        read = Read(self._added(angles.around.rows, angles.left, angles, split(value, self._width)[1]))
+        read = Read(self._added(angles.around.rows, angles.left, angles, products.split(value, self._width)[1]))
 
         def run(execution: Run, out: NDArray[Any]) -> None:
             radians, (numbers, far) = read(execution), execution.prepared[angles]
             places = np.flatnonzero(far[_rows(execution, numbers)])
             if len(places):
                 rows = radians.reshape(-1, angles.around.inner)
-                rows[places] = reduced(rows[places])
+                rows[places] = products.reduced(rows[places])
             np.copyto(out, radians, casting="same_kind")
 
         return self.program.step("reduce what is far from half a turn", "single", run, read)
 
-    def _angles(self, value: Node) -> Angles | None:
+    def _angles(self, value: Node) -> products.Angles | None:
         """Angles that lie around one of their packet or block; None where they do not, or nobody knows."""
         if value not in self._angles_of:
-            angles = self._angles_of[value] = angles_of(value, self._shape, self._layout.leaves)
+            angles = self._angles_of[value] = products.angles_of(value, self._shape, self._layout.leaves)
             self.low += [] if angles is None else angles.nodes
         return self._angles_of[value]
 
     def _sum(self, node: Node) -> int | None:
         """A sum: one matrix product for what is low, and what is full added to it."""
-        product = product_of(node, self._shape)
+        product = products.product_of(node, self._shape)
         if product is None:
             return None
         self.low += product.nodes
-        return self._added(product.rows, lambda run: (product.left(run),), product, split(node, self._width)[1])
+        return self._added(product.rows, lambda run: (product.left(run),), product, products.split(node, self._width)[1])
 
     def _added(self, rows: NDArray[Any], left: Callable[[Run], tuple[Any, ...]], place: Any, full: list[Term]) -> int:
         """A matrix product of numbers and rows; what is full is added to it.
@@ -323,7 +313,7 @@ class Compiler:
             if place not in execution.prepared:
                 execution.prepared[place] = left(execution)
             numbers = execution.prepared[place][0]
-            multiplied(numbers[:, _rows(execution, numbers)].T, rows, out.reshape(-1, inner))
+            products.multiplied(numbers[:, _rows(execution, numbers)].T, rows, out.reshape(-1, inner))
 
         register = self.program.step(f"sum of {len(rows)} products", "double", run)
         for part in full:
@@ -369,7 +359,7 @@ def _rows(run: Run, numbers: NDArray[Any]) -> slice:
     return slice(run.start * each, run.stop * each)
 
 
-def _shared_by(angles: Angles, run: Run) -> NDArray[np.float32]:
+def _shared_by(angles: products.Angles, run: Run) -> NDArray[np.float32]:
     """The angle that all points of each packet or block have."""
     name = ("alike", angles)
     if name not in run.prepared:

@@ -1,4 +1,6 @@
-"""Rows of bytes side by side: what checksums of a whole batch compute with, whatever the algorithm.
+"""The checksums of many frames at once, given as rows of bytes: what calls one by one would give, by steps that take all rows.
+
+`over` and `batch` know the algorithms of `lidarspec.spec.checksums`; one of an author's own is asked for its `batch`.
 
 `words` turns rows into columns of eight bytes, so that one step of NumPy takes the same eight bytes of every row.
 
@@ -8,28 +10,118 @@ become one word before, without tables: eight bytes on, a byte counts as the sum
 what the polynomial says (its eighth power has the same terms, eight times as far apart). So each word is XORed onto sums for
 0 to 7 bytes on, and these are moved and added up. Where rows are few and short, each byte is looked up by its place. A wider
 register runs along all rows at once, two bytes a step, by a table of 65,536; long rows are cut into segments that run side by
-side and are joined in pairs. Tables depend on the polynomial and the distance alone.
-
-Registers are kept in wire order, where the low byte is the one that meets the next data byte: for `refin` the usual
-reflected register, otherwise the usual register aligned left with its bytes swapped. One formula serves both.
+side and are joined in pairs. Tables depend on the polynomial and the distance alone. Registers are in wire order, see `Crc`.
 """
 
-from collections.abc import Sequence
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
 from functools import lru_cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-REGISTER_BYTES = [2] * 17 + [4] * 16 + [8] * 32  # that a register is kept in, by its width
+from lidarspec.spec.checksums import MIRROR, REGISTER_BYTES, Checksum, Crc, Fold15, Sum, Values, WordXor, Xor, ZeroPadded, byte_table
+
+LOOP_BYTES = 2048  # below this, a Python loop over bytes is done before NumPy's calls have started
+NARROW_LOOP_BYTES = 256  # the same where the register is a byte
+ONE_BY_ONE = 4  # rows that are done one by one sooner than together
+BLOCK_BYTES = 1 << 20  # rows taken at a time: few enough for the caches, and many enough to hide NumPy's cost per call
 FEW, SHORT = 1 << 13, 1 << 7  # bytes of all rows, and of one, for which a table for each place pays
 MANY = 1024  # rows whose words are summed in less time than tables take
-MIRROR = bytes(int(f"{byte:08b}"[::-1], 2) for byte in range(256))
 
 #: which bytes of a row: from one to another, one span after another.
 Spans = tuple[tuple[int, int], ...]
 
 _BYTE, _BYTE_BITS = np.uint64(0xFF), np.uint64(8)
+
+
+def batch(algorithm: Checksum, rows: NDArray[np.uint8]) -> Values:
+    """The checksum of each row, shape (n,), for frames of one length, shape (n, m), contiguous or not."""
+    return over(algorithm, rows, ((0, rows.shape[1]),))
+
+
+def over(algorithm: Checksum, rows: NDArray[np.uint8], spans: Spans) -> Values:
+    """The checksum of some bytes of each row, shape (n,), wherever in the rows they stand: one span after another."""
+    values = _TOGETHER.get(type(algorithm))
+    if values is None or _are_few(algorithm, rows, spans):
+        return algorithm.batch(cut(rows, spans))
+    step = max(1, BLOCK_BYTES // max(rows.shape[1], 1))
+    if len(rows) <= step:
+        return values(algorithm, rows, spans)
+    return np.concatenate([values(algorithm, rows[first : first + step], spans) for first in range(0, len(rows), step)])
+
+
+def _are_few(algorithm: Checksum, rows: NDArray[np.uint8], spans: Spans) -> bool:
+    """Whether the rows are done one by one sooner than together."""
+    if not isinstance(algorithm, Crc):
+        return len(rows) < ONE_BY_ONE
+    length = sum(stop - start for start, stop in spans)
+    return len(rows) * length < (NARROW_LOOP_BYTES if algorithm.width <= 8 else LOOP_BYTES)
+
+
+def _crc(algorithm: Crc, rows: NDArray[np.uint8], spans: Spans) -> Values:
+    left = registers(rows, spans, algorithm.start, algorithm.width, algorithm.poly, algorithm.refin)
+    if not algorithm.refin:
+        left = left.byteswap() >> 8 * left.itemsize - algorithm.width
+    values = left.astype(np.uint64)
+    if algorithm.refin != algorithm.refout:
+        mirrored = np.frombuffer(MIRROR, np.uint8).take(values.byteswap().view(np.uint8))
+        values = mirrored.view(np.uint64) >> np.uint64(64 - algorithm.width)
+    return values ^ np.uint64(algorithm.xorout) if algorithm.xorout else values
+
+
+def _xor(algorithm: Xor, rows: NDArray[np.uint8], spans: Spans) -> Values:
+    columns = words(rows, spans=spans)
+    return folded_xor(xor(columns, range(len(columns))))
+
+
+def _sum(algorithm: Sum, rows: NDArray[np.uint8], spans: Spans) -> Values:
+    return byte_sums(words(rows, spans=spans)) & np.uint64((1 << algorithm.width) - 1)
+
+
+def _word_xor(algorithm: WordXor, rows: NDArray[np.uint8], spans: Spans) -> Values:
+    columns = words(rows, spans=spans)
+    low, high, part = np.zeros((3, len(rows)), np.uint64)
+    for which, masks in _word_masks(algorithm, len(columns)):
+        total = xor(columns, which)
+        np.bitwise_xor(low, np.bitwise_and(total, masks[0], out=part), out=low)
+        np.bitwise_xor(high, np.bitwise_and(total, masks[1], out=part), out=high)
+    return folded_xor(low) | folded_xor(high) << np.uint64(8)
+
+
+@lru_cache(maxsize=512)
+def _word_masks(algorithm: WordXor, number: int) -> list[tuple[list[int], tuple[np.uint64, np.uint64]]]:
+    """Where the low and the high bytes stand in so many words of `words`, as masks; with the words that have the same."""
+    masks = np.zeros((2, 8 * number), np.uint8)
+    for mask, half in zip(masks, algorithm.halves, strict=True):
+        for part in half:
+            mask[part] = 0xFF
+    places: dict[tuple[np.uint64, np.uint64], list[int]] = {}
+    for word, (low, high) in enumerate(masks.view("<u8").T):
+        places.setdefault((low, high), []).append(word)
+    return [(which, both) for both, which in places.items()]
+
+
+def _fold15(algorithm: Fold15, rows: NDArray[np.uint8], spans: Spans) -> Values:
+    rows = cut(rows, spans)
+    tail, total = rows[:, rows.shape[1] % 2 - 60 :], np.zeros(len(rows), np.uint64)
+    last = (tail.shape[1] - 1) // 2
+    for place, byte in enumerate(tail.T):
+        total += byte.astype(np.uint64) << np.uint64(last - place // 2 + 8 * (place % 2))
+    return (total & np.uint64(0x7FFF)) + (total >> np.uint64(15)) & np.uint64(0x7FFF)
+
+
+def _zero_padded(algorithm: ZeroPadded, rows: NDArray[np.uint8], spans: Spans) -> Values:
+    rows = cut(rows, spans)
+    return batch(algorithm.algorithm, np.pad(rows, ((0, 0), (0, -rows.shape[1] % algorithm.to))))
+
+
+_TOGETHER: dict[type[Checksum], Callable[[Any, NDArray[np.uint8], Spans], Values]] = {
+    **{Crc: _crc, Xor: _xor, Sum: _sum, WordXor: _word_xor},
+    **{Fold15: _fold15, ZeroPadded: _zero_padded},
+}
 
 
 def words(rows: NDArray[np.uint8], *, spans: Spans | None = None, zeros_first: bool = False) -> NDArray[np.uint64]:
@@ -227,25 +319,6 @@ def _wide(rows: NDArray[np.uint8], spans: Spans, start: int, width: int, poly: i
         found = np.hstack([found[:, :odd], jumped.reshape(count, -1) ^ found[:, odd + 1 :: 2]])
         segment *= 2
     return np.asarray(found[:, 0] ^ (start >> 8 * length))
-
-
-def reflected(value: int, width: int) -> int:
-    """The value with its bits in the opposite order."""
-    return int(f"{value:0{width}b}"[::-1], 2)
-
-
-def mirrored_bytes(register: int) -> int:
-    """The register with the bits of each byte mirrored, which leads from one bit order to the other."""
-    return int.from_bytes(register.to_bytes(8, "little").translate(MIRROR), "little")
-
-
-@lru_cache(maxsize=256)
-def byte_table(width: int, poly: int, refin: bool) -> tuple[int, ...]:
-    """The register after one byte, by the XOR of that byte and the register's low byte."""
-    table, feedback = list(range(256)), reflected(poly, width)
-    for _ in range(8):
-        table = [register >> 1 ^ (feedback if register & 1 else 0) for register in table]
-    return tuple(table if refin else (mirrored_bytes(table[byte]) for byte in MIRROR))
 
 
 @lru_cache(maxsize=1024)

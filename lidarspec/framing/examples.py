@@ -1,0 +1,129 @@
+"""Valid frames with seeded random content, for tests, docs and the REPL.
+
+A header is drawn by chance, and the rest of a frame of its layout is random bytes with constants and checksums in place; what is not
+plausible is drawn again, in the end around the values that the sensor's `sweep` declares. What does not compile is drawn field by field.
+"""
+
+from __future__ import annotations
+
+import functools
+import random
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarspec.errors import SpecError, UnknownFrame, UsageError
+from lidarspec.framing.frame_engine import CompiledCodec, InterpretedCodec, codec
+from lidarspec.framing.plausibility import plausibility
+from lidarspec.framing.results import VALID
+from lidarspec.spec.construct_layer import Fault, random_value
+from lidarspec.spec.description import Spec
+from lidarspec.wire.build import build
+from lidarspec.wire.frame_table import Group, Rows
+from lidarspec.wire.layout import Layout
+
+#: random frames made at once, and how often, before a sensor's own `sweep` has to help.
+BATCH, TRIES = 64, 40
+#: field path -> what draws a raw value of it.
+Drawn = Mapping[str, Callable[[random.Random], Any]]
+NOTHING: Drawn = {}
+
+
+def example(sensor: Spec, frame: str, *, seed: int = 0) -> bytes:
+    """The bytes of a valid frame with seeded random content.
+
+    Raises:
+        UnknownFrame: with the closest known name.
+    """
+    if frame not in sensor.frames:
+        raise UnknownFrame(frame, sensor.frames, place=sensor.id)
+    return examples(sensor, frame, random.Random(f"{sensor.id} {frame} {seed}"))[0]
+
+
+def examples(sensor: Spec, frame: str, source: random.Random, drawn: Drawn = NOTHING) -> list[bytes]:
+    """Some valid frames of one random header, at least one: what `example` picks from, for tests that need many.
+
+    Args:
+        drawn: field path -> what draws its raw value, for what random values never make.
+    """
+    engine = codec(sensor.frames[frame])
+    if not isinstance(engine, CompiledCodec):
+        return [_interpreted(sensor, frame, engine, source, drawn)]
+    for _ in range(TRIES):
+        layout, chosen = engine.tree.choose(source, drawn)
+        rows = np.frombuffer(source.randbytes(BATCH * layout.size), np.uint8).reshape(BATCH, layout.size).copy()
+        for path, draw in drawn.items():
+            if path in layout.leaves and path not in chosen:
+                leaf = layout.leaves[path]
+                count = BATCH * int(np.prod(leaf.shape, dtype=np.intp))
+                leaf.store(rows, np.array([draw(source) for _ in range(count)]).reshape(BATCH, *leaf.shape))
+        found = _plausible(sensor, frame, layout, _headed(rows, layout, chosen))
+        if found:
+            return found
+    return [_swept(sensor, frame, engine, source)]
+
+
+def _interpreted(sensor: Spec, frame: str, engine: InterpretedCodec, source: random.Random, drawn: Drawn) -> bytes:
+    """A frame that construct alone can read."""
+    for _ in range(BATCH * TRIES):
+        try:
+            data = build(sensor, frame, random_value(engine.frame.prepared, source, drawn), {})
+        except (UsageError, Fault):  # what was drawn goes not together; something else may
+            continue
+        if engine.survey(np.frombuffer(data, np.uint8), np.zeros(1, np.intp)).status[0] == VALID:
+            return data
+    raise SpecError("no random frame is valid", path=frame, sensor=sensor.id)
+
+
+def _headed(rows: NDArray[np.uint8], layout: Layout, chosen: dict[str, int]) -> NDArray[np.uint8]:
+    """Random frames with the header values of their layout, constants and checksums set."""
+    for path, value in chosen.items():
+        layout.leaves[path].store(rows, value)
+    layout.seal(rows)
+    return rows
+
+
+def _plausible(sensor: Spec, frame: str, layout: Layout, rows: NDArray[np.uint8]) -> list[bytes]:
+    table = Rows(codec(sensor.frames[frame]).schema, [Group(layout, np.arange(len(rows)), rows)])
+    if sensor.frames[frame].plausible is None:
+        return [row.tobytes() for row in rows]
+    errors: list[str] = []
+    good = np.flatnonzero(plausibility(sensor.frames[frame], table, errors) == 0)
+    if errors:
+        raise SpecError(errors[0].strip().splitlines()[-1], path=f"{frame}.plausible", sensor=sensor.id)
+    return [row.tobytes() for row in rows[good]]
+
+
+def _swept(sensor: Spec, frame: str, engine: CompiledCodec, source: random.Random) -> bytes:
+    """A frame around the values that the sensor's `sweep` declares, where random ones are never plausible."""
+    sweep = sensor.simulation_of(frame).sweep
+    if sweep is None:
+        raise SpecError("no random frame passes `plausible`, and there is no `sweep` to start from", path=frame, sensor=sensor.id)
+    for _ in range(TRIES):
+        values = sweep(source.randrange(10_000))
+        layout, chosen = engine.tree.choose(source, _stated(engine, values))
+        rows = np.frombuffer(source.randbytes(layout.size), np.uint8).reshape(1, layout.size).copy()
+        for path, value in values.items():
+            leaf = layout.leaves.get(path)
+            if leaf is not None and path not in chosen:
+                leaf.store(rows, leaf.info.raw(np.asarray(value, np.float64)))
+        found = _plausible(sensor, frame, layout, _headed(rows, layout, chosen))
+        if found:
+            return found[0]
+    raise SpecError("neither random frames nor those along `sweep` pass `plausible`", path=frame, sensor=sensor.id)
+
+
+def _stated(engine: CompiledCodec, values: Mapping[str, Any]) -> Drawn:
+    """What gives the numbers of a sweep, raw, where a header asks for them."""
+    fields = engine.schema.fields
+    found: dict[str, Callable[[random.Random], Any]] = {}
+    for path, value in values.items():
+        if path in fields and np.ndim(value) == 0 and not isinstance(value, bytes):
+            found[path] = functools.partial(_always, fields[path].raw(float(value)))
+    return found
+
+
+def _always(raw: int, _: random.Random) -> int:
+    return raw
