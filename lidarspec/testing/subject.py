@@ -13,14 +13,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from lidarspec.errors import WireError
 from lidarspec.framing.examples import examples
 from lidarspec.framing.frame_engine import codec
-from lidarspec.plugins import sensor as named_sensor
-from lidarspec.spec.description import Frame
-from lidarspec.spec.sensor import Sensor
-from lidarspec.spec.tree import Sealed, nodes
-from lidarspec.simulation.frame_maker import examples
 from lidarspec.spec import Frame, Sensor
 from lidarspec.spec.tree import FieldInfo, Sealed, nodes
 
