@@ -8,6 +8,7 @@ flipped and tried, through the engine itself, for the one that would make it who
 
 from __future__ import annotations
 
+import contextlib
 import io
 import itertools
 import re
@@ -195,11 +196,9 @@ class _Trail:
         self._blocks = dict(_blocks(frame.tree, ""))
         trail: list[Seen] = []
         self.failed = True
-        try:
+        with contextlib.suppress(Exception):  # construct lets anything out of expressions; `parse_typed` has said what is wrong
             frame.prepared.parse_stream(io.BytesIO(data), _verify=False, _trail=trail)
             self.failed = False
-        except Exception:  # construct lets anything out of expressions; what is wrong has been said by `parse_typed`
-            pass
         self._parts = [(field_path(seen.path), seen) for seen in trail if seen.seal is None]
         self._verdicts = {path: verdict for seen in trail if seen.seal is not None for path, verdict in _verdicts(data, seen)}
         self.end = max((seen.end for path, seen in self._parts if not self._in_block(path)), default=0)

@@ -147,7 +147,7 @@ class Row:
         return set(re.findall(r"\[(\d+)\]", self.path)) <= {"0"}
 
     def _values(self, *, alone: bool) -> list[str]:
-        """Each value in words, with its name where there are several."""
+        """Each value in words: with its name, unless the unit says enough, and with its bits; those of further elements are left out."""
         if alone and self.remarks:
             return []
         units = [value.unit for value in self.values if value.unit and "[" in self.path]
@@ -155,7 +155,9 @@ class Row:
         words = []
         for value in self.values:
             name = value.name if names.count(value.name) == 1 else value.path.removeprefix(f"{self.path}.")
-            words.append(_named(value, name, plain=alone or units.count(value.unit) == 1, bits=self.first))
+            text, where = str(value), f" ({value.bits})" if value.bits and self.first else ""
+            says_enough = alone or units.count(value.unit) == 1
+            words.append(f"{text}{where}" if says_enough else f"{name} {text or value.raw.hex(' ')}{where}")
         return words
 
     def to_dict(self) -> dict[str, Any]:
@@ -163,13 +165,6 @@ class Row:
         facts = {"offset": self.offset, "hex": self.data.hex(" "), "path": self.path, "meaning": self.meaning, "right": self.right}
         points = [{name: number(value) for name, value in point._asdict().items()} for point in self.points]
         return {**facts, "values": [value.to_dict() for value in self.values]} | ({"points": points} if points else {})
-
-
-def _named(value: Value, name: str, *, plain: bool, bits: bool) -> str:
-    """A value with its name, unless the unit says enough, and with its bits; those of an array's elements are told once."""
-    text = str(value)
-    where = f" ({value.bits})" if value.bits and bits else ""
-    return f"{text}{where}" if plain else f"{name} {text or value.raw.hex(' ')}{where}"
 
 
 @dataclass(frozen=True)

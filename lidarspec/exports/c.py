@@ -12,6 +12,7 @@ import functools
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from importlib import resources
+from textwrap import indent
 from typing import Any
 
 from lidarspec._version import __version__
@@ -58,12 +59,12 @@ def checksum(algorithm: Checksum, name: str) -> str:
     if isinstance(algorithm, ZeroPadded):
         if isinstance(inner, Fold15):
             raise Refused("a folded sum that is padded with zeros: which bytes count depends on how many there are in all")
-        pad = f"    for (; i % {algorithm.to}; ++i) {{\n        const uint8_t byte = 0;\n{_indented(body.step, 8)}\n    }}\n"
+        pad = f"    for (; i % {algorithm.to}; ++i) {{\n        const uint8_t byte = 0;\n{indent(body.step, 8 * ' ')}\n    }}\n"
     return _FUNCTION.format(
         text=algorithm.describe(),
         name=name,
-        begin=_indented(body.begin + "\nsize_t i = 0;" * is_counting, 4),
-        step=_indented(body.step, 12),
+        begin=indent(body.begin + "\nsize_t i = 0;" * is_counting, 4 * " "),
+        step=indent(body.step, 12 * " "),
         counting=", ++i" * is_counting,
         pad=pad,
         result=body.result,
@@ -121,10 +122,6 @@ def _crc(crc: Crc) -> _Body:
 def _literal(value: int, size: int) -> str:
     digits = f"0x{value:0{size // 4}x}"
     return f"UINT64_C({digits})" if size == 64 else f"{digits}u"
-
-
-def _indented(text: str, spaces: int) -> str:
-    return "\n".join(" " * spaces + line for line in text.splitlines())
 
 
 _LENGTH = """\

@@ -1,6 +1,6 @@
 """Packet diagrams as manuals have them: rows of four bytes, every field a box, repeated parts drawn once with their number.
 
-A diagram is made in two steps. `cells` says what is shown of a frame tree: boxes in the order of the wire (`Cell`), and groups
+A diagram is made in two steps. `_Cells` says what is shown of a frame tree: boxes in the order of the wire (`Cell`), and groups
 that repeat or that some headers leave out (`Group`). `_Sheet` draws these from top to bottom as SVG: a box across the end of a row goes on
 in the next, a group has rows of its own with a bracket beside them, and a field too long to draw, or of no fixed length, is a torn row.
 """
@@ -47,11 +47,6 @@ class Group:
 
 
 Item = Cell | Group
-
-
-def cells(message: Message) -> tuple[Item, ...]:
-    """The items of a frame type."""
-    return _Cells(message.seals, mixed=not byte_order(message)).visit(message.root, Extent(), 0)
 
 
 def byte_order(message: Message) -> str:
@@ -168,8 +163,7 @@ def svg(sensor: Sensor) -> str:
         order = byte_order(message)
         detail = f"{size} byte{'s' * (size != '1')}" + (f", integers {order}-endian" if order else "")
         sheet.title(f"{sensor.vendor} {sensor.model}: {message.name}", detail)
-        sheet.ruler()
-        sheet.items(cells(message), 0)
+        sheet.items(_Cells(message.seals, mixed=not order).visit(message.root, Extent(), 0), 0)
         sheet.close()
     return sheet.document(f"{sensor.id}: packet diagrams")
 
@@ -188,13 +182,10 @@ class _Sheet:
     deepest: int = 0
 
     def title(self, text: str, detail: str) -> None:
-        """The name of a frame type above its rows."""
+        """The name of a frame type above its rows, then bytes and bits above the first of them."""
         self.parts.append(_text(EDGE, self.top + 14, text, 15, weight="bold"))
         self.parts.append(_text(EDGE, self.top + 31, detail, 11.5, fill=FAINT))
         self.top += 48
-
-    def ruler(self) -> None:
-        """Bytes and bits above the first row."""
         for byte in range(BITS // 8):
             self.parts.append(_text(LEFT + (8 * byte + 4) * BIT, self.top, f"byte {byte}", 10.5, fill=FAINT, anchor="middle"))
         for bit in range(BITS):
@@ -272,9 +263,8 @@ class _Sheet:
         self.parts += _outlined([(LEFT, self.top, BITS)], cell)
         for share in (0.12, 0.88):
             x = LEFT + share * width
-            self.parts.append(
-                f'<path d="M{x - 4:g} {self.top:g}l8 {ROW / 3:g}l-8 {ROW / 3:g}l8 {ROW / 3:g}" fill="none" stroke="{FAINT}"/>'
-            )
+            path = f"M{x - 4:g} {self.top:g}l8 {ROW / 3:g}l-8 {ROW / 3:g}l8 {ROW / 3:g}"
+            self.parts.append(f'<path d="{path}" fill="none" stroke="{FAINT}"/>')
         self.parts += _label(LEFT, self.top, width, cell)
         self.top, self.used = self.top + ROW, 0
 

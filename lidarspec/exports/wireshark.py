@@ -128,9 +128,8 @@ class _Writer:
                 return {"kind": "empty", "skip": 0}
 
     def _number(self, node: tree.Number) -> Table:
-        kind = {"uint": "UINT", "int": "INT", "float": "FLOAT"}[node.kind] + ("" if node.kind == "float" else str(_width(8 * node.size)))
-        if node.kind == "float" and node.size == 8:
-            kind = "DOUBLE"
+        width = _width(8 * node.size)
+        kind = {"uint": f"UINT{width}", "int": f"INT{width}", "float": "DOUBLE" if node.size == 8 else "FLOAT"}[node.kind]
         table: Table = {"kind": "number", "name": node.name, "type": node.kind, "size": node.size}
         table |= {"le": (node.order == "little" and node.size > 1) or None, **self._described(node.info, kind)}
         return table | {"skip": self._skip(node.info, node.size)}
@@ -275,9 +274,8 @@ def _word_order(block: tree.Block) -> str | None:
 
 def _run(bits: BitField, size: int, order: str) -> int | None:
     """The lowest bit of a field in the word that a block is, None where it is no run of bits in order."""
-    starts = {
-        8 * (segment.byte if order == "little" else size - 1 - segment.byte) + segment.low - segment.target for segment in bits.segments
-    }
+    places = ((run, run.byte if order == "little" else size - 1 - run.byte) for run in bits.segments)
+    starts = {8 * byte + run.low - run.target for run, byte in places}
     return starts.pop() if len(starts) == 1 else None
 
 
@@ -332,9 +330,8 @@ def dissector(sensor: Sensor) -> str:
         "places": _patterns(sensor),
         "frames": [_frame(message, name) for message in by_direction],
     }
-    head = _HEAD.format(
-        title=title, version=__version__, source=" ".join(sensor.source.split()), name=quoted(name), title_quoted=quoted(title)
-    )
+    source = " ".join(sensor.source.split())
+    head = _HEAD.format(title=title, version=__version__, source=source, name=quoted(name), title_quoted=quoted(title))
     walker = resources.files("lidarspec.exports").joinpath("wireshark.lua").read_text(encoding="utf-8")
     return "\n".join([head, f"local sensor = {lua(about)}\n", walker])
 

@@ -228,9 +228,8 @@ class Violation(AssertionError):
     def __init__(self, code: str, what: str, path: str = "") -> None:
         self.code, self.what, self.path = code, what, path
         rule = RULES[code]
-        super().__init__(
-            f"{code} {rule.title}\n  where: {path or 'the sensor'}\n  what:  {what}\n  why:   {rule.why}\n  write: {rule.write}"
-        )
+        head = f"{code} {rule.title}\n  where: {path or 'the sensor'}"
+        super().__init__(f"{head}\n  what:  {what}\n  why:   {rule.why}\n  write: {rule.write}")
 
 
 def require(holds: object, code: str, what: str, path: str = "") -> None:

@@ -150,9 +150,8 @@ def _lost(subject: Subject, name: str, data: bytes, built: bytes, code: str) -> 
     one, other = (subject.sensor.parse(part, frame=name, verify=False) for part in (data, built))
     found = next(((path, a, b) for (path, a), (_, b) in zip(leaves(one), leaves(other), strict=False) if a != b), None)
     if found is None:
-        raise Violation(
-            code, f"byte {spot} of {len(data)} is {data[spot : spot + 1].hex()} and comes back as {built[spot : spot + 1].hex()}", name
-        )
+        was, became = (part[spot : spot + 1].hex() for part in (data, built))
+        raise Violation(code, f"byte {spot} of {len(data)} is {was} and comes back as {became}", name)
     path, before, after = found
     raise Violation("LS303" if is_cut(before, after) else code, f"{before!r} comes back as {after!r}", f"{name}.{path}")
 
@@ -227,9 +226,8 @@ def _check(subject: Subject, name: str, parsed: Any, spots: list[Any], edits: li
         target, found, _ = list(material.integers(again))[_index(parsed, holder, key)]
         wanted, got = holder[key], target[found]
         require(got == wanted or path in sealed, "LS305", f"{wanted} is written, and {got} is read", f"{name}.{path}")
-    require(
-        subject.sensor.build(name, again) == built, "LS302", f"an edit of {edits[0][1]} builds other bytes again", f"{name}.{edits[0][1]}"
-    )
+    path = edits[0][1]
+    require(subject.sensor.build(name, again) == built, "LS302", f"an edit of {path} builds other bytes again", f"{name}.{path}")
 
 
 def _index(parsed: Any, holder: Any, key: Any) -> int:
@@ -299,9 +297,8 @@ def every_single_bit_error_is_seen(subject: Subject, name: str) -> None:
         covered = {byte for seal in layout.seals if not seal.absent for start, end in seal.spans for byte in range(start, end)}
         for byte, bit in passing:
             field = next((path for path, (start, end) in layout.places.items() if start <= byte < end), "")
-            require(
-                byte not in covered, "LS310", f"bit {bit} of byte {byte} is flipped, and the frame passes", f"{name}.{field}".rstrip(".")
-            )
+            place = f"{name}.{field}".rstrip(".")
+            require(byte not in covered, "LS310", f"bit {bit} of byte {byte} is flipped, and the frame passes", place)
     if tried:
         kind = "under a checksum" if sealed else "without a checksum"
         subject.measured[f"{name}, {kind}: single-bit errors that pass"] = f"{100 * passed / tried:.3g} %"

@@ -16,8 +16,6 @@ from typing import Any
 from lidarspec.framing.examples import examples
 from lidarspec.framing.frame_engine import codec
 from lidarspec.spec import Frame, Sensor
-from lidarspec.spec.description import Frame
-from lidarspec.spec.sensor import Sensor
 from lidarspec.spec.tree import FieldInfo, Sealed, nodes
 
 #: frames up to this length are cut at every byte, longer ones at so many places.
