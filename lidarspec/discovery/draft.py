@@ -42,6 +42,8 @@ TAKEN = {"ACK", "COMMAND", "DATA", "RATE", "SAMPLES", "TURNS"}
 #: frames of a capture that are kept as vectors.
 VECTORS = 3
 _ID = re.compile(r"([a-z0-9]+)-([a-z0-9]+(?:-[a-z0-9]+)*)")
+#: characters of a line of what is written, at most.
+LINE = 140
 _CONDITION = re.compile(r"^(.*?) *#if (\w+)\n", re.MULTILINE)
 #: bytes of a constant that are told, and how many have to be constant together to be a field.
 TOLD, RUN = 8, 2
@@ -541,9 +543,15 @@ def _imports(text: dict[str, str]) -> dict[str, str]:
     }
     return {
         "construct_names": ", ".join(sorted(construct, key=_case)),
-        "own_names": ", ".join(sorted(own, key=_case)),
+        "own_import": _import("lidarspec.spec", sorted(own, key=_case)),
         "typing": "from typing import Any\n" if "Any" in code else "",
     }
+
+
+def _import(module: str, names: list[str]) -> str:
+    """An import of these names, on one line where that holds them."""
+    line = f"from {module} import {', '.join(names)}"
+    return line if len(line) <= LINE else f"from {module} import (\n" + "".join(f"    {name},\n" for name in names) + ")"
 
 
 def _case(name: str) -> tuple[bool, str, int]:
