@@ -32,6 +32,9 @@ VLP16, VLP16_RAW, HELIOS = (
 )
 
 
+ROOT = Path(__file__).resolve().parents[2]
+
+
 def drafted(name: str) -> Draft:
     opened = transport(str(capture(name)))
     try:
@@ -138,9 +141,10 @@ def test_a_draft_is_written_as_the_projects_own_sensors_are(tmp_path: Path) -> N
     text = "".join(path.read_text(encoding="utf-8") for path in tmp_path.glob("*/lidarspec_acme_*/__init__.py"))
     for mark in ("/ Array(\n        12,", "this.count", "class Check(Checksum):", "deg2rad(f.angle_4)", "Sequence(", "confirm=2", "over=("):
         assert mark in text
-    config = ["--config", str(Path(__file__).parents[2] / "pyproject.toml")]
+    config = ["--config", str(ROOT / "pyproject.toml")]
     for words in (["check"], ["format", "--check"]):
-        done = subprocess.run([sys.executable, "-m", "ruff", *words, *config, str(tmp_path)], capture_output=True, text=True, check=False)
+        ruff = [sys.executable, "-m", "ruff", *words, *config, str(tmp_path)]
+        done = subprocess.run(ruff, cwd=ROOT, capture_output=True, text=True, check=False)  # where lidarspec is first party
         assert done.returncode == 0, done.stdout
 
 
