@@ -18,10 +18,11 @@ from lidarspec.errors import UsageError, refuse_text
 from lidarspec.framing.datagrams import sorted_datagrams
 from lidarspec.framing.frame_engine import codec
 from lidarspec.framing.results import Counters, Found, Frames, Numbers, array_of
-from lidarspec.framing.search import Framing, Mode, Piece
-from lidarspec.framing.weak_frames import cut
+from lidarspec.framing.search import Bytes1D, Framing, Mode, Piece, leftmost
+from lidarspec.framing.steady import steady_stream
+from lidarspec.framing.weak_frames import Runs
 from lidarspec.spec.description import Frame, Spec
-from lidarspec.wire.arrays import alike, repeated
+from lidarspec.wire.arrays import alike, keep_freed_memory, repeated
 from lidarspec.wire.layout import Sums
 
 __all__ = ["BACKENDS", "Decoder", "backend", "frames_of", "is_stream"]
@@ -55,6 +56,7 @@ class Decoder:
             raise UsageError(f"{sensor.id} has no frames yet: configure it with its file first")
         self.sensor, self.stream, self.interpreted, self.backend = sensor, stream, interpreted, backend
         self.stats = Counters()
+        keep_freed_memory()
         self._framing = _framing(tuple(sensor.incoming), tuple(sensor.incoming.values()), interpreted, sums)
         answer = sensor.options.get("answer", "")  # as if the frame that the answer comes after had been seen
         self._mode = Mode(after=sensor.frames[answer].after if answer in sensor.frames else None)
@@ -183,7 +185,7 @@ class Decoder:
             part = buffer[start : start + self._size]
             last = start + len(part) == len(buffer)
             part = part if lasting else part.copy()
-            piece = cut(self._framing, part, self._mode, base=self._base, final=final and last)
+            piece = self._piece(part, final=final and last)
             frames = self._entered(part, piece, at)
             found += [frames] if len(frames) else []  # none at all would keep its bytes
             start, self._base = start + piece.end, self._base + piece.end
@@ -193,6 +195,14 @@ class Decoder:
             most = LONGEST if 2 * frames.total > piece.end else PIECE
             self._size = min(max(4 * piece.end, self._least), max(most, self._least))
         return start
+
+    def _piece(self, buffer: Bytes1D, *, final: bool) -> Piece:
+        """A piece of a stream cut into frames: by runs where a weak type is looked for, as rows while nothing disturbs; else by search."""
+        framing, mode = self._framing, self._mode
+        if any(framing.weak(kind) for kind in framing.active(mode)):
+            return Runs(framing, buffer, mode, self._base, final=final).cut()
+        piece = None if final else steady_stream(framing, buffer, mode)
+        return leftmost(framing, buffer, mode, final=final) if piece is None else piece
 
     def _entered(self, buffer: NDArray[np.uint8], piece: Piece, at: int | None) -> Frames:
         """The frames of a piece with their place in the input, and all that was found in it counted."""

@@ -20,8 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.framing.frame_engine import Codec
-from lidarspec.framing.results import CONSTANT, COUNTED, PLUGIN, SHORT, VALID, Frames, Status
-from lidarspec.wire.layout import Bytes2D, Layout, Marks, Sums, words
+from lidarspec.framing.results import CONSTANT, COUNTED, PLUGIN, SHORT, VALID, Frames
+from lidarspec.wire.layout import Marks, Sums, words
 
 #: candidates of one type in a piece; where there are more, the piece is made shorter, so that memory stays small.
 MOST = 1 << 15
@@ -84,7 +84,7 @@ class Framing:
     """
 
     def __init__(self, codecs: Mapping[str, Codec], sums: Sums | None = None) -> None:
-        self.names, self.codecs, self._sums = tuple(codecs), list(codecs.values()), sums
+        self.names, self.codecs, self.sums = tuple(codecs), list(codecs.values()), sums
         self.named = {codec.frame.after for codec in self.codecs} - {None}
         self.marks = [codec.marks for codec in self.codecs]
         self.words = [words(marks) for marks in self.marks]
@@ -116,11 +116,7 @@ class Framing:
 
     def survey(self, kind: int, buffer: Bytes1D, offsets: Offsets, *, gathered: bool = True) -> Frames:
         """The candidates of a type at these offsets, which have its constants, each with its layout and whether it is a frame."""
-        return self.codecs[kind].survey(buffer, offsets, kind=kind, gathered=gathered, sums=self._sums)
-
-    def survey_rows(self, kind: int, rows: Bytes2D) -> tuple[Layout, Status, tuple[str, ...]] | None:
-        """The layout of candidates of a type, one a row, the status of each, (n,), and tracebacks; None where their layouts differ."""
-        return self.codecs[kind].survey_rows(rows, sums=self._sums)
+        return self.codecs[kind].survey(buffer, offsets, kind=kind, gathered=gathered, sums=self.sums)
 
     def candidates(self, buffer: Bytes1D, mode: Mode) -> tuple[Bytes1D, list[Frames]]:
         """The candidates of each type that is looked for and not weak, in the bytes or, where there are too many, in fewer of them."""

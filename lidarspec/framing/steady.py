@@ -67,7 +67,7 @@ def judged(framing: Framing, kind: int, buffer: NDArray[np.uint8], rows: Bytes2D
         rows: of the buffer, at one distance.
         first: where they begin in it.
     """
-    survey = framing.survey_rows(kind, rows)
+    survey = framing.codecs[kind].survey_rows(rows, sums=framing.sums)
     if survey is None:
         return None
     layout, status, errors = survey

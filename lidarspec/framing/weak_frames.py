@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.framing.results import CONSTANT, IMPLAUSIBLE, PLUGIN, SHORT, VALID, Frames
-from lidarspec.framing.search import Bytes1D, Framing, Mode, Offsets, Piece, count_rejected, fitting, leftmost, merged
-from lidarspec.framing.steady import leading, steady_stream
+from lidarspec.framing.search import Bytes1D, Framing, Mode, Offsets, Piece, count_rejected, fitting, merged
+from lidarspec.framing.steady import leading
 from lidarspec.wire.arrays import repeated
 from lidarspec.wire.layout import Layout
 
@@ -29,24 +29,6 @@ NARROW, WIDE = 1 << 8, 1 << 12
 WAIT = -1
 
 _UNKNOWN = 255
-
-
-def cut(framing: Framing, buffer: Bytes1D, mode: Mode, *, base: int, final: bool) -> Piece:
-    """Cut one piece of a stream into frames.
-
-    Args:
-        buffer: the bytes not yet decided and those after them.
-        mode: remembered between pieces, changed here.
-        base: offset of the buffer in the stream.
-        final: give up candidates that need more bytes than there are.
-
-    Returns:
-        The frames, and in `end` the first byte that has to be looked at again together with what follows.
-    """
-    if any(framing.weak(kind) for kind in framing.active(mode)):
-        return _Runs(framing, buffer, mode, base, final=final).cut()
-    piece = None if final else steady_stream(framing, buffer, mode)
-    return leftmost(framing, buffer, mode, final=final) if piece is None else piece
 
 
 class Lane:
@@ -175,7 +157,8 @@ class Lane:
         assert self._size
         rows = np.ndarray((number, self._size), np.uint8, self._buffer, spot, (self._size, 1))
         count = leading(self._framing, self.kind, rows) or 0
-        survey = self._framing.survey_rows(self.kind, rows[:count]) if count else None
+        codec = self._framing.codecs[self.kind]
+        survey = codec.survey_rows(rows[:count], sums=self._framing.sums) if count else None
         if survey is not None:
             layout, status, errors = survey
             offsets = slice(spot, spot + count * self._size, self._size)
@@ -241,8 +224,15 @@ class Lane:
             self.layouts += layouts
 
 
-class _Runs:
-    """One pass over a piece."""
+class Runs:
+    """One pass over a piece of a stream in which a weak type is looked for.
+
+    Args:
+        buffer: the bytes not yet decided and those after them.
+        mode: remembered between pieces, changed here.
+        base: offset of the buffer in the stream.
+        final: give up candidates that need more bytes than there are.
+    """
 
     def __init__(self, framing: Framing, buffer: Bytes1D, mode: Mode, base: int, *, final: bool) -> None:
         self._framing, self._mode, self._base = framing, mode, base
