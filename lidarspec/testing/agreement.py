@@ -230,7 +230,7 @@ def _cut_anywhere(subject: Subject, data: bytes) -> None:
 def single_packets_equal_a_batch(subject: Subject) -> None:
     """Packets that come one by one are those of one batch."""
     found = subject.sensor.split(material.delivery(subject.sensor, subject.conversation()))
-    for name in material.incoming(subject.sensor):
+    for name in subject.sensor.incoming:
         stats = [Decoder(subject.sensor, stream=True).stats for _ in range(2)]
         single, batch = (PacketStream(subject.sensor, name, each) for each in stats)
         assert_same_packets(joined([single.add([packed([item])]) for item in found]), batch.add([packed(found)]))

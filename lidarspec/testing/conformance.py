@@ -22,12 +22,11 @@ from lidarspec.spec.sensor import Sensor
 from lidarspec.testing import agreement, commands, frames, geometry, vectors
 from lidarspec.testing.declared import declared
 from lidarspec.testing.findings import Finding, Violation, left_over
-from lidarspec.testing.geometry import data_frames
 from lidarspec.testing.subject import EXAMPLES, Subject
 
 
 def _no_sweep(subject: Subject) -> str:
-    names = data_frames(subject)
+    names = subject.sensor.data_frames
     if not any(subject.sensor.simulation_of(name).sweep for name in names):
         return "it declares no `sweep`, and cannot be simulated"
     alone = [name for name in names if not isinstance(codec(subject.sensor.frames[name]), CompiledCodec)]
@@ -72,7 +71,7 @@ class Property:
 
     def cases(self, subject: Subject) -> Iterable[tuple[str, ...]]:
         """What it is asked of."""
-        names = {"frame": subject.sensor.frames, "data": data_frames(subject), "command": subject.sensor.commands}
+        names = {"frame": subject.sensor.frames, "data": subject.sensor.data_frames, "command": subject.sensor.commands}
         return [()] if self.each == "sensor" else [(name,) for name in names[self.each]]
 
     def findings(self, subject: Subject) -> list[Finding]:

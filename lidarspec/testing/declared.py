@@ -17,7 +17,7 @@ from lidarspec.spec.construct_layer import is_expression
 from lidarspec.spec.fields import factor
 from lidarspec.spec.tree import Sealed, Struct, infos, nodes
 from lidarspec.testing.findings import Finding
-from lidarspec.testing.geometry import data_frames, field_of, traced, used
+from lidarspec.testing.geometry import field_of, traced, used
 from lidarspec.testing.subject import Subject
 from lidarspec.wire.layout import Layout
 
@@ -39,7 +39,7 @@ def declared(subject: Subject) -> list[Finding]:
     sensor = subject.sensor
     checks: list[Findings] = [_sensor(sensor), _clock(sensor)]
     checks += [_frame(subject, name, frame) for name, frame in sensor.frames.items()]
-    checks += [_points(subject, name) for name in data_frames(subject)]
+    checks += [_points(subject, name) for name in subject.sensor.data_frames]
     checks += [_reach(subject)]
     findings: list[Finding] = []
     for check in checks:
@@ -209,7 +209,7 @@ def _points(subject: Subject, name: str) -> Findings:
 def _reach(subject: Subject) -> Findings:
     """A range limit that no data frame can hold in the field that its ranges are."""
     reach: list[tuple[float, str]] = []
-    for name in data_frames(subject):
+    for name in subject.sensor.data_frames:
         try:
             result = traced(subject, name)
         except Exception:  # said elsewhere

@@ -50,11 +50,6 @@ FULL = {"deg": 360.0, "rad": 2 * np.pi}
 EXACT, UNTOLD = 2e-6, 0.004
 
 
-def data_frames(subject: Subject) -> list[str]:
-    """The names of the frame types that carry points."""
-    return [name for name, frame in subject.sensor.frames.items() if frame.data]
-
-
 def swept(subject: Subject, name: str, packets: int, start: int = 0) -> list[bytes]:
     """Packets along the sensor's `sweep`; none where it declares none, or the frame type is not compiled."""
     sweep = subject.sensor.simulation_of(name).sweep

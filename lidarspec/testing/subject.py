@@ -22,11 +22,6 @@ from lidarspec.spec.tree import FieldInfo, Sealed, nodes
 SHORT = 300
 
 
-def incoming(sensor: Sensor) -> list[str]:
-    """The names of the frame types that the sensor sends."""
-    return [name for name, frame in sensor.frames.items() if frame.direction == "in"]
-
-
 def delivery(sensor: Sensor, frames: list[tuple[str, bytes]]) -> Any:
     """Frames as the data link delivers them: datagrams, or one run of bytes."""
     parts = [data for _, data in frames]
@@ -162,7 +157,7 @@ class Subject:
         """Frames of all incoming types as the sensor could send them: (type, bytes), each where it is looked for and believed."""
         frames: list[tuple[str, bytes]] = []
         for turn in range(rounds):
-            for name in incoming(self.sensor):
+            for name in self.sensor.incoming:
                 frame, first = self.sensor.frames[name], seed * 1000 + turn * 10
                 if frame.after is not None:
                     frames.append((frame.after, self.example(frame.after, seed=first)))

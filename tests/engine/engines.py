@@ -23,7 +23,7 @@ def clean_and_damaged_input_read_alike(sensor: Sensor) -> None:
 def values_at_the_edges_read_alike(sensor: Sensor) -> None:
     """Fail unless frames with values at the edges of their fields' ranges give the same on both engines; long frames are left out."""
     subject = Subject(sensor)
-    for name in material.incoming(sensor):
+    for name in sensor.incoming:
         fields, source = codec(sensor.frames[name]).schema.fields, subject.source(f"edges {name}")
         if sensor.frames[name].max_length > material.SHORT or not isinstance(codec(sensor.frames[name]), CompiledCodec):
             continue

@@ -85,7 +85,7 @@ def noise_is_cut_as_the_rule_says(subject: Subject) -> None:
 
 def the_longest_frame_is_a_frame(subject: Subject) -> None:
     """The longest of many examples is found in a stream."""
-    for name in material.incoming(subject.sensor):
+    for name in subject.sensor.incoming:
         frame = subject.sensor.frames[name]
         if frame.after is None and frame.confirm == 1:
             longest = longest_example(subject, name)

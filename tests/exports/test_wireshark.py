@@ -49,9 +49,7 @@ def test_what_only_python_can_decide_is_refused_with_the_reason() -> None:
 
 @pytest.mark.parametrize("sensor", SENSORS)
 def test_every_field_reads_as_lidarspec_reads_it(sensor: Sensor, tmp_path: Path) -> None:
-    outgoing = [
-        (name, sensor.example(name, seed=seed)) for seed in range(3) for name in sensor.frames if name not in material.incoming(sensor)
-    ]
+    outgoing = [(name, sensor.example(name, seed=seed)) for seed in range(3) for name in sensor.frames if name not in sensor.incoming]
     frames = [*Subject(sensor).conversation(), *outgoing]
     capture = captured(sensor, [data for _, data in frames], tmp_path / "frames.pcap")
     script = written(sensor, tmp_path)
@@ -97,7 +95,7 @@ def test_physical_values_are_fields_too(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", ["ldrobot-stl27l", "shape-nested", "shape-nibbles", "shape-oddities"])
 def test_a_wrong_checksum_is_marked(name: str, tmp_path: Path) -> None:
     sensor = EVERY[name]
-    sealed = [kind for kind in material.incoming(sensor) if material.seals(sensor, kind, sensor.example(kind))]
+    sealed = [kind for kind in sensor.incoming if material.seals(sensor, kind, sensor.example(kind))]
     frames = []
     for kind in sealed:
         good = sensor.example(kind, seed=3)
