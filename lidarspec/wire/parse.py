@@ -10,7 +10,7 @@ import functools
 import io
 import re
 import struct
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Literal
 
 import construct
@@ -60,8 +60,12 @@ def unpacked(root: Node, layout: Layout, frame: bytes) -> Any:
     return reader(frame)[0]
 
 
-#: from the bytes of a frame to the values of a part of it, one for each element of the arrays that it is in, row by row.
-Reader = Callable[[bytes], Sequence[Any]]
+#: the byte orders in which a bit block is a number.
+ENDS: tuple[Literal["little"], Literal["big"]] = ("little", "big")
+
+#: from the bytes of a frame (below a bit block: from the numbers in its place) to the values of a part of it, one for each element
+#: of the arrays that it is in, row by row.
+Reader = Callable[[Any], Sequence[Any]]
 
 
 def _reader(node: Node, path: str, layout: Layout, count: int) -> Reader:
@@ -176,13 +180,57 @@ def _names(names: _Names, numbers: Reader, frame: bytes) -> Sequence[Any]:
 
 
 def _bits(node: Block, path: str, layout: Layout, count: int) -> Reader:
-    """What reads the parts of a bit block, by the keys under which construct has them."""
+    """What reads a bit block: each as one number, in the order that leaves fewer runs of bits, and its parts where construct has them."""
     leaf = layout.leaves[".".join(name for name in (path, *node.parts[0].names) if name)]
     offsets = _offsets(leaf, leaf.shape[: len(leaf.strides)])
-    spots = {segment.byte for part in node.parts for segment in part.bits.segments}
-    columns = {spot: _unpack([offset + spot for offset in offsets], "<", "B") for spot in spots}
-    readers = [_labelled(part.info, functools.partial(_joined, part.bits, columns)) for part in node.parts]
-    return _grouped([(part.bits.keys, reader) for part, reader in zip(node.parts, readers, strict=True)], count)
+    orders = [(order, [_runs(part.bits, node.size, order) for part in node.parts]) for order in ENDS]
+    order, numbers = min(orders, key=lambda each: sum(len(runs) for runs in each[1]))
+    readers = [_labelled(part.info, _part(part.bits, runs)) for part, runs in zip(node.parts, numbers, strict=True)]
+    parts = _grouped([(part.bits.keys, reader) for part, reader in zip(node.parts, readers, strict=True)], count)
+    code = {1: "B", 2: "H", 4: "I", 8: "Q"}.get(node.size)
+    if code is not None:
+        blocks = _unpack(offsets, "<" if order == "little" else ">", code)
+    else:
+        blocks = functools.partial(_integers, _unpack(offsets, "<", f"{node.size}s"), order, False)
+    return functools.partial(_parts, parts, blocks)
+
+
+def _parts(parts: Reader, blocks: Reader, frame: bytes) -> Sequence[Any]:
+    return parts(blocks(frame))
+
+
+def _runs(field: BitField, size: int, order: Literal["little", "big"]) -> list[tuple[int, int, int]]:
+    """The bits of a part in its block as one number: lowest bit, mask and lowest bit of the value, of each run."""
+    runs = list[tuple[int, int, int]]()
+    for segment in sorted(field.segments, key=lambda segment: segment.target):
+        low = 8 * (segment.byte if order == "little" else size - 1 - segment.byte) + segment.low
+        first, mask, target = runs[-1] if runs else (low, 0, segment.target)
+        if runs and (low - first != segment.target - target or mask.bit_length() != segment.target - target):
+            first, mask, target = low, 0, segment.target
+        elif runs:
+            runs.pop()
+        runs.append((first, mask | segment.mask >> segment.low << (segment.target - target), target))
+    return runs
+
+
+def _part(field: BitField, runs: Sequence[tuple[int, int, int]]) -> Reader:
+    """What takes the values of a part out of its blocks."""
+    low, mask, target = runs[0]
+    if len(runs) > 1 or field.signed or field.flag or target:
+        return functools.partial(_joined, field, runs)
+    return functools.partial(_masked, low, mask)
+
+
+def _masked(low: int, mask: int, blocks: Sequence[int]) -> Sequence[int]:
+    return [block >> low & mask for block in blocks]
+
+
+def _joined(field: BitField, runs: Sequence[tuple[int, int, int]], blocks: Sequence[int]) -> Sequence[int]:
+    values = [sum((block >> low & mask) << target for low, mask, target in runs) for block in blocks]
+    if field.signed:
+        sign = 1 << (field.width - 1)
+        return [(value ^ sign) - sign for value in values]
+    return [value == 1 for value in values] if field.flag else values
 
 
 def _grouped(parts: Sequence[tuple[tuple[str | int, ...], Reader]], count: int) -> Reader:
@@ -200,18 +248,6 @@ def _grouped(parts: Sequence[tuple[tuple[str | int, ...], Reader]], count: int) 
 
 def _rows(readers: Sequence[Reader], frame: bytes) -> Sequence[ListContainer]:
     return [ListContainer(row) for row in zip(*(reader(frame) for reader in readers), strict=True)]
-
-
-def _joined(field: BitField, columns: Mapping[int, Reader], frame: bytes) -> Sequence[int]:
-    """The values of a bit field from the bytes that hold its bits."""
-    values: Sequence[int] = ()
-    for part in field.segments:
-        bits = [(byte & part.mask) >> part.low << part.target for byte in columns[part.byte](frame)]
-        values = [one | other for one, other in zip(values, bits, strict=True)] if values else bits
-    if field.signed:
-        sign = 1 << (field.width - 1)
-        return [(value ^ sign) - sign for value in values]
-    return [value == 1 for value in values] if field.flag else values
 
 
 def parse_typed(sensor: Spec, data: bytes, *, frame: str | None = None, verify: bool = True) -> tuple[str, Any]:
