@@ -27,8 +27,8 @@ Numbers = NDArray[np.int64] | range
 #: what a candidate is: a frame, one that is short of bytes, or why it is none.
 VALID, SHORT, LENGTH, CONSTANT, CHECKSUM, IMPLAUSIBLE, PLUGIN = range(7)
 
-#: layouts whose frames are found one layout after another sooner than by sorting.
-FEW = 16
+#: layouts whose frames are found one layout after another sooner than by sorting, and sooner than by counting first.
+FEW, FEWER = 16, 4
 
 #: which counter a rejected candidate raises.
 COUNTED = {SHORT: "bad_length", LENGTH: "bad_length", CHECKSUM: "bad_checksum", IMPLAUSIBLE: "implausible", PLUGIN: "plugin_errors"}
@@ -219,6 +219,9 @@ class Frames:
         form = alike(self.forms)
         if form is not None:
             return [(self.layouts[form], counted(len(self)))] if form >= 0 else []
+        if len(self.layouts) <= FEWER:
+            groups = [(layout, np.flatnonzero(self.forms == form)) for form, layout in enumerate(self.layouts)]
+            return [(layout, which) for layout, which in groups if len(which)]
         numbers = np.bincount(self.forms + 1)[1:]
         present = np.flatnonzero(numbers).tolist()
         if len(present) <= FEW:

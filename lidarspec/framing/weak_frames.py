@@ -103,7 +103,12 @@ class Lane:
 
     def forms(self, offsets: Offsets) -> Offsets:
         """Which of its layouts the valid candidates at these offsets have, (k,); -1 where nobody knows."""
-        return self._forms[offsets] if len(self._forms) else repeated(0, len(offsets))
+        return self._forms[offsets] if self.has_forms else repeated(0, len(offsets))
+
+    @property
+    def has_forms(self) -> bool:
+        """Whether its frames may have more than one layout."""
+        return len(self._forms) > 0
 
     def _stands(self, spot: int, *, first: bool) -> int:
         """Whether a frame of this type, of a run or its first, stands at an offset: 1, 0 or `WAIT`."""
@@ -330,12 +335,18 @@ class Runs:
             kind, spot, number, size = taken[0]
             kinds, sizes = repeated(kind, number), repeated(size, number)
             starts: Offsets = np.arange(spot, spot + number * size, size)
+            layouts, forms = self._layouts(kinds, starts)
         else:
             all_kinds, spots, numbers, all_sizes = np.array(taken, np.intp).T
-            within = np.arange(int(numbers.sum())) - np.repeat(np.cumsum(numbers) - numbers, numbers)
             kinds, sizes = np.repeat(all_kinds, numbers), np.repeat(all_sizes, numbers)
-            starts = np.repeat(spots, numbers) + within * sizes
-        layouts, forms = self._layouts(kinds, starts)
+            steps, last = sizes.copy(), spots + (numbers - 1) * all_sizes
+            steps[np.cumsum(numbers) - numbers] = spots - np.concatenate(([0], last[:-1]))
+            starts = np.cumsum(steps)
+            if any(lane.has_forms for lane in self._lanes):
+                layouts, forms = self._layouts(kinds, starts)
+            else:  # all frames of a run have one layout
+                layouts, forms = self._layouts(all_kinds, spots)
+                forms = np.repeat(forms, numbers)
         return Frames(self._buffer, kinds, starts, sizes, layouts=layouts, forms=forms)
 
     def _layouts(self, kinds: Offsets, starts: Offsets) -> tuple[tuple[Layout, ...], Offsets]:
@@ -344,7 +355,7 @@ class Runs:
             if np.count_nonzero(kinds == lane.kind) == len(kinds):
                 return tuple(lane.layouts), lane.forms(starts)
         layouts, forms = list(self._live.layouts), np.full(len(kinds), -1, np.intp)
-        strong = np.isin(kinds, [lane.kind for lane in self._lanes], invert=True)
+        strong = np.logical_and.reduce([kinds != lane.kind for lane in self._lanes])
         forms[strong] = self._live.forms[self._live.starts.searchsorted(starts[strong])]
         for lane in self._lanes:
             own = kinds == lane.kind
