@@ -156,7 +156,7 @@ def joined(parts: Sequence[Packets]) -> Packets:
 
 def joined_tables(tables: Sequence[Any]) -> Table:
     """Several tables of one frame type, one after another."""
-    return type(tables[0]).joined(tables)  # type: ignore[no-any-return]
+    return tables[0] if len(tables) == 1 else type(tables[0]).joined(tables)  # type: ignore[no-any-return]
 
 
 def _nested(schema: Schema, columns: Mapping[str, NDArray[Any]], prefix: str) -> np.dtype[Any]:

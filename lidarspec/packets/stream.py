@@ -132,9 +132,7 @@ class PacketStream:
 
     def _table(self, parts: Sequence[_Part]) -> Table:
         tables = [self._codec.gather(part.frames if part.where is None else part.frames.only(part.own)) for part in parts if part.number]
-        if not tables:
-            return self._codec.table([])
-        return tables[0] if len(tables) == 1 else joined_tables(tables)
+        return joined_tables(tables) if tables else self._codec.table([])
 
     def _states(self, parts: Sequence[_Part], number: int, *, whole: bool) -> dict[str, StateOf]:
         """The frames of each other type, and which of them was the last before each packet."""
@@ -143,21 +141,21 @@ class PacketStream:
                 return dict.fromkeys(self._others, (None, repeated(-1, number)))
             return {name: self._unchanged(name, number) for name in self._others}
         seen = self._others_in(parts)
-        return {name: self._state_of(name, *seen[name], number=number, whole=whole) for name in self._others}
+        return {name: self._state_of(name, seen.get(name, []), number=number, whole=whole) for name in self._others}
 
-    def _others_in(self, parts: Sequence[_Part]) -> dict[str, tuple[list[bytes], list[int]]]:
-        """The frames of other types, and how many of ours came before each."""
-        seen: dict[str, tuple[list[bytes], list[int]]] = {name: ([], []) for name in self._others}
+    def _others_in(self, parts: Sequence[_Part]) -> dict[str, list[tuple[Frames, NDArray[np.intp]]]]:
+        """The frames of other types, and how many of ours came before each, (k,)."""
+        seen: dict[str, list[tuple[Frames, NDArray[np.intp]]]] = {}
         number = 0
         for part in parts:
             if part.where is not None:
-                frames, others = part.frames, np.ones(len(part.frames), np.bool_)
-                others[part.own] = False
-                for rank, index in enumerate(np.flatnonzero(others).tolist()):
-                    name = frames.names[frames.kinds[index]]
-                    if name in seen:
-                        seen[name][0].append(frames.data(index))
-                        seen[name][1].append(number + index - rank)
+                mask = np.ones(len(part.frames), np.bool_)
+                mask[part.own] = False
+                others = np.flatnonzero(mask)
+                kinds, before = part.frames.kinds[others], number + others - np.arange(len(others))
+                for kind in np.unique(kinds).tolist():
+                    which = kinds == kind
+                    seen.setdefault(part.frames.names[kind], []).append((part.frames.only(others[which]), before[which]))
             number += part.number
         return seen
 
@@ -175,17 +173,20 @@ class PacketStream:
             known = self._tables[name] = (data, codec(self.sensor.frames[name], interpreted=self._interpreted).table([data]))
         return known[1]
 
-    def _state_of(self, name: str, frames: list[bytes], before: list[int], *, number: int, whole: bool) -> StateOf:
-        if not frames:
+    def _state_of(self, name: str, seen: Sequence[tuple[Frames, NDArray[np.intp]]], *, number: int, whole: bool) -> StateOf:
+        if not seen:
             return self._unchanged(name, number)
+        engine = codec(self.sensor.frames[name], interpreted=self._interpreted)
+        tables: list[Table] = [engine.gather(frames) for frames, _ in seen]
+        before = np.concatenate([places for _, places in seen])
         if name in self._state:
-            frames, before = [self._state[name], *frames], [0, *before]
+            tables, before = [self._last(name), *tables], np.concatenate(([0], before))
         elif whole:
-            before = [0, *before[1:]]
-        which = np.repeat(np.arange(-1, len(before)), np.diff([0, *before, number])) if any(before) else repeated(len(before) - 1, number)
-        self._state[name] = frames[-1]
-        table: Table = codec(self.sensor.frames[name], interpreted=self._interpreted).table(frames)
-        return table, which
+            before[0] = 0
+        last = seen[-1][0]
+        self._state[name] = last.data(len(last) - 1)
+        which = np.repeat(np.arange(-1, len(before)), np.diff(before, prepend=0, append=number))
+        return joined_tables(tables), which
 
 
 @dataclass(frozen=True, eq=False)
