@@ -347,26 +347,6 @@ class Fields:
         raise UnknownField(path, self._schema.fields)
 
 
-#: among the paths of `Watched`: something else than fields was looked at.
-UNKNOWN = ""
-
-
-class Watched(Fields):
-    """`Fields` that keep the paths of the fields that were looked at in `seen`."""
-
-    def __init__(self, batch: Batch, seen: set[str], schema: Schema | None = None, prefix: str = "") -> None:
-        super().__init__(batch, schema, prefix)
-        self._seen = seen
-
-    def __getattr__(self, name: str) -> Any:
-        value = super().__getattr__(name)
-        if isinstance(value, Fields):
-            return Watched(self._batch, self._seen, self._schema, f"{self._prefix}{name}.")
-        path = f"{self._prefix}{name}"
-        self._seen.add(path if path in self._schema.fields else UNKNOWN)
-        return value
-
-
 class _States:
     """``f.state``: the frames of other types that were last before each packet."""
 

@@ -21,10 +21,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.columns.columns import Batch, Column, Fields, unpadded
-from lidarspec.columns.graph import Node, Traced, conjuncts, evaluate, fields_beside, sample_of, trace
+from lidarspec.columns.graph import Expression, Traced, conjuncts, sample_of, trace
 from lidarspec.framing.results import CHECKSUM, CONSTANT, IMPLAUSIBLE, PLUGIN, VALID
 from lidarspec.spec.description import Frame
-from lidarspec.spec.tree import FieldInfo
 from lidarspec.wire.arrays import taken
 from lidarspec.wire.frame_table import Group, Rows, Table
 from lidarspec.wire.layout import Bytes2D, Layout, Leaf, Seal, Sums, elements, marks, right, words
@@ -120,19 +119,6 @@ def _all(array: NDArray[Any], answer: Any, batch: Batch) -> NDArray[np.bool_]:
     return np.asarray((flat if mask is None else flat | ~mask).all(axis=1))
 
 
-@dataclass(frozen=True, eq=False)
-class Condition:
-    """A part of the test: a node of the trace, and the fields that it depends on, all in the same arrays."""
-
-    node: Node
-    fields: tuple[FieldInfo, ...]
-
-    def holds(self, columns: Mapping[str, NDArray[np.float64]]) -> NDArray[np.bool_]:
-        """Whether the condition is true, for columns of the fields in their units, element by element."""
-        with np.errstate(all="ignore"):
-            return np.asarray(evaluate(self.node, {}, lambda node: columns.get(node.path))).astype(np.bool_)
-
-
 class Conditions:
     """The test of one frame type.
 
@@ -157,7 +143,7 @@ class Conditions:
             return []  # a test on no elements holds, and what is combined with it is a test on none either
         return [self._check(part, own) for part, own in zip(self._parts, leaves, strict=True)]
 
-    def _check(self, part: Condition, leaves: Mapping[str, Leaf]) -> Check:
+    def _check(self, part: Expression, leaves: Mapping[str, Leaf]) -> Check:
         places = {(leaf.shape, leaf.strides) for leaf in leaves.values()}
         first, last = _window(leaves.values())
         if last - first > 2 or len(places) > 1 or any(len(shape) != len(strides) for shape, strides in places):
@@ -174,11 +160,11 @@ class Conditions:
 class _Computed:
     """A condition on more bytes than a table is made for."""
 
-    part: Condition
+    part: Expression
     leaves: Mapping[str, Leaf]
 
     def __call__(self, rows: Bytes2D) -> NDArray[np.bool_]:
-        held = self.part.holds(_physical(self.part, self.leaves, rows))
+        held = _held(self.part, self.leaves, rows)
         held = np.broadcast_to(held, (len(rows), *held.shape[1:]))
         return np.asarray(held.all(axis=tuple(range(1, held.ndim))))
 
@@ -234,7 +220,7 @@ class _LookedUp:
         return np.asarray(held.all(axis=tuple(range(1, held.ndim)))) if self.shape else held
 
 
-def _table(part: Condition, leaves: Mapping[str, Leaf], size: int) -> _Table:
+def _table(part: Expression, leaves: Mapping[str, Leaf], size: int) -> _Table:
     """A condition on so many bytes, at most two."""
     for dtype in map(np.dtype, ("<u2", ">u2") if size == 2 else ("u1",)):
         blocks = np.split(np.arange(1 << 8 * dtype.itemsize, dtype=dtype), 16)  # so that it takes little memory at a time
@@ -253,20 +239,15 @@ def _bits(listed: NDArray[np.bool_]) -> tuple[int, tuple[int, ...]] | None:
     return (mask, tuple(allowed)) if 0 < len(allowed) <= ALLOWED else None
 
 
-def _tried(part: Condition, leaves: Mapping[str, Leaf], codes: NDArray[Any]) -> NDArray[np.bool_]:
+def _tried(part: Expression, leaves: Mapping[str, Leaf], codes: NDArray[Any]) -> NDArray[np.bool_]:
     """Whether a condition holds where the bytes are these integers."""
     rows = codes.view(np.uint8).reshape(len(codes), -1)
-    return np.broadcast_to(part.holds(_physical(part, leaves, rows)), len(rows))
+    return np.broadcast_to(_held(part, leaves, rows), len(rows))
 
 
-def _physical(part: Condition, leaves: Mapping[str, Leaf], rows: Bytes2D) -> dict[str, NDArray[np.float64]]:
-    """The fields of a condition in their units; nan where the layout lacks one."""
-    found = {}
-    for info in part.fields:
-        leaf = leaves.get(info.path)
-        array = np.full(len(rows), np.nan) if leaf is None else leaf.load(rows).astype(np.float64)
-        found[info.path] = info.physical(array)
-    return found
+def _held(part: Expression, leaves: Mapping[str, Leaf], rows: Bytes2D) -> NDArray[np.bool_]:
+    """Whether a condition holds, element by element; a field that the layout lacks is nan."""
+    return part.values({path: leaf.load(rows) for path, leaf in leaves.items()}).astype(np.bool_)
 
 
 def _window(leaves: Iterable[Leaf]) -> tuple[int, int]:
@@ -278,12 +259,12 @@ def _window(leaves: Iterable[Leaf]) -> tuple[int, int]:
     return (min(spots), max(spots) + 1) if spots else (0, 0)
 
 
-def _parts(plausible: Callable[[Any], Any], schema: Schema, layout: Layout) -> list[Condition] | None:
+def _parts(plausible: Callable[[Any], Any], schema: Schema, layout: Layout) -> list[Expression] | None:
     blank = Group(layout, np.zeros(1, np.intp), np.zeros((1, layout.size), np.uint8))
     try:
         answer, _ = trace(plausible, sample_of(Batch(Rows(schema, [blank]), np.zeros(1, np.bool_)), blank))
         if not isinstance(answer, Traced):
             return None
-        return [Condition(node, fields_beside(node, schema)) for node in conjuncts(answer.node)]
+        return [Expression.of(node, schema) for node in conjuncts(answer.node)]
     except Exception:  # the function itself will say so, frame by frame
         return None
