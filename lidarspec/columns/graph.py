@@ -147,20 +147,17 @@ class Traced(NDArrayOperatorsMixin):
             raise SpecError("columns cannot be changed in place; write a new expression instead")
         if method != "__call__":
             raise Untraceable(f"np.{ufunc.__name__}.{method} takes several values together")
-        return self._called((lambda *arrays: ufunc(*arrays, **kwargs)) if kwargs else ufunc, inputs)
+        return self.applied((lambda *arrays: ufunc(*arrays, **kwargs)) if kwargs else ufunc, *inputs)
 
     def __array_function__(self, function: Callable[..., Any], types: Any, args: Any, kwargs: Any) -> Traced:
         if function not in ELEMENTWISE:
             raise Untraceable(f"np.{function.__name__} is not elementwise")
-        return self._called((lambda *arrays: function(*arrays, **kwargs)) if kwargs else function, args)
+        return self.applied((lambda *arrays: function(*arrays, **kwargs)) if kwargs else function, *args)
 
     def applied(self, function: Callable[..., Any], *values: Any) -> Traced:
         """What a function of arrays makes of the values, noted down."""
-        return self._called(function, values)
-
-    def _called(self, function: Callable[..., Any], values: tuple[Any, ...]) -> Traced:
         samples = [value.node.sample if isinstance(value, Traced) else value for value in values]
-        return self._tape.add("call", function, tuple(values), self.node.sample.applied(function, *samples))
+        return self._tape.add("call", function, values, self.node.sample.applied(function, *samples))
 
     def on(self, *axes: str) -> Traced:
         """The value on other axes, by the names of arrays, noted down."""
