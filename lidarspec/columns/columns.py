@@ -243,7 +243,7 @@ def aligned(values: tuple[Any, ...], batch: Batch) -> tuple[list[NDArray[Any]], 
     arrays = []
     for value in values:
         if isinstance(value, Column):
-            arrays.append(value.array.reshape(*value.shape, *(1,) * (depth - len(value.axes))))
+            arrays.append(deep(value.array, depth))
             continue
         array = np.asarray(value)
         arrays.append(array)
@@ -302,7 +302,11 @@ def field_column(info: FieldInfo, table: Table, depth: int, batch: Batch, which:
 
 def field_array(info: FieldInfo, table: Table, depth: int) -> NDArray[np.float64]:
     """A field in its unit, (n, ...), with `depth` axes behind the first at least, of length 1 where the field has none."""
-    array = physical(info, table)
+    return deep(physical(info, table), depth)
+
+
+def deep(array: NDArray[Any], depth: int) -> NDArray[Any]:
+    """Values of packets, (n, ...), with axes of length 1 behind them, up to `depth` behind the first."""
     return array.reshape(*array.shape, *(1,) * (depth + 1 - array.ndim))
 
 
@@ -322,7 +326,7 @@ def physical(info: FieldInfo, table: Table) -> NDArray[np.float64]:
         array += info.offset
     there = table.present(info.path)
     if there is not None:
-        array = np.where(there.reshape(*there.shape, *(1,) * (array.ndim - there.ndim)), array, np.nan)
+        array = np.where(deep(there, array.ndim - 1), array, np.nan)
     return array
 
 

@@ -281,11 +281,9 @@ def frames_of(decoder: Decoder, data: Any) -> list[Frames]:
     """Every frame of a whole input: bytes as a stream, an iterable or (n, size) array as datagrams."""
     if is_stream(data):
         return decoder.frames(data) + decoder.rest()
-    if isinstance(data, np.ndarray):
-        everything, step = np.ascontiguousarray(data, np.uint8), min(max(ROW_BYTES // max(data.shape[1], 1), 1), ROWS)
-        return [decoder.datagrams(everything[start : start + step]) for start in range(0, len(everything), step)]
-    packets = list(data)
-    step = max(1, min(TOGETHER, ROW_BYTES // max(len(packets[0]), 1))) if packets else 1
+    packets: Any = np.ascontiguousarray(data, np.uint8) if isinstance(data, np.ndarray) else list(data)
+    most = ROWS if isinstance(data, np.ndarray) else TOGETHER
+    step = max(1, min(most, ROW_BYTES // max(len(packets[0]), 1))) if len(packets) else 1
     return [decoder.datagrams(packets[start : start + step]) for start in range(0, len(packets), step)]
 
 

@@ -147,26 +147,20 @@ class Conditions:
         places = {(leaf.shape, leaf.strides) for leaf in leaves.values()}
         first, last = _window(leaves.values())
         if last - first > 2 or len(places) > 1 or any(len(shape) != len(strides) for shape, strides in places):
-            return _Computed(part, leaves)
+            return functools.partial(_computed, part, leaves)  # more bytes than a table is made for
         key = (id(part), *((path, leaf.offset - first, leaf.wire, leaf.elements) for path, leaf in leaves.items()))
         if key not in self._tables:
             single = {path: replace(leaf.at(first), shape=(), strides=()) for path, leaf in leaves.items()}
             self._tables[key] = _table(part, single, last - first)
         shape, strides = places.pop() if places else ((), ())
-        return _LookedUp(self._tables[key], first, shape, strides)
+        return functools.partial(_looked_up, self._tables[key], first, shape, strides)
 
 
-@dataclass(frozen=True, eq=False)
-class _Computed:
-    """A condition on more bytes than a table is made for."""
-
-    part: Expression
-    leaves: Mapping[str, Leaf]
-
-    def __call__(self, rows: Bytes2D) -> NDArray[np.bool_]:
-        held = _held(self.part, self.leaves, rows)
-        held = np.broadcast_to(held, (len(rows), *held.shape[1:]))
-        return np.asarray(held.all(axis=tuple(range(1, held.ndim))))
+def _computed(part: Expression, leaves: Mapping[str, Leaf], rows: Bytes2D) -> NDArray[np.bool_]:
+    """Whether a condition holds everywhere in each frame; a field that the layout lacks is nan."""
+    held = part.values({path: leaf.load(rows) for path, leaf in leaves.items()}).astype(np.bool_)
+    held = np.broadcast_to(held, (len(rows), *held.shape[1:]))
+    return np.asarray(held.all(axis=tuple(range(1, held.ndim))))
 
 
 @dataclass(frozen=True, eq=False)
@@ -202,29 +196,21 @@ class _Table:
         return np.frombuffer(values.tobytes().translate(self.listed.tobytes()), np.bool_).reshape(values.shape)
 
 
-@dataclass(frozen=True, eq=False)
-class _LookedUp:
-    """A condition on one or two bytes of a frame, or of each element of an array in it."""
-
-    table: _Table
-    spot: int
-    shape: tuple[int, ...]
-    strides: tuple[int, ...]
-
-    def __call__(self, rows: Bytes2D) -> NDArray[np.bool_]:
-        if not len(rows):
-            return np.empty(0, np.bool_)
-        view = elements(rows, self.table.dtype, self.spot, self.shape, self.strides)
-        values = view if view.itemsize == 1 else view.astype(self.table.dtype.newbyteorder("="))
-        held = self.table.holds(values)
-        return np.asarray(held.all(axis=tuple(range(1, held.ndim)))) if self.shape else held
+def _looked_up(table: _Table, spot: int, shape: tuple[int, ...], strides: tuple[int, ...], rows: Bytes2D) -> NDArray[np.bool_]:
+    """Whether a condition holds on one or two bytes of each frame, or of each element of an array in it."""
+    if not len(rows):
+        return np.empty(0, np.bool_)
+    view = elements(rows, table.dtype, spot, shape, strides)
+    values = view if view.itemsize == 1 else view.astype(table.dtype.newbyteorder("="))
+    held = table.holds(values)
+    return np.asarray(held.all(axis=tuple(range(1, held.ndim)))) if shape else held
 
 
 def _table(part: Expression, leaves: Mapping[str, Leaf], size: int) -> _Table:
     """A condition on so many bytes, at most two."""
     for dtype in map(np.dtype, ("<u2", ">u2") if size == 2 else ("u1",)):
         blocks = np.split(np.arange(1 << 8 * dtype.itemsize, dtype=dtype), 16)  # so that it takes little memory at a time
-        listed = np.concatenate([_tried(part, leaves, codes) for codes in blocks])
+        listed = np.concatenate([_computed(part, leaves, codes.view(np.uint8).reshape(len(codes), -1)) for codes in blocks])
         true = np.flatnonzero(listed)
         if len(true) and true[-1] - true[0] == len(true) - 1:
             return _Table(dtype, (int(true[0]), int(true[-1])), listed)
@@ -237,17 +223,6 @@ def _bits(listed: NDArray[np.bool_]) -> tuple[int, tuple[int, ...]] | None:
     mask = sum(bit for bit in map(int, 1 << np.arange(16)) if bit < len(listed) and (listed != listed[values ^ bit]).any())
     allowed = np.unique(values[listed] & mask).tolist()
     return (mask, tuple(allowed)) if 0 < len(allowed) <= ALLOWED else None
-
-
-def _tried(part: Expression, leaves: Mapping[str, Leaf], codes: NDArray[Any]) -> NDArray[np.bool_]:
-    """Whether a condition holds where the bytes are these integers."""
-    rows = codes.view(np.uint8).reshape(len(codes), -1)
-    return np.broadcast_to(_held(part, leaves, rows), len(rows))
-
-
-def _held(part: Expression, leaves: Mapping[str, Leaf], rows: Bytes2D) -> NDArray[np.bool_]:
-    """Whether a condition holds, element by element; a field that the layout lacks is nan."""
-    return part.values({path: leaf.load(rows) for path, leaf in leaves.items()}).astype(np.bool_)
 
 
 def _window(leaves: Iterable[Leaf]) -> tuple[int, int]:

@@ -121,10 +121,6 @@ class PacketStream:
 
     def _states(self, parts: Sequence[_Part], number: int, *, whole: bool) -> dict[str, StateOf]:
         """The frames of each other type, and which of them was the last before each packet."""
-        if all(part.where is None for part in parts):
-            if not self._state:
-                return dict.fromkeys(self._others, (None, repeated(-1, number)))
-            return {name: self._unchanged(name, number) for name in self._others}
         seen = self._others_in(parts)
         return {name: self._state_of(name, *seen[name], number=number, whole=whole) for name in self._others}
 
@@ -144,12 +140,6 @@ class PacketStream:
             number += part.number
         return seen
 
-    def _unchanged(self, name: str, number: int) -> StateOf:
-        """The state of packets during which no frame of this other type came."""
-        if name not in self._state:
-            return None, repeated(-1, number)
-        return self._last(name), repeated(0, number)
-
     def _codec_of(self, name: str) -> Codec:
         return codec(self.sensor.frames[name], interpreted=self._backend == "construct")
 
@@ -163,7 +153,7 @@ class PacketStream:
 
     def _state_of(self, name: str, frames: list[bytes], before: list[int], *, number: int, whole: bool) -> StateOf:
         if not frames:
-            return self._unchanged(name, number)
+            return (self._last(name), repeated(0, number)) if name in self._state else (None, repeated(-1, number))
         if name in self._state:
             frames, before = [self._state[name], *frames], [0, *before]
         elif whole:

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.columns.columns import Batch, Column, Fields, field_array
+from lidarspec.columns.columns import Batch, Column, Fields, deep, field_array
 from lidarspec.columns.graph import Node, evaluate
 from lidarspec.points import numpy_plan
 from lidarspec.points.cloud import ColumnSource, Stretch, later
@@ -98,10 +98,7 @@ class Share:
     def plain(self, name: str) -> NDArray[Any]:
         """A part of what `points` returned, for every point of the group, evaluated plainly: (packets, *shape of the plan)."""
         part, shape = self.plan.parts[name], (len(self), *self.plan.shape)
-        array = self.known.array(part) if isinstance(part, Node) else np.asarray(part)
-        if isinstance(part, Node):
-            array = array.reshape(*array.shape, *(1,) * (len(shape) - array.ndim))
-        return np.broadcast_to(array, shape)
+        return np.broadcast_to(deep(self.known.array(part), len(shape) - 1) if isinstance(part, Node) else np.asarray(part), shape)
 
     def some(self, which: NDArray[np.intp]) -> Share:
         """The share of some of the packets, by index, with what is known of them plainly."""
@@ -347,4 +344,4 @@ class BatchColumns(ColumnSource):
     def times_of(self, share: Share, first: int, stop: int) -> NDArray[np.float64]:
         """The times of all points of some packets of a share, seconds since `base`: (packets, *shape of the plan)."""
         offsets = seconds_since(self.packets.time_ns[share.group.where[first:stop]], self.base)
-        return np.asarray(share.plain("time")[first:stop] + offsets.reshape(-1, *(1,) * len(share.plan.shape)))
+        return np.asarray(share.plain("time")[first:stop] + deep(offsets, len(share.plan.shape)))

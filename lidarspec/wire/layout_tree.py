@@ -382,16 +382,11 @@ def rows_at(buffer: NDArray[np.uint8], offsets: NDArray[np.intp], size: int, *, 
 
 
 class HeaderTree:
-    """All layouts of one frame type.
-
-    Attributes:
-        prefix: the constants whose place depends on no header field: offset -> (mask, value).
-    """
+    """All layouts of one frame type."""
 
     def __init__(self, frame: tree.Node, limit: int) -> None:
         self._frame, self._limit = frame, limit
         self._root, self._size = _Node(), 0
-        self.prefix = prefix_of(frame, limit)
 
     def classify(self, buffer: NDArray[np.uint8], offsets: NDArray[np.intp]) -> list[Group]:
         """The candidates at `offsets`, sorted by layout: (layout or refusal, indices) for each, without those whose header is cut off."""

@@ -14,10 +14,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lidarspec.columns.columns import deep
 from lidarspec.columns.graph import Node, Term, chosen, is_full, key, last_axis, only_field
 from lidarspec.points.numpy_plan import products
 from lidarspec.points.numpy_plan.blocks import Blocks
-from lidarspec.points.numpy_plan.program import Number, Program, Read, Run, deep
+from lidarspec.points.numpy_plan.program import Program, Read, Run
 from lidarspec.points.numpy_plan.registers import TYPES
 from lidarspec.points.plan import Plan
 from lidarspec.points.windows import Window, every_value, shift_of, window
@@ -177,7 +178,7 @@ class Compiler:
 
     def _argument(self, value: Any, depth: int) -> Callable[[Run], Any]:
         if not isinstance(value, Node):
-            return lambda run: value
+            return _always(value)
         if is_full(value, self._width):
             read, shape = Read(self._double(value)), (*value.shape, *(1,) * (depth - len(value.shape)))
             return lambda run: read(run).reshape(-1, *shape)
@@ -189,8 +190,7 @@ class Compiler:
         if is_full(value, self._width):
             return Read(self._single(value))
         if not isinstance(value, Node) and np.size(value) == 1:
-            number = np.float32(np.asarray(value).reshape(()))
-            return lambda run: number
+            return _always(np.float32(np.asarray(value).reshape(())))
         return Read(self._once(("row", id(value)), lambda: self._spread(value, "single")))
 
     def _spread(self, value: Any, kind: str) -> int:
@@ -327,7 +327,7 @@ class Compiler:
         if options is None:
             return self.program.call("add", "double", np.add, Read(sum_), Read(self._scaled(part.full, factor)))
         condition, *values = options
-        first, second = (Read(self._scaled(value, factor)) if isinstance(value, Node) else Number(value * factor) for value in values)
+        first, second = (Read(self._scaled(value, factor)) if isinstance(value, Node) else _always(value * factor) for value in values)
         self.low.append(condition)
         shape, depth, before = self._shape, len(self._shape), Read(sum_)
 
@@ -351,6 +351,10 @@ class Compiler:
         if factor == 1:
             return read.register
         return self.program.step(f"times {factor:.6g}", "double", lambda run, out: np.multiply(read(run), factor, out=out), read)
+
+
+def _always(value: Any) -> Callable[[Run], Any]:
+    return lambda run: value
 
 
 def _rows(run: Run, numbers: NDArray[Any]) -> slice:

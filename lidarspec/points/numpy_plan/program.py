@@ -61,21 +61,6 @@ class Read:
         return run.views[self.register]
 
 
-@dataclass(frozen=True)
-class Number:
-    """A number as an argument of a step."""
-
-    value: float
-
-    def __call__(self, run: Run) -> float:
-        return self.value
-
-
-def deep(array: NDArray[Any], depth: int) -> NDArray[Any]:
-    """Values of packets, (n, ...), with axes of length 1 behind them, up to `depth` of the points."""
-    return array.reshape(*array.shape, *(1,) * (1 + depth - array.ndim))
-
-
 class Program:
     """The calls that make some flat float32 or float64 columns.
 
