@@ -227,11 +227,8 @@ def _bits(listed: NDArray[np.bool_]) -> tuple[int, tuple[int, ...]] | None:
 
 def _window(leaves: Iterable[Leaf]) -> tuple[int, int]:
     """First byte that the first elements of some fields take, and the one after their last."""
-    spots = []
-    for leaf in leaves:
-        spots += [leaf.offset, leaf.offset + leaf.size - 1] if leaf.wire else []
-        spots += [leaf.offset + segment.byte for element in leaf.elements for segment in element.segments]
-    return (min(spots), max(spots) + 1) if spots else (0, 0)
+    spans = [leaf.held for leaf in leaves]
+    return (min(start for start, _ in spans), max(stop for _, stop in spans)) if spans else (0, 0)
 
 
 def _parts(plausible: Callable[[Any], Any], schema: Schema, layout: Layout) -> list[Expression] | None:

@@ -39,9 +39,8 @@ def window(leaf: Leaf) -> Window | None:
         return Window(leaf.offset, leaf.wire.itemsize) if leaf.wire.itemsize <= 2 and leaf.wire.kind in "iu" else None
     if len(leaf.shape) > len(leaf.strides):
         return None
-    held = [segment.byte for segment in leaf.elements[0].segments]
-    low, high = min(held), max(held)
-    return Window(leaf.offset + low, high - low + 1) if high - low < 2 else None
+    start, stop = leaf.held
+    return Window(start, stop - start) if stop - start <= 2 else None
 
 
 def raw_values(leaf: Leaf, seen: Window) -> NDArray[Any]:

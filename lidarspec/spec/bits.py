@@ -45,18 +45,6 @@ class BitField:
     flag: bool = False
 
     @cached_property
-    def words(self) -> tuple[tuple[str, int, int], ...] | None:
-        """The value as words, if it is whole bytes in a row: type, first byte and lowest bit of each; else None."""
-        if self.run is None:
-            return None
-        (order, first, count), words, at = self.run, list[tuple[str, int, int]](), 0
-        while at < count:
-            size = 1 << min((count - at).bit_length() - 1, 3)
-            words.append((f"{order}u{size}", first + at, 8 * (at if order == "<" else count - at - size)))
-            at += size
-        return tuple(words)
-
-    @cached_property
     def run(self) -> tuple[str, int, int] | None:
         """The value as whole bytes in a row, if it is: "<" or ">", the first byte, and how many; else None."""
         parts = sorted(self.segments, key=lambda part: part.byte)

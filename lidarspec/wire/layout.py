@@ -111,15 +111,8 @@ class Leaf:
     def _bits(self, rows: Bytes2D, element: BitField) -> NDArray[Any]:
         assert self.info.dtype is not None
         wide = np.dtype(f"u{self.info.dtype.itemsize}")
-        whole = self._whole(rows, element, wide)
-        words = element.words if wide.itemsize > 2 and whole is None else None
-        if whole is not None:
-            total = whole
-        elif words is not None:
-            total = self._view(rows, np.dtype(words[0][0]), words[0][1]).astype(wide) << wide.type(words[0][2])
-            for word, byte, target in words[1:]:
-                total |= self._view(rows, np.dtype(word), byte).astype(wide) << wide.type(target)
-        else:
+        total = self._whole(rows, element, wide)
+        if total is None:
             total = np.zeros((len(rows), *self.shape[: len(self.strides)]), wide)
             for part in element.segments:
                 bits = (self._view(rows, np.dtype("u1"), part.byte) & np.uint8(part.mask)) >> part.low
@@ -143,6 +136,14 @@ class Leaf:
         elif spare:
             total &= wide.type((1 << 8 * count) - 1)
         return total
+
+    @property
+    def held(self) -> tuple[int, int]:
+        """The first byte that holds any bit of it, where it stands first in its arrays, and the one after the last."""
+        if not self.elements:
+            return self.offset, self.offset + self.size
+        spots = [self.offset + part.byte for element in self.elements for part in element.segments]
+        return min(spots), max(spots) + 1
 
     def at(self, offset: int) -> Leaf:
         """The field with its place counted from `offset`."""
