@@ -100,16 +100,22 @@ class Share:
         part, shape = self.plan.parts[name], (len(self), *self.plan.shape)
         return np.broadcast_to(deep(self.known.array(part), len(shape) - 1) if isinstance(part, Node) else np.asarray(part), shape)
 
+    @classmethod
+    def part(cls, plan: Plan, batch: Batch, group: Group, remembered: Mapping[int, Column]) -> Share:
+        """The share of some packets of a batch; `remembered`: the results of all its packets that remember others, by the node's number."""
+        own = batch.of(group)
+        share = cls(plan, group, Plain(own), own)
+        for number, column in remembered.items():
+            node = plan.tape.nodes[number]
+            array = column.array[group.where] if len(column.array) > 1 else column.array
+            corner = (slice(None), *(slice(0, length) for length in node.shape))
+            share.known.know(node, Column(array[corner], node.sample.axes, own))
+        return share
+
     def some(self, which: NDArray[np.intp]) -> Share:
         """The share of some of the packets, by index, with what is known of them plainly."""
-        group = Group(self.group.layout, which, self.group.rows[which])
-        batch = self.batch.of(group)
-        known = Plain(batch)
-        for node in self.plan.eager:
-            if node.kind in REMEMBERING:
-                column = self.known.column(node)
-                known.know(node, Column(column.array[which] if len(column.array) > 1 else column.array, column.axes, batch))
-        return Share(self.plan, Group(group.layout, np.arange(len(which)), group.rows), known, batch)
+        remembered = {node.number: self.known.column(node) for node in self.plan.eager if node.kind in REMEMBERING}
+        return Share.part(self.plan, self.batch, Group(self.group.layout, which, self.group.rows[which]), remembered)
 
 
 def maker_of(plan: Plan, names: tuple[str, ...], backend: str, number: int) -> Maker:
