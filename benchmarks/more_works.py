@@ -121,7 +121,7 @@ def as_they_come(sensor: ls.Sensor, packets: list[bytes], together: int, backend
 
     def run() -> None:
         decoder = sensor.decoder(backend=backend)
-        stream = PacketStream(sensor, sensor.data_frame, decoder.stats, interpreted=decoder.interpreted)
+        stream = PacketStream(sensor, sensor.data_frame, decoder.stats, backend=decoder.backend)
         waiting: list[bytes] = []
         for packet in packets:
             waiting.append(packet)

@@ -238,11 +238,11 @@ class Registry:
         try:
             self._manager.register(plugin, name)
             sensors = self._sensors_of(plugin)
-        except pluggy.PluginValidationError as error:
-            self._rollback(name)
-            raise SpecError(" ".join(str(error).split()), path=name) from None
-        except BaseException:
-            self._rollback(name)
+        except BaseException as error:
+            if self._manager.has_plugin(name):
+                self._manager.unregister(name=name)
+            if isinstance(error, pluggy.PluginValidationError):
+                raise SpecError(" ".join(str(error).split()), path=name) from None
             raise
         self._keep(plugin, sensors)
         self._ready.clear()
@@ -352,10 +352,6 @@ class Registry:
             if self._owners.get(name, plugin) != plugin or sum(name in (s.id, *s.aliases) for s in own) > 1:
                 raise SpecError("another sensor has this id already", sensor=name)
 
-    def _rollback(self, name: str) -> None:
-        if self._manager.has_plugin(name):
-            self._manager.unregister(name=name)
-
 
 def _loaded(entry: EntryPoint, names: str, add: Callable[[Any], list[str]]) -> Plugin:
     """What became of an entry point that is loaded and added; whatever it raises disturbs no other."""
@@ -443,12 +439,8 @@ def _from_file(text: str) -> Sensor:
     file = Path(f"{path}.py" if colon else text)
     module = file_module(file)
     local = Registry()
-    try:
+    with _faults_of(file):
         ids = local.add(module, name=str(file))
-    except LidarSpecError:
-        raise
-    except (Exception, SystemExit) as error:
-        raise SpecError(f"{type(error).__name__}: {error}", path=str(file)) from error
     if not ids:
         raise SpecError("there is no function lidarspec_sensors, marked @hookimpl, that returns a sensor", path=str(file))
     if len(ids) > 1 and not wanted:
@@ -471,13 +463,20 @@ def file_module(file: Path) -> ModuleType:
     assert module_spec is not None
     assert module_spec.loader is not None
     module = importlib.util.module_from_spec(module_spec)
-    try:
+    with _faults_of(file):
         module_spec.loader.exec_module(module)
+    return module
+
+
+@contextlib.contextmanager
+def _faults_of(file: Path) -> Iterator[None]:
+    """Whatever the code of a file raises, as a `SpecError` that names the file."""
+    try:
+        yield
     except LidarSpecError:
         raise
     except (Exception, SystemExit) as error:
         raise SpecError(f"{type(error).__name__}: {error}", path=str(file)) from error
-    return module
 
 
 def rebuilt(sensor_id: str, options: Mapping[str, Any]) -> Sensor:

@@ -17,7 +17,7 @@ Axes that are kept by name whatever the depth (M3), elements of an array by inde
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -28,7 +28,6 @@ from numpy.typing import NDArray
 from lidarspec.errors import SpecError, UnknownField
 from lidarspec.spec.tree import FieldInfo
 from lidarspec.wire.frame_table import Group, Rows, Table
-from lidarspec.wire.schema import Schema
 
 #: NumPy functions that work element by element, and so keep axes; others see plain arrays.
 ELEMENTWISE = {np.where, np.clip, np.nan_to_num, np.round, np.isclose, np.real_if_close}
@@ -123,7 +122,7 @@ class Column(NDArrayOperatorsMixin):
         Raises:
             SpecError: for fewer axes than the column has, or an array that the frame does not have.
         """
-        chain = self.batch.table.schema.chain()
+        chain = self.batch.table.schema.chain
         own = [index for index, name in enumerate(self.axes) if name is not None]
         if len(axes) < len(own):
             raise SpecError(f"a column with {len(own)} axes cannot be put on {axes}")
@@ -240,11 +239,11 @@ def aligned(values: tuple[Any, ...], batch: Batch) -> tuple[list[NDArray[Any]], 
             if name is not None and names[index] not in (None, name):
                 raise SpecError(f"axis {names[index]!r} meets axis {name!r}: put one on the other's place with .on(...)")
             names[index] = name if name is not None else names[index]
-    chain = batch.table.schema.chain()
+    chain = batch.table.schema.chain
     arrays = []
     for value in values:
         if isinstance(value, Column):
-            arrays.append(value.array.reshape(*value.shape, *(1,) * (depth - len(value.axes))))
+            arrays.append(deep(value.array, depth))
             continue
         array = np.asarray(value)
         arrays.append(array)
@@ -303,7 +302,11 @@ def field_column(info: FieldInfo, table: Table, depth: int, batch: Batch, which:
 
 def field_array(info: FieldInfo, table: Table, depth: int) -> NDArray[np.float64]:
     """A field in its unit, (n, ...), with `depth` axes behind the first at least, of length 1 where the field has none."""
-    array = physical(info, table)
+    return deep(physical(info, table), depth)
+
+
+def deep(array: NDArray[Any], depth: int) -> NDArray[Any]:
+    """Values of packets, (n, ...), with axes of length 1 behind them, up to `depth` behind the first."""
     return array.reshape(*array.shape, *(1,) * (depth + 1 - array.ndim))
 
 
@@ -323,48 +326,40 @@ def physical(info: FieldInfo, table: Table) -> NDArray[np.float64]:
         array += info.offset
     there = table.present(info.path)
     if there is not None:
-        array = np.where(there.reshape(*there.shape, *(1,) * (array.ndim - there.ndim)), array, np.nan)
+        array = np.where(deep(there, array.ndim - 1), array, np.nan)
     return array
 
 
 class Fields:
-    """The fields of a batch of packets by attribute, as columns: ``f.points.distance``, ``f.state.difop.vertical``."""
+    """The fields of a batch of packets by attribute, as columns: ``f.points.distance``, ``f.state.difop.vertical``.
 
-    def __init__(self, batch: Batch, schema: Schema | None = None, prefix: str = "") -> None:
-        self._batch, self._schema, self._prefix = batch, schema or batch.table.schema, prefix
+    Args:
+        prefix: the names so far, each with a dot behind it.
+        frame: the other frame type that they are of; "" for the packets themselves.
+    """
+
+    def __init__(self, batch: Batch, prefix: str = "", frame: str = "") -> None:
+        self._batch, self._prefix, self._frame = batch, prefix, frame
 
     def __getattr__(self, name: str) -> Any:
         if name.startswith("__"):
             raise AttributeError(name)
-        if name == "state" and not self._prefix:
+        if name == "state" and not self._prefix and not self._frame:
             return _States(self._batch)
-        path = f"{self._prefix}{name}"
-        info = self._schema.fields.get(path)
-        if info is not None:
-            return field_column(info, self._batch.table, self._schema.depth(), self._batch)
-        if any(known.startswith(f"{path}.") for known in self._schema.fields):
-            return Fields(self._batch, self._schema, f"{path}.")
-        raise UnknownField(path, self._schema.fields)
+        path, known = f"{self._prefix}{name}", _paths(self._batch, self._frame)
+        if path in known:
+            return _column(self._batch, self._frame, path)
+        if any(other.startswith(f"{path}.") for other in known):
+            return Fields(self._batch, f"{path}.", self._frame)
+        raise UnknownField(path, known, place=f"state.{self._frame}" if self._frame else "")
 
 
-#: among the paths of `Watched`: something else than fields was looked at.
-UNKNOWN = ""
-
-
-class Watched(Fields):
-    """`Fields` that keep the paths of the fields that were looked at in `seen`."""
-
-    def __init__(self, batch: Batch, seen: set[str], schema: Schema | None = None, prefix: str = "") -> None:
-        super().__init__(batch, schema, prefix)
-        self._seen = seen
-
-    def __getattr__(self, name: str) -> Any:
-        value = super().__getattr__(name)
-        if isinstance(value, Fields):
-            return Watched(self._batch, self._seen, self._schema, f"{self._prefix}{name}.")
-        path = f"{self._prefix}{name}"
-        self._seen.add(path if path in self._schema.fields else UNKNOWN)
-        return value
+def _paths(batch: Batch, frame: str) -> Iterable[str]:
+    """The fields of a batch, or those of the frames of another type that were last before its packets."""
+    if not frame:
+        return batch.table.schema.fields
+    table, _ = batch.state[frame]
+    return {*batch.defaults.get(frame, {}), *(table.schema.fields if table is not None else ())}
 
 
 class _States:
@@ -378,42 +373,28 @@ class _States:
             raise AttributeError(name)
         if name not in self._batch.state:
             raise UnknownField(name, self._batch.state, place="state")
-        return _State(self._batch, name, "")
+        return Fields(self._batch, frame=name)
 
 
-class _State:
-    """``f.state.difop``: the fields of one other frame type, or their declared defaults."""
-
-    def __init__(self, batch: Batch, frame: str, prefix: str) -> None:
-        self._batch, self._frame, self._prefix = batch, frame, prefix
-
-    def __getattr__(self, name: str) -> Any:
-        if name.startswith("__"):
-            raise AttributeError(name)
-        path = f"{self._prefix}{name}"
-        table, which = self._batch.state[self._frame]
-        defaults = self._batch.defaults.get(self._frame, {})
-        known = set(defaults) | (set(table.schema.fields) if table is not None else set())
-        if path in known:
-            return self._column(path, table, which, defaults)
-        if any(other.startswith(f"{path}.") for other in known):
-            return _State(self._batch, self._frame, f"{path}.")
-        raise UnknownField(path, known, place=f"state.{self._frame}")
-
-    def _column(self, path: str, table: Table | None, which: NDArray[np.intp], defaults: Mapping[str, Any]) -> Column:
-        batch, depth = self._batch, self._batch.table.schema.depth()
-        missing = which < 0
-        if not missing.any() and table is not None:
-            same = len(which) == 0 or int(which.min()) == int(which.max())
-            return field_column(table.schema.fields[path], table, depth, batch, which[:1] if same else which)
-        if path not in defaults:
-            raise SpecError(f"no {self._frame} frame has arrived yet, and no default is declared", path=f"state.{self._frame}.{path}")
-        batch.nominal = True
-        default = np.asarray(defaults[path], np.float64)
-        names = tuple(path if length != 1 else None for length in default.shape)
-        spare = (1,) * max(depth - default.ndim, 0)
-        array = default.reshape(1, *default.shape, *spare)
-        if table is not None and not missing.all():
-            known = field_column(table.schema.fields[path], table, depth, batch, np.maximum(which, 0)).array
-            array = np.where(missing.reshape(-1, *(1,) * (known.ndim - 1)), array, known)
-        return Column(array, (*names, *(None,) * len(spare)), batch)
+def _column(batch: Batch, frame: str, path: str) -> Column:
+    """A field of a batch; of another frame type that of the frame that was last before each packet, or its declared default."""
+    depth = batch.table.schema.depth()
+    if not frame:
+        return field_column(batch.table.schema.fields[path], batch.table, depth, batch)
+    table, which = batch.state[frame]
+    defaults = batch.defaults.get(frame, {})
+    missing = which < 0
+    if not missing.any() and table is not None:
+        same = len(which) == 0 or int(which.min()) == int(which.max())
+        return field_column(table.schema.fields[path], table, depth, batch, which[:1] if same else which)
+    if path not in defaults:
+        raise SpecError(f"no {frame} frame has arrived yet, and no default is declared", path=f"state.{frame}.{path}")
+    batch.nominal = True
+    default = np.asarray(defaults[path], np.float64)
+    names = tuple(path if length != 1 else None for length in default.shape)
+    spare = (1,) * max(depth - default.ndim, 0)
+    array = default.reshape(1, *default.shape, *spare)
+    if table is not None and not missing.all():
+        known = field_column(table.schema.fields[path], table, depth, batch, np.maximum(which, 0)).array
+        array = np.where(missing.reshape(-1, *(1,) * (known.ndim - 1)), array, known)
+    return Column(array, (*names, *(None,) * len(spare)), batch)

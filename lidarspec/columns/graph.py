@@ -18,9 +18,9 @@ values that are traced. Points by coordinates (M2): their expressions are nodes 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, lru_cache
 from operator import attrgetter
 from typing import Any
 
@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 from lidarspec.columns.columns import ELEMENTWISE, Batch, Column, Fields, called
 from lidarspec.errors import SpecError
 from lidarspec.spec.tree import FieldInfo
-from lidarspec.wire.frame_table import Group
+from lidarspec.wire.frame_table import Group, Rows, Table
 from lidarspec.wire.schema import Schema
 
 
@@ -147,20 +147,17 @@ class Traced(NDArrayOperatorsMixin):
             raise SpecError("columns cannot be changed in place; write a new expression instead")
         if method != "__call__":
             raise Untraceable(f"np.{ufunc.__name__}.{method} takes several values together")
-        return self._called((lambda *arrays: ufunc(*arrays, **kwargs)) if kwargs else ufunc, inputs)
+        return self.applied((lambda *arrays: ufunc(*arrays, **kwargs)) if kwargs else ufunc, *inputs)
 
     def __array_function__(self, function: Callable[..., Any], types: Any, args: Any, kwargs: Any) -> Traced:
         if function not in ELEMENTWISE:
             raise Untraceable(f"np.{function.__name__} is not elementwise")
-        return self._called((lambda *arrays: function(*arrays, **kwargs)) if kwargs else function, args)
+        return self.applied((lambda *arrays: function(*arrays, **kwargs)) if kwargs else function, *args)
 
     def applied(self, function: Callable[..., Any], *values: Any) -> Traced:
         """What a function of arrays makes of the values, noted down."""
-        return self._called(function, values)
-
-    def _called(self, function: Callable[..., Any], values: tuple[Any, ...]) -> Traced:
         samples = [value.node.sample if isinstance(value, Traced) else value for value in values]
-        return self._tape.add("call", function, tuple(values), self.node.sample.applied(function, *samples))
+        return self._tape.add("call", function, values, self.node.sample.applied(function, *samples))
 
     def on(self, *axes: str) -> Traced:
         """The value on other axes, by the names of arrays, noted down."""
@@ -275,18 +272,131 @@ def only_field(node: Node) -> Node | None:
     return node.fields[0] if node.fields is not None and len(node.fields) == 1 else None
 
 
-def fields_beside(node: Node, schema: Schema) -> tuple[FieldInfo, ...]:
-    """The fields that an expression is made of, all in the same arrays, each once.
+@dataclass(frozen=True, eq=False)
+class Expression:
+    """An expression of fields of the frame that are all in the same arrays.
+
+    Attributes:
+        node: what is computed.
+        fields: those that it is made of, each once.
+    """
+
+    node: Node
+    fields: tuple[FieldInfo, ...]
+
+    @classmethod
+    def of(cls, node: Node, schema: Schema) -> Expression:
+        """A node as such an expression.
+
+        Raises:
+            Untraceable: if it is made of more than fields of the frame that stand side by side.
+        """
+        if node.fields is None:
+            raise Untraceable("made of more than fields of the frame")
+        infos = tuple(schema.fields[source.path] for source in node.fields)
+        if len({info.axes for info in infos}) != 1:
+            raise Untraceable("made of fields of different arrays")
+        return cls(node, infos)
+
+    def values(self, raw: Mapping[str, NDArray[Any]]) -> NDArray[Any]:
+        """What it comes to, element by element, by the raw values of its fields; one that is left out is nan."""
+        with np.errstate(all="ignore"):
+            columns = {info.path: info.physical(np.asarray(raw.get(info.path, np.nan), np.float64)) for info in self.fields}
+            return np.asarray(evaluate(self.node, {}, lambda node: columns.get(node.path)))
+
+
+#: values of a term that are remembered.
+REMEMBERED = 64
+
+#: the integers that are wanted of the plain values of a term, for so many packets: (n,) or (1,).
+Made = Callable[[Any, int], NDArray[np.int64]]
+
+
+class HeaderFunction:
+    """A function of header fields, taken apart: each term of it is computed again only where its fields change.
+
+    Most of a clock is a date, and most counters depend on a setting: the same in thousands of packets, and dozens of operations to read.
+
+    Args:
+        function: of `Fields`; gives a column, or several, the terms.
+        made: the integers that are wanted of a term.
+    """
+
+    def __init__(self, function: Callable[[Any], Any], made: Made) -> None:
+        self._function, self._made = function, made
+        self._terms: list[_Term] | None = None
+        self._is_tried = False
+
+    def __call__(self, batch: Batch) -> list[NDArray[np.int64]]:
+        """The integers of each term, (n,) or (1,)."""
+        table = batch.table
+        if not self._is_tried and isinstance(table, Rows):
+            self._is_tried, self._terms = True, self._apart(batch, table)
+        if self._terms is None:  # only the function itself can tell
+            return [self._made(term, len(batch)) for term in _several(self._function(Fields(batch)))]
+        return [term(table) for term in self._terms]
+
+    def _apart(self, batch: Batch, table: Rows) -> list[_Term] | None:
+        try:
+            traced, _ = trace(self._function, sample_of(batch, table.groups[0]))
+            return [_Term(Expression.of(term.node, table.schema), self._made) for term in _several(traced)]
+        except Exception:  # the function itself says so, if anything is wrong
+            return None
+
+
+def _several(terms: Any) -> Sequence[Any]:
+    return terms if isinstance(terms, tuple | list) else (terms,)
+
+
+class _Term:
+    """A part of what a function gives.
 
     Raises:
-        Untraceable: if it is made of more than fields of the frame that stand side by side.
+        Untraceable: if its fields are no plain ones of the header.
     """
-    if node.fields is None:
-        raise Untraceable("made of more than fields of the frame")
-    infos = tuple(schema.fields[source.path] for source in node.fields)
-    if len({info.axes for info in infos}) != 1:
-        raise Untraceable("made of fields of different arrays")
-    return infos
+
+    def __init__(self, expression: Expression, made: Made) -> None:
+        if any(info.axes or info.optional for info in expression.fields):
+            raise Untraceable("not every packet has its fields once")
+        self._expression, self._made = expression, made
+        self._known: dict[tuple[Any, ...], NDArray[np.int64]] = {}
+
+    def __call__(self, table: Table) -> NDArray[np.int64]:
+        columns = [table.raw(info.path) for info in self._expression.fields]
+        if self._expression.node.kind == "field":
+            return self._computed(columns)
+        changes = np.zeros(len(table), np.bool_)
+        for column in columns:
+            changes[1:] |= column[1:] != column[:-1]
+        starts = np.flatnonzero(changes)
+        if not len(starts):
+            return self._once([column[:1] for column in columns])
+        if 2 * len(starts) > len(table):
+            return self._computed(columns)
+        starts = np.concatenate([[0], starts])
+        values = self._computed([column[starts] for column in columns])
+        return np.repeat(values, np.diff(starts, append=len(table)))
+
+    def _once(self, columns: list[NDArray[Any]]) -> NDArray[np.int64]:
+        """The integer of one packet, (1,), which a later one with equal readings shares."""
+        key = tuple(column.item(0) for column in columns)
+        found = self._known.get(key)
+        if found is None:
+            found = self._computed(columns)
+            if len(self._known) >= REMEMBERED:
+                self._known.clear()
+            self._known[key] = found
+        return found
+
+    def _computed(self, columns: list[NDArray[Any]]) -> NDArray[np.int64]:
+        raw = {info.path: column for info, column in zip(self._expression.fields, columns, strict=True)}
+        return self._made(self._expression.values(raw), len(columns[0]))
+
+
+@lru_cache(maxsize=256)
+def header_function(function: Callable[[Any], Any], schema: Schema, made: Made) -> HeaderFunction:
+    """The function for frames of a type, by their schema, with what it remembers."""
+    return HeaderFunction(function, made)
 
 
 def conjuncts(node: Node) -> Iterator[Node]:

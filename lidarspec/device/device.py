@@ -89,7 +89,7 @@ class PacketReader:
 
     def _made(self, name: str) -> PacketStream:
         decoder = self._decoder
-        return PacketStream(self._sensor, name, decoder.stats, interpreted=decoder.interpreted, backend=decoder.backend, state=self._state)
+        return PacketStream(self._sensor, name, decoder.stats, backend=decoder.backend, state=self._state)
 
 
 class Device(Closing):

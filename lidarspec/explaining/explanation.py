@@ -334,7 +334,7 @@ def _points(sensor: Sensor, name: str, data: bytes, rows: Sequence[Row]) -> tupl
         return none, (*notes, f"no points: {error}")
     notes += ["defaults stand in for what a frame of another type would say"] * bool(evaluated.cloud.nominal)
     points = [Point.of(evaluated.cloud, index) for index in range(len(evaluated.cloud))]
-    chain = packets.table.schema.chain()
+    chain = packets.table.schema.chain
     if not chain:
         return none, (*notes, *(f"point {point}" for point in points[:TOLD]))
     inside = evaluated.counts[0].astype(np.bool_)

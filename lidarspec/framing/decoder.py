@@ -46,18 +46,17 @@ class Decoder:
     Args:
         sensor: the sensor; only its incoming frames are looked for.
         stream: a byte stream, or datagrams one for each `feed`.
-        interpreted: let construct judge every candidate.
-        backend: what makes points of its packets, "auto", "numpy" or "jit".
+        backend: what makes points of its packets, "auto", "numpy" or "jit"; "construct" also judges every candidate.
         sums: what computes checksums; by default their algorithms.
     """
 
-    def __init__(self, sensor: Spec, *, stream: bool, interpreted: bool = False, backend: str = "auto", sums: Sums | None = None) -> None:
+    def __init__(self, sensor: Spec, *, stream: bool, backend: str = "auto", sums: Sums | None = None) -> None:
         if not sensor.incoming:
             raise UsageError(f"{sensor.id} has no frames yet: configure it with its file first")
-        self.sensor, self.stream, self.interpreted, self.backend = sensor, stream, interpreted, backend
+        self.sensor, self.stream, self.backend = sensor, stream, backend
         self.stats = Counters()
         keep_freed_memory()
-        self._framing = _framing(tuple(sensor.incoming), tuple(sensor.incoming.values()), interpreted, sums)
+        self._framing = _framing(tuple(sensor.incoming), tuple(sensor.incoming.values()), backend == "construct", sums)
         answer = sensor.options.get("answer", "")  # as if the frame that the answer comes after had been seen
         self._mode = Mode(after=sensor.frames[answer].after if answer in sensor.frames else None)
         self._pending, self._base, self._need = b"", 0, 0
@@ -160,12 +159,7 @@ class Decoder:
         self, buffer: NDArray[np.uint8], starts: NDArray[np.intp], sizes: NDArray[np.intp], good: NDArray[np.bool_]
     ) -> NDArray[np.int64]:
         """The bytes in datagrams that are no frames before each one that is, fillers left out; counts them."""
-        lost = np.where(good, 0, sizes)
-        if self._fillers:
-            for index in np.flatnonzero(lost).tolist():
-                lost[index] -= self._skip(buffer[starts[index] : starts[index] + sizes[index]])
-        else:
-            self.stats.bytes_skipped += int(lost.sum())
+        lost = self._skipped(buffer, np.where(good, 0, sizes), starts + sizes)
         before = np.concatenate([[-self._gap], np.cumsum(lost)[good]])
         self._gap = int(lost.sum() - before[-1])
         return np.diff(before)
@@ -219,25 +213,22 @@ class Decoder:
         places = frames.places
         if not self._gap and isinstance(places, range) and places.start == 0 and places.stop == end:
             return repeated(0, len(frames))
-        gaps = np.empty(len(frames) + 1, np.int64)
-        gaps[:-1], gaps[-1] = frames.starts, end
-        gaps[1:] -= frames.starts + frames.sizes
-        if self._fillers:
-            for index in np.flatnonzero(gaps).tolist():
-                stop = int(frames.starts[index]) if index < len(frames) else end
-                gaps[index] -= self._skip(buffer[stop - gaps[index] : stop])
-        else:
-            self.stats.bytes_skipped += int(gaps.sum())
+        stops = np.append(frames.starts, end)
+        gaps = stops - np.concatenate([[0], frames.starts + frames.sizes])
+        gaps = self._skipped(buffer, gaps, stops)
         gaps[0] += self._gap
         self._gap = int(gaps[-1])
         return gaps[:-1]
 
-    def _skip(self, skipped: NDArray[np.uint8]) -> int:
-        """Count skipped bytes; the number of fillers among them."""
-        fillers = len(skipped) - len(skipped.tobytes().translate(None, self._fillers))
-        self.stats.bytes_skipped += len(skipped)
-        self.stats.bytes_filler += fillers
-        return fillers
+    def _skipped(self, buffer: NDArray[np.uint8], sizes: NDArray[np.int64], stops: NDArray[np.int64]) -> NDArray[np.int64]:
+        """The numbers of skipped bytes that end at these stops, fillers left out; counts them."""
+        self.stats.bytes_skipped += int(sizes.sum())
+        for index in np.flatnonzero(sizes).tolist() if self._fillers else ():
+            skipped = buffer[stops[index] - sizes[index] : stops[index]]
+            fillers = len(skipped) - len(skipped.tobytes().translate(None, self._fillers))
+            self.stats.bytes_filler += fillers
+            sizes[index] -= fillers
+        return sizes
 
     def _rejected(self, numbers: Mapping[str, int], errors: Sequence[str]) -> None:
         for name, number in numbers.items():
@@ -290,11 +281,9 @@ def frames_of(decoder: Decoder, data: Any) -> list[Frames]:
     """Every frame of a whole input: bytes as a stream, an iterable or (n, size) array as datagrams."""
     if is_stream(data):
         return decoder.frames(data) + decoder.rest()
-    if isinstance(data, np.ndarray):
-        everything, step = np.ascontiguousarray(data, np.uint8), min(max(ROW_BYTES // max(data.shape[1], 1), 1), ROWS)
-        return [decoder.datagrams(everything[start : start + step]) for start in range(0, len(everything), step)]
-    packets = list(data)
-    step = max(1, min(TOGETHER, ROW_BYTES // max(len(packets[0]), 1))) if packets else 1
+    packets: Any = np.ascontiguousarray(data, np.uint8) if isinstance(data, np.ndarray) else list(data)
+    most = ROWS if isinstance(data, np.ndarray) else TOGETHER
+    step = max(1, min(most, ROW_BYTES // max(len(packets[0]), 1))) if len(packets) else 1
     return [decoder.datagrams(packets[start : start + step]) for start in range(0, len(packets), step)]
 
 

@@ -13,8 +13,7 @@ from __future__ import annotations
 import functools
 import io
 import traceback
-from collections.abc import Iterable, Mapping
-from typing import Protocol
+from collections.abc import Iterable
 
 import construct
 import numpy as np
@@ -27,32 +26,30 @@ from lidarspec.spec.construct_layer import Mismatch, fixed_size
 from lidarspec.spec.description import Frame
 from lidarspec.wire.arrays import alike, counted, repeated
 from lidarspec.wire.frame_table import Group, Records, Rows, Table
-from lidarspec.wire.layout import Layout, Marks, Sums, marks
+from lidarspec.wire.layout import Layout, Sums, marks
 from lidarspec.wire.layout_tree import NotCompilable, Refused, frame_layouts, prefix_of, rows_at
-from lidarspec.wire.schema import Schema, schema
+from lidarspec.wire.schema import schema
 
 #: bytes of candidates looked at in one go, so that memory stays small on hostile streams.
 BLOCK = 1 << 19
 
 
-class Codec(Protocol):
+class Codec:
     """The engine of one frame type.
 
     Attributes:
+        prefix: the constants at the start: offset -> (mask, value).
+        marks: these, whole bytes first, which tell the most.
         size: that of all its frames, None where they differ.
         layout: that of all its frames, None where they differ or construct parses them.
-        marks: the constants of `prefix`, whole bytes first, which tell the most.
     """
 
-    frame: Frame
-    schema: Schema
-    size: int | None
-    layout: Layout | None
-    marks: Marks
+    layout: Layout | None = None
 
-    @property
-    def prefix(self) -> Mapping[int, tuple[int, int]]:
-        """The constants at the start: offset -> (mask, value)."""
+    def __init__(self, frame: Frame) -> None:
+        self.frame, self.schema = frame, schema(frame.tree)
+        self.prefix, self.size = prefix_of(frame.tree, frame.max_length), fixed_size(frame.prepared) or None
+        self.marks = marks(self.prefix)
 
     def survey(
         self, buffer: NDArray[np.uint8], offsets: NDArray[np.intp], *, kind: int = 0, gathered: bool = True, sums: Sums | None = None
@@ -65,18 +62,22 @@ class Codec(Protocol):
             gathered: whether their bytes are wanted too, as `Frames.rows`.
             sums: what computes checksums; by default their algorithms.
         """
+        raise NotImplementedError
 
     def survey_rows(self, rows: NDArray[np.uint8], *, sums: Sums | None = None) -> tuple[Layout, Status, tuple[str, ...]] | None:
-        """The layout of candidates of one size, one a row, the status of each, and tracebacks; None where their layouts differ."""
+        """The layout of candidates of one size, one a row, the status of each, and tracebacks; None where they have not one."""
+        return None
 
     def table(self, frames: Iterable[bytes]) -> Table:
         """Frames known to be of this type, as columns."""
+        raise NotImplementedError
 
     def gather(self, frames: Frames) -> Table:
         """Frames that were found, all of this type, as columns."""
+        return self.table(map(frames.data, range(len(frames))))
 
 
-class CompiledCodec:
+class CompiledCodec(Codec):
     """A frame type whose layouts are compiled.
 
     Raises:
@@ -87,11 +88,9 @@ class CompiledCodec:
         layouts = frame_layouts(frame)
         if isinstance(layouts, NotCompilable):
             raise layouts
-        self.frame, self.schema, self.tree = frame, schema(frame.tree), layouts
-        self.prefix, self.size = self.tree.prefix, fixed_size(frame.prepared) or None
-        self.marks = marks(self.prefix)
-        layout = self.tree.layout(b"")
-        self.layout: Layout | None = layout if isinstance(layout, Layout) else None
+        super().__init__(frame)
+        self.tree, layout = layouts, layouts.layout(b"")
+        self.layout = layout if isinstance(layout, Layout) else None
         self._conditions: Conditions | None = None
 
     def survey(
@@ -190,14 +189,12 @@ class CompiledCodec:
         return judge
 
 
-class InterpretedCodec:
+class InterpretedCodec(Codec):
     """A frame type that construct parses, one candidate at a time; `reason` says why it is not compiled."""
 
     def __init__(self, frame: Frame, reason: str = "") -> None:
-        self.frame, self.reason, self.schema = frame, reason, schema(frame.tree)
-        self.prefix, self.size = prefix_of(frame.tree, frame.max_length), fixed_size(frame.prepared) or None
-        self.marks = marks(self.prefix)
-        self.layout: Layout | None = None
+        super().__init__(frame)
+        self.reason = reason
 
     def survey(
         self, buffer: NDArray[np.uint8], offsets: NDArray[np.intp], *, kind: int = 0, gathered: bool = True, sums: Sums | None = None
@@ -210,15 +207,9 @@ class InterpretedCodec:
             status[index], sizes[index] = self._judge(data, errors)
         return Frames(buffer, repeated(kind, len(offsets)), offsets, sizes, status=status, errors=tuple(errors))
 
-    def survey_rows(self, rows: NDArray[np.uint8], *, sums: Sums | None = None) -> None:
-        return None
-
     def table(self, frames: Iterable[bytes]) -> Records:
         frames = list(frames)
         return Records(self.schema, [self.frame.prepared.parse(frame, _verify=False) for frame in frames], frames)
-
-    def gather(self, frames: Frames) -> Records:
-        return self.table(map(frames.data, range(len(frames))))
 
     def _judge(self, data: bytes, errors: list[str]) -> tuple[int, int]:
         stream = io.BytesIO(data)

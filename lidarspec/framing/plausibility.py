@@ -21,10 +21,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.columns.columns import Batch, Column, Fields, unpadded
-from lidarspec.columns.graph import Node, Traced, conjuncts, evaluate, fields_beside, sample_of, trace
+from lidarspec.columns.graph import Expression, Traced, conjuncts, sample_of, trace
 from lidarspec.framing.results import CHECKSUM, CONSTANT, IMPLAUSIBLE, PLUGIN, VALID
 from lidarspec.spec.description import Frame
-from lidarspec.spec.tree import FieldInfo
 from lidarspec.wire.arrays import taken
 from lidarspec.wire.frame_table import Group, Rows, Table
 from lidarspec.wire.layout import Bytes2D, Layout, Leaf, Seal, Sums, elements, marks, right, words
@@ -120,19 +119,6 @@ def _all(array: NDArray[Any], answer: Any, batch: Batch) -> NDArray[np.bool_]:
     return np.asarray((flat if mask is None else flat | ~mask).all(axis=1))
 
 
-@dataclass(frozen=True, eq=False)
-class Condition:
-    """A part of the test: a node of the trace, and the fields that it depends on, all in the same arrays."""
-
-    node: Node
-    fields: tuple[FieldInfo, ...]
-
-    def holds(self, columns: Mapping[str, NDArray[np.float64]]) -> NDArray[np.bool_]:
-        """Whether the condition is true, for columns of the fields in their units, element by element."""
-        with np.errstate(all="ignore"):
-            return np.asarray(evaluate(self.node, {}, lambda node: columns.get(node.path))).astype(np.bool_)
-
-
 class Conditions:
     """The test of one frame type.
 
@@ -157,30 +143,24 @@ class Conditions:
             return []  # a test on no elements holds, and what is combined with it is a test on none either
         return [self._check(part, own) for part, own in zip(self._parts, leaves, strict=True)]
 
-    def _check(self, part: Condition, leaves: Mapping[str, Leaf]) -> Check:
+    def _check(self, part: Expression, leaves: Mapping[str, Leaf]) -> Check:
         places = {(leaf.shape, leaf.strides) for leaf in leaves.values()}
         first, last = _window(leaves.values())
         if last - first > 2 or len(places) > 1 or any(len(shape) != len(strides) for shape, strides in places):
-            return _Computed(part, leaves)
+            return functools.partial(_computed, part, leaves)  # more bytes than a table is made for
         key = (id(part), *((path, leaf.offset - first, leaf.wire, leaf.elements) for path, leaf in leaves.items()))
         if key not in self._tables:
             single = {path: replace(leaf.at(first), shape=(), strides=()) for path, leaf in leaves.items()}
             self._tables[key] = _table(part, single, last - first)
         shape, strides = places.pop() if places else ((), ())
-        return _LookedUp(self._tables[key], first, shape, strides)
+        return functools.partial(_looked_up, self._tables[key], first, shape, strides)
 
 
-@dataclass(frozen=True, eq=False)
-class _Computed:
-    """A condition on more bytes than a table is made for."""
-
-    part: Condition
-    leaves: Mapping[str, Leaf]
-
-    def __call__(self, rows: Bytes2D) -> NDArray[np.bool_]:
-        held = self.part.holds(_physical(self.part, self.leaves, rows))
-        held = np.broadcast_to(held, (len(rows), *held.shape[1:]))
-        return np.asarray(held.all(axis=tuple(range(1, held.ndim))))
+def _computed(part: Expression, leaves: Mapping[str, Leaf], rows: Bytes2D) -> NDArray[np.bool_]:
+    """Whether a condition holds everywhere in each frame; a field that the layout lacks is nan."""
+    held = part.values({path: leaf.load(rows) for path, leaf in leaves.items()}).astype(np.bool_)
+    held = np.broadcast_to(held, (len(rows), *held.shape[1:]))
+    return np.asarray(held.all(axis=tuple(range(1, held.ndim))))
 
 
 @dataclass(frozen=True, eq=False)
@@ -216,29 +196,21 @@ class _Table:
         return np.frombuffer(values.tobytes().translate(self.listed.tobytes()), np.bool_).reshape(values.shape)
 
 
-@dataclass(frozen=True, eq=False)
-class _LookedUp:
-    """A condition on one or two bytes of a frame, or of each element of an array in it."""
-
-    table: _Table
-    spot: int
-    shape: tuple[int, ...]
-    strides: tuple[int, ...]
-
-    def __call__(self, rows: Bytes2D) -> NDArray[np.bool_]:
-        if not len(rows):
-            return np.empty(0, np.bool_)
-        view = elements(rows, self.table.dtype, self.spot, self.shape, self.strides)
-        values = view if view.itemsize == 1 else view.astype(self.table.dtype.newbyteorder("="))
-        held = self.table.holds(values)
-        return np.asarray(held.all(axis=tuple(range(1, held.ndim)))) if self.shape else held
+def _looked_up(table: _Table, spot: int, shape: tuple[int, ...], strides: tuple[int, ...], rows: Bytes2D) -> NDArray[np.bool_]:
+    """Whether a condition holds on one or two bytes of each frame, or of each element of an array in it."""
+    if not len(rows):
+        return np.empty(0, np.bool_)
+    view = elements(rows, table.dtype, spot, shape, strides)
+    values = view if view.itemsize == 1 else view.astype(table.dtype.newbyteorder("="))
+    held = table.holds(values)
+    return np.asarray(held.all(axis=tuple(range(1, held.ndim)))) if shape else held
 
 
-def _table(part: Condition, leaves: Mapping[str, Leaf], size: int) -> _Table:
+def _table(part: Expression, leaves: Mapping[str, Leaf], size: int) -> _Table:
     """A condition on so many bytes, at most two."""
     for dtype in map(np.dtype, ("<u2", ">u2") if size == 2 else ("u1",)):
         blocks = np.split(np.arange(1 << 8 * dtype.itemsize, dtype=dtype), 16)  # so that it takes little memory at a time
-        listed = np.concatenate([_tried(part, leaves, codes) for codes in blocks])
+        listed = np.concatenate([_computed(part, leaves, codes.view(np.uint8).reshape(len(codes), -1)) for codes in blocks])
         true = np.flatnonzero(listed)
         if len(true) and true[-1] - true[0] == len(true) - 1:
             return _Table(dtype, (int(true[0]), int(true[-1])), listed)
@@ -253,37 +225,18 @@ def _bits(listed: NDArray[np.bool_]) -> tuple[int, tuple[int, ...]] | None:
     return (mask, tuple(allowed)) if 0 < len(allowed) <= ALLOWED else None
 
 
-def _tried(part: Condition, leaves: Mapping[str, Leaf], codes: NDArray[Any]) -> NDArray[np.bool_]:
-    """Whether a condition holds where the bytes are these integers."""
-    rows = codes.view(np.uint8).reshape(len(codes), -1)
-    return np.broadcast_to(part.holds(_physical(part, leaves, rows)), len(rows))
-
-
-def _physical(part: Condition, leaves: Mapping[str, Leaf], rows: Bytes2D) -> dict[str, NDArray[np.float64]]:
-    """The fields of a condition in their units; nan where the layout lacks one."""
-    found = {}
-    for info in part.fields:
-        leaf = leaves.get(info.path)
-        array = np.full(len(rows), np.nan) if leaf is None else leaf.load(rows).astype(np.float64)
-        found[info.path] = info.physical(array)
-    return found
-
-
 def _window(leaves: Iterable[Leaf]) -> tuple[int, int]:
     """First byte that the first elements of some fields take, and the one after their last."""
-    spots = []
-    for leaf in leaves:
-        spots += [leaf.offset, leaf.offset + leaf.size - 1] if leaf.wire else []
-        spots += [leaf.offset + segment.byte for element in leaf.elements for segment in element.segments]
-    return (min(spots), max(spots) + 1) if spots else (0, 0)
+    spans = [leaf.held for leaf in leaves]
+    return (min(start for start, _ in spans), max(stop for _, stop in spans)) if spans else (0, 0)
 
 
-def _parts(plausible: Callable[[Any], Any], schema: Schema, layout: Layout) -> list[Condition] | None:
+def _parts(plausible: Callable[[Any], Any], schema: Schema, layout: Layout) -> list[Expression] | None:
     blank = Group(layout, np.zeros(1, np.intp), np.zeros((1, layout.size), np.uint8))
     try:
         answer, _ = trace(plausible, sample_of(Batch(Rows(schema, [blank]), np.zeros(1, np.bool_)), blank))
         if not isinstance(answer, Traced):
             return None
-        return [Condition(node, fields_beside(node, schema)) for node in conjuncts(answer.node)]
+        return [Expression.of(node, schema) for node in conjuncts(answer.node)]
     except Exception:  # the function itself will say so, frame by frame
         return None

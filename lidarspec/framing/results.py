@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.wire.arrays import alike, counted, repeated, some, taken
+from lidarspec.wire.arrays import alike, by_value, counted, repeated, some, taken
 from lidarspec.wire.layout import Bytes2D, Layout
 
 Indices = NDArray[np.intp]
@@ -222,13 +222,7 @@ class Frames:
         if len(self.layouts) <= FEWER:
             groups = [(layout, np.flatnonzero(self.forms == form)) for form, layout in enumerate(self.layouts)]
             return [(layout, which) for layout, which in groups if len(which)]
-        numbers = np.bincount(self.forms + 1)[1:]
-        present = np.flatnonzero(numbers).tolist()
-        if len(present) <= FEW:
-            return [(self.layouts[form], np.flatnonzero(self.forms == form)) for form in present]
-        order = np.argsort(self.forms, kind="stable")[len(self) - int(numbers.sum()) :]
-        parts = np.split(order, np.cumsum(numbers[present])[:-1])
-        return [(self.layouts[form], which) for form, which in zip(present, parts, strict=True)]
+        return [(self.layouts[form], which) for form, which in by_value(self.forms, FEW) if form >= 0]
 
     def located(self, names: tuple[str, ...], places: Numbers, gaps: NDArray[np.int64], at: NDArray[np.int64]) -> Frames:
         """These frames with their place in the input; gathered rows stand for the buffer, so that the rest of it can go."""

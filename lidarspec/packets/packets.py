@@ -18,6 +18,9 @@ from lidarspec.spec.description import Spec
 from lidarspec.wire.frame_table import Table
 from lidarspec.wire.schema import Schema
 
+#: what is known of each packet besides its fields.
+_COLUMNS = ("offset", "time_ns", "host_ns", "index", "breaks")
+
 StateOf = tuple[Table | None, NDArray[np.intp]]
 
 
@@ -118,19 +121,10 @@ class Packets:
     def take(self, which: Any) -> Packets:
         """The packets that indices, a mask or a slice pick, with their times, offsets and state."""
         indices = np.arange(len(self))[which]
-        return Packets(
-            self.sensor,
-            self.frame,
-            self.table.take(indices),
-            offset=self.offset[indices],
-            time_ns=self.time_ns[indices],
-            host_ns=self.host_ns[indices],
-            index=self.index[indices],
-            breaks=self.breaks[indices],
-            state={name: (table, chosen[indices]) for name, (table, chosen) in self.state.items()},
-            stats=self.stats,
-            backend=self.backend,
-        )
+        columns: dict[str, Any] = {name: getattr(self, name)[indices] for name in _COLUMNS}
+        state = {name: (table, chosen[indices]) for name, (table, chosen) in self.state.items()}
+        table = self.table.take(indices)
+        return Packets(self.sensor, self.frame, table, **columns, state=state, stats=self.stats, backend=self.backend)
 
     def batch(self, carry: dict[int, NDArray[np.float64]] | None = None) -> Batch:
         """The packets as a plugin's functions are given them, through `Fields`; `carry`: what the batch before left."""
@@ -149,7 +143,7 @@ def joined(parts: Sequence[Packets]) -> Packets:
         starts = np.cumsum([0] + [0 if table is None else len(table) for table in tables])
         which = [np.where(part.state[name][1] < 0, -1, part.state[name][1] + start) for part, start in zip(parts, starts[:-1], strict=True)]
         state[name] = (joined_tables(known) if known else None, np.concatenate(which))
-    columns = {key: np.concatenate([getattr(part, key) for part in parts]) for key in ("offset", "time_ns", "host_ns", "index", "breaks")}
+    columns = {key: np.concatenate([getattr(part, key) for part in parts]) for key in _COLUMNS}
     table = joined_tables([part.table for part in parts])
     return Packets(head.sensor, head.frame, table, **columns, state=state, stats=parts[-1].stats, backend=head.backend)
 

@@ -8,13 +8,13 @@ back for a while.
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.columns.columns import UNKNOWN, Batch, Watched
+from lidarspec.columns.columns import Batch
+from lidarspec.columns.graph import header_function
 from lidarspec.errors import SpecError
 from lidarspec.framing.results import Counters
 from lidarspec.packets.packets import Packets, joined
@@ -26,52 +26,11 @@ LATE = 64
 EARLY = 10
 #: counters with at least so many values start again at 0 only when the sensor does.
 LONG = 1 << 16
-#: results of a function that are remembered.
-REMEMBERED = 64
 
 
-class Remembered:
-    """A function of header fields, which is not called again for values that it has been called with.
-
-    Most counters and clocks depend on one or two settings of the sensor that hardly ever change, so that comparing them
-    with what they were before is much cheaper than computing with them.
-    """
-
-    def __init__(self) -> None:
-        self._paths: tuple[str, ...] | None = None
-        self._known: dict[tuple[int, ...], int] = {}
-
-    def __call__(self, function: Callable[[Any], Any], batch: Batch) -> int | NDArray[np.int64]:
-        """What the function says, (n,), or one number where it is the same for all packets."""
-        key = self._key(batch)
-        if key is not None and key in self._known:
-            return self._known[key]
-        seen: set[str] = set()
-        values = np.asarray(function(Watched(batch, seen)), np.float64).reshape(-1).astype(np.int64)
-        self._paths = _header(batch, seen) if self._paths is None or set(self._paths) == seen else ()
-        key = self._key(batch)
-        if len(values) == 1 or (len(values) and bool((values == values[0]).all())):
-            if key is not None and len(self._known) < REMEMBERED:
-                self._known[key] = values.item(0)
-            return values.item(0)
-        return np.asarray(np.broadcast_to(values, (len(batch),)))
-
-    def _key(self, batch: Batch) -> tuple[int, ...] | None:
-        """The values of the fields, if they are the same in all packets."""
-        key = []
-        for path in self._paths or ():
-            raw = batch.table.raw(path)
-            if not len(raw) or np.count_nonzero(raw == raw[0]) < len(raw):
-                return None
-            key.append(raw.item(0))
-        return tuple(key) or None
-
-
-def _header(batch: Batch, seen: set[str]) -> tuple[str, ...]:
-    """The fields that were looked at, if all are integers of the header that no frame lacks; else none."""
-    infos = [batch.table.schema.fields[path] for path in sorted(seen - {UNKNOWN})]
-    plain = all(not info.axes and not info.optional and info.dtype is not None and info.dtype.kind in "ui" for info in infos)
-    return tuple(info.path for info in infos) if plain and UNKNOWN not in seen else ()
+def _whole(values: Any, number: int) -> NDArray[np.int64]:
+    found = np.asarray(values, np.float64).reshape(-1).astype(np.int64)
+    return found if len(found) == 1 else np.broadcast_to(found, (number,))
 
 
 class SequenceTracker:
@@ -84,7 +43,6 @@ class SequenceTracker:
         self._index = -1
         self._first = 0
         self._missing: set[int] = set()
-        self._highest = Remembered()
 
     def push(self, batch: Batch) -> tuple[NDArray[np.int64], NDArray[np.bool_] | None]:
         """The index of each packet, (n,), and True where packets are missing before it, (n,); None where nowhere.
@@ -143,7 +101,8 @@ class SequenceTracker:
         """The highest number of the counter, for each packet or for all."""
         last = self._rule.last
         if callable(last):
-            return self._highest(last, batch)
+            (values,) = header_function(last, batch.table.schema, _whole)(batch)
+            return values.item(0) if (values == values[0]).all() else values
         return widest if last is None else int(last)
 
     def _step(self, number: int, period: int) -> tuple[int, bool]:

@@ -34,7 +34,6 @@ class PacketStream:
     Args:
         sensor, frame: whose, and of which type.
         stats: the decoder's counters; lost, duplicate and late packets are added to them.
-        interpreted: parse with construct.
         backend: what makes points of the packets, "auto", "numpy", "jit" or "construct".
         state: frames of other types, by name, that count as seen before the first packet.
     """
@@ -45,15 +44,13 @@ class PacketStream:
         frame: str,
         stats: Counters,
         *,
-        interpreted: bool = False,
         backend: str = "auto",
         state: Mapping[str, bytes] | None = None,
     ) -> None:
         if frame not in sensor.frames:
             raise UnknownFrame(frame, sensor.frames, place=sensor.id)
-        self.sensor, self.frame, self.stats, self._interpreted = sensor, frame, stats, interpreted
-        self._backend = backend
-        self._codec: Codec = codec(sensor.frames[frame], interpreted=interpreted)
+        self.sensor, self.frame, self.stats, self._backend = sensor, frame, stats, backend
+        self._codec = self._codec_of(frame)
         self._others = [name for name, other in sensor.incoming.items() if not other.data and name != frame]
         self._state: dict[str, bytes] = dict(state or {})
         data = sensor.frames[frame].data
@@ -84,19 +81,8 @@ class PacketStream:
                     breaks = breaks if jumps is None else breaks | jumps
                 if self._clock is not None:
                     time = self._guarded(self._times, host, batch, host)
-        return Packets(
-            self.sensor,
-            self.frame,
-            table,
-            offset=offset,
-            time_ns=time,
-            host_ns=host,
-            index=index,
-            breaks=breaks,
-            state=state,
-            stats=self.stats,
-            backend=self._backend,
-        )
+        columns: dict[str, Any] = {"offset": offset, "time_ns": time, "host_ns": host, "index": index, "breaks": breaks}
+        return Packets(self.sensor, self.frame, table, **columns, state=state, stats=self.stats, backend=self._backend)
 
     def interrupt(self) -> None:
         """Input was lost here: there is a break before the next packet."""
@@ -115,16 +101,13 @@ class PacketStream:
 
     def _breaks(self, part: _Part) -> NDArray[np.bool_]:
         """Whether something was lost before each of our frames, since ours before it."""
-        breaks = np.zeros(part.number, np.bool_)
-        gaps = part.frames.gaps
+        breaks, left, gaps = np.zeros(part.number, np.bool_), False, part.frames.gaps
         if alike(gaps) != 0 and gaps.any():
             losses = np.cumsum(gaps > 0)
             marks = losses[part.own]
             breaks[:1] = marks[:1] > 0
             breaks[1:] = marks[1:] > marks[:-1]
             left = int(losses[-1]) > (int(marks[-1]) if part.number else 0)
-        else:
-            left = False
         if part.number:
             breaks[0] |= self._gap
         self._gap = left or (self._gap and not part.number)
@@ -136,10 +119,6 @@ class PacketStream:
 
     def _states(self, parts: Sequence[_Part], number: int, *, whole: bool) -> dict[str, StateOf]:
         """The frames of each other type, and which of them was the last before each packet."""
-        if all(part.where is None for part in parts):
-            if not self._state:
-                return dict.fromkeys(self._others, (None, repeated(-1, number)))
-            return {name: self._unchanged(name, number) for name in self._others}
         seen = self._others_in(parts)
         return {name: self._state_of(name, seen.get(name, []), number=number, whole=whole) for name in self._others}
 
@@ -159,25 +138,21 @@ class PacketStream:
             number += part.number
         return seen
 
-    def _unchanged(self, name: str, number: int) -> StateOf:
-        """The state of packets during which no frame of this other type came."""
-        if name not in self._state:
-            return None, repeated(-1, number)
-        return self._last(name), repeated(0, number)
+    def _codec_of(self, name: str) -> Codec:
+        return codec(self.sensor.frames[name], interpreted=self._backend == "construct")
 
     def _last(self, name: str) -> Table:
         """The last frame of another type, as a table."""
         data = self._state[name]
         known = self._tables.get(name)
         if known is None or known[0] is not data:
-            known = self._tables[name] = (data, codec(self.sensor.frames[name], interpreted=self._interpreted).table([data]))
+            known = self._tables[name] = (data, self._codec_of(name).table([data]))
         return known[1]
 
     def _state_of(self, name: str, seen: Sequence[tuple[Frames, NDArray[np.intp]]], *, number: int, whole: bool) -> StateOf:
         if not seen:
-            return self._unchanged(name, number)
-        engine = codec(self.sensor.frames[name], interpreted=self._interpreted)
-        tables: list[Table] = [engine.gather(frames) for frames, _ in seen]
+            return (self._last(name), repeated(0, number)) if name in self._state else (None, repeated(-1, number))
+        tables: list[Table] = [self._codec_of(name).gather(frames) for frames, _ in seen]
         before = np.concatenate([places for _, places in seen])
         if name in self._state:
             tables, before = [self._last(name), *tables], np.concatenate(([0], before))

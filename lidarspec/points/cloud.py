@@ -10,6 +10,7 @@ Further columns of points (M5) get a place beside the others here and in `conven
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any, NamedTuple
@@ -284,15 +285,11 @@ class LazyCloud(PointCloud):
         return super().__getitem__(which)
 
     def __reduce__(self) -> Any:
-        return _cloud, ({f.name: getattr(self, f.name) for f in fields(self)},)
+        return functools.partial(PointCloud, **{f.name: getattr(self, f.name) for f in fields(self)}), ()
 
 
 for _name in (*COLUMNS, "valid"):
     setattr(LazyCloud, _name, _Unread(_name))
-
-
-def _cloud(values: dict[str, Any]) -> PointCloud:
-    return PointCloud(**values)
 
 
 def source_of(cloud: PointCloud) -> ColumnSource:

@@ -7,6 +7,7 @@ columns of its cloud cost is paid when they are read. The values of a packet do 
 from __future__ import annotations
 
 import traceback
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -41,9 +42,6 @@ def _planned(packets: PacketBatch, carry: Carry | None, *, final: bool, epoch: i
     """The points of a batch by plans; None where there is none for these packets.
 
     Args:
-        carry: what the batch before left.
-        final: nothing follows, so that no packet waits.
-        epoch: the time that the cloud's stamp is, int64 ns; by default that of the first packet.
         alone: no batch follows that needs `Evaluated.carry`, and nobody asks for the counts.
     """
     table = packets.table
@@ -61,7 +59,7 @@ def _planned(packets: PacketBatch, carry: Carry | None, *, final: bool, epoch: i
     try:
         simple = alone and len(plans) == 1 and ascends(table.groups[0].where)
         remembered = {n.number: whole.column(n) for n in plans[0].eager if n.kind in (("state",) if simple else REMEMBERING)}
-        shares = [_share(packets, batch, plan, group, whole, remembered) for plan, group in zip(plans, table.groups, strict=True)]
+        shares = [_share(plan, batch, group, whole, remembered) for plan, group in zip(plans, table.groups, strict=True)]
         if not all(_holds(share) for share in shares):
             return None
     except (SpecError, ValueError):
@@ -72,18 +70,10 @@ def _planned(packets: PacketBatch, carry: Carry | None, *, final: bool, epoch: i
     return Evaluated(cloud, ready, batch.carried(ready), counts, Fields(batch), plans[0].axes)
 
 
-def _share(packets: PacketBatch, batch: Batch, plan: Plan, group: Group, whole: Plain, remembered: dict[int, Column]) -> Share:
+def _share(plan: Plan, batch: Batch, group: Group, whole: Plain, remembered: Mapping[int, Column]) -> Share:
     """A group with its plain results; those that remember other packets are of the whole batch."""
-    if len(group.where) == len(packets) and ascends(group.where):
-        return Share(plan, group, whole, batch)
-    batch = batch.of(group)
-    known = Plain(batch)
-    for number, column in remembered.items():
-        node = plan.tape.nodes[number]
-        array = column.array[group.where] if len(column.array) > 1 else column.array
-        corner = (slice(None), *(slice(0, length) for length in node.shape))
-        known.know(node, Column(array[corner], node.sample.axes, batch))
-    return Share(plan, group, known, batch)
+    is_whole = len(group.where) == len(batch) and ascends(group.where)
+    return Share(plan, group, whole, batch) if is_whole else Share.part(plan, batch, group, remembered)
 
 
 def _holds(share: Share) -> bool:

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.columns.columns import Batch, Column, Fields, field_array
+from lidarspec.columns.columns import Batch, Column, Fields, deep, field_array
 from lidarspec.columns.graph import Node, evaluate
 from lidarspec.points import numpy_plan
 from lidarspec.points.cloud import ColumnSource, Stretch, later
@@ -98,21 +98,24 @@ class Share:
     def plain(self, name: str) -> NDArray[Any]:
         """A part of what `points` returned, for every point of the group, evaluated plainly: (packets, *shape of the plan)."""
         part, shape = self.plan.parts[name], (len(self), *self.plan.shape)
-        array = self.known.array(part) if isinstance(part, Node) else np.asarray(part)
-        if isinstance(part, Node):
-            array = array.reshape(*array.shape, *(1,) * (len(shape) - array.ndim))
-        return np.broadcast_to(array, shape)
+        return np.broadcast_to(deep(self.known.array(part), len(shape) - 1) if isinstance(part, Node) else np.asarray(part), shape)
+
+    @classmethod
+    def part(cls, plan: Plan, batch: Batch, group: Group, remembered: Mapping[int, Column]) -> Share:
+        """The share of some packets of a batch; `remembered`: the results of all its packets that remember others, by the node's number."""
+        own = batch.of(group)
+        share = cls(plan, group, Plain(own), own)
+        for number, column in remembered.items():
+            node = plan.tape.nodes[number]
+            array = column.array[group.where] if len(column.array) > 1 else column.array
+            corner = (slice(None), *(slice(0, length) for length in node.shape))
+            share.known.know(node, Column(array[corner], node.sample.axes, own))
+        return share
 
     def some(self, which: NDArray[np.intp]) -> Share:
         """The share of some of the packets, by index, with what is known of them plainly."""
-        group = Group(self.group.layout, which, self.group.rows[which])
-        batch = self.batch.of(group)
-        known = Plain(batch)
-        for node in self.plan.eager:
-            if node.kind in REMEMBERING:
-                column = self.known.column(node)
-                known.know(node, Column(column.array[which] if len(column.array) > 1 else column.array, column.axes, batch))
-        return Share(self.plan, Group(group.layout, np.arange(len(which)), group.rows), known, batch)
+        remembered = {node.number: self.known.column(node) for node in self.plan.eager if node.kind in REMEMBERING}
+        return Share.part(self.plan, self.batch, Group(self.group.layout, which, self.group.rows[which]), remembered)
 
 
 def maker_of(plan: Plan, names: tuple[str, ...], backend: str, number: int) -> Maker:
@@ -347,4 +350,4 @@ class BatchColumns(ColumnSource):
     def times_of(self, share: Share, first: int, stop: int) -> NDArray[np.float64]:
         """The times of all points of some packets of a share, seconds since `base`: (packets, *shape of the plan)."""
         offsets = seconds_since(self.packets.time_ns[share.group.where[first:stop]], self.base)
-        return np.asarray(share.plain("time")[first:stop] + offsets.reshape(-1, *(1,) * len(share.plan.shape)))
+        return np.asarray(share.plain("time")[first:stop] + deep(offsets, len(share.plan.shape)))

@@ -161,20 +161,10 @@ def make_cloud(flat: dict[str, NDArray[Any]], turn: NDArray[np.float64] | None =
         valid &= np.isfinite(xyz).all(axis=0)
         if turn is not None:
             xyz, azimuth = turn @ np.where(valid, xyz, 0), conventions.turned_azimuth(azimuth, turn)
-        xyz = np.where(valid, xyz, np.nan).astype(np.float32)
-        optional: dict[str, Any] = {name: conventions.numbers_of(name, flat[name]) for name in _OPTIONAL if name in flat}
-        return PointCloud(
-            x=xyz[0],
-            y=xyz[1],
-            z=xyz[2],
-            range=distance.astype(np.float32),
-            azimuth=conventions.narrowed(azimuth),
-            elevation=elevation.astype(np.float32),
-            time=np.array(flat["time"], np.float64),
-            valid=valid,
-            **optional,
-            **extra,
-        )
+        angles = {"azimuth": conventions.narrowed(azimuth), "elevation": elevation.astype(np.float32)}
+        columns = dict(zip("xyz", np.where(valid, xyz, np.nan).astype(np.float32), strict=True)) | angles
+        columns |= {name: conventions.numbers_of(name, flat[name]) for name in _OPTIONAL if name in flat}
+        return PointCloud(**columns, range=distance.astype(np.float32), time=np.array(flat["time"], np.float64), valid=valid, **extra)
 
 
 def _xyz(flat: dict[str, NDArray[Any]], distance: NDArray[Any], azimuth: NDArray[Any], elevation: NDArray[Any]) -> NDArray[np.float64]:

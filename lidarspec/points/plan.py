@@ -136,17 +136,13 @@ class Plan:
 
     def safe(self, values: Callable[[Node], NDArray[Any]]) -> bool:
         """Whether all directions are numbers where everything that they are made of is: then a nan marks all coordinates alike."""
-        return self._may_be_safe and all(np.isfinite(values(low)).all() for low in self._low_directions)
+        return self._may_be_safe and all(np.isfinite(values(term.low)).all() for term in self._directions if term.low is not None)
 
     @cached_property
     def _may_be_safe(self) -> bool:
         """Whether everything in the directions is a number but for what is known of a batch only."""
         fixed = all(isinstance(part, Node) or np.isfinite(part).all() for part in self._directions_given)
         return fixed and all(np.isfinite(term.row).all() and (term.full is None or self._finite(term.full)) for term in self._directions)
-
-    @cached_property
-    def _low_directions(self) -> list[Node]:
-        return [term.low for term in self._directions if term.low is not None]
 
     @cached_property
     def _directions(self) -> list[graph.Term]:

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.columns.graph import Node, evaluate, only_field
+from lidarspec.columns.graph import Expression, Node, only_field
 from lidarspec.wire.layout import Leaf
 
 
@@ -39,9 +39,8 @@ def window(leaf: Leaf) -> Window | None:
         return Window(leaf.offset, leaf.wire.itemsize) if leaf.wire.itemsize <= 2 and leaf.wire.kind in "iu" else None
     if len(leaf.shape) > len(leaf.strides):
         return None
-    held = [segment.byte for segment in leaf.elements[0].segments]
-    low, high = min(held), max(held)
-    return Window(leaf.offset + low, high - low + 1) if high - low < 2 else None
+    start, stop = leaf.held
+    return Window(start, stop - start) if stop - start <= 2 else None
 
 
 def raw_values(leaf: Leaf, seen: Window) -> NDArray[Any]:
@@ -69,10 +68,8 @@ def every_value(node: Node, leaf: Leaf) -> NDArray[Any] | None:
     seen = window(leaf)
     if seen is None:
         return None
-    raw = raw_values(leaf, seen).astype(np.float64)
-    physical = leaf.info.physical(raw)
-    with np.errstate(all="ignore"):
-        return np.asarray(evaluate(node, {}, lambda source: physical if source.kind == "field" else None)).reshape(raw.shape)
+    raw = raw_values(leaf, seen)
+    return Expression(node, (leaf.info,)).values({leaf.info.path: raw}).reshape(raw.shape)
 
 
 def possible(node: Node, leaves: Mapping[str, Leaf]) -> NDArray[Any] | None:

@@ -45,18 +45,6 @@ class BitField:
     flag: bool = False
 
     @cached_property
-    def words(self) -> tuple[tuple[str, int, int], ...] | None:
-        """The value as words, if it is whole bytes in a row: type, first byte and lowest bit of each; else None."""
-        if self.run is None:
-            return None
-        (order, first, count), words, at = self.run, list[tuple[str, int, int]](), 0
-        while at < count:
-            size = 1 << min((count - at).bit_length() - 1, 3)
-            words.append((f"{order}u{size}", first + at, 8 * (at if order == "<" else count - at - size)))
-            at += size
-        return tuple(words)
-
-    @cached_property
     def run(self) -> tuple[str, int, int] | None:
         """The value as whole bytes in a row, if it is: "<" or ">", the first byte, and how many; else None."""
         parts = sorted(self.segments, key=lambda part: part.byte)
@@ -126,19 +114,12 @@ def _field(keys: tuple[str | int, ...], pairs: list[tuple[int, int]], *, flag: b
 
 def _segments(targets: dict[int, int]) -> Iterator[Segment]:
     """Runs of bits that keep their order within one byte."""
-    run: list[int] = []
-    for bit in sorted(targets):
-        if run and (bit != run[-1] + 1 or bit // 8 != run[0] // 8 or targets[bit] != targets[run[-1]] + 1):
-            yield _segment(run, targets)
-            run = []
-        run.append(bit)
-    if run:
-        yield _segment(run, targets)
-
-
-def _segment(run: list[int], targets: dict[int, int]) -> Segment:
-    low = run[0] % 8
-    return Segment(run[0] // 8, ((1 << len(run)) - 1) << low, low, targets[run[0]])
+    runs: dict[tuple[int, int, int], list[int]] = {}
+    for number, bit in enumerate(sorted(targets)):
+        runs.setdefault((bit // 8, bit - number, targets[bit] - bit), []).append(bit)
+    for bits in runs.values():
+        low = bits[0] % 8
+        yield Segment(bits[0] // 8, ((1 << len(bits)) - 1) << low, low, targets[bits[0]])
 
 
 def _confirmed(parse: Parse, size: int, fields: list[BitField]) -> bool:

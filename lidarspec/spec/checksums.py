@@ -195,16 +195,8 @@ class ZeroPadded(Checksum):
 
     def __post_init__(self) -> None:
         _require(self, to=range(1, 1 << 31))
-
-    @property
-    def width(self) -> int:  # type: ignore[override]
-        """The width of the algorithm that is padded for, in bits."""
-        return self.algorithm.width
-
-    @property
-    def order(self) -> ByteOrder:  # type: ignore[override]
-        """The byte order of the algorithm that is padded for."""
-        return self.algorithm.order
+        object.__setattr__(self, "width", self.algorithm.width)
+        object.__setattr__(self, "order", self.algorithm.order)
 
     def __call__(self, data: Bytes) -> int:
         return self.algorithm(bytes(data) + bytes(-len(data) % self.to))

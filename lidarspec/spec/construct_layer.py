@@ -19,7 +19,7 @@ import struct
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import construct
 import numpy as np
@@ -121,9 +121,7 @@ class MarkedStruct(Struct):  # type: ignore[misc]
 class IndexedArray(Array):  # type: ignore[misc]
     """An Array that says in an error's path which element it was, and has no more elements than its frame can have bytes (or bits)."""
 
-    def __init__(self, count: Any, subcon: Construct, limit: int) -> None:
-        super().__init__(count, subcon)
-        self.limit = limit
+    limit: int
 
     def _parse(self, stream: Any, context: Any, path: str) -> Any:
         count = construct.evaluate(self.count, context)
@@ -207,12 +205,6 @@ class Describing(Subconstruct):  # type: ignore[misc]
         """What is known of the field, with what this part says of it."""
         raise NotImplementedError
 
-    def _parse(self, stream: Any, context: Any, path: str) -> Any:
-        return self.subcon._parsereport(stream, context, path)
-
-    def _build(self, obj: Any, stream: Any, context: Any, path: str) -> Any:
-        return self.subcon._build(obj, stream, context, path)
-
 
 class Sealing(Subconstruct):  # type: ignore[misc]
     """A struct with a checksum.
@@ -236,43 +228,42 @@ def verifying(context: Any, *, checksums: bool = False) -> bool:
     return wanted is True if checksums else bool(wanted)
 
 
+#: construct's classes -> those that stand in for them.
+_OWN: dict[type, type] = {Struct: MarkedStruct, Array: IndexedArray, Const: CheckedConst, construct.Enum: NamedEnum}
+
+#: attributes of constructs that hold others; "cases" does by key.
+_INNER = ("subcon", "thensubcon", "elsesubcon", "default")
+
+
 def prepare(con: Construct, limit: int = sys.maxsize) -> Construct:
     """A copy of an author's struct with the engine's own classes in the places of construct's.
 
     Args:
         limit: the longest frame, in bytes; within a bit block in bits.
     """
-    if isinstance(con, Struct):
-        return MarkedStruct(*(prepare(child, limit) for child in con.subcons))
     if isinstance(con, FormatField):
-        if con.fmtstr[-1] not in "efd":
-            return con
-        return ExactFloat(con.fmtstr[0], con.fmtstr[-1])
+        return ExactFloat(con.fmtstr[0], con.fmtstr[-1]) if con.fmtstr[-1] in "efd" else con
     if isinstance(con, Bytes):
         return CountedBytes(con.length)
-    if isinstance(con, Array):
-        return IndexedArray(con.count, prepare(con.subcon, limit), limit)
-    if isinstance(con, Const):
-        return CheckedConst(con.value, prepare(con.subcon, limit))
-    if isinstance(con, construct.Enum):
-        named = NamedEnum(prepare(con.subcon, limit))
-        named.encmapping, named.decmapping, named.ksymapping = con.encmapping, con.decmapping, con.ksymapping
-        return named
-    if isinstance(con, construct.IfThenElse):
-        return construct.IfThenElse(con.condfunc, prepare(con.thensubcon, limit), prepare(con.elsesubcon, limit))
-    if isinstance(con, construct.Switch):
-        cases = {key: prepare(case, limit) for key, case in con.cases.items()}
-        return construct.Switch(con.keyfunc, cases, prepare(con.default, limit))
+    if isinstance(con, Struct):
+        return MarkedStruct(*(prepare(child, limit) for child in con.subcons))
     if isinstance(con, construct.Renamed):
         inner = con.subcon
         while isinstance(inner, construct.Renamed):  # ("name" / con) * "docs" wraps twice, and the path would name it twice
             inner = inner.subcon
         return construct.Renamed(prepare(inner, limit), newname=con.name, newdocs=con.docs)
-    if isinstance(con, Subconstruct):
-        same = copy.copy(con)
-        same.subcon = prepare(con.subcon, 8 * limit if isinstance(con, construct.Transformed | construct.Restreamed) else limit)
-        return same
-    return con
+    if not isinstance(con, Subconstruct | construct.IfThenElse | construct.Switch):
+        return con
+    same = copy.copy(con)
+    same.__class__ = next((own for kind, own in _OWN.items() if isinstance(con, kind)), type(con))
+    below = 8 * limit if isinstance(con, construct.Transformed | construct.Restreamed) else limit
+    for name in vars(con).keys() & _INNER:
+        setattr(same, name, prepare(getattr(con, name), below))
+    if isinstance(con, construct.Switch):
+        same.cases = {key: prepare(case, limit) for key, case in con.cases.items()}
+    if isinstance(same, IndexedArray):
+        same.limit = limit
+    return same
 
 
 def unwrap(con: Construct, *, bits: bool = True) -> Construct:
@@ -305,7 +296,7 @@ def fixed_size(con: Construct) -> int:
 def member(obj: Any, dotted: str, default: object = _MISSING) -> Any:
     """The member of a nested mapping under a dotted name."""
     for part in dotted.split("."):
-        if default is not _MISSING and (obj is None or part not in obj):
+        if default is not _MISSING and (not isinstance(obj, Mapping) or part not in obj):
             return default
         obj = obj[part]
     return obj
@@ -423,7 +414,7 @@ def children(con: Construct) -> list[Construct]:
     """The constructs directly below one, branches included."""
     if isinstance(con, Struct):
         return list(con.subcons)
-    found = [getattr(con, name) for name in ("subcon", "thensubcon", "elsesubcon", "default") if name in vars(con)]
+    found = [getattr(con, name) for name in _INNER if name in vars(con)]
     return found + (list(con.cases.values()) if "cases" in vars(con) else [])
 
 
@@ -706,11 +697,10 @@ class _Builder:
         if name and place.scope is not None:
             place.scope.add(name, tree.Ref(info.path, info))
         if isinstance(con, FormatField) and con.fmtstr[-1] != "?":
-            kind = "float" if con.fmtstr[-1] in "efd" else "uint" if con.fmtstr[-1].isupper() else "int"
             big = con.fmtstr[0] in ">!" or (con.fmtstr[0] == "=" and sys.byteorder == "big")
-            node: tree.Node = tree.Number(info, con.length, kind, "big" if big else "little")  # type: ignore[arg-type]
+            node: tree.Node = tree.Number(info, con.length, _KINDS[info.dtype.kind], "big" if big else "little")  # type: ignore[union-attr]
         elif isinstance(con, BytesInteger) and not _is_odd(con):
-            node = tree.Number(info, con.length, "int" if con.signed else "uint", "little" if con.swapped else "big")
+            node = tree.Number(info, con.length, _KINDS[info.dtype.kind], "little" if con.swapped else "big")  # type: ignore[union-attr]
         elif isinstance(con, Bytes):
             node = tree.Blob(name, info, self._formula(con.length, place), info.const)
         else:
@@ -739,6 +729,10 @@ class _Builder:
             info = infos[".".join(part for part in (place.info.path, *names) if part)]
             parts.append(tree.Part(info, bits, names, tuple(key for key in bits.keys if isinstance(key, int))))
         return tree.Block(place.name, place.info, size, tuple(parts))
+
+
+#: of numbers, by those of their types.
+_KINDS: dict[str, Literal["uint", "int", "float"]] = {"u": "uint", "i": "int", "f": "float"}
 
 
 def axis_path(info: tree.FieldInfo) -> str:
@@ -812,12 +806,7 @@ def _is_odd(con: BytesInteger) -> bool:
 @functools.lru_cache(maxsize=4096)
 def _probed(con: Construct, size: int) -> list[BitField] | None:
     """The bit fields of a block; None where construct decides on its bits, or values are no plain integers."""
-    return probe(functools.partial(_values, con), size) if _is_even(con) else None
-
-
-def _values(con: Construct, block: bytes) -> dict[tuple[str | int, ...], Any]:
-    """The values of a block of bytes by where the parsed block holds them; constants are not checked, since every pattern is tried."""
-    return dict(leaves(con.parse(block, _verify=False)))
+    return probe(lambda block: dict(leaves(con.parse(block, _verify=False))), size) if _is_even(con) else None  # every pattern is tried
 
 
 def _is_even(con: Construct) -> bool:

@@ -101,8 +101,9 @@ class Frame:
         _freeze(self, "acknowledged")
         object.__setattr__(self, "prepared", prepare(self.struct, self.max_length or sys.maxsize))
         check_struct(self.prepared)
-        if not self.max_length:
-            object.__setattr__(self, "max_length", _whole_length(self.prepared))
+        if not self.max_length and not fixed_size(self.prepared):
+            raise SpecError("max_length may be left out only where the struct has a fixed size")
+        object.__setattr__(self, "max_length", self.max_length or fixed_size(self.prepared))
 
     @cached_property
     def tree(self) -> Node:
@@ -303,10 +304,3 @@ def _known(sensor: Spec, path: str, names: Iterable[str | None], table: Mapping[
     for name in names:
         if name is not None and name not in table and sensor.frames:
             raise SpecError(f"{name!r} is not among {', '.join(table) or 'none'}", path=path, sensor=sensor.id)
-
-
-def _whole_length(struct: Construct) -> int:
-    size = fixed_size(struct)
-    if not size:
-        raise SpecError("max_length may be left out only where the struct has a fixed size")
-    return size

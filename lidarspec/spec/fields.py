@@ -129,10 +129,10 @@ class Checksummed(layer.Sealing):
             return obj
         stream.seek(start)
         data = stream.read(end - start)
-        stored, computed = self._stored(obj), self._computed(data, obj, start)
+        stored, computed = self.verdict(data, obj, start)
         if stored != computed and stored not in self.absent:
             name = self.fields[0]
-            width = (self._width() + 3) // 4
+            width = (sum(layer.bit_width(self._field(name)) for name in self.fields) + 3) // 4
             expected, got = (f"0x{value:0{width}x}" for value in (computed, stored))
             reason = "checksum"
             raise layer.Mismatch(f"{path} -> {name.replace('.', ' -> ')}", self._span(obj, name)[0], expected, got, reason)
@@ -146,7 +146,8 @@ class Checksummed(layer.Sealing):
         con, trial = self._marked, io.BytesIO()
         con._build(blank, trial, context, path)
         data = trial.getvalue()
-        parsed = con._parsereport(io.BytesIO(data), _unverified(context), path)
+        unverified = Container({**context, "_params": Container(_verify=False)})  # what was just built is parsed back
+        parsed = con._parsereport(io.BytesIO(data), unverified, path)
         if None not in given and self._stored(parsed) in self.absent:
             return con._build(blank, stream, context, path)
         return con._build(self._filled(blank, self._computed(data, parsed, 0)), stream, context, path)
@@ -196,9 +197,6 @@ class Checksummed(layer.Sealing):
             value >>= width
         return obj
 
-    def _width(self) -> int:
-        return sum(layer.bit_width(self._field(name)) for name in self.fields)
-
     def _field(self, name: str) -> Construct:
         con = self.subcon
         for part in name.split("."):
@@ -224,11 +222,4 @@ def _replaced(obj: Any, name: str, value: object) -> Any:
     head, _, rest = name.partition(".")
     copy = Container(obj)
     copy[head] = _replaced(copy.get(head, {}), rest, value) if rest else value
-    return copy
-
-
-def _unverified(context: Any) -> Any:
-    """A context for parsing back what was just built: what is known stays, checks are off."""
-    copy = Container(context)
-    copy["_params"] = Container(_verify=False)
     return copy

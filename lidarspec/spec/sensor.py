@@ -132,7 +132,7 @@ class Sensor(Spec):
 
             sums = compiled_sums()
         stream = not self.datagrams if stream is None else stream
-        return Decoder(self, stream=stream, interpreted=chosen == "construct", backend=chosen, sums=sums)
+        return Decoder(self, stream=stream, backend=chosen, sums=sums)
 
     def split(self, data: Any, *, backend: str = "auto") -> list[Found]:
         """Every incoming frame of all types, in stream order. Raises on no bytes whatever.
@@ -167,7 +167,7 @@ class Sensor(Spec):
         decoder = self.decoder(stream=is_stream(data), backend=backend)
         frames = frames_of(decoder, data)
         name = frame or data_frame(self, frames) or self.data_frame
-        return PacketStream(self, name, decoder.stats, interpreted=decoder.interpreted, backend=decoder.backend).add(frames, whole=True)
+        return PacketStream(self, name, decoder.stats, backend=decoder.backend).add(frames, whole=True)
 
     def scans(self, data: Any, *, backend: str = "auto") -> Iterator[Scan]:
         """Every scan of the data; the first and last piece are marked ``complete=False``.

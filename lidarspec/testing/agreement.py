@@ -146,7 +146,7 @@ def assert_backends_agree(sensor: Sensor, data: Any) -> None:
 def _packets(decoder: Decoder, name: str, found: Sequence[Frames]) -> Packets:
     """The packets of one type among the frames of a whole input, which is framed once for all types."""
     stats = copy.deepcopy(decoder.stats)
-    return PacketStream(decoder.sensor, name, stats, interpreted=decoder.interpreted).add(found, whole=True)
+    return PacketStream(decoder.sensor, name, stats, backend=decoder.backend).add(found, whole=True)
 
 
 def a_clean_input_loses_nothing(subject: Subject) -> None:

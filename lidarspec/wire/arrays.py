@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,6 +48,23 @@ def _numbers() -> NDArray[np.int64]:
 def alike(values: NDArray[np.int64]) -> int | None:
     """The value that all are, where the array itself says so, as one from `repeated` does; else None."""
     return values.item(0) if values.strides == (0,) and len(values) else None
+
+
+def by_value(values: NDArray[Any], few: int) -> list[tuple[int, NDArray[np.intp]]]:
+    """Each of the different values, ascending, with the indices of those that are equal to it, (k,), ascending.
+
+    Args:
+        few: so many different ones are found one by one sooner than sorted.
+    """
+    found, left = list[int](), values
+    while len(left) and len(found) < few:
+        found.append(left.item(0))
+        left = left[left != left[0]]
+    if not len(left):
+        return [(value, np.flatnonzero(values == value)) for value in sorted(found)]
+    order = np.argsort(values, kind="stable")
+    edges = np.flatnonzero(np.diff(values[order])) + 1
+    return [(values.item(places[0]), places) for places in np.split(order, edges)]
 
 
 def taken(rows: NDArray[np.uint8], which: NDArray[np.intp] | NDArray[np.bool_]) -> NDArray[np.uint8]:

@@ -11,7 +11,7 @@ import numpy as np
 from construct import Container
 
 from lidarspec.errors import LidarSpecError, MissingField, OutOfRange, SpecError, UnknownCommand, UnknownField, UnknownFrame, UsageError
-from lidarspec.spec.construct_layer import Mismatch, WireNaN, field_path, seen
+from lidarspec.spec.construct_layer import Mismatch, WireNaN, field_path, member, seen
 from lidarspec.spec.description import Spec
 from lidarspec.spec.tree import Blob, FieldInfo, Formula, Node, Number, Read, Sealed, Struct, evaluated, nodes, refs
 from lidarspec.wire.schema import Schema, schema
@@ -145,20 +145,13 @@ def _fill_counts(given: Container, table: Schema) -> None:
     for axis, count in table.arrays.items():
         if count is None or "[]" in axis:
             continue
-        inner, _, name = axis.rpartition(".")
-        scope, asked = _scope(given, inner), refs(count)
-        if scope is None or not isinstance(scope.get(name), list | bytes) or not asked:
+        array, asked = member(given, axis, None), refs(count)
+        if not isinstance(array, list | bytes) or not asked:
             continue
         holder, field = _place(given, asked[0].path)
         if isinstance(holder, dict) and holder.get(field) is None:
             read = functools.partial(given_value, given, table.fields)
-            holder[field] = _solved(count, read, holder, field, len(scope[name]), table.fields.get(asked[0].path), axis)
-
-
-def _scope(given: Any, path: str) -> Any:
-    for name in path.split(".") if path else ():
-        given = given.get(name) if isinstance(given, dict) else None
-    return given if isinstance(given, dict) else None
+            holder[field] = _solved(count, read, holder, field, len(array), table.fields.get(asked[0].path), axis)
 
 
 def given_value(given: Mapping[str, Any], fields: Mapping[str, FieldInfo], path: str) -> tuple[FieldInfo, Any] | str | None:

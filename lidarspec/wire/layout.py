@@ -111,15 +111,8 @@ class Leaf:
     def _bits(self, rows: Bytes2D, element: BitField) -> NDArray[Any]:
         assert self.info.dtype is not None
         wide = np.dtype(f"u{self.info.dtype.itemsize}")
-        whole = self._whole(rows, element, wide)
-        words = element.words if wide.itemsize > 2 and whole is None else None
-        if whole is not None:
-            total = whole
-        elif words is not None:
-            total = self._view(rows, np.dtype(words[0][0]), words[0][1]).astype(wide) << wide.type(words[0][2])
-            for word, byte, target in words[1:]:
-                total |= self._view(rows, np.dtype(word), byte).astype(wide) << wide.type(target)
-        else:
+        total = self._whole(rows, element, wide)
+        if total is None:
             total = np.zeros((len(rows), *self.shape[: len(self.strides)]), wide)
             for part in element.segments:
                 bits = (self._view(rows, np.dtype("u1"), part.byte) & np.uint8(part.mask)) >> part.low
@@ -143,6 +136,14 @@ class Leaf:
         elif spare:
             total &= wide.type((1 << 8 * count) - 1)
         return total
+
+    @property
+    def held(self) -> tuple[int, int]:
+        """The first byte that holds any bit of it, where it stands first in its arrays, and the one after the last."""
+        if not self.elements:
+            return self.offset, self.offset + self.size
+        spots = [self.offset + part.byte for element in self.elements for part in element.segments]
+        return min(spots), max(spots) + 1
 
     def at(self, offset: int) -> Leaf:
         """The field with its place counted from `offset`."""
@@ -168,15 +169,17 @@ class Seal:
             return self.leaves[0].load(rows).astype(np.uint64)
         total, shift = np.zeros(len(rows), np.uint64), 0
         for leaf in self.leaves:
+            values = leaf.load(rows).astype(np.uint64)
             if leaf.info.kind == "bytes":
-                values = leaf.load(rows).astype(np.uint64)
-                order = range(values.shape[1]) if self.algorithm.order == "little" else reversed(range(values.shape[1]))
-                for power, column in enumerate(order):
-                    total |= values[:, column] << np.uint64(shift + 8 * power)
-            else:
-                total |= leaf.load(rows).astype(np.uint64) << np.uint64(shift)
+                values = np.bitwise_or.reduce(values << self._powers(leaf), axis=1)
+            total |= values << np.uint64(shift)
             shift += leaf.info.bits
         return total
+
+    def _powers(self, leaf: Leaf) -> NDArray[np.uint64]:
+        """By how many bits each byte of a field of bytes is shifted, (k,)."""
+        powers = np.arange(0, leaf.info.bits, 8, dtype=np.uint64)
+        return powers if self.algorithm.order == "little" else powers[::-1]
 
     def computed(self, rows: Bytes2D, sums: Sums | None = None) -> NDArray[np.uint64]:
         """The values that should stand there, (n,).
@@ -193,9 +196,7 @@ class Seal:
         for leaf in self.leaves:
             part = (values >> np.uint64(shift)) & np.uint64((1 << leaf.info.bits) - 1)
             if leaf.info.kind == "bytes":
-                size = leaf.shape[-1]
-                powers = range(size) if self.algorithm.order == "little" else reversed(range(size))
-                part = np.stack([part >> np.uint64(8 * power) & np.uint64(0xFF) for power in powers], axis=1)
+                part = part[:, None] >> self._powers(leaf) & np.uint64(0xFF)
             leaf.store(rows, part)
             shift += leaf.info.bits
 
@@ -248,11 +249,6 @@ class Layout:
     lengths: Mapping[str, int] = field(default_factory=dict)
     notes: dict[Any, Any] = field(default_factory=dict, repr=False)
 
-    def __post_init__(self) -> None:
-        spots = sorted(self.constants)
-        masks, values = ([self.constants[spot][i] for spot in spots] for i in (0, 1))
-        object.__setattr__(self, "_constants", (np.array(spots, np.intp), np.array(masks, np.uint8), np.array(values, np.uint8)))
-
     @cached_property
     def _mask(self) -> int:
         """The bits of a frame that are constant, as one number."""
@@ -274,15 +270,11 @@ class Layout:
         """Write what follows from the header, the constants and the checksums into frames given as rows of bytes."""
         for leaf, value in self.following:
             leaf.store(rows, value)
-        spots, masks, values = self._constants  # type: ignore[attr-defined]
-        rows[:, spots] = rows[:, spots] & ~masks | values
+        if self.constants:
+            spots, facts = list(self.constants), np.array(list(self.constants.values()), np.uint8)
+            rows[:, spots] = rows[:, spots] & ~facts[:, 0] | facts[:, 1]
         for seal in self.seals:
             seal.fill(rows)
-
-    def constant(self, rows: Bytes2D) -> NDArray[np.bool_]:
-        """Which frames have all constants in place, (n,)."""
-        spots, masks, values = self._constants  # type: ignore[attr-defined]
-        return np.asarray(((rows[:, spots] & masks) == values).all(axis=1))
 
 
 #: constants: offset, mask, value.

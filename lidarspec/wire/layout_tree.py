@@ -18,7 +18,6 @@ import random
 import traceback
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -28,6 +27,7 @@ from lidarspec.errors import SpecError
 from lidarspec.spec import tree
 from lidarspec.spec.bits import BitField, whole_bytes
 from lidarspec.spec.description import Frame
+from lidarspec.wire.arrays import by_value
 from lidarspec.wire.layout import Layout, Leaf, Seal
 from lidarspec.wire.schema import schema
 
@@ -276,7 +276,7 @@ class _Walk:
         if node.over is not None:
             spans = [(self.places[node.over[0]][0], self.places[node.over[1]][1])]
         else:
-            held = sorted(map(_held, leaves))
+            held = sorted(leaf.held for leaf in leaves)
             edges = [start, *(edge for span in held for edge in span), self.cursor]
             spans = [(a, b) for a, b in zip(edges[::2], edges[1::2], strict=True) if b > a]
         self.seals.append(Seal(leaves, tuple(spans), node.algorithm, node.absent))
@@ -302,14 +302,6 @@ class _Walk:
         if count < 0:
             raise TooLong(path)
         return count
-
-
-def _held(leaf: Leaf) -> tuple[int, int]:
-    """From the first to the last byte that holds any bit of a field."""
-    if not leaf.elements:
-        return leaf.offset, leaf.offset + leaf.size
-    spots = [part.byte for element in leaf.elements for part in element.segments]
-    return leaf.offset + min(spots), leaf.offset + max(spots) + 1
 
 
 Draw = Callable[[random.Random], int]
@@ -382,16 +374,11 @@ def rows_at(buffer: NDArray[np.uint8], offsets: NDArray[np.intp], size: int, *, 
 
 
 class HeaderTree:
-    """All layouts of one frame type.
-
-    Attributes:
-        prefix: the constants whose place depends on no header field: offset -> (mask, value).
-    """
+    """All layouts of one frame type."""
 
     def __init__(self, frame: tree.Node, limit: int) -> None:
         self._frame, self._limit = frame, limit
         self._root, self._size = _Node(), 0
-        self.prefix = prefix_of(frame, limit)
 
     def classify(self, buffer: NDArray[np.uint8], offsets: NDArray[np.intp]) -> list[Group]:
         """The candidates at `offsets`, sorted by layout: (layout or refusal, indices) for each, without those whose header is cut off."""
@@ -473,14 +460,7 @@ class HeaderTree:
         values = leaf.at(leaf.offset).load(rows_at(buffer, offsets[which] + leaf.offset, leaf.size))
         if np.count_nonzero(values == values[0]) == len(values):
             return [(node.children.setdefault(values.item(0), _Node()), which)]
-        few = _few(values)
-        if few is not None:
-            return [(node.children.setdefault(value, _Node()), which[values == value]) for value in few]
-        order = np.argsort(values, kind="stable")
-        values = values[order]
-        edges = [0, *(np.flatnonzero(values[1:] != values[:-1]) + 1).tolist(), len(values)]
-        which = which[order]
-        return [(node.children.setdefault(int(values[start]), _Node()), which[start:stop]) for start, stop in pairwise(edges)]
+        return [(node.children.setdefault(value, _Node()), which[places]) for value, places in by_value(values, FEW)]
 
     def _explore(self, sample: NDArray[np.uint8]) -> None:
         """Find the layout of one sample, and add the fields that decide it to the tree; as far as the sample goes."""
@@ -523,12 +503,3 @@ def frame_layouts(frame: Frame) -> HeaderTree | NotCompilable:
         return HeaderTree(frame.tree, frame.max_length)
     except NotCompilable as reason:
         return reason
-
-
-def _few(values: NDArray[Any]) -> list[int] | None:
-    """The values in ascending order, if they are few different ones, which are found one by one sooner than sorted."""
-    found, left = list[int](), values
-    while len(left) and len(found) < FEW:
-        found.append(left.item(0))
-        left = left[left != left[0]]
-    return None if len(left) else sorted(found)

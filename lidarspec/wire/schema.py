@@ -25,17 +25,14 @@ class Schema:
     fields: Mapping[str, FieldInfo]
     arrays: Mapping[str, Formula | None]
 
+    @cached_property
     def chain(self) -> tuple[str, ...]:
         """The axes of the deepest nesting of arrays; the first one of equally deep ones."""
-        return self._chain
-
-    @cached_property
-    def _chain(self) -> tuple[str, ...]:
         return max((info.axes for info in self.fields.values() if info.kind != "bytes"), key=len, default=())
 
     def depth(self) -> int:
         """How many arrays are nested at most."""
-        return len(self.chain())
+        return len(self.chain)
 
 
 def schema(root: Node) -> Schema:

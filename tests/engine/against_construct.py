@@ -129,7 +129,7 @@ def clouds_agree(struct: Construct, frames: Iterable[bytes], *, max_length: int 
     table, tried = schema(frame_tree(struct)), 0
     for path, info in table.fields.items():
         is_small = info.kind == "int" and info.bits <= 16 and not info.scaled
-        if not is_small or not info.axes or info.axes != table.chain() or any(path.startswith(f"{other}.") for other in table.fields):
+        if not is_small or not info.axes or info.axes != table.chain or any(path.startswith(f"{other}.") for other in table.fields):
             continue
         ours = dataclasses.replace(plain_sensor, points=functools.partial(_ranges, path=path))
         values = [value for _, wanted in kept for value in flat(at(wanted, path.split(".")), len(info.axes))]

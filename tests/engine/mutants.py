@@ -19,7 +19,7 @@ class Parser:
     """Bytes in, frames out; frames are looked for byte by byte."""
 
     def __init__(self, sensor: Sensor) -> None:
-        self.sensor, self.stats, self.interpreted = sensor, Counters(), False
+        self.sensor, self.stats, self.backend = sensor, Counters(), "auto"
         self.buffer, self.base = b"", 0
 
     def feed(self, data: bytes, at: int | None = None) -> list[Found]:

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from lidarspec._version import __version__
 from lidarspec.errors import UsageError
 from lidarspec.points.numba_kernels.source import Text, written
-from lidarspec.points.plan import Plan, PointsFunction, Values
+from lidarspec.points.plan import Maker, Plan, PointsFunction, Values
 from lidarspec.wire.layout import Bytes2D, span
 
 CACHE, THREADS = "LIDARSPEC_CACHE", "LIDARSPEC_THREADS"
@@ -44,7 +44,7 @@ _OWN: WeakKeyDictionary[PointsFunction, int] = WeakKeyDictionary()
 _MADE: WeakKeyDictionary[PointsFunction, dict[tuple[str, ...], int]] = WeakKeyDictionary()
 
 
-class Kernel:
+class Kernel(Maker):
     """The columns that a text describes, for frames of one layout.
 
     Args:
@@ -54,8 +54,7 @@ class Kernel:
 
     def __init__(self, text: Text, width: int) -> None:
         self._text, self._width = text, width
-        wanted = text.wanted
-        self._numbers = np.array(wanted.numbers, np.int64)
+        self._numbers = np.array(text.wanted.numbers, np.int64)
         self._function: Any = None
 
     @property
@@ -73,17 +72,9 @@ class Kernel:
         self._function = self._function or function_of(self._text.source)
 
     def columns(self, number: int) -> dict[str, NDArray[Any]]:
-        """The columns of so many frames, by name, to be filled: (number * width,) each."""
         return {name: np.empty(number * self._width, np.float32) for name in self._text.names}
 
     def run(self, rows: Bytes2D, values: Values, columns: Mapping[str, NDArray[Any]]) -> None:
-        """Fill the columns of all frames.
-
-        Args:
-            rows: the frames, at one distance from each other.
-            values: the plain result of a node for these frames, shape (n or 1, ...).
-            columns: flat, contiguous and as long as `columns` makes them.
-        """
         self.compile()
         count, stride = rows.shape[0], rows.strides[0]
         given: list[Any] = []

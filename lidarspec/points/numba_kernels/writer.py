@@ -12,13 +12,14 @@ import math
 from collections.abc import Callable, Set
 from dataclasses import dataclass, field
 from itertools import islice
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.columns.graph import FACTORS, Node, key, last_axis, traverse
 from lidarspec.points.windows import every_value, possible, raw_values, window
+from lidarspec.spec.bits import whole_bytes
 from lidarspec.wire.layout import Layout, Leaf
 
 _SIGNS = {np.add: "+", np.subtract: "-", np.multiply: "*", np.true_divide: "/", np.equal: "==", np.not_equal: "!="}
@@ -68,18 +69,12 @@ def is_number(value: Any, leaves: Any) -> bool:
 
 def integer(leaf: Leaf, byte: Any) -> str | None:
     """The raw value of a field as an expression of its bytes, `byte(offset)` each; None where it has no simple one."""
-    if leaf.wire is not None:
-        size, kind = leaf.wire.itemsize, leaf.wire.kind
-        if kind not in "iu" or size > 4:
-            return None
-        order = range(size) if leaf.wire.byteorder != ">" else reversed(range(size))
-        total = " | ".join(
-            f"{byte(leaf.offset + at)} << {8 * power}" if power else byte(leaf.offset + at) for power, at in enumerate(order)
-        )
-        return f"np.int64(np.int{8 * size}({total}))" if kind == "i" else f"({total})"
-    if len(leaf.shape) > len(leaf.strides) or leaf.elements[0].width > 48:
+    if len(leaf.shape) > len(leaf.strides) or (leaf.wire is not None and leaf.wire.kind == "f"):
         return None
-    element = leaf.elements[0]
+    order: Literal["little", "big"] = "big" if leaf.wire is not None and leaf.wire.byteorder == ">" else "little"
+    element = leaf.elements[0] if leaf.wire is None else whole_bytes(leaf.wire.itemsize, order, signed=leaf.wire.kind == "i")
+    if element.width > 48:
+        return None
     parts = []
     for part in element.segments:
         bits = byte(leaf.offset + part.byte)

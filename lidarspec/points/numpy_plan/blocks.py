@@ -41,12 +41,8 @@ class Blocks:
 
     def _regular(self, size: int, strides: tuple[int, ...]) -> bool:
         """Whether elements follow each other at one distance from frame to frame too."""
-        expected = size
-        for length, stride in zip(self.shape, strides, strict=True):
-            if stride * length != expected:
-                return False
-            expected = stride
-        return True
+        steps = zip(self.shape, strides, (size, *strides), strict=False)
+        return all(stride * length == outer for length, stride, outer in steps)
 
     def loading(self, rows: Bytes2D, room: NDArray[np.uint8]) -> Loading:
         """Their fields, compacted in this room."""

@@ -9,19 +9,22 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lidarspec.columns.columns import deep
 from lidarspec.columns.graph import Node, Term, chosen, is_full, key, last_axis, only_field
 from lidarspec.points.numpy_plan import products
 from lidarspec.points.numpy_plan.blocks import Blocks
-from lidarspec.points.numpy_plan.program import Number, Program, Read, Run, deep
+from lidarspec.points.numpy_plan.program import Program, Read, Run
 from lidarspec.points.numpy_plan.registers import TYPES
 from lidarspec.points.plan import Plan
 from lidarspec.points.windows import Window, every_value, shift_of, window
 from lidarspec.wire.layout import Leaf
+
+_Made = TypeVar("_Made")
 
 
 class Compiler:
@@ -35,19 +38,17 @@ class Compiler:
     def __init__(self, plan: Plan, tables: dict[Any, NDArray[Any]]) -> None:
         self.program, self.low = Program(plan.width, plan.safe), list[Node]()
         self._layout, self._shape, self._width, self._tables = plan.layout, plan.shape, plan.width, tables
-        self._registers: dict[Any, int] = {}
-        self._shifts: dict[tuple[str, Window], tuple[int, int] | None] = {}
-        self._angles_of: dict[Node, products.Angles | None] = {}
-        self._rotations: dict[Node, products.Rotation | None] = {}
+        self._known: dict[Any, Any] = {}
 
     def want(self, name: str, value: Any, kind: str) -> None:
         """Make a column of this name; `kind` is "single" or "double"."""
         self.program.outputs[name] = self._single(value) if kind == "single" else self._double(value)
 
-    def _once(self, name: Any, make: Callable[[], int]) -> int:
-        if name not in self._registers:
-            self._registers[name] = make()
-        return self._registers[name]
+    def _once(self, name: Any, make: Callable[[], _Made]) -> _Made:
+        """What was made under this name: a register, or what says how to make one."""
+        if name not in self._known:
+            self._known[name] = make()
+        return self._known[name]  # type: ignore[no-any-return]
 
     def _single(self, value: Any) -> int:
         """An expression in float32; only products and tables are computed in that precision."""
@@ -59,14 +60,12 @@ class Compiler:
         register = self._of_field(node, "single")
         if register is not None:
             return register
-        if node.kind == "call" and node.function is np.multiply:
-            first, second = (self._factor(arg) for arg in node.args)
-            return self.program.call("multiply", "single", np.multiply, first, second)
         if node.kind == "call" and node.function in (np.cos, np.sin):
             return self._direction(node)
-        if node.kind == "call" and node.function is np.add and any(not isinstance(arg, Node) for arg in node.args):
+        is_offset = node.function is np.add and any(not isinstance(arg, Node) for arg in node.args)
+        if node.kind == "call" and (node.function is np.multiply or is_offset):
             first, second = (self._factor(arg) for arg in node.args)
-            return self.program.call("add", "single", np.add, first, second)
+            return self.program.call(node.function.__name__, "single", node.function, first, second)
         read = Read(self._double(node))
         return self.program.step("as float32", "single", lambda run, out: np.copyto(out, read(run), casting="same_kind"), read)
 
@@ -80,9 +79,8 @@ class Compiler:
         kind = "flag" if node.sample.array.dtype.kind == "b" else "double"
         register = self._of_field(node, kind)
         if register is None and node.kind == "call":
-            register = self._sum(node)
-        if register is None and node.kind == "call":
-            register = self._plain(node, kind)
+            product = self._sum(node)
+            register = self._plain(node, kind) if product is None else product
         return register if register is not None else self._spread(node, kind)
 
     def _of_field(self, node: Node, kind: str, factor: float = 1.0) -> int | None:
@@ -111,9 +109,7 @@ class Compiler:
         """How a field that shares its window with others is cut out of it: shift and mask, or None where that takes a table."""
         if leaf.wire is not None:
             return None
-        if (leaf.info.path, seen) not in self._shifts:
-            self._shifts[leaf.info.path, seen] = shift_of(leaf, seen)
-        return self._shifts[leaf.info.path, seen]
+        return self._once(("shift", leaf.info.path, seen), lambda: shift_of(leaf, seen))
 
     def _table(self, node: Node, leaf: Leaf, seen: Window, kind: str, factor: float) -> NDArray[Any]:
         shift = self._shift(leaf, seen)
@@ -177,7 +173,7 @@ class Compiler:
 
     def _argument(self, value: Any, depth: int) -> Callable[[Run], Any]:
         if not isinstance(value, Node):
-            return lambda run: value
+            return _always(value)
         if is_full(value, self._width):
             read, shape = Read(self._double(value)), (*value.shape, *(1,) * (depth - len(value.shape)))
             return lambda run: read(run).reshape(-1, *shape)
@@ -189,8 +185,7 @@ class Compiler:
         if is_full(value, self._width):
             return Read(self._single(value))
         if not isinstance(value, Node) and np.size(value) == 1:
-            number = np.float32(np.asarray(value).reshape(()))
-            return lambda run: number
+            return _always(np.float32(np.asarray(value).reshape(())))
         return Read(self._once(("row", id(value)), lambda: self._spread(value, "single")))
 
     def _spread(self, value: Any, kind: str) -> int:
@@ -221,10 +216,8 @@ class Compiler:
         return self.program.call(function.__name__, "single", function, Read(angle))
 
     def _rotation(self, value: Node) -> products.Rotation | None:
-        if value not in self._rotations:
-            angles = self._angles(value)
-            self._rotations[value] = None if angles is None else products.Rotation.of(angles)
-        return self._rotations[value]
+        angles = self._angles(value)
+        return None if angles is None else self._once(("rotation", value), lambda: products.Rotation.of(angles))
 
     def _wide(self, rotation: products.Rotation) -> int:
         """The angles of those packets or blocks whose points are too far apart for one rotation, within half a turn."""
@@ -287,10 +280,9 @@ class Compiler:
 
     def _angles(self, value: Node) -> products.Angles | None:
         """Angles that lie around one of their packet or block; None where they do not, or nobody knows."""
-        if value not in self._angles_of:
-            angles = self._angles_of[value] = products.angles_of(value, self._shape, self._layout.leaves)
-            self.low += [] if angles is None else angles.nodes
-        return self._angles_of[value]
+        angles = self._once(("angles", value), lambda: products.angles_of(value, self._shape, self._layout.leaves))
+        self.low += [] if angles is None else angles.nodes
+        return angles
 
     def _sum(self, node: Node) -> int | None:
         """A sum: one matrix product for what is low, and what is full added to it."""
@@ -327,7 +319,7 @@ class Compiler:
         if options is None:
             return self.program.call("add", "double", np.add, Read(sum_), Read(self._scaled(part.full, factor)))
         condition, *values = options
-        first, second = (Read(self._scaled(value, factor)) if isinstance(value, Node) else Number(value * factor) for value in values)
+        first, second = (Read(self._scaled(value, factor)) if isinstance(value, Node) else _always(value * factor) for value in values)
         self.low.append(condition)
         shape, depth, before = self._shape, len(self._shape), Read(sum_)
 
@@ -351,6 +343,10 @@ class Compiler:
         if factor == 1:
             return read.register
         return self.program.step(f"times {factor:.6g}", "double", lambda run, out: np.multiply(read(run), factor, out=out), read)
+
+
+def _always(value: Any) -> Callable[[Run], Any]:
+    return lambda run: value
 
 
 def _rows(run: Run, numbers: NDArray[Any]) -> slice:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from lidarspec.points.numpy_plan.blocks import Blocks
 from lidarspec.points.numpy_plan.registers import TYPES, borrowed, given_back, slots_of
-from lidarspec.points.plan import Values
+from lidarspec.points.plan import Maker, Values
 from lidarspec.wire.layout import Bytes2D
 
 #: points of a chunk, so that its scratch arrays stay in the cache.
@@ -61,22 +61,7 @@ class Read:
         return run.views[self.register]
 
 
-@dataclass(frozen=True)
-class Number:
-    """A number as an argument of a step."""
-
-    value: float
-
-    def __call__(self, run: Run) -> float:
-        return self.value
-
-
-def deep(array: NDArray[Any], depth: int) -> NDArray[Any]:
-    """Values of packets, (n, ...), with axes of length 1 behind them, up to `depth` of the points."""
-    return array.reshape(*array.shape, *(1,) * (1 + depth - array.ndim))
-
-
-class Program:
+class Program(Maker):
     """The calls that make some flat float32 or float64 columns.
 
     Args:
@@ -136,17 +121,9 @@ class Program:
         return register
 
     def columns(self, number: int) -> dict[str, NDArray[Any]]:
-        """The columns of so many frames, by name, to be filled: (number * width,) each."""
         return {name: np.empty(number * self.width, TYPES[self.kinds[register]]) for name, register in self.outputs.items()}
 
     def run(self, rows: Bytes2D, values: Values, columns: Mapping[str, NDArray[Any]]) -> None:
-        """Fill the columns of all frames.
-
-        Args:
-            rows: the frames, at one distance from each other.
-            values: the plain result of a node for these frames, shape (n or 1, ...).
-            columns: flat, contiguous and as long as `columns` makes them.
-        """
         number = len(rows)
         if not number:
             return
