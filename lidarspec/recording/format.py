@@ -191,14 +191,6 @@ def size_at(buffer: bytes | bytearray | memoryview, start: int = 0) -> int:
     return int(_HEAD.size + addresses + size + _CRC.size)
 
 
-def whole_records(buffer: bytes | bytearray | memoryview, limit: int) -> int:
-    """The bytes of those records at the beginning of the buffer that end within the first `limit` bytes."""
-    end = 0
-    while 0 < (size := size_at(buffer, end)) <= limit - end:
-        end += size
-    return end
-
-
 class RecordReader(Closing):
     """The records of an open file, from behind its magic bytes on; memory is bounded by a block and a record.
 

@@ -343,14 +343,14 @@ def test_one_sender_of_several(tmp_path: Path) -> None:
 
 
 def test_frames_of_two_senders_are_not_mixed(tmp_path: Path) -> None:
-    from lidarspec.captures.pcap import PcapWriter
+    from lidarspec.captures.pcap import capture_head, datagram_record
     from lidarspec.simulation.simulator import simulate
 
     path = tmp_path / "two.pcap"
     with path.open("wb") as file:
-        writer = PcapWriter(file)
+        file.write(capture_head())
         for index, data in enumerate(simulate(ls.sensor("robosense-m1"), 40)):
-            writer.write(Datagram(data, index, (f"10.0.0.{1 + index % 2}", 6699), made.DESTINATION))
+            file.write(datagram_record(Datagram(data, index, (f"10.0.0.{1 + index % 2}", 6699), made.DESTINATION)))
     with ls.open(path, "robosense-m1") as device, pytest.raises(ls.UsageError, match=r"10\.0\.0\.1 and 10\.0\.0\.2.*src=10\.0\.0\.1"):
         list(device.packets())
     with ls.open(f"{path}?src=10.0.0.2", "robosense-m1") as device:
