@@ -231,7 +231,7 @@ class Appender:
         """The thread: what waits is written, and put on the disk when that is due, until the end or a failure."""
         try:
             due = time.monotonic() + DISK_SECONDS
-            while not self._is_done():
+            while not (self._closing and not self._waiting and self._kept == self._taken):
                 with self._changed:
                     self._changed.wait_for(lambda: self._waiting or self._kept < self._taken or self._closing)
                     self._changed.wait_for(self._is_urgent, FLUSH_SECONDS)
@@ -251,9 +251,6 @@ class Appender:
                 self._changed.notify_all()
         finally:
             self._file.close()
-
-    def _is_done(self) -> bool:
-        return self._closing and not self._waiting and self._kept == self._taken
 
     def _is_urgent(self) -> bool:
         return len(self._waiting) >= FLUSH_BYTES or self._asked > self._kept or self._closing
