@@ -19,7 +19,7 @@ from itertools import combinations, product, zip_longest
 import numpy as np
 
 from lidarspec.discovery.samples import Match, Place, Samples, Span, doubt, enough, spans
-from lidarspec.spec.checksums import CRCS, KNOWN, ByteOrder, Crc, name_of
+from lidarspec.spec.checksums import CRCS, KNOWN, MIRROR, ByteOrder, Crc, name_of, reflected
 
 #: how much larger than sought a common divisor may be, where its divisors are tried one by one.
 SPARE = 11
@@ -31,7 +31,6 @@ DIVIDED = 256
 TAKEN, PICKS = 4, 6
 #: most polynomials that are held against all frames for one place and span.
 WEIGHED = 64
-_MIRROR = bytes(int(f"{byte:08b}"[::-1], 2) for byte in range(256))
 #: (size of what is covered, message with the checksum behind it) of each frame.
 Codewords = list[tuple[int, int]]
 
@@ -124,10 +123,10 @@ class _Reading:
     refout: bool
 
     def message(self, data: bytes) -> int:
-        return int.from_bytes(data.translate(_MIRROR) if self.refin else data, "big") << self.width
+        return int.from_bytes(data.translate(MIRROR) if self.refin else data, "big") << self.width
 
     def register(self, value: int) -> int:
-        return int(f"{value:0{self.width}b}"[::-1], 2) if self.refout else value
+        return reflected(value, self.width) if self.refout else value
 
     def started(self, init: int, size: int) -> int:
         """What a start value adds to the message of `size` bytes."""
