@@ -1,4 +1,4 @@
-"""Captures: the UDP datagrams of a pcap or pcapng file, and the records of pcap files that are written.
+"""Captures: the UDP datagrams of a pcap or pcapng file, and the records of those that are written.
 
 Theory of operation: `records` walks the records of the file, `ip` takes the captured frames apart, and this module
 joins the two and counts in `CaptureStats` whatever gives no datagram. Captures are hostile input: past the first four bytes
@@ -9,31 +9,17 @@ from __future__ import annotations
 
 import ipaddress
 import os
-import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import BinaryIO
 
-from lidarspec.captures.ip import ETHERNET, LARGEST_PAYLOAD, Reassembly, Refused, address, ip_packet, udp, udp_frame
-from lidarspec.captures.records import (
-    LARGEST_PACKET,
-    NANOSECOND_MAGIC,
-    CapturedPacket,
-    Damaged,
-    Passed,
-    Source,
-    Truncated,
-    is_capture,
-    records,
-)
+from lidarspec.captures.ip import LARGEST_PAYLOAD, Reassembly, Refused, address, ip_packet, udp, udp_frame
+from lidarspec.captures.records import CapturedPacket, Damaged, Passed, Source, Truncated, is_capture, packet_record, records
 from lidarspec.errors import SourceError, UsageError, system_errors
 from lidarspec.transports.protocol import Closing
 
-_SECOND = 1_000_000_000
-#: bytes of the head of a pcap file, and the head of a record.
-_HEAD_SIZE, _RECORD = 24, struct.Struct("<IIII")
 #: the link types kept for private use: captures of byte streams have the first.
 USER_LINKS = range(147, 163)
 #: who sent a datagram, and to whom, where nobody knows.
@@ -194,15 +180,6 @@ class StreamReader(CaptureReader):
         return Datagram(packet.data, packet.at, NOBODY, NOBODY)
 
 
-def capture_head(link: int = ETHERNET) -> bytes:
-    """What a pcap file begins with: little-endian, with nanoseconds.
-
-    Args:
-        link: the link type: Ethernet for `datagram_record`; USER0 for `packet_record`, when no protocol is around the bytes.
-    """
-    return struct.pack("<4sHHiIII", NANOSECOND_MAGIC, 2, 4, 0, 0, LARGEST_PACKET, link)
-
-
 def datagram_record(datagram: Datagram) -> bytes:
     """The record of one datagram, unfragmented, as Ethernet, IPv4 and UDP.
 
@@ -212,27 +189,6 @@ def datagram_record(datagram: Datagram) -> bytes:
     if len(datagram.data) > LARGEST_PAYLOAD:
         raise UsageError(f"a datagram of {len(datagram.data)} bytes: UDP over IPv4 carries at most {LARGEST_PAYLOAD}")
     return packet_record(udp_frame(datagram.data, _endpoint(*datagram.source), _endpoint(*datagram.destination)), datagram.at)
-
-
-def packet_record(data: bytes, at: int) -> bytes:
-    """The record of one packet as it is, of the file's link type, with its time in ns since 1970.
-
-    Raises:
-        UsageError: for a packet or time that no record can hold.
-    """
-    seconds, nanoseconds = divmod(at, _SECOND)
-    if not 0 <= seconds < 1 << 32:
-        raise UsageError(f"a capture time of {at} ns: pcap holds the years 1970 to 2106")
-    if len(data) > LARGEST_PACKET:
-        raise UsageError(f"a packet of {len(data)} bytes: a record holds at most {LARGEST_PACKET}")
-    return _RECORD.pack(seconds, nanoseconds, len(data), len(data)) + data
-
-
-def record_size(data: bytes | bytearray, at: int) -> int:
-    """The length of the record that begins there in a piece of a written file, or of the file's head, which the first piece begins with."""
-    if at == 0 and is_capture(bytes(data[:4])):
-        return _HEAD_SIZE
-    return _RECORD.size + int.from_bytes(data[at + 8 : at + 12], "little")
 
 
 def is_stream_capture(head: bytes) -> bool:

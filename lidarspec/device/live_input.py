@@ -81,12 +81,12 @@ class Watch:
     @property
     def warnings(self) -> list[str]:
         """What is wrong, with the next command."""
-        state = self.state
+        baud = f": {self._transport.baud} baud is likely wrong" if self._transport.baud else ""
         text = {
             "disconnected": f"{self._source}: the device is gone; waiting for it to come back",
             "silent": f"{self._source}: nothing has arrived for {self.silent_for:.1f} s",
-            "no frames": f"{self._source}: {self._unframed} bytes, and no frame of {self._sensor.id} among them{self._baud}",
-        }.get(state)
+            "no frames": f"{self._source}: {self._unframed} bytes, and no frame of {self._sensor.id} among them{baud}",
+        }.get(self.state)
         return [f"{text}; next: {self.following()}"] if text else []
 
     def following(self) -> str:
@@ -102,11 +102,6 @@ class Watch:
     @property
     def _longest(self) -> int:
         return max((frame.max_length * frame.confirm for frame in self._sensor.frames.values()), default=0)
-
-    @property
-    def _baud(self) -> str:
-        baud = self._transport.baud
-        return f": {baud} baud is likely wrong" if baud else ""
 
 
 class LiveInput(Input):
@@ -133,7 +128,8 @@ class LiveInput(Input):
         period: float = PERIOD,
     ) -> None:
         self._source, self.sensor, self._recorder, self._period = source, sensor, recorder, period
-        self._backend = calm(backend)
+        chosen = backend_named(backend)
+        self._backend = "numpy" if chosen == "auto" else chosen  # none by itself that stops to compile: nothing would be decoded meanwhile
         self.queue, self._session = BoundedQueue(policy), Session(sensor)
         self.decoder: Decoder = sensor.decoder(stream=not opened.datagrams, backend=self._backend)
         self._decoders, self._captures = {"data": self.decoder}, {}
@@ -381,12 +377,6 @@ def _runs(events: list[Event]) -> list[tuple[str, list[Chunk] | Mark | BaseExcep
             run, of = [item], link
             found.append((link, run))
     return found
-
-
-def calm(name: str) -> str:
-    """The back end of a live stream: none by itself that stops to compile, since nothing would be decoded meanwhile."""
-    chosen = backend_named(name)
-    return "numpy" if chosen == "auto" else chosen
 
 
 def _silence(sensor: Sensor, opened: LiveTransport) -> float:

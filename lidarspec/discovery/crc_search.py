@@ -253,16 +253,11 @@ def _registers(words: Codewords, poly: int, reading: _Reading, *, open_: bool) -
 def _solved(left: dict[int, int], poly: int, reading: _Reading) -> Iterator[tuple[Crc, int, tuple[str, ...]]]:
     """Start value and final XOR from frames of several lengths, by linear equations."""
     (size, rest), *others = left.items()
-    equations = []
+    equations, bits = [], range(reading.width)
     for other, other_rest in others:
-        columns = [
-            remainder(reading.started(1 << bit, size), poly) ^ remainder(reading.started(1 << bit, other), poly)
-            for bit in range(reading.width)
-        ]
+        columns = [remainder(reading.started(1 << bit, size) ^ reading.started(1 << bit, other), poly) for bit in bits]
         wanted = rest ^ other_rest
-        equations += [
-            (sum((columns[bit] >> row & 1) << bit for bit in range(reading.width)), wanted >> row & 1) for row in range(reading.width)
-        ]
+        equations += [(sum((columns[bit] >> row & 1) << bit for bit in bits), wanted >> row & 1) for row in bits]
     found = solve(equations, reading.width)
     if found is not None:
         first, free = found

@@ -14,7 +14,9 @@ from pathlib import Path
 from typing import Any, Literal
 
 from lidarspec._version import __version__
-from lidarspec.captures.pcap import NOBODY, USER_LINKS, Datagram, capture_head, datagram_record, packet_record, record_size
+from lidarspec.captures.ip import ETHERNET
+from lidarspec.captures.pcap import NOBODY, USER_LINKS, Datagram, datagram_record
+from lidarspec.captures.records import capture_head, packet_record, record_size
 from lidarspec.errors import UnknownFormat, UsageError
 from lidarspec.framing.decoder import Decoder
 from lidarspec.framing.results import Found
@@ -102,7 +104,7 @@ class PcapRecorder(Appender):
     def __init__(self, path: str | Path, *, port: int = 0, overwrite: bool = False) -> None:
         super().__init__(path, record_size, overwrite=overwrite)
         self._receiver = (NOBODY[0], port)
-        self._put(capture_head())
+        self._put(capture_head(ETHERNET))
 
     def write(self, chunk: Chunk, direction: Literal["in", "out"] = "in") -> None:
         """Take a datagram that was received; one that was sent is none of the sensor's, and is left out.

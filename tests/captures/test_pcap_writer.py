@@ -10,7 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from lidarspec.captures.pcap import CaptureReader, CaptureStats, Datagram, capture_head, datagram_record
+from lidarspec.captures.ip import ETHERNET
+from lidarspec.captures.pcap import CaptureReader, CaptureStats, Datagram, datagram_record
+from lidarspec.captures.records import capture_head
 from lidarspec.errors import SourceError, UsageError
 from lidarspec.recording.recorders import recorder
 from lidarspec.spec import Chunk
@@ -24,7 +26,7 @@ def chunk(datagram: Datagram) -> Chunk:
 
 
 def test_writer_bytes() -> None:
-    assert (capture_head() + datagram_record(DATAGRAM)).hex(" ") == (
+    assert (capture_head(ETHERNET) + datagram_record(DATAGRAM)).hex(" ") == (
         "4d 3c b2 a1 02 00 04 00 00 00 00 00 00 00 00 00 00 00 04 00 01 00 00 00 "  # pcap header
         "00 f1 53 65 15 cd 5b 07 2d 00 00 00 2d 00 00 00 "  # time 1700000000 s, 123456789 ns; 45 bytes
         "02 00 00 00 00 01 02 00 00 00 00 02 08 00 "  # Ethernet
@@ -43,7 +45,7 @@ def test_written_datagrams_come_back_with_right_checksums() -> None:
     for record in records:
         total = sum(struct.unpack_from(">10H", record, 16 + 14))
         assert (total & 0xFFFF) + (total >> 16) == 0xFFFF
-    assert made.read(capture_head() + b"".join(records)) == (written, CaptureStats(packets=len(written), datagrams=len(written)))
+    assert made.read(capture_head(ETHERNET) + b"".join(records)) == (written, CaptureStats(packets=len(written), datagrams=len(written)))
 
 
 @pytest.mark.parametrize(
@@ -115,4 +117,4 @@ def test_real_capture_written_again_reads_the_same() -> None:
     if not path.exists():
         pytest.skip(f"no capture {path.name} in {made.CAPTURES} (set LIDARSPEC_CAPTURES)")
     datagrams = list(CaptureReader(path))
-    assert made.read(capture_head() + b"".join(map(datagram_record, datagrams)))[0] == datagrams
+    assert made.read(capture_head(ETHERNET) + b"".join(map(datagram_record, datagrams)))[0] == datagrams

@@ -11,7 +11,9 @@ from pathlib import Path
 import pytest
 
 from lidarspec import Sensor
-from lidarspec.captures.pcap import USER_LINKS, Datagram, capture_head, datagram_record, packet_record
+from lidarspec.captures.ip import ETHERNET
+from lidarspec.captures.pcap import USER_LINKS, Datagram, datagram_record
+from lidarspec.captures.records import capture_head, packet_record
 from lidarspec.exports import export
 from lidarspec.spec import Udp
 
@@ -54,7 +56,7 @@ def captured(sensor: Sensor, frames: Iterable[bytes], path: Path) -> Path:
     """A capture of these frames, one to a packet, as the sensor's data link carries them."""
     link = sensor.links["data"]
     with path.open("wb") as file:
-        file.write(capture_head() if sensor.datagrams else capture_head(USER_LINKS[0]))
+        file.write(capture_head(ETHERNET if sensor.datagrams else USER_LINKS[0]))
         for number, frame in enumerate(frames):
             if isinstance(link, Udp) and sensor.datagrams:
                 port = link.ports[0] if link.ports else 9
