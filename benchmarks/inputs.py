@@ -11,7 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 import lidarspec as ls
-from lidarspec.captures.pcap import Datagram, PcapWriter
+from lidarspec.captures.ip import ETHERNET
+from lidarspec.captures.pcap import Datagram, datagram_record
+from lidarspec.captures.records import capture_head
 from lidarspec.simulation.simulator import opening, simulate
 
 #: sensor, frames of a full run, the answer it is configured for.
@@ -98,7 +100,7 @@ class Inputs:
         path = self.folder / f"{key}.pcap"
         sender, receiver = ("192.168.1.200", 6699), ("192.168.1.102", 6699)
         with path.open("wb") as file:
-            writer = PcapWriter(file)
+            file.write(capture_head(ETHERNET))
             for index, frame in enumerate(self.frames(key)):
-                writer.write(Datagram(frame, 1_700_000_000 * 10**9 + index * 158_730, sender, receiver))
+                file.write(datagram_record(Datagram(frame, 1_700_000_000 * 10**9 + index * 158_730, sender, receiver)))
         return path

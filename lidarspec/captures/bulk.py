@@ -18,20 +18,9 @@ from numpy.typing import NDArray
 
 from lidarspec.captures.ip import Headers, headers
 from lidarspec.captures.pcap import CaptureReader, Datagram
-from lidarspec.captures.records import (
-    LARGEST_BLOCK,
-    CapturedPacket,
-    Damaged,
-    Passed,
-    PcapngBlocks,
-    PcapRecords,
-    Source,
-    Times,
-    Truncated,
-    records,
-)
+from lidarspec.captures.records import LARGEST_BLOCK, Damaged, Form, Passed, Source, Times, Truncated, records
 from lidarspec.framing.decoder import Decoder
-from lidarspec.framing.results import Frames
+from lidarspec.framing.results import Frames, Indices
 
 #: bytes of a record, from its start, that are compared at most; longer headers are read plainly.
 WIDEST = 128
@@ -63,15 +52,13 @@ class Alike:
     length: int
     start: int
     size: int
-    source: tuple[str, int]
+    source: Sender
     times: Times
     value: NDArray[np.uint64]
     mask: NDArray[np.uint64]
     trailer: str | None
 
-    def find(
-        self, storage: NDArray[np.uint8], starts: NDArray[np.intp], lengths: NDArray[np.intp]
-    ) -> tuple[NDArray[np.bool_] | None, NDArray[np.int64]]:
+    def find(self, storage: NDArray[np.uint8], starts: Indices, lengths: Indices) -> tuple[NDArray[np.bool_] | None, NDArray[np.int64]]:
         """Which of these records are like it, (n,), or None where all are, and their times, (n,) ns; 128 bytes behind each can be read."""
         same = lengths == self.length
         if not same.all():
@@ -93,14 +80,12 @@ class Alike:
         return (None, at) if good is None or good.all() else (good, at[good])
 
 
-def alike(
-    record: bytes, packet: CapturedPacket, headers: Headers, source: tuple[str, int], form: PcapRecords | PcapngBlocks
-) -> Alike | None:
+def alike(record: bytes, headers: Headers, source: Sender, form: Form) -> Alike | None:
     """What records like this one have in common; None where that cannot be told from their first bytes.
 
     Args:
         record: all its bytes.
-        packet, headers, source: what was found in it.
+        headers, source: what was found in it.
         form: the file it stands in.
     """
     pattern = form.pattern(record)
@@ -120,13 +105,13 @@ def alike(
 class Walk(NamedTuple):
     """Where the records that are whole begin, and where the last one ends; `stuck`: what follows has to be read plainly."""
 
-    starts: NDArray[np.intp]
+    starts: Indices
     stuck: bool
 
 
-def walked(storage: NDArray[np.uint8], start: int, stop: int, form: PcapRecords | PcapngBlocks) -> Walk:
+def walked(storage: NDArray[np.uint8], start: int, stop: int, form: Form) -> Walk:
     """The records of a window from `start` to `stop`."""
-    pieces: list[NDArray[np.intp]] = []
+    pieces: list[Indices] = []
     single: list[int] = []
     at, before, patience, length = start, 0, 0, -1
     view = storage.data
@@ -143,7 +128,7 @@ def walked(storage: NDArray[np.uint8], start: int, stop: int, form: PcapRecords 
     return Walk(np.concatenate([*pieces, np.array([*single, at], np.intp)]), length == 0)
 
 
-def _same(storage: NDArray[np.uint8], at: int, count: int, length: int, form: PcapRecords | PcapngBlocks) -> int:
+def _same(storage: NDArray[np.uint8], at: int, count: int, length: int, form: Form) -> int:
     """How many of `count` records that would begin every `length` bytes do have that length, until the first that has not."""
     place, claim = form.claim(length)
     claims: NDArray[np.uint32] = np.ndarray((count,), f"{form.order}u4", storage, at + place, (length,))
@@ -151,7 +136,7 @@ def _same(storage: NDArray[np.uint8], at: int, count: int, length: int, form: Pc
     return int(others.argmax()) if others.any() else count
 
 
-def _windows(storage: NDArray[np.uint8], starts: NDArray[np.intp], width: int) -> NDArray[np.uint8]:
+def _windows(storage: NDArray[np.uint8], starts: Indices, width: int) -> NDArray[np.uint8]:
     """The bytes from each start on, (n, width)."""
     everywhere: NDArray[np.void] = np.ndarray((len(storage) - width + 1,), f"V{width}", storage, 0, (1,))
     return everywhere[starts].view(np.uint8).reshape(len(starts), width)
@@ -170,10 +155,10 @@ class Batch:
     """
 
     buffer: NDArray[np.uint8]
-    starts: NDArray[np.intp]
-    sizes: NDArray[np.intp]
+    starts: Indices
+    sizes: Indices
     at: NDArray[np.int64]
-    senders: NDArray[np.intp]
+    senders: Indices
     names: tuple[Sender, ...]
 
     def __len__(self) -> int:
@@ -189,13 +174,6 @@ class Batch:
             return self
         wanted = np.array([name[0] == host for name in self.names], np.bool_)[self.senders]
         return Batch(self.buffer, self.starts[wanted], self.sizes[wanted], self.at[wanted], self.senders[wanted], self.names)
-
-    def by_sender(self) -> dict[Sender, NDArray[np.intp]]:
-        """Which datagrams came from each sender, as indices, (k,) each."""
-        if len(self.names) == 1:
-            return {self.names[0]: np.arange(len(self))}
-        parts = {name: np.flatnonzero(self.senders == index) for index, name in enumerate(self.names)}
-        return {name: part for name, part in parts.items() if len(part)}
 
     def hosts(self, found: Frames) -> dict[str, list[str]]:
         """The addresses that frames found in these datagrams came from, by type of frame."""
@@ -254,9 +232,7 @@ class CaptureBatches(CaptureReader):
 class _Records:
     """The records that are whole in the window; where there are none, the one that comes next."""
 
-    def __init__(
-        self, reader: CaptureReader, source: Source, form: PcapRecords | PcapngBlocks, starts: NDArray[np.intp], known: list[Alike]
-    ) -> None:
+    def __init__(self, reader: CaptureReader, source: Source, form: Form, starts: Indices, known: list[Alike]) -> None:
         self._reader, self._source, self._form, self._known = reader, source, form, known
         number = max(len(starts) - 1, 1)
         self._are_whole = len(starts) > 1
@@ -322,7 +298,7 @@ class _Records:
         return Batch(self._source.lent(), self._starts[:number] + kind.start, sizes, self._at, senders, (kind.source,))
 
     def _with_plain(
-        self, buffer: NDArray[np.uint8], columns: list[NDArray[Any]], known: NDArray[np.intp], names: dict[Sender, int]
+        self, buffer: NDArray[np.uint8], columns: list[NDArray[Any]], known: Indices, names: dict[Sender, int]
     ) -> NDArray[np.uint8]:
         """The buffer with the bytes of datagrams that are not in it as they are, which take their places in the columns."""
         data = b"".join(datagram.data for datagram in self._plain.values())
@@ -346,7 +322,7 @@ class _Records:
             return
         places = headers(packet.data, packet.link)
         record = self._source.storage[self._starts[index] : self._starts[index + 1]].tobytes()
-        found = alike(record, packet, places, datagram.source, self._form) if places else None
+        found = alike(record, places, datagram.source, self._form) if places else None
         if found is not None:
             self._learnt += 1
             self._known = [*self._known, found]

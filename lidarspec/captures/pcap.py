@@ -1,4 +1,4 @@
-"""Captures: the UDP datagrams of a pcap or pcapng file, and a writer of pcap files.
+"""Captures: the UDP datagrams of a pcap or pcapng file, and the records of those that are written.
 
 Theory of operation: `records` walks the records of the file, `ip` takes the captured frames apart, and this module
 joins the two and counts in `CaptureStats` whatever gives no datagram. Captures are hostile input: past the first four bytes
@@ -9,31 +9,17 @@ from __future__ import annotations
 
 import ipaddress
 import os
-import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import BinaryIO
 
-from lidarspec.captures.ip import ETHERNET, LARGEST_PAYLOAD, Reassembly, Refused, address, ip_packet, udp, udp_frame
-from lidarspec.captures.records import (
-    LARGEST_PACKET,
-    NANOSECOND_MAGIC,
-    CapturedPacket,
-    Damaged,
-    Passed,
-    Source,
-    Truncated,
-    is_capture,
-    records,
-)
+from lidarspec.captures.ip import LARGEST_PAYLOAD, Reassembly, Refused, address, ip_packet, udp, udp_frame
+from lidarspec.captures.records import CapturedPacket, Damaged, Passed, Source, Truncated, is_capture, packet_record, records
 from lidarspec.errors import SourceError, UsageError, system_errors
 from lidarspec.transports.protocol import Closing
 
-__all__ = ["CaptureReader", "CaptureStats", "Datagram", "PcapWriter", "StreamReader", "is_capture", "is_stream_capture"]
-
-_SECOND = 1_000_000_000
 #: the link types kept for private use: captures of byte streams have the first.
 USER_LINKS = range(147, 163)
 #: who sent a datagram, and to whom, where nobody knows.
@@ -194,74 +180,15 @@ class StreamReader(CaptureReader):
         return Datagram(packet.data, packet.at, NOBODY, NOBODY)
 
 
-class PcapWriter:
-    """Writes a pcap file that Wireshark opens, little-endian, with nanoseconds: datagrams as Ethernet, IPv4 and UDP, or bare packets.
-
-    Args:
-        file: a file open for binary writing; it stays open, and buffered bytes are its owner's to flush.
-        link: the link type: Ethernet for `write`; USER0 for `packet`, when no protocol is around the bytes.
+def datagram_record(datagram: Datagram) -> bytes:
+    """The record of one datagram, unfragmented, as Ethernet, IPv4 and UDP.
 
     Raises:
-        SourceError: the file does not take all bytes (a full disk). Where it can be cut, it is cut to its last whole record.
+        UsageError: more than 65,507 bytes, an address that is not IPv4, or a port or time that no record can hold.
     """
-
-    def __init__(self, file: BinaryIO, link: int = ETHERNET) -> None:
-        self._file = file
-        self._end = file.tell() if file.seekable() else None  # of the last whole record
-        self._is_broken = False
-        self._append(struct.pack("<4sHHiIII", NANOSECOND_MAGIC, 2, 4, 0, 0, LARGEST_PACKET, link))
-
-    def write(self, datagram: Datagram) -> None:
-        """Appends one datagram, unfragmented.
-
-        Raises:
-            UsageError: more than 65,507 bytes, an address that is not IPv4, or a port or time that no record can hold.
-            SourceError: the file does not take all bytes, now or at an earlier call.
-        """
-        if len(datagram.data) > LARGEST_PAYLOAD:
-            raise UsageError(f"a datagram of {len(datagram.data)} bytes: UDP over IPv4 carries at most {LARGEST_PAYLOAD}")
-        self.packet(udp_frame(datagram.data, _endpoint(*datagram.source), _endpoint(*datagram.destination)), datagram.at)
-
-    def packet(self, data: bytes, at: int) -> None:
-        """Appends one packet as it is, of the writer's link type, with its time in ns since 1970.
-
-        Raises:
-            UsageError: for a packet or time that no record can hold.
-            SourceError: as `write`.
-        """
-        seconds, nanoseconds = divmod(at, _SECOND)
-        if not 0 <= seconds < 1 << 32:
-            raise UsageError(f"a capture time of {at} ns: pcap holds the years 1970 to 2106")
-        if len(data) > LARGEST_PACKET:
-            raise UsageError(f"a packet of {len(data)} bytes: a record holds at most {LARGEST_PACKET}")
-        self._append(struct.pack("<IIII", seconds, nanoseconds, len(data), len(data)) + data)
-
-    def _append(self, record: bytes) -> None:
-        if self._is_broken:
-            raise SourceError("the capture file ends in half a record since an earlier write failed")
-        left = memoryview(record)
-        try:
-            while left:
-                written = self._file.write(left)
-                if not written:
-                    raise OSError("the file takes no more bytes")
-                left = left[written:]
-        except OSError as error:
-            self._is_broken = not self._cut()
-            raise SourceError(f"cannot write the capture: {error}") from error
-        if self._end is not None:
-            self._end += len(record)
-
-    def _cut(self) -> bool:
-        """Whether the file could be cut to its last whole record."""
-        if self._end is None:
-            return False
-        try:
-            self._file.seek(self._end)
-            self._file.truncate()
-        except OSError:
-            return False
-        return True
+    if len(datagram.data) > LARGEST_PAYLOAD:
+        raise UsageError(f"a datagram of {len(datagram.data)} bytes: UDP over IPv4 carries at most {LARGEST_PAYLOAD}")
+    return packet_record(udp_frame(datagram.data, _endpoint(*datagram.source), _endpoint(*datagram.destination)), datagram.at)
 
 
 def is_stream_capture(head: bytes) -> bool:

@@ -24,7 +24,7 @@ from typing import Any, BinaryIO, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.errors import SourceError
+from lidarspec.errors import SourceError, UsageError
 
 LARGEST_PACKET = 1 << 18  # what libpcap and Wireshark allow on the link types read here
 NANOSECOND_MAGIC = b"\x4d\x3c\xb2\xa1"
@@ -35,6 +35,8 @@ _PCAP = {  # magic: byte order, nanoseconds in a unit of time
     NANOSECOND_MAGIC: ("<", 1),
     b"\xa1\xb2\x3c\x4d": (">", 1),
 }
+#: the head of a file that is written, little-endian, and that of a record in it.
+_HEAD, _RECORD = struct.Struct("<4sHHiIII"), struct.Struct("<IIII")
 _SECTION = b"\x0a\x0d\x0d\x0a"  # the same in both byte orders
 _SECTION_KIND = int.from_bytes(_SECTION)
 _ORDERS = {b"\x4d\x3c\x2b\x1a": "<", b"\x1a\x2b\x3c\x4d": ">"}
@@ -394,7 +396,11 @@ class PcapngBlocks:
         return Passed.NO_PACKET
 
 
-def records(source: Source) -> PcapRecords | PcapngBlocks:
+#: the records of either format.
+Form = PcapRecords | PcapngBlocks
+
+
+def records(source: Source) -> Form:
     """The records of a capture whose magic `is_capture` knows.
 
     Raises:
@@ -455,3 +461,33 @@ def _block_packet(order: str, kind: int, body: bytes, interfaces: list[Interface
     if not -(1 << 63) <= at < 1 << 63:
         return None
     return CapturedPacket(interface.link, at, body[20 : 20 + captured], original)
+
+
+def capture_head(link: int) -> bytes:
+    """What a pcap file begins with: little-endian, with nanoseconds.
+
+    Args:
+        link: the link type: `ip.ETHERNET` for datagrams; USER0 for bare packets, when no protocol is around the bytes.
+    """
+    return _HEAD.pack(NANOSECOND_MAGIC, 2, 4, 0, 0, LARGEST_PACKET, link)
+
+
+def packet_record(data: bytes, at: int) -> bytes:
+    """The record of one packet as it is, of the file's link type, with its time in ns since 1970.
+
+    Raises:
+        UsageError: for a packet or time that no record can hold.
+    """
+    seconds, nanoseconds = divmod(at, _SECOND)
+    if not 0 <= seconds < 1 << 32:
+        raise UsageError(f"a capture time of {at} ns: pcap holds the years 1970 to 2106")
+    if len(data) > LARGEST_PACKET:
+        raise UsageError(f"a packet of {len(data)} bytes: a record holds at most {LARGEST_PACKET}")
+    return _RECORD.pack(seconds, nanoseconds, len(data), len(data)) + data
+
+
+def record_size(data: bytes | bytearray, at: int) -> int:
+    """The length of the record that begins there in a piece of a written file, or of the file's head, which the first piece begins with."""
+    if at == 0 and is_capture(bytes(data[:4])):
+        return _HEAD.size
+    return _RECORD.size + int.from_bytes(data[at + 8 : at + 12], "little")

@@ -124,7 +124,7 @@ def _of_file(path: str, period: int | None, offset: int) -> list[bytes]:
         return cut(b"".join(chunks), period, offset)
     if datagrams and path.endswith(HEX):
         return list(chunks)
-    found = structure(chunks, datagrams=datagrams, seal=False)
+    found = structure(chunks, datagrams=datagrams)
     if found is None:
         raise suggest(UsageError(f"{path}: where its frames begin cannot be seen"), f"lidarspec crc {path} --period BYTES --offset BYTES")
     length = f"{found.period} bytes" if found.period else f"{found.length} bytes"

@@ -42,7 +42,7 @@ class Arrival:
 
 
 class Input(Protocol):
-    """Where a device has its frames from, live or not.
+    """Where a device has its frames from, live or not; what nothing is said of is as with a file.
 
     Attributes:
         is_live: whether data come at their own pace, and not from a file.
@@ -50,9 +50,9 @@ class Input(Protocol):
         stays_on: whether the sensor is left as it is at the end.
     """
 
-    is_live: bool
+    is_live: bool = False
     decoder: Decoder
-    stays_on: bool
+    stays_on: bool = True
 
     @property
     def state(self) -> str:
@@ -73,36 +73,45 @@ class Input(Protocol):
     @property
     def queued(self) -> int | None:
         """Chunks that have arrived and wait to be decoded; None where nothing waits."""
+        return None
 
     def begin(self) -> None:
         """Send the commands that the sensor declares for its start.
 
         Raises:
-            CommandError: where the device does not start.
+            CommandError: where the device does not start, unless it sends data all the same.
         """
 
     def next(self, wait: float) -> Arrival | None:
-        """The next frames; None where none come within `wait` seconds, or at the end."""
+        """The next frames; None where none come within `wait` seconds, or at the end.
+
+        Raises:
+            SourceError: where nothing can be read any more.
+            UsageError: where several senders' frames would be mixed.
+        """
 
     def mark(self) -> int:
         """How much has been produced; for `caught_up`."""
+        return 0
 
     def caught_up(self, mark: int) -> bool:
-        """Whether everything that had been produced at a mark has been decoded."""
+        """Whether everything that had been produced at a mark has been decoded; of a file each scan is looked at in its turn."""
+        return True
 
     def send(self, name: str, *, timeout: float | None = None, **arguments: Any) -> Reply:
-        """The reply to a command.
+        """The reply to a command, which other threads may wait for at the same time.
 
         Raises:
-            UsageError: for what the sensor does not take.
-            CommandError: where the device refuses or keeps silent, or there is none.
+            UnknownCommand, UnknownField, MissingField, OutOfRange: for what the sensor does not take; nothing is sent.
+            CommandError: where the device refuses, the connection is lost or there is no device; ReplyTimeout where it keeps silent.
         """
 
     def first_state(self) -> dict[str, bytes]:
-        """Frames of other types, by name, that count as seen before the first packet."""
+        """Frames of other types, by name, that count as seen before the first packet: of a live sensor none, before it says it."""
+        return {}
 
     def close(self) -> None:
-        """Stop the sensor where it was started, and give everything back."""
+        """Stop the sensor where it was started, and give everything back; a second call does nothing."""
 
 
 class Senders:
@@ -194,11 +203,9 @@ def fed(decoder: Decoder, chunks: Sequence[Chunk]) -> list[Frames]:
 def answers(found: Sequence[Frames], awaited: frozenset[str]) -> list[Found]:
     """The frames of some types, one by one."""
     picked = []
-    for spans in found:
-        kinds = [index for index, name in enumerate(spans.names) if name in awaited]
-        for index in np.flatnonzero(np.isin(spans.kinds, kinds)).tolist():
-            at = int(spans.at[index])
-            picked.append(Found(spans.names[spans.kinds[index]], int(spans.offsets[index]), spans.data(index), None if at < 0 else at))
+    for frames in found:
+        kinds = [index for index, name in enumerate(frames.names) if name in awaited]
+        picked += frames.only(np.isin(frames.kinds, kinds)).found()
     return picked
 
 
@@ -206,25 +213,20 @@ def answers(found: Sequence[Frames], awaited: frozenset[str]) -> list[Found]:
 BATCH_BYTES, BATCH_CHUNKS = 1 << 18, 1024
 
 
-class FileInput:
+class FileInput(Input):
     """What a transport that ends holds; the consumer's own pace is the policy, so that nothing is ever dropped.
 
     Attributes:
-        decoder: what finds the frames.
-        ended: whether everything was read.
         state: "streaming", "ended" or "closed".
     """
 
-    is_live = False
-    queued = None
-    stays_on = True
+    state = "streaming"
 
     def __init__(self, source: str | Path, sensor: Sensor, opened: Transport, *, backend: str) -> None:
         self._source, self._sensor, self._transport = source, sensor, opened
         self.decoder: Decoder = sensor.decoder(stream=not opened.datagrams, backend=backend)
         self._senders = Senders(source, sensor)
         self._arrivals = self._read()
-        self.state = "streaming"
 
     @property
     def ended(self) -> bool:
@@ -232,18 +234,15 @@ class FileInput:
 
     @property
     def warnings(self) -> list[str]:
-        """What is to be said about the source, such as a file that is cut off."""
         return list(self._transport.warnings)
 
     @property
     def stats(self) -> Counters:
-        """The counters."""
         stats = self.decoder.stats
         stats.foreign, stats.disconnects = self._transport.foreign, self._transport.disconnects
         return stats
 
     def next(self, wait: float) -> Arrival | None:
-        """The next frames; None at the end."""
         found = next(self._arrivals, None)
         if found is None:
             self.state = "ended"
@@ -252,20 +251,10 @@ class FileInput:
     def begin(self) -> None:
         """A file has no sensor to be started."""
 
-    def caught_up(self, mark: int) -> bool:
-        """A file has no newest scan: each is looked at in its turn."""
-        return True
-
-    def mark(self) -> int:
-        """Nothing is produced but what is asked for."""
-        return 0
-
-    def send(self, name: str, *, timeout: float | None = None, **arguments: object) -> Reply:
-        """Nothing can be sent to a file."""
+    def send(self, name: str, *, timeout: float | None = None, **arguments: Any) -> Reply:
         raise CommandError(f"{self._sensor.id} {name}: {self._source} is a file, there is no device to send it to")
 
     def close(self) -> None:
-        """Give the file back."""
         self.state = "closed"
         self._transport.close()
 

@@ -119,9 +119,8 @@ def _read(device: Device, served: Served, turns: int) -> tuple[tuple[Reply, ...]
             return replies, tuple(scans), device.stats
         if time.monotonic() > limit:
             break
-    raise SourceError(
-        f"the simulated {device.sensor.id} gave {len(scans)} scans in {PATIENCE + turns:g} s, and not {turns}: {device.stats}"
-    )
+    number = f"{len(scans)} scans in {PATIENCE + turns:g} s, and not {turns}"
+    raise SourceError(f"the simulated {device.sensor.id} gave {number}: {device.stats}")
 
 
 def _whole(scans: Iterator[Scan], number: int) -> list[Scan]:

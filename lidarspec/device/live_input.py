@@ -16,7 +16,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from lidarspec.device.arrivals import Arrival, Senders, answers, fed
+from lidarspec.device.arrivals import Arrival, Input, Senders, answers, fed
 from lidarspec.device.capture_thread import BoundedQueue, Capture, Event, Mark
 from lidarspec.device.session import Outgoing, Pending, Reply, Session
 from lidarspec.errors import CommandError, LidarSpecError, ReplyTimeout, suggest
@@ -81,12 +81,12 @@ class Watch:
     @property
     def warnings(self) -> list[str]:
         """What is wrong, with the next command."""
-        state = self.state
+        baud = f": {self._transport.baud} baud is likely wrong" if self._transport.baud else ""
         text = {
             "disconnected": f"{self._source}: the device is gone; waiting for it to come back",
             "silent": f"{self._source}: nothing has arrived for {self.silent_for:.1f} s",
-            "no frames": f"{self._source}: {self._unframed} bytes, and no frame of {self._sensor.id} among them{self._baud}",
-        }.get(state)
+            "no frames": f"{self._source}: {self._unframed} bytes, and no frame of {self._sensor.id} among them{baud}",
+        }.get(self.state)
         return [f"{text}; next: {self.following()}"] if text else []
 
     def following(self) -> str:
@@ -103,13 +103,8 @@ class Watch:
     def _longest(self) -> int:
         return max((frame.max_length * frame.confirm for frame in self._sensor.frames.values()), default=0)
 
-    @property
-    def _baud(self) -> str:
-        baud = self._transport.baud
-        return f": {baud} baud is likely wrong" if baud else ""
 
-
-class LiveInput:
+class LiveInput(Input):
     """A sensor on a live transport.
 
     Args:
@@ -117,10 +112,6 @@ class LiveInput:
         policy: of the queue, "drop_oldest" or "block".
         recorder: gets everything that arrives and is sent, before the queue.
         period: seconds between two decodings.
-
-    Attributes:
-        decoder: what finds the frames on the data link.
-        stays_on: whether the sensor is left as it is at the end.
     """
 
     is_live = True
@@ -137,7 +128,8 @@ class LiveInput:
         period: float = PERIOD,
     ) -> None:
         self._source, self.sensor, self._recorder, self._period = source, sensor, recorder, period
-        self._backend = calm(backend)
+        chosen = backend_named(backend)
+        self._backend = "numpy" if chosen == "auto" else chosen  # none by itself that stops to compile: nothing would be decoded meanwhile
         self.queue, self._session = BoundedQueue(policy), Session(sensor)
         self.decoder: Decoder = sensor.decoder(stream=not opened.datagrams, backend=self._backend)
         self._decoders, self._captures = {"data": self.decoder}, {}
@@ -163,7 +155,6 @@ class LiveInput:
 
     @property
     def warnings(self) -> list[str]:
-        """What is to be said about the source now."""
         said = [warning for capture in self._captures.values() for warning in capture.transport.warnings] + self._said
         if self._recorder is not None and self._recorder.error is not None:
             said.append(f"the recording has stopped: {self._recorder.error}")
@@ -171,7 +162,6 @@ class LiveInput:
 
     @property
     def stats(self) -> Counters:
-        """The counters of the data link, those of the transports included."""
         stats, captures = self.decoder.stats, list(self._captures.values())
         stats.kernel_drops = sum(capture.transport.kernel_drops for capture in captures)
         stats.foreign = self._foreign + sum(capture.transport.foreign for capture in captures)
@@ -181,19 +171,9 @@ class LiveInput:
 
     @property
     def queued(self) -> int:
-        """Chunks that have arrived and wait to be decoded."""
         return len(self.queue)
 
-    def first_state(self) -> dict[str, bytes]:
-        """Nothing is known of a live sensor before it says it."""
-        return {}
-
     def begin(self) -> None:
-        """Send the commands that the sensor declares for its start.
-
-        Raises:
-            CommandError: where it does not answer, unless it sends data all the same.
-        """
         self._stops = bool(self.sensor.on_open)
         for name in self.sensor.on_open:
             try:
@@ -204,12 +184,6 @@ class LiveInput:
                 self._said.append(f"{error}; data come all the same")
 
     def next(self, wait: float) -> Arrival | None:
-        """The next frames; None where none come within `wait` seconds, or it was closed.
-
-        Raises:
-            SourceError: where nothing can be read any more.
-            UsageError: where several senders' frames would be mixed.
-        """
         deadline = time.monotonic() + wait
         while True:
             with self._turn:
@@ -225,20 +199,12 @@ class LiveInput:
                     return None
 
     def mark(self) -> int:
-        """How much has been produced, as a number for `caught_up`."""
         return self.queue.produced
 
     def caught_up(self, mark: int) -> bool:
-        """Whether everything that had been produced at a mark has been decoded."""
         return not self._ready and self.queue.consumed + self.queue.dropped >= mark
 
     def send(self, name: str, *, timeout: float | None = None, **arguments: Any) -> Reply:
-        """The reply to a command, which other threads may wait for at the same time.
-
-        Raises:
-            UnknownCommand, UnknownField, MissingField, OutOfRange: for what the sensor does not take; nothing is sent.
-            CommandError: where the device refuses, or the connection is lost; ReplyTimeout where it keeps silent.
-        """
         if name in self.sensor.commands:
             self._await_sender(self.sensor.commands[name], timeout)
         with self._talk:
@@ -260,7 +226,6 @@ class LiveInput:
             self._help()
 
     def close(self) -> None:
-        """Stop the sensor where it was started, and give everything back; a second call does nothing."""
         if self._closed:
             return
         try:
@@ -412,12 +377,6 @@ def _runs(events: list[Event]) -> list[tuple[str, list[Chunk] | Mark | BaseExcep
             run, of = [item], link
             found.append((link, run))
     return found
-
-
-def calm(name: str) -> str:
-    """The back end of a live stream: none by itself that stops to compile, since nothing would be decoded meanwhile."""
-    chosen = backend_named(name)
-    return "numpy" if chosen == "auto" else chosen
 
 
 def _silence(sensor: Sensor, opened: LiveTransport) -> float:

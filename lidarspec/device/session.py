@@ -136,11 +136,8 @@ class Expected:
             return [f"a frame {frame}"]
         asked = {path: value for path, value in self.values.items() if path in self.tables[frame]}
         got = {path: found_at(values, path) for path in asked}
-        return [
-            f"{path} {'missing' if got[path] is _MISSING else got[path]} instead of {value}"
-            for path, value in asked.items()
-            if got[path] != value
-        ]
+        wrong = [(path, "missing" if got[path] is _MISSING else got[path]) for path in asked if got[path] != asked[path]]
+        return [f"{path} {there} instead of {asked[path]}" for path, there in wrong]
 
     def alike(self, other: Expected) -> bool:
         """Whether one frame could be the reply to both."""
@@ -309,7 +306,7 @@ class Session:
             if current is not None and now >= current.gives_up:
                 self._give_up(line, current, _silence(self.sensor, current))
             elif current is not None and current.next_sending is not None and now >= current.next_sending:
-                self._send(line, current, now)
+                self._send(current, now)
             self._advance(link, now)
 
     @property
@@ -349,14 +346,14 @@ class Session:
         line.owed = [owed for owed in line.owed if owed.until > now]
         while (ready := line.ready()) is not None and now >= ready:
             request = line.queue.popleft()
-            self._send(line, request, now)
+            self._send(request, now)
             if request.expected is not None:
                 line.current = request
             else:
                 line.quiet = now + _ns(request.command.settle)
                 request.pending.settle(Reply(request.name, None, None, False, now))
 
-    def _send(self, line: _Line, request: _Request, now: int) -> None:
+    def _send(self, request: _Request, now: int) -> None:
         command = request.command
         request.sent.append(now)
         self._out.append(Outgoing(command.link, request.data, command.lines))

@@ -19,7 +19,7 @@ from itertools import combinations, product, zip_longest
 import numpy as np
 
 from lidarspec.discovery.samples import Match, Place, Samples, Span, doubt, enough, spans
-from lidarspec.spec.checksums import CRCS, KNOWN, ByteOrder, Crc, name_of
+from lidarspec.spec.checksums import CRCS, KNOWN, MIRROR, ByteOrder, Crc, name_of, reflected
 
 #: how much larger than sought a common divisor may be, where its divisors are tried one by one.
 SPARE = 11
@@ -31,7 +31,6 @@ DIVIDED = 256
 TAKEN, PICKS = 4, 6
 #: most polynomials that are held against all frames for one place and span.
 WEIGHED = 64
-_MIRROR = bytes(int(f"{byte:08b}"[::-1], 2) for byte in range(256))
 #: (size of what is covered, message with the checksum behind it) of each frame.
 Codewords = list[tuple[int, int]]
 
@@ -124,10 +123,10 @@ class _Reading:
     refout: bool
 
     def message(self, data: bytes) -> int:
-        return int.from_bytes(data.translate(_MIRROR) if self.refin else data, "big") << self.width
+        return int.from_bytes(data.translate(MIRROR) if self.refin else data, "big") << self.width
 
     def register(self, value: int) -> int:
-        return int(f"{value:0{self.width}b}"[::-1], 2) if self.refout else value
+        return reflected(value, self.width) if self.refout else value
 
     def started(self, init: int, size: int) -> int:
         """What a start value adds to the message of `size` bytes."""
@@ -254,16 +253,11 @@ def _registers(words: Codewords, poly: int, reading: _Reading, *, open_: bool) -
 def _solved(left: dict[int, int], poly: int, reading: _Reading) -> Iterator[tuple[Crc, int, tuple[str, ...]]]:
     """Start value and final XOR from frames of several lengths, by linear equations."""
     (size, rest), *others = left.items()
-    equations = []
+    equations, bits = [], range(reading.width)
     for other, other_rest in others:
-        columns = [
-            remainder(reading.started(1 << bit, size), poly) ^ remainder(reading.started(1 << bit, other), poly)
-            for bit in range(reading.width)
-        ]
+        columns = [remainder(reading.started(1 << bit, size) ^ reading.started(1 << bit, other), poly) for bit in bits]
         wanted = rest ^ other_rest
-        equations += [
-            (sum((columns[bit] >> row & 1) << bit for bit in range(reading.width)), wanted >> row & 1) for row in range(reading.width)
-        ]
+        equations += [(sum((columns[bit] >> row & 1) << bit for bit in bits), wanted >> row & 1) for row in bits]
     found = solve(equations, reading.width)
     if found is not None:
         first, free = found

@@ -16,6 +16,7 @@ import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +28,7 @@ from lidarspec.framing.frame_engine import codec
 from lidarspec.framing.results import VALID, Found
 from lidarspec.plugins import sensors
 from lidarspec.simulation.simulator import simulate
+from lidarspec.spec.construct_layer import leaves
 from lidarspec.spec.links import Serial
 from lidarspec.spec.sensor import Sensor
 from lidarspec.spec.tree import FieldInfo
@@ -100,34 +102,25 @@ def _by_name(sensor: Sensor, found: Sequence[Found]) -> str:
         if read.get(item.frame, READ) >= READ:
             continue
         read[item.frame] += 1
-        fields = _fields(sensor, item.frame)
-        for path, text in _texts(sensor.parse(item.data, item.frame), fields):
+        for path, text in _texts(sensor.parse(item.data, item.frame), schema(sensor.frames[item.frame].tree).fields):
             if _plain(text) == model:
                 return f"{item.frame}.{path} says {text}"
     return ""
 
 
-def _fields(sensor: Sensor, frame: str) -> Mapping[str, FieldInfo]:
-    return schema(sensor.frames[frame].tree).fields
-
-
-def _texts(values: object, fields: Mapping[str, FieldInfo], above: str = "") -> Iterator[tuple[str, str]]:
+def _texts(parsed: Any, fields: Mapping[str, FieldInfo]) -> Iterator[tuple[str, str]]:
     """The fields outside arrays that hold a text, or a number with a meaning, and what they say."""
-    if not isinstance(values, Mapping):
-        return
-    for name, value in values.items():
-        path = f"{above}.{name}" if above else str(name)
-        info = fields.get(path)
-        if isinstance(value, Mapping):
-            yield from _texts(value, fields, path)
-        elif isinstance(value, bytes):
+    for keys, value in leaves(parsed):
+        path = ".".join(map(str, keys))
+        if isinstance(value, bytes) and path in fields:
             text = value.split(b"\0")[0].decode("ascii", "replace")
             if text.isprintable() and text:
                 yield path, text
-        elif info is not None and isinstance(value, int):
+        elif isinstance(value, int) and path in fields:
+            info = fields[path]
             meanings = {int(number, 0): text.strip() for number, text in _VALUE.findall(info.docs)} | dict(info.labels)
-            if int(value) in meanings:
-                yield path, str(meanings[int(value)])
+            if value in meanings:
+                yield path, str(meanings[value])
 
 
 def _plain(text: str) -> str:

@@ -167,9 +167,8 @@ def _interfaces(numbers: list[int], host: str, rates: dict[str, float]) -> Itera
     listed = "/".join(map(str, numbers))
     active = {name: rate for name, rate in rates.items() if name != LOOPBACK and rate >= 1}
     if host:
-        yield Finding(
-            True, f"only packets to {host} are listened to; a sensor may send to another address", f"lidarspec doctor udp://:{numbers[0]}"
-        )
+        text = f"only packets to {host} are listened to; a sensor may send to another address"
+        yield Finding(True, text, f"lidarspec doctor udp://:{numbers[0]}")
     for name, rate in active.items():
         text = f"{name} receives {rate:.0f} packets/s, none of them on port {listed}: another port, another address, or a firewall"
         yield Finding(False, text, f"sudo tcpdump -ni {name} udp")
@@ -177,9 +176,8 @@ def _interfaces(numbers: list[int], host: str, rates: dict[str, float]) -> Itera
             text = f"{name} drops senders whose addresses it does not reach, as a sensor with its factory address is (rp_filter)"
             yield Finding(False, text, f"sudo sysctl -w net.ipv4.conf.all.rp_filter=2 net.ipv4.conf.{name}.rp_filter=2")
     if rates and not active:
-        yield Finding(
-            False, "no network interface receives anything: cable, power of the sensor, or an interface that is down", "ip -br address"
-        )
+        text = "no network interface receives anything: cable, power of the sensor, or an interface that is down"
+        yield Finding(False, text, "ip -br address")
 
 
 def _heard(source: str, sensor: Sensor | None, seconds: float) -> Iterator[Finding]:
@@ -236,9 +234,8 @@ def _nothing(source: str, sensor: Sensor | None) -> Finding:
     quoted = quote(source)
     if sensor is not None and sensor in started_first():
         start = next(name for name in sensor.on_open if sensor.commands[name].starts)
-        return Finding(
-            False, f"nothing came; {sensor.id} sends nothing before it is started", f"lidarspec send {quoted} {start} -s {sensor.id}"
-        )
+        text = f"nothing came; {sensor.id} sends nothing before it is started"
+        return Finding(False, text, f"lidarspec send {quoted} {start} -s {sensor.id}")
     address = live_address(source)
     if sensor is None and address is not None and address.scheme == "serial":
         text = "nothing came: a sensor that has to be started first, no power, or its transmit line is not on our receive line"

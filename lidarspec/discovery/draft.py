@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.discovery.checksum_search import search
-from lidarspec.discovery.periods import CIRCLES, FEW, FRONT, STEADY, Candidate, Length, candidates, follows, structure
+from lidarspec.discovery.periods import CIRCLES, FEW, FRONT, STEADY, Candidate, Length, candidates, follows, runs, structure, usual_bytes
 from lidarspec.discovery.samples import Match, Place, values
 from lidarspec.errors import SourceError, UsageError, WireError
 from lidarspec.spec.checksums import ByteOrder
@@ -131,7 +131,7 @@ def draft(chunks: Sequence[bytes], *, datagrams: bool) -> Draft:
     Raises:
         WireError: where no frames of one kind can be seen.
     """
-    found = structure(chunks, datagrams=datagrams, seal=False)
+    found = structure(chunks, datagrams=datagrams)
     if found is None:
         raise WireError("no frames of one kind can be seen in these bytes", data=b"".join(chunks[:1])[:16])
     parts = chunks if datagrams else [b"".join(chunks)]
@@ -155,7 +155,7 @@ def _begun(first: Draft, parts: Sequence[bytes], start: int) -> Draft | None:
     else:
         return None
     rows = np.frombuffer(b"".join(frames), np.uint8).reshape(len(frames), -1)
-    usual = np.array([np.bincount(column, minlength=256).argmax() for column in rows[:, :SYNC].T], np.uint8)
+    usual = usual_bytes(rows[:, :SYNC])
     steady = (rows[:, : len(usual)] == usual).mean(axis=0) >= (STEADY if len(rows) >= FEW else 1)
     length = int(np.argmin(steady)) if not steady.all() else len(steady)
     sync = usual[: length if len(rows) >= MANY else min(length, SHORT_SYNC)].tobytes()
@@ -352,17 +352,11 @@ def _fields(draft: Draft) -> Iterator[Field]:
 def _known(draft: Draft) -> list[Field]:
     """The fields that something is known of, without overlaps."""
     found = list(_header(draft))
-    if draft.length is not None:
-        told = sorted({len(frame) for _, frame in draft.frames})
-        seen = (
-            f"frames of {told[0]} to {told[-1]} bytes"
-            if len(told) > 1
-            else f"whole frames of {told[0]} bytes, and the beginning of another"
-        )
-        why = f"frames are as long as {draft.length} says: {seen}"
-        found.append(
-            Field(draft.length.place, draft.length.size, _counter_name(draft), _integer(draft.length.size, draft.length.order), (why,))
-        )
+    if (length := draft.length) is not None:
+        sizes = sorted({len(frame) for _, frame in draft.frames})
+        of_one = f"whole frames of {sizes[0]} bytes, and the beginning of another"
+        why = f"frames are as long as {length} says: {of_one if len(sizes) == 1 else f'frames of {sizes[0]} to {sizes[-1]} bytes'}"
+        found.append(Field(length.place, length.size, _counter_name(draft), _integer(length.size, length.order), (why,)))
     if draft.seal is not None and not draft.tail:
         found.append(_check(draft, draft.seal, draft.seal.place.start(draft.head)))
     if draft.blocks is not None:
@@ -396,10 +390,8 @@ def _gap(rows: NDArray[np.uint8], start: int, end: int, cuts: Sequence[int]) -> 
 
 def _constant_edges(rows: NDArray[np.uint8], start: int, end: int) -> set[int]:
     """Where runs of bytes that never change begin and end."""
-    steady = np.concatenate([[False], (rows[:, start:end] == rows[0, start:end]).all(axis=0), [False]])
-    begins, ends = (np.flatnonzero(np.diff(steady.astype(np.int8)) == step) for step in (1, -1))
-    runs = [(int(a), int(b)) for a, b in zip(begins, ends, strict=True) if b - a >= RUN]
-    return {start + edge for run in runs for edge in run}
+    steady = (rows[:, start:end] == rows[0, start:end]).all(axis=0)
+    return {start + edge for run in runs(steady) if run[1] - run[0] >= RUN for edge in run}
 
 
 def _constant(columns: NDArray[np.uint8]) -> tuple[str, ...]:
@@ -461,14 +453,8 @@ def _counter_name(draft: Draft) -> str:
 
 def _check(draft: Draft, seal: Match, start: int) -> Field:
     chance = "which may be chance: hold more frames against it" if seal.doubt < WEAK else f"a wrong one would be so once in {seal.odds}"
-    elsewhere = tuple(remark for remark in seal.remarks if "constant" not in remark)
-    return Field(
-        start,
-        seal.place.size,
-        "check",
-        _integer(seal.place.size, seal.order),
-        (f"right in {seal.right} of {seal.total} frames, {chance}", *elsewhere),
-    )
+    why = (f"right in {seal.right} of {seal.total} frames, {chance}", *(one for one in seal.remarks if "constant" not in one))
+    return Field(start, seal.place.size, "check", _integer(seal.place.size, seal.order), why)
 
 
 def _seal_text(draft: Draft, fields: Sequence[Field]) -> tuple[str, str] | None:
@@ -484,13 +470,8 @@ def _seal_text(draft: Draft, fields: Sequence[Field]) -> tuple[str, str] | None:
         (first, last), place = (ranges[0][0], ranges[-1][1]), draft.seal.place.start(shortest)
         inside = [field.name for field in fields if first <= (field.start if field.start >= 0 else place) < last and field.name != "check"]
         over = f"    over={tuple(inside)!r},\n".replace("'", '"')
-    return f'    field="check",\n    algorithm={algorithm},\n{over}', _typed(draft.seal.paste) if own else ""
-
-
-def _typed(text: str) -> str:
-    return text.replace("def __call__(self, data):", "def __call__(self, data: Any) -> int:").replace(
-        "def describe(self):", "def describe(self) -> str:"
-    )
+    typed = draft.seal.paste.replace("(self, data):", "(self, data: Any) -> int:").replace("(self):", "(self) -> str:")
+    return f'    field="check",\n    algorithm={algorithm},\n{over}', typed if own else ""
 
 
 def _span_cuts(draft: Draft) -> list[int]:
@@ -533,14 +514,8 @@ def _imports(text: dict[str, str]) -> dict[str, str]:
     """The names that the text uses, by the library that they are from."""
     code = "\n".join(text.values())
     construct = sorted(set(re.findall(r"\b(Array|Bytes|Const|Int\d+u[lb]|this(?=\.))\b", code)) | {"Struct"})
-    own = {
-        "Fields",
-        "Frame",
-        "Polar",
-        "Sensor",
-        "hookimpl",
-        *re.findall(r"\b(Check(?:sum|summed)|Crc|Every|Fold15|OnWrap|Scaled|Sequence|Serial|Sum|Udp|WordXor|Xor)\b", code),
-    }
+    asked = re.findall(r"\b(Check(?:sum|summed)|Crc|Every|Fold15|OnWrap|Scaled|Sequence|Serial|Sum|Udp|WordXor|Xor)\b", code)
+    own = {"Fields", "Frame", "Polar", "Sensor", "hookimpl", *asked}
     return {
         "construct_names": ", ".join(sorted(construct, key=_case)),
         "own_import": _import("lidarspec.spec", sorted(own, key=_case)),
@@ -583,19 +558,9 @@ class Names:
             raise UsageError(f"{self.id!r} is no id: it is vendor-model in lower case with hyphens, such as acme-x1")
 
     @property
-    def vendor(self) -> str:
-        """The part of the id before the first hyphen, as a name."""
-        return self.id.partition("-")[0].capitalize()
-
-    @property
-    def model(self) -> str:
-        """The rest of it."""
-        return self.id.partition("-")[2].upper()
-
-    @property
     def constant(self) -> str:
         """The sensor's name in its module."""
-        name = self.model.replace("-", "_")
+        name = self.id.partition("-")[2].upper().replace("-", "_")
         return name if name.isidentifier() and name not in TAKEN else f"SENSOR_{name}"
 
     @property
@@ -610,7 +575,9 @@ class Names:
 
     def values(self) -> dict[str, str]:
         """Everything for the templates."""
-        return {name: getattr(self, name) for name in ("id", "vendor", "model", "constant", "distribution", "module")}
+        vendor, _, model = self.id.partition("-")
+        names = {name: getattr(self, name) for name in ("id", "constant", "distribution", "module")}
+        return {**names, "vendor": vendor.capitalize(), "model": model.upper()}
 
 
 def invented(names: Names, link: Link) -> dict[str, str]:

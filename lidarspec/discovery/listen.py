@@ -147,7 +147,8 @@ def everywhere(ports: list[str], *, seconds: float = LISTEN) -> Iterator[Heard]:
 
 def started_first() -> list[Sensor]:
     """The installed sensors on a serial port that send nothing before they are told to."""
-    return [sensor for sensor in sensors().values() if _starts(sensor) and data_link(sensor, Serial)]
+    told = [sensor for sensor in sensors().values() if any(sensor.commands[name].starts for name in sensor.on_open)]
+    return [sensor for sensor in told if data_link(sensor, Serial)]
 
 
 def probe(source: str | Path) -> Iterator[Heard]:
@@ -171,10 +172,6 @@ def probe(source: str | Path) -> Iterator[Heard]:
             with contextlib.closing(live(given, sensor)) as opened:
                 chunks = _Probe(sensor, opened).run()
             yield Heard(str(source), tuple(chunks), baud=None if plain else baud)
-
-
-def _starts(sensor: Sensor) -> bool:
-    return any(sensor.commands[name].starts for name in sensor.on_open)
 
 
 class _Probe:

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -237,7 +238,6 @@ class Structure:
         length: how they say it, where it varies.
         share: share of the bytes that are in them.
         frames: the frames.
-        checksums: what may seal them, the likeliest first.
     """
 
     sync: bytes
@@ -245,20 +245,31 @@ class Structure:
     length: Length | None
     share: float
     frames: tuple[bytes, ...]
-    checksums: tuple[Match, ...]
+
+    @cached_property
+    def checksums(self) -> tuple[Match, ...]:
+        """What may seal them, the likeliest first; the search takes seconds."""
+        return tuple(search(self.frames))
 
 
-def structure(chunks: Sequence[bytes], *, datagrams: bool, seal: bool = True) -> Structure | None:
+def structure(chunks: Sequence[bytes], *, datagrams: bool) -> Structure | None:
     """The likely structure of unknown bytes, None where there is none to be seen.
 
     Args:
         chunks: datagrams, or pieces of a stream.
-        seal: also search for the checksum, which takes seconds.
     """
-    found = _of_datagrams(chunks) if datagrams else _of_stream(np.frombuffer(b"".join(chunks)[:LOOKED_AT], np.uint8))
-    if found is None or not seal:
-        return found
-    return Structure(found.sync, found.period, found.length, found.share, found.frames, tuple(search(found.frames)))
+    return _of_datagrams(chunks) if datagrams else _of_stream(np.frombuffer(b"".join(chunks)[:LOOKED_AT], np.uint8))
+
+
+def usual_bytes(rows: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """The commonest value of each column, (n,)."""
+    return np.array([np.bincount(column, minlength=256).argmax() for column in rows.T], np.uint8)
+
+
+def runs(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """Where each run of True begins, and the first place behind it."""
+    edges = np.flatnonzero(np.diff(mask, prepend=False, append=False)).tolist()
+    return list(zip(edges[::2], edges[1::2], strict=True))
 
 
 def cut(data: bytes, period: int, start: int = 0) -> list[bytes]:
@@ -278,7 +289,7 @@ def _of_datagrams(chunks: Sequence[bytes]) -> Structure | None:
     rows = np.frombuffer(b"".join(frames), np.uint8).reshape(len(frames), length)
     steady = (rows == rows[0]).all(axis=0)
     sync = frames[0][: int(np.argmin(steady)) if not steady.all() else length][:16]
-    return Structure(sync, length, None, len(frames) * length / sum(map(len, chunks)), tuple(frames), ())
+    return Structure(sync, length, None, len(frames) * length / sum(map(len, chunks)), tuple(frames))
 
 
 def _of_stream(data: NDArray[np.uint8]) -> Structure | None:
@@ -323,7 +334,7 @@ def _framed(data: NDArray[np.uint8], period: int) -> Iterator[tuple[float, Struc
     """Frames of this length, which begin with the longest run of bytes that are always the same, and the share of such bytes."""
     count = len(data) // period
     rows = data[: count * period].reshape(count, period)
-    usual = np.array([np.bincount(column, minlength=256).argmax() for column in rows.T], np.uint8)
+    usual = usual_bytes(rows)
     steady = (rows == usual).mean(axis=0) >= STEADY if count >= 2 * FRAMES else (rows == usual).all(axis=0)
     if not (steady & (usual != 0)).any() or steady.all():
         return
@@ -332,19 +343,16 @@ def _framed(data: NDArray[np.uint8], period: int) -> Iterator[tuple[float, Struc
     frames = [frame for frame in cut(data.tobytes(), period, start) if frame.startswith(sync)]
     if len(frames) >= FRAMES:
         share = len(frames) * period / len(data)
-        yield share * float((steady & (usual != 0)).mean()), Structure(sync[:16], period, None, share, tuple(frames), ())
+        yield share * float((steady & (usual != 0)).mean()), Structure(sync[:16], period, None, share, tuple(frames))
 
 
 def _longest_run(steady: NDArray[np.bool_], usual: NDArray[np.uint8]) -> tuple[int, int]:
     """Start and length of the longest run of steady bytes, around the end too, without zeros in front: they tell little."""
-    size, best = len(steady), (-1, 0, 0)
-    for start in range(size):
-        if steady[start] and not steady[start - 1]:
-            run = usual[
-                [(start + step) % size for step in range(next(step for step in range(1, size + 1) if not steady[(start + step) % size]))]
-            ]
-            zeros = int(np.argmax(run != 0)) if run.any() else 0
-            best = max(best, (int(np.count_nonzero(run)), -((start + zeros) % size), len(run) - zeros))
+    turn, best = int(np.argmin(steady)), (-1, 0, 0)  # the circle is cut where no run is
+    for start, end in runs(np.roll(steady, -turn)):
+        run = np.roll(usual, -turn)[start:end]
+        zeros = int(np.argmax(run != 0)) if run.any() else 0
+        best = max(best, (int(np.count_nonzero(run)), -((turn + start + zeros) % len(usual)), len(run) - zeros))
     return -best[1], best[2]
 
 
@@ -390,7 +398,7 @@ def _explained(data: NDArray[np.uint8], starts: NDArray[np.intp], sync: bytes) -
         return None
     whole = data.tobytes()
     frames = [whole[start : start + step] for start, step in zip(starts[:-1][told].tolist(), steps[told].tolist(), strict=True)]
-    return Structure(sync, None, length, share, tuple(frames), ())
+    return Structure(sync, None, length, share, tuple(frames))
 
 
 def _commonest(numbers: NDArray[np.int64]) -> tuple[int, int]:

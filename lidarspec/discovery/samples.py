@@ -172,13 +172,8 @@ class Samples:
     def places(self, size: int) -> Iterator[Place]:
         """Where a checksum of so many bytes can stand: at the end, in front, and elsewhere; only where what stands there varies."""
         last = self.shortest - size
-        near = (
-            range(last, last + 1)
-            if self.alone
-            else range(last + 1)
-            if self.shortest <= SHORT
-            else [*range(NEAR), *range(last - NEAR, last + 1)]
-        )
+        first = last if self.alone else 0
+        near = range(first, last + 1) if self.alone or self.shortest <= SHORT else [*range(NEAR), *range(last - NEAR, last + 1)]
         by_front = sorted((place for place in near if place >= 0), key=lambda place: min(last - place, place + 0.5))
         for front in dict.fromkeys(by_front):
             from_end = len(self.groups) > 1 or front > last // 2

@@ -27,29 +27,29 @@ BACKLOG = 1 << 26
 #: seconds that `sync` and `close` give a disk.
 PATIENCE = 60.0
 
-#: (bytes, limit) -> how many of them make whole records that end within the limit.
-Whole = Callable[[bytes | bytearray, int], int]
+#: (bytes, place) -> the length of the record that begins there; 0 or less where none does.
+Size = Callable[[bytes | bytearray, int], int]
 
 
 class RecordFile:
     """A new file, opened at once.
 
     Args:
-        whole: where a piece of the file may be cut.
+        size_at: how long records are, since a piece of the file may be cut behind each; None where it may be anywhere.
 
     Raises:
         UsageError: where it exists, and is not to be overwritten.
         SourceError: where it cannot be made.
     """
 
-    def __init__(self, path: str, whole: Whole, *, overwrite: bool) -> None:
+    def __init__(self, path: str, size_at: Size | None, *, overwrite: bool) -> None:
         try:
             self._file = open(path, "wb" if overwrite else "xb", buffering=0)  # noqa: SIM115  closed by `close`
         except FileExistsError:
             raise UsageError(f"{path} exists already; it is not overwritten unless asked for") from None
         except OSError as error:
             raise SourceError(f"{path}: {error.strerror or error}") from None
-        self.size, self._whole = 0, whole
+        self.size, self._size_at = 0, size_at
 
     def append(self, records: bytes | bytearray) -> None:
         """Write whole records.
@@ -71,6 +71,13 @@ class RecordFile:
                 self._file.truncate(self.size)
             raise
         self.size += written
+
+    def _whole(self, records: bytes | bytearray, limit: int) -> int:
+        """The bytes of those records that end within the limit."""
+        end = limit if self._size_at is None else 0
+        while self._size_at is not None and 0 < (size := self._size_at(records, end)) <= limit - end:
+            end += size
+        return end
 
     def keep(self) -> None:
         """Returns when all of it is on the disk; pipes and devices have none."""
@@ -117,7 +124,7 @@ class Appender:
     raised once, by the next `sync` or by `close`; the file is then valid to its last whole record.
 
     Args:
-        path, whole, overwrite: as in `RecordFile`.
+        path, size_at, overwrite: as in `RecordFile`.
 
     Attributes:
         records, bytes: taken so far, and the bytes of the wire in them.
@@ -125,13 +132,13 @@ class Appender:
         error: what went wrong with the file, None where nothing did.
     """
 
-    def __init__(self, path: str | Path, whole: Whole, *, overwrite: bool) -> None:
+    def __init__(self, path: str | Path, size_at: Size | None, *, overwrite: bool) -> None:
         self.path, self.records, self.bytes, self.dropped = str(path), 0, 0, 0
         self.error: SourceError | None = None
         self._changed, self._waiting = threading.Condition(), bytearray()
         self._untold, self._raised, self._closing = 0, False, False
         self._taken, self._asked, self._kept = 0, 0, 0  # pieces: in memory or further, asked to be on the disk, and there
-        self._file = RecordFile(self.path, whole, overwrite=overwrite)
+        self._file = RecordFile(self.path, size_at, overwrite=overwrite)
         self._thread = threading.Thread(target=self._work, name=f"recorder of {path}", daemon=True)
         self._thread.start()
         atexit.register(self._finish)
@@ -224,7 +231,7 @@ class Appender:
         """The thread: what waits is written, and put on the disk when that is due, until the end or a failure."""
         try:
             due = time.monotonic() + DISK_SECONDS
-            while not self._is_done():
+            while not (self._closing and not self._waiting and self._kept == self._taken):
                 with self._changed:
                     self._changed.wait_for(lambda: self._waiting or self._kept < self._taken or self._closing)
                     self._changed.wait_for(self._is_urgent, FLUSH_SECONDS)
@@ -244,9 +251,6 @@ class Appender:
                 self._changed.notify_all()
         finally:
             self._file.close()
-
-    def _is_done(self) -> bool:
-        return self._closing and not self._waiting and self._kept == self._taken
 
     def _is_urgent(self) -> bool:
         return len(self._waiting) >= FLUSH_BYTES or self._asked > self._kept or self._closing

@@ -29,7 +29,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, fields
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, BinaryIO, Literal
+from typing import Any, Literal
 
 from lidarspec.errors import SourceError, UsageError, WireError, suggest, system_errors
 from lidarspec.plugins import sensor as named_sensor
@@ -39,18 +39,6 @@ from lidarspec.transports.protocol import Closing
 VERSION = 1
 _ID = re.compile(r"[a-z0-9]+(-[a-z0-9]+)*")
 _WORD = re.compile(r"[A-Za-z0-9_+-]{1,40}")
-_KINDS: dict[str, type | tuple[type, ...]] = {
-    "sensor": str,
-    "options": dict,
-    "source": str,
-    "datagrams": bool,
-    "baud": (int, type(None)),
-    "versions": dict,
-    "created": str,
-    "wall_ns": int,
-    "monotonic_ns": int,
-    "version": int,
-}
 MAGIC = b"\x89LSR\r\n\x1a\n"
 MARK = b"\xb5LS\x1e"
 HEADER, RECEIVED, SENT, EVENT = range(4)
@@ -128,10 +116,11 @@ def read_header(data: bytes) -> Header:
         values = None
     if not isinstance(values, dict):
         raise WireError("the header of the recording is no JSON object", data=data[:16])
-    known = {name: values.get(name, getattr(_BLANK, name)) for name in _KINDS}
-    for name, kind in _KINDS.items():
-        if not isinstance(known[name], kind) or (isinstance(known[name], bool) and kind is not bool):
-            raise WireError(f"the header of the recording has {name} = {str(known[name])[:40]!r}", path=name, got=known[name])
+    known = {item.name: values.get(item.name, getattr(_BLANK, item.name)) for item in fields(Header)}
+    for name, value in known.items():
+        kind = (int, type(None)) if name == "baud" else type(getattr(_BLANK, name))
+        if not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool):
+            raise WireError(f"the header of the recording has {name} = {str(value)[:40]!r}", path=name, got=value)
     return Header(**known)
 
 
@@ -191,39 +180,73 @@ def size_at(buffer: bytes | bytearray | memoryview, start: int = 0) -> int:
     return int(_HEAD.size + addresses + size + _CRC.size)
 
 
-def whole_records(buffer: bytes | bytearray | memoryview, limit: int) -> int:
-    """The bytes of those records at the beginning of the buffer that end within the first `limit` bytes."""
-    end = 0
-    while 0 < (size := size_at(buffer, end)) <= limit - end:
-        end += size
-    return end
+class Recording(Closing):
+    """A recording, read in order: an iterable of `Record`s that goes on where the last loop stopped, and a context manager.
 
-
-class RecordReader(Closing):
-    """The records of an open file, from behind its magic bytes on; memory is bounded by a block and a record.
+    Memory is bounded by a block and a record.
 
     Args:
-        salvage: look for the next good record behind a damaged place, instead of stopping there.
+        path: the file.
+        salvage: look for the next good record behind a damaged place, even the header, instead of stopping there.
 
     Attributes:
+        header: what it says of itself.
         records: good records so far, the header and events among them.
         damaged: places so far that hold no good record; a record that is not whole at the end is one.
         leftover: bytes in damaged places; without `salvage` all that are behind the last good record.
         is_cut: whether the last damaged place is a record that the file ends in.
         offset: file offset of the next record, or of the damage that ended the reading.
+
+    Raises:
+        SourceError: where the file cannot be opened, is no recording, or one of a later format.
+        WireError: where its header is damaged, and `salvage` is not asked for.
     """
 
-    def __init__(self, file: BinaryIO, *, salvage: bool = False) -> None:
-        self._file, self.salvage = file, salvage
+    def __init__(self, path: str | Path, *, salvage: bool = False) -> None:
+        self.path, self.salvage = str(path), salvage
         self._window, self._place = b"", 0
         self.records = self.damaged = self.leftover = 0
         self.is_cut, self.offset = False, len(MAGIC)
+        with system_errors(path):
+            self._file = open(path, "rb")  # noqa: SIM115  closed by `close`
+        try:
+            self._records = self._begin()
+        except BaseException:
+            self.close()
+            raise
 
     def close(self) -> None:
         """Close the file."""
         self._file.close()
 
-    def pairs(self) -> Iterator[tuple[int, Record]]:
+    def __iter__(self) -> Iterator[Record]:
+        return self._records
+
+    def _begin(self) -> Iterator[Record]:
+        """Read the header; the records behind it."""
+        with system_errors(self.path):
+            magic = self._file.read(len(MAGIC))
+            if magic != MAGIC:
+                seen = f"it begins with {magic.hex(' ')}" if magic else "it is empty"
+                raise SourceError(f"{self.path}: not an .lsr recording: {seen}")
+            pairs = self._pairs()
+            first = next(pairs, None)
+        if first is not None and first[0] == HEADER:
+            self.header = read_header(first[1].data)
+            if self.header.version > VERSION:
+                raise SourceError(f"{self.path}: written in format {self.header.version}, and this lidarspec knows {VERSION}")
+            return self._known(pairs)
+        if not self.salvage:
+            damage = WireError(f"{self.path}: the header of the recording is damaged or cut off")
+            raise suggest(damage, f"lidarspec record {self.path} --salvage -o mended.lsr")
+        self.header = Header()
+        return self._known(itertools.chain([] if first is None else [first], pairs))
+
+    def _known(self, pairs: Iterator[tuple[int, Record]]) -> Iterator[Record]:
+        with system_errors(self.path):
+            yield from (record for kind, record in pairs if kind in DIRECTIONS)
+
+    def _pairs(self) -> Iterator[tuple[int, Record]]:
         """Kind and content of every good record."""
         while self._holds(1):
             if (size := self._good()) > 0:
@@ -247,7 +270,8 @@ class RecordReader(Closing):
             return 0
         end = self._place + size - _CRC.size
         passes = zlib.crc32(self._window[self._place : end]) == _CRC.unpack_from(self._window, end)[0]
-        return size if passes and _addresses_fit(self._window, self._place) else 0
+        start = self._place + _HEAD.size
+        return size if passes and _endpoints(self._window[start : start + self._window[self._place + 6]]) else 0
 
     def _holds(self, number: int) -> bool:
         """Whether so many bytes are in the window from the place on, after reading more where it takes that."""
@@ -291,22 +315,11 @@ class RecordReader(Closing):
 def _unpacked(record: bytes) -> tuple[int, Record]:
     _, kind, flags, addresses, size, at = _HEAD.unpack_from(record)
     start = _HEAD.size + addresses
-    sender, receiver = _endpoints(record[_HEAD.size : start]) if addresses else (None, None)
+    sender, receiver = _endpoints(record[_HEAD.size : start]) or (None, None)
     known = None if at == _UNKNOWN else at
     direction = DIRECTIONS.get(kind, "event")
     marks = (bool(flags & mark) for mark in (DATAGRAM, GAP, QUIET))
     return kind, Record(direction, record[start : start + size], known, sender, receiver, *marks)
-
-
-def _addresses_fit(buffer: bytes, start: int) -> bool:
-    """Whether the addresses of a record are two, and fill their place."""
-    length = buffer[start + 6]
-    place, end = start + _HEAD.size, start + _HEAD.size + length
-    for _ in range(2 if length else 0):
-        if place >= end:
-            return False
-        place += 1 + buffer[place] + 2 * bool(buffer[place])
-    return place == end
 
 
 @lru_cache(maxsize=256)
@@ -321,65 +334,13 @@ def _endpoint(address: Address | None) -> bytes:
 
 
 @lru_cache(maxsize=256)
-def _endpoints(data: bytes) -> tuple[Address | None, Address | None]:
+def _endpoints(data: bytes) -> list[Address | None] | None:
+    """Sender and receiver as they stand in a record; None where they are not two, or do not fill their place."""
     found: list[Address | None] = []
     place = 0
-    for _ in range(2):
+    while len(found) < 2 and place < len(data):
         length = data[place]
-        host = data[place + 1 : place + 1 + length].decode("utf-8", "replace")
-        found.append((host, _PORT.unpack_from(data, place + 1 + length)[0]) if length else None)
-        place += 1 + length + 2 * bool(length)
-    return found[0], found[1]
-
-
-class Recording(RecordReader):
-    """A recording, read in order: an iterable of `Record`s that goes on where the last loop stopped, and a context manager.
-
-    Args:
-        path: the file.
-        salvage: go on behind damaged places, even where the header is one.
-
-    Attributes:
-        header: what it says of itself; the others are those of `RecordReader`.
-
-    Raises:
-        SourceError: where the file cannot be opened, is no recording, or one of a later format.
-        WireError: where its header is damaged, and `salvage` is not asked for.
-    """
-
-    def __init__(self, path: str | Path, *, salvage: bool = False) -> None:
-        self.path = str(path)
-        with system_errors(path):
-            super().__init__(open(path, "rb"), salvage=salvage)  # noqa: SIM115  closed by `close`
-        try:
-            self._records = self._begin()
-        except BaseException:
-            self.close()
-            raise
-
-    def __iter__(self) -> Iterator[Record]:
-        return self._records
-
-    def _begin(self) -> Iterator[Record]:
-        """Read the header; the records behind it."""
-        with system_errors(self.path):
-            magic = self._file.read(len(MAGIC))
-            if magic != MAGIC:
-                seen = f"it begins with {magic.hex(' ')}" if magic else "it is empty"
-                raise SourceError(f"{self.path}: not an .lsr recording: {seen}")
-            pairs = self.pairs()
-            first = next(pairs, None)
-        if first is not None and first[0] == HEADER:
-            self.header = read_header(first[1].data)
-            if self.header.version > VERSION:
-                raise SourceError(f"{self.path}: written in format {self.header.version}, and this lidarspec knows {VERSION}")
-            return self._known(pairs)
-        if not self.salvage:
-            damage = WireError(f"{self.path}: the header of the recording is damaged or cut off")
-            raise suggest(damage, f"lidarspec record {self.path} --salvage -o mended.lsr")
-        self.header = Header()
-        return self._known(itertools.chain([] if first is None else [first], pairs))
-
-    def _known(self, pairs: Iterator[tuple[int, Record]]) -> Iterator[Record]:
-        with system_errors(self.path):
-            yield from (record for kind, record in pairs if kind in DIRECTIONS)
+        host, end = data[place + 1 : place + 1 + length].decode("utf-8", "replace"), place + 1 + length + 2 * bool(length)
+        found.append((host, int.from_bytes(data[end - 2 : end], "little")) if length else None)
+        place = end
+    return (found or [None, None]) if place == len(data) and len(found) != 1 else None

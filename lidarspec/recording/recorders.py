@@ -6,9 +6,7 @@ whole records, which a thread of their own writes (`appending`).
 
 from __future__ import annotations
 
-import io
 import json
-import struct
 import time
 from collections.abc import Callable
 from datetime import datetime
@@ -16,14 +14,15 @@ from pathlib import Path
 from typing import Any, Literal
 
 from lidarspec._version import __version__
-from lidarspec.captures.pcap import NOBODY, USER_LINKS, Datagram, PcapWriter
-from lidarspec.captures.records import is_capture
+from lidarspec.captures.ip import ETHERNET
+from lidarspec.captures.pcap import NOBODY, USER_LINKS, Datagram, datagram_record
+from lidarspec.captures.records import capture_head, packet_record, record_size
 from lidarspec.errors import UnknownFormat, UsageError
 from lidarspec.framing.decoder import Decoder
 from lidarspec.framing.results import Found
 from lidarspec.plugins import registry, sensor as named_sensor
 from lidarspec.recording.appending import Appender, Log
-from lidarspec.recording.format import DATAGRAM, EVENT, GAP, HEADER, LARGEST, MAGIC, QUIET, RECEIVED, SENT, Header, packed, whole_records
+from lidarspec.recording.format import DATAGRAM, EVENT, GAP, HEADER, LARGEST, MAGIC, QUIET, RECEIVED, SENT, Header, packed, size_at
 from lidarspec.spec.description import Spec
 from lidarspec.spec.links import Udp
 from lidarspec.transports.protocol import Chunk, Transport
@@ -31,7 +30,6 @@ from lidarspec.transports.protocol import Chunk, Transport
 SUFFIXES = (".lsr", ".pcap", ".bin")
 #: bytes between frames that make one packet at most.
 LARGEST_GAP = 1 << 16
-_HEAD, _RECORD = 24, 16
 #: a file, a recorder, or what makes one when the source is open.
 RecordTo = str | Path | Appender | Callable[[Transport], Log]
 
@@ -71,7 +69,7 @@ class Recorder(Appender):
         overwrite: bool = False,
     ) -> None:
         self.header = _header(sensor, str(source), datagrams=datagrams, baud=baud)
-        super().__init__(path, _whole, overwrite=overwrite)
+        super().__init__(path, _record_size, overwrite=overwrite)
         self._put(MAGIC + packed(HEADER, self.header.to_json(), self.header.wall_ns))
         try:
             self.sync()
@@ -104,10 +102,9 @@ class PcapRecorder(Appender):
     """
 
     def __init__(self, path: str | Path, *, port: int = 0, overwrite: bool = False) -> None:
-        self._made, self._receiver = io.BytesIO(), (NOBODY[0], port)
-        self._writer = PcapWriter(self._made)
-        super().__init__(path, _whole_packets, overwrite=overwrite)
-        self._put(_taken_out(self._made))
+        super().__init__(path, record_size, overwrite=overwrite)
+        self._receiver = (NOBODY[0], port)
+        self._put(capture_head(ETHERNET))
 
     def write(self, chunk: Chunk, direction: Literal["in", "out"] = "in") -> None:
         """Take a datagram that was received; one that was sent is none of the sensor's, and is left out.
@@ -116,8 +113,8 @@ class PcapRecorder(Appender):
             UsageError: for addresses that are not IPv4.
         """
         if direction == "in":
-            self._writer.write(Datagram(chunk.data, chunk.at or 0, chunk.sender or NOBODY, chunk.receiver or self._receiver))
-            self._put(_taken_out(self._made), len(chunk.data))
+            datagram = Datagram(chunk.data, chunk.at or 0, chunk.sender or NOBODY, chunk.receiver or self._receiver)
+            self._put(datagram_record(datagram), len(chunk.data))
 
 
 class FrameRecorder(Appender):
@@ -131,11 +128,10 @@ class FrameRecorder(Appender):
     """
 
     def __init__(self, path: str | Path, sensor: Spec, *, overwrite: bool = False) -> None:
-        self._made, self._decoder = io.BytesIO(), Decoder(sensor, stream=True)
+        self._decoder = Decoder(sensor, stream=True)
         self._held, self._base, self._at = bytearray(), 0, 0
-        self._writer = PcapWriter(self._made, USER_LINKS[0])
-        super().__init__(path, _whole_packets, overwrite=overwrite)
-        self._put(_taken_out(self._made))
+        super().__init__(path, record_size, overwrite=overwrite)
+        self._put(capture_head(USER_LINKS[0]))
 
     def write(self, chunk: Chunk, direction: Literal["in", "out"] = "in") -> None:
         """Take bytes that were received; those that were sent are left out."""
@@ -160,10 +156,9 @@ class FrameRecorder(Appender):
             size -= part
 
     def _packet(self, size: int, at: int) -> None:
-        self._writer.packet(bytes(self._held[:size]), at)
+        self._put(packet_record(bytes(self._held[:size]), at), size)
         del self._held[:size]
         self._base += size
-        self._put(_taken_out(self._made), size)
 
     def _finish(self) -> None:
         if not self._closing:
@@ -175,7 +170,7 @@ class RawRecorder(Appender):
     """Writes the bytes that are received, and nothing else."""
 
     def __init__(self, path: str | Path, *, overwrite: bool = False) -> None:
-        super().__init__(path, lambda data, limit: limit, overwrite=overwrite)
+        super().__init__(path, None, overwrite=overwrite)
 
     def write(self, chunk: Chunk, direction: Literal["in", "out"] = "in") -> None:
         """Take bytes that were received."""
@@ -266,29 +261,6 @@ def _event(name: str, at: int, details: dict[str, Any]) -> bytes:
     return packed(EVENT, json.dumps({"event": name, **details}, default=str).encode(), at)
 
 
-def _whole(data: bytes | bytearray, limit: int) -> int:
-    """How much of a piece of the file can stay; the first begins with the magic bytes."""
-    if data[: len(MAGIC)] != MAGIC:
-        return whole_records(data, limit)
-    return len(MAGIC) + whole_records(data[len(MAGIC) :], limit - len(MAGIC)) if limit >= len(MAGIC) else 0
-
-
-def _taken_out(made: io.BytesIO) -> bytes:
-    """What a writer has made since it was last asked."""
-    data = made.getvalue()
-    made.seek(0)
-    made.truncate()
-    return data
-
-
-def _whole_packets(data: bytes | bytearray, limit: int) -> int:
-    """The bytes of those packets of a piece of a capture that end within the limit; the first piece begins with the file's header."""
-    end = _HEAD if is_capture(bytes(data[:4])) else 0
-    if end > limit:
-        return 0
-    while end + _RECORD <= limit:
-        size = _RECORD + int(struct.unpack_from("<I", data, end + 8)[0])
-        if size > limit - end:
-            break
-        end += size
-    return end
+def _record_size(data: bytes | bytearray, at: int) -> int:
+    """The length of the record that begins there in a piece of a recording, or of the magic bytes, which the first piece begins with."""
+    return len(MAGIC) if data.startswith(MAGIC, at) else size_at(data, at)

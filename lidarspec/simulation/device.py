@@ -66,9 +66,8 @@ class Answering:
     def __init__(self, sensor: Spec) -> None:
         self._sensor = sensor
         self._heard: dict[str, int] = {}
-        self._decoders = {
-            link: _listening(sensor, link) for link in {command.link for command in sensor.commands.values() if command.frame}
-        }
+        links = {command.link for command in sensor.commands.values() if command.frame}
+        self._decoders = {link: _listening(sensor, link) for link in links}
         self._makers: dict[str, FrameMaker] = {}
 
     def requests(self, data: bytes, now: int, link: str) -> list[Request]:
@@ -115,15 +114,9 @@ class Answering:
     def _request(self, frame: str, data: bytes, link: str) -> Request | None:
         """The command that a frame is: of several that fit, the one that says most about it."""
         values = dict(_flat(parse(self._sensor, data, frame=frame)))
-        fitting = [
-            (name, command)
-            for name, command in self._sensor.commands.items()
-            if (command.frame, command.link) == (frame, link) and all(values.get(path) == value for path, value in command.values.items())
-        ]
-        if not fitting:
-            return None
-        name, command = max(fitting, key=lambda one: len(one[1].values))
-        return Request(name, command, values)
+        sent = [one for one in self._sensor.commands.items() if (one[1].frame, one[1].link) == (frame, link)]
+        fitting = [one for one in sent if all(values.get(path) == value for path, value in one[1].values.items())]
+        return Request(*max(fitting, key=lambda one: len(one[1].values)), values) if fitting else None
 
 
 def _listening(sensor: Spec, link: str) -> Decoder:

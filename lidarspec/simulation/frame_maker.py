@@ -120,11 +120,8 @@ def _steps(leaf: Leaf, given: Sequence[Any]) -> NDArray[Any]:
     """Physical values as raw ones, with room for the arrays that the field is in; bytes fill up with zeros."""
     info = leaf.info
     if info.kind == "bytes":
-        given = [_padded(value, leaf.shape[-1]) if isinstance(value, bytes) else value for value in given]
+        size = leaf.shape[-1]
+        given = [list(value[:size].ljust(size, b"\0")) if isinstance(value, bytes) else value for value in given]
     values = np.array([np.asarray(value, np.float64) for value in given])
     values = values.reshape(*values.shape, *(1,) * (1 + len(leaf.shape) - values.ndim))
     return np.asarray(info.raw(values))
-
-
-def _padded(value: bytes, size: int) -> list[int]:
-    return list(value[:size].ljust(size, b"\0"))

@@ -284,13 +284,10 @@ class Pace:
             return np.asarray(np.rint(np.arange(len(table)) * 1e9 / self._rate), np.int64)
         if self._sensor.clock:
             return self._by_clock(table)
-        steps = (
-            beams().counts * self._point * 1e9
-            if self._point
-            else _sizes(table) * BITS * 1e9 / self._baud
-            if self._baud
-            else np.zeros(len(table))
-        )
+        if self._point:
+            steps = beams().counts * self._point * 1e9
+        else:
+            steps = _sizes(table) * BITS * 1e9 / self._baud if self._baud else np.zeros(len(table))
         return np.asarray(np.rint(np.concatenate([[0], np.cumsum(steps[:-1])])), np.int64)
 
     def _by_clock(self, table: Rows) -> Times:

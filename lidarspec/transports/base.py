@@ -116,6 +116,12 @@ class HostClock:
         return time.monotonic_ns() + self._offset
 
 
+def rest(until: float) -> None:
+    """Returns at a time of the monotonic clock: between two reads some bytes gather, so that not each of them wakes us."""
+    if (pause := until - time.monotonic()) > 0:
+        time.sleep(pause)
+
+
 def readable(descriptor: int, timeout: float) -> bool:
     """Whether there is something to read, or the other side has hung up, within so many seconds."""
     if sys.platform == "win32":  # which has no poll

@@ -87,9 +87,8 @@ def _damage(recording: Recording) -> str:
         return f"{recording.path} is damaged in {recording.damaged} place{'s' * (recording.damaged > 1)}: {lost}, everything else was"
     if recording.is_cut:
         return f"{recording.path} is cut off in its last record: {lost}, everything before them was"
-    return (
-        f"{recording.path} is damaged at byte {recording.offset}: {lost}; next: lidarspec record {recording.path} --salvage -o mended.lsr"
-    )
+    mending = f"lidarspec record {recording.path} --salvage -o mended.lsr"
+    return f"{recording.path} is damaged at byte {recording.offset}: {lost}; next: {mending}"
 
 
 class FileTransport(Transport):

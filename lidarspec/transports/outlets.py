@@ -88,6 +88,7 @@ class Outlet:
 
     def close(self) -> None:
         """Give everything back."""
+        self.unplug()
 
 
 class UdpOutlet(Outlet):
@@ -230,9 +231,6 @@ class TcpOutlet(Outlet):
                     pass
             self._forget(client)
 
-    def close(self) -> None:
-        self.unplug()
-
     def _accept(self) -> None:
         with contextlib.suppress(OSError):
             client, _ = self._listener.accept()
@@ -311,9 +309,6 @@ class PtyOutlet(Outlet):
             os.close(self._master)
         self._master = -1
         self._waiting.clear()
-
-    def close(self) -> None:
-        self.unplug()
 
     def receive(self, wait: float) -> list[bytes]:
         if self._master < 0:

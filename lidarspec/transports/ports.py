@@ -56,9 +56,8 @@ def serial_ports() -> list[SerialPort]:
     for port in sorted(list_ports.comports(), key=lambda port: str(port.device)):
         description = port.description if port.description not in (None, "n/a") else ""
         maker = f" by {port.manufacturer}" if port.manufacturer else ""
-        found.append(
-            SerialPort(port.device, f"{description}{maker}".strip(), lasting(port.device), allowed(port.device), users(port.device))
-        )
+        path = port.device
+        found.append(SerialPort(path, f"{description}{maker}".strip(), lasting(path), allowed(path), users(path)))
     return found
 
 

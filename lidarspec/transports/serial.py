@@ -17,7 +17,7 @@ import serial
 from lidarspec.errors import SourceError, UsageError
 from lidarspec.spec.links import Serial
 from lidarspec.spec.sensor import Sensor
-from lidarspec.transports.base import Address, HostClock, data_link, failure, lost, named, readable, reason
+from lidarspec.transports.base import Address, HostClock, data_link, failure, lost, named, readable, reason, rest
 from lidarspec.transports.protocol import Chunk, LiveTransport
 
 try:
@@ -56,9 +56,7 @@ class SerialTransport(LiveTransport):
         self._port = self._open()
 
     def read(self, timeout: float) -> list[Chunk]:
-        pause = self._rested - time.monotonic()
-        if pause > 0:
-            time.sleep(pause)
+        rest(self._rested)
         try:
             data = self._read_posix(timeout) if os.name == "posix" else self._read_any(timeout)
         except GONE as error:
@@ -82,7 +80,7 @@ class SerialTransport(LiveTransport):
             try:
                 setattr(self._port, name, level)
             except GONE as error:
-                if not _has_no_lines(error):
+                if not {errno.ENOTTY, errno.EINVAL} & set(_numbers(error)):  # of a port without such lines, as a pseudo-terminal
                     raise lost(self.label, _cause(error)) from None
 
     def reopen(self) -> None:
@@ -126,22 +124,15 @@ class SerialTransport(LiveTransport):
 
     def _read_posix(self, timeout: float) -> bytes:
         descriptor = self._port.fileno()
-        data = self._waiting(descriptor)  # after the pause there is something, as a rule
-        if not data:
-            if not readable(descriptor, timeout):
-                return b""
-            data = os.read(descriptor, BLOCK)
+        with contextlib.suppress(BlockingIOError):
+            if data := os.read(descriptor, BLOCK):
+                return data  # as a rule, after the pause; nothing may mean a hang-up, which the system tells only who waits
+        if not readable(descriptor, timeout):
+            return b""
+        data = os.read(descriptor, BLOCK)
         if not data:
             raise lost(self.label, "it hung up")
         return data
-
-    @staticmethod
-    def _waiting(descriptor: int) -> bytes:
-        """What has arrived; nothing as well where the line has hung up, which the system tells only who waits."""
-        try:
-            return os.read(descriptor, BLOCK)
-        except BlockingIOError:
-            return b""
 
     def _read_any(self, timeout: float) -> bytes:
         self._port.timeout = timeout
@@ -173,11 +164,10 @@ def connect(address: Address, sensor: Sensor | None = None) -> SerialTransport:
 
 def _cause(error: BaseException) -> str:
     """What the system says, where pyserial wraps it in a sentence of its own."""
-    numbers = [number for number in error.args if isinstance(number, int)]
+    numbers = _numbers(error)
     return os.strerror(numbers[0]) if numbers else reason(error) if isinstance(error, OSError) else str(error)
 
 
-def _has_no_lines(error: BaseException) -> bool:
-    """Whether the port is of a kind without control lines, such as a pseudo terminal."""
-    numbers = {number for number in error.args if isinstance(number, int)}
-    return bool(numbers & {errno.ENOTTY, errno.EINVAL})
+def _numbers(error: BaseException) -> list[int]:
+    """The numbers of the system's errors that it was made of."""
+    return [number for number in error.args if isinstance(number, int)]

@@ -10,7 +10,7 @@ import time
 from lidarspec.errors import SourceError, UsageError
 from lidarspec.spec.links import Tcp
 from lidarspec.spec.sensor import Sensor
-from lidarspec.transports.base import Address, HostClock, data_link, failure, lost, named, readable, reason
+from lidarspec.transports.base import Address, HostClock, data_link, failure, lost, named, readable, reason, rest
 from lidarspec.transports.protocol import Chunk, Disconnected, LiveTransport
 
 #: bytes read at once, and seconds between two reads, in which a fast stream gathers some.
@@ -33,9 +33,7 @@ class TcpTransport(LiveTransport):
         self._socket = self._connected(PATIENCE)
 
     def read(self, timeout: float) -> list[Chunk]:
-        pause = self._rested - time.monotonic()
-        if pause > 0:
-            time.sleep(pause)
+        rest(self._rested)
         try:
             if not readable(self._socket.fileno(), timeout):
                 return []

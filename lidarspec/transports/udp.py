@@ -17,7 +17,7 @@ import ctypes
 import errno
 import ipaddress
 import os
-import select
+import selectors
 import socket
 import struct
 import sys
@@ -27,7 +27,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from lidarspec.errors import SourceError, UsageError
 from lidarspec.spec.links import Udp, is_datagram
 from lidarspec.spec.sensor import Sensor
-from lidarspec.transports.base import Address, HostClock, failure, lost, named, reason
+from lidarspec.transports.base import Address, HostClock, failure, lost, named, reason, rest
 from lidarspec.transports.protocol import Chunk, LiveTransport
 
 #: datagrams in one call, and the room for each: memory that is not written to costs nothing.
@@ -192,29 +192,28 @@ class UdpTransport(LiveTransport):
         self.clock = HostClock()
         self.label, self.datagrams = label, datagrams
         self._sender, self._last, self._sensor = sender, remote, sensor
-        self._sockets: dict[int, _Socket] = {}
+        self._selector = selectors.DefaultSelector()
+        self._sockets: list[_Socket] = []
         self._rested = 0.0
-        self._poller = select.poll() if sys.platform != "win32" else None
         slots = _slots()
         try:
             for port in ports:
-                self._add(_Socket(self._bound(host, port, group), slots))
+                self._sockets.append(_Socket(self._bound(host, port, group), slots))
+                self._selector.register(self._sockets[-1].socket, selectors.EVENT_READ, self._sockets[-1])
         except BaseException:
             self.close()
             raise
-        self.ports = tuple(one.address[1] for one in self._sockets.values())
-        smallest = min((one.buffer for one in self._sockets.values()), default=BUFFER)
+        self.ports = tuple(one.address[1] for one in self._sockets)
+        smallest = min((one.buffer for one in self._sockets), default=BUFFER)
         self.warnings = shortfall(BUFFER, smallest)
 
     def read(self, timeout: float) -> list[Chunk]:
-        pause = self._rested - time.monotonic()
-        if pause > 0:
-            time.sleep(pause)
+        rest(self._rested)
         found: list[Chunk] = []
-        ready = [self._sockets[descriptor] for descriptor in self._ready(timeout)]
+        ready = [] if self.closed else [key.data for key, _ in self._selector.select(timeout)]
         for one in ready:
             self._fetch(one, found)
-        self.kernel_drops = sum(each.drops for each in self._sockets.values())
+        self.kernel_drops = sum(each.drops for each in self._sockets)
         gathers = 0 < len(found) < MANY and all(one.is_timed for one in ready)
         self._rested = time.monotonic() + PAUSE if gathers else 0.0
         return found
@@ -223,7 +222,7 @@ class UdpTransport(LiveTransport):
         if self._last is None:
             raise failure(f"{self.label}: nothing has arrived yet, so nobody knows the sensor's address", f"lidarspec doctor {self.label}")
         try:
-            next(iter(self._sockets.values())).socket.sendto(data, self._last)
+            self._sockets[0].socket.sendto(data, self._last)
         except OSError as error:
             raise lost(self.label, error) from None
 
@@ -240,13 +239,9 @@ class UdpTransport(LiveTransport):
 
     def close(self) -> None:
         self.closed = True
-        for one in self._sockets.values():
+        self._selector.close()
+        for one in self._sockets:
             one.socket.close()
-
-    def _ready(self, timeout: float) -> list[int]:
-        if self._poller is not None:
-            return [descriptor for descriptor, _ in self._poller.poll(timeout * 1000)]
-        return select.select(list(self._sockets), [], [], timeout)[0]
 
     def _fetch(self, one: _Socket, found: list[Chunk]) -> None:
         """Everything that waits in a socket, up to a limit that is fair to the others."""
@@ -263,11 +258,6 @@ class UdpTransport(LiveTransport):
         except OSError as error:
             if not self.closed:
                 raise SourceError(f"{self.label}: {reason(error)}") from None
-
-    def _add(self, one: _Socket) -> None:
-        self._sockets[one.socket.fileno()] = one
-        if self._poller is not None:
-            self._poller.register(one.socket, select.POLLIN)
 
     def _bound(self, host: str, port: int, group: str | None) -> socket.socket:
         family = socket.AF_INET6 if ":" in host or ":" in (group or "") else socket.AF_INET

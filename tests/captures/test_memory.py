@@ -10,7 +10,9 @@ from pathlib import Path
 import pytest
 
 import lidarspec as ls
-from lidarspec.captures.pcap import Datagram, PcapWriter
+from lidarspec.captures.ip import ETHERNET
+from lidarspec.captures.pcap import Datagram, datagram_record
+from lidarspec.captures.records import capture_head
 from lidarspec.simulation.simulator import simulate
 
 SENSOR = "robosense-m1"
@@ -37,9 +39,9 @@ def written(path: Path, megabytes: int) -> int:
     """Writes frames of the sensor over and over; the number of packets."""
     frames = simulate(ls.sensor(SENSOR), 630)
     with path.open("wb") as file:
-        writer = PcapWriter(file)
+        file.write(capture_head(ETHERNET))
         for index, frame in enumerate(frames):
-            writer.write(Datagram(frame, 10**18 + index * 158_730, *ENDS))
+            file.write(datagram_record(Datagram(frame, 10**18 + index * 158_730, *ENDS)))
     data = path.read_bytes()
     times = max((megabytes << 20) // len(data), 1)
     with path.open("ab") as file:

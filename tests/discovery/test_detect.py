@@ -203,12 +203,12 @@ class TestStructure:
         assert found.checksums[0].paste == "WordXor(head=8, groups=(1, 2))"
 
     def test_long_frames_with_shorter_ones_in_them(self) -> None:
-        found = structure([b"".join(simulate(ls.sensor("robosense-m1"), 60))], datagrams=False, seal=False)
+        found = structure([b"".join(simulate(ls.sensor("robosense-m1"), 60))], datagrams=False)
         assert found is not None
         assert (found.sync[:4].hex(), found.period) == ("55aa5aa5", 1210)
 
     def test_datagrams(self) -> None:
-        found = structure(simulate(ls.sensor("robosense-m1"), 20), datagrams=True, seal=False)
+        found = structure(simulate(ls.sensor("robosense-m1"), 20), datagrams=True)
         assert found is not None
         assert (found.sync[:4].hex(), found.period, found.share) == ("55aa5aa5", 1210, 1.0)
 

@@ -11,7 +11,9 @@ from pathlib import Path
 import pytest
 
 from lidarspec import Sensor
-from lidarspec.captures.pcap import USER_LINKS, Datagram, PcapWriter
+from lidarspec.captures.ip import ETHERNET
+from lidarspec.captures.pcap import USER_LINKS, Datagram, datagram_record
+from lidarspec.captures.records import capture_head, packet_record
 from lidarspec.exports import export
 from lidarspec.spec import Udp
 
@@ -54,11 +56,11 @@ def captured(sensor: Sensor, frames: Iterable[bytes], path: Path) -> Path:
     """A capture of these frames, one to a packet, as the sensor's data link carries them."""
     link = sensor.links["data"]
     with path.open("wb") as file:
-        writer = PcapWriter(file) if sensor.datagrams else PcapWriter(file, USER_LINKS[0])
+        file.write(capture_head(ETHERNET if sensor.datagrams else USER_LINKS[0]))
         for number, frame in enumerate(frames):
             if isinstance(link, Udp) and sensor.datagrams:
                 port = link.ports[0] if link.ports else 9
-                writer.write(Datagram(frame, number * 1_000_000, ("192.0.2.1", port), ("192.0.2.2", port)))
+                file.write(datagram_record(Datagram(frame, number * 1_000_000, ("192.0.2.1", port), ("192.0.2.2", port))))
             else:
-                writer.packet(frame, number * 1_000_000)
+                file.write(packet_record(frame, number * 1_000_000))
     return path

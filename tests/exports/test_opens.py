@@ -8,7 +8,9 @@ from pathlib import Path
 import pytest
 
 import lidarspec
-from lidarspec.captures.pcap import CaptureStats, Datagram, PcapWriter, StreamReader
+from lidarspec.captures.ip import ETHERNET
+from lidarspec.captures.pcap import CaptureStats, Datagram, StreamReader, datagram_record
+from lidarspec.captures.records import capture_head
 from lidarspec.recording.recorders import FrameRecorder, recorder
 from lidarspec.transports.open_url import transport
 from lidarspec.transports.protocol import Chunk
@@ -24,10 +26,10 @@ def test_the_writer_s_captures(tmp_path: Path) -> None:
     draw, capture = random.Random(1), tmp_path / "it.pcap"
     sizes = [0, 1, 47, 1248, 65_507]
     with capture.open("wb") as file:
-        writer = PcapWriter(file)
+        file.write(capture_head(ETHERNET))
         for number, size in enumerate(sizes):
             at = 1_700_000_000_123_456_789 + number
-            writer.write(Datagram(draw.randbytes(size), at, ("192.0.2.1", 49_152 + number), ("192.0.2.2", 49_000)))
+            file.write(datagram_record(Datagram(draw.randbytes(size), at, ("192.0.2.1", 49_152 + number), ("192.0.2.2", 49_000))))
     fields = ["frame.time_epoch", "udp.length", "ip.src", "udp.dstport"]
     text = tshark(capture, "-T", "fields", *(option for name in fields for option in ("-e", name)), *CHECKED)
     times = [f"1700000000.{123_456_789 + number}" for number in range(len(sizes))]

@@ -13,7 +13,9 @@ import pytest
 
 import lidarspec as ls
 from lidarspec import Decoder, Packets, PointCloud, Scan, Sensor
-from lidarspec.captures.pcap import Datagram, PcapWriter
+from lidarspec.captures.ip import ETHERNET
+from lidarspec.captures.pcap import Datagram, datagram_record
+from lidarspec.captures.records import capture_head
 from lidarspec.packets.stream import PacketStream
 from lidarspec.points import lazy_columns
 from lidarspec.points.cloud import COLUMNS
@@ -146,9 +148,9 @@ def test_a_scan_is_forgotten_once_it_was_given(opened: bool, tmp_path: Path) -> 
     sensor, path = ls.sensor("velodyne-vlp16"), tmp_path / "some.pcap"
     frames = simulate(sensor, 700)
     with path.open("wb") as file:
-        writer = PcapWriter(file)
+        file.write(capture_head(ETHERNET))
         for frame in frames:
-            writer.write(Datagram(frame, 10**18, ("192.168.1.200", 2368), ("192.168.1.102", 2368)))
+            file.write(datagram_record(Datagram(frame, 10**18, ("192.168.1.200", 2368), ("192.168.1.102", 2368))))
     given = list[weakref.ref[Scan]]()
     with ls.open(path, sensor) as device:
         for scan in device.scans() if opened else scans_of(sensor, [sensor.decode(frames)]):

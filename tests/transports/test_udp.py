@@ -122,7 +122,7 @@ def test_the_kernel_says_when_a_datagram_came() -> None:
 def test_what_the_kernel_drops_is_counted_exactly() -> None:
     port = free_port()
     one = opened(f"udp://127.0.0.1:{port}")
-    (inner,) = one._sockets.values()
+    (inner,) = one._sockets
     inner.socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 20_000)
     with udp() as sender:
         found = 0
@@ -158,7 +158,7 @@ def test_a_buffer_that_is_too_small_is_told_with_the_line_that_mends_it() -> Non
 
 def test_the_buffer_is_read_back() -> None:
     one = opened(f"udp://127.0.0.1:{free_port()}")
-    (inner,) = one._sockets.values()
+    (inner,) = one._sockets
     kernel = inner.socket.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
     assert inner.buffer == kernel // (2 if sys.platform == "linux" else 1)
     assert bool(one.warnings) == (inner.buffer < BUFFER)
