@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
 import shutil
 import sys
 import time
@@ -17,8 +16,9 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from lidarspec.errors import SourceError
+from lidarspec.errors import system_errors
 from lidarspec.explaining.listing import Line, folded, text as plain_text
+from lidarspec.formats import replacing
 
 #: seconds between two lines.
 PERIOD = 0.2
@@ -52,8 +52,20 @@ class Progress:
         self._write(f"\r{line.ljust(self._width)}")
         self._width = len(line)
 
+    def follow(self, remarks: Iterable[str], text: Callable[[], str]) -> None:
+        """Show a text while something goes on, and what it remarks; empty remarks only pass the time."""
+        for remark in remarks:
+            self(text)
+            if remark:
+                self.note(remark)
+
+    def note(self, remark: str) -> None:
+        """Say something else, in the place of the line."""
+        self.clear()
+        note(remark)
+
     def clear(self) -> None:
-        """Take the line away, so that something else can be said."""
+        """Take the line away."""
         if self._width:
             self._write(f"\r{' ' * self._width}\r")
             self._width, self._due = 0, 0.0
@@ -86,17 +98,8 @@ def emit(text: str, output: str | None) -> None:
         return
     path = Path(output)
     is_replaced = path.is_file() or not path.exists()  # and not a device or a pipe
-    part = path.with_name(f".{path.name}.{os.getpid()}") if is_replaced else path
-    try:
+    with system_errors(output), replacing(path) if is_replaced else contextlib.nullcontext(path) as part:
         part.write_text(text + "\n", encoding="utf-8")
-        if is_replaced:
-            os.replace(part, path)
-    except OSError as error:
-        raise SourceError(f"{output}: {error.strerror or error}") from None
-    finally:
-        if is_replaced:
-            with contextlib.suppress(OSError):
-                part.unlink()
 
 
 def emit_lines(lines: Iterable[Line], output: str | None) -> None:
