@@ -15,7 +15,7 @@ from importlib import resources
 from typing import Any
 
 from lidarspec._version import __version__
-from lidarspec.exports import Message, Refused, messages
+from lidarspec.exports import Message, Refused, asked, messages
 from lidarspec.framing.frame_engine import codec
 from lidarspec.spec import Checksum, Crc, Fold15, Sensor, Sum, Tcp, Udp, WordXor, Xor, ZeroPadded, tree
 from lidarspec.spec.bits import BitField
@@ -98,8 +98,7 @@ class _Writer:
     types: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        asked = {ref.path for node in tree.nodes(self.message.root) for value in tree.formulas(node) for ref in tree.refs(value)}
-        self.kept = asked | self.message.seals.keys()
+        self.kept = {ref.path for ref in asked(self.message.root)} | self.message.seals.keys()
         self.marked = {path for seal in self.message.seals.values() for path in seal.over or ()}
 
     def node(self, node: tree.Node, path: str = "") -> Table:
