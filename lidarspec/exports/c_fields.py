@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 from lidarspec.exports import Message, Refused, asked
@@ -181,7 +181,6 @@ def given(node: tree.Node, depth: int) -> str:
     return arguments(depth) if is_own else ", ".join(["p", *["0"] * depth])
 
 
-@dataclass
 class CLayout:
     """The entries of a frame type, in the order of the wire.
 
@@ -194,13 +193,10 @@ class CLayout:
         Refused: where an entry cannot be found without reading all elements before it.
     """
 
-    message: Message
-    name: Callable[[str, str], str]
-    entries: list[Entry] = field(default_factory=list)
-    size: Extent = field(init=False)
-
-    def __post_init__(self) -> None:
-        top = Entry("", self.message.root, Extent(), Extent())
+    def __init__(self, message: Message, name: Callable[[str, str], str]) -> None:
+        self.message, self.name = message, name
+        self.entries: list[Entry] = []
+        top = Entry("", message.root, Extent(), Extent())
         self.size = self.extent(top)
         self._visit(top)
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import groupby
 from typing import Any, Literal
 
@@ -162,7 +162,6 @@ class Cells:
         return Cells(codes, self.inks)
 
 
-@dataclass(eq=False)
 class Canvas:
     """Dots and labels on a grid of cells.
 
@@ -175,18 +174,11 @@ class Canvas:
         labels: text in cells, (row, column) -> character and ink.
     """
 
-    width: int
-    height: int
-    ramp: str = "range"
-    dots: NDArray[np.bool_] = field(init=False)
-    lines: NDArray[np.bool_] = field(init=False)
-    steps: NDArray[np.int16] = field(init=False)
-    labels: dict[tuple[int, int], tuple[str, int]] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        self.dots = np.zeros((DOWN * self.height, ACROSS * self.width), np.bool_)
-        self.lines = np.zeros_like(self.dots)
-        self.steps = np.full((self.height, self.width), -1, np.int16)
+    def __init__(self, width: int, height: int, ramp: str = "range") -> None:
+        self.width, self.height, self.ramp = width, height, ramp
+        self.dots, self.lines = np.zeros((2, DOWN * height, ACROSS * width), np.bool_)
+        self.steps = np.full((height, width), -1, np.int16)
+        self.labels: dict[tuple[int, int], tuple[str, int]] = {}
 
     def plot(self, column: NDArray[Any], row: NDArray[Any], shade: NDArray[Any]) -> None:
         """Set dots of points at fractional dot coordinates; what is outside is left out.

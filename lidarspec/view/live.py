@@ -5,6 +5,7 @@ Around the picture stand title, figures, the meaning of the colours and the keys
 
 from __future__ import annotations
 
+import itertools
 import math
 import textwrap
 import time
@@ -49,8 +50,6 @@ KEYS = (
 _HINTS = (("space pause", "c colour"), ("+ - zoom", "0 all"), ("? help", "q quit"))
 
 Figure = tuple[str, str, int]
-#: names tried for a file before it is given up.
-TRIES = 100
 
 
 class Switch:
@@ -98,14 +97,12 @@ class Switch:
 
     def write(self, chunk: Chunk, direction: Literal["in", "out"] = "in") -> None:
         """Record what arrived or was sent, while it is on."""
-        current = self._recorder
-        if current is not None:
+        if (current := self._recorder) is not None:
             current.write(chunk, direction)
 
     def event(self, name: str, at: int | None = None, **details: Any) -> None:
         """Record that something happened, while it is on."""
-        current = self._recorder
-        if current is not None:
+        if (current := self._recorder) is not None:
             current.event(name, at, **details)
 
     def close(self) -> None:
@@ -121,11 +118,11 @@ class Switch:
             current.close()
 
     def _begin(self) -> None:
-        assert self._opened is not None
-        begin = f"{self.sensor_id}-{time.strftime('%Y%m%d-%H%M%S')}"
-        names = (f"{begin}{f'-{number}' if number else ''}.lsr" for number in range(TRIES))
-        path = self._folder / next(name for name in names if not (self._folder / name).exists())
         opened = self._opened
+        assert opened is not None
+        begin = f"{self.sensor_id}-{time.strftime('%Y%m%d-%H%M%S')}"
+        paths = (self._folder / f"{begin}{f'-{number}' if number else ''}.lsr" for number in itertools.count())
+        path = next(path for path in paths if not path.exists())
         self._recorder = recorder(path, self.sensor_id, self._source, datagrams=opened.datagrams, baud=opened.baud)
         self.name = path.name
 
