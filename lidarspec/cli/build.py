@@ -6,7 +6,6 @@ import functools
 import re
 from collections.abc import Callable, Mapping, Sequence
 from fractions import Fraction
-from pathlib import Path
 from shlex import quote
 from typing import Any
 
@@ -17,17 +16,7 @@ from lidarspec.cli.options import DURATION, output_options, sensor_option
 from lidarspec.cli.output import emit, emit_json, table
 from lidarspec.device.device import Device, open as open_device
 from lidarspec.device.session import Reply
-from lidarspec.errors import (
-    CommandError,
-    LidarSpecError,
-    OutOfRange,
-    UnknownCommand,
-    UnknownField,
-    UnknownFrame,
-    UsageError,
-    suggest,
-    system_errors,
-)
+from lidarspec.errors import CommandError, LidarSpecError, OutOfRange, UnknownCommand, UnknownField, UnknownFrame, UsageError, suggest
 from lidarspec.explaining.explanation import explain
 from lidarspec.plugins import sensor as named_sensor
 from lidarspec.spec.fields import factor, split_unit
@@ -63,11 +52,8 @@ def build(sensor_id: str, frame: str, assignments: Sequence[str], as_json: bool,
         raise suggest(error, f"lidarspec show {sensor_id}") from None
     if as_json:
         emit_json({"sensor": sensor.id, "frame": frame, "size": len(data), "hex": data.hex(" ")}, output)
-    elif output is None or output.endswith(".hex"):
-        emit(data.hex(" "), output)
     else:
-        with system_errors(output):
-            Path(output).write_bytes(data)
+        emit(data.hex(" ") if output is None or output.endswith(".hex") else data, output)
 
 
 def values(table: Schema, assignments: Sequence[str], place: str) -> dict[str, Any]:
@@ -189,13 +175,7 @@ def _length(table: Schema, given: Mapping[str, Any], path: str, place: str) -> i
 @click.option("--timeout", type=DURATION, metavar="TIME", help="How long to wait for the reply; by default what the sensor declares.")
 @output_options
 def send(
-    source: str,
-    command: str,
-    assignments: Sequence[str],
-    sensor_id: str | None,
-    timeout: float | None,
-    as_json: bool,
-    output: str | None,
+    source: str, command: str, assignments: Sequence[str], sensor_id: str | None, timeout: float | None, as_json: bool, output: str | None
 ) -> None:
     """Send a command to a sensor, and print its reply.
 

@@ -137,11 +137,7 @@ def _sent(device: SimulatedDevice) -> str:
 @contextlib.contextmanager
 def _ended_by_terminate() -> Iterator[None]:
     """SIGTERM ends it as Ctrl-C does, so that a link does not stay behind."""
-
-    def interrupt(number: int, frame: object) -> None:
-        raise KeyboardInterrupt
-
-    before = signal.signal(signal.SIGTERM, interrupt)
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         yield
     finally:
