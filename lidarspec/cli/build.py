@@ -6,7 +6,6 @@ import functools
 import re
 from collections.abc import Callable, Mapping, Sequence
 from fractions import Fraction
-from pathlib import Path
 from shlex import quote
 from typing import Any
 
@@ -17,17 +16,7 @@ from lidarspec.cli.options import DURATION, output_options, sensor_option
 from lidarspec.cli.output import emit, emit_json, table
 from lidarspec.device.device import Device, open as open_device
 from lidarspec.device.session import Reply
-from lidarspec.errors import (
-    CommandError,
-    LidarSpecError,
-    OutOfRange,
-    UnknownCommand,
-    UnknownField,
-    UnknownFrame,
-    UsageError,
-    suggest,
-    system_errors,
-)
+from lidarspec.errors import CommandError, LidarSpecError, OutOfRange, UnknownCommand, UnknownField, UnknownFrame, UsageError, suggest
 from lidarspec.explaining.explanation import explain
 from lidarspec.plugins import sensor as named_sensor
 from lidarspec.spec.fields import factor, split_unit
@@ -36,11 +25,11 @@ from lidarspec.spec.tree import FieldInfo, evaluated
 from lidarspec.wire.build import given_value
 from lidarspec.wire.schema import Schema, schema
 
-_STEP = re.compile(r"(\w+)((?:\[(?:\d+|\*)\])*)")
-_PATH = re.compile(rf"{_STEP.pattern}(?:\.{_STEP.pattern})*")
+_STEP = r"\w+(?:\[(?:\d+|\*)\])*"
+_PATH = re.compile(rf"{_STEP}(?:\.{_STEP})*")
 
-Index = int | str
-Steps = list[tuple[str, list[Index]]]
+#: names of fields, and indices: a number, or "*" for every element.
+Steps = list[int | str]
 
 
 @click.command()
@@ -63,11 +52,8 @@ def build(sensor_id: str, frame: str, assignments: Sequence[str], as_json: bool,
         raise suggest(error, f"lidarspec show {sensor_id}") from None
     if as_json:
         emit_json({"sensor": sensor.id, "frame": frame, "size": len(data), "hex": data.hex(" ")}, output)
-    elif output is None or output.endswith(".hex"):
-        emit(data.hex(" "), output)
     else:
-        with system_errors(output):
-            Path(output).write_bytes(data)
+        emit(data.hex(" ") if output is None or output.endswith(".hex") else data, output)
 
 
 def values(table: Schema, assignments: Sequence[str], place: str) -> dict[str, Any]:
@@ -78,8 +64,8 @@ def values(table: Schema, assignments: Sequence[str], place: str) -> dict[str, A
     """
     parsed = [_assignment(table, text, place) for text in assignments]
     found: dict[str, Any] = {}
-    for steps, value in sorted(parsed, key=lambda item: any(indices for _, indices in item[0])):
-        _put(found, steps, value, lambda path: _length(table, found, path, place), "")
+    for steps, value in sorted(parsed, key=lambda item: any(_is_index(step) for step in item[0])):
+        _put(found, steps, value, lambda path: _length(table, found, path, place))
     return found
 
 
@@ -87,15 +73,13 @@ def _assignment(table: Schema, text: str, place: str) -> tuple[Steps, Any]:
     path, equals, value = text.partition("=")
     if not equals or not _PATH.fullmatch(path):
         raise UsageError(f"{place}: {text!r} is not field=value")
-    steps: Steps = [
-        (name, [part if part == "*" else int(part) for part in re.findall(r"[\d*]+", indices)]) for name, indices in _STEP.findall(path)
-    ]
-    plain = ".".join(name for name, _ in steps)
+    steps: Steps = [int(step) if step.isdigit() else step for step in re.findall(r"\w+|\*", path)]
+    plain = ".".join(str(step) for step in steps if not _is_index(step))
     info = table.fields.get(plain)
     if info is None:
         raise UnknownField(path, table.fields, place=place)
     arrays = len(info.axes) - (info.kind == "bytes")
-    given = sum(len(indices) for _, indices in steps)
+    given = sum(map(_is_index, steps))
     if given != arrays:
         raise UsageError(f"{place}: {plain} is in {arrays} array{'s' * (arrays != 1)}, and {path!r} has {given} indices")
     return steps, _raw(info, value.strip(), path, place)
@@ -111,13 +95,9 @@ def _raw(info: FieldInfo, text: str, path: str, place: str) -> Any:
     for raw, label in info.labels.items():
         if text == label:
             return raw
-    digits, unit = split_unit(text)
-    try:
-        number = Fraction(int(digits, 0)) if re.fullmatch(r"0[xXbBoO]\w+", digits) else Fraction(digits)
-    except ValueError:
-        raise UsageError(f"{place}: {path} takes a number, not {text!r}") from None
+    number, unit = _number(text, info.unit, f"{place}: {path}", "a number")
     if unit:
-        return _steps(info, number, unit, path, place)
+        return _nearest(info, number, path, place)
     if number.denominator == 1 and info.kind != "float":
         return int(number)
     if info.kind == "int":
@@ -125,47 +105,50 @@ def _raw(info: FieldInfo, text: str, path: str, place: str) -> Any:
     return float(number)
 
 
-def _steps(info: FieldInfo, number: Fraction, unit: str, path: str, place: str) -> int | float:
-    """The raw value nearest to a physical one."""
-    per_unit = factor(unit, info.unit)
+def _number(text: str, unit: str, place: str, wanted: str) -> tuple[Fraction, str]:
+    """A number, turned into a unit where it has one of its own, and this one."""
+    digits, given = split_unit(text)
+    per_unit = factor(given, unit) if given else Fraction(1)
     if per_unit is None:
-        raise UsageError(f"{place}: {path} is in {info.unit or 'no unit'}, and {unit!r} cannot be turned into that")
-    raw: int | float = info.raw(number * per_unit)
+        raise UsageError(f"{place} is in {unit or 'no unit'}, and {given!r} cannot be turned into that")
+    try:
+        number = Fraction(int(digits, 0)) if digits[:2].lower() in ("0x", "0b", "0o") else Fraction(digits)
+    except ValueError:
+        raise UsageError(f"{place} takes {wanted}, not {text!r}") from None
+    return number * per_unit, given
+
+
+def _nearest(info: FieldInfo, number: Fraction, path: str, place: str) -> int | float:
+    """The raw value nearest to a physical one."""
+    raw: int | float = info.raw(number)
     if info.kind != "int":
         return float(raw)
     low, high = info.limits
     if not low <= raw <= high:
         edges = [float(info.physical(Fraction(edge))) for edge in (low, high)]
-        raise OutOfRange(path, float(number * per_unit), *edges, unit=info.unit, place=place)
+        raise OutOfRange(path, float(number), *edges, unit=info.unit, place=place)
     return raw
 
 
-def _put(target: dict[str, Any], steps: Steps, value: Any, length: Callable[[str], int], above: str) -> None:
-    """Set a value; "*" stands for every element of an array of known length."""
-    (name, indices), *rest = steps
-    path = f"{above}.{name}" if above else name
-    if not indices:
-        if rest:
-            _put(target.setdefault(name, {}), rest, value, length, path)
-        else:
-            target[name] = value
-        return
-    _elements(target.setdefault(name, []), indices, rest, value, length, path)
+def _is_index(step: int | str) -> bool:
+    return step == "*" or isinstance(step, int)
 
 
-def _elements(array: list[Any], indices: list[Index], rest: Steps, value: Any, length: Callable[[str], int], path: str) -> None:
-    index, *more = indices
-    places = range(length(path) or len(array)) if index == "*" else [int(index)]
-    for place in places:
-        array.extend([None] * (place + 1 - len(array)))
-        if more:
-            array[place] = array[place] or []
-            _elements(array[place], more, rest, value, length, f"{path}[]")
-        elif rest:
-            array[place] = array[place] or {}
-            _put(array[place], rest, value, length, path)
-        else:
-            array[place] = value
+def _put(target: Any, steps: Steps, value: Any, length: Callable[[str], int], path: str = "") -> Any:
+    """A struct or array, or a new one for None, with a value set in it; "*" stands for every element of an array of known length."""
+    if not steps:
+        return value
+    step, *rest = steps
+    if isinstance(step, str) and step != "*":
+        target = {} if target is None else target
+        below = f"{path.removesuffix('[]')}.{step}".removeprefix(".")
+        target[step] = _put(target.get(step), rest, value, length, below)
+        return target
+    target = [] if target is None else target
+    for place in range(length(path) or len(target)) if step == "*" else [int(step)]:
+        target.extend([None] * (place + 1 - len(target)))
+        target[place] = _put(target[place], rest, value, length, f"{path}[]")
+    return target
 
 
 def _length(table: Schema, given: Mapping[str, Any], path: str, place: str) -> int:
@@ -192,13 +175,7 @@ def _length(table: Schema, given: Mapping[str, Any], path: str, place: str) -> i
 @click.option("--timeout", type=DURATION, metavar="TIME", help="How long to wait for the reply; by default what the sensor declares.")
 @output_options
 def send(
-    source: str,
-    command: str,
-    assignments: Sequence[str],
-    sensor_id: str | None,
-    timeout: float | None,
-    as_json: bool,
-    output: str | None,
+    source: str, command: str, assignments: Sequence[str], sensor_id: str | None, timeout: float | None, as_json: bool, output: str | None
 ) -> None:
     """Send a command to a sensor, and print its reply.
 
@@ -245,22 +222,9 @@ def arguments(sensor: Sensor, name: str, assignments: Sequence[str]) -> dict[str
         if argument not in command.args or command.frame is None:
             raise UnknownField(argument, command.args, place=f"{sensor.id} {name}")
         unit = schema(sensor.frames[command.frame].tree).fields[command.args[argument][0]].unit
-        found[argument] = _number(value, unit, f"{sensor.id} {name}: {argument}")
+        number, _ = _number(value.strip(), unit, f"{sensor.id} {name}: {argument}", f"a number in {unit}" if unit else "a number")
+        found[argument] = int(number) if number.denominator == 1 else float(number)
     return found
-
-
-def _number(text: str, unit: str, place: str) -> float | int:
-    """A number in a unit, out of one with or without a unit of its own."""
-    digits, given = split_unit(text.strip())
-    per_unit = factor(given, unit) if given else Fraction(1)
-    if per_unit is None:
-        raise UsageError(f"{place} is in {unit or 'no unit'}, and {given!r} cannot be turned into that")
-    try:
-        number = Fraction(int(digits, 0)) if digits[:2].lower() in ("0x", "0b", "0o") else Fraction(digits)
-    except ValueError:
-        raise UsageError(f"{place} takes a number{f' in {unit}' * bool(unit)}, not {text!r}") from None
-    number *= per_unit
-    return int(number) if number.denominator == 1 else float(number)
 
 
 def _text(sensor: Sensor, reply: Reply, output: str | None) -> str:

@@ -59,15 +59,9 @@ def _following(error: Exception, command: str, verb: str) -> str:
         from lidarspec.plugins import registry
 
         return "lidarspec plugins" if any(plugin.error for plugin in registry().plugins) else command
-    sensor = _sensor(error)
+    sensor = str(getattr(error, "sensor", "") or getattr(error, "place", "")).partition(" ")[0]
     if isinstance(error, errors.SpecError) and error.path.endswith(".py"):
         return f"lidarspec check {error.path}"
     if "{sensor}" in command and not sensor:
         return "lidarspec plugins" if isinstance(error, errors.SpecError) else "lidarspec sensors"
     return command.format(sensor=sensor, verb=verb).replace("  ", " ")
-
-
-def _sensor(error: Exception) -> str:
-    """The id of the sensor that an error is about, "" where it says none."""
-    place = str(getattr(error, "sensor", "") or getattr(error, "place", ""))
-    return place.partition(" ")[0]

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import itertools
-import os
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import click
 
-from lidarspec.cli.inputs import nearest_fault, no_frame, nothing_came, scans_of
+from lidarspec.cli.inputs import nearest_fault, no_frame, nothing_came, refuse_overwriting, scans_of
 from lidarspec.cli.options import sensor_option
 from lidarspec.cli.output import emit, emit_json, note
 from lidarspec.device.device import Device, open as open_device
@@ -59,9 +58,7 @@ def convert(source: str, target: str, sensor_id: str | None, count: int | None, 
     number of the scan; metres, radians, and seconds since the scan's stamp.
     """
     format_of(target)
-    path = source.partition("?")[0]
-    if os.path.exists(path) and os.path.exists(target) and os.path.samefile(path, target):
-        raise UsageError(f"{target} is the input: it would be overwritten")
+    refuse_overwriting(source, target, "input")
     sensor = _detected(source, target) if sensor_id is None else named_sensor(sensor_id)
     written = Written()
     with open_device(source, sensor) as device:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator, Sequence
 from shlex import quote
+from textwrap import indent
 from typing import Any
 
 import click
@@ -14,14 +15,13 @@ from lidarspec.cli.inputs import read
 from lidarspec.cli.options import DURATION, output_options, sensor_option
 from lidarspec.cli.output import emit, emit_json, note, table
 from lidarspec.discovery.checksum_search import search
-from lidarspec.discovery.detect import Score, Verdict, best, verdict, verdicts
+from lidarspec.discovery.detect import Verdict, best, verdict, verdicts
 from lidarspec.discovery.doctor import Finding, computer, examined
 from lidarspec.discovery.listen import LISTEN, Heard, everywhere, hear, probe, started_first, udp_ports
 from lidarspec.discovery.periods import Structure, cut, structure
 from lidarspec.discovery.samples import Match
 from lidarspec.errors import SourceError, UsageError, suggest
 from lidarspec.plugins import sensor as named_sensor, sensors
-from lidarspec.spec.checksums import CRCS, Crc
 from lidarspec.spec.links import Serial, Udp
 from lidarspec.transports.base import data_link, with_option
 from lidarspec.transports.open_url import live_address, resolved
@@ -42,7 +42,8 @@ def ports(as_json: bool, output: str | None) -> None:
     """The serial ports of this computer, and the UDP ports that installed sensors send to."""
     serial, udp = serial_ports(), {port: udp_users(port) for port in udp_ports()}
     if as_json:
-        emit_json({"serial": [_serial(port) for port in serial], "udp": [_udp(port, users) for port, users in udp.items()]}, output)
+        listed = [{**vars(port), "users": [vars(user) for user in port.users]} for port in serial]
+        emit_json({"serial": listed, "udp": [_udp(port, users) for port, users in udp.items()]}, output)
         return
     rows = [[port.path, port.description or "serial port", _state(port), port.lasting] for port in serial]
     rows += [[f"udp://:{port}", ", ".join(_senders(port)), _udp_state(users), ""] for port, users in udp.items()]
@@ -65,10 +66,6 @@ def _state(port: SerialPort) -> str:
 
 def _udp_state(users: tuple[User, ...] | None) -> str:
     return "free" if users is None else f"in use by {', '.join(map(str, users)) or 'another user'}"
-
-
-def _serial(port: SerialPort) -> dict[str, Any]:
-    return {**vars(port), "users": [vars(user) for user in port.users]}
 
 
 def _udp(port: int, users: tuple[User, ...] | None) -> dict[str, Any]:
@@ -157,13 +154,8 @@ def _text(match: Match, length: int) -> str:
         f"  over:  {match.span.told(match.place, length)}",
         *(f"  note:  {remark}" for remark in match.remarks),
     ]
-    known = isinstance(match.algorithm, Crc) and match.algorithm in CRCS.values()
-    lines += (
-        [f"  paste: {match.paste}"]
-        if "\n" not in match.paste or known
-        else ["  paste:", *("    " + line for line in match.paste.splitlines())]
-    )
-    return "\n".join(lines)
+    paste = f"\n{indent(match.paste, '    ')}" if "\n" in match.paste else f" {match.paste}"
+    return "\n".join([*lines, f"  paste:{paste}"])
 
 
 @click.command()
@@ -306,25 +298,23 @@ def _told(one: Verdict) -> dict[str, Any]:
         "failure": str(heard.failure) if heard.failure else None,
         "sensor": one.sensor.id if one.sensor is not None else None,
         "alike": [score.sensor.id for score in one.alike],
-        "fits": [_score(score) for score in one.scores],
+        "fits": [
+            {"sensor": score.sensor.id, "share": round(score.share, 4), "data_frames": score.data_frames, "told_by": score.why}
+            for score in one.scores
+        ],
     }
-
-
-def _score(score: Score) -> dict[str, Any]:
-    return {"sensor": score.sensor.id, "share": round(score.share, 4), "data_frames": score.data_frames, "told_by": score.why}
 
 
 def _structure_told(found: Structure | None) -> dict[str, Any] | None:
     if found is None:
         return None
-    checksums = [checksum_told(match) for match in found.checksums]
     return {
         "sync": found.sync.hex(" "),
         "period": found.period,
         "length": str(found.length) if found.length else None,
         "share": round(found.share, 4),
         "frames": len(found.frames),
-        "checksums": checksums,
+        "checksums": [checksum_told(match) for match in found.checksums],
     }
 
 

@@ -38,7 +38,9 @@ def parse(words: Sequence[str], sensor_id: str | None, count: int | None, as_jso
         raise no_frame(sensor, given)
     frames = [(piece, explained(piece.data, sensor, piece.frame)) for piece in found if piece.frame]
     if as_json:
-        listed = [{"frame": f.frame, "offset": p.offset, "size": len(p.data), "fields": _raw(sensor, p)} for p, f in frames]
+        listed = [
+            {"frame": f.frame, "offset": p.offset, "size": len(p.data), "fields": plain(sensor.parse(p.data, p.frame))} for p, f in frames
+        ]
         emit_json({"sensor": sensor.id, "fits": fits, "frames": listed}, output)
         return
     skipped = sum(len(piece.data) for piece in found if not piece.frame)
@@ -190,10 +192,6 @@ def _raw_text(raw: Any) -> str:
     if not isinstance(raw, bytes | bytearray):
         return str(raw)
     return raw.hex(" ") if len(raw) <= 2 * LINED else f"{raw[: 2 * LINED].hex(' ')} ... ({len(raw)} bytes)"
-
-
-def _raw(sensor: Sensor, piece: Piece) -> Any:
-    return plain(sensor.parse(piece.data, piece.frame))
 
 
 def plain(parsed: Any) -> Any:

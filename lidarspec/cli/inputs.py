@@ -54,6 +54,17 @@ def read(words: Sequence[str]) -> Heard:
         raise UsageError(f"{text[:QUOTED]!r} is no file, and not hexadecimal: {error}") from None
 
 
+def refuse_overwriting(source: str, target: str, what: str = "source") -> None:
+    """Nothing, where a file is written to that is not the one that is read.
+
+    Raises:
+        UsageError: where it is.
+    """
+    path = source.partition("?")[0]
+    if os.path.exists(path) and os.path.exists(target) and os.path.samefile(path, target):
+        raise UsageError(f"{target} is the {what}: it would be overwritten")
+
+
 def no_frame(sensor: Sensor, given: Heard) -> WireError:
     """Why there is no frame of this sensor in the input, with the next command."""
     data = given.data

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
 import shutil
 import sys
 import time
@@ -17,8 +16,9 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from lidarspec.errors import SourceError
+from lidarspec.errors import system_errors
 from lidarspec.explaining.listing import Line, folded, text as plain_text
+from lidarspec.formats import replacing
 
 #: seconds between two lines.
 PERIOD = 0.2
@@ -36,7 +36,7 @@ STYLES = {
 }
 
 
-class Progress:
+class Progress(contextlib.AbstractContextManager["Progress"]):
     """The line, on standard error; a context manager that takes it away at the end."""
 
     def __init__(self) -> None:
@@ -49,24 +49,29 @@ class Progress:
             return
         self._due = time.monotonic() + PERIOD
         line = text()[: shutil.get_terminal_size().columns - 1]
-        self._write(f"\r{line.ljust(self._width)}")
+        click.echo(f"\r{line.ljust(self._width)}", err=True, nl=False)
         self._width = len(line)
 
-    def clear(self) -> None:
-        """Take the line away, so that something else can be said."""
-        if self._width:
-            self._write(f"\r{' ' * self._width}\r")
-            self._width, self._due = 0, 0.0
+    def follow(self, remarks: Iterable[str], text: Callable[[], str]) -> None:
+        """Show a text while something goes on, and what it remarks; empty remarks only pass the time."""
+        for remark in remarks:
+            self(text)
+            if remark:
+                self.note(remark)
 
-    def __enter__(self) -> Progress:
-        return self
+    def note(self, remark: str) -> None:
+        """Say something else, in the place of the line."""
+        self.clear()
+        note(remark)
+
+    def clear(self) -> None:
+        """Take the line away."""
+        if self._width:
+            click.echo(f"\r{' ' * self._width}\r", err=True, nl=False)
+            self._width, self._due = 0, 0.0
 
     def __exit__(self, *_: object) -> None:
         self.clear()
-
-    def _write(self, text: str) -> None:
-        sys.stderr.write(text)
-        sys.stderr.flush()
 
 
 def size(number: float) -> str:
@@ -75,28 +80,19 @@ def size(number: float) -> str:
     return f"{number:.0f} bytes" if not power else f"{number / 1000**power:.1f} {'?kMG'[power]}B"
 
 
-def emit(text: str, output: str | None) -> None:
-    """Text to standard output, or into a file, which keeps what it held until the new text is whole.
+def emit(content: str | bytes, output: str | None) -> None:
+    """Text, or bytes as they are, to standard output or into a file, which keeps what it held until the new content is whole.
 
     Raises:
         SourceError: where the file cannot be written.
     """
     if output is None or output == "-":
-        click.echo(text)
+        click.echo(content, nl=isinstance(content, str))
         return
     path = Path(output)
     is_replaced = path.is_file() or not path.exists()  # and not a device or a pipe
-    part = path.with_name(f".{path.name}.{os.getpid()}") if is_replaced else path
-    try:
-        part.write_text(text + "\n", encoding="utf-8")
-        if is_replaced:
-            os.replace(part, path)
-    except OSError as error:
-        raise SourceError(f"{output}: {error.strerror or error}") from None
-    finally:
-        if is_replaced:
-            with contextlib.suppress(OSError):
-                part.unlink()
+    with system_errors(output), replacing(path) if is_replaced else contextlib.nullcontext(path) as part:
+        part.write_bytes(content if isinstance(content, bytes) else f"{content}\n".encode())
 
 
 def emit_lines(lines: Iterable[Line], output: str | None) -> None:
@@ -125,7 +121,12 @@ def note(text: str) -> None:
 def table(headers: Sequence[str], rows: Sequence[Sequence[str]], output: str | None = None) -> str:
     """Rows as aligned columns; folded to a terminal's width where there is one, each row in one line otherwise."""
     if output is None and Console().is_terminal:
-        return drawn(_folded(headers, rows))
+        folded = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style="bold")
+        for header in headers:
+            folded.add_column(header, overflow="fold")
+        for row in rows:
+            folded.add_row(*map(Text, row))
+        return drawn(folded)
     lines = [headers, *rows]
     widths = [max(len(line[column]) for line in lines) for column in range(len(headers))]
     return "\n".join("  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip() for line in lines)
@@ -137,12 +138,3 @@ def drawn(what: Table | Text) -> str:
     with console.capture() as captured:
         console.print(what, soft_wrap=isinstance(what, Text), highlight=False)
     return captured.get().rstrip("\n")
-
-
-def _folded(headers: Sequence[str], rows: Sequence[Sequence[str]]) -> Table:
-    folded = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style="bold")
-    for header in headers:
-        folded.add_column(header, overflow="fold")
-    for row in rows:
-        folded.add_row(*(Text(cell) for cell in row))
-    return folded

@@ -21,7 +21,7 @@ from lidarspec.cli.output import note
 from lidarspec.device.device import Device, open as open_device
 from lidarspec.errors import UnknownFrame
 from lidarspec.scans.scans import Scan
-from lidarspec.view.feed import LOOK, Feed, Reading
+from lidarspec.view.feed import LOOK, Feed, Reading, told
 
 #: unit, width and decimals of the columns of points.
 POINTS = {
@@ -101,8 +101,8 @@ def _lines(rows: Iterable[tuple[Units, Row]], *, as_json: bool) -> Iterator[str]
         if not widths:
             headers = [f"{name} [{units[name]}]" if units.get(name) else name for name in shown]
             widths = [max(len(header), _width(name)) for header, name in zip(headers, shown, strict=True)]
-            yield _joined(headers, widths)
-        yield _joined([_text(name, value) for name, value in shown.items()], widths)
+            yield _row(headers, widths)
+        yield _row([_text(name, value) for name, value in shown.items()], widths)
 
 
 def _points(device: Device, until: float, patience: Patience, *, every_point: bool) -> Iterator[tuple[Units, Row]]:
@@ -153,8 +153,8 @@ def _text(name: str, value: Any) -> str:
     return f"{value:.{POINTS[name][2]}f}" if name in POINTS else f"{value:.{DIGITS}g}"
 
 
-def _joined(cells: Sequence[str], widths: Sequence[int]) -> str:
-    return " ".join(cell.rjust(width) for cell, width in zip(cells, widths, strict=True))
+def _row(cells: Sequence[str], widths: Sequence[int]) -> str:
+    return " ".join(cell.rjust(width) for cell, width in zip(cells, widths, strict=True)).rstrip()
 
 
 def _plain(value: Any) -> Any:
@@ -172,18 +172,20 @@ def _plain(value: Any) -> Any:
 
 #: name and unit of each figure, the width of its column (0: only in the summary), and its text.
 FIGURES: tuple[tuple[str, str, int, Callable[[Reading], str]], ...] = (
-    ("speed", "Hz", 6, lambda r: _number(r.speed_hz, ".2f")),
-    ("packets", "/s", 8, lambda r: _number(r.packet_rate_hz, ".1f")),
-    ("points", "/scan", 7, lambda r: _number(r.points, ".0f")),
-    ("valid", "/scan", 7, lambda r: _number(r.valid, ".0f")),
-    ("errors", "%", 7, lambda r: _number(_hundredfold(r.error_rate), ".3f")),
-    ("skipped", "%", 7, lambda r: _number(_hundredfold(r.skipped_rate), ".3f")),
-    ("loss", "%", 7, lambda r: _number(_hundredfold(r.loss_rate), ".3f")),
-    ("jitter", "ms", 8, lambda r: _number(r.jitter_s and r.jitter_s * 1e3, ".3f")),
-    ("gap", "ms", 0, lambda r: _number(r.longest_gap_s and r.longest_gap_s * 1e3, ".2f")),
-    ("input", "kB/s", 0, lambda r: _number(r.bytes_per_s and r.bytes_per_s / 1e3, ".1f")),
+    ("speed", "Hz", 6, lambda r: told(r.speed_hz, "{:.2f}")),
+    ("packets", "/s", 8, lambda r: told(r.packet_rate_hz, "{:.1f}")),
+    ("points", "/scan", 7, lambda r: told(r.points, "{:.0f}")),
+    ("valid", "/scan", 7, lambda r: told(r.valid, "{:.0f}")),
+    ("errors", "%", 7, lambda r: told(r.error_rate, "{:.3f}", 100)),
+    ("skipped", "%", 7, lambda r: told(r.skipped_rate, "{:.3f}", 100)),
+    ("loss", "%", 7, lambda r: told(r.loss_rate, "{:.3f}", 100)),
+    ("jitter", "ms", 8, lambda r: told(r.jitter_s, "{:.3f}", 1e3)),
+    ("gap", "ms", 0, lambda r: told(r.longest_gap_s, "{:.2f}", 1e3)),
+    ("input", "kB/s", 0, lambda r: told(r.bytes_per_s, "{:.1f}", 1e-3)),
 )
 COLUMNS = [figure for figure in FIGURES if figure[2]]
+#: of the columns of `stats`: the time, the figures, and what waits.
+WIDTHS = [6, *(width for _, _, width, _ in COLUMNS), 6]
 
 
 @dataclass
@@ -200,11 +202,11 @@ class Lines:
             self._emit({"kind": "interval", "at_s": at, **self._figures(reading)})
             return
         if self.printed % AGAIN == 0:
-            click.echo(_row(["time", *(name for name, _, _, _ in COLUMNS), "queue"]))
-            click.echo(_row(["s", *(unit for _, unit, _, _ in COLUMNS), ""]))
+            click.echo(_row(["time", *(name for name, _, _, _ in COLUMNS), "queue"], WIDTHS))
+            click.echo(_row(["s", *(unit for _, unit, _, _ in COLUMNS), ""], WIDTHS))
         self.printed += 1
-        waiting = self.device.queued
-        click.echo(_row([_number(at, ".1f"), *(text(reading) for _, _, _, text in COLUMNS), "-" if waiting is None else str(waiting)]))
+        figures = [text(reading) for _, _, _, text in COLUMNS]
+        click.echo(_row([told(at, "{:.1f}"), *figures, told(self.device.queued, "{}")], WIDTHS))
         sys.stdout.flush()
 
     def summary(self, reading: Reading) -> None:
@@ -298,16 +300,3 @@ def _by_the_packets(feed: Feed, lines: Lines, interval: float, lasting: float) -
         if passed >= (edges + 1) * interval:
             edges = int(passed / interval)
             lines.interval(round(passed, 3), feed.meter.reading(feed.device.stats))
-
-
-def _row(texts: list[str]) -> str:
-    widths = [6, *(width for _, _, width, _ in COLUMNS), 6]
-    return " ".join(text.rjust(width) for text, width in zip(texts, widths, strict=True)).rstrip()
-
-
-def _number(value: float | None, form: str) -> str:
-    return "-" if value is None or not math.isfinite(value) else format(value, form)
-
-
-def _hundredfold(value: float | None) -> float | None:
-    return None if value is None else 100 * value

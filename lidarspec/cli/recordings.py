@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import contextlib
-import functools
 import os
 import shlex
 
 import click
 
 from lidarspec.cli.failures import INTERRUPTED
-from lidarspec.cli.inputs import nothing_came
+from lidarspec.cli.inputs import nothing_came, refuse_overwriting
 from lidarspec.cli.options import DURATION, SPEED, sensor_option
 from lidarspec.cli.output import Progress, emit_json, note, size
 from lidarspec.device.settings import named
@@ -58,9 +57,7 @@ def record(
         check_suffix(target)
     except UnknownFormat as error:
         raise suggest(error, "lidarspec record --help") from None
-    path = source.partition("?")[0]
-    if os.path.exists(path) and os.path.exists(target) and os.path.samefile(path, target):
-        raise UsageError(f"{target} is the source: it would be overwritten")
+    refuse_overwriting(source, target)
     known = named(source)
     sensor = named_sensor(sensor_id) if sensor_id else declared(source) if is_live(source) else known.configured() if known else None
     task = SourceRecording(source, target, sensor, seconds=seconds, count=count, start=not no_start, overwrite=force, salvage=salvage)
@@ -92,12 +89,7 @@ def record(
 
 def _recorded(task: SourceRecording) -> None:
     with Progress() as progress, contextlib.closing(task.run()) as remarks:
-        for remark in remarks:
-            if task.recorder is not None:
-                progress(functools.partial(_taken, task, task.recorder))
-            if remark:
-                progress.clear()
-                note(remark)
+        progress.follow(remarks, lambda: _taken(task, task.recorder) if task.recorder is not None else "")
 
 
 def _taken(task: SourceRecording, kept: Appender) -> str:
@@ -156,8 +148,8 @@ def replay(file: str, place: str, speed: float | None, loop: bool, force: bool, 
     is_file = place.endswith(SUFFIXES) and "://" not in place
     if is_file and loop:
         raise UsageError("a file cannot take a replay that never ends: leave out --loop")
-    if is_file and os.path.exists(place) and os.path.samefile(file.partition("?")[0], place):
-        raise UsageError(f"{place} is the source: it would be overwritten")
+    if is_file:
+        refuse_overwriting(file, place)
     with contextlib.closing(transport(file)) as source:
         sensor = _sensor(source, sensor_id)
         outlet = (
@@ -178,11 +170,7 @@ def _run(played: Replay, outlet: Outlet, file: str) -> bool:
     """Whether it was interrupted before its end."""
     with contextlib.closing(outlet), Progress() as progress:
         try:
-            for remark in played.run():
-                progress(lambda: _told(played))
-                if remark:
-                    progress.clear()
-                    note(remark)
+            progress.follow(played.run(), lambda: _told(played))
         except KeyboardInterrupt:
             return True
         except WireError as error:

@@ -12,12 +12,13 @@ from lidarspec.cli.options import output_options
 from lidarspec.cli.output import emit, emit_json, note, table
 from lidarspec.columns.columns import Batch
 from lidarspec.errors import SpecError
+from lidarspec.exports.json import facts, link_data
 from lidarspec.plugins import registry, sensor as named_sensor
 from lidarspec.points.numpy_plan import describe
 from lidarspec.points.plan import Plan, plan_for
 from lidarspec.simulation.frame_maker import FrameMaker
 from lidarspec.spec.description import Frame
-from lidarspec.spec.links import Link, Serial, Tcp, Udp
+from lidarspec.spec.links import Link, Serial, Udp
 from lidarspec.spec.sensor import Sensor
 from lidarspec.wire.wire_table import frame_size, wire_table
 
@@ -56,7 +57,7 @@ def show(sensor_id: str, as_plan: bool, as_json: bool, output: str | None) -> No
         emit_json(plans, output) if as_json else emit("\n".join(line for name in plans for line in (f"{name}:", *plans[name])), output)
         return
     if as_json:
-        frames = {name: _frame(frame) | {"rows": [vars(row) for row in wire_table(frame)]} for name, frame in sensor.frames.items()}
+        frames = {name: _frame(frame) for name, frame in sensor.frames.items()}
         commands = {name: _command(sensor, name) for name in sensor.commands}
         emit_json({**_facts(sensor), "frames": frames, "commands": commands}, output)
         return
@@ -102,17 +103,17 @@ def plugins(as_json: bool, output: str | None) -> None:
 def _facts(sensor: Sensor) -> dict[str, Any]:
     """What is known of a sensor, for JSON."""
     return {
-        **{name: getattr(sensor, name) for name in ("id", "vendor", "model", "status", "source")},
-        "aliases": list(sensor.aliases),
-        "links": {name: _link(link) for name, link in sensor.links.items()},
+        **facts(sensor, "id", "vendor", "model", "status", "source", "aliases"),
+        "links": {name: link_data(link) for name, link in sensor.links.items()},
         "frames": list(sensor.frames),
         "commands": list(sensor.commands),
-        "range_limits": list(sensor.range_limits),
+        **facts(sensor, "range_limits"),
     }
 
 
 def _frame(frame: Frame) -> dict[str, Any]:
-    return {"direction": frame.direction, "data": frame.data, "size": frame_size(frame), "max_length": frame.max_length}
+    rows = [vars(row) for row in wire_table(frame)]
+    return {**facts(frame, "direction", "data"), "size": frame_size(frame), "max_length": frame.max_length, "rows": rows}
 
 
 def _command(sensor: Sensor, name: str) -> Mapping[str, Any]:
@@ -135,8 +136,3 @@ def _link_text(link: Link) -> str:
     if isinstance(link, Serial):
         return f"serial {'/'.join(str(baud) for baud in link.bauds)} baud"
     return f"udp {'/'.join(str(port) for port in link.ports)}" if isinstance(link, Udp) else f"tcp {link.port}"
-
-
-def _link(link: Link) -> dict[str, Any]:
-    kind = {Serial: "serial", Udp: "udp", Tcp: "tcp"}[type(link)]
-    return {"kind": kind, **{name: list(value) if isinstance(value, tuple) else value for name, value in vars(link).items()}}

@@ -118,17 +118,12 @@ def _watching(device: SimulatedDevice, opened: Outlet, progress: Progress) -> Ca
 
     def turn() -> None:
         nonlocal heard, present
-        for name in device.heard[heard:]:
-            progress.clear()
-            note(f"{time.monotonic() - began:.1f} s: {name}")
-        heard = len(device.heard)
-        if device.present != present and not present:
-            progress.clear()
-            note(f"{time.monotonic() - began:.1f} s: plugged in again, {opened.place}")
-        elif device.present != present:
-            progress.clear()
-            note(f"{time.monotonic() - began:.1f} s: unplugged")
-        present = device.present
+        events = device.heard[heard:]
+        if device.present != present:
+            events += [f"plugged in again, {opened.place}" if device.present else "unplugged"]
+        for event in events:
+            progress.note(f"{time.monotonic() - began:.1f} s: {event}")
+        heard, present = len(device.heard), device.present
         progress(lambda: f"{time.monotonic() - began:.0f} s, {_sent(device)}")
 
     return turn
@@ -142,11 +137,7 @@ def _sent(device: SimulatedDevice) -> str:
 @contextlib.contextmanager
 def _ended_by_terminate() -> Iterator[None]:
     """SIGTERM ends it as Ctrl-C does, so that a link does not stay behind."""
-
-    def interrupt(number: int, frame: object) -> None:
-        raise KeyboardInterrupt
-
-    before = signal.signal(signal.SIGTERM, interrupt)
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         yield
     finally:

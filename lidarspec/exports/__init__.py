@@ -97,6 +97,11 @@ def messages(sensor: Sensor) -> tuple[Message, ...]:
     return tuple(_message(sensor, name, frame) for name, frame in sensor.frames.items())
 
 
+def asked(node: tree.Node) -> list[tree.Ref]:
+    """The fields that the formulas of a node and of what is in it ask for."""
+    return [ref for below in tree.nodes(node) for value in tree.formulas(below) for ref in tree.refs(value)]
+
+
 def _message(sensor: Sensor, name: str, frame: Frame) -> Message:
     try:
         root = frame.tree

@@ -17,7 +17,7 @@ from typing import Any
 
 from lidarspec._version import __version__
 from lidarspec.exports import Message, Refused, c_fields, messages
-from lidarspec.exports.c_fields import Access, CLayout, Entry, accesses, arguments, comment, identifier, parameters, quoted, word
+from lidarspec.exports.c_fields import CLayout, Entry, accesses, arguments, comment, identifier, parameters, quoted, word
 from lidarspec.spec import Checksum, Crc, Fold15, Sensor, Sum, WordXor, Xor, ZeroPadded
 from lidarspec.spec.checksums import byte_table, mirrored_bytes, reflected
 from lidarspec.spec.tree import Blob, Block, Formula, Number, Op, Repeat, Sealed, formulas, refs
@@ -205,7 +205,7 @@ def _divisors(value: Formula) -> Iterator[Formula]:
 def _checksum(layout: CLayout, entry: Entry, seal: Sealed, algorithm: str) -> str:
     held = [access for path in seal.fields for access in accesses(layout, path)]
     for path in seal.fields:
-        if [access.entry.depth for access in held if access.info.path == path] != [entry.depth]:
+        if [access.depth for access in held if access.info.path == path] != [entry.depth]:
             raise Refused(f"{path}: a checksum that stands in several places")
     return _CHECKSUM.format(
         name=layout.name(entry.path, "checksum_ok").removesuffix("_ok"),
@@ -218,32 +218,32 @@ def _checksum(layout: CLayout, entry: Entry, seal: Sealed, algorithm: str) -> st
     )
 
 
-def _spans(layout: CLayout, entry: Entry, seal: Sealed, held: list[Access]) -> Iterator[tuple[Extent, Extent]]:
+def _spans(layout: CLayout, entry: Entry, seal: Sealed, held: list[Entry]) -> Iterator[tuple[Extent, Extent]]:
     """The byte ranges that a checksum covers: from its first to its last part, or all that holds no bit of it."""
     if seal.over is not None:
         first, last = (layout.whole(path) for path in seal.over)
         yield first.start, last.start + last.size
         return
     start = entry.start
-    order = {id(other): number for number, other in enumerate(layout.entries)}
-    for access in sorted(held, key=lambda access: (order[id(access.entry)], access.span[0])):
+    order = {id(other.node): number for number, other in enumerate(layout.entries)}
+    for access in sorted(held, key=lambda access: (order[id(access.node)], access.span[0])):
         first_byte, size = access.span
-        begin = access.entry.start + Extent(first_byte)
+        begin = access.start + Extent(first_byte)
         if str(begin) != str(start):
             yield start, begin
-        start = access.entry.start + size
+        start = access.start + size
     if str(start) != str(entry.start + entry.size):
         yield start, entry.start + entry.size
 
 
-def _stored(held: list[Access], order: str) -> str:
+def _stored(held: list[Entry], order: str) -> str:
     """The value that several fields hold, low bits first."""
     terms, shift = [], 0
     for access in held:
-        node = access.entry.node
+        node = access.node
         if isinstance(node, Blob):
             assert isinstance(node.size, int)
-            value, width = word(access.entry.start, node.size, order), 8 * node.size
+            value, width = word(access.start, node.size, order), 8 * node.size
         else:
             value, width = access.expression, access.info.bits
         value = f"((uint64_t)({value}) & UINT64_C(0x{(1 << width) - 1:x}))"
@@ -258,8 +258,7 @@ def _constants(layout: CLayout) -> Iterator[str]:
         if isinstance(node, Blob) and node.const is not None:
             yield _unless(entry, f"memcmp(p + {entry.start}, {quoted(node.const)}, {len(node.const)}) != 0")
         elif isinstance(node, Number | Block):
-            for part in node.parts if isinstance(node, Block) else (None,):
-                access = Access(entry, part)
+            for access in entry.fields:
                 if access.info.const is not None:
                     yield _unless(entry, f"({access.expression}) != {_number(access.info.const)}")
 

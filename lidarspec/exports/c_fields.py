@@ -12,10 +12,10 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
-from lidarspec.exports import Message, Refused
+from lidarspec.exports import Message, Refused, asked
 from lidarspec.spec import tree
 from lidarspec.wire.wire_table import Extent, meaning, unit_text
 
@@ -116,6 +116,7 @@ class Entry:
         depth: number of arrays that it is in.
         conditions: what has to hold for it to be there.
         loops: for each of those arrays the C expression of its count.
+        part: of a bit block, what is read of it.
     """
 
     path: str
@@ -125,16 +126,53 @@ class Entry:
     depth: int = 0
     conditions: tuple[Condition, ...] = ()
     loops: tuple[str, ...] = ()
+    part: tree.Part | None = None
 
     @property
     def where(self) -> str:
         """The conditions as one; "" for none."""
         return " && ".join(condition.text for condition in self.conditions)
 
+    @property
+    def fields(self) -> list[Entry]:
+        """What can be read there: an entry for each part of a bit block, else itself."""
+        return [replace(self, part=part) for part in self.node.parts] if isinstance(self.node, tree.Block) else [self]
 
-def asked(node: tree.Node) -> list[tree.Ref]:
-    """The fields that the formulas of a node and of what is in it ask for."""
-    return [ref for below in tree.nodes(node) for value in tree.formulas(below) for ref in tree.refs(value)]
+    @property
+    def info(self) -> tree.FieldInfo:
+        """The field."""
+        return self.part.info if self.part is not None else tree.infos(self.node)[0]
+
+    @property
+    def indices(self) -> tuple[int, ...]:
+        """Where it stands in the arrays inside its bit block."""
+        return self.part.indices if self.part is not None else ()
+
+    @property
+    def expression(self) -> str:
+        """What is read there, as C."""
+        node = self.node
+        if self.part is not None:
+            return _bits(self.part, self.start)
+        assert isinstance(node, tree.Number)
+        raw = f"p[{self.start}]" if node.size == 1 else word(self.start, node.size, node.order)
+        if node.kind == "float":
+            return f"{FLOATS[node.size]}({raw})"
+        return f"lidarspec_signed({raw}, {8 * node.size})" if node.kind == "int" else raw
+
+    @property
+    def span(self) -> tuple[int, Extent]:
+        """The first byte of the word and the end of its last, from the start of the entry."""
+        if self.part is None:
+            return 0, self.size
+        offsets = [segment.byte for segment in self.part.bits.segments]
+        return min(offsets), Extent(max(offsets) + 1)
+
+    @property
+    def condition(self) -> str:
+        """When it is there, of a part in its bit block too; "" for always."""
+        inside = [f"{index(self.depth + level)} == {number}" for level, number in enumerate(self.indices)]
+        return " && ".join(filter(None, (self.where, *inside)))
 
 
 def given(node: tree.Node, depth: int) -> str:
@@ -143,7 +181,6 @@ def given(node: tree.Node, depth: int) -> str:
     return arguments(depth) if is_own else ", ".join(["p", *["0"] * depth])
 
 
-@dataclass
 class CLayout:
     """The entries of a frame type, in the order of the wire.
 
@@ -156,13 +193,10 @@ class CLayout:
         Refused: where an entry cannot be found without reading all elements before it.
     """
 
-    message: Message
-    name: Callable[[str, str], str]
-    entries: list[Entry] = field(default_factory=list)
-    size: Extent = field(init=False)
-
-    def __post_init__(self) -> None:
-        top = Entry("", self.message.root, Extent(), Extent())
+    def __init__(self, message: Message, name: Callable[[str, str], str]) -> None:
+        self.message, self.name = message, name
+        self.entries: list[Entry] = []
+        top = Entry("", message.root, Extent(), Extent())
         self.size = self.extent(top)
         self._visit(top)
 
@@ -293,56 +327,16 @@ SI: dict[str, tuple[str, float, float]] = {
 FLOATS = {2: "lidarspec_half", 4: "lidarspec_float", 8: "lidarspec_double"}
 
 
-@dataclass(frozen=True)
-class Access:
-    """One way to read a field: in one entry, and of a bit block one of its parts."""
-
-    entry: Entry
-    part: tree.Part | None = None
-
-    @property
-    def info(self) -> tree.FieldInfo:
-        """The field."""
-        return self.part.info if self.part is not None else tree.infos(self.entry.node)[0]
-
-    @property
-    def expression(self) -> str:
-        """What is read there, as C."""
-        node, entry = self.entry.node, self.entry
-        if self.part is not None:
-            return _bits(self.part, entry)
-        assert isinstance(node, tree.Number)
-        raw = f"p[{entry.start}]" if node.size == 1 else word(entry.start, node.size, node.order)
-        if node.kind == "float":
-            return f"{FLOATS[node.size]}({raw})"
-        return f"lidarspec_signed({raw}, {8 * node.size})" if node.kind == "int" else raw
-
-    @property
-    def span(self) -> tuple[int, Extent]:
-        """The first byte of the word and the end of its last, from the start of the entry."""
-        if self.part is None:
-            return 0, self.entry.size
-        offsets = [segment.byte for segment in self.part.bits.segments]
-        return min(offsets), Extent(max(offsets) + 1)
-
-    @property
-    def condition(self) -> str:
-        """When it is there; "" for always."""
-        indices = self.part.indices if self.part else ()
-        inside = [f"{index(self.entry.depth + level)} == {number}" for level, number in enumerate(indices)]
-        return " && ".join(filter(None, (self.entry.where, *inside)))
-
-
 def word(start: Extent, size: int, order: str) -> str:
     """An unsigned integer of several bytes."""
     return f"lidarspec_{'le' if order == 'little' else 'be'}(p + {start}, {size})"
 
 
-def _bits(part: tree.Part, entry: Entry) -> str:
+def _bits(part: tree.Part, start: Extent) -> str:
     wide = "uint64_t" if part.bits.width > 32 else "uint32_t"
     terms = []
     for segment in part.bits.segments:
-        byte = f"p[{entry.start + Extent(segment.byte)}]"
+        byte = f"p[{start + Extent(segment.byte)}]"
         term = f"({wide})" + (f"({byte} & 0x{segment.mask:02x}u)" if segment.mask != 0xFF else byte)
         shift = segment.target - segment.low
         terms.append(f"{term} {'<<' if shift > 0 else '>>'} {abs(shift)}" if shift else term)
@@ -350,25 +344,18 @@ def _bits(part: tree.Part, entry: Entry) -> str:
     return f"lidarspec_signed({value}, {part.bits.width})" if part.bits.signed else value
 
 
-def accesses(layout: CLayout, path: str) -> list[Access]:
-    """All ways to read a field."""
-    ways: list[Access] = []
-    for entry in layout.named(path):
-        parts = entry.node.parts if isinstance(entry.node, tree.Block) else (None,)
-        ways += [Access(entry, part) for part in parts if part is None or part.info.path == path]
-    return ways
+def accesses(layout: CLayout, path: str) -> list[Entry]:
+    """All ways to read a field: an entry for each."""
+    return [access for entry in layout.named(path) for access in entry.fields if access.info.path == path]
 
 
 def fields(layout: CLayout) -> Iterator[str]:
     """The functions of all fields in the order of the wire; one that stands in several alternatives comes with the last."""
-    owned = [list(dict.fromkeys(_functions(entry))) for entry in layout.entries]
-    last = {function: number for number, functions in enumerate(owned) for function in functions}
+    functions = [function for entry in layout.entries for function in dict.fromkeys(_functions(entry))]
     extents = list(_extents(layout))
     yield from (text.partition("\n")[0].partition(" {")[0] + ";" for text in extents)
-    for number, functions in enumerate(owned):
-        for write, path in functions:
-            if last[write, path] == number:
-                yield from write(layout, path)
+    for write, path in reversed(dict.fromkeys(reversed(functions))):
+        yield from write(layout, path)
     yield from extents
 
 
@@ -405,8 +392,7 @@ def _inner(part: tree.Part) -> tuple[str, ...]:
 
 def _inner_count(layout: CLayout, axis: str) -> Iterator[str]:
     """The number of elements of an array inside a bit block."""
-    blocks = [(entry, entry.node.parts) for entry in layout.entries if isinstance(entry.node, tree.Block)]
-    inside = [(entry, part) for entry, parts in blocks for part in parts if axis in _inner(part)]
+    inside = [(access, access.part) for entry in layout.entries for access in entry.fields if access.part and axis in _inner(access.part)]
     entry, part = inside[0]
     level = _inner(part).index(axis)
     count = max(part.indices[level] for _, part in inside) + 1
@@ -423,19 +409,19 @@ def _field(layout: CLayout, path: str) -> Iterator[str]:
     """The functions of a field: what it holds, whether it is there, its scaling; and the names of its values."""
     ways = accesses(layout, path)
     name, first = layout.name(path, ""), ways[0]
-    depth = first.entry.depth + (len(first.part.indices) if first.part else 0)
+    depth = first.depth + len(first.indices)
     yield from (f"#define {name.upper()}_{identifier(label).upper()} {value}" for value, label in first.info.labels.items())
     yield comment(unit_text(first.info), meaning(first.info))
-    if isinstance(first.entry.node, tree.Blob):
+    if isinstance(first.node, tree.Blob):
         kind = ""
-        sizes = [(access.entry.where, layout.length(access.entry.node.size)) for access in ways if isinstance(access.entry.node, tree.Blob)]
+        sizes = [(access.where, layout.length(access.node.size)) for access in ways if isinstance(access.node, tree.Blob)]
         yield _function("size_t", layout.name(path, "size"), depth, sizes)
-        yield _function("const uint8_t *", name, depth, [(access.entry.where, f"p + ({access.entry.start})") for access in ways])
+        yield _function("const uint8_t *", name, depth, [(access.where, f"p + ({access.start})") for access in ways])
     else:
         kind = number_type([access.info for access in ways])
         yield _function(kind, name, depth, [(access.condition, f"({kind}){_grouped(access.expression)}") for access in ways])
-    if any(access.entry.conditions for access in ways):
-        places = dict.fromkeys(access.entry.where or "1" for access in ways)
+    if any(access.conditions for access in ways):
+        places = dict.fromkeys(access.where or "1" for access in ways)
         yield _function("int", layout.name(path, "present"), depth, [("", " || ".join(f"({where})" for where in places))])
     if kind and (first.info.scaled or first.info.unit):
         yield from _scaling(first.info, name, kind)

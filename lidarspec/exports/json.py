@@ -35,28 +35,30 @@ def spec(sensor: Sensor) -> dict[str, Any]:
     Raises:
         Refused: where a frame holds Python code that no data can stand for.
     """
+    sequence = sensor.sequence
     return {
         "lidarspec": VERSION,
-        **_facts(sensor, "id", "vendor", "model", "aliases", "status", "source", "range_limits", "vendor_axes"),
-        "links": {name: _link(link) for name, link in sensor.links.items()},
+        **facts(sensor, "id", "vendor", "model", "aliases", "status", "source", "range_limits", "vendor_axes"),
+        "links": {name: link_data(link) for name, link in sensor.links.items()},
         "scan": {"rule": type(sensor.scan).__name__, **dataclasses.asdict(sensor.scan)},
         "clock": _clock(sensor),
-        "sequence": _sequence(sensor),
+        "sequence": sequence and facts(sequence, "field", "first") | {"last": None if callable(sequence.last) else sequence.last},
         "fillers": sensor.fillers.hex(),
         "frames": {message.name: _frame(message) for message in messages(sensor)},
         "commands": {name: _command(command) for name, command in sensor.commands.items()},
-        **_facts(sensor, "on_open", "on_close"),
+        **facts(sensor, "on_open", "on_close"),
     }
 
 
-def _facts(value: object, *names: str) -> dict[str, Any]:
+def facts(value: object, *names: str) -> dict[str, Any]:
     """Some attributes of a value as data: tuples as lists, mappings as objects."""
-    facts = ((name, getattr(value, name)) for name in names)
-    return {name: list(fact) if isinstance(fact, tuple) else dict(fact) if isinstance(fact, Mapping) else fact for name, fact in facts}
+    own = ((name, getattr(value, name)) for name in names)
+    return {name: list(fact) if isinstance(fact, tuple) else dict(fact) if isinstance(fact, Mapping) else fact for name, fact in own}
 
 
-def _link(link: Link) -> dict[str, Any]:
-    return {"kind": {Serial: "serial", Udp: "udp", Tcp: "tcp"}[type(link)], **_facts(link, *vars(link))}
+def link_data(link: Link) -> dict[str, Any]:
+    """A link as data: its kind, then what its class declares."""
+    return {"kind": {Serial: "serial", Udp: "udp", Tcp: "tcp"}[type(link)], **facts(link, *vars(link))}
 
 
 def _clock(sensor: Sensor) -> dict[str, Any] | None:
@@ -67,19 +69,12 @@ def _clock(sensor: Sensor) -> dict[str, Any] | None:
     return {"fields": fields, "wraps_at": sensor.clock.wraps_at}
 
 
-def _sequence(sensor: Sensor) -> dict[str, Any] | None:
-    if sensor.sequence is None:
-        return None
-    last = None if callable(sensor.sequence.last) else sensor.sequence.last
-    return {"field": sensor.sequence.field, "first": sensor.sequence.first, "last": last}
-
-
 def _frame(message: Message) -> dict[str, Any]:
     frame = message.frame
     return {
-        **_facts(frame, "direction", "data"),
+        **facts(frame, "direction", "data"),
         "size": frame_size(frame),
-        **_facts(frame, "max_length", "after", "confirm"),
+        **facts(frame, "max_length", "after", "confirm"),
         "plausible": frame.plausible is not None,
         "layout": node_data(message.root),
     }
@@ -87,9 +82,9 @@ def _frame(message: Message) -> dict[str, Any]:
 
 def _command(command: Command) -> dict[str, Any]:
     return {
-        **_facts(command, "frame", "values"),
+        **facts(command, "frame", "values"),
         "args": {name: {"field": path, "low": low, "high": high} for name, (path, low, high) in command.args.items()},
-        **_facts(command, "replies", "matches", "echoes", "timeout", "retries", "settle", "link", "lines", "starts", "stops", "every"),
+        **facts(command, "replies", "matches", "echoes", "timeout", "retries", "settle", "link", "lines", "starts", "stops", "every"),
     }
 
 
@@ -146,4 +141,4 @@ def _seal(node: tree.Sealed) -> dict[str, Any]:
     own: dict[str, Any] = dataclasses.asdict(algorithm) if dataclasses.is_dataclass(algorithm) else {}
     known = {name: value for name, value in own.items() if isinstance(value, int | str | bool | tuple)}
     kind = {"kind": type(algorithm).__name__, "width": algorithm.width, "describe": algorithm.describe()}
-    return {**_facts(node, "fields", "over", "absent"), "algorithm": {**kind, **known}}
+    return {**facts(node, "fields", "over", "absent"), "algorithm": {**kind, **known}}

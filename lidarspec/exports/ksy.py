@@ -2,13 +2,14 @@
 
 A frame type becomes a Kaitai type, and so does each struct in it: a type has attributes in the order of the wire (`seq`), calculated
 `instances` and inner `types`, and is plain data until `yaml` writes the document. Formulas name a field by its way from the type that asks
-(`Scope`), since Kaitai knows no paths from the top. Bit blocks become bit-sized integers where one of Kaitai's two bit orders meets their
+(`reached`), since Kaitai knows no paths from the top. Bit blocks become bit-sized integers where one of Kaitai's two bit orders meets their
 parts in a row, else bytes and calculated instances; a field with a scale gets an instance with the physical value. Checksums,
 plausibility and what points are made of cannot be said in Kaitai: checksums are named in the documentation of their fields.
 """
 
 from __future__ import annotations
 
+import functools
 import json
 import re
 from collections.abc import Callable, Iterator, Mapping
@@ -74,27 +75,21 @@ def identifier(name: str) -> str:
     return re.sub(r"[^a-z0-9_]", "_", name.lower())
 
 
-@dataclass(frozen=True)
-class Scope:
-    """The types that an expression stands in, outermost first, by the path of their struct; None for one that has no struct."""
+#: the types that an expression stands in, outermost first, by the path of their struct; None for one that holds a single part.
+Scope = tuple[str | None, ...]
 
-    levels: tuple[str | None, ...] = ()
 
-    def inside(self, path: str | None) -> Scope:
-        """In the type of the struct at a path, or with None in one that holds a single part."""
-        return Scope((*self.levels, path))
+def reached(scope: Scope, ref: tree.Ref) -> str:
+    """A field as an integer, by its way from a type.
 
-    def field(self, ref: tree.Ref) -> str:
-        """A field as an integer, by its way from here.
-
-        Raises:
-            Refused: where no type around this place holds it.
-        """
-        for up, path in enumerate(reversed(self.levels)):
-            if path is not None and (path == "" or ref.path.startswith(f"{path}.")):
-                names = ref.path.removeprefix(f"{path}.").split(".")
-                return "_parent." * up + ".".join(map(identifier, names)) + ".to_i" * (ref.info.bits == 1)
-        raise Refused(f"{ref.path} cannot be reached in Kaitai")
+    Raises:
+        Refused: where no type around this place holds it.
+    """
+    for up, path in enumerate(reversed(scope)):
+        if path is not None and (path == "" or ref.path.startswith(f"{path}.")):
+            names = ref.path.removeprefix(f"{path}.").split(".")
+            return "_parent." * up + ".".join(map(identifier, names)) + ".to_i" * (ref.info.bits == 1)
+    raise Refused(f"{ref.path} cannot be reached in Kaitai")
 
 
 _OPERATIONS = {"//": "({} / {})", "not": "({} == 0 ? 1 : 0)", **{symbol: f"({{}} {symbol} {{}} ? 1 : 0)" for symbol in tree.COMPARISONS}}
@@ -102,7 +97,7 @@ _OPERATIONS = {"//": "({} / {})", "not": "({} == 0 ? 1 : 0)", **{symbol: f"({{}}
 
 def number(formula: tree.Formula, scope: Scope) -> str:
     """A formula as an integer."""
-    return tree.written(formula, scope.field, _OPERATIONS)
+    return tree.written(formula, functools.partial(reached, scope), _OPERATIONS)
 
 
 def truth(formula: tree.Formula, scope: Scope) -> str:
@@ -242,7 +237,7 @@ def ksy(sensor: Sensor) -> str:
 
 def _frame(sensor: Sensor, message: Message) -> Attribute:
     try:
-        return _Types(message.seals).struct(message.root, Scope())
+        return _Types(message.seals).struct(message.root, ())
     except Refused as refused:
         raise Refused(f"{sensor.id} {message.name}: {refused}") from None
 
@@ -279,7 +274,7 @@ class _Types:
         body = node.body if isinstance(node, tree.Sealed) else node
         kaitai = _Type()
         for member in body.members:
-            self._member(kaitai, member, scope.inside(body.path))
+            self._member(kaitai, member, (*scope, body.path))
         return kaitai.done(body.path)
 
     def _member(self, kaitai: _Type, node: tree.Node, scope: Scope, **more: Any) -> None:
@@ -325,7 +320,7 @@ class _Types:
                 if not part.indices:
                     self._physical(kaitai, part.info, {}, name="_".join(part.names) or "value")
             return kaitai.done(node.info.path)
-        self._member(kaitai, _value(node), scope.inside(None))
+        self._member(kaitai, _value(node), (*scope, None))
         return kaitai.done(node.name)
 
     def _repeat(self, kaitai: _Type, node: tree.Repeat, scope: Scope, **more: Any) -> None:

@@ -10,12 +10,11 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 from importlib import resources
 from typing import Any
 
 from lidarspec._version import __version__
-from lidarspec.exports import Message, Refused, messages
+from lidarspec.exports import Message, Refused, asked, messages
 from lidarspec.framing.frame_engine import codec
 from lidarspec.spec import Checksum, Crc, Fold15, Sensor, Sum, Tcp, Udp, WordXor, Xor, ZeroPadded, tree
 from lidarspec.spec.bits import BitField
@@ -80,7 +79,6 @@ SUMMED = 4
 Table = dict[str, Any]
 
 
-@dataclass
 class _Writer:
     """Writes the tables of one frame type.
 
@@ -91,16 +89,11 @@ class _Writer:
         types: name of a field of Wireshark -> family of its type.
     """
 
-    message: Message
-    prefix: str
-    kept: set[str] = field(init=False)
-    marked: set[str] = field(init=False)
-    types: dict[str, str] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        asked = {ref.path for node in tree.nodes(self.message.root) for value in tree.formulas(node) for ref in tree.refs(value)}
-        self.kept = asked | self.message.seals.keys()
-        self.marked = {path for seal in self.message.seals.values() for path in seal.over or ()}
+    def __init__(self, message: Message, prefix: str) -> None:
+        self.message, self.prefix = message, prefix
+        self.kept = {ref.path for ref in asked(message.root)} | message.seals.keys()
+        self.marked = {path for seal in message.seals.values() for path in seal.over or ()}
+        self.types: dict[str, str] = {}
 
     def node(self, node: tree.Node, path: str = "") -> Table:
         """A node as a table; `skip` says how many bytes it takes where it need not be looked at to measure the frame."""

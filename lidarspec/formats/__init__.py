@@ -11,10 +11,10 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
-from lidarspec.errors import LidarSpecError, SourceError, SpecError, UnknownFormat
+from lidarspec.errors import LidarSpecError, SpecError, UnknownFormat, system_errors
 from lidarspec.formats.arrays import NPZ
 from lidarspec.formats.text import CSV
 from lidarspec.plugins import registry
@@ -54,6 +54,24 @@ def format_of(path: str | Path) -> Format:
     return known[suffix]
 
 
+@contextlib.contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """A file beside another one to write to, which takes its place when the block ends, and is gone if that fails.
+
+    Raises:
+        SourceError: where the file cannot be written.
+    """
+    part = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
+    try:
+        with system_errors(path):
+            part.unlink(missing_ok=True)
+            yield part
+            os.replace(part, path)
+    finally:
+        with contextlib.suppress(OSError):
+            part.unlink()
+
+
 def write(path: str | Path, scans: Iterable[Scan], *, every_point: bool = False) -> None:
     """Write scans to a file in the format of its suffix.
 
@@ -67,14 +85,5 @@ def write(path: str | Path, scans: Iterable[Scan], *, every_point: bool = False)
     """
     path = Path(path)
     chosen = format_of(path)
-    part = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
-    try:
-        with contextlib.suppress(FileNotFoundError):
-            part.unlink()
+    with replacing(path) as part:
         chosen(part, scans, every_point=every_point)
-        os.replace(part, path)
-    except OSError as error:
-        raise SourceError(f"{path}: {error.strerror or error}") from None
-    finally:
-        with contextlib.suppress(OSError):
-            part.unlink()

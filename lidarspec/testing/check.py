@@ -16,7 +16,7 @@ import inspect
 import re
 import tomllib
 import traceback
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -220,32 +220,29 @@ Spot = tuple[str, int]
 
 
 class Places:
-    """The text of some modules, to be asked where things stand in it."""
+    """The text of some modules by file, to be asked where things stand in it: fields by their names, all else by kind and name."""
 
-    def __init__(self, files: Iterable[Path]) -> None:
-        self._fields: list[tuple[tuple[str, ...], Spot]] = []
-        self._keys: dict[str, Spot] = {}
-        self._frames: dict[str, Spot] = {}
-        self._sensors: dict[str, Spot] = {}
-        for file in files:
-            tree = ast.parse(file.read_text(encoding="utf-8"), str(file))
-            self._fields += [(chain, (str(file), line)) for chain, line in _fields(tree, ())]
-            self._read(tree, str(file))
+    def __init__(self, trees: Mapping[str, ast.Module]) -> None:
+        self._fields = [(chain, (file, line)) for file, tree in trees.items() for chain, line in _fields(tree, ())]
+        self._others: dict[tuple[str, str], Spot] = {}
+        for file, tree in trees.items():
+            for kind, name, line in _named(tree):
+                self._others.setdefault((kind, name), (file, line))
 
     def placed(self, finding: Finding, sensor: Sensor | None = None) -> Finding:
         """The finding with the file and line of what it is about, where they can be told."""
         if finding.file:
             return finding
-        spot = self._spot(finding.path, sensor) or (self._sensors.get(sensor.id) if sensor else None)
+        spot = self._spot(finding.path, sensor) or (self._others.get(("sensor", sensor.id)) if sensor else None)
         return replace(finding, file=spot[0], line=spot[1]) if spot else finding
 
     def _spot(self, path: str, sensor: Sensor | None) -> Spot | None:
         path = re.sub(r"\[\d*\]", "", path.rpartition(" ")[2])
         frame, _, below = path.partition(".")
         if frame == "commands":
-            return self._keys.get(below.partition(".")[0])
+            return self._others.get(("key", below.partition(".")[0]))
         function = self._function(frame, below, sensor) if below in ("points", "plausible", "sweep") else None
-        return function or (self._field(tuple(below.split("."))) if below else None) or self._frames.get(frame)
+        return function or (self._field(tuple(below.split("."))) if below else None) or self._others.get(("frame", frame))
 
     def _function(self, frame: str, name: str, sensor: Sensor | None) -> Spot | None:
         if sensor is None or frame not in sensor.frames:
@@ -265,19 +262,21 @@ class Places:
         fitting = [(len(chain), spot) for chain, spot in self._fields if parts[-len(chain) :] == chain]
         return max(fitting, key=lambda found: found[0])[1] if fitting else None
 
-    def _read(self, tree: ast.Module, file: str) -> None:
-        for node in ast.walk(tree):
-            match node:
-                case ast.Dict(keys=keys, values=values):
-                    for key, value in zip(keys, values, strict=True):
-                        if isinstance(key, ast.Constant) and isinstance(key.value, str):
-                            self._keys.setdefault(key.value, (file, key.lineno))
-                            if isinstance(value, ast.Call) and ast.unparse(value.func).endswith(("Frame", "replace")):
-                                self._frames.setdefault(key.value, (file, key.lineno))
-                case ast.Call(args=[ast.Constant(value=str(name)), *_]):
-                    self._sensors.setdefault(name, (file, node.lineno))
-                case ast.keyword(arg="id", value=ast.Constant(value=str(name))):
-                    self._sensors.setdefault(name, (file, node.value.lineno))
+
+def _named(tree: ast.Module) -> Iterator[tuple[str, str, int]]:
+    """What may be a key, a frame type or a sensor: kind, name and line."""
+    for node in ast.walk(tree):
+        match node:
+            case ast.Dict(keys=keys, values=values):
+                for key, value in zip(keys, values, strict=True):
+                    if isinstance(key, ast.Constant) and isinstance(key.value, str):
+                        yield "key", key.value, key.lineno
+                        if isinstance(value, ast.Call) and ast.unparse(value.func).endswith(("Frame", "replace")):
+                            yield "frame", key.value, key.lineno
+            case ast.Call(args=[ast.Constant(value=str(name)), *_]):
+                yield "sensor", name, node.lineno
+            case ast.keyword(arg="id", value=ast.Constant(value=str(name))):
+                yield "sensor", name, node.value.lineno
 
 
 def _fields(node: ast.AST, chain: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...], int]]:
@@ -298,13 +297,9 @@ WALL_CLOCKS = frozenset(
 BROAD = frozenset({"Exception", "BaseException"})
 
 
-def written(files: Iterable[Path]) -> list[Finding]:
-    """The findings in the text of some modules."""
-    found = []
-    for file in files:
-        tree = ast.parse(file.read_text(encoding="utf-8"), str(file))
-        found += [Finding(code, what, file=str(file), line=node.lineno) for code, what, node in _mistakes(tree)]
-    return found
+def written(trees: Mapping[str, ast.Module]) -> list[Finding]:
+    """The findings in the text of some modules, by file."""
+    return [Finding(code, what, file=file, line=node.lineno) for file, tree in trees.items() for code, what, node in _mistakes(tree)]
 
 
 def _mistakes(tree: ast.Module) -> Iterator[tuple[str, str, ast.expr | ast.stmt | ast.ExceptHandler]]:
@@ -410,8 +405,9 @@ def reports(
         vectors: golden vectors; by default those that the target has.
         watch: is told what is looked at.
     """
-    places = Places(target.files)
-    mistakes = [places.placed(finding) for finding in target.findings] + written(target.files)
+    trees = {str(file): ast.parse(file.read_text(encoding="utf-8"), str(file)) for file in target.files}
+    places = Places(trees)
+    mistakes = [places.placed(finding) for finding in target.findings] + written(trees)
     single = [sensor for sensor in target.sensors if len(target.sensors) == 1]
     if mistakes and not single:
         yield Report(name, mistakes)

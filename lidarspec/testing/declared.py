@@ -71,12 +71,12 @@ def _clock(sensor: Sensor) -> Findings:
     if not isinstance(clock, Clock) or callable(clock.source) or clock.wraps_at is not None or not sensor.frames:
         return
     fields = codec(sensor.frames[sensor.data_frame]).schema.fields
-    infos = [fields.get(path) for path in ((clock.source,) if isinstance(clock.source, str) else clock.source)]
+    paths = (clock.source,) if isinstance(clock.source, str) else clock.source
+    infos = [fields.get(path) for path in paths]
     spans = [info.limits[1] * info.scale * float(factor(info.unit, "s") or 0) if info and info.kind == "int" else np.inf for info in infos]
     if 0 < sum(spans) < LONG:
-        path = clock.source if isinstance(clock.source, str) else clock.source[0]
         what = f"it can count {sum(spans):g} s, then it starts again, and wraps_at is not given"
-        yield "LS509", what, f"{sensor.data_frame}.{path}"
+        yield "LS509", what, f"{sensor.data_frame}.{paths[0]}"
 
 
 def _frame(subject: Subject, name: str, frame: Frame) -> Findings:

@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import groupby
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from rich.color import Color, ColorSystem
 from rich.text import Text
 
 Depth = Literal["truecolor", "256", "standard", "none"]
@@ -80,10 +81,11 @@ def sgr(ink: int, depth: Depth) -> str:
         parts.append("1")
     if depth == "none" or chosen.rgb is None:
         parts += ["2"] * chosen.faint
-    elif depth == "truecolor":
-        parts.append("38;2;" + ";".join(map(str, chosen.rgb)))
+    elif depth == "standard":
+        parts.append(str(chosen.standard))
     else:
-        parts.append(f"38;5;{_cube(chosen.rgb)}" if depth == "256" else str(chosen.standard))
+        shown = ColorSystem.TRUECOLOR if depth == "truecolor" else ColorSystem.EIGHT_BIT
+        parts += Color.from_rgb(*chosen.rgb).downgrade(shown).get_ansi_codes()
     return f"\x1b[{';'.join(parts)}m"
 
 
@@ -92,17 +94,6 @@ def style(ink: int) -> str:
     chosen = INKS[ink]
     colour = "" if chosen.rgb is None else "#" + "".join(f"{part:02x}" for part in chosen.rgb)
     return " ".join(part for part in ("bold" if chosen.bold else "", colour) if part)
-
-
-def _cube(rgb: Rgb) -> int:
-    """The nearest colour of the 6 by 6 by 6 cube, or grey of the 24, among 256 colours."""
-    levels = (0, 95, 135, 175, 215, 255)
-    near = [min(range(6), key=lambda index, part=part: abs(levels[index] - part)) for part in rgb]  # type: ignore[misc]
-    grey = min(23, max(0, round((sum(rgb) / 3 - 8) / 10)))
-    cube_error = sum((levels[index] - part) ** 2 for index, part in zip(near, rgb, strict=True))
-    if sum((8 + 10 * grey - part) ** 2 for part in rgb) < cube_error:
-        return 232 + grey
-    return 16 + 36 * near[0] + 6 * near[1] + near[2]
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,7 +162,6 @@ class Cells:
         return Cells(codes, self.inks)
 
 
-@dataclass(eq=False)
 class Canvas:
     """Dots and labels on a grid of cells.
 
@@ -184,18 +174,11 @@ class Canvas:
         labels: text in cells, (row, column) -> character and ink.
     """
 
-    width: int
-    height: int
-    ramp: str = "range"
-    dots: NDArray[np.bool_] = field(init=False)
-    lines: NDArray[np.bool_] = field(init=False)
-    steps: NDArray[np.int16] = field(init=False)
-    labels: dict[tuple[int, int], tuple[str, int]] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        self.dots = np.zeros((DOWN * self.height, ACROSS * self.width), np.bool_)
-        self.lines = np.zeros_like(self.dots)
-        self.steps = np.full((self.height, self.width), -1, np.int16)
+    def __init__(self, width: int, height: int, ramp: str = "range") -> None:
+        self.width, self.height, self.ramp = width, height, ramp
+        self.dots, self.lines = np.zeros((2, DOWN * height, ACROSS * width), np.bool_)
+        self.steps = np.full((height, width), -1, np.int16)
+        self.labels: dict[tuple[int, int], tuple[str, int]] = {}
 
     def plot(self, column: NDArray[Any], row: NDArray[Any], shade: NDArray[Any]) -> None:
         """Set dots of points at fractional dot coordinates; what is outside is left out.

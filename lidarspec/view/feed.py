@@ -173,6 +173,11 @@ def totals(counters: Counters) -> dict[str, int]:
     }
 
 
+def told(value: float | None, form: str, times: float = 1) -> str:
+    """A figure as text, times a factor; "-" where it is not known."""
+    return "-" if value is None or not math.isfinite(value) else form.format(value * times)
+
+
 def _share(some: int, others: int) -> float:
     return some / (some + others) if some + others > 0 else 0.0
 

@@ -5,6 +5,7 @@ Around the picture stand title, figures, the meaning of the colours and the keys
 
 from __future__ import annotations
 
+import itertools
 import math
 import textwrap
 import time
@@ -21,7 +22,7 @@ from lidarspec.recording.recorders import recorder
 from lidarspec.scans.scans import Scan
 from lidarspec.transports.protocol import Chunk, Transport
 from lidarspec.view.canvas import ALARM, FAINT, GOOD, LABEL, PLAIN, RAMPS, STEPS, STRONG, Cells
-from lidarspec.view.feed import NOTHING, Feed, Reading
+from lidarspec.view.feed import NOTHING, Feed, Reading, told
 from lidarspec.view.polar import Look, look, picture
 from lidarspec.view.screen import Screen
 
@@ -49,8 +50,6 @@ KEYS = (
 _HINTS = (("space pause", "c colour"), ("+ - zoom", "0 all"), ("? help", "q quit"))
 
 Figure = tuple[str, str, int]
-#: names tried for a file before it is given up.
-TRIES = 100
 
 
 class Switch:
@@ -98,14 +97,12 @@ class Switch:
 
     def write(self, chunk: Chunk, direction: Literal["in", "out"] = "in") -> None:
         """Record what arrived or was sent, while it is on."""
-        current = self._recorder
-        if current is not None:
+        if (current := self._recorder) is not None:
             current.write(chunk, direction)
 
     def event(self, name: str, at: int | None = None, **details: Any) -> None:
         """Record that something happened, while it is on."""
-        current = self._recorder
-        if current is not None:
+        if (current := self._recorder) is not None:
             current.event(name, at, **details)
 
     def close(self) -> None:
@@ -121,28 +118,13 @@ class Switch:
             current.close()
 
     def _begin(self) -> None:
-        assert self._opened is not None
-        begin = f"{self.sensor_id}-{time.strftime('%Y%m%d-%H%M%S')}"
-        names = (f"{begin}{f'-{number}' if number else ''}.lsr" for number in range(TRIES))
-        path = self._folder / next(name for name in names if not (self._folder / name).exists())
         opened = self._opened
+        assert opened is not None
+        begin = f"{self.sensor_id}-{time.strftime('%Y%m%d-%H%M%S')}"
+        paths = (self._folder / f"{begin}{f'-{number}' if number else ''}.lsr" for number in itertools.count())
+        path = next(path for path in paths if not path.exists())
         self._recorder = recorder(path, self.sensor_id, self._source, datagrams=opened.datagrams, baud=opened.baud)
         self.name = path.name
-
-
-@dataclass(frozen=True)
-class Layout:
-    """Where things are: the picture's size, and whether the figures stand beside or below it."""
-
-    width: int
-    height: int
-    beside: bool
-
-    @classmethod
-    def of(cls, columns: int, lines: int) -> Layout:
-        """For a window; a narrow one has one line of figures below."""
-        beside = columns >= NARROWEST + BESIDE + 1 and lines >= 14
-        return cls(columns - BESIDE - 1 if beside else columns, max(lines - (1 if beside else 2), 1), beside)
 
 
 def _write_beside(whole: Cells, left: int, figures: Sequence[Figure], look: Look) -> None:
@@ -215,13 +197,7 @@ def _write_ramp(whole: Cells, row: int, column: int, look: Look) -> None:
 
 
 def _rate(name: str, rate: float | None) -> Figure:
-    if rate is None:
-        return name, "-", PLAIN
-    return name, f"{rate:.2%}".replace("%", " %"), ALARM if rate >= ALARMING else PLAIN
-
-
-def _told(value: float | None, form: str, times: float = 1.0) -> str:
-    return "-" if value is None else form.format(value * times)
+    return name, told(rate, "{:.2f} %", 100), ALARM if (rate or 0.0) >= ALARMING else PLAIN
 
 
 @dataclass(frozen=True)
@@ -313,25 +289,20 @@ class Window:
         return screen.keys.read(0)
 
     def cells(self, columns: int, lines: int) -> Cells:
-        """The window as it is now."""
+        """The window as it is now; the figures stand beside the picture, or below it in one line where the window is narrow."""
         self._take()
-        layout = Layout.of(columns, lines)
-        found = self._current_look()
-        points = self._scan.points if self._scan is not None else None
-        drawn = (
-            Cells.blank(layout.width, layout.height)
-            if points is None
-            else picture(points, width=layout.width, height=layout.height, look=found)
-        )
-        told = self._complaint()
-        if told:
-            note = message(layout.width, told)
-            drawn.paste(max((layout.height - note.size[1]) // 2, 0), (layout.width - note.size[0]) // 2, note)
+        is_wide = columns >= NARROWEST + BESIDE + 1 and lines >= 14
+        width, height = columns - BESIDE - 1 if is_wide else columns, max(lines - (1 if is_wide else 2), 1)
+        look, scan, complaint = self._current_look(), self._scan, self._complaint()
+        drawn = Cells.blank(width, height) if scan is None else picture(scan.points, width=width, height=height, look=look)
+        if complaint:
+            note = message(width, complaint)
+            drawn.paste(max((height - note.size[1]) // 2, 0), (width - note.size[0]) // 2, note)
         whole = Cells.blank(columns, lines)
         _write_title(whole, self._feed.device.sensor.id, self._source, *self._state())
         whole.paste(1, 0, drawn)
-        if layout.beside:
-            _write_beside(whole, layout.width, self._figures(), found)
+        if is_wide:
+            _write_beside(whole, width, self._figures(), look)
         else:
             _write_line(whole, self._figures())
         if self.choice.helped:
@@ -389,16 +360,16 @@ class Window:
         near = float(valid.min()) if len(valid) else math.nan
         lost = device.stats.lost
         figures = [
-            ("speed", _told(reading.speed_hz, "{:.1f} Hz"), STRONG),
-            ("packets", _told(reading.packet_rate_hz, "{:.0f} /s"), PLAIN),
-            ("input", _told(reading.bytes_per_s, "{:.1f} kB/s", 1e-3), PLAIN),
+            ("speed", told(reading.speed_hz, "{:.1f} Hz"), STRONG),
+            ("packets", told(reading.packet_rate_hz, "{:.0f} /s"), PLAIN),
+            ("input", told(reading.bytes_per_s, "{:.1f} kB/s", 1e-3), PLAIN),
             ("points", str(points), PLAIN),
-            ("valid", f"{len(valid) / points:.1%}".replace("%", " %") if points else "-", PLAIN),
-            ("nearest", _told(near if math.isfinite(near) else None, "{:.2f} m"), PLAIN),
+            ("valid", told(len(valid) / points if points else None, "{:.1f} %", 100), PLAIN),
+            ("nearest", told(near, "{:.2f} m"), PLAIN),
             _rate("errors", reading.error_rate if self._reading else None),
             _rate("skipped", reading.skipped_rate if self._reading else None),
             ("lost", str(lost) if lost or reading.loss_rate is not None else "-", ALARM if lost else PLAIN),
-            ("jitter", _told(reading.jitter_s, "{:.2f} ms", 1e3), PLAIN),
+            ("jitter", told(reading.jitter_s, "{:.2f} ms", 1e3), PLAIN),
         ]
         return figures if device.queued is None else [*figures, ("queue", str(device.queued), PLAIN)]
 

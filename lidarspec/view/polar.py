@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -86,17 +87,15 @@ def reach_of(cloud: PointCloud) -> float:
     return rounded_up(max(farthest if farthest <= FAR_BEYOND * most else most, 1e-3))
 
 
-def rounded_up(value: float) -> float:
-    """The next of a few round numbers, such as 1.2, 1.5, 2, 2.5, 3, 4 ... 10, 12."""
+def rounded_up(value: float, steps: Sequence[float] = ROUND) -> float:
+    """The next of a few round numbers, by default such as 1.2, 1.5, 2, 2.5, 3, 4 ... 10, 12."""
     power = 10.0 ** math.floor(math.log10(value))
-    return next((step * power for step in ROUND if step * power >= value * 0.999), 10 * power)
+    return next((step * power for step in steps if step * power >= value * 0.999), 10 * power)
 
 
 def ring_step(reach: float) -> float:
     """Metres from ring to ring: 1, 2 or 5 times a power of ten, at most four rings."""
-    rough = reach / RINGS
-    power = 10.0 ** math.floor(math.log10(rough))
-    return next(step * power for step in (1, 2, 5, 10) if step * power >= rough * 0.999)
+    return rounded_up(reach / RINGS, (1, 2, 5, 10))
 
 
 def _scale(width: int, height: int, reach: float) -> float:

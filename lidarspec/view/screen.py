@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import signal
 import sys
 import time
@@ -21,6 +22,8 @@ from lidarspec.view.canvas import Cells, Depth, sgr
 
 #: what the cursor keys send on POSIX, after escape, and on Windows, after a byte of their own.
 _POSIX = {"[A": "up", "[B": "down", "[C": "right", "[D": "left", "OA": "up", "OB": "down", "OC": "right", "OD": "left"}
+#: a cursor key, the sequence of another one, or a character.
+_KEY = re.compile(r"\x1b([\[O][A-D])|\x1b[\[O][^A-Za-z~]*.?|(.)", re.DOTALL)
 _WINDOWS = {"H": "up", "P": "down", "M": "right", "K": "left"}
 #: seconds between two looks at the keyboard on Windows, which has nothing to wait on.
 _LOOK = 0.02
@@ -49,21 +52,8 @@ class Keys:
 
 def decoded(text: str) -> list[str]:
     """The keys in what a POSIX terminal sent; sequences of other keys are left out."""
-    found: list[str] = []
-    while text:
-        if text[0] != "\x1b":
-            found.append(text[0])
-            text = text[1:]
-        elif text[1:3] in _POSIX:
-            found.append(_POSIX[text[1:3]])
-            text = text[3:]
-        elif text[1:2] in ("[", "O"):
-            end = next((place for place, character in enumerate(text[2:], 2) if character.isalpha() or character == "~"), len(text))
-            text = text[end + 1 :]
-        else:
-            found.append("escape")
-            text = text[1:]
-    return found
+    keys = _KEY.finditer(text)
+    return [_POSIX[key[1]] if key[1] else "escape" if key[2] == "\x1b" else key[2] for key in keys if key[1] or key[2]]
 
 
 if sys.platform == "win32":

@@ -168,5 +168,6 @@ def test_built_frames_go_to_files_and_back(tmp_path: Path) -> None:
     for target in (raw, text):
         ran("build", "cspc-m1c1-mini", "command", "mode=0xf0", "-o", target)
     assert raw.read_bytes() == bytes.fromhex(text.read_text(encoding="ascii")) == b"\xaa\x55\xf0\x0f"
+    assert ran("build", "cspc-m1c1-mini", "command", "mode=0xf0", "-o", "-").stdout_bytes == raw.read_bytes()
     assert printed("build", "cspc-m1c1-mini", "command", "mode=240")["hex"] == "aa 55 f0 0f"
     assert "0x0f ok (XOR-8 over 3 bytes)" in ran("explain", raw, "-s", "cspc-m1c1-mini").stdout
