@@ -15,9 +15,8 @@ from numpy.typing import NDArray
 
 from lidarspec.framing.results import CONSTANT, IMPLAUSIBLE, PLUGIN, SHORT, VALID, Frames
 from lidarspec.framing.search import Bytes1D, Framing, Mode, Offsets, Piece, count_rejected, fitting, merged
-from lidarspec.framing.steady import leading
 from lidarspec.wire.arrays import repeated
-from lidarspec.wire.layout import Layout
+from lidarspec.wire.layout import Layout, right
 
 #: strides judged together at first, and at most; and how many are judged sooner as the rows of an array.
 FIRST, LONGEST, FEW = 64, 1 << 14, 8
@@ -161,7 +160,8 @@ class Lane:
             return 0
         assert self._size
         rows = np.ndarray((number, self._size), np.uint8, self._buffer, spot, (self._size, 1))
-        count = leading(self._framing, self.kind, rows) or 0
+        marked = right(self._framing.words[self.kind], rows)
+        count = number if marked is None else int(marked.argmin())
         codec = self._framing.codecs[self.kind]
         survey = codec.survey_rows(rows[:count], sums=self._framing.sums) if count else None
         if survey is not None:
