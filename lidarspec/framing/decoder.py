@@ -213,8 +213,10 @@ class Decoder:
         places = frames.places
         if not self._gap and isinstance(places, range) and places.start == 0 and places.stop == end:
             return repeated(0, len(frames))
-        stops = np.append(frames.starts, end)
-        gaps = stops - np.concatenate([[0], frames.starts + frames.sizes])
+        gaps = np.empty(len(frames) + 1, np.int64)
+        gaps[:-1], gaps[-1] = frames.starts, end
+        stops = gaps.copy()
+        gaps[1:] -= frames.starts + frames.sizes
         gaps = self._skipped(buffer, gaps, stops)
         gaps[0] += self._gap
         self._gap = int(gaps[-1])

@@ -11,10 +11,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.framing.results import SHORT, Frames, Indices, Numbers
+from lidarspec.framing.results import Frames, Indices, Numbers
 from lidarspec.framing.search import Framing, Mode, Piece
 from lidarspec.wire.arrays import alike, repeated
-from lidarspec.wire.layout import Bytes2D, Marks, exclude, right
+from lidarspec.wire.layout import Bytes2D, Layout, Marks, exclude, right
 
 #: rows that are looked at before all are; bytes of a piece that is looked at so even after a piece with damaged frames.
 FEW, SMALL = 64, 1 << 16
@@ -99,18 +99,23 @@ def _piece(framing: Framing, mode: Mode, frames: Frames) -> Piece:
     """A piece that ends with these frames, and waits for a next one where that is there in part."""
     number, size = len(frames), mode.size
     rest = frames.buffer[number * size :]
-    need = _awaited(framing, mode, frames.kinds.item(0), rest) if 0 < len(rest) < size else 0
+    kind, layout = frames.kinds.item(0), frames.layout
+    need = _awaited(framing, mode, kind, layout, rest.tobytes()) if layout is not None and 0 < len(rest) < size else 0
     return Piece(frames, number * size, need > 0, need)
 
 
-def _awaited(framing: Framing, mode: Mode, kind: int, rest: NDArray[np.uint8]) -> int:
-    """How many bytes tell more of a next frame of the same type, of which so much is there; 0 where it may be something else."""
-    data = rest.tobytes()
-    first = next((other for other in framing.active(mode) if _begins(framing.marks[other], data)), None)
-    if first != kind or framing.codecs[kind].size is None:
+def _awaited(framing: Framing, mode: Mode, kind: int, layout: Layout, rest: bytes) -> int:
+    """How many bytes tell more of a next frame of the same layout, of which so much is there; 0 where it may be something else."""
+    first = next((other for other in framing.active(mode) if _begins(framing.marks[other], rest)), None)
+    if first != kind or framing.codecs[kind].size != layout.size:
         return 0
-    survey = framing.survey(kind, rest, np.zeros(1, np.intp), gathered=False)
-    return survey.sizes.item(0) if survey.status[0] == SHORT else 0
+    need = layout.size
+    for spot, (mask, value) in layout.constants.items():
+        if spot >= len(rest):
+            need = min(need, spot + 1)
+        elif rest[spot] & mask != value:
+            return 0
+    return need
 
 
 def _begins(marks: Marks, data: bytes) -> bool:

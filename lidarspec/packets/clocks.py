@@ -31,7 +31,7 @@ class Unwrapper:
     """
 
     def __init__(self, wraps_at: float | None) -> None:
-        self._turn = int(exact(wraps_at) * 10**9) if wraps_at else 0
+        self._turn = _turn(wraps_at) if wraps_at else 0
         self._last: tuple[int, int, int] | None = None
 
     def push(self, ns: Times, host: Times) -> Times:
@@ -40,7 +40,7 @@ class Unwrapper:
             return ns
         raw, time, at = self._last or (int(ns[0]), int(ns[0]), int(host[0]))
         half = self._turn // 2
-        steps = np.diff(ns, prepend=raw)
+        steps = _steps(ns, raw)
         over = np.flatnonzero((steps < -half) | (steps >= self._turn - half))
         if not len(over) and alike(host) == 0:
             times = ns if time == raw else ns + (time - raw)
@@ -82,6 +82,12 @@ def clock_ns(sensor: Spec, batch: Batch) -> Times:
 
 
 @lru_cache(maxsize=256)
+def _turn(seconds: float) -> int:
+    """So many seconds in nanoseconds, as the number is written."""
+    return int(exact(seconds) * 10**9)
+
+
+@lru_cache(maxsize=256)
 def _terms(paths: tuple[str, ...], schema: Schema, sensor: str) -> list[tuple[str, Any, Any, int]]:
     """The fields that add up to a clock: path, nanoseconds in one step and at zero, furthest reading (0 where these are fractions)."""
     found = []
@@ -105,6 +111,14 @@ def _scaling(unit: str, scale: float, offset: float) -> tuple[Any, Any] | None:
     if step.denominator == 1 and zero.denominator == 1 and step < 2**62:
         return int(step), int(zero)
     return step, zero
+
+
+def _steps(values: NDArray[np.int64], before: int) -> NDArray[np.int64]:
+    """Differences from one to the next, (n,), the first one to `before`."""
+    steps = np.empty(len(values), np.int64)
+    steps[0] = values[0] - before
+    np.subtract(values[1:], values[:-1], out=steps[1:])
+    return steps
 
 
 def _within(raw: NDArray[Any], furthest: int) -> Times:

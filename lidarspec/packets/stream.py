@@ -119,6 +119,8 @@ class PacketStream:
 
     def _states(self, parts: Sequence[_Part], number: int, *, whole: bool) -> dict[str, StateOf]:
         """The frames of each other type, and which of them was the last before each packet."""
+        if not self._state and all(part.where is None for part in parts):
+            return dict.fromkeys(self._others, (None, repeated(-1, number)))
         seen = self._others_in(parts)
         return {name: self._state_of(name, seen.get(name, []), number=number, whole=whole) for name in self._others}
 

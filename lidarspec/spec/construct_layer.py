@@ -548,11 +548,6 @@ def unnamed(raw: int) -> Any:
     return construct.EnumInteger(raw)
 
 
-def _evaluated(expression: Any, paths: tuple[str, ...], read: tree.Read) -> Any:
-    """The value of an expression in a struct; `paths` of that and of all around it, innermost first."""
-    return expression(_Fields(read, paths)) if callable(expression) else expression
-
-
 @dataclass(frozen=True)
 class _Place:
     """Where in the tree a construct stands: what is said of it, what its expressions see, and whether it is a part of a bit block."""
@@ -648,8 +643,11 @@ class _Builder:
         while scope is not None:
             paths.append(scope.path)
             scope = scope.parent
-        function = functools.partial(_evaluated, expression, tuple(paths or [""]))
-        path = place.info.path
+        ways, path = tuple(paths or [""]), place.info.path
+
+        def function(read: tree.Read) -> Any:
+            return expression(_Fields(read, ways)) if callable(expression) else expression
+
         return tree.Code(function, tuple(dict.fromkeys(asked)), f"{path}: {reason}", _spelled(expression, path), blind)
 
     def _select(self, con: construct.Switch, place: _Place) -> tree.Select:

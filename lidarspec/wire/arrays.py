@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from functools import lru_cache
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -63,8 +64,9 @@ def by_value(values: NDArray[Any], few: int) -> list[tuple[int, NDArray[np.intp]
     if not len(left):
         return [(value, np.flatnonzero(values == value)) for value in sorted(found)]
     order = np.argsort(values, kind="stable")
-    edges = np.flatnonzero(np.diff(values[order])) + 1
-    return [(values.item(places[0]), places) for places in np.split(order, edges)]
+    ordered = values[order]
+    edges = [0, *(np.flatnonzero(ordered[1:] != ordered[:-1]) + 1).tolist(), len(values)]
+    return [(ordered.item(start), order[start:stop]) for start, stop in pairwise(edges)]
 
 
 def taken(rows: NDArray[np.uint8], which: NDArray[np.intp] | NDArray[np.bool_]) -> NDArray[np.uint8]:
