@@ -74,7 +74,8 @@ class Watch:
             return "disconnected"
         if self.silent_for > PATIENCE:
             return "silent"
-        if self._unframed_since is not None and time.monotonic() - self._unframed_since > PATIENCE and self._unframed > self._longest:
+        longest = max((frame.max_length * frame.confirm for frame in self._sensor.frames.values()), default=0)
+        if self._unframed_since is not None and time.monotonic() - self._unframed_since > PATIENCE and self._unframed > longest:
             return "no frames"
         return "streaming" if self._decoder.stats.frames else "waiting"
 
@@ -98,10 +99,6 @@ class Watch:
     @property
     def _unframed(self) -> int:
         return self._decoder.stats.bytes_in - self._bytes
-
-    @property
-    def _longest(self) -> int:
-        return max((frame.max_length * frame.confirm for frame in self._sensor.frames.values()), default=0)
 
 
 class LiveInput(Input):
