@@ -362,16 +362,15 @@ class LiveInput(Input):
 def _runs(events: list[Event]) -> list[tuple[str, list[Chunk] | Mark | BaseException]]:
     """Events with consecutive chunks of one link joined, up to where the line was interrupted."""
     found: list[tuple[str, list[Chunk] | Mark | BaseException]] = []
-    of = ""
-    run: list[Chunk] = []
+    run: list[Chunk] = []  # the last of them, empty where that is no chunks
     for link, item in events:
         if not isinstance(item, Chunk):
+            run = []
             found.append((link, item))
-            of = ""
-        elif link == of and not item.gap:
+        elif run and found[-1][0] == link and not item.gap:
             run.append(item)
         else:
-            run, of = [item], link
+            run = [item]
             found.append((link, run))
     return found
 

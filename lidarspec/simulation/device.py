@@ -51,8 +51,7 @@ class Request:
     values: Mapping[str, Any]
 
 
-@dataclass(frozen=True)
-class Answered:
+class Answered(NamedTuple):
     """A piece of an answer: the name of a frame and its bytes; no name for bytes that are no frame. Or seconds of a pause."""
 
     frame: str = ""
