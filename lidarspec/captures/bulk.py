@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -102,21 +102,14 @@ def alike(record: bytes, headers: Headers, source: Sender, form: Form) -> Alike 
     return Alike(len(record), start, headers.payload, source, pattern.times, value, mask.view(np.uint64), pattern.trailer)
 
 
-class Walk(NamedTuple):
-    """Where the records that are whole begin, and where the last one ends; `stuck`: what follows has to be read plainly."""
-
-    starts: Indices
-    stuck: bool
-
-
-def walked(storage: NDArray[np.uint8], start: int, stop: int, form: Form) -> Walk:
-    """The records of a window from `start` to `stop`."""
+def walked(storage: NDArray[np.uint8], start: int, stop: int, form: Form) -> tuple[Indices, bool]:
+    """Where whole records begin from `start` to `stop`, and where the last one ends; and whether what follows has to be read plainly."""
     pieces: list[Indices] = []
     single: list[int] = []
     at, before, patience, length = start, 0, 0, -1
     view = storage.data
     if stop - at < _HEAD:
-        return Walk(np.array([at], np.intp), False)
+        return np.array([at], np.intp), False
     while stop - at >= _HEAD and (length := form.length(view, at)) and at + length <= stop:
         if length == before and not patience and stop - at >= _RUN * length:
             run = _same(storage, at, (stop - at) // length, length, form)
@@ -125,7 +118,7 @@ def walked(storage: NDArray[np.uint8], start: int, stop: int, form: Form) -> Wal
             continue
         single.append(at)
         at, before, patience = at + length, length, max(patience - 1, 0)
-    return Walk(np.concatenate([*pieces, np.array([*single, at], np.intp)]), length == 0)
+    return np.concatenate([*pieces, np.array([*single, at], np.intp)]), length == 0
 
 
 def _same(storage: NDArray[np.uint8], at: int, count: int, length: int, form: Form) -> int:
@@ -206,8 +199,7 @@ def first_frames(decoder: Decoder, batches: Iterable[Batch], wanted: Collection[
 class CaptureBatches(CaptureReader):
     """The datagrams of a capture in batches of arrays, which say of each what `CaptureReader` says; read either way, not both."""
 
-    def _reading(self, file: BinaryIO) -> Source:
-        return Source(file, largest=LARGEST)
+    largest = LARGEST
 
     def batches(self) -> Iterator[Batch]:
         """The datagrams of the file, as many at once as were read at once."""
@@ -215,10 +207,10 @@ class CaptureBatches(CaptureReader):
         with self._to_the_end():
             form = records(self._source)
             while self._source.begin_record():
-                walk = walked(self._source.storage, self._source.at, self._source.stop, form)
-                if len(walk.starts) < 2 and not walk.stuck and self._source.more():
+                starts, stuck = walked(self._source.storage, self._source.at, self._source.stop, form)
+                if len(starts) < 2 and not stuck and self._source.more():
                     continue
-                starts = walk.starts if len(walk.starts) > 1 else np.array([self._source.at])
+                starts = starts if len(starts) > 1 else np.array([self._source.at])
                 found = _Records(self, self._source, form, starts, known)
                 ended = found.read()
                 if len(batch := found.batch()):

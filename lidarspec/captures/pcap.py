@@ -16,7 +16,7 @@ from functools import lru_cache
 from typing import BinaryIO
 
 from lidarspec.captures.ip import LARGEST_PAYLOAD, Reassembly, Refused, address, ip_packet, udp, udp_frame
-from lidarspec.captures.records import CapturedPacket, Damaged, Passed, Source, Truncated, is_capture, packet_record, records
+from lidarspec.captures.records import SMALLEST, CapturedPacket, Damaged, Passed, Source, Truncated, is_capture, packet_record, records
 from lidarspec.errors import SourceError, UsageError, system_errors
 from lidarspec.transports.protocol import Closing
 
@@ -77,10 +77,13 @@ class CaptureReader(Closing):
 
     Attributes:
         stats: what was met so far.
+        largest: bytes that are read at once, at most.
 
     Raises:
         SourceError: the file cannot be read, or is no capture at all. Damage further on is counted, never raised.
     """
+
+    largest = SMALLEST
 
     def __init__(self, file: BinaryIO | str | os.PathLike[str]) -> None:
         self.stats = CaptureStats()
@@ -88,7 +91,7 @@ class CaptureReader(Closing):
         if isinstance(file, str | os.PathLike):
             with system_errors(os.fspath(file)):
                 file = self._owned = open(file, "rb")  # noqa: SIM115  closed by `close`
-        self._source = self._reading(file)
+        self._source = Source(file, largest=self.largest)
         self._fragments = Reassembly()
         self._datagrams: Iterator[Datagram] | None = None
         try:
@@ -109,9 +112,6 @@ class CaptureReader(Closing):
         """Closes the file, if it was given as a path."""
         if self._owned is not None:
             self._owned.close()
-
-    def _reading(self, file: BinaryIO) -> Source:
-        return Source(file)
 
     def _walk(self) -> Iterator[Datagram]:
         with self._to_the_end():

@@ -138,12 +138,9 @@ class AsyncDevice:
         opening = asyncio.get_running_loop().run_in_executor(self._sender, self._opening)
         try:
             self._device = await _whole(opening)
-        except asyncio.CancelledError:
+        except BaseException:
             if opening.done() and not opening.cancelled() and opening.exception() is None:
                 self._device = opening.result()
-            await self.close()
-            raise
-        except BaseException:
             await self.close()
             raise
         return self

@@ -11,7 +11,7 @@ import itertools
 import socket
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -76,7 +76,7 @@ def demonstrate(sensor: Sensor, *, turns: int = 5, errors: float = 0.01, seed: i
         place, replies, scans, stats = _live(sensor, simulated, path, turns)
         line, recorded = simulated.lines["data"], path.stat().st_size
         with open_device(path, sensor) as recording:
-            again = digest(_whole(recording.scans(), turns))
+            again = digest(list(itertools.islice((scan for scan in recording.scans() if scan.complete), turns)))
     digested = digest([scan for scan in scans if scan.complete])
     return Demonstration(sensor, place, replies, scans, stats, line.sent, line.intact, digested, again, recorded)
 
@@ -121,10 +121,6 @@ def _read(device: Device, served: Served, turns: int) -> tuple[tuple[Reply, ...]
             break
     number = f"{len(scans)} scans in {PATIENCE + turns:g} s, and not {turns}"
     raise SourceError(f"the simulated {device.sensor.id} gave {number}: {device.stats}")
-
-
-def _whole(scans: Iterator[Scan], number: int) -> list[Scan]:
-    return list(itertools.islice((scan for scan in scans if scan.complete), number))
 
 
 def _free_port() -> int:

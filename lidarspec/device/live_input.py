@@ -74,7 +74,8 @@ class Watch:
             return "disconnected"
         if self.silent_for > PATIENCE:
             return "silent"
-        if self._unframed_since is not None and time.monotonic() - self._unframed_since > PATIENCE and self._unframed > self._longest:
+        longest = max((frame.max_length * frame.confirm for frame in self._sensor.frames.values()), default=0)
+        if self._unframed_since is not None and time.monotonic() - self._unframed_since > PATIENCE and self._unframed > longest:
             return "no frames"
         return "streaming" if self._decoder.stats.frames else "waiting"
 
@@ -98,10 +99,6 @@ class Watch:
     @property
     def _unframed(self) -> int:
         return self._decoder.stats.bytes_in - self._bytes
-
-    @property
-    def _longest(self) -> int:
-        return max((frame.max_length * frame.confirm for frame in self._sensor.frames.values()), default=0)
 
 
 class LiveInput(Input):
@@ -365,16 +362,15 @@ class LiveInput(Input):
 def _runs(events: list[Event]) -> list[tuple[str, list[Chunk] | Mark | BaseException]]:
     """Events with consecutive chunks of one link joined, up to where the line was interrupted."""
     found: list[tuple[str, list[Chunk] | Mark | BaseException]] = []
-    of = ""
-    run: list[Chunk] = []
+    run: list[Chunk] = []  # the last of them, empty where that is no chunks
     for link, item in events:
         if not isinstance(item, Chunk):
+            run = []
             found.append((link, item))
-            of = ""
-        elif link == of and not item.gap:
+        elif run and found[-1][0] == link and not item.gap:
             run.append(item)
         else:
-            run, of = [item], link
+            run = [item]
             found.append((link, run))
     return found
 

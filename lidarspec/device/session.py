@@ -125,11 +125,6 @@ class Expected:
     tables: Mapping[str, Mapping[str, FieldInfo]]
     values: Mapping[str, Any]
 
-    @classmethod
-    def of(cls, command: Command, tables: Mapping[str, Mapping[str, FieldInfo]], request: Any) -> Expected:
-        """What answers a command of which `request` are the fields sent."""
-        return cls(tables, {**command.matches, **{path: found_at(request, path) for path in command.echoes}})
-
     def differs(self, frame: str, values: Any) -> list[str]:
         """What is wrong with a frame as the reply, field by field; empty where it is the reply."""
         if frame not in self.tables:
@@ -261,10 +256,11 @@ class Session:
         data = self.sensor.command(name, **arguments)
         command = self.sensor.commands[name]
         tables = {reply: self._table(reply) for reply in command.replies}
-        request = self.sensor.parse(data, command.frame) if command.echoes else None
+        sent = self.sensor.parse(data, command.frame) if command.echoes else None
+        values = {**command.matches, **{path: found_at(sent, path) for path in command.echoes}}
         wait = _ns(command.timeout) * (1 + command.retries) if timeout is None else _ns(timeout)
         pending = Pending(f"{self.sensor.id} {name}")
-        expected = Expected.of(command, tables, request) if tables else None
+        expected = Expected(tables, values) if tables else None
         self._lines.setdefault(command.link, _Line()).queue.append(_Request(name, command, data, expected, wait, pending))
         if command.every:
             self._beats[name] = _Beat(arguments, now + _ns(command.every), pending)

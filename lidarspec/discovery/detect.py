@@ -356,10 +356,8 @@ def nearest(data: bytes) -> WireError | None:
     for sensor in sensors().values():
         try:
             parse_typed(sensor, data)
-        except WireError as fault:
-            faults.append(fault)
-        except LidarSpecError:
-            continue
+        except LidarSpecError as fault:
+            faults += [fault] if isinstance(fault, WireError) else []
     return max((fault for fault in faults if _begins_alike(fault)), key=lambda fault: fault.offset, default=None)
 
 

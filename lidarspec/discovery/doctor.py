@@ -100,10 +100,8 @@ def _permission(port: str) -> Iterator[Finding]:
     if not ports.allowed(port):
         group = ports.group(port)
         text = f"{port}: this user may not open it"
-        if group:
-            yield Finding(False, f"{text}; the group {group} may, from the next login on", f"sudo usermod -aG {group} $USER")
-        else:
-            yield Finding(False, f"{text}; nobody but root may", _rule(port))
+        by_group = Finding(False, f"{text}; the group {group} may, from the next login on", f"sudo usermod -aG {group} $USER")
+        yield by_group if group else Finding(False, f"{text}; nobody but root may", _rule(port))
 
 
 def _rule(port: str) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -126,12 +127,8 @@ class Samples:
     def __init__(self, frames: Iterable[bytes], *, most: int = 256) -> None:
         distinct = list(dict.fromkeys(frame for frame in frames if frame))[:most]
         self.frames: list[bytes] = sorted(distinct, key=len)
-        by_length: dict[int, list[bytes]] = {}
-        for frame in self.frames:
-            by_length.setdefault(len(frame), []).append(frame)
-        self.groups: list[NDArray[np.uint8]] = [
-            np.frombuffer(b"".join(group), np.uint8).reshape(len(group), length) for length, group in by_length.items()
-        ]
+        groups = (list(group) for _, group in itertools.groupby(self.frames, len))
+        self.groups: list[NDArray[np.uint8]] = [np.frombuffer(b"".join(group), np.uint8).reshape(len(group), -1) for group in groups]
 
     def __len__(self) -> int:
         return len(self.frames)

@@ -193,6 +193,8 @@ class _Trail:
 
     def __init__(self, frame: Frame, data: bytes) -> None:
         self._data, self._schema = data, schema(frame.tree)
+        fields = self._schema.fields.values()
+        self._arrays = [axis for info in fields for axis in (info.axes[:-1] if info.kind == "bytes" else info.axes)]
         self._blocks = dict(_blocks(frame.tree, ""))
         trail: list[Seen] = []
         self.failed = True
@@ -234,12 +236,8 @@ class _Trail:
         head, bracket, _ = path.rpartition("]")
         array = plain(head + bracket)
         in_blocks = tuple(f"{plain(block)}." for block in self._blocks)
-        further = any(axis.startswith(f"{array}.") and not axis.startswith(in_blocks) for axis in self._arrays())
+        further = any(axis.startswith(f"{array}.") and not axis.startswith(in_blocks) for axis in self._arrays)
         return path if not bracket or further else head + bracket
-
-    def _arrays(self) -> Iterator[str]:
-        for info in self._schema.fields.values():
-            yield from info.axes[:-1] if info.kind == "bytes" else info.axes
 
     def _row(self, path: str, group: Sequence[tuple[str, Seen]]) -> Row:
         start, end = group[0][1].start, group[-1][1].end

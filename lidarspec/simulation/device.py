@@ -15,8 +15,8 @@ import math
 import random
 from collections import Counter
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, replace
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 from lidarspec.errors import SpecError
 from lidarspec.framing.decoder import Decoder
@@ -51,8 +51,7 @@ class Request:
     values: Mapping[str, Any]
 
 
-@dataclass(frozen=True)
-class Answered:
+class Answered(NamedTuple):
     """A piece of an answer: the name of a frame and its bytes; no name for bytes that are no frame. Or seconds of a pause."""
 
     frame: str = ""
@@ -133,15 +132,14 @@ def _flat(values: Mapping[str, Any], prefix: str = "") -> Iterable[tuple[str, An
             yield f"{prefix}{name}", value
 
 
-@dataclass(order=True, frozen=True)
-class _Due:
+class _Due(NamedTuple):
     """Something to be sent at a time, ns since the device was switched on; what was planned first goes first."""
 
     at: float
     number: int
-    link: str = field(compare=False)
-    frame: str = field(compare=False)
-    data: bytes = field(compare=False)
+    link: str
+    frame: str
+    data: bytes
 
 
 class _Stream:

@@ -104,15 +104,13 @@ class Line:
             else:
                 harmed = self._harmed(data)
                 self.intact += harmed == data
-                heapq.heappush(self._late, (self._number + self._delay(), self._number, name, harmed))
+                depth = self._faults.reorder
+                delay = self._source.randint(1, depth) if depth and self._source.random() < LATE else 0
+                heapq.heappush(self._late, (self._number + delay, self._number, name, harmed))
             while self._late and self._late[0][0] <= self._number:
                 arrived.append(heapq.heappop(self._late)[2:])
             self._number += 1
         return arrived
-
-    def _delay(self) -> int:
-        depth = self._faults.reorder
-        return self._source.randint(1, depth) if depth and self._source.random() < LATE else 0
 
     def _gap(self) -> int:
         """Sound bytes up to the next damaged one."""

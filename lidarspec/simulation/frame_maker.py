@@ -36,9 +36,8 @@ class FrameMaker:
         self.sensor, self.engine = sensor, engine
         self._layouts: dict[tuple[int, ...], Layout] = {}
         self._asked: list[str] = []
-        self._elsewhere = {
-            path for other in sensor.frames.values() if other.data and sensor.frames[frame].data for path in codec(other).schema.fields
-        }
+        others = sensor.data_frames if sensor.frames[frame].data else ()
+        self._elsewhere = {path for other in others for path in codec(sensor.frames[other]).schema.fields}
 
     def table(self, frames: Sequence[Values]) -> Rows:
         """One frame for each mapping of field paths to physical values; arrays may be given as bytes, too.
@@ -61,30 +60,28 @@ class FrameMaker:
 
     def _layout(self, values: Values) -> Layout:
         """The layout that these values of header fields ask for."""
-        known = self._layouts.get(tuple(self._raw(values, path) for path in self._asked))
-        if known is None:
-            asked: list[str] = []
-            known = self._walked(values, asked)
-            self._layouts = self._layouts if asked == self._asked else {}
-            self._asked = asked
-            self._layouts[tuple(self._raw(values, path) for path in asked)] = known
-        return known
+        frame = self.engine.frame
+        while True:
+            header = {path: self._raw(values, path) for path in self._asked}
+            key = tuple(header.values())
+            try:
+                if key not in self._layouts:
+                    self._layouts[key] = layout_of(frame.tree, header, frame.max_length)
+                return self._layouts[key]
+            except Unknown as unknown:
+                self._asked.append(unknown.leaf.info.path)
+                self._layouts.clear()
+            except TooLong as error:
+                raise self._too_long(values, str(error)) from None
 
-    def _walked(self, values: Values, asked: list[str]) -> Layout:
-        frame, fields = self.engine.frame, self.engine.schema.fields
-        try:
-            while True:
-                try:
-                    return layout_of(frame.tree, {path: self._raw(values, path) for path in asked}, frame.max_length)
-                except Unknown as unknown:
-                    asked.append(unknown.leaf.info.path)
-        except TooLong as error:
-            left_out = [path for path in asked if path not in values and fields[path].const is None]
-            given = ", ".join(f"{path} = {values[path]}" for path in asked if path in values)
-            reason = f"with {given} there is no frame of at most {frame.max_length} bytes (max_length)"
-            if left_out:
-                reason = f"sweep has to give {left_out[0]!r}, which the length of the frame depends on"
-            raise SpecError(reason, path=str(error), sensor=self.sensor.id) from None
+    def _too_long(self, values: Values, path: str) -> SpecError:
+        fields, most = self.engine.schema.fields, self.engine.frame.max_length
+        left_out = [path for path in self._asked if path not in values and fields[path].const is None]
+        given = ", ".join(f"{path} = {values[path]}" for path in self._asked if path in values)
+        reason = f"with {given} there is no frame of at most {most} bytes (max_length)"
+        if left_out:
+            reason = f"sweep has to give {left_out[0]!r}, which the length of the frame depends on"
+        return SpecError(reason, path=path, sensor=self.sensor.id)
 
     def _rows(self, layout: Layout, frames: Sequence[Values]) -> NDArray[np.uint8]:
         rows = np.zeros((len(frames), layout.size), np.uint8)

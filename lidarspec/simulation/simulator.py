@@ -15,7 +15,7 @@ Points by coordinates (M2) are linear in the range: with the directions declared
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -174,7 +174,7 @@ class Measurement:
         for path, info in table.schema.fields.items():
             if factor(info.unit, "m") is None or not any(path in group.layout.leaves for group in table.groups):
                 continue
-            (answer,) = self._answers(table, path, PROBE)
+            answer = self._probed(table, [path], PROBE)[0].range
             expected = info.physical(PROBE)
             inner = [spot for spot in self._inner(table, answer) if np.isclose(_part(answer, spot), expected).any()]
             found += [Target(path, spot, info.scale, info.offset) for spot in inner]
@@ -192,7 +192,7 @@ class Measurement:
             metres = factor(info.unit, "m") is not None
             if not metres and (info.unit or info.kind != "int" or not info.axes):
                 continue
-            answers = self._answers(table, path, PROBE, 2 * PROBE, 3 * PROBE)
+            answers = [beams.range for beams in self._probed(table, [path], PROBE, 2 * PROBE, 3 * PROBE)]
             for spot in self._inner(table, answers[0]):
                 once, twice, thrice = (_part(answer, spot) for answer in answers)
                 even = np.isclose(thrice - twice, twice - once) & (twice > once) & (once > 0)
@@ -200,20 +200,22 @@ class Measurement:
                     found.append(Target(path, spot, None))
         return found
 
-    def _answers(self, table: Rows, path: str, *probes: int) -> list[Floats]:
-        """The ranges while a field has one value and another; the table is left as it was."""
-        before, answers = table.raw(path), []
+    def _probed(self, table: Rows, paths: Iterable[str], *probes: int) -> list[Beams]:
+        """The beams while some fields have one value and another; the table is left as it was."""
+        before, beams = {path: table.raw(path) for path in paths}, []
         for probe in probes:
-            store(table, path, np.array(probe))
-            answers.append(self.beams(table).range)
-        store(table, path, before)
-        return answers
+            for path in before:
+                store(table, path, np.array(probe))
+            beams.append(self.beams(table))
+        for path, raw in before.items():
+            store(table, path, raw)
+        return beams
 
     def _step(self, table: Rows, target: Target) -> tuple[Any, Any]:
         """Metres of one raw step and of raw 0, numbers or for each point."""
         if target.step is not None:
             return target.step, target.zero
-        once, twice = (_part(answer, target.inner) for answer in self._answers(table, target.path, PROBE, 2 * PROBE))
+        once, twice = (_part(beams.range, target.inner) for beams in self._probed(table, [target.path], PROBE, 2 * PROBE))
         return (twice - once) / PROBE, 2 * once - twice
 
     def _inner(self, table: Rows, answer: Floats) -> list[tuple[int, ...]]:
@@ -223,15 +225,7 @@ class Measurement:
 
     def _turning(self, table: Rows) -> bool:
         """Whether directions depend on ranges."""
-        directions: list[Beams] = []
-        before = {target.path: table.raw(target.path) for target in self._targets}
-        for probe in (PROBE, 2 * PROBE):
-            for path in before:
-                store(table, path, np.array(probe))
-            directions.append(self.beams(table))
-        for path, raw in before.items():
-            store(table, path, raw)
-        first, second = directions
+        first, second = self._probed(table, [target.path for target in self._targets], PROBE, 2 * PROBE)
         same = (np.array_equal(getattr(first, name), getattr(second, name), equal_nan=True) for name in ("azimuth", "elevation"))
         return not all(same)
 

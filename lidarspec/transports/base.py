@@ -7,6 +7,7 @@ import re
 import select
 import sys
 import time
+from abc import abstractmethod
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,10 +18,12 @@ from lidarspec.errors import SourceError, UnknownOption, UsageError, suggest
 from lidarspec.spec.description import Spec
 from lidarspec.spec.links import Link
 from lidarspec.spec.sensor import Sensor
-from lidarspec.transports.protocol import Disconnected
+from lidarspec.transports.protocol import Chunk, Disconnected, LiveTransport
 
 #: options that every live SOURCE takes: the address of the link that commands go over, where it is not that of the data.
 COMMON = frozenset({"control"})
+#: seconds between two reads, in which a fast line gathers some bytes: it would wake us for every one.
+PAUSE = 0.002
 L = TypeVar("L", bound=Link)
 _SWITCH = {"0": False, "1": True, "false": False, "true": True, "off": False, "on": True}
 
@@ -122,6 +125,34 @@ def rest(until: float) -> None:
         time.sleep(pause)
 
 
+class StreamTransport(LiveTransport):
+    """A line that bytes come over, read as they come, with a short pause after each read.
+
+    Attributes:
+        gone: everything that a line which went away raises.
+    """
+
+    gone: tuple[type[BaseException], ...] = (OSError, ValueError)
+
+    def __init__(self, label: str, sensor: Sensor | None) -> None:
+        self.label, self._sensor, self._clock, self._rested = label, sensor, HostClock(), 0.0
+
+    def read(self, timeout: float) -> list[Chunk]:
+        rest(self._rested)
+        try:
+            data = self._received(timeout)
+        except self.gone as error:
+            if self.closed:
+                return []
+            raise lost(self.label, error) from None
+        self._rested = time.monotonic() + PAUSE if data else 0.0
+        return [Chunk(data, self._clock.now())] if data else []
+
+    @abstractmethod
+    def _received(self, timeout: float) -> bytes:
+        """What has arrived; nothing where nothing did for `timeout` seconds."""
+
+
 def readable(descriptor: int, timeout: float) -> bool:
     """Whether there is something to read, or the other side has hung up, within so many seconds."""
     if sys.platform == "win32":  # which has no poll
@@ -136,16 +167,20 @@ def failure(text: str, following: str) -> SourceError:
     return suggest(SourceError(text), following)
 
 
-def lost(label: str, error: Exception | str) -> Disconnected:
+def lost(label: str, error: BaseException | str) -> Disconnected:
     """The device behind a source went away."""
     return Disconnected(f"{label}: the connection was lost: {reason(error)}")
 
 
-def reason(error: Exception | str) -> str:
-    """What the system says, in its own words."""
-    if isinstance(error, OSError) and error.errno:
-        return os.strerror(error.errno)
-    return str(error)
+def reason(error: BaseException | str) -> str:
+    """What the system says, in its own words, also where pyserial wraps it in a sentence of its own."""
+    numbers = error_numbers(error) if isinstance(error, BaseException) else []
+    return os.strerror(numbers[0]) if numbers else str(error)
+
+
+def error_numbers(error: BaseException) -> list[int]:
+    """The numbers of the system's errors that an exception was made of."""
+    return [number for number in error.args if isinstance(number, int)]
 
 
 def data_link(sensor: Spec | None, kind: type[L]) -> L | None:

@@ -10,15 +10,13 @@ from __future__ import annotations
 import contextlib
 import errno
 import os
-import time
 
 import serial
 
 from lidarspec.errors import SourceError, UsageError
 from lidarspec.spec.links import Serial
 from lidarspec.spec.sensor import Sensor
-from lidarspec.transports.base import Address, HostClock, data_link, failure, lost, named, readable, reason, rest
-from lidarspec.transports.protocol import Chunk, LiveTransport
+from lidarspec.transports.base import Address, StreamTransport, data_link, error_numbers, failure, lost, named, readable, reason
 
 try:
     from termios import error as TermiosError
@@ -27,14 +25,14 @@ except ImportError:  # no POSIX
 
 #: everything that a port which went away raises.
 GONE = (serial.SerialException, OSError, TermiosError, TypeError, ValueError)
-#: bytes read at once, and seconds between two reads, in which a fast line gathers some.
-BLOCK, PAUSE = 1 << 16, 0.002
+#: bytes read at once.
+BLOCK = 1 << 16
 #: seconds that a device may take to accept what is written.
 WRITE_TIMEOUT = 2.0
 OPTIONS = ("baud", "dtr", "rts")
 
 
-class SerialTransport(LiveTransport):
+class SerialTransport(StreamTransport):
     """A serial port, 8N1.
 
     Args:
@@ -47,30 +45,18 @@ class SerialTransport(LiveTransport):
     """
 
     baud: int
+    gone = GONE
 
     def __init__(self, port: str, baud: int, *, dtr: bool | None = None, rts: bool | None = None, sensor: Sensor | None = None) -> None:
-        self.clock = HostClock()
-        self.label, self.baud = port, baud
-        self._levels, self._sensor = {"dtr": dtr, "rts": rts}, sensor
-        self._rested = 0.0
+        super().__init__(port, sensor)
+        self.baud, self._levels = baud, {"dtr": dtr, "rts": rts}
         self._port = self._open()
-
-    def read(self, timeout: float) -> list[Chunk]:
-        rest(self._rested)
-        try:
-            data = self._read_posix(timeout) if os.name == "posix" else self._read_any(timeout)
-        except GONE as error:
-            if self.closed:
-                return []
-            raise lost(self.label, _cause(error)) from None
-        self._rested = time.monotonic() + PAUSE if data else 0.0
-        return [Chunk(data, self.clock.now())] if data else []
 
     def write(self, data: bytes) -> None:
         try:
             self._port.write(data)
         except GONE as error:
-            raise lost(self.label, _cause(error)) from None
+            raise lost(self.label, error) from None
 
     def lines(self, *, dtr: bool | None = None, rts: bool | None = None) -> None:
         for name, level in (("dtr", dtr), ("rts", rts)):
@@ -80,8 +66,8 @@ class SerialTransport(LiveTransport):
             try:
                 setattr(self._port, name, level)
             except GONE as error:
-                if not {errno.ENOTTY, errno.EINVAL} & set(_numbers(error)):  # of a port without such lines, as a pseudo-terminal
-                    raise lost(self.label, _cause(error)) from None
+                if not {errno.ENOTTY, errno.EINVAL} & set(error_numbers(error)):  # of a port without such lines, as a pseudo-terminal
+                    raise lost(self.label, error) from None
 
     def reopen(self) -> None:
         self._shut()
@@ -120,9 +106,12 @@ class SerialTransport(LiveTransport):
             return failure(f"{self.label}: in use by another program", f"lidarspec doctor {source}")
         if isinstance(error, ValueError) or "baud" in str(error).lower():
             return failure(f"{self.label}: it cannot run at {self.baud} baud: {error}", f"lidarspec detect {self.label}")
-        return failure(f"{self.label}: {_cause(error)}", "lidarspec ports")
+        return failure(f"{self.label}: {reason(error)}", "lidarspec ports")
 
-    def _read_posix(self, timeout: float) -> bytes:
+    def _received(self, timeout: float) -> bytes:
+        if os.name != "posix":
+            self._port.timeout = timeout
+            return bytes(self._port.read(max(1, self._port.in_waiting)))
         descriptor = self._port.fileno()
         with contextlib.suppress(BlockingIOError):
             if data := os.read(descriptor, BLOCK):
@@ -132,11 +121,6 @@ class SerialTransport(LiveTransport):
         data = os.read(descriptor, BLOCK)
         if not data:
             raise lost(self.label, "it hung up")
-        return data
-
-    def _read_any(self, timeout: float) -> bytes:
-        self._port.timeout = timeout
-        data: bytes = self._port.read(max(1, self._port.in_waiting))
         return data
 
 
@@ -160,14 +144,3 @@ def connect(address: Address, sensor: Sensor | None = None) -> SerialTransport:
     dtr, rts = (declared.dtr, declared.rts) if declared else (None, None)
     levels = {name: default if (level := address.switch(name)) is None else level for name, default in (("dtr", dtr), ("rts", rts))}
     return SerialTransport(address.place, baud, sensor=sensor, **levels)
-
-
-def _cause(error: BaseException) -> str:
-    """What the system says, where pyserial wraps it in a sentence of its own."""
-    numbers = _numbers(error)
-    return os.strerror(numbers[0]) if numbers else reason(error) if isinstance(error, OSError) else str(error)
-
-
-def _numbers(error: BaseException) -> list[int]:
-    """The numbers of the system's errors that it was made of."""
-    return [number for number in error.args if isinstance(number, int)]

@@ -5,21 +5,20 @@ from __future__ import annotations
 import contextlib
 import errno
 import socket
-import time
 
 from lidarspec.errors import SourceError, UsageError
 from lidarspec.spec.links import Tcp
 from lidarspec.spec.sensor import Sensor
-from lidarspec.transports.base import Address, HostClock, data_link, failure, lost, named, readable, reason, rest
-from lidarspec.transports.protocol import Chunk, Disconnected, LiveTransport
+from lidarspec.transports.base import Address, StreamTransport, data_link, failure, lost, named, readable, reason
+from lidarspec.transports.protocol import Disconnected
 
-#: bytes read at once, and seconds between two reads, in which a fast stream gathers some.
-BLOCK, PAUSE = 1 << 18, 0.002
+#: bytes read at once.
+BLOCK = 1 << 18
 #: seconds that a connection may take at first, and when it is tried again.
 PATIENCE, AGAIN = 5.0, 0.5
 
 
-class TcpTransport(LiveTransport):
+class TcpTransport(StreamTransport):
     """A connection to a sensor.
 
     Raises:
@@ -27,25 +26,17 @@ class TcpTransport(LiveTransport):
     """
 
     def __init__(self, label: str, host: str, port: int, *, sensor: Sensor | None = None) -> None:
-        self.clock = HostClock()
-        self.label, self._address, self._sensor = label, (host, port), sensor
-        self._rested = 0.0
+        super().__init__(label, sensor)
+        self._address = (host, port)
         self._socket = self._connected(PATIENCE)
 
-    def read(self, timeout: float) -> list[Chunk]:
-        rest(self._rested)
-        try:
-            if not readable(self._socket.fileno(), timeout):
-                return []
-            data = self._socket.recv(BLOCK)
-        except (OSError, ValueError) as error:
-            if self.closed:
-                return []
-            raise lost(self.label, error) from None
+    def _received(self, timeout: float) -> bytes:
+        if not readable(self._socket.fileno(), timeout):
+            return b""
+        data = self._socket.recv(BLOCK)
         if not data:
             raise Disconnected(f"{self.label}: the sensor closed the connection")
-        self._rested = time.monotonic() + PAUSE
-        return [Chunk(data, self.clock.now())]
+        return data
 
     def write(self, data: bytes) -> None:
         try:

@@ -195,7 +195,9 @@ class UdpTransport(LiveTransport):
         self._selector = selectors.DefaultSelector()
         self._sockets: list[_Socket] = []
         self._rested = 0.0
-        slots = _slots()
+        slots: Slots | None = None
+        with contextlib.suppress(OSError):
+            slots = Slots() if sys.platform == "linux" else None
         try:
             for port in ports:
                 self._sockets.append(_Socket(self._bound(host, port, group), slots))
@@ -356,14 +358,6 @@ class _Socket:
 def _carried(seconds: int, nanoseconds: int, now: int, anchor: int) -> int:
     """A time of the wall clock, which reads `anchor` now, as one of a clock that reads `now`; of the last minute, whatever it says."""
     return now - min(max(anchor - seconds * 1_000_000_000 - nanoseconds, 0), LATEST)
-
-
-def _slots() -> Slots | None:
-    """Room for many datagrams at once, where the system can fetch them so."""
-    try:
-        return Slots() if sys.platform == "linux" else None
-    except OSError:
-        return None
 
 
 def connect(address: Address, sensor: Sensor | None = None) -> UdpTransport:

@@ -19,7 +19,6 @@ import numpy as np
 import pytest
 
 import lidarspec as ls
-from lidarspec.captures import bulk as windows
 from lidarspec.captures.bulk import Batch, CaptureBatches
 from lidarspec.captures.pcap import CaptureReader, Datagram
 from lidarspec.transports.files import CaptureTransport, open_file
@@ -278,7 +277,7 @@ def address(batch: Batch) -> int:
 
 
 def test_buffers_are_used_again_once_nobody_holds_them(long_capture: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(windows, "LARGEST", 1 << 21)
+    monkeypatch.setattr(CaptureBatches, "largest", 1 << 21)
     places = [address(batch) for batch in CaptureBatches(long_capture).batches()]
     assert len(places) > 12
     assert len(set(places)) <= 3
@@ -309,7 +308,7 @@ def test_whoever_holds_a_view_of_a_buffer_keeps_it(hold: Callable[[Batch], objec
 
 
 def test_packets_of_a_file_stay_right_while_the_file_is_read_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(windows, "LARGEST", 1 << 21)
+    monkeypatch.setattr(CaptureBatches, "largest", 1 << 21)
     from tests.captures.test_memory import SENSOR, written
 
     path = tmp_path / "kept.pcap"
