@@ -14,7 +14,6 @@ FINDINGS, USAGE, SOURCE, NO_DATA, DEVICE, INTERRUPTED = 1, 2, 3, 4, 5, 130
 #: error class -> exit code and the next command; the first that fits, "{sensor}" and "{verb}" filled in.
 CODES: tuple[tuple[type[Exception] | tuple[type[Exception], ...], int, str], ...] = (
     (errors.UnknownSensor, USAGE, "lidarspec sensors"),
-    (errors.UnknownFormat, USAGE, "lidarspec convert --help"),
     ((errors.UnknownFrame, errors.UnknownField, errors.MissingField, errors.OutOfRange), USAGE, "lidarspec show {sensor}"),
     ((errors.UsageError, click.ClickException), USAGE, "lidarspec {verb} --help"),
     ((errors.SourceError, OSError), SOURCE, "lidarspec {verb} --help"),

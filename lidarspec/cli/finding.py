@@ -16,7 +16,7 @@ from lidarspec.cli.options import DURATION, output_options, sensor_option
 from lidarspec.cli.output import emit, emit_json, note, table
 from lidarspec.discovery.checksum_search import search
 from lidarspec.discovery.detect import Verdict, best, verdict, verdicts
-from lidarspec.discovery.doctor import Finding, computer, examined
+from lidarspec.discovery.doctor import computer, examined
 from lidarspec.discovery.listen import LISTEN, Heard, everywhere, hear, probe, started_first, udp_ports
 from lidarspec.discovery.periods import Structure, cut, structure
 from lidarspec.discovery.samples import Match
@@ -100,7 +100,6 @@ def crc(words: Sequence[str], period: int | None, offset: int, as_json: bool, ou
 
 
 def _frames(words: Sequence[str], period: int | None, offset: int) -> list[bytes]:
-    """The sample frames."""
     if len(words) == 1 and (words[0] == "-" or os.path.exists(words[0])):
         return _of_file(words[0], period, offset)
     whole = read(words).data
@@ -349,10 +348,7 @@ def doctor(source: str | None, sensor_id: str | None, duration: float, as_json: 
     if as_json:
         emit_json([vars(finding) for finding in found], output)
     else:
-        emit("\n".join(line for finding in found for line in _lines(finding)) or "nothing is wrong with the ports of this computer", output)
+        lines = [f"{'ok   ' if one.ok else 'wrong'}  {one.text}" + (f"\n       next: {one.mend}" if one.mend else "") for one in found]
+        emit("\n".join(lines) or "nothing is wrong with the ports of this computer", output)
     if any(not finding.ok for finding in found):
         raise click.exceptions.Exit(FINDINGS)
-
-
-def _lines(finding: Finding) -> list[str]:
-    return [f"{'ok   ' if finding.ok else 'wrong'}  {finding.text}"] + ([f"       next: {finding.mend}"] if finding.mend else [])

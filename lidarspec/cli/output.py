@@ -18,7 +18,6 @@ from rich.text import Text
 
 from lidarspec.errors import system_errors
 from lidarspec.explaining.listing import Line, folded, text as plain_text
-from lidarspec.formats import replacing
 
 #: seconds between two lines.
 PERIOD = 0.2
@@ -89,6 +88,8 @@ def emit(content: str | bytes, output: str | None) -> None:
     if output is None or output == "-":
         click.echo(content, nl=isinstance(content, str))
         return
+    from lidarspec.formats import replacing  # and all that scans are made of, for the verbs that write a file
+
     path = Path(output)
     is_replaced = path.is_file() or not path.exists()  # and not a device or a pipe
     with system_errors(output), replacing(path) if is_replaced else contextlib.nullcontext(path) as part:

@@ -15,7 +15,7 @@ from lidarspec.cli.output import Progress, emit_json, note, size
 from lidarspec.device.settings import named
 from lidarspec.device.source_recording import SourceRecording, recorder_like
 from lidarspec.discovery.detect import declared
-from lidarspec.errors import CommandError, LidarSpecError, SourceError, UnknownFormat, UsageError, WireError, suggest
+from lidarspec.errors import CommandError, LidarSpecError, SourceError, UsageError, WireError, suggest
 from lidarspec.plugins import sensor as named_sensor
 from lidarspec.recording.appending import Appender
 from lidarspec.recording.recorders import SUFFIXES, Recorder, check_suffix, declared_port
@@ -53,10 +53,7 @@ def record(
     A sensor that is named, with -s or by the source (sim:ID), is started, and what it is stands in the file; without, bytes are
     recorded as they come.
     """
-    try:
-        check_suffix(target)
-    except UnknownFormat as error:
-        raise suggest(error, "lidarspec record --help") from None
+    check_suffix(target)
     refuse_overwriting(source, target)
     known = named(source)
     sensor = named_sensor(sensor_id) if sensor_id else declared(source) if is_live(source) else known.configured() if known else None

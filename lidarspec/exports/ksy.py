@@ -371,7 +371,6 @@ class _Types:
 
 
 def _size(formula: tree.Formula, scope: Scope) -> int | str:
-    """A number of bytes or elements."""
     return formula if isinstance(formula, int) else number(formula, scope)
 
 

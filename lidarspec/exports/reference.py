@@ -53,7 +53,6 @@ def page(sensor: Sensor, pictures: Mapping[str, str] | None = None) -> str:
 
 
 def _facts(sensor: Sensor) -> Iterator[str]:
-    """The table at the top."""
     rows = [("id", ", ".join(f"`{name}`" for name in (sensor.id, *sensor.aliases)))]
     rows += [(f"link `{name}`", _link(link)) for name, link in sensor.links.items()]
     rows += [("range", "{:g} m to {:g} m".format(*sensor.range_limits)), ("scan", f"ends {_rule(sensor.scan)}")]

@@ -41,7 +41,6 @@ def formula(value: tree.Formula) -> Code:
 
 
 def _function(value: tree.Formula) -> Code:
-    """A formula as a function of the values of fields."""
     return Code(f"function(v) return {tree.written(value, lambda ref: f'v[{quoted(ref.path)}]', _OPERATIONS)} end")
 
 

@@ -241,26 +241,27 @@ class Places:
         frame, _, below = path.partition(".")
         if frame == "commands":
             return self._others.get(("key", below.partition(".")[0]))
-        function = self._function(frame, below, sensor) if below in ("points", "plausible", "sweep") else None
-        return function or (self._field(tuple(below.split("."))) if below else None) or self._others.get(("frame", frame))
-
-    def _function(self, frame: str, name: str, sensor: Sensor | None) -> Spot | None:
-        if sensor is None or frame not in sensor.frames:
-            return None
-        functions = {
-            "points": sensor.frames[frame].points or sensor.points,
-            "plausible": sensor.frames[frame].plausible,
-            "sweep": sensor.simulation_of(frame).sweep,
-        }
-        function = functions[name]
-        while isinstance(function, functools.partial):
-            function = function.func
-        return (function.__code__.co_filename, function.__code__.co_firstlineno) if inspect.isfunction(function) else None
+        return (
+            _function(frame, below, sensor)
+            or (self._field(tuple(below.split("."))) if below else None)
+            or self._others.get(("frame", frame))
+        )
 
     def _field(self, parts: tuple[str, ...]) -> Spot | None:
         """The field whose names in the text are the longest end of the path."""
         fitting = [(len(chain), spot) for chain, spot in self._fields if parts[-len(chain) :] == chain]
         return max(fitting, key=lambda found: found[0])[1] if fitting else None
+
+
+def _function(frame: str, name: str, sensor: Sensor | None) -> Spot | None:
+    """Where a function of a frame type is written."""
+    if sensor is None or frame not in sensor.frames:
+        return None
+    own, sweep = sensor.frames[frame], sensor.simulation_of(frame).sweep
+    function = {"points": own.points or sensor.points, "plausible": own.plausible, "sweep": sweep}.get(name)
+    while isinstance(function, functools.partial):
+        function = function.func
+    return (function.__code__.co_filename, function.__code__.co_firstlineno) if inspect.isfunction(function) else None
 
 
 def _named(tree: ast.Module) -> Iterator[tuple[str, str, int]]:

@@ -127,8 +127,6 @@ def _points(subject: Subject, name: str, data: bytes, wanted: Mapping[str, Mappi
             require(column in COLUMNS and getattr(cloud, column) is not None, "LS702", f"points have no {column!r}", f"{place} {name}")
             got[column] = float(getattr(cloud, column)[spot])
         wrong = [column for column, value in columns.items() if not np.isclose(got[column], value, rtol=NEAR, atol=NEAR)]
-        mirrored = bool(wrong) and all(
-            column in ("y", "azimuth") and np.isclose(got[column], -columns[column], atol=NEAR) for column in wrong
-        )
+        mirrored = all(column in ("y", "azimuth") and np.isclose(got[column], -columns[column], atol=NEAR) for column in wrong)
         said = ", ".join(f"{column} is {got[column]:.5g}, and {columns[column]:g} is printed" for column in wrong)
         require(not wrong, "LS709" if mirrored else "LS708", f"point {spot}: {said}", f"{place} {name}.points")
