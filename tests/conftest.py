@@ -34,6 +34,9 @@ def _alone(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
         for name in ("XDG_CONFIG_HOME", "APPDATA"):
             patch.setenv(name, str(base / "settings"))
         patch.setenv("LIDARSPEC_CACHE", str(every / "kernels"))  # one for all workers
+        patch.setenv("PYTHONPYCACHEPREFIX", str(every / "bytecode"))  # programs that tests start compile a module once, in this folder
+        patch.delenv("PYTHONDONTWRITEBYTECODE", raising=False)
+        patch.setenv("OPENBLAS_NUM_THREADS", "1")  # and none of them multiplies matrices
         patch.chdir(here)
         yield
 
