@@ -25,7 +25,7 @@ demo: $(USERS)
 	@$(BIN)/lidarspec demo -s ldrobot-stl27l
 
 test: $(DEVELOPERS)
-	@$(BIN)/python -m pytest -n auto $(ARGS)
+	@$(BIN)/python -m pytest -n auto --dist worksteal $(ARGS)
 
 # The conformance suite with 4000 examples instead of 20: hours.
 test-long: $(DEVELOPERS)
