@@ -34,6 +34,10 @@ def _alone(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
         for name in ("XDG_CONFIG_HOME", "APPDATA"):
             patch.setenv(name, str(base / "settings"))
         patch.setenv("LIDARSPEC_CACHE", str(every / "kernels"))  # one for all workers
+        patch.setenv("OPENBLAS_NUM_THREADS", "1")  # programs that tests start multiply no matrices
+        if os.environ.get("PYTHONDONTWRITEBYTECODE"):  # and compile their modules once all the same, beside the sources of nobody
+            patch.delenv("PYTHONDONTWRITEBYTECODE")
+            patch.setenv("PYTHONPYCACHEPREFIX", str(every / "bytecode"))
         patch.chdir(here)
         yield
 

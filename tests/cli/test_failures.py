@@ -27,9 +27,10 @@ SENSOR = ("-s", "ldrobot-stl27l")
 
 
 @pytest.fixture
-def folder(tmp_path: Path) -> Path:
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     for name, data in FILES.items():
         (tmp_path / name).write_bytes(data)
+    monkeypatch.chdir(tmp_path)
     return tmp_path
 
 
@@ -90,13 +91,19 @@ def folder(tmp_path: Path) -> Path:
 )
 def test_wrong_input(folder: Path, words: tuple[str, ...], code: int, told: list[str]) -> None:
     before = sorted(os.listdir(folder))
-    done = process(*words, cwd=folder)
-    message = done.stderr.decode()
-    assert done.returncode == code, message
-    assert done.stdout == b""
-    assert all(text in message for text in told), message
-    assert message.rstrip().splitlines()[-1].startswith("  next: lidarspec "), message
+    result = ran(*words, code=code)
+    assert result.stdout == ""
+    assert all(text in result.stderr for text in told), result.stderr
+    assert result.stderr.rstrip().splitlines()[-1].startswith("  next: lidarspec "), result.stderr
     assert sorted(os.listdir(folder)) == before
+
+
+@pytest.mark.parametrize(
+    ("words", "code"), [(("shw",), 2), (("convert", "missing.bin", "o.csv", *SENSOR), 3), (("convert", "damaged.bin", "o.csv", *SENSOR), 4)]
+)
+def test_a_program_says_and_ends_with_the_same(folder: Path, words: tuple[str, ...], code: int) -> None:
+    done = process(*words, cwd=folder)
+    assert (done.returncode, done.stdout, done.stderr.decode()) == (code, b"", ran(*words, code=code).stderr)
 
 
 def test_the_place_of_an_error_is_marked() -> None:

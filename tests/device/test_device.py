@@ -353,7 +353,7 @@ def test_packets_and_scans_of_a_file_go_on_where_its_scan_was_found(tmp_path: Pa
 
 def test_a_long_file_goes_on_behind_what_was_read_before(tmp_path: Path) -> None:
     path = tmp_path / "raw.bin"
-    frames = turning(TURNING, 40_000)
+    frames = turning(TURNING, 4_000) * 10
     path.write_bytes(b"".join(frames))
     with ls.open(path, TURNING) as device:
         whole = [len(packets) for packets in device.packets()]

@@ -14,7 +14,7 @@ from lidarspec.testing.subject import Subject
 from tests.engine.oracle import Cut
 
 #: about so many bytes to a stream: the oracle takes its time.
-LENGTH = 2500
+LENGTH = 1500
 
 
 def damaged(data: bytes, rate: float, seed: int, *, burst: int = 1) -> bytes:

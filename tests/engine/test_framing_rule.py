@@ -13,6 +13,7 @@ from tests.engine import framing_rule as rule, mutants
 from tests.shapes import SHAPES
 
 SHAPED = streams(SHAPES)
+INSTALLED = {name: sensor for name, sensor in STREAMS.items() if name not in SHAPES}
 #: bytes of a stream for a sensor whose mechanisms the shapes have one by one.
 FEW = 800
 
@@ -33,7 +34,7 @@ def test_the_rule_holds_on_every_shape(sensor: Sensor, holds: Callable[[Subject]
     holds(Subject(sensor))
 
 
-@pytest.mark.parametrize("sensor", STREAMS.values(), ids=STREAMS)
+@pytest.mark.parametrize("sensor", INSTALLED.values(), ids=INSTALLED)
 def test_every_recoverable_frame_of_every_sensor_is_recovered(sensor: Sensor) -> None:
     rule.every_recoverable_frame_is_recovered(Subject(sensor), FEW)
 

@@ -29,7 +29,7 @@ from tests.all_sensors import DISTINCT
 from tests.shapes import SHAPES
 
 each_sensor = pytest.mark.parametrize("sensor", DISTINCT.values(), ids=DISTINCT)
-EXAMPLES = 40
+EXAMPLES = 20
 
 
 @functools.cache

@@ -108,9 +108,9 @@ def test_a_period_that_depends_on_the_frame_is_looked_up_again_when_it_changes()
     """The counter of this sensor ends at 630 or 1260, by a field."""
     sensor = ls.sensor("robosense-m1")
     single = list(simulate(sensor, 1300))
-    dual = [
-        sensor.build("data", {**sensor.parse(frame), "wave_mode": 0, "pkt_psn": number}) for number, frame in enumerate(single[:1260], 1)
-    ]
+    frame = sensor.build("data", {**sensor.parse(single[0]), "wave_mode": 0})
+    dual = [frame[:4] + number.to_bytes(2, "big") + frame[6:] for number in range(1, 1261)]
+    assert [sensor.parse(data).pkt_psn for data in dual[::420]] == [1, 421, 841]
     datagrams = [*single[:630], *dual, *dual[:40], *single[:100]]
     batches, _, stats = run(sensor, datagrams, [0, 300, 640, 1500, len(datagrams)])
     assert (stats.lost, stats.late, stats.duplicates) == (0, 0, 0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import gc
 import itertools
 import weakref
@@ -29,10 +30,15 @@ BACKENDS = ["numpy", "jit"]
 SENSORS = {**ls.sensors(), **{name: sensor for name, sensor in SHAPES.items() if sensor.frames}}
 
 
+@functools.cache
+def frames_of(name: str, number: int) -> list[bytes]:
+    return list(simulate(ls.sensor(name), number))
+
+
 def packets_of(name: str, number: int, backend: str) -> Packets:
     if backend == "jit":
         pytest.importorskip("numba")
-    return ls.sensor(name).decode(simulate(ls.sensor(name), number), backend=backend)
+    return ls.sensor(name).decode(frames_of(name, number), backend=backend)
 
 
 def batches(packets: Packets, *sizes: int) -> list[Packets]:

@@ -2,22 +2,37 @@
 
 from __future__ import annotations
 
+import os
+
 from lidarspec import Sensor
 from lidarspec.framing.frame_engine import InterpretedCodec, codec
-from lidarspec.testing import SensorConformance
+from lidarspec.testing import SensorConformance, agreement
 from lidarspec.testing.conformance import PROPERTIES
 from tests.all_sensors import DISTINCT, EVERY
 
+#: half of what the kit takes where nothing is said: `make test-long` tries as many as one has time for.
+EXAMPLES = int(os.environ.get("LIDARSPEC_EXAMPLES", "20"))
 #: frames that construct alone can read.
 REFUSED = {"shape-text data"}
 #: what is left out for a relative: what holds for the frames is tried on one sensor of those that share them.
 OF_FRAMES = {f"test_{one.name}": None for one in PROPERTIES if one.each == "frame"}
+#: and what is left out besides where the same functions read them.
+OF_READING = {f"test_{one.name}": None for one in PROPERTIES if one.function.__module__ == agreement.__name__}
+READING = ("data_frame", "points", "clock", "sequence", "scan", "state")
+
+
+def _shared(sensor: Sensor) -> dict[str, None]:
+    """The tests that a relative has in common with the sensor that is tried for those of its frames."""
+    if sensor.id in DISTINCT:
+        return {}
+    tried = next(other for other in DISTINCT.values() if list(other.frames.values()) == list(sensor.frames.values()))
+    return OF_FRAMES | (OF_READING if all(getattr(sensor, name) == getattr(tried, name) for name in READING) else {})
 
 
 def _tests(sensor: Sensor) -> type[SensorConformance]:
     """The test class of one sensor."""
-    shared = {} if sensor.id in DISTINCT else OF_FRAMES
-    return type(f"Test_{sensor.id.replace('-', '_')}", (SensorConformance,), {"sensor": sensor, "__module__": __name__, **shared})
+    values = {"sensor": sensor, "examples": EXAMPLES, "__module__": __name__, **_shared(sensor)}
+    return type(f"Test_{sensor.id.replace('-', '_')}", (SensorConformance,), values)
 
 
 globals().update({case.__name__: case for case in map(_tests, EVERY.values())})

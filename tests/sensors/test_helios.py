@@ -229,7 +229,7 @@ def test_a_file_is_read_with_the_first_device_information_from_its_start() -> No
 
 def test_the_capture_is_the_same_on_both_paths_and_built_again() -> None:
     data = datagrams()
-    some = [*data[:12], data[DIFOP_AT], *data[700:]]
+    some = [*data[:12], data[DIFOP_AT], *data[730:]]
     decoded(SENSOR, some)
     decoded(SENSOR, some, "difop")
     for datagram in some:

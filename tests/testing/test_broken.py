@@ -113,7 +113,7 @@ LINES = {
 def found(name: str) -> list[Finding]:
     """What `check` says of one of the modules."""
     file = HERE / f"{name}.py"
-    return [finding for report in reports(target(file), str(file), examples=10) for finding in report.findings]
+    return [finding for report in reports(target(file), str(file), examples=4) for finding in report.findings]
 
 
 @pytest.mark.parametrize("name", EVERY)

@@ -113,7 +113,7 @@ class Lossy(Sensor):
 
 def test_a_failing_edit_shrinks_to_the_field_at_fault() -> None:
     with pytest.raises(Violation) as found:
-        values_survive_building_and_parsing(Subject(sound.sensor(kind=Lossy), 200), "data")
+        values_survive_building_and_parsing(Subject(sound.sensor(kind=Lossy), 80), "data")
     assert (found.value.code, found.value.path) == ("LS305", "data.tilt")
     assert found.value.what == "-101 is written, and 101 is read"
 

@@ -76,7 +76,7 @@ class Terminal:
         self.text()
         return self.process.returncode
 
-    def loaded(self) -> None:
+    def loaded(self, moment: float = 0.3) -> None:
         """Wait until the program has imported what it works with, and then a moment; where that cannot be seen, time has to do."""
         end = time.monotonic() + DEADLINE
         while self.process.poll() is None and time.monotonic() < end:
@@ -88,7 +88,7 @@ class Terminal:
             if "_multiarray_umath" in maps:
                 break
             self._read(0.02)
-        end = time.monotonic() + 0.3
+        end = time.monotonic() + moment
         while time.monotonic() < end:
             self._read(0.05)
 

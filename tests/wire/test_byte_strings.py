@@ -101,7 +101,7 @@ def test_they_are_read_and_built_as_in_construct(name: str) -> None:
 def test_such_a_frame_keeps_every_promise(name: str) -> None:
     fields: Any = {**COMPILED, **INTERPRETED}[name]
     inner = Struct("magic" / Const(b"\xf1\x5a"), "k" / Int8ub, "y" / If(this.k > 2, Int8ub), "v" / fields, "end" / Const(b"\xe1\x77"))
-    subject = Subject(sensor(inner))
+    subject = Subject(sensor(inner), 12)
     found = [finding for one in PROPERTIES if one.name in HELD and not one.lacks(subject) for finding in one.findings(subject)]
     assert not found, found
     values_at_the_edges_read_alike(subject.sensor)
