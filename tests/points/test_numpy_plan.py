@@ -19,6 +19,8 @@ from lidarspec.spec.links import is_datagram
 from lidarspec.testing.agreement import assert_same_points
 from lidarspec.testing.subject import Subject
 from lidarspec.wire.frame_table import Rows
+from tests.engine.against_construct import clouds_agree, sensor
+from tests.engine.random_specs import made
 from tests.shapes import SHAPES
 
 SHAPED = {name: sensor for name, sensor in SHAPES.items() if sensor.frames}
@@ -110,6 +112,21 @@ def test_a_factor_that_is_zero_or_negative_leaves_no_point_behind() -> None:
         frames.append(sensor.build("data", parsed))
     table = sensor.decode(frames)
     assert_same_points(evaluated(table).cloud, evaluate(table).cloud)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        'Struct("text" / Bytes(3), "n" / Int64ub, "x" / Array(3, Struct("v" / Int8sb)))',
+        'Struct("x" / Array(2, Struct("h" / Int8ub, "y" / Array(3, Struct("text" / Bytes(2), "v" / Int16ul)))))',
+        'Struct("x" / Array(2, Struct("y" / Array(3, Struct("z" / Array(2, Int8ub), "v" / Int16ul)))), "end" / Int8ub)',
+    ],
+)
+def test_arrays_of_one_form_are_told_apart_and_elements_may_begin_with_anything(text: str) -> None:
+    """Blocks of elements had the offset of any field of this form, and ran past the frame."""
+    struct = made(text)
+    frames = [sensor(struct).example("data", seed=seed) for seed in range(5)]
+    assert clouds_agree(struct, frames, backends=("numpy",)) or "z" in text
 
 
 def test_columns_are_made_once_and_slices_share_them() -> None:

@@ -35,7 +35,8 @@ class Blocks:
         count = self.shape[-1] if self.shape else 1
         self.is_flat = self._regular(size, strides)
         self._length = count * self.stride
-        self._base = 0 if self.is_flat else max(min(*(leaf.offset for leaf in leaves), size - self._length), 0)
+        last = sum((number - 1) * step for number, step in zip(self.shape, strides[:-1], strict=False))  # from the first block on
+        self._base = 0 if self.is_flat else min(*(leaf.offset for leaf in leaves), size - last - self._length)
         self._strides, self._size = strides[:-1], size
         self.room = 0 if self.is_flat else math.prod(self.shape[:-1]) * self._length
 

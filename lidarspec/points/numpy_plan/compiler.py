@@ -155,7 +155,7 @@ class Compiler:
         for blocks in self.program.blocks:
             if blocks.shape == leaf.shape and blocks.holds(seen):
                 return blocks
-        beside = [other for other in self._layout.leaves.values() if other.shape == leaf.shape and other.strides == leaf.strides]
+        beside = [other for other in self._layout.leaves.values() if (other.info.axes, other.shape) == (leaf.info.axes, leaf.shape)]
         self.program.blocks.append(Blocks(beside, self._layout.size))
         return self.program.blocks[-1]
 
