@@ -161,18 +161,13 @@ class Senders:
         Raises:
             UsageError: where another address sends frames as well.
         """
-        hosts = {chunk.sender[0] for chunk in chunks if chunk.sender}
-        if not hosts - {self._ours or next(iter(hosts), None)}:
-            self._ours = self._ours or next(iter(hosts), None)
-            return list(chunks)
-        self._ours = self._ours or next(chunk.sender[0] for chunk in chunks if chunk.sender)
-        for chunk in chunks:
-            host = chunk.sender[0] if chunk.sender else self._ours
-            if host == self._ours or not self._sends_frames(host, chunk):
-                continue
-            if main.stats.frames:
-                raise self._several(self._ours, host, f"frames of {self._sensor.id}")
-            self._ours = host
+        sent = [(chunk.sender[0], chunk) for chunk in chunks if chunk.sender]
+        for host, chunk in sent:
+            self._ours = self._ours or host
+            if host != self._ours and self._sends_frames(host, chunk):
+                if main.stats.frames:
+                    raise self._several(self._ours, host, f"frames of {self._sensor.id}")
+                self._ours = host
         return [chunk for chunk in chunks if not chunk.sender or chunk.sender[0] == self._ours]
 
     def _sends_frames(self, host: str, chunk: Chunk) -> bool:

@@ -315,6 +315,7 @@ def drafted(draft: Draft, *, origin: str, link: str) -> dict[str, str]:
     struct = f"Checksummed(\n    Struct(\n{body}\n    ),\n{seal[0]})" if seal else f"Struct(\n{body}\n)"
     below = [f"f.{path} < 360" for path in angles if "." not in path]
     plausible = below[0] if len(below) == 1 else " & ".join(f"({one})" for one in below)
+    check = f'def plausible(f: Fields) -> Any:\n    """Angles below 360 degrees."""\n    return {plausible}\n\n\n'
     is_weak = not draft.datagrams and not below and _strength(draft) <= FEW_BITS
     counters = [one for one in draft.candidates if one.kind == "counter" and one.offset < draft.head]
     text = {
@@ -323,9 +324,7 @@ def drafted(draft: Draft, *, origin: str, link: str) -> dict[str, str]:
         "checksum_class": f"\n{seal[1]}\n\n\n" if seal and seal[1] else "",
         "sealed": "" if seal else "# No checksum was found: XORs, sums and CRCs of 8, 16 and 32 bits were tried.\n",
         "struct": struct,
-        "plausible": f'def plausible(f: Fields) -> Any:\n    """Angles below 360 degrees."""\n    return {plausible}\n\n\n'
-        if below
-        else "",
+        "plausible": check if below else "",
         "azimuth": f"np.deg2rad(f.{angles[0]})" if angles else "np.zeros(1)",
         "distance": f"0 * f.{angles[0]}" if angles else "np.zeros(1)",
         "arguments": "".join(f"    {line}\n" for line in _arguments(angles, counters)),
@@ -596,9 +595,8 @@ def captured(names: Names, link: Link, draft: Draft, *, origin: str, port: int |
     serial = "Serial(115_200)},  # the baud rate: a capture does not tell it"
     udp = f"Udp({port})}},  # where the capture's datagrams went" if port else "Udp(2368)},  # the port: this capture does not tell it"
     values = {**names.values(), **drafted(draft, origin=origin, link=serial if link == "serial" else udp)}
-    frames = [
-        {"frame": "data", "hex": data.hex(" "), "values": {}, "source": f"{origin}, at byte {at}"} for at, data in draft.frames[:VECTORS]
-    ]
+    kept = draft.frames[:VECTORS]
+    frames = [{"frame": "data", "hex": data.hex(" "), "values": {}, "source": f"{origin}, at byte {at}"} for at, data in kept]
     return _files(names, link, values, json.dumps(frames, indent=2) + "\n", ("README_draft.md", "draft.py", "test_draft.py"))
 
 

@@ -177,7 +177,7 @@ class Samples:
             places = [Place(front - self.shortest, size)] if from_end else []
             if not from_end or (len(self.groups) > 1 and front < NEAR):
                 places.append(Place(front, size))
-            yield from (place for place in places if self._varies(place))
+            yield from (place for place in places if self.alone or len(np.unique(self.fields(place, "little"))) > len(self) // 8 + 1)
 
     @property
     def alone(self) -> bool:
@@ -193,10 +193,6 @@ class Samples:
         distinct = min(len(np.unique(column)) for column in columns) / min(len(self), 256)
         apart = min(int(np.ptp(column)) for column in columns) >= APART
         return 2 * apart + min(1.0, distinct * (USUAL if place.offset == -place.size else 1))
-
-    def _varies(self, place: Place) -> bool:
-        there = self.fields(place, "little")
-        return len(there) < 2 or len(np.unique(there)) > len(there) // 8 + 1
 
 
 def spans(place: Place, samples: Samples) -> Iterator[Span]:

@@ -290,16 +290,14 @@ class Recording(Closing):
         """Go to the next mark, or to the end; the bytes passed over."""
         before = self.offset
         self._skip(1)
-        while self._holds(1):
-            found = self._window.find(MARK, self._place)
-            if found >= 0:
-                self._skip(found - self._place)
-                break
-            keep = min(len(MARK) - 1, len(self._window) - self._place)
-            self._skip(len(self._window) - self._place - keep)
+        while (found := self._window.find(MARK, self._place)) < 0:
+            left = len(self._window) - self._place
+            keep = min(len(MARK) - 1, left)  # which a mark may begin with
+            self._skip(left - keep)
             if not self._holds(keep + 1):
                 self._skip(keep)
-                break
+                return self.offset - before
+        self._skip(found - self._place)
         return self.offset - before
 
     def _rest(self) -> int:

@@ -90,11 +90,10 @@ class Answering:
 
     def frame(self, name: str, number: int = 0, values: Mapping[str, Any] | None = None) -> bytes:
         """A frame of a type other than data: the defaults of the spec, its `sweep`, and these physical values."""
-        maker = self._makers.get(name)
-        if maker is None:
-            maker = self._makers[name] = FrameMaker(self._sensor, name)
+        if name not in self._makers:
+            self._makers[name] = FrameMaker(self._sensor, name)
         sweep = self._sensor.frames[name].simulation.sweep
-        return maker.frame({**self._sensor.state.get(name, {}), **(sweep(number) if sweep else {}), **(values or {})})
+        return self._makers[name].frame({**self._sensor.state.get(name, {}), **(sweep(number) if sweep else {}), **(values or {})})
 
     def _answer(self, answer: Answer, request: Request) -> Answered:
         if isinstance(answer, bytes):

@@ -110,14 +110,20 @@ class FileTransport(Transport):
         if self._file is not sys.stdin.buffer:
             self._file.close()
 
+    def _warn(self, stats: CaptureStats) -> None:
+        """Take down what a capture does not hold whole."""
+        if stats.truncated_tail:
+            self.warnings.append(f"{self._path} is cut off in its last record; everything before it was read")
+        if stats.snapped:
+            self.warnings.append(f"{self._path}: {stats.snapped} packets were cut by the capture's snap length")
+
 
 class HexTransport(FileTransport):
     """Bytes written as hexadecimal text; white space is free, "#" begins a comment, an offset column ends in ":"."""
 
     def chunks(self) -> Iterator[Chunk]:
         for number, line in enumerate(self._file, start=1):
-            text = line.decode("ascii", "replace").partition("#")[0]
-            text = text.rpartition(":")[2]
+            text = line.decode("ascii", "replace").partition("#")[0].rpartition(":")[2]
             try:
                 yield Chunk(bytes.fromhex(text))
             except ValueError:
@@ -156,12 +162,6 @@ class CaptureTransport(FileTransport):
                 yield mine
         self._warn(reader.stats)
 
-    def _warn(self, stats: CaptureStats) -> None:
-        if stats.truncated_tail:
-            self.warnings.append(f"{self._path} is cut off in its last record; everything before it was read")
-        if stats.snapped:
-            self.warnings.append(f"{self._path}: {stats.snapped} packets were cut by the capture's snap length")
-
 
 class StreamCaptureTransport(FileTransport):
     """The bytes of a capture of a byte stream, packet by packet."""
@@ -169,8 +169,7 @@ class StreamCaptureTransport(FileTransport):
     def chunks(self) -> Iterator[Chunk]:
         reader = StreamReader(self._file)
         yield from (Chunk(packet.data, packet.at or None) for packet in reader)
-        if reader.stats.truncated_tail:
-            self.warnings.append(f"{self._path} is cut off in its last record; everything before it was read")
+        self._warn(reader.stats)
 
 
 def open_file(path: str, *, sender: str | None = None) -> FileTransport | RecordingTransport:

@@ -138,10 +138,8 @@ class UdpOutlet(Outlet):
             if not port:
                 text = "the datagrams do not say which port they went to: name one, as in"
                 raise UsageError(f"{self.place}: {text} udp://{self.host}:2368")
-            tries = 0
-            while not self._sent(chunk.data, port):
-                tries += 1
-                if tries > 1 and not patient:
+            while not self._sent(chunk.data, port) and not self._sent(chunk.data, port):
+                if not patient:
                     self.unsent += len(chunk.data)
                     break
 

@@ -63,10 +63,8 @@ def serial_ports() -> list[SerialPort]:
 
 def lasting(port: str) -> str:
     """The name under /dev/serial/by-id that leads to a port, "" where there is none."""
-    for link in sorted(Path("/dev/serial/by-id").glob("*")):
-        if os.path.realpath(link) == os.path.realpath(port):
-            return str(link)
-    return ""
+    links = sorted(Path("/dev/serial/by-id").glob("*"))
+    return next((str(link) for link in links if os.path.realpath(link) == os.path.realpath(port)), "")
 
 
 def allowed(port: str) -> bool:

@@ -125,7 +125,6 @@ def connect(address: Address, sensor: Sensor | None = None) -> SimulatedTranspor
     address.check(OPTIONS)
     if not address.place and sensor is None:
         raise UsageError(f"{address.text}: name the sensor, as in sim:ID; lidarspec sensors lists them")
-    named = named_sensor(address.place) if address.place else sensor
-    assert named is not None
-    simulated = sensor if sensor is not None and sensor.id == named.id else named
-    return SimulatedTransport(address.text, simulated, simulated_device(simulated, address.options))
+    if sensor is None or (address.place and named_sensor(address.place).id != sensor.id):
+        sensor = named_sensor(address.place)
+    return SimulatedTransport(address.text, sensor, simulated_device(sensor, address.options))
