@@ -216,7 +216,8 @@ class _Walk:
             raise
         except Exception:
             pass  # what construct never looks at cannot fail
-        self.cursor, self.constants = start, constants
+        finally:
+            self.cursor, self.constants = start, constants
 
     def _field(self, node: tree.Number | tree.Blob | tree.Block, path: str, shape: tuple[int, ...], strides: tuple[int, ...]) -> None:
         match node:

@@ -117,3 +117,10 @@ def test_a_frame_without_a_byte_is_never_found(text: str) -> None:
     ours = sensor(made(text))
     for backend in BACKENDS:
         assert len(ours.decode([b"", b"\0"], backend=backend)) == 0
+
+
+def test_constants_of_an_element_that_is_not_there_are_asked_of_no_frame() -> None:
+    element = 'Struct(Const(b"M"), "x" / Switch(this._.n, {7: Struct("y" / Int8ub)}, default=Array(this._.n % 4, Const(5, Int16ul))))'
+    ours = sensor(made(f'Struct("n" / Int8ub, "a" / Array(0, {element}), "z" / Int16ub)'))
+    for backend in BACKENDS:
+        assert len(ours.decode([b"\x01\x02\x03", b"\x07M\x03"], backend=backend)) == 2
