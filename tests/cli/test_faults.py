@@ -147,8 +147,7 @@ def seen_by_a_shell(code: int) -> int:
 
 def test_an_interrupt_ends_every_verb_with_130(worked: list[tuple[str, Terminal]], tmp_path: Path) -> None:
     for _, terminal in worked:
-        terminal.loaded(0.0)
-    worked[-1][1].loaded()
+        terminal.loaded()
     for _, terminal in worked:
         terminal.type("\x03")
     ends = {words: (seen_by_a_shell(terminal.ended()), "Traceback" in terminal.raw, terminal.is_as_before()) for words, terminal in worked}

@@ -36,7 +36,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.chdir(here)
     (here.parent / "lidarspec.toml").write_text(GOOD, encoding="utf-8")
     sensor = ls.sensor(SENSOR)
-    (here.parent / "front.bin").write_bytes(b"".join(simulate(sensor, 600)))
+    (here.parent / "front.bin").write_bytes(b"".join(simulate(sensor, 400)))
     return here.parent
 
 

@@ -11,7 +11,7 @@ from lidarspec.testing.subject import Subject
 from tests.engine.oracle import Cut, Oracle
 from tests.engine.streams import LENGTH, Books, clean, damaged, decoded, longest_example
 
-RATES = (0.0, 1e-5, 1e-4, 1e-3, 5e-3)
+RATES = (0.0, 1e-4, 1e-3, 5e-3)  # the first that damages anything damages one run
 BURSTS = (8, 16, 64)
 
 

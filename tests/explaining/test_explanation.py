@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import json
 import math
 import re
@@ -24,6 +25,7 @@ EXAMPLE = bytes.fromhex("542c6808ab7ee000e4dc00e2d900e5d500e3d300e4d000e9cd00e4c
 SMALL = 150
 
 
+@functools.cache
 def examples(sensor: str, frame: str) -> list[bytes]:
     return [SENSORS[sensor].example(frame, seed=seed) for seed in range(2)]
 

@@ -39,7 +39,7 @@ def test_the_writer_s_captures(tmp_path: Path) -> None:
 
 
 @needs_tshark
-@pytest.mark.parametrize(("name", "time"), [("velodyne-vlp16", "30ms"), ("robosense-m1", "5ms"), ("ldrobot-stl27l", "20ms")])
+@pytest.mark.parametrize(("name", "time"), [("velodyne-vlp16", "30ms"), ("ldrobot-stl27l", "20ms")])
 def test_simulated_and_recorded_captures(name: str, time: str, tmp_path: Path) -> None:
     sensor, script = lidarspec.sensor(name), written(lidarspec.sensor(name), tmp_path)
     simulated, recorded, again = tmp_path / "sim.pcap", tmp_path / "it.lsr", tmp_path / "again.pcap"

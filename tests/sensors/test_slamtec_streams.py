@@ -42,7 +42,7 @@ def test_a_descriptor_switches_to_its_own_frames_alone(answer: str) -> None:
 # Of 781 bytes, 1 % of damage leaves nothing whole; so HQ capsules are tried with less, too.
 @pytest.mark.parametrize(("answer", "rate"), [*((answer, 0.01) for answer in ANSWERS), ("hq", 0.001)])
 def test_a_damaged_stream_equals_the_oracle(answer: str, rate: float) -> None:
-    number = {"hq": 16, "ultra_dense": 60}.get(answer, 30)
+    number = {("hq", 0.001): 16, ("hq", 0.01): 6, ("ultra_dense", 0.01): 60}.get((answer, rate), 30)
     data = damaged(capsules(answer, number), rate, 11)
     found = [(item.frame, item.offset, item.data) for item in A1.split(data)]
     assert found == Oracle(A1, data).frames()

@@ -76,21 +76,18 @@ class Terminal:
         self.text()
         return self.process.returncode
 
-    def loaded(self, moment: float = 0.3) -> None:
-        """Wait until the program has imported what it works with, and then a moment; where that cannot be seen, time has to do."""
-        end = time.monotonic() + DEADLINE
-        while self.process.poll() is None and time.monotonic() < end:
+    def loaded(self) -> None:
+        """Wait until the program has imported what it works with and sleeps now and then; where that cannot be seen, time has to do."""
+        end, asleep = time.monotonic() + DEADLINE, 0
+        while asleep < 5 and self.process.poll() is None and time.monotonic() < end:
             try:
                 maps = Path(f"/proc/{self.process.pid}/maps").read_text(encoding="utf-8")
+                state = Path(f"/proc/{self.process.pid}/stat").read_text(encoding="utf-8").rpartition(") ")[2]
             except OSError:
-                maps = ""
+                maps = state = ""
                 end = min(end, time.monotonic() + 3)
-            if "_multiarray_umath" in maps:
-                break
+            asleep += "_multiarray_umath" in maps and state.startswith("S")  # one that is being loaded runs, or waits for the disk
             self._read(0.02)
-        end = time.monotonic() + moment
-        while time.monotonic() < end:
-            self._read(0.05)
 
     def is_as_before(self) -> bool:
         """Whether the terminal's modes are as they were before the program began."""
