@@ -16,7 +16,7 @@ import inspect
 import re
 import tomllib
 import traceback
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -52,13 +52,15 @@ class Target:
         sensors: that were found in it.
         findings: what kept others from being found.
         files: the modules that it is written in.
-        vectors: its golden vectors: beside a file; of a distribution with one sensor, in its folder or its tests.
+        vectors: its golden vectors: beside its modules, or in the folder of its distribution's source or the tests there.
+        family: the ids of the sensors that share them: of the file, or of the whole distribution.
     """
 
     sensors: list[Sensor] = field(default_factory=list)
     findings: list[Finding] = field(default_factory=list)
     files: list[Path] = field(default_factory=list)
     vectors: Path | None = None
+    family: tuple[str, ...] = ()
 
 
 def target(text: str | Path) -> Target:
@@ -79,14 +81,17 @@ def target(text: str | Path) -> Target:
     sensor = registry().sensor(name)
     homes = [plugin for plugin in registry().plugins if sensor.id in plugin.sensors]
     files = [file for plugin in homes for file in module_files(plugin.entry_point.partition(" = ")[2])]
-    alone = [file.parent for file in files if [plugin.sensors for plugin in homes] == [(sensor.id,)]]
-    return Target([sensor], [], files, _vectors(*alone, *(folder.parent for folder in alone)))
+    family = [
+        one for plugin in registry().plugins if plugin.distribution in {home.distribution for home in homes} for one in plugin.sensors
+    ]
+    return Target([sensor], [], files, _vectors(files), tuple(family))
 
 
 def _file(file: Path) -> Target:
-    found = Target(files=[file], vectors=_vectors(file.parent))
+    found = Target(files=[file], vectors=_vectors([file]))
     try:
         found.sensors = _added(file_module(file), str(file))
+        found.family = tuple(sensor.id for sensor in found.sensors[1:] and found.sensors)
         if not found.sensors:
             raise SpecError("there is no function lidarspec_sensors, marked @hookimpl, that returns a sensor")
     except SourceError:
@@ -106,12 +111,14 @@ def _folder(folder: Path) -> Target:
     entries = _entries(name)
     if not entries:
         raise SourceError(f"{name} is not installed, or has no sensors: pip install -e {folder}")
-    found = _distribution(entries)
-    found.vectors = _vectors(folder, folder / "tests") if len(found.sensors) == 1 else None
-    return found
+    return _distribution(entries)
 
 
-def _vectors(*folders: Path) -> Path | None:
+def _vectors(files: Iterable[Path]) -> Path | None:
+    """The golden vectors of some modules."""
+    beside = dict.fromkeys(file.resolve().parent for file in files)
+    sources = [home for folder in beside for home in (folder, *folder.parents[:2]) if (home / "pyproject.toml").is_file()]
+    folders = [*beside, *sources, *(home / "tests" for home in sources)]
     return next((folder / VECTORS for folder in folders if (folder / VECTORS).is_file()), None)
 
 
@@ -133,6 +140,7 @@ def _distribution(entries: list[EntryPoint]) -> Target:
             continue
         found.files += [file for file in module_files(entry.value) if file not in found.files]
         found.sensors += [known.get(sensor.id, sensor) for sensor in sensors if sensor.id not in {one.id for one in found.sensors}]
+    found.vectors, found.family = _vectors(found.files), tuple(sensor.id for sensor in found.sensors)
     names = {_normal(entry.distribution) for entry in entries}
     told = [(plugin, _said(plugin.error)) for plugin in registry().plugins if _normal(plugin.distribution) in names and plugin.error]
     found.findings += [Finding(code, plugin.error, plugin.entry_point) for plugin, code in told if code in ("LS005", "LS010")]
@@ -413,7 +421,7 @@ def reports(
     if mistakes and not single:
         yield Report(name, mistakes)
     for sensor in target.sensors:
-        subject = Subject(sensor, examples, vectors=vectors or target.vectors)
+        subject = Subject(sensor, examples, vectors=vectors or target.vectors, family=() if vectors and single else target.family)
         yield _report(subject, places, mistakes if single else [], watch or (lambda text: None))
 
 

@@ -42,10 +42,6 @@ def _no_device(subject: Subject) -> str:
     return _no_sweep(subject) if has_replies else "it has no commands with a documented reply"
 
 
-def _no_vectors(subject: Subject) -> str:
-    return "" if subject.vectors else "there is no file of golden vectors"
-
-
 @dataclass(frozen=True)
 class Property:
     """Something that has to hold.
@@ -103,7 +99,9 @@ PROPERTIES = (
     Property(frames.a_truncated_frame_is_a_wire_error, "frame", "LS307"),
     Property(frames.a_damaged_frame_is_at_worst_a_wire_error, "frame", "LS308"),
     Property(frames.every_single_bit_error_is_seen, "frame", "LS310"),
-    Property(vectors.vectors_hold, "sensor", "LS706", lacks=_no_vectors),
+    Property(vectors.the_status_is_proven, "sensor", "LS710"),
+    Property(vectors.vectors_hold, "sensor", "LS706", lacks=vectors.lacking),
+    Property(vectors.every_data_field_is_pinned_down, "data", "LS711", lacks=vectors.lacking, unless=("LS702", "LS703", "LS707")),
     Property(geometry.clouds_keep_the_conventions, "data", "LS501"),
     Property(geometry.directions_are_radians, "data", "LS502", unless=("LS414",)),
     Property(geometry.a_single_point_has_a_direction, "data", "LS503", unless=("LS414",)),

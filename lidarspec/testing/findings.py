@@ -106,6 +106,10 @@ LS706 a vector has another value | the sensor means something else by these byte
 LS707 a vector is not a frame | a real sensor's bytes are refused | the struct as the manual has it
 LS708 a vector has its point elsewhere | the picture is wrong | `points` as the manual has it
 LS709 a mirrored point | left and right are exchanged | azimuth=-np.deg2rad(clockwise)
+LS710 a status without vectors | nobody can see that a frame of a real sensor was ever read
+      | vectors.json with frames of the manual or a capture, or status="manual"
+LS711 a field that no vector pins down | byte order, scale or place of it may be wrong, and nothing shows it
+      | its value in `values` or `units`, in one vector at least another one than 0
 LS801 an exception is swallowed | what goes wrong is neither seen nor counted | no try at all: the engine counts it
 LS802 the clock of the wall | it jumps, and two runs give two results | the sensor's own clock, or time given by the caller
 LS803 a short write is ignored | the rest of a command never arrives | sendall, or write on until all is written

@@ -113,6 +113,7 @@ class Subject:
         examples: how many examples of each frame type a property tries.
         strategies: "frame.field" -> how its raw value is drawn: a hypothesis strategy, or a function of `random.Random`.
         vectors: the file of golden vectors, None where there is none.
+        family: the ids of the sensors that share that file; none where it is this sensor's alone.
         measured: what was measured, in words, by what it is of.
     """
 
@@ -120,6 +121,7 @@ class Subject:
     examples: int = EXAMPLES
     strategies: Mapping[str, Any] = field(default_factory=dict)
     vectors: Path | None = None
+    family: tuple[str, ...] = ()
     measured: dict[str, str] = field(default_factory=dict)
     _known: dict[tuple[str, int], bytes] = field(default_factory=dict, repr=False)
     _drawers: dict[str, dict[str, Callable[[random.Random], int]]] = field(default_factory=dict, repr=False)

@@ -7,6 +7,9 @@
 
 `values` are raw integers of the wire, `units` the same in the fields' units, `points` what becomes of single points (range, x, y, z,
 azimuth and elevation in radians, intensity, ring). All three may be left out: then the bytes have to be such a frame, and build again.
+`sensor` is the id, or a list of ids, of the sensors that an entry is of; where one sensor alone has the file, it may be left out.
+
+What the vectors leave open is looked at as well: a status that claims more than there is, and fields of the data that none pins down.
 """
 
 from __future__ import annotations
@@ -25,18 +28,19 @@ from lidarspec.spec.tree import FieldInfo
 from lidarspec.testing.findings import Violation, require
 from lidarspec.testing.frames import leaves
 from lidarspec.testing.geometry import read
-from lidarspec.testing.subject import Subject
+from lidarspec.testing.subject import Subject, seals
 
 #: what a point may differ by: metres and radians as manuals print them.
 NEAR = 2e-4
-KEYS = {"source", "frame", "hex", "values", "units", "points", "note"}
+KEYS = {"source", "sensor", "frame", "hex", "values", "units", "points", "note"}
+#: names of fields that say nothing, and have nothing to be pinned down to.
+IDLE = re.compile(r"reserved|unused|unknown|spare|padding|filler", re.IGNORECASE)
 COLUMNS = ("range", "x", "y", "z", "azimuth", "elevation", "intensity", "ring", "return_index")
 
 
 def vectors_hold(subject: Subject) -> None:
     """Every golden vector parses to its values, builds again, and has its points where they are said to be."""
-    for index, vector in enumerate(entries(subject)):
-        place = f"vectors[{index}]"
+    for place, vector in entries(subject).items():
         require(str(vector.get("source", "")).strip(), "LS701", "it names no source", place)
         data = bytes.fromhex(vector["hex"])
         name = vector["frame"]
@@ -47,30 +51,80 @@ def vectors_hold(subject: Subject) -> None:
             _points(subject, name, data, vector["points"], place)
 
 
-def entries(subject: Subject) -> list[Any]:
-    """The vectors of the subject's file.
+def lacking(subject: Subject) -> str:
+    """Why there are no vectors of this sensor; "" where there are, and where `vectors_hold` says what is wrong with them."""
+    if subject.vectors is None:
+        return "there is no file of golden vectors"
+    try:
+        return "" if entries(subject) else f"{Path(subject.vectors).name} has none of {subject.sensor.id}"
+    except Violation:
+        return ""
+
+
+def the_status_is_proven(subject: Subject) -> None:
+    """A sensor that is said to be proven by more than its manual's text has vectors of its own."""
+    status, missing = subject.sensor.status, lacking(subject)
+    require(status == "manual" or not missing, "LS710", f"status is {status!r}, and {missing}")
+
+
+def every_data_field_is_pinned_down(subject: Subject, name: str) -> None:
+    """Each field of the data has a value in some vector, and another one than 0."""
+    vectors = [vector for vector in entries(subject).values() if vector["frame"] == name]
+    require(vectors, "LS711", f"no vector is a {name!r} frame", name)
+    pinned: dict[str, bool] = {}
+    for vector in vectors:
+        read_as = dict(leaves(_parsed(subject, name, bytes.fromhex(vector["hex"]), name)))
+        for path in (*vector.get("values", {}), *vector.get("units", {})):
+            plain = re.sub(r"\[\d+\]", "", path)
+            pinned[plain] = pinned.get(plain, False) or bool(read_as.get(path))
+    sealing = seals(subject.sensor, name, subject.example(name))
+    free = [path for path, info in subject.fields(name).items() if info.const is None and info.kind in ("int", "float")]
+    asked = [path for path in free if path not in sealing and not IDLE.search(path.rpartition(".")[2])]
+    said = {"no vector gives a value of": [path for path in asked if path not in pinned]}
+    said["0 alone is given of"] = [path for path in asked if pinned.get(path) is False]
+    told = "; ".join(f"{words} {', '.join(paths)}" for words, paths in said.items() if paths)
+    require(not told, "LS711", told, name)
+
+
+def entries(subject: Subject) -> dict[str, Any]:
+    """The vectors of the sensor by their places in the file.
 
     Raises:
         Violation: where it cannot be read, or has an entry that is no vector.
     """
     if subject.vectors is None:
-        return []
+        return {}
     try:
         found = json.loads(Path(subject.vectors).read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         raise Violation("LS702", str(error), str(subject.vectors)) from None
     if not isinstance(found, list):
         raise Violation("LS702", "the file is no list of vectors", str(subject.vectors))
+    mine = {}
     for index, vector in enumerate(found):
         place = f"vectors[{index}]"
         require(isinstance(vector, dict), "LS702", "it is no object", place)
+        if not _is_of(subject, vector, place):
+            continue
         require(not vector.keys() - KEYS, "LS702", f"unknown keys {sorted(vector.keys() - KEYS)}; known are {sorted(KEYS)}", place)
         require(vector.get("frame") in subject.sensor.frames, "LS702", f"there is no frame {vector.get('frame')!r}", place)
         try:
             bytes.fromhex(vector.get("hex", "-"))
         except (ValueError, TypeError):
             raise Violation("LS702", "its `hex` is no hex text", place) from None
-    return found
+        mine[place] = vector
+    return mine
+
+
+def _is_of(subject: Subject, vector: Mapping[str, Any], place: str) -> bool:
+    """Whether an entry is of the sensor; one that could be of nobody, or of any of several, is a finding."""
+    named, family = vector.get("sensor", []), subject.family
+    ids = [named] if isinstance(named, str) else named
+    told = f'it names no sensor, and the file is shared by {", ".join(family)}: "sensor": "{subject.sensor.id}"'
+    require(ids or len(family) < 2, "LS702", told, place)
+    nobody = [one for one in ids if family and one not in family]
+    require(not nobody, "LS702", f"there is no sensor {', '.join(map(repr, nobody))} here, but {', '.join(family)}", place)
+    return not ids or subject.sensor.id in ids
 
 
 def _parsed(subject: Subject, name: str, data: bytes, place: str) -> Any:
@@ -80,7 +134,7 @@ def _parsed(subject: Subject, name: str, data: bytes, place: str) -> Any:
     except WireError as error:
         if ": checksum " not in error.reason:
             raise Violation("LS707", error.reason, f"{place} {name}.{error.path}") from error
-        same = [bytes.fromhex(one["hex"]) for one in entries(subject) if one["frame"] == name]
+        same = [bytes.fromhex(one["hex"]) for one in entries(subject).values() if one["frame"] == name]
         fitting = [f"{match.paste} over {match.span.told(match.place, len(data))}" for match in search(same)[:2]]
         fits = f"; {' or '.join(fitting)} fits" if fitting else ""
         raise Violation("LS703", f"{error.reason}{fits}", f"{place} {name}.{error.path}") from error

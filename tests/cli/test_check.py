@@ -49,6 +49,13 @@ def test_a_distribution_is_checked_with_all_of_its_sensors() -> None:
     assert [report["name"] for report in found] == ["ldrobot-ld06", "ldrobot-stl27l"]
 
 
+def test_vectors_of_a_distribution_with_several_sensors_are_looked_at() -> None:
+    folder = ROOT / "plugins" / "lidarspec-ldrobot"
+    for name in ("ldrobot-ld06", "lidarspec-ldrobot", folder):
+        for report in json.loads(ran("check", name, "--max-examples", "3", "--json").stdout):
+            assert not {"vectors_hold", "every_data_field_is_pinned_down"} & report["skipped"].keys()
+
+
 def test_a_distribution_is_checked_by_its_folder(tmp_path: Path) -> None:
     report, _ = json.loads(ran("check", ROOT / "plugins" / "lidarspec-ldrobot", "--max-examples", "3", "--json").stdout)
     assert report["name"] == "ldrobot-ld06"

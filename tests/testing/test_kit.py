@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
+import tempfile
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,6 +18,7 @@ from hypothesis import strategies as st
 from lidarspec import Sensor
 from lidarspec.spec import Checksummed, Fields, Frame, Polar, Sum, take
 from lidarspec.testing.check import Target, reports
+from lidarspec.testing.conformance import PROPERTIES
 from lidarspec.testing.declared import declared
 from lidarspec.testing.findings import Violation, left_over
 from lidarspec.testing.frames import values_survive_building_and_parsing
@@ -144,6 +148,46 @@ def test_what_only_looks_up_a_table_needs_no_unit() -> None:
 
     assert left(sound.sensor(points=points)) == set()
     assert left(sound.sensor(points=lambda f: Polar(f.samples.distance, f.number / 256))) == {"LS201"}
+
+
+BY_VECTORS = Path(sound.__file__).parent / "by_vectors" / "vectors.json"
+
+
+def told(sensor: Sensor, vectors: list[dict[str, Any]] | None, *family: str) -> list[str]:
+    """What the golden vectors of a sensor are said to lack."""
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "vectors.json"
+        file.write_text(json.dumps(vectors), encoding="utf-8")
+        subject = Subject(sensor, vectors=None if vectors is None else file, family=family)
+        about = [one for one in PROPERTIES if one.function.__module__ == vectors_hold.__module__ and not one.lacks(subject)]
+        return [f"{finding.code} {finding.path}: {finding.what}" for one in about for finding in one.findings(subject)]
+
+
+def test_a_status_is_proven_by_vectors_of_its_own() -> None:
+    proven, known = sound.sensor(status="capture"), json.loads(BY_VECTORS.read_text(encoding="utf-8"))
+    assert told(proven, None) == ["LS710 : status is 'capture', and there is no file of golden vectors"]
+    assert told(proven, [{**entry, "sensor": "broken-two"} for entry in known]) == [
+        "LS710 : status is 'capture', and vectors.json has none of broken-one"
+    ]
+    assert told(proven, [{**entry, "sensor": ["broken-one", "broken-two"]} for entry in known], "broken-one", "broken-two") == []
+    assert told(sound.sensor(), None) == []
+
+
+def test_vectors_of_several_sensors_say_whose_they_are() -> None:
+    known = json.loads(BY_VECTORS.read_text(encoding="utf-8"))
+    asked = told(sound.sensor(), known, "broken-one", "broken-two")
+    assert 'it names no sensor, and the file is shared by broken-one, broken-two: "sensor": "broken-one"' in asked[0]
+    asked = told(sound.sensor(), [{**entry, "sensor": "borken-one"} for entry in known], "broken-one")
+    assert "there is no sensor 'borken-one' here, but broken-one" in asked[0]
+
+
+def test_a_field_of_the_data_that_no_vector_pins_down_is_named() -> None:
+    first, second = json.loads(BY_VECTORS.read_text(encoding="utf-8"))
+    del first["values"]["last"], first["values"]["samples[1].distance"], second["values"]["samples[1].distance"]
+    first["values"]["samples[2].distance"] = 0
+    assert told(sound.sensor(), [first, second]) == ["LS711 data: no vector gives a value of last; 0 alone is given of samples.distance"]
+    ack = {"frame": "ack", "hex": sound.sensor().example("ack").hex(), "source": "made up"}
+    assert told(sound.sensor(), [ack])[0] == "LS711 data: no vector is a 'data' frame"
 
 
 def test_vectors_that_prove_nothing_are_findings(tmp_path: Path) -> None:
