@@ -99,6 +99,7 @@ PROPERTIES = (
     Property(frames.a_truncated_frame_is_a_wire_error, "frame", "LS307"),
     Property(frames.a_damaged_frame_is_at_worst_a_wire_error, "frame", "LS308"),
     Property(frames.every_single_bit_error_is_seen, "frame", "LS310"),
+    Property(vectors.every_checksum_is_checked, "frame", "LS212"),
     Property(vectors.the_status_is_proven, "sensor", "LS710"),
     Property(vectors.vectors_hold, "sensor", "LS706", lacks=vectors.lacking),
     Property(vectors.every_data_field_is_pinned_down, "data", "LS711", lacks=vectors.lacking, unless=("LS702", "LS703", "LS707")),

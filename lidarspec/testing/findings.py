@@ -63,6 +63,8 @@ LS208 `points` that cannot be traced | it is evaluated plainly: ten times slower
 LS209 an acknowledgement of nothing | it would hide the next finding of its kind | acknowledged= without it, or with a reason
 LS210 a range limit that its field cannot hold | scale or limit is wrong | the scale of the manual, and its limit in metres
 LS211 a part of the declaration is missing | nothing can open, decode or find the sensor | vendor, model, a data frame and a data link
+LS212 a checksum that nobody checks | damaged frames are taken for good ones
+      | Checksummed(Struct(...), field="crc", algorithm=...); `lidarspec crc` finds the algorithm
 LS301 no example can be made up | nothing can be tried on it
       | a `sweep`, on another frame than data Frame(sweep=), or strategies = {"frame.field": ...} in the test class
 LS302 bytes do not survive parsing and building | a replayed or edited frame is another one | fields that keep every bit

@@ -17,22 +17,32 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from lidarspec.discovery.checksum_search import search
+from lidarspec.discovery.samples import Match
 from lidarspec.errors import LidarSpecError, WireError
+from lidarspec.framing.frame_engine import CompiledCodec, codec
 from lidarspec.spec.tree import FieldInfo
 from lidarspec.testing.findings import Violation, require
 from lidarspec.testing.frames import leaves
 from lidarspec.testing.geometry import read
-from lidarspec.testing.subject import Subject, seals
+from lidarspec.testing.subject import SHORT, Subject, seals
+from lidarspec.wire.layout import Layout
 
 #: what a point may differ by: metres and radians as manuals print them.
 NEAR = 2e-4
 KEYS = {"source", "sensor", "frame", "hex", "values", "units", "points", "note"}
+#: names of fields that hold a checksum.
+CHECK = re.compile(
+    r"(\w+_)?(crc|checksum|check_?sum|check|chk|chksum|cksum|cs|bcc|lrc|fcs|xor|sum)_?(8|16|32)?(_(lo|hi|low|high|lsb|msb))?"
+)
+#: doubt at which a field of any other name can only be a checksum: one wrong guess in four thousand looks like that.
+PROVEN = 12
 #: names of fields that say nothing, and have nothing to be pinned down to.
 IDLE = re.compile(r"reserved|unused|unknown|spare|padding|filler", re.IGNORECASE)
 COLUMNS = ("range", "x", "y", "z", "azimuth", "elevation", "intensity", "ring", "return_index")
@@ -84,6 +94,40 @@ def every_data_field_is_pinned_down(subject: Subject, name: str) -> None:
     said["0 alone is given of"] = [path for path in asked if pinned.get(path) is False]
     told = "; ".join(f"{words} {', '.join(paths)}" for words, paths in said.items() if paths)
     require(not told, "LS711", told, name)
+
+
+def every_checksum_is_checked(subject: Subject, name: str) -> None:
+    """No field that no `Checksummed` names is a checksum, by its own name or by what the search finds over the vectors."""
+    sealing = seals(subject.sensor, name, subject.example(name))
+    free = [path for path, info in subject.fields(name).items() if info.const is None and path not in sealing]
+    named = [path for path in free if CHECK.fullmatch(path.rpartition(".")[2])]
+    try:
+        frames = [bytes.fromhex(vector["hex"]) for vector in entries(subject).values() if vector["frame"] == name]
+    except Violation:  # said by `vectors_hold`
+        frames = []
+    for match in [] if sealing else _common(frames):
+        path = _standing(subject, name, match, frames[0])
+        if path in (named or free) and (named or match.doubt >= PROVEN):
+            fits = f"{match.paste} over {match.span.told(match.place, len(frames[0]))} fits every vector"
+            raise Violation("LS212", f"{fits}, and no Checksummed holds a frame to it", f"{name}.{path}")
+    require(not named, "LS212", "it is a checksum by its name, and no Checksummed holds a frame to it", f"{name}.{''.join(named[:1])}")
+
+
+def _common(frames: list[bytes]) -> list[Match]:
+    """The checksums that fit all of some frames; long ones are searched one by one, for what stands where checksums usually do."""
+    if max(map(len, frames), default=0) <= SHORT:
+        return search(frames)
+    first, *others = [{(match.paste, match.place, match.span): match for match in search([frame])} for frame in frames]
+    return [replace(match, doubt=match.doubt * len(frames)) for key, match in first.items() if all(key in other for other in others)]
+
+
+def _standing(subject: Subject, name: str, match: Match, frame: bytes) -> str:
+    """The field that a checksum stands in; "" where that cannot be told."""
+    engine = codec(subject.sensor.frames[name])
+    layout = engine.tree.layout(frame) if isinstance(engine, CompiledCodec) else None
+    start = match.place.start(len(frame))
+    leaves = layout.leaves.items() if isinstance(layout, Layout) else ()
+    return next((path for path, leaf in leaves if leaf.offset in range(start, start + match.place.size) and not leaf.shape), "")
 
 
 def entries(subject: Subject) -> dict[str, Any]:

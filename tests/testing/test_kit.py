@@ -12,11 +12,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from construct import Const, Int8ul, Int16ul, Struct
+from construct import Array, Const, Int8ul, Int16ul, Struct
 from hypothesis import strategies as st
 
 from lidarspec import Sensor
-from lidarspec.spec import Checksummed, Fields, Frame, Polar, Sum, take
+from lidarspec.spec import Checksummed, Crc, Fields, Frame, Polar, Sum, take
 from lidarspec.testing.check import Target, reports
 from lidarspec.testing.conformance import PROPERTIES
 from lidarspec.testing.declared import declared
@@ -188,6 +188,18 @@ def test_a_field_of_the_data_that_no_vector_pins_down_is_named() -> None:
     assert told(sound.sensor(), [first, second]) == ["LS711 data: no vector gives a value of last; 0 alone is given of samples.distance"]
     ack = {"frame": "ack", "hex": sound.sensor().example("ack").hex(), "source": "made up"}
     assert told(sound.sensor(), [ack])[0] == "LS711 data: no vector is a 'data' frame"
+
+
+@pytest.mark.parametrize("samples", [3, 200], ids=["short", "long"])
+def test_a_checksum_of_another_name_is_found_in_the_vectors(samples: int) -> None:
+    struct = Struct("header" / Const(b"\xaa\x55\xc3"), "samples" / Array(samples, Int16ul), "end" / Int16ul)
+    plain = Frame(struct, data=True, max_length=5 + 2 * samples)
+    sealed = replace(plain, struct=Checksummed(struct, field="end", algorithm=Crc(16, 0x8005)))
+    examples = [sound.sensor(sealed).example("data", seed=seed) for seed in range(3)]
+    vectors = [{"frame": "data", "hex": data.hex(), "source": "made up"} for data in examples]
+    said = "LS212 data.end: Crc(width=16, poly=0x8005) over all other bytes fits every vector"
+    assert told(sound.sensor(plain), vectors)[0].startswith(said)
+    assert not any(text.startswith("LS212") for text in told(sound.sensor(sealed), vectors))
 
 
 def test_vectors_that_prove_nothing_are_findings(tmp_path: Path) -> None:
