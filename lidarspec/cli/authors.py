@@ -101,6 +101,7 @@ def _told(report: Report, *, verbose: bool) -> list[str]:
     more = f", {report.held} properties hold" if report.held else ""
     more += f", {len(report.skipped)} skipped" if report.skipped else ""
     lines = [f"{report.name}: {verdict}{more}"]
+    lines += [f"  {name}: {value}" for name, value in report.picture.items()]
     if verbose:
         lines += [f"  skipped   {name}: {reason}" for name, reason in report.skipped.items()]
         lines += [f"  measured  {name}: {value}" for name, value in report.measured.items()]

@@ -28,6 +28,7 @@ from lidarspec.testing.conformance import PROPERTIES
 from lidarspec.testing.declared import declared
 from lidarspec.testing.findings import Finding, left_over
 from lidarspec.testing.subject import EXAMPLES, Subject
+from lidarspec.testing.vectors import points_stand_in_two_quadrants
 
 #: the name of a file of golden vectors.
 VECTORS = "vectors.json"
@@ -389,7 +390,8 @@ class Report:
         findings: what is wrong.
         held: how many properties hold.
         skipped: property -> why it does not apply.
-        measured: what was measured along the way.
+        measured: what was measured of frames along the way.
+        picture: what was measured of points, and what it has to be held against.
     """
 
     name: str
@@ -397,6 +399,7 @@ class Report:
     held: int = 0
     skipped: dict[str, str] = field(default_factory=dict)
     measured: dict[str, str] = field(default_factory=dict)
+    picture: dict[str, str] = field(default_factory=dict)
 
     def to_dict(self) -> dict[str, Any]:
         """The report as JSON has it."""
@@ -425,6 +428,15 @@ def reports(
         yield _report(subject, places, mistakes if single else [], watch or (lambda text: None))
 
 
+def _beside(sensor: Sensor, skipped: Mapping[str, str]) -> Iterator[tuple[str, str]]:
+    """What the picture of a sensor has to be held against."""
+    missing = skipped.get(points_stand_in_two_quadrants.__name__)
+    if missing:
+        yield "vectors", f"{missing}; x and y of points in two quadrants would prove the picture"
+    yield "vendor_axes", f"x, y, z are {', '.join(sensor.vendor_axes)}" if sensor.vendor_axes else "not declared"
+    yield "source", sensor.source
+
+
 def _report(subject: Subject, places: Places, mistakes: list[Finding], watch: Callable[[str], None]) -> Report:
     sensor: Sensor = subject.sensor
     report = Report(sensor.id, list(mistakes))
@@ -450,4 +462,5 @@ def _report(subject: Subject, places: Places, mistakes: list[Finding], watch: Ca
     left = left_over(distinct, sensor, whole=ELSE not in report.skipped)
     report.findings = [places.placed(finding, sensor) for finding in left]
     report.measured = subject.measured
+    report.picture = subject.picture and {**dict(sorted(subject.picture.items())), **dict(_beside(sensor, report.skipped))}
     return report

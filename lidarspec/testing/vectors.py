@@ -96,6 +96,27 @@ def every_data_field_is_pinned_down(subject: Subject, name: str) -> None:
     require(not told, "LS711", told, name)
 
 
+def points_stand_in_two_quadrants(subject: Subject, name: str) -> None:
+    """Points that the vectors place lie in two quadrants at least, and all points of their frames within the sensor's reach."""
+    vectors = [vector for vector in entries(subject).values() if vector["frame"] == name]
+    placed = [point for vector in vectors for point in vector.get("points", {}).values() if {"x", "y"} <= point.keys()]
+    quadrants = {(point["x"] > 0, point["y"] > 0) for point in placed if point["x"] and point["y"]}
+    clouds = [read(subject, name, [bytes.fromhex(vector["hex"])] * subject.sensor.frames[name].confirm).points() for vector in vectors]
+    ranges = np.concatenate([np.empty(0), *(cloud.range[cloud.valid] for cloud in clouds)])
+    seen = f"{ranges.min():.4g} .. {ranges.max():.4g} m" if len(ranges) else "no returns"
+    number = f"{len(quadrants)} quadrant{'s' * (len(quadrants) != 1)}"
+    subject.picture[f"{name}: vectors"] = f"{seen} in {len(vectors)} of them, which say x and y in {number}"
+    far = subject.sensor.range_limits[1]
+    require(
+        not len(ranges) or ranges.max() <= far * (1 + NEAR),
+        "LS713",
+        f"{ranges.max(initial=0):.4g} m, and range_limits end at {far:g} m",
+        name,
+    )
+    if vectors:
+        require(len(quadrants) > 1, "LS712", f"they say x and y of points in {number}", f"{name}.points")
+
+
 def every_checksum_is_checked(subject: Subject, name: str) -> None:
     """No field that no `Checksummed` names is a checksum, by its own name or by what the search finds over the vectors."""
     sealing = seals(subject.sensor, name, subject.example(name))

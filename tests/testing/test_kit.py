@@ -7,6 +7,7 @@ import subprocess
 import sys
 import tempfile
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,7 @@ from lidarspec.testing.conformance import PROPERTIES
 from lidarspec.testing.declared import declared
 from lidarspec.testing.findings import Violation, left_over
 from lidarspec.testing.frames import values_survive_building_and_parsing
+from lidarspec.testing.geometry import the_points_turn_as_the_axes_do
 from lidarspec.testing.subject import Subject
 from lidarspec.testing.vectors import vectors_hold
 from tests.broken import sound
@@ -188,6 +190,28 @@ def test_a_field_of_the_data_that_no_vector_pins_down_is_named() -> None:
     assert told(sound.sensor(), [first, second]) == ["LS711 data: no vector gives a value of last; 0 alone is given of samples.distance"]
     ack = {"frame": "ack", "hex": sound.sensor().example("ack").hex(), "source": "made up"}
     assert told(sound.sensor(), [ack])[0] == "LS711 data: no vector is a 'data' frame"
+
+
+def test_vectors_place_points_in_two_quadrants_within_reach() -> None:
+    first, second = json.loads(BY_VECTORS.read_text(encoding="utf-8"))
+    assert told(sound.sensor(range_limits=(0.05, 4.0)), [first, second]) == ["LS713 data: 4.66 m, and range_limits end at 4 m"]
+    del second["points"]
+    assert told(sound.sensor(), [first, second]) == ["LS712 data.points: they say x and y of points in 1 quadrant"]
+
+
+@pytest.mark.parametrize(("axes", "sense"), [(("right", "forward", "up"), "clockwise"), (("forward", "left", "up"), "counter-clockwise")])
+def test_the_sense_of_the_points_is_measured_and_held_against_the_axes(axes: tuple[str, str, str], sense: str) -> None:
+    sign = 1 if sense == "counter-clockwise" else -1
+
+    def turning(sign: int, f: Fields) -> Polar:
+        return Polar(f.samples.distance, sign * sound.points(f).azimuth)
+
+    right, wrong = (Subject(sound.sensor(points=partial(turning, way), vendor_axes=axes)) for way in (sign, -sign))
+    the_points_turn_as_the_axes_do(right, "data")
+    assert right.picture["data: sense"] == f"{sense} as first grows, seen from above"
+    with pytest.raises(Violation, match=f"angles run {sense}") as found:
+        the_points_turn_as_the_axes_do(wrong, "data")
+    assert found.value.code == "LS511"
 
 
 @pytest.mark.parametrize("samples", [3, 200], ids=["short", "long"])
