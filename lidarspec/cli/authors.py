@@ -70,7 +70,7 @@ def _drafted(names: Names, link: str | None, capture: str) -> dict[str, str]:
 @click.command()
 @click.argument("name", metavar="ID|FILE|DISTRIBUTION|FOLDER")
 @click.option("--max-examples", type=click.IntRange(1), default=EXAMPLES, show_default=True, help="Examples of each frame type.")
-@click.option("--vectors", metavar="FILE", help="Golden vectors; by default vectors.json beside a file.")
+@click.option("--vectors", metavar="FILE", help="Golden vectors; by default vectors.json beside the modules.")
 @click.option("-v", "--verbose", is_flag=True, help="Also what was skipped and why, and what was measured.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 @click.option("-o", "--output", metavar="FILE", help="Write to a file instead of standard output.")
@@ -101,6 +101,7 @@ def _told(report: Report, *, verbose: bool) -> list[str]:
     more = f", {report.held} properties hold" if report.held else ""
     more += f", {len(report.skipped)} skipped" if report.skipped else ""
     lines = [f"{report.name}: {verdict}{more}"]
+    lines += [f"  {name}: {value}" for name, value in report.picture.items()]
     if verbose:
         lines += [f"  skipped   {name}: {reason}" for name, reason in report.skipped.items()]
         lines += [f"  measured  {name}: {value}" for name, value in report.measured.items()]

@@ -16,7 +16,7 @@ import inspect
 import re
 import tomllib
 import traceback
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -28,6 +28,7 @@ from lidarspec.testing.conformance import PROPERTIES
 from lidarspec.testing.declared import declared
 from lidarspec.testing.findings import Finding, left_over
 from lidarspec.testing.subject import EXAMPLES, Subject
+from lidarspec.testing.vectors import points_stand_in_two_quadrants
 
 #: the name of a file of golden vectors.
 VECTORS = "vectors.json"
@@ -52,13 +53,15 @@ class Target:
         sensors: that were found in it.
         findings: what kept others from being found.
         files: the modules that it is written in.
-        vectors: its golden vectors: beside a file; of a distribution with one sensor, in its folder or its tests.
+        vectors: its golden vectors: beside its modules, or in the folder of its distribution's source or the tests there.
+        family: the ids of the sensors that share them: of the file, or of the whole distribution.
     """
 
     sensors: list[Sensor] = field(default_factory=list)
     findings: list[Finding] = field(default_factory=list)
     files: list[Path] = field(default_factory=list)
     vectors: Path | None = None
+    family: tuple[str, ...] = ()
 
 
 def target(text: str | Path) -> Target:
@@ -79,14 +82,17 @@ def target(text: str | Path) -> Target:
     sensor = registry().sensor(name)
     homes = [plugin for plugin in registry().plugins if sensor.id in plugin.sensors]
     files = [file for plugin in homes for file in module_files(plugin.entry_point.partition(" = ")[2])]
-    alone = [file.parent for file in files if [plugin.sensors for plugin in homes] == [(sensor.id,)]]
-    return Target([sensor], [], files, _vectors(*alone, *(folder.parent for folder in alone)))
+    family = [
+        one for plugin in registry().plugins if plugin.distribution in {home.distribution for home in homes} for one in plugin.sensors
+    ]
+    return Target([sensor], [], files, _vectors(files), tuple(family))
 
 
 def _file(file: Path) -> Target:
-    found = Target(files=[file], vectors=_vectors(file.parent))
+    found = Target(files=[file], vectors=_vectors([file]))
     try:
         found.sensors = _added(file_module(file), str(file))
+        found.family = tuple(sensor.id for sensor in found.sensors[1:] and found.sensors)
         if not found.sensors:
             raise SpecError("there is no function lidarspec_sensors, marked @hookimpl, that returns a sensor")
     except SourceError:
@@ -106,12 +112,14 @@ def _folder(folder: Path) -> Target:
     entries = _entries(name)
     if not entries:
         raise SourceError(f"{name} is not installed, or has no sensors: pip install -e {folder}")
-    found = _distribution(entries)
-    found.vectors = _vectors(folder, folder / "tests") if len(found.sensors) == 1 else None
-    return found
+    return _distribution(entries)
 
 
-def _vectors(*folders: Path) -> Path | None:
+def _vectors(files: Iterable[Path]) -> Path | None:
+    """The golden vectors of some modules."""
+    beside = dict.fromkeys(file.resolve().parent for file in files)
+    sources = [home for folder in beside for home in (folder, *folder.parents[:2]) if (home / "pyproject.toml").is_file()]
+    folders = [*beside, *sources, *(home / "tests" for home in sources)]
     return next((folder / VECTORS for folder in folders if (folder / VECTORS).is_file()), None)
 
 
@@ -133,6 +141,7 @@ def _distribution(entries: list[EntryPoint]) -> Target:
             continue
         found.files += [file for file in module_files(entry.value) if file not in found.files]
         found.sensors += [known.get(sensor.id, sensor) for sensor in sensors if sensor.id not in {one.id for one in found.sensors}]
+    found.vectors, found.family = _vectors(found.files), tuple(sensor.id for sensor in found.sensors)
     names = {_normal(entry.distribution) for entry in entries}
     told = [(plugin, _said(plugin.error)) for plugin in registry().plugins if _normal(plugin.distribution) in names and plugin.error]
     found.findings += [Finding(code, plugin.error, plugin.entry_point) for plugin, code in told if code in ("LS005", "LS010")]
@@ -381,7 +390,8 @@ class Report:
         findings: what is wrong.
         held: how many properties hold.
         skipped: property -> why it does not apply.
-        measured: what was measured along the way.
+        measured: what was measured of frames along the way.
+        picture: what was measured of points, and what it has to be held against.
     """
 
     name: str
@@ -389,6 +399,7 @@ class Report:
     held: int = 0
     skipped: dict[str, str] = field(default_factory=dict)
     measured: dict[str, str] = field(default_factory=dict)
+    picture: dict[str, str] = field(default_factory=dict)
 
     def to_dict(self) -> dict[str, Any]:
         """The report as JSON has it."""
@@ -413,8 +424,17 @@ def reports(
     if mistakes and not single:
         yield Report(name, mistakes)
     for sensor in target.sensors:
-        subject = Subject(sensor, examples, vectors=vectors or target.vectors)
+        subject = Subject(sensor, examples, vectors=vectors or target.vectors, family=() if vectors and single else target.family)
         yield _report(subject, places, mistakes if single else [], watch or (lambda text: None))
+
+
+def _beside(sensor: Sensor, skipped: Mapping[str, str]) -> Iterator[tuple[str, str]]:
+    """What the picture of a sensor has to be held against."""
+    missing = skipped.get(points_stand_in_two_quadrants.__name__)
+    if missing:
+        yield "vectors", f"{missing}; x and y of points in two quadrants would prove the picture"
+    yield "vendor_axes", f"x, y, z are {', '.join(sensor.vendor_axes)}" if sensor.vendor_axes else "not declared"
+    yield "source", sensor.source
 
 
 def _report(subject: Subject, places: Places, mistakes: list[Finding], watch: Callable[[str], None]) -> Report:
@@ -442,4 +462,5 @@ def _report(subject: Subject, places: Places, mistakes: list[Finding], watch: Ca
     left = left_over(distinct, sensor, whole=ELSE not in report.skipped)
     report.findings = [places.placed(finding, sensor) for finding in left]
     report.measured = subject.measured
+    report.picture = subject.picture and {**dict(sorted(subject.picture.items())), **dict(_beside(sensor, report.skipped))}
     return report

@@ -42,10 +42,6 @@ def _no_device(subject: Subject) -> str:
     return _no_sweep(subject) if has_replies else "it has no commands with a documented reply"
 
 
-def _no_vectors(subject: Subject) -> str:
-    return "" if subject.vectors else "there is no file of golden vectors"
-
-
 @dataclass(frozen=True)
 class Property:
     """Something that has to hold.
@@ -103,11 +99,16 @@ PROPERTIES = (
     Property(frames.a_truncated_frame_is_a_wire_error, "frame", "LS307"),
     Property(frames.a_damaged_frame_is_at_worst_a_wire_error, "frame", "LS308"),
     Property(frames.every_single_bit_error_is_seen, "frame", "LS310"),
-    Property(vectors.vectors_hold, "sensor", "LS706", lacks=_no_vectors),
+    Property(vectors.every_checksum_is_checked, "frame", "LS212"),
+    Property(vectors.the_status_is_proven, "sensor", "LS710"),
+    Property(vectors.vectors_hold, "sensor", "LS706", lacks=vectors.lacking),
+    Property(vectors.every_data_field_is_pinned_down, "data", "LS711", lacks=vectors.lacking, unless=("LS702", "LS703", "LS707")),
+    Property(vectors.points_stand_in_two_quadrants, "data", "LS712", lacks=vectors.lacking, unless=("LS702", "LS703", "LS707")),
     Property(geometry.clouds_keep_the_conventions, "data", "LS501"),
     Property(geometry.directions_are_radians, "data", "LS502", unless=("LS414",)),
     Property(geometry.a_single_point_has_a_direction, "data", "LS503", unless=("LS414",)),
     Property(geometry.the_full_circle_is_the_same_as_none, "data", "LS505", unless=("LS414", "LS503")),
+    Property(geometry.the_points_turn_as_the_axes_do, "data", "LS511", unless=("LS414", "LS502")),
     Property(geometry.angles_are_in_order, "data", "LS506", lacks=_no_sweep, unless=("LS414", "LS502")),
     Property(geometry.counters_run_on, "data", "LS509", lacks=_no_sweep, unless=("LS414",)),
     Property(agreement.the_same_bytes_give_the_same_points, "sensor", "LS415", unless=("LS414",)),
@@ -186,7 +187,7 @@ def _test(one: Property) -> Callable[..., None]:
         if reason:
             pytest.skip(reason)
         found = one.findings(subject)
-        for name, value in subject.measured.items():
+        for name, value in (subject.measured | subject.picture).items():
             record_property(name, value)
         _hold(left_over(found, subject.sensor, whole=False))
 

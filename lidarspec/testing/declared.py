@@ -219,7 +219,10 @@ def _reach(subject: Subject) -> Findings:
         metres = factor(info.unit, "m") if info is not None and info.kind == "int" else None
         if info is None or metres is None:
             return
-        reach.append((info.physical(info.limits[1]) * float(metres), f"{name}.{info.path}"))
+        declared = "{:g} .. {:g}".format(*subject.sensor.range_limits)
+        held = [info.physical(raw) * float(metres) for raw in (1, info.limits[1])]
+        subject.picture[f"{name}: range"] = f"{held[0]:.4g} .. {held[1]:.6g} m can be said, {declared} m is declared"
+        reach.append((held[1], f"{name}.{info.path}"))
     furthest, path = max(reach, default=(np.inf, ""))
     if subject.sensor.range_limits[1] > furthest * 1.001:
         yield "LS210", f"it ends at {furthest:g} m, and range_limits at {subject.sensor.range_limits[1]:g} m", path

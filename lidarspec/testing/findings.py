@@ -63,6 +63,8 @@ LS208 `points` that cannot be traced | it is evaluated plainly: ten times slower
 LS209 an acknowledgement of nothing | it would hide the next finding of its kind | acknowledged= without it, or with a reason
 LS210 a range limit that its field cannot hold | scale or limit is wrong | the scale of the manual, and its limit in metres
 LS211 a part of the declaration is missing | nothing can open, decode or find the sensor | vendor, model, a data frame and a data link
+LS212 a checksum that nobody checks | damaged frames are taken for good ones
+      | Checksummed(Struct(...), field="crc", algorithm=...); `lidarspec crc` finds the algorithm
 LS301 no example can be made up | nothing can be tried on it
       | a `sweep`, on another frame than data Frame(sweep=), or strategies = {"frame.field": ...} in the test class
 LS302 bytes do not survive parsing and building | a replayed or edited frame is another one | fields that keep every bit
@@ -93,6 +95,8 @@ LS507 a simulated scene does not come back | what is written is not what is read
 LS508 a `sweep` that cannot be simulated | sim, demo and virtual_port fail | the raw angles and counters of packet i
 LS509 the clock runs back where it starts again | durations come out negative | Clock(..., wraps_at=) in seconds
 LS510 the counter's start is taken for a loss | every turn of it counts packets as lost or late | Sequence(field, first=, last=)
+LS511 points that turn the other way | left and right are exchanged, or vendor_axes are not the manual's
+      | azimuth=-np.deg2rad(clockwise), or the vendor_axes of the manual's figure
 LS601 a command that does not parse back | the sensor is told something else | values and args by the paths of its frame
 LS602 an argument that is not held to its range | the sensor is asked for what it cannot do | args={name: (path, lowest, highest)}
 LS603 a reply that cannot match | the command waits for ever | matches= and echoes= by fields that the reply has
@@ -106,6 +110,14 @@ LS706 a vector has another value | the sensor means something else by these byte
 LS707 a vector is not a frame | a real sensor's bytes are refused | the struct as the manual has it
 LS708 a vector has its point elsewhere | the picture is wrong | `points` as the manual has it
 LS709 a mirrored point | left and right are exchanged | azimuth=-np.deg2rad(clockwise)
+LS710 a status without vectors | nobody can see that a frame of a real sensor was ever read
+      | vectors.json with frames of the manual or a capture, or status="manual"
+LS711 a field that no vector pins down | byte order, scale or place of it may be wrong, and nothing shows it
+      | its value in `values` or `units`, in one vector at least another one than 0
+LS712 points in one quadrant alone | a mirrored or turned picture has them as well
+      | x and y of points in two quadrants, worked out by hand, in `points`
+LS713 a vector that reaches too far | its byte order or scale is wrong, or the limit
+      | the byte order and scale of the manual, and its range_limits in metres
 LS801 an exception is swallowed | what goes wrong is neither seen nor counted | no try at all: the engine counts it
 LS802 the clock of the wall | it jumps, and two runs give two results | the sensor's own clock, or time given by the caller
 LS803 a short write is ignored | the rest of a command never arrives | sendall, or write on until all is written

@@ -1,9 +1,10 @@
 """Whether the points of a sensor are where its manual has them, as far as that shows without the manual.
 
-Three things are looked at. Of examples: clouds keep the conventions, and what `points` returns, traced, says which fields each column is
+Four things are looked at. Of examples: clouds keep the conventions, and what `points` returns, traced, says which fields each column is
 made of. Of packets along the sensor's `sweep`: directions are radians, go one way from beam to beam, cross the full circle without a
-leap, and exist for a single point; clock and counter run on. Of packets simulated in a room: the points that come back lie on its walls,
-by a geometry of this module's own (`off`), not the simulator's.
+leap, and exist for a single point; clock and counter run on. Of a frame whose angle is moved by a few steps: which way the points turn,
+and whether the vendor's axes turn that way. Of packets simulated in a room: the points that come back lie on its walls, by a geometry of
+this module's own (`off`), not the simulator's. What is measured on the way is told (`Subject.picture`), to be held against the manual.
 """
 
 from __future__ import annotations
@@ -22,6 +23,8 @@ from lidarspec.errors import LidarSpecError, SpecError, UsageError
 from lidarspec.framing.examples import examples
 from lidarspec.framing.frame_engine import CompiledCodec, codec
 from lidarspec.packets.packets import Packets
+from lidarspec.points.cloud import PointCloud
+from lidarspec.points.conventions import axis_matrix
 from lidarspec.points.plain import evaluate
 from lidarspec.simulation.frame_maker import FrameMaker, sealed
 from lidarspec.simulation.scenes import Room, furnished
@@ -45,6 +48,12 @@ TURNS, DRAWN = 4 * np.pi, 15 * np.pi
 ONE_WAY, BACK, MEDIANS = 0.8, np.deg2rad(1.5), 4
 #: raw steps by which an angle is moved to see whether the points move with it.
 SMALL = 4
+#: seeds of the examples that values are put into, until one has points.
+BASES = range(1, 9)
+#: radians from point to point above which they turn.
+SEEN = 1e-5
+#: share of a direction along one of two axes from which on it is that axis's.
+ALONG = 0.9
 FULL = {"deg": 360.0, "rad": 2 * np.pi}
 #: metres by which a point may be off its surface beyond half a step: float32, and steps that a header or a code word widens.
 EXACT, UNTOLD = 2e-6, 0.004
@@ -165,26 +174,45 @@ def the_full_circle_is_the_same_as_none(subject: Subject, name: str) -> None:
         full = _full_circle(info)
         if full is None:
             continue
-        clouds: list[Any] = []
-        for value in (full[0], full[0] + SMALL, full[1]):
-            frame = _with(subject, name, path, value)
-            if frame is None:
-                break
-            try:
-                packets = read(subject, name, [frame] * max(2, subject.sensor.frames[name].confirm))
-                clouds += [packets.points()] if len(packets) else []
-            except SpecError as error:
-                raise Violation("LS505", f"{path} of exactly {FULL[info.unit]:g} {info.unit}: {error.reason}", f"{name}.{path}") from error
-        if len(clouds) < 3 or len({len(cloud) for cloud in clouds}) > 1:
+        try:
+            clouds = _with_values(subject, name, path, (full[0], full[0] + SMALL, full[1]))
+        except SpecError as error:
+            raise Violation("LS505", f"{path} of exactly {FULL[info.unit]:g} {info.unit}: {error.reason}", f"{name}.{path}") from error
+        if not clouds or not _turn(info, clouds[0], clouds[1]):
             continue
-        nought, turned, circle = clouds
-        moved = np.abs((turned.azimuth - nought.azimuth + np.pi) % (2 * np.pi) - np.pi)
-        along = float(np.nanmax(moved, initial=0)) / (SMALL * abs(info.scale) * 2 * np.pi / FULL[info.unit])
-        if not 0.5 < along < 1.5:
-            continue  # points do not move with it: a rate, a step, or another angle than the azimuth
+        nought, _, circle = clouds
         apart = np.nanmax(np.abs(nought.xyz - circle.xyz) / (1 + np.abs(nought.range))[:, None], initial=0)
         same = np.array_equal(nought.valid, circle.valid) and apart < 1e-3
         require(same, "LS505", f"{path} of exactly {FULL[info.unit]:g} {info.unit} gives other points than 0", f"{name}.{path}")
+
+
+def the_points_turn_as_the_axes_do(subject: Subject, name: str) -> None:
+    """With the angle on the wire, points turn from the vendor's axis at its zero towards the other one; what is seen of it is told."""
+    for path, info in subject.fields(name).items():
+        zero = _zero(info)
+        clouds = [] if zero is None else _with_values(subject, name, path, (zero, zero + SMALL))
+        sense = _turn(info, *clouds) if clouds else 0
+        if not sense:
+            continue
+        first = float(clouds[0].azimuth[np.isfinite(clouds[0].azimuth)][0])
+        words = {1: "counter-clockwise", -1: "clockwise"}
+        subject.picture[f"{name}: sense"] = f"{words[sense]} as {path} grows, seen from above"
+        subject.picture[f"{name}: first beam"] = f"at azimuth {np.rad2deg(first) + 0:.1f} deg where {path} is 0 (0 is ahead, 90 is left)"
+        axes = subject.sensor.vendor_axes
+        expected = _sense_of(axes, first) if axes else 0
+        said = (
+            f"points turn {words[sense]} as {path} grows, and with vendor_axes of {', '.join(axes or ())} angles run {words.get(expected)}"
+        )
+        require(expected in (0, sense), "LS511", said, f"{name}.points")
+        return
+
+
+def _sense_of(axes: tuple[str, str, str], zero: float) -> int:
+    """Which way angles run, 1 counter-clockwise, that begin at the azimuth `zero` on one axis and go to the other; 0: nobody can tell."""
+    x, y, _ = axis_matrix(axes)
+    along = np.abs([x, y]) @ [np.cos(zero), np.sin(zero), 0]
+    turning = round(float(np.cross(x, y)[2]))
+    return 0 if max(along) < ALONG else turning if along[0] > along[1] else -turning
 
 
 def angles_are_in_order(subject: Subject, name: str) -> None:
@@ -204,6 +232,9 @@ def angles_are_in_order(subject: Subject, name: str) -> None:
         if moving.sum() < 8:
             continue
         median = float(np.median(steps[moving]))
+        turning = "counter-clockwise" if median > 0 else "clockwise"
+        if abs(median) > SEEN:
+            subject.picture.setdefault(f"{name}: step", f"{abs(np.rad2deg(median)):.3g} deg {turning} from point to point along the sweep")
         one_way = float((np.sign(steps[moving]) == np.sign(median)).mean())
         back = steps * np.sign(median) < -max(BACK, MEDIANS * abs(median))
         if one_way < ONE_WAY:
@@ -232,19 +263,47 @@ def counters_run_on(subject: Subject, name: str) -> None:
         require(back.min() >= 0, "LS509", f"packet {spot + 1} of the sweep is {-back.min() / 1e9:g} s before the one in front of it", name)
 
 
-def _full_circle(info: FieldInfo) -> tuple[int, int] | None:
-    """The raw values of no angle and of the full circle; None where the field cannot hold both."""
+def _zero(info: FieldInfo) -> int | None:
+    """The raw value of no angle, nearly; None where the field is no angle or has none."""
     if info.kind != "int" or info.const is not None or info.unit not in FULL or not info.scale:
         return None
-    raw = [(value - info.offset) / info.scale for value in (0.0, FULL[info.unit])]
-    low, high = info.limits
-    whole = all(abs(value - round(value)) < 1e-6 and low <= round(value) <= high for value in raw)
-    return (round(raw[0]), round(raw[1])) if whole else None
+    raw = round(-info.offset / info.scale)
+    return raw if info.limits[0] <= raw <= info.limits[1] - SMALL else None
 
 
-def _with(subject: Subject, name: str, path: str, value: int) -> bytes | None:
+def _full_circle(info: FieldInfo) -> tuple[int, int] | None:
+    """The raw values of no angle and of the full circle; None where the field cannot hold both."""
+    zero = _zero(info)
+    circle = (FULL[info.unit] - info.offset) / info.scale if zero is not None else math.nan
+    whole = zero is not None and abs(circle - round(circle)) < 1e-6 and round(circle) <= info.limits[1] and not info.physical(zero)
+    return (zero, round(circle)) if zero is not None and whole else None
+
+
+def _with_values(subject: Subject, name: str, path: str, values: tuple[int, ...]) -> list[PointCloud]:
+    """The points of an example with each of these values in a field; none where no example can carry them all, with as many points.
+
+    Raises:
+        SpecError: where `points` fails on them.
+    """
+    for seed in BASES:
+        frames = [_with(subject, name, path, value, seed) for value in values]
+        packets = [read(subject, name, [frame] * max(2, subject.sensor.frames[name].confirm)) for frame in frames if frame is not None]
+        clouds = [each.points() for each in packets if len(each)]
+        if len(clouds) == len(values) and len(clouds[0]) and len({len(cloud) for cloud in clouds}) == 1:
+            return clouds
+    return []
+
+
+def _turn(info: FieldInfo, nought: PointCloud, turned: PointCloud) -> int:
+    """Which way points turned with a field, 1 counter-clockwise; 0 where they did not: a rate, or another angle than the azimuth."""
+    moved = (turned.azimuth - nought.azimuth + np.pi) % (2 * np.pi) - np.pi
+    most = float(max(moved[np.isfinite(moved)], key=abs, default=0)) / (SMALL * info.scale * 2 * np.pi / FULL[info.unit])
+    return int(np.sign(most)) if 0.5 < abs(most) < 1.5 else 0
+
+
+def _with(subject: Subject, name: str, path: str, value: int, seed: int) -> bytes | None:
     """An example with every element of one field set; None where no frame can carry it."""
-    parsed = copy.deepcopy(subject.sensor.parse(subject.example(name, seed=1), frame=name))
+    parsed = copy.deepcopy(subject.sensor.parse(subject.example(name, seed=seed), frame=name))
     for holder, key, own in list(material.integers(parsed)):
         if own == path:
             holder[key] = value
@@ -280,13 +339,15 @@ def a_simulated_scene_comes_back(subject: Subject, name: str) -> None:
     room = furnished(len(subject.sensor.id))
     room = Room(room.walls, room.boxes)
     try:
-        frames = simulation(subject.sensor, name).block(5, SCENE_PACKETS, room).frames
+        block = simulation(subject.sensor, name).block(5, SCENE_PACKETS, room)
     except UsageError:
         return
     except LidarSpecError as error:
         raise Violation("LS508", str(error), f"{name}.sweep") from error
-    cloud = read(subject, name, frames).points()
-    known = len(cloud) - 2 * len(cloud) // len(frames)  # directions of the last packet may ask for what follows
+    cloud = read(subject, name, block.frames).points()
+    seconds = float(block.times[-1]) / 1e9
+    subject.picture[f"{name}: rate"] = f"{len(cloud) / seconds:.0f} points a second, simulated" if seconds else "nothing tells it"
+    known = len(cloud) - 2 * len(cloud) // len(block.frames)  # directions of the last packet may ask for what follows
     valid = cloud.valid[:known]
     share = float(valid.mean()) if known else 0.0
     require(share > 0.5, "LS507", f"{share:.0%} of the beams in a closed room return", f"{name}.points")

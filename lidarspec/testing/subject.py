@@ -113,14 +113,18 @@ class Subject:
         examples: how many examples of each frame type a property tries.
         strategies: "frame.field" -> how its raw value is drawn: a hypothesis strategy, or a function of `random.Random`.
         vectors: the file of golden vectors, None where there is none.
-        measured: what was measured, in words, by what it is of.
+        family: the ids of the sensors that share that file; none where it is this sensor's alone.
+        measured: what was measured of frames, in words, by what it is of.
+        picture: what was measured of points, likewise: to be held against the manual.
     """
 
     sensor: Sensor
     examples: int = EXAMPLES
     strategies: Mapping[str, Any] = field(default_factory=dict)
     vectors: Path | None = None
+    family: tuple[str, ...] = ()
     measured: dict[str, str] = field(default_factory=dict)
+    picture: dict[str, str] = field(default_factory=dict)
     _known: dict[tuple[str, int], bytes] = field(default_factory=dict, repr=False)
     _drawers: dict[str, dict[str, Callable[[random.Random], int]]] = field(default_factory=dict, repr=False)
 

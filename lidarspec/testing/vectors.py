@@ -7,6 +7,9 @@
 
 `values` are raw integers of the wire, `units` the same in the fields' units, `points` what becomes of single points (range, x, y, z,
 azimuth and elevation in radians, intensity, ring). All three may be left out: then the bytes have to be such a frame, and build again.
+`sensor` is the id, or a list of ids, of the sensors that an entry is of; where one sensor alone has the file, it may be left out.
+
+What the vectors leave open is looked at as well: a status that claims more than there is, and fields of the data that none pins down.
 """
 
 from __future__ import annotations
@@ -14,29 +17,40 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from lidarspec.discovery.checksum_search import search
+from lidarspec.discovery.samples import Match
 from lidarspec.errors import LidarSpecError, WireError
+from lidarspec.framing.frame_engine import CompiledCodec, codec
 from lidarspec.spec.tree import FieldInfo
 from lidarspec.testing.findings import Violation, require
 from lidarspec.testing.frames import leaves
 from lidarspec.testing.geometry import read
-from lidarspec.testing.subject import Subject
+from lidarspec.testing.subject import SHORT, Subject, seals
+from lidarspec.wire.layout import Layout
 
 #: what a point may differ by: metres and radians as manuals print them.
 NEAR = 2e-4
-KEYS = {"source", "frame", "hex", "values", "units", "points", "note"}
+KEYS = {"source", "sensor", "frame", "hex", "values", "units", "points", "note"}
+#: names of fields that hold a checksum.
+CHECK = re.compile(
+    r"(\w+_)?(crc|checksum|check_?sum|check|chk|chksum|cksum|cs|bcc|lrc|fcs|xor|sum)_?(8|16|32)?(_(lo|hi|low|high|lsb|msb))?"
+)
+#: doubt at which a field of any other name can only be a checksum: one wrong guess in four thousand looks like that.
+PROVEN = 12
+#: names of fields that say nothing, and have nothing to be pinned down to.
+IDLE = re.compile(r"reserved|unused|unknown|spare|padding|filler", re.IGNORECASE)
 COLUMNS = ("range", "x", "y", "z", "azimuth", "elevation", "intensity", "ring", "return_index")
 
 
 def vectors_hold(subject: Subject) -> None:
     """Every golden vector parses to its values, builds again, and has its points where they are said to be."""
-    for index, vector in enumerate(entries(subject)):
-        place = f"vectors[{index}]"
+    for place, vector in entries(subject).items():
         require(str(vector.get("source", "")).strip(), "LS701", "it names no source", place)
         data = bytes.fromhex(vector["hex"])
         name = vector["frame"]
@@ -47,30 +61,135 @@ def vectors_hold(subject: Subject) -> None:
             _points(subject, name, data, vector["points"], place)
 
 
-def entries(subject: Subject) -> list[Any]:
-    """The vectors of the subject's file.
+def lacking(subject: Subject) -> str:
+    """Why there are no vectors of this sensor; "" where there are, and where `vectors_hold` says what is wrong with them."""
+    if subject.vectors is None:
+        return "there is no file of golden vectors"
+    try:
+        return "" if entries(subject) else f"{Path(subject.vectors).name} has none of {subject.sensor.id}"
+    except Violation:
+        return ""
+
+
+def the_status_is_proven(subject: Subject) -> None:
+    """A sensor that is said to be proven by more than its manual's text has vectors of its own."""
+    status, missing = subject.sensor.status, lacking(subject)
+    require(status == "manual" or not missing, "LS710", f"status is {status!r}, and {missing}")
+
+
+def every_data_field_is_pinned_down(subject: Subject, name: str) -> None:
+    """Each field of the data has a value in some vector, and another one than 0."""
+    vectors = [vector for vector in entries(subject).values() if vector["frame"] == name]
+    require(vectors, "LS711", f"no vector is a {name!r} frame", name)
+    pinned: dict[str, bool] = {}
+    for vector in vectors:
+        read_as = dict(leaves(_parsed(subject, name, bytes.fromhex(vector["hex"]), name)))
+        for path in (*vector.get("values", {}), *vector.get("units", {})):
+            plain = re.sub(r"\[\d+\]", "", path)
+            pinned[plain] = pinned.get(plain, False) or bool(read_as.get(path))
+    sealing = seals(subject.sensor, name, subject.example(name))
+    free = [path for path, info in subject.fields(name).items() if info.const is None and info.kind in ("int", "float")]
+    asked = [path for path in free if path not in sealing and not IDLE.search(path.rpartition(".")[2])]
+    said = {"no vector gives a value of": [path for path in asked if path not in pinned]}
+    said["0 alone is given of"] = [path for path in asked if pinned.get(path) is False]
+    told = "; ".join(f"{words} {', '.join(paths)}" for words, paths in said.items() if paths)
+    require(not told, "LS711", told, name)
+
+
+def points_stand_in_two_quadrants(subject: Subject, name: str) -> None:
+    """Points that the vectors place lie in two quadrants at least, and all points of their frames within the sensor's reach."""
+    vectors = [vector for vector in entries(subject).values() if vector["frame"] == name]
+    placed = [point for vector in vectors for point in vector.get("points", {}).values() if {"x", "y"} <= point.keys()]
+    quadrants = {(point["x"] > 0, point["y"] > 0) for point in placed if point["x"] and point["y"]}
+    clouds = [read(subject, name, [bytes.fromhex(vector["hex"])] * subject.sensor.frames[name].confirm).points() for vector in vectors]
+    ranges = np.concatenate([np.empty(0), *(cloud.range[cloud.valid] for cloud in clouds)])
+    seen = f"{ranges.min():.4g} .. {ranges.max():.4g} m" if len(ranges) else "no returns"
+    number = f"{len(quadrants)} quadrant{'s' * (len(quadrants) != 1)}"
+    subject.picture[f"{name}: vectors"] = f"{seen} in {len(vectors)} of them, which say x and y in {number}"
+    far = subject.sensor.range_limits[1]
+    require(
+        not len(ranges) or ranges.max() <= far * (1 + NEAR),
+        "LS713",
+        f"{ranges.max(initial=0):.4g} m, and range_limits end at {far:g} m",
+        name,
+    )
+    if vectors:
+        require(len(quadrants) > 1, "LS712", f"they say x and y of points in {number}", f"{name}.points")
+
+
+def every_checksum_is_checked(subject: Subject, name: str) -> None:
+    """No field that no `Checksummed` names is a checksum, by its own name or by what the search finds over the vectors."""
+    sealing = seals(subject.sensor, name, subject.example(name))
+    free = [path for path, info in subject.fields(name).items() if info.const is None and path not in sealing]
+    named = [path for path in free if CHECK.fullmatch(path.rpartition(".")[2])]
+    try:
+        frames = [bytes.fromhex(vector["hex"]) for vector in entries(subject).values() if vector["frame"] == name]
+    except Violation:  # said by `vectors_hold`
+        frames = []
+    for match in [] if sealing else _common(frames):
+        path = _standing(subject, name, match, frames[0])
+        if path in (named or free) and (named or match.doubt >= PROVEN):
+            fits = f"{match.paste} over {match.span.told(match.place, len(frames[0]))} fits every vector"
+            raise Violation("LS212", f"{fits}, and no Checksummed holds a frame to it", f"{name}.{path}")
+    require(not named, "LS212", "it is a checksum by its name, and no Checksummed holds a frame to it", f"{name}.{''.join(named[:1])}")
+
+
+def _common(frames: list[bytes]) -> list[Match]:
+    """The checksums that fit all of some frames; long ones are searched one by one, for what stands where checksums usually do."""
+    if max(map(len, frames), default=0) <= SHORT:
+        return search(frames)
+    first, *others = [{(match.paste, match.place, match.span): match for match in search([frame])} for frame in frames]
+    return [replace(match, doubt=match.doubt * len(frames)) for key, match in first.items() if all(key in other for other in others)]
+
+
+def _standing(subject: Subject, name: str, match: Match, frame: bytes) -> str:
+    """The field that a checksum stands in; "" where that cannot be told."""
+    engine = codec(subject.sensor.frames[name])
+    layout = engine.tree.layout(frame) if isinstance(engine, CompiledCodec) else None
+    start = match.place.start(len(frame))
+    leaves = layout.leaves.items() if isinstance(layout, Layout) else ()
+    return next((path for path, leaf in leaves if leaf.offset in range(start, start + match.place.size) and not leaf.shape), "")
+
+
+def entries(subject: Subject) -> dict[str, Any]:
+    """The vectors of the sensor by their places in the file.
 
     Raises:
         Violation: where it cannot be read, or has an entry that is no vector.
     """
     if subject.vectors is None:
-        return []
+        return {}
     try:
         found = json.loads(Path(subject.vectors).read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         raise Violation("LS702", str(error), str(subject.vectors)) from None
     if not isinstance(found, list):
         raise Violation("LS702", "the file is no list of vectors", str(subject.vectors))
+    mine = {}
     for index, vector in enumerate(found):
         place = f"vectors[{index}]"
         require(isinstance(vector, dict), "LS702", "it is no object", place)
+        if not _is_of(subject, vector, place):
+            continue
         require(not vector.keys() - KEYS, "LS702", f"unknown keys {sorted(vector.keys() - KEYS)}; known are {sorted(KEYS)}", place)
         require(vector.get("frame") in subject.sensor.frames, "LS702", f"there is no frame {vector.get('frame')!r}", place)
         try:
             bytes.fromhex(vector.get("hex", "-"))
         except (ValueError, TypeError):
             raise Violation("LS702", "its `hex` is no hex text", place) from None
-    return found
+        mine[place] = vector
+    return mine
+
+
+def _is_of(subject: Subject, vector: Mapping[str, Any], place: str) -> bool:
+    """Whether an entry is of the sensor; one that could be of nobody, or of any of several, is a finding."""
+    named, family = vector.get("sensor", []), subject.family
+    ids = [named] if isinstance(named, str) else named
+    told = f'it names no sensor, and the file is shared by {", ".join(family)}: "sensor": "{subject.sensor.id}"'
+    require(ids or len(family) < 2, "LS702", told, place)
+    nobody = [one for one in ids if family and one not in family]
+    require(not nobody, "LS702", f"there is no sensor {', '.join(map(repr, nobody))} here, but {', '.join(family)}", place)
+    return not ids or subject.sensor.id in ids
 
 
 def _parsed(subject: Subject, name: str, data: bytes, place: str) -> Any:
@@ -80,7 +199,7 @@ def _parsed(subject: Subject, name: str, data: bytes, place: str) -> Any:
     except WireError as error:
         if ": checksum " not in error.reason:
             raise Violation("LS707", error.reason, f"{place} {name}.{error.path}") from error
-        same = [bytes.fromhex(one["hex"]) for one in entries(subject) if one["frame"] == name]
+        same = [bytes.fromhex(one["hex"]) for one in entries(subject).values() if one["frame"] == name]
         fitting = [f"{match.paste} over {match.span.told(match.place, len(data))}" for match in search(same)[:2]]
         fits = f"; {' or '.join(fitting)} fits" if fitting else ""
         raise Violation("LS703", f"{error.reason}{fits}", f"{place} {name}.{error.path}") from error

@@ -32,7 +32,7 @@ def test_a_finding_says_what_where_why_and_what_to_write(tmp_path: Path) -> None
     line = next(number for number, row in enumerate(bare.splitlines(), 1) if '"distance" /' in row)
     assert f"LS201 {RULES['LS201'].title}\n  where  acme-x1 data.samples.distance ({file}:{line})\n  what   " in done.output
     assert f"  why    {RULES['LS201'].why}\n  write  {RULES['LS201'].write}" in done.output
-    assert done.output.rstrip().splitlines()[-1].startswith("acme-x1: 1 finding, ")
+    assert [line for line in done.output.splitlines() if line[:1] != " "][-1].startswith("acme-x1: 1 finding, ")
 
 
 def test_json_has_the_same(tmp_path: Path) -> None:
@@ -47,6 +47,31 @@ def test_json_has_the_same(tmp_path: Path) -> None:
 def test_a_distribution_is_checked_with_all_of_its_sensors() -> None:
     found = json.loads(ran("check", "lidarspec-ldrobot", "--max-examples", "3", "--json").stdout)
     assert [report["name"] for report in found] == ["ldrobot-ld06", "ldrobot-stl27l"]
+
+
+def test_what_was_measured_stands_beside_what_it_is_held_against() -> None:
+    lines = ran("check", "ldrobot-stl27l", "--max-examples", "3").output.splitlines()
+    assert lines == [
+        lines[0],
+        "  data: first beam: at azimuth 0.0 deg where start_angle is 0 (0 is ahead, 90 is left)",
+        "  data: range: 0.001 .. 65.535 m can be said, 0.03 .. 25 m is declared",
+        lines[3],
+        "  data: sense: clockwise as start_angle grows, seen from above",
+        "  data: step: 0.166 deg clockwise from point to point along the sweep",
+        "  data: vectors: 0.192 .. 2 m in 2 of them, which say x and y in 3 quadrants",
+        "  vendor_axes: x, y, z are forward, right, up",
+        "  source: STL-27L development manual, sections 1 to 4",
+    ]
+    assert re.fullmatch(r"  data: rate: 21[56]\d\d points a second, simulated", lines[3])
+    unproven = ran("check", STRANGER, "--max-examples", "3").output
+    assert "  vectors: there is no file of golden vectors; x and y of points in two quadrants would prove the picture" in unproven
+
+
+def test_vectors_of_a_distribution_with_several_sensors_are_looked_at() -> None:
+    folder = ROOT / "plugins" / "lidarspec-ldrobot"
+    for name in ("ldrobot-ld06", "lidarspec-ldrobot", folder):
+        for report in json.loads(ran("check", name, "--max-examples", "3", "--json").stdout):
+            assert not {"vectors_hold", "every_data_field_is_pinned_down"} & report["skipped"].keys()
 
 
 def test_a_distribution_is_checked_by_its_folder(tmp_path: Path) -> None:

@@ -7,8 +7,10 @@ import os
 from lidarspec import Sensor
 from lidarspec.framing.frame_engine import InterpretedCodec, codec
 from lidarspec.testing import SensorConformance, agreement
+from lidarspec.testing.check import target
 from lidarspec.testing.conformance import PROPERTIES
 from tests.all_sensors import DISTINCT, EVERY
+from tests.shapes import SHAPES
 
 #: half of what the kit takes where nothing is said: `make test-long` tries as many as one has time for.
 EXAMPLES = int(os.environ.get("LIDARSPEC_EXAMPLES", "20"))
@@ -31,7 +33,8 @@ def _shared(sensor: Sensor) -> dict[str, None]:
 
 def _tests(sensor: Sensor) -> type[SensorConformance]:
     """The test class of one sensor."""
-    values = {"sensor": sensor, "examples": EXAMPLES, "__module__": __name__, **_shared(sensor)}
+    vectors = None if sensor.id in SHAPES else target(sensor.id).vectors
+    values = {"sensor": sensor, "examples": EXAMPLES, "vectors": vectors, "__module__": __name__, **_shared(sensor)}
     return type(f"Test_{sensor.id.replace('-', '_')}", (SensorConformance,), values)
 
 

@@ -39,7 +39,9 @@ SENSOR = Sensor(
     model="Weak",
     frames={
         "info": Frame(INFO, max_length=5, acknowledged={"LS206": "no line is noisy enough for a shape"}),
-        "data": Frame(DATA, data=True, max_length=5, plausible=plausible, confirm=3),
+        "data": Frame(
+            DATA, data=True, max_length=5, plausible=plausible, confirm=3, acknowledged={"LS212": "one bit, held by `plausible`"}
+        ),
     },
     points=points,
     scan=OnFlag("head.start"),

@@ -2,22 +2,28 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
+import tempfile
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-from construct import Const, Int8ul, Int16ul, Struct
+from construct import Array, Const, Int8ul, Int16ul, Struct
 from hypothesis import strategies as st
 
 from lidarspec import Sensor
-from lidarspec.spec import Checksummed, Fields, Frame, Polar, Sum, take
+from lidarspec.spec import Checksummed, Crc, Fields, Frame, Polar, Sum, take
 from lidarspec.testing.check import Target, reports
+from lidarspec.testing.conformance import PROPERTIES
 from lidarspec.testing.declared import declared
 from lidarspec.testing.findings import Violation, left_over
 from lidarspec.testing.frames import values_survive_building_and_parsing
+from lidarspec.testing.geometry import the_points_turn_as_the_axes_do
 from lidarspec.testing.subject import Subject
 from lidarspec.testing.vectors import vectors_hold
 from tests.broken import sound
@@ -144,6 +150,80 @@ def test_what_only_looks_up_a_table_needs_no_unit() -> None:
 
     assert left(sound.sensor(points=points)) == set()
     assert left(sound.sensor(points=lambda f: Polar(f.samples.distance, f.number / 256))) == {"LS201"}
+
+
+BY_VECTORS = Path(sound.__file__).parent / "by_vectors" / "vectors.json"
+
+
+def told(sensor: Sensor, vectors: list[dict[str, Any]] | None, *family: str) -> list[str]:
+    """What the golden vectors of a sensor are said to lack."""
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "vectors.json"
+        file.write_text(json.dumps(vectors), encoding="utf-8")
+        subject = Subject(sensor, vectors=None if vectors is None else file, family=family)
+        about = [one for one in PROPERTIES if one.function.__module__ == vectors_hold.__module__ and not one.lacks(subject)]
+        return [f"{finding.code} {finding.path}: {finding.what}" for one in about for finding in one.findings(subject)]
+
+
+def test_a_status_is_proven_by_vectors_of_its_own() -> None:
+    proven, known = sound.sensor(status="capture"), json.loads(BY_VECTORS.read_text(encoding="utf-8"))
+    assert told(proven, None) == ["LS710 : status is 'capture', and there is no file of golden vectors"]
+    assert told(proven, [{**entry, "sensor": "broken-two"} for entry in known]) == [
+        "LS710 : status is 'capture', and vectors.json has none of broken-one"
+    ]
+    assert told(proven, [{**entry, "sensor": ["broken-one", "broken-two"]} for entry in known], "broken-one", "broken-two") == []
+    assert told(sound.sensor(), None) == []
+
+
+def test_vectors_of_several_sensors_say_whose_they_are() -> None:
+    known = json.loads(BY_VECTORS.read_text(encoding="utf-8"))
+    asked = told(sound.sensor(), known, "broken-one", "broken-two")
+    assert 'it names no sensor, and the file is shared by broken-one, broken-two: "sensor": "broken-one"' in asked[0]
+    asked = told(sound.sensor(), [{**entry, "sensor": "borken-one"} for entry in known], "broken-one")
+    assert "there is no sensor 'borken-one' here, but broken-one" in asked[0]
+
+
+def test_a_field_of_the_data_that_no_vector_pins_down_is_named() -> None:
+    first, second = json.loads(BY_VECTORS.read_text(encoding="utf-8"))
+    del first["values"]["last"], first["values"]["samples[1].distance"], second["values"]["samples[1].distance"]
+    first["values"]["samples[2].distance"] = 0
+    assert told(sound.sensor(), [first, second]) == ["LS711 data: no vector gives a value of last; 0 alone is given of samples.distance"]
+    ack = {"frame": "ack", "hex": sound.sensor().example("ack").hex(), "source": "made up"}
+    assert told(sound.sensor(), [ack])[0] == "LS711 data: no vector is a 'data' frame"
+
+
+def test_vectors_place_points_in_two_quadrants_within_reach() -> None:
+    first, second = json.loads(BY_VECTORS.read_text(encoding="utf-8"))
+    assert told(sound.sensor(range_limits=(0.05, 4.0)), [first, second]) == ["LS713 data: 4.66 m, and range_limits end at 4 m"]
+    del second["points"]
+    assert told(sound.sensor(), [first, second]) == ["LS712 data.points: they say x and y of points in 1 quadrant"]
+
+
+@pytest.mark.parametrize(("axes", "sense"), [(("right", "forward", "up"), "clockwise"), (("forward", "left", "up"), "counter-clockwise")])
+def test_the_sense_of_the_points_is_measured_and_held_against_the_axes(axes: tuple[str, str, str], sense: str) -> None:
+    sign = 1 if sense == "counter-clockwise" else -1
+
+    def turning(sign: int, f: Fields) -> Polar:
+        return Polar(f.samples.distance, sign * sound.points(f).azimuth)
+
+    right, wrong = (Subject(sound.sensor(points=partial(turning, way), vendor_axes=axes)) for way in (sign, -sign))
+    the_points_turn_as_the_axes_do(right, "data")
+    assert right.picture["data: sense"] == f"{sense} as first grows, seen from above"
+    with pytest.raises(Violation, match=f"angles run {sense}") as found:
+        the_points_turn_as_the_axes_do(wrong, "data")
+    assert found.value.code == "LS511"
+
+
+@pytest.mark.parametrize("samples", [3, 200], ids=["short", "long"])
+def test_a_checksum_of_another_name_is_found_in_the_vectors(samples: int) -> None:
+    struct = Struct("header" / Const(b"\xaa\x55\xc3"), "samples" / Array(samples, Int16ul), "end" / Int16ul)
+    plain = Frame(struct, data=True, max_length=5 + 2 * samples)
+    sealed = replace(plain, struct=Checksummed(struct, field="end", algorithm=Crc(16, 0x8005)))
+    examples = [sound.sensor(sealed).example("data", seed=seed) for seed in range(3)]
+    vectors = [{"frame": "data", "hex": data.hex(), "source": "made up"} for data in examples]
+    said = "LS212 data.end: Crc(width=16, poly=0x8005) over all other bytes fits every vector"
+    assert told(sound.sensor(plain), vectors)[0].startswith(said)
+    assert not any(text.startswith("LS212") for text in told(sound.sensor(sealed), vectors))
 
 
 def test_vectors_that_prove_nothing_are_findings(tmp_path: Path) -> None:

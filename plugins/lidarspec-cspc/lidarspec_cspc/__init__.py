@@ -253,6 +253,7 @@ COIN_D4 = dataclasses.replace(
     turn=None,  # the manual's two speeds are the M1C1_Mini's
     relatives={"cspc-m1c1-mini": "info.model"},
     status="capture",
+    acknowledged={"LS710": "the start-up is another's capture: the project's tests read it where it is"},
     source="the M1C1_Mini's manual; baud rate from the vendor's SDK; a captured start-up of a COIN-D4",
 )
 

@@ -18,7 +18,7 @@ from construct import Array, Bytes, Const, Int8ul, Int16ul, Int32ul, Struct
 
 from lidarspec.spec import Clock, Fields, Frame, OnWrap, Polar, Scaled, Sensor, Sequence, Simulation, Udp
 from lidarspec_hesai.calibration import Calibration, configure, nominal
-from lidarspec_hesai.parts import FACTORY, RETURN_MODES, TURN, UTC, beams, clock, turning
+from lidarspec_hesai.parts import FACTORY, RETURN_MODES, TURN, UNPUBLISHED, UTC, beams, clock, turning
 
 BLOCKS, CHANNELS = 10, 40
 PER_TURN = 1800  # blocks in a turn at 10 Hz and single return: 0.2 degrees
@@ -104,5 +104,6 @@ PANDAR40P = Sensor(
     vendor_axes=("right", "forward", "up"),
     turn=TURN,
     status="capture",
+    acknowledged=UNPUBLISHED,
     source="HesaiLidar_SDK_2.0 (udp_protocol_p40.h, Pandar40P correction files); captures of tier4/nebula and velocity.report",
 )

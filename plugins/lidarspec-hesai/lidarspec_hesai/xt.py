@@ -15,7 +15,7 @@ from construct import Bytes, Int8ul, Int16ul, Int32ul
 from lidarspec.spec import Clock, Fields, Frame, OnWrap, Polar, Scaled, Sensor, Sequence, Simulation, Udp
 from lidarspec_hesai.calibration import Calibration, configure, nominal
 from lidarspec_hesai.headed import block_numbers, distance, header, longest, packet, plausible
-from lidarspec_hesai.parts import FACTORY, RETURN_MODES, TURN, UTC, beams, clock, turning
+from lidarspec_hesai.parts import FACTORY, RETURN_MODES, TURN, UNPUBLISHED, UTC, beams, clock, turning
 
 BLOCKS = 8
 PER_TURN = 2000  # blocks in a turn at 10 Hz and single return: 0.18 degrees
@@ -62,6 +62,7 @@ XT32 = Sensor(
     vendor_axes=("right", "forward", "up"),
     turn=TURN,
     status="capture",
+    acknowledged=UNPUBLISHED,
     source="HesaiLidar_SDK_2.0 (udp_protocol_v6_1.h, PandarXT correction files); capture of tier4/nebula",
 )
 

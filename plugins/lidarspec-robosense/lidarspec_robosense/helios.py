@@ -236,5 +236,9 @@ HELIOS_16P = Sensor(
     # firmware: the first of three boards in Table 11; the temperature has its sign in a field of its own
     info={"serial": "difop.serial_number", "firmware": "difop.top_firmware", "model": "data.lidar_type"},
     status="capture",
+    acknowledged={
+        "LS511": "the rotor turns clockwise, and the angle on the wire with it, in axes that are right-handed",
+        "LS710": "the capture is another's, and too large: the project's tests read it where it is",
+    },
     source="RS-Helios-16P user manual, 5.4, 6.2, 6.3 and appendix B; rs_driver; nebula's capture and point clouds",
 )

@@ -155,5 +155,6 @@ M1 = Sensor(
     turn=(FRAME_RATE, FRAME_RATE),
     info={"model": "data.lidar_type"},
     status="vectors",
+    acknowledged={"LS710": "the guides print parts of packets: the project's tests put them in frames"},
     source="RS-LiDAR-M1 user guide 2.1.2 (Table 5); RS-LiDAR-M1P user guide, pages 9 to 14; rs_driver",
 )

@@ -60,6 +60,7 @@ VLP16 = Sensor(
     relatives={"velodyne-hdl32e": "timestamp: a packet each 1327 us, with dual return 664 us; an HDL-32E's 553 and 276 us"},
     info={"temperature": "position.top_board_temperature"},  # the product byte is not to be trusted
     status="capture",
+    acknowledged={"LS710": "the captures are others', and too large: the project's tests read them where they are"},
     source="velodyne_decoder and ros-drivers/velodyne, citing the VLP-16 user manual; three captures",
 )
 
