@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import re
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
@@ -65,6 +66,16 @@ def test_plugins_import_public_names_only(plugin: Path) -> None:
 def test_the_extra_all_names_every_distribution() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     assert sorted(project["optional-dependencies"]["all"]) == sorted(path.parent.name for path in PLUGINS)
+
+
+def test_the_oldest_versions_that_are_tested_are_those_that_are_declared() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    extras = project["optional-dependencies"]
+    declared = [re.match(r"([\w-]+)>=([\d.]+)", text) for text in (*project["dependencies"], *extras["jit"], *extras["testing"])]
+    tested = re.findall(r"^([\w-]+)==([\d.]+)$", (ROOT / ".ci" / "oldest.txt").read_text(encoding="utf-8"), re.MULTILINE)
+    assert None not in declared
+    assert dict(tested).keys() == {match[1] for match in declared if match}
+    assert all(f"{dict(tested)[match[1]]}.0".startswith(f"{match[2]}.") for match in declared if match)
 
 
 def tree(files: Mapping[str, str]) -> dict[str, Module]:

@@ -15,7 +15,7 @@ from typing import Any, NoReturn
 import click
 
 from lidarspec._version import __version__
-from lidarspec.cli.failures import INTERRUPTED, USAGE, report
+from lidarspec.cli.failures import INTERRUPTED, report
 from lidarspec.errors import did_you_mean
 
 #: group -> verb -> (module, what it does); the texts are those of the verbs' own help.
@@ -95,9 +95,6 @@ def _run(group: click.Group, words: list[str]) -> int:
             group.invoke(ctx)
         sys.stdout.flush()
         return 0
-    except click.exceptions.NoArgsIsHelpError as help_page:
-        click.echo(help_page.ctx.get_help() if help_page.ctx else "")
-        return USAGE
     except click.exceptions.Exit as done:
         return done.exit_code
     except (KeyboardInterrupt, click.Abort):
@@ -120,11 +117,14 @@ def _silence() -> None:
         os.dup2(nowhere, sys.stdout.fileno())
 
 
-@click.group(cls=Verbs, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 120})
+@click.group(cls=Verbs, invoke_without_command=True, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 120})
 @click.version_option(__version__, prog_name="lidarspec", message="%(prog)s %(version)s")
-def main() -> None:
+@click.pass_context
+def main(ctx: click.Context) -> None:
     """Every lidar's wire protocol written down once: parse, build, explain and convert what sensors send.
 
     SOURCE is a file (.pcap, .pcapng, .bin, .hex) or - for standard input. Exit codes: 0 ok, 1 findings, 2 usage,
     3 source cannot be opened, 4 no valid data, 5 device refused, 130 interrupted.
     """
+    if ctx.invoked_subcommand is None:
+        click.echo(ctx.get_help())
