@@ -11,7 +11,7 @@ import numpy as np
 from lidarspec.cli.options import output_options
 from lidarspec.cli.output import emit, emit_json, note, table
 from lidarspec.columns.columns import Batch
-from lidarspec.errors import SpecError
+from lidarspec.errors import NO_SENSORS, SpecError
 from lidarspec.exports.json import facts, link_data
 from lidarspec.plugins import registry, sensor as named_sensor
 from lidarspec.points.numpy_plan import describe
@@ -24,7 +24,6 @@ from lidarspec.wire.wire_table import frame_size, wire_table
 
 #: packets that a plan is shown for: as many as a turn may take, since some of them are shorter.
 PACKETS = 32
-NO_SENSORS = "no sensor is installed: pip install 'lidarspec[all]'"
 
 
 @click.command()
@@ -63,7 +62,7 @@ def show(sensor_id: str, as_plan: bool, as_json: bool, output: str | None) -> No
         return
     low, high = sensor.range_limits
     parts = [
-        f"{sensor.id}: {sensor.vendor} {sensor.model}",
+        f"{sensor.id}: {sensor.vendor} {sensor.model}" + (f", also {', '.join(sensor.aliases)}" if sensor.aliases else ""),
         f"  link    {_links(sensor)}\n  range   {low:g} .. {high:g} m\n  status  {sensor.status}\n  source  {sensor.source}",
     ]
     parts += [f"  command {name}{_command_text(_command(sensor, name))}" for name in sensor.commands]
