@@ -17,9 +17,8 @@ from rich.text import Text
 from lidarspec.cli.failures import FINDINGS
 from lidarspec.cli.options import DURATION, SHARE, sensor_option
 from lidarspec.cli.output import Progress, drawn, emit_json, note, size
-from lidarspec.cli.sensors import NO_SENSORS
 from lidarspec.device.demo import Demonstration, demonstrate
-from lidarspec.errors import UsageError, suggest
+from lidarspec.errors import NO_SENSORS, UsageError, suggest
 from lidarspec.plugins import registry, sensor as named_sensor
 from lidarspec.recording.recorders import SUFFIXES
 from lidarspec.scans.scans import Scan

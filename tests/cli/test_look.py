@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
 import lidarspec as ls
 from lidarspec.cli.root import VERBS, main
-from tests.cli.running import printed, process, ran
+from lidarspec.plugins import Registry
+from tests.cli.running import EXAMPLE, printed, process, ran
 
 
 def test_help_imports_neither_numpy_nor_construct() -> None:
@@ -104,3 +106,37 @@ def test_demo_counts_what_the_line_did(sensor: str) -> None:
     clean = printed("demo", "-s", sensor, "-n", 1, "--errors", 0)
     assert clean["stats"]["bad_checksum"] == clean["stats"]["bytes_skipped"] == 0
     assert clean["sha256"] != found["sha256"]
+
+
+@pytest.mark.parametrize(
+    ("words", "code"),
+    [
+        (("sensors",), 0),
+        (("plugins",), 0),
+        (("ports",), 0),
+        (("demo",), 2),
+        *(((verb, "x.bin"), 4) for verb in ("detect", "read", "view", "stats", "parse", "explain")),
+        *(((verb, "ld06"), 2) for verb in ("show", "sim", "check")),
+        (("doctor", "x.bin"), 1),
+        (("send", "x.bin", "start"), 4),
+        (("convert", "x.bin", "x.csv"), 4),
+        (("plot", "x.bin", "-o", "x.svg"), 4),
+        (("build", "ld06", "data"), 2),
+        (("export", "c", "ld06"), 2),
+        (("record", "x.bin", "-o", "x.lsr", "-s", "ld06"), 2),
+        (("replay", "x.bin", "-s", "ld06"), 2),
+    ],
+)
+def test_without_sensors_every_verb_says_what_to_install(
+    words: tuple[str, ...], code: int, bare_registry: Registry, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "x.bin").write_bytes(EXAMPLE * 3)
+    monkeypatch.chdir(tmp_path)
+    done = ran(*words, code=code)
+    assert (done.stdout + done.stderr).count("no sensor is installed: pip install 'lidarspec[all]'") == 1
+
+
+def test_a_file_needs_no_installed_sensor(bare_registry: Registry) -> None:
+    stranger = Path(__file__).parents[1] / "shapes" / "stranger" / "acme_lidars.py"
+    done = ran("parse", "00 00", "-s", stranger, code=4)
+    assert "pip install" not in done.stderr
