@@ -48,7 +48,8 @@ def report(error: Exception, verb: str) -> int:
 
 def _lacks_sensors(error: Exception) -> bool:
     """Whether bytes or a device are nobody's because no sensor is installed."""
-    if not isinstance(error, errors.WireError | errors.CommandError) or getattr(error, "sensor", "") or " -s " in errors.suggestion(error):
+    named = str(getattr(error, "sensor", "")) or " -s " in errors.suggestion(error)
+    if named or not isinstance(error, errors.WireError | errors.CommandError):
         return False
     from lidarspec.plugins import sensors
 
