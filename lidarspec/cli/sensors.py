@@ -12,6 +12,7 @@ from lidarspec.cli.options import output_options
 from lidarspec.cli.output import emit, emit_json, note, table
 from lidarspec.columns.columns import Batch
 from lidarspec.errors import NO_SENSORS, SpecError
+from lidarspec.explaining.wording import limits
 from lidarspec.exports.json import facts, link_data
 from lidarspec.plugins import registry, sensor as named_sensor
 from lidarspec.points.numpy_plan import describe
@@ -123,7 +124,7 @@ def _command(sensor: Sensor, name: str) -> Mapping[str, Any]:
 
 
 def _command_text(command: Mapping[str, Any]) -> str:
-    args = "".join(f" {name}={limits['low']:g}..{limits['high']:g}" for name, limits in command["arguments"].items())
+    args = "".join(f" {name}={limits(arg['low'], arg['high'])}" for name, arg in command["arguments"].items())
     return f"{args}{': ' if command['hex'] else ''}{command['hex']}{', answered by ' + command['reply'] if command['reply'] else ''}"
 
 
