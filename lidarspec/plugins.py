@@ -286,6 +286,11 @@ class Registry:
             self._aliases |= dict.fromkeys(sensor.aliases, sensor.id)
             self._owners |= dict.fromkeys((sensor.id, *sensor.aliases), plugin)
 
+    def names(self) -> list[str]:
+        """Every id and alias, sorted; what only has an entry point is not loaded for it."""
+        offered = {entry.name for entries in self._offered.values() for entry in entries}
+        return sorted(offered | set(self._loaded) | set(self._aliases))
+
     def sensors(self) -> dict[str, Sensor]:
         """Every sensor by id, sorted, with its hooks applied."""
         self._load_all()

@@ -8,9 +8,11 @@ from typing import Any
 import click
 import numpy as np
 
+from lidarspec._version import __version__
 from lidarspec.cli.options import output_options
 from lidarspec.cli.output import emit, emit_json, note, table
 from lidarspec.columns.columns import Batch
+from lidarspec.device.settings import FILE, devices
 from lidarspec.errors import NO_SENSORS, SpecError
 from lidarspec.explaining.wording import limits
 from lidarspec.exports.json import facts, link_data
@@ -21,10 +23,39 @@ from lidarspec.simulation.frame_maker import FrameMaker
 from lidarspec.spec.description import Frame
 from lidarspec.spec.links import Link, Serial, Udp
 from lidarspec.spec.sensor import Sensor
+from lidarspec.transports.ports import serial_ports
 from lidarspec.wire.wire_table import frame_size, wire_table
 
 #: packets that a plan is shown for: as many as a turn may take, since some of them are shorter.
 PACKETS = 32
+
+
+def guide() -> str:
+    """What is installed and connected here, and what to type; in fifteen lines."""
+    known = registry().sensors()
+    ports = [port.path for port in serial_ports()]
+    named = list(devices())
+    source = (named or ports or ["sim:" + next(iter(known), "ID")])[0]
+    vendors = ", ".join(dict.fromkeys(sensor.vendor for sensor in known.values()))
+    return "\n".join(
+        [
+            f"lidarspec {__version__}",
+            f"{len(known)} sensors of {vendors}" if known else NO_SENSORS,
+            f"serial ports: {', '.join(ports) or 'none'}",
+            *([f"devices of {FILE}: {', '.join(named)}"] if named else []),
+            "",
+            "  lidarspec demo                          a simulated sensor, from its port to a picture",
+            "  lidarspec sensors                       which are installed, and how far each is proven",
+            "  lidarspec detect                        which one sends, on which port",
+            f"  lidarspec view {source:<25}the sensor at work, drawn here",
+            f"  lidarspec record {source + ' -o a.lsr':<23}everything that it sends, into a file",
+            "  lidarspec convert a.pcap points.csv     a capture or recording into points",
+            "  lidarspec explain 54 2c 68 08 ...       every byte of a frame",
+            "  lidarspec doctor                        why nothing comes",
+            "",
+            "lidarspec help: every verb; lidarspec help VERB: its options",
+        ]
+    )
 
 
 @click.command()
