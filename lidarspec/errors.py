@@ -8,9 +8,12 @@ own text from typed arguments, so that the place of a fault can be read from the
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from types import MappingProxyType
 from typing import TypeVar
+
+NO_SENSORS = "no sensor is installed: pip install 'lidarspec[all]'"
 
 
 class LidarSpecError(Exception):
@@ -63,13 +66,32 @@ class UsageError(LidarSpecError):
     """A call that cannot be carried out as it was made: the caller's fault."""
 
 
-def did_you_mean(name: str, known: Iterable[str], *, alike: float = 0.5) -> str:
-    """A closing clause such as ``; did you mean 'speed'?``, or an empty text where nothing is close."""
+#: names that have what was typed as a part, which are suggested together at most.
+SUGGESTED = 6
+
+
+def did_you_mean(name: str, known: Iterable[str], *, alike: float = 0.5, aliases: Mapping[str, str] = MappingProxyType({})) -> str:
+    """A closing clause such as ``; did you mean 'speed'?``, or an empty text where nothing is close.
+
+    Names that have this one as a part are meant before the one whose letters are the most alike.
+
+    Args:
+        alike: the share of letters, from 0 to 1, that a name has to have in common.
+        aliases: other names of some of those, which are suggested in their place.
+    """
     import difflib  # for the one call in many thousands that has to suggest something
 
-    by_letters = {other.lower(): other for other in known}
-    close = difflib.get_close_matches(name.lower(), list(by_letters), n=1, cutoff=alike)
-    return f"; did you mean {by_letters[close[0]]!r}?" if close else ""
+    by_letters = {other.lower(): aliases.get(other, other) for other in (*known, *aliases)}
+    parts = dict.fromkeys(meant for other, meant in by_letters.items() if len(name) > 1 and name.lower() in other)
+    close = difflib.get_close_matches(name.lower(), by_letters, n=1, cutoff=alike)
+    named = list(parts) if 0 < len(parts) <= SUGGESTED else [by_letters[other] for other in close]
+    return f"; did you mean {listed(named)}?" if named else ""
+
+
+def listed(names: Sequence[str]) -> str:
+    """Names in words: 'a', 'b' or 'c'."""
+    *others, last = map(repr, names)
+    return f"{', '.join(others)} or {last}" if others else last
 
 
 _NEXT = "next: "
@@ -107,13 +129,14 @@ class UnknownName(UsageError):
     what = "name"
     alike = 0.5
 
-    def __init__(self, name: str, known: Iterable[str] = (), *, place: str = "", hint: str = "") -> None:
-        known = sorted(known)
-        self.name, self.known, self.place = name, tuple(known), place
-        suggestion = did_you_mean(name, known, alike=self.alike)
-        listed = f" (known: {', '.join(known)})" if known and not suggestion and len(known) <= 12 else ""
+    def __init__(
+        self, name: str, known: Iterable[str] = (), *, place: str = "", hint: str = "", aliases: Mapping[str, str] = MappingProxyType({})
+    ) -> None:
+        self.name, self.known, self.place = name, tuple(sorted(known)), place
+        suggestion = did_you_mean(name, self.known, alike=self.alike, aliases=aliases)
+        names = f" (known: {', '.join(self.known)})" if self.known and not suggestion and len(self.known) <= 12 else ""
         where = f"{place}: " if place else ""
-        super().__init__(f"{where}unknown {self.what} {name!r}{suggestion}{listed}{hint}")
+        super().__init__(f"{where}unknown {self.what} {name!r}{suggestion}{names}{hint}")
 
 
 class UnknownSensor(UnknownName):

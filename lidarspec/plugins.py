@@ -32,7 +32,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import pluggy
 
-from lidarspec.errors import LidarSpecError, SourceError, SpecError, UnknownSensor, UsageError
+from lidarspec.errors import NO_SENSORS, LidarSpecError, SourceError, SpecError, UnknownSensor, UsageError
 from lidarspec.spec.checksums import Checksum
 from lidarspec.spec.construct_layer import prepare, seals
 from lidarspec.spec.description import Frame
@@ -286,13 +286,18 @@ class Registry:
             self._aliases |= dict.fromkeys(sensor.aliases, sensor.id)
             self._owners |= dict.fromkeys((sensor.id, *sensor.aliases), plugin)
 
+    def names(self) -> list[str]:
+        """Every id and alias, sorted; what only has an entry point is not loaded for it."""
+        offered = {entry.name for entries in self._offered.values() for entry in entries}
+        return sorted(offered | set(self._loaded) | set(self._aliases))
+
     def sensors(self) -> dict[str, Sensor]:
         """Every sensor by id, sorted, with its hooks applied."""
         self._load_all()
         return {name: self.sensor(name) for name in sorted(self._loaded)}
 
     def sensor(self, name: str) -> Sensor:
-        """One sensor by id or alias, with its hooks applied.
+        """One sensor by id or alias, in capitals and with other hyphens too, with its hooks applied.
 
         Raises:
             UnknownSensor: with a suggestion, or with what to install where there is no sensor at all.
@@ -303,10 +308,11 @@ class Registry:
                     self._load(entry)
         if name not in self._loaded and name not in self._aliases:
             self._load_all()
+            name = next((known for known in (*self._loaded, *self._aliases) if _letters(known) == _letters(name)), name)
         name = self._aliases.get(name, name)
         if name not in self._loaded:
-            hint = "" if self._loaded else "; no sensor is installed: pip install 'lidarspec[all]'"
-            raise UnknownSensor(name, [*self._loaded, *self._aliases], hint=hint)
+            hint = "" if self._loaded else f"; {NO_SENSORS}"
+            raise UnknownSensor(name, self._loaded, hint=hint, aliases=self._aliases)
         if name not in self._ready:
             self._ready[name] = self.hooked(self._loaded[name])
         return self._ready[name]
@@ -363,6 +369,10 @@ def _loaded(entry: EntryPoint, names: str, add: Callable[[Any], list[str]]) -> P
     except BaseException as error:
         reason = str(error) if isinstance(error, LidarSpecError) else f"{type(error).__name__}: {error}"
         return replace(plugin, error=reason, traceback=traceback.format_exc())
+
+
+def _letters(name: str) -> str:
+    return re.sub(r"[\W_]", "", name).lower()
 
 
 def _resealed(frame: Frame, algorithm: Any) -> Frame:

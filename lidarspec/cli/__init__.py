@@ -4,6 +4,7 @@ In: the words of a command. Out: text or JSON, an exit code, and one message wit
 order:
 
 * `root`: the verbs, each loaded when it is asked for; `main`, the entry point.
+* `completion`: what can stand at a place, for the shell.
 * `options`, `inputs`: words as arguments: what verbs share, and where bytes come from.
 * `output`, `failures`: results as text, tables or JSON; failures as one message and an exit code.
 * `sensors`, `frames`, `build`: what is installed, what a frame says, a frame out of values.

@@ -33,11 +33,27 @@ def report(error: Exception, verb: str) -> int:
             click.echo("".join(traceback.format_exception(error)), err=True)
         click.echo("  next: the same with LIDARSPEC_DEBUG=1, and report it with what that prints", err=True)
         return code
-    click.echo(_message(error), err=True)
+    message = _message(error)
+    click.echo(message, err=True)
+    if errors.NO_SENSORS in message:
+        return code
+    if _lacks_sensors(error):
+        click.echo(f"  {errors.NO_SENSORS}", err=True)
+        return code
     errors.suggest(error, _following(error, command, verb))
     for note in error.__notes__:
         click.echo(f"  {note}", err=True)
     return code
+
+
+def _lacks_sensors(error: Exception) -> bool:
+    """Whether bytes or a device are nobody's because no sensor is installed."""
+    named = str(getattr(error, "sensor", "")) or " -s " in errors.suggestion(error)
+    if named or not isinstance(error, errors.WireError | errors.CommandError):
+        return False
+    from lidarspec.plugins import sensors
+
+    return not sensors()
 
 
 def _message(error: Exception) -> str:

@@ -11,7 +11,7 @@ from pathlib import Path
 import click
 
 from lidarspec.cli.inputs import nearest_fault, no_frame, nothing_came, refuse_overwriting, scans_of
-from lidarspec.cli.options import sensor_option
+from lidarspec.cli.options import colour_option, count_option, sensor_option
 from lidarspec.cli.output import emit, emit_json, note
 from lidarspec.device.device import Device, open as open_device
 from lidarspec.discovery.detect import detected, scores
@@ -48,7 +48,7 @@ class Written:
 @click.argument("source", metavar="IN")
 @click.argument("target", metavar="OUT")
 @sensor_option
-@click.option("-n", "--count", type=click.IntRange(min=1), help="Scans at most.")
+@count_option("scans")
 @click.option("--all", "every_point", is_flag=True, help="Keep points without a valid return.")
 @click.option("--json", "as_json", is_flag=True, help="Print a summary as JSON.")
 def convert(source: str, target: str, sensor_id: str | None, count: int | None, every_point: bool, as_json: bool) -> None:
@@ -124,8 +124,8 @@ def _again(source: str) -> Heard | None:
 @click.argument("source", metavar="IN")
 @click.option("-o", "--output", metavar="FILE.svg", required=True, help="Where to; - is standard output.")
 @sensor_option
-@click.option("-n", "--number", type=click.IntRange(min=1), default=1, show_default=True, help="Which of the whole scans.")
-@click.option("--colour", "ramp", type=click.Choice(["range", "intensity"]), default="range", show_default=True, help="What colours show.")
+@click.option("--scan", "number", type=click.IntRange(min=1), metavar="NUMBER", default=1, show_default=True, help="Which whole scan.")
+@colour_option
 @click.option("--max-range", type=click.FloatRange(min=0, min_open=True), metavar="METRES", help="From the middle to the edge.")
 def plot(source: str, output: str, sensor_id: str | None, number: int, ramp: str, max_range: float | None) -> None:
     """A scan as an SVG picture.

@@ -20,7 +20,7 @@ from lidarspec.discovery.doctor import computer, examined
 from lidarspec.discovery.listen import LISTEN, Heard, everywhere, hear, probe, started_first, udp_ports
 from lidarspec.discovery.periods import Structure, cut, structure
 from lidarspec.discovery.samples import Match
-from lidarspec.errors import SourceError, UsageError, suggest
+from lidarspec.errors import NO_SENSORS, SourceError, UsageError, suggest
 from lidarspec.plugins import sensor as named_sensor, sensors
 from lidarspec.spec.links import Serial, Udp
 from lidarspec.transports.base import data_link, with_option
@@ -50,7 +50,7 @@ def ports(as_json: bool, output: str | None) -> None:
     emit(table(["port", "what it is", "state", "lasting name"], rows, output), output)
     if not serial:
         note("there is no serial port; one that should be here: is it plugged in?")
-    note(f"next: lidarspec detect{f' {serial[0].path}' if len(serial) == 1 else ''}")
+    note(f"next: lidarspec detect{f' {serial[0].path}' if len(serial) == 1 else ''}" if sensors() else NO_SENSORS)
 
 
 def _senders(port: int) -> list[str]:
@@ -237,6 +237,8 @@ def _place(heard: Heard) -> str:
 
 
 def _conclusions(source: str | None, found: Sequence[Verdict], unknown: Structure | None, *, start: bool) -> Iterator[str]:
+    if not sensors():
+        yield NO_SENSORS
     for one in found:
         if one.heard.failure is not None:
             yield f"{one.heard.failure}"
@@ -350,5 +352,7 @@ def doctor(source: str | None, sensor_id: str | None, duration: float, as_json: 
     else:
         lines = [f"{'ok   ' if one.ok else 'wrong'}  {one.text}" + (f"\n       next: {one.mend}" if one.mend else "") for one in found]
         emit("\n".join(lines) or "nothing is wrong with the ports of this computer", output)
+    if sensor is None and not sensors():
+        note(NO_SENSORS)
     if any(not finding.ok for finding in found):
         raise click.exceptions.Exit(FINDINGS)

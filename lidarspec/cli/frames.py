@@ -8,7 +8,7 @@ from typing import Any
 import click
 
 from lidarspec.cli.inputs import nearest_fault, no_frame, read
-from lidarspec.cli.options import output_options, sensor_option
+from lidarspec.cli.options import count_option, output_options, sensor_option
 from lidarspec.cli.output import emit, emit_json, emit_lines, note, table
 from lidarspec.discovery.detect import Piece, fitting, likely_starts, pieces
 from lidarspec.discovery.listen import Heard
@@ -22,14 +22,13 @@ from lidarspec.spec.sensor import Sensor
 #: places in bytes between frames that are explained as damaged frames, at most.
 DAMAGED = 64
 
-count_option = click.option("-n", "--count", type=click.IntRange(min=1), help="Frames at most.")
 words_argument = click.argument("words", metavar="HEX|FILE|-", nargs=-1, required=True)
 
 
 @click.command()
 @words_argument
 @sensor_option
-@count_option
+@count_option("frames")
 @output_options
 def parse(words: Sequence[str], sensor_id: str | None, count: int | None, as_json: bool, output: str | None) -> None:
     """The fields of each frame in some bytes."""
@@ -57,7 +56,7 @@ def parse(words: Sequence[str], sensor_id: str | None, count: int | None, as_jso
 @words_argument
 @sensor_option
 @click.option("-f", "--frame", metavar="NAME", help="The frame type, where the bytes do not tell.")
-@count_option
+@count_option("frames")
 @click.option("--bits", is_flag=True, help="Draw the bits of every element of an array, not of the first alone.")
 @click.option(
     "--diff", metavar="HEX|FILE|next", help="What differs from this frame, to the bit; 'next': from the second frame of the input."

@@ -88,7 +88,7 @@ def nearest_fault(given: Heard) -> WireError:
         return suggest(WireError(f"{given.source} holds no bytes"), "lidarspec sensors")
     best = nearest(given.data)
     if best is None:
-        text = f"no frame of any of the {len(sensors())} installed sensors"
+        text = f"no frame of any of the {len(sensors())} installed sensors" if sensors() else "no frame of an installed sensor"
         return suggest(WireError(text, data=given.data[:QUOTED]), "lidarspec sensors")
     return suggest(best, f"lidarspec explain {given.source} -s {best.sensor}")
 

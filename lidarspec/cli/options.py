@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 import click
 
 from lidarspec.errors import UsageError
-from lidarspec.spec.fields import duration
+from lidarspec.spec.fields import duration, share
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -17,6 +17,17 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 def sensor_option(function: Function) -> Function:
     """``-s/--sensor``."""
     return click.option("-s", "--sensor", "sensor_id", metavar="ID", help="The sensor: an id, an alias, or a file ./mysensor.py.")(function)
+
+
+def count_option(what: str, **more: Any) -> Callable[[Function], Function]:
+    """``-n/--count``: so many, and then the verb ends."""
+    return click.option("-n", "--count", type=click.IntRange(min=1), help=f"So many {what}, and then it ends.", **more)
+
+
+def colour_option(function: Function) -> Function:
+    """``--colour`` of pictures, in both spellings."""
+    kinds = click.Choice(["range", "intensity"])
+    return click.option("--colour", "--color", "ramp", type=kinds, default="range", show_default=True, help="What colours show.")(function)
 
 
 def output_options(function: Function) -> Function:
@@ -54,13 +65,6 @@ def _duration(text: str) -> float:
     return seconds
 
 
-def _share(text: str) -> float:
-    share = float(text.removesuffix("%")) / (100 if text.endswith("%") else 1)
-    if not 0 <= share <= 1:
-        raise ValueError(text)
-    return share
-
-
 def _speed(text: str) -> float:
     speed = 0.0 if text == "max" else float(text.removesuffix("x"))
     if text != "max" and not 0 < speed < math.inf:
@@ -71,6 +75,6 @@ def _speed(text: str) -> float:
 #: seconds from "10s", "500ms", "2min", "1h" or a bare number.
 DURATION = Number("duration", _duration, "duration above 0, such as 10s, 500ms, 2min or 1h")
 #: a number from 0 to 1, from "1%" or "0.01".
-SHARE = Number("share", _share, "share, such as 1% or 0.01")
+SHARE = Number("share", share, "share, such as 1% or 0.01")
 #: a factor above 0; 0 for "max".
 SPEED = Number("speed", _speed, "speed: a factor such as 1, 0.5 or 10, or max")

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import json
 import shutil
 import sys
+import textwrap
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import click
 from rich.console import Console
-from rich.table import Table
 from rich.text import Text
 
 from lidarspec.errors import system_errors
@@ -21,6 +22,8 @@ from lidarspec.explaining.listing import Line, folded, text as plain_text
 
 #: seconds between two lines.
 PERIOD = 0.2
+#: blanks between columns of a table; those before prose below its row; the least width of prose beside it.
+GAP, HANGING, PROSE = 2, 6, 24
 #: the colours of what stands in a line, by its role.
 STYLES = {
     "title": "bold",
@@ -97,14 +100,17 @@ def emit(content: str | bytes, output: str | None) -> None:
 
 
 def emit_lines(lines: Iterable[Line], output: str | None) -> None:
-    """Lines with roles: in colours, and folded to its width, on a terminal (NO_COLOR is obeyed); as plain text anywhere else."""
+    """Lines with roles: in colours on a terminal, and folded to its width; as plain text anywhere else.
+
+    NO_COLOR and FORCE_COLOR are obeyed; what goes through a pipe in colours is not folded.
+    """
     if output is None and (console := Console()).is_terminal:
         found = Text()
         for line in lines:
-            for span in folded(line, console.width):
+            for span in folded(line, console.width) if sys.stdout.isatty() else line:
                 found.append(span.text, STYLES.get(span.role))
             found.append("\n")
-        click.echo(drawn(found))
+        click.echo(drawn(found), color=True)
         return
     emit("\n".join(plain_text(line) for line in lines), output)
 
@@ -120,22 +126,47 @@ def note(text: str) -> None:
 
 
 def table(headers: Sequence[str], rows: Sequence[Sequence[str]], output: str | None = None) -> str:
-    """Rows as aligned columns; folded to a terminal's width where there is one, each row in one line otherwise."""
-    if output is None and Console().is_terminal:
-        folded = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style="bold")
-        for header in headers:
-            folded.add_column(header, overflow="fold")
-        for row in rows:
-            folded.add_row(*map(Text, row))
-        return drawn(folded)
+    """Rows as aligned columns; fitted to a terminal's width where there is one, each row in one line otherwise.
+
+    Cells are folded between words, so that an id or a path stays whole. Where that leaves too little for the last column, which has the
+    prose, it stands in lines of its own below each row.
+    """
     lines = [headers, *rows]
-    widths = [max(len(line[column]) for line in lines) for column in range(len(headers))]
-    return "\n".join("  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip() for line in lines)
+    room = shutil.get_terminal_size().columns if output is None and sys.stdout.isatty() else sys.maxsize
+    widths = _widths(lines, room)
+    full = max(len(line[-1]) for line in lines)
+    hangs = widths[-1] < min(full, PROSE) or sum(widths) + GAP * (len(widths) - 1) > room
+    widths = _widths([line[:-1] for line in lines], room) if hangs else widths
+    return "\n".join(text.rstrip() for line in lines for text in _folded(line, widths, room))
 
 
-def drawn(what: Table | Text) -> str:
-    """What rich draws, as text to echo; rich itself would end the process on a closed pipe."""
+def _widths(lines: Sequence[Sequence[str]], room: int) -> list[int]:
+    """The widths of columns, the widest folded first, but never within a word."""
+    columns = list(zip(*lines, strict=True))
+    widths = [max(map(len, cells)) for cells in columns]
+    for place in sorted(range(len(columns)), key=lambda place: -widths[place]):
+        excess = max(sum(widths) + GAP * (len(widths) - 1) - room, 0)
+        word = max((len(word) for cell in columns[place] for word in cell.split()), default=0)
+        widths[place] = max(word, widths[place] - excess)
+    return widths
+
+
+def _folded(line: Sequence[str], widths: Sequence[int], room: int) -> Iterator[str]:
+    """The lines of one row; cells for which there is no width below it."""
+
+    def wrapped(cell: str, width: int) -> list[str]:
+        return textwrap.wrap(cell, width, break_long_words=False, break_on_hyphens=False) if len(cell) > width else [cell]
+
+    cells = [wrapped(cell, width) for cell, width in zip(line, widths, strict=False)]
+    for parts in itertools.zip_longest(*cells, fillvalue=""):
+        yield (" " * GAP).join(part.ljust(width) for part, width in zip(parts, widths, strict=True))
+    for cell in line[len(widths) :]:
+        yield from (" " * HANGING + text for text in wrapped(cell, room - HANGING) if text)
+
+
+def drawn(what: Text) -> str:
+    """What rich draws, as text to echo in colour; rich itself would end the process on a closed pipe."""
     console = Console()
     with console.capture() as captured:
-        console.print(what, soft_wrap=isinstance(what, Text), highlight=False)
+        console.print(what, soft_wrap=True, highlight=False)
     return captured.get().rstrip("\n")

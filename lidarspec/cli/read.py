@@ -16,7 +16,7 @@ import numpy as np
 
 from lidarspec.cli.failures import FINDINGS
 from lidarspec.cli.inputs import Patience, nothing_came
-from lidarspec.cli.options import DURATION, SHARE, sensor_option
+from lidarspec.cli.options import DURATION, SHARE, count_option, sensor_option
 from lidarspec.cli.output import note
 from lidarspec.device.device import Device, open as open_device
 from lidarspec.errors import UnknownFrame
@@ -54,7 +54,7 @@ ROUNDED = 1e-6
 @sensor_option
 @click.option("--packets", "whole", is_flag=True, help="A row for each packet of the data frame, not for each point.")
 @click.option("-f", "--frame", metavar="NAME", help="The packets of this frame type.")
-@click.option("-n", "--count", type=click.IntRange(min=1), help="Rows at most.")
+@count_option("rows")
 @click.option("-t", "--duration", type=DURATION, help="How long at most, such as 10s.")
 @click.option("--all", "every_point", is_flag=True, help="Points without a valid return as well.")
 @click.option("--json", "as_json", is_flag=True, help="Print a JSON object on each line.")
@@ -231,7 +231,7 @@ class Lines:
 @click.command()
 @click.argument("source", metavar="SOURCE")
 @sensor_option
-@click.option("-n", "--count", type=click.IntRange(min=1), help="Lines at most.")
+@count_option("lines")
 @click.option("-t", "--duration", type=DURATION, help="How long, such as 10s; without it until the input ends.")
 @click.option("--interval", type=DURATION, default="1s", show_default=True, help="From line to line.")
 @click.option("--max-errors", type=SHARE, help="Exit code 1 where more of the frames are wrong or lost, such as 1%.")

@@ -10,7 +10,7 @@ import click
 
 from lidarspec.cli.failures import INTERRUPTED
 from lidarspec.cli.inputs import nothing_came, refuse_overwriting
-from lidarspec.cli.options import DURATION, SPEED, sensor_option
+from lidarspec.cli.options import DURATION, SPEED, count_option, sensor_option
 from lidarspec.cli.output import Progress, emit_json, note, size
 from lidarspec.device.settings import named
 from lidarspec.device.source_recording import SourceRecording, recorder_like
@@ -32,7 +32,7 @@ from lidarspec.transports.serving import LATE, Replay
 @click.option("-o", "--output", "target", metavar="FILE", required=True, help="The file: .lsr, .pcap for Wireshark, .bin for bytes alone.")
 @sensor_option
 @click.option("-t", "--duration", "seconds", type=DURATION, help="How long, such as 10s; until Ctrl-C by default.")
-@click.option("-n", "--count", type=click.IntRange(min=1), help="So many packets at least: the sensor's data packets, or datagrams.")
+@count_option("packets (the sensor's data packets, or datagrams) at least")
 @click.option("--no-start", is_flag=True, help="Send the sensor no commands.")
 @click.option("--force", is_flag=True, help="Overwrite FILE.")
 @click.option("--salvage", is_flag=True, help="Go on behind damaged places, where SOURCE is a recording.")
@@ -154,7 +154,7 @@ def replay(file: str, place: str, speed: float | None, loop: bool, force: bool, 
             if is_file
             else replay_outlet(place, datagrams=source.datagrams, port=declared_port(sensor))
         )
-    _announce(file, outlet, sensor)
+    _announce(file, outlet, sensor, as_json=as_json)
     factor = (None if is_file else 1.0) if speed is None else speed or None
     played = Replay(file, outlet, speed=factor, needs_times=speed is not None, loop=loop)
     is_interrupted = _run(played, outlet, file)
@@ -194,14 +194,16 @@ def _file(source: Transport, file: str, place: str, sensor: Sensor | None, *, fo
         raise suggest(error, "the same with --force, or with another file") if os.path.exists(place) and not force else error from None
 
 
-def _announce(file: str, outlet: Outlet, sensor: Sensor | None) -> None:
-    """Where it plays to, and what to type there."""
+def _announce(file: str, outlet: Outlet, sensor: Sensor | None, *, as_json: bool) -> None:
+    """Where it plays to, on standard output unless that is for JSON, and what to type there."""
     if isinstance(outlet, FileOutlet):
         return
     place = outlet.place
     if place.startswith("udp:") and ":" not in place.removeprefix("udp://"):
         place = "udp://" if sensor else "udp://:PORT"
     waits = "" if place.startswith("udp:") else ", as soon as it is opened"
+    if not as_json:
+        click.echo(outlet.place)
     note(f"playing {file} to {outlet.place}{waits}")
     note(f"next: lidarspec {_shown(sensor, place)}")
 

@@ -15,7 +15,7 @@ from typing import Any, NoReturn
 import click
 
 from lidarspec._version import __version__
-from lidarspec.cli.failures import INTERRUPTED, USAGE, report
+from lidarspec.cli.failures import INTERRUPTED, report
 from lidarspec.errors import did_you_mean
 
 #: group -> verb -> (module, what it does); the texts are those of the verbs' own help.
@@ -28,6 +28,7 @@ GROUPS = {
         "doctor": ("finding", "What keeps a sensor's bytes from coming, and the command that mends it."),
         "plugins": ("sensors", "The plugins that were found, and what is wrong with those that do not load."),
         "demo": ("sim", "A simulated sensor on a port: started, read through a bad line, recorded, read again, drawn."),
+        "help": ("root", "What a verb does, and its options; without a verb, all of them."),
     },
     "stream": {
         "read": ("read", "The points that a sensor sends, a row each; or its packets."),
@@ -68,10 +69,14 @@ class Verbs(click.Group):
             return None
         module = importlib.import_module(f"lidarspec.cli.{VERBS[cmd_name][0]}")
         found: click.Command = getattr(module, cmd_name)
+        if ctx.resilient_parsing:
+            from lidarspec.cli.completion import attach
+
+            attach(found)
         return found
 
     def resolve_command(self, ctx: click.Context, args: list[str]) -> tuple[str | None, click.Command | None, list[str]]:
-        if args[0] not in VERBS:
+        if args[0] not in VERBS and not ctx.resilient_parsing:
             raise click.UsageError(f"unknown verb {args[0]!r}{did_you_mean(args[0], VERBS)}", ctx)
         return super().resolve_command(ctx, args)
 
@@ -80,8 +85,19 @@ class Verbs(click.Group):
             with formatter.section(group):
                 formatter.write_dl([(verb, text) for verb, (_, text) in verbs.items()])
 
+    def shell_complete(self, ctx: click.Context, incomplete: str) -> list[Any]:
+        """The verbs, none of which is loaded for it; and the options."""
+        from click.shell_completion import CompletionItem
+
+        found = [CompletionItem(verb, help=text) for verb, (_, text) in VERBS.items() if verb.startswith(incomplete)]
+        return found + click.Command.shell_complete(self, ctx, incomplete)
+
     def main(self, args: Sequence[str] | None = None, prog_name: str | None = None, **extra: Any) -> NoReturn:  # type: ignore[override]
         """Run one verb and exit with its code; no exception leaves this."""
+        if instruction := os.environ.get("_LIDARSPEC_COMPLETE"):
+            from lidarspec.cli.completion import completed
+
+            sys.exit(completed(self, instruction))
         words = list(sys.argv[1:] if args is None else args)
         sys.exit(_run(self, words))
 
@@ -95,9 +111,6 @@ def _run(group: click.Group, words: list[str]) -> int:
             group.invoke(ctx)
         sys.stdout.flush()
         return 0
-    except click.exceptions.NoArgsIsHelpError as help_page:
-        click.echo(help_page.ctx.get_help() if help_page.ctx else "")
-        return USAGE
     except click.exceptions.Exit as done:
         return done.exit_code
     except (KeyboardInterrupt, click.Abort):
@@ -120,11 +133,30 @@ def _silence() -> None:
         os.dup2(nowhere, sys.stdout.fileno())
 
 
-@click.group(cls=Verbs, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 120})
+@click.group(cls=Verbs, invoke_without_command=True, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 120})
 @click.version_option(__version__, prog_name="lidarspec", message="%(prog)s %(version)s")
-def main() -> None:
+@click.pass_context
+def main(ctx: click.Context) -> None:
     """Every lidar's wire protocol written down once: parse, build, explain and convert what sensors send.
 
     SOURCE is a file (.pcap, .pcapng, .bin, .hex) or - for standard input. Exit codes: 0 ok, 1 findings, 2 usage,
     3 source cannot be opened, 4 no valid data, 5 device refused, 130 interrupted.
     """
+    if ctx.invoked_subcommand is None:
+        from lidarspec.cli.sensors import guide
+
+        click.echo(guide())
+
+
+@click.command()
+@click.argument("verb", required=False)
+@click.pass_context
+def help(ctx: click.Context, verb: str | None) -> None:
+    """What a verb does, and its options; without a verb, all of them."""
+    root = ctx.find_root()
+    if verb is None:
+        click.echo(root.get_help())
+        return
+    _, command, _ = main.resolve_command(root, [verb])
+    assert command is not None
+    click.echo(command.get_help(click.Context(command, info_name=verb, parent=root)))

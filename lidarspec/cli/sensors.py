@@ -8,10 +8,13 @@ from typing import Any
 import click
 import numpy as np
 
+from lidarspec._version import __version__
 from lidarspec.cli.options import output_options
 from lidarspec.cli.output import emit, emit_json, note, table
 from lidarspec.columns.columns import Batch
-from lidarspec.errors import SpecError
+from lidarspec.device.settings import FILE, devices
+from lidarspec.errors import NO_SENSORS, SpecError
+from lidarspec.explaining.wording import limits
 from lidarspec.exports.json import facts, link_data
 from lidarspec.plugins import registry, sensor as named_sensor
 from lidarspec.points.numpy_plan import describe
@@ -20,11 +23,39 @@ from lidarspec.simulation.frame_maker import FrameMaker
 from lidarspec.spec.description import Frame
 from lidarspec.spec.links import Link, Serial, Udp
 from lidarspec.spec.sensor import Sensor
+from lidarspec.transports.ports import serial_ports
 from lidarspec.wire.wire_table import frame_size, wire_table
 
 #: packets that a plan is shown for: as many as a turn may take, since some of them are shorter.
 PACKETS = 32
-NO_SENSORS = "no sensor is installed: pip install 'lidarspec[all]'"
+
+
+def guide() -> str:
+    """What is installed and connected here, and what to type; in fifteen lines."""
+    known = registry().sensors()
+    ports = [port.path for port in serial_ports()]
+    named = list(devices())
+    source = (named or ports or ["sim:" + next(iter(known), "ID")])[0]
+    vendors = ", ".join(dict.fromkeys(sensor.vendor for sensor in known.values()))
+    return "\n".join(
+        [
+            f"lidarspec {__version__}",
+            f"{len(known)} sensors of {vendors}" if known else NO_SENSORS,
+            f"serial ports: {', '.join(ports) or 'none'}",
+            *([f"devices of {FILE}: {', '.join(named)}"] if named else []),
+            "",
+            "  lidarspec demo                          a simulated sensor, drawn",
+            "  lidarspec sensors                       what is installed, how far proven",
+            "  lidarspec detect                        which one sends, on which port",
+            f"  lidarspec view {source:<25}it at work, drawn here",
+            f"  lidarspec record {source + ' -o a.lsr':<23}all that it sends, into a file",
+            "  lidarspec convert a.pcap points.csv     a capture into points",
+            "  lidarspec explain 54 2c 68 08 ...       every byte of a frame",
+            "  lidarspec doctor                        why nothing comes",
+            "",
+            "lidarspec help: every verb; lidarspec help VERB: its options",
+        ]
+    )
 
 
 @click.command()
@@ -63,7 +94,7 @@ def show(sensor_id: str, as_plan: bool, as_json: bool, output: str | None) -> No
         return
     low, high = sensor.range_limits
     parts = [
-        f"{sensor.id}: {sensor.vendor} {sensor.model}",
+        f"{sensor.id}: {sensor.vendor} {sensor.model}" + (f", also {', '.join(sensor.aliases)}" if sensor.aliases else ""),
         f"  link    {_links(sensor)}\n  range   {low:g} .. {high:g} m\n  status  {sensor.status}\n  source  {sensor.source}",
     ]
     parts += [f"  command {name}{_command_text(_command(sensor, name))}" for name in sensor.commands]
@@ -124,7 +155,7 @@ def _command(sensor: Sensor, name: str) -> Mapping[str, Any]:
 
 
 def _command_text(command: Mapping[str, Any]) -> str:
-    args = "".join(f" {name}={limits['low']:g}..{limits['high']:g}" for name, limits in command["arguments"].items())
+    args = "".join(f" {name}={limits(arg['low'], arg['high'])}" for name, arg in command["arguments"].items())
     return f"{args}{': ' if command['hex'] else ''}{command['hex']}{', answered by ' + command['reply'] if command['reply'] else ''}"
 
 

@@ -15,11 +15,10 @@ import numpy as np
 from rich.text import Text
 
 from lidarspec.cli.failures import FINDINGS
-from lidarspec.cli.options import DURATION, SHARE, sensor_option
+from lidarspec.cli.options import DURATION, SHARE, count_option, sensor_option
 from lidarspec.cli.output import Progress, drawn, emit_json, note, size
-from lidarspec.cli.sensors import NO_SENSORS
 from lidarspec.device.demo import Demonstration, demonstrate
-from lidarspec.errors import UsageError, suggest
+from lidarspec.errors import NO_SENSORS, UsageError, suggest
 from lidarspec.plugins import registry, sensor as named_sensor
 from lidarspec.recording.recorders import SUFFIXES
 from lidarspec.scans.scans import Scan
@@ -46,8 +45,8 @@ WIDEST, HIGHEST, SUMMARY = 100, 42, 8
 @click.option("--rate", metavar="FACTOR", default="1", show_default=True, help="How many times faster than in reality, or max.")
 @click.option("--scene", metavar="FILE", help="What the sensor sees, a TOML file.  [default: a room]")
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Of the room and of what goes wrong.")
-@click.option("--errors", type=SHARE, default="0", show_default=True, help="Share of the bytes that the line damages.")
-@click.option("--loss", type=SHARE, default="0", show_default=True, help="Share of the packets that get lost.")
+@click.option("--errors", type=SHARE, default="0%", show_default=True, help="Share of the bytes that the line damages.")
+@click.option("--loss", type=SHARE, default="0%", show_default=True, help="Share of the packets that get lost.")
 @click.option("--reorder", type=click.IntRange(0, 1000), default=0, show_default=True, help="How many places late a datagram may come.")
 @click.option("--unplug", type=DURATION, help="Pull the plug after so long, again and again.")
 @click.option("--absent", type=DURATION, default="2s", show_default=True, help="How long it is out then.")
@@ -146,8 +145,8 @@ def _ended_by_terminate() -> Iterator[None]:
 
 @click.command()
 @sensor_option
-@click.option("-n", "--count", type=click.IntRange(min=1), default=5, show_default=True, help="Whole scans to wait for.")
-@click.option("--errors", type=click.FloatRange(0, 1), default=0.01, show_default=True, help="Share of the bytes that the line damages.")
+@count_option("whole scans", default=5, show_default=True)
+@click.option("--errors", type=SHARE, default="1%", show_default=True, help="Share of the bytes that the line damages.")
 @click.option("--json", "as_json", is_flag=True, help="Print the summary as JSON.")
 def demo(sensor_id: str | None, count: int, errors: float, as_json: bool) -> None:
     """A simulated sensor on a port: started, read through a bad line, recorded, read again, drawn."""
@@ -160,7 +159,7 @@ def demo(sensor_id: str | None, count: int, errors: float, as_json: bool) -> Non
     if as_json:
         emit_json(_facts(result, whole), None)
     else:
-        click.echo("\n".join([drawn(_picture(whole[-1])), *_summary(result, whole, errors)]))
+        click.echo("\n".join([drawn(_picture(whole[-1])), *_summary(result, whole, errors)]), color=True)
     if result.digest != result.again:
         click.get_current_context().exit(FINDINGS)
 

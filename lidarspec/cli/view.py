@@ -10,7 +10,7 @@ from pathlib import Path
 import click
 
 from lidarspec.cli.inputs import PATIENCE, nothing_came
-from lidarspec.cli.options import DURATION, sensor_option
+from lidarspec.cli.options import DURATION, colour_option, sensor_option
 from lidarspec.cli.output import drawn, note
 from lidarspec.device.device import Device, open as open_device
 from lidarspec.transports.open_url import is_live
@@ -26,7 +26,7 @@ from lidarspec.view.screen import Screen, Terminated, encodable, interactive, ke
 @sensor_option
 @click.option("-t", "--duration", type=DURATION, help="How long at most, such as 30s; for a first picture 10s.")
 @click.option("--once", is_flag=True, help="Print one picture and end, as where standard output is no terminal.")
-@click.option("--colour", "ramp", type=click.Choice(["range", "intensity"]), default="range", show_default=True, help="What colours show.")
+@colour_option
 def view(source: str, sensor_id: str | None, duration: float | None, once: bool, ramp: str) -> None:
     """A sensor at work, drawn in the terminal.
 
@@ -37,7 +37,7 @@ def view(source: str, sensor_id: str | None, duration: float | None, once: bool,
     """
     if once or not interactive():
         with open_device(source, sensor_id) as device:
-            click.echo(_printed(device, source, ramp, duration or PATIENCE))
+            click.echo(_printed(device, source, ramp, duration or PATIENCE), color=True)
             for warning in device.warnings:
                 note(warning)
         return

@@ -229,6 +229,11 @@ def fixed(value: float, digits: int | None) -> str:
     return text if text.strip("-0.") else text.removeprefix("-")
 
 
+def limits(low: float, high: float, between: str = "..") -> str:
+    """A range of numbers, with every digit of whole ones: "0..4294967295"."""
+    return between.join(f"{end:.0f}" if float(end).is_integer() else f"{end:g}" for end in (low, high))
+
+
 def ascii_text(data: bytes | bytearray) -> str:
     """Printable ASCII, which zeros may follow, in quotes; nothing for other bytes."""
     text = bytes(data).rstrip(b"\0").decode("ascii", "replace")

@@ -13,7 +13,7 @@ from dataclasses import dataclass, fields
 from typing import Any
 
 from lidarspec.errors import OutOfRange, UsageError
-from lidarspec.spec.fields import duration
+from lidarspec.spec.fields import duration, share
 
 #: share of the datagrams that come late where any are reordered.
 LATE = 0.1
@@ -49,12 +49,12 @@ class Faults:
 
 
 def faults_of(options: Mapping[str, str]) -> Faults:
-    """The faults that options name by text: ``{"errors": "0.01", "unplug": "30s"}``.
+    """The faults that options name by text: ``{"errors": "1%", "loss": "0.01", "unplug": "30s"}``.
 
     Raises:
         UsageError: for a value that is not of its kind.
     """
-    read: dict[str, Any] = {"errors": float, "loss": float, "reorder": int, "unplug": duration, "absent": duration}
+    read: dict[str, Any] = {"errors": share, "loss": share, "reorder": int, "unplug": duration, "absent": duration}
     values = {}
     for name, text in options.items():
         try:

@@ -74,6 +74,18 @@ def duration(text: str) -> float:
     raise UsageError(f"{text!r} is no duration: a number with ms, s, min or h, such as 10s")
 
 
+def share(text: str) -> float:
+    """A number from 0 to 1 out of "1%" or "0.01".
+
+    Raises:
+        ValueError: where it is none.
+    """
+    number = float(text.removesuffix("%")) / (100 if text.endswith("%") else 1)
+    if not 0 <= number <= 1:
+        raise ValueError(text)
+    return number
+
+
 class Scaled(layer.Describing):
     """A number on the wire with what it measures: ``physical = raw * scale + offset`` in `unit`.
 

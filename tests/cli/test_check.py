@@ -78,12 +78,12 @@ def test_a_distribution_is_checked_by_its_folder(tmp_path: Path) -> None:
     report, _ = json.loads(ran("check", ROOT / "plugins" / "lidarspec-ldrobot", "--max-examples", "3", "--json").stdout)
     assert report["name"] == "ldrobot-ld06"
     (tmp_path / "pyproject.toml").write_text('[project]\nname = "lidarspec-nobody-has"\n', encoding="utf-8")
-    assert f"lidarspec-nobody-has is not installed, or has no sensors: pip install -e {tmp_path}" in ran("check", tmp_path, code=3).output
+    assert f"lidarspec-nobody-has is not installed, or has no sensors: pip install -e {tmp_path}" in ran("check", tmp_path, code=3).stderr
 
 
 @pytest.mark.parametrize(("name", "code", "said"), [("nobody-has", 2, "unknown sensor"), ("./none.py", 3, "no such file")])
 def test_what_is_not_there_is_no_finding(name: str, code: int, said: str) -> None:
-    assert said in ran("check", name, code=code).output
+    assert said in ran("check", name, code=code).stderr
 
 
 def test_every_rule_has_its_heading() -> None:

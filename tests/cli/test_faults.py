@@ -119,7 +119,7 @@ WORKING: tuple[tuple[str, ...], ...] = (
     ("sim", "ldrobot-stl27l"),
     ("demo", *STL, "-n", "900"),
     ("convert", SIM, "points.csv", *STL),
-    ("plot", SIM, "-o", "scan.svg", "-n", "900", *STL),
+    ("plot", SIM, "-o", "scan.svg", "--scan", "900", *STL),
     ("send", "SILENT", "start", *COMMANDED, "--timeout", "60s"),
     ("detect", "SILENT", "-t", "60s"),
     ("doctor", f"udp://127.0.0.1:{free_port()}", "-t", "60s"),

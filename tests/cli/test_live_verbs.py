@@ -164,7 +164,7 @@ def test_view_of_a_live_source_waits_for_a_whole_scan() -> None:
 def test_plot_writes_a_picture(capture: Path, tmp_path: Path) -> None:
     import xml.etree.ElementTree as ET
 
-    ran("plot", capture, *SENSOR, "-o", tmp_path / "scan.svg", "-n", "3")
+    ran("plot", capture, *SENSOR, "-o", tmp_path / "scan.svg", "--scan", "3", "--color", "intensity")
     root = ET.fromstring((tmp_path / "scan.svg").read_text(encoding="utf-8"))
     dots = [place for path in root.findall(".//{*}path") if path.get("stroke-linecap") for place in path.get("d", "").split("M")[1:]]
     assert 500 < len(dots) <= 2160

@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
+from pathlib import Path
 
+import click
 import pytest
 
 import lidarspec as ls
+from lidarspec.cli.options import SHARE
 from lidarspec.cli.root import VERBS, main
-from tests.cli.running import printed, process, ran
+from lidarspec.plugins import Registry
+from lidarspec.simulation.faults import faults_of
+from tests.cli.running import EXAMPLE, printed, process, ran
 
 
 def test_help_imports_neither_numpy_nor_construct() -> None:
@@ -104,3 +110,86 @@ def test_demo_counts_what_the_line_did(sensor: str) -> None:
     clean = printed("demo", "-s", sensor, "-n", 1, "--errors", 0)
     assert clean["stats"]["bad_checksum"] == clean["stats"]["bytes_skipped"] == 0
     assert clean["sha256"] != found["sha256"]
+
+
+@pytest.mark.parametrize(
+    ("words", "code"),
+    [
+        (("sensors",), 0),
+        (("plugins",), 0),
+        (("ports",), 0),
+        (("demo",), 2),
+        *(((verb, "x.bin"), 4) for verb in ("detect", "read", "view", "stats", "parse", "explain")),
+        *(((verb, "ld06"), 2) for verb in ("show", "sim", "check")),
+        (("doctor", "x.bin"), 1),
+        (("send", "x.bin", "start"), 4),
+        (("convert", "x.bin", "x.csv"), 4),
+        (("plot", "x.bin", "-o", "x.svg"), 4),
+        (("build", "ld06", "data"), 2),
+        (("export", "c", "ld06"), 2),
+        (("record", "x.bin", "-o", "x.lsr", "-s", "ld06"), 2),
+        (("replay", "x.bin", "-s", "ld06"), 2),
+    ],
+)
+def test_without_sensors_every_verb_says_what_to_install(
+    words: tuple[str, ...], code: int, bare_registry: Registry, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "x.bin").write_bytes(EXAMPLE * 3)
+    monkeypatch.chdir(tmp_path)
+    done = ran(*words, code=code)
+    assert (done.stdout + done.stderr).count("no sensor is installed: pip install 'lidarspec[all]'") == 1
+
+
+def test_a_file_needs_no_installed_sensor(bare_registry: Registry) -> None:
+    stranger = Path(__file__).parents[1] / "shapes" / "stranger" / "acme_lidars.py"
+    done = ran("parse", "00 00", "-s", stranger, code=4)
+    assert "pip install" not in done.stderr
+
+
+@pytest.mark.skipif(not hasattr(os, "openpty"), reason="needs pseudo terminals")
+def test_on_a_terminal_of_80_columns_ids_and_fields_stay_whole() -> None:
+    from tests.view.terminal import Terminal
+
+    shown = {}
+    for words in (("sensors",), ("show", "cspc-m1c1-mini")):
+        with Terminal(*words, columns=80, lines=80) as window:
+            assert window.ended() == 0
+            shown[words[0]] = window.raw.replace("\r", "").splitlines()
+    assert set(ls.sensors()) <= {line.partition(" ")[0] for line in shown["sensors"]}
+    assert all(len(line) <= 80 for lines in shown.values() for line in lines if not line.startswith("  "))
+    place = next(place for place, line in enumerate(shown["show"]) if "samples[i].distance" in line)
+    assert shown["show"][place].split("  ")[0] == "10 + 3*i"
+    assert "      0: no return" in shown["show"][place + 1 : place + 3]
+
+
+def test_the_limits_of_a_command_are_printed_with_every_digit() -> None:
+    assert "command get_config key=0..4294967295, answered" in ran("show", "slamtec-rplidar-a1").stdout
+
+
+@pytest.mark.parametrize("words", [("explain", EXAMPLE.hex()), ("view", "x.bin", "--color", "range")])
+def test_colours_go_through_a_pipe_where_that_is_asked_for(words: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "x.bin").write_bytes(b"".join(ls.simulate(ls.sensor("ldrobot-stl27l"), 400)))
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("NO_COLOR", raising=False)
+    assert "\x1b[" not in ran(*words).stdout
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    assert "\x1b[" in ran(*words).stdout
+
+
+def test_a_share_is_written_in_per_cent_or_as_a_number_everywhere() -> None:
+    for text in ("1%", "0.01"):
+        assert SHARE.convert(text, None, None) == faults_of({"errors": text, "loss": text}).errors == 0.01
+    assert "[default: 1%]" in ran("demo", "--help").stdout
+    assert "errors" in ran("stats", "sim:ldrobot-stl27l?errors=200%", code=2).stderr
+
+
+def test_one_option_has_one_meaning_in_every_verb() -> None:
+    options: dict[str, set[str | None]] = {}
+    for verb in VERBS:
+        command = main.get_command(main.make_context("lidarspec", [verb]), verb)
+        assert command is not None
+        for option in command.params:
+            if isinstance(option, click.Option):
+                for name in option.opts:
+                    options.setdefault(name, set()).add(max(option.opts, key=len))
+    assert {name: names for name, names in options.items() if len(names) > 1} == {}

@@ -313,3 +313,8 @@ def test_a_loop_serves_one_reader_after_another_until_ctrl_c(stream: Path, tmp_p
         player.hears(f"(?s)(nobody reads.*){{{number}}}")
     player.child.send_signal(signal.SIGINT)
     assert "stream.lsr to /dev/" in player.ended(130)
+
+
+def test_a_script_reads_where_a_replay_plays_to_on_standard_output(datagrams: Path) -> None:
+    done = ran("replay", datagrams, "--to", "udp://127.0.0.1:45672", "--speed", "10x")
+    assert done.stdout == "udp://127.0.0.1:45672\n"

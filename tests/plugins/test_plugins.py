@@ -16,6 +16,7 @@ import pytest
 import lidarspec
 from lidarspec import SourceError, SpecError, UsageError
 from lidarspec.errors import UnknownSensor
+from lidarspec.plugins import SENSORS, entry_points
 from lidarspec.testing import SensorConformance
 
 HERE = Path(__file__).resolve().parents[1] / "shapes"
@@ -245,8 +246,32 @@ def test_a_relative_file_needs_no_more_than_its_name(tmp_path: Path, monkeypatch
 
 
 @pytest.mark.parametrize(
-    ("name", "meant"), [("ldrobot-stl27", "ldrobot-stl27l"), ("LDROBOT-LD06", "ldrobot-ld06"), ("ld06", "ldrobot-ld06")]
+    ("name", "meant"),
+    [
+        ("ldrobot-stl27", "'ldrobot-stl27l'"),
+        ("LDROBOT-LD60", "'ldrobot-ld06'"),
+        ("ld60", "'ldrobot-ld06'"),
+        ("xt", "'hesai-xt16' or 'hesai-xt32'"),
+        ("helios", "'robosense-helios16p'"),
+        ("VLP", "'velodyne-vlp16'"),
+    ],
 )
-def test_an_unknown_sensor_suggests_the_closest(name: str, meant: str) -> None:
-    with pytest.raises(UnknownSensor, match=f"did you mean '{meant}'"):
+def test_an_unknown_sensor_suggests_those_with_this_part_or_the_closest(name: str, meant: str) -> None:
+    with pytest.raises(UnknownSensor, match=rf"did you mean {meant}\?$"):
         lidarspec.sensor(name)
+
+
+@pytest.mark.parametrize(
+    ("name", "meant"),
+    [
+        *(("ld19", "ldrobot-ld06"), ("LD06", "ldrobot-ld06"), ("STL-27L", "ldrobot-stl27l"), ("rplidar", "slamtec-rplidar-a1")),
+        *(("Puck", "velodyne-vlp16"), ("vlp_16", "velodyne-vlp16"), ("PandarXT-32", "hesai-xt32"), ("helios16p", "robosense-helios16p")),
+    ],
+)
+def test_a_sensor_is_known_by_the_names_that_people_use(name: str, meant: str) -> None:
+    assert lidarspec.sensor(name).id == meant
+
+
+def test_each_name_of_a_sensor_loads_it_alone() -> None:
+    offered = {entry.name for entry in entry_points(SENSORS)}
+    assert {name for sensor in lidarspec.sensors().values() for name in (sensor.id, *sensor.aliases)} <= offered

@@ -239,6 +239,7 @@ M1C1_MINI = Sensor(
     turn=(LOW_SPEED, 7.0),  # manual 1c
     relatives={"cspc-coin-d4": "info.model"},
     info={"model": "info.model", "firmware": "info.revision"},  # ack.firmware is 0 but in the answer to start (manual 2.1.3)
+    aliases=("m1c1-mini", "m1c1"),
     status="vectors",
     source="CSPC M1C1_Mini development manual (3-byte samples), sections 1 and 2; baud rate and FC from the vendor's SDK",
 )
@@ -247,6 +248,7 @@ COIN_D4 = dataclasses.replace(
     M1C1_MINI,
     id="cspc-coin-d4",
     model="COIN-D4",
+    aliases=("coin-d4",),
     links={"data": Serial(230_400, dtr=False)},
     simulation=Simulation(sweep, answers={"start": started(1, b"COIN-D4", 1, b"\xfa\xfa"), "get_version": VERSION}),
     state={"info": {"correction": 0, "zero_angle": 0}},  # the device information of a live unit

@@ -103,6 +103,7 @@ PANDAR40P = Sensor(
     range_limits=(0.3, 200.0),
     vendor_axes=("right", "forward", "up"),
     turn=TURN,
+    aliases=("pandar40p",),
     status="capture",
     acknowledged=UNPUBLISHED,
     source="HesaiLidar_SDK_2.0 (udp_protocol_p40.h, Pandar40P correction files); captures of tier4/nebula and velocity.report",

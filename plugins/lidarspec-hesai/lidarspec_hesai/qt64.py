@@ -80,6 +80,7 @@ QT64 = Sensor(
     range_limits=(0.1, 60.0),
     vendor_axes=("right", "forward", "up"),
     turn=TURN,
+    aliases=("qt64", "pandarqt64"),
     status="capture",
     acknowledged=UNPUBLISHED,
     source="HesaiLidar_SDK_2.0 (udp_protocol_v3_1.h, PandarQT correction files); capture of tier4/nebula",

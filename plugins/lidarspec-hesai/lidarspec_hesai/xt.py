@@ -61,6 +61,7 @@ XT32 = Sensor(
     range_limits=(0.05, 120.0),
     vendor_axes=("right", "forward", "up"),
     turn=TURN,
+    aliases=("xt32", "pandarxt-32"),
     status="capture",
     acknowledged=UNPUBLISHED,
     source="HesaiLidar_SDK_2.0 (udp_protocol_v6_1.h, PandarXT correction files); capture of tier4/nebula",
@@ -73,6 +74,7 @@ XT16 = dataclasses.replace(
     frames={"data": Frame(packet(6, 1, 16, TAIL), data=True, max_length=longest(16, BLOCKS), plausible=plausible)},
     points=partial(points, channels=TABLE_16),
     configure=partial(configure, points, TABLE_16),
+    aliases=("xt16", "pandarxt-16"),
     status="vectors",
     source="HesaiLidar_SDK_2.0 (udp_protocol_v6_1.h, PandarXT-16 correction files); one captured packet of tier4/nebula",
 )

@@ -80,6 +80,7 @@ STL27L = Sensor(
     vendor_axes=("forward", "right", "up"),
     turn=(9.9, 10.1),  # by its own control (manual, section 1); no limits are given for control by PWM
     relatives={"ldrobot-ld06": "frames come 1800 to the second, an LD06's 375"},
+    aliases=("stl27l",),
     status="vectors",
     source="STL-27L development manual, sections 1 to 4",
 )
@@ -88,6 +89,7 @@ LD06 = dataclasses.replace(
     STL27L,
     id="ldrobot-ld06",
     model="LD06",
+    aliases=("ld06", "ld19"),  # one manual, one frame, one baud rate
     points=partial(points, rate=RATE_LD06),
     simulation=Simulation(partial(sweep, rate=RATE_LD06)),
     links={"data": Serial(230_400)},

@@ -235,6 +235,7 @@ HELIOS_16P = Sensor(
     turn=(TURNS, 20.0),  # 600 and 1200 rpm (manual B.1)
     # firmware: the first of three boards in Table 11; the temperature has its sign in a field of its own
     info={"serial": "difop.serial_number", "firmware": "difop.top_firmware", "model": "data.lidar_type"},
+    aliases=("helios16p", "rs-helios-16p"),
     status="capture",
     acknowledged={
         "LS511": "the rotor turns clockwise, and the angle on the wire with it, in axes that are right-handed",

@@ -154,6 +154,7 @@ M1 = Sensor(
     vendor_axes=("forward", "left", "up"),
     turn=(FRAME_RATE, FRAME_RATE),
     info={"model": "data.lidar_type"},
+    aliases=("rs-m1", "rs-lidar-m1"),
     status="vectors",
     acknowledged={"LS710": "the guides print parts of packets: the project's tests put them in frames"},
     source="RS-LiDAR-M1 user guide 2.1.2 (Table 5); RS-LiDAR-M1P user guide, pages 9 to 14; rs_driver",

@@ -136,6 +136,7 @@ def rplidar(
     turn: tuple[float, float] | None = None,
     status: str,
     source: str,
+    aliases: tuple[str, ...] = (),
 ) -> Sensor:
     """One model of the family; simulated, it is this unit."""
     commands = {**COMMANDS, **motor}
@@ -163,7 +164,7 @@ def rplidar(
         info={"serial": "info.serial", "model": "info.model"},  # the firmware stands in two fields, major and minor
         status=status,
         source=f"RPLIDAR interface protocol and SDK; {source}",
-        aliases=(f"rplidar-{name.lower()}",),
+        aliases=(f"rplidar-{name.lower()}", *aliases),
     )
 
 
@@ -176,6 +177,7 @@ A1 = rplidar(
     turn=(1.0, 10.0),  # A1M8 data sheet, scan rate
     status="vectors",
     source="A1M8 data sheet; an A1's exchange",
+    aliases=("rplidar",),  # the one that most people have
 )
 A3 = rplidar(
     "A3",

@@ -59,6 +59,7 @@ VLP16 = Sensor(
     # 12 blocks, or 6 shots: periods of 110.592 and 46.080 us
     relatives={"velodyne-hdl32e": "timestamp: a packet each 1327 us, with dual return 664 us; an HDL-32E's 553 and 276 us"},
     info={"temperature": "position.top_board_temperature"},  # the product byte is not to be trusted
+    aliases=("vlp16", "puck"),
     status="capture",
     acknowledged={"LS710": "the captures are others', and too large: the project's tests read them where they are"},
     source="velodyne_decoder and ros-drivers/velodyne, citing the VLP-16 user manual; three captures",
@@ -68,6 +69,7 @@ HDL32E = dataclasses.replace(
     VLP16,
     id="velodyne-hdl32e",
     model="HDL-32E",
+    aliases=("hdl32e",),
     points=partial(points, model=HDL32E_FIRINGS),
     simulation=Simulation(partial(sweep, model=HDL32E_FIRINGS)),
     configure=partial(configure, HDL32E_FIRINGS),

@@ -1,0 +1,154 @@
+"""What can stand at a place of the command line, for completion in bash, zsh and fish: click's own, with what lidarspec knows.
+
+`_LIDARSPEC_COMPLETE=bash_source lidarspec` prints what the shell has to be told. What stands for a parameter follows from its name, which
+means the same in every verb (`BY_NAME`): ids of sensors, frames, fields, commands, ports, devices of `lidarspec.toml`, files.
+"""
+
+from __future__ import annotations
+
+import functools
+import glob
+import os
+from collections.abc import Callable, Iterable
+
+import click
+from click.shell_completion import BashComplete, CompletionItem, add_completion_class, shell_complete
+
+from lidarspec.device.settings import devices, named
+from lidarspec.discovery.detect import declared
+from lidarspec.errors import LidarSpecError
+from lidarspec.plugins import registry, sensor as named_sensor
+from lidarspec.spec.sensor import Sensor
+from lidarspec.spec.tree import FieldInfo
+from lidarspec.transports.ports import serial_ports
+from lidarspec.wire.schema import schema
+
+#: the variable in which a shell says what it wants.
+VARIABLE = "_LIDARSPEC_COMPLETE"
+#: where bash breaks words, as a user does not.
+BREAKS = ":="
+
+
+@add_completion_class
+class Bash(BashComplete):
+    """click's completion for bash, with words that hold ``:`` or ``=``, and without a blank behind ``field=`` and ``sim:``."""
+
+    source_template = BashComplete.source_template.replace(
+        "COMPREPLY+=($value)", "COMPREPLY+=($value)\n            [[ $value == *[=:/] ]] && compopt -o nospace"
+    )
+    _broken = ""
+
+    def get_completion_args(self) -> tuple[list[str], str]:
+        """The words in front of the cursor, and the one at it, put together again."""
+        args, incomplete = super().get_completion_args()
+        words: list[str] = []
+        for word in (*args, incomplete):
+            if words and word and (word[0] in BREAKS or words[-1][-1:] in BREAKS):
+                words[-1] += word
+            elif word or not words or words[-1][-1:] not in BREAKS:
+                words.append(word)
+        *args, incomplete = words
+        self._broken = incomplete[: max(incomplete.rfind(mark) for mark in BREAKS) + 1]
+        return args, incomplete
+
+    def format_completion(self, item: CompletionItem) -> str:
+        """What bash puts in the place of the last piece of the word."""
+        return f"{item.type},{item.value.removeprefix(self._broken)}"
+
+
+def completed(group: click.Command, instruction: str) -> int:
+    """Print what a shell asks for; the exit code."""
+    try:
+        return shell_complete(group, {}, "lidarspec", VARIABLE, instruction)
+    except LidarSpecError:  # settings or plugins with a mistake, which the verb itself will name
+        return 1
+
+
+def attach(command: click.Command) -> None:
+    """Have the parameters of a verb completed by their names."""
+    for param in command.params:
+        names = BY_NAME.get(param.name or "")
+        if names is not None and isinstance(param.type, click.types.StringParamType):
+            param.shell_complete = functools.partial(_items, names)  # type: ignore[method-assign]
+
+
+def _items(names: Callable[[click.Context, str], Iterable[str]], ctx: click.Context, incomplete: str) -> list[CompletionItem]:
+    found = [CompletionItem(name) for name in names(ctx, incomplete) if name.startswith(incomplete) and name != incomplete]
+    return found if found or names in LISTED else [CompletionItem(incomplete, type="file")]
+
+
+def _sensors(ctx: click.Context, incomplete: str) -> Iterable[str]:
+    return registry().names()
+
+
+def _sources(ctx: click.Context, incomplete: str) -> Iterable[str]:
+    """Devices, ports, simulated sensors, and files beside them; where there are files alone the shell does that better."""
+    simulated = [f"sim:{name}" for name in registry().names()] if incomplete.startswith("sim:") else ["sim:"]
+    places = [*devices(), *(port.path for port in serial_ports()), "udp://", "tcp://", *simulated]
+    if not any(place.startswith(incomplete) for place in places):
+        return []
+    return [*places, *(name + "/" * os.path.isdir(name) for name in sorted(glob.glob(glob.escape(incomplete) + "*")))]
+
+
+def _sensor(ctx: click.Context) -> Sensor | None:
+    """The sensor of the words in front of the cursor: named, of a device of lidarspec.toml, or simulated."""
+    if ctx.params.get("sensor_id"):
+        return named_sensor(ctx.params["sensor_id"])
+    source = ctx.params.get("source") or ""
+    known = named(source)
+    return known.configured() if known else declared(source)
+
+
+def _frames(ctx: click.Context, incomplete: str) -> Iterable[str]:
+    sensor = _sensor(ctx)
+    return sensor.frames if sensor else ()
+
+
+def _commands(ctx: click.Context, incomplete: str) -> Iterable[str]:
+    sensor = _sensor(ctx)
+    return sensor.commands if sensor else ()
+
+
+def _assignments(ctx: click.Context, incomplete: str) -> Iterable[str]:
+    """Fields of a frame, or arguments of a command."""
+    sensor, frame, command = _sensor(ctx), ctx.params.get("frame") or "", ctx.params.get("command") or ""
+    if sensor and frame in sensor.frames:
+        fields = schema(sensor.frames[frame].tree).fields
+        return [f"{_assigned(path, info)}=" for path, info in fields.items() if info.const is None]
+    return [f"{argument}=" for argument in sensor.commands[command].args] if sensor and command in sensor.commands else ()
+
+
+def _assigned(path: str, info: FieldInfo) -> str:
+    """The path of a field for all elements of its arrays: "points[*].distance"."""
+    *outer, last = path.split(".")
+    steps = [*(f"{step}[*]" if step in info.axes else step for step in outer), last]
+    return ".".join(steps) + ("[*]" if last in info.axes and info.kind != "bytes" else "")
+
+
+def _files(ctx: click.Context, incomplete: str) -> Iterable[str]:
+    return ()
+
+
+def _verbs(ctx: click.Context, incomplete: str) -> Iterable[str]:
+    root = ctx.find_root().command
+    return root.list_commands(ctx) if isinstance(root, click.Group) else ()
+
+
+def _either(ctx: click.Context, incomplete: str) -> Iterable[str]:
+    """A sensor or a distribution."""
+    return [*registry().names(), *sorted({plugin.distribution for plugin in registry().plugins})]
+
+
+#: what is all that there can be; elsewhere files can stand as well.
+LISTED = (_frames, _commands, _assignments, _verbs)
+#: the name of a parameter -> what can stand there.
+BY_NAME: dict[str, Callable[[click.Context, str], Iterable[str]]] = {
+    "sensor_id": _sensors,
+    "source": _sources,
+    "frame": _frames,
+    "command": _commands,
+    "assignments": _assignments,
+    "name": _either,
+    "verb": _verbs,
+    **dict.fromkeys(("file", "words", "target", "output", "scene", "vectors", "capture", "into", "diff", "link", "place", "to"), _files),
+}
