@@ -74,7 +74,7 @@ class Column(NDArrayOperatorsMixin):
 
     Attributes:
         array: shape (n or 1, ...), one axis per array level of the struct, length 1 where the value is further out.
-        axes: names of the axes after the first; None where the length is 1.
+        axes: names of the axes after the first; None where the length is 1; with a "?" where plain arrays alone are as long by now.
         ready: packets from the start whose values depend on nothing that is still to come.
         source: the field's path, while the column is an unchanged field.
     """
@@ -112,7 +112,11 @@ class Column(NDArrayOperatorsMixin):
     def applied(self, function: Callable[..., Any], *values: Any) -> Column:
         """`function` of arrays, lined up by axes; columns on the left, arrays by their last axes as in NumPy."""
         arrays, axes, ready = aligned(values, self.batch)
-        array = called(function, arrays)
+        try:
+            array = called(function, arrays)
+        except ValueError:
+            together({str(place): array for place, array in enumerate(arrays, 1)}, axes)
+            raise
         names = (*axes, *(f"<{index}>" for index in range(len(axes), array.ndim - 1)))
         return Column(array, names, self.batch, ready=ready)
 
@@ -210,8 +214,9 @@ class RowOfValues:
 def unpadded(axes: tuple[str | None, ...], shape: tuple[int, ...], batch: Batch) -> NDArray[np.bool_] | None:
     """Which elements, (n, product of the other lengths), are not padding; None where none is."""
     mask: NDArray[np.bool_] | None = None
-    for index, name in enumerate(axes):
-        if name is None or name.startswith("<") or isinstance(batch.table.schema.arrays.get(name), int):
+    for index, axis in enumerate(axes):
+        name = (axis or "<").rstrip("?")
+        if name.startswith("<") or isinstance(batch.table.schema.arrays.get(name), int):
             continue
         counts = batch.table.counts(name)
         if len(counts) and int(counts.min()) == shape[1 + index]:
@@ -236,9 +241,11 @@ def aligned(values: tuple[Any, ...], batch: Batch) -> tuple[list[NDArray[Any]], 
     names: list[str | None] = [None] * depth
     for column in columns:
         for index, name in enumerate(column.axes):
-            if name is not None and names[index] not in (None, name):
-                raise SpecError(f"axis {names[index]!r} meets axis {name!r}: put one on the other's place with .on(...)")
-            names[index] = name if name is not None else names[index]
+            known = names[index] or "?"
+            if known.endswith("?"):
+                names[index] = name or names[index]
+            elif name is not None and not name.endswith("?") and name != known:
+                raise SpecError(f"axis {known!r} meets axis {name!r}: put one on the other's place with .on(...)")
     chain = batch.table.schema.chain
     arrays = []
     for value in values:
@@ -250,8 +257,52 @@ def aligned(values: tuple[Any, ...], batch: Batch) -> tuple[list[NDArray[Any]], 
         for index in range(depth):
             place = array.ndim - depth + index
             if place >= 0 and array.shape[place] != 1 and names[index] is None:
-                names[index] = chain[index] if index < len(chain) else f"<{index}>"
+                own = "?" if array.ndim <= depth else ""  # with an axis for the packets it was made of columns
+                names[index] = f"{chain[index]}{own}" if index < len(chain) else f"<{index}>"
     return arrays, tuple(names), min((column.ready for column in columns), default=len(batch))
+
+
+def of_points(parts: Mapping[str, Any], batch: Batch) -> tuple[list[NDArray[Any]], tuple[str | None, ...], int, tuple[int, ...]]:
+    """The parts of points as `aligned` gives them, and the shape that they have together, (n, ...).
+
+    Raises:
+        SpecError: where axes of different arrays meet, lengths do not fit, or a plain array is along an axis that no field has.
+    """
+    arrays, axes, ready = aligned(tuple(parts.values()), batch)
+    named = dict(zip(parts, arrays, strict=True))
+    shape = together({"": np.empty((len(batch), *(1,) * len(axes)), np.bool_), **named}, axes)
+    stray = next((index for index, name in enumerate(axes) if name is not None and name.endswith("?")), None)
+    if stray is not None or len(shape) > 1 + len(axes):
+        where = f"along {axes[stray]!r}".replace("?", "") if stray is not None else "along a further axis"
+        hint = "the last axis of a plain array goes with the innermost array of the frame: add [..., None] for one further out"
+        raise SpecError(f"points {where}, where no field of theirs is ({_lengths(named, axes)}); {hint}")
+    return arrays, axes, ready, shape
+
+
+def together(arrays: Mapping[str, NDArray[Any]], axes: tuple[str | None, ...]) -> tuple[int, ...]:
+    """The shape that arrays broadcast to.
+
+    Args:
+        arrays: by what they are called; what has no name is not told.
+        axes: names of their axes after the first.
+
+    Raises:
+        SpecError: where lengths do not fit.
+    """
+    try:
+        return np.broadcast_shapes(*(array.shape for array in arrays.values()))
+    except ValueError:
+        raise SpecError(f"lengths that do not go together: {_lengths(arrays, axes)}") from None
+
+
+def _lengths(arrays: Mapping[str, NDArray[Any]], axes: tuple[str | None, ...]) -> str:
+    """How long arrays are along which axes: "range: samples 3, azimuth: samples 4"; those of one number are left out."""
+    names, told = ("packets", *((name or "").rstrip("?") for name in axes)), []
+    for what, array in arrays.items():
+        own = [f"{name} {size}".strip() for name, size in zip(reversed(names), reversed(array.shape), strict=False) if size != 1]
+        extra = [str(size) for size in array.shape[: max(array.ndim - len(names), 0)]]
+        told += [f"{what}: {' x '.join(extra + own[::-1])}"] if what and (own or extra) else []
+    return ", ".join(told)
 
 
 def _only_numbers_beside(values: tuple[Any, ...]) -> bool:

@@ -14,7 +14,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.columns.columns import Batch, Carry, Column, Fields, aligned, unpadded
+from lidarspec.columns.columns import Batch, Carry, Column, Fields, aligned, of_points, unpadded
 from lidarspec.errors import SpecError
 from lidarspec.framing.results import Counters
 from lidarspec.points import conventions
@@ -120,9 +120,8 @@ def _anchored(value: Any, anchor: Column) -> Column:
 
 def _flattened(packets: PacketBatch, result: Points, batch: Batch, stamp_ns: int, *, final: bool) -> Evaluated:
     columns = columns_of(parts_of(result), batch)
-    arrays, axes, ready = aligned(tuple(columns.values()), batch)
+    arrays, axes, ready, shape = of_points(columns, batch)
     ready = len(packets) if final else ready
-    shape = np.broadcast_shapes((len(packets),) + (1,) * len(axes), *(array.shape for array in arrays))
     mask = unpadded(axes, shape, batch)
     flat = {name: _flat(array, shape, mask, ready) for name, array in zip(columns, arrays, strict=True)}
     offsets = conventions.seconds_since(packets.time_ns, stamp_ns).reshape(-1, *(1,) * len(axes))

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.columns import graph
-from lidarspec.columns.columns import Batch, aligned
+from lidarspec.columns.columns import Batch, of_points
 from lidarspec.columns.graph import Node, Traced, Untraceable, is_full, only_field
 from lidarspec.points.conventions import coordinates, is_zero, marked, returned_range, shown_range
 from lidarspec.points.plain import columns_of, parts_of
@@ -85,8 +85,8 @@ class Plan:
         self.function, self.layout, self.nominal = function, layout, result.nominal
         self.parts = {name: graph.node_of(value) for name, value in parts_of(result).items()}
         columns = columns_of({name: part.sample if isinstance(part, Node) else part for name, part in self.parts.items()}, sample)
-        arrays, self.axes, _ = aligned(tuple(columns.values()), sample)
-        self.shape = np.broadcast_shapes((2,) + (1,) * len(self.axes), *(array.shape for array in arrays))[1:]
+        _, self.axes, _, shape = of_points(columns, sample)
+        self.shape = shape[1:]
         self.varying = {name for name, count in schema.arrays.items() if not isinstance(count, int)}
         self.tables = _TABLES.setdefault(function, {})
         self.programs: dict[tuple[str, ...], Maker] = {}

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.columns.columns import Batch, Column, Fields, aligned
+from lidarspec.columns.columns import Batch, Column, Fields, of_points
 from lidarspec.errors import SpecError, UsageError
 from lidarspec.framing.examples import example
 from lidarspec.packets.clocks import clock_ns
@@ -137,8 +137,9 @@ class Measurement:
             polar = self._points(Fields(batch))
             if not isinstance(polar, Polar) or not isinstance(polar.range, Column):
                 raise SpecError("only polar points can be simulated", path="points", sensor=self._sensor.id)
-            parts = (polar.range, polar.azimuth, polar.elevation, polar.time, *polar.origin)
-            arrays = [np.asarray(array, np.float64) for array in aligned(parts, batch)[0]]
+            parts = {name: getattr(polar, name) for name in ("range", "azimuth", "elevation", "time")}
+            parts |= dict(zip(("ox", "oy", "oz"), polar.origin, strict=True))
+            arrays = [np.asarray(array, np.float64) for array in of_points(parts, batch)[0]]
         depth = max(array.ndim for array in arrays)
         full = [array.reshape(*(1,) * (depth - array.ndim), *array.shape) for array in arrays]
         intensity = polar.intensity.source if isinstance(polar.intensity, Column) else ""

@@ -119,20 +119,24 @@ class MarkedStruct(Struct):  # type: ignore[misc]
 
 
 class IndexedArray(Array):  # type: ignore[misc]
-    """An Array that says in an error's path which element it was, and has no more elements than its frame can have bytes (or bits)."""
+    """An Array that says in an error's path which element it was, and has no more elements than its frame can have bytes (or bits).
+
+    Nor has a frame more elements without a byte, all its arrays together: nested ones would multiply.
+    """
 
     limit: int
+    in_bits: bool
 
     def _parse(self, stream: Any, context: Any, path: str) -> Any:
-        count = construct.evaluate(self.count, context)
-        if not 0 <= count <= self.limit:
-            raise construct.RangeError(f"invalid count {count}", path=path)
+        count = _bounded(construct.evaluate(self.count, context), self.limit, "count", path)
         found = construct.ListContainer()
         for index in range(count):
             context._index = index
             start = stream.tell()
             found.append(self.subcon._parsereport(stream, context, f"{path}[{index}]"))
             note(context, f"{path}[{index}]", start, stream.tell(), found[-1])
+            if stream.tell() == start and not self.in_bits:
+                context._params["_empty"] = _bounded(context._params.get("_empty", 0) + 1, self.limit, "count", path)
         return found
 
     def _build(self, obj: Any, stream: Any, context: Any, path: str) -> Any:
@@ -146,6 +150,13 @@ class IndexedArray(Array):  # type: ignore[misc]
             context._index = index
             built.append(self.subcon._build(element, stream, context, f"{path}[{index}]"))
         return built
+
+
+def _bounded(number: int, limit: int, what: str, path: str) -> int:
+    """A count or a length that a frame can have; RangeError for another one."""
+    if not 0 <= number <= limit:
+        raise construct.RangeError(f"invalid {what} {number}", path=path)
+    return number
 
 
 class CheckedConst(Const):  # type: ignore[misc]
@@ -162,10 +173,10 @@ class CheckedConst(Const):  # type: ignore[misc]
 class CountedBytes(Bytes):  # type: ignore[misc]
     """Bytes, of which a wrong length is told from an end of the stream, and what are none from an expression that fails."""
 
+    limit: int
+
     def _parse(self, stream: Any, context: Any, path: str) -> Any:
-        length = operator.index(construct.evaluate(self.length, context))
-        if length < 0:
-            raise construct.RangeError(f"invalid length {length}", path=path)
+        length = _bounded(operator.index(construct.evaluate(self.length, context)), self.limit, "length", path)
         return construct.stream_read(stream, length, path)
 
     def _build(self, obj: Any, stream: Any, context: Any, path: str) -> Any:
@@ -235,34 +246,37 @@ _OWN: dict[type, type] = {Struct: MarkedStruct, Array: IndexedArray, Const: Chec
 _INNER = ("subcon", "thensubcon", "elsesubcon", "default")
 
 
-def prepare(con: Construct, limit: int = sys.maxsize) -> Construct:
+def prepare(con: Construct, limit: int = sys.maxsize, *, in_bits: bool = False) -> Construct:
     """A copy of an author's struct with the engine's own classes in the places of construct's.
 
     Args:
         limit: the longest frame, in bytes; within a bit block in bits.
+        in_bits: whether it stands within a bit block.
     """
     if isinstance(con, FormatField):
         return ExactFloat(con.fmtstr[0], con.fmtstr[-1]) if con.fmtstr[-1] in "efd" else con
     if isinstance(con, Bytes):
-        return CountedBytes(con.length)
+        counted = CountedBytes(con.length)
+        counted.limit = limit
+        return counted
     if isinstance(con, Struct):
-        return MarkedStruct(*(prepare(child, limit) for child in con.subcons))
+        return MarkedStruct(*(prepare(child, limit, in_bits=in_bits) for child in con.subcons))
     if isinstance(con, construct.Renamed):
         inner = con.subcon
         while isinstance(inner, construct.Renamed):  # ("name" / con) * "docs" wraps twice, and the path would name it twice
             inner = inner.subcon
-        return construct.Renamed(prepare(inner, limit), newname=con.name, newdocs=con.docs)
+        return construct.Renamed(prepare(inner, limit, in_bits=in_bits), newname=con.name, newdocs=con.docs)
     if not isinstance(con, Subconstruct | construct.IfThenElse | construct.Switch):
         return con
     same = copy.copy(con)
     same.__class__ = next((own for kind, own in _OWN.items() if isinstance(con, kind)), type(con))
-    below = 8 * limit if isinstance(con, construct.Transformed | construct.Restreamed) else limit
+    is_block = isinstance(con, construct.Transformed | construct.Restreamed)
     for name in vars(con).keys() & _INNER:
-        setattr(same, name, prepare(getattr(con, name), below))
+        setattr(same, name, prepare(getattr(con, name), 8 * limit if is_block else limit, in_bits=in_bits or is_block))
     if isinstance(con, construct.Switch):
-        same.cases = {key: prepare(case, limit) for key, case in con.cases.items()}
+        same.cases = {key: prepare(case, limit, in_bits=in_bits) for key, case in con.cases.items()}
     if isinstance(same, IndexedArray):
-        same.limit = limit
+        same.limit, same.in_bits = limit, in_bits
     return same
 
 
@@ -426,6 +440,10 @@ def seals(con: Construct) -> Iterator[Sealing]:
         yield from seals(child)
 
 
+#: the highest of the low numbers that are drawn half of the time: as a count, a number of any size hardly ever fits.
+MANY = 40
+
+
 def random_value(con: Construct, source: random.Random, drawn: Drawn, scope: Any = None, path: str = "") -> Any:
     """A random value that a construct can build; for parts that have no places and so cannot be filled with random bytes.
 
@@ -447,7 +465,8 @@ def random_value(con: Construct, source: random.Random, drawn: Drawn, scope: Any
                 values[child.name] = random_value(child, source, drawn, values, f"{path}.{child.name}" if path else child.name)
         return values
     if isinstance(con, Array):
-        return [random_value(con.subcon, source, drawn, scope, path) for _ in range(construct.evaluate(con.count, scope))]
+        count = _bounded(construct.evaluate(con.count, scope), con.limit, "count", path)
+        return [random_value(con.subcon, source, drawn, scope, path) for _ in range(count)]
     if isinstance(con, construct.IfThenElse):
         return random_value(con.thensubcon if construct.evaluate(con.condfunc, scope) else con.elsesubcon, source, drawn, scope, path)
     if isinstance(con, construct.Switch):
@@ -472,7 +491,9 @@ def _random_leaf(con: Construct, source: random.Random, scope: Any) -> Any:
     if con is construct.GreedyBytes:
         return source.randbytes(source.randint(0, 4))
     if isinstance(con, Bytes):
-        return source.randbytes(construct.evaluate(con.length, scope))
+        return source.randbytes(_bounded(construct.evaluate(con.length, scope), con.limit, "length", ""))
+    if isinstance(con, FormatField | BytesInteger | BitsInteger) and source.random() < 0.5:  # it may be a count
+        return con.parse(con.build(source.randint(0, min(MANY, (1 << (bit_width(con) - 1)) - 1))))
     if isinstance(con, BitsInteger):
         value = source.getrandbits(con.length)
         return value - (1 << con.length) if con.signed and value >> (con.length - 1) else value

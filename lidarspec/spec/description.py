@@ -99,11 +99,12 @@ class Frame:
         if self.max_length < 0 or self.confirm < 1:
             raise SpecError("max_length and confirm are at least 1")
         _freeze(self, "acknowledged")
-        object.__setattr__(self, "prepared", prepare(self.struct, self.max_length or sys.maxsize))
+        longest = self.max_length or fixed_size(self.struct)
+        object.__setattr__(self, "prepared", prepare(self.struct, longest or sys.maxsize))
         check_struct(self.prepared)
-        if not self.max_length and not fixed_size(self.prepared):
+        if not longest:
             raise SpecError("max_length may be left out only where the struct has a fixed size")
-        object.__setattr__(self, "max_length", self.max_length or fixed_size(self.prepared))
+        object.__setattr__(self, "max_length", longest)
 
     @cached_property
     def tree(self) -> Node:

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import math
 import operator
 import random
 import traceback
@@ -128,6 +129,8 @@ class _Walk:
     places: dict[str, tuple[int, int]] = field(default_factory=dict)
     branches: dict[tree.Node, tree.Node] = field(default_factory=dict)
     lengths: dict[str, int] = field(default_factory=dict)
+    #: elements without a byte, of all arrays.
+    empty: int = 0
     #: what expressions can ask for by now: a field, the path of a struct, None for what the header leaves out.
     parts: dict[str, Leaf | str | None] = field(default_factory=dict)
 
@@ -197,7 +200,8 @@ class _Walk:
         else:
             self._no_element(node.element, path, (*shape, count), (*strides, 0))
         size, depth = self.cursor - start, len(strides)
-        if start + size * count > self.limit:
+        self.empty += 0 if size else math.prod(shape) * count
+        if start + size * count > self.limit or self.empty > self.limit:
             raise TooLong(path)
         for name, leaf in self.leaves.items():
             if node.axis in leaf.info.axes:

@@ -8,12 +8,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from construct import Const, ConstructError, Int16ub, Int16ul, Rebuild, Struct, this
+from construct import Array, Const, ConstructError, Int8ub, Int16ub, Int16ul, Rebuild, Struct, this
 
-from lidarspec import PointCloud, Sensor, UsageError
+from lidarspec import PointCloud, Sensor, SpecError, UsageError
 from lidarspec.errors import OutOfRange
 from lidarspec.simulation.simulator import simulate
-from lidarspec.spec import Checksummed, Frame, Simulation, Sum, Xor, spread, wrap
+from lidarspec.spec import Checksummed, Frame, Polar, Scaled, Simulation, Sum, Xor, spread, wrap
+from tests.engine import against_construct
 from tests.shapes import SHAPES, calibration
 
 both = pytest.mark.parametrize("backend", ["auto", "construct"])
@@ -320,3 +321,50 @@ def test_a_sequence_counts_what_is_lost_doubled_and_late(backend: str) -> None:
     shuffled = list(sensor.scans([frame(n) for n in (1, 2, 4, 3, 3, 5, 7, 6, 8, 8)], backend=backend))
     for one, other in zip(ordered, shuffled, strict=True):
         np.testing.assert_array_equal(one.points.xyz, other.points.xyz)
+
+
+#: three ranges beside a deeper array, which says nothing of them.
+BESIDE = Struct("near" / Array(3, Int8ub), "other" / Array(4, Array(3, Int8ub)))
+
+
+@both
+def test_a_plain_array_along_an_axis_of_no_field_is_refused_by_its_axes_and_lengths(backend: str) -> None:
+    angles = np.array([0.1, 0.2, 0.3])
+    sensor = against_construct.sensor(BESIDE)
+    for points in (
+        lambda f: Polar(range=f.near, azimuth=angles),
+        lambda f: Polar(range=f.near * angles, azimuth=0),
+        lambda f: Polar(range=np.asarray(f.near)[:, :, 0], azimuth=0),  # (n, k) in a frame that is one level deeper
+    ):
+        packets = replace(sensor, points=points).decode([bytes(range(1, 16))] * 2, backend=backend)
+        with pytest.raises(SpecError, match=r"along 'other(\[\])?', where no field of theirs is \(.*other\[\] 3.*add \[..., None\]"):
+            packets.points()
+    for points in (
+        lambda f: Polar(range=f.near, azimuth=angles[:, None]),
+        lambda f: Polar(range=f.near, azimuth=f.near * 0 + angles[:, None]),
+        lambda f: Polar(range=np.asarray(f.near), azimuth=angles[:, None]),
+    ):
+        cloud = replace(sensor, points=points).decode([bytes(range(1, 16))] * 2, backend=backend).points()
+        np.testing.assert_allclose(cloud.azimuth, [*angles] * 2, rtol=1e-6)
+        assert cloud.range.tolist() == [1, 2, 3] * 2
+
+
+@both
+def test_lengths_that_do_not_fit_are_named_with_their_axes(backend: str) -> None:
+    sensor = against_construct.sensor(BESIDE)
+    parts = replace(sensor, points=lambda f: Polar(range=f.other, azimuth=np.zeros(2))).decode([bytes(15)], backend=backend)
+    with pytest.raises(SpecError, match=r"lengths that do not go together: range: other 4 x other\[\] 3, azimuth: other\[\] 2"):
+        parts.points()
+    terms = replace(sensor, points=lambda f: Polar(range=f.other * np.ones((3, 1)), azimuth=0)).decode([bytes(15)], backend=backend)
+    with pytest.raises(SpecError, match=r"lengths that do not go together: 1: other 4 x other\[\] 3, 2: other 3"):
+        terms.points()
+
+
+def test_what_a_sensor_in_a_scene_measures_is_refused_for_the_same_axes() -> None:
+    sensor = replace(
+        against_construct.sensor(Struct("near" / Array(3, Scaled(Int8ub, 0.1, "m")), "other" / Array(4, Array(3, Int8ub)))),
+        points=lambda f: Polar(range=f.near * np.ones(3), azimuth=0),
+        simulation=Simulation(lambda i: {}, rate=10),
+    )
+    with pytest.raises(SpecError, match=r"along 'other\[\]'"):
+        simulate(sensor, 2)

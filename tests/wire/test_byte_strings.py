@@ -210,3 +210,32 @@ def test_a_count_is_bounded_by_the_longest_frame_also_where_elements_have_no_byt
     assert len(ours.parse(short).v) == 3
     with pytest.raises(WireError, match="v: invalid count 4294967295"):
         ours.parse(huge)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_elements_without_a_byte_are_bounded_together(backend: str) -> None:
+    """Else arrays within arrays would multiply: two bytes would cost a loop over eight million elements."""
+    ours = sensor(Struct("k" / Int8ub, "a" / Int8ub, "v" / Array(this.a, Array(this.a, Array(this.a, Struct())))), max_length=60)
+    stats = ours.decode([b"\0\3", b"\0\xff", b"\0\x3c"], backend=backend).stats  # 3 + 9 + 27 elements; too many
+    assert (stats.frames, stats.bad_length, stats.plugin_errors) == ({"data": 1}, 2, 0)
+    assert len(ours.parse(b"\0\3").v[2][2]) == 3
+    with pytest.raises(WireError, match="invalid count 61"):
+        ours.parse(b"\0\x3c", verify=False)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_elements_within_a_bit_block_are_no_elements_without_a_byte(backend: str) -> None:
+    block = BitStruct("x" / BitsInteger(8), "no" / Array(3, Struct()))
+    assert len(sensor(Struct("v" / Array(20, block)), max_length=20).decode([bytes(20)], backend=backend)) == 1
+
+
+@pytest.mark.parametrize("part", [Array(this.n, Struct()), Array(this.n, Int8ub), Bytes(this.n)])
+def test_examples_that_construct_alone_reads_have_counts_that_fit(part: Any) -> None:
+    ours = sensor(Struct("n" / Int32ub, "v" / part, "twice" / Computed(this.n * 2)), max_length=300)
+    assert isinstance(codec(ours.frames["data"]), InterpretedCodec)
+    assert len({len(ours.parse(ours.example("data", seed=seed)).v) for seed in range(8)}) > 3
+
+
+def test_a_count_is_bounded_by_the_size_of_a_frame_that_declares_no_longest_length() -> None:
+    with pytest.raises(WireError, match="v: invalid count 1000000000"):
+        sensor(Struct("k" / Int8ub, "v" / Array(10**9, Struct())), max_length=0).parse(b"\0")
