@@ -8,9 +8,11 @@ own text from typed arguments, so that the place of a fault can be read from the
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator, Sequence
+import traceback
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import TypeVar
+from pathlib import Path
+from typing import Any, TypeVar
 
 
 class LidarSpecError(Exception):
@@ -29,6 +31,68 @@ class SpecError(LidarSpecError):
     def __init__(self, reason: str, *, path: str = "", sensor: str = "", rule: str = "") -> None:
         self.reason, self.path, self.sensor, self.rule = reason, path, sensor, rule
         super().__init__(": ".join(part for part in (sensor, path, reason) if part))
+
+
+#: packages whose lines are not the plugin's, though it calls them.
+_NOT_ITS_OWN = ("construct", "numpy", "pluggy", "hypothesis", "_pytest")
+
+
+class PluginError(SpecError):
+    """A function of a plugin raised, or returned what cannot be used; where a stream is read, it is counted.
+
+    Attributes:
+        file, line: where in the plugin, "" and 0 where that is not known.
+        traceback: of what was raised, as text.
+    """
+
+    def __init__(
+        self, reason: str, *, path: str = "", sensor: str = "", rule: str = "", file: str = "", line: int = 0, traceback: str = ""
+    ) -> None:
+        self.file, self.line, self.traceback = file, line, traceback
+        super().__init__(reason, path=path, sensor=sensor, rule=rule)
+
+    @classmethod
+    def of(cls, error: Exception, what: str, *, sensor: str = "", function: Callable[..., Any] | None = None) -> PluginError:
+        """The error for what a plugin's function raised.
+
+        Args:
+            what: the function in words, such as "points of data".
+            function: it; where nothing of the plugin's own was running, its first line is the place.
+        """
+        if isinstance(error, PluginError):
+            return error
+        file, line = raised_at(error)
+        code = getattr(getattr(function, "func", function), "__code__", None)
+        if not file and code is not None:
+            file, line = code.co_filename, code.co_firstlineno
+        place = f" ({shown_path(file)}:{line})" if file else ""
+        reason = f"{type(error).__name__}: {' '.join(str(error).split())}{place}"
+        text = "".join(traceback.format_exception(error))
+        return cls(reason, path=what, sensor=sensor, rule=getattr(error, "rule", ""), file=file, line=line, traceback=text)
+
+
+def shown_path(file: str) -> str:
+    """A path as it is typed in the folder that one is in; as it is where it lies elsewhere."""
+    return os.path.relpath(file) if Path(file).is_relative_to(Path.cwd()) else file
+
+
+def raised_at(error: BaseException) -> tuple[str, int]:
+    """File and line of the plugin that an exception came out of: the innermost that is neither ours nor a library's; "" and 0 for none."""
+    ours = Path(__file__).parent
+    for spot in reversed(traceback.extract_tb(error.__traceback__)):
+        file = Path(spot.filename)
+        if file.is_file() and not file.is_relative_to(ours) and not set(file.parts) & set(_NOT_ITS_OWN):
+            return spot.filename, spot.lineno or 0
+    return "", 0
+
+
+@contextmanager
+def plugin_errors(what: str, sensor: str, function: Callable[..., Any] | None = None) -> Iterator[None]:
+    """Whatever a plugin's function raises within, as a `PluginError`."""
+    try:
+        yield
+    except Exception as error:
+        raise PluginError.of(error, what, sensor=sensor, function=function) from error
 
 
 class WireError(LidarSpecError):

@@ -286,6 +286,11 @@ class Registry:
             self._aliases |= dict.fromkeys(sensor.aliases, sensor.id)
             self._owners |= dict.fromkeys((sensor.id, *sensor.aliases), plugin)
 
+    def __contains__(self, name: str) -> bool:
+        """Whether there is a sensor of this id or alias."""
+        self._load_all()
+        return name in self._loaded or name in self._aliases
+
     def sensors(self) -> dict[str, Sensor]:
         """Every sensor by id, sorted, with its hooks applied."""
         self._load_all()
