@@ -66,7 +66,8 @@ class PluginError(SpecError):
         if not file and code is not None:
             file, line = code.co_filename, code.co_firstlineno
         place = f" ({shown_path(file)}:{line})" if file else ""
-        reason = f"{type(error).__name__}: {' '.join(str(error).split())}{place}"
+        kind = "" if type(error) is SpecError else f"{type(error).__name__}: "
+        reason = f"{kind}{' '.join(str(error).split())}{place}"
         text = "".join(traceback.format_exception(error))
         return cls(reason, path=what, sensor=sensor, rule=getattr(error, "rule", ""), file=file, line=line, traceback=text)
 

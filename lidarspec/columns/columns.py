@@ -30,7 +30,12 @@ from lidarspec.spec.tree import FieldInfo
 from lidarspec.wire.frame_table import Group, Rows, Table
 
 #: NumPy functions that work element by element, and so keep axes; others see plain arrays.
+BITWISE = {np.bitwise_and, np.bitwise_or, np.bitwise_xor, np.invert}
 ELEMENTWISE = {np.where, np.clip, np.nan_to_num, np.round, np.isclose, np.real_if_close}
+
+#: what is said where Python, or a bitwise operator, asks one answer of a column.
+NO_TRUTH = "a column has an answer for each packet: & | ~ in place of `and`, `or`, `not` and a < f.x < b, np.where in place of `if`"
+NO_BITS = "& | ~ take conditions, and fields are float64: each comparison in parentheses, (f.a < 1) & (f.b < 2); for bits a BitStruct"
 
 Carry = dict[int, NDArray[np.float64]]
 
@@ -94,7 +99,7 @@ class Column(NDArrayOperatorsMixin):
         return self.array if dtype is None else self.array.astype(dtype)
 
     def __bool__(self) -> bool:
-        return bool(self.array)
+        raise SpecError(NO_TRUTH, rule="LS213")
 
     def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: Any, **kwargs: Any) -> Any:
         if kwargs.get("out") is not None:
@@ -112,7 +117,15 @@ class Column(NDArrayOperatorsMixin):
     def applied(self, function: Callable[..., Any], *values: Any) -> Column:
         """`function` of arrays, lined up by axes; columns on the left, arrays by their last axes as in NumPy."""
         arrays, axes, ready = aligned(values, self.batch)
-        array = called(function, arrays)
+        try:
+            array = called(function, arrays)
+        except TypeError:
+            if function in BITWISE:
+                raise SpecError(NO_BITS, rule="LS213") from None
+            raise
+        except ValueError:
+            shapes = [extent(value) for value in values if np.ndim(value)]
+            raise SpecError(f"{' and '.join(shapes)} do not fit together", rule="LS214") from None
         names = (*axes, *(f"<{index}>" for index in range(len(axes), array.ndim - 1)))
         return Column(array, names, self.batch, ready=ready)
 
@@ -252,6 +265,14 @@ def aligned(values: tuple[Any, ...], batch: Batch) -> tuple[list[NDArray[Any]], 
             if place >= 0 and array.shape[place] != 1 and names[index] is None:
                 names[index] = chain[index] if index < len(chain) else f"<{index}>"
     return arrays, tuple(names), min((column.ready for column in columns), default=len(batch))
+
+
+def extent(value: Any) -> str:
+    """What a column, or an array beside columns, has: its lengths, each with the array of the frame that it is of."""
+    if not isinstance(value, Column):
+        return f"an array of shape {np.shape(value)}"
+    lengths = [f"{length} {name}" if name else f"{length}" for length, name in zip(value.shape[1:], value.axes, strict=True) if length != 1]
+    return " x ".join(lengths) if lengths else "one for each packet"
 
 
 def _only_numbers_beside(values: tuple[Any, ...]) -> bool:

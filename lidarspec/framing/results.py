@@ -88,7 +88,9 @@ class Counters:
             return None
         first = self.failures[0]
         reason = f"{first.reason}, at {self.plugin_errors} packet{'s' * (self.plugin_errors != 1)}"
-        return PluginError(reason, path=first.path, sensor=sensor, file=first.file, line=first.line, traceback=first.traceback)
+        return PluginError(
+            reason, path=first.path, sensor=sensor, rule=first.rule, file=first.file, line=first.line, traceback=first.traceback
+        )
 
     def __str__(self) -> str:
         parts = [f"{name} {value}" for name, value in self.to_dict().items() if value and name != "frames"]

@@ -8,14 +8,15 @@ Columns that a sensor adds under names of its own (M5) join `parts_of`; points b
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass, fields
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.columns.columns import Batch, Carry, Column, Fields, aligned, unpadded
-from lidarspec.errors import plugin_errors
+from lidarspec.columns.columns import Batch, Carry, Column, Fields, aligned, extent, unpadded
+from lidarspec.errors import SpecError, plugin_errors
 from lidarspec.framing.results import Counters
 from lidarspec.points import conventions
 from lidarspec.points.cloud import PointCloud
@@ -118,9 +119,12 @@ def _anchored(value: Any, anchor: Column) -> Column:
 
 def _flattened(packets: PacketBatch, result: Points, batch: Batch, stamp_ns: int, *, final: bool) -> Evaluated:
     columns = columns_of(parts_of(result), batch)
-    arrays, axes, ready = aligned(tuple(columns.values()), batch)
+    try:
+        arrays, axes, ready = aligned(tuple(columns.values()), batch)
+        shape = np.broadcast_shapes((len(packets),) + (1,) * len(axes), *(array.shape for array in arrays))
+    except (SpecError, ValueError) as error:
+        raise _misfit(type(result).__name__, columns, batch) or error from None
     ready = len(packets) if final else ready
-    shape = np.broadcast_shapes((len(packets),) + (1,) * len(axes), *(array.shape for array in arrays))
     mask = unpadded(axes, shape, batch)
     flat = {name: _flat(array, shape, mask, ready) for name, array in zip(columns, arrays, strict=True)}
     offsets = conventions.seconds_since(packets.time_ns, stamp_ns).reshape(-1, *(1,) * len(axes))
@@ -135,6 +139,17 @@ def _flattened(packets: PacketBatch, result: Points, batch: Batch, stamp_ns: int
         nominal=np.bool_(batch.nominal or result.nominal),
     )
     return Evaluated(cloud, ready, batch.carried(ready), inside[:ready].astype(np.intp), Fields(batch), axes)
+
+
+def _misfit(kind: str, columns: dict[str, Column], batch: Batch) -> SpecError | None:
+    """What is wrong with columns that do not fit together: the first two that do not."""
+    for (one, first), (other, second) in itertools.combinations(columns.items(), 2):
+        try:
+            np.broadcast_shapes(*(array.shape for array in aligned((first, second), batch)[0]))
+        except (SpecError, ValueError):
+            wanted = "each argument has the lengths of the frame's arrays, or one value for each packet"
+            return SpecError(f"{kind}({one}=, {other}=): {one} is {extent(first)}, and {other} is {extent(second)}; {wanted}", rule="LS214")
+    return None
 
 
 def _flat(array: NDArray[Any], shape: tuple[int, ...], mask: NDArray[np.bool_] | None, ready: int) -> NDArray[Any]:

@@ -63,6 +63,10 @@ LS208 `points` that cannot be traced | it is evaluated plainly: ten times slower
 LS209 an acknowledgement of nothing | it would hide the next finding of its kind | acknowledged= without it, or with a reason
 LS210 a range limit that its field cannot hold | scale or limit is wrong | the scale of the manual, and its limit in metres
 LS211 a part of the declaration is missing | nothing can open, decode or find the sensor | vendor, model, a data frame and a data link
+LS212 a field that no data frame has | scans, clock or counter come from it, and never come | a path that `lidarspec show` prints
+LS213 Python asks whether a column is true | it takes one answer, and a column has one for each packet
+      | (f.a < 1) & (f.b < 2), with | and ~, and np.where in place of `if`
+LS214 columns that do not fit together | a point needs one value of each | arrays as long as the frame's own, or one value for each packet
 LS301 no example can be made up | nothing can be tried on it
       | a `sweep`, on another frame than data Frame(sweep=), or strategies = {"frame.field": ...} in the test class
 LS302 bytes do not survive parsing and building | a replayed or edited frame is another one | fields that keep every bit

@@ -116,7 +116,7 @@ def clouds_keep_the_conventions(subject: Subject, name: str) -> None:
         packets = read(subject, name, frames)
         cloud = packets.points()
     except SpecError as error:
-        raise Violation("LS414", str(error), f"{name}.points") from error
+        raise Violation(error.rule or "LS414", error.reason, f"{name}.points") from error
     require(not packets.stats.plugin_errors, "LS414", str(packets.stats.failure("")), name)
     try:
         assert_well_formed(cloud)
