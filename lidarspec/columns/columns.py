@@ -95,6 +95,11 @@ class Column(NDArrayOperatorsMixin):
         """The shape of the array."""
         return self.array.shape
 
+    @property
+    def seen(self) -> NDArray[Any]:
+        """Its values, as far as they are known: of all packets."""
+        return self.array
+
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
         return self.array if dtype is None else self.array.astype(dtype)
 

@@ -142,6 +142,11 @@ class Traced(NDArrayOperatorsMixin):
     def __init__(self, node: Node, tape: Tape) -> None:
         self.node, self._tape = node, tape
 
+    @property
+    def seen(self) -> NDArray[Any]:
+        """Its values, as far as they are known: of the sample."""
+        return self.node.sample.array
+
     def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: Any, **kwargs: Any) -> Traced:
         if kwargs.get("out") is not None:
             raise SpecError("columns cannot be changed in place; write a new expression instead")

@@ -67,6 +67,8 @@ LS212 a field that no data frame has | scans, clock or counter come from it, and
 LS213 Python asks whether a column is true | it takes one answer, and a column has one for each packet
       | (f.a < 1) & (f.b < 2), with | and ~, and np.where in place of `if`
 LS214 columns that do not fit together | a point needs one value of each | arrays as long as the frame's own, or one value for each packet
+LS215 `spread` folds everything onto one value | all samples of a packet get one angle, or one time
+      | full= as the circle in the unit of the angles; steps(count) for the index of a sample
 LS301 no example can be made up | nothing can be tried on it
       | a `sweep`, on another frame than data Frame(sweep=), or strategies = {"frame.field": ...} in the test class
 LS302 bytes do not survive parsing and building | a replayed or edited frame is another one | fields that keep every bit

@@ -86,6 +86,7 @@ DECLARED = {
     "and_in_points": {"LS213"},
     "without_parentheses": {"LS213"},
     "off_by_one": {"LS214"},
+    "folded_times": {"LS215"},
     "no_example": {"LS301"},
     "not_held": {"LS312"},
     "blind_checksum": {"LS310"},
