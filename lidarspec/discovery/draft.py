@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from lidarspec.discovery.checksum_search import search
 from lidarspec.discovery.periods import CIRCLES, FEW, FRONT, STEADY, Candidate, Length, candidates, follows, runs, structure, usual_bytes
 from lidarspec.discovery.samples import Match, Place, values
-from lidarspec.errors import SourceError, UsageError, WireError
+from lidarspec.errors import UsageError, WireError, system_errors
 from lidarspec.spec.checksums import ByteOrder
 
 #: frames that a checksum is looked for with, longest sync, and the same where there are few frames: more may be chance.
@@ -545,17 +545,33 @@ def _bytes(data: bytes) -> str:
 
 @dataclass(frozen=True)
 class Names:
-    """What is called after a sensor, by its id.
+    """What is called after a sensor.
+
+    Args:
+        id: of the sensor.
+        distribution: what is installed; by default one for this sensor alone, "lidarspec-" and its id.
+        vendor, model: as people write them; by default after the id.
 
     Raises:
-        UsageError: for what is no id.
+        UsageError: for what is no id, no name of a distribution, or cannot stand in a text of Python.
     """
 
     id: str
+    distribution: str = ""
+    vendor: str = ""
+    model: str = ""
 
     def __post_init__(self) -> None:
         if not _ID.fullmatch(self.id):
             raise UsageError(f"{self.id!r} is no id: it is vendor-model in lower case with hyphens, such as acme-x1")
+        vendor, _, model = self.id.partition("-")
+        defaults = {"distribution": f"lidarspec-{self.id}", "vendor": vendor.capitalize(), "model": model.upper()}
+        for name, default in defaults.items():
+            object.__setattr__(self, name, getattr(self, name) or default)
+        if not re.fullmatch(r"[a-z][a-z0-9]*(-[a-z0-9]+)*", self.distribution):
+            raise UsageError(f"{self.distribution!r} is no name of a distribution: lower case with hyphens, such as lidarspec-acme")
+        if unfit := re.search(r'["\\\n]', self.vendor + self.model):
+            raise UsageError(f"vendor and model cannot have {unfit[0]!r} in them")
 
     @property
     def constant(self) -> str:
@@ -564,20 +580,13 @@ class Names:
         return name if name.isidentifier() and name not in TAKEN else f"SENSOR_{name}"
 
     @property
-    def distribution(self) -> str:
-        """What is installed."""
-        return f"lidarspec-{self.id}"
-
-    @property
     def module(self) -> str:
         """What is imported."""
         return self.distribution.replace("-", "_")
 
     def values(self) -> dict[str, str]:
         """Everything for the templates."""
-        vendor, _, model = self.id.partition("-")
-        names = {name: getattr(self, name) for name in ("id", "constant", "distribution", "module")}
-        return {**names, "vendor": vendor.capitalize(), "model": model.upper()}
+        return {name: getattr(self, name) for name in ("id", "constant", "distribution", "module", "vendor", "model")}
 
 
 def invented(names: Names, link: Link) -> dict[str, str]:
@@ -597,7 +606,8 @@ def captured(names: Names, link: Link, draft: Draft, *, origin: str, port: int |
     udp = f"Udp({port})}},  # where the capture's datagrams went" if port else "Udp(2368)},  # the port: this capture does not tell it"
     values = {**names.values(), **drafted(draft, origin=origin, link=serial if link == "serial" else udp)}
     frames = [
-        {"frame": "data", "hex": data.hex(" "), "values": {}, "source": f"{origin}, at byte {at}"} for at, data in draft.frames[:VECTORS]
+        {"sensor": names.id, "frame": "data", "hex": data.hex(" "), "values": {}, "source": f"{origin}, at byte {at}"}
+        for at, data in draft.frames[:VECTORS]
     ]
     return _files(names, link, values, json.dumps(frames, indent=2) + "\n", ("README_draft.md", "draft.py", "test_draft.py"))
 
@@ -622,19 +632,51 @@ def filled(template: str, values: Mapping[str, str], link: Link) -> str:
     return Template(chosen).substitute(values)
 
 
-def write(folder: Path, texts: Mapping[str, str]) -> None:
-    """Put files into a folder that is not there yet.
+#: where a distribution lists its sensors.
+_LISTED = '[project.entry-points."lidarspec.sensors"]\n'
+
+
+def joining(folder: Path, names: Names, texts: Mapping[str, str]) -> dict[str, str]:
+    """The files, by path, that make a sensor one more of a distribution that is there: a module and tests of its own, and what is changed.
+
+    Args:
+        folder: of the distribution.
+        texts: the files of a distribution with this sensor alone.
 
     Raises:
-        UsageError: where it is there.
-        SourceError: where it cannot be written.
+        UsageError: where it is another distribution, or has such a sensor already.
+        SourceError: where its files cannot be read.
     """
-    if folder.exists():
-        raise UsageError(f"{folder} exists already: nothing was written")
-    try:
+    with system_errors(folder):
+        project, readme = ((folder / name).read_text(encoding="utf-8") for name in ("pyproject.toml", "README.md"))
+        vectors = (folder / "vectors.json").read_text(encoding="utf-8") if (folder / "vectors.json").exists() else "[]"
+    if f'name = "{names.distribution}"\n' not in project or _LISTED not in project:
+        raise UsageError(f"{folder / 'pyproject.toml'} is not that of {names.distribution}, or lists no lidarspec.sensors")
+    part = names.id.partition("-")[2].replace("-", "_")
+    part = part if part.isidentifier() else f"model_{part}"
+    test = f"tests/test_{names.id.replace('-', '_')}.py"
+    new = {f"{names.module}/{part}.py": texts[f"{names.module}/__init__.py"], test: texts[test]}
+    for name in new:
+        if (folder / name).exists():
+            raise UsageError(f"{folder / name} exists already: nothing was written")
+    entry = f'{names.id} = "{names.module}.{part}:{names.constant}"\n'
+    own, before = texts["vectors.json"].strip().removeprefix("["), vectors.rstrip().removesuffix("]").rstrip()
+    return {
+        **new,
+        "pyproject.toml": project.replace(_LISTED, _LISTED + entry),
+        "vectors.json": f"{before}{'' if before == '[' else ','}{own}\n",
+        "README.md": f"{readme.rstrip()}\n\nThe {names.vendor} {names.model}, `{names.id}`, stands in `{names.module}/{part}.py`.\n",
+    }
+
+
+def write(folder: Path, texts: Mapping[str, str]) -> None:
+    """Put files into a folder.
+
+    Raises:
+        SourceError: where one cannot be written.
+    """
+    with system_errors(folder):
         for name, text in texts.items():
             path = folder / name
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise SourceError(f"{error.filename or folder}: {error.strerror or error}") from None

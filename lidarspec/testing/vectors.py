@@ -7,6 +7,7 @@
 
 `values` are raw integers of the wire, `units` the same in the fields' units, `points` what becomes of single points (range, x, y, z,
 azimuth and elevation in radians, intensity, ring). All three may be left out: then the bytes have to be such a frame, and build again.
+`sensor` is the id of the one that an entry is of, where several share the file.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from lidarspec.testing.subject import Subject
 
 #: what a point may differ by: metres and radians as manuals print them.
 NEAR = 2e-4
-KEYS = {"source", "frame", "hex", "values", "units", "points", "note"}
+KEYS = {"sensor", "source", "frame", "hex", "values", "units", "points", "note"}
 COLUMNS = ("range", "x", "y", "z", "azimuth", "elevation", "intensity", "ring", "return_index")
 
 
@@ -48,7 +49,7 @@ def vectors_hold(subject: Subject) -> None:
 
 
 def entries(subject: Subject) -> list[Any]:
-    """The vectors of the subject's file.
+    """The vectors of the subject's file, but for those that name other sensors.
 
     Raises:
         Violation: where it cannot be read, or has an entry that is no vector.
@@ -61,16 +62,20 @@ def entries(subject: Subject) -> list[Any]:
         raise Violation("LS702", str(error), str(subject.vectors)) from None
     if not isinstance(found, list):
         raise Violation("LS702", "the file is no list of vectors", str(subject.vectors))
+    own = []
     for index, vector in enumerate(found):
         place = f"vectors[{index}]"
         require(isinstance(vector, dict), "LS702", "it is no object", place)
+        if vector.get("sensor", subject.sensor.id) != subject.sensor.id:
+            continue
+        own.append(vector)
         require(not vector.keys() - KEYS, "LS702", f"unknown keys {sorted(vector.keys() - KEYS)}; known are {sorted(KEYS)}", place)
         require(vector.get("frame") in subject.sensor.frames, "LS702", f"there is no frame {vector.get('frame')!r}", place)
         try:
             bytes.fromhex(vector.get("hex", "-"))
         except (ValueError, TypeError):
             raise Violation("LS702", "its `hex` is no hex text", place) from None
-    return found
+    return own
 
 
 def _parsed(subject: Subject, name: str, data: bytes, place: str) -> Any:
