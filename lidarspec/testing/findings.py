@@ -103,6 +103,8 @@ LS601 a command that does not parse back | the sensor is told something else | v
 LS602 an argument that is not held to its range | the sensor is asked for what it cannot do | args={name: (path, lowest, highest)}
 LS603 a reply that cannot match | the command waits for ever | matches= and echoes= by fields that the reply has
 LS604 a command without the documented reply | the simulated sensor keeps silent | answers=, or matches= that the reply can have
+LS605 a command or reply that is not as its vector has it | the sensor is told, or answers, something else
+      | values, args, matches and echoes as the manual has them
 LS701 a vector without its source | nobody can look it up | "source": "manual, section" in each entry
 LS702 a vector that cannot be read | it proves nothing | [{"frame": ..., "hex": ..., "values": {...}, "source": ...}]
 LS703 a checksum over the wrong span | no frame of a real sensor is accepted | over= and the algorithm that fit the vectors

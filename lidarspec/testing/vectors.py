@@ -7,6 +7,7 @@
 
 `values` are raw integers of the wire, `units` the same in the fields' units, `points` what becomes of single points (range, x, y, z,
 azimuth and elevation in radians, intensity, ring). All three may be left out: then the bytes have to be such a frame, and build again.
+An entry with `command` is what is sent for a command with `args`, by name in units; `reply` is what answers it.
 `sensor` is the id of the one that an entry is of, where several share the file.
 """
 
@@ -23,6 +24,7 @@ import numpy as np
 from lidarspec.discovery.checksum_search import search
 from lidarspec.errors import LidarSpecError, WireError
 from lidarspec.spec.tree import FieldInfo
+from lidarspec.testing.commands import an_exchange_holds
 from lidarspec.testing.findings import Violation, require
 from lidarspec.testing.frames import leaves
 from lidarspec.testing.geometry import read
@@ -30,7 +32,7 @@ from lidarspec.testing.subject import Subject
 
 #: what a point may differ by: metres and radians as manuals print them.
 NEAR = 2e-4
-KEYS = {"sensor", "source", "frame", "hex", "values", "units", "points", "note"}
+KEYS = {"sensor", "command", "args", "reply", "source", "frame", "hex", "values", "units", "points", "note"}
 COLUMNS = ("range", "x", "y", "z", "azimuth", "elevation", "intensity", "ring", "return_index")
 
 
@@ -44,6 +46,9 @@ def vectors_hold(subject: Subject) -> None:
         parsed = _parsed(subject, name, data, place)
         _values(subject, name, data, parsed, vector, place)
         require(subject.sensor.build(name, parsed) == data, "LS302", "its bytes do not survive parsing and building", f"{place} {name}")
+        if "command" in vector:
+            answer = bytes.fromhex(vector["reply"]) if "reply" in vector else None
+            an_exchange_holds(subject.sensor, vector["command"], vector.get("args", {}), data, answer, f"{place} {vector['command']}")
         if vector.get("points"):
             _points(subject, name, data, vector["points"], place)
 
@@ -70,11 +75,17 @@ def entries(subject: Subject) -> list[Any]:
             continue
         own.append(vector)
         require(not vector.keys() - KEYS, "LS702", f"unknown keys {sorted(vector.keys() - KEYS)}; known are {sorted(KEYS)}", place)
+        if "command" in vector:
+            known = subject.sensor.commands.get(vector["command"])
+            vector.setdefault("frame", known.frame if known is not None else None)
+            sends = known is not None and known.frame == vector["frame"]
+            require(sends, "LS702", f"no command {vector['command']!r} sends such a frame", place)
         require(vector.get("frame") in subject.sensor.frames, "LS702", f"there is no frame {vector.get('frame')!r}", place)
         try:
             bytes.fromhex(vector.get("hex", "-"))
+            bytes.fromhex(vector.get("reply", ""))
         except (ValueError, TypeError):
-            raise Violation("LS702", "its `hex` is no hex text", place) from None
+            raise Violation("LS702", "its `hex`, or its `reply`, is no hex text", place) from None
     return own
 
 
