@@ -51,6 +51,10 @@ TOLD, RUN = 8, 2
 LONG = 64
 #: doubt below which a checksum may be chance, as one in so many powers of two.
 WEAK = 12
+#: frames after which most bits of their checksums have changed.
+DIFFERENT = 16
+#: other candidates that are told of.
+OFFERED = 3
 #: bits of constants and checksum that let noise through: two frames in a row are asked for then.
 FEW_BITS = 24
 
@@ -85,6 +89,7 @@ class Draft:
         candidates: fields that rise, outside the blocks.
         blocks: parts of the frame that begin alike.
         seal: the checksum, None where none was found.
+        others: what else fits as the checksum.
         front: bytes that nearly all frames have at least, where a length counts bytes: as many are looked into.
     """
 
@@ -97,6 +102,7 @@ class Draft:
     candidates: tuple[Candidate, ...] = ()
     blocks: Blocks | None = None
     seal: Match | None = None
+    others: tuple[Match, ...] = ()
     front: int = 0
 
     @property
@@ -142,7 +148,8 @@ def draft(chunks: Sequence[bytes], *, datagrams: bool) -> Draft:
     known = _counted(replace(first, frames=tuple(_walk(first, parts))), parts[-1])
     known = _fronted(known, parts)
     known = replace(known, candidates=tuple(candidates(known.rows)))
-    known = replace(known, seal=_seal(known))
+    seals = _seals(known)
+    known = replace(known, seal=seals[0] if seals else None, others=tuple(seals[1:]))
     return _detailed(replace(known, frames=tuple(_walk(known, parts))))
 
 
@@ -220,15 +227,22 @@ def _fronted(known: Draft, parts: Sequence[bytes]) -> Draft:
     return replace(known, frames=tuple(_walk(known, parts)))
 
 
-def _seal(known: Draft) -> Match | None:
-    """The checksum that fits, the first of those that do not stand where something rises."""
+def _seals(known: Draft) -> list[Match]:
+    """The checksums that fit and do not stand where something rises, or where next to nothing changes."""
     frames = [frame for _, frame in known.frames]
     step = max(1, len(frames) // SOUGHT)
     shortest = min(map(len, frames), default=0)
-    for match in search(frames[::step][:SOUGHT]):
-        if not any(_overlaps(match.place, one, shortest) for one in known.candidates) and _can_stand(known, match):
-            return match
-    return None
+    some = frames[::step][:SOUGHT]
+    free = (match for match in search(some) if not any(_overlaps(match.place, one, shortest) for one in known.candidates))
+    return [match for match in free if _can_stand(known, match) and _changes(match, some)]
+
+
+def _changes(match: Match, frames: Sequence[bytes]) -> bool:
+    """Whether most bits of a checksum change; of few frames nobody knows."""
+    starts = [match.place.start(len(frame)) for frame in frames]
+    stored = [int.from_bytes(frame[start : start + match.place.size]) for frame, start in zip(frames, starts, strict=True)]
+    changing = np.bitwise_or.reduce([value ^ stored[0] for value in stored])
+    return len(frames) < DIFFERENT or 2 * int(changing).bit_count() > 8 * match.place.size
 
 
 def _overlaps(place: Place, one: Candidate, length: int) -> bool:
@@ -253,12 +267,13 @@ def _detailed(known: Draft) -> Draft:
     if not known.frames:
         return known
     rows = known.rows
-    blocks = _blocks(rows) if known.size is not None else None
     found = known.candidates
+    blocks = (_blocks(rows) or _rows_of(found, rows.shape[1])) if known.size is not None else None
     if blocks is not None:
         inside = rows[:, blocks.start : blocks.end].reshape(-1, blocks.size)
         within = tuple(one for one in candidates(inside) if one.offset >= len(blocks.flag))
-        blocks = replace(blocks, candidates=within)
+        blocks = replace(blocks, candidates=within) if blocks.flag or any(one.offset == 0 for one in within) else None
+    if blocks is not None:
         found = tuple(one for one in found if one.end <= blocks.start or one.offset >= blocks.end)
     shortest = min(len(frame) for _, frame in known.frames)
     free = tuple(one for one in found if known.seal is None or not _overlaps(known.seal.place, one, shortest))
@@ -281,6 +296,22 @@ def _blocks(rows: NDArray[np.uint8]) -> Blocks | None:
         if count >= BLOCKS and count * size >= FILLED * rows.shape[1]:
             found.append(Blocks(spots[0], size, count, bytes(pair)))
     return max(found, key=lambda blocks: blocks.count * blocks.size, default=None)
+
+
+def _rows_of(found: Sequence[Candidate], length: int) -> Blocks | None:
+    """The parts of a frame that begin with a field of the same kind at equal distances, the longest row of them."""
+    rows = []
+    for one in found:
+        like = [(one.size, one.order, one.kind, one.circle)]
+        same = [
+            other.offset for other in found if (other.size, other.order, other.kind, other.circle) in like and other.offset >= one.offset
+        ]
+        for step in {offset - one.offset for offset in same[1:]}:
+            count = next(number for number in itertools.count(1) if one.offset + number * step not in same)
+            count -= one.offset + count * step > length
+            if count >= BLOCKS:
+                rows.append(Blocks(one.offset, step, count, b""))
+    return max(rows, key=lambda blocks: blocks.count * blocks.size, default=None)
 
 
 @dataclass(frozen=True)
@@ -316,7 +347,8 @@ def drafted(draft: Draft, *, origin: str, link: str) -> dict[str, str]:
     below = [f"f.{path} < 360" for path in angles if "." not in path]
     plausible = below[0] if len(below) == 1 else " & ".join(f"({one})" for one in below)
     is_weak = not draft.datagrams and not below and _strength(draft) <= FEW_BITS
-    counters = [one for one in draft.candidates if one.kind == "counter" and one.offset < draft.head]
+    counting = (one for one in draft.candidates if one.kind == "counter" and one.offset < draft.head)
+    counters = sorted(counting, key=lambda one: (-one.right / one.total, -one.size))  # the one that never jumps
     text = {
         "frames_told": f"{len(draft.frames)} frame{'s' * (len(draft.frames) != 1)}, {draft.share:.1%} of its {draft.bytes_in} bytes",
         "origin": origin,
@@ -414,12 +446,13 @@ def _rising(draft: Draft, one: Candidate, what: str = "frame") -> Field:
             first, last = (values(draft.rows, each.offset, each.size, each.order) for each in (other, one))
             if same and follows(first, last, one.circle) > 1 - 1 / FEW:
                 why = (*why, f"lies between this frame's {other.name} and the next one's: the angle of the last sample?")
+                break
     return Field(one.offset, one.size, one.name, code, why)
 
 
 def _block_field(draft: Draft, blocks: Blocks) -> Field:
     rows = draft.rows[:, blocks.start : blocks.end].reshape(-1, blocks.size)
-    fields, at = [Field(0, len(blocks.flag), "flag", f"Const({_bytes(blocks.flag)})")], len(blocks.flag)
+    fields, at = [Field(0, len(blocks.flag), "flag", f"Const({_bytes(blocks.flag)})")] if blocks.flag else [], len(blocks.flag)
     for one in [*(_rising(draft, each, "block") for each in blocks.candidates), Field(blocks.size, 0, "", "")]:
         fields += _gap(rows, at, one.start, ())
         fields += [one] if one.name else []
@@ -427,7 +460,7 @@ def _block_field(draft: Draft, blocks: Blocks) -> Field:
     indent = " " * (16 if draft.seal else 12)
     body = "\n".join(line for field in fields for line in field.lines(indent))
     code = f"Array(\n{indent[8:]}    {blocks.count},\n{indent[8:]}    Struct(\n{body}\n{indent[8:]}    ),\n{indent[8:]})"
-    why = f"{blocks.count} blocks of {blocks.size} bytes that begin with {blocks.flag.hex(' ')}"
+    why = f"{blocks.count} blocks of {blocks.size} bytes that begin with {blocks.flag.hex(' ') or 'the same field'}"
     return Field(blocks.start, blocks.end - blocks.start, "blocks", code, (why,))
 
 
@@ -454,6 +487,9 @@ def _counter_name(draft: Draft) -> str:
 def _check(draft: Draft, seal: Match, start: int) -> Field:
     chance = "which may be chance: hold more frames against it" if seal.doubt < WEAK else f"a wrong one would be so once in {seal.odds}"
     why = (f"right in {seal.right} of {seal.total} frames, {chance}", *(one for one in seal.remarks if "constant" not in one))
+    size = min(len(frame) for _, frame in draft.frames)
+    for other in draft.others[:OFFERED]:
+        why = (*why, f"or {other.paste.splitlines()[0]} at byte {other.place.start(size)} over {other.span.told(other.place, size)}")
     return Field(start, seal.place.size, "check", _integer(seal.place.size, seal.order), why)
 
 
@@ -496,11 +532,20 @@ def _strength(draft: Draft) -> int:
 
 
 def _arguments(angles: Sequence[str], counters: Sequence[Candidate]) -> Iterator[str]:
-    yield f'scan=OnWrap("{angles[0]}"),' if angles else "scan=Every(0.1),  # seconds: no angle is known that a turn could be told by"
+    yield (
+        f'scan=OnWrap("{angles[0]}"),{_or(angles[1:])}'
+        if angles
+        else "scan=Every(0.1),  # seconds: no angle is known that a turn could be told by"
+    )
     if counters:
         one = counters[0]
         limits = f", first={one.first}, last={one.circle - 1}" if one.wraps else ""
-        yield f'sequence=Sequence("{one.name}"{limits}),  # a jump in it is a loss'
+        yield f'sequence=Sequence("{one.name}"{limits}),  # a jump in it is a loss{_or([other.name for other in counters[1:]], "")}'
+
+
+def _or(names: Sequence[str], begin: str = "  #") -> str:
+    """The others that it could be, as the end of a comment."""
+    return f"{begin or ';'} or {', '.join(names[:OFFERED])}" if names else ""
 
 
 def _longest(draft: Draft) -> str:
