@@ -8,10 +8,8 @@ own text from typed arguments, so that the place of a fault can be read from the
 from __future__ import annotations
 
 import os
-import traceback
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any, TypeVar
 
 
@@ -59,6 +57,8 @@ class PluginError(SpecError):
             what: the function in words, such as "points of data".
             function: it; where nothing of the plugin's own was running, its first line is the place.
         """
+        from traceback import format_exception  # where nothing fails, nobody waits for it
+
         if isinstance(error, PluginError):
             return error
         file, line = raised_at(error)
@@ -68,22 +68,24 @@ class PluginError(SpecError):
         place = f" ({shown_path(file)}:{line})" if file else ""
         kind = "" if type(error) is SpecError else f"{type(error).__name__}: "
         reason = f"{kind}{' '.join(str(error).split())}{place}"
-        text = "".join(traceback.format_exception(error))
+        text = "".join(format_exception(error))
         return cls(reason, path=what, sensor=sensor, rule=getattr(error, "rule", ""), file=file, line=line, traceback=text)
 
 
 def shown_path(file: str) -> str:
     """A path as it is typed in the folder that one is in; as it is where it lies elsewhere."""
-    return os.path.relpath(file) if Path(file).is_relative_to(Path.cwd()) else file
+    return os.path.relpath(file) if os.path.abspath(file).startswith(os.path.join(os.getcwd(), "")) else file
 
 
 def raised_at(error: BaseException) -> tuple[str, int]:
     """File and line of the plugin that an exception came out of: the innermost that is neither ours nor a library's; "" and 0 for none."""
-    ours = Path(__file__).parent
-    for spot in reversed(traceback.extract_tb(error.__traceback__)):
-        file = Path(spot.filename)
-        if file.is_file() and not file.is_relative_to(ours) and not set(file.parts) & set(_NOT_ITS_OWN):
-            return spot.filename, spot.lineno or 0
+    from traceback import extract_tb
+
+    ours = os.path.join(os.path.dirname(__file__), "")
+    for spot in reversed(extract_tb(error.__traceback__)):
+        file = spot.filename
+        if os.path.isfile(file) and not file.startswith(ours) and not set(file.split(os.sep)) & set(_NOT_ITS_OWN):
+            return file, spot.lineno or 0
     return "", 0
 
 

@@ -150,7 +150,7 @@ def _multiplied(subject: Subject, name: str) -> set[str]:
 
 def _measured(frame: Frame) -> set[str]:
     """The paths of fields that are pure numbers: declared with Scaled, and no steps of anything."""
-    return {info.path for node in nodes(frame.tree) for info in infos(node) if info.measured and (info.unit or not info.scaled)}
+    return {info.path for node in nodes(frame.tree) for info in infos(node) if info.measured and not info.unit and not info.scaled}
 
 
 def _plausible(subject: Subject, name: str, frame: Frame) -> Findings:
@@ -260,7 +260,7 @@ def _column(subject: Subject, name: str, value: Any, column: str, units: tuple[s
     free = [info for info in infos if info is not None and info.const is None and not info.labels]
     if free and not any(factor(info.unit, unit) is not None for info in infos if info is not None for unit in units):
         bare = [info for info in free if not is_unit(info.unit)]
-        if bare:
+        if bare and not {info.path for info in bare} & _measured(subject.sensor.frames[name]):
             order = list(subject.fields(name))
             first = min(bare, key=lambda info: (-len(info.axes), order.index(info.path) if info.path in order else len(order)))
             said = f"{first.unit!r} is no unit of it: {' or '.join(units)}" if first.unit else f"it has no unit: {' or '.join(units)}"
