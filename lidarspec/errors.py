@@ -8,10 +8,10 @@ own text from typed arguments, so that the place of a fault can be read from the
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from types import MappingProxyType
-from typing import TypeVar
+from typing import Any, TypeVar
 
 NO_SENSORS = "no sensor is installed: pip install 'lidarspec[all]'"
 
@@ -32,6 +32,73 @@ class SpecError(LidarSpecError):
     def __init__(self, reason: str, *, path: str = "", sensor: str = "", rule: str = "") -> None:
         self.reason, self.path, self.sensor, self.rule = reason, path, sensor, rule
         super().__init__(": ".join(part for part in (sensor, path, reason) if part))
+
+
+#: packages whose lines are not the plugin's, though it calls them.
+_NOT_ITS_OWN = ("construct", "numpy", "pluggy", "hypothesis", "_pytest")
+
+
+class PluginError(SpecError):
+    """A function of a plugin raised, or returned what cannot be used; where a stream is read, it is counted.
+
+    Attributes:
+        file, line: where in the plugin, "" and 0 where that is not known.
+        traceback: of what was raised, as text.
+    """
+
+    def __init__(
+        self, reason: str, *, path: str = "", sensor: str = "", rule: str = "", file: str = "", line: int = 0, traceback: str = ""
+    ) -> None:
+        self.file, self.line, self.traceback = file, line, traceback
+        super().__init__(reason, path=path, sensor=sensor, rule=rule)
+
+    @classmethod
+    def of(cls, error: Exception, what: str, *, sensor: str = "", function: Callable[..., Any] | None = None) -> PluginError:
+        """The error for what a plugin's function raised.
+
+        Args:
+            what: the function in words, such as "points of data".
+            function: it; where nothing of the plugin's own was running, its first line is the place.
+        """
+        from traceback import format_exception  # where nothing fails, nobody waits for it
+
+        if isinstance(error, PluginError):
+            return error
+        file, line = raised_at(error)
+        code = getattr(getattr(function, "func", function), "__code__", None)
+        if not file and code is not None:
+            file, line = code.co_filename, code.co_firstlineno
+        place = f" ({shown_path(file)}:{line})" if file else ""
+        kind = "" if type(error) is SpecError else f"{type(error).__name__}: "
+        reason = f"{kind}{' '.join(str(error).split())}{place}"
+        text = "".join(format_exception(error))
+        return cls(reason, path=what, sensor=sensor, rule=getattr(error, "rule", ""), file=file, line=line, traceback=text)
+
+
+def shown_path(file: str) -> str:
+    """A path as it is typed in the folder that one is in; as it is where it lies elsewhere."""
+    return os.path.relpath(file) if os.path.abspath(file).startswith(os.path.join(os.getcwd(), "")) else file
+
+
+def raised_at(error: BaseException) -> tuple[str, int]:
+    """File and line of the plugin that an exception came out of: the innermost that is neither ours nor a library's; "" and 0 for none."""
+    from traceback import extract_tb
+
+    ours = os.path.join(os.path.dirname(__file__), "")
+    for spot in reversed(extract_tb(error.__traceback__)):
+        file = spot.filename
+        if os.path.isfile(file) and not file.startswith(ours) and not set(file.split(os.sep)) & set(_NOT_ITS_OWN):
+            return file, spot.lineno or 0
+    return "", 0
+
+
+@contextmanager
+def plugin_errors(what: str, sensor: str, function: Callable[..., Any] | None = None) -> Iterator[None]:
+    """Whatever a plugin's function raises within, as a `PluginError`."""
+    try:
+        yield
+    except Exception as error:
+        raise PluginError.of(error, what, sensor=sensor, function=function) from error
 
 
 class WireError(LidarSpecError):

@@ -291,6 +291,11 @@ class Registry:
         offered = {entry.name for entries in self._offered.values() for entry in entries}
         return sorted(offered | set(self._loaded) | set(self._aliases))
 
+    def __contains__(self, name: str) -> bool:
+        """Whether there is a sensor of this id or alias."""
+        self._load_all()
+        return name in self._loaded or name in self._aliases
+
     def sensors(self) -> dict[str, Sensor]:
         """Every sensor by id, sorted, with its hooks applied."""
         self._load_all()

@@ -11,7 +11,7 @@ import click
 
 from lidarspec.cli.failures import FINDINGS
 from lidarspec.cli.output import Progress, emit, emit_json, note
-from lidarspec.discovery.draft import Link, Names, captured, draft, invented, write
+from lidarspec.discovery.draft import Link, Names, captured, draft, invented, joining, write
 from lidarspec.discovery.listen import beginning
 from lidarspec.errors import UsageError, WireError, suggest
 from lidarspec.exports import EXPORTS, Refused, export as exported, narrowed
@@ -28,22 +28,31 @@ MOST = 1 << 22
 @click.command()
 @click.argument("sensor_id", metavar="ID")
 @click.option("--into", metavar="DIR", default=".", help="Where the distribution's folder goes; by default into this one.")
+@click.option(
+    "--distribution", metavar="NAME", help="What is installed, such as lidarspec-acme; one that is there gets this sensor as well."
+)
+@click.option("--vendor", metavar="NAME", help="As people write it; by default after the id.")
+@click.option("--model", metavar="NAME", help="As people write it; by default after the id.")
 @click.option("--link", type=click.Choice(["serial", "udp"]), help="What the sensor sends over; serial by default.")
 @click.option("--from-capture", "capture", metavar="FILE", help="Draft the frames from their bytes: raw, .pcap, .lsr, .hex.")
-def new(sensor_id: str, into: str, link: str | None, capture: str | None) -> None:
+def new(
+    sensor_id: str, into: str, distribution: str | None, vendor: str | None, model: str | None, link: str | None, capture: str | None
+) -> None:
     """A distribution for a sensor of your own, which works before anything in it is changed.
 
     It has an invented sensor with frames, checksum, points, commands and simulation, its tests, and the entry point by which it is
-    found once it is installed. With --from-capture it has what the bytes of a capture can be told to consist of: sync bytes, length,
+    found once it is installed. With --distribution it joins a family: a module and tests of its own, beside those that are there.
+    With --from-capture it has what the bytes of a capture can be told to consist of: sync bytes, length,
     checksum, counters, angles, each with the evidence for it; what cannot be told is called unknown.
     """
-    names = Names(sensor_id)
+    names = Names(sensor_id, distribution or "", vendor or "", model or "")
     if sensor_id in sensors():
         raise suggest(UsageError(f"{sensor_id} is installed already: choose another id"), f"lidarspec show {sensor_id}")
     folder = Path(into) / names.distribution
-    if folder.exists():
-        raise UsageError(f"{folder} exists already: nothing was written")
+    if folder.exists() and distribution is None:
+        raise suggest(UsageError(f"{folder} exists already: nothing was written"), f"lidarspec new {sensor_id} --distribution NAME")
     texts = invented(names, "udp" if link == "udp" else "serial") if capture is None else _drafted(names, link, capture)
+    texts = joining(folder, names, texts) if folder.exists() else texts
     write(folder, texts)
     for name in texts:
         click.echo(folder / name)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 import traceback
 
 import click
@@ -70,13 +71,15 @@ def _message(error: Exception) -> str:
 
 def _following(error: Exception, command: str, verb: str) -> str:
     """The next command; what is said of plugins, where an unknown sensor may be one of a plugin that does not load."""
-    if isinstance(error, errors.UnknownSensor):
-        from lidarspec.plugins import registry
+    from lidarspec.plugins import registry
 
+    if isinstance(error, errors.UnknownSensor):
         return "lidarspec plugins" if any(plugin.error for plugin in registry().plugins) else command
     sensor = str(getattr(error, "sensor", "") or getattr(error, "place", "")).partition(" ")[0]
     if isinstance(error, errors.SpecError) and error.path.endswith(".py"):
         return f"lidarspec check {error.path}"
+    if isinstance(error, errors.PluginError) and error.file and sensor not in registry():  # one of a file that was named
+        return f"lidarspec check {shlex.quote(errors.shown_path(error.file))}"
     if "{sensor}" in command and not sensor:
         return "lidarspec plugins" if isinstance(error, errors.SpecError) else "lidarspec sensors"
     return command.format(sensor=sensor, verb=verb).replace("  ", " ")

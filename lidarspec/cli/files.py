@@ -10,7 +10,7 @@ from pathlib import Path
 
 import click
 
-from lidarspec.cli.inputs import nearest_fault, no_frame, nothing_came, refuse_overwriting, scans_of
+from lidarspec.cli.inputs import nearest_fault, no_frame, nothing_came, refuse_overwriting, remark, scans_of
 from lidarspec.cli.options import colour_option, count_option, sensor_option
 from lidarspec.cli.output import emit, emit_json, note
 from lidarspec.device.device import Device, open as open_device
@@ -81,14 +81,11 @@ def _detected(source: str, target: str) -> Sensor:
 
 
 def _sum_up(device: Device, target: str, written: Written, *, as_json: bool) -> None:
-    for warning in device.warnings:
-        note(warning)
     note(f"{target}: {written.points} points of {written.scans} scan{'s' * (written.scans != 1)} of {device.sensor.id}; {device.stats}")
-    if device.stats.tracebacks:
-        note(f"the plugin failed: {device.stats.tracebacks[0].strip().splitlines()[-1]}")
     if as_json:
         stats = device.stats.to_dict()
         emit_json({"sensor": device.sensor.id, "output": target, "scans": written.scans, "points": written.points, "stats": stats}, None)
+    remark(device)
 
 
 def _no_data(device: Device, source: str, target: str) -> Exception:
@@ -96,8 +93,8 @@ def _no_data(device: Device, source: str, target: str) -> Exception:
     sensor, stats = device.sensor, device.stats
     if stats.bytes_in == 0:
         return suggest(WireError(f"{source} holds no bytes", sensor=sensor.id), f"lidarspec show {sensor.id}")
-    if stats.tracebacks:
-        return WireError(f"no points: {stats.tracebacks[0].strip().splitlines()[-1]}", sensor=sensor.id)
+    if (failure := stats.failure(sensor.id)) is not None:
+        return failure
     given = _again(source)
     if given is not None:
         others = [score.sensor.id for score in scores(list(given.chunks), datagrams=given.datagrams) if score.sensor.id != sensor.id]
@@ -148,3 +145,4 @@ def plot(source: str, output: str, sensor_id: str | None, number: int, ramp: str
             note(f"{source} has {whole} whole scan{'s' * (whole != 1)}; drawn is the last piece of it that could be")
         title = f"{device.sensor.id}: {chosen}"
         emit(svg(chosen.points, look(chosen.points, ramp=ramp, reach=max_range), title), output)
+        remark(device)

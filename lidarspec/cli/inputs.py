@@ -10,6 +10,7 @@ import time
 from collections.abc import Iterator, Sequence
 from shlex import quote
 
+from lidarspec.cli.output import note
 from lidarspec.device.device import Device
 from lidarspec.device.settings import devices
 from lidarspec.discovery.detect import nearest
@@ -94,8 +95,10 @@ def nearest_fault(given: Heard) -> WireError:
 
 
 def nothing_came(device: Device, source: str, seconds: float | None = None) -> LidarSpecError:
-    """Why there is nothing to show: no data frame in a file, a silent device, or one whose bytes are no frames."""
+    """Why there is nothing to show: a plugin that raises, no data frame in a file, a silent device, or one whose bytes are no frames."""
     sensor, stats = device.sensor, device.stats
+    if (failure := stats.failure(sensor.id)) is not None:
+        return failure
     if not device.is_live:
         what = "holds no bytes" if stats.bytes_in == 0 else f"has no data frame: {stats}"
         return suggest(WireError(f"{source} {what}", sensor=sensor.id), f"lidarspec explain {source} -s {sensor.id}")
@@ -104,6 +107,20 @@ def nothing_came(device: Device, source: str, seconds: float | None = None) -> L
         return suggest(CommandError(f"{sensor.id} on {source} sent nothing{waited}"), f"lidarspec doctor {source} -s {sensor.id}")
     error = WireError(f"{source}: {stats.bytes_in} bytes{waited}, and not a scan of data frames among them: {stats}", sensor=sensor.id)
     return suggest(error, f"lidarspec detect {source}")
+
+
+def remark(device: Device) -> None:
+    """Say what is to be said of a source that was read.
+
+    Raises:
+        PluginError: where a function of the plugin raised at some of the packets.
+    """
+    failure = device.stats.failure(device.sensor.id)
+    for warning in device.warnings:
+        if failure is None or warning != str(failure):
+            note(warning)
+    if failure is not None:
+        raise failure
 
 
 class Patience:

@@ -151,12 +151,19 @@ def _command(sensor: Sensor, name: str) -> Mapping[str, Any]:
     command = sensor.commands[name]
     args = {name: {"field": path, "low": low, "high": high} for name, (path, low, high) in command.args.items()}
     frame = "" if command.frame is None or args else sensor.command(name).hex(" ")
-    return {"frame": command.frame, "arguments": args, "hex": frame, "reply": " or ".join(command.replies) or None}
+    return {
+        "frame": command.frame,
+        "arguments": args,
+        "hex": frame,
+        "reply": " or ".join(command.replies) or None,
+        "only_stopped": command.only_stopped,
+    }
 
 
 def _command_text(command: Mapping[str, Any]) -> str:
     args = "".join(f" {name}={limits(arg['low'], arg['high'])}" for name, arg in command["arguments"].items())
-    return f"{args}{': ' if command['hex'] else ''}{command['hex']}{', answered by ' + command['reply'] if command['reply'] else ''}"
+    answer = f", answered by {command['reply']}{' while it is stopped' if command['only_stopped'] else ''}" if command["reply"] else ""
+    return f"{args}{': ' if command['hex'] else ''}{command['hex']}{answer}"
 
 
 def _links(sensor: Sensor) -> str:

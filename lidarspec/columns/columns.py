@@ -30,7 +30,12 @@ from lidarspec.spec.tree import FieldInfo
 from lidarspec.wire.frame_table import Group, Rows, Table
 
 #: NumPy functions that work element by element, and so keep axes; others see plain arrays.
+BITWISE = {np.bitwise_and, np.bitwise_or, np.bitwise_xor, np.invert}
 ELEMENTWISE = {np.where, np.clip, np.nan_to_num, np.round, np.isclose, np.real_if_close}
+
+#: what is said where Python, or a bitwise operator, asks one answer of a column.
+NO_TRUTH = "a column has an answer for each packet: & | ~ in place of `and`, `or`, `not` and a < f.x < b, np.where in place of `if`"
+NO_BITS = "& | ~ take conditions, and fields are float64: each comparison in parentheses, (f.a < 1) & (f.b < 2); for bits a BitStruct"
 
 Carry = dict[int, NDArray[np.float64]]
 
@@ -90,11 +95,16 @@ class Column(NDArrayOperatorsMixin):
         """The shape of the array."""
         return self.array.shape
 
+    @property
+    def seen(self) -> NDArray[Any]:
+        """Its values, as far as they are known: of all packets."""
+        return self.array
+
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
         return self.array if dtype is None else self.array.astype(dtype)
 
     def __bool__(self) -> bool:
-        return bool(self.array)
+        raise SpecError(NO_TRUTH, rule="LS213")
 
     def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: Any, **kwargs: Any) -> Any:
         if kwargs.get("out") is not None:
@@ -114,6 +124,10 @@ class Column(NDArrayOperatorsMixin):
         arrays, axes, ready = aligned(values, self.batch)
         try:
             array = called(function, arrays)
+        except TypeError:
+            if function in BITWISE:
+                raise SpecError(NO_BITS, rule="LS213") from None
+            raise
         except ValueError:
             together({str(place): array for place, array in enumerate(arrays, 1)}, axes)
             raise
@@ -275,7 +289,7 @@ def of_points(parts: Mapping[str, Any], batch: Batch) -> tuple[list[NDArray[Any]
     if stray is not None or len(shape) > 1 + len(axes):
         where = f"along {axes[stray]!r}".replace("?", "") if stray is not None else "along a further axis"
         hint = "the last axis of a plain array goes with the innermost array of the frame: add [..., None] for one further out"
-        raise SpecError(f"points {where}, where no field of theirs is ({_lengths(named, axes)}); {hint}")
+        raise SpecError(f"points {where}, where no field of theirs is ({_lengths(named, axes)}); {hint}", rule="LS214")
     return arrays, axes, ready, shape
 
 
@@ -292,7 +306,7 @@ def together(arrays: Mapping[str, NDArray[Any]], axes: tuple[str | None, ...]) -
     try:
         return np.broadcast_shapes(*(array.shape for array in arrays.values()))
     except ValueError:
-        raise SpecError(f"lengths that do not go together: {_lengths(arrays, axes)}") from None
+        raise SpecError(f"lengths that do not go together: {_lengths(arrays, axes)}", rule="LS214") from None
 
 
 def _lengths(arrays: Mapping[str, NDArray[Any]], axes: tuple[str | None, ...]) -> str:

@@ -28,7 +28,7 @@ import numpy as np
 from numpy.lib.mixins import NDArrayOperatorsMixin
 from numpy.typing import NDArray
 
-from lidarspec.columns.columns import ELEMENTWISE, Batch, Column, Fields, called
+from lidarspec.columns.columns import ELEMENTWISE, NO_TRUTH, Batch, Column, Fields, called
 from lidarspec.errors import SpecError
 from lidarspec.spec.tree import FieldInfo
 from lidarspec.wire.frame_table import Group, Rows, Table
@@ -142,6 +142,11 @@ class Traced(NDArrayOperatorsMixin):
     def __init__(self, node: Node, tape: Tape) -> None:
         self.node, self._tape = node, tape
 
+    @property
+    def seen(self) -> NDArray[Any]:
+        """Its values, as far as they are known: of the sample."""
+        return self.node.sample.array
+
     def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: Any, **kwargs: Any) -> Traced:
         if kwargs.get("out") is not None:
             raise SpecError("columns cannot be changed in place; write a new expression instead")
@@ -187,7 +192,7 @@ class Traced(NDArrayOperatorsMixin):
         raise Untraceable("a column is made an array")
 
     def __bool__(self) -> bool:
-        raise Untraceable("a branch depends on data")
+        raise SpecError(NO_TRUTH, rule="LS213")
 
     def __len__(self) -> int:
         raise Untraceable("the length of a column")

@@ -68,6 +68,7 @@ def demonstrate(sensor: Sensor, *, turns: int = 5, errors: float = 0.01, seed: i
 
     Raises:
         SourceError: where no line can be had, or the scans do not come.
+        PluginError: where a function of the plugin raises.
     """
     faults = Faults(loss=errors) if sensor.datagrams else Faults(errors=errors)
     simulated = SimulatedDevice(sensor, seed=seed, faults=faults)
@@ -116,9 +117,13 @@ def _read(device: Device, served: Served, turns: int) -> tuple[tuple[Reply, ...]
             served.rest()
             while device.newest(QUIET) is not None:
                 pass  # what is still on the way counts as sent, so it is read too
-            return replies, tuple(scans), device.stats
+            break
         if time.monotonic() > limit:
             break
+    if (failure := device.stats.failure(device.sensor.id)) is not None:
+        raise failure
+    if sum(one.complete for one in scans) >= turns:
+        return replies, tuple(scans), device.stats
     number = f"{len(scans)} scans in {PATIENCE + turns:g} s, and not {turns}"
     raise SourceError(f"the simulated {device.sensor.id} gave {number}: {device.stats}")
 

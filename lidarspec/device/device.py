@@ -133,8 +133,10 @@ class Device(Closing):
 
     @property
     def warnings(self) -> list[str]:
-        """What is to be said about the source now: a file that is cut off, silence, a likely wrong baud rate, a small buffer."""
-        return self._input.warnings
+        """What is to be said about the source now: a file that is cut off, silence, a likely wrong baud rate, a small buffer; and what
+        the plugin failed at."""
+        failure = self.stats.failure(self.sensor.id)
+        return self._input.warnings if failure is None else [*self._input.warnings, str(failure)]
 
     @property
     def state(self) -> str:

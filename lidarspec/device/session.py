@@ -391,7 +391,10 @@ def _silence(sensor: Sensor, request: _Request) -> CommandError:
     if request.wrong:
         return CommandError(f"{place}: the device answered with {request.wrong}")
     often = f", sent {len(request.sent)} times" if len(request.sent) > 1 else ""
-    return ReplyTimeout(f"{place}: no {' or '.join(request.command.replies)} frame came within {request.timeout / SECOND:g} s{often}")
+    stop = next((name for name, command in sensor.commands.items() if command.stops), "stop") if request.command.only_stopped else ""
+    hint = f"; it is answered only while the sensor is stopped: send {stop!r} first" if stop else ""
+    waited = f"{request.timeout / SECOND:g} s{often}"
+    return ReplyTimeout(f"{place}: no {' or '.join(request.command.replies)} frame came within {waited}{hint}")
 
 
 def _ns(seconds: float) -> int:

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from lidarspec.discovery.checksum_search import search
 from lidarspec.discovery.periods import CIRCLES, FEW, FRONT, STEADY, Candidate, Length, candidates, follows, runs, structure, usual_bytes
 from lidarspec.discovery.samples import Match, Place, values
-from lidarspec.errors import SourceError, UsageError, WireError
+from lidarspec.errors import UsageError, WireError, system_errors
 from lidarspec.spec.checksums import ByteOrder
 
 #: frames that a checksum is looked for with, longest sync, and the same where there are few frames: more may be chance.
@@ -51,6 +51,10 @@ TOLD, RUN = 8, 2
 LONG = 64
 #: doubt below which a checksum may be chance, as one in so many powers of two.
 WEAK = 12
+#: frames after which most bits of their checksums have changed.
+DIFFERENT = 16
+#: other candidates that are told of.
+OFFERED = 3
 #: bits of constants and checksum that let noise through: two frames in a row are asked for then.
 FEW_BITS = 24
 
@@ -85,6 +89,7 @@ class Draft:
         candidates: fields that rise, outside the blocks.
         blocks: parts of the frame that begin alike.
         seal: the checksum, None where none was found.
+        others: what else fits as the checksum.
         front: bytes that nearly all frames have at least, where a length counts bytes: as many are looked into.
     """
 
@@ -97,6 +102,7 @@ class Draft:
     candidates: tuple[Candidate, ...] = ()
     blocks: Blocks | None = None
     seal: Match | None = None
+    others: tuple[Match, ...] = ()
     front: int = 0
 
     @property
@@ -142,7 +148,8 @@ def draft(chunks: Sequence[bytes], *, datagrams: bool) -> Draft:
     known = _counted(replace(first, frames=tuple(_walk(first, parts))), parts[-1])
     known = _fronted(known, parts)
     known = replace(known, candidates=tuple(candidates(known.rows)))
-    known = replace(known, seal=_seal(known))
+    seals = _seals(known)
+    known = replace(known, seal=seals[0] if seals else None, others=tuple(seals[1:]))
     return _detailed(replace(known, frames=tuple(_walk(known, parts))))
 
 
@@ -220,15 +227,22 @@ def _fronted(known: Draft, parts: Sequence[bytes]) -> Draft:
     return replace(known, frames=tuple(_walk(known, parts)))
 
 
-def _seal(known: Draft) -> Match | None:
-    """The checksum that fits, the first of those that do not stand where something rises."""
+def _seals(known: Draft) -> list[Match]:
+    """The checksums that fit and do not stand where something rises, or where next to nothing changes."""
     frames = [frame for _, frame in known.frames]
     step = max(1, len(frames) // SOUGHT)
     shortest = min(map(len, frames), default=0)
-    for match in search(frames[::step][:SOUGHT]):
-        if not any(_overlaps(match.place, one, shortest) for one in known.candidates) and _can_stand(known, match):
-            return match
-    return None
+    some = frames[::step][:SOUGHT]
+    free = (match for match in search(some) if not any(_overlaps(match.place, one, shortest) for one in known.candidates))
+    return [match for match in free if _can_stand(known, match) and _changes(match, some)]
+
+
+def _changes(match: Match, frames: Sequence[bytes]) -> bool:
+    """Whether most bits of a checksum change; of few frames nobody knows."""
+    starts = [match.place.start(len(frame)) for frame in frames]
+    stored = [int.from_bytes(frame[start : start + match.place.size]) for frame, start in zip(frames, starts, strict=True)]
+    changing = np.bitwise_or.reduce([value ^ stored[0] for value in stored])
+    return len(frames) < DIFFERENT or 2 * int(changing).bit_count() > 8 * match.place.size
 
 
 def _overlaps(place: Place, one: Candidate, length: int) -> bool:
@@ -253,12 +267,13 @@ def _detailed(known: Draft) -> Draft:
     if not known.frames:
         return known
     rows = known.rows
-    blocks = _blocks(rows) if known.size is not None else None
     found = known.candidates
+    blocks = (_blocks(rows) or _rows_of(found, rows.shape[1])) if known.size is not None else None
     if blocks is not None:
         inside = rows[:, blocks.start : blocks.end].reshape(-1, blocks.size)
         within = tuple(one for one in candidates(inside) if one.offset >= len(blocks.flag))
-        blocks = replace(blocks, candidates=within)
+        blocks = replace(blocks, candidates=within) if blocks.flag or any(one.offset == 0 for one in within) else None
+    if blocks is not None:
         found = tuple(one for one in found if one.end <= blocks.start or one.offset >= blocks.end)
     shortest = min(len(frame) for _, frame in known.frames)
     free = tuple(one for one in found if known.seal is None or not _overlaps(known.seal.place, one, shortest))
@@ -281,6 +296,22 @@ def _blocks(rows: NDArray[np.uint8]) -> Blocks | None:
         if count >= BLOCKS and count * size >= FILLED * rows.shape[1]:
             found.append(Blocks(spots[0], size, count, bytes(pair)))
     return max(found, key=lambda blocks: blocks.count * blocks.size, default=None)
+
+
+def _rows_of(found: Sequence[Candidate], length: int) -> Blocks | None:
+    """The parts of a frame that begin with a field of the same kind at equal distances, the longest row of them."""
+    rows = []
+    for one in found:
+        like = [(one.size, one.order, one.kind, one.circle)]
+        same = [
+            other.offset for other in found if (other.size, other.order, other.kind, other.circle) in like and other.offset >= one.offset
+        ]
+        for step in {offset - one.offset for offset in same[1:]}:
+            count = next(number for number in itertools.count(1) if one.offset + number * step not in same)
+            count -= one.offset + count * step > length
+            if count >= BLOCKS:
+                rows.append(Blocks(one.offset, step, count, b""))
+    return max(rows, key=lambda blocks: blocks.count * blocks.size, default=None)
 
 
 @dataclass(frozen=True)
@@ -317,7 +348,8 @@ def drafted(draft: Draft, *, origin: str, link: str) -> dict[str, str]:
     plausible = below[0] if len(below) == 1 else " & ".join(f"({one})" for one in below)
     check = f'def plausible(f: Fields) -> Any:\n    """Angles below 360 degrees."""\n    return {plausible}\n\n\n'
     is_weak = not draft.datagrams and not below and _strength(draft) <= FEW_BITS
-    counters = [one for one in draft.candidates if one.kind == "counter" and one.offset < draft.head]
+    counting = (one for one in draft.candidates if one.kind == "counter" and one.offset < draft.head)
+    counters = sorted(counting, key=lambda one: (-one.right / one.total, -one.size))  # the one that never jumps
     text = {
         "frames_told": f"{len(draft.frames)} frame{'s' * (len(draft.frames) != 1)}, {draft.share:.1%} of its {draft.bytes_in} bytes",
         "origin": origin,
@@ -413,12 +445,13 @@ def _rising(draft: Draft, one: Candidate, what: str = "frame") -> Field:
             first, last = (values(draft.rows, each.offset, each.size, each.order) for each in (other, one))
             if same and follows(first, last, one.circle) > 1 - 1 / FEW:
                 why = (*why, f"lies between this frame's {other.name} and the next one's: the angle of the last sample?")
+                break
     return Field(one.offset, one.size, one.name, code, why)
 
 
 def _block_field(draft: Draft, blocks: Blocks) -> Field:
     rows = draft.rows[:, blocks.start : blocks.end].reshape(-1, blocks.size)
-    fields, at = [Field(0, len(blocks.flag), "flag", f"Const({_bytes(blocks.flag)})")], len(blocks.flag)
+    fields, at = [Field(0, len(blocks.flag), "flag", f"Const({_bytes(blocks.flag)})")] if blocks.flag else [], len(blocks.flag)
     for one in [*(_rising(draft, each, "block") for each in blocks.candidates), Field(blocks.size, 0, "", "")]:
         fields += _gap(rows, at, one.start, ())
         fields += [one] if one.name else []
@@ -426,7 +459,7 @@ def _block_field(draft: Draft, blocks: Blocks) -> Field:
     indent = " " * (16 if draft.seal else 12)
     body = "\n".join(line for field in fields for line in field.lines(indent))
     code = f"Array(\n{indent[8:]}    {blocks.count},\n{indent[8:]}    Struct(\n{body}\n{indent[8:]}    ),\n{indent[8:]})"
-    why = f"{blocks.count} blocks of {blocks.size} bytes that begin with {blocks.flag.hex(' ')}"
+    why = f"{blocks.count} blocks of {blocks.size} bytes that begin with {blocks.flag.hex(' ') or 'the same field'}"
     return Field(blocks.start, blocks.end - blocks.start, "blocks", code, (why,))
 
 
@@ -453,6 +486,9 @@ def _counter_name(draft: Draft) -> str:
 def _check(draft: Draft, seal: Match, start: int) -> Field:
     chance = "which may be chance: hold more frames against it" if seal.doubt < WEAK else f"a wrong one would be so once in {seal.odds}"
     why = (f"right in {seal.right} of {seal.total} frames, {chance}", *(one for one in seal.remarks if "constant" not in one))
+    size = min(len(frame) for _, frame in draft.frames)
+    for other in draft.others[:OFFERED]:
+        why = (*why, f"or {other.paste.splitlines()[0]} at byte {other.place.start(size)} over {other.span.told(other.place, size)}")
     return Field(start, seal.place.size, "check", _integer(seal.place.size, seal.order), why)
 
 
@@ -495,11 +531,20 @@ def _strength(draft: Draft) -> int:
 
 
 def _arguments(angles: Sequence[str], counters: Sequence[Candidate]) -> Iterator[str]:
-    yield f'scan=OnWrap("{angles[0]}"),' if angles else "scan=Every(0.1),  # seconds: no angle is known that a turn could be told by"
+    yield (
+        f'scan=OnWrap("{angles[0]}"),{_or(angles[1:])}'
+        if angles
+        else "scan=Every(0.1),  # seconds: no angle is known that a turn could be told by"
+    )
     if counters:
         one = counters[0]
         limits = f", first={one.first}, last={one.circle - 1}" if one.wraps else ""
-        yield f'sequence=Sequence("{one.name}"{limits}),  # a jump in it is a loss'
+        yield f'sequence=Sequence("{one.name}"{limits}),  # a jump in it is a loss{_or([other.name for other in counters[1:]], "")}'
+
+
+def _or(names: Sequence[str], begin: str = "  #") -> str:
+    """The others that it could be, as the end of a comment."""
+    return f"{begin or ';'} or {', '.join(names[:OFFERED])}" if names else ""
 
 
 def _longest(draft: Draft) -> str:
@@ -544,17 +589,33 @@ def _bytes(data: bytes) -> str:
 
 @dataclass(frozen=True)
 class Names:
-    """What is called after a sensor, by its id.
+    """What is called after a sensor.
+
+    Args:
+        id: of the sensor.
+        distribution: what is installed; by default one for this sensor alone, "lidarspec-" and its id.
+        vendor, model: as people write them; by default after the id.
 
     Raises:
-        UsageError: for what is no id.
+        UsageError: for what is no id, no name of a distribution, or cannot stand in a text of Python.
     """
 
     id: str
+    distribution: str = ""
+    vendor: str = ""
+    model: str = ""
 
     def __post_init__(self) -> None:
         if not _ID.fullmatch(self.id):
             raise UsageError(f"{self.id!r} is no id: it is vendor-model in lower case with hyphens, such as acme-x1")
+        vendor, _, model = self.id.partition("-")
+        defaults = {"distribution": f"lidarspec-{self.id}", "vendor": vendor.capitalize(), "model": model.upper()}
+        for name, default in defaults.items():
+            object.__setattr__(self, name, getattr(self, name) or default)
+        if not re.fullmatch(r"[a-z][a-z0-9]*(-[a-z0-9]+)*", self.distribution):
+            raise UsageError(f"{self.distribution!r} is no name of a distribution: lower case with hyphens, such as lidarspec-acme")
+        if unfit := re.search(r'["\\\n]', self.vendor + self.model):
+            raise UsageError(f"vendor and model cannot have {unfit[0]!r} in them")
 
     @property
     def constant(self) -> str:
@@ -563,20 +624,13 @@ class Names:
         return name if name.isidentifier() and name not in TAKEN else f"SENSOR_{name}"
 
     @property
-    def distribution(self) -> str:
-        """What is installed."""
-        return f"lidarspec-{self.id}"
-
-    @property
     def module(self) -> str:
         """What is imported."""
         return self.distribution.replace("-", "_")
 
     def values(self) -> dict[str, str]:
         """Everything for the templates."""
-        vendor, _, model = self.id.partition("-")
-        names = {name: getattr(self, name) for name in ("id", "constant", "distribution", "module")}
-        return {**names, "vendor": vendor.capitalize(), "model": model.upper()}
+        return {name: getattr(self, name) for name in ("id", "constant", "distribution", "module", "vendor", "model")}
 
 
 def invented(names: Names, link: Link) -> dict[str, str]:
@@ -595,8 +649,10 @@ def captured(names: Names, link: Link, draft: Draft, *, origin: str, port: int |
     serial = "Serial(115_200)},  # the baud rate: a capture does not tell it"
     udp = f"Udp({port})}},  # where the capture's datagrams went" if port else "Udp(2368)},  # the port: this capture does not tell it"
     values = {**names.values(), **drafted(draft, origin=origin, link=serial if link == "serial" else udp)}
-    kept = draft.frames[:VECTORS]
-    frames = [{"frame": "data", "hex": data.hex(" "), "values": {}, "source": f"{origin}, at byte {at}"} for at, data in kept]
+    frames = [
+        {"sensor": names.id, "frame": "data", "hex": data.hex(" "), "values": {}, "source": f"{origin}, at byte {at}"}
+        for at, data in draft.frames[:VECTORS]
+    ]
     return _files(names, link, values, json.dumps(frames, indent=2) + "\n", ("README_draft.md", "draft.py", "test_draft.py"))
 
 
@@ -620,19 +676,51 @@ def filled(template: str, values: Mapping[str, str], link: Link) -> str:
     return Template(chosen).substitute(values)
 
 
-def write(folder: Path, texts: Mapping[str, str]) -> None:
-    """Put files into a folder that is not there yet.
+#: where a distribution lists its sensors.
+_LISTED = '[project.entry-points."lidarspec.sensors"]\n'
+
+
+def joining(folder: Path, names: Names, texts: Mapping[str, str]) -> dict[str, str]:
+    """The files, by path, that make a sensor one more of a distribution that is there: a module and tests of its own, and what is changed.
+
+    Args:
+        folder: of the distribution.
+        texts: the files of a distribution with this sensor alone.
 
     Raises:
-        UsageError: where it is there.
-        SourceError: where it cannot be written.
+        UsageError: where it is another distribution, or has such a sensor already.
+        SourceError: where its files cannot be read.
     """
-    if folder.exists():
-        raise UsageError(f"{folder} exists already: nothing was written")
-    try:
+    with system_errors(folder):
+        project, readme = ((folder / name).read_text(encoding="utf-8") for name in ("pyproject.toml", "README.md"))
+        vectors = (folder / "vectors.json").read_text(encoding="utf-8") if (folder / "vectors.json").exists() else "[]"
+    if f'name = "{names.distribution}"\n' not in project or _LISTED not in project:
+        raise UsageError(f"{folder / 'pyproject.toml'} is not that of {names.distribution}, or lists no lidarspec.sensors")
+    part = names.id.partition("-")[2].replace("-", "_")
+    part = part if part.isidentifier() else f"model_{part}"
+    test = f"tests/test_{names.id.replace('-', '_')}.py"
+    new = {f"{names.module}/{part}.py": texts[f"{names.module}/__init__.py"], test: texts[test]}
+    for name in new:
+        if (folder / name).exists():
+            raise UsageError(f"{folder / name} exists already: nothing was written")
+    entry = f'{names.id} = "{names.module}.{part}:{names.constant}"\n'
+    own, before = texts["vectors.json"].strip().removeprefix("["), vectors.rstrip().removesuffix("]").rstrip()
+    return {
+        **new,
+        "pyproject.toml": project.replace(_LISTED, _LISTED + entry),
+        "vectors.json": f"{before}{'' if before == '[' else ','}{own}\n",
+        "README.md": f"{readme.rstrip()}\n\nThe {names.vendor} {names.model}, `{names.id}`, stands in `{names.module}/{part}.py`.\n",
+    }
+
+
+def write(folder: Path, texts: Mapping[str, str]) -> None:
+    """Put files into a folder.
+
+    Raises:
+        SourceError: where one cannot be written.
+    """
+    with system_errors(folder):
         for name, text in texts.items():
             path = folder / name
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise SourceError(f"{error.filename or folder}: {error.strerror or error}") from None

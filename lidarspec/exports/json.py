@@ -84,7 +84,21 @@ def _command(command: Command) -> dict[str, Any]:
     return {
         **facts(command, "frame", "values"),
         "args": {name: {"field": path, "low": low, "high": high} for name, (path, low, high) in command.args.items()},
-        **facts(command, "replies", "matches", "echoes", "timeout", "retries", "settle", "link", "lines", "starts", "stops", "every"),
+        **facts(
+            command,
+            "replies",
+            "matches",
+            "echoes",
+            "timeout",
+            "retries",
+            "settle",
+            "link",
+            "lines",
+            "starts",
+            "stops",
+            "only_stopped",
+            "every",
+        ),
     }
 
 

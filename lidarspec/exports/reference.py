@@ -113,6 +113,7 @@ def _effect(sensor: Sensor, name: str) -> str:
     said = {
         "starts the data": command.starts,
         "stops the data": command.stops,
+        "answered only while no data are sent": command.only_stopped,
         f"{command.settle:g} s before the next command": command.settle > 0,
         f"again every {command.every:g} s": command.every > 0,
         "sent on opening": name in sensor.on_open,

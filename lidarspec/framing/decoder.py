@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.errors import UsageError, refuse_text
+from lidarspec.errors import PluginError, UsageError, refuse_text
 from lidarspec.framing.datagrams import sorted_datagrams
 from lidarspec.framing.frame_engine import codec
 from lidarspec.framing.results import Counters, Found, Frames, Numbers, array_of
@@ -232,10 +232,10 @@ class Decoder:
             sizes[index] -= fillers
         return sizes
 
-    def _rejected(self, numbers: Mapping[str, int], errors: Sequence[str]) -> None:
+    def _rejected(self, numbers: Mapping[str, int], errors: Sequence[PluginError]) -> None:
         for name, number in numbers.items():
             setattr(self.stats, name, getattr(self.stats, name) + number)
-        self.stats.tracebacks += errors[: 5 - len(self.stats.tracebacks)]
+        self.stats.failures += errors[: 5 - len(self.stats.failures)]
 
     def _count(self, kinds: NDArray[np.intp]) -> None:
         frames = self.stats.frames

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.errors import SpecError, UnknownFrame, UsageError
+from lidarspec.errors import PluginError, SpecError, UnknownFrame, UsageError
 from lidarspec.framing.frame_engine import CompiledCodec, InterpretedCodec, codec
 from lidarspec.framing.plausibility import plausibility
 from lidarspec.framing.results import VALID
@@ -89,10 +89,10 @@ def _plausible(sensor: Spec, frame: str, layout: Layout, rows: NDArray[np.uint8]
     table = Rows(codec(sensor.frames[frame]).schema, [Group(layout, np.arange(len(rows)), rows)])
     if sensor.frames[frame].plausible is None:
         return [row.tobytes() for row in rows]
-    errors: list[str] = []
+    errors: list[PluginError] = []
     good = np.flatnonzero(plausibility(sensor.frames[frame], table, errors) == 0)
     if errors:
-        raise SpecError(errors[0].strip().splitlines()[-1], path=f"{frame}.plausible", sensor=sensor.id)
+        raise SpecError(errors[0].reason, path=f"{frame}.plausible", sensor=sensor.id, rule=errors[0].rule)
     return [row.tobytes() for row in rows[good]]
 
 

@@ -12,14 +12,13 @@ from __future__ import annotations
 
 import functools
 import io
-import traceback
 from collections.abc import Iterable
 
 import construct
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.errors import SpecError
+from lidarspec.errors import PluginError, SpecError
 from lidarspec.framing.plausibility import Check, Conditions, Judge, plausibility
 from lidarspec.framing.results import CHECKSUM, CONSTANT, LENGTH, PLUGIN, SHORT, VALID, Frames, Status
 from lidarspec.spec.construct_layer import Mismatch, fixed_size
@@ -64,8 +63,8 @@ class Codec:
         """
         raise NotImplementedError
 
-    def survey_rows(self, rows: NDArray[np.uint8], *, sums: Sums | None = None) -> tuple[Layout, Status, tuple[str, ...]] | None:
-        """The layout of candidates of one size, one a row, the status of each, and tracebacks; None where they have not one."""
+    def survey_rows(self, rows: NDArray[np.uint8], *, sums: Sums | None = None) -> tuple[Layout, Status, tuple[PluginError, ...]] | None:
+        """The layout of candidates of one size, one a row, the status of each, and failures of the plugin; None where they have not one."""
         return None
 
     def table(self, frames: Iterable[bytes]) -> Table:
@@ -97,7 +96,7 @@ class CompiledCodec(Codec):
         self, buffer: NDArray[np.uint8], offsets: NDArray[np.intp], *, kind: int = 0, gathered: bool = True, sums: Sums | None = None
     ) -> Frames:
         groups = [(self.layout, counted(len(offsets)))] if self.layout is not None else self.tree.classify(buffer, offsets)
-        kinds, errors = repeated(kind, len(offsets)), list[str]()
+        kinds, errors = repeated(kind, len(offsets)), list[PluginError]()
         if len(groups) == 1 and len(groups[0][1]) == len(offsets) and isinstance(only := groups[0][0], Layout):
             status, sizes, rows = self._judged(buffer, offsets, only, errors, gathered=gathered, sums=sums)
             return Frames(buffer, kinds, offsets, sizes, layouts=(only,), status=status, rows=rows, errors=tuple(errors))
@@ -117,15 +116,22 @@ class CompiledCodec(Codec):
             sizes[which] = own
         return Frames(buffer, kinds, offsets, sizes, layouts=tuple(layouts), forms=forms, status=status, errors=tuple(errors))
 
-    def survey_rows(self, rows: NDArray[np.uint8], *, sums: Sums | None = None) -> tuple[Layout, Status, tuple[str, ...]] | None:
+    def survey_rows(self, rows: NDArray[np.uint8], *, sums: Sums | None = None) -> tuple[Layout, Status, tuple[PluginError, ...]] | None:
         layout = self.layout or self.tree.common(rows)
         if layout is None or layout.size != rows.shape[1]:
             return None
-        errors: list[str] = []
+        errors: list[PluginError] = []
         return layout, self._judge(layout)(rows, errors, sums), tuple(errors)
 
     def _judged(
-        self, buffer: NDArray[np.uint8], offsets: NDArray[np.intp], layout: Layout, errors: list[str], *, gathered: bool, sums: Sums | None
+        self,
+        buffer: NDArray[np.uint8],
+        offsets: NDArray[np.intp],
+        layout: Layout,
+        errors: list[PluginError],
+        *,
+        gathered: bool,
+        sums: Sums | None,
     ) -> tuple[NDArray[np.uint8], NDArray[np.intp], NDArray[np.uint8] | None]:
         """Candidates of one layout.
 
@@ -146,7 +152,14 @@ class CompiledCodec(Codec):
         return status, sizes, rows
 
     def _judged_whole(
-        self, buffer: NDArray[np.uint8], offsets: NDArray[np.intp], layout: Layout, errors: list[str], *, gathered: bool, sums: Sums | None
+        self,
+        buffer: NDArray[np.uint8],
+        offsets: NDArray[np.intp],
+        layout: Layout,
+        errors: list[PluginError],
+        *,
+        gathered: bool,
+        sums: Sums | None,
     ) -> tuple[NDArray[np.uint8], NDArray[np.uint8] | None]:
         """The status of whole candidates of one layout; their bytes, one a row, if they are wanted and not too many."""
         judge = self._judge(layout)
@@ -201,7 +214,7 @@ class InterpretedCodec(Codec):
     ) -> Frames:
         status = np.zeros(len(offsets), np.uint8)
         sizes = np.zeros(len(offsets), np.intp)
-        errors: list[str] = []
+        errors: list[PluginError] = []
         for index, offset in enumerate(offsets):
             data = buffer[offset : offset + self.frame.max_length].tobytes()
             status[index], sizes[index] = self._judge(data, errors)
@@ -211,7 +224,7 @@ class InterpretedCodec(Codec):
         frames = list(frames)
         return Records(self.schema, [self.frame.prepared.parse(frame, _verify=False) for frame in frames], frames)
 
-    def _judge(self, data: bytes, errors: list[str]) -> tuple[int, int]:
+    def _judge(self, data: bytes, errors: list[PluginError]) -> tuple[int, int]:
         stream = io.BytesIO(data)
         try:
             self.frame.prepared.parse_stream(stream, _verify="constants")
@@ -227,8 +240,8 @@ class InterpretedCodec(Codec):
             raise
         except construct.ConstructError:
             return LENGTH, 0
-        except Exception:
-            errors.append(traceback.format_exc())
+        except Exception as error:
+            errors.append(PluginError.of(error, "struct"))
             return PLUGIN, 0
         if self.frame.plausible is None:
             return VALID, size

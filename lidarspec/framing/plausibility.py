@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import functools
 import math
-import traceback
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
@@ -22,6 +21,7 @@ from numpy.typing import NDArray
 
 from lidarspec.columns.columns import Batch, Column, Fields, unpadded
 from lidarspec.columns.graph import Expression, Traced, conjuncts, sample_of, trace
+from lidarspec.errors import PluginError
 from lidarspec.framing.results import CHECKSUM, CONSTANT, IMPLAUSIBLE, PLUGIN, VALID
 from lidarspec.spec.description import Frame
 from lidarspec.wire.arrays import taken
@@ -48,12 +48,12 @@ class Judge:
         self._frame, self._schema, self._layout, self._checks = frame, schema, layout, checks
         self._constants = words(marks({spot: known for spot, known in layout.constants.items() if prefix.get(spot) != known}))
 
-    def __call__(self, rows: Bytes2D, errors: list[str], sums: Sums | None = None) -> NDArray[np.uint8]:
+    def __call__(self, rows: Bytes2D, errors: list[PluginError], sums: Sums | None = None) -> NDArray[np.uint8]:
         """The status of each candidate, (n,).
 
         Args:
             rows: the candidates, whole, one a row.
-            errors: tracebacks out of plugins are added to these.
+            errors: failures of the plugin are added to these.
             sums: what computes checksums; by default their algorithms.
         """
         status = np.zeros(len(rows), np.uint8)
@@ -74,7 +74,7 @@ class Judge:
             if np.count_nonzero(held) < len(held):
                 status[~held & (status == VALID)] = IMPLAUSIBLE
 
-    def _asked(self, rows: Bytes2D, errors: list[str]) -> NDArray[np.uint8]:
+    def _asked(self, rows: Bytes2D, errors: list[PluginError]) -> NDArray[np.uint8]:
         return plausibility(self._frame, Rows(self._schema, [Group(self._layout, np.arange(len(rows)), rows)]), errors)
 
 
@@ -88,17 +88,17 @@ def _among(status: NDArray[np.uint8], rows: Bytes2D, judge: Callable[[Bytes2D], 
         status[left] = judge(taken(rows, left))
 
 
-def intactness(seal: Seal, errors: list[str], sums: Sums | None, rows: Bytes2D) -> NDArray[np.uint8]:
+def intactness(seal: Seal, errors: list[PluginError], sums: Sums | None, rows: Bytes2D) -> NDArray[np.uint8]:
     """`VALID`, `CHECKSUM` or `PLUGIN` for each frame, (n,), by one of its checksums."""
     try:
         wrong = ~seal.intact(rows, sums)
         return np.multiply(wrong.view(np.uint8), np.uint8(CHECKSUM))
-    except Exception:
-        errors += [traceback.format_exc()] * len(rows)
+    except Exception as error:
+        errors += [PluginError.of(error, "checksum")] * len(rows)
         return np.full(len(rows), PLUGIN, np.uint8)
 
 
-def plausibility(frame: Frame, table: Table, errors: list[str]) -> NDArray[np.uint8]:
+def plausibility(frame: Frame, table: Table, errors: list[PluginError]) -> NDArray[np.uint8]:
     """`VALID`, `IMPLAUSIBLE` or `PLUGIN` for each frame of a table, (n,), by the frame's own test."""
     assert frame.plausible is not None
     batch = Batch(table, np.zeros(len(table), np.bool_))
@@ -107,8 +107,8 @@ def plausibility(frame: Frame, table: Table, errors: list[str]) -> NDArray[np.ui
             answer = frame.plausible(Fields(batch))
         array = np.broadcast_to(np.asarray(answer), (len(table), *np.shape(answer)[1:])) if np.ndim(answer) else np.full(len(table), answer)
         return np.where(_all(array, answer, batch), VALID, IMPLAUSIBLE).astype(np.uint8)
-    except Exception:
-        errors += [traceback.format_exc()] * len(table)
+    except Exception as error:
+        errors += [PluginError.of(error, "plausible", function=frame.plausible)] * len(table)
         return np.full(len(table), PLUGIN, np.uint8)
 
 

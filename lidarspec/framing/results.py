@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lidarspec.errors import PluginError
 from lidarspec.wire.arrays import alike, by_value, counted, repeated, some, taken
 from lidarspec.wire.layout import Bytes2D, Layout
 
@@ -45,7 +46,7 @@ class Counters:
         bad_checksum, bad_length, implausible: rejected candidates.
         lost, duplicates, late: packets, by the sensor's sequence.
         kernel_drops, queue_dropped, foreign, disconnects: counted by the transports.
-        plugin_errors: exceptions out of a plugin; `tracebacks` keeps the first ones.
+        plugin_errors: packets, or candidates, at which a function of the plugin raised; `failures` keeps the first ones.
     """
 
     bytes_in: int = 0
@@ -64,17 +65,32 @@ class Counters:
     foreign: int = 0
     plugin_errors: int = 0
     disconnects: int = 0
-    tracebacks: list[str] = field(default_factory=list, repr=False, compare=False)
+    failures: list[PluginError] = field(default_factory=list, repr=False, compare=False)
 
     def to_dict(self) -> dict[str, Any]:
         """The counters by name."""
-        return {f.name: getattr(self, f.name) for f in fields(self) if f.name != "tracebacks"}
+        return {f.name: getattr(self, f.name) for f in fields(self) if f.name != "failures"}
 
-    def error(self, traceback: str, number: int = 1) -> None:
-        """Count an exception out of a plugin, and keep the first few tracebacks."""
+    def error(self, failure: PluginError, number: int) -> None:
+        """Count so many packets at which a function of the plugin raised, and keep the first few failures."""
         self.plugin_errors += number
-        if len(self.tracebacks) < 5:
-            self.tracebacks.append(traceback)
+        if len(self.failures) < 5:
+            self.failures.append(failure)
+
+    @property
+    def tracebacks(self) -> list[str]:
+        """Those of the first few failures, as text."""
+        return [failure.traceback for failure in self.failures]
+
+    def failure(self, sensor: str) -> PluginError | None:
+        """What the plugin of a sensor failed at first, with the number of packets, None where it did not fail."""
+        if not self.failures:
+            return None
+        first = self.failures[0]
+        reason = f"{first.reason}, at {self.plugin_errors} packet{'s' * (self.plugin_errors != 1)}"
+        return PluginError(
+            reason, path=first.path, sensor=sensor, rule=first.rule, file=first.file, line=first.line, traceback=first.traceback
+        )
 
     def __str__(self) -> str:
         parts = [f"{name} {value}" for name, value in self.to_dict().items() if value and name != "frames"]
@@ -113,7 +129,7 @@ class Frames:
         places: these offsets, as a range where the frames have one size and follow one another.
         rows: the bytes of each, one a row, where all have one layout and somebody gathered them; of candidates, of as many
             from the first one on as are whole.
-        errors: tracebacks out of plugins.
+        errors: failures of the plugin.
     """
 
     def __init__(
@@ -127,7 +143,7 @@ class Frames:
         forms: Indices | None = None,
         status: Status | None = None,
         rows: Bytes2D | None = None,
-        errors: tuple[str, ...] = (),
+        errors: tuple[PluginError, ...] = (),
     ) -> None:
         number = len(kinds)
         self.buffer, self.kinds, self.sizes, self.layouts, self.rows, self.errors = buffer, kinds, sizes, layouts, rows, errors

@@ -19,6 +19,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from lidarspec.errors import PluginError
 from lidarspec.framing.frame_engine import Codec
 from lidarspec.framing.results import CONSTANT, COUNTED, PLUGIN, SHORT, VALID, Frames
 from lidarspec.wire.layout import Marks, Sums, words
@@ -55,7 +56,7 @@ class Piece:
         waiting: whether the rest makes sense only together with bytes that follow the piece.
         need: how long the rest has to be at least before that; 0 if unknown.
         rejected: number of rejected candidates by counter.
-        errors: tracebacks out of plugins.
+        errors: failures of the plugin.
     """
 
     frames: Frames
@@ -63,9 +64,9 @@ class Piece:
     waiting: bool = False
     need: int = 0
     rejected: dict[str, int] = field(default_factory=dict)
-    errors: list[str] = field(default_factory=list)
+    errors: list[PluginError] = field(default_factory=list)
 
-    def reject(self, numbers: Sequence[int], errors: Sequence[str]) -> None:
+    def reject(self, numbers: Sequence[int], errors: Sequence[PluginError]) -> None:
         """Count candidates as rejected: how many of each status."""
         for reason, number in enumerate(numbers):
             name = COUNTED.get(reason)

@@ -13,6 +13,7 @@ import bisect
 import numpy as np
 from numpy.typing import NDArray
 
+from lidarspec.errors import PluginError
 from lidarspec.framing.results import CONSTANT, IMPLAUSIBLE, PLUGIN, SHORT, VALID, Frames
 from lidarspec.framing.search import Bytes1D, Framing, Mode, Offsets, Piece, count_rejected, fitting, merged
 from lidarspec.wire.arrays import repeated
@@ -49,7 +50,7 @@ class Lane:
         self._forms = np.zeros(0 if codec.layout else len(buffer), np.intp)
         self.layouts: list[Layout] = [codec.layout] if codec.layout else []
         self.status = np.full(len(buffer), _UNKNOWN, np.uint8)
-        self.errors: tuple[str, ...] = ()
+        self.errors: tuple[PluginError, ...] = ()
         self._start = self._stop = self._end = 0
         self._width = NARROW
         self._hits: list[int] = []
@@ -221,8 +222,8 @@ class Lane:
             self._sizes[fit] = survey.sizes
         self._know(fit, survey.layouts, survey.forms, survey.errors)
 
-    def _know(self, offsets: Offsets | slice, layouts: tuple[Layout, ...], forms: Offsets, errors: tuple[str, ...]) -> None:
-        """Remember the layouts of candidates, and tracebacks."""
+    def _know(self, offsets: Offsets | slice, layouts: tuple[Layout, ...], forms: Offsets, errors: tuple[PluginError, ...]) -> None:
+        """Remember the layouts of candidates, and failures of the plugin."""
         self.errors = errors or self.errors
         if len(self._forms):
             self._forms[offsets] = np.where(forms < 0, -1, forms + len(self.layouts))

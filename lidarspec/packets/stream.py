@@ -6,7 +6,6 @@ the last frame of each other type, and whether bytes were skipped since the last
 
 from __future__ import annotations
 
-import traceback
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -17,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.columns.columns import Batch
-from lidarspec.errors import UnknownFrame
+from lidarspec.errors import PluginError, UnknownFrame
 from lidarspec.framing.frame_engine import Codec, codec
 from lidarspec.framing.results import Counters, Frames, Numbers
 from lidarspec.packets.clocks import Unwrapper, clock_ns
@@ -77,10 +76,10 @@ class PacketStream:
             batch = Batch(table, breaks, state, self.sensor.state)
             with np.errstate(all="ignore"):
                 if self._sequence is not None:
-                    index, jumps = self._guarded(self._sequence.push, (index, None), batch)
+                    index, jumps = self._guarded("sequence", self._sequence.push, (index, None), batch)
                     breaks = breaks if jumps is None else breaks | jumps
                 if self._clock is not None:
-                    time = self._guarded(self._times, host, batch, host)
+                    time = self._guarded("clock", self._times, host, batch, host)
         columns: dict[str, Any] = {"offset": offset, "time_ns": time, "host_ns": host, "index": index, "breaks": breaks}
         return Packets(self.sensor, self.frame, table, **columns, state=state, stats=self.stats, backend=self._backend)
 
@@ -88,11 +87,11 @@ class PacketStream:
         """Input was lost here: there is a break before the next packet."""
         self._gap = True
 
-    def _guarded(self, function: Callable[..., Any], otherwise: Any, *args: Any) -> Any:
+    def _guarded(self, what: str, function: Callable[..., Any], otherwise: Any, batch: Batch, *args: Any) -> Any:
         try:
-            return function(*args)
-        except Exception:
-            self.stats.error(traceback.format_exc())
+            return function(batch, *args)
+        except Exception as error:
+            self.stats.error(PluginError.of(error, what), len(batch))
             return otherwise
 
     def _times(self, batch: Batch, host: NDArray[np.int64]) -> NDArray[np.int64]:

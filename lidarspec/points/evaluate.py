@@ -6,7 +6,6 @@ columns of its cloud cost is paid when they are read. The values of a packet do 
 
 from __future__ import annotations
 
-import traceback
 from collections.abc import Mapping
 from typing import Any
 
@@ -14,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.columns.columns import Batch, Carry, Column, Fields
-from lidarspec.errors import SpecError
+from lidarspec.errors import PluginError, SpecError
 from lidarspec.points.cloud import LazyCloud, PointCloud
 from lidarspec.points.conventions import rows_of
 from lidarspec.points.lazy_columns import BatchColumns, Plain, Share
@@ -32,7 +31,7 @@ def evaluated(packets: PacketBatch, carry: Carry | None = None, *, final: bool =
         epoch: the time that the cloud's stamp is, int64 ns; by default that of the first packet.
 
     Raises:
-        SpecError: where the plugin's function fails or returns columns that do not fit; the cause is chained.
+        PluginError: where the plugin's function fails or returns columns that do not fit; the cause is chained.
     """
     planned = _planned(packets, carry, final=final, epoch=epoch)
     return planned if planned is not None else evaluate(packets, carry, final=final, epoch=epoch)
@@ -122,8 +121,8 @@ def guarded(packets: PacketBatch, carry: Carry | None = None, *, final: bool, ep
     """
     try:
         return evaluated(packets, carry, final=final, epoch=epoch)
-    except SpecError:
-        packets.stats.error(traceback.format_exc())
+    except SpecError as error:
+        packets.stats.error(PluginError.of(error, f"points of {packets.frame}"), len(packets))
         return None
 
 

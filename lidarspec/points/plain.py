@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.columns.columns import Batch, Carry, Column, Fields, aligned, of_points, unpadded
-from lidarspec.errors import SpecError
+from lidarspec.errors import plugin_errors
 from lidarspec.framing.results import Counters
 from lidarspec.points import conventions
 from lidarspec.points.cloud import PointCloud
@@ -80,17 +80,15 @@ def evaluate(packets: PacketBatch, carry: Carry | None = None, *, final: bool = 
         epoch: the time that the cloud's stamp is, int64 ns; by default that of the first packet.
 
     Raises:
-        SpecError: where the plugin's function fails or returns columns that do not fit; the cause is chained.
+        PluginError: where the plugin's function fails or returns columns that do not fit; the cause is chained.
     """
     batch = packets.batch(carry)
-    try:
-        with np.errstate(all="ignore"):
-            result = packets.sensor.points_of(packets.frame)(Fields(batch))
-            if not isinstance(result, Polar | Cartesian):
-                raise TypeError(f"has to return Polar or Cartesian, not {type(result).__name__}")
-            return _flattened(packets, result, batch, stamp_of(packets, epoch), final=final)
-    except Exception as error:
-        raise SpecError(f"{type(error).__name__}: {error}", path=f"points of {packets.frame}", sensor=packets.sensor.id) from error
+    function = packets.sensor.points_of(packets.frame)
+    with plugin_errors(f"points of {packets.frame}", packets.sensor.id, function), np.errstate(all="ignore"):
+        result = function(Fields(batch))
+        if not isinstance(result, Polar | Cartesian):
+            raise TypeError(f"has to return Polar or Cartesian, not {type(result).__name__}")
+        return _flattened(packets, result, batch, stamp_of(packets, epoch), final=final)
 
 
 def stamp_of(packets: PacketBatch, epoch: int | None) -> int:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.columns.columns import Column
-from lidarspec.errors import SpecError
+from lidarspec.errors import SpecError, UnknownField
 from lidarspec.packets.packets import Packets
 from lidarspec.points.cloud import COLUMNS
 from lidarspec.points.plain import Evaluated
@@ -154,7 +154,10 @@ class Cutter:
 def _field(found: Evaluated, path: str) -> Column:
     column: Any = found.fields
     for name in path.split("."):
-        column = getattr(column, name)
+        try:
+            column = getattr(column, name)
+        except UnknownField as error:
+            raise SpecError(str(error), path="scan", rule="LS216") from None
     if not isinstance(column, Column):
         raise SpecError("scans are cut by a field, and this is a struct", path=path)
     return column

@@ -294,9 +294,11 @@ class SimulatedDevice:
             self._put(due.at + SECOND / rate, due.link, due.frame, self._answering.frame(due.frame, number))
 
     def _obey(self, request: Request, now: float) -> None:
-        """Answer a command; where it starts the sensor, data follows the answer."""
+        """Answer a command, unless it has to wait until the data stop; where it starts the sensor, data follows the answer."""
         self.heard.append(request.name)
         command, at, mode = request.command, now, None
+        if command.only_stopped and self._stream is not None:
+            return
         if command.starts or command.stops:
             self._stream = None
             self._plan = [due for due in self._plan if due.frame and self.sensor.frames[due.frame].simulation.rate]

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.columns.columns import Batch, Column, Fields, of_points
-from lidarspec.errors import SpecError, UsageError
+from lidarspec.errors import SpecError, UsageError, plugin_errors
 from lidarspec.framing.examples import example
 from lidarspec.packets.clocks import clock_ns
 from lidarspec.simulation.frame_maker import FrameMaker, sealed
@@ -94,7 +94,7 @@ class Measurement:
     """
 
     def __init__(self, sensor: Spec, frame: str, table: Rows) -> None:
-        self._sensor = sensor
+        self._sensor, self._frame = sensor, frame
         self._points = sensor.points_of(frame)
         self._encode: Callable[[Polar], Mapping[str, Any]] | None = sensor.simulation_of(frame).encode
         self._targets = () if self._encode else self._traced(table)
@@ -133,7 +133,7 @@ class Measurement:
         number = len(table)
         state = {name: (None, np.full(number, -1, np.intp)) for name in self._sensor.state}
         batch = Batch(table, np.zeros(number, np.bool_), state, self._sensor.state)
-        with np.errstate(all="ignore"):
+        with np.errstate(all="ignore"), plugin_errors(f"points of {self._frame}", self._sensor.id, self._points):
             polar = self._points(Fields(batch))
             if not isinstance(polar, Polar) or not isinstance(polar.range, Column):
                 raise SpecError("only polar points can be simulated", path="points", sensor=self._sensor.id)
@@ -158,7 +158,8 @@ class Measurement:
         """The raw values of the fields that carry these ranges."""
         if self._encode is not None:
             polar = Polar(ranges, np.broadcast_to(beams.azimuth, ranges.shape), np.broadcast_to(beams.elevation, ranges.shape))
-            return {path: np.asarray(values) for path, values in self._encode(polar).items()}
+            with plugin_errors(f"encode of {self._frame}", self._sensor.id, self._encode):
+                return {path: np.asarray(values) for path, values in self._encode(polar).items()}
         found: dict[str, NDArray[Any]] = {}
         for target, (step, zero) in zip(self._targets, steps, strict=True):
             info = table.schema.fields[target.path]
@@ -333,9 +334,9 @@ class Simulation:
         sweep = sensor.simulation_of(frame).sweep
         if sweep is None:
             raise UsageError(f"{sensor.id} declares no sweep for {frame!r} frames, and cannot be simulated")
-        self._sweep: Callable[[int], Mapping[str, Any]] = sweep
+        self._sensor, self._frame, self._sweep = sensor, frame, sweep
         self._maker = FrameMaker(sensor, frame)
-        table = self._maker.table([sweep(index) for index in range(PROBED)])
+        table = self._table(range(PROBED))
         self._measurement = Measurement(sensor, frame, table)
         self._pace = Pace(sensor, frame, table, self._measurement.beams(table))
         self.interval = self._pace.interval
@@ -346,10 +347,15 @@ class Simulation:
         Args:
             since: seconds since the scene began at the first of them.
         """
-        table = self._maker.table([self._sweep(start + index) for index in range(count + AHEAD)])
+        table = self._table(range(start, start + count + AHEAD))
         times = self._pace.times(table, functools.partial(self._measurement.beams, table))
         self._measurement.fill(table, scene, since + times / 1e9)
         return Block(sealed(table)[:count], times[: count + 1])
+
+    def _table(self, numbers: range) -> Rows:
+        """The packets of these numbers, before anything is measured."""
+        with plugin_errors(f"sweep of {self._frame}", self._sensor.id, self._sweep):
+            return self._maker.table([self._sweep(number) for number in numbers])
 
 
 @functools.lru_cache(maxsize=64)

@@ -53,6 +53,7 @@ if TYPE_CHECKING:
         previous as previous,
         spread as spread,
         stack as stack,
+        steps as steps,
         take as take,
         wrap as wrap,
     )
@@ -73,7 +74,7 @@ _NAMES = {
     "spec.timing": ("Clock", "Sequence", "OnWrap", "OnFlag", "OnChange", "OnRewind", "Every"),
     "columns.columns": ("Fields", "Column"),
     "spec.results": ("Points", "Polar", "Cartesian"),
-    "spec.vocabulary": ("spread", "wrap", "following", "previous", "last", "stack", "take"),
+    "spec.vocabulary": ("spread", "wrap", "following", "previous", "last", "stack", "steps", "take"),
     "plugins": ("hookimpl",),
     "transports.protocol": ("Format", "Transport", "LiveTransport", "Chunk", "Disconnected"),
 }

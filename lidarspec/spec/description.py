@@ -134,6 +134,7 @@ class Command:
         link: the link it goes over.
         lines: levels of control lines, {"dtr": False}, set with it.
         starts, stops: whether the sensor sends data after it, or no longer does.
+        only_stopped: whether it is answered only while the sensor sends no data, and passed over otherwise.
         every: seconds after which it is sent once more, again and again from its first time on (a heartbeat); 0: never.
     """
 
@@ -150,6 +151,7 @@ class Command:
     lines: Mapping[str, bool] = field(default_factory=dict)
     starts: bool = False
     stops: bool = False
+    only_stopped: bool = False
     every: float = 0.0
 
     def __post_init__(self) -> None:
@@ -282,6 +284,8 @@ def _check_spec(sensor: Spec) -> None:
     for name, command in sensor.commands.items():
         _known(sensor, f"commands.{name}", [command.frame, *command.replies], sensor.frames)
         _known(sensor, f"commands.{name}.link", [command.link], sensor.links)
+        if command.only_stopped and not any(other.starts or other.stops for other in sensor.commands.values()):
+            raise SpecError("it is answered only while the sensor is stopped, and no command starts or stops it", path=f"commands.{name}")
         if "timeout" in command.args:
             raise SpecError("'timeout' is how long its reply is waited for, and cannot be an argument", path=f"commands.{name}.args")
     if sensor.commands:

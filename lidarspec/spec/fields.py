@@ -7,6 +7,8 @@ those few that someone may type are converted exactly.
 from __future__ import annotations
 
 import io
+import math
+import numbers
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
@@ -15,7 +17,7 @@ from typing import Any
 
 from construct import Construct, Container
 
-from lidarspec.errors import UsageError
+from lidarspec.errors import SpecError, UsageError
 from lidarspec.spec import construct_layer as layer
 from lidarspec.spec.checksums import Checksum
 from lidarspec.spec.tree import FieldInfo
@@ -37,6 +39,11 @@ def factor(unit: str, target: str) -> Fraction | None:
     if unit == target:
         return Fraction(1)
     return _FACTORS.get(target, {}).get(unit)
+
+
+def is_unit(unit: str) -> bool:
+    """Whether a unit is one that can be turned into others."""
+    return any(unit in table for table in _FACTORS.values())
 
 
 def split_unit(text: str) -> tuple[str, str]:
@@ -96,9 +103,17 @@ class Scaled(layer.Describing):
         scale: the size of one raw step, in `unit`.
         unit: "m", "s", "deg", "deg/s", "Hz", ... ("" for a pure number).
         offset: physical value of raw 0, in `unit`.
+
+    Raises:
+        SpecError: for a step that is 0 or no number, and for arguments in another order.
     """
 
     def __init__(self, subcon: Construct, scale: float, unit: str, offset: float = 0) -> None:
+        given = ["a field" if hasattr(value, "parse") else repr(value) for value in (subcon, scale, unit, offset)]
+        steps = [value for value in (scale, offset) if isinstance(value, numbers.Real) and math.isfinite(value)]
+        if given[0] != "a field" or len(steps) < 2 or not scale or not isinstance(unit, str):
+            wanted = 'a field, the size of a step, its unit and an offset, Scaled(Int16ul, 0.001, "m")'
+            raise SpecError(f"Scaled takes {wanted}, not {', '.join(given)}")
         super().__init__(subcon)
         self.scale, self.unit, self.offset = scale, unit, offset
 

@@ -11,6 +11,8 @@ from typing import Any
 
 import numpy as np
 
+from lidarspec.errors import SpecError
+
 Array = Any
 
 
@@ -25,11 +27,27 @@ def spread(start: Array, end: Array, count: Array, *, full: float) -> Array:
     Returns:
         float64, shape (n, count), not wrapped, so that differences stay positive; with a column as `count`, the
         longest one, and what is beyond a packet's own count is never used.
+
+    Raises:
+        SpecError: where every end that differs from its start is whole turns away, so that all points have one angle.
     """
+    turn = end - start
+    _refuse_folded(turn, full)
     if isinstance(count, int | np.integer):
-        return start + wrap(end - start, full) * (np.arange(int(count)) / max(int(count) - 1, 1))
-    steps = count.steps() if hasattr(count, "steps") else np.arange(int(np.max(count, initial=0)))
-    return start + wrap(end - start, full) / np.maximum(count - 1, 1) * steps
+        return start + wrap(turn, full) * (steps(count) / max(int(count) - 1, 1))
+    return start + wrap(turn, full) / np.maximum(count - 1, 1) * steps(count)
+
+
+def steps(count: Array) -> Array:
+    """The index of each sample of a packet: 0, 1, 2 ... up to the largest count, such as for times, ``steps(f.count) / RATE``.
+
+    Args:
+        count: samples of each packet, a number or a column; it has to be that of the innermost array.
+
+    Returns:
+        Integers, shape (count,); with a column as `count` as many as the longest packet of the batch has, as its arrays do.
+    """
+    return count.steps() if hasattr(count, "steps") else np.arange(int(np.max(count, initial=0)))
 
 
 def wrap(a: Array, full: float) -> Array:
@@ -100,6 +118,14 @@ class LookUp:
         inside = (spots >= 0) & (spots < len(self.entries))
         found = self.entries[np.where(inside, spots, 0).astype(np.intp)] if len(self.entries) else np.zeros(np.shape(spots))
         return np.where(inside, found, np.nan)
+
+
+def _refuse_folded(turn: Array, full: float) -> None:
+    angles = np.asarray(turn.seen if hasattr(turn, "seen") else turn, np.float64)
+    moved = angles[angles != 0]
+    if moved.size and not np.mod(moved, full).any():
+        reason = f"spread(start, end): every end is whole turns of {full:g} from its start, and all points would have one angle"
+        raise SpecError(f"{reason}; full= is the circle in the unit of the angles, and the index of a sample is steps(count)", rule="LS215")
 
 
 def _shifted(a: Array, step: int) -> Array:

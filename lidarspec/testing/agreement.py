@@ -160,7 +160,7 @@ def a_clean_input_loses_nothing(subject: Subject) -> None:
         took = f"; a {found[wrong][0]!r} frame is found there" if wrong < len(found) and found[wrong][0] != name else ""
         raise Violation("LS306" if took else "LS401", f"of {len(frames)} frames, number {wrong} is not found{took}", name)
     stats = subject.sensor.decode(data).stats
-    require(not stats.plugin_errors, "LS414", stats.tracebacks[0].strip().splitlines()[-1] if stats.tracebacks else "")
+    require(not stats.plugin_errors, "LS414", str(stats.failure("")))
     require((stats.bytes_skipped, stats.pending) == (0, 0), "LS401", f"{stats.bytes_skipped} bytes skipped, {stats.pending} pending")
 
 
@@ -245,7 +245,7 @@ def scans_do_not_depend_on_batches(subject: Subject) -> None:
         stream = PacketStream(subject.sensor, subject.sensor.data_frame, stats)
         batches = [stream.add([packed(found[start : start + size])]) for start in range(0, len(found), size)]
         scans = list(scans_of(subject.sensor, batches))
-        require(not stats.plugin_errors, "LS414", stats.tracebacks[0] if stats.tracebacks else "")
+        require(not stats.plugin_errors, "LS414", str(stats.failure("")))
         return scans
 
     whole = scans(len(found))

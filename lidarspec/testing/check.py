@@ -378,7 +378,7 @@ def _short_write(call: ast.Call, *, sockets: bool) -> bool:
 
 
 #: rules without which there is nothing to try, and what is skipped then.
-FATAL, ELSE = frozenset({"LS114", "LS115", "LS301"}), "everything else"
+FATAL, ELSE = frozenset({"LS213", "LS114", "LS115", "LS301"}), "everything else"
 
 
 @dataclass(eq=False)

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import math
+from typing import Any
+
 from lidarspec.device.session import Reply, Session
 from lidarspec.errors import CommandError, LidarSpecError, OutOfRange
 from lidarspec.framing.frame_engine import codec
+from lidarspec.framing.results import Found
 from lidarspec.simulation.device import SimulatedDevice
 from lidarspec.spec.construct_layer import member
 from lidarspec.spec.links import is_datagram
 from lidarspec.spec.sensor import Sensor
 from lidarspec.testing.findings import Violation, require
 from lidarspec.testing.subject import Subject
+from lidarspec.wire.parse import parse_typed
 
 #: ns of one step of a simulated conversation.
 STEP = 20_000_000
@@ -59,6 +64,29 @@ def arguments_are_held_to_their_ranges(subject: Subject, name: str) -> None:
             raise Violation("LS602", f"{key} = {outside:g} is sent, and {low:g} .. {high:g} is declared", f"commands.{name}.args.{key}")
 
 
+def an_exchange_holds(sensor: Sensor, name: str, given: dict[str, Any], data: bytes, answer: bytes | None, place: str) -> None:
+    """A command with these arguments has these bytes, and these bytes are its reply.
+
+    Raises:
+        Violation: where they are other ones, or no such reply.
+    """
+    command = sensor.commands[name]
+    try:
+        built = sensor.command(name, **given)
+        require(built == data, "LS605", f"{built.hex(' ')} is sent, and {data.hex(' ')} is printed", place)
+        if answer is None:
+            return
+        require(command.replies, "LS605", "it has a reply here, and none is declared", place)
+        session = Session(sensor)
+        pending = session.request(name, 0, **given)
+        kind, _ = parse_typed(sensor, answer)
+        session.receive([Found(kind, 0, answer)], 1, link=command.link)
+        session.tick(math.ceil(1e9 * (1 + command.timeout) * (2 + command.retries)))
+        pending.result()
+    except LidarSpecError as error:
+        raise Violation("LS605", str(error), place) from error
+
+
 def replies_can_match(subject: Subject, name: str) -> None:
     """Every field that a reply is told by is a field of one of the replies."""
     command = subject.sensor.commands[name]
@@ -93,6 +121,9 @@ def _asked(subject: Subject, name: str, given: dict[str, float]) -> Reply:
     command, sensor = subject.sensor.commands[name], subject.sensor
     device, session = SimulatedDevice(sensor), Session(sensor)
     device.start(0)
+    stops = next((one for one, other in sensor.commands.items() if other.stops and other.frame is not None and not other.args), "")
+    if command.only_stopped and stops:
+        device.receive(sensor.command(stops), 0, sensor.commands[stops].link)
     pending = session.request(name, 0, **given)
     decoder = sensor.decoder(stream=not is_datagram(sensor.links[command.link]))
     now = 0

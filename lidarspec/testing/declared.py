@@ -10,11 +10,12 @@ import numpy as np
 
 from lidarspec.columns.columns import Batch, Fields
 from lidarspec.columns.graph import Traced, Untraceable
-from lidarspec.errors import LidarSpecError
+from lidarspec.errors import LidarSpecError, SpecError, did_you_mean
 from lidarspec.framing.frame_engine import CompiledCodec, codec
-from lidarspec.spec import Clock, Frame, Polar, Sensor
+from lidarspec.points.conventions import TYPES
+from lidarspec.spec import Clock, Frame, OnWrap, Polar, Sensor
 from lidarspec.spec.construct_layer import is_expression
-from lidarspec.spec.fields import factor
+from lidarspec.spec.fields import factor, is_unit
 from lidarspec.spec.tree import Sealed, Struct, infos, nodes
 from lidarspec.testing.findings import Finding
 from lidarspec.testing.geometry import field_of, traced, used
@@ -27,6 +28,8 @@ MEASURES = frozenset(["distance", "range", "radius", "angle", "azimuth", "elevat
 COMMON = 1 / 200
 #: bits of constants and checksums below which noise makes a frame every few megabytes, on a stream and in a datagram.
 WEAK, WEAK_DATAGRAM = 24, 8
+#: how many times the length of the longest random frame a longest length may be.
+FAR = 8
 #: seconds after which nobody cares any more that a clock starts again.
 LONG = 7 * 86_400
 PLACEHOLDER = re.compile(r"\s*(\?*|-*|todo.*|tbd.*|n/?a|none|unknown)\s*", re.IGNORECASE)
@@ -37,7 +40,7 @@ Findings = Iterator[tuple[str, str, str]]
 def declared(subject: Subject) -> list[Finding]:
     """The findings in a declaration, as (code, what, path) made into findings of this sensor."""
     sensor = subject.sensor
-    checks: list[Findings] = [_sensor(sensor), _clock(sensor)]
+    checks: list[Findings] = [_sensor(sensor), _asked(sensor), _clock(sensor)]
     checks += [_frame(subject, name, frame) for name, frame in sensor.frames.items()]
     checks += [_points(subject, name) for name in subject.sensor.data_frames]
     checks += [_reach(subject)]
@@ -65,6 +68,19 @@ def _sensor(sensor: Sensor) -> Findings:
         yield "LS210", f"range_limits are {low:g} .. {high:g}", "range_limits"
 
 
+def _asked(sensor: Sensor) -> Findings:
+    """The fields that scans, clock and counter come from have to be there."""
+    known = {path for name in sensor.data_frames for path in codec(sensor.frames[name]).schema.fields}
+    cut_by = known | set(TYPES) if isinstance(sensor.scan, OnWrap) else known
+    clock = sensor.clock.source if sensor.clock is not None else ()
+    asked = {"scan": getattr(sensor.scan, "name", ""), "sequence": sensor.sequence.field if sensor.sequence is not None else ""}
+    given = [*asked.items(), *(("clock", path) for path in ((clock,) if isinstance(clock, str) else () if callable(clock) else clock))]
+    for place, path in given:
+        there = cut_by if place == "scan" else known
+        if path and path not in there:
+            yield "LS216", f"there is no field {path!r}{did_you_mean(path, there)}", place
+
+
 def _clock(sensor: Sensor) -> Findings:
     """A clock that starts again within days has to say so."""
     clock = sensor.clock
@@ -87,6 +103,8 @@ def _frame(subject: Subject, name: str, frame: Frame) -> Findings:
         yield "LS116", getattr(engine, "reason", "its layout cannot be computed"), name
     elif engine.size is not None and engine.size != frame.max_length:
         yield "LS203", f"every frame has {engine.size} bytes, and max_length is {frame.max_length}", name
+    else:
+        yield from _longest(subject, name, frame)
     yield from _names(subject, name, frame)
     if frame.plausible is not None:
         yield from _plausible(subject, name, frame)
@@ -100,6 +118,16 @@ def _frame(subject: Subject, name: str, frame: Frame) -> Findings:
         if frame.direction == "in":
             yield from _sync(subject, name, frame, engine)
             yield from _strength(subject, name, frame, layouts)
+
+
+def _longest(subject: Subject, name: str, frame: Frame) -> Findings:
+    """A longest length that frames of random content do not come near to: damage is waited for that much longer."""
+    try:
+        sizes = [len(subject.example(name, seed=seed)) for seed in range(12)]
+    except LidarSpecError:  # said elsewhere
+        return
+    if FAR * max(sizes) < frame.max_length:
+        yield "LS203", f"the longest of {len(sizes)} random frames has {max(sizes)} bytes, and max_length is {frame.max_length}", name
 
 
 def _names(subject: Subject, name: str, frame: Frame) -> Findings:
@@ -121,8 +149,8 @@ def _multiplied(subject: Subject, name: str) -> set[str]:
 
 
 def _measured(frame: Frame) -> set[str]:
-    """The paths of fields that are declared with Scaled."""
-    return {info.path for node in nodes(frame.tree) for info in infos(node) if info.measured}
+    """The paths of fields that are pure numbers: declared with Scaled, and no steps of anything."""
+    return {info.path for node in nodes(frame.tree) for info in infos(node) if info.measured and not info.unit and not info.scaled}
 
 
 def _plausible(subject: Subject, name: str, frame: Frame) -> Findings:
@@ -134,7 +162,8 @@ def _plausible(subject: Subject, name: str, frame: Frame) -> Findings:
         with np.errstate(all="ignore"):
             answer = frame.plausible(Fields(Batch(table, np.zeros(len(table), np.bool_))))  # type: ignore[misc]
     except Exception as error:
-        yield "LS414", f"plausible: {type(error).__name__}: {error}", f"{name}.plausible"
+        text = error.reason if isinstance(error, SpecError) else f"plausible: {type(error).__name__}: {error}"
+        yield getattr(error, "rule", "") or "LS414", text, f"{name}.plausible"
         return
     if is_expression(answer):
         yield "LS207", f"it returns {answer!r}, an expression of construct", f"{name}.plausible"
@@ -233,9 +262,9 @@ def _column(subject: Subject, name: str, value: Any, column: str, units: tuple[s
     infos = [field_of(subject, name, node) for node in used(value, looked_up=False)]
     free = [info for info in infos if info is not None and info.const is None and not info.labels]
     if free and not any(factor(info.unit, unit) is not None for info in infos if info is not None for unit in units):
-        pure = _measured(subject.sensor.frames[name])
-        bare = [info for info in free if not info.unit and info.path not in pure]
-        if bare and len(bare) == len([info for info in free if not info.unit]):
+        bare = [info for info in free if not is_unit(info.unit)]
+        if bare and not {info.path for info in bare} & _measured(subject.sensor.frames[name]):
             order = list(subject.fields(name))
             first = min(bare, key=lambda info: (-len(info.axes), order.index(info.path) if info.path in order else len(order)))
-            yield "LS201", f"the {column} of points comes from it, and it has no unit", f"{name}.{first.path}"
+            said = f"{first.unit!r} is no unit of it: {' or '.join(units)}" if first.unit else f"it has no unit: {' or '.join(units)}"
+            yield "LS201", f"the {column} of points comes from it, and {said}", f"{name}.{first.path}"

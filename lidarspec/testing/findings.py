@@ -65,6 +65,12 @@ LS210 a range limit that its field cannot hold | scale or limit is wrong | the s
 LS211 a part of the declaration is missing | nothing can open, decode or find the sensor | vendor, model, a data frame and a data link
 LS212 a checksum that nobody checks | damaged frames are taken for good ones
       | Checksummed(Struct(...), field="crc", algorithm=...); `lidarspec crc` finds the algorithm
+LS213 Python asks whether a column is true | it takes one answer, and a column has one for each packet
+      | (f.a < 1) & (f.b < 2), with | and ~, and np.where in place of `if`
+LS214 columns that do not fit together | a point needs one value of each | arrays as long as the frame's own, or one value for each packet
+LS215 `spread` folds everything onto one value | all samples of a packet get one angle, or one time
+      | full= as the circle in the unit of the angles; steps(count) for the index of a sample
+LS216 a field that no data frame has | scans, clock or counter come from it, and never come | a path that `lidarspec show` prints
 LS301 no example can be made up | nothing can be tried on it
       | a `sweep`, on another frame than data Frame(sweep=), or strategies = {"frame.field": ...} in the test class
 LS302 bytes do not survive parsing and building | a replayed or edited frame is another one | fields that keep every bit
@@ -101,6 +107,8 @@ LS601 a command that does not parse back | the sensor is told something else | v
 LS602 an argument that is not held to its range | the sensor is asked for what it cannot do | args={name: (path, lowest, highest)}
 LS603 a reply that cannot match | the command waits for ever | matches= and echoes= by fields that the reply has
 LS604 a command without the documented reply | the simulated sensor keeps silent | answers=, or matches= that the reply can have
+LS605 a command or reply that is not as its vector has it | the sensor is told, or answers, something else
+      | values, args, matches and echoes as the manual has them
 LS701 a vector without its source | nobody can look it up | "source": "manual, section" in each entry
 LS702 a vector that cannot be read | it proves nothing | [{"frame": ..., "hex": ..., "values": {...}, "source": ...}]
 LS703 a checksum over the wrong span | no frame of a real sensor is accepted | over= and the algorithm that fit the vectors

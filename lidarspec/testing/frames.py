@@ -40,7 +40,7 @@ def examples_are_valid_and_repeat(subject: Subject, name: str) -> None:
         found = [subject.example(name, seed=seed) for seed in subject.seeds(frame)]
     except SpecError as error:
         path = error.path if error.path.startswith(name) else f"{name}.{error.path}" if error.path else name
-        raise Violation("LS301", error.reason, path) from error
+        raise Violation(error.rule or "LS301", error.reason, path) from error
     again = [subject.sensor.example(name, seed=seed) for seed in range(3)] if not subject.drawers(name) else found[:3]
     require(found[:3] == again, "LS311", "two examples of one seed differ", name)
     longest = max(map(len, found))

@@ -125,9 +125,8 @@ def clouds_keep_the_conventions(subject: Subject, name: str) -> None:
         packets = read(subject, name, frames)
         cloud = packets.points()
     except SpecError as error:
-        raise Violation("LS414", str(error), f"{name}.points") from error
-    errors = packets.stats.tracebacks
-    require(not packets.stats.plugin_errors, "LS414", errors[0].strip().splitlines()[-1] if errors else "", name)
+        raise Violation(error.rule or "LS414", error.reason, f"{name}.points") from error
+    require(not packets.stats.plugin_errors, "LS414", str(packets.stats.failure("")), name)
     try:
         assert_well_formed(cloud)
     except AssertionError as error:

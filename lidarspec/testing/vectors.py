@@ -8,6 +8,7 @@
 `values` are raw integers of the wire, `units` the same in the fields' units, `points` what becomes of single points (range, x, y, z,
 azimuth and elevation in radians, intensity, ring). All three may be left out: then the bytes have to be such a frame, and build again.
 `sensor` is the id, or a list of ids, of the sensors that an entry is of; where one sensor alone has the file, it may be left out.
+An entry with `command` is what is sent for a command with `args`, by name in units; `reply` is what answers it.
 
 What the vectors leave open is looked at as well: a status that claims more than there is, and fields of the data that none pins down.
 """
@@ -28,6 +29,7 @@ from lidarspec.discovery.samples import Match
 from lidarspec.errors import LidarSpecError, WireError
 from lidarspec.framing.frame_engine import CompiledCodec, codec
 from lidarspec.spec.tree import FieldInfo
+from lidarspec.testing.commands import an_exchange_holds
 from lidarspec.testing.findings import Violation, require
 from lidarspec.testing.frames import leaves
 from lidarspec.testing.geometry import read
@@ -36,7 +38,7 @@ from lidarspec.wire.layout import Layout
 
 #: what a point may differ by: metres and radians as manuals print them.
 NEAR = 2e-4
-KEYS = {"source", "sensor", "frame", "hex", "values", "units", "points", "note"}
+KEYS = {"sensor", "command", "args", "reply", "source", "frame", "hex", "values", "units", "points", "note"}
 #: names of fields that hold a checksum.
 CHECK = re.compile(
     r"(\w+_)?(crc|checksum|check_?sum|check|chk|chksum|cksum|cs|bcc|lrc|fcs|xor|sum)_?(8|16|32)?(_(lo|hi|low|high|lsb|msb))?"
@@ -57,6 +59,9 @@ def vectors_hold(subject: Subject) -> None:
         parsed = _parsed(subject, name, data, place)
         _values(subject, name, data, parsed, vector, place)
         require(subject.sensor.build(name, parsed) == data, "LS302", "its bytes do not survive parsing and building", f"{place} {name}")
+        if "command" in vector:
+            answer = bytes.fromhex(vector["reply"]) if "reply" in vector else None
+            an_exchange_holds(subject.sensor, vector["command"], vector.get("args", {}), data, answer, f"{place} {vector['command']}")
         if vector.get("points"):
             _points(subject, name, data, vector["points"], place)
 
@@ -172,11 +177,17 @@ def entries(subject: Subject) -> dict[str, Any]:
         if not _is_of(subject, vector, place):
             continue
         require(not vector.keys() - KEYS, "LS702", f"unknown keys {sorted(vector.keys() - KEYS)}; known are {sorted(KEYS)}", place)
+        if "command" in vector:
+            known = subject.sensor.commands.get(vector["command"])
+            vector.setdefault("frame", known.frame if known is not None else None)
+            sends = known is not None and known.frame == vector["frame"]
+            require(sends, "LS702", f"no command {vector['command']!r} sends such a frame", place)
         require(vector.get("frame") in subject.sensor.frames, "LS702", f"there is no frame {vector.get('frame')!r}", place)
         try:
             bytes.fromhex(vector.get("hex", "-"))
+            bytes.fromhex(vector.get("reply", ""))
         except (ValueError, TypeError):
-            raise Violation("LS702", "its `hex` is no hex text", place) from None
+            raise Violation("LS702", "its `hex`, or its `reply`, is no hex text", place) from None
         mine[place] = vector
     return mine
 

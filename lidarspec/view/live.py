@@ -378,6 +378,9 @@ class Window:
         device = self._feed.device
         if self._record is not None and self._record.trouble:
             return self._record.trouble
+        failure = device.stats.failure(device.sensor.id)
+        if failure is not None:
+            return str(failure)
         if self._feed.ended:
             return "" if self._scan is not None else "the input ended without a scan"
         troubled = self._live and device.state not in ("streaming", "waiting")

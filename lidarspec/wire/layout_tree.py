@@ -16,7 +16,6 @@ import functools
 import math
 import operator
 import random
-import traceback
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -24,7 +23,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.errors import SpecError
+from lidarspec.errors import PluginError, SpecError
 from lidarspec.spec import tree
 from lidarspec.spec.bits import BitField, whole_bytes
 from lidarspec.spec.description import Frame
@@ -340,9 +339,9 @@ FEW = 4
 
 @dataclass(frozen=True, eq=False)
 class Refused:
-    """A header that leads to no frame: too long, or an expression of the plugin failed (`error`: its traceback)."""
+    """A header that leads to no frame: too long, or an expression of the plugin failed (`error`)."""
 
-    error: str = ""
+    error: PluginError | None = None
 
 
 @dataclass(eq=False)
@@ -492,8 +491,8 @@ class HeaderTree:
             return None, Refused()
         except SpecError:
             raise
-        except Exception:
-            return None, Refused(traceback.format_exc())
+        except Exception as error:
+            return None, Refused(PluginError.of(error, "struct"))
 
 
 @functools.lru_cache(maxsize=2048)

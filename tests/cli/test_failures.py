@@ -11,6 +11,8 @@ from pathlib import Path
 
 import pytest
 
+import lidarspec
+from tests.broken import points_fail, sound
 from tests.cli.running import EXAMPLE, process, ran
 
 TEXT = b"these are the minutes of a meeting, and no lidar was there\n"
@@ -172,3 +174,66 @@ def test_a_bug_is_owned_up_to_without_a_traceback(tmp_path: Path) -> None:
     done = process("show", f"./{broken.name}", cwd=tmp_path)
     assert done.returncode == 1
     assert b"ZeroDivisionError: by hand" in done.stderr
+
+
+RAISES = Path(points_fail.__file__)
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("read", "frames.bin"),
+        ("stats", "frames.bin"),
+        ("plot", "frames.bin", "-o", "picture.svg"),
+        ("view", "frames.bin", "--once"),
+        ("convert", "frames.bin", "points.csv"),
+        ("demo",),
+        ("sim", str(RAISES), "--to", "new.bin"),
+    ],
+    ids=lambda words: words[0],
+)
+def test_a_plugin_that_raises_is_named_alike_by_every_verb(words: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its id, what raised, the file and line, the number of packets where some were read; exit code 1."""
+    monkeypatch.chdir(tmp_path)
+    Path("frames.bin").write_bytes(b"".join(lidarspec.simulate(sound.sensor(), 12)))
+    said = ran(*words, *(() if words[0] == "sim" else ("-s", RAISES)), code=1).stderr
+    line = next(number for number, text in enumerate(RAISES.read_text(encoding="utf-8").splitlines(), 1) if "distnace" in text)
+    assert "broken-one: points of data: UnknownField: unknown field 'samples.distnace'" in said
+    assert f"points_fail.py:{line})" in said
+    assert "frames.bin" not in words or f":{line}), at 12 packets\n" in said
+    assert f"next: lidarspec check {RAISES}" in said
+
+
+SOMETIMES = """
+from lidarspec.spec import hookimpl
+from tests.broken import sound
+
+def points(f):
+    if (f.number.array > 5).any():
+        raise ArithmeticError("by hand")
+    return sound.points(f)
+
+@hookimpl
+def lidarspec_sensors():
+    return [sound.sensor(points=points)]
+"""
+
+
+def test_a_plugin_that_raises_now_and_then_ends_with_its_message_and_in_python_is_a_warning(tmp_path: Path) -> None:
+    (file := tmp_path / "sometimes.py").write_text(SOMETIMES, encoding="utf-8")
+    (tmp_path / "packets.hex").write_text("\n".join(frame.hex() for frame in lidarspec.simulate(sound.sensor(), 12)), encoding="utf-8")
+    said = ran("plot", tmp_path / "packets.hex", "-o", "-", "-s", file, code=1).stderr
+    assert f"broken-one: points of data: ArithmeticError: by hand ({file}:7), at " in said
+    with lidarspec.open(tmp_path / "packets.hex", str(file)) as device:
+        list(device.scans())
+    assert [warning for warning in device.warnings if f"({file}:7), at" in warning]
+
+
+def test_what_a_sweep_raises_is_the_plugins(tmp_path: Path) -> None:
+    text = SOMETIMES.replace("points=points", "simulation=Simulation(lambda i: 1 / 0)").replace(
+        "import hookimpl", "import Simulation, hookimpl"
+    )
+    (file := tmp_path / "sweeping.py").write_text(text, encoding="utf-8")
+    assert (
+        f"sweep of data: ZeroDivisionError: division by zero ({file}:12)" in ran("sim", file, "--to", tmp_path / "new.bin", code=1).stderr
+    )

@@ -170,3 +170,39 @@ def test_odd_ids_make_working_modules(tmp_path: Path, name: str) -> None:
 def test_a_place_that_cannot_be_written_is_named(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     assert "file" in ran("new", "acme-x1", "--into", tmp_path / "file", code=3).stderr
+
+
+def test_a_second_model_joins_a_distribution(tmp_path: Path) -> None:
+    family = ("--into", tmp_path, "--distribution", "lidarspec-acme", "--vendor", "ACME Robotics")
+    ran("new", "acme-x1", *family, "--model", "X1 Pro")
+    folder = tmp_path / "lidarspec-acme"
+    before = {file: file.read_bytes() for file in folder.rglob("*.py")}
+    told = ran("new", "acme-2d-x", *family, "--link", "udp").stdout.splitlines()
+    assert all(file.read_bytes() == text for file, text in before.items())
+    assert str(folder / "lidarspec_acme" / "model_2d_x.py") in told
+    assert [ls.sensor(folder / "lidarspec_acme" / name).vendor for name in ("__init__.py", "model_2d_x.py")] == ["ACME Robotics"] * 2
+    assert {entry["sensor"] for entry in json.loads((folder / "vectors.json").read_text(encoding="utf-8"))} == {"acme-x1", "acme-2d-x"}
+    assert "acme-2d-x" in (folder / "README.md").read_text(encoding="utf-8")
+    assert " passed" in run(folder, "pytest", "-q", "-p", "no:cacheprovider", "-k", "vectors or by_hand or declaration")
+    assert "ACME Robotics X1 Pro" in run(folder, "lidarspec", "show", "acme-x1")
+    assert "exists already" in ran("new", "acme-2d-x", *family, code=2).stderr
+    assert (
+        "is not that of lidarspec-other"
+        in ran("new", "acme-x3", "--into", _other(tmp_path), "--distribution", "lidarspec-other", code=2).stderr
+    )
+
+
+def _other(folder: Path) -> Path:
+    """A folder with one of the name lidarspec-other that is no distribution of sensors."""
+    (place := folder / "elsewhere" / "lidarspec-other").mkdir(parents=True)
+    for name in ("pyproject.toml", "README.md"):
+        (place / name).write_text("[project]\n", encoding="utf-8")
+    return place.parent
+
+
+@pytest.mark.parametrize(
+    ("option", "name", "said"), [("--distribution", "Acme Lidars", "no name of a distribution"), ("--vendor", 'the "best"', "cannot have")]
+)
+def test_names_that_cannot_be_are_refused(option: str, name: str, said: str, tmp_path: Path) -> None:
+    assert said in ran("new", "acme-x1", "--into", tmp_path, option, name, code=2).stderr
+    assert not list(tmp_path.iterdir())

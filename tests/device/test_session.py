@@ -352,3 +352,14 @@ def _next_event(session: Session, coming: list[tuple[int, int, int]], now: int) 
     while coming and coming[0][0] <= now:
         due.append(heapq.heappop(coming))
     return now, due
+
+
+def test_a_command_that_is_answered_only_while_the_sensor_is_stopped_says_so() -> None:
+    asking = dataclasses.replace(SENSOR.commands["start"], starts=False, only_stopped=True)
+    session = Session(with_commands(ask=asking))
+    pending = session.request("ask", 0)
+    session.tick(10 * SECOND)
+    with pytest.raises(ReplyTimeout, match="answered only while the sensor is stopped: send 'stop' first"):
+        pending.result()
+    with pytest.raises(ls.SpecError, match="no command starts or stops it"):
+        dataclasses.replace(SENSOR, commands={"ask": asking}, on_open=(), on_close=())

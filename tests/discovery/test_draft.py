@@ -14,7 +14,7 @@ import lidarspec as ls
 from lidarspec import UsageError, WireError
 from lidarspec.columns.columns import aligned
 from lidarspec.discovery.checksum_search import Changed
-from lidarspec.discovery.draft import Draft, Names, draft
+from lidarspec.discovery.draft import Draft, Names, draft, drafted as text_of
 from lidarspec.discovery.periods import candidates
 from lidarspec.discovery.samples import Place
 from lidarspec.simulation.simulator import simulate
@@ -264,3 +264,34 @@ def test_points_may_depend_on_no_field() -> None:
     batch = shape.decode(shape.example("data") * 3).batch()
     arrays, axes, ready = aligned((np.zeros(1), 0.0), batch)
     assert ([array.tolist() for array in arrays], axes, ready) == ([[0.0], 0.0], (), 3)
+
+
+def written(frames: list[bytes], *, datagrams: bool = False) -> dict[str, str]:
+    """The texts of a draft of these frames."""
+    return text_of(draft(frames if datagrams else [b"".join(frames)], datagrams=datagrams), origin="the tests", link="")
+
+
+def test_fields_alike_at_equal_distances_are_an_array() -> None:
+    struct = written(simulate(ls.sensor("hesai-xt16"), 300), datagrams=True)["struct"]
+    assert "# 8 blocks of 66 bytes that begin with the same field" in struct
+    assert struct.count('Scaled(Int16ul, 0.01, "deg")') == 1
+    assert "lies between" not in struct
+
+
+def test_the_counter_that_never_jumps_is_taken_and_the_others_are_offered() -> None:
+    draw = random.Random(1)
+    frames = [b"\x0f\x55" + bytes([(i + i // 50 * 3) % 256, 0]) + i.to_bytes(2, "little") + draw.randbytes(10) for i in range(200)]
+    assert 'sequence=Sequence("counter_4"),  # a jump in it is a loss; or counter_2' in written(frames)["arguments"]
+
+
+def test_other_checksums_that_fit_and_other_angles_are_offered() -> None:
+    text = written(simulate(ls.sensor("ldrobot-ld06"), 300))
+    assert "# or Crc(width=8, poly=0x4D, xorout=0x18) at byte 46 over all other bytes but the first 1" in text["struct"]
+    assert 'scan=OnWrap("angle_4"),  # or angle_42' in text["arguments"]
+
+
+def test_a_checksum_of_which_most_bits_never_change_is_none() -> None:
+    draw = random.Random(1)
+    bodies = [b"\x0f\x55\x07\x09\x01\x02" + bytes([draw.randrange(2)]) for _ in range(200)]
+    frames = [body + Xor()(body).to_bytes(1) for body in bodies]
+    assert draft([b"".join(frames)], datagrams=False).seal is None

@@ -67,7 +67,7 @@ def test_only_frames_with_the_counter_are_counted() -> None:
 
 def test_a_counter_that_no_data_frame_has_is_an_error_of_the_plugin() -> None:
     wrong = replace(lengths.SENSOR, sequence=Sequence("countre"))
-    assert wrong.decode(simulate(PLAIN, 2)).stats.plugin_errors == 1
+    assert wrong.decode(simulate(PLAIN, 2)).stats.plugin_errors == 2  # packets
 
 
 def test_a_sweep_may_name_fields_of_the_other_form_but_none_that_do_not_exist() -> None:

@@ -45,7 +45,7 @@ FAILING = {
     "broken-plausible": "no such luck",
     "broken-points": "no such luck",
     "broken-field": "did you mean 'distances'?",
-    "broken-shape": "shape mismatch",
+    "broken-shape": "range is 4 distances, and azimuth is 3 distances",
     "broken-result": "has to return Polar or Cartesian",
 }
 

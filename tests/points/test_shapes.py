@@ -11,9 +11,9 @@ import pytest
 from construct import Array, Const, ConstructError, Int8ub, Int16ub, Int16ul, Rebuild, Struct, this
 
 from lidarspec import PointCloud, Sensor, SpecError, UsageError
-from lidarspec.errors import OutOfRange
+from lidarspec.errors import OutOfRange, PluginError
 from lidarspec.simulation.simulator import simulate
-from lidarspec.spec import Checksummed, Frame, Polar, Scaled, Simulation, Sum, Xor, spread, wrap
+from lidarspec.spec import Checksummed, Frame, Polar, Scaled, Simulation, Sum, Xor, spread, steps, wrap
 from tests.engine import against_construct
 from tests.shapes import SHAPES, calibration
 
@@ -43,6 +43,25 @@ def test_counts_spread_the_angles_and_wrap(backend: str) -> None:
     packets = sensor.decode(frame(0, 10, 1, 2, 3) + frame(0, 10, 7), backend=backend)
     assert packets.count("samples").tolist() == [3, 1]
     assert packets.raw["samples"]["distance"].tolist() == [[1, 2, 3], [7, 0, 0]]
+
+
+@both
+def test_the_index_of_a_sample_is_as_long_as_the_arrays_of_the_batch(backend: str) -> None:
+    shape = SHAPES["shape-count"]
+    timed = replace(shape, points=lambda f: replace(shape.points(f), time=steps(f.count) / 100))
+    short = timed.build("data", first=0, last=100, samples=[dict(distance=1000, quality=9)] * 2)
+    long = timed.build("data", first=0, last=100, samples=[dict(distance=1000, quality=9)] * 3)
+    assert cloud_of(timed, short, backend=backend).time.tolist() == pytest.approx([0, 0.01])
+    assert cloud_of(timed, short, long, short, backend=backend).time.tolist() == pytest.approx([0, 0.01, 0, 0.01, 0.02, 0, 0.01])
+    assert steps(3).tolist() == [0, 1, 2]
+
+
+def test_a_spread_that_folds_everything_onto_one_value_says_so() -> None:
+    shape = SHAPES["shape-count"]
+    folded = replace(shape, points=lambda f: replace(shape.points(f), time=spread(0, f.count - 1, f.count, full=1.0)))
+    packets = folded.decode(b"".join(shape.example("data", seed=seed) for seed in range(3)))
+    with pytest.raises(PluginError, match=r"whole turns of 1 from its start.*steps\(count\)"):
+        packets.points()
 
 
 def test_a_sweep_of_one_beam_starts_and_ends_at_its_start() -> None:

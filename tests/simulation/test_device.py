@@ -85,9 +85,9 @@ def test_an_rplidar_says_what_it_is_and_scans_in_the_mode_that_is_asked_for() ->
     assert A1.parse(asked(device, "get_us_per_sample", 0, mode=3)).value.us_per_sample == 127 * 256
     assert bytes(A1.parse(asked(device, "get_mode_name", 0, mode=3)).value.data) == b"Sensitivity\0"
     assert asked(device, "get_mode_name", 0, mode=9) == b""
+    types = [A1.parse(asked(device, "get_answer_type", 0, mode=mode)).value.answer_type for mode in range(4)]
     kinds = {}
-    for mode in range(4):
-        kind = A1.parse(asked(device, "get_answer_type", 0, mode=mode)).value.answer_type
+    for mode, kind in enumerate(types):
         started = asked(device, "express_scan", mode * SECOND, mode=mode) if mode else asked(device, "scan", 0)
         started += passing(device, mode * SECOND, mode * SECOND + SECOND // 2)
         assert A1.parse(started[:7])["type"] == kind
@@ -101,7 +101,10 @@ def test_an_rplidar_says_what_it_is_and_scans_in_the_mode_that_is_asked_for() ->
         2: ["ultra", "ultra_descriptor"],
         3: ["ultra", "ultra_descriptor"],
     }
+    assert b"\xa5\x5a\x14" not in asked(device, "get_info", 5 * SECOND)  # answered only while it does not scan
+    assert device.heard[-1] == "get_info"
     assert asked(device, "stop", 5 * SECOND).count(b"\xa5\x5a") == 0
+    assert A1.parse(asked(device, "get_info", 5 * SECOND)).hardware == 7
     assert passing(device, 5 * SECOND, 6 * SECOND) == b""
 
 

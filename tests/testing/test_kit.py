@@ -240,3 +240,23 @@ def test_vectors_that_prove_nothing_are_findings(tmp_path: Path) -> None:
         with pytest.raises(Violation) as found:
             vectors_hold(Subject(sound.sensor(), vectors=file))
         assert found.value.code == code, text
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({}, ""),
+        ({"hex": "16 61 02 75"}, "16 61 01 76 is sent, and 16 61 02 75 is printed"),
+        ({"reply": "17 71 44 02 20"}, "the device answered with ack with code 2 instead of 1"),
+        ({"command": "stop"}, "no command 'stop' sends such a frame"),
+        ({"args": {"speed": 3}}, "unknown"),
+    ],
+)
+def test_vectors_hold_commands_and_their_replies(changes: dict[str, Any], said: str, tmp_path: Path) -> None:
+    vector = {"command": "start", "hex": "16 61 01 76", "reply": "17 71 44 01 23", "source": "by hand"}
+    (file := tmp_path / "vectors.json").write_text(json.dumps([vector | changes]), encoding="utf-8")
+    if not said:
+        vectors_hold(Subject(sound.sensor(), vectors=file))
+        return
+    with pytest.raises(Violation, match=said):
+        vectors_hold(Subject(sound.sensor(), vectors=file))

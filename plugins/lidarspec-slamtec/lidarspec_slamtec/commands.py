@@ -1,7 +1,7 @@
 """What can be asked of an RPLIDAR, and how its motor is driven: by the line DTR, by PWM or by a speed.
 
 Source: RPLIDAR interface protocol, "requests"; how long to wait after them and the motor's commands from the vendor's SDK
-(sl_lidar_driver.cpp). No command but stop is answered while scan data is sent.
+(sl_lidar_driver.cpp). While scan data is sent, what asks for information is not answered; another scan begins anew.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ def plain(cmd: int, **more: Any) -> Command:
 
 def asking(frame: str, reply: str | tuple[str, ...], values: Mapping[str, int] | None = None, **more: Any) -> Command:
     """A request with a reply; it does no harm twice: what a sensor is stays the same, and a scan begins anew."""
-    return Command(frame, values or {}, reply=reply, retries=1, **more)
+    return Command(frame, values or {}, reply=reply, retries=1, only_stopped=not more.get("starts"), **more)
 
 
 def about_sensor(key: int) -> Command:

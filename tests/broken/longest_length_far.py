@@ -1,0 +1,11 @@
+"""A longest length that no frame comes near to."""
+
+from __future__ import annotations
+
+from lidarspec.spec import hookimpl
+from tests.broken.sound import frame, sensor
+
+
+@hookimpl
+def lidarspec_sensors():
+    return [sensor(frame(max_length=100_000))]

@@ -1,0 +1,15 @@
+"""Scaled with its unit before its step."""
+
+from __future__ import annotations
+
+from construct import Array, Int8ul, Int16ul, Struct, this
+
+from lidarspec.spec import Scaled, hookimpl
+from tests.broken.sound import frame, sealed, sensor
+
+SAMPLE = Struct("distance" / Scaled(Int16ul, "m", 0.001), "quality" / Int8ul)
+
+
+@hookimpl
+def lidarspec_sensors():
+    return [sensor(frame(sealed(samples=Array(this.count, SAMPLE))))]
