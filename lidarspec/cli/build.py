@@ -22,6 +22,7 @@ from lidarspec.plugins import sensor as named_sensor
 from lidarspec.spec.fields import factor, split_unit
 from lidarspec.spec.sensor import Sensor
 from lidarspec.spec.tree import FieldInfo, evaluated
+from lidarspec.transports.files import unhexed
 from lidarspec.wire.build import given_value
 from lidarspec.wire.schema import Schema, schema
 
@@ -89,7 +90,7 @@ def _raw(info: FieldInfo, text: str, path: str, place: str) -> Any:
     """The raw value that a text stands for: hexadecimal for bytes, a label, a number, or a number with a unit."""
     if info.kind == "bytes":
         try:
-            return bytes.fromhex(text)
+            return unhexed(text)
         except ValueError:
             raise UsageError(f"{place}: {path} takes bytes in hexadecimal, not {text!r}") from None
     for raw, label in info.labels.items():

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import json
 import shutil
 import sys
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
+from textwrap import indent
 from typing import Any
 
 import click
@@ -85,33 +87,55 @@ def emit(content: str | bytes, output: str | None) -> None:
     Raises:
         SourceError: where the file cannot be written.
     """
+    emit_parts([content], output)
+
+
+def emit_parts(parts: Iterable[str | bytes], output: str | None) -> None:
+    """Texts, a line or more each, or bytes, as they are made; the same places as `emit`."""
     if output is None or output == "-":
-        click.echo(content, nl=isinstance(content, str))
+        for part in parts:
+            click.echo(part, nl=isinstance(part, str))
         return
     from lidarspec.formats import replacing  # and all that scans are made of, for the verbs that write a file
 
     path = Path(output)
     is_replaced = path.is_file() or not path.exists()  # and not a device or a pipe
-    with system_errors(output), replacing(path) if is_replaced else contextlib.nullcontext(path) as part:
-        part.write_bytes(content if isinstance(content, bytes) else f"{content}\n".encode())
+    with system_errors(output), replacing(path) if is_replaced else contextlib.nullcontext(path) as written, written.open("wb") as file:
+        for part in parts:
+            file.write(part if isinstance(part, bytes) else f"{part}\n".encode())
 
 
 def emit_lines(lines: Iterable[Line], output: str | None) -> None:
-    """Lines with roles: in colours, and folded to its width, on a terminal (NO_COLOR is obeyed); as plain text anywhere else."""
-    if output is None and (console := Console()).is_terminal:
-        found = Text()
-        for line in lines:
-            for span in folded(line, console.width):
-                found.append(span.text, STYLES.get(span.role))
-            found.append("\n")
-        click.echo(drawn(found))
-        return
-    emit("\n".join(plain_text(line) for line in lines), output)
+    """Lines with roles, as they are made: in colours, and folded to its width, on a terminal (NO_COLOR is obeyed); else as plain text."""
+    is_drawn = output is None and Console().is_terminal
+    emit_parts((_coloured(line) if is_drawn else plain_text(line) for line in lines), output)
+
+
+def _coloured(line: Line) -> str:
+    drawing = Text()
+    for span in folded(line, Console().width):
+        drawing.append(span.text, STYLES.get(span.role))
+    return drawn(drawing)
 
 
 def emit_json(value: Any, output: str | None) -> None:
     """A value as JSON; the same places as `emit`."""
     emit(json.dumps(value, indent=2, allow_nan=False), output)
+
+
+def emit_json_list(head: dict[str, Any], name: str, items: Iterable[Any], output: str | None) -> None:
+    """An object as JSON whose last entry is a list, each item as it is made; the same places as `emit`."""
+    beginning = json.dumps({**head, name: []}, indent=2, allow_nan=False).removesuffix("]\n}")
+    emit_parts(itertools.chain(_items(beginning, items), ["  ]\n}"]), output)
+
+
+def _items(beginning: str, items: Iterable[Any]) -> Iterator[str]:
+    """Each item with the comma that belongs behind it: one is held back until the next is there."""
+    held = beginning
+    for number, item in enumerate(items):
+        yield held + "," * bool(number)
+        held = indent(json.dumps(item, indent=2, allow_nan=False), "    ")
+    yield held
 
 
 def note(text: str) -> None:
