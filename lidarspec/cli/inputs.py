@@ -114,15 +114,18 @@ def _no_bytes(words: Sequence[str], error: ValueError) -> LidarSpecError:
     return UsageError(f"{text[:QUOTED]!r} is no file, and not hexadecimal: {error}")
 
 
-def refuse_overwriting(source: str, target: str, what: str = "source") -> None:
-    """Nothing, where a file is written to that is not the one that is read.
+def refuse_overwriting(source: str, target: str, what: str = "source", *, force: bool = True) -> None:
+    """Nothing, where a file is written to that is not the one that is read, and with `force` off is new.
 
     Raises:
-        UsageError: where it is.
+        UsageError: where it is not.
     """
     path = source.partition("?")[0]
     if os.path.exists(path) and os.path.exists(target) and os.path.samefile(path, target):
         raise UsageError(f"{target} is the {what}: it would be overwritten")
+    if not force and os.path.exists(target):
+        error = UsageError(f"{target} exists already; it is not overwritten unless asked for")
+        raise suggest(error, "the same with --force, or with another file")
 
 
 def no_frame(sensor: Sensor, given: Heard) -> WireError:
