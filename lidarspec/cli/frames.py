@@ -110,11 +110,14 @@ def explain(
             listed = ({"offset": piece.offset, **part.to_dict()} for piece, part in parts)
             emit_json_list({"sensor": sensor.id, "fits": fits}, "frames", listed, output)
         else:
-            emit_lines(_listing(sensor, parts, at, every=bits, verdicts=bad), output)
+            emit_lines(listing(sensor, parts, at, every=bits, verdicts=bad), output)
         selection.conclude(given)
 
 
-def _listing(sensor: Sensor, parts: Iterable[tuple[Piece, Explanation]], at: int | None, *, every: bool, verdicts: bool) -> Iterator[Line]:
+def listing(
+    sensor: Sensor, parts: Iterable[tuple[Piece, Explanation]], at: int | None = None, *, every: bool = False, verdicts: bool = False
+) -> Iterator[Line]:
+    """The lines of explained pieces, each below a title, which says what stands `at` a byte, and with `verdicts` what is wrong."""
     for index, (piece, part) in enumerate(parts):
         yield from [()] * bool(index)
         title = Span(_title(sensor, piece, part.frame), "title")
@@ -191,13 +194,18 @@ class Selection:
     def _within(self, piece: Piece) -> Iterator[tuple[Piece, Explanation]]:
         try:
             for part, what in explained(self._sensor, piece, self._frame):
+                if self._bad and what.is_filler:
+                    continue
                 if self._frame not in (None, what.frame):
-                    self.others, self.unframed = self.others + bool(what.frame), self.unframed + (0 if what.frame else len(part.data))
+                    self.others, self.unframed = (
+                        self.others + bool(what.frame),
+                        self.unframed + (0 if what.frame or what.is_filler else len(part.data)),
+                    )
                 elif part.end > self._from and part.offset < self._to:
                     self._fault = self._fault or what.fault
                     self._shown += 1
                     self.damaged += bool(what.frame) and what.fault is not None
-                    self.unframed += 0 if what.frame else len(part.data)
+                    self.unframed += 0 if what.frame or what.is_filler else len(part.data)
                     yield part, what
                     if self._bad and self.damaged >= self._count:
                         return

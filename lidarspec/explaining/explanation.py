@@ -74,6 +74,11 @@ class Explanation:
         """What is wrong with the frame, in one sentence; "valid" where nothing is."""
         return "valid" if self.fault is None else self.fault.reason
 
+    @property
+    def is_filler(self) -> bool:
+        """Whether it is no frame, and nothing but bytes that the sensor sends between frames."""
+        return not self.frame and all(row.right for row in self.rows)
+
     def lines(self, *, every: bool = False) -> list[Line]:
         """The listing in pieces; `every` draws the bits of all elements of an array, and not of the first alone."""
         return [*Listing(self.rows, every=every).lines(), *((Span("note: ", "note"), Span(note)) for note in self.notes)]

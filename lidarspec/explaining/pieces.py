@@ -131,7 +131,9 @@ def explained(sensor: Sensor, piece: Piece, frame: str | None = None) -> Iterato
 
 
 def _skipped(sensor: Sensor, piece: Piece) -> tuple[Piece, Explanation]:
-    return piece, Explanation(sensor.id, "", piece.data, (Row(0, piece.data, "", (), ("in no frame",), right=False),))
+    is_filler = not piece.data.translate(None, bytes(sensor.fillers))
+    remark = "filler" if is_filler else "in no frame"
+    return piece, Explanation(sensor.id, "", piece.data, (Row(0, piece.data, "", (), (remark,), right=is_filler),))
 
 
 def _damaged(sensor: Sensor, piece: Piece) -> Iterator[Piece]:

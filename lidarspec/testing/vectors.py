@@ -26,6 +26,7 @@ from lidarspec.testing.findings import Violation, require
 from lidarspec.testing.frames import leaves
 from lidarspec.testing.geometry import read
 from lidarspec.testing.subject import Subject
+from lidarspec.transports.files import unhexed
 
 #: what a point may differ by: metres and radians as manuals print them.
 NEAR = 2e-4
@@ -38,7 +39,7 @@ def vectors_hold(subject: Subject) -> None:
     for index, vector in enumerate(entries(subject)):
         place = f"vectors[{index}]"
         require(str(vector.get("source", "")).strip(), "LS701", "it names no source", place)
-        data = bytes.fromhex(vector["hex"])
+        data = unhexed(vector["hex"])
         name = vector["frame"]
         parsed = _parsed(subject, name, data, place)
         _values(subject, name, data, parsed, vector, place)
@@ -67,7 +68,7 @@ def entries(subject: Subject) -> list[Any]:
         require(not vector.keys() - KEYS, "LS702", f"unknown keys {sorted(vector.keys() - KEYS)}; known are {sorted(KEYS)}", place)
         require(vector.get("frame") in subject.sensor.frames, "LS702", f"there is no frame {vector.get('frame')!r}", place)
         try:
-            bytes.fromhex(vector.get("hex", "-"))
+            unhexed(vector.get("hex", "-"))
         except (ValueError, TypeError):
             raise Violation("LS702", "its `hex` is no hex text", place) from None
     return found
@@ -80,7 +81,7 @@ def _parsed(subject: Subject, name: str, data: bytes, place: str) -> Any:
     except WireError as error:
         if ": checksum " not in error.reason:
             raise Violation("LS707", error.reason, f"{place} {name}.{error.path}") from error
-        same = [bytes.fromhex(one["hex"]) for one in entries(subject) if one["frame"] == name]
+        same = [unhexed(one["hex"]) for one in entries(subject) if one["frame"] == name]
         fitting = [f"{match.paste} over {match.span.told(match.place, len(data))}" for match in search(same)[:2]]
         fits = f"; {' or '.join(fitting)} fits" if fitting else ""
         raise Violation("LS703", f"{error.reason}{fits}", f"{place} {name}.{error.path}") from error
