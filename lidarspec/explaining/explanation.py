@@ -42,7 +42,7 @@ DIGITS, SPARE = 12, 2
 Keys = tuple[str | int, ...]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Explanation:
     """A frame explained: rows that name every byte exactly once, in order. Its text is the listing that the command line prints.
 
@@ -60,6 +60,9 @@ class Explanation:
     rows: tuple[Row, ...]
     fault: WireError | None = None
     notes: tuple[str, ...] = ()
+
+    def __repr__(self) -> str:
+        return f"Explanation({self.sensor} {self.frame or 'skipped'}, {len(self.data)} bytes: {self.verdict})"
 
     def __str__(self) -> str:
         return "\n".join(text(line) for line in self.lines())

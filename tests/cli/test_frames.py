@@ -119,6 +119,8 @@ def test_explain_shows_what_is_damaged_alone(tmp_path: Path) -> None:
         *(line for line in result.stdout.splitlines() if line.startswith("note: one lost byte would explain it")),
     ]
     assert result.stderr == "29 frames, 1 damaged, 0 bytes in no frame\n"
+    filled = b"\xff\xfe".join(ls.simulate(ls.sensor("cspc-m1c1-mini"), 9))  # fillers are no damage
+    assert "9 frames, 0 damaged, 0 bytes in no frame" in ran("explain", filled.hex(), "--bad", "-s", "cspc-m1c1-mini").stderr
     clean = ran("explain", frames[0].hex(), "--bad", *SENSOR)
     assert (clean.stdout, clean.stderr) == ("", "1 frame, 0 damaged, 0 bytes in no frame\n")
 
