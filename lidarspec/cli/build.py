@@ -3,28 +3,36 @@
 from __future__ import annotations
 
 import functools
+import math
 import re
+import time
 from collections.abc import Callable, Mapping, Sequence
 from fractions import Fraction
 from shlex import quote
-from typing import Any
+from typing import Any, Literal
 
 import click
 
-from lidarspec.cli.frames import plain
+from lidarspec.cli.frames import listing, plain
 from lidarspec.cli.options import DURATION, output_options, sensor_option
-from lidarspec.cli.output import emit, emit_json, table
+from lidarspec.cli.output import emit, emit_json, emit_lines, note, table
 from lidarspec.device.device import Device, open as open_device
 from lidarspec.device.session import Reply
 from lidarspec.errors import CommandError, LidarSpecError, OutOfRange, UnknownCommand, UnknownField, UnknownFrame, UsageError, suggest
 from lidarspec.explaining.explanation import explain
+from lidarspec.explaining.pieces import explained, pieces
 from lidarspec.plugins import sensor as named_sensor
 from lidarspec.spec.fields import factor, split_unit
 from lidarspec.spec.sensor import Sensor
 from lidarspec.spec.tree import FieldInfo, evaluated
+from lidarspec.transports.files import unhexed
+from lidarspec.transports.open_url import is_live
+from lidarspec.transports.protocol import Chunk
 from lidarspec.wire.build import given_value
 from lidarspec.wire.schema import Schema, schema
 
+#: seconds to wait for what comes back on bytes sent by hand, and of silence behind it that end it.
+ANSWERED, QUIET = 1.0, 0.2
 _STEP = r"\w+(?:\[(?:\d+|\*)\])*"
 _PATH = re.compile(rf"{_STEP}(?:\.{_STEP})*")
 
@@ -89,7 +97,7 @@ def _raw(info: FieldInfo, text: str, path: str, place: str) -> Any:
     """The raw value that a text stands for: hexadecimal for bytes, a label, a number, or a number with a unit."""
     if info.kind == "bytes":
         try:
-            return bytes.fromhex(text)
+            return unhexed(text)
         except ValueError:
             raise UsageError(f"{place}: {path} takes bytes in hexadecimal, not {text!r}") from None
     for raw, label in info.labels.items():
@@ -169,21 +177,36 @@ def _length(table: Schema, given: Mapping[str, Any], path: str, place: str) -> i
 
 @click.command()
 @click.argument("source")
-@click.argument("command")
-@click.argument("assignments", metavar="ARGUMENT=VALUE", nargs=-1)
+@click.argument("command", required=False)
+@click.argument("assignments", metavar="[ARGUMENT=VALUE]...", nargs=-1)
 @sensor_option
+@click.option("--hex", "digits", metavar="HEX", help="Send these bytes in the place of a command, and explain what comes back.")
 @click.option("--timeout", type=DURATION, metavar="TIME", help="How long to wait for the reply; by default what the sensor declares.")
 @output_options
 def send(
-    source: str, command: str, assignments: Sequence[str], sensor_id: str | None, timeout: float | None, as_json: bool, output: str | None
+    source: str,
+    command: str | None,
+    assignments: Sequence[str],
+    sensor_id: str | None,
+    digits: str | None,
+    timeout: float | None,
+    as_json: bool,
+    output: str | None,
 ) -> None:
     """Send a command to a sensor, and print its reply.
 
     Nothing else is sent: a sensor that it starts goes on when the verb ends. Values are in the unit that `show` prints, or bring
     their own: rate=600rpm. A sensor that keeps silent until it is started has to be named with -s.
     """
-    with open_device(source, sensor_id, start=False) as device:
+    if (command is None) == (digits is None):
+        raise UsageError("send takes either the name of a command, or bytes: --hex 'a5 50'")
+    data, answer = b"" if digits is None else _bytes(digits), _Answer()
+    record = (lambda _: answer) if digits is not None and is_live(source) else None
+    with open_device(source, sensor_id, start=False, record=record) as device:
         device.leave_on()
+        if command is None:
+            _write(device, source, data, answer, timeout, as_json=as_json, output=output)
+            return
         reply = _sent(device, source, command, assignments, timeout)
         sensor = device.sensor
     if as_json:
@@ -192,16 +215,77 @@ def send(
         emit(_text(sensor, reply, output), output)
 
 
+def _bytes(digits: str) -> bytes:
+    try:
+        return unhexed(digits)
+    except ValueError as error:
+        raise UsageError(f"--hex takes bytes in hexadecimal: {error}") from None
+
+
+class _Answer:
+    """What arrives, in the place of a recording."""
+
+    error = None
+
+    def __init__(self) -> None:
+        self.chunks: list[Chunk] = []
+
+    def write(self, chunk: Chunk, direction: Literal["in", "out"] = "in") -> None:
+        if direction == "in":
+            self.chunks.append(chunk)
+
+    def event(self, name: str, at: int | None = None, **details: Any) -> None:
+        """Nothing is made of it: what was lost is missing in the answer."""
+
+    def close(self) -> None:
+        """There is nothing to close."""
+
+    def after(self, number: int, seconds: float) -> list[Chunk]:
+        """The chunks behind the first so many: until the line has been quiet for a moment, or so many seconds have passed."""
+        end, heard, quiet = time.monotonic() + seconds, number, math.inf
+        while (now := time.monotonic()) < min(end, quiet):
+            if len(self.chunks) > heard:
+                heard, quiet = len(self.chunks), now + QUIET
+            time.sleep(QUIET / 10)
+        return self.chunks[number:]
+
+
+def _write(device: Device, source: str, data: bytes, answer: _Answer, timeout: float | None, *, as_json: bool, output: str | None) -> None:
+    """Send bytes, and print what comes back, explained; data frames, which come all the same, are only counted."""
+    _refuse_file(device, source)
+    sensor, before = device.sensor, len(answer.chunks)
+    device.write(data)
+    note(f"sent {len(data)} byte{'s' * (len(data) != 1)}: {data.hex(' ')}")
+    heard = answer.after(before, ANSWERED if timeout is None else timeout)
+    found = list(pieces(sensor, heard, datagrams=sensor.datagrams)) if heard else []
+    rest = [piece for piece in found if piece.frame not in sensor.data_frames]
+    if len(rest) < len(found):  # they go on: what is cut off by the beginning and the end of listening is of these
+        note(f"{len(found) - len(rest)} data frames came meanwhile")
+        rest = [piece for piece in rest if piece.is_valid or piece not in (found[0], found[-1])]
+    parts = [(piece, part) for cut in rest for piece, part in explained(sensor, cut) if not part.is_filler]
+    if as_json:
+        frames = [{"offset": piece.offset, **part.to_dict()} for piece, part in parts]
+        emit_json({"sensor": sensor.id, "sent": data.hex(" "), "frames": frames}, output)
+    elif parts:
+        emit_lines(listing(sensor, parts), output)
+    if not parts:
+        note("nothing came back")
+
+
 def _sent(device: Device, source: str, command: str, assignments: Sequence[str], timeout: float | None) -> Reply:
     sensor = device.sensor
-    if not device.is_live:
-        raise suggest(UsageError(f"{source} is a file: nothing can be sent to it"), "lidarspec ports")
+    _refuse_file(device, source)
     try:
         return device.send(command, timeout=timeout, **arguments(sensor, command, assignments))
     except UsageError as error:
         raise suggest(error, f"lidarspec show {sensor.id}") from None
     except CommandError as error:
         raise suggest(error, f"lidarspec doctor {quote(source)} -s {sensor.id}") from None
+
+
+def _refuse_file(device: Device, source: str) -> None:
+    if not device.is_live:
+        raise suggest(UsageError(f"{source} is a file: nothing can be sent to it"), "lidarspec ports")
 
 
 def arguments(sensor: Sensor, name: str, assignments: Sequence[str]) -> dict[str, float | int]:

@@ -50,15 +50,16 @@ class Written:
 @sensor_option
 @count_option("scans")
 @click.option("--all", "every_point", is_flag=True, help="Keep points without a valid return.")
+@click.option("--force", is_flag=True, help="Overwrite OUT.")
 @click.option("--json", "as_json", is_flag=True, help="Print a summary as JSON.")
-def convert(source: str, target: str, sensor_id: str | None, count: int | None, every_point: bool, as_json: bool) -> None:
+def convert(source: str, target: str, sensor_id: str | None, count: int | None, every_point: bool, force: bool, as_json: bool) -> None:
     """Write the points of a capture or raw file to a file, in the format of its suffix.
 
     .csv and .npz hold x y z range azimuth elevation intensity time ring return_index, those that the sensor has, and the
     number of the scan; metres, radians, and seconds since the scan's stamp.
     """
     format_of(target)
-    refuse_overwriting(source, target, "input")
+    refuse_overwriting(source, target, "input", force=force)
     sensor = _detected(source, target) if sensor_id is None else named_sensor(sensor_id)
     written = Written()
     with open_device(source, sensor) as device:

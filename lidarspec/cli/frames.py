@@ -1,26 +1,27 @@
-"""The verbs that look into frames."""
+"""`parse` and `explain`: the frames in some bytes, and every byte of them, as they are found."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import itertools
+import math
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 import click
 
-from lidarspec.cli.inputs import nearest_fault, no_frame, read
-from lidarspec.cli.options import count_option, output_options, sensor_option
-from lidarspec.cli.output import emit, emit_json, emit_lines, note, table
-from lidarspec.discovery.detect import Piece, fitting, likely_starts, pieces
+from lidarspec.cli.failures import FINDINGS
+from lidarspec.cli.inputs import nearest_fault, no_frame, opened
+from lidarspec.cli.options import OFFSET, count_option, output_options, sensor_option
+from lidarspec.cli.output import emit_json, emit_json_list, emit_lines, emit_parts, note, table
+from lidarspec.discovery.detect import fitting
 from lidarspec.discovery.listen import Heard
 from lidarspec.errors import UsageError, WireError, suggest
-from lidarspec.explaining.explanation import Explanation, explain as explained
+from lidarspec.explaining.explanation import Explanation, explain as explain_frame
 from lidarspec.explaining.listing import LINED, Line, told
-from lidarspec.explaining.wording import Row, Span, number
+from lidarspec.explaining.pieces import Piece, explained, pieces
+from lidarspec.explaining.wording import Span, number
 from lidarspec.plugins import sensor as named_sensor
 from lidarspec.spec.sensor import Sensor
-
-#: places in bytes between frames that are explained as damaged frames, at most.
-DAMAGED = 64
 
 words_argument = click.argument("words", metavar="HEX|FILE|-", nargs=-1, required=True)
 
@@ -32,31 +33,43 @@ words_argument = click.argument("words", metavar="HEX|FILE|-", nargs=-1, require
 @output_options
 def parse(words: Sequence[str], sensor_id: str | None, count: int | None, as_json: bool, output: str | None) -> None:
     """The fields of each frame in some bytes."""
-    given, sensor, fits, found = _found(words, sensor_id, count)
-    if not found:
-        raise no_frame(sensor, given)
-    frames = [(piece, explained(piece.data, sensor, piece.frame)) for piece in found if piece.frame]
-    if as_json:
-        listed = [
-            {"frame": f.frame, "offset": p.offset, "size": len(p.data), "fields": plain(sensor.parse(p.data, p.frame))} for p, f in frames
-        ]
-        emit_json({"sensor": sensor.id, "fits": fits, "frames": listed}, output)
-        return
-    skipped = sum(len(piece.data) for piece in found if not piece.frame)
-    if skipped:
-        note(f"{skipped} bytes are in no frame; lidarspec explain names them")
-    parts = []
-    for piece, frame in frames:
-        rows = [[value.path, _raw_text(value.raw), str(value) if value.unit or value.label else ""] for value in frame.fields.values()]
-        parts.append(_title(sensor, piece) + "\n" + table(["field", "raw", "value"], rows, output))
-    emit("\n\n".join(parts), output)
+    with opened(words) as (given, chunks):
+        sensor, fits = _sensor(given, sensor_id)
+        selection = Selection(sensor, count=count)
+        found = selection.frames(pieces(sensor, chunks, datagrams=given.datagrams))
+        first = next(found, None)
+        if first is None:
+            raise no_frame(sensor, given)
+        frames = itertools.chain([first], found)
+        if as_json:
+            emit_json_list({"sensor": sensor.id, "fits": fits}, "frames", (_fields(sensor, piece) for piece in frames), output)
+        else:
+            emit_parts(_tables(sensor, frames, output), output)
+        if selection.unframed:
+            note(f"{selection.unframed} bytes are in no frame; lidarspec explain names them")
+
+
+def _fields(sensor: Sensor, piece: Piece) -> dict[str, Any]:
+    """A frame for JSON."""
+    facts = {"frame": piece.frame, "offset": piece.offset, "size": len(piece.data)}
+    return {**facts, "fields": plain(sensor.parse(piece.data, piece.frame))}
+
+
+def _tables(sensor: Sensor, frames: Iterable[Piece], output: str | None) -> Iterator[str]:
+    for index, piece in enumerate(frames):
+        values = explain_frame(piece.data, sensor, piece.frame).fields.values()
+        rows = [[value.path, _raw_text(value.raw), str(value) if value.unit or value.label else ""] for value in values]
+        yield "\n" * bool(index) + _title(sensor, piece, piece.frame) + "\n" + table(["field", "raw", "value"], rows, output)
 
 
 @click.command()
 @words_argument
 @sensor_option
-@click.option("-f", "--frame", metavar="NAME", help="The frame type, where the bytes do not tell.")
+@click.option("-f", "--frame", metavar="NAME", help="The frame type, where the bytes do not tell; of many frames, this type alone.")
 @count_option("frames")
+@click.option("--bad", is_flag=True, help="What is damaged, or in no frame, alone.")
+@click.option("--at", type=OFFSET, metavar="OFFSET", help="What stands at this byte of the input alone.")
+@click.option("--slice", "stretch", metavar="FROM:TO", help="What stands in these bytes of the input alone, whole frames.")
 @click.option("--bits", is_flag=True, help="Draw the bits of every element of an array, not of the first alone.")
 @click.option(
     "--diff", metavar="HEX|FILE|next", help="What differs from this frame, to the bit; 'next': from the second frame of the input."
@@ -67,70 +80,202 @@ def explain(
     sensor_id: str | None,
     frame: str | None,
     count: int | None,
+    bad: bool,
+    at: int | None,
+    stretch: str | None,
     bits: bool,
     diff: str | None,
     as_json: bool,
     output: str | None,
 ) -> None:
-    """Every byte of each frame: offset, hex, field, value, unit, meaning."""
-    given, sensor, fits, found = _found(words, sensor_id, count, frame, damaged=True)
-    if not given.data:
-        raise no_frame(sensor, given)
-    if diff is not None:
-        _compare(sensor, given, found, diff, frame, as_json=as_json, output=output)
-        return
-    parts = [part for piece in found or [Piece(0, given.data, "?")] for part in _parts(sensor, piece)]
-    if as_json:
-        listed = [{"offset": piece.offset, **part.to_dict()} for piece, part in parts]
-        emit_json({"sensor": sensor.id, "fits": fits, "frames": listed}, output)
-    else:
-        lines: list[Line] = []
-        for piece, part in parts:
-            lines += [()] * bool(lines) + [(Span(_title(sensor, piece, part), "title"),), *part.lines(every=bits)]
-        emit_lines(lines, output)
-    if not any(part.frame and part.fault is None for _, part in parts):
-        raise suggest(next(part.fault for _, part in parts if part.fault), f"lidarspec show {sensor.id}")
+    """Every byte of each frame: offset, hex, field, value, unit, meaning.
+
+    A damaged frame is told with what became of it: a flipped bit, a lost or inserted byte, where it is cut off. With --bad the exit
+    code is 1 where something is damaged. OFFSETs are those that are printed, 940 or 0x3ac; of a capture, in the payloads, joined.
+    """
+    if at is not None and stretch is not None:
+        raise UsageError("--at is for one byte, and --slice for several: leave out one of them")
+    with opened(words) as (given, chunks):
+        sensor, fits = _sensor(given, sensor_id, damaged=True)
+        if not given.data:
+            raise no_frame(sensor, given)
+        found = pieces(sensor, chunks, datagrams=given.datagrams, frame=frame)
+        if diff is not None:
+            _compare(sensor, given, found, diff, frame, as_json=as_json, output=output)
+            return
+        selection = Selection(sensor, frame, count=count, bad=bad, at=at, stretch=stretch)
+        parts = selection.parts(found)
+        if as_json:
+            listed = ({"offset": piece.offset, **part.to_dict()} for piece, part in parts)
+            emit_json_list({"sensor": sensor.id, "fits": fits}, "frames", listed, output)
+        else:
+            emit_lines(listing(sensor, parts, at, every=bits, verdicts=bad), output)
+        selection.conclude(given)
 
 
-def _compare(sensor: Sensor, given: Heard, found: list[Piece], diff: str, frame: str | None, *, as_json: bool, output: str | None) -> None:
-    """Print what differs between the first frame of the input and another one."""
-    frames = [piece for piece in found if piece.frame] or [Piece(0, given.data, "?")]
-    if diff == "next":
-        same = [piece for piece in frames[1:] if piece.frame == frames[0].frame]
-        if not same:
-            raise UsageError(f"the input has no second {frames[0].frame} frame to compare with")
-        other = same[0]
-    else:
-        data = read([diff])
-        whole = [Piece(0, data.data, frame)] if frame else pieces(sensor, data.chunks, datagrams=data.datagrams)
-        rest = [piece for piece in whole if piece.frame]
-        other = next((piece for piece in rest if piece.frame == frames[0].frame), Piece(0, data.data, frames[0].frame))
-    first, second = _explained(sensor, frames[0]), _explained(sensor, other)
-    differing = first.differences(second)
-    if as_json:
-        emit_json({"sensor": sensor.id, "frame": first.frame, "differences": [part.to_dict() for part in differing]}, output)
-    else:
-        emit_lines([(Span(f"{sensor.id} {first.frame}", "title"),), *told(differing, (len(first.data), len(second.data)))], output)
+def listing(
+    sensor: Sensor, parts: Iterable[tuple[Piece, Explanation]], at: int | None = None, *, every: bool = False, verdicts: bool = False
+) -> Iterator[Line]:
+    """The lines of explained pieces, each below a title, which says what stands `at` a byte, and with `verdicts` what is wrong."""
+    for index, (piece, part) in enumerate(parts):
+        yield from [()] * bool(index)
+        title = Span(_title(sensor, piece, part.frame), "title")
+        place = "" if at is None else next((value.path for value in part.fields.values() if value.covers(at - piece.offset)), "")
+        verdict = f": {part.verdict}" if verdicts and part.fault is not None else ""
+        yield (title, Span(f"; byte {at} is in {place}" if place else ""), Span(verdict, "bad"))
+        yield from part.lines(every=every)
 
 
-def _found(
-    words: Sequence[str], sensor_id: str | None, count: int | None, frame: str | None = None, *, damaged: bool = False
-) -> tuple[Heard, Sensor, list[str], list[Piece]]:
-    """The input, its sensor, the ids of all that fit, and what is in it up to frame number `count`.
+class Selection:
+    """What of an input is shown, and what has gone by.
+
+    Args:
+        frame: one frame type alone.
+        count: frames at most; with `bad`, damaged ones.
+        bad: damaged pieces alone.
+        at, stretch: what stands at this byte alone, or in these, as "FROM:TO".
+
+    Attributes:
+        valid, damaged, unframed, others: frames, damaged ones, bytes that are in neither, and frames of other types.
 
     Raises:
-        WireError: where no sensor was named and none fits; with `damaged`, one of which the bytes begin like a frame does.
+        UsageError: for a stretch that is none.
     """
-    given = read(words)
-    sensor, fits = _sensor(given, sensor_id, damaged=damaged)
-    found = [Piece(0, given.data, frame)] if frame else pieces(sensor, given.chunks, datagrams=given.datagrams)
-    places = [place for place, piece in enumerate(found) if piece.frame]
-    if count is not None and len(places) >= count:
-        found = found[: places[count - 1] + 1]
-    return given, sensor, fits, found
+
+    def __init__(
+        self,
+        sensor: Sensor,
+        frame: str | None = None,
+        *,
+        count: int | None = None,
+        bad: bool = False,
+        at: int | None = None,
+        stretch: str | None = None,
+    ) -> None:
+        self._sensor, self._frame, self._count, self._bad = sensor, frame, math.inf if count is None else count, bad
+        stretched: tuple[float, float] = _stretch(stretch) if at is None else (at, at + 1)
+        self._from, self._to = stretched
+        self._fault: WireError | None = None
+        self._shown, self._end, self._ended = 0, 0, False
+        self.valid = self.damaged = self.unframed = self.others = 0
+
+    def frames(self, found: Iterable[Piece]) -> Iterator[Piece]:
+        """The frames, and no others."""
+        for piece in found:
+            if piece.is_valid:
+                self.valid += 1
+                yield piece
+                if self.valid == self._count:
+                    return
+            else:
+                self.unframed += len(piece.data)
+
+    def parts(self, found: Iterable[Piece]) -> Iterator[tuple[Piece, Explanation]]:
+        """What is to be shown, explained, as it is found.
+
+        Raises:
+            WireError: for a whole input that does not even begin like a frame.
+        """
+        for piece in found:
+            if piece.offset >= self._to:
+                return
+            self._end = piece.end
+            is_other = self._frame is not None and piece.is_valid and piece.frame != self._frame
+            self.others += is_other
+            self.valid += piece.is_valid and not is_other
+            if is_other or (self._bad and piece.is_valid) or piece.end <= self._from:
+                continue
+            yield from self._within(piece)
+            if (self.damaged if self._bad else self.valid) >= self._count:
+                return
+        self._ended = True
+
+    def _within(self, piece: Piece) -> Iterator[tuple[Piece, Explanation]]:
+        try:
+            for part, what in explained(self._sensor, piece, self._frame):
+                if self._bad and what.is_filler:
+                    continue
+                if self._frame not in (None, what.frame):
+                    self.others, self.unframed = (
+                        self.others + bool(what.frame),
+                        self.unframed + (0 if what.frame or what.is_filler else len(part.data)),
+                    )
+                elif part.end > self._from and part.offset < self._to:
+                    self._fault = self._fault or what.fault
+                    self._shown += 1
+                    self.damaged += bool(what.frame) and what.fault is not None
+                    self.unframed += 0 if what.frame or what.is_filler else len(part.data)
+                    yield part, what
+                    if self._bad and self.damaged >= self._count:
+                        return
+        except WireError as fault:
+            raise suggest(fault, f"lidarspec show {self._sensor.id}") from None
+
+    def conclude(self, given: Heard) -> None:
+        """Say what was shown of how much.
+
+        Raises:
+            UsageError: where the input ends before the stretch.
+            WireError: where it holds no frame.
+            Exit: where what was looked for is damage, and there is some.
+        """
+        if self._ended and not self._shown and self._end <= self._from:
+            raise UsageError(f"{given.source} has {self._end} bytes: there is no byte {self._from}")
+        if not self.valid and (self._ended or not self._bad):
+            if self._fault is None and self._frame is not None:
+                others = f", and {self.others} of other types" if self.others else ""
+                raise WireError(f"{given.source} has no {self._frame} frame{others}", sensor=self._sensor.id)
+            raise no_frame(self._sensor, given) if self._fault is None else suggest(self._fault, f"lidarspec show {self._sensor.id}")
+        if self._bad or self.others or ((self.damaged or self.unframed) and self._shown > 1):
+            note(", ".join(self._counts()))
+        if self._bad and (self.damaged or self.unframed):
+            raise click.exceptions.Exit(FINDINGS)
+
+    def _counts(self) -> Iterator[str]:
+        yield f"{self.valid} frame{'s' * (self.valid != 1)}"
+        yield f"{self.damaged} damaged"
+        yield f"{self.unframed} byte{'s' * (self.unframed != 1)} in no frame"
+        if self.others:
+            yield f"{self.others} of other types left out"
 
 
-def _sensor(given: Heard, sensor_id: str | None, *, damaged: bool) -> tuple[Sensor, list[str]]:
+def _stretch(text: str | None) -> tuple[float, float]:
+    """From which byte up to which."""
+    first, colon, last = (text or ":").partition(":")
+    try:
+        start, end = int(first or "0", 0), int(last, 0) if last else math.inf
+    except ValueError:
+        start, end = 0, 0
+    if not colon or not 0 <= start < end:
+        raise UsageError(f"{text!r} is no FROM:TO, such as 940:1034, 0x3ac: or :47")
+    return start, end
+
+
+def _compare(
+    sensor: Sensor, given: Heard, found: Iterator[Piece], diff: str, frame: str | None, *, as_json: bool, output: str | None
+) -> None:
+    """Print what differs between the first frame of the input and another one."""
+    frames = (piece for piece in found if piece.frame and (frame is None or piece.frame == frame or not piece.is_valid))
+    first = next(frames, None)
+    if first is None:
+        raise no_frame(sensor, given)
+    if diff == "next":
+        other = next((piece for piece in frames if piece.frame == first.frame), None)
+        if other is None:
+            raise UsageError(f"the input has no second {first.frame} frame to compare with")
+    else:
+        with opened([diff]) as (heard, chunks):
+            second = pieces(sensor, chunks, datagrams=heard.datagrams, frame=frame)
+            other = next((piece for piece in second if piece.frame == first.frame), Piece(0, heard.data, first.frame))
+    (_, before), (_, after) = (next(explained(sensor, piece, frame)) for piece in (first, other))
+    differing = before.differences(after)
+    if as_json:
+        emit_json({"sensor": sensor.id, "frame": before.frame, "differences": [part.to_dict() for part in differing]}, output)
+    else:
+        emit_lines([(Span(f"{sensor.id} {before.frame}", "title"),), *told(differing, (len(before.data), len(after.data)))], output)
+
+
+def _sensor(given: Heard, sensor_id: str | None, *, damaged: bool = False) -> tuple[Sensor, list[str]]:
     """The sensor named, or the one whose bytes these are, and the ids of all whose bytes they could be."""
     if sensor_id is not None:
         return named_sensor(sensor_id), []
@@ -146,45 +291,9 @@ def _sensor(given: Heard, sensor_id: str | None, *, damaged: bool) -> tuple[Sens
     return named_sensor(fault.sensor), []
 
 
-def _explained(sensor: Sensor, piece: Piece) -> Explanation:
-    """A frame explained; "?" for bytes that may begin like one."""
-    try:
-        return explained(piece.data, sensor, None if piece.frame == "?" else piece.frame)
-    except WireError as fault:
-        raise suggest(fault, f"lidarspec show {sensor.id}") from None
-
-
-def _parts(sensor: Sensor, piece: Piece) -> Iterator[tuple[Piece, Explanation]]:
-    """A piece of the input explained; of bytes that are in no frame, those that begin like one as far as they go."""
-    if piece.frame:
-        yield piece, _explained(sensor, piece)
-        return
-    data, end = piece.data, 0
-    for start in likely_starts(sensor, data)[:DAMAGED]:
-        if start < end:
-            continue
-        try:
-            found = explained(data[start:], sensor)
-            left = found.rows[-1].data if found.rows and not found.rows[-1].path else b""
-            found = explained(data[start : len(data) - len(left)], sensor, found.frame)
-        except WireError:
-            continue
-        if start > end:
-            yield _skipped(sensor, Piece(piece.offset + end, data[end:start], ""))
-        end = start + len(found.data)
-        yield Piece(piece.offset + start, found.data, found.frame), found
-    if end < len(data):
-        yield _skipped(sensor, Piece(piece.offset + end, data[end:], ""))
-
-
-def _skipped(sensor: Sensor, piece: Piece) -> tuple[Piece, Explanation]:
-    return piece, Explanation(sensor.id, "", piece.data, (Row(0, piece.data, "", (), ("in no frame",), right=False),))
-
-
-def _title(sensor: Sensor, piece: Piece, part: Explanation | None = None) -> str:
-    kind = part.frame if part is not None else piece.frame
+def _title(sensor: Sensor, piece: Piece, frame: str) -> str:
     where = f" at byte {piece.offset}" if piece.offset else ""
-    return f"{sensor.id} {kind or 'skipped'}{where}, {len(piece.data)} byte{'s' * (len(piece.data) != 1)}"
+    return f"{sensor.id} {frame or 'skipped'}{where}, {len(piece.data)} byte{'s' * (len(piece.data) != 1)}"
 
 
 def _raw_text(raw: Any) -> str:

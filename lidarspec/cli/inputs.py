@@ -3,23 +3,27 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import os
 import re
 import sys
 import time
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from shlex import quote
 
 from lidarspec.cli.output import note
 from lidarspec.device.device import Device
 from lidarspec.device.settings import devices
 from lidarspec.discovery.detect import nearest
-from lidarspec.discovery.listen import Heard
+from lidarspec.discovery.listen import LOOKED_AT, Heard
 from lidarspec.errors import CommandError, LidarSpecError, SourceError, UsageError, WireError, suggest, system_errors
 from lidarspec.plugins import sensors
 from lidarspec.scans.scans import Scan
 from lidarspec.spec.sensor import Sensor
+from lidarspec.transports.files import unhexed
 from lidarspec.transports.open_url import is_port, live_address, transport
+from lidarspec.transports.protocol import Chunk
 from lidarspec.wire.parse import parse_typed
 
 #: longest hexadecimal text that is repeated in the next command, and of other text in a message.
@@ -30,8 +34,9 @@ PATIENCE = 10.0
 LOOK = 0.1
 
 
-def read(words: Sequence[str]) -> Heard:
-    """The input that the words of a command line stand for.
+@contextlib.contextmanager
+def opened(words: Sequence[str]) -> Iterator[tuple[Heard, Iterator[Chunk]]]:
+    """The beginning of the input that the words of a command line stand for, and all of it, which is read as it is asked for.
 
     Raises:
         UsageError: for text that is neither hexadecimal nor a file.
@@ -39,31 +44,89 @@ def read(words: Sequence[str]) -> Heard:
     """
     text = " ".join(words)
     if text == "-":
-        data = sys.stdin.buffer.read()
-        return Heard("-", (_unhexed(data) or data,))
-    if len(words) == 1 and os.path.exists(text) and not is_port(text):
-        return _file(text)
-    try:
-        return Heard(text if len(text) <= REPEATED else "-", (_bytes(text),))
-    except ValueError as error:
-        if text in (known := devices()):
-            return read([known[text].source])
-        if len(words) == 1 and live_address(text) is not None:
-            raise suggest(UsageError(f"{text} is live: this takes bytes or a file"), f"lidarspec read {quote(text)} --packets") from None
-        if len(words) == 1 and re.search(r"[/\\.]", text):
-            raise SourceError(f"{text}: no such file") from None
-        raise UsageError(f"{text[:QUOTED]!r} is no file, and not hexadecimal: {error}") from None
+        reading = _beginning(text, _standard_input(), datagrams=False)
+    elif len(words) == 1 and os.path.exists(text) and not is_port(text):
+        reading = _file(text)
+    else:
+        try:
+            if not (data := unhexed(text)):
+                raise ValueError("there are no digits")
+            reading = _beginning(text if len(text) <= REPEATED else "-", iter([Chunk(data)]), datagrams=False)
+        except ValueError as error:
+            known = devices()
+            if text not in known:
+                raise _no_bytes(words, error) from None
+            reading = opened([known[text].source])
+    with reading as given:
+        yield given
 
 
-def refuse_overwriting(source: str, target: str, what: str = "source") -> None:
-    """Nothing, where a file is written to that is not the one that is read.
+@contextlib.contextmanager
+def _file(path: str) -> Iterator[tuple[Heard, Iterator[Chunk]]]:
+    with contextlib.closing(transport(path)) as file, _beginning(path, file.chunks(), datagrams=file.datagrams) as given:
+        yield given
+
+
+@contextlib.contextmanager
+def _beginning(source: str, chunks: Iterator[Chunk], *, datagrams: bool) -> Iterator[tuple[Heard, Iterator[Chunk]]]:
+    head, size = list[Chunk](), 0
+    with system_errors(source):
+        for chunk in chunks:
+            head.append(chunk)
+            if (size := size + len(chunk.data)) >= LOOKED_AT:
+                break
+    yield Heard(source, tuple(chunk.data for chunk in head), datagrams), itertools.chain(head, _rest(source, chunks))
+
+
+def _rest(source: str, chunks: Iterator[Chunk]) -> Iterator[Chunk]:
+    with system_errors(source):
+        yield from chunks
+
+
+def _standard_input() -> Iterator[Chunk]:
+    """What comes over standard input, as it comes; hexadecimal text as the bytes that it stands for."""
+    head = sys.stdin.buffer.read(LOOKED_AT)
+    if head.isascii():
+        head += sys.stdin.buffer.read()
+        with contextlib.suppress(ValueError):
+            head = unhexed(head.decode("ascii"))
+    yield Chunk(head)
+    yield from transport("-").chunks()
+
+
+def read(words: Sequence[str]) -> Heard:
+    """The whole input that the words of a command line stand for.
 
     Raises:
-        UsageError: where it is.
+        UsageError: for text that is neither hexadecimal nor a file.
+        SourceError: for a file that cannot be read.
+    """
+    with opened(words) as (given, chunks):
+        return replace(given, chunks=tuple(chunk.data for chunk in chunks))
+
+
+def _no_bytes(words: Sequence[str], error: ValueError) -> LidarSpecError:
+    """Why words are neither a file nor hexadecimal digits."""
+    text = " ".join(words)
+    if len(words) == 1 and live_address(text) is not None:
+        return suggest(UsageError(f"{text} is live: this takes bytes or a file"), f"lidarspec read {quote(text)} --packets")
+    if len(words) == 1 and re.search(r"[/\\.]", text):
+        return SourceError(f"{text}: no such file")
+    return UsageError(f"{text[:QUOTED]!r} is no file, and not hexadecimal: {error}")
+
+
+def refuse_overwriting(source: str, target: str, what: str = "source", *, force: bool = True) -> None:
+    """Nothing, where a file is written to that is not the one that is read, and with `force` off is new.
+
+    Raises:
+        UsageError: where it is not.
     """
     path = source.partition("?")[0]
     if os.path.exists(path) and os.path.exists(target) and os.path.samefile(path, target):
         raise UsageError(f"{target} is the {what}: it would be overwritten")
+    if not force and os.path.exists(target):
+        error = UsageError(f"{target} exists already; it is not overwritten unless asked for")
+        raise suggest(error, "the same with --force, or with another file")
 
 
 def no_frame(sensor: Sensor, given: Heard) -> WireError:
@@ -151,27 +214,3 @@ def scans_of(device: Device, source: str) -> Iterator[Scan]:
         if scan is not None:
             yield scan
         patience.check()
-
-
-def _file(path: str) -> Heard:
-    with system_errors(path), contextlib.closing(transport(path)) as opened:
-        return Heard(path, tuple(chunk.data for chunk in opened.chunks()), opened.datagrams)
-
-
-def _bytes(text: str) -> bytes:
-    """The bytes of hexadecimal text, with spaces, commas, colons and 0x as one likes."""
-    digits = re.sub(r"0[xX]|[\s,:]", "", text)
-    bad = re.search(r"[^0-9a-fA-F]", digits)
-    if bad or not digits:
-        raise ValueError(f"{bad[0]!r} is no digit of it" if bad else "there are no digits")
-    if len(digits) % 2:
-        raise ValueError(f"{len(digits)} digits make no whole bytes")
-    return bytes.fromhex(digits)
-
-
-def _unhexed(data: bytes) -> bytes | None:
-    """The bytes that a text stands for, None where it is not hexadecimal."""
-    try:
-        return _bytes(data.decode("ascii"))
-    except ValueError:
-        return None

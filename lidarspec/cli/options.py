@@ -65,6 +65,13 @@ def _duration(text: str) -> float:
     return seconds
 
 
+def _offset(text: str) -> int:
+    offset = int(text, 0)
+    if offset < 0:
+        raise ValueError(text)
+    return offset
+
+
 def _speed(text: str) -> float:
     speed = 0.0 if text == "max" else float(text.removesuffix("x"))
     if text != "max" and not 0 < speed < math.inf:
@@ -76,5 +83,7 @@ def _speed(text: str) -> float:
 DURATION = Number("duration", _duration, "duration above 0, such as 10s, 500ms, 2min or 1h")
 #: a number from 0 to 1, from "1%" or "0.01".
 SHARE = Number("share", share, "share, such as 1% or 0.01")
+#: bytes, from "940" or "0x3ac".
+OFFSET = Number("offset", _offset, "offset of a byte, such as 940 or 0x3ac")
 #: a factor above 0; 0 for "max".
 SPEED = Number("speed", _speed, "speed: a factor such as 1, 0.5 or 10, or max")

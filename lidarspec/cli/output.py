@@ -11,6 +11,7 @@ import textwrap
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
+from textwrap import indent
 from typing import Any
 
 import click
@@ -88,36 +89,62 @@ def emit(content: str | bytes, output: str | None) -> None:
     Raises:
         SourceError: where the file cannot be written.
     """
+    emit_parts([content], output)
+
+
+def emit_parts(parts: Iterable[str | bytes], output: str | None, *, colour: bool | None = None) -> None:
+    """Texts, a line or more each, or bytes, as they are made; the same places as `emit`; `colour`: whether colours stay in a pipe."""
     if output is None or output == "-":
-        click.echo(content, nl=isinstance(content, str))
+        for part in parts:
+            click.echo(part, nl=isinstance(part, str), color=colour)
         return
     from lidarspec.formats import replacing  # and all that scans are made of, for the verbs that write a file
 
     path = Path(output)
     is_replaced = path.is_file() or not path.exists()  # and not a device or a pipe
-    with system_errors(output), replacing(path) if is_replaced else contextlib.nullcontext(path) as part:
-        part.write_bytes(content if isinstance(content, bytes) else f"{content}\n".encode())
+    with system_errors(output), replacing(path) if is_replaced else contextlib.nullcontext(path) as written, written.open("wb") as file:
+        for part in parts:
+            file.write(part if isinstance(part, bytes) else f"{part}\n".encode())
 
 
 def emit_lines(lines: Iterable[Line], output: str | None) -> None:
-    """Lines with roles: in colours on a terminal, and folded to its width; as plain text anywhere else.
+    """Lines with roles, as they are made: in colours on a terminal, and folded to its width; as plain text anywhere else.
 
     NO_COLOR and FORCE_COLOR are obeyed; what goes through a pipe in colours is not folded.
     """
-    if output is None and (console := Console()).is_terminal:
-        found = Text()
-        for line in lines:
-            for span in folded(line, console.width) if sys.stdout.isatty() else line:
-                found.append(span.text, STYLES.get(span.role))
-            found.append("\n")
-        click.echo(drawn(found), color=True)
+    console = Console()
+    if output is not None or not console.is_terminal:
+        emit_parts(map(plain_text, lines), output)
         return
-    emit("\n".join(plain_text(line) for line in lines), output)
+    width = console.width if sys.stdout.isatty() else None
+    emit_parts((_coloured(line, width) for line in lines), output, colour=True)
+
+
+def _coloured(line: Line, width: int | None) -> str:
+    drawing = Text()
+    for span in line if width is None else folded(line, width):
+        drawing.append(span.text, STYLES.get(span.role))
+    return drawn(drawing)
 
 
 def emit_json(value: Any, output: str | None) -> None:
     """A value as JSON; the same places as `emit`."""
     emit(json.dumps(value, indent=2, allow_nan=False), output)
+
+
+def emit_json_list(head: dict[str, Any], name: str, items: Iterable[Any], output: str | None) -> None:
+    """An object as JSON whose last entry is a list, each item as it is made; the same places as `emit`."""
+    beginning = json.dumps({**head, name: []}, indent=2, allow_nan=False).removesuffix("]\n}")
+    emit_parts(itertools.chain(_items(beginning, items), ["  ]\n}"]), output)
+
+
+def _items(beginning: str, items: Iterable[Any]) -> Iterator[str]:
+    """Each item with the comma that belongs behind it: one is held back until the next is there."""
+    held = beginning
+    for number, item in enumerate(items):
+        yield held + "," * bool(number)
+        held = indent(json.dumps(item, indent=2, allow_nan=False), "    ")
+    yield held
 
 
 def note(text: str) -> None:

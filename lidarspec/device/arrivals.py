@@ -16,7 +16,7 @@ import numpy as np
 
 from lidarspec.captures.bulk import first_frames
 from lidarspec.device.session import Reply
-from lidarspec.errors import CommandError, UsageError, suggest
+from lidarspec.errors import CommandError, SourceError, UsageError, suggest
 from lidarspec.framing.decoder import Decoder
 from lidarspec.framing.results import Counters, Found, Frames
 from lidarspec.spec.sensor import Sensor
@@ -104,6 +104,14 @@ class Input(Protocol):
         Raises:
             UnknownCommand, UnknownField, MissingField, OutOfRange: for what the sensor does not take; nothing is sent.
             CommandError: where the device refuses, the connection is lost or there is no device; ReplyTimeout where it keeps silent.
+        """
+
+    def write(self, data: bytes, link: str = "data") -> None:
+        """Send bytes as they are; what answers them is read as everything else.
+
+        Raises:
+            UsageError: for a text, and for a link that the sensor does not have.
+            SourceError: where the connection is lost, or there is no device.
         """
 
     def first_state(self) -> dict[str, bytes]:
@@ -248,6 +256,9 @@ class FileInput(Input):
 
     def send(self, name: str, *, timeout: float | None = None, **arguments: Any) -> Reply:
         raise CommandError(f"{self._sensor.id} {name}: {self._source} is a file, there is no device to send it to")
+
+    def write(self, data: bytes, link: str = "data") -> None:
+        raise SourceError(f"{self._source} is a file, there is no device to send bytes to")
 
     def close(self) -> None:
         self.state = "closed"

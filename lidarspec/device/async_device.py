@@ -127,6 +127,19 @@ class AsyncDevice:
         """
         return await self._run(self._sender, partial(self.device.send, name, timeout=timeout, **arguments))
 
+    async def write(self, data: bytes, link: str = "data") -> None:
+        """Send bytes by hand, as they are; nothing is waited for, and what answers them comes with everything else.
+
+        Args:
+            data: the bytes; nobody looks at what they say, so that a sensor that they start is not stopped on closing.
+            link: over which of the sensor's links.
+
+        Raises:
+            UsageError: for a text, and for a link that the sensor does not have.
+            SourceError: where the connection is lost, or there is no device.
+        """
+        await self._run(self._sender, partial(self.device.write, data, link))
+
     async def close(self) -> None:
         """Stop the sensor where it was started, and give the source back; a second call does nothing."""
         if self._device is not None:

@@ -264,6 +264,19 @@ class Device(Closing):
         """
         return self._input.send(name, timeout=timeout, **arguments)
 
+    def write(self, data: bytes, link: str = "data") -> None:
+        """Send bytes by hand, as they are; nothing is waited for, and what answers them comes with everything else.
+
+        Args:
+            data: the bytes; nobody looks at what they say, so that a sensor that they start is not stopped on closing.
+            link: over which of the sensor's links.
+
+        Raises:
+            UsageError: for a text, and for a link that the sensor does not have.
+            SourceError: where the connection is lost, or there is no device.
+        """
+        self._input.write(data, link)
+
     def leave_on(self) -> None:
         """Let the sensor go on as it is when the device is closed."""
         self._input.stays_on = True

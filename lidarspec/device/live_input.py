@@ -19,11 +19,10 @@ from typing import Any
 from lidarspec.device.arrivals import Arrival, Input, Senders, answers, fed
 from lidarspec.device.capture_thread import BoundedQueue, Capture, Event, Mark
 from lidarspec.device.session import Outgoing, Pending, Reply, Session
-from lidarspec.errors import CommandError, LidarSpecError, ReplyTimeout, suggest
+from lidarspec.errors import CommandError, LidarSpecError, ReplyTimeout, SourceError, UsageError, refuse_text, suggest
 from lidarspec.framing.decoder import Decoder, backend as backend_named
 from lidarspec.framing.results import Counters, Frames
 from lidarspec.recording.appending import Log
-from lidarspec.spec.description import Command
 from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.open_url import control_link, has_control
 from lidarspec.transports.protocol import Chunk, LiveTransport
@@ -203,7 +202,8 @@ class LiveInput(Input):
 
     def send(self, name: str, *, timeout: float | None = None, **arguments: Any) -> Reply:
         if name in self.sensor.commands:
-            self._await_sender(self.sensor.commands[name], timeout)
+            command = self.sensor.commands[name]
+            self._await_sender(command.link, command.timeout * (1 + command.retries) if timeout is None else timeout)
         with self._talk:
             pending = self._session.request(name, time.monotonic_ns(), timeout=timeout, **arguments)
             self._speak()
@@ -213,12 +213,22 @@ class LiveInput(Input):
             self._help(pending)
         return pending.result()
 
-    def _await_sender(self, command: Command, timeout: float | None) -> None:
-        """Wait for a first datagram where it alone says where the sensor is, as long as for a reply."""
+    def write(self, data: bytes, link: str = "data") -> None:
+        refuse_text(data)
+        if link not in self.sensor.links:
+            raise UsageError(f"{self.sensor.id} has no link {link!r}; its links are {', '.join(self.sensor.links)}")
+        if self._closed:
+            raise SourceError(f"{self._source}: the device is closed")
+        self._await_sender(link, PATIENCE)
+        with self._talk:
+            self._write(Outgoing(link, bytes(data)))
+
+    def _await_sender(self, link: str, seconds: float) -> None:
+        """Wait for a first datagram where it alone says where the sensor is."""
         data = self._captures["data"].transport
-        if command.link not in self._captures and (data.peer() or has_control(self._source)):
+        if link not in self._captures and (data.peer() or has_control(self._source)):
             return
-        limit = time.monotonic() + (command.timeout * (1 + command.retries) if timeout is None else timeout)
+        limit = time.monotonic() + seconds
         while not data.addressed and self._failure is None and time.monotonic() < limit:
             self._help()
 

@@ -295,17 +295,8 @@ def _nothing(source: str, found: Sequence[Verdict]) -> Exception:
     return suggest(error, f"lidarspec doctor {source}")
 
 
-#: constant bits that make bytes look like a frame, and constant bytes that do so in the midst of others.
-ALIKE, SYNC = 8, 2
-
-
-@dataclass(frozen=True)
-class Piece:
-    """A frame in the input, or with `frame` "" bytes that are in none."""
-
-    offset: int
-    data: bytes
-    frame: str
+#: constant bits that make bytes look like a frame.
+ALIKE = 8
 
 
 def fitting(chunks: Sequence[bytes], *, datagrams: bool) -> list[Sensor]:
@@ -317,37 +308,6 @@ def fitting(chunks: Sequence[bytes], *, datagrams: bool) -> list[Sensor]:
         return whole
     found = scores(chunks, datagrams=datagrams) if data else []
     return [score.sensor for score in found if score.share >= found[0].share - AS_GOOD]
-
-
-def pieces(sensor: Sensor, chunks: Sequence[bytes], *, datagrams: bool) -> list[Piece]:
-    """The frames of the input in order, and the bytes between them; empty where there is no frame."""
-    data = b"".join(chunks)
-    try:
-        return [Piece(0, data, parse_typed(sensor, data)[0])]
-    except LidarSpecError:
-        frames = sensor.split(list(chunks) if datagrams else data)
-    if not frames:
-        return []
-    found: list[Piece] = []
-    end = 0
-    for frame in frames:
-        if frame.offset > end:
-            found.append(Piece(end, data[end : frame.offset], ""))
-        found.append(Piece(frame.offset, frame.data, frame.frame))
-        end = frame.offset + len(frame.data)
-    return found + ([Piece(end, data[end:], "")] if end < len(data) else [])
-
-
-def likely_starts(sensor: Sensor, data: bytes) -> list[int]:
-    """Where bytes begin like an incoming frame: with two constant bytes or more, and any other; in ascending order."""
-    starts: set[int] = set()
-    for frame in sensor.frames.values():
-        prefix = codec(frame).prefix
-        size = next((spot for spot in range(len(prefix) + 1) if prefix.get(spot, (0, 0))[0] != 0xFF), 0)
-        if frame.direction == "in" and size >= SYNC:
-            magic = bytes(prefix[spot][1] for spot in range(size))
-            starts |= {found.start() for found in re.finditer(re.escape(magic) + b"(?=.)", data, re.DOTALL)}
-    return sorted(starts)
 
 
 def nearest(data: bytes) -> WireError | None:

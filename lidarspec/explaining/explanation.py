@@ -2,8 +2,8 @@
 
 construct itself reads the frame, unverified, and notes every part on its way (`_Trail`). So a frame that is cut off is explained as
 far as it goes, one without a computable layout like any other, and no offset is known here. What the author says of a part comes from the
-frame tree: names of values, units, constants, and which bits of a block are whose. Of a damaged frame each single bit is
-flipped and tried, through the engine itself, for the one that would make it whole again. A valid frame goes on to its points.
+frame tree: names of values, units, constants, and which bits of a block are whose. A damaged frame is told with what would explain
+the damage, a valid one goes on to its points.
 """
 
 from __future__ import annotations
@@ -14,15 +14,16 @@ import itertools
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from lidarspec.errors import LidarSpecError, WireError
+from lidarspec.explaining.damage import told
 from lidarspec.explaining.listing import Line, Listing, text
 from lidarspec.explaining.wording import Difference, Point, Row, Span, Value
-from lidarspec.framing.frame_engine import Codec, CompiledCodec, codec
-from lidarspec.framing.results import IMPLAUSIBLE, VALID, Counters, Found, packed
+from lidarspec.framing.frame_engine import codec
+from lidarspec.framing.results import IMPLAUSIBLE, Counters, Found, packed
 from lidarspec.packets.stream import PacketStream
 from lidarspec.points.plain import evaluate
 from lidarspec.spec import Checksummed, Frame, Sensor
@@ -33,17 +34,15 @@ from lidarspec.wire.parse import parse_typed
 from lidarspec.wire.schema import schema
 from lidarspec.wire.wire_table import bit_text, hexed
 
-#: bytes of candidates that are tried in one go, and the longest frame that construct alone has to read so often.
-BLOCK, INTERPRETED = 1 << 20, 128
 #: most points of a frame without arrays that are told.
 TOLD = 4
-#: most decimals that steps are told apart by, those that may be added to show one in full, and most flipped bits that are told one by one.
-DIGITS, SPARE, FLIPS = 12, 2, 3
+#: most decimals that steps are told apart by, and those that may be added to show one in full.
+DIGITS, SPARE = 12, 2
 
 Keys = tuple[str | int, ...]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Explanation:
     """A frame explained: rows that name every byte exactly once, in order. Its text is the listing that the command line prints.
 
@@ -62,6 +61,9 @@ class Explanation:
     fault: WireError | None = None
     notes: tuple[str, ...] = ()
 
+    def __repr__(self) -> str:
+        return f"Explanation({self.sensor} {self.frame or 'skipped'}, {len(self.data)} bytes: {self.verdict})"
+
     def __str__(self) -> str:
         return "\n".join(text(line) for line in self.lines())
 
@@ -74,6 +76,11 @@ class Explanation:
     def verdict(self) -> str:
         """What is wrong with the frame, in one sentence; "valid" where nothing is."""
         return "valid" if self.fault is None else self.fault.reason
+
+    @property
+    def is_filler(self) -> bool:
+        """Whether it is no frame, and nothing but bytes that the sensor sends between frames."""
+        return not self.frame and all(row.right for row in self.rows)
 
     def lines(self, *, every: bool = False) -> list[Line]:
         """The listing in pieces; `every` draws the bits of all elements of an array, and not of the first alone."""
@@ -116,7 +123,11 @@ def explain(data: bytes, sensor: Sensor, frame: str | None = None) -> Explanatio
     trail = _Trail(sensor.frames[name], data)
     rows = (*trail.rows(), *trail.rest(fault))
     if fault is not None and not fits(sensor, data[: trail.end], name):
-        return Explanation(sensor.id, name, data, rows, fault, tuple(_flipped(sensor, name, data, trail)))
+
+        def values(sent: bytes) -> dict[str, Value]:
+            return _Trail(sensor.frames[name], sent).values()
+
+        return Explanation(sensor.id, name, data, rows, fault, tuple(told(sensor.frames[name], data, values)))
     points, notes = _points(sensor, name, data[: trail.end], rows)
     rows = tuple(replace(row, points=given) for row, given in zip(rows, points, strict=True))
     return Explanation(sensor.id, name, data, rows, fault, notes)
@@ -129,63 +140,6 @@ def fits(sensor: Sensor, data: bytes, name: str) -> bool:
     except WireError:
         return False
     return True
-
-
-class Flip(NamedTuple):
-    """A bit that may have flipped: byte of the frame, and bit of it, 0 the lowest."""
-
-    offset: int
-    bit: int
-
-    def mended(self, data: bytes) -> bytes:
-        """The bytes with this bit turned back."""
-        return data[: self.offset] + bytes([data[self.offset] ^ 1 << self.bit]) + data[self.offset + 1 :]
-
-
-def flips(sensor: Sensor, name: str, data: bytes) -> list[Flip]:
-    """Every single bit of which the opposite makes the bytes one valid and plausible frame of this type."""
-    frame = sensor.frames[name]
-    engine = codec(frame)
-    if not 0 < len(data) <= frame.max_length or (not isinstance(engine, CompiledCodec) and len(data) > INTERPRETED):
-        return []
-    if engine.size not in (None, len(data)) or any(offset >= len(data) for offset in engine.prefix):
-        return []
-    wrong = {offset for offset, (mask, value) in engine.prefix.items() if data[offset] & mask != value}
-    if len(wrong) > 1:
-        return []
-    tried = [Flip(offset, bit) for offset in wrong or range(len(data)) for bit in range(8)]
-    size = max(1, BLOCK // len(data))
-    return [flip for first in range(0, len(tried), size) for flip in _mending(tried[first : first + size], data, engine)]
-
-
-def _mending(tried: list[Flip], data: bytes, engine: Codec) -> list[Flip]:
-    """The flips after which the bytes are one valid and plausible frame."""
-    rows = np.tile(np.frombuffer(data, np.uint8), (len(tried), 1))
-    rows[np.arange(len(tried)), [flip.offset for flip in tried]] ^= np.array([1 << flip.bit for flip in tried], np.uint8)
-    fits = np.ones(len(tried), np.bool_)
-    for offset, (mask, value) in engine.prefix.items():
-        fits &= rows[:, offset] & mask == value
-    fitting = np.flatnonzero(fits)
-    if not len(fitting):
-        return []
-    survey = engine.survey(rows.reshape(-1), fitting * len(data))
-    right = (survey.status == VALID) & (survey.sizes == len(data))
-    return [tried[number] for number in fitting[right].tolist()]
-
-
-def _flipped(sensor: Sensor, name: str, data: bytes, trail: _Trail) -> Iterator[str]:
-    """Which single flipped bit would explain the damage, with what its field would have said."""
-    mending = flips(sensor, name, data)
-    if len(mending) > FLIPS:
-        yield f"one flipped bit would explain it, but in any of {len(mending)} places, so that nothing can be said of where"
-        return
-    before = trail.values()
-    for flip in mending:
-        after = _Trail(sensor.frames[name], flip.mended(data)).values()
-        path = next((path for path, value in after.items() if value.holds(flip.offset, flip.bit)), "")
-        values = [str(part[path]) for part in (before, after) if path in part]
-        said = f", {path} {', sent as '.join(values)}" if path and all(values) else f", {path}" if path else ""
-        yield f"{'one' if len(mending) == 1 else 'a'} flipped bit would explain it: byte {flip.offset} bit {flip.bit}{said}"
 
 
 class _Trail:

@@ -85,6 +85,10 @@ class Value:
         place = offset - self.start
         return 0 <= place < len(self.masks) and bool(self.masks[place] >> bit & 1)
 
+    def covers(self, offset: int) -> bool:
+        """Whether it has bits in a byte of the frame."""
+        return any(self.holds(offset, bit) for bit in range(8))
+
     def __str__(self) -> str:
         if self.physical is None:
             return ascii_text(self.raw) if isinstance(self.raw, bytes | bytearray) else repr(self.raw)

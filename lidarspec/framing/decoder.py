@@ -65,6 +65,9 @@ class Decoder:
         self._least = max(LEAST, 2 * self._framing.reach)
         self._size = max(PIECE, self._least)
 
+    def __repr__(self) -> str:
+        return f"Decoder({self.sensor.id}, {'stream' if self.stream else 'datagrams'}, {self.backend}: {self.stats})"
+
     def feed(self, data: Data, at: int | None = None) -> list[Found]:
         """The frames that these bytes complete, in stream order. Raises on no bytes whatever.
 

@@ -31,11 +31,14 @@ VALID, SHORT, LENGTH, CONSTANT, CHECKSUM, IMPLAUSIBLE, PLUGIN = range(7)
 #: layouts whose frames are found one layout after another sooner than by sorting, and sooner than by counting first.
 FEW, FEWER = 16, 4
 
+#: bytes that the repr of a frame shows.
+SHOWN = 8
+
 #: which counter a rejected candidate raises.
 COUNTED = {SHORT: "bad_length", LENGTH: "bad_length", CHECKSUM: "bad_checksum", IMPLAUSIBLE: "implausible", PLUGIN: "plugin_errors"}
 
 
-@dataclass
+@dataclass(repr=False)
 class Counters:
     """What became of the input. ``bytes_in == bytes in frames + bytes_skipped + pending`` always holds.
 
@@ -92,12 +95,15 @@ class Counters:
             reason, path=first.path, sensor=sensor, rule=first.rule, file=first.file, line=first.line, traceback=first.traceback
         )
 
+    def __repr__(self) -> str:
+        return f"Counters({self})"
+
     def __str__(self) -> str:
         parts = [f"{name} {value}" for name, value in self.to_dict().items() if value and name != "frames"]
         return ", ".join([*(f"{number} {name} frames" for name, number in self.frames.items()), *parts]) or "nothing yet"
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, repr=False)
 class Found:
     """One frame in the input.
 
@@ -114,6 +120,10 @@ class Found:
     data: bytes
     at: int | None = None
     gap: int = 0
+
+    def __repr__(self) -> str:
+        begin = f"{self.data[:SHOWN].hex(' ')}{' ...' * (len(self.data) > SHOWN)}"
+        return f"Found({self.frame} at byte {self.offset}, {len(self.data)} bytes: {begin})"
 
 
 class Frames:

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.columns.columns import Carry
+from lidarspec.errors import UsageError
 from lidarspec.packets.packets import Packets, joined as joined_packets
 from lidarspec.packets.sequences import Reorder
 from lidarspec.points.cloud import ColumnSource, LazyCloud, Mount, PointCloud, Stretch, Stretches, source_of
@@ -73,12 +75,20 @@ class Scan:
         return f"Scan({len(self)} points, {rate}{span}, {'complete' if self.complete else 'partial'})"
 
     def to_bins(self, n: int) -> NDArray[np.float32]:
-        """The nearest return in each of n equal sectors from -pi on: (n,) float32 metres, inf where there is none."""
-        return self._binned(n)[0]
+        """The nearest return in each of n equal sectors from -pi on: (n,) float32 metres, inf where there is none.
+
+        Raises:
+            UsageError: for a number of sectors that is none.
+        """
+        return self._binned(_sectors(n, "to_bins"))[0]
 
     def to_laserscan(self, n: int | None = None) -> LaserScan:
-        """The scan on an even grid of n angles over the whole turn, by default as many as there are points."""
-        count = max(len(self), 1) if n is None else n
+        """The scan on an even grid of n angles over the whole turn, by default as many as there are points.
+
+        Raises:
+            UsageError: for a number of angles that is none.
+        """
+        count = max(len(self), 1) if n is None else _sectors(n, "to_laserscan")
         ranges, intensities = self._binned(count, centred=True)
         step = 2 * np.pi / count
         period = (
@@ -101,6 +111,12 @@ class Scan:
         if self.points.intensity is not None:
             strength[bins[chosen]] = self.points.intensity[valid][chosen]
         return binned, strength
+
+
+def _sectors(number: Any, place: str) -> int:
+    if isinstance(number, bool) or not isinstance(number, int | np.integer) or number < 1:
+        raise UsageError(f"{place} takes how many sectors the turn has, a whole number from 1 on, not {number!r}")
+    return int(number)
 
 
 class ScanStream:

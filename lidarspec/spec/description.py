@@ -21,7 +21,7 @@ from lidarspec.spec.construct_layer import check_struct, fixed_size, frame_tree,
 from lidarspec.spec.links import Link, is_datagram
 from lidarspec.spec.results import Points
 from lidarspec.spec.timing import Clock, Sequence, Split
-from lidarspec.spec.tree import Node
+from lidarspec.spec.tree import Node, Sealed, children
 
 #: version of the plugin interface; the engine reads this one and the one before.
 API = 1
@@ -105,6 +105,13 @@ class Frame:
         if not longest:
             raise SpecError("max_length may be left out only where the struct has a fixed size")
         object.__setattr__(self, "max_length", longest)
+
+    def __repr__(self) -> str:
+        size = fixed_size(self.prepared)
+        kind = "data, " if self.data else "out, " if self.direction == "out" else ""
+        root = self.tree.body if isinstance(self.tree, Sealed) else self.tree
+        names = [member.name for member in children(root) if member.name]
+        return f"Frame({kind}{size or f'up to {self.max_length}'} bytes{': ' * bool(names)}{', '.join(names)})"
 
     @cached_property
     def tree(self) -> Node:

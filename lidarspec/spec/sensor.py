@@ -66,19 +66,20 @@ class Sensor(Spec):
         function = self.configure.function if isinstance(self.configure, Configure) else self.configure
         object.__setattr__(self, "configure", Configure(self, function))
 
-    def parse(self, data: bytes, frame: str | None = None, *, verify: bool = True) -> Any:
+    def parse(self, data: bytes, frame: str | None = None, *, verify: bool = True, units: bool = False) -> Any:
         """Exactly one frame as a construct Container of raw wire integers.
 
         Args:
             frame: its type; found out where left out.
             verify: False accepts wrong constants, a wrong checksum and trailing bytes.
+            units: physical values, as ``build(units=True)`` takes them: those of scaled fields in their units, others as they are.
 
         Raises:
             WireError: where the bytes are not such a frame: sensor, offset, field path, expected and got.
         """
         from lidarspec.wire.parse import parse
 
-        return parse(self, data, frame=frame, verify=verify)
+        return parse(self, data, frame=frame, verify=verify, units=units)
 
     def build(self, frame: str, value: Any = None, /, *, units: bool = False, **values: Any) -> bytes:
         """The bytes of one frame; constants, counts and the checksum are filled in.

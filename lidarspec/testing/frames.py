@@ -16,7 +16,8 @@ from typing import Any
 import numpy as np
 
 from lidarspec.errors import SpecError, UsageError, WireError
-from lidarspec.explaining.explanation import fits, flips
+from lidarspec.explaining.damage import changes
+from lidarspec.explaining.explanation import fits
 from lidarspec.framing.frame_engine import CompiledCodec, codec
 from lidarspec.framing.results import VALID
 from lidarspec.spec.tree import FieldInfo
@@ -287,10 +288,10 @@ def every_single_bit_error_is_seen(subject: Subject, name: str) -> None:
         if any(int(seal.stored(row)[0]) in seal.absent for seal in layout.seals):
             continue
         sealed = bool(layout.seals)
-        passing = flips(subject.sensor, name, data)
+        passing = changes(subject.sensor.frames[name], data, ["flipped bit"])
         tried, passed = tried + 8 * len(data), passed + len(passing)
         covered = {byte for seal in layout.seals if not seal.absent for start, end in seal.spans for byte in range(start, end)}
-        for byte, bit in passing:
+        for _, byte, bit in passing:
             field = next((path for path, (start, end) in layout.places.items() if start <= byte < end), "")
             place = f"{name}.{field}".rstrip(".")
             require(byte not in covered, "LS310", f"bit {bit} of byte {byte} is flipped, and the frame passes", place)

@@ -34,6 +34,7 @@ from lidarspec.testing.findings import Violation, require
 from lidarspec.testing.frames import leaves
 from lidarspec.testing.geometry import read
 from lidarspec.testing.subject import SHORT, Subject, seals
+from lidarspec.transports.files import unhexed
 from lidarspec.wire.layout import Layout
 
 #: what a point may differ by: metres and radians as manuals print them.
@@ -54,13 +55,13 @@ def vectors_hold(subject: Subject) -> None:
     """Every golden vector parses to its values, builds again, and has its points where they are said to be."""
     for place, vector in entries(subject).items():
         require(str(vector.get("source", "")).strip(), "LS701", "it names no source", place)
-        data = bytes.fromhex(vector["hex"])
+        data = unhexed(vector["hex"])
         name = vector["frame"]
         parsed = _parsed(subject, name, data, place)
         _values(subject, name, data, parsed, vector, place)
         require(subject.sensor.build(name, parsed) == data, "LS302", "its bytes do not survive parsing and building", f"{place} {name}")
         if "command" in vector:
-            answer = bytes.fromhex(vector["reply"]) if "reply" in vector else None
+            answer = unhexed(vector["reply"]) if "reply" in vector else None
             an_exchange_holds(subject.sensor, vector["command"], vector.get("args", {}), data, answer, f"{place} {vector['command']}")
         if vector.get("points"):
             _points(subject, name, data, vector["points"], place)
@@ -88,7 +89,7 @@ def every_data_field_is_pinned_down(subject: Subject, name: str) -> None:
     require(vectors, "LS711", f"no vector is a {name!r} frame", name)
     pinned: dict[str, bool] = {}
     for vector in vectors:
-        read_as = dict(leaves(_parsed(subject, name, bytes.fromhex(vector["hex"]), name)))
+        read_as = dict(leaves(_parsed(subject, name, unhexed(vector["hex"]), name)))
         for path in (*vector.get("values", {}), *vector.get("units", {})):
             plain = re.sub(r"\[\d+\]", "", path)
             pinned[plain] = pinned.get(plain, False) or bool(read_as.get(path))
@@ -106,7 +107,7 @@ def points_stand_in_two_quadrants(subject: Subject, name: str) -> None:
     vectors = [vector for vector in entries(subject).values() if vector["frame"] == name]
     placed = [point for vector in vectors for point in vector.get("points", {}).values() if {"x", "y"} <= point.keys()]
     quadrants = {(point["x"] > 0, point["y"] > 0) for point in placed if point["x"] and point["y"]}
-    clouds = [read(subject, name, [bytes.fromhex(vector["hex"])] * subject.sensor.frames[name].confirm).points() for vector in vectors]
+    clouds = [read(subject, name, [unhexed(vector["hex"])] * subject.sensor.frames[name].confirm).points() for vector in vectors]
     ranges = np.concatenate([np.empty(0), *(cloud.range[cloud.valid] for cloud in clouds)])
     seen = f"{ranges.min():.4g} .. {ranges.max():.4g} m" if len(ranges) else "no returns"
     number = f"{len(quadrants)} quadrant{'s' * (len(quadrants) != 1)}"
@@ -128,7 +129,7 @@ def every_checksum_is_checked(subject: Subject, name: str) -> None:
     free = [path for path, info in subject.fields(name).items() if info.const is None and path not in sealing]
     named = [path for path in free if CHECK.fullmatch(path.rpartition(".")[2])]
     try:
-        frames = [bytes.fromhex(vector["hex"]) for vector in entries(subject).values() if vector["frame"] == name]
+        frames = [unhexed(vector["hex"]) for vector in entries(subject).values() if vector["frame"] == name]
     except Violation:  # said by `vectors_hold`
         frames = []
     for match in [] if sealing else _common(frames):
@@ -184,8 +185,8 @@ def entries(subject: Subject) -> dict[str, Any]:
             require(sends, "LS702", f"no command {vector['command']!r} sends such a frame", place)
         require(vector.get("frame") in subject.sensor.frames, "LS702", f"there is no frame {vector.get('frame')!r}", place)
         try:
-            bytes.fromhex(vector.get("hex", "-"))
-            bytes.fromhex(vector.get("reply", ""))
+            unhexed(vector.get("hex", "-"))
+            unhexed(vector.get("reply", ""))
         except (ValueError, TypeError):
             raise Violation("LS702", "its `hex`, or its `reply`, is no hex text", place) from None
         mine[place] = vector
@@ -210,7 +211,7 @@ def _parsed(subject: Subject, name: str, data: bytes, place: str) -> Any:
     except WireError as error:
         if ": checksum " not in error.reason:
             raise Violation("LS707", error.reason, f"{place} {name}.{error.path}") from error
-        same = [bytes.fromhex(one["hex"]) for one in entries(subject).values() if one["frame"] == name]
+        same = [unhexed(one["hex"]) for one in entries(subject).values() if one["frame"] == name]
         fitting = [f"{match.paste} over {match.span.told(match.place, len(data))}" for match in search(same)[:2]]
         fits = f"; {' or '.join(fitting)} fits" if fitting else ""
         raise Violation("LS703", f"{error.reason}{fits}", f"{place} {name}.{error.path}") from error

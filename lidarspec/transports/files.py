@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import re
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -24,6 +25,9 @@ from lidarspec.transports.protocol import Chunk, Transport
 INTERRUPTIONS = frozenset({"disconnect", "reconnect", "dropped"})
 #: bytes read at once.
 BLOCK = 1 << 18
+#: in hexadecimal text: offsets and comments, what may stand between bytes, and what may not stand anywhere else.
+_BESIDE = re.compile(r"^\s*(?:0[xX])?[0-9a-fA-F]{3,}:(?=\s)|(?:#|//).*", re.MULTILINE)
+_BETWEEN, _NO_DIGIT = re.compile(r"[\s,;:{}]+"), re.compile(r"[^0-9a-fA-F]")
 
 
 class RecordingTransport(Transport):
@@ -119,15 +123,38 @@ class FileTransport(Transport):
 
 
 class HexTransport(FileTransport):
-    """Bytes written as hexadecimal text; white space is free, "#" begins a comment, an offset column ends in ":"."""
+    """Bytes written as hexadecimal text, in any way that `unhexed` reads; lines without digits are passed over."""
 
     def chunks(self) -> Iterator[Chunk]:
         for number, line in enumerate(self._file, start=1):
-            text = line.decode("ascii", "replace").partition("#")[0].rpartition(":")[2]
+            text = line.decode("ascii", "replace")
             try:
-                yield Chunk(bytes.fromhex(text))
-            except ValueError:
-                raise WireError(f"{self._path}, line {number}: not hexadecimal: {text.strip()[:40]!r}") from None
+                yield Chunk(unhexed(text))
+            except ValueError as error:
+                raise WireError(f"{self._path}, line {number}: not hexadecimal: {error}") from None
+
+
+def unhexed(text: str) -> bytes:
+    """The bytes that hexadecimal text stands for, as people print it: "54 2c", "542c", "54:2c", "0x54, 0x2C", "{0x54,0x2c};", "\\x54".
+
+    "#" and "//" begin a comment, which goes to the end of the line; a first column of three digits or more and ":" is an offset.
+
+    Raises:
+        ValueError: where something else is in it, or a word makes no whole bytes.
+    """
+    words = _BETWEEN.split(_BESIDE.sub("", text).replace("\\x", " "))
+    return b"".join(_whole_bytes(word) for word in words if word)
+
+
+def _whole_bytes(word: str) -> bytes:
+    digits = word.removeprefix("0x").removeprefix("0X")
+    if bad := _NO_DIGIT.search(digits):
+        raise ValueError(f"{bad[0]!r} is no digit of it")
+    if len(digits) == 1 and digits != word:
+        digits = f"0{digits}"
+    if not digits or len(digits) % 2:
+        raise ValueError(f"{word!r} makes no whole bytes")
+    return bytes.fromhex(digits)
 
 
 class CaptureTransport(FileTransport):

@@ -109,8 +109,10 @@ class _Values:
     def _number(self, info: FieldInfo, value: Any, shown: str) -> Any:
         if isinstance(value, np.generic):
             value = value.item()
-        if isinstance(value, str | WireNaN | bytes) or info.kind not in ("int", "float"):
+        if isinstance(value, str | WireNaN | bytes):
             return value
+        if info.kind not in ("int", "float"):
+            return info.raw(value) if self._units and info.scaled and isinstance(value, int | float) else value
         if info.kind == "float":
             raw = info.raw(value) if self._units else value
             return raw if isinstance(raw, int) else float(raw)

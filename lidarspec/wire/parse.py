@@ -10,7 +10,7 @@ import functools
 import io
 import re
 import struct
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal
 
 import construct
@@ -23,14 +23,16 @@ from lidarspec.spec.description import Spec
 from lidarspec.spec.tree import Blob, Block, FieldInfo, Node, Number, Repeat, Sealed, Select, Struct, When
 from lidarspec.wire.layout import Layout, Leaf
 from lidarspec.wire.layout_tree import NotCompilable, Refused, frame_layouts, prefix_of
+from lidarspec.wire.schema import schema
 
 
-def parse(sensor: Spec, data: bytes, *, frame: str | None = None, verify: bool = True) -> Any:
+def parse(sensor: Spec, data: bytes, *, frame: str | None = None, verify: bool = True, units: bool = False) -> Any:
     """The Container of raw values of one frame, exactly.
 
     Args:
         frame: its type; found out where left out.
         verify: False accepts wrong constants, a wrong checksum and trailing bytes.
+        units: scaled values in the units of their fields.
 
     Raises:
         WireError: for bytes that are no such frame.
@@ -39,6 +41,16 @@ def parse(sensor: Spec, data: bytes, *, frame: str | None = None, verify: bool =
     if not isinstance(data, bytes):
         refuse_text(data)
         data = bytes(data)
+    found = _compiled(sensor, data, frame)
+    if found is None:
+        name, values = parse_typed(sensor, data, frame=frame, verify=verify)
+        found = name, clean(values)
+    name, values = found
+    return _physical(schema(sensor.frames[name].tree).fields, values, "") if units else values
+
+
+def _compiled(sensor: Spec, data: bytes, frame: str | None) -> tuple[str, Any] | None:
+    """The type and values of a frame that is sound, by its layout; None where construct has to read it."""
     try:
         for name in sensor.frames if frame is None or frame not in sensor.frames else (frame,):
             layouts = frame_layouts(sensor.frames[name])
@@ -46,12 +58,21 @@ def parse(sensor: Spec, data: bytes, *, frame: str | None = None, verify: bool =
                 break  # it may be of this type, which comes first
             layout = layouts.layout(data)
             if isinstance(layout, Layout) and layout.sound(data):
-                return unpacked(sensor.frames[name].tree, layout, data)
+                return name, unpacked(sensor.frames[name].tree, layout, data)
     except SpecError:
         raise
     except Exception:  # out of a plugin: construct meets it again, and it is told with its place
         pass
-    return clean(parse_typed(sensor, data, frame=frame, verify=verify)[1])
+    return None
+
+
+def _physical(fields: Mapping[str, FieldInfo], value: Any, path: str) -> Any:
+    """Values with those of scaled fields in their units."""
+    if isinstance(value, dict):
+        return Container((name, _physical(fields, part, f"{path}.{name}".strip("."))) for name, part in value.items())
+    if isinstance(value, list):
+        return ListContainer(_physical(fields, part, path) for part in value)
+    return fields[path].physical(value) if path in fields and fields[path].scaled else value
 
 
 def unpacked(root: Node, layout: Layout, frame: bytes) -> Any:

@@ -92,7 +92,7 @@ def test_hexadecimal_text_and_standard_input_are_read(tmp_path: Path) -> None:
     text.write_text("\n".join([EXAMPLE[:20].hex(" "), EXAMPLE[20:].hex(" ")]), encoding="ascii")
     ran("convert", text, target, "-s", "ldrobot-stl27l")
     first = target.read_bytes()
-    assert process("convert", "-", target, "-s", "ldrobot-stl27l", given=EXAMPLE).returncode == 0
+    assert process("convert", "-", target, "--force", "-s", "ldrobot-stl27l", given=EXAMPLE).returncode == 0
     assert target.read_bytes() == first
     assert len(read(target)["x"]) == 12
 
@@ -120,3 +120,16 @@ def test_the_input_is_never_overwritten(tmp_path: Path, suffix: str) -> None:
     source.write_bytes(EXAMPLE)
     assert "is the input" in ran("convert", source, source, "-s", "ldrobot-stl27l", code=2).stderr
     assert source.read_bytes() == EXAMPLE
+
+
+@pytest.mark.parametrize("suffix", ["csv", "npz"])
+def test_a_file_is_overwritten_when_it_is_asked_for_alone(tmp_path: Path, suffix: str) -> None:
+    source, target = tmp_path / "in.bin", tmp_path / f"out.{suffix}"
+    source.write_bytes(EXAMPLE)
+    target.write_bytes(b"a week of work")
+    said = ran("convert", source, target, "-s", "ldrobot-stl27l", code=2).stderr
+    assert f"{target} exists already" in said
+    assert "--force" in said
+    assert target.read_bytes() == b"a week of work"
+    ran("convert", source, target, "--force", "-s", "ldrobot-stl27l")
+    assert target.stat().st_size > 100

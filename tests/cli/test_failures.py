@@ -74,7 +74,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         (("parse", "cut.bin", *SENSOR), 4, ["points[4].intensity", "next: lidarspec explain cut.bin -s ldrobot-stl27l"]),
         (("parse", "damaged.bin", *SENSOR), 4, ["checksum 0x00, expected 0x50"]),
         (("parse", "missing.bin"), 3, ["missing.bin: no such file"]),
-        (("parse", "54 2"), 2, ["3 digits make no whole bytes"]),
+        (("parse", "54 2"), 2, ["'2' makes no whole bytes"]),
         (("parse", "54", "zz"), 2, ["'z' is no digit of it"]),
         (("parse", "whole.bin", "-s", "ldrobot"), 2, ["unknown sensor 'ldrobot'"]),
         (("explain", "text.bin"), 4, ["no frame of any"]),

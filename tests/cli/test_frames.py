@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+import threading
 from pathlib import Path
 
 import pytest
@@ -104,6 +107,61 @@ def test_explain_takes_the_frame_type_where_bytes_do_not_tell() -> None:
     result = ran("explain", damaged.hex(), "--frame", "data", *SENSOR, code=4)
     assert "wrong: 00 2c, expected 54 2c" in result.stdout
     ran("explain", damaged.hex(), "--frame", "dat", *SENSOR, code=2)
+
+
+def test_explain_shows_what_is_damaged_alone(tmp_path: Path) -> None:
+    frames = ls.simulate(ls.sensor("ldrobot-stl27l"), 30)
+    frames[20] = frames[20][:30] + frames[20][31:]
+    (tmp_path / "drive.bin").write_bytes(b"".join(frames))
+    result = ran("explain", tmp_path / "drive.bin", "--bad", *SENSOR, code=1)
+    assert [line for line in result.stdout.splitlines() if not line.startswith("00")] == [
+        "ldrobot-stl27l data at byte 940, 46 bytes: frame ends at byte 46 of 47: crc needs 1 byte, 0 left",
+        *(line for line in result.stdout.splitlines() if line.startswith("note: one lost byte would explain it")),
+    ]
+    assert result.stderr == "29 frames, 1 damaged, 0 bytes in no frame\n"
+    filled = b"\xff\xfe".join(ls.simulate(ls.sensor("cspc-m1c1-mini"), 9))  # fillers are no damage
+    assert "9 frames, 0 damaged, 0 bytes in no frame" in ran("explain", filled.hex(), "--bad", "-s", "cspc-m1c1-mini").stderr
+    clean = ran("explain", frames[0].hex(), "--bad", *SENSOR)
+    assert (clean.stdout, clean.stderr) == ("", "1 frame, 0 damaged, 0 bytes in no frame\n")
+
+
+def test_explain_shows_what_stands_at_some_bytes_alone(tmp_path: Path) -> None:
+    path = tmp_path / "drive.bin"
+    path.write_bytes(b"".join(ls.simulate(ls.sensor("ldrobot-stl27l"), 300)))
+    assert ran("explain", path, "--at", "0x3b2", *SENSOR).stdout.startswith(
+        "ldrobot-stl27l data at byte 940, 47 bytes; byte 946 is in points[0].distance\n"
+    )
+    assert [frame["offset"] for frame in printed("explain", path, "--slice", "46:95", *SENSOR)["frames"]] == [0, 47, 94]
+    assert len(printed("explain", path, "--slice", "14000:", *SENSOR)["frames"]) == 3
+    assert "14100 bytes: there is no byte 14100" in ran("explain", path, "--at", 14100, *SENSOR, code=2).stderr
+    for words in (("--slice", "9"), ("--slice", "9:8"), ("--slice", "a:"), ("--at", "-1"), ("--at", 1, "--slice", "1:2")):
+        ran("explain", path, *words, *SENSOR, code=2)
+
+
+def test_explain_takes_one_frame_type_out_of_a_stream() -> None:
+    sensor = ls.sensor("cspc-coin-d4")
+    data = b"".join(sensor.example(name, seed=seed) for seed in range(6) for name in ("info", "data"))
+    result = ran("explain", data.hex(), "-f", "info", "-s", sensor.id)
+    assert result.stdout.count("cspc-coin-d4 info") == 6
+    assert "cspc-coin-d4 data" not in result.stdout
+    assert result.stderr == "6 frames, 0 damaged, 0 bytes in no frame, 6 of other types left out\n"
+    said = ran("explain", (EXAMPLE * 20).hex(), "-f", "scan_start", "-s", sensor.id, code=4).stderr
+    assert "has no scan_start frame" in said
+
+
+def test_explain_answers_while_its_input_goes_on_and_stops_with_its_reader() -> None:
+    command = [sys.executable, "-m", "lidarspec", "explain", "-", *SENSOR]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as running:
+        assert running.stdin is not None
+        assert running.stdout is not None
+        running.stdin.write(EXAMPLE * 3000)
+        running.stdin.flush()
+        patience = threading.Timer(60, running.kill)
+        patience.start()
+        assert running.stdout.readline() == b"ldrobot-stl27l data, 47 bytes\n"
+        running.stdout.close()
+        assert running.wait() == 0
+        patience.cancel()
 
 
 def test_captures_are_explained() -> None:

@@ -223,3 +223,17 @@ class TestDoctor:
 
     def test_the_whole_computer(self) -> None:
         assert process("doctor").returncode in (0, 1)
+
+
+def test_bytes_sent_by_hand_are_answered_and_the_answer_is_explained() -> None:
+    sensor = ("-s", "slamtec-rplidar-a1")
+    said = ran("send", "sim:slamtec-rplidar-a1", "--hex", "0xA5, 0x50  # get_info", *sensor)
+    assert said.stdout.startswith("slamtec-rplidar-a1 info, 27 bytes\n0000  a5 5a ")
+    assert said.stderr == "sent 2 bytes: a5 50\n"
+    told = printed("send", "sim:cspc-m1c1-mini", "--hex", "aa55f00f", "-s", "cspc-m1c1-mini")
+    assert (told["sent"], [frame["frame"] for frame in told["frames"]]) == ("aa 55 f0 0f", ["ack"])
+    streaming = ran("send", "sim:ldrobot-stl27l", "--hex", "00", "--timeout", "300ms")
+    assert streaming.stdout == ""
+    assert "data frames came meanwhile\nnothing came back\n" in streaming.stderr
+    for words in (("--hex", "5z"), ("--hex", "a5 50", "start"), ()):
+        ran("send", "sim:slamtec-rplidar-a1", *words, *sensor, code=2)

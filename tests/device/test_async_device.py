@@ -40,6 +40,7 @@ def test_scans_packets_and_commands_are_awaited(line: Port) -> None:
                     break
             assert found[1].complete
             assert (await opened.send("speed", rate=10.0, trim=0.0)).confirmed
+            await opened.write(SENSOR.command("spin"))
             assert (await opened.latest(SLACK)).complete
             async for packets in opened.packets():
                 assert len(packets)

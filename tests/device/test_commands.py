@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 
 import lidarspec as ls
-from lidarspec.errors import CommandError, OutOfRange, ReplyTimeout, SourceError
+from lidarspec.errors import CommandError, OutOfRange, ReplyTimeout, SourceError, UsageError
 from lidarspec.recording.format import Recording
 from lidarspec.spec import Tcp, Udp
 from tests.lines import SLACK, Port, free_port, port, turning, udp, until, working
@@ -113,6 +113,24 @@ def test_a_reply_among_data_and_the_data_go_on(line: Port, tmp_path: Path) -> No
     with Recording(path) as recording:
         sent = [record.data for record in recording if record.direction == "out"]
     assert [SENSOR.parse(data, "order").code for data in sent] == [START, SPEED, STOP]
+
+
+def test_bytes_by_hand_go_out_as_they_are(line: Port, tmp_path: Path) -> None:
+    device = Obedient(line)
+    with working(device.work), ls.open(f"serial://{line.name}", SENSOR, start=False, record=tmp_path / "all.lsr") as opened:
+        opened.write(SENSOR.command("start"))
+        assert opened.latest(SLACK).complete
+        for wrong, reason in ((lambda: opened.write("a5 50"), "bytes are taken"), (lambda: opened.write(b"1", "power"), "no link 'power'")):
+            with pytest.raises(UsageError, match=reason):
+                wrong()
+    assert device.heard == [START]
+    with Recording(tmp_path / "all.lsr") as recording:
+        assert [record.data for record in recording if record.direction == "out"] == [SENSOR.command("start")]
+    with pytest.raises(SourceError, match="closed"):
+        opened.write(b"1")
+    (tmp_path / "drive.bin").write_bytes(b"")
+    with ls.open(tmp_path / "drive.bin", SENSOR) as file, pytest.raises(SourceError, match="is a file"):
+        file.write(b"1")
 
 
 def test_a_command_from_another_thread_while_scans_are_read(line: Port) -> None:

@@ -7,7 +7,7 @@ import re
 import pytest
 
 import lidarspec as ls
-from lidarspec.explaining.explanation import Flip, explain, flips
+from lidarspec.explaining.explanation import explain
 from lidarspec.explaining.listing import folded, parents, text, told
 from lidarspec.explaining.wording import Span, bit_picture
 from tests.all_sensors import EVERY as SENSORS, FRAMES
@@ -55,37 +55,6 @@ def test_pictures_show_every_bit_of_a_block_once(sensor: str, frame: str) -> Non
 
 def test_a_picture_has_dots_for_other_bits() -> None:
     assert bit_picture(b"\xa5\xff\x81", b"\xf0\x00\xff") == "1010.... .. 10000001"
-
-
-def test_the_flipped_bit_of_a_damaged_frame_is_found() -> None:
-    data = STL.example("data", seed=4)
-    for offset, bit in ((0, 3), (7, 6), (20, 0), (46, 1)):
-        damaged = Flip(offset, bit).mended(data)
-        assert Flip(offset, bit) in flips(STL, "data", damaged)
-        for flip in flips(STL, "data", damaged):
-            STL.parse(flip.mended(damaged))
-
-
-@pytest.mark.parametrize(("sensor", "frame"), [place for place in FRAMES if place[1] == "data" and place[0].startswith("shape-")])
-def test_what_a_flip_is_said_to_mend_is_mended(sensor: str, frame: str) -> None:
-    value = SENSORS[sensor]
-    data = value.example(frame)
-    for flip in flips(value, frame, Flip(len(data) // 2, 2).mended(data)):
-        value.parse(flip.mended(Flip(len(data) // 2, 2).mended(data)), frame)
-
-
-def test_damage_that_one_bit_explains_is_told_with_the_field() -> None:
-    notes = explain(Flip(46, 0).mended(EXAMPLE), STL).notes
-    assert "a flipped bit would explain it: byte 46 bit 0, crc 81, sent as 80" in notes
-    assert "a flipped bit would explain it: byte 15 bit 7, points[3].distance 0.213 m, sent as 0.085 m" in notes
-    assert explain(EXAMPLE[:20], STL).notes == ()
-
-
-def test_where_any_bit_may_have_flipped_only_that_is_told() -> None:
-    sensor = ls.sensor("cspc-m1c1-mini")
-    data = sensor.example("data", seed=2)
-    (note,) = explain(Flip(20, 2).mended(data), sensor, "data").notes
-    assert re.fullmatch(r"one flipped bit would explain it, but in any of \d+ places, so that nothing can be said of where", note)
 
 
 def test_differences_are_told_field_by_field_and_to_the_bit() -> None:

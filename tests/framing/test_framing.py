@@ -6,6 +6,8 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
+import lidarspec as ls
+import lidarspec.spec
 from lidarspec import Sensor
 from lidarspec.testing.agreement import assert_backends_agree
 from lidarspec.testing.subject import Subject
@@ -166,3 +168,22 @@ def test_a_frame_is_out_with_its_last_byte(name: str) -> None:
         for found in decoder.feed(data[spot : spot + 1]):
             assert found.offset + len(found.data) == spot + 1
     assert decoder.stats.pending == 0
+
+
+def test_a_line_says_what_things_are() -> None:
+    sensor = ls.sensor("cspc-coin-d4")
+    frame, decoder = sensor.frames["info"], sensor.decoder()
+    data = sensor.example("info", seed=1)
+    (found,) = decoder.feed(data) + decoder.finish()
+    assert repr(frame) == f"Frame({frame.max_length} bytes: {', '.join(sensor.parse(data))})"
+    assert repr(sensor.frames["data"]).startswith("Frame(data, up to ")
+    assert repr(ls.sensor("cspc-m1c1-mini").frames["command"]).startswith("Frame(out, 4 bytes: ")
+    assert repr(decoder) == f"Decoder(cspc-coin-d4, stream, auto: 1 info frames, bytes_in {len(data)})"
+    assert repr(decoder.stats) == f"Counters(1 info frames, bytes_in {len(data)})"
+    assert repr(found) == f"Found(info at byte 0, {len(data)} bytes: {data[:8].hex(' ')} ...)"
+    assert repr(ls.explain(data, sensor)) == f"Explanation(cspc-coin-d4 info, {len(data)} bytes: valid)"
+
+
+def test_completion_offers_public_names_alone() -> None:
+    for module in (ls, ls.spec):
+        assert dir(module) == sorted(module.__all__)

@@ -8,6 +8,7 @@ import itertools
 import weakref
 from collections import Counter
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from lidarspec import Decoder, Packets, PointCloud, Scan, Sensor
 from lidarspec.captures.ip import ETHERNET
 from lidarspec.captures.pcap import Datagram, datagram_record
 from lidarspec.captures.records import capture_head
+from lidarspec.errors import UsageError
 from lidarspec.packets.stream import PacketStream
 from lidarspec.points import lazy_columns
 from lidarspec.points.cloud import COLUMNS
@@ -200,3 +202,13 @@ def test_packets_that_stay_where_they_were_read_give_the_same_points(name: str, 
         if len(separate.table.groups[0].where) == len(rows) > 1:
             assert separate.table.groups[0].rows.strides[0] == size + (size > 1)
         assert_cut_from([Scan(separate.points(), 0.0, True, sensor)], together.points())
+
+
+@pytest.mark.parametrize("number", [0, -1, 2.5, "360", True])
+def test_a_number_of_sectors_that_is_none_is_refused_by_name(number: Any) -> None:
+    sensor = ls.sensor("ldrobot-stl27l")
+    scan = next(sensor.scans(sensor.example("data")))
+    for bins in (scan.to_bins, scan.to_laserscan):
+        with pytest.raises(UsageError, match=f"{bins.__name__} takes how many sectors the turn has"):
+            bins(number)
+    assert scan.to_bins(np.int32(4)).shape == (4,)

@@ -27,6 +27,7 @@ from construct import (
     this,
 )
 
+import lidarspec as ls
 from lidarspec import Sensor
 from lidarspec.framing.frame_engine import CompiledCodec, codec
 from lidarspec.spec import Frame
@@ -144,3 +145,22 @@ def test_headers_lead_to_their_own_layout_also_after_some_were_forgotten(monkeyp
             assert unpack(frame, b"\x5b" + data[1:]) is None
     assert unpack(frame, b"\x5a\x02") is None
     assert unpack(frame, b"") is None
+
+
+def test_units_are_those_that_build_takes() -> None:
+    sensor = ls.sensor("ldrobot-stl27l")
+    data = sensor.build("data", sensor.parse(sensor.example("data")), speed=3600, start_angle=32427)
+    found = sensor.parse(data, units=True)
+    assert (found.speed, found.start_angle, found.header) == (3600, pytest.approx(324.27), b"\x54\x2c")
+    raw = sensor.parse(data)
+    assert [point.distance for point in found.points] == pytest.approx([point.distance / 1000 for point in raw.points])
+    assert [point.intensity for point in found.points] == [point.intensity for point in raw.points]
+    assert sensor.build("data", found, units=True) == data
+    broken = data[:-1] + bytes([data[-1] ^ 1])
+    assert sensor.parse(broken, verify=False, units=True).start_angle == pytest.approx(324.27)
+
+
+@pytest.mark.parametrize(("sensor", "frame"), [place for place in FRAMES if place[0] != "shape-numbers"])
+def test_values_in_units_are_built_as_they_came(sensor: str, frame: str) -> None:
+    data = EVERY[sensor].example(frame, seed=2)
+    assert EVERY[sensor].build(frame, EVERY[sensor].parse(data, frame, units=True), units=True) == data

@@ -1,0 +1,134 @@
+"""What became of the bytes of a frame on their way: the one change that explains the damage.
+
+Each single bit is turned back, each single byte taken out, and every byte put in at every place, and the engine itself says which of
+these make one valid frame of the type. So nothing is known here of checksums and lengths. With a short checksum several changes may do
+by chance: where they are many, what happened is told, and not where.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarspec.explaining.wording import Value
+from lidarspec.framing.frame_engine import Codec, CompiledCodec, codec
+from lidarspec.framing.results import VALID
+from lidarspec.spec import Frame
+from lidarspec.wire.arrays import counted
+
+#: bytes of candidates that are tried in one go, the longest frame that construct alone has to read so often, and the longest in
+#: which lost bytes are looked for, of which there are 256 for each place.
+BLOCK, INTERPRETED, SEARCHED = 1 << 20, 128, 512
+#: most changes that are told one by one.
+TOLD = 3
+#: what may have happened, the likeliest first: by how many bytes it made the frame longer, and how many candidates there are for a place.
+KINDS = {"flipped bit": (0, 8), "inserted byte": (1, 1), "lost byte": (-1, 256)}
+
+
+class Change(NamedTuple):
+    """One thing that may have happened to a frame.
+
+    Attributes:
+        kind: "flipped bit", "inserted byte" or "lost byte".
+        offset: the byte of the damaged frame that was changed or inserted, or before which one was lost.
+        value: which bit, 0 the lowest; or the byte.
+    """
+
+    kind: str
+    offset: int
+    value: int
+
+    def mended(self, data: bytes) -> bytes:
+        """The bytes as they were sent."""
+        before, after = data[: self.offset], data[self.offset :]
+        if self.kind == "inserted byte":
+            return before + after[1:]
+        if self.kind == "lost byte":
+            return before + bytes([self.value]) + after
+        return before + bytes([after[0] ^ 1 << self.value]) + after[1:]
+
+
+def changes(frame: Frame, data: bytes, kinds: Iterable[str] = KINDS) -> list[Change]:
+    """Every single change of the likeliest kind that makes these bytes of one valid and plausible frame of this type."""
+    engine = codec(frame)
+    for kind in kinds if data else ():
+        longer, values = KINDS[kind]
+        size = len(data) - longer
+        fits = engine.size in (None, size) and max(engine.prefix, default=-1) < size
+        if fits and 0 < size <= _most(engine, values) and (found := list(_found(kind, values, data, size, engine))):
+            return found
+    return []
+
+
+def _most(engine: Codec, values: int) -> int:
+    """The longest frame of which every candidate is tried, so many for a place."""
+    is_compiled, is_many = isinstance(engine, CompiledCodec), values > 8
+    return (SEARCHED if is_compiled else 0) if is_many else engine.frame.max_length if is_compiled else INTERPRETED
+
+
+def _found(kind: str, values: int, data: bytes, size: int, engine: Codec) -> Iterator[Change]:
+    places = np.arange(max(len(data), size))
+    old = np.frombuffer(data, np.uint8)
+    if kind == "inserted byte":
+        places = places[np.diff(old, prepend=~old[:1]) != 0]  # of a run of equal bytes the first stands for all
+    offsets = np.repeat(places, values)
+    numbers = old[places] if values == 1 else np.tile(np.arange(values, dtype=np.uint8), len(places))
+    if kind == "lost byte":
+        is_new = numbers != old[offsets - 1]  # the same byte once more before an equal one
+        is_new[offsets == 0] = True
+        offsets, numbers = offsets[is_new], numbers[is_new]
+    step = max(1, BLOCK // size)
+    for first in range(0, len(offsets), step):
+        part = slice(first, first + step)
+        rows = _rows(kind, old, offsets[part], numbers[part], size)
+        fits = np.ones(len(rows), np.bool_)
+        for spot, (mask, value) in engine.prefix.items():
+            fits &= rows[:, spot] & mask == value
+        which = np.flatnonzero(fits)
+        survey = engine.survey(rows.reshape(-1), which * size) if len(which) else None
+        right = which[(survey.status == VALID) & (survey.sizes == size)] if survey is not None else which
+        yield from (Change(kind, int(offsets[first + one]), int(numbers[first + one])) for one in right.tolist())
+
+
+def _rows(kind: str, old: NDArray[np.uint8], offsets: NDArray[np.intp], numbers: NDArray[np.uint8], size: int) -> NDArray[np.uint8]:
+    """The bytes with each change undone, one a row."""
+    columns, places = counted(size), offsets[:, None]
+    if kind == "inserted byte":
+        return old[columns + (columns >= places)]
+    if kind == "lost byte":
+        rows = old[np.minimum(columns - (columns > places), len(old) - 1)]
+        rows[np.arange(len(rows)), offsets] = numbers
+        return rows
+    rows = np.tile(old, (len(offsets), 1))
+    rows[np.arange(len(rows)), offsets] ^= np.uint8(1) << numbers
+    return rows
+
+
+def told(frame: Frame, data: bytes, values: Callable[[bytes], Mapping[str, Value]]) -> Iterator[str]:
+    """Which single change would explain the damage, with what its field would have said.
+
+    Args:
+        values: every value in some bytes by its path, as far as they go.
+    """
+    found = changes(frame, data)
+    if len(found) > TOLD:
+        yield f"one {found[0].kind} would explain it, but in any of {len(found)} places, so that nothing can be said of where"
+        return
+    before = values(data) if found else {}
+    for change in found:
+        explains = f"{'one' if len(found) == 1 else 'a'} {change.kind} would explain it"
+        yield f"{explains}: {_place(change, before, values(change.mended(data)))}"
+
+
+def _place(change: Change, before: Mapping[str, Value], after: Mapping[str, Value]) -> str:
+    kind, offset, value = change
+    if kind == "inserted byte":
+        return f"byte {offset}, 0x{value:02x}"
+    path = next((path for path, there in after.items() if there.holds(offset, value) or (kind == "lost byte" and there.covers(offset))), "")
+    if kind == "lost byte":
+        return f"0x{value:02x} before byte {offset}" + (f", in {path}" if path else "")
+    values = [str(part[path]) for part in (before, after) if path in part]
+    return f"byte {offset} bit {value}" + (f", {path} {', sent as '.join(values)}" if path and all(values) else f", {path}" if path else "")

@@ -1,0 +1,75 @@
+"""What became of a damaged frame: the flipped bit, the lost or inserted byte."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+
+import lidarspec as ls
+from lidarspec.explaining.damage import Change, changes
+from lidarspec.explaining.explanation import explain
+from tests.all_sensors import EVERY as SENSORS, FRAMES
+from tests.cli.running import EXAMPLE
+
+STL = ls.sensor("ldrobot-stl27l")
+STL_FRAME = STL.frames["data"]
+
+
+def flipped(offset: int, bit: int) -> Change:
+    return Change("flipped bit", offset, bit)
+
+
+def test_the_flipped_bit_of_a_damaged_frame_is_found() -> None:
+    data = STL.example("data", seed=4)
+    for flip in (flipped(0, 3), flipped(7, 6), flipped(20, 0), flipped(46, 1)):
+        damaged = flip.mended(data)
+        assert flip in changes(STL_FRAME, damaged)
+        for change in changes(STL_FRAME, damaged):
+            STL.parse(change.mended(damaged))
+
+
+@pytest.mark.parametrize("offset", [0, 1, 7, 20, 46])
+def test_a_lost_and_an_inserted_byte_are_found(offset: int) -> None:
+    data = STL.example("data", seed=4)
+    lost, more = data[:offset] + data[offset + 1 :], data[:offset] + b"\x9b" + data[offset:]
+    for damaged in (lost, more):
+        found = changes(STL_FRAME, damaged)
+        assert data in {change.mended(damaged) for change in found}
+        for change in found:
+            STL.parse(change.mended(damaged))
+    assert {change.kind for change in changes(STL_FRAME, lost)} == {"lost byte"}
+    assert {change.kind for change in changes(STL_FRAME, more)} == {"inserted byte"}
+
+
+def test_a_lost_and_an_inserted_byte_are_told() -> None:
+    assert explain(EXAMPLE[1:], STL, "data").notes == ("one lost byte would explain it: 0x54 before byte 0, in header",)
+    (note,) = explain(EXAMPLE[:20] + EXAMPLE[21:], STL).notes
+    assert re.fullmatch(r"one lost byte would explain it, but in any of \d+ places, so that nothing can be said of where", note)
+    assert "byte 20, 0x9b" in " ".join(explain(EXAMPLE[:20] + b"\x9b" + EXAMPLE[20:], STL).notes)
+    assert explain(EXAMPLE[:20] + EXAMPLE[23:], STL).notes == ()
+    assert explain(EXAMPLE + b"abc", STL).notes == ()
+
+
+@pytest.mark.parametrize(("sensor", "frame"), [place for place in FRAMES if place[1] == "data" and place[0].startswith("shape-")])
+def test_what_is_said_to_mend_a_frame_mends_it(sensor: str, frame: str) -> None:
+    value = SENSORS[sensor]
+    data = value.example(frame)
+    middle = len(data) // 2
+    for damaged in (flipped(middle, 2).mended(data), data[:middle] + data[middle + 1 :], data[:middle] + b"\x9b" + data[middle:]):
+        for change in changes(value.frames[frame], damaged):
+            value.parse(change.mended(damaged), frame)
+
+
+def test_damage_that_one_bit_explains_is_told_with_the_field() -> None:
+    notes = explain(flipped(46, 0).mended(EXAMPLE), STL).notes
+    assert "a flipped bit would explain it: byte 46 bit 0, crc 81, sent as 80" in notes
+    assert "a flipped bit would explain it: byte 15 bit 7, points[3].distance 0.213 m, sent as 0.085 m" in notes
+    assert explain(EXAMPLE[:20], STL).notes == ()
+
+
+def test_where_any_bit_may_have_flipped_only_that_is_told() -> None:
+    sensor = ls.sensor("cspc-m1c1-mini")
+    data = sensor.example("data", seed=2)
+    (note,) = explain(flipped(20, 2).mended(data), sensor, "data").notes
+    assert re.fullmatch(r"one flipped bit would explain it, but in any of \d+ places, so that nothing can be said of where", note)
