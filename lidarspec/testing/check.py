@@ -28,7 +28,7 @@ from lidarspec.testing.conformance import PROPERTIES
 from lidarspec.testing.declared import declared
 from lidarspec.testing.findings import Finding, left_over
 from lidarspec.testing.subject import EXAMPLES, Subject
-from lidarspec.testing.vectors import points_stand_in_two_quadrants
+from lidarspec.testing.vectors import lacking
 
 #: the name of a file of golden vectors.
 VECTORS = "vectors.json"
@@ -447,9 +447,9 @@ def reports(
         yield _report(subject, places, mistakes if single else [], watch or (lambda text: None))
 
 
-def _beside(sensor: Sensor, skipped: Mapping[str, str]) -> Iterator[tuple[str, str]]:
+def _beside(subject: Subject) -> Iterator[tuple[str, str]]:
     """What the picture of a sensor has to be held against."""
-    missing = skipped.get(points_stand_in_two_quadrants.__name__)
+    sensor, missing = subject.sensor, lacking(subject)
     if missing:
         yield "vectors", f"{missing}; x and y of points in two quadrants would prove the picture"
     yield "vendor_axes", f"x, y, z are {', '.join(sensor.vendor_axes)}" if sensor.vendor_axes else "not declared"
@@ -481,5 +481,5 @@ def _report(subject: Subject, places: Places, mistakes: list[Finding], watch: Ca
     left = left_over(distinct, sensor, whole=ELSE not in report.skipped)
     report.findings = [places.placed(finding, sensor) for finding in left]
     report.measured = subject.measured
-    report.picture = subject.picture and {**dict(sorted(subject.picture.items())), **dict(_beside(sensor, report.skipped))}
+    report.picture = subject.picture and {**dict(sorted(subject.picture.items())), **dict(_beside(subject))}
     return report
