@@ -360,8 +360,14 @@ class Registry:
         if not isinstance(sensor, Sensor):
             raise SpecError(f"lidarspec_sensors returns sensors, not {type(sensor).__name__}")
         for name in (sensor.id, *sensor.aliases):
-            if self._owners.get(name, plugin) != plugin or sum(name in (s.id, *s.aliases) for s in own) > 1:
-                raise SpecError("another sensor has this id already", sensor=name)
+            owner = self._owners.get(name, plugin)
+            if owner != plugin or sum(name in (s.id, *s.aliases) for s in own) > 1:
+                whose = "one of the same plugin" if owner == plugin else f"that of {self._place(owner)}"
+                raise SpecError(f"another sensor has this id already: {whose}", sensor=name)
+
+    def _place(self, plugin: Any) -> str:
+        """A plugin that is loaded, as "distribution:module" or "distribution:entry"."""
+        return ":".join(plugin) if isinstance(plugin, tuple) else str(self._manager.get_name(plugin))
 
 
 def _loaded(entry: EntryPoint, names: str, add: Callable[[Any], list[str]]) -> Plugin:

@@ -9,6 +9,7 @@ import click
 import numpy as np
 
 from lidarspec._version import __version__
+from lidarspec.cli.failures import FINDINGS
 from lidarspec.cli.options import output_options
 from lidarspec.cli.output import emit, emit_json, note, table
 from lidarspec.columns.columns import Batch
@@ -121,14 +122,20 @@ def _plan(sensor: Sensor, frame: str) -> list[str]:
 
 @click.command()
 @output_options
-def plugins(as_json: bool, output: str | None) -> None:
-    """The plugins that were found, and what is wrong with those that do not load."""
+@click.pass_context
+def plugins(ctx: click.Context, as_json: bool, output: str | None) -> None:
+    """The plugins that were found, and what is wrong with those that do not load.
+
+    Exit code 1 where one does not.
+    """
     found = registry().plugins
+    rows = [[p.distribution, p.version, p.entry_point, f"not loaded: {p.error}" if p.error else ", ".join(p.sensors)] for p in found]
     if as_json:
         emit_json([{**vars(plugin), "sensors": list(plugin.sensors)} for plugin in found], output)
-        return
-    rows = [[p.distribution, p.version, p.entry_point, f"not loaded: {p.error}" if p.error else ", ".join(p.sensors)] for p in found]
-    emit(table(["distribution", "version", "entry point", "sensors"], rows, output) if rows else NO_SENSORS, output)
+    else:
+        emit(table(["distribution", "version", "entry point", "sensors"], rows, output) if rows else NO_SENSORS, output)
+    if any(plugin.error for plugin in found):
+        ctx.exit(FINDINGS)
 
 
 def _facts(sensor: Sensor) -> dict[str, Any]:

@@ -28,7 +28,7 @@ from lidarspec.testing.conformance import PROPERTIES
 from lidarspec.testing.declared import declared
 from lidarspec.testing.findings import Finding, left_over
 from lidarspec.testing.subject import EXAMPLES, Subject
-from lidarspec.testing.vectors import points_stand_in_two_quadrants
+from lidarspec.testing.vectors import lacking
 
 #: the name of a file of golden vectors.
 VECTORS = "vectors.json"
@@ -85,7 +85,7 @@ def target(text: str | Path) -> Target:
     family = [
         one for plugin in registry().plugins if plugin.distribution in {home.distribution for home in homes} for one in plugin.sensors
     ]
-    return Target([sensor], [], files, _vectors(files), tuple(family))
+    return Target([sensor], _rivals([sensor]), files, _vectors(files), tuple(family))
 
 
 def _file(file: Path) -> Target:
@@ -93,6 +93,7 @@ def _file(file: Path) -> Target:
     try:
         found.sensors = _added(file_module(file), str(file))
         found.family = tuple(sensor.id for sensor in found.sensors[1:] and found.sensors)
+        found.findings += _holders(found.sensors, file)
         if not found.sensors:
             raise SpecError("there is no function lidarspec_sensors, marked @hookimpl, that returns a sensor")
     except SourceError:
@@ -131,7 +132,6 @@ def _entries(distribution: str) -> list[EntryPoint]:
 
 def _distribution(entries: list[EntryPoint]) -> Target:
     found = Target()
-    known = registry().sensors()
     for entry in entries:
         try:
             sensors = _added(entry.load(), entry.value)
@@ -140,12 +140,30 @@ def _distribution(entries: list[EntryPoint]) -> Target:
             found.findings.append(replace(finding, path=finding.path or f"{entry.name} = {entry.value}"))
             continue
         found.files += [file for file in module_files(entry.value) if file not in found.files]
-        found.sensors += [known.get(sensor.id, sensor) for sensor in sensors if sensor.id not in {one.id for one in found.sensors}]
+        found.sensors += [sensor for sensor in sensors if sensor.id not in {one.id for one in found.sensors}]
     found.vectors, found.family = _vectors(found.files), tuple(sensor.id for sensor in found.sensors)
     names = {_normal(entry.distribution) for entry in entries}
-    told = [(plugin, _said(plugin.error)) for plugin in registry().plugins if _normal(plugin.distribution) in names and plugin.error]
-    found.findings += [Finding(code, plugin.error, plugin.entry_point) for plugin, code in told if code in ("LS005", "LS010")]
+    failing = [plugin for plugin in registry().plugins if _normal(plugin.distribution) in names and _said(plugin.error) == "LS010"]
+    found.findings += [Finding("LS010", plugin.error, plugin.entry_point) for plugin in failing]
+    found.findings += _rivals(found.sensors)
     return found
+
+
+def _rivals(sensors: list[Sensor]) -> list[Finding]:
+    """The plugins that were refused because of a name of these sensors, or that these were refused for: each with who has it."""
+    names = {name for sensor in sensors for name in (sensor.id, *sensor.aliases)}
+    refused = [plugin for plugin in registry().plugins if _said(plugin.error) == "LS005" and plugin.error.partition(":")[0] in names]
+    return [Finding("LS005", f"{plugin.distribution} has {plugin.error}", plugin.entry_point) for plugin in refused]
+
+
+def _holders(sensors: list[Sensor], file: Path) -> list[Finding]:
+    """The installed plugins, written in other files than this one, that have the ids of its sensors."""
+    return [
+        Finding("LS005", f"{plugin.distribution} is installed, and has it ({plugin.entry_point})", "", sensor.id)
+        for sensor in sensors
+        for plugin in registry().plugins
+        if sensor.id in plugin.sensors and not any(file.samefile(own) for own in module_files(plugin.entry_point.partition(" = ")[2]))
+    ]
 
 
 def _added(plugin: Any, name: str) -> list[Sensor]:
@@ -419,7 +437,8 @@ def reports(
     """
     trees = {str(file): ast.parse(file.read_text(encoding="utf-8"), str(file)) for file in target.files}
     places = Places(trees)
-    mistakes = [places.placed(finding) for finding in target.findings] + written(trees)
+    known = {sensor.id: sensor for sensor in target.sensors}
+    mistakes = [places.placed(finding, known.get(finding.sensor)) for finding in target.findings] + written(trees)
     single = [sensor for sensor in target.sensors if len(target.sensors) == 1]
     if mistakes and not single:
         yield Report(name, mistakes)
@@ -428,9 +447,9 @@ def reports(
         yield _report(subject, places, mistakes if single else [], watch or (lambda text: None))
 
 
-def _beside(sensor: Sensor, skipped: Mapping[str, str]) -> Iterator[tuple[str, str]]:
+def _beside(subject: Subject) -> Iterator[tuple[str, str]]:
     """What the picture of a sensor has to be held against."""
-    missing = skipped.get(points_stand_in_two_quadrants.__name__)
+    sensor, missing = subject.sensor, lacking(subject)
     if missing:
         yield "vectors", f"{missing}; x and y of points in two quadrants would prove the picture"
     yield "vendor_axes", f"x, y, z are {', '.join(sensor.vendor_axes)}" if sensor.vendor_axes else "not declared"
@@ -462,5 +481,5 @@ def _report(subject: Subject, places: Places, mistakes: list[Finding], watch: Ca
     left = left_over(distinct, sensor, whole=ELSE not in report.skipped)
     report.findings = [places.placed(finding, sensor) for finding in left]
     report.measured = subject.measured
-    report.picture = subject.picture and {**dict(sorted(subject.picture.items())), **dict(_beside(sensor, report.skipped))}
+    report.picture = subject.picture and {**dict(sorted(subject.picture.items())), **dict(_beside(subject))}
     return report

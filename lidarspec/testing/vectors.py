@@ -135,9 +135,15 @@ def every_checksum_is_checked(subject: Subject, name: str) -> None:
     for match in [] if sealing else _common(frames):
         path = _standing(subject, name, match, frames[0])
         if path in (named or free) and (named or match.doubt >= PROVEN):
-            fits = f"{match.paste} over {match.span.told(match.place, len(frames[0]))} fits every vector"
+            fits = f"{_in_words(match, len(frames[0]))} fits every vector"
             raise Violation("LS212", f"{fits}, and no Checksummed holds a frame to it", f"{name}.{path}")
     require(not named, "LS212", "it is a checksum by its name, and no Checksummed holds a frame to it", f"{name}.{''.join(named[:1])}")
+
+
+def _in_words(match: Match, length: int) -> str:
+    """A checksum that fits, what it covers, and the byte order of its field."""
+    order = f", in a field that is {match.order}-endian," if match.place.size > 1 else ""
+    return f"{match.paste} over {match.span.told(match.place, length)}{order}"
 
 
 def _common(frames: list[bytes]) -> list[Match]:
@@ -212,7 +218,7 @@ def _parsed(subject: Subject, name: str, data: bytes, place: str) -> Any:
         if ": checksum " not in error.reason:
             raise Violation("LS707", error.reason, f"{place} {name}.{error.path}") from error
         same = [unhexed(one["hex"]) for one in entries(subject).values() if one["frame"] == name]
-        fitting = [f"{match.paste} over {match.span.told(match.place, len(data))}" for match in search(same)[:2]]
+        fitting = [_in_words(match, len(data)) for match in search(same)[:2]]
         fits = f"; {' or '.join(fitting)} fits" if fitting else ""
         raise Violation("LS703", f"{error.reason}{fits}", f"{place} {name}.{error.path}") from error
     except LidarSpecError as error:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 from pathlib import Path
 
 import pytest
@@ -65,6 +66,20 @@ def test_what_was_measured_stands_beside_what_it_is_held_against() -> None:
     assert re.fullmatch(r"  data: rate: 21[56]\d\d points a second, simulated", lines[3])
     unproven = ran("check", STRANGER, "--max-examples", "3").output
     assert "  vectors: there is no file of golden vectors; x and y of points in two quadrants would prove the picture" in unproven
+
+
+def test_a_file_with_the_id_of_an_installed_sensor_is_told_whose_it_is(tmp_path: Path) -> None:
+    installed = ROOT / "plugins" / "lidarspec-ldrobot" / "lidarspec_ldrobot" / "__init__.py"
+    shutil.copy(installed, tmp_path / "mine.py")
+    shutil.copy(installed.with_name("vectors.json"), tmp_path)
+    (loading, *others) = json.loads(ran("check", tmp_path / "mine.py", "--max-examples", "3", "--json", code=1).stdout)
+    assert [finding["sensor"] for finding in loading["findings"]] == ["ldrobot-stl27l", "ldrobot-ld06"]
+    assert {finding["code"] for finding in loading["findings"]} == {"LS005"}
+    said = "lidarspec-ldrobot is installed, and has it (lidarspec.sensors = lidarspec_ldrobot)"
+    assert loading["findings"][0]["what"] == said
+    assert loading["findings"][0]["line"]
+    assert not any(report["findings"] for report in others)
+    ran("check", installed, "--max-examples", "3")
 
 
 def test_vectors_of_a_distribution_with_several_sensors_are_looked_at() -> None:

@@ -175,7 +175,7 @@ def test_of_two_with_one_id_the_first_wins_whichever_is_asked_for(plugins: dict[
     assert sorted(found.sensors()) == ["acme-x1", "acme-x2", "acme-x3"]
     assert [(plugin.error, plugin.sensors) for plugin in found.plugins] == [
         ("", ("acme-x1", "acme-x2")),
-        ("acme-x2: another sensor has this id already", ("acme-x3",)),
+        ("acme-x2: another sensor has this id already: that of dist:acme", ("acme-x3",)),
     ]
 
 
@@ -203,7 +203,7 @@ def test_an_entry_that_names_no_such_sensor_is_named_and_leaves_nothing(
 def test_a_sensor_cannot_take_an_id_from_a_module_that_is_always_loaded(plugins: dict[str, SimpleNamespace]) -> None:
     found = registry("zz = again", offered="acme-x2 = acme")
     assert found.sensor("acme-x2").model == "again"
-    assert [plugin.error for plugin in found.plugins] == ["", "acme-x2: another sensor has this id already"]
+    assert [plugin.error for plugin in found.plugins] == ["", "acme-x2: another sensor has this id already: that of dist:zz"]
 
 
 def test_threads_that_ask_at_once_get_the_same_sensor(plugins: dict[str, SimpleNamespace]) -> None:

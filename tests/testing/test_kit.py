@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from construct import Array, Const, Int8ul, Int16ul, Struct
+from construct import Array, Const, Int8ul, Int16ub, Int16ul, Struct
 from hypothesis import strategies as st
 
 from lidarspec import Sensor
@@ -214,6 +214,12 @@ def test_the_sense_of_the_points_is_measured_and_held_against_the_axes(axes: tup
     assert found.value.code == "LS511"
 
 
+def test_a_checksum_in_the_other_byte_order_is_told_with_the_right_one() -> None:
+    swapped = sound.frame(Checksummed(sound.struct(sum=Int16ub), field="sum", algorithm=Sum(16)))
+    known = json.loads(BY_VECTORS.read_text(encoding="utf-8"))
+    assert "Sum(16) over all other bytes, in a field that is little-endian," in told(sound.sensor(swapped), known)[0]
+
+
 @pytest.mark.parametrize("samples", [3, 200], ids=["short", "long"])
 def test_a_checksum_of_another_name_is_found_in_the_vectors(samples: int) -> None:
     struct = Struct("header" / Const(b"\xaa\x55\xc3"), "samples" / Array(samples, Int16ul), "end" / Int16ul)
@@ -221,7 +227,7 @@ def test_a_checksum_of_another_name_is_found_in_the_vectors(samples: int) -> Non
     sealed = replace(plain, struct=Checksummed(struct, field="end", algorithm=Crc(16, 0x8005)))
     examples = [sound.sensor(sealed).example("data", seed=seed) for seed in range(3)]
     vectors = [{"frame": "data", "hex": data.hex(), "source": "made up"} for data in examples]
-    said = "LS212 data.end: Crc(width=16, poly=0x8005) over all other bytes fits every vector"
+    said = "LS212 data.end: Crc(width=16, poly=0x8005) over all other bytes, in a field that is little-endian, fits every vector"
     assert told(sound.sensor(plain), vectors)[0].startswith(said)
     assert not any(text.startswith("LS212") for text in told(sound.sensor(sealed), vectors))
 
