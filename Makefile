@@ -48,9 +48,10 @@ docs: $(WRITERS)
 wheels: $(DEVELOPERS)
 	@for project in . $(PLUGINS); do $(BIN)/python -m build --wheel --no-isolation --outdir $(DIST) $$project || exit 1; done
 
-# The pages of the sensors in docs/reference/sensors, from their specs.
+# The pages of the sensors in docs/reference/sensors, from their specs; those of the verbs, and the manual pages, from the commands.
 reference: $(USERS)
 	@$(BIN)/python docs/reference_pages.py
+	@$(BIN)/python docs/command_pages.py
 
 # The libraries to compare with bring old versions of others along, so they have an environment of their own.
 bench:

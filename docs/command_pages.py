@@ -1,0 +1,97 @@
+"""Makes the manual pages in docs/man, and the usage and options of each verb in docs/reference/command-line.md, from the commands.
+
+    python docs/command_pages.py
+
+`make reference` runs it; tests/docs/test_reference_pages.py holds that the pages are up to date. In command-line.md only what stands
+between the marks is made; the words around it are written by hand.
+"""
+
+from __future__ import annotations
+
+import inspect
+import re
+from pathlib import Path
+
+import click
+
+from lidarspec import __version__
+from lidarspec.cli.root import VERBS, main as root
+
+DOCS = Path(__file__).parent
+PAGE = "reference/command-line.md"
+BEGIN, END = "<!-- made by make reference -->", "<!-- until here -->"
+
+
+def context(verb: str) -> click.Context:
+    """The verb as it is invoked; of "" the command itself."""
+    top = click.Context(root, info_name="lidarspec")
+    command = root.get_command(top, verb)
+    return click.Context(command, info_name=verb, parent=top) if command else top
+
+
+def paragraphs(verb: str) -> list[str]:
+    """What the verb does, each paragraph in one line."""
+    return [" ".join(text.split()) for text in inspect.cleandoc(context(verb).command.help or "").split("\n\n")]
+
+
+def usage(verb: str) -> str:
+    """How the verb is typed."""
+    command = context(verb)
+    return " ".join([command.command_path, *command.command.collect_usage_pieces(command)])
+
+
+def options(verb: str) -> list[tuple[str, str]]:
+    """Each option as it is typed, and what it does."""
+    records = (param.get_help_record(context(verb)) for param in context(verb).command.params if isinstance(param, click.Option))
+    return [(typed, " ".join(text.split())) for typed, text in filter(None, records)]
+
+
+def section(verb: str) -> str:
+    """What is made of a verb's section."""
+    rows = [f"| `{typed}` | {text} |" for typed, text in ((t.replace("|", "\\|"), x.replace("|", "\\|")) for t, x in options(verb))]
+    table = ["", "| option | |", "|---|---|", *rows] if rows else []
+    return "\n".join([BEGIN, "", f"`{usage(verb)}`", "", "\n\n".join(paragraphs(verb)), *table, "", END])
+
+
+def page(text: str) -> str:
+    """command-line.md with every made part as it is now; a verb without one gets it below its heading."""
+    for verb in VERBS:
+        before, heading, after = text.partition(f"## {verb}\n\n")
+        rest = re.sub(rf"\A{re.escape(BEGIN)}.*?{re.escape(END)}\n\n?", "", after, flags=re.DOTALL)
+        text = f"{before}{heading}{section(verb)}\n\n{rest}" if heading else text
+    return text
+
+
+def manual(verb: str) -> str:
+    """The manual page of a verb; of "" that of the command."""
+    name = f"lidarspec-{verb}" if verb else "lidarspec"
+    said = paragraphs(verb)
+    lines = [f'.TH {name.upper()} 1 "" "lidarspec {__version__}" "lidarspec"', ".SH NAME", f"{name} \\- {_roff(said[0])}"]
+    lines += [".SH SYNOPSIS", _roff(usage(verb)), ".SH DESCRIPTION", "\n.PP\n".join(map(_roff, said))]
+    terms = [(".SH OPTIONS", options(verb))] if options(verb) else []
+    if not verb:
+        terms.append((".SH VERBS", [(f"lidarspec-{name}(1)", text) for name, (_, text) in VERBS.items()]))
+    for heading, items in terms:
+        lines += [heading, *(f".TP\n\\fB{_roff(term)}\\fR\n{_roff(text)}" for term, text in items)]
+    return "\n".join([*lines, *([".SH SEE ALSO\nlidarspec(1)"] if verb else []), ""])
+
+
+def _roff(text: str) -> str:
+    escaped = text.replace("\\", "\\e").replace("-", "\\-")
+    return f"\\&{escaped}" if escaped.startswith((".", "'")) else escaped
+
+
+def pages() -> dict[str, str]:
+    """The text of every file, by its path under docs."""
+    names = {verb: f"man/lidarspec-{verb}.1" for verb in VERBS} | {"": "man/lidarspec.1"}
+    return {PAGE: page((DOCS / PAGE).read_text(encoding="utf-8"))} | {path: manual(verb) for verb, path in names.items()}
+
+
+def main() -> None:
+    for path, text in pages().items():
+        (DOCS / path).parent.mkdir(exist_ok=True)
+        (DOCS / path).write_text(text, encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
