@@ -62,7 +62,7 @@ def test_show_draws_the_wire_table_of_every_frame() -> None:
 
 def test_show_tells_commands_and_their_bytes() -> None:
     found = printed("show", "cspc-m1c1-mini")
-    assert found["commands"]["start"] == {"frame": "command", "arguments": {}, "hex": "aa 55 f0 0f", "reply": "ack"}
+    assert found["commands"]["start"] == {"frame": "command", "arguments": {}, "hex": "aa 55 f0 0f", "reply": "ack", "only_stopped": False}
     assert found["frames"]["data"]["size"] == "10 + 3*lsn"
     assert "command start: aa 55 f0 0f, answered by ack" in ran("show", "cspc-m1c1-mini").stdout
 
