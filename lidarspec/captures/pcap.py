@@ -16,7 +16,19 @@ from functools import lru_cache
 from typing import BinaryIO
 
 from lidarspec.captures.ip import LARGEST_PAYLOAD, Reassembly, Refused, address, ip_packet, udp, udp_frame
-from lidarspec.captures.records import SMALLEST, CapturedPacket, Damaged, Passed, Source, Truncated, is_capture, packet_record, records
+from lidarspec.captures.records import (
+    SMALLEST,
+    CapturedPacket,
+    Damaged,
+    Form,
+    Passed,
+    Source,
+    Truncated,
+    is_capture,
+    packet_record,
+    records,
+    resume,
+)
 from lidarspec.errors import SourceError, UsageError, system_errors
 from lidarspec.transports.protocol import Closing
 
@@ -55,6 +67,8 @@ class CaptureStats:
         fragments: UDP packets that were IP fragments.
         incomplete_fragments: those whose datagram never became whole.
         malformed: packets and records that contradict themselves.
+        damaged: places where a record could not be read, and bytes were passed over to the next one that could.
+        lost: bytes that were passed over there.
         stopped_at: file offset of the truncated or malformed record that ended the reading, else None.
     """
 
@@ -66,6 +80,8 @@ class CaptureStats:
     fragments: int = 0
     incomplete_fragments: int = 0
     malformed: int = 0
+    damaged: int = 0
+    lost: int = 0
     stopped_at: int | None = None
 
 
@@ -95,7 +111,7 @@ class CaptureReader(Closing):
         self._fragments = Reassembly()
         self._datagrams: Iterator[Datagram] | None = None
         try:
-            magic = self._source.magic()
+            magic = bytes(self._source.ahead(4))
             if not is_capture(magic):
                 seen = f"it begins with {magic.hex(' ')}" if magic else "it is empty"
                 raise SourceError(f"{getattr(file, 'name', 'input')}: neither a pcap nor a pcapng capture: {seen}")
@@ -115,12 +131,25 @@ class CaptureReader(Closing):
 
     def _walk(self) -> Iterator[Datagram]:
         with self._to_the_end():
-            found = records(self._source)
+            form = records(self._source)
             while self._source.begin_record():
-                datagram = self.datagram(found.read())
+                try:
+                    datagram = self.datagram(form.read())
+                except Damaged:
+                    self._pass_over(form)
+                    continue
                 if datagram is not None:
                     self.stats.datagrams += 1
                     yield datagram
+
+    def _pass_over(self, form: Form) -> None:
+        """Goes behind a damaged record, to the next one or the end; counts what is lost."""
+        begun = self._source.record
+        found = resume(self._source, form)
+        self.stats.malformed += 1
+        self.stats.damaged += 1
+        self.stats.lost += self._source.place - begun
+        self.stats.stopped_at = None if found else begun
 
     @contextmanager
     def _to_the_end(self) -> Iterator[None]:
@@ -129,9 +158,6 @@ class CaptureReader(Closing):
             yield
         except Truncated:
             self.stats.truncated_tail = True
-            self.stats.stopped_at = self._source.record
-        except Damaged:
-            self.stats.malformed += 1
             self.stats.stopped_at = self._source.record
         finally:
             self.close()

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import click
 
-from lidarspec.cli.inputs import nearest_fault, no_frame, nothing_came, refuse_overwriting, scans_of
+from lidarspec.cli.inputs import conclude, nearest_fault, no_frame, nothing_came, refuse_overwriting, scans_of
 from lidarspec.cli.options import sensor_option
 from lidarspec.cli.output import emit, emit_json, note
 from lidarspec.device.device import Device, open as open_device
@@ -81,14 +81,13 @@ def _detected(source: str, target: str) -> Sensor:
 
 
 def _sum_up(device: Device, target: str, written: Written, *, as_json: bool) -> None:
-    for warning in device.warnings:
-        note(warning)
     note(f"{target}: {written.points} points of {written.scans} scan{'s' * (written.scans != 1)} of {device.sensor.id}; {device.stats}")
     if device.stats.tracebacks:
         note(f"the plugin failed: {device.stats.tracebacks[0].strip().splitlines()[-1]}")
     if as_json:
         stats = device.stats.to_dict()
         emit_json({"sensor": device.sensor.id, "output": target, "scans": written.scans, "points": written.points, "stats": stats}, None)
+    conclude(device)
 
 
 def _no_data(device: Device, source: str, target: str) -> Exception:
@@ -148,3 +147,4 @@ def plot(source: str, output: str, sensor_id: str | None, number: int, ramp: str
             note(f"{source} has {whole} whole scan{'s' * (whole != 1)}; drawn is the last piece of it that could be")
         title = f"{device.sensor.id}: {chosen}"
         emit(svg(chosen.points, look(chosen.points, ramp=ramp, reach=max_range), title), output)
+        conclude(device)

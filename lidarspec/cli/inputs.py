@@ -10,6 +10,10 @@ import time
 from collections.abc import Iterator, Sequence
 from shlex import quote
 
+import click
+
+from lidarspec.cli.failures import FINDINGS
+from lidarspec.cli.output import note
 from lidarspec.device.device import Device
 from lidarspec.device.settings import devices
 from lidarspec.discovery.detect import nearest
@@ -104,6 +108,14 @@ def nothing_came(device: Device, source: str, seconds: float | None = None) -> L
         return suggest(CommandError(f"{sensor.id} on {source} sent nothing{waited}"), f"lidarspec doctor {source} -s {sensor.id}")
     error = WireError(f"{source}: {stats.bytes_in} bytes{waited}, and not a scan of data frames among them: {stats}", sensor=sensor.id)
     return suggest(error, f"lidarspec detect {source}")
+
+
+def conclude(device: Device) -> None:
+    """Say what there is to be said of a source that was read; exit code 1 where bytes of it are damaged, and could not be."""
+    for warning in device.warnings:
+        note(warning)
+    if device.stats.unread:
+        raise click.exceptions.Exit(FINDINGS)
 
 
 class Patience:

@@ -234,7 +234,7 @@ class FileInput(Input):
     @property
     def stats(self) -> Counters:
         stats = self.decoder.stats
-        stats.foreign, stats.disconnects = self._transport.foreign, self._transport.disconnects
+        stats.foreign, stats.disconnects, stats.unread = self._transport.foreign, self._transport.disconnects, self._transport.unread
         return stats
 
     def next(self, wait: float) -> Arrival | None:

@@ -45,6 +45,7 @@ class Counters:
         bad_checksum, bad_length, implausible: rejected candidates.
         lost, duplicates, late: packets, by the sensor's sequence.
         kernel_drops, queue_dropped, foreign, disconnects: counted by the transports.
+        unread: bytes of a damaged file that could not be read.
         plugin_errors: exceptions out of a plugin; `tracebacks` keeps the first ones.
     """
 
@@ -64,6 +65,7 @@ class Counters:
     foreign: int = 0
     plugin_errors: int = 0
     disconnects: int = 0
+    unread: int = 0
     tracebacks: list[str] = field(default_factory=list, repr=False, compare=False)
 
     def to_dict(self) -> dict[str, Any]:

@@ -56,6 +56,7 @@ class RecordingTransport(Transport):
                 interrupted = False
         if self._recording.damaged:
             self.warnings.append(_damage(self._recording))
+            self.unread = 0 if self._recording.is_cut else self._recording.leftover
 
     def write(self, data: bytes) -> None:
         raise SourceError(f"{self._recording.path} is a recording: nothing can be sent to it")
@@ -84,11 +85,16 @@ def _damage(recording: Recording) -> str:
     """Where a recording is damaged, and how much of it was not read."""
     lost = f"{recording.leftover} bytes were not read"
     if recording.salvage:
-        return f"{recording.path} is damaged in {recording.damaged} place{'s' * (recording.damaged > 1)}: {lost}, everything else was"
+        return _passed_over(str(recording.path), recording.damaged, recording.leftover)
     if recording.is_cut:
         return f"{recording.path} is cut off in its last record: {lost}, everything before them was"
     mending = f"lidarspec record {recording.path} --salvage -o mended.lsr"
     return f"{recording.path} is damaged at byte {recording.offset}: {lost}; next: {mending}"
+
+
+def _passed_over(path: str, places: int, size: int) -> str:
+    """How much of a file was not read between what was."""
+    return f"{path} is damaged in {places} place{'s' * (places > 1)}: {size} bytes were not read, everything else was"
 
 
 class FileTransport(Transport):
@@ -112,10 +118,19 @@ class FileTransport(Transport):
 
     def _warn(self, stats: CaptureStats) -> None:
         """Take down what a capture does not hold whole."""
+        self.unread = stats.lost
+        if stats.damaged:
+            self.warnings.append(_passed_over(self._path, stats.damaged, stats.lost))
         if stats.truncated_tail:
             self.warnings.append(f"{self._path} is cut off in its last record; everything before it was read")
         if stats.snapped:
             self.warnings.append(f"{self._path}: {stats.snapped} packets were cut by the capture's snap length")
+        if stats.incomplete_fragments:
+            self.warnings.append(
+                f"{self._path}: {stats.incomplete_fragments} IP fragments were left out, others of their datagrams are missing"
+            )
+        if contradicting := stats.malformed - stats.damaged:
+            self.warnings.append(f"{self._path}: {contradicting} packets were left out, since their headers contradict themselves")
 
 
 class HexTransport(FileTransport):

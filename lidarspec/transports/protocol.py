@@ -83,6 +83,7 @@ class Transport(ABC):
         foreign: datagrams from other senders than the one asked for, so far.
         kernel_drops: datagrams that the system threw away, so far, since nobody fetched them in time.
         disconnects: interruptions of the line that a recording tells of, so far.
+        unread: bytes of a damaged file that could not be read, so far.
     """
 
     datagrams: bool = False
@@ -91,6 +92,7 @@ class Transport(ABC):
     foreign: int = 0
     kernel_drops: int = 0
     disconnects: int = 0
+    unread: int = 0
 
     @abstractmethod
     def chunks(self) -> Iterator[Chunk]:
