@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import ipaddress
 import os
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import BinaryIO
 
@@ -34,6 +35,8 @@ from lidarspec.transports.protocol import Closing
 
 #: the link types kept for private use: captures of byte streams have the first.
 USER_LINKS = range(147, 163)
+#: kinds of packets that are counted by their names.
+MOST_KINDS = 16
 #: who sent a datagram, and to whom, where nobody knows.
 NOBODY = ("0.0.0.0", 0)
 
@@ -62,6 +65,7 @@ class CaptureStats:
         packets: captured packets, of whatever kind.
         datagrams: UDP datagrams handed out.
         other: packets that are not UDP over IP.
+        others: how many of them by what they are, "ARP" or "TCP"; of so many kinds at most.
         truncated_tail: whether the file ends in the middle of a record; all before it was read.
         snapped: UDP packets that the capture's snap length cut short; they are not handed out.
         fragments: UDP packets that were IP fragments.
@@ -75,6 +79,7 @@ class CaptureStats:
     packets: int = 0
     datagrams: int = 0
     other: int = 0
+    others: Counter[str] = field(default_factory=Counter, compare=False)
     truncated_tail: bool = False
     snapped: int = 0
     fragments: int = 0
@@ -83,6 +88,11 @@ class CaptureStats:
     damaged: int = 0
     lost: int = 0
     stopped_at: int | None = None
+
+    def leave(self, what: str) -> None:
+        """Count a packet that is no UDP over IP."""
+        self.other += 1
+        self.others[what if what in self.others or len(self.others) < MOST_KINDS else "more"] += 1
 
 
 class CaptureReader(Closing):
@@ -183,7 +193,7 @@ class CaptureReader(Closing):
             part = udp(ip)
         except Refused as refused:
             if refused.reason == "other":
-                stats.other += 1
+                stats.leave(refused.what)
             elif refused.reason == "short" and len(packet.data) < packet.original:
                 stats.snapped += 1
             else:
@@ -198,10 +208,12 @@ class StreamReader(CaptureReader):
 
     def datagram(self, packet: CapturedPacket | Passed) -> Datagram | None:
         """What the packet holds; counts it where it is of another link type."""
-        if isinstance(packet, Passed) or packet.link not in USER_LINKS:
-            self.stats.other += 1
+        if isinstance(packet, Passed):
             return None
         self.stats.packets += 1
+        if packet.link not in USER_LINKS:
+            self.stats.leave(f"link type {packet.link}")
+            return None
         self.stats.snapped += len(packet.data) < packet.original
         return Datagram(packet.data, packet.at, NOBODY, NOBODY)
 

@@ -22,6 +22,7 @@ from lidarspec.plugins import sensor as named_sensor
 from lidarspec.scans.scans import Scan
 from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.open_url import transport
+from lidarspec.transports.protocol import no_bytes
 from lidarspec.view.polar import look
 from lidarspec.view.svg import svg
 
@@ -94,7 +95,7 @@ def _no_data(device: Device, source: str, target: str) -> Exception:
     """Why nothing came out: an empty file, a damaged frame, another sensor's bytes, or no lidar's at all."""
     sensor, stats = device.sensor, device.stats
     if stats.bytes_in == 0:
-        return suggest(WireError(f"{source} holds no bytes", sensor=sensor.id), f"lidarspec show {sensor.id}")
+        return suggest(WireError(no_bytes(source, device.warnings), sensor=sensor.id), f"lidarspec show {sensor.id}")
     if stats.tracebacks:
         return WireError(f"no points: {stats.tracebacks[0].strip().splitlines()[-1]}", sensor=sensor.id)
     given = _again(source)
@@ -114,7 +115,8 @@ def _again(source: str) -> Heard | None:
         return None
     with contextlib.closing(transport(source)) as opened:
         try:
-            return Heard(source, tuple(chunk.data for chunk in beginning(opened, LOOKED_AT)), opened.datagrams)
+            chunks = tuple(chunk.data for chunk in beginning(opened, LOOKED_AT))
+            return Heard(source, chunks, opened.datagrams, warnings=tuple(opened.warnings))
         except LidarSpecError:
             return None
 

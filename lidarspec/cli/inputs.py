@@ -23,6 +23,7 @@ from lidarspec.plugins import sensors
 from lidarspec.scans.scans import Scan
 from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.open_url import is_port, live_address, transport
+from lidarspec.transports.protocol import no_bytes
 from lidarspec.wire.parse import parse_typed
 
 #: longest hexadecimal text that is repeated in the next command, and of other text in a message.
@@ -75,7 +76,7 @@ def no_frame(sensor: Sensor, given: Heard) -> WireError:
     longest = max((frame.max_length for frame in sensor.frames.values()), default=0)
     command = f"lidarspec explain {given.source} -s {sensor.id}"
     if not data:
-        return suggest(WireError(f"{given.source} holds no bytes", sensor=sensor.id), f"lidarspec build {sensor.id} --help")
+        return suggest(WireError(no_bytes(given.source, given.warnings), sensor=sensor.id), f"lidarspec build {sensor.id} --help")
     if len(data) > longest:
         error = WireError(f"no frame in {len(data)} bytes", sensor=sensor.id, expected="a frame", data=data[:longest])
         return suggest(error, "lidarspec sensors")
@@ -89,7 +90,7 @@ def no_frame(sensor: Sensor, given: Heard) -> WireError:
 def nearest_fault(given: Heard) -> WireError:
     """No sensor fits: what the one that came farthest says, with its id, or that none came far."""
     if not given.data:
-        return suggest(WireError(f"{given.source} holds no bytes"), "lidarspec sensors")
+        return suggest(WireError(no_bytes(given.source, given.warnings)), "lidarspec sensors")
     best = nearest(given.data)
     if best is None:
         text = f"no frame of any of the {len(sensors())} installed sensors"
@@ -101,8 +102,10 @@ def nothing_came(device: Device, source: str, seconds: float | None = None) -> L
     """Why there is nothing to show: no data frame in a file, a silent device, or one whose bytes are no frames."""
     sensor, stats = device.sensor, device.stats
     if not device.is_live:
-        what = "holds no bytes" if stats.bytes_in == 0 else f"has no data frame: {stats}"
-        return suggest(WireError(f"{source} {what}", sensor=sensor.id), f"lidarspec explain {source} -s {sensor.id}")
+        said = (
+            "; ".join([f"{source} has no data frame: {stats}", *device.warnings]) if stats.bytes_in else no_bytes(source, device.warnings)
+        )
+        return suggest(WireError(said, sensor=sensor.id), f"lidarspec explain {source} -s {sensor.id}")
     waited = "" if seconds is None else f" within {seconds:.1f} s".replace(".0 s", " s")
     if stats.bytes_in == 0:
         return suggest(CommandError(f"{sensor.id} on {source} sent nothing{waited}"), f"lidarspec doctor {source} -s {sensor.id}")
@@ -150,7 +153,10 @@ def scans_of(device: Device, source: str) -> Iterator[Scan]:
 
 def _file(path: str) -> Heard:
     with system_errors(path), contextlib.closing(transport(path)) as opened:
-        return Heard(path, tuple(chunk.data for chunk in opened.chunks()), opened.datagrams)
+        chunks = tuple(chunk.data for chunk in opened.chunks())
+        for warning in opened.warnings if chunks else ():
+            note(warning)
+        return Heard(path, chunks, opened.datagrams, warnings=tuple(opened.warnings))
 
 
 def _bytes(text: str) -> bytes:

@@ -45,6 +45,8 @@ def view(source: str, sensor_id: str | None, duration: float | None, once: bool,
         if switch is not None:
             switch.sensor_id = device.sensor.id
         _show(device, Window(Feed(device, played=True), source, ramp=ramp, record=switch, duration=duration), taken=source == "-")
+        if not device.is_live:
+            conclude(device)
     for path, size in switch.written if switch else ():
         note(f"recorded {size} bytes; next: lidarspec view {Path(path).name}")
 

@@ -18,7 +18,7 @@ from lidarspec.spec.sensor import Sensor
 from lidarspec.transports import ports
 from lidarspec.transports.base import Address, data_link, with_option
 from lidarspec.transports.open_url import live_address, resolved, transport
-from lidarspec.transports.protocol import LiveTransport
+from lidarspec.transports.protocol import LiveTransport, no_bytes
 from lidarspec.transports.udp import BUFFER, shortfall
 
 #: share of the bytes outside frames from which on a line is bad.
@@ -82,7 +82,10 @@ def _file(path: str) -> Iterator[Finding]:
         yield Finding(False, f"{path} is empty")
     else:
         found = max(verdicts(path), key=lambda one: one.heard.size)
-        yield _verdict(path, found, None)
+        if found.heard.size:
+            yield _verdict(path, found, None)
+        for text in found.heard.warnings or [no_bytes(path, ())] * (not found.heard.size):
+            yield Finding(False, text)
 
 
 def _serial(source: str, address: Address, sensor: Sensor | None, seconds: float) -> Iterator[Finding]:

@@ -46,6 +46,7 @@ class Heard:
         baud: at which a serial port was read; None for another source, and for a port that has no baud rate.
         sender: address of the sender, where there are several.
         failure: why it could not be opened.
+        warnings: what is to be said of the source, once it was read to its end.
     """
 
     source: str
@@ -54,6 +55,7 @@ class Heard:
     baud: int | None = None
     sender: str = ""
     failure: SourceError | None = field(default=None, compare=False)
+    warnings: tuple[str, ...] = ()
 
     @property
     def size(self) -> int:
@@ -107,11 +109,13 @@ def _heard(source: str, seconds: float, baud: int | None, name: str) -> Iterator
     with contextlib.closing(transport(source)) as opened:
         number = DATAGRAMS if opened.datagrams else None
         chunks = _listened(opened, seconds) if isinstance(opened, LiveTransport) else beginning(opened, LOOKED_AT, number=number)
+        said = () if isinstance(opened, LiveTransport) else tuple(opened.warnings)
     by_sender: dict[str, list[bytes]] = {}
     for chunk in chunks:
         by_sender.setdefault(chunk.sender[0] if chunk.sender else "", []).append(chunk.data)
     for sender, data in (by_sender or {"": []}).items():
-        yield Heard(name, tuple(data), opened.datagrams, baud, sender if len(by_sender) > 1 else "")
+        named = sender if len(by_sender) > 1 else ""
+        yield Heard(name, tuple(data), opened.datagrams, baud, named, warnings=said)
 
 
 def beginning(opened: Transport, most: int, *, number: int | None = None) -> list[Chunk]:

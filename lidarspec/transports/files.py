@@ -125,6 +125,11 @@ class FileTransport(Transport):
             self.warnings.append(f"{self._path} is cut off in its last record; everything before it was read")
         if stats.snapped:
             self.warnings.append(f"{self._path}: {stats.snapped} packets were cut by the capture's snap length")
+        if stats.other > stats.datagrams:
+            kinds = ", ".join(f"{number} {what}" for what, number in stats.others.most_common())
+            self.warnings.append(f"{self._path}: {stats.other} of {stats.packets} packets are no UDP over IP, and were not read: {kinds}")
+        if not stats.packets:
+            self.warnings.append(f"{self._path} is a capture without a packet")
         if stats.incomplete_fragments:
             self.warnings.append(
                 f"{self._path}: {stats.incomplete_fragments} IP fragments were left out, others of their datagrams are missing"

@@ -115,6 +115,11 @@ class Transport(ABC):
         """Give the port, socket or file back."""
 
 
+def no_bytes(source: str | Path, warnings: Sequence[str]) -> str:
+    """Why there are no bytes in a file: what its transport says of it, or that there are none."""
+    return "; ".join(warnings) or f"{source} holds no bytes"
+
+
 class Disconnected(SourceError):
     """The device behind a live source went away; `LiveTransport.reopen` finds it again when it comes back."""
 

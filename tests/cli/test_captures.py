@@ -42,3 +42,48 @@ def test_a_damaged_capture_is_read_on_and_said_to_be_damaged(verb: str, tmp_path
     assert f"{path} is damaged in 1 place: {len(some[700])} bytes were not read, everything else was" in done.stderr
     if verb == "read":
         assert done.stdout.count("\n") == 1299
+
+
+TCP = made.ethernet(made.ipv4(bytes(40), protocol=6))
+ARP = made.ethernet(bytes(28), ethertype=0x0806)
+
+
+@pytest.mark.parametrize(
+    ("words", "code"),
+    [
+        (("convert", "{path}", "{target}.csv", "-s", M1), 4),
+        (("convert", "{path}", "{target}.csv"), 4),
+        (("read", "{path}", "-s", M1), 4),
+        (("stats", "{path}", "-s", M1), 4),
+        (("view", "{path}", "-s", M1), 4),
+        (("view", "{path}"), 4),
+        (("plot", "{path}", "-s", M1, "-o", "{target}.svg"), 4),
+        (("detect", "{path}"), 4),
+        (("doctor", "{path}"), 1),
+        (("parse", "{path}", "-s", M1), 4),
+        (("explain", "{path}"), 4),
+        (("crc", "{path}"), 4),
+        (("new", "acme-x1", "--into", "{target}", "--from-capture", "{path}"), 4),
+        (("record", "{path}", "-o", "{target}.lsr"), 4),
+        (("replay", "{path}", "--to", "{target}.lsr"), 4),
+    ],
+    ids=lambda value: value[0] + str(len(value)) if isinstance(value, tuple) else "",
+)
+def test_every_verb_says_what_is_in_a_capture_of_which_nothing_is_read(words: tuple[str, ...], code: int, tmp_path: Path) -> None:
+    path = capture(tmp_path / "tcp.pcap", *(made.record(each) for each in (TCP, ARP, TCP)))
+    done = ran(*(word.format(path=path, target=tmp_path / "out") for word in words), code=code)
+    said = f"{path}: 3 of 3 packets are no UDP over IP, and were not read: 2 TCP, 1 ARP"
+    assert done.output.count(said) == 1, done.output
+    assert "holds no bytes" not in done.output
+    assert "nothing came" not in done.output
+
+
+def test_what_is_beside_the_datagrams_is_said_where_it_is_the_most(tmp_path: Path) -> None:
+    some, empty = records(2), capture(tmp_path / "empty.pcap")
+    background = capture(tmp_path / "some.pcap", *some, *(made.record(ARP) for _ in range(2)))
+    assert "packets" not in ran("parse", background, "-s", M1).stderr
+    mostly = capture(tmp_path / "mostly.pcap", *some, *(made.record(ARP) for _ in range(3)))
+    assert "3 of 5 packets are no UDP over IP, and were not read: 3 ARP" in ran("parse", mostly, "-s", M1).stderr
+    assert f"{empty} is a capture without a packet" in ran("parse", empty, "-s", M1, code=4).stderr
+    cut = capture(tmp_path / "cut.pcap", *(made.record(made.frame(bytes(400))[:90], original=442) for _ in range(3)))
+    assert f"{cut}: 3 packets were cut by the capture's snap length" in ran("view", cut, "-s", M1, code=4).stderr
