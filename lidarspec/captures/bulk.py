@@ -21,6 +21,7 @@ from lidarspec.captures.pcap import CaptureReader, Datagram
 from lidarspec.captures.records import LARGEST_BLOCK, Damaged, Form, Passed, Source, Times, Truncated, records
 from lidarspec.framing.decoder import Decoder
 from lidarspec.framing.results import Frames, Indices
+from lidarspec.transports.protocol import Origin, Sender
 
 #: bytes of a record, from its start, that are compared at most; longer headers are read plainly.
 WIDEST = 128
@@ -33,7 +34,6 @@ _HEAD = 16  # bytes of a record of either format, as far as they tell the length
 _RUN = 16
 #: kinds of datagrams that are known at a time, and that become known in one batch: nobody's capture makes this slow.
 MOST_KNOWN = 16
-Sender = tuple[str, int]
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,26 +161,24 @@ class Batch:
         """The bytes of one datagram."""
         return self.buffer[self.starts[index] : self.starts[index] + self.sizes[index]].tobytes()
 
-    def of(self, host: str) -> Batch:
-        """The datagrams of the batch that come from one address."""
-        if all(name[0] == host for name in self.names):
+    def of(self, origin: Origin) -> Batch:
+        """The datagrams of the batch that come from one address, or one port of it."""
+        if all(name in origin for name in self.names):
             return self
-        wanted = np.array([name[0] == host for name in self.names], np.bool_)[self.senders]
+        wanted = np.array([name in origin for name in self.names], np.bool_)[self.senders]
         return Batch(self.buffer, self.starts[wanted], self.sizes[wanted], self.at[wanted], self.senders[wanted], self.names)
 
-    def hosts(self, found: Frames) -> dict[str, list[str]]:
-        """The addresses that frames found in these datagrams came from, by type of frame."""
-        hosts: dict[str, list[str]] = {}
+    def sent(self, found: Frames) -> Iterator[tuple[str, Sender]]:
+        """The types of frames found in these datagrams, and who sent them: of each type again where the sender changes."""
         if len(self.names) == 1:
-            for kind in np.flatnonzero(np.bincount(found.kinds)).tolist():
-                hosts[found.names[kind]] = [self.names[0][0]]
-            return hosts
+            yield from ((found.names[kind], self.names[0]) for kind in np.flatnonzero(np.bincount(found.kinds)).tolist())
+            return
         order = np.argsort(self.starts, kind="stable")
         senders = self.senders[order[np.searchsorted(self.starts[order], found.starts)]]
-        for kind, sender in dict.fromkeys(zip(found.kinds.tolist(), senders.tolist(), strict=True)):
-            known = hosts.setdefault(found.names[kind], [])
-            known += [self.names[sender][0]] if self.names[sender][0] not in known else []
-        return hosts
+        for kind in np.unique(found.kinds).tolist():
+            own = senders[found.kinds == kind]
+            changes = np.flatnonzero(np.diff(own, prepend=-1))
+            yield from ((found.names[kind], self.names[sender]) for sender in own[changes].tolist())
 
 
 def first_frames(decoder: Decoder, batches: Iterable[Batch], wanted: Collection[str]) -> dict[str, bytes]:

@@ -56,7 +56,7 @@ def _drafted(names: Names, link: str | None, capture: str) -> dict[str, str]:
     groups: dict[object, list[Chunk]] = {}
     with contextlib.closing(transport(capture)) as opened:
         for chunk in beginning(opened, MOST):
-            groups.setdefault((chunk.sender and chunk.sender[0], chunk.receiver and chunk.receiver[1]), []).append(chunk)
+            groups.setdefault((chunk.sender, chunk.receiver and chunk.receiver[1]), []).append(chunk)
     chunks = max(groups.values(), key=lambda group: sum(len(chunk.data) for chunk in group), default=[])
     if not any(chunk.data for chunk in chunks):
         raise WireError(no_bytes(capture, opened.warnings))

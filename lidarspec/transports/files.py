@@ -18,7 +18,7 @@ from lidarspec.captures.pcap import CaptureReader, CaptureStats, StreamReader, i
 from lidarspec.captures.records import is_capture
 from lidarspec.errors import SourceError, WireError, system_errors
 from lidarspec.recording.format import MAGIC, Header, Record, Recording
-from lidarspec.transports.protocol import Chunk, Transport
+from lidarspec.transports.protocol import Chunk, Origin, Transport
 
 #: events behind which a frame begun earlier does not go on.
 INTERRUPTIONS = frozenset({"disconnect", "reconnect", "dropped"})
@@ -31,7 +31,7 @@ class RecordingTransport(Transport):
 
     Args:
         path: the file.
-        sender: only datagrams from this address.
+        sender: only datagrams from this address, or "ADDRESS:PORT".
         salvage: go on behind damaged places.
 
     Attributes:
@@ -41,7 +41,7 @@ class RecordingTransport(Transport):
     def __init__(self, path: str | Path, *, sender: str | None = None, salvage: bool = False) -> None:
         self._recording = Recording(path, salvage=salvage)
         self.header: Header = self._recording.header
-        self.datagrams, self._sender = self.header.datagrams, sender
+        self.datagrams, self._origin = self.header.datagrams, None if sender is None else Origin.parse(sender)
         self.warnings: list[str] = []
 
     def chunks(self) -> Iterator[Chunk]:
@@ -65,7 +65,7 @@ class RecordingTransport(Transport):
         self._recording.close()
 
     def _wanted(self, record: Record) -> bool:
-        if self._sender is None or (record.sender is not None and record.sender[0] == self._sender):
+        if self._origin is None or record.sender in self._origin:
             return True
         self.foreign += 1
         return False
@@ -157,12 +157,12 @@ class CaptureTransport(FileTransport):
 
     def __init__(self, path: str, file: BinaryIO, *, sender: str | None = None) -> None:
         super().__init__(path, file)
-        self._sender = sender
+        self._origin = None if sender is None else Origin.parse(sender)
 
     def chunks(self) -> Iterator[Chunk]:
         reader = CaptureReader(self._file)
         for datagram in reader:
-            if self._sender is not None and datagram.source[0] != self._sender:
+            if self._origin is not None and datagram.source not in self._origin:
                 self.foreign += 1
                 continue
             yield Chunk(datagram.data, datagram.at, datagram.source, datagram.destination)
@@ -176,7 +176,7 @@ class CaptureTransport(FileTransport):
         """
         reader = CaptureBatches(self._file)
         for batch in reader.batches():
-            mine = batch if self._sender is None else batch.of(self._sender)
+            mine = batch if self._origin is None else batch.of(self._origin)
             self.foreign += len(batch) - len(mine)
             if len(mine):
                 yield mine

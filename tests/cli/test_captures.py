@@ -87,3 +87,28 @@ def test_what_is_beside_the_datagrams_is_said_where_it_is_the_most(tmp_path: Pat
     assert f"{empty} is a capture without a packet" in ran("parse", empty, "-s", M1, code=4).stderr
     cut = capture(tmp_path / "cut.pcap", *(made.record(made.frame(bytes(400))[:90], original=442) for _ in range(3)))
     assert f"{cut}: 3 packets were cut by the capture's snap length" in ran("view", cut, "-s", M1, code=4).stderr
+
+
+def test_senders_of_one_address_are_told_apart_by_their_ports(tmp_path: Path) -> None:
+    path = capture(tmp_path / "two.pcap", *records(40, ("10.0.0.1", 40001), ("10.0.0.1", 40002)))
+    recording = tmp_path / "two.lsr"
+    ran("record", path, "-o", recording)
+    for source in (path, recording):
+        said = ran("convert", source, tmp_path / "out.csv", "-s", M1, code=2).stderr
+        assert "10.0.0.1:40001 and 10.0.0.1:40002" in said or "10.0.0.1:40002 and 10.0.0.1:40001" in said
+        found = [f"{source} from 10.0.0.1:4000{number}" for number in (1, 2)]
+        assert all(each in ran("detect", source).output for each in found)
+        doctor = ran("doctor", source, code=1).output
+        assert f"10.0.0.1:40001 and 10.0.0.1:40002 all send frames of {M1}" in doctor
+        assert f"lidarspec view '{source}?src=10.0.0.1:40001' -s {M1}" in doctor
+        assert ran("read", f"{source}?src=10.0.0.1:40002", "-s", M1, "--packets", "--json").stdout.count("\n") == 20
+    assert "2 senders were recorded" in ran("replay", recording, "--to", "udp://127.0.0.1:9", "--speed", "max").stderr
+
+
+def test_a_sensor_that_sends_from_several_ports_to_several_is_one_sender(tmp_path: Path) -> None:
+    data = records(20, ("10.0.0.1", 6699))
+    status = [datagram_record(Datagram(b"status", 10**18, ("10.0.0.1", 7788), ("10.0.0.2", 7788))) for _ in range(20)]
+    path = capture(tmp_path / "one.pcap", *(each for pair in zip(data, status, strict=True) for each in pair))
+    assert "10.0.0.1" not in ran("detect", path).output
+    assert "choose" not in ran("doctor", path).output
+    ran("convert", path, tmp_path / "out.csv", "-s", M1)
