@@ -126,7 +126,8 @@ class Senders:
         self._source, self._sensor = source, sensor
         self._now: dict[str, Sender] = {}  # who sends the frames of a type, and who did before
         self._before: dict[str, set[Sender]] = {}
-        self._others: dict[Sender, Decoder] = {}
+        self._others: dict[Sender, Decoder] = {}  # of streams: what senders send, and who has sent frames
+        self._framed: set[Sender] = set()
 
     def check(self, chunks: Sequence[Chunk], found: Frames) -> None:
         """Look who sent the frames of these datagrams.
@@ -170,10 +171,12 @@ class Senders:
         mine: list[Chunk] = []
         for chunk in chunks:
             known = self._now.setdefault("", chunk.sender) if chunk.sender else None
-            if chunk.sender and chunk.sender != known and self._sends_frames(chunk.sender, chunk):
-                if main.stats.frames:
+            has_begun = bool(main.stats.frames)
+            if chunk.sender and (chunk.sender != known or not has_begun) and self._sends_frames(chunk.sender, chunk):
+                if has_begun or known in self._framed:
                     self.see([("", chunk.sender)])
                 self._now[""] = chunk.sender
+                self._framed.add(chunk.sender)
             mine += [chunk] if not chunk.sender or chunk.sender == self._now[""] else []
         return mine
 
