@@ -22,6 +22,7 @@ from lidarspec.errors import CommandError, LidarSpecError, SourceError, UsageErr
 from lidarspec.plugins import sensors
 from lidarspec.scans.scans import Scan
 from lidarspec.spec.sensor import Sensor
+from lidarspec.transports.files import refuse_piped
 from lidarspec.transports.open_url import is_port, live_address, transport
 from lidarspec.transports.protocol import no_bytes
 from lidarspec.wire.parse import parse_typed
@@ -44,6 +45,7 @@ def read(words: Sequence[str]) -> Heard:
     text = " ".join(words)
     if text == "-":
         data = sys.stdin.buffer.read()
+        refuse_piped(data)
         return Heard("-", (_unhexed(data) or data,))
     if len(words) == 1 and os.path.exists(text) and not is_port(text):
         return _file(text)

@@ -8,22 +8,44 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
+import re
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from shlex import quote
 from typing import BinaryIO
 
 from lidarspec.captures.bulk import Batch, CaptureBatches
 from lidarspec.captures.pcap import CaptureReader, CaptureStats, StreamReader, is_stream_capture
 from lidarspec.captures.records import is_capture
-from lidarspec.errors import SourceError, WireError, system_errors
+from lidarspec.errors import SourceError, WireError, suggest, system_errors
 from lidarspec.recording.format import MAGIC, Header, Record, Recording
 from lidarspec.transports.protocol import Chunk, Origin, Transport
 
 #: events behind which a frame begun earlier does not go on.
 INTERRUPTIONS = frozenset({"disconnect", "reconnect", "dropped"})
-#: bytes read at once.
-BLOCK = 1 << 18
+#: bytes read at once, and bytes that say what a file is.
+BLOCK, HEAD = 1 << 18, 512
+#: how files begin that hold no bytes as a sensor sent them, or these in a shape of their own; what they are, and what takes the bytes out.
+CONTAINERS = {
+    rb"\x1f\x8b\x08[\x00-\x1f]": ("compressed by gzip", "gunzip -k {}"),
+    rb"BZh[1-9]1AY&SY": ("compressed by bzip2", "bunzip2 -k {}"),
+    rb"\xfd7zXZ\x00": ("compressed by xz", "unxz -k {}"),
+    rb"\x28\xb5\x2f\xfd": ("compressed by zstd", "unzstd {}"),
+    rb"\x04\x22\x4d\x18": ("compressed by lz4", "unlz4 {}"),
+    rb"PK\x03\x04": ("a zip archive, as .npz files are too", "unzip -l {}"),
+    rb"7z\xbc\xaf\x27\x1c": ("a 7z archive", "7z l {}"),
+    rb".{257}ustar": ("a tar archive", "tar -tf {}"),
+    rb"SQLite format 3\x00": ("an SQLite database, as ROS 2 bags are", ""),
+    rb"#ROSBAG V": ("a ROS 1 bag", ""),
+    rb"\x89MCAP0\r\n": ("an MCAP file, as ROS 2 bags are", ""),
+    rb"\x89HDF\r\n": ("an HDF5 file", ""),
+    rb"PAR1": ("a Parquet file", ""),
+    rb"\x93NUMPY": ("a NumPy array", ""),
+    rb"# \.PCD v|ply\r?\n|LASF": ("a file of points", ""),
+    rb"snoop\x00{3}|btsnoop\x00|\x34\xcd\xb2\xa1|\xa1\xb2\xcd\x34": ("a capture of another format", "editcap {} capture.pcapng"),
+}
 
 
 class RecordingTransport(Transport):
@@ -138,6 +160,16 @@ class FileTransport(Transport):
             self.warnings.append(f"{self._path}: {contradicting} packets were left out, since their headers contradict themselves")
 
 
+class PipeTransport(FileTransport):
+    """The bytes of standard input."""
+
+    def chunks(self) -> Iterator[Chunk]:
+        for number, chunk in enumerate(super().chunks()):
+            if not number:
+                refuse_piped(chunk.data)
+            yield chunk
+
+
 class HexTransport(FileTransport):
     """Bytes written as hexadecimal text; white space is free, "#" begins a comment, an offset column ends in ":"."""
 
@@ -192,17 +224,44 @@ class StreamCaptureTransport(FileTransport):
         self._warn(reader.stats)
 
 
+def refuse_container(path: str, head: bytes) -> None:
+    """Nothing, for a file that is read as the bytes it holds.
+
+    Args:
+        head: its first `HEAD` bytes, or all.
+
+    Raises:
+        SourceError: where it begins as a file of another kind, which is named.
+    """
+    for beginning, (what, command) in CONTAINERS.items():
+        if re.match(beginning, head, re.DOTALL):
+            error = SourceError(f"{path} is {what}, and is not read: this takes captures, recordings and bytes as a sensor sent them")
+            raise suggest(error, command.format(quote(path))) if command and os.path.exists(path) else error
+
+
+def refuse_piped(data: bytes) -> None:
+    """Nothing, for standard input that is read as the bytes it holds.
+
+    Raises:
+        SourceError: where it begins as a file that is read otherwise, or not at all.
+    """
+    refuse_container("standard input", data[:HEAD])
+    if is_capture(data[:4]) or data.startswith(MAGIC):
+        raise SourceError("standard input is a capture or a recording, which are read from files: give the path of one")
+
+
 def open_file(path: str, *, sender: str | None = None) -> FileTransport | RecordingTransport:
     """The transport for a file, by what it holds; "-" is standard input.
 
     Raises:
-        SourceError: where it cannot be opened.
+        SourceError: where it cannot be opened, or is a file of another kind, such as an archive or a bag.
     """
     if path == "-":
-        return FileTransport("standard input", sys.stdin.buffer)
+        return PipeTransport("standard input", sys.stdin.buffer)
     with system_errors(path), contextlib.ExitStack() as undo:
         file = undo.enter_context(open(path, "rb"))
-        head = file.peek(24)[:24]
+        head = file.peek(HEAD)[:HEAD]
+        refuse_container(path, head)
         undo.pop_all()  # the transport closes it
     if head.startswith(MAGIC):
         file.close()

@@ -2,8 +2,16 @@
 
 from __future__ import annotations
 
+import bz2
+import gzip
+import io
+import lzma
+import sqlite3
+import tarfile
+import zipfile
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import lidarspec as ls
@@ -12,7 +20,7 @@ from lidarspec.captures.pcap import Datagram, datagram_record
 from lidarspec.captures.records import capture_head
 from lidarspec.simulation.simulator import simulate
 from tests import made_captures as made
-from tests.cli.running import ran
+from tests.cli.running import process, ran
 
 M1 = "robosense-m1"
 
@@ -112,3 +120,56 @@ def test_a_sensor_that_sends_from_several_ports_to_several_is_one_sender(tmp_pat
     assert "10.0.0.1" not in ran("detect", path).output
     assert "choose" not in ran("doctor", path).output
     ran("convert", path, tmp_path / "out.csv", "-s", M1)
+
+
+def container(name: str, path: Path) -> Path:
+    """A file of a kind that others write, with what lidarspec could read in it."""
+    held = path.with_name("held.pcap")
+    packets = capture(held, *records(3)).read_bytes()
+    if name == "SQLite":
+        with sqlite3.connect(path) as bag:
+            bag.execute("create table messages (data blob)")
+            bag.execute("insert into messages values (?)", (packets,))
+        bag.close()
+    elif name == "zip":
+        with zipfile.ZipFile(path, "w") as archive:
+            archive.write(held)
+    elif name == "tar":
+        with tarfile.open(path, "w") as tar:
+            tar.add(held)
+    elif name == "NumPy":
+        with path.open("wb") as file:
+            np.save(file, np.arange(3))
+    else:
+        packing = {"gzip": gzip.compress, "bzip2": bz2.compress, "xz": lzma.compress}
+        begun = {"ROS 1 bag": b"#ROSBAG V2.0\n", "MCAP": b"\x89MCAP0\r\n", "points": b"# .PCD v0.7\n", "zstd": b"\x28\xb5\x2f\xfd"}
+        path.write_bytes(packing[name](packets) if name in packing else begun[name] + packets)
+    return path
+
+
+@pytest.mark.parametrize("name", ["SQLite", "zip", "tar", "NumPy", "gzip", "bzip2", "xz", "zstd", "ROS 1 bag", "MCAP", "points"])
+def test_files_of_other_kinds_are_named_and_not_taken_for_bytes(name: str, tmp_path: Path) -> None:
+    path = container(name, tmp_path / "other.bin")
+    said = ran("convert", path, tmp_path / "out.csv", "-s", M1, code=3).stderr
+    assert f"{path} is " in said
+    assert name in said
+    assert "and is not read" in said
+    ran("detect", path, code=3)
+    if name == "gzip":
+        assert f"next: gunzip -k {path}" in said
+
+
+def test_standard_input_is_no_way_around_it(tmp_path: Path) -> None:
+    packed = container("gzip", tmp_path / "other.gz").read_bytes()
+    for words in (("convert", "-", tmp_path / "out.csv"), ("parse", "-")):
+        done = process(*words, "-s", M1, given=packed)
+        assert (done.returncode, b"standard input is compressed by gzip" in done.stderr) == (3, True)
+    done = process("record", "-", "-o", tmp_path / "it.bin", given=(tmp_path / "held.pcap").read_bytes())
+    assert (done.returncode, b"give the path" in done.stderr) == (3, True)
+
+
+def test_bytes_that_only_begin_a_little_like_an_archive_are_bytes(tmp_path: Path) -> None:
+    path = tmp_path / "it.bin"
+    for begun in (b"\x1f\x8b", b"PK", b"BZh9", b"\x1f\x8b\x08\xff", b"#", io.DEFAULT_BUFFER_SIZE * b"\0"):
+        path.write_bytes(begun + bytes(8))
+        assert ran("record", path, "-o", tmp_path / "it.lsr", "--force").stderr
