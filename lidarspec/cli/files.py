@@ -12,7 +12,7 @@ import click
 
 from lidarspec.cli.inputs import conclude, nearest_fault, no_frame, nothing_came, refuse_overwriting, scans_of
 from lidarspec.cli.options import sensor_option
-from lidarspec.cli.output import emit, emit_json, note
+from lidarspec.cli.output import Progress, emit, emit_json, note, size
 from lidarspec.device.device import Device, open as open_device
 from lidarspec.discovery.detect import detected, scores
 from lidarspec.discovery.listen import Heard, beginning
@@ -32,16 +32,22 @@ LOOKED_AT = 1 << 16
 
 @dataclass
 class Written:
-    """What has gone through so far."""
+    """What has gone through so far, and said on a terminal while it does."""
 
+    device: Device
+    target: str
     scans: int = 0
     points: int = 0
 
-    def counting(self, scans: Iterable[Scan], *, every_point: bool) -> Iterator[Scan]:
+    def __str__(self) -> str:
+        return f"{self.target}: {self.points} points of {self.scans} scan{'s' * (self.scans != 1)}"
+
+    def counting(self, scans: Iterable[Scan], progress: Progress, *, every_point: bool) -> Iterator[Scan]:
         """The scans, counted on their way."""
         for scan in scans:
             self.scans += 1
             self.points += len(scan) if every_point else int(scan.points.valid.sum())
+            progress(lambda: f"{self}, {size(self.device.stats.bytes_in)} read")
             yield scan
 
 
@@ -61,13 +67,15 @@ def convert(source: str, target: str, sensor_id: str | None, count: int | None, 
     format_of(target)
     refuse_overwriting(source, target, "input")
     sensor = _detected(source, target) if sensor_id is None else named_sensor(sensor_id)
-    written = Written()
-    with open_device(source, sensor) as device:
+    with open_device(source, sensor) as device, Progress() as progress:
+        written = Written(device, target)
         scans = itertools.islice(scans_of(device, source), count)
         first = next(scans, None)
         if first is None:
             raise _no_data(device, source, target)
-        write(target, written.counting(itertools.chain([first], scans), every_point=every_point), every_point=every_point)
+        counted = written.counting(itertools.chain([first], scans), progress, every_point=every_point)
+        write(target, counted, every_point=every_point)
+        progress.clear()
         _sum_up(device, target, written, as_json=as_json)
 
 
@@ -82,7 +90,7 @@ def _detected(source: str, target: str) -> Sensor:
 
 
 def _sum_up(device: Device, target: str, written: Written, *, as_json: bool) -> None:
-    note(f"{target}: {written.points} points of {written.scans} scan{'s' * (written.scans != 1)} of {device.sensor.id}; {device.stats}")
+    note(f"{written} of {device.sensor.id}; {device.stats}")
     if device.stats.tracebacks:
         note(f"the plugin failed: {device.stats.tracebacks[0].strip().splitlines()[-1]}")
     if as_json:

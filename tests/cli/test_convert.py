@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import csv
 import json
+import os
+import re
 from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+import lidarspec as ls
+from lidarspec.simulation.simulator import simulate
 from tests.cli.running import COIN_D4, EXAMPLE, LD06, printed, process, ran
 from tests.sensors.evidence import capture
 
@@ -120,3 +124,16 @@ def test_the_input_is_never_overwritten(tmp_path: Path, suffix: str) -> None:
     source.write_bytes(EXAMPLE)
     assert "is the input" in ran("convert", source, source, "-s", "ldrobot-stl27l", code=2).stderr
     assert source.read_bytes() == EXAMPLE
+
+
+@pytest.mark.skipif(not hasattr(os, "openpty"), reason="needs pseudo terminals")
+def test_a_terminal_shows_how_far_it_is(tmp_path: Path) -> None:
+    from tests.view.terminal import Terminal
+
+    (tmp_path / "drive.bin").write_bytes(b"".join(simulate(ls.sensor("ldrobot-stl27l"), 900)))
+    with Terminal("convert", "drive.bin", "out.npz", "-s", "ldrobot-stl27l", cwd=tmp_path) as terminal:
+        assert terminal.ended() == 0
+        shown = terminal.text()
+    assert re.search(r"\rout\.npz: \d+ points of 1 scan, [\d.]+ kB read", terminal.raw)
+    assert " read" not in shown
+    assert "out.npz: 10800 points of" in shown
