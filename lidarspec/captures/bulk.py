@@ -21,6 +21,7 @@ from lidarspec.captures.pcap import CaptureReader, Datagram
 from lidarspec.captures.records import LARGEST_BLOCK, Damaged, Form, Passed, Source, Times, Truncated, records
 from lidarspec.framing.decoder import Decoder
 from lidarspec.framing.results import Frames, Indices
+from lidarspec.transports.protocol import Origin, Sender
 
 #: bytes of a record, from its start, that are compared at most; longer headers are read plainly.
 WIDEST = 128
@@ -28,12 +29,11 @@ WIDEST = 128
 #: bytes that a buffer grows to, where the file has so many.
 LARGEST = 8 * LARGEST_BLOCK
 _TRAILER = 4
-_HEAD = 12  # bytes of a record of either format, as far as they tell the length
+_HEAD = 16  # bytes of a record of either format, as far as they tell the length and whether that is sure
 #: records of one length in a row for which looking at all of them at once is worth while.
 _RUN = 16
 #: kinds of datagrams that are known at a time, and that become known in one batch: nobody's capture makes this slow.
 MOST_KNOWN = 16
-Sender = tuple[str, int]
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,8 +123,8 @@ def walked(storage: NDArray[np.uint8], start: int, stop: int, form: Form) -> tup
 
 def _same(storage: NDArray[np.uint8], at: int, count: int, length: int, form: Form) -> int:
     """How many of `count` records that would begin every `length` bytes do have that length, until the first that has not."""
-    place, claim = form.claim(length)
-    claims: NDArray[np.uint32] = np.ndarray((count,), f"{form.order}u4", storage, at + place, (length,))
+    place, kind, claim = form.claim(length)
+    claims: NDArray[Any] = np.ndarray((count,), kind, storage, at + place, (length,))
     others = claims != claim
     return int(others.argmax()) if others.any() else count
 
@@ -161,26 +161,24 @@ class Batch:
         """The bytes of one datagram."""
         return self.buffer[self.starts[index] : self.starts[index] + self.sizes[index]].tobytes()
 
-    def of(self, host: str) -> Batch:
-        """The datagrams of the batch that come from one address."""
-        if all(name[0] == host for name in self.names):
+    def of(self, origin: Origin) -> Batch:
+        """The datagrams of the batch that come from one address, or one port of it."""
+        if all(name in origin for name in self.names):
             return self
-        wanted = np.array([name[0] == host for name in self.names], np.bool_)[self.senders]
+        wanted = np.array([name in origin for name in self.names], np.bool_)[self.senders]
         return Batch(self.buffer, self.starts[wanted], self.sizes[wanted], self.at[wanted], self.senders[wanted], self.names)
 
-    def hosts(self, found: Frames) -> dict[str, list[str]]:
-        """The addresses that frames found in these datagrams came from, by type of frame."""
-        hosts: dict[str, list[str]] = {}
+    def sent(self, found: Frames) -> Iterator[tuple[str, Sender]]:
+        """The types of frames found in these datagrams, and who sent them: of each type again where the sender changes."""
         if len(self.names) == 1:
-            for kind in np.flatnonzero(np.bincount(found.kinds)).tolist():
-                hosts[found.names[kind]] = [self.names[0][0]]
-            return hosts
+            yield from ((found.names[kind], self.names[0]) for kind in np.flatnonzero(np.bincount(found.kinds)).tolist())
+            return
         order = np.argsort(self.starts, kind="stable")
         senders = self.senders[order[np.searchsorted(self.starts[order], found.starts)]]
-        for kind, sender in dict.fromkeys(zip(found.kinds.tolist(), senders.tolist(), strict=True)):
-            known = hosts.setdefault(found.names[kind], [])
-            known += [self.names[sender][0]] if self.names[sender][0] not in known else []
-        return hosts
+        for kind in np.unique(found.kinds).tolist():
+            own = senders[found.kinds == kind]
+            changes = np.flatnonzero(np.diff(own, prepend=-1))
+            yield from ((found.names[kind], self.names[sender]) for sender in own[changes].tolist())
 
 
 def first_frames(decoder: Decoder, batches: Iterable[Batch], wanted: Collection[str]) -> dict[str, bytes]:
@@ -216,7 +214,9 @@ class CaptureBatches(CaptureReader):
                 if len(batch := found.batch()):
                     self.stats.datagrams += len(batch)
                     yield batch
-                if ended is not None:
+                if isinstance(ended, Damaged):
+                    self._pass_over(form)
+                elif ended is not None:
                     raise ended
                 known = found.still_known()
 
@@ -235,6 +235,7 @@ class _Records:
         self._learnt = self._counted = 0  # kinds; packets that were read plainly and are known all the same
         self._only: Alike | None = None  # what all records are like
         self._section = form.sections
+        self._storage, self._buffer = source.storage, source.lent()  # of another the source may be, once it has looked further ahead
 
     def read(self) -> Exception | None:
         """What ended the reading of the file, if it ended here."""
@@ -277,7 +278,7 @@ class _Records:
         facts = np.array([(one.start, one.size, names.setdefault(one.source, len(names))) for one in self._known], np.intp).reshape(-1, 3)
         starts, sizes, senders = facts[kinds].T if len(facts) != 1 else (np.full(len(known), fact) for fact in facts.ravel())
         columns = [self._starts[known] + starts, sizes, self._at[known], senders]
-        buffer = self._source.lent() if len(known) else np.empty(0, np.uint8)
+        buffer = self._buffer if len(known) else np.empty(0, np.uint8)
         if self._plain:
             buffer = self._with_plain(buffer, columns, known, names)
         return Batch(buffer, columns[0], columns[1], columns[2], columns[3], tuple(names))
@@ -287,7 +288,7 @@ class _Records:
         number = len(self._at)
         self._reader.stats.packets += number - self._counted
         sizes, senders = (np.broadcast_to(np.intp(fact), number) for fact in (kind.size, 0))
-        return Batch(self._source.lent(), self._starts[:number] + kind.start, sizes, self._at, senders, (kind.source,))
+        return Batch(self._buffer, self._starts[:number] + kind.start, sizes, self._at, senders, (kind.source,))
 
     def _with_plain(
         self, buffer: NDArray[np.uint8], columns: list[NDArray[Any]], known: Indices, names: dict[Sender, int]
@@ -313,7 +314,7 @@ class _Records:
         if self._learnt == MOST_KNOWN or not self._are_whole:
             return
         places = headers(packet.data, packet.link)
-        record = self._source.storage[self._starts[index] : self._starts[index + 1]].tobytes()
+        record = self._storage[self._starts[index] : self._starts[index + 1]].tobytes()
         found = alike(record, places, datagram.source, self._form) if places else None
         if found is not None:
             self._learnt += 1
@@ -327,7 +328,7 @@ class _Records:
         """Whether all records are now known."""
         alike, number = self._known[kind], len(self._kinds)
         if kind == 0 and self._are_whole:
-            found, at = alike.find(self._source.storage, self._starts[:number], self._lengths)
+            found, at = alike.find(self._storage, self._starts[:number], self._lengths)
             if found is None:
                 self._only, self._at = alike, at
                 self._kinds = np.broadcast_to(np.intp(0), number)
@@ -335,7 +336,7 @@ class _Records:
             left = np.flatnonzero(found)
         else:
             left = np.flatnonzero(self._kinds < 0)
-            found, at = alike.find(self._source.storage, self._starts[left], self._lengths[left])
+            found, at = alike.find(self._storage, self._starts[left], self._lengths[left])
             left = left if found is None else left[found]
         self._kinds[left] = kind
         self._at[left] = at

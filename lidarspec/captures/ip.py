@@ -4,11 +4,13 @@ Knows nothing of files. A frame goes through `ip_packet`, if it is a fragment th
 `udp`; whichever step finds that no datagram comes of it raises `Refused` with the reason.
 
 Two fields are not trusted. Checksums: where the capturing machine is the sender, its network card fills them in only after
-the capture. The length of an unfragmented packet, where more is claimed than is there: a lidar in the field puts the IPv4
-length of its data packets, 1234, also into packets of 540 bytes. UDP's own length decides whether the payload is whole.
+the capture. The length of an unfragmented packet, where more is claimed than is there, or 0: a lidar in the field puts the IPv4 length of
+its data packets, 1234, also into packets of 540 bytes, and a network card that cuts packets up fills it in after the capture.
+UDP's own length decides whether the payload is whole.
 
 Source: RFC 768 (UDP), RFC 791 (IPv4), RFC 8200 (IPv6), RFC 5722 (overlapping fragments), RFC 6946 (atomic fragments),
-IEEE 802.1Q (VLAN tags), and the link-layer header types of tcpdump.org.
+RFC 1661 and 1662 (PPP), RFC 2516 (PPPoE), RFC 3032 (MPLS), IEEE 802.1Q (VLAN tags), IEEE 802.11 9.2 and 9.3.2 (data frames),
+radiotap.org (its header), and the link-layer header types of tcpdump.org.
 """
 
 from __future__ import annotations
@@ -30,6 +32,12 @@ _ETHERTYPE_LINKS = {ETHERNET: (12, 14), 113: (14, 16), 276: (0, 20)}  # offset o
 _VLAN_TAGS = {0x8100, 0x88A8, 0x9100}
 _IP_ETHERTYPES = {0x0800, 0x86DD}
 _IP_FAMILIES = {2, 10, 24, 28, 30}  # AF_INET everywhere; AF_INET6 of Linux, NetBSD, FreeBSD and macOS
+_PPP_LINKS = {9: 0, 50: 0, 51: 6}  # what stands before PPP's header: nothing, or that of PPPoE
+_PPPOE, _MPLS, _PPP_IP = 0x8864, {0x8847, 0x8848}, {0x0021, 0x0057}
+_WIFI, _RADIOTAP = 105, 127
+#: what packets are called that are no UDP, by EtherType and by IP protocol.
+_ETHERTYPES = {0x0806: "ARP", 0x8863: "PPPoE discovery", 0x888E: "802.1X", 0x88CC: "LLDP", 0x88F7: "PTP"}
+_PROTOCOLS = {1: "ICMP", 2: "IGMP", 6: "TCP", 47: "GRE", 50: "ESP", 58: "ICMPv6", 132: "SCTP"}
 
 _UDP = 17
 _FRAGMENT = 44
@@ -39,6 +47,7 @@ _ETHERNET_HEADER = struct.Struct(">6s6sH")
 _IPV4_HEADER = struct.Struct(">BxHHHBB2s4s4s")
 _IPV6_HEADER = struct.Struct(">4xHBx16s16s")
 _UDP_HEADER = struct.Struct(">HHHH")
+_SNAP_HEADER, _SNAP = struct.Struct(">6sH"), bytes.fromhex("aaaa03000000")
 _TO_MAC, _FROM_MAC = bytes.fromhex("020000000001"), bytes.fromhex("020000000002")  # locally administered, nobody's
 _DO_NOT_FRAGMENT, _TIME_TO_LIVE = 0x4000, 64
 
@@ -48,11 +57,12 @@ class Refused(Exception):
 
     Attributes:
         reason: "other" (not UDP), "short" (fewer bytes than its headers say) or "malformed" (headers that cannot be).
+        what: the name of what it is instead of UDP.
     """
 
-    def __init__(self, reason: Literal["other", "short", "malformed"]) -> None:
+    def __init__(self, reason: Literal["other", "short", "malformed"], what: str = "") -> None:
         super().__init__(reason)
-        self.reason = reason
+        self.reason, self.what = reason, what
 
 
 class Fragment(NamedTuple):
@@ -129,7 +139,7 @@ def udp(packet: IpPacket) -> UdpPacket:
     try:
         protocol, at = _past_extensions(packet.protocol, packet.body)
         if protocol != _UDP:
-            raise Refused("malformed" if protocol == _FRAGMENT else "other")
+            raise Refused("malformed") if protocol == _FRAGMENT else _not_udp(protocol)
         source, destination, length, _ = _UDP_HEADER.unpack_from(packet.body, at)
     except struct.error:
         raise Refused("short") from None
@@ -190,27 +200,91 @@ def _ip_start(frame: bytes, link: int) -> int:
     if link in _LOOPBACK:
         # The family stands in the byte order of the capturing machine; families are small, so the smaller reading is right.
         if min(*struct.unpack_from("<I", frame), *struct.unpack_from(">I", frame)) not in _IP_FAMILIES:
-            raise Refused("other")
+            raise Refused("other", "loopback without IP")
         return 4
+    if link in _PPP_LINKS:
+        return _past_ppp(frame, _PPP_LINKS[link])
+    if link in (_WIFI, _RADIOTAP):
+        return _past_ethertype(frame, *_past_wifi(frame, link))
     if link not in _ETHERTYPE_LINKS:
-        raise Refused("other")
+        raise Refused("other", f"link type {link}")
     at, start = _ETHERTYPE_LINKS[link]
-    ethertype = frame[at] << 8 | frame[at + 1]
+    return _past_ethertype(frame, frame[at] << 8 | frame[at + 1], start)
+
+
+def _past_ethertype(frame: bytes, ethertype: int, start: int) -> int:
+    """Where IP begins behind an EtherType, with whatever tags and labels."""
     while ethertype in _VLAN_TAGS:
         ethertype = frame[start + 2] << 8 | frame[start + 3]
         start += 4
+    if ethertype == _PPPOE:
+        return _past_ppp(frame, start + 6)
+    if ethertype in _MPLS:
+        while not frame[start + 2] & 1:  # the bottom of the stack of labels
+            start += 4
+        if frame[start + 4] >> 4 not in (4, 6):
+            raise Refused("other", "MPLS without IP")
+        return start + 4
     if ethertype not in _IP_ETHERTYPES:
-        raise Refused("other")
+        what = _ETHERTYPES.get(ethertype, f"EtherType 0x{ethertype:04x}")
+        raise Refused("other", what if ethertype >= 0x0600 else "802.3 without EtherType")
     return start
+
+
+def _past_ppp(frame: bytes, at: int) -> int:
+    """Where IP begins behind PPP's header, of which address and control, and the upper byte of the protocol, may be left out."""
+    at += 2 * (frame[at] == 0xFF)
+    short = frame[at] & 1
+    protocol = frame[at] if short else frame[at] << 8 | frame[at + 1]
+    if protocol not in _PPP_IP:
+        raise Refused("other", f"PPP protocol 0x{protocol:04x}")
+    return at + 2 - short
+
+
+def _past_wifi(frame: bytes, link: int) -> tuple[int, int]:
+    """The EtherType in a data frame of 802.11, and where what it names begins."""
+    at, is_padded = _past_radiotap(frame) if link == _RADIOTAP else (0, False)
+    control, flags = frame[at], frame[at + 1]
+    if control & 0x4C != 0x08:
+        raise Refused("other", "802.11 without data")
+    if flags & 0x40:
+        raise Refused("other", "encrypted 802.11")
+    size = 30 if flags & 3 == 3 else 24
+    is_whole = not flags & 0x04 and not frame[at + 22] & 0x0F
+    if control & 0x80:  # QoS
+        is_whole = is_whole and not frame[at + size] & 0x80
+        size += 6 if flags & 0x80 else 2
+    if not is_whole:
+        raise Refused("other", "802.11 in fragments or aggregates")
+    start = at + size + (-size % 4 if is_padded else 0)
+    snap, ethertype = _SNAP_HEADER.unpack_from(frame, start)
+    if snap != _SNAP:
+        raise Refused("other", "802.11 without EtherType")
+    return ethertype, start + _SNAP_HEADER.size
+
+
+def _past_radiotap(frame: bytes) -> tuple[int, bool]:
+    """The length of a radiotap header, and whether the header behind it is padded to words of 4 bytes, which its flags say."""
+    length, present = struct.unpack_from("<HI", frame, 2)
+    at, more = 8, present
+    while more & 1 << 31:
+        (more,) = struct.unpack_from("<I", frame, at)
+        at += 4
+    at = at + -at % 8 + 8 if present & 1 else at
+    return length, bool(present & 2 and frame[at] & 0x20)
+
+
+def _not_udp(protocol: int) -> Refused:
+    return Refused("other", _PROTOCOLS.get(protocol, f"IP protocol {protocol}"))
 
 
 def _ipv4(frame: bytes, start: int) -> IpPacket:
     first, total, ident, place, _, protocol, _, source, destination = _IPV4_HEADER.unpack_from(frame, start)
-    header = (first & 0x0F) * 4
+    header, total = (first & 0x0F) * 4, total or len(frame) - start
     if header < _IPV4_HEADER.size or total < header:
         raise Refused("malformed")
     if protocol != _UDP:
-        raise Refused("other")
+        raise _not_udp(protocol)
     body = frame[start + header : start + total]
     fragment = _fragment(ident, (place & 0x1FFF) * 8, total - header, more=bool(place & 0x2000))
     if fragment is not None and len(body) < total - header:
@@ -230,7 +304,7 @@ def _ipv6(frame: bytes, start: int) -> IpPacket:
         at += 8
         fragment = _fragment(ident, place & 0xFFF8, len(body) - at + missing, more=bool(place & 1))
     if protocol != _UDP and protocol not in _EXTENSIONS:
-        raise Refused("other")
+        raise _not_udp(protocol)
     if fragment is not None and missing:
         raise Refused("short")
     return IpPacket(source, destination, protocol, body[at:], body_start + at, fragment)

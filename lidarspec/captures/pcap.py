@@ -9,19 +9,34 @@ from __future__ import annotations
 
 import ipaddress
 import os
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import BinaryIO
 
 from lidarspec.captures.ip import LARGEST_PAYLOAD, Reassembly, Refused, address, ip_packet, udp, udp_frame
-from lidarspec.captures.records import SMALLEST, CapturedPacket, Damaged, Passed, Source, Truncated, is_capture, packet_record, records
+from lidarspec.captures.records import (
+    SMALLEST,
+    CapturedPacket,
+    Damaged,
+    Form,
+    Passed,
+    Source,
+    Truncated,
+    is_capture,
+    packet_record,
+    records,
+    resume,
+)
 from lidarspec.errors import SourceError, UsageError, system_errors
 from lidarspec.transports.protocol import Closing
 
 #: the link types kept for private use: captures of byte streams have the first.
 USER_LINKS = range(147, 163)
+#: kinds of packets that are counted by their names.
+MOST_KINDS = 16
 #: who sent a datagram, and to whom, where nobody knows.
 NOBODY = ("0.0.0.0", 0)
 
@@ -50,23 +65,34 @@ class CaptureStats:
         packets: captured packets, of whatever kind.
         datagrams: UDP datagrams handed out.
         other: packets that are not UDP over IP.
+        others: how many of them by what they are, "ARP" or "TCP"; of so many kinds at most.
         truncated_tail: whether the file ends in the middle of a record; all before it was read.
         snapped: UDP packets that the capture's snap length cut short; they are not handed out.
         fragments: UDP packets that were IP fragments.
         incomplete_fragments: those whose datagram never became whole.
         malformed: packets and records that contradict themselves.
+        damaged: places where a record could not be read, and bytes were passed over to the next one that could.
+        lost: bytes that were passed over there.
         stopped_at: file offset of the truncated or malformed record that ended the reading, else None.
     """
 
     packets: int = 0
     datagrams: int = 0
     other: int = 0
+    others: Counter[str] = field(default_factory=Counter, compare=False)
     truncated_tail: bool = False
     snapped: int = 0
     fragments: int = 0
     incomplete_fragments: int = 0
     malformed: int = 0
+    damaged: int = 0
+    lost: int = 0
     stopped_at: int | None = None
+
+    def leave(self, what: str) -> None:
+        """Count a packet that is no UDP over IP."""
+        self.other += 1
+        self.others[what if what in self.others or len(self.others) < MOST_KINDS else "more"] += 1
 
 
 class CaptureReader(Closing):
@@ -95,7 +121,7 @@ class CaptureReader(Closing):
         self._fragments = Reassembly()
         self._datagrams: Iterator[Datagram] | None = None
         try:
-            magic = self._source.magic()
+            magic = bytes(self._source.ahead(4))
             if not is_capture(magic):
                 seen = f"it begins with {magic.hex(' ')}" if magic else "it is empty"
                 raise SourceError(f"{getattr(file, 'name', 'input')}: neither a pcap nor a pcapng capture: {seen}")
@@ -115,12 +141,25 @@ class CaptureReader(Closing):
 
     def _walk(self) -> Iterator[Datagram]:
         with self._to_the_end():
-            found = records(self._source)
+            form = records(self._source)
             while self._source.begin_record():
-                datagram = self.datagram(found.read())
+                try:
+                    datagram = self.datagram(form.read())
+                except Damaged:
+                    self._pass_over(form)
+                    continue
                 if datagram is not None:
                     self.stats.datagrams += 1
                     yield datagram
+
+    def _pass_over(self, form: Form) -> None:
+        """Goes behind a damaged record, to the next one or the end; counts what is lost."""
+        begun = self._source.record
+        found = resume(self._source, form)
+        self.stats.malformed += 1
+        self.stats.damaged += 1
+        self.stats.lost += self._source.place - begun
+        self.stats.stopped_at = None if found else begun
 
     @contextmanager
     def _to_the_end(self) -> Iterator[None]:
@@ -129,9 +168,6 @@ class CaptureReader(Closing):
             yield
         except Truncated:
             self.stats.truncated_tail = True
-            self.stats.stopped_at = self._source.record
-        except Damaged:
-            self.stats.malformed += 1
             self.stats.stopped_at = self._source.record
         finally:
             self.close()
@@ -157,7 +193,7 @@ class CaptureReader(Closing):
             part = udp(ip)
         except Refused as refused:
             if refused.reason == "other":
-                stats.other += 1
+                stats.leave(refused.what)
             elif refused.reason == "short" and len(packet.data) < packet.original:
                 stats.snapped += 1
             else:
@@ -172,10 +208,12 @@ class StreamReader(CaptureReader):
 
     def datagram(self, packet: CapturedPacket | Passed) -> Datagram | None:
         """What the packet holds; counts it where it is of another link type."""
-        if isinstance(packet, Passed) or packet.link not in USER_LINKS:
-            self.stats.other += 1
+        if isinstance(packet, Passed):
             return None
         self.stats.packets += 1
+        if packet.link not in USER_LINKS:
+            self.stats.leave(f"link type {packet.link}")
+            return None
         self.stats.snapped += len(packet.data) < packet.original
         return Datagram(packet.data, packet.at, NOBODY, NOBODY)
 

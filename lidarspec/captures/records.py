@@ -1,7 +1,10 @@
 """The records of pcap and pcapng files: all that is known of the two formats, for one record and for many alike.
 
 Hostile input: `Source` reads in bounded steps, so that a length in the file never becomes an allocation, and each turn of
-the walkers either advances or ends the reading. It reads into buffers that can be lent out: one is not written to again while an
+the walkers either advances or ends the reading. Damaged input: a doubtful length is believed unless other records begin within
+what it claims, and behind a record that cannot be read `resume` goes to the next place where records follow each other.
+
+`Source` reads into buffers that can be lent out: one is not written to again while an
 array that was `lent`, or anything made from it without a copy, is alive. So whoever needs the bytes for longer just keeps them.
 
 Source: the IETF drafts "PCAP Capture File Format" (draft-ietf-opsawg-pcap) and "PCAP Now Generic Capture File Format"
@@ -13,6 +16,7 @@ from __future__ import annotations
 import functools
 import io
 import os
+import re
 import stat
 import struct
 import weakref
@@ -42,6 +46,7 @@ _SECTION_KIND = int.from_bytes(_SECTION)
 _ORDERS = {b"\x4d\x3c\x2b\x1a": "<", b"\x1a\x2b\x3c\x4d": ">"}
 _INTERFACE, _OBSOLETE_PACKET, _SIMPLE_PACKET, ENHANCED_PACKET = 1, 2, 3, 6
 _PACKETS = {_OBSOLETE_PACKET, _SIMPLE_PACKET, ENHANCED_PACKET}
+_LAST_KIND = 10  # that the draft gives a number, but for the section's
 _TIME_RESOLUTION, _TIME_OFFSET = 9, 14  # options of an interface
 
 #: bytes of a buffer at first, and most of those that are passed over at once.
@@ -51,6 +56,10 @@ SLACK = 256
 #: buffers kept for use again.
 MOST_KEPT = 2
 LARGEST_BLOCK = 1 << 20  # a packet with its options; longer blocks are passed over unread
+#: places that are looked at together for the next record, and bytes behind each that may be needed: a packet, its options, a head.
+_STEP, _REACH = 1 << 16, LARGEST_PACKET + (1 << 12)
+#: seconds between two packets in a row, and between two of a file, at most, where a record may begin.
+_DAY, _YEAR = 86_400, 31_536_000
 _MOST_INTERFACES = 1024
 _SECOND = 1_000_000_000
 _FURTHEST = 4_000_000_000  # seconds; times further on are read one by one, so that none overflows
@@ -97,6 +106,7 @@ class Source:
         storage: the buffer in use, `SLACK` bytes longer than it is ever filled.
         at: where in `storage` the next byte stands.
         record: file offset of the record that was begun last.
+        place: file offset of the next byte.
     """
 
     def __init__(self, file: BinaryIO, *, largest: int = SMALLEST) -> None:
@@ -113,14 +123,18 @@ class Source:
         """How much of `storage` is filled."""
         return len(self._data)
 
-    def magic(self) -> bytes:
-        """The next four bytes, which stay there; fewer at the end."""
-        self._has(4)
-        return bytes(self._data[self.at : self.at + 4])
+    @property
+    def place(self) -> int:
+        return self._passed + self.at
+
+    def ahead(self, size: int) -> memoryview:
+        """The next `size` bytes, which stay there; fewer at the end."""
+        self._has(size)
+        return self._data[self.at : self.at + size]
 
     def begin_record(self) -> bool:
         """Whether a record begins here, rather than the end of the input."""
-        self.record = self._passed + self.at
+        self.record = self.place
         return self._has(1)
 
     def take(self, size: int) -> bytes:
@@ -297,19 +311,21 @@ class PcapRecords:
     def __init__(self, source: Source) -> None:
         self._source = source
         self.order, self._unit = _PCAP[source.take(4)]
-        *_, link = struct.unpack(self.order + "HHiIII", source.take(20))
+        *_, self._snap_length, link = struct.unpack(self.order + "HHiIII", source.take(20))
         self.link = link & 0xFFFF  # the upper half tells the length of the frame check sequence
         self._head = struct.Struct(self.order + "IIII")
         self._lengths = struct.Struct(self.order + "II")
+        self._began: int | None = None
 
     def length(self, data: memoryview | bytes, at: int) -> int:
-        """The length of the record that begins there, of which 12 bytes are there; 0 where it says something that cannot be."""
-        captured, _ = self._lengths.unpack_from(data, at + 8)
-        return self._head.size + captured if captured <= LARGEST_PACKET else 0
+        """The length of the record that begins there, of which 16 bytes are there; 0 where it is doubtful, or cannot be."""
+        captured, original = self._lengths.unpack_from(data, at + 8)
+        return self._head.size + captured if self._is_sure(captured, original) else 0
 
-    def claim(self, length: int) -> tuple[int, int]:
-        """Where in a record of a length its length stands, and the number that stands there."""
-        return 8, length - self._head.size
+    def claim(self, length: int) -> tuple[int, str, int]:
+        """Where in a whole packet's record of a length that stands, as what type, and the number that stands there: the length, twice."""
+        captured: int = length - self._head.size
+        return 8, f"{self.order}u8", captured << 32 | captured
 
     def pattern(self, record: bytes) -> Pattern:
         """What records like this one have in common."""
@@ -322,11 +338,48 @@ class PcapRecords:
         Raises:
             Truncated, Damaged: nothing can be read from `source.record` on.
         """
-        head = self._source.take(self._head.size)
-        if not self.length(head, 0):
-            raise Damaged
+        head = self._source.ahead(self._head.size)
+        if len(head) < self._head.size:
+            raise Truncated
         seconds, fraction, captured, original = self._head.unpack(head)
+        if captured > LARGEST_PACKET or not any(head):  # a hole in a file is full of zeros
+            raise Damaged
+        if not self._is_sure(captured, original) and self._is_false(captured, original):
+            raise Damaged
+        self._began = seconds if self._began is None else self._began
+        self._source.skip(self._head.size)
         return CapturedPacket(self.link, seconds * _SECOND + fraction * self._unit, self._source.take(captured), original)
+
+    def first_place(self, data: memoryview, stop: int, *, is_end: bool) -> int | None:
+        """The first place below `stop` where a record begins that another one, or the end of the input, follows."""
+        count = len(data) - self._head.size + 1
+        if count <= 0:
+            return None
+        seconds, fractions, captured, original = (np.ndarray((count,), f"{self.order}u4", data, at, (1,)) for at in (0, 4, 8, 12))
+        likely = (captured[:stop] <= original[:stop]) & (original[:stop] <= LARGEST_PACKET) & (captured[:stop] > 0)
+        places = np.flatnonzero(likely & (fractions[:stop] < _SECOND // self._unit))
+        if self._began is not None:
+            places = places[abs(seconds[places].astype(np.int64) - self._began) <= _YEAR]
+        behind = places + self._head.size + captured[places]
+        right = (behind == len(data)) & (captured[places] == original[places]) & is_end
+        followed = behind < count
+        before, after = places[followed], behind[followed]
+        right[followed] = (captured[after] <= original[after]) & (original[after] <= LARGEST_PACKET) & (captured[after] > 0)
+        right[followed] &= abs(seconds[after].astype(np.int64) - seconds[before]) <= _DAY
+        return int(places[right.argmax()]) if right.any() else None
+
+    def _is_sure(self, captured: int, original: int) -> bool:
+        """Whether two lengths bear each other out: the packet is whole, or cut where the file says."""
+        return 0 < captured <= LARGEST_PACKET and captured in (original, self._snap_length)
+
+    def _is_false(self, captured: int, original: int) -> bool:
+        """Whether a record is longer or shorter than it says: none begins where it ends, and others do within it or its whole packet."""
+        size, within = self._head.size + captured, max(captured, min(original, LARGEST_PACKET) + 1)
+        data = self._source.ahead(self._head.size + within + _REACH)
+        is_end = len(data) < self._head.size + within + _REACH
+        if len(data) == size or self.first_place(data[size:], 1, is_end=is_end) is not None:
+            return False
+        return self.first_place(data[self._head.size :], within, is_end=is_end) is not None
 
 
 class Interface(NamedTuple):
@@ -349,8 +402,9 @@ class PcapngBlocks:
     def __init__(self, source: Source) -> None:
         self._source = source
         self.sections = 0
-        self.order = ""
+        self.order = "<"
         self._interfaces: list[Interface] = []
+        self._knows_all = True  # interfaces of the section so far
 
     def length(self, data: memoryview | bytes, at: int) -> int:
         """The length of the block that begins there; 0 where it can only be read by itself, since it says something that cannot be,
@@ -358,9 +412,9 @@ class PcapngBlocks:
         kind, length = struct.unpack_from(self.order + "II", data, at)
         return 0 if kind == _SECTION_KIND or length > LARGEST_BLOCK or not _can_be(length) else length
 
-    def claim(self, length: int) -> tuple[int, int]:
-        """Where in a block of a length its length stands, and the number that stands there."""
-        return 4, length
+    def claim(self, length: int) -> tuple[int, str, int]:
+        """Where in a block of a length that stands, as what type, and the number that stands there."""
+        return 4, f"{self.order}u4", length
 
     def pattern(self, record: bytes) -> Pattern | None:
         """What blocks like this one have in common; None for kinds that are read one by one."""
@@ -376,24 +430,55 @@ class PcapngBlocks:
         Raises:
             Truncated, Damaged: nothing can be read from `source.record` on.
         """
-        head = self._source.take(12)
+        head = bytes(self._source.ahead(12))
+        if len(head) < 12:
+            raise Truncated
         if head[:4] == _SECTION:
             if head[8:] not in _ORDERS:
                 raise Damaged
-            self.order, self._interfaces, self.sections = _ORDERS[head[8:]], [], self.sections + 1
+            self.order, self._interfaces, self._knows_all, self.sections = _ORDERS[head[8:]], [], True, self.sections + 1
         kind, length = struct.unpack_from(self.order + "II", head)
-        body = _block_body(self._source, head, length)
+        if self._is_false(kind, length):
+            self._knows_all = self._knows_all and kind != _INTERFACE
+            raise Damaged
+        if length > LARGEST_BLOCK:
+            self._source.skip(length)
+            return Passed.NO_PACKET
+        body = self._source.take(length)[8:-4]
         if kind == _INTERFACE:
-            # Packets name interfaces by number: with one lost, all that follows would be misread.
-            if body is None or len(body) < 8 or len(self._interfaces) == _MOST_INTERFACES:
+            if len(body) < 8 or len(self._interfaces) == _MOST_INTERFACES:
+                self._knows_all = False
                 raise Damaged
             self._interfaces.append(_interface(self.order, body))
-        elif kind in _PACKETS:
-            packet = None if body is None else _block_packet(self.order, kind, body, self._interfaces)
-            return packet or Passed.MALFORMED
-        elif body is None and length <= LARGEST_BLOCK:
-            return Passed.MALFORMED
-        return Passed.NO_PACKET
+        return _block_packet(self.order, kind, body, self._interfaces) or Passed.MALFORMED if kind in _PACKETS else Passed.NO_PACKET
+
+    def first_place(self, data: memoryview, stop: int, *, is_end: bool) -> int | None:
+        """The first place below `stop` where a whole block begins, or a section; the latter alone where an interface was lost.
+
+        Packets name interfaces by number: with one lost, all that follow would be misread.
+        """
+        sections = (found.start() for found in re.finditer(re.escape(_SECTION), data[: stop + 3]))
+        section = next((at for at in sections if bytes(data[at + 8 : at + 12]) in _ORDERS), None)
+        count = len(data) - 11
+        if not self._knows_all or count <= 0:
+            return section
+        words = np.ndarray((count + 8,), f"{self.order}u4", data, 0, (1,))
+        kinds, lengths = words[:-8][:stop], words[4:-4][:stop]
+        places = np.flatnonzero((kinds > 0) & (kinds <= _LAST_KIND) & (lengths >= 12) & (lengths <= _REACH))
+        ends = places + lengths[places]
+        places, ends = places[ends <= len(data)], ends[ends <= len(data)]
+        right = places[words[ends - 4] == lengths[places]].tolist()
+        return min([*right[:1], *([section] if section is not None else [])], default=None)
+
+    def _is_false(self, kind: int, length: int) -> bool:
+        """Whether a block is of another length than it says: its end does not repeat it, or is not there while others begin within it."""
+        if not _can_be(length) or (length > LARGEST_BLOCK and kind in _PACKETS | {_INTERFACE}):
+            return True
+        size = _REACH if length > LARGEST_BLOCK else length
+        data = self._source.ahead(size)
+        if len(data) == length:
+            return data[-4:] != data[4:8]
+        return self.first_place(data[4:], size, is_end=True) is not None
 
 
 #: the records of either format.
@@ -406,23 +491,23 @@ def records(source: Source) -> Form:
     Raises:
         Truncated: the head of the file is cut.
     """
-    return PcapngBlocks(source) if source.magic() == _SECTION else PcapRecords(source)
+    return PcapngBlocks(source) if source.ahead(4) == _SECTION else PcapRecords(source)
+
+
+def resume(source: Source, form: Form) -> bool:
+    """Goes to the next place where records begin, behind one that is damaged; False where there is none, at the end."""
+    source.skip(len(source.ahead(1)))
+    while data := source.ahead(_STEP + _REACH):
+        found = form.first_place(data, _STEP, is_end=len(data) < _STEP + _REACH)
+        source.skip(min(_STEP, len(data)) if found is None else found)
+        if found is not None:
+            return True
+    return False
 
 
 def _can_be(length: int) -> bool:
     """Whether a block can have a length: that of its head and tail at least, in words."""
     return length >= 12 and length % 4 == 0
-
-
-def _block_body(source: Source, head: bytes, length: int) -> bytes | None:
-    """What stands between the two lengths of a block, None where they differ or the block is too long to be held."""
-    if not _can_be(length):
-        raise Damaged
-    if length > LARGEST_BLOCK:
-        source.skip(length - 12)
-        return None
-    block = head[8:] + source.take(length - 12)
-    return block[:-4] if block[-4:] == head[4:8] else None
 
 
 def _interface(order: str, body: bytes) -> Interface:

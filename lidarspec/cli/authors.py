@@ -19,7 +19,7 @@ from lidarspec.plugins import sensor as named_sensor, sensors
 from lidarspec.testing.check import Report, reports, target
 from lidarspec.testing.subject import EXAMPLES
 from lidarspec.transports.open_url import transport
-from lidarspec.transports.protocol import Chunk
+from lidarspec.transports.protocol import Chunk, no_bytes
 
 #: bytes of a capture that are looked at.
 MOST = 1 << 22
@@ -65,10 +65,10 @@ def _drafted(names: Names, link: str | None, capture: str) -> dict[str, str]:
     groups: dict[object, list[Chunk]] = {}
     with contextlib.closing(transport(capture)) as opened:
         for chunk in beginning(opened, MOST):
-            groups.setdefault((chunk.sender and chunk.sender[0], chunk.receiver and chunk.receiver[1]), []).append(chunk)
+            groups.setdefault((chunk.sender, chunk.receiver and chunk.receiver[1]), []).append(chunk)
     chunks = max(groups.values(), key=lambda group: sum(len(chunk.data) for chunk in group), default=[])
     if not any(chunk.data for chunk in chunks):
-        raise WireError(f"{capture} holds no bytes")
+        raise WireError(no_bytes(capture, opened.warnings))
     found = draft([chunk.data for chunk in chunks], datagrams=opened.datagrams)
     note(f"{capture}: {len(found.frames)} frames, {found.share:.1%} of {found.bytes_in} bytes")
     receiver = chunks[0].receiver

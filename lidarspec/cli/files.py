@@ -10,9 +10,9 @@ from pathlib import Path
 
 import click
 
-from lidarspec.cli.inputs import nearest_fault, no_frame, nothing_came, refuse_overwriting, remark, scans_of
+from lidarspec.cli.inputs import conclude, nearest_fault, no_frame, nothing_came, refuse_overwriting, scans_of
 from lidarspec.cli.options import colour_option, count_option, sensor_option
-from lidarspec.cli.output import emit, emit_json, note
+from lidarspec.cli.output import Progress, emit, emit_json, note, size
 from lidarspec.device.device import Device, open as open_device
 from lidarspec.discovery.detect import detected, scores
 from lidarspec.discovery.listen import Heard, beginning
@@ -22,6 +22,7 @@ from lidarspec.plugins import sensor as named_sensor
 from lidarspec.scans.scans import Scan
 from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.open_url import transport
+from lidarspec.transports.protocol import no_bytes
 from lidarspec.view.polar import look
 from lidarspec.view.svg import svg
 
@@ -31,16 +32,22 @@ LOOKED_AT = 1 << 16
 
 @dataclass
 class Written:
-    """What has gone through so far."""
+    """What has gone through so far, and said on a terminal while it does."""
 
+    device: Device
+    target: str
     scans: int = 0
     points: int = 0
 
-    def counting(self, scans: Iterable[Scan], *, every_point: bool) -> Iterator[Scan]:
+    def __str__(self) -> str:
+        return f"{self.target}: {self.points} points of {self.scans} scan{'s' * (self.scans != 1)}"
+
+    def counting(self, scans: Iterable[Scan], progress: Progress, *, every_point: bool) -> Iterator[Scan]:
         """The scans, counted on their way."""
         for scan in scans:
             self.scans += 1
             self.points += len(scan) if every_point else int(scan.points.valid.sum())
+            progress(lambda: f"{self}, {size(self.device.stats.bytes_in)} read")
             yield scan
 
 
@@ -61,13 +68,15 @@ def convert(source: str, target: str, sensor_id: str | None, count: int | None, 
     format_of(target)
     refuse_overwriting(source, target, "input", force=force)
     sensor = _detected(source, target) if sensor_id is None else named_sensor(sensor_id)
-    written = Written()
-    with open_device(source, sensor) as device:
+    with open_device(source, sensor) as device, Progress() as progress:
+        written = Written(device, target)
         scans = itertools.islice(scans_of(device, source), count)
         first = next(scans, None)
         if first is None:
             raise _no_data(device, source, target)
-        write(target, written.counting(itertools.chain([first], scans), every_point=every_point), every_point=every_point)
+        counted = written.counting(itertools.chain([first], scans), progress, every_point=every_point)
+        write(target, counted, every_point=every_point)
+        progress.clear()
         _sum_up(device, target, written, as_json=as_json)
 
 
@@ -82,18 +91,18 @@ def _detected(source: str, target: str) -> Sensor:
 
 
 def _sum_up(device: Device, target: str, written: Written, *, as_json: bool) -> None:
-    note(f"{target}: {written.points} points of {written.scans} scan{'s' * (written.scans != 1)} of {device.sensor.id}; {device.stats}")
+    note(f"{written} of {device.sensor.id}; {device.stats}")
     if as_json:
         stats = device.stats.to_dict()
         emit_json({"sensor": device.sensor.id, "output": target, "scans": written.scans, "points": written.points, "stats": stats}, None)
-    remark(device)
+    conclude(device)
 
 
 def _no_data(device: Device, source: str, target: str) -> Exception:
     """Why nothing came out: an empty file, a damaged frame, another sensor's bytes, or no lidar's at all."""
     sensor, stats = device.sensor, device.stats
     if stats.bytes_in == 0:
-        return suggest(WireError(f"{source} holds no bytes", sensor=sensor.id), f"lidarspec show {sensor.id}")
+        return suggest(WireError(no_bytes(source, device.warnings), sensor=sensor.id), f"lidarspec show {sensor.id}")
     if (failure := stats.failure(sensor.id)) is not None:
         return failure
     given = _again(source)
@@ -113,7 +122,8 @@ def _again(source: str) -> Heard | None:
         return None
     with contextlib.closing(transport(source)) as opened:
         try:
-            return Heard(source, tuple(chunk.data for chunk in beginning(opened, LOOKED_AT)), opened.datagrams)
+            chunks = tuple(chunk.data for chunk in beginning(opened, LOOKED_AT))
+            return Heard(source, chunks, opened.datagrams, warnings=tuple(opened.warnings))
         except LidarSpecError:
             return None
 
@@ -146,4 +156,4 @@ def plot(source: str, output: str, sensor_id: str | None, number: int, ramp: str
             note(f"{source} has {whole} whole scan{'s' * (whole != 1)}; drawn is the last piece of it that could be")
         title = f"{device.sensor.id}: {chosen}"
         emit(svg(chosen.points, look(chosen.points, ramp=ramp, reach=max_range), title), output)
-        remark(device)
+        conclude(device)

@@ -20,12 +20,13 @@ from lidarspec.discovery.doctor import computer, examined
 from lidarspec.discovery.listen import LISTEN, Heard, everywhere, hear, probe, started_first, udp_ports
 from lidarspec.discovery.periods import Structure, cut, structure
 from lidarspec.discovery.samples import Match
-from lidarspec.errors import NO_SENSORS, SourceError, UsageError, suggest
+from lidarspec.errors import NO_SENSORS, SourceError, UsageError, WireError, suggest
 from lidarspec.plugins import sensor as named_sensor, sensors
 from lidarspec.spec.links import Serial, Udp
 from lidarspec.transports.base import data_link, with_option
 from lidarspec.transports.open_url import live_address, resolved
 from lidarspec.transports.ports import SerialPort, User, serial_ports, udp_users
+from lidarspec.transports.protocol import no_bytes
 
 #: doubt below which a match may well be chance.
 WEAK = 12
@@ -112,6 +113,10 @@ def _frames(words: Sequence[str], period: int | None, offset: int) -> list[bytes
 def _of_file(path: str, period: int | None, offset: int) -> list[bytes]:
     if path != "-" and not path.endswith(HEX):
         heard = max(hear(path), key=lambda one: one.size)
+        if not heard.size:
+            raise suggest(WireError(no_bytes(path, heard.warnings)), "lidarspec sensors")
+        for warning in heard.warnings:
+            note(warning)
         chunks, datagrams = heard.chunks, heard.datagrams
     else:
         given = read([path])
@@ -239,6 +244,7 @@ def _place(heard: Heard) -> str:
 def _conclusions(source: str | None, found: Sequence[Verdict], unknown: Structure | None, *, start: bool) -> Iterator[str]:
     if not sensors():
         yield NO_SENSORS
+    yield from dict.fromkeys(warning for one in found for warning in one.heard.warnings)
     for one in found:
         if one.heard.failure is not None:
             yield f"{one.heard.failure}"
@@ -254,6 +260,10 @@ def _conclusions(source: str | None, found: Sequence[Verdict], unknown: Structur
     if size:
         yield f"{size} bytes, and no frame of an installed sensor" + ("" if unknown else "; nor can frames of one kind be seen in them")
         yield f"next: {_following(source, unknown)}"
+        return
+    if source is not None and live_address(source) is None:
+        yield from [no_bytes(source, ())] * (not any(one.heard.warnings for one in found))
+        yield "next: lidarspec sensors"
         return
     yield "nothing came"
     is_serial = source is None or ((address := live_address(source)) is not None and address.scheme == "serial")

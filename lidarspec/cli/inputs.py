@@ -12,6 +12,9 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from shlex import quote
 
+import click
+
+from lidarspec.cli.failures import FINDINGS
 from lidarspec.cli.output import note
 from lidarspec.device.device import Device
 from lidarspec.device.settings import devices
@@ -21,9 +24,9 @@ from lidarspec.errors import CommandError, LidarSpecError, SourceError, UsageErr
 from lidarspec.plugins import sensors
 from lidarspec.scans.scans import Scan
 from lidarspec.spec.sensor import Sensor
-from lidarspec.transports.files import unhexed
+from lidarspec.transports.files import refuse_piped, unhexed
 from lidarspec.transports.open_url import is_port, live_address, transport
-from lidarspec.transports.protocol import Chunk
+from lidarspec.transports.protocol import Chunk, no_bytes
 from lidarspec.wire.parse import parse_typed
 
 #: longest hexadecimal text that is repeated in the next command, and of other text in a message.
@@ -63,19 +66,25 @@ def opened(words: Sequence[str]) -> Iterator[tuple[Heard, Iterator[Chunk]]]:
 
 @contextlib.contextmanager
 def _file(path: str) -> Iterator[tuple[Heard, Iterator[Chunk]]]:
-    with contextlib.closing(transport(path)) as file, _beginning(path, file.chunks(), datagrams=file.datagrams) as given:
-        yield given
+    with contextlib.closing(transport(path)) as file:
+        with _beginning(path, file.chunks(), datagrams=file.datagrams, warnings=file.warnings) as given:
+            yield given
+        for warning in file.warnings if given[0].chunks else ():
+            note(warning)
 
 
 @contextlib.contextmanager
-def _beginning(source: str, chunks: Iterator[Chunk], *, datagrams: bool) -> Iterator[tuple[Heard, Iterator[Chunk]]]:
+def _beginning(
+    source: str, chunks: Iterator[Chunk], *, datagrams: bool, warnings: Sequence[str] = ()
+) -> Iterator[tuple[Heard, Iterator[Chunk]]]:
     head, size = list[Chunk](), 0
     with system_errors(source):
         for chunk in chunks:
             head.append(chunk)
             if (size := size + len(chunk.data)) >= LOOKED_AT:
                 break
-    yield Heard(source, tuple(chunk.data for chunk in head), datagrams), itertools.chain(head, _rest(source, chunks))
+    data = tuple(chunk.data for chunk in head)
+    yield Heard(source, data, datagrams, warnings=tuple(warnings)), itertools.chain(head, _rest(source, chunks))
 
 
 def _rest(source: str, chunks: Iterator[Chunk]) -> Iterator[Chunk]:
@@ -86,6 +95,7 @@ def _rest(source: str, chunks: Iterator[Chunk]) -> Iterator[Chunk]:
 def _standard_input() -> Iterator[Chunk]:
     """What comes over standard input, as it comes; hexadecimal text as the bytes that it stands for."""
     head = sys.stdin.buffer.read(LOOKED_AT)
+    refuse_piped(head)
     if head.isascii():
         head += sys.stdin.buffer.read()
         with contextlib.suppress(ValueError):
@@ -135,7 +145,7 @@ def no_frame(sensor: Sensor, given: Heard) -> WireError:
     longest = max((frame.max_length for frame in sensor.frames.values()), default=0)
     command = f"lidarspec explain {given.source} -s {sensor.id}"
     if not data:
-        return suggest(WireError(f"{given.source} holds no bytes", sensor=sensor.id), f"lidarspec build {sensor.id} --help")
+        return suggest(WireError(no_bytes(given.source, given.warnings), sensor=sensor.id), f"lidarspec build {sensor.id} --help")
     if len(data) > longest:
         error = WireError(f"no frame in {len(data)} bytes", sensor=sensor.id, expected="a frame", data=data[:longest])
         return suggest(error, "lidarspec sensors")
@@ -149,7 +159,7 @@ def no_frame(sensor: Sensor, given: Heard) -> WireError:
 def nearest_fault(given: Heard) -> WireError:
     """No sensor fits: what the one that came farthest says, with its id, or that none came far."""
     if not given.data:
-        return suggest(WireError(f"{given.source} holds no bytes"), "lidarspec sensors")
+        return suggest(WireError(no_bytes(given.source, given.warnings)), "lidarspec sensors")
     best = nearest(given.data)
     if best is None:
         text = f"no frame of any of the {len(sensors())} installed sensors" if sensors() else "no frame of an installed sensor"
@@ -163,8 +173,10 @@ def nothing_came(device: Device, source: str, seconds: float | None = None) -> L
     if (failure := stats.failure(sensor.id)) is not None:
         return failure
     if not device.is_live:
-        what = "holds no bytes" if stats.bytes_in == 0 else f"has no data frame: {stats}"
-        return suggest(WireError(f"{source} {what}", sensor=sensor.id), f"lidarspec explain {source} -s {sensor.id}")
+        said = (
+            "; ".join([f"{source} has no data frame: {stats}", *device.warnings]) if stats.bytes_in else no_bytes(source, device.warnings)
+        )
+        return suggest(WireError(said, sensor=sensor.id), f"lidarspec explain {source} -s {sensor.id}")
     waited = "" if seconds is None else f" within {seconds:.1f} s".replace(".0 s", " s")
     if stats.bytes_in == 0:
         return suggest(CommandError(f"{sensor.id} on {source} sent nothing{waited}"), f"lidarspec doctor {source} -s {sensor.id}")
@@ -172,8 +184,8 @@ def nothing_came(device: Device, source: str, seconds: float | None = None) -> L
     return suggest(error, f"lidarspec detect {source}")
 
 
-def remark(device: Device) -> None:
-    """Say what is to be said of a source that was read.
+def conclude(device: Device) -> None:
+    """Say what there is to be said of a source that was read; exit code 1 where bytes of it are damaged, and could not be.
 
     Raises:
         PluginError: where a function of the plugin raised at some of the packets.
@@ -184,6 +196,8 @@ def remark(device: Device) -> None:
             note(warning)
     if failure is not None:
         raise failure
+    if device.stats.unread:
+        raise click.exceptions.Exit(FINDINGS)
 
 
 class Patience:

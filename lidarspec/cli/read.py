@@ -15,7 +15,7 @@ import click
 import numpy as np
 
 from lidarspec.cli.failures import FINDINGS
-from lidarspec.cli.inputs import Patience, nothing_came, remark
+from lidarspec.cli.inputs import Patience, conclude, nothing_came
 from lidarspec.cli.options import DURATION, SHARE, count_option, sensor_option
 from lidarspec.cli.output import note
 from lidarspec.device.device import Device, open as open_device
@@ -86,7 +86,7 @@ def read(
             printed += 1
         if not printed and not device.stats.frames:
             raise nothing_came(device, source, duration)
-        remark(device)
+        conclude(device)
 
 
 def _lines(rows: Iterable[tuple[Units, Row]], *, as_json: bool) -> Iterator[str]:
@@ -259,11 +259,13 @@ def stats(
         if found.packets == 0:
             raise nothing_came(device, source, found.seconds)
         lines.summary(found)
-        remark(device)
         worst = max(found.error_rate, found.loss_rate or 0.0)
-        if max_errors is not None and worst > max_errors:
+        is_too_bad = max_errors is not None and worst > max_errors
+        if is_too_bad:
             note(f"{worst:.3%} of the frames are wrong or lost, more than {max_errors:.3%}")
-            click.get_current_context().exit(FINDINGS)
+        conclude(device)
+        if is_too_bad:
+            raise click.exceptions.Exit(FINDINGS)
 
 
 def _summary(feed: Feed, start: float) -> Reading:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import click
 
-from lidarspec.cli.inputs import PATIENCE, nothing_came, remark
+from lidarspec.cli.inputs import PATIENCE, conclude, nothing_came
 from lidarspec.cli.options import DURATION, colour_option, sensor_option
 from lidarspec.cli.output import drawn, note
 from lidarspec.device.device import Device, open as open_device
@@ -38,14 +38,14 @@ def view(source: str, sensor_id: str | None, duration: float | None, once: bool,
     if once or not interactive():
         with open_device(source, sensor_id) as device:
             click.echo(_printed(device, source, ramp, duration or PATIENCE), color=True)
-            remark(device)
+            conclude(device)
         return
     switch = Switch(source, Path.cwd()) if is_live(source) else None
     with open_device(source, sensor_id, record=switch.attached if switch else None, period=LOOK) as device:
         if switch is not None:
             switch.sensor_id = device.sensor.id
         _show(device, Window(Feed(device, played=True), source, ramp=ramp, record=switch, duration=duration), taken=source == "-")
-        remark(device)
+        conclude(device)
     for path, size in switch.written if switch else ():
         note(f"recorded {size} bytes; next: lidarspec view {Path(path).name}")
 

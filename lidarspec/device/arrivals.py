@@ -20,9 +20,10 @@ from lidarspec.errors import CommandError, SourceError, UsageError, suggest
 from lidarspec.framing.decoder import Decoder
 from lidarspec.framing.results import Counters, Found, Frames
 from lidarspec.spec.sensor import Sensor
+from lidarspec.transports.base import with_option
 from lidarspec.transports.files import CaptureTransport
 from lidarspec.transports.open_url import transport
-from lidarspec.transports.protocol import Chunk, Transport
+from lidarspec.transports.protocol import Chunk, Sender, Transport, endpoint
 
 #: other senders of a stream that are looked at; datagrams of further ones are foreign unseen.
 SENDERS = 16
@@ -131,63 +132,73 @@ class Senders:
 
     def __init__(self, source: str | Path, sensor: Sensor) -> None:
         self._source, self._sensor = source, sensor
-        self._first: dict[str, str] = {}
-        self._ours: str | None = None
-        self._others: dict[str, Decoder] = {}
+        self._now: dict[str, Sender] = {}  # who sends the frames of a type, and who did before
+        self._before: dict[str, set[Sender]] = {}
+        self._others: dict[Sender, Decoder] = {}  # of streams: what senders send, and who has sent frames
+        self._framed: set[Sender] = set()
 
     def check(self, chunks: Sequence[Chunk], found: Frames) -> None:
         """Look who sent the frames of these datagrams.
 
         Raises:
-            UsageError: where two addresses send frames of one type.
+            UsageError: where two senders send frames of one type.
         """
         senders = {chunk.sender for chunk in chunks}
-        sender = senders.pop() if len(senders) == 1 else None
-        if sender is not None and all(host == sender[0] for host in self._first.values()):
-            for kind in np.unique(found.kinds).tolist():
-                self._first.setdefault(found.names[kind], sender[0])
+        if len(senders) == 1:
+            self.see((found.names[kind], sender) for sender in senders if sender for kind in np.unique(found.kinds).tolist())
             return
-        hosts = [chunk.sender[0] if chunk.sender else None for chunk in chunks]
         sizes = np.array([len(chunk.data) for chunk in chunks])
         places = np.searchsorted(np.cumsum(sizes) - sizes, found.starts, side="right") - 1
-        sent = [(found.names[kind], hosts[place]) for kind, place in zip(found.kinds.tolist(), places.tolist(), strict=True)]
-        self.see((name, host) for name, host in sent if host is not None)
+        sent = zip(found.kinds.tolist(), (chunks[place].sender for place in places.tolist()), strict=True)
+        self.see((found.names[kind], sender) for kind, sender in sent if sender is not None)
 
-    def see(self, sent: Iterable[tuple[str, str]]) -> None:
-        """Look who sent frames: the type of each, and the address.
+    def see(self, sent: Iterable[tuple[str, Sender]]) -> None:
+        """Look who sent frames: the type of each, and the sender.
+
+        A sensor that was started anew may send from another port of its address than before; two sensors there take turns.
 
         Raises:
-            UsageError: where two addresses send frames of one type.
+            UsageError: where two senders send frames of one type.
         """
-        for name, host in sent:
-            if self._first.setdefault(name, host) != host:
-                raise self._several(self._first[name], host, f"{name} frames")
+        for name, sender in sent:
+            known = self._now.setdefault(name, sender)
+            if sender == known:
+                continue
+            before = self._before.setdefault(name, set())
+            if sender[0] != known[0] or sender in before or len(before) == SENDERS:
+                raise self._several(known, sender, f"{name} frames" if name else f"frames of {self._sensor.id}")
+            before.add(known)
+            self._now[name] = sender
 
     def ours(self, chunks: Sequence[Chunk], main: Decoder) -> list[Chunk]:
         """Those pieces of a stream in datagrams that come from the sender which is listened to, the first that sends frames.
 
         Raises:
-            UsageError: where another address sends frames as well.
+            UsageError: where another one sends frames as well.
         """
-        sent = [(chunk.sender[0], chunk) for chunk in chunks if chunk.sender]
-        for host, chunk in sent:
-            self._ours = self._ours or host
-            if host != self._ours and self._sends_frames(host, chunk):
-                if main.stats.frames:
-                    raise self._several(self._ours, host, f"frames of {self._sensor.id}")
-                self._ours = host
-        return [chunk for chunk in chunks if not chunk.sender or chunk.sender[0] == self._ours]
+        mine: list[Chunk] = []
+        for chunk in chunks:
+            known = self._now.setdefault("", chunk.sender) if chunk.sender else None
+            has_begun = bool(main.stats.frames)
+            if chunk.sender and (chunk.sender != known or not has_begun) and self._sends_frames(chunk.sender, chunk):
+                if has_begun or known in self._framed:
+                    self.see([("", chunk.sender)])
+                self._now[""] = chunk.sender
+                self._framed.add(chunk.sender)
+            mine += [chunk] if not chunk.sender or chunk.sender == self._now[""] else []
+        return mine
 
-    def _sends_frames(self, host: str, chunk: Chunk) -> bool:
-        if host not in self._others and len(self._others) >= SENDERS:
+    def _sends_frames(self, sender: Sender, chunk: Chunk) -> bool:
+        if sender not in self._others and len(self._others) >= SENDERS:
             return False
-        decoder = self._others.setdefault(host, self._sensor.decoder(stream=True))
+        decoder = self._others.setdefault(sender, self._sensor.decoder(stream=True))
         return bool(decoder.feed(chunk.data))
 
-    def _several(self, first: str, other: str, what: str) -> UsageError:
+    def _several(self, first: Sender, other: Sender, what: str) -> UsageError:
+        one, two = (endpoint(sender) if first[0] == other[0] else sender[0] for sender in (first, other))
         mark = "&" if "?" in str(self._source) else "?"
-        error = UsageError(f"{self._source}: {first} and {other} both send {what}; choose one with {mark}src={first}")
-        return suggest(error, f"the same with '{self._source}{mark}src={first}'")
+        error = UsageError(f"{self._source}: {one} and {two} both send {what}; choose one with {mark}src={one}")
+        return suggest(error, f"the same with '{with_option(self._source, 'src', one)}'")
 
 
 def fed(decoder: Decoder, chunks: Sequence[Chunk]) -> list[Frames]:
@@ -242,7 +253,7 @@ class FileInput(Input):
     @property
     def stats(self) -> Counters:
         stats = self.decoder.stats
-        stats.foreign, stats.disconnects = self._transport.foreign, self._transport.disconnects
+        stats.foreign, stats.disconnects, stats.unread = self._transport.foreign, self._transport.disconnects, self._transport.unread
         return stats
 
     def next(self, wait: float) -> Arrival | None:
@@ -287,7 +298,7 @@ class FileInput(Input):
         if isinstance(self._transport, CaptureTransport) and not self.decoder.stream:
             for datagrams in self._transport.batches():
                 spans = self.decoder.placed(datagrams.buffer, datagrams.starts, datagrams.sizes, datagrams.at)
-                self._senders.see((name, host) for name, hosts in datagrams.hosts(spans).items() for host in hosts)
+                self._senders.see(datagrams.sent(spans))
                 yield Arrival([spans])
             return
         for batch in _batches(self._transport.chunks()):

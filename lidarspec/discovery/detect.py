@@ -35,6 +35,7 @@ from lidarspec.spec.tree import FieldInfo
 from lidarspec.transports.base import data_link
 from lidarspec.transports.files import RecordingTransport
 from lidarspec.transports.open_url import live_address, resolved, transport
+from lidarspec.transports.protocol import no_bytes
 from lidarspec.transports.simulated import SimulatedTransport
 from lidarspec.wire.parse import parse_typed
 from lidarspec.wire.schema import schema
@@ -290,7 +291,7 @@ def _nothing(source: str, found: Sequence[Verdict]) -> Exception:
     if heard.size:
         return WireError(f"{source}: no installed sensor's frames are in it", data=heard.chunks[0][:SHOWN])
     if live_address(source) is None:
-        return WireError(f"{source}: it holds no bytes")
+        return WireError(no_bytes(source, heard.warnings))
     error = CommandError(f"{source}: nothing comes; a sensor that has to be started first is named with -s")
     return suggest(error, f"lidarspec doctor {source}")
 

@@ -2,23 +2,22 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from shlex import quote
 
 from lidarspec.discovery.detect import Verdict, verdict, verdicts
-from lidarspec.discovery.listen import LISTEN, Heard, bauds, has_no_baud, started_first, udp_ports
+from lidarspec.discovery.listen import LISTEN, bauds, heard_as, started_first, udp_ports
 from lidarspec.errors import LidarSpecError, UsageError, suggestion
 from lidarspec.spec.links import Serial, Udp
 from lidarspec.spec.sensor import Sensor
 from lidarspec.transports import ports
 from lidarspec.transports.base import Address, data_link, with_option
-from lidarspec.transports.open_url import live_address, resolved, transport
-from lidarspec.transports.protocol import LiveTransport
+from lidarspec.transports.open_url import live_address, resolved
+from lidarspec.transports.protocol import no_bytes
 from lidarspec.transports.udp import BUFFER, shortfall
 
 #: share of the bytes outside frames from which on a line is bad.
@@ -74,15 +73,21 @@ def computer() -> Iterator[Finding]:
 
 
 def _file(path: str) -> Iterator[Finding]:
-    if not os.path.exists(path):
+    name = path if os.path.exists(path) else path.rpartition("?")[0]  # what stands behind it chooses a sender
+    if not os.path.exists(name):
         yield Finding(False, f"{path}: no such file or port", "lidarspec ports")
-    elif not os.access(path, os.R_OK):
+    elif not os.access(name, os.R_OK):
         yield Finding(False, f"{path}: this user may not read it", f"sudo chmod a+r {path}")
-    elif os.path.getsize(path) == 0:
+    elif os.path.getsize(name) == 0:
         yield Finding(False, f"{path} is empty")
     else:
-        found = max(verdicts(path), key=lambda one: one.heard.size)
-        yield _verdict(path, found, None)
+        tried = verdicts(path)
+        found = max(tried, key=lambda one: one.heard.size)
+        if found.heard.size:
+            yield _verdict(path, found, None)
+        yield from _several(path, tried)
+        for text in found.heard.warnings or [no_bytes(path, ())] * (not found.heard.size):
+            yield Finding(False, text)
 
 
 def _serial(source: str, address: Address, sensor: Sensor | None, seconds: float) -> Iterator[Finding]:
@@ -181,27 +186,27 @@ def _interfaces(numbers: list[int], host: str, rates: dict[str, float]) -> Itera
 def _heard(source: str, sensor: Sensor | None, seconds: float) -> Iterator[Finding]:
     """What comes, and whether it is what should come."""
     try:
-        found = _as_expected(source, sensor, seconds) if sensor is not None else None
-        if found is None or not found.scores:
-            tried = [*([found] if found is not None else []), *verdicts(source, seconds=seconds)]
-            found = max(tried, key=lambda one: (bool(one.scores), one.heard.size))
+        tried = [verdict(heard) for heard in heard_as(source, sensor, seconds)] if sensor is not None else []
+        if not any(one.scores for one in tried):
+            tried += verdicts(source, seconds=seconds)
     except LidarSpecError as error:
         command = suggestion(error)
         yield Finding(False, str(error), "" if "doctor" in command and not isinstance(error, UsageError) else command)
         return
-    yield _verdict(source, found, sensor)
+    yield _verdict(source, max(tried, key=lambda one: (bool(one.scores), one.heard.size)), sensor)
+    yield from _several(source, tried)
 
 
-def _as_expected(source: str, sensor: Sensor, seconds: float) -> Verdict | None:
-    """What comes over a source that is opened as the sensor declares."""
-    with contextlib.closing(transport(source, sensor)) as opened:
-        end, chunks = time.monotonic() + seconds, list[bytes]()
-        while (left := end - time.monotonic()) > 0 and isinstance(opened, LiveTransport):
-            chunks += [chunk.data for chunk in opened.read(min(left, 0.1))]
-        address = live_address(source)
-        plain = address is not None and has_no_baud(address.place)
-        datagrams, baud = opened.datagrams, None if plain else opened.baud
-    return verdict(Heard(source, tuple(chunks), datagrams, baud)) if chunks else None
+def _several(source: str, found: Sequence[Verdict]) -> Iterator[Finding]:
+    """Senders whose frames are of one sensor, and would be mixed."""
+    senders: dict[str, list[str]] = {}
+    for one in found:
+        if one.scores and one.heard.sender:
+            senders.setdefault(one.scores[0].sensor.id, []).append(one.heard.sender)
+    for name, several in senders.items():
+        if len(several) > 1:
+            command = f"lidarspec view {quote(with_option(source, 'src', several[0]))} -s {name}"
+            yield Finding(False, f"{' and '.join(several)} all send frames of {name}: choose one", command)
 
 
 def _verdict(source: str, found: Verdict, sensor: Sensor | None) -> Finding:

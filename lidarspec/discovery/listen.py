@@ -9,7 +9,7 @@ import contextlib
 import itertools
 import os
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -21,7 +21,7 @@ from lidarspec.spec.links import Serial, Udp
 from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.base import data_link, with_option
 from lidarspec.transports.open_url import live, live_address, transport
-from lidarspec.transports.protocol import Chunk, Disconnected, LiveTransport, Transport
+from lidarspec.transports.protocol import Chunk, Disconnected, LiveTransport, Transport, sender_names
 
 #: bytes and datagrams that are looked at; of a live source, bytes that are enough.
 LOOKED_AT, DATAGRAMS, PLENTY = 1 << 17, 400, 1 << 14
@@ -46,6 +46,7 @@ class Heard:
         baud: at which a serial port was read; None for another source, and for a port that has no baud rate.
         sender: address of the sender, where there are several.
         failure: why it could not be opened.
+        warnings: what is to be said of the source, once it was read to its end.
     """
 
     source: str
@@ -54,6 +55,7 @@ class Heard:
     baud: int | None = None
     sender: str = ""
     failure: SourceError | None = field(default=None, compare=False)
+    warnings: tuple[str, ...] = ()
 
     @property
     def size(self) -> int:
@@ -107,11 +109,29 @@ def _heard(source: str, seconds: float, baud: int | None, name: str) -> Iterator
     with contextlib.closing(transport(source)) as opened:
         number = DATAGRAMS if opened.datagrams else None
         chunks = _listened(opened, seconds) if isinstance(opened, LiveTransport) else beginning(opened, LOOKED_AT, number=number)
-    by_sender: dict[str, list[bytes]] = {}
+        said = () if isinstance(opened, LiveTransport) else tuple(opened.warnings)
+    yield from _by_sender(Heard(name, (), opened.datagrams, baud, warnings=said), chunks)
+
+
+def _by_sender(heard: Heard, chunks: Sequence[Chunk]) -> Iterator[Heard]:
+    """What was heard, of each sender; of a single one without a name."""
+    names = sender_names((chunk.sender, chunk.receiver) for chunk in chunks)
+    by_sender: dict[str, list[bytes]] = {name: [] for name in names.values()} or {"": []}
     for chunk in chunks:
-        by_sender.setdefault(chunk.sender[0] if chunk.sender else "", []).append(chunk.data)
-    for sender, data in (by_sender or {"": []}).items():
-        yield Heard(name, tuple(data), opened.datagrams, baud, sender if len(by_sender) > 1 else "")
+        by_sender[names[chunk.sender]].append(chunk.data)
+    for sender, data in by_sender.items():
+        yield replace(heard, chunks=tuple(data), sender=sender if len(by_sender) > 1 else "")
+
+
+def heard_as(source: str | Path, sensor: Sensor, seconds: float) -> list[Heard]:
+    """What comes over a live source within some seconds, of each sender, where it is opened as a sensor declares; [] where nothing does."""
+    address, chunks = live_address(source), list[Chunk]()
+    with contextlib.closing(transport(source, sensor)) as opened:
+        end = time.monotonic() + seconds
+        while (left := end - time.monotonic()) > 0 and isinstance(opened, LiveTransport):
+            chunks += opened.read(min(left, LOOK))
+    baud = None if address is not None and has_no_baud(address.place) else opened.baud
+    return list(_by_sender(Heard(str(source), (), opened.datagrams, baud), chunks)) if chunks else []
 
 
 def beginning(opened: Transport, most: int, *, number: int | None = None) -> list[Chunk]:

@@ -1,30 +1,74 @@
-"""NumPy's .npz: one array a column, and one entry a scan for the stamps."""
+"""NumPy's .npz: one array a column, and one entry a scan for the stamps; written scan by scan, so memory stays small.
+
+How long an array is stands before it, and is known at the end alone: until then each column grows in a file of its own, without a
+name, in the same folder.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import shutil
+import tempfile
+import zipfile
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import DTypeLike, NDArray
 
-from lidarspec.points.cloud import COLUMNS, PointCloud
+from lidarspec.points.cloud import COLUMNS
 from lidarspec.scans.scans import Scan
 from lidarspec.transports.protocol import Format
 
 
+class Column:
+    """One column, as long as scans come."""
+
+    def __init__(self, folder: Path, dtype: DTypeLike) -> None:
+        self._file = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115  closed by `close`
+        self._dtype, self._length = np.dtype(dtype), 0
+
+    def add(self, values: NDArray[Any]) -> None:
+        """Append the values of a scan."""
+        self._file.write(np.ascontiguousarray(values, self._dtype).view(np.uint8).data)
+        self._length += len(values)
+
+    def put(self, archive: zipfile.ZipFile, name: str) -> None:
+        """Put all of it into an archive, as NumPy reads it."""
+        self._file.seek(0)
+        with archive.open(f"{name}.npy", "w", force_zip64=True) as target:
+            shape = {"descr": self._dtype.str, "fortran_order": False, "shape": (self._length,)}
+            np.lib.format.write_array_header_1_0(target, shape)
+            shutil.copyfileobj(self._file, target)
+
+    def close(self) -> None:
+        """Give its file back."""
+        self._file.close()
+
+
 def write(path: Path, scans: Iterable[Scan], *, every_point: bool) -> None:
     """Write the columns that all scans have, `scan` for each point, and for each scan `stamp_ns`, `rate_hz` and `complete`."""
-    clouds: list[PointCloud] = []
-    facts: list[tuple[int, float, bool]] = []
-    for scan in scans:
-        clouds.append(scan.points if every_point else scan.points[scan.points.valid])
-        facts.append((scan.stamp_ns, scan.rate_hz, scan.complete))
-    names = [name for name in COLUMNS if clouds and all(name in cloud.columns for cloud in clouds)]
-    columns = {name: np.concatenate([cloud.columns[name] for cloud in clouds]) for name in names}
-    numbers = np.repeat(np.arange(len(clouds), dtype=np.int32), [len(cloud) for cloud in clouds])
-    each = np.array(facts, [("stamp_ns", np.int64), ("rate_hz", np.float64), ("complete", np.bool_)])
-    with path.open("wb") as file:
-        np.savez(file, allow_pickle=False, **columns, scan=numbers, **{name: each[name] for name in each.dtype.names or ()})
+    with contextlib.ExitStack() as files:
+
+        def column(dtype: DTypeLike) -> Column:
+            return files.enter_context(contextlib.closing(Column(path.parent, dtype)))
+
+        facts = {"stamp_ns": column(np.int64), "rate_hz": column(np.float64), "complete": column(np.bool_)}
+        numbers, columns = column(np.int32), dict[str, Column]()
+        for number, scan in enumerate(scans):
+            cloud = scan.points if every_point else scan.points[scan.points.valid]
+            own = cloud.columns
+            columns = columns if number else {name: column(own[name].dtype) for name in COLUMNS if name in own}
+            columns = {name: kept for name, kept in columns.items() if name in own}
+            for name, kept in columns.items():
+                kept.add(own[name])
+            numbers.add(np.full(len(cloud), number))
+            for name, kept in facts.items():
+                kept.add(np.array([getattr(scan, name)]))
+        with zipfile.ZipFile(path, "w") as archive:
+            for name, kept in {**columns, "scan": numbers, **facts}.items():
+                kept.put(archive, name)
 
 
 NPZ = Format(".npz", "NumPy arrays, one a column", write)

@@ -49,6 +49,7 @@ class Counters:
         bad_checksum, bad_length, implausible: rejected candidates.
         lost, duplicates, late: packets, by the sensor's sequence.
         kernel_drops, queue_dropped, foreign, disconnects: counted by the transports.
+        unread: bytes of a damaged file that could not be read.
         plugin_errors: packets, or candidates, at which a function of the plugin raised; `failures` keeps the first ones.
     """
 
@@ -68,6 +69,7 @@ class Counters:
     foreign: int = 0
     plugin_errors: int = 0
     disconnects: int = 0
+    unread: int = 0
     failures: list[PluginError] = field(default_factory=list, repr=False, compare=False)
 
     def to_dict(self) -> dict[str, Any]:

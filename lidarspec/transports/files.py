@@ -8,26 +8,47 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 import re
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from shlex import quote
 from typing import BinaryIO
 
 from lidarspec.captures.bulk import Batch, CaptureBatches
 from lidarspec.captures.pcap import CaptureReader, CaptureStats, StreamReader, is_stream_capture
 from lidarspec.captures.records import is_capture
-from lidarspec.errors import SourceError, WireError, system_errors
+from lidarspec.errors import SourceError, WireError, suggest, system_errors
 from lidarspec.recording.format import MAGIC, Header, Record, Recording
-from lidarspec.transports.protocol import Chunk, Transport
+from lidarspec.transports.protocol import Chunk, Origin, Transport
 
 #: events behind which a frame begun earlier does not go on.
 INTERRUPTIONS = frozenset({"disconnect", "reconnect", "dropped"})
-#: bytes read at once.
-BLOCK = 1 << 18
 #: in hexadecimal text: offsets and comments, what may stand between bytes, and what may not stand anywhere else.
 _BESIDE = re.compile(r"^\s*(?:0[xX])?[0-9a-fA-F]{3,}:(?=\s)|(?:#|//).*", re.MULTILINE)
 _BETWEEN, _NO_DIGIT = re.compile(r"[\s,;:{}]+"), re.compile(r"[^0-9a-fA-F]")
+#: bytes read at once, and bytes that say what a file is.
+BLOCK, HEAD = 1 << 18, 512
+#: how files begin that hold no bytes as a sensor sent them, or these in a shape of their own; what they are, and what takes the bytes out.
+CONTAINERS = {
+    rb"\x1f\x8b\x08[\x00-\x1f]": ("compressed by gzip", "gunzip -k {}"),
+    rb"BZh[1-9]1AY&SY": ("compressed by bzip2", "bunzip2 -k {}"),
+    rb"\xfd7zXZ\x00": ("compressed by xz", "unxz -k {}"),
+    rb"\x28\xb5\x2f\xfd": ("compressed by zstd", "unzstd {}"),
+    rb"\x04\x22\x4d\x18": ("compressed by lz4", "unlz4 {}"),
+    rb"PK\x03\x04": ("a zip archive, as .npz files are too", "unzip -l {}"),
+    rb"7z\xbc\xaf\x27\x1c": ("a 7z archive", "7z l {}"),
+    rb".{257}ustar": ("a tar archive", "tar -tf {}"),
+    rb"SQLite format 3\x00": ("an SQLite database, as ROS 2 bags are", ""),
+    rb"#ROSBAG V": ("a ROS 1 bag", ""),
+    rb"\x89MCAP0\r\n": ("an MCAP file, as ROS 2 bags are", ""),
+    rb"\x89HDF\r\n": ("an HDF5 file", ""),
+    rb"PAR1": ("a Parquet file", ""),
+    rb"\x93NUMPY": ("a NumPy array", ""),
+    rb"# \.PCD v|ply\r?\n|LASF": ("a file of points", ""),
+    rb"snoop\x00{3}|btsnoop\x00|\x34\xcd\xb2\xa1|\xa1\xb2\xcd\x34": ("a capture of another format", "editcap {} capture.pcapng"),
+}
 
 
 class RecordingTransport(Transport):
@@ -35,7 +56,7 @@ class RecordingTransport(Transport):
 
     Args:
         path: the file.
-        sender: only datagrams from this address.
+        sender: only datagrams from this address, or "ADDRESS:PORT".
         salvage: go on behind damaged places.
 
     Attributes:
@@ -45,7 +66,7 @@ class RecordingTransport(Transport):
     def __init__(self, path: str | Path, *, sender: str | None = None, salvage: bool = False) -> None:
         self._recording = Recording(path, salvage=salvage)
         self.header: Header = self._recording.header
-        self.datagrams, self._sender = self.header.datagrams, sender
+        self.datagrams, self._origin = self.header.datagrams, None if sender is None else Origin.parse(sender)
         self.warnings: list[str] = []
 
     def chunks(self) -> Iterator[Chunk]:
@@ -60,6 +81,7 @@ class RecordingTransport(Transport):
                 interrupted = False
         if self._recording.damaged:
             self.warnings.append(_damage(self._recording))
+            self.unread = 0 if self._recording.is_cut else self._recording.leftover
 
     def write(self, data: bytes) -> None:
         raise SourceError(f"{self._recording.path} is a recording: nothing can be sent to it")
@@ -68,7 +90,7 @@ class RecordingTransport(Transport):
         self._recording.close()
 
     def _wanted(self, record: Record) -> bool:
-        if self._sender is None or (record.sender is not None and record.sender[0] == self._sender):
+        if self._origin is None or record.sender in self._origin:
             return True
         self.foreign += 1
         return False
@@ -88,11 +110,16 @@ def _damage(recording: Recording) -> str:
     """Where a recording is damaged, and how much of it was not read."""
     lost = f"{recording.leftover} bytes were not read"
     if recording.salvage:
-        return f"{recording.path} is damaged in {recording.damaged} place{'s' * (recording.damaged > 1)}: {lost}, everything else was"
+        return _passed_over(str(recording.path), recording.damaged, recording.leftover)
     if recording.is_cut:
         return f"{recording.path} is cut off in its last record: {lost}, everything before them was"
     mending = f"lidarspec record {recording.path} --salvage -o mended.lsr"
     return f"{recording.path} is damaged at byte {recording.offset}: {lost}; next: {mending}"
+
+
+def _passed_over(path: str, places: int, size: int) -> str:
+    """How much of a file was not read between what was."""
+    return f"{path} is damaged in {places} place{'s' * (places > 1)}: {size} bytes were not read, everything else was"
 
 
 class FileTransport(Transport):
@@ -116,10 +143,34 @@ class FileTransport(Transport):
 
     def _warn(self, stats: CaptureStats) -> None:
         """Take down what a capture does not hold whole."""
+        self.unread = stats.lost
+        if stats.damaged:
+            self.warnings.append(_passed_over(self._path, stats.damaged, stats.lost))
         if stats.truncated_tail:
             self.warnings.append(f"{self._path} is cut off in its last record; everything before it was read")
         if stats.snapped:
             self.warnings.append(f"{self._path}: {stats.snapped} packets were cut by the capture's snap length")
+        if stats.other > stats.datagrams:
+            kinds = ", ".join(f"{number} {what}" for what, number in stats.others.most_common())
+            self.warnings.append(f"{self._path}: {stats.other} of {stats.packets} packets are no UDP over IP, and were not read: {kinds}")
+        if not stats.packets:
+            self.warnings.append(f"{self._path} is a capture without a packet")
+        if stats.incomplete_fragments:
+            self.warnings.append(
+                f"{self._path}: {stats.incomplete_fragments} IP fragments were left out, others of their datagrams are missing"
+            )
+        if contradicting := stats.malformed - stats.damaged:
+            self.warnings.append(f"{self._path}: {contradicting} packets were left out, since their headers contradict themselves")
+
+
+class PipeTransport(FileTransport):
+    """The bytes of standard input."""
+
+    def chunks(self) -> Iterator[Chunk]:
+        for number, chunk in enumerate(super().chunks()):
+            if not number:
+                refuse_piped(chunk.data)
+            yield chunk
 
 
 class HexTransport(FileTransport):
@@ -164,12 +215,12 @@ class CaptureTransport(FileTransport):
 
     def __init__(self, path: str, file: BinaryIO, *, sender: str | None = None) -> None:
         super().__init__(path, file)
-        self._sender = sender
+        self._origin = None if sender is None else Origin.parse(sender)
 
     def chunks(self) -> Iterator[Chunk]:
         reader = CaptureReader(self._file)
         for datagram in reader:
-            if self._sender is not None and datagram.source[0] != self._sender:
+            if self._origin is not None and datagram.source not in self._origin:
                 self.foreign += 1
                 continue
             yield Chunk(datagram.data, datagram.at, datagram.source, datagram.destination)
@@ -183,7 +234,7 @@ class CaptureTransport(FileTransport):
         """
         reader = CaptureBatches(self._file)
         for batch in reader.batches():
-            mine = batch if self._sender is None else batch.of(self._sender)
+            mine = batch if self._origin is None else batch.of(self._origin)
             self.foreign += len(batch) - len(mine)
             if len(mine):
                 yield mine
@@ -199,17 +250,44 @@ class StreamCaptureTransport(FileTransport):
         self._warn(reader.stats)
 
 
+def refuse_container(path: str, head: bytes) -> None:
+    """Nothing, for a file that is read as the bytes it holds.
+
+    Args:
+        head: its first `HEAD` bytes, or all.
+
+    Raises:
+        SourceError: where it begins as a file of another kind, which is named.
+    """
+    for beginning, (what, command) in CONTAINERS.items():
+        if re.match(beginning, head, re.DOTALL):
+            error = SourceError(f"{path} is {what}, and is not read: this takes captures, recordings and bytes as a sensor sent them")
+            raise suggest(error, command.format(quote(path))) if command and os.path.exists(path) else error
+
+
+def refuse_piped(data: bytes) -> None:
+    """Nothing, for standard input that is read as the bytes it holds.
+
+    Raises:
+        SourceError: where it begins as a file that is read otherwise, or not at all.
+    """
+    refuse_container("standard input", data[:HEAD])
+    if is_capture(data[:4]) or data.startswith(MAGIC):
+        raise SourceError("standard input is a capture or a recording, which are read from files: give the path of one")
+
+
 def open_file(path: str, *, sender: str | None = None) -> FileTransport | RecordingTransport:
     """The transport for a file, by what it holds; "-" is standard input.
 
     Raises:
-        SourceError: where it cannot be opened.
+        SourceError: where it cannot be opened, or is a file of another kind, such as an archive or a bag.
     """
     if path == "-":
-        return FileTransport("standard input", sys.stdin.buffer)
+        return PipeTransport("standard input", sys.stdin.buffer)
     with system_errors(path), contextlib.ExitStack() as undo:
         file = undo.enter_context(open(path, "rb"))
-        head = file.peek(24)[:24]
+        head = file.peek(HEAD)[:HEAD]
+        refuse_container(path, head)
         undo.pop_all()  # the transport closes it
     if head.startswith(MAGIC):
         file.close()

@@ -6,7 +6,9 @@ A `Transport` is the only place for input and output: it gives `Chunk`s and take
 
 from __future__ import annotations
 
+import re
 from abc import ABC, abstractmethod
+from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +19,53 @@ from lidarspec.errors import SourceError, UsageError
 
 #: seconds between two looks at whether somebody wants to stop.
 POLL = 0.05
+#: who sends datagrams: address and port.
+Sender = tuple[str, int]
+
+
+@dataclass(frozen=True)
+class Origin:
+    """Whose datagrams are wanted: those of an address, or of one of its ports; a sender is `in` it, or not."""
+
+    host: str
+    port: int | None = None
+
+    @classmethod
+    def parse(cls, text: str) -> Origin:
+        """What "192.168.1.201", "192.168.1.201:2368", "fe80::1" and "[fe80::1]:2368" stand for.
+
+        Raises:
+            UsageError: for a port that is none.
+        """
+        found = re.fullmatch(r"\[(.*)\](?::(.*))?|([^:]*):([^:]*)", text)
+        if found is None:
+            return cls(text)
+        host, port = found[1] or found[3] or "", found[4] if found[1] is None else found[2]
+        if port is not None and not (port.isdecimal() and 0 < int(port) < 65536):
+            raise UsageError(f"src={text}: a sender is ADDRESS or ADDRESS:PORT")
+        return cls(host, None if port is None else int(port))
+
+    def __contains__(self, sender: Sender | None) -> bool:
+        return sender is not None and sender[0] == self.host and self.port in (None, sender[1])
+
+
+def endpoint(sender: Sender) -> str:
+    """A sender as it is written, and as `src=` takes it: "192.168.1.201:2368", "[fe80::1]:2368"."""
+    return f"[{sender[0]}]:{sender[1]}" if ":" in sender[0] else f"{sender[0]}:{sender[1]}"
+
+
+def sender_names(ends: Iterable[tuple[Sender | None, Sender | None]]) -> dict[Sender | None, str]:
+    """What to call each sender: by its address, and its port where several of one address send to one port; "" where nobody knows it.
+
+    Args:
+        ends: sender and receiver of datagrams; a sensor may send from several ports, but not the same.
+    """
+    known, ports = dict.fromkeys(ends), defaultdict[tuple[str, int | None], set[int]](set)
+    for sender, receiver in known:
+        if sender is not None:
+            ports[sender[0], receiver and receiver[1]].add(sender[1])
+    shared = {host for (host, _), sending in ports.items() if len(sending) > 1}
+    return {sender: "" if sender is None else endpoint(sender) if sender[0] in shared else sender[0] for sender, _ in known}
 
 
 @dataclass(frozen=True)
@@ -53,8 +102,8 @@ class Chunk:
 
     data: bytes
     at: int | None = None
-    sender: tuple[str, int] | None = None
-    receiver: tuple[str, int] | None = None
+    sender: Sender | None = None
+    receiver: Sender | None = None
     gap: bool = False
     quiet: bool = False
 
@@ -83,6 +132,7 @@ class Transport(ABC):
         foreign: datagrams from other senders than the one asked for, so far.
         kernel_drops: datagrams that the system threw away, so far, since nobody fetched them in time.
         disconnects: interruptions of the line that a recording tells of, so far.
+        unread: bytes of a damaged file that could not be read, so far.
     """
 
     datagrams: bool = False
@@ -91,6 +141,7 @@ class Transport(ABC):
     foreign: int = 0
     kernel_drops: int = 0
     disconnects: int = 0
+    unread: int = 0
 
     @abstractmethod
     def chunks(self) -> Iterator[Chunk]:
@@ -111,6 +162,11 @@ class Transport(ABC):
     @abstractmethod
     def close(self) -> None:
         """Give the port, socket or file back."""
+
+
+def no_bytes(source: str | Path, warnings: Sequence[str]) -> str:
+    """Why there are no bytes in a file: what its transport says of it, or that there are none."""
+    return "; ".join(warnings) or f"{source} holds no bytes"
 
 
 class Disconnected(SourceError):

@@ -22,7 +22,7 @@ from lidarspec.simulation.device import SECOND, SimulatedDevice
 from lidarspec.spec.links import Udp
 from lidarspec.transports.open_url import transport
 from lidarspec.transports.outlets import HERE, Outlet
-from lidarspec.transports.protocol import POLL, Chunk, Closing, Disconnected
+from lidarspec.transports.protocol import POLL, Chunk, Closing, Disconnected, Sender, sender_names
 from lidarspec.wire.build import build_command
 
 #: seconds at least between two sendings.
@@ -270,7 +270,7 @@ class Replay:
     Attributes:
         chunks, bytes: sent so far.
         late: how many chunks went out more than 20 ms late; `latest` by how many ns the latest did.
-        senders: addresses that datagrams came from then.
+        senders: who sent the datagrams then.
         is_timed: whether the file has times.
         digest: SHA-256 of all bytes.
         seconds: since the first listener came.
@@ -279,7 +279,7 @@ class Replay:
     def __init__(self, file: str, outlet: Outlet, *, speed: float | None = 1.0, needs_times: bool = False, loop: bool = False) -> None:
         self._file, self._outlet, self._speed, self._needs_times, self._loop = file, outlet, speed, needs_times, loop
         self.chunks = self.bytes = self.late = self.latest = 0
-        self.senders, self.is_timed, self.digest = set[str](), True, hashlib.sha256()
+        self._ends, self.is_timed, self.digest = set[tuple[Sender | None, Sender | None]](), True, hashlib.sha256()
         self._began = time.monotonic()
 
     @property
@@ -326,5 +326,9 @@ class Replay:
         self.bytes += len(chunk.data)
         self.digest.update(chunk.data)
         self.late, self.latest = self.late + (late > LATE), max(self.latest, late)
-        if chunk.sender is not None:
-            self.senders.add(chunk.sender[0])
+        self._ends.add((chunk.sender, chunk.receiver))
+
+    @property
+    def senders(self) -> set[str]:
+        """What the senders are called that datagrams came from then."""
+        return set(sender_names(self._ends).values()) - {""}

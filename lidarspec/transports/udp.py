@@ -28,7 +28,7 @@ from lidarspec.errors import SourceError, UsageError
 from lidarspec.spec.links import Udp, is_datagram
 from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.base import Address, HostClock, failure, lost, named, reason, rest
-from lidarspec.transports.protocol import Chunk, LiveTransport
+from lidarspec.transports.protocol import Chunk, LiveTransport, Origin
 
 #: datagrams in one call, and the room for each: memory that is not written to costs nothing.
 MANY, LARGEST = 256, 1 << 16
@@ -166,7 +166,7 @@ class UdpTransport(LiveTransport):
         ports: where to listen; 0 takes any that is free.
         host: address of the interface, "" for all.
         group: multicast group to join.
-        sender: only datagrams from this address; others are counted as foreign.
+        sender: only datagrams from this address, or "ADDRESS:PORT"; others are counted as foreign.
         datagrams: whether each is a whole frame, not a piece of a stream.
         sensor: for the next command in messages.
 
@@ -191,7 +191,7 @@ class UdpTransport(LiveTransport):
     ) -> None:
         self.clock = HostClock()
         self.label, self.datagrams = label, datagrams
-        self._sender, self._last, self._sensor = sender, remote, sensor
+        self._origin, self._last, self._sensor = None if sender is None else Origin.parse(sender), remote, sensor
         self._selector = selectors.DefaultSelector()
         self._sockets: list[_Socket] = []
         self._rested = 0.0
@@ -237,7 +237,7 @@ class UdpTransport(LiveTransport):
         """Sockets stay open, whatever becomes of the sensor."""
 
     def peer(self) -> str | None:
-        return self._sender or (self._last[0] if self._last else None)
+        return self._origin.host if self._origin else self._last[0] if self._last else None
 
     def close(self) -> None:
         self.closed = True
@@ -248,9 +248,9 @@ class UdpTransport(LiveTransport):
     def _fetch(self, one: _Socket, found: list[Chunk]) -> None:
         """Everything that waits in a socket, up to a limit that is fair to the others."""
         try:
-            own = self._sender
+            own = self._origin
             for data, sender, at in one.datagrams(self.clock.now()):
-                if own is not None and sender[0] != own:
+                if own is not None and sender not in own:
                     self.foreign += 1
                     continue
                 self._last = sender

@@ -382,7 +382,7 @@ class Window:
         if failure is not None:
             return str(failure)
         if self._feed.ended:
-            return "" if self._scan is not None else "the input ended without a scan"
+            return "" if self._scan is not None else (device.warnings or ["the input ended without a scan"])[-1]
         troubled = self._live and device.state not in ("streaming", "waiting")
         return device.warnings[-1] if troubled and device.warnings else ""
 

@@ -43,6 +43,14 @@ def read_at(records: Sequence[tuple[int, bytes]]) -> tuple[list[bytes], CaptureS
     return made.payloads(made.pcap_head(link=101) + b"".join(made.record(packet, seconds=seconds) for seconds, packet in records))
 
 
+def wifi(control: int, flags: int, *, padding: int = 0) -> bytes:
+    """The header of a data frame of 802.11, up to the EtherType of IPv4."""
+    size = (30 if flags & 3 == 3 else 24) + (6 if flags & 0x80 else 2) * (control >> 7)
+    return bytes([control, flags]) + bytes(size - 2 + padding) + bytes.fromhex("aaaa030000000800")
+
+
+PPPOE = bytes.fromhex("11000001003f0021")
+LABELS = bytes.fromhex("0001003f 0002003f 0003013f")  # the last has the bottom bit
 LINKS = [
     *((link, packet) for link in (12, 101) for packet in (PACKET, PACKET6)),
     *((228, PACKET), (229, PACKET6)),
@@ -57,6 +65,20 @@ LINKS = [
     (276, struct.pack(">HHIHBB8s", 0x86DD, 0, 2, 1, 0, 6, bytes(range(8))) + PACKET6),
     *((link, struct.pack(order + "I", 2) + PACKET) for link in (0, 108) for order in "<>"),
     *((0, struct.pack("<I", family) + PACKET6) for family in (10, 24, 28, 30)),
+    *((link, head + PACKET) for link in (9, 50) for head in (b"\xff\x03\x00\x21", b"\x00\x21", b"\xff\x03\x21", b"\x21")),
+    (9, b"\xff\x03\x00\x57" + PACKET6),
+    (51, PPPOE + PACKET),
+    (1, made.ethernet(PPPOE + PACKET, ethertype=0x8864)),
+    (1, made.ethernet(struct.pack(">HH", 5, 0x8864) + PPPOE[:-1] + b"\x57" + PACKET6, ethertype=0x8100)),
+    (1, made.ethernet(LABELS + PACKET, ethertype=0x8847)),
+    (1, made.ethernet(LABELS[8:] + PACKET6, ethertype=0x8848)),
+    (1, made.ethernet(made.ipv4(made.udp(b"one"), total=0))),
+    (105, wifi(0x08, 0x01) + PACKET),
+    (105, wifi(0x88, 0x03) + PACKET),
+    (127, bytes.fromhex("0000080000000000") + wifi(0x88, 0x82) + PACKET),
+    # present: the sensor's time and flags, which say that the 26 bytes of the header are padded; and flags behind a second word
+    (127, bytes.fromhex("0000180003000000") + bytes(8) + b"\x20" + bytes(7) + wifi(0x88, 0x02, padding=2) + PACKET),
+    (127, bytes.fromhex("00000d0002000080" + "00000000" + "00") + wifi(0x08, 0x02) + PACKET),
 ]
 
 
@@ -77,23 +99,34 @@ def test_frames_cut_at_every_byte_are_snapped_or_malformed(link: int, frame: byt
         assert made.payloads(made.pcap(cut, link=link)) == ([], CaptureStats(packets=1, malformed=1))
 
 
-@pytest.mark.parametrize(
-    ("link", "frame"),
-    [
-        (1, made.ethernet(bytes(28), ethertype=0x0806)),
-        (1, made.ethernet(b"\xaa\xaa\x03" + PACKET, ethertype=len(PACKET) + 3)),
-        (1, made.ethernet(struct.pack(">HH", 5, 0x0806) + bytes(28), ethertype=0x8100)),
-        (0, struct.pack("<I", 7) + PACKET),
-        (101, made.ipv4(bytes(20), protocol=TCP)),
-        (101, made.ipv4(bytes(24), protocol=TCP, place=0x2000)),
-        (101, made.ipv6(bytes(20), following=TCP)),
-        (101, made.ipv6(extension(TCP) + bytes(20), following=HOP_BY_HOP)),
-        (101, fragment6(0, 16, following=TCP)),
-        (147, PACKET),
-    ],
-    ids=["ARP", "LLC", "ARP in VLAN", "not IP", "TCP", "TCP fragment", "TCP over IPv6", "TCP after options", "TCP fragment 6", "link"],
-)
-def test_everything_else_is_other(link: int, frame: bytes) -> None:
+OTHERS = {
+    "ARP": (1, made.ethernet(bytes(28), ethertype=0x0806)),
+    "802.3 without EtherType": (1, made.ethernet(b"\xaa\xaa\x03" + PACKET, ethertype=len(PACKET) + 3)),
+    "ARP in VLAN": (1, made.ethernet(struct.pack(">HH", 5, 0x0806) + bytes(28), ethertype=0x8100)),
+    "EtherType 0x1234": (1, made.ethernet(bytes(28), ethertype=0x1234)),
+    "loopback without IP": (0, struct.pack("<I", 7) + PACKET),
+    "TCP": (101, made.ipv4(bytes(20), protocol=TCP)),
+    "TCP in fragments": (101, made.ipv4(bytes(24), protocol=TCP, place=0x2000)),
+    "TCP over IPv6": (101, made.ipv6(bytes(20), following=TCP)),
+    "TCP after options": (101, made.ipv6(extension(TCP) + bytes(20), following=HOP_BY_HOP)),
+    "TCP in fragments of IPv6": (101, fragment6(0, 16, following=TCP)),
+    "IP protocol 99": (101, made.ipv4(bytes(20), protocol=99)),
+    "link type 147": (147, PACKET),
+    "PPP protocol 0xc021": (9, b"\xff\x03\xc0\x21" + bytes(8)),
+    "PPPoE discovery": (1, made.ethernet(bytes(20), ethertype=0x8863)),
+    "MPLS without IP": (1, made.ethernet(LABELS + bytes(20), ethertype=0x8847)),
+    "802.11 without data": (105, bytes.fromhex("8000") + bytes(40)),
+    "encrypted 802.11": (105, wifi(0x08, 0x42) + PACKET),
+    "802.11 in fragments or aggregates": (105, wifi(0x08, 0x06) + PACKET),
+    "802.11 without EtherType": (105, wifi(0x08, 0x02)[:-8] + bytes(8) + PACKET),
+}
+
+
+@pytest.mark.parametrize("what", OTHERS)
+def test_everything_else_is_other_and_named(what: str) -> None:
+    link, frame = OTHERS[what]
+    stats = read(frame, link=link)[1]
+    assert stats.others == {what.split(maxsplit=1)[0] if what.startswith(("TCP", "ARP")) else what: 1}
     assert read(frame, link=link) == ([], CaptureStats(packets=1, other=1))
 
 

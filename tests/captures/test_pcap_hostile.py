@@ -7,6 +7,7 @@ import random
 import struct
 import tracemalloc
 from collections import Counter
+from dataclasses import replace
 from itertools import accumulate
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -26,19 +27,39 @@ DAMAGE: dict[str, tuple[bytes, int, dict[str, Any]]] = {  # block: datagrams rea
     "unknown kind": (made.block(0x80001234, b"private!"), 2, {}),
     "unknown kind, longer than is ever held": (made.block(0x0BAD, bytes(3 << 20)), 2, {}),
     "name resolution and statistics": (made.block(4, bytes(4)) + made.block(5, bytes(12)), 2, {}),
-    "packet, longer than is ever held": (made.block(made.ENHANCED, bytes(3 << 20)), 2, {"malformed": 1}),
-    "interface, longer than is ever held": (made.block(made.INTERFACE, bytes(3 << 20)), 1, {"malformed": 1, "stopped_at": END}),
-    "length 0": (made.block(made.ENHANCED, b"", length=0), 1, {"malformed": 1, "stopped_at": END}),
-    "length 8": (made.block(0x0BAD, b"", length=8), 1, {"malformed": 1, "stopped_at": END}),
-    "length not a multiple of 4": (made.block(0x0BAD, b"ab"), 1, {"malformed": 1, "stopped_at": END}),
-    "length beyond the file": (made.block(0x0BAD, b"", length=0x8000), 1, {"truncated_tail": True, "stopped_at": END}),
-    "length of 4 GiB": (made.block(0x0BAD, b"", length=0xFFFFFFFC), 1, {"truncated_tail": True, "stopped_at": END}),
-    "lengths differ": (made.block(0x0BAD, b"", trailer=16), 2, {"malformed": 1}),
-    "lengths differ, packet": (made.block(made.ENHANCED, GOOD[8:-4], trailer=12), 2, {"malformed": 1}),
-    "lengths differ, interface": (made.block(made.INTERFACE, bytes(8), trailer=12), 1, {"malformed": 1, "stopped_at": END}),
-    "interface without its fields": (made.block(made.INTERFACE, bytes(4)), 1, {"malformed": 1, "stopped_at": END}),
-    "more interfaces than are ever held": (made.interface() * 1024, 1, {"malformed": 1, "stopped_at": END + 1023 * 20}),
-    "byte order magic": (made.block(0x0A0D0D0A, bytes(16)), 1, {"malformed": 1, "stopped_at": END}),
+    "packet, longer than is ever held": (
+        made.block(made.ENHANCED, bytes(3 << 20)),
+        2,
+        {"malformed": 1, "damaged": 1, "lost": 12 + (3 << 20)},
+    ),
+    "interface, longer than is ever held": (
+        made.block(made.INTERFACE, bytes(3 << 20)),
+        1,
+        {"malformed": 1, "damaged": 1, "lost": 12 + (3 << 20) + len(GOOD), "stopped_at": END},
+    ),
+    "length 0": (made.block(made.ENHANCED, b"", length=0), 2, {"malformed": 1, "damaged": 1, "lost": 12}),
+    "length 8": (made.block(0x0BAD, b"", length=8), 2, {"malformed": 1, "damaged": 1, "lost": 12}),
+    "length not a multiple of 4": (made.block(0x0BAD, b"ab"), 2, {"malformed": 1, "damaged": 1, "lost": 14}),
+    "length beyond the file": (made.block(0x0BAD, b"", length=0x8000), 2, {"malformed": 1, "damaged": 1, "lost": 12}),
+    "length of 4 GiB": (made.block(0x0BAD, b"", length=0xFFFFFFFC), 2, {"malformed": 1, "damaged": 1, "lost": 12}),
+    "lengths differ": (made.block(0x0BAD, b"", trailer=16), 2, {"malformed": 1, "damaged": 1, "lost": 12}),
+    "lengths differ, packet": (made.block(made.ENHANCED, GOOD[8:-4], trailer=12), 2, {"malformed": 1, "damaged": 1, "lost": len(GOOD)}),
+    "lengths differ, interface": (
+        made.block(made.INTERFACE, bytes(8), trailer=12),
+        1,
+        {"malformed": 1, "damaged": 1, "lost": 20 + len(GOOD), "stopped_at": END},
+    ),
+    "interface without its fields": (
+        made.block(made.INTERFACE, bytes(4)),
+        1,
+        {"malformed": 1, "damaged": 1, "lost": 16 + len(GOOD), "stopped_at": END},
+    ),
+    "more interfaces than are ever held": (
+        made.interface() * 1024,
+        1,
+        {"malformed": 1, "damaged": 1, "lost": 20 + len(GOOD), "stopped_at": END + 1023 * 20},
+    ),
+    "byte order magic": (made.block(0x0A0D0D0A, bytes(16)), 2, {"malformed": 1, "damaged": 1, "lost": 28}),
     "unknown interface": (made.packet(FRAME, number=1), 2, {"malformed": 1}),
     "unknown interface, obsolete": (made.packet(FRAME, number=1, kind=made.OBSOLETE), 2, {"malformed": 1}),
     "more captured than the block holds": (made.packet(FRAME, captured=len(FRAME) + 4), 2, {"malformed": 1}),
@@ -59,10 +80,49 @@ def test_damaged_blocks_are_passed_over_or_end_the_reading(case: str) -> None:
     assert stats == CaptureStats(**{"packets": count, "datagrams": count, **counted})
 
 
-def test_record_too_long_for_a_packet_ends_the_reading() -> None:
-    capture = made.pcap(FRAME)
-    long = struct.pack("<IIII", 0, 0, (1 << 18) + 1, (1 << 18) + 1) + bytes((1 << 18) + 1)
-    assert made.payloads(capture + long) == ([b"one"], CaptureStats(packets=1, datagrams=1, malformed=1, stopped_at=len(capture)))
+def test_record_too_long_for_a_packet_ends_the_reading_where_none_follows() -> None:
+    capture, size = made.pcap(FRAME), (1 << 18) + 1
+    long = struct.pack("<IIII", 0, 0, size, size) + bytes(size)
+    counted = CaptureStats(packets=1, datagrams=1, malformed=1, damaged=1, lost=len(long))
+    assert made.payloads(capture + long) == ([b"one"], replace(counted, stopped_at=len(capture)))
+    following = made.record(FRAME) * 2
+    assert made.payloads(capture + long + following) == ([b"one"] * 3, replace(counted, packets=3, datagrams=3))
+
+
+@pytest.mark.parametrize("is_pcapng", [False, True], ids=["pcap", "pcapng"])
+def test_a_damaged_length_costs_its_own_packet_alone(is_pcapng: bool) -> None:
+    frames = [made.frame(bytes([number]) * 1200) for number in range(200)]
+    records = [made.packet(each) if is_pcapng else made.record(each) for each in frames]
+    head = made.section() + made.interface() if is_pcapng else made.pcap_head()
+    draw = random.Random(4)
+    for _ in range(60):
+        at = draw.randrange(len(records))
+        whole = records[at]
+        place, length = (4, len(whole)) if is_pcapng else (8, len(whole) - 16)
+        wrong = draw.choice([length ^ 1 << draw.randrange(32), draw.randrange(300_000), draw.randrange(1 << 32)])
+        damaged = whole[:place] + struct.pack("<I", wrong) + whole[place + 4 :]
+        found, stats = made.payloads(head + b"".join([*records[:at], damaged, *records[at + 1 :]]))
+        others = [bytes([number]) * 1200 for number in range(200) if number != at]
+        assert (found, stats.damaged, stats.lost, stats.stopped_at) == (others, 1, len(whole), None if at < 199 else stats.stopped_at)
+
+
+def test_bytes_missing_from_a_file_and_a_hole_in_it_cost_the_packets_they_touch() -> None:
+    frames = [made.frame(bytes([number]) * 1200) for number in range(200)]
+    capture = made.pcap(*frames)
+    size = len(made.record(frames[0]))
+    for begin, gone in ((size * 50 + 90, 700), (size * 50 + 8, 2 * size + 5), (size * 50, 20)):
+        found, stats = made.payloads(capture[:begin] + capture[begin + gone :])
+        assert (stats.damaged, stats.stopped_at) == (1, None)
+        assert len(found) >= 200 - 2 - -(-gone // size)
+    hole = bytes(4096)
+    found, stats = made.payloads(capture[: size * 50 + 300] + hole + capture[size * 50 + 300 + len(hole) :])
+    assert (len(found), stats.damaged, stats.stopped_at) == (197, 1, None)
+
+
+def test_packets_cut_by_a_tool_that_does_not_say_so_in_the_head_are_no_damage() -> None:
+    cut = [made.record(made.frame(bytes(400))[: 100 + number], original=442) for number in range(50)]
+    stats = made.read(made.pcap_head() + b"".join([*cut, made.record(FRAME), *cut]))[1]
+    assert stats == CaptureStats(packets=101, datagrams=1, snapped=100)
 
 
 def test_long_files_tell_where_they_are_cut() -> None:

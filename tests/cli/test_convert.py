@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import csv
 import json
+import os
+import re
 from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+import lidarspec as ls
+from lidarspec.simulation.simulator import simulate
 from tests.cli.running import COIN_D4, EXAMPLE, LD06, printed, process, ran
 from tests.sensors.evidence import capture
 
@@ -133,3 +137,16 @@ def test_a_file_is_overwritten_when_it_is_asked_for_alone(tmp_path: Path, suffix
     assert target.read_bytes() == b"a week of work"
     ran("convert", source, target, "--force", "-s", "ldrobot-stl27l")
     assert target.stat().st_size > 100
+
+
+@pytest.mark.skipif(not hasattr(os, "openpty"), reason="needs pseudo terminals")
+def test_a_terminal_shows_how_far_it_is(tmp_path: Path) -> None:
+    from tests.view.terminal import Terminal
+
+    (tmp_path / "drive.bin").write_bytes(b"".join(simulate(ls.sensor("ldrobot-stl27l"), 900)))
+    with Terminal("convert", "drive.bin", "out.npz", "-s", "ldrobot-stl27l", cwd=tmp_path) as terminal:
+        assert terminal.ended() == 0
+        shown = terminal.text()
+    assert re.search(r"\rout\.npz: \d+ points of 1 scan, [\d.]+ kB read", terminal.raw)
+    assert " read" not in shown
+    assert "out.npz: 10800 points of" in shown

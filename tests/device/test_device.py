@@ -197,6 +197,48 @@ def test_two_senders_are_listed_and_one_can_be_chosen() -> None:
             until(lambda: device.stats.foreign == 4)
 
 
+def test_two_senders_of_one_address_are_told_apart_by_their_ports() -> None:
+    number, frames = free_port(), turning(WHOLE, 4)
+    with udp("127.0.0.2") as one, udp("127.0.0.2") as two:
+        ports = [each.getsockname()[1] for each in (one, two)]
+
+        def send() -> None:
+            for frame in frames:
+                one.sendto(frame, ("127.0.0.1", number))
+                two.sendto(frame, ("127.0.0.1", number))
+
+        with ls.open(f"udp://:{number}", WHOLE) as device:
+            send()
+            sender = f"127.0.0.2:({'|'.join(map(str, ports))})"
+            with pytest.raises(UsageError, match=rf"{sender} and {sender} both send data frames; choose one with \?src={sender}"):
+                packets(device, 8)
+        with ls.open(f"udp://:{number}?src=127.0.0.2:{ports[1]}", WHOLE) as device:
+            send()
+            packets(device, 4)
+            until(lambda: device.stats.foreign == 4)
+
+
+def test_a_sensor_that_comes_back_with_another_port_is_read_on() -> None:
+    number, frames = free_port(), turning(WHOLE, 4)
+    with ls.open(f"udp://:{number}", WHOLE) as device:
+        for _ in range(3):
+            with udp("127.0.0.2") as one:
+                for frame in frames:
+                    one.sendto(frame, ("127.0.0.1", number))
+                packets(device, 4)
+
+
+def test_a_stream_in_datagrams_of_two_ports_is_not_joined() -> None:
+    sensor = dataclasses.replace(TURNING, links={"data": Udp(7009, stream=True)})
+    number, frames = free_port(), turning(sensor, 12)
+    with ls.open(f"udp://:{number}", sensor) as device, udp("127.0.0.2") as one, udp("127.0.0.2") as two:
+        for frame in frames:
+            for each in (one, two):
+                each.sendto(frame, ("127.0.0.1", number))
+        with pytest.raises(UsageError, match=r"127\.0\.0\.2:\d+ and 127\.0\.0\.2:\d+ both send frames"):
+            packets(device, 100)
+
+
 def test_a_stream_in_datagrams_is_joined_by_sender() -> None:
     sensor = dataclasses.replace(TURNING, links={"data": Udp(7009, stream=True)})
     number, frames = free_port(), turning(sensor, 12)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+import tracemalloc
 import weakref
 from collections.abc import Iterator
 from pathlib import Path
@@ -71,6 +72,12 @@ def test_npz_holds_the_columns_of_the_clouds_and_the_stamps(tmp_path: Path, ever
         assert arrays["complete"].tolist() == [False, True]
 
 
+def test_no_scan_at_all_is_a_file_without_points(tmp_path: Path) -> None:
+    write(tmp_path / "a.npz", [])
+    with np.load(tmp_path / "a.npz") as arrays:
+        assert {name: array.shape for name, array in arrays.items()} == dict.fromkeys(["scan", "stamp_ns", "rate_hz", "complete"], (0,))
+
+
 def test_a_column_that_a_sensor_lacks_is_left_out(tmp_path: Path) -> None:
     write(tmp_path / "a.csv", [scan(0, intensity=False)])
     assert rows(tmp_path / "a.csv")[0] == [*(name for name in COLUMNS if name != "intensity"), "scan"]
@@ -79,21 +86,33 @@ def test_a_column_that_a_sensor_lacks_is_left_out(tmp_path: Path) -> None:
     assert np.isnan(values[-4:, header.index("intensity")]).all()
 
 
-def test_csv_holds_one_scan_at_a_time(tmp_path: Path) -> None:
-    alive: weakref.WeakSet[Scan] = weakref.WeakSet()
+@pytest.mark.parametrize("name", ["a.csv", "a.npz"])
+def test_one_scan_is_held_at_a_time(tmp_path: Path, name: str) -> None:
+    clouds: list[weakref.ref[PointCloud]] = []
     most = 0
 
     def scans() -> Iterator[Scan]:
         nonlocal most
         for number in range(30):
             one = scan(number)
-            alive.add(one)
-            most = max(most, len(alive))
+            clouds.append(weakref.ref(one.points))
+            most = max(most, sum(cloud() is not None for cloud in clouds))
             yield one
             del one
 
-    write(tmp_path / "a.csv", scans())
+    write(tmp_path / name, scans(), every_point=True)
     assert most <= 2
+
+
+@pytest.mark.parametrize("every_point", [False, True])
+def test_the_memory_of_npz_does_not_grow_with_the_number_of_scans(tmp_path: Path, every_point: bool) -> None:
+    peaks = []
+    for number in (20, 200):
+        tracemalloc.start()
+        write(tmp_path / "a.npz", (scan(index, points=2000) for index in range(number)), every_point=every_point)
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    assert peaks[1] < peaks[0] + 300_000, peaks  # bytes; the file has 15 MB
 
 
 @pytest.mark.parametrize("name", ["a.csv", "a.npz"])

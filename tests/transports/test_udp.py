@@ -12,6 +12,7 @@ import lidarspec as ls
 from lidarspec.errors import SourceError, UsageError
 from lidarspec.spec import Chunk
 from lidarspec.transports.open_url import transport
+from lidarspec.transports.protocol import Origin, endpoint
 from lidarspec.transports.udp import BUFFER, UdpTransport, _Socket, shortfall
 from tests.lines import free_port, udp, until
 from tests.shapes import SHAPES
@@ -65,6 +66,28 @@ def test_a_host_binds_that_interface_alone() -> None:
         sender.sendto(b"right", ("127.0.0.1", port))
     assert [chunk.data for chunk in read(one, 1)] == [b"right"]
     one.close()
+
+
+@pytest.mark.parametrize(
+    ("text", "origin"),
+    [
+        ("10.0.0.1", Origin("10.0.0.1")),
+        ("10.0.0.1:2368", Origin("10.0.0.1", 2368)),
+        ("fe80::1", Origin("fe80::1")),
+        ("[fe80::1]", Origin("fe80::1")),
+        ("[fe80::1]:2368", Origin("fe80::1", 2368)),
+    ],
+)
+def test_a_sender_is_an_address_or_a_port_of_it(text: str, origin: Origin) -> None:
+    assert Origin.parse(text) == origin
+    assert (origin.host, 2368) in origin
+    assert ((origin.host, 2369) in origin) == (origin.port is None)
+    assert Origin.parse(endpoint((origin.host, 7))) == Origin(origin.host, 7)
+
+
+def test_a_port_that_is_none_is_refused() -> None:
+    with pytest.raises(UsageError, match="a sender is ADDRESS or ADDRESS:PORT"):
+        opened("udp://:2368?src=10.0.0.1:0")
 
 
 def test_other_senders_are_foreign_where_one_is_asked_for() -> None:

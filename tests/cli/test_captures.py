@@ -1,0 +1,175 @@
+"""What verbs say of captures and files that give less than they hold: damage, packets not read, several senders, containers."""
+
+from __future__ import annotations
+
+import bz2
+import gzip
+import io
+import lzma
+import sqlite3
+import tarfile
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import lidarspec as ls
+from lidarspec.captures.ip import ETHERNET
+from lidarspec.captures.pcap import Datagram, datagram_record
+from lidarspec.captures.records import capture_head
+from lidarspec.simulation.simulator import simulate
+from tests import made_captures as made
+from tests.cli.running import process, ran
+
+M1 = "robosense-m1"
+
+
+def records(number: int, *sources: tuple[str, int]) -> list[bytes]:
+    """The records of a sensor's packets, from these senders in turn."""
+    packets = simulate(ls.sensor(M1), number)
+    ends = sources or (made.SOURCE,)
+    return [
+        datagram_record(Datagram(data, 10**18 + index * 158_730, ends[index % len(ends)], made.DESTINATION))
+        for index, data in enumerate(packets)
+    ]
+
+
+def capture(path: Path, *records: bytes, link: int = ETHERNET) -> Path:
+    path.write_bytes(capture_head(link) + b"".join(records))
+    return path
+
+
+@pytest.mark.parametrize("verb", ["convert", "read", "stats", "plot"])
+def test_a_damaged_capture_is_read_on_and_said_to_be_damaged(verb: str, tmp_path: Path) -> None:
+    some = records(1300)
+    some[700] = some[700][:10] + b"\x7f" + some[700][11:]
+    path = capture(tmp_path / "it.pcap", *some)
+    target = {"convert": [tmp_path / "out.csv"], "plot": ["-o", tmp_path / "out.svg", "-n", 9]}.get(verb, [])
+    done = ran(verb, path, *target, "-s", M1, *(["--packets", "--json"] if verb == "read" else []), code=1)
+    assert f"{path} is damaged in 1 place: {len(some[700])} bytes were not read, everything else was" in done.stderr
+    if verb == "read":
+        assert done.stdout.count("\n") == 1299
+
+
+TCP = made.ethernet(made.ipv4(bytes(40), protocol=6))
+ARP = made.ethernet(bytes(28), ethertype=0x0806)
+
+
+@pytest.mark.parametrize(
+    ("words", "code"),
+    [
+        (("convert", "{path}", "{target}.csv", "-s", M1), 4),
+        (("convert", "{path}", "{target}.csv"), 4),
+        (("read", "{path}", "-s", M1), 4),
+        (("stats", "{path}", "-s", M1), 4),
+        (("view", "{path}", "-s", M1), 4),
+        (("view", "{path}"), 4),
+        (("plot", "{path}", "-s", M1, "-o", "{target}.svg"), 4),
+        (("detect", "{path}"), 4),
+        (("doctor", "{path}"), 1),
+        (("parse", "{path}", "-s", M1), 4),
+        (("explain", "{path}"), 4),
+        (("crc", "{path}"), 4),
+        (("new", "acme-x1", "--into", "{target}", "--from-capture", "{path}"), 4),
+        (("record", "{path}", "-o", "{target}.lsr"), 4),
+        (("replay", "{path}", "--to", "{target}.lsr"), 4),
+    ],
+    ids=lambda value: value[0] + str(len(value)) if isinstance(value, tuple) else "",
+)
+def test_every_verb_says_what_is_in_a_capture_of_which_nothing_is_read(words: tuple[str, ...], code: int, tmp_path: Path) -> None:
+    path = capture(tmp_path / "tcp.pcap", *(made.record(each) for each in (TCP, ARP, TCP)))
+    done = ran(*(word.format(path=path, target=tmp_path / "out") for word in words), code=code)
+    said = f"{path}: 3 of 3 packets are no UDP over IP, and were not read: 2 TCP, 1 ARP"
+    assert done.output.count(said) == 1, done.output
+    assert "holds no bytes" not in done.output
+    assert "nothing came" not in done.output
+
+
+def test_what_is_beside_the_datagrams_is_said_where_it_is_the_most(tmp_path: Path) -> None:
+    some, empty = records(2), capture(tmp_path / "empty.pcap")
+    background = capture(tmp_path / "some.pcap", *some, *(made.record(ARP) for _ in range(2)))
+    assert "packets" not in ran("parse", background, "-s", M1).stderr
+    mostly = capture(tmp_path / "mostly.pcap", *some, *(made.record(ARP) for _ in range(3)))
+    assert "3 of 5 packets are no UDP over IP, and were not read: 3 ARP" in ran("parse", mostly, "-s", M1).stderr
+    assert f"{empty} is a capture without a packet" in ran("parse", empty, "-s", M1, code=4).stderr
+    cut = capture(tmp_path / "cut.pcap", *(made.record(made.frame(bytes(400))[:90], original=442) for _ in range(3)))
+    assert f"{cut}: 3 packets were cut by the capture's snap length" in ran("view", cut, "-s", M1, code=4).stderr
+
+
+def test_senders_of_one_address_are_told_apart_by_their_ports(tmp_path: Path) -> None:
+    path = capture(tmp_path / "two.pcap", *records(40, ("10.0.0.1", 40001), ("10.0.0.1", 40002)))
+    recording = tmp_path / "two.lsr"
+    ran("record", path, "-o", recording)
+    for source in (path, recording):
+        said = ran("convert", source, tmp_path / "out.csv", "-s", M1, code=2).stderr
+        assert "10.0.0.1:40001 and 10.0.0.1:40002" in said or "10.0.0.1:40002 and 10.0.0.1:40001" in said
+        found = [f"{source} from 10.0.0.1:4000{number}" for number in (1, 2)]
+        assert all(each in ran("detect", source).output for each in found)
+        doctor = ran("doctor", source, code=1).output
+        assert f"10.0.0.1:40001 and 10.0.0.1:40002 all send frames of {M1}" in doctor
+        assert f"lidarspec view '{source}?src=10.0.0.1:40001' -s {M1}" in doctor
+        assert ran("read", f"{source}?src=10.0.0.1:40002", "-s", M1, "--packets", "--json").stdout.count("\n") == 20
+    assert "2 senders were recorded" in ran("replay", recording, "--to", "udp://127.0.0.1:9", "--speed", "max").stderr
+
+
+def test_a_sensor_that_sends_from_several_ports_to_several_is_one_sender(tmp_path: Path) -> None:
+    data = records(20, ("10.0.0.1", 6699))
+    status = [datagram_record(Datagram(b"status", 10**18, ("10.0.0.1", 7788), ("10.0.0.2", 7788))) for _ in range(20)]
+    path = capture(tmp_path / "one.pcap", *(each for pair in zip(data, status, strict=True) for each in pair))
+    assert "10.0.0.1" not in ran("detect", path).output
+    assert "choose" not in ran("doctor", path).output
+    ran("convert", path, tmp_path / "out.csv", "-s", M1)
+
+
+def container(name: str, path: Path) -> Path:
+    """A file of a kind that others write, with what lidarspec could read in it."""
+    held = path.with_name("held.pcap")
+    packets = capture(held, *records(3)).read_bytes()
+    if name == "SQLite":
+        with sqlite3.connect(path) as bag:
+            bag.execute("create table messages (data blob)")
+            bag.execute("insert into messages values (?)", (packets,))
+        bag.close()
+    elif name == "zip":
+        with zipfile.ZipFile(path, "w") as archive:
+            archive.write(held)
+    elif name == "tar":
+        with tarfile.open(path, "w") as tar:
+            tar.add(held)
+    elif name == "NumPy":
+        with path.open("wb") as file:
+            np.save(file, np.arange(3))
+    else:
+        packing = {"gzip": gzip.compress, "bzip2": bz2.compress, "xz": lzma.compress}
+        begun = {"ROS 1 bag": b"#ROSBAG V2.0\n", "MCAP": b"\x89MCAP0\r\n", "points": b"# .PCD v0.7\n", "zstd": b"\x28\xb5\x2f\xfd"}
+        path.write_bytes(packing[name](packets) if name in packing else begun[name] + packets)
+    return path
+
+
+@pytest.mark.parametrize("name", ["SQLite", "zip", "tar", "NumPy", "gzip", "bzip2", "xz", "zstd", "ROS 1 bag", "MCAP", "points"])
+def test_files_of_other_kinds_are_named_and_not_taken_for_bytes(name: str, tmp_path: Path) -> None:
+    path = container(name, tmp_path / "other.bin")
+    said = ran("convert", path, tmp_path / "out.csv", "-s", M1, code=3).stderr
+    assert f"{path} is " in said
+    assert name in said
+    assert "and is not read" in said
+    ran("detect", path, code=3)
+    if name == "gzip":
+        assert f"next: gunzip -k {path}" in said
+
+
+def test_standard_input_is_no_way_around_it(tmp_path: Path) -> None:
+    packed = container("gzip", tmp_path / "other.gz").read_bytes()
+    for words in (("convert", "-", tmp_path / "out.csv"), ("parse", "-")):
+        done = process(*words, "-s", M1, given=packed)
+        assert (done.returncode, b"standard input is compressed by gzip" in done.stderr) == (3, True)
+    done = process("record", "-", "-o", tmp_path / "it.bin", given=(tmp_path / "held.pcap").read_bytes())
+    assert (done.returncode, b"give the path" in done.stderr) == (3, True)
+
+
+def test_bytes_that_only_begin_a_little_like_an_archive_are_bytes(tmp_path: Path) -> None:
+    path = tmp_path / "it.bin"
+    for begun in (b"\x1f\x8b", b"PK", b"BZh9", b"\x1f\x8b\x08\xff", b"#", io.DEFAULT_BUFFER_SIZE * b"\0"):
+        path.write_bytes(begun + bytes(8))
+        assert ran("record", path, "-o", tmp_path / "it.lsr", "--force").stderr
