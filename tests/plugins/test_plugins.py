@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import pickle
 import shutil
 import subprocess
 import sys
@@ -16,6 +17,7 @@ import pytest
 import lidarspec
 from lidarspec import SourceError, SpecError, UsageError
 from lidarspec.errors import UnknownSensor
+from lidarspec.plugins import file_module
 from lidarspec.testing import SensorConformance
 
 HERE = Path(__file__).resolve().parents[1] / "shapes"
@@ -44,7 +46,7 @@ FAILING = {
     "broken-plausible": "no such luck",
     "broken-points": "no such luck",
     "broken-field": "did you mean 'distances'?",
-    "broken-shape": "shape mismatch",
+    "broken-shape": "lengths that do not go together",
     "broken-result": "has to return Polar or Cartesian",
 }
 
@@ -250,3 +252,19 @@ def test_a_relative_file_needs_no_more_than_its_name(tmp_path: Path, monkeypatch
 def test_an_unknown_sensor_suggests_the_closest(name: str, meant: str) -> None:
     with pytest.raises(UnknownSensor, match=f"did you mean '{meant}'"):
         lidarspec.sensor(name)
+
+
+def test_a_file_may_have_dataclasses_with_annotations_that_are_texts(tmp_path: Path) -> None:
+    text = STRANGER.read_text(encoding="utf-8")
+    own = "\n".join(["", "from dataclasses import dataclass", "", "@dataclass", "class Laser:", "    angle: float = 0.0", ""])
+    file, broken = tmp_path / "mine.py", tmp_path / "broken.py"
+    file.write_text(text + own, encoding="utf-8")
+    assert "from __future__ import annotations" in text
+    assert lidarspec.sensor(str(file)).frames
+    module = file_module(file)
+    assert pickle.loads(pickle.dumps(module.Laser(2.0))) == module.Laser(2.0)
+    broken.write_text("1 / 0", encoding="utf-8")
+    before = set(sys.modules)
+    with pytest.raises(SpecError, match="ZeroDivisionError"):
+        lidarspec.sensor(str(broken))
+    assert set(sys.modules) == before
