@@ -9,15 +9,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from construct import Const, Int8ul, Int16ul, Struct
+from construct import Const, Float16b, Float32l, Float64l, Int8ul, Int16ul, Struct
 from hypothesis import strategies as st
 
 from lidarspec import Sensor
-from lidarspec.spec import Checksummed, Fields, Frame, Polar, Sum, take
+from lidarspec.spec import Checksummed, Fields, Frame, Polar, Scaled, Sum, take
 from lidarspec.testing.check import Target, reports
 from lidarspec.testing.declared import declared
 from lidarspec.testing.findings import Violation, left_over
-from lidarspec.testing.frames import values_survive_building_and_parsing
+from lidarspec.testing.frames import values_in_units_build_the_same_bytes, values_survive_building_and_parsing
 from lidarspec.testing.subject import Subject
 from lidarspec.testing.vectors import vectors_hold
 from tests.broken import sound
@@ -160,3 +160,10 @@ def test_vectors_that_prove_nothing_are_findings(tmp_path: Path) -> None:
         with pytest.raises(Violation) as found:
             vectors_hold(Subject(sound.sensor(), vectors=file))
         assert found.value.code == code, text
+
+
+def test_scaled_floats_are_read_and_built_in_their_unit() -> None:
+    for kind, offset in ((Float16b, 0.0), (Float32l, 0.0), (Float32l, 3.0), (Float64l, 0.0)):
+        fields = sound.sealed(warmth=Scaled(kind, 0.1, "degC", offset=offset))
+        subject = Subject(sound.sensor(sound.frame(fields, max_length=sound.SIZE + kind.sizeof())))
+        values_in_units_build_the_same_bytes(subject, "data")
