@@ -29,6 +29,7 @@ from dataclasses import dataclass, replace
 from importlib.machinery import PathFinder
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, NamedTuple
+from zlib import crc32
 
 import pluggy
 
@@ -453,11 +454,16 @@ def sensor(name: str | Path) -> Sensor:
     return registry().sensor(text)
 
 
-def _from_file(text: str) -> Sensor:
+def file_and_id(text: str) -> tuple[Path, str]:
+    """The file of "FILE" or "FILE.py:id", and the id, "" where none is named."""
     from pathlib import Path
 
     path, colon, wanted = text.partition(".py:")
-    file = Path(f"{path}.py" if colon else text)
+    return Path(f"{path}.py" if colon else text), wanted
+
+
+def _from_file(text: str) -> Sensor:
+    file, wanted = file_and_id(text)
     module = file_module(file)
     local = Registry()
     with _faults_of(file):
@@ -473,19 +479,24 @@ def _from_file(text: str) -> Sensor:
 
 
 def file_module(file: Path) -> ModuleType:
-    """A file as a module.
+    """A file as a module, which `sys.modules` has under a name of its own, as dataclasses, pickle and typing expect it.
 
     Raises:
         SourceError, SpecError: for one that is not there, or cannot be imported.
     """
     if not file.is_file():
         raise SourceError(f"{file}: no such file")
-    module_spec = importlib.util.spec_from_file_location(f"lidarspec_file_{file.stem}", file)
+    module_spec = importlib.util.spec_from_file_location(f"lidarspec_file_{file.stem}_{crc32(bytes(file.resolve())):08x}", file)
     assert module_spec is not None
     assert module_spec.loader is not None
     module = importlib.util.module_from_spec(module_spec)
-    with _faults_of(file):
-        module_spec.loader.exec_module(module)
+    sys.modules[module.__name__] = module
+    try:
+        with _faults_of(file):
+            module_spec.loader.exec_module(module)
+    except BaseException:
+        del sys.modules[module.__name__]
+        raise
     return module
 
 

@@ -28,7 +28,7 @@ from lidarspec.spec.tree import FieldInfo, evaluated
 from lidarspec.transports.files import unhexed
 from lidarspec.transports.open_url import is_live
 from lidarspec.transports.protocol import Chunk
-from lidarspec.wire.build import given_value
+from lidarspec.wire.build import argument_field, given_value
 from lidarspec.wire.schema import Schema, schema
 
 #: seconds to wait for what comes back on bytes sent by hand, and of silence behind it that end it.
@@ -305,7 +305,7 @@ def arguments(sensor: Sensor, name: str, assignments: Sequence[str]) -> dict[str
             raise UsageError(f"{sensor.id} {name}: {text!r} is not argument=value")
         if argument not in command.args or command.frame is None:
             raise UnknownField(argument, command.args, place=f"{sensor.id} {name}")
-        unit = schema(sensor.frames[command.frame].tree).fields[command.args[argument][0]].unit
+        unit = argument_field(sensor, name, argument).unit
         number, _ = _number(value.strip(), unit, f"{sensor.id} {name}: {argument}", f"a number in {unit}" if unit else "a number")
         found[argument] = int(number) if number.denominator == 1 else float(number)
     return found

@@ -363,7 +363,8 @@ class LiveInput(Input):
     def _opened(self, link: str) -> LiveTransport:
         """The transport of a link; one apart from the data's is opened when it is first needed."""
         if link not in self._captures:
-            opened = control_link(self._source, link, self.sensor.links[link], self._captures["data"].transport.peer())
+            data = self._captures["data"].transport
+            opened = data.link(link) or control_link(self._source, link, self.sensor.links[link], data.peer())
             self._decoders[link] = self.sensor.decoder(stream=not opened.datagrams, backend=self._backend)
             self._captures[link] = Capture(opened, self.queue, link=link)
         return self._captures[link].transport

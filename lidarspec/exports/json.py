@@ -51,9 +51,18 @@ def spec(sensor: Sensor) -> dict[str, Any]:
 
 
 def facts(value: object, *names: str) -> dict[str, Any]:
-    """Some attributes of a value as data: tuples as lists, mappings as objects."""
+    """Some attributes of a value as data, by their names."""
     own = ((name, getattr(value, name)) for name in names)
-    return {name: list(fact) if isinstance(fact, tuple) else dict(fact) if isinstance(fact, Mapping) else fact for name, fact in own}
+    return {name: _plain(fact) for name, fact in own}
+
+
+def _plain(fact: Any) -> Any:
+    """A fact as data: tuples as lists, mappings as objects, bytes as hex."""
+    if isinstance(fact, Mapping):
+        return {name: _plain(value) for name, value in fact.items()}
+    if isinstance(fact, list | tuple):
+        return [_plain(value) for value in fact]
+    return fact.hex() if isinstance(fact, bytes | bytearray) else fact
 
 
 def link_data(link: Link) -> dict[str, Any]:

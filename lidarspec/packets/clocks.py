@@ -13,6 +13,7 @@ from lidarspec.columns.graph import header_function
 from lidarspec.errors import SpecError
 from lidarspec.spec.description import Spec
 from lidarspec.spec.fields import factor
+from lidarspec.spec.timing import Clock
 from lidarspec.spec.tree import exact
 from lidarspec.wire.arrays import alike
 from lidarspec.wire.schema import Schema
@@ -68,7 +69,7 @@ def clock_ns(sensor: Spec, batch: Batch) -> Times:
         terms = header_function(source, batch.table.schema, _nanoseconds)(batch)
         return sum(terms, np.zeros(len(batch), np.int64))
     total: Times | None = None
-    for path, step, zero, furthest in _terms((source,) if isinstance(source, str) else tuple(source), batch.table.schema, sensor.id):
+    for path, step, zero, furthest in clock_terms(paths(sensor.clock), batch.table.schema, sensor.id):
         raw = batch.table.raw(path)
         if furthest and raw.dtype.kind in "ui":
             part = _within(raw, furthest)
@@ -87,18 +88,28 @@ def _turn(seconds: float) -> int:
     return int(exact(seconds) * 10**9)
 
 
+def paths(clock: Clock) -> tuple[str, ...]:
+    """The fields that add up to a clock; none where a function computes it."""
+    return (clock.source,) if isinstance(clock.source, str) else () if callable(clock.source) else tuple(clock.source)
+
+
 @lru_cache(maxsize=256)
-def _terms(paths: tuple[str, ...], schema: Schema, sensor: str) -> list[tuple[str, Any, Any, int]]:
-    """The fields that add up to a clock: path, nanoseconds in one step and at zero, furthest reading (0 where these are fractions)."""
+def clock_terms(fields: tuple[str, ...], schema: Schema, sensor: str) -> list[tuple[str, Any, Any, int]]:
+    """The fields that add up to a clock: path, nanoseconds in one step and at zero, furthest reading (0 where these are fractions).
+
+    Raises:
+        SpecError: for one that is no time, or not one of each packet.
+    """
     found = []
-    for path in paths:
+    for path in fields:
         info = schema.fields.get(path)
         scaling = _scaling(info.unit, info.scale, info.offset) if info else None
         if info is None or scaling is None or info.axes:
-            raise SpecError("a clock is a field of the header with a unit of time", path=path, sensor=sensor)
+            reason = "a clock is one field of the frame, with a unit of time and outside arrays"
+            raise SpecError(reason if info else "no data frame has this field for the clock", path=path, sensor=sensor)
         step, zero = scaling
         whole = isinstance(step, int) and isinstance(zero, int)
-        found.append((path, step, zero, _FURTHEST // len(paths) // max(step, 1) if whole else 0))
+        found.append((path, step, zero, _FURTHEST // len(fields) // max(step, 1) if whole else 0))
     return found
 
 

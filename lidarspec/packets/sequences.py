@@ -26,6 +26,10 @@ LATE = 64
 EARLY = 10
 #: counters with at least so many values start again at 0 only when the sensor does.
 LONG = 1 << 16
+#: counters with more values fill 64 bits: differences wrap by themselves.
+WIDE = 1 << 63
+#: the index of a first packet, and a step from one to the next, are no larger: an index fits 64 bits however often the sensor starts again.
+FARTHEST = 1 << 32
 
 
 def _whole(values: Any, number: int) -> NDArray[np.int64]:
@@ -53,9 +57,11 @@ class SequenceTracker:
         info = batch.table.schema.fields.get(self._rule.field)
         if info is None or info.axes:
             raise SpecError("a sequence is a field of the header", path=self._rule.field)
-        numbers = batch.table.raw(self._rule.field).astype(np.int64)
+        numbers = batch.table.raw(self._rule.field)
         there = batch.table.present(self._rule.field)
         periods = self._last(batch, (1 << info.bits) - 1) - self._rule.first + 1
+        if not isinstance(periods, int) or periods <= WIDE:
+            numbers = numbers.astype(np.int64)
         if there is None or bool(there.all()):
             return self._runs(numbers, periods)
         each = np.broadcast_to(periods, numbers.shape)
@@ -63,12 +69,12 @@ class SequenceTracker:
         found = [self._step(number, period) if known else self._unnumbered() for number, period, known in steps]
         return np.array([index for index, _ in found], np.int64), np.array([jump for _, jump in found], np.bool_)
 
-    def _runs(self, numbers: NDArray[np.int64], periods: int | NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.bool_] | None]:
+    def _runs(self, numbers: NDArray[Any], periods: int | NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.bool_] | None]:
         """The index of packets that are all numbered, and where some are missing; those that follow one another are counted together."""
         one, each = (periods, None) if isinstance(periods, int) else (0, periods)
         steady = numbers[1:] - numbers[:-1]
         ones = steady == 1
-        if np.count_nonzero(ones) < len(ones):
+        if one <= WIDE and np.count_nonzero(ones) < len(ones):
             ones |= (steady - 1) % np.maximum(one if each is None else each[1:], 1) == 0
         steady = ones if each is None else ones & (each[1:] == each[:-1])
         if np.count_nonzero(steady) == len(steady) and self._follows(numbers.item(0), one if each is None else each.item(0)):
@@ -116,7 +122,7 @@ class SequenceTracker:
         reach = LATE if self._index - behind >= self._first else EARLY
         if ahead == 0 or behind <= min(reach, period // 2):
             return self._back(0 if ahead == 0 else behind), False
-        if period >= LONG and ahead > period // 2:
+        if period >= LONG and ahead > min(period // 2, FARTHEST):
             self._begin(number, period)
             return self._index, True
         lost = range(self._index + 1, self._index + ahead)
@@ -133,9 +139,10 @@ class SequenceTracker:
 
     def _begin(self, number: int, period: int) -> None:
         """A first packet, or the sensor started again: nothing is known to be lost."""
-        start = (number - self._rule.first) % period
-        turns = 0 if self._index < 0 else self._index // period + 2
-        self._number, self._period, self._index = number, period, turns * period + start
+        turn = min(period, FARTHEST)
+        start = (number - self._rule.first) % period % turn
+        turns = 0 if self._index < 0 else self._index // turn + 2
+        self._number, self._period, self._index = number, period, turns * turn + start
         self._first, self._missing = self._index, set()
 
     def _back(self, behind: int) -> int:

@@ -19,7 +19,7 @@ from lidarspec.columns.columns import Batch
 from lidarspec.errors import PluginError, UnknownFrame
 from lidarspec.framing.frame_engine import Codec, codec
 from lidarspec.framing.results import Counters, Frames, Numbers
-from lidarspec.packets.clocks import Unwrapper, clock_ns
+from lidarspec.packets.clocks import Unwrapper, clock_ns, clock_terms, paths
 from lidarspec.packets.packets import Packets, StateOf, joined_tables
 from lidarspec.packets.sequences import SequenceTracker
 from lidarspec.spec.description import Spec
@@ -53,8 +53,12 @@ class PacketStream:
         self._others = [name for name, other in sensor.incoming.items() if not other.data and name != frame]
         self._state: dict[str, bytes] = dict(state or {})
         data = sensor.frames[frame].data
-        self._sequence = SequenceTracker(sensor.sequence, stats) if sensor.sequence and data and _counted(sensor, frame) else None
-        self._clock = Unwrapper(sensor.clock.wraps_at) if sensor.clock and data else None
+        counted = sensor.sequence is not None and data and _has(sensor, frame, sensor.sequence.field)
+        self._sequence = SequenceTracker(sensor.sequence, stats) if sensor.sequence and counted else None
+        timed = sensor.clock is not None and data and all(_has(sensor, frame, path) for path in paths(sensor.clock))
+        self._clock = Unwrapper(sensor.clock.wraps_at) if sensor.clock and timed else None
+        if sensor.clock and timed:
+            clock_terms(paths(sensor.clock), self._codec.schema, sensor.id)
         self._gap, self._number = False, 0
         self._tables: dict[str, tuple[bytes, Table]] = {}
 
@@ -214,10 +218,9 @@ def data_frame(sensor: Spec, found: Sequence[Frames]) -> str | None:
     return None
 
 
-def _counted(sensor: Spec, frame: str) -> bool:
-    """Whether packets of this type are counted: not, if only other data frames have the counter."""
-    assert sensor.sequence is not None
-    having = [name for name in sensor.data_frames if sensor.sequence.field in codec(sensor.frames[name]).schema.fields]
+def _has(sensor: Spec, frame: str, path: str) -> bool:
+    """Whether packets of this type are to have a field, such as the counter: not, if only other data frames have it."""
+    having = [name for name in sensor.data_frames if path in codec(sensor.frames[name]).schema.fields]
     return frame in having or not having
 
 

@@ -27,6 +27,7 @@ from lidarspec.simulation.scenes import Scene, furnished
 from lidarspec.simulation.simulator import Simulation, simulation
 from lidarspec.spec.description import Answer, Command, Spec, with_frames
 from lidarspec.spec.links import is_datagram
+from lidarspec.spec.tree import FieldInfo
 from lidarspec.wire.parse import parse
 
 SECOND = 1_000_000_000
@@ -103,11 +104,11 @@ class Answering:
         name, values = (answer, {}) if isinstance(answer, str) else answer
         return Answered(name, self.frame(name, 0, {**self._agreed(name, request), **values}))
 
-    def _agreed(self, name: str, request: Request) -> dict[str, float]:
+    def _agreed(self, name: str, request: Request) -> dict[str, Any]:
         """The physical values that tie a reply to its request."""
         fields = codec(self._sensor.frames[name]).schema.fields
         raw = {path: request.values[path] for path in request.command.echoes if path in request.values} | dict(request.command.matches)
-        return {path: fields[path].physical(value) for path, value in raw.items() if path in fields}
+        return {path: _physical(fields[path], value) for path, value in raw.items() if path in fields}
 
     def _request(self, frame: str, data: bytes, link: str) -> Request | None:
         """The command that a frame is: of several that fit, the one that says most about it."""
@@ -121,6 +122,15 @@ def _listening(sensor: Spec, link: str) -> Decoder:
     """A decoder of what is sent to the sensor: the outgoing frames, seen from its side."""
     frames = {name: replace(frame, direction="in") for name, frame in sensor.frames.items() if frame.direction == "out"}
     return Decoder(with_frames(sensor, frames), stream=not is_datagram(sensor.links.get(link)))
+
+
+def _physical(info: FieldInfo, value: Any) -> Any:
+    """A parsed value in the unit of its field; bytes as they are, the number of a name, the numbers of an array."""
+    if isinstance(value, bytes) or (isinstance(value, list) and info.kind == "bytes"):
+        return value
+    if isinstance(value, list | tuple):
+        return [_physical(info, one) for one in value]
+    return info.physical(next((raw for raw, name in info.labels.items() if name == value), value))
 
 
 def _flat(values: Mapping[str, Any], prefix: str = "") -> Iterable[tuple[str, Any]]:

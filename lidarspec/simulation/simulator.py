@@ -15,7 +15,7 @@ Points by coordinates (M2) are linear in the range: with the directions declared
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Container, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -91,14 +91,18 @@ class Measurement:
 
     Raises:
         SpecError: where ranges cannot be traced back to fields and there is no `encode`.
+
+    Args:
+        given: paths of the fields that the sensor's `sweep` gives, which are left as they are where they are not ranges.
     """
 
-    def __init__(self, sensor: Spec, frame: str, table: Rows) -> None:
+    def __init__(self, sensor: Spec, frame: str, table: Rows, given: Container[str] = ()) -> None:
         self._sensor, self._frame = sensor, frame
         self._points = sensor.points_of(frame)
         self._encode: Callable[[Polar], Mapping[str, Any]] | None = sensor.simulation_of(frame).encode
         self._targets = () if self._encode else self._traced(table)
-        self._intensity = self.beams(table).intensity
+        intensity = self.beams(table).intensity
+        self._intensity = "" if intensity in given else intensity
         self._coupled = self._encode is not None or self._turning(table)
 
     def fill(self, table: Rows, scene: Scene, times: Floats) -> None:
@@ -336,8 +340,9 @@ class Simulation:
             raise UsageError(f"{sensor.id} declares no sweep for {frame!r} frames, and cannot be simulated")
         self._sensor, self._frame, self._sweep = sensor, frame, sweep
         self._maker = FrameMaker(sensor, frame)
+        swept: set[str] = set().union(*(sweep(index) for index in range(PROBED)))
         table = self._table(range(PROBED))
-        self._measurement = Measurement(sensor, frame, table)
+        self._measurement = Measurement(sensor, frame, table, swept)
         self._pace = Pace(sensor, frame, table, self._measurement.beams(table))
         self.interval = self._pace.interval
 

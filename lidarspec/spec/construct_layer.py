@@ -12,6 +12,7 @@ from __future__ import annotations
 import contextlib
 import copy
 import functools
+import io
 import math
 import operator
 import re
@@ -145,11 +146,36 @@ class IndexedArray(Array):  # type: ignore[misc]
             raise Mismatch(path, 0, "a list of its elements", repr(obj), "value")
         if len(obj) != count:
             raise construct.RangeError(f"expected {count} elements, found {len(obj)}", path=path)
-        built = construct.ListContainer()
-        for index, element in enumerate(obj):
-            context._index = index
-            built.append(self.subcon._build(element, stream, context, f"{path}[{index}]"))
-        return built
+        return _built(self, obj, stream, context, path)
+
+
+def _built(con: Subconstruct, elements: Iterable[Any], stream: Any, context: Any, path: str) -> Any:
+    """Build the elements of an array, with the index in an error's path."""
+    built = construct.ListContainer()
+    for index, element in enumerate(elements):
+        context._index = index
+        built.append(con.subcon._build(element, stream, context, f"{path}[{index}]"))
+    return built
+
+
+class FullRange(construct.GreedyRange):  # type: ignore[misc]
+    """A GreedyRange that takes up all bytes of the part that bounds it: construct's own drops an element that fails, and what follows."""
+
+    def _parse(self, stream: Any, context: Any, path: str) -> Any:
+        found = construct.ListContainer()
+        while stream.read(1):
+            stream.seek(-1, io.SEEK_CUR)
+            context._index, start, place = len(found), stream.tell(), f"{path}[{len(found)}]"
+            found.append(self.subcon._parsereport(stream, context, place))
+            note(context, place, start, stream.tell(), found[-1])
+            if stream.tell() == start:
+                raise construct.RangeError("an element without a byte never ends", path=place)
+        return found
+
+    def _build(self, obj: Any, stream: Any, context: Any, path: str) -> Any:
+        if not isinstance(obj, list | tuple):
+            raise Mismatch(path, 0, "a list of its elements", repr(obj), "value")
+        return _built(self, obj, stream, context, path)
 
 
 def _bounded(number: int, limit: int, what: str, path: str) -> int:
@@ -240,7 +266,9 @@ def verifying(context: Any, *, checksums: bool = False) -> bool:
 
 
 #: construct's classes -> those that stand in for them.
-_OWN: dict[type, type] = {Struct: MarkedStruct, Array: IndexedArray, Const: CheckedConst, construct.Enum: NamedEnum}
+_OWN: dict[type, type] = {
+    **{Struct: MarkedStruct, Array: IndexedArray, Const: CheckedConst, construct.Enum: NamedEnum, construct.GreedyRange: FullRange},
+}
 
 #: attributes of constructs that hold others; "cases" does by key.
 _INNER = ("subcon", "thensubcon", "elsesubcon", "default")
@@ -343,18 +371,21 @@ SHADOWED = frozenset(name for name in dir(Container) if not name.startswith("_")
 _REFUSED: dict[type, tuple[str, str]] = {
     type(construct.Pickled): ("LS110", "Pickled runs code from the wire"),
     construct.FlagsEnum: ("LS108", "FlagsEnum loses undeclared bits: declare each bit as a field of a BitStruct"),
-    construct.GreedyRange: ("LS111", "GreedyRange has no end of its own on a stream: give a count, or a terminator"),
-    type(construct.GreedyBytes): ("LS111", "GreedyBytes has no end of its own on a stream: give a length, or a terminator"),
     construct.RawCopy: ("LS109", "RawCopy ignores edits on rebuild: use Checksummed"),
     construct.Checksum: ("LS109", "construct's Checksum needs RawCopy, which ignores edits on rebuild: use Checksummed"),
     construct.Padded: ("LS106", "padding loses its bytes on a round trip: declare it as a field, such as 'reserved' / Bytes(n)"),
+    construct.Aligned: (
+        "LS106",
+        "Aligned loses its padding on a round trip: declare it as a field, such as 'reserved' / Bytes(-this.size % 4)",
+    ),
     construct.Pointer: ("LS112", "Pointer reads outside the frame"),
     construct.Seek: ("LS112", "Seek reads outside the frame"),
     construct.Select: ("LS113", "Select and Optional hide errors in the bytes: use If or Switch on a header field"),
 }
 
-#: what gives a greedy field its end.
+#: what gives a greedy part its end, and what has none of its own.
 _BOUNDED = (construct.NullTerminated, construct.FixedSized, construct.Prefixed)
+_GREEDY = (construct.GreedyRange, type(construct.GreedyBytes))
 
 
 def check_struct(con: Construct) -> None:
@@ -363,6 +394,7 @@ def check_struct(con: Construct) -> None:
     Raises:
         SpecError: for a shadowed, reserved, duplicate or missing name, or a construct that loses bits or never ends.
     """
+    _check_ends(con, "", bounded=False)
     for path, part, in_bits in _walk(con, "", in_bits=False):
         for kind, (rule, reason) in _REFUSED.items():
             if isinstance(part, kind):
@@ -372,6 +404,33 @@ def check_struct(con: Construct) -> None:
         if isinstance(part, Struct):
             _check_names(part, path, in_bits=in_bits)
     _check_measures(con, "", (1, 0, ""), {})
+
+
+def _check_ends(con: Construct, path: str, *, bounded: bool) -> None:
+    """Refuse what has no end on a stream: greedy parts, unless they are the last in one that has an end; and what such a one would drop."""
+    path = f"{path}.{con.name}".strip(".") if isinstance(con, construct.Renamed) else path
+    if isinstance(con, _GREEDY) and not bounded:
+        name, what = (type(con), "length") if con is construct.GreedyBytes else (construct.GreedyRange, "count")
+        reason = f"{name.__name__} has no end of its own on a stream: give a {what}, or a terminator, or bound it by Prefixed or FixedSized"
+        raise SpecError(reason, path=path, rule="LS111")
+    below = children(con)
+    for child in below:
+        passes = bounded and child is below[-1] if isinstance(con, Struct) else bounded
+        _check_ends(child, path, bounded=isinstance(con, _BOUNDED) or (passes and not isinstance(con, Array | construct.GreedyRange)))
+    is_sized = isinstance(con, construct.FixedSized)
+    fits = is_sized and isinstance(con.length, int) and fixed_size(con.subcon) == con.length
+    if isinstance(con, _BOUNDED) and not fits and not _fills(con.subcon, padded=is_sized):
+        reason = f"{type(con).__name__} loses what its content leaves of it: let the content end with a field for it, 'rest' / GreedyBytes"
+        raise SpecError(reason, path=path, rule="LS106")
+
+
+def _fills(con: Construct, *, padded: bool) -> bool:
+    """Whether a part takes up all bytes that it is given, and builds them again; `padded`: with zeros behind it where it is shorter."""
+    if isinstance(con, construct.NullStripped):
+        return padded and con.pad == b"\0" and con.subcon is construct.GreedyBytes
+    if isinstance(con, (Array, *_BOUNDED)) or not children(con):
+        return con is construct.GreedyBytes
+    return isinstance(con, construct.GreedyRange) or _fills(children(con)[-1], padded=padded)
 
 
 def _check_names(struct: Struct, path: str, *, in_bits: bool) -> None:
@@ -416,8 +475,6 @@ def _walk(con: Construct, path: str, *, in_bits: bool) -> Iterator[tuple[str, Co
     if con.name is not None and isinstance(con, construct.Renamed):
         path = f"{path}.{con.name}" if path else con.name
     yield path, con, in_bits
-    if isinstance(con, _BOUNDED) and unwrap(con.subcon) is construct.GreedyBytes:
-        return
     if isinstance(con, construct.Transformed | construct.Restreamed):
         in_bits = True
     for child in children(con):
@@ -460,10 +517,13 @@ def random_value(con: Construct, source: random.Random, drawn: Drawn, scope: Any
             return con.func(scope)
     if isinstance(con, Struct):
         values = Container(_=scope)
+        values._root = values if scope is None else scope._root
         for child in con.subcons:
             if child.name is not None:
                 values[child.name] = random_value(child, source, drawn, values, f"{path}.{child.name}" if path else child.name)
         return values
+    if isinstance(con, construct.GreedyRange):
+        return [random_value(con.subcon, source, drawn, scope, path) for _ in range(source.randint(0, 4))]
     if isinstance(con, Array):
         count = _bounded(construct.evaluate(con.count, scope), con.limit, "count", path)
         return [random_value(con.subcon, source, drawn, scope, path) for _ in range(count)]
@@ -482,8 +542,8 @@ def random_value(con: Construct, source: random.Random, drawn: Drawn, scope: Any
 
 
 def _random_leaf(con: Construct, source: random.Random, scope: Any) -> Any:
-    if con is construct.Pass:
-        return None
+    if con is construct.Pass or isinstance(con, construct.Check):
+        return None  # whether a Check holds is seen when the frame is built
     if isinstance(con, construct.NullTerminated):
         return str(source.randrange(10 ** source.randint(1, 4))).encode()
     if isinstance(con, construct.Computed):

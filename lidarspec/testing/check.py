@@ -21,8 +21,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from lidarspec.errors import SourceError, SpecError
-from lidarspec.plugins import GROUP, SENSORS, EntryPoint, Registry, entry_points, file_module, registry
+from lidarspec.errors import SourceError, SpecError, UnknownSensor
+from lidarspec.plugins import GROUP, SENSORS, EntryPoint, Registry, entry_points, file_and_id, file_module, registry
 from lidarspec.spec.sensor import Sensor
 from lidarspec.testing.conformance import PROPERTIES
 from lidarspec.testing.declared import declared
@@ -65,7 +65,7 @@ class Target:
 
 
 def target(text: str | Path) -> Target:
-    """What a name stands for: a file, the id or alias of an installed sensor, or a distribution, by its name or its folder.
+    """What a name stands for: a file, one sensor of it ("FILE.py:id"), the id or alias of an installed one, a distribution or its folder.
 
     Raises:
         SourceError: for a file that is not there, and for the folder of a distribution that is not installed.
@@ -74,8 +74,9 @@ def target(text: str | Path) -> Target:
     name = str(text)
     if (Path(name) / "pyproject.toml").is_file():
         return _folder(Path(name))
-    if "/" in name or "\\" in name or name.endswith(".py"):
-        return _file(Path(name))
+    file, wanted = file_and_id(name)
+    if "/" in name or "\\" in name or file.suffix == ".py":
+        return _file(file, wanted)
     entries = _entries(name)
     if entries:
         return _distribution(entries)
@@ -88,7 +89,7 @@ def target(text: str | Path) -> Target:
     return Target([sensor], _rivals([sensor]), files, _vectors(files), tuple(family))
 
 
-def _file(file: Path) -> Target:
+def _file(file: Path, wanted: str) -> Target:
     found = Target(files=[file], vectors=_vectors([file]))
     try:
         found.sensors = _added(file_module(file), str(file))
@@ -101,6 +102,11 @@ def _file(file: Path) -> Target:
     except (Exception, SystemExit) as error:
         found.findings.append(loading(error, [file]))
         found.files = found.files if _readable(file) else []
+        return found
+    ids = [sensor.id for sensor in found.sensors]
+    found.sensors = [sensor for sensor in found.sensors if wanted in ("", sensor.id)]
+    if not found.sensors:
+        raise UnknownSensor(wanted, ids, place=str(file))
     return found
 
 

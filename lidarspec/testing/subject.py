@@ -63,27 +63,30 @@ def mutated(data: bytes, source: random.Random) -> bytes:
     return bytes(found)
 
 
-def integers(parsed: Any, path: str = "") -> Iterator[tuple[Any, Any, str]]:
-    """The integers of a parsed frame: (container, key in it, field path)."""
+def integers(parsed: Any, path: str = "", kinds: tuple[type, ...] = (int,)) -> Iterator[tuple[Any, Any, str]]:
+    """The integers, or the values of other types, of a parsed frame: (container, key in it, field path)."""
     entries: Iterable[tuple[Any, Any]] = parsed.items() if isinstance(parsed, dict) else enumerate(parsed)
     for key, value in entries:
         below = path if isinstance(parsed, list) else f"{path}.{key}" if path else key
         if isinstance(value, dict | list):
-            yield from integers(value, below)
-        elif type(value) is int:
+            yield from integers(value, below, kinds)
+        elif type(value) in kinds:
             yield parsed, key, below
 
 
 def physical(sensor: Sensor, name: str, data: bytes) -> Any:
-    """A parsed frame with its scaled integers in units; None where one is too wide for a float to hold exactly."""
+    """A parsed frame with its scaled numbers in units; None where one is too wide for a float to hold exactly."""
     fields = codec(sensor.frames[name]).schema.fields
     parsed = sensor.parse(data, frame=name)
-    for holder, key, path in list(integers(parsed)):
+    for holder, key, path in list(integers(parsed, kinds=(int, float))):
         info = fields.get(path)
-        if info is not None and info.scaled and info.kind == "int":
-            if info.bits > 48:
+        if info is not None and info.scaled and info.kind in ("int", "float"):
+            value = info.physical(holder[key])
+            if info.kind == "float" and info.dtype is not None and info.dtype.type(info.raw(value)) != holder[key]:
                 return None
-            holder[key] = info.physical(holder[key])
+            if info.kind == "int" and info.bits > 48:
+                return None
+            holder[key] = value
     return parsed
 
 

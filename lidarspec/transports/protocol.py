@@ -222,6 +222,10 @@ class LiveTransport(Transport):
         """
         raise UsageError(f"{self.label}: only a serial port has control lines")
 
+    def link(self, name: str) -> LiveTransport | None:
+        """The open transport of another link of the same device; None where it has an address of its own."""
+        return None
+
     def peer(self) -> str | None:
         """The host of the device, as far as it is known."""
         return None

@@ -12,9 +12,9 @@ from lidarspec.plugins import sensor as named_sensor
 from lidarspec.simulation.device import SECOND, SimulatedDevice
 from lidarspec.simulation.faults import FAULTS, faults_of
 from lidarspec.simulation.scenes import read_scene
-from lidarspec.spec.links import Serial
+from lidarspec.spec.links import Serial, is_datagram
 from lidarspec.spec.sensor import Sensor
-from lidarspec.transports.base import Address, HostClock, data_link, failure
+from lidarspec.transports.base import Address, HostClock, failure
 from lidarspec.transports.protocol import Chunk, Disconnected, LiveTransport
 
 OPTIONS = ("rate", "scene", "seed", *FAULTS)
@@ -23,22 +23,37 @@ PAUSE = 2_000_000
 
 
 class SimulatedTransport(LiveTransport):
-    """The data link of a simulated device.
+    """A link of a simulated device; that of the data switches it on, and reading it makes time pass for all.
+
+    Args:
+        name: of the link.
+        data: the data link of the same device, for another one.
 
     Attributes:
         sensor, device: which is simulated.
         baud: of its serial line, None where it has none.
     """
 
-    def __init__(self, label: str, sensor: Sensor, device: SimulatedDevice) -> None:
-        self.label, self.device, self.sensor = label, device, sensor
-        link = data_link(sensor, Serial)
-        self.datagrams = self.sensor.datagrams
-        self.baud = link.baud if link else None
+    def __init__(
+        self, label: str, sensor: Sensor, device: SimulatedDevice, name: str = "data", data: SimulatedTransport | None = None
+    ) -> None:
+        self.label, self.device, self.sensor, self._name = label, device, sensor, name
+        link = sensor.links.get(name)
+        self.datagrams = is_datagram(link)
+        self.baud = link.baud if isinstance(link, Serial) else None
         self.overflow = "block" if math.isinf(device.rate) else "drop_oldest"
-        self._changed, self._clock = threading.Condition(), HostClock()
+        self._changed: threading.Condition = data._changed if data else threading.Condition()
+        self._clock = HostClock()
+        #: what has left the device on the links that are open, and was not read yet.
+        self._left: dict[str, list[bytes]] = data._left if data else {}
+        self._left[name] = []
         self._rested = 0
-        device.start(time.monotonic_ns())
+        if data is None:
+            device.start(time.monotonic_ns())
+
+    def link(self, name: str) -> SimulatedTransport:
+        with self._changed:
+            return SimulatedTransport(self.label, self.sensor, self.device, name, self)
 
     def read(self, timeout: float) -> list[Chunk]:
         end = time.monotonic_ns() + int(timeout * SECOND)
@@ -48,7 +63,7 @@ class SimulatedTransport(LiveTransport):
                 chunks = self._arrived(now) if now >= self._rested else []
                 if chunks or now >= end:
                     return chunks
-                due = self.device.deadline
+                due = self.device.deadline if self._name == "data" else None
                 wake = end if due is None else min(end, max(due, self._rested))
                 self._changed.wait(max(wake - now, 0) / SECOND)
         return []
@@ -57,7 +72,7 @@ class SimulatedTransport(LiveTransport):
         with self._changed:
             if not self.device.present:
                 raise Disconnected(f"{self.label}: the simulated sensor is unplugged")
-            self.device.receive(data, time.monotonic_ns())
+            self.device.receive(data, time.monotonic_ns(), self._name)
             self._changed.notify_all()
 
     def reopen(self) -> None:
@@ -75,7 +90,11 @@ class SimulatedTransport(LiveTransport):
             self._changed.notify_all()
 
     def _arrived(self, now: int) -> list[Chunk]:
-        out = [data for link, data in self.device.outgoing(now) if link == "data"]
+        for link, data in self.device.outgoing(now) if self._name == "data" else ():
+            if link in self._left:
+                self._left[link].append(data)
+                self._changed.notify_all()
+        out, self._left[self._name] = self._left[self._name], []
         if not self.device.present:
             raise Disconnected(f"{self.label}: the simulated sensor was unplugged")
         self._rested = now + PAUSE if out and math.isfinite(self.device.rate) else now

@@ -75,6 +75,8 @@ class _Values:
 
     def checked(self, value: Any, path: str, shown: str = "") -> Any:
         info = self._table.fields.get(path)
+        if info is not None and info.kind == "other":
+            return value  # construct alone knows what it takes
         if isinstance(value, Mapping):
             return self._mapping(value, path, shown)
         if info is not None and info.kind == "bytes" and isinstance(value, bytes | bytearray):
@@ -191,22 +193,40 @@ def build_command(sensor: Spec, name: str, arguments: Mapping[str, Any]) -> byte
         raise UnknownField(min(unknown), command.args, place=place)
     if command.frame is None:
         return b""
-    fields = schema(sensor.frames[command.frame].tree).fields
     values = Container()
     for path, value in command.values.items():
-        holder, name = _place(values, path)
-        holder[name] = value
+        holder, last = _place(values, path)
+        holder[last] = value
     for argument, (path, low, high) in command.args.items():
+        info = argument_field(sensor, name, argument)
         if argument not in arguments:
             raise MissingField(argument, place=place)
         value = arguments[argument]
+        if not isinstance(value, int | float | np.number):
+            raise UsageError(f"{place}: {argument} is a number, not {value!r:.60}")
         if not low <= value <= high:
-            raise OutOfRange(argument, value, low, high, unit=fields[path].unit, place=place)
-        raw = fields[path].raw(value)
-        bottom, top = fields[path].limits if fields[path].kind == "int" else (raw, raw)
-        holder, name = _place(values, path)
-        holder[name] = min(max(raw, bottom), top)
+            raise OutOfRange(argument, value, low, high, unit=info.unit, place=place)
+        raw = info.raw(value)
+        bottom, top = info.limits if info.kind == "int" else (raw, raw)
+        holder, last = _place(values, path)
+        holder[last] = min(max(raw, bottom), top)
     return build(sensor, command.frame, None, values)
+
+
+def argument_field(sensor: Spec, name: str, argument: str) -> FieldInfo:
+    """The field that an argument of a command goes into.
+
+    Raises:
+        SpecError: where it is not one number.
+    """
+    command = sensor.commands[name]
+    path = command.args[argument][0]
+    info = schema(sensor.frames[command.frame].tree).fields.get(path) if command.frame else None
+    if info is None or info.axes or info.kind not in ("int", "float"):
+        what = "in an array" if "[" in path or (info and info.kind != "bytes" and info.axes) else info.kind if info else "no field"
+        reason = f"an argument goes into a field of {command.frame} that is one number, and {path!r} is {what}: give the field in `values`"
+        raise SpecError(reason, path=f"commands.{name}.args.{argument}", sensor=sensor.id)
+    return info
 
 
 def _place(values: Any, path: str) -> tuple[Any, str]:

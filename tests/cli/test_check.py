@@ -115,3 +115,11 @@ def test_what_keeps_a_file_from_being_a_sensor_is_said_with_its_place(tmp_path: 
     said = "there is no function lidarspec_sensors, marked @hookimpl, that returns a sensor"
     assert f"  where  {file}\n  what   {said}\n" in ran("check", file, code=1).stdout
     assert ran("show", file, code=1).stderr.splitlines() == [f"{file}: {said}", f"  next: lidarspec check {file}"]
+
+
+def test_one_sensor_of_a_file_is_checked_by_its_id(tmp_path: Path) -> None:
+    file = tmp_path / "two.py"
+    text = STRANGER.read_text(encoding="utf-8").replace("return [X1]", "return [X1, dataclasses.replace(X1, id='acme-x2', aliases=())]")
+    file.write_text(text, encoding="utf-8")
+    assert ran("check", f"{file}:acme-x2", "--max-examples", "4").output.startswith("acme-x2: clean")
+    assert "unknown sensor 'acme-x3'; did you mean 'acme-x2'?" in ran("check", f"{file}:acme-x3", code=2).output

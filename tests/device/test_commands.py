@@ -22,7 +22,8 @@ import pytest
 import lidarspec as ls
 from lidarspec.errors import CommandError, OutOfRange, ReplyTimeout, SourceError, UsageError
 from lidarspec.recording.format import Recording
-from lidarspec.spec import Tcp, Udp
+from lidarspec.spec import Command, Serial, Tcp, Udp
+from tests.broken import sound
 from tests.lines import SLACK, Port, free_port, port, turning, udp, until, working
 from tests.shapes import SHAPES
 
@@ -325,3 +326,13 @@ def test_an_unknown_control_address_is_asked_for() -> None:
     sensor = dataclasses.replace(SENSOR, links=links, commands=commands, on_close=())
     with pytest.raises((SourceError, CommandError), match="nobody knows the address of the control link"):
         ls.open(f"udp://127.0.0.1:{free_port()}", sensor)
+
+
+@pytest.mark.parametrize("source", ["sim:", "sim:?rate=max"])
+def test_a_simulated_sensor_is_asked_over_its_control_link(source: str) -> None:
+    start = Command("order", {"code": 1}, reply="ack", echoes=("code",), link="control", starts=True)
+    links = {"data": Serial(115_200), "control": Tcp(7010)}
+    sensor = sound.sensor(links=links, commands={"start": start, "again": dataclasses.replace(start, starts=False)}, on_open=("start",))
+    with ls.open(source, sensor) as device:
+        assert len(next(iter(device.scans())).points.x) > 0
+        assert device.send("again").confirmed

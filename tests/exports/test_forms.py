@@ -12,11 +12,14 @@ from typing import Any
 from xml.etree import ElementTree
 
 import pytest
+from construct import Bytes, Const, Struct
 
 import lidarspec as ls
 from lidarspec.exports import EXPORTS, Refused, UnknownExport, export, narrowed
 from lidarspec.exports.diagram import BIT, BITS, LEFT
+from lidarspec.spec import Command, Frame
 from lidarspec.wire.schema import schema
+from tests.broken import sound
 from tests.cli.running import ran
 from tests.exports.json_decoder import Decoder
 from tests.shapes import SHAPES
@@ -165,3 +168,11 @@ def test_the_verb_says_what_is_wrong() -> None:
     assert json.loads(result.stdout)["vendor"]
     assert "unknown frame 'dta'; did you mean 'data'?" in ran("export", "svg", "ldrobot-ld06", "--frame", "dta", code=2).stderr
     assert "did you mean 'ldrobot-ld06'" in ran("export", "svg", "ldrobot-ld60", code=2).stderr
+
+
+def test_bytes_in_a_command_are_hex_in_the_json() -> None:
+    order = Frame(Struct("header" / Const(b"\x16"), "key" / Bytes(2)), direction="out")
+    command = Command("order", {"key": b"\xab\xcd"}, reply="ack", matches={"code": b"\x01"})
+    sensor = sound.sensor(frames={"data": sound.frame(), "ack": Frame(sound.ACK), "order": order}, commands={"start": command})
+    said = json.loads(export(sensor, "json"))["commands"]["start"]
+    assert (said["values"], said["matches"]) == ({"key": "abcd"}, {"code": "01"})

@@ -2,10 +2,17 @@
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Iterable
+
 import numpy as np
 import pytest
+from construct import Array, Int8ub, Int16ul, Int64ul, Struct
 
+from lidarspec import SpecError
 from lidarspec.packets.clocks import Unwrapper
+from lidarspec.spec import Clock, Scaled, Sequence
+from tests.engine.against_construct import BACKENDS, sensor
 
 SECOND = 10**9
 NOW = 1_700_000_000 * SECOND
@@ -37,3 +44,29 @@ def test_readings_run_on_over_a_hundred_turns_also_when_late() -> None:
     assert true[-1] // (30 * SECOND) > 60
     found = np.concatenate([clock.push(part % (30 * SECOND), np.zeros(len(part), np.int64)) for part in np.array_split(true, 37)])
     assert (found - found[0] == true - true[0]).all()
+
+
+def test_a_clock_in_an_array_is_refused_before_any_bytes() -> None:
+    frame = Struct("b" / Array(2, Struct("t" / Scaled(Int16ul, 0.001, "s"), "d" / Int8ub)))
+    refused = dataclasses.replace(sensor(frame), clock=Clock("b.t"))
+    with pytest.raises(SpecError, match=r"b\.t: a clock is one field of the frame, with a unit of time and outside arrays"):
+        refused.decode([])
+    with pytest.raises(SpecError, match="when: no data frame has this field for the clock"):
+        dataclasses.replace(sensor(frame), clock=Clock("when")).decode([])
+
+
+def wide(numbers: Iterable[int]) -> list[bytes]:
+    return [number.to_bytes(8, "little") + b"\1" for number in numbers]
+
+
+@pytest.mark.parametrize("first", [0, 1])
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_counter_of_64_bits_counts_losses_and_starts_again(first: int, backend: str) -> None:
+    counted = dataclasses.replace(sensor(Struct("n" / Int64ul, "d" / Int8ub)), sequence=Sequence("n", first=first))
+    turn = [2**63 - 1, 2**63, 2**64 - 2, 2**64 - 1, first, first + 1]
+    for numbers, lost in (([1, 2, 3, 7, 8], 3), (turn[:2], 0), (turn[2:], 0), ([2**64 - 3, first + 1], 3)):
+        stats = counted.decode(wide(numbers), backend=backend).stats
+        assert (stats.lost, stats.late, stats.duplicates, stats.plugin_errors) == (lost, 0, 0, 0), numbers
+    packets = counted.decode(wide([10**18, 5, 6, 2**63, 2**63 + 1]), backend=backend)  # it was switched off and on
+    assert (packets.stats.lost, packets.stats.plugin_errors) == (0, 0)
+    assert np.diff(packets.index)[[1, 3]].tolist() == [1, 1]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import pickle
 import shutil
 import subprocess
 import sys
@@ -16,7 +17,7 @@ import pytest
 import lidarspec
 from lidarspec import SourceError, SpecError, UsageError
 from lidarspec.errors import UnknownSensor
-from lidarspec.plugins import SENSORS, entry_points
+from lidarspec.plugins import SENSORS, entry_points, file_module
 from lidarspec.testing import SensorConformance
 
 HERE = Path(__file__).resolve().parents[1] / "shapes"
@@ -45,7 +46,7 @@ FAILING = {
     "broken-plausible": "no such luck",
     "broken-points": "no such luck",
     "broken-field": "did you mean 'distances'?",
-    "broken-shape": "range is 4 distances, and azimuth is 3 distances",
+    "broken-shape": "lengths that do not go together",
     "broken-result": "has to return Polar or Cartesian",
 }
 
@@ -286,3 +287,19 @@ def test_a_sensor_is_known_by_the_names_that_people_use(name: str, meant: str) -
 def test_each_name_of_a_sensor_loads_it_alone() -> None:
     offered = {entry.name for entry in entry_points(SENSORS)}
     assert {name for sensor in lidarspec.sensors().values() for name in (sensor.id, *sensor.aliases)} <= offered
+
+
+def test_a_file_may_have_dataclasses_with_annotations_that_are_texts(tmp_path: Path) -> None:
+    text = STRANGER.read_text(encoding="utf-8")
+    own = "\n".join(["", "from dataclasses import dataclass", "", "@dataclass", "class Laser:", "    angle: float = 0.0", ""])
+    file, broken = tmp_path / "mine.py", tmp_path / "broken.py"
+    file.write_text(text + own, encoding="utf-8")
+    assert "from __future__ import annotations" in text
+    assert lidarspec.sensor(str(file)).frames
+    module = file_module(file)
+    assert pickle.loads(pickle.dumps(module.Laser(2.0))) == module.Laser(2.0)
+    broken.write_text("1 / 0", encoding="utf-8")
+    before = set(sys.modules)
+    with pytest.raises(SpecError, match="ZeroDivisionError"):
+        lidarspec.sensor(str(broken))
+    assert set(sys.modules) == before

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from construct import Bytes, Int8ub, Struct, this
 
 import lidarspec
 from lidarspec import Packets, UsageError
@@ -21,13 +22,14 @@ from lidarspec.points.numba_kernels.source import written
 from lidarspec.points.plain import evaluate
 from lidarspec.points.plan import Plan, plan_for
 from lidarspec.simulation.simulator import opening, simulate
-from lidarspec.spec import Checksum, Crc, Fields, Polar, WordXor, Xor
+from lidarspec.spec import Checksum, Checksummed, Crc, Fields, Polar, WordXor, Xor
 from lidarspec.spec.links import is_datagram
 from lidarspec.testing.agreement import assert_same_points
 from lidarspec.testing.subject import Subject
 from lidarspec.wire.frame_table import Rows
 from lidarspec.wire.layout import Seal
 from lidarspec.wire.row_checksums import batch
+from tests.engine import against_construct
 from tests.shapes import SHAPES
 
 pytest.importorskip("numba", reason="the fused back end needs Numba: pip install 'lidarspec[jit]'")
@@ -217,3 +219,10 @@ def test_streams_are_cut_alike() -> None:
     one, other = (sensor.decode(data, backend=backend) for backend in ("numpy", "jit"))
     np.testing.assert_array_equal(one.offset, other.offset)
     assert one.stats == other.stats
+
+
+def test_a_checksum_over_no_bytes_is_right_where_it_is_that_of_none() -> None:
+    part = Checksummed(Struct("text" / Bytes(this._.size % 3), "sum" / Int8ub), "sum", Crc(8, 0x4D))
+    sensor = against_construct.sensor(Struct("size" / Int8ub, "part" / part))
+    packets = sensor.decode([b"\0\0", b"\3\0", b"\0\1"], backend="jit")
+    assert (len(packets), packets.stats.bad_checksum, packets.stats.plugin_errors) == (2, 1, 0)

@@ -4,16 +4,22 @@ from __future__ import annotations
 
 import math
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import pytest
+from construct import Array, Bytes, Const, Enum, Int8ul, Struct
 
 import lidarspec as ls
 from lidarspec import Sensor, UsageError
 from lidarspec.errors import OutOfRange
 from lidarspec.simulation.device import SECOND, SimulatedDevice
 from lidarspec.simulation.faults import Faults, Line, faults_of
+from lidarspec.spec import Command, Frame, Scaled
 from lidarspec.spec.fields import duration
+from lidarspec.testing.commands import the_simulated_sensor_answers
+from lidarspec.testing.subject import Subject
+from tests.broken import sound
 
 MINI, STL, A1 = ls.sensor("cspc-m1c1-mini"), ls.sensor("ldrobot-stl27l"), ls.sensor("slamtec-rplidar-a1")
 MS = SECOND // 1000
@@ -264,3 +270,14 @@ def test_faults_by_text() -> None:
     assert (duration("2min"), duration("1.5h"), duration("7"), duration("20us")) == (120, 5400, 7, pytest.approx(20e-6))
     with pytest.raises(UsageError, match="keep their order"):
         on(STL, faults=Faults(reorder=2))
+
+
+@pytest.mark.parametrize("told", [{"echoes": ("key", "mode", "rates")}, {"matches": {"key": b"abc", "mode": "fast", "rates": [20, 30]}}])
+def test_a_reply_is_told_by_bytes_names_and_arrays(told: dict[str, Any]) -> None:
+    fields = {"key": Bytes(3), "mode": Enum(Int8ul, slow=1, fast=7), "rates": Array(2, Scaled(Int8ul, 0.1, "Hz"))}
+    order, ack = (Struct("header" / Const(head), *(name / con for name, con in fields.items())) for head in (b"\x16\x61", b"\x17\x71"))
+    sensor = sound.sensor(
+        frames={"data": sound.frame(), "ack": Frame(ack), "order": Frame(order, direction="out")},
+        commands={"start": Command("order", {"key": b"abc", "mode": "fast", "rates": [20, 30]}, reply="ack", starts=True, **told)},
+    )
+    the_simulated_sensor_answers(Subject(sensor), "start")

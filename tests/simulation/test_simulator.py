@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from construct import Array, Int8ub, Struct
 from numpy.typing import NDArray
 
 import lidarspec as ls
@@ -15,8 +16,9 @@ from lidarspec import Sensor, SourceError, SpecError, UsageError
 from lidarspec.simulation.device import SECOND, SimulatedDevice
 from lidarspec.simulation.scenes import Box, Mover, Room, furnished, read_scene, scene_of
 from lidarspec.simulation.simulator import simulate, simulation
-from lidarspec.spec import Cartesian, Frame, Polar, Serial, Simulation, Udp
+from lidarspec.spec import Cartesian, Frame, Polar, Scaled, Serial, Simulation, Udp
 from lidarspec.testing.geometry import off
+from tests.engine import against_construct
 from tests.shapes import count, sized
 
 #: metres by which a point may be off its surface: half a step of the range, and float32.
@@ -256,3 +258,15 @@ def test_a_scene_that_cannot_be_read_is_the_systems_fault(tmp_path: Path) -> Non
     (tmp_path / "binary.toml").write_bytes(b"\xff\xfe\x00")
     with pytest.raises(UsageError, match="UTF-8"):
         read_scene(tmp_path / "binary.toml")
+
+
+def test_an_intensity_that_sweep_gives_stays() -> None:
+    frame = Struct("points" / Array(3, Struct("distance" / Scaled(Int8ub, 0.05, "m"), "intensity" / Int8ub)))
+    made = replace(
+        against_construct.sensor(frame),
+        points=lambda f: Polar(range=f.points.distance, azimuth=np.arange(3), intensity=f.points.intensity),
+        simulation=Simulation(lambda i: {"points.intensity": [7, 8, 9]}, rate=10),
+    )
+    assert made.decode(simulate(made, 2)).points().intensity.tolist() == [7, 8, 9] * 2
+    free = replace(made, simulation=Simulation(lambda i: {}, rate=10))
+    assert 0 < free.decode(simulate(free, 2)).points().intensity.min() != 7

@@ -13,16 +13,16 @@ from typing import Any
 
 import numpy as np
 import pytest
-from construct import Array, Const, Int8ul, Int16ub, Int16ul, Struct
+from construct import Array, Const, Float16b, Float32l, Float64l, Int8ul, Int16ub, Int16ul, Struct
 from hypothesis import strategies as st
 
 from lidarspec import Sensor
-from lidarspec.spec import Checksummed, Crc, Fields, Frame, Polar, Sum, take
+from lidarspec.spec import Checksummed, Crc, Fields, Frame, Polar, Scaled, Sum, take
 from lidarspec.testing.check import Target, reports
 from lidarspec.testing.conformance import PROPERTIES
 from lidarspec.testing.declared import declared
 from lidarspec.testing.findings import Violation, left_over
-from lidarspec.testing.frames import values_survive_building_and_parsing
+from lidarspec.testing.frames import values_in_units_build_the_same_bytes, values_survive_building_and_parsing
 from lidarspec.testing.geometry import the_points_turn_as_the_axes_do
 from lidarspec.testing.subject import Subject
 from lidarspec.testing.vectors import vectors_hold
@@ -266,3 +266,10 @@ def test_vectors_hold_commands_and_their_replies(changes: dict[str, Any], said: 
         return
     with pytest.raises(Violation, match=said):
         vectors_hold(Subject(sound.sensor(), vectors=file))
+
+
+def test_scaled_floats_are_read_and_built_in_their_unit() -> None:
+    for kind, offset in ((Float16b, 0.0), (Float32l, 0.0), (Float32l, 3.0), (Float64l, 0.0)):
+        fields = sound.sealed(warmth=Scaled(kind, 0.1, "degC", offset=offset))
+        subject = Subject(sound.sensor(sound.frame(fields, max_length=sound.SIZE + kind.sizeof())))
+        values_in_units_build_the_same_bytes(subject, "data")

@@ -7,20 +7,24 @@ from typing import Any
 import numpy as np
 import pytest
 from construct import (
+    Aligned,
     Array,
     BitsInteger,
     BitStruct,
     Bytes,
+    Check,
     Computed,
     Const,
     CString,
     FixedSized,
     GreedyBytes,
+    GreedyRange,
     If,
     Int8sb,
     Int8ub,
     Int16ub,
     Int32ub,
+    NullStripped,
     NullTerminated,
     Prefixed,
     Struct,
@@ -33,7 +37,7 @@ from lidarspec import SpecError, UsageError, WireError
 from lidarspec.framing.frame_engine import CompiledCodec, InterpretedCodec, codec
 from lidarspec.testing.conformance import PROPERTIES
 from lidarspec.testing.subject import Subject
-from tests.engine.against_construct import BACKENDS, agree, sensor
+from tests.engine.against_construct import BACKENDS, agree, plain, sensor
 from tests.engine.engines import clean_and_damaged_input_read_alike, values_at_the_edges_read_alike
 
 TEXT = NullTerminated(GreedyBytes)
@@ -239,3 +243,67 @@ def test_examples_that_construct_alone_reads_have_counts_that_fit(part: Any) -> 
 def test_a_count_is_bounded_by_the_size_of_a_frame_that_declares_no_longest_length() -> None:
     with pytest.raises(WireError, match="v: invalid count 1000000000"):
         sensor(Struct("k" / Int8ub, "v" / Array(10**9, Struct())), max_length=0).parse(b"\0")
+
+
+BOUNDED: dict[str, tuple[Any, bytes, Any]] = {
+    "after its length": (Prefixed(Int8ub, GreedyRange(Int16ub)), b"\4\0\1\0\2", [1, 2]),
+    "of none": (Prefixed(Int8ub, GreedyRange(Int16ub)), b"\0", []),
+    "of a fixed size": (FixedSized(4, GreedyRange(Int16ub)), b"\0\1\0\2", [1, 2]),
+    "of structs": (
+        Prefixed(Int8ub, GreedyRange(Struct("n" / Int8ub, "x" / Bytes(this.n)))),
+        b"\3\1a\0",
+        [{"n": 1, "x": b"a"}, {"n": 0, "x": b""}],
+    ),
+    "behind a field": (Prefixed(Int8ub, Struct("a" / Int8ub, "r" / GreedyRange(Int8ub))), b"\3\7\5\6", {"a": 7, "r": [5, 6]}),
+    "a rest": (Prefixed(Int8ub, Struct("a" / Int8ub, "r" / GreedyBytes)), b"\3\7\5\6", {"a": 7, "r": b"\5\6"}),
+    "a text in its place": (FixedSized(4, NullStripped(GreedyBytes)), b"ab\0\0", b"ab"),
+}
+
+
+@pytest.mark.parametrize("name", BOUNDED)
+def test_greedy_parts_with_an_end_are_read_and_built(name: str) -> None:
+    part, data, wanted = BOUNDED[name]
+    ours = sensor(Struct("k" / Int8ub, "v" / part))
+    assert plain(ours.parse(b"\1" + data).v) == wanted
+    assert ours.build("data", ours.parse(b"\1" + data)) == b"\1" + data
+    assert ours.decode([b"\1" + data])["k"].tolist() == [1]
+    for seed in range(4):
+        example = ours.example("data", seed=seed)
+        assert ours.build("data", ours.parse(example)) == example
+
+
+def test_of_a_greedy_array_no_byte_is_dropped() -> None:
+    with pytest.raises(WireError, match=r"v\[1\]"):
+        sensor(Struct("v" / Prefixed(Int8ub, GreedyRange(Int16ub)))).parse(b"\3\0\1\0")
+    with pytest.raises(WireError, match=r"v\[0\]: an element without a byte never ends"):
+        sensor(Struct("v" / Prefixed(Int8ub, GreedyRange(Struct())))).parse(b"\1\0")
+    with pytest.raises(UsageError, match="v: expected a list"):
+        sensor(Struct("v" / Prefixed(Int8ub, GreedyRange(Int16ub)))).build("data", v=5)
+
+
+@pytest.mark.parametrize(
+    ("part", "reason"),
+    [
+        (GreedyRange(Int8ub), "GreedyRange has no end of its own"),
+        (Prefixed(Int8ub, Struct("r" / GreedyBytes, "a" / Int8ub)), "r: GreedyBytes has no end of its own"),
+        (Prefixed(Int8ub, GreedyRange(GreedyBytes)), "GreedyBytes has no end of its own"),
+        (Aligned(4, Int8ub), "Aligned loses its padding"),
+        (FixedSized(4, Int8ub), "FixedSized loses what its content leaves"),
+        (FixedSized(this.k, Struct("a" / Int8ub)), "FixedSized loses what its content leaves"),
+        (FixedSized(8, TEXT), "FixedSized loses what its content leaves"),
+        (Prefixed(Int8ub, Int16ub), "Prefixed loses what its content leaves"),
+        (Prefixed(Int8ub, NullStripped(GreedyBytes)), "Prefixed loses what its content leaves"),
+    ],
+)
+def test_what_has_no_end_or_drops_bytes_is_refused(part: Any, reason: str) -> None:
+    with pytest.raises(SpecError, match=reason):
+        sensor(Struct("k" / Int8ub, "v" / part))
+
+
+def test_examples_hold_what_is_checked_and_see_the_whole_frame() -> None:
+    checked = Struct("ok" / Check(this._.a < 200), "x" / Array(this._root.a % 3, Int8ub))
+    ours = sensor(Struct("a" / Int8ub, "v" / Array(2, checked), "twice" / Computed(this._root.a * 2)))
+    examples = [ours.parse(ours.example("data", seed=seed)) for seed in range(9)]
+    assert all(found.a < 200 and found.twice == 2 * found.a and len(found.v[1].x) == found.a % 3 for found in examples)
+    with pytest.raises(WireError, match=r"v\[0\].ok: check failed"):
+        ours.parse(b"\xc8\0\0\0\0")

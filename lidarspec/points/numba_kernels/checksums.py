@@ -110,6 +110,8 @@ _KNOWN: WeakKeyDictionary[Seal, _Shares] = WeakKeyDictionary()
 def checksums(seal: Seal, rows: Bytes2D) -> NDArray[np.uint64] | None:
     """The checksums of frames, (n,); None where NumPy is to compute them."""
     known = _KNOWN.get(seal)
+    if known is None and not seal.spans:
+        return None  # over no bytes there is nothing to compute
     if known is None:
         known = _KNOWN[seal] = _Shares(seal)
     known.seen += len(rows)
