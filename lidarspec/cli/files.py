@@ -16,7 +16,7 @@ from lidarspec.cli.output import emit, emit_json, note
 from lidarspec.device.device import Device, open as open_device
 from lidarspec.discovery.detect import detected, scores
 from lidarspec.discovery.listen import Heard, beginning
-from lidarspec.errors import LidarSpecError, UsageError, WireError, suggest
+from lidarspec.errors import LidarSpecError, UsageError, WireError, suggest, suggestion
 from lidarspec.formats import format_of, write
 from lidarspec.plugins import sensor as named_sensor
 from lidarspec.scans.scans import Scan
@@ -76,7 +76,7 @@ def _detected(source: str, target: str) -> Sensor:
     except UsageError as error:
         raise suggest(error, f"lidarspec convert {source} {target} -s ID") from None
     except WireError as error:
-        given = _again(source)
+        given = None if suggestion(error) else _again(source)
         raise error if given is None else nearest_fault(given) from None
 
 

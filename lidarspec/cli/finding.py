@@ -15,7 +15,7 @@ from lidarspec.cli.inputs import read
 from lidarspec.cli.options import DURATION, output_options, sensor_option
 from lidarspec.cli.output import emit, emit_json, note, table
 from lidarspec.discovery.checksum_search import search
-from lidarspec.discovery.detect import Verdict, best, verdict, verdicts
+from lidarspec.discovery.detect import Verdict, best, names, others_named, verdict, verdicts
 from lidarspec.discovery.doctor import computer, examined
 from lidarspec.discovery.listen import LISTEN, Heard, everywhere, hear, probe, started_first, udp_ports
 from lidarspec.discovery.periods import Structure, cut, structure
@@ -183,7 +183,7 @@ def detect(source: str | None, duration: float, start: bool, as_json: bool, outp
         emit(_structure_text(unknown), output)
     for line in _conclusions(source, found, unknown, start=start):
         note(line)
-    if not fitting:
+    if not any(one.alike for one in fitting):
         raise click.exceptions.Exit(_code(source, found))
 
 
@@ -210,7 +210,7 @@ def _everywhere(duration: float, *, start: bool) -> Iterator[Verdict]:
         try:
             yield from _one(port, duration, start=start)
         except SourceError as error:
-            yield Verdict(Heard(port, failure=error), (), ())
+            yield Verdict(Heard(port, failure=error))
     for heard in everywhere([], seconds=duration):
         yield verdict(heard)
 
@@ -226,8 +226,10 @@ def _detected_text(found: Sequence[Verdict], output: str | None) -> str:
     for one in found:
         alike = {score.sensor.id for score in one.alike}
         for score in one.scores:
-            verdict_of = "no" if score.sensor.id not in alike else "yes" if len(alike) == 1 else "perhaps"
+            verdict_of = "no" if score.sensor.id not in alike else "yes" if one.sensor is not None else "perhaps"
             rows.append([_place(one.heard), score.sensor.id, verdict_of, f"{score.share:.1%}", str(score.data_frames), score.why])
+        verdict_of = "perhaps" if alike else "yes"
+        rows += [[_place(one.heard), f"{name}, not installed", verdict_of, "", "", why] for name, why in one.others.items()]
     return table(["source", "sensor", "is it", "in frames", "data frames", "told by"], rows, output)
 
 
@@ -243,9 +245,11 @@ def _conclusions(source: str | None, found: Sequence[Verdict], unknown: Structur
         elif one.sensor is not None:
             yield f"next: lidarspec {_verb(one)} {_again(one)} -s {one.sensor.id}"
         elif one.alike:
-            ids = [score.sensor.id for score in one.alike]
-            yield f"{_place(one.heard)}: {', '.join(ids)} send the same frames, and nothing in these tells them apart: choose one"
-            yield f"next: lidarspec {_verb(one)} {_again(one)} -s {ids[0]}"
+            yield f"{_place(one.heard)}: {', '.join(names(one))} send the same frames, and nothing in these tells them apart: choose one"
+            yield f"next: lidarspec {_verb(one)} {_again(one)} -s {one.alike[0].sensor.id}"
+        elif one.others:
+            yield f"{_place(one.heard)}: {others_named(one)}"
+            yield f"next: lidarspec new {next(iter(one.others))} --from-capture {quote(one.heard.source)}"
     if any(one.scores for one in found):
         return
     size = sum(one.heard.size for one in found)
@@ -297,6 +301,7 @@ def _told(one: Verdict) -> dict[str, Any]:
         "failure": str(heard.failure) if heard.failure else None,
         "sensor": one.sensor.id if one.sensor is not None else None,
         "alike": [score.sensor.id for score in one.alike],
+        "not_installed": dict(one.others),
         "fits": [
             {"sensor": score.sensor.id, "share": round(score.share, 4), "data_frames": score.data_frames, "told_by": score.why}
             for score in one.scores

@@ -6,6 +6,7 @@ import random
 import socket
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -78,6 +79,62 @@ def test_clocks_tell_twins_apart(name: str) -> None:
     found = verdict(Heard("", tuple(data), datagrams=sensor.datagrams))
     assert found.sensor is sensor
     assert "its clock advances by" in found.alike[0].why
+
+
+def old_firmware(number: int, *, period: float = 12 * 110.592e-6, mode: int = 0x37, product: int = 0x21) -> list[bytes]:
+    """Packets of the Velodyne form with the product byte that both an HDL-32E and a VLP-16 with old firmware send."""
+    data = simulate(ls.sensor("velodyne-vlp16"), number)
+    tails = (round(i * period * 1e6).to_bytes(4, "little") + bytes([mode, product]) for i in range(number))
+    return [packet[:1200] + tail for packet, tail in zip(data, tails, strict=True)]
+
+
+def swapped(data: list[bytes]) -> list[bytes]:
+    return [data[i ^ 1] for i in range(len(data) & ~1)]
+
+
+@pytest.mark.parametrize(
+    "as_it_comes",
+    [
+        lambda data: [packet for packet in data if random.Random(packet[1200:1204]).random() > 0.1],
+        lambda data: [packet for packet in data for _ in range(2)],
+        swapped,
+    ],
+    ids=["a tenth lost", "doubled", "swapped"],
+)
+def test_a_network_does_not_change_what_the_clock_says(as_it_comes: Callable[[list[bytes]], list[bytes]]) -> None:
+    found = verdict(Heard("", tuple(as_it_comes(old_firmware(200))), datagrams=True))
+    assert (found.sensor and found.sensor.id, found.alike[0].why) == ("velodyne-vlp16", "its clock advances by 1.33 ms a packet")
+
+
+def test_the_pace_of_a_clock_is_that_of_the_mode_that_the_packets_name() -> None:
+    dual = old_firmware(60, period=6 * 110.592e-6, mode=0x39)
+    assert (found := verdict(Heard("", tuple(dual), datagrams=True)).sensor) is not None
+    assert found.id == "velodyne-vlp16"
+
+
+def test_a_name_that_is_not_to_be_trusted_tells_nothing() -> None:
+    found = verdict(Heard("", tuple(old_firmware(2)), datagrams=True))
+    assert (found.sensor, {score.sensor.id for score in found.alike}) == (None, {"velodyne-hdl32e", "velodyne-vlp16"})
+
+
+def test_relatives_that_are_not_installed_are_recognised(tmp_path: Path) -> None:
+    xt32 = ls.sensor("hesai-xt32")
+    xt32m = [xt32.build("data", xt32.parse(packet), block_count=6, blocks=xt32.parse(packet).blocks[:6]) for packet in simulate(xt32, 5)]
+    for data, name in ((xt32m, "hesai-xt32m"), (old_firmware(60, period=6 * 110.592e-6, product=0x28), "velodyne-vlp32c")):
+        found = verdict(Heard("", tuple(data), datagrams=True))
+        assert (found.alike, [*found.others]) == ((), [name])
+        (tmp_path / "one.bin").write_bytes(data[0])
+        with pytest.raises(WireError, match=f"these are frames of {name} .*, which no installed plugin reads"):
+            detected(tmp_path / "one.bin")
+
+
+def test_a_relative_that_only_its_start_would_tell_leaves_a_doubt() -> None:
+    sensor = ls.sensor("cspc-coin-d4")
+    data = b"".join(simulate(sensor, 60))
+    at_its_baud_rate = verdict(Heard("", (data,), baud=230_400))
+    assert (at_its_baud_rate.sensor, [*at_its_baud_rate.others]) == (None, ["ydlidar-t-mini"])
+    named = sensor.build("info", model=b"COIN-D4".ljust(12, b"\0"), zero_angle=0, direction=0, correction=0, reserved=bytes(3), revision=1)
+    assert verdict(Heard("", (named + data,))).sensor is sensor
 
 
 def test_a_baud_rate_decides_where_the_bytes_do_not() -> None:
