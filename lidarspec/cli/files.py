@@ -148,3 +148,5 @@ def plot(source: str, output: str, sensor_id: str | None, number: int, ramp: str
             note(f"{source} has {whole} whole scan{'s' * (whole != 1)}; drawn is the last piece of it that could be")
         title = f"{device.sensor.id}: {chosen}"
         emit(svg(chosen.points, look(chosen.points, ramp=ramp, reach=max_range), title), output)
+        for warning in device.warnings:
+            note(warning)

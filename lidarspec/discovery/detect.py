@@ -82,6 +82,13 @@ def told_apart(candidates: Sequence[Sensor], found: Sequence[Found]) -> Told:
     )
 
 
+def contradiction(sensor: Sensor, found: Sequence[Found]) -> str:
+    """The relatives whose frames these are and not the sensor's, each with what says so; "" where nothing does."""
+    known = sensors()
+    told = told_apart([sensor, *(known[name] for name in sensor.relatives if name in known)], found)
+    return "" if sensor.id in told.alike else " or ".join(f"{name} ({why})" for name, why in (told.alike or told.others).items())
+
+
 def _shown(sensor: Sensor, found: Sequence[Found]) -> dict[str, str]:
     """The relatives that most of the data frames can only be of, by id, each with what tells it."""
     single = {name: relative for name, relative in sensor.relatives.items() if isinstance(relative, Relative)}

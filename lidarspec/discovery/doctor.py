@@ -51,7 +51,7 @@ def examined(source: str | Path, sensor: Sensor | None = None, *, seconds: float
     text = resolved(source)
     address = live_address(text)
     if address is None:
-        yield from _file(text)
+        yield from _file(text, sensor)
     elif address.scheme == "serial":
         yield from _serial(text, address, sensor, seconds)
     elif address.scheme == "udp":
@@ -73,7 +73,7 @@ def computer() -> Iterator[Finding]:
     yield from _buffer()
 
 
-def _file(path: str) -> Iterator[Finding]:
+def _file(path: str, sensor: Sensor | None) -> Iterator[Finding]:
     if not os.path.exists(path):
         yield Finding(False, f"{path}: no such file or port", "lidarspec ports")
     elif not os.access(path, os.R_OK):
@@ -82,7 +82,7 @@ def _file(path: str) -> Iterator[Finding]:
         yield Finding(False, f"{path} is empty")
     else:
         found = max(verdicts(path), key=lambda one: one.heard.size)
-        yield _verdict(path, found, None)
+        yield _verdict(path, found, sensor)
 
 
 def _serial(source: str, address: Address, sensor: Sensor | None, seconds: float) -> Iterator[Finding]:
@@ -207,6 +207,7 @@ def _as_expected(source: str, sensor: Sensor, seconds: float) -> Verdict | None:
 def _verdict(source: str, found: Verdict, sensor: Sensor | None) -> Finding:
     """One finding on what was heard."""
     heard, ids = found.heard, [score.sensor.id for score in found.scores]
+    may_be = {score.sensor.id: score.why for score in found.alike} or dict(found.others)
     quoted = quote(source)
     if not heard.size:
         return _nothing(source, sensor)
@@ -217,6 +218,10 @@ def _verdict(source: str, found: Verdict, sensor: Sensor | None) -> Finding:
     if sensor is not None and sensor.id not in ids:
         return Finding(False, f"it sends frames of {ids[0]}{at}, not of {sensor.id}", f"lidarspec view {quoted} -s {ids[0]}")
     name = sensor.id if sensor is not None else ids[0]
+    if name not in may_be:
+        other, why = next(iter(may_be.items()))
+        command = f"lidarspec view {quoted} -s {other}" if found.alike else f"lidarspec detect {quoted}"
+        return Finding(False, f"it sends frames of {other} ({why}){at}, not of {name}", command)
     score = next(score for score in found.scores if score.sensor.id == name)
     link = data_link(score.sensor, Serial)
     if heard.baud is not None and link and heard.baud not in link.bauds:

@@ -10,6 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import lidarspec as ls
+from lidarspec.simulation.simulator import simulate
 from tests.cli.running import COIN_D4, EXAMPLE, LD06, printed, process, ran
 from tests.sensors.evidence import capture
 
@@ -102,6 +104,12 @@ def test_several_sensors_with_the_same_frames_have_to_be_chosen_from(tmp_path: P
     source.write_bytes(EXAMPLE * 3)
     result = ran("convert", source, tmp_path / "out.csv", code=2)
     assert "ldrobot-ld06, ldrobot-stl27l send the same frames" in result.stderr
+
+
+def test_points_of_a_sensor_that_the_frames_contradict_come_with_a_word(tmp_path: Path) -> None:
+    (tmp_path / "vlp16.bin").write_bytes(b"".join(simulate(ls.sensor("velodyne-vlp16"), 60)))
+    told = ran("convert", tmp_path / "vlp16.bin", tmp_path / "out.csv", "-s", "velodyne-hdl32e").stderr
+    assert "the frames are those of velodyne-vlp16 (its clock advances by 1.33 ms a packet)" in told
 
 
 def test_scans_can_be_limited(tmp_path: Path) -> None:

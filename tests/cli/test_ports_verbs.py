@@ -168,6 +168,13 @@ class TestDoctor:
         assert "it sends frames of ldrobot-stl27l, not of cspc-coin-d4" in found
         assert f"next: lidarspec view {made.path} -s ldrobot-stl27l" in found
 
+    def test_a_file_is_held_against_the_sensor_that_is_named(self, tmp_path: Path) -> None:
+        path = tmp_path / "vlp16.bin"
+        path.write_bytes(b"".join(simulate(ls.sensor("velodyne-vlp16"), 60)))
+        assert "ok     velodyne-vlp16 sends: 60 data frames" in ran("doctor", path, "-s", "velodyne-vlp16").stdout
+        for name in ("velodyne-hdl32e", "robosense-m1"):
+            assert f", not of {name}\n" in ran("doctor", path, "-s", name, code=1).stdout
+
     def test_one_that_waits_to_be_started(self) -> None:
         with virtual_port("cspc-m1c1-mini") as made:
             found = ran("doctor", made.path, "-s", "cspc-m1c1-mini", "-t", "300ms", code=1).stdout
