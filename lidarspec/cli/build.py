@@ -175,7 +175,13 @@ def _length(table: Schema, given: Mapping[str, Any], path: str, place: str) -> i
 @click.option("--timeout", type=DURATION, metavar="TIME", help="How long to wait for the reply; by default what the sensor declares.")
 @output_options
 def send(
-    source: str, command: str, assignments: Sequence[str], sensor_id: str | None, timeout: float | None, as_json: bool, output: str | None
+    source: str,
+    command: str,
+    assignments: Sequence[str],
+    sensor_id: str | Sensor | None,
+    timeout: float | None,
+    as_json: bool,
+    output: str | None,
 ) -> None:
     """Send a command to a sensor, and print its reply.
 

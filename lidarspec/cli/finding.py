@@ -15,7 +15,7 @@ from lidarspec.cli.inputs import read
 from lidarspec.cli.options import DURATION, output_options, sensor_option
 from lidarspec.cli.output import emit, emit_json, note, table
 from lidarspec.discovery.checksum_search import search
-from lidarspec.discovery.detect import Verdict, best, names, others_named, verdict, verdicts
+from lidarspec.discovery.detect import Verdict, best, chosen, names, others_named, verdict, verdicts
 from lidarspec.discovery.doctor import computer, examined
 from lidarspec.discovery.listen import LISTEN, Heard, everywhere, hear, probe, started_first, udp_ports
 from lidarspec.discovery.periods import Structure, cut, structure
@@ -23,6 +23,7 @@ from lidarspec.discovery.samples import Match
 from lidarspec.errors import SourceError, UsageError, suggest
 from lidarspec.plugins import sensor as named_sensor, sensors
 from lidarspec.spec.links import Serial, Udp
+from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.base import data_link, with_option
 from lidarspec.transports.open_url import live_address, resolved
 from lidarspec.transports.ports import SerialPort, User, serial_ports, udp_users
@@ -243,10 +244,10 @@ def _conclusions(source: str | None, found: Sequence[Verdict], unknown: Structur
         if one.heard.failure is not None:
             yield f"{one.heard.failure}"
         elif one.sensor is not None:
-            yield f"next: lidarspec {_verb(one)} {_again(one)} -s {one.sensor.id}"
+            yield f"next: lidarspec {_verb(one)} {_again(one)} {chosen(one.sensor)}"
         elif one.alike:
             yield f"{_place(one.heard)}: {', '.join(names(one))} send the same frames, and nothing in these tells them apart: choose one"
-            yield f"next: lidarspec {_verb(one)} {_again(one)} -s {one.alike[0].sensor.id}"
+            yield f"next: lidarspec {_verb(one)} {_again(one)} {chosen(one.alike[0].sensor)}"
         elif one.others:
             yield f"{_place(one.heard)}: {others_named(one)}"
             yield f"next: lidarspec new {next(iter(one.others))} --from-capture {quote(one.heard.source)}"
@@ -340,7 +341,7 @@ def _structure_text(found: Structure) -> str:
 @sensor_option
 @click.option("-t", "--duration", type=DURATION, default=LISTEN, metavar="TIME", help="How long to listen for, each time.")
 @output_options
-def doctor(source: str | None, sensor_id: str | None, duration: float, as_json: bool, output: str | None) -> None:
+def doctor(source: str | None, sensor_id: str | Sensor | None, duration: float, as_json: bool, output: str | None) -> None:
     """What keeps a sensor's bytes from coming, and the command that mends it.
 
     Looks for missing ports and rights, ports in use, small buffers, silence, a wrong baud rate, a wrong interface. Without SOURCE

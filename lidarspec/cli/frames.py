@@ -31,7 +31,7 @@ words_argument = click.argument("words", metavar="HEX|FILE|-", nargs=-1, require
 @sensor_option
 @count_option
 @output_options
-def parse(words: Sequence[str], sensor_id: str | None, count: int | None, as_json: bool, output: str | None) -> None:
+def parse(words: Sequence[str], sensor_id: str | Sensor | None, count: int | None, as_json: bool, output: str | None) -> None:
     """The fields of each frame in some bytes."""
     given, sensor, fits, found = _found(words, sensor_id, count)
     if not found:
@@ -65,7 +65,7 @@ def parse(words: Sequence[str], sensor_id: str | None, count: int | None, as_jso
 @output_options
 def explain(
     words: Sequence[str],
-    sensor_id: str | None,
+    sensor_id: str | Sensor | None,
     frame: str | None,
     count: int | None,
     bits: bool,
@@ -115,7 +115,7 @@ def _compare(sensor: Sensor, given: Heard, found: list[Piece], diff: str, frame:
 
 
 def _found(
-    words: Sequence[str], sensor_id: str | None, count: int | None, frame: str | None = None, *, damaged: bool = False
+    words: Sequence[str], sensor_id: str | Sensor | None, count: int | None, frame: str | None = None, *, damaged: bool = False
 ) -> tuple[Heard, Sensor, list[str], list[Piece]]:
     """The input, its sensor, the ids of all that fit, and what is in it up to frame number `count`.
 
@@ -131,7 +131,7 @@ def _found(
     return given, sensor, fits, found
 
 
-def _sensor(given: Heard, sensor_id: str | None, *, damaged: bool) -> tuple[Sensor, list[str]]:
+def _sensor(given: Heard, sensor_id: str | Sensor | None, *, damaged: bool) -> tuple[Sensor, list[str]]:
     """The sensor named, or the one whose bytes these are, and the ids of all whose bytes they could be."""
     if sensor_id is not None:
         return named_sensor(sensor_id), []

@@ -8,12 +8,13 @@ import re
 import sys
 import time
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 from shlex import quote
 
 from lidarspec.device.device import Device
 from lidarspec.device.settings import devices
-from lidarspec.discovery.detect import nearest
-from lidarspec.discovery.listen import Heard
+from lidarspec.discovery.detect import chosen, nearest, verdict
+from lidarspec.discovery.listen import Heard, beginning
 from lidarspec.errors import CommandError, LidarSpecError, SourceError, UsageError, WireError, suggest, system_errors
 from lidarspec.plugins import sensors
 from lidarspec.scans.scans import Scan
@@ -23,6 +24,8 @@ from lidarspec.wire.parse import parse_typed
 
 #: longest hexadecimal text that is repeated in the next command, and of other text in a message.
 REPEATED, QUOTED = 400, 64
+#: datagrams and bytes looked at again to say why there is no data in a file.
+LOOKED_AT = 1 << 16
 #: seconds that a device is given for its first frame.
 PATIENCE = 10.0
 #: seconds between two looks at a source that sends nothing.
@@ -97,6 +100,8 @@ def nothing_came(device: Device, source: str, seconds: float | None = None) -> L
     """Why there is nothing to show: no data frame in a file, a silent device, or one whose bytes are no frames."""
     sensor, stats = device.sensor, device.stats
     if not device.is_live:
+        if stats.bytes_in and (instead := fits_instead(sensor, source)):
+            return suggest(WireError(f"{source} {instead[0]}", sensor=sensor.id), f"the same with {instead[1]}")
         what = "holds no bytes" if stats.bytes_in == 0 else f"has no data frame: {stats}"
         return suggest(WireError(f"{source} {what}", sensor=sensor.id), f"lidarspec explain {source} -s {sensor.id}")
     waited = "" if seconds is None else f" within {seconds:.1f} s".replace(".0 s", " s")
@@ -104,6 +109,31 @@ def nothing_came(device: Device, source: str, seconds: float | None = None) -> L
         return suggest(CommandError(f"{sensor.id} on {source} sent nothing{waited}"), f"lidarspec doctor {source} -s {sensor.id}")
     error = WireError(f"{source}: {stats.bytes_in} bytes{waited}, and not a scan of data frames among them: {stats}", sensor=sensor.id)
     return suggest(error, f"lidarspec detect {source}")
+
+
+def again(source: str) -> Heard | None:
+    """The beginning of a file once more; None for what can be read only once."""
+    if not Path(source.partition("?")[0]).is_file():
+        return None
+    with contextlib.closing(transport(source)) as opened:
+        try:
+            return Heard(source, tuple(chunk.data for chunk in beginning(opened, LOOKED_AT)), opened.datagrams)
+        except LidarSpecError:
+            return None
+
+
+def fits_instead(sensor: Sensor, source: str) -> tuple[str, str] | None:
+    """What a file holds that has no data frame of a sensor, and the options with which it is read; None where nothing fits."""
+    given = again(source)
+    found = verdict(given).scores if given is not None else ()
+    own = next((score.sensor.options for score in found if score.sensor.id == sensor.id), None)
+    if own:
+        told = " and ".join(f"{name}={value}" for name, value in own.items())
+        return f"does not say which data frames it holds: they are found with {told}", chosen(sensor.configure(**own))
+    others = [score.sensor for score in found if score.sensor.id != sensor.id]
+    if not others:
+        return None
+    return f"has no data frame of it; its frames are those of {', '.join(other.id for other in others)}", chosen(others[0])
 
 
 class Patience:

@@ -149,7 +149,7 @@ def _ended_by_terminate() -> Iterator[None]:
 @click.option("-n", "--count", type=click.IntRange(min=1), default=5, show_default=True, help="Whole scans to wait for.")
 @click.option("--errors", type=click.FloatRange(0, 1), default=0.01, show_default=True, help="Share of the bytes that the line damages.")
 @click.option("--json", "as_json", is_flag=True, help="Print the summary as JSON.")
-def demo(sensor_id: str | None, count: int, errors: float, as_json: bool) -> None:
+def demo(sensor_id: str | Sensor | None, count: int, errors: float, as_json: bool) -> None:
     """A simulated sensor on a port: started, read through a bad line, recorded, read again, drawn."""
     simulated = (one for one in registry().sensors().values() if any(one.simulation_of(name).sweep for name in one.data_frames))
     sensor = named_sensor(sensor_id) if sensor_id else next(simulated, None)

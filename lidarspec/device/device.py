@@ -372,5 +372,5 @@ def open(
     device = named(source)
     if sensor is None:
         sensor = detected(source)
-    known, mount = sensor if isinstance(sensor, Sensor) else named_sensor(sensor), None if device is None else device.mount
-    return Device(source, known, backend=backend, start=start, record=record, overflow=overflow, period=period, mount=mount)
+    mount = None if device is None else device.mount
+    return Device(source, named_sensor(sensor), backend=backend, start=start, record=record, overflow=overflow, period=period, mount=mount)

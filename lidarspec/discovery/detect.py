@@ -225,7 +225,7 @@ def _each(known: Sequence[Sensor], scored: Callable[[Sensor], Score | None]) -> 
         if frames not in shared:
             shared[frames] = scored(sensor)
         if (score := shared[frames]) is not None:
-            shared[sensor.id] = replace(score, sensor=sensor)
+            shared[sensor.id] = replace(score, sensor=sensor.configure(**score.sensor.options) if score.sensor.options else sensor)
     return [score for key, score in shared.items() if isinstance(key, str) and score is not None]
 
 
@@ -237,11 +237,10 @@ def _score(sensor: Sensor, chunks: Sequence[bytes], *, datagrams: bool) -> Score
 
 
 def _from_the_middle(sensor: Sensor, chunks: Sequence[bytes], *, datagrams: bool) -> Score | None:
-    """The best score of a sensor whose data frames come after others, as if one of those had been seen before."""
+    """The best score of a sensor whose data frames come after others, configured as if one of those had been seen before."""
     answers = [name for name in sensor.data_frames if sensor.frames[name].after is not None]
     scored = [_score(sensor.configure(answer=name), chunks, datagrams=datagrams) for name in answers]
-    best = max((score for score in scored if score is not None), key=lambda score: score.share, default=None)
-    return None if best is None else replace(best, sensor=sensor)
+    return max((score for score in scored if score is not None), key=lambda score: score.share, default=None)
 
 
 def verdict(heard: Heard) -> Verdict:
@@ -303,8 +302,14 @@ def detected(source: str | Path) -> Sensor:
         listed = ", ".join(f"{one.sensor.id} ({one.heard.sender})" for one in fitting if one.sensor)
         raise UsageError(f"{source}: several sensors send, {listed}; choose one with ?src=ADDRESS and -s")
     if fitting[0].sensor is None:
-        raise UsageError(f"{source}: {', '.join(names(fitting[0]))} send the same frames; name the sensor with -s")
+        example = chosen(fitting[0].alike[0].sensor)
+        raise UsageError(f"{source}: {', '.join(names(fitting[0]))} send the same frames; name one, as with {example}")
     return fitting[0].sensor
+
+
+def chosen(sensor: Sensor) -> str:
+    """What to type for a sensor and what it is configured with."""
+    return " ".join([f"-s {sensor.id}", *(f"-O {name}={value}" for name, value in sensor.options.items())])
 
 
 def names(found: Verdict) -> list[str]:
@@ -372,7 +377,7 @@ def fitting(chunks: Sequence[bytes], *, datagrams: bool) -> list[Sensor]:
     if whole:
         return whole
     found = scores(chunks, datagrams=datagrams) if data else []
-    return [score.sensor for score in found if score.share >= found[0].share - AS_GOOD]
+    return [score.sensor for score in found if score.share >= max(found[0].share - AS_GOOD, FITS)]
 
 
 def pieces(sensor: Sensor, chunks: Sequence[bytes], *, datagrams: bool) -> list[Piece]:

@@ -112,6 +112,37 @@ def test_points_of_a_sensor_that_the_frames_contradict_come_with_a_word(tmp_path
     assert "the frames are those of velodyne-vlp16 (its clock advances by 1.33 ms a packet)" in told
 
 
+def test_a_log_without_its_descriptor_is_led_to_the_option_that_reads_it(tmp_path: Path) -> None:
+    sensor, log, out = ls.sensor("slamtec-rplidar-a1"), tmp_path / "nodes.bin", tmp_path / "out.csv"
+    log.write_bytes(b"".join(simulate(sensor, 900)))
+    assert "name one, as with -s slamtec-rplidar-a1 -O answer=node" in ran("convert", log, out, code=2).stderr
+    told = ran("convert", log, out, "-s", "slamtec-rplidar-s2", code=4).stderr
+    assert "they are found with answer=node" in told
+    following = next(line for line in told.splitlines() if "next: " in line).split("next: lidarspec ")[1]
+    ran(*following.split())
+    assert len(out.read_text().splitlines()) > 700
+    assert "-s slamtec-rplidar-a1 -O answer=node" in ran("detect", log).stderr
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["-O", "answer=node"], "name the sensor with -s"),
+        (["-s", "slamtec-rplidar-a1", "-O", "answer"], "an option has a value: NAME=VALUE"),
+        (["-s", "slamtec-rplidar-a1", "-O", "answr=node"], "answr"),
+        (["-s", "slamtec-rplidar-a1", "-O", "mode=7000"], "mode is a number from 0 to 255, not 7000"),
+    ],
+)
+def test_options_of_a_sensor_that_cannot_be(tmp_path: Path, options: list[str], said: str) -> None:
+    (tmp_path / "nodes.bin").write_bytes(EXAMPLE)
+    for words in (
+        ["convert", tmp_path / "nodes.bin", tmp_path / "out.csv"],
+        ["read", tmp_path / "nodes.bin"],
+        ["parse", tmp_path / "nodes.bin"],
+    ):
+        assert said in ran(*words, *options, code=2).stderr
+
+
 def test_scans_can_be_limited(tmp_path: Path) -> None:
     name = "velodyne/vlp16_dual/packets.derived.pcap"
     sensor = ("-s", "velodyne-vlp16")

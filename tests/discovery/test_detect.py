@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import random
 import socket
 import threading
@@ -13,7 +14,7 @@ import pytest
 
 import lidarspec as ls
 from lidarspec import CommandError, SourceError, UsageError, WireError
-from lidarspec.discovery.detect import detected, scores, verdict, verdicts
+from lidarspec.discovery.detect import detected, fitting, scores, verdict, verdicts
 from lidarspec.discovery.listen import Heard, bauds, hear, probe, started_first, udp_ports
 from lidarspec.discovery.periods import structure
 from lidarspec.simulation.simulator import simulate
@@ -148,6 +149,22 @@ def test_a_baud_rate_decides_where_the_bytes_do_not() -> None:
 def test_a_scan_that_is_met_in_its_middle_is_known_all_the_same() -> None:
     sensor = ls.sensor("slamtec-rplidar-a1")
     assert "slamtec-rplidar-a1" in {score.sensor.id for score in scores([b"".join(simulate(sensor, 300))], datagrams=False)}
+
+
+def test_the_middle_of_a_scan_is_read_with_the_answer_that_began_it() -> None:
+    data = b"".join(simulate(ls.sensor("slamtec-rplidar-a1"), 300))
+    found = verdict(Heard("", (data,)))
+    assert {(score.sensor.id, score.sensor.options["answer"]) for score in found.alike} == {
+        (f"slamtec-rplidar-{model}", "node") for model in ("a1", "a3", "c1", "s2")
+    }
+    assert len(found.alike[0].sensor.decode(data)) == 300
+
+
+def test_what_is_no_fit_for_one_question_is_none_for_another() -> None:
+    packed = gzip.compress(b"".join(b"%d\n" % number for number in range(40_000)))
+    assert scores([packed], datagrams=False)
+    assert verdict(Heard("", (packed,))).scores == ()
+    assert fitting([packed], datagrams=False) == []
 
 
 def test_chance_frames_in_much_noise_are_no_fit() -> None:
