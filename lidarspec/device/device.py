@@ -139,8 +139,8 @@ class Device(Closing):
     @property
     def warnings(self) -> list[str]:
         """What is to be said about the source now: a file that is cut off, silence, a likely wrong baud rate, a small buffer, frames
-        that are another sensor's."""
-        return [*self._input.warnings, *self._doubts]
+        that are another sensor's, a nominal calibration."""
+        return [*self._input.warnings, *self._doubts, *([_nominal(self.sensor)] if self.stats.nominal else [])]
 
     @property
     def state(self) -> str:
@@ -330,6 +330,14 @@ class Device(Closing):
                     text = f"{self._source}: read as {self.sensor.id}, and the frames are those of {other}"
                     self._doubts.append(f"{text}; next: lidarspec detect {quote(str(self._source))}")
         return arrival
+
+
+def _nominal(sensor: Sensor) -> str:
+    """That a default calibration stood in, and how the sensor's own is given."""
+    text = f"{sensor.id}: points by the nominal calibration of the model, not of this unit"
+    if files := [name for name in sensor.configure.files if name not in sensor.options]:
+        return f"{text}; its own: -O {files[0]}=FILE, in Python sensor.configure({files[0]}=FILE)"
+    return text + (f", where no {' or '.join(sensor.state)} frame had come" if sensor.state else "")
 
 
 def _close(source: Input | Transport, recorder: Log | None) -> None:

@@ -46,6 +46,7 @@ class Counters:
         lost, duplicates, late: packets, by the sensor's sequence.
         kernel_drops, queue_dropped, foreign, disconnects: counted by the transports.
         plugin_errors: exceptions out of a plugin; `tracebacks` keeps the first ones.
+        nominal: whether a default calibration stood in for the sensor's own in any scan.
     """
 
     bytes_in: int = 0
@@ -65,10 +66,11 @@ class Counters:
     plugin_errors: int = 0
     disconnects: int = 0
     tracebacks: list[str] = field(default_factory=list, repr=False, compare=False)
+    nominal: bool = field(default=False, repr=False, compare=False)
 
     def to_dict(self) -> dict[str, Any]:
         """The counters by name."""
-        return {f.name: getattr(self, f.name) for f in fields(self) if f.name != "tracebacks"}
+        return {f.name: getattr(self, f.name) for f in fields(self) if f.compare}
 
     def error(self, traceback: str, number: int = 1) -> None:
         """Count an exception out of a plugin, and keep the first few tracebacks."""

@@ -70,7 +70,8 @@ class Scan:
         ranges = self.points.range[self.points.valid]
         span = f"{ranges.min():.2f}..{ranges.max():.2f} m" if len(ranges) else "no returns"
         rate = f"{self.rate_hz:.1f} Hz, " if np.isfinite(self.rate_hz) else ""
-        return f"Scan({len(self)} points, {rate}{span}, {'complete' if self.complete else 'partial'})"
+        nominal = ", nominal calibration" if self.points.nominal else ""
+        return f"Scan({len(self)} points, {rate}{span}, {'complete' if self.complete else 'partial'}{nominal})"
 
     def to_bins(self, n: int) -> NDArray[np.float32]:
         """The nearest return in each of n equal sectors from -pi on: (n,) float32 metres, inf where there is none."""

@@ -205,6 +205,12 @@ class Configure:
         configured = self._by_function(own) if own else sensor
         return replace(configured, options={**sensor.options, **options}, configure=self.function)
 
+    @property
+    def files(self) -> tuple[str, ...]:
+        """The names of the sensor's own options that take a path."""
+        known = inspect.signature(self.function).parameters if self.function is not None else {}
+        return tuple(name for name, parameter in known.items() if "Path" in str(parameter.annotation))
+
     def _by_function(self, options: Mapping[str, Any]) -> Sensor:
         if self.function is None:
             raise UnknownOption(min(options), OPTIONS, place=self.sensor.id)

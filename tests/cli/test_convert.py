@@ -112,6 +112,20 @@ def test_points_of_a_sensor_that_the_frames_contradict_come_with_a_word(tmp_path
     assert "the frames are those of velodyne-vlp16 (its clock advances by 1.33 ms a packet)" in told
 
 
+def test_every_verb_that_shows_points_says_where_their_angles_are_nominal(tmp_path: Path) -> None:
+    path = tmp_path / "xt32.bin"
+    path.write_bytes(b"".join(simulate(ls.sensor("hesai-xt32"), 300)))
+    picture, table = tmp_path / "out.svg", tmp_path / "out.csv"
+    for words in (
+        ["convert", path, table],
+        ["read", path, "-n", 1],
+        ["view", path, "--once"],
+        ["plot", path, "-o", picture],
+        ["stats", path],
+    ):
+        assert ran(*words, "-s", "hesai-xt32").stderr.count("-O calibration=FILE") == 1
+
+
 def test_a_log_without_its_descriptor_is_led_to_the_option_that_reads_it(tmp_path: Path) -> None:
     sensor, log, out = ls.sensor("slamtec-rplidar-a1"), tmp_path / "nodes.bin", tmp_path / "out.csv"
     log.write_bytes(b"".join(simulate(sensor, 900)))

@@ -339,6 +339,23 @@ def test_a_live_sensor_that_the_frames_contradict_is_told_of() -> None:
         assert any("those of ldrobot-stl27l" in warning for warning in device.warnings)
 
 
+def test_a_nominal_calibration_is_told_of_once_with_the_way_to_give_the_units_own(tmp_path: Path) -> None:
+    path, angles = tmp_path / "xt32.bin", tmp_path / "angles.csv"
+    path.write_bytes(b"".join(simulate(ls.sensor("hesai-xt32"), 300)))
+    angles.write_text("\n".join(f"{channel + 1},{15 - channel},0.1" for channel in range(32)), encoding="utf-8")
+    with ls.open(path) as device:
+        assert all("nominal calibration" in repr(scan) for scan in device.scans())
+        (warning,) = device.warnings
+        assert "-O calibration=FILE, in Python sensor.configure(calibration=FILE)" in warning
+    with ls.open(path, ls.sensor("hesai-xt32").configure(calibration=angles)) as device:
+        assert not any("nominal" in repr(scan) for scan in device.scans())
+        assert device.warnings == []
+    path.write_bytes(b"".join(simulate(ls.sensor("robosense-helios16p"), 300)))
+    with ls.open(path) as device:
+        assert list(device.scans())
+        assert "where no difop frame had come" in device.warnings[0]
+
+
 def test_a_file_without_a_frame_of_the_sensor_says_so(tmp_path: Path) -> None:
     path = tmp_path / "vlp16.bin"
     path.write_bytes(b"".join(simulate(ls.sensor("velodyne-vlp16"), 5)))
