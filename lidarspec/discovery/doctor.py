@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from shlex import quote
 
-from lidarspec.discovery.detect import Verdict, verdict, verdicts
+from lidarspec.discovery.detect import CLEAR, Verdict, verdict, verdicts
 from lidarspec.discovery.listen import LISTEN, Heard, bauds, has_no_baud, started_first, udp_ports
 from lidarspec.errors import LidarSpecError, UsageError, suggestion
 from lidarspec.spec.links import Serial, Udp
@@ -21,8 +21,6 @@ from lidarspec.transports.open_url import live_address, resolved, transport
 from lidarspec.transports.protocol import LiveTransport
 from lidarspec.transports.udp import BUFFER, shortfall
 
-#: share of the bytes outside frames from which on a line is bad.
-BAD = 0.02
 LOOPBACK = "lo"
 
 
@@ -227,7 +225,8 @@ def _verdict(source: str, found: Verdict, sensor: Sensor | None) -> Finding:
     if heard.baud is not None and link and heard.baud not in link.bauds:
         again = quote(with_option(source, "baud", heard.baud))
         return Finding(False, f"{name} sends{at}, and {link.baud} is declared", f"lidarspec view {again} -s {name}")
-    if 1 - score.share > BAD and heard.size > 4096:
+    cut_off = 2 * max(frame.max_length for frame in score.sensor.incoming.values()) / heard.size  # the first frame, and the last
+    if score.share + (0 if heard.datagrams else cut_off) < CLEAR:
         return Finding(False, f"{name} sends{at}, and {1 - score.share:.0%} of the bytes are in no frame: cable, ground or baud rate")
     return Finding(True, f"{name} sends{at}: {score.data_frames} data frames, {score.share:.0%} of the bytes in frames")
 

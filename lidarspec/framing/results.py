@@ -43,6 +43,7 @@ class Counters:
         bytes_filler: declared fillers among the skipped bytes.
         pending: bytes held because a candidate needs more.
         bad_checksum, bad_length, implausible: rejected candidates.
+        bad_constant: datagrams without the constants of any frame; in a stream such bytes are skipped, and are no candidate.
         lost, duplicates, late: packets, by the sensor's sequence.
         kernel_drops, queue_dropped, foreign, disconnects: counted by the transports.
         plugin_errors: exceptions out of a plugin; `tracebacks` keeps the first ones.
@@ -56,6 +57,7 @@ class Counters:
     pending: int = 0
     bad_checksum: int = 0
     bad_length: int = 0
+    bad_constant: int = 0
     implausible: int = 0
     lost: int = 0
     duplicates: int = 0

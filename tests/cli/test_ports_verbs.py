@@ -175,6 +175,15 @@ class TestDoctor:
         for name in ("velodyne-hdl32e", "robosense-m1"):
             assert f", not of {name}\n" in ran("doctor", path, "-s", name, code=1).stdout
 
+    @pytest.mark.parametrize(("damaged", "code"), [(0.03, 0), (0.3, 1), (0.6, 1)])
+    def test_a_line_is_bad_where_more_than_a_tenth_of_its_bytes_is_in_no_frame(self, tmp_path: Path, damaged: float, code: int) -> None:
+        frames = simulate(ls.sensor("ldrobot-stl27l"), 60)
+        for size in (60, 300):
+            data = [bytes(47) if (i * damaged) % 1 < damaged else frame for i, frame in enumerate((frames * 5)[:size])]
+            (tmp_path / "line.bin").write_bytes(b"".join(data))
+            said = ran("doctor", tmp_path / "line.bin", "-s", "ldrobot-stl27l", code=code).stdout
+            assert said.startswith("wrong" if code else "ok")
+
     def test_one_that_waits_to_be_started(self) -> None:
         with virtual_port("cspc-m1c1-mini") as made:
             found = ran("doctor", made.path, "-s", "cspc-m1c1-mini", "-t", "300ms", code=1).stdout
