@@ -175,7 +175,7 @@ def detect(source: str | None, duration: float, start: bool, as_json: bool, outp
     source = None if source is None else resolved(source)
     found = list(_everywhere(duration, start=start)) if source is None else _one(source, duration, start=start)
     fitting = [one for one in found if one.scores]
-    unknown = None if fitting else _unknown(found)
+    unknown = None if fitting or any(one.fault for one in found) else _unknown(found)
     if as_json:
         emit_json({"sources": [_told(one) for one in found], "structure": _structure_told(unknown)}, output)
     elif fitting:
@@ -254,6 +254,11 @@ def _conclusions(source: str | None, found: Sequence[Verdict], unknown: Structur
     if any(one.scores for one in found):
         return
     size = sum(one.heard.size for one in found)
+    for one in (faulty := [one for one in found if one.fault]):
+        yield f"{_place(one.heard)}: {one.fault}"
+        yield f"next: lidarspec crc {quote(one.heard.source)}"
+    if faulty:
+        return
     if size:
         yield f"{size} bytes, and no frame of an installed sensor" + ("" if unknown else "; nor can frames of one kind be seen in them")
         yield f"next: {_following(source, unknown)}"
@@ -303,6 +308,7 @@ def _told(one: Verdict) -> dict[str, Any]:
         "sensor": one.sensor.id if one.sensor is not None else None,
         "alike": [score.sensor.id for score in one.alike],
         "not_installed": dict(one.others),
+        "fault": one.fault or None,
         "fits": [
             {"sensor": score.sensor.id, "share": round(score.share, 4), "data_frames": score.data_frames, "told_by": score.why}
             for score in one.scores

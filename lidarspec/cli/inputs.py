@@ -13,7 +13,7 @@ from shlex import quote
 
 from lidarspec.device.device import Device
 from lidarspec.device.settings import devices
-from lidarspec.discovery.detect import chosen, nearest, verdict
+from lidarspec.discovery.detect import chosen, nearest, never_right, verdict
 from lidarspec.discovery.listen import Heard, beginning
 from lidarspec.errors import CommandError, LidarSpecError, SourceError, UsageError, WireError, suggest, system_errors
 from lidarspec.plugins import sensors
@@ -75,6 +75,8 @@ def no_frame(sensor: Sensor, given: Heard) -> WireError:
     command = f"lidarspec explain {given.source} -s {sensor.id}"
     if not data:
         return suggest(WireError(f"{given.source} holds no bytes", sensor=sensor.id), f"lidarspec build {sensor.id} --help")
+    if (fault := _never_right(given)) is not None:
+        return fault
     if len(data) > longest:
         error = WireError(f"no frame in {len(data)} bytes", sensor=sensor.id, expected="a frame", data=data[:longest])
         return suggest(error, "lidarspec sensors")
@@ -89,11 +91,19 @@ def nearest_fault(given: Heard) -> WireError:
     """No sensor fits: what the one that came farthest says, with its id, or that none came far."""
     if not given.data:
         return suggest(WireError(f"{given.source} holds no bytes"), "lidarspec sensors")
+    if (fault := _never_right(given)) is not None:
+        return fault
     best = nearest(given.data)
     if best is None:
         text = f"no frame of any of the {len(sensors())} installed sensors"
         return suggest(WireError(text, data=given.data[:QUOTED]), "lidarspec sensors")
     return suggest(best, f"lidarspec explain {given.source} -s {best.sensor}")
+
+
+def _never_right(given: Heard) -> WireError | None:
+    """That the input is frames of a sensor whose checksums are never right; None where it is not."""
+    fault = never_right(given.chunks, datagrams=given.datagrams)
+    return suggest(WireError(f"{given.source}: {fault}"), f"lidarspec crc {given.source}") if fault else None
 
 
 def nothing_came(device: Device, source: str, seconds: float | None = None) -> LidarSpecError:
@@ -102,6 +112,8 @@ def nothing_came(device: Device, source: str, seconds: float | None = None) -> L
     if not device.is_live:
         if stats.bytes_in and (instead := fits_instead(sensor, source)):
             return suggest(WireError(f"{source} {instead[0]}", sensor=sensor.id), f"the same with {instead[1]}")
+        if not stats.frames and (given := again(source)) is not None and (fault := _never_right(given)) is not None:
+            return fault
         what = "holds no bytes" if stats.bytes_in == 0 else f"has no data frame: {stats}"
         return suggest(WireError(f"{source} {what}", sensor=sensor.id), f"lidarspec explain {source} -s {sensor.id}")
     waited = "" if seconds is None else f" within {seconds:.1f} s".replace(".0 s", " s")

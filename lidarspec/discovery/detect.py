@@ -19,11 +19,14 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lidarspec.columns.columns import Fields
 from lidarspec.device.settings import named
+from lidarspec.discovery.checksum_search import search
 from lidarspec.discovery.listen import Heard, hear
 from lidarspec.errors import CommandError, LidarSpecError, UsageError, WireError, suggest
+from lidarspec.framing.decoder import Decoder
 from lidarspec.framing.frame_engine import codec
 from lidarspec.framing.results import VALID, Found
 from lidarspec.packets.packets import Packets
@@ -37,6 +40,7 @@ from lidarspec.transports.base import data_link
 from lidarspec.transports.files import RecordingTransport
 from lidarspec.transports.open_url import live_address, resolved, transport
 from lidarspec.transports.simulated import SimulatedTransport
+from lidarspec.wire.layout import Bytes2D, Seal, Sums
 from lidarspec.wire.parse import parse_typed
 from lidarspec.wire.schema import schema
 
@@ -47,6 +51,8 @@ _VALUE = re.compile(r"\b(0x[0-9a-fA-F]+|\d+)\s+([^,;:]+)")
 SHOWN = 16
 #: share of the bytes that has to be in a sensor's frames for it to fit, how close to the best another is as good, and what is beyond doubt.
 FITS, AS_GOOD, CLEAR = 0.2, 0.01, 0.9
+#: data frames one after another that are no chance even where no checksum is right.
+RHYTHM = 3
 
 
 class Told(NamedTuple):
@@ -190,12 +196,14 @@ class Verdict:
         alike: those that it may be.
         others: relatives of theirs, by id, each with what tells it apart, that are not installed: it may be one of them too; where `alike`
             is empty it is one.
+        fault: what is wrong with frames that are a sensor's but for their checksums; "" where there are none.
     """
 
     heard: Heard
     scores: tuple[Score, ...] = ()
     alike: tuple[Score, ...] = ()
     others: Mapping[str, str] = field(default_factory=dict)
+    fault: str = ""
 
     @property
     def sensor(self) -> Sensor | None:
@@ -210,11 +218,41 @@ class Verdict:
 
 def scores(chunks: Sequence[bytes], *, datagrams: bool) -> list[Score]:
     """Every installed sensor of which a data frame was found, the best first."""
-    known = [sensor for sensor in sensors().values() if any(frame.direction == "in" for frame in sensor.frames.values())]
+    known = _readable()
     found = _each(known, lambda sensor: _score(sensor, chunks, datagrams=datagrams))
     if not any(score.share >= FITS for score in found):
         found += _each(known, lambda sensor: _from_the_middle(sensor, chunks, datagrams=datagrams))
     return sorted(found, key=lambda score: (-score.share, score.sensor.id))
+
+
+def _readable() -> list[Sensor]:
+    """The installed sensors that have frames before they are configured."""
+    return [sensor for sensor in sensors().values() if sensor.incoming]
+
+
+def never_right(chunks: Sequence[bytes], *, datagrams: bool) -> str:
+    """What to say of bytes that are the frames of a sensor but for their checksums, which are never right; "" of all others."""
+    as_stored = _each(_readable(), lambda sensor: _score(sensor, chunks, datagrams=datagrams, sums=_stored))
+    found = [score for score in as_stored if score.share >= CLEAR and score.data_frames >= RHYTHM]
+    if not found or _score(found[0].sensor, chunks, datagrams=datagrams) is not None:
+        return ""
+    kinds = [item.frame for item in found[0].found]
+    most = max(set(kinds), key=kinds.count)
+    frames = [item.data for item in found[0].found if item.frame == most]
+    ids = " or ".join(score.sensor.id for score in found)
+    text = f"{len(frames)} {most} frames of {ids} by their constants, lengths and rhythm, and their checksums are never right"
+    match = next(iter(search(frames)), None)
+    if match is None:
+        return f"{text}; no other checksum fits either"
+    length = len(frames[0])
+    covered = sum(last - first for first, last in match.span.ranges(match.place, length))
+    where = f"{match.algorithm.describe()} in {match.place} is right in {match.right} of {match.total}"
+    return f"{text}: {where}, over {covered} of the {length - match.place.size} other bytes ({match.span.told(match.place, length)})"
+
+
+def _stored(seal: Seal, rows: Bytes2D) -> NDArray[np.uint64]:
+    """The checksums that stand in the frames, whatever they are, in place of those that should."""
+    return seal.stored(rows)
 
 
 def _each(known: Sequence[Sensor], scored: Callable[[Sensor], Score | None]) -> list[Score]:
@@ -229,8 +267,8 @@ def _each(known: Sequence[Sensor], scored: Callable[[Sensor], Score | None]) -> 
     return [score for key, score in shared.items() if isinstance(key, str) and score is not None]
 
 
-def _score(sensor: Sensor, chunks: Sequence[bytes], *, datagrams: bool) -> Score | None:
-    decoder = sensor.decoder(stream=not datagrams)
+def _score(sensor: Sensor, chunks: Sequence[bytes], *, datagrams: bool, sums: Sums | None = None) -> Score | None:
+    decoder = Decoder(sensor, stream=not datagrams, sums=sums)
     items = [item for chunk in chunks for item in decoder.feed(chunk)] + decoder.finish()
     number = sum(decoder.stats.frames.get(name, 0) for name in sensor.data_frames)
     return Score(sensor, 1 - decoder.stats.bytes_skipped / decoder.stats.bytes_in, number, tuple(items)) if number else None
@@ -248,7 +286,7 @@ def verdict(heard: Heard) -> Verdict:
     fitting = [score for score in scores(heard.chunks, datagrams=heard.datagrams) if score.share >= FITS]
     best = [score for score in fitting if score.share >= fitting[0].share - AS_GOOD]
     if not best:
-        return Verdict(heard)
+        return Verdict(heard, fault=never_right(heard.chunks, datagrams=heard.datagrams))
     told = told_apart([score.sensor for score in best], best[0].found)
     alike = [replace(score, why=told.alike[score.sensor.id]) for score in best if score.sensor.id in told.alike]
     if len(alike) > 1 and heard.baud is not None:
@@ -348,6 +386,8 @@ def declared(source: str | Path) -> Sensor | None:
 def _nothing(source: str, found: Sequence[Verdict]) -> Exception:
     """What to say where no sensor fits."""
     heard = max((one.heard for one in found), key=lambda one: one.size, default=Heard(source))
+    if fault := next((one.fault for one in found if one.fault), ""):
+        return suggest(WireError(f"{source}: {fault}"), f"lidarspec crc {source}")
     if heard.size:
         return WireError(f"{source}: no installed sensor's frames are in it", data=heard.chunks[0][:SHOWN])
     if live_address(source) is None:

@@ -209,6 +209,8 @@ def _verdict(source: str, found: Verdict, sensor: Sensor | None) -> Finding:
     quoted = quote(source)
     if not heard.size:
         return _nothing(source, sensor)
+    if found.fault:
+        return Finding(False, found.fault, f"lidarspec crc {quoted}")
     if not found.scores:
         at = " at any baud rate" if heard.baud is not None and len(bauds()) > 1 else ""
         return Finding(False, f"{heard.size} bytes came, and no frame of an installed sensor{at}", f"lidarspec detect {quoted}")

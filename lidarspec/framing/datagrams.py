@@ -171,7 +171,7 @@ class _Batch:
         least = min(self._framing.ends[kind] for kind in self._framing.active(mode))
         unknown = np.isin(reasons, (VALID, CONSTANT))
         others = unknown & (sizes >= max(least, 1))
-        if number := np.count_nonzero(others):
+        if number := int(np.count_nonzero(others)):
             self._piece.rejected["bad_constant"] = self._piece.rejected.get("bad_constant", 0) + number
         self._piece.reject(np.bincount(np.where(unknown, LENGTH, reasons)[~others]).tolist(), ())
 

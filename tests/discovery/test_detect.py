@@ -18,6 +18,7 @@ from lidarspec.discovery.detect import detected, fitting, scores, verdict, verdi
 from lidarspec.discovery.listen import Heard, bauds, hear, probe, started_first, udp_ports
 from lidarspec.discovery.periods import structure
 from lidarspec.simulation.simulator import simulate
+from lidarspec.spec import Crc
 from lidarspec.testing.fixtures import virtual_port
 from tests.lines import Port, paced, port, working
 from tests.sensors.evidence import capture
@@ -165,6 +166,32 @@ def test_what_is_no_fit_for_one_question_is_none_for_another() -> None:
     assert scores([packed], datagrams=False)
     assert verdict(Heard("", (packed,))).scores == ()
     assert fitting([packed], datagrams=False) == []
+
+
+def firmware_bug(number: int) -> list[bytes]:
+    """Frames of an STL-27L whose checksum leaves out their first byte."""
+    crc = Crc(width=8, poly=0x4D)
+    return [frame[:46] + bytes([crc(frame[1:46])]) for frame in simulate(ls.sensor("ldrobot-stl27l"), number)]
+
+
+def test_frames_whose_checksums_are_never_right_are_found_and_answered(tmp_path: Path) -> None:
+    data, path = b"".join(firmware_bug(60)), tmp_path / "bug.bin"
+    found = verdict(Heard("", (data,)))
+    assert (found.scores, found.sensor) == ((), None)
+    assert found.fault.startswith("60 data frames of ldrobot-ld06 or ldrobot-stl27l by their constants, lengths and rhythm")
+    assert "CRC-8 poly 0x4d in the last byte is right in 60 of 60, over 45 of the 46 other bytes" in found.fault
+    path.write_bytes(data)
+    with pytest.raises(WireError, match="their checksums are never right") as error:
+        detected(path)
+    assert error.value.__notes__ == [f"next: lidarspec crc {path}"]
+    noise = random.Random(2)
+    sealed_by_chance = [frame[:46] + noise.randbytes(1) for frame in firmware_bug(60)]
+    assert "no other checksum fits either" in verdict(Heard("", (b"".join(sealed_by_chance[:12]),))).fault
+
+
+def test_a_wrong_checksum_now_and_then_is_damage_and_no_bug() -> None:
+    good, bad = simulate(ls.sensor("ldrobot-stl27l"), 60), firmware_bug(60)
+    assert verdict(Heard("", (b"".join(bad[:58] + good[58:]),))).fault == ""
 
 
 def test_chance_frames_in_much_noise_are_no_fit() -> None:
