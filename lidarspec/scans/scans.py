@@ -118,15 +118,19 @@ class Losses:
         """Whether at least half of each scan is there that ends in these packets: one for each of the `cuts`, which are between points."""
         sizes = packets.table.sizes[: points.ready]
         missing = self._missing_before(packets, sizes)
-        edges = np.searchsorted(first_points(points), cuts).tolist() if len(cuts) else []
+        first = first_points(points) if len(cuts) else sizes
         judged, start = list[bool](), 0
-        for edge in edges:
+        for cut in cuts:
+            edge = int(np.searchsorted(first, cut, side="right")) - 1  # the packet that the cut is in
+            begins = bool(first[edge] == cut)
+            edge += not begins
             self._there += float(sizes[start:edge].sum())
-            self._missing += float(missing[start : edge + 1].sum())
+            self._missing += float(missing[start : edge + begins].sum())
             judged.append(self._missing <= self._there)
             # of what is missing at the cut nobody knows to which scan it belongs, unless the packet there says that it is the first
-            self._there, self._missing = 0.0, 0.0 if self._starts_are_seen else float(missing[edge : edge + 1].sum())
-            start, missing[edge : edge + 1] = edge, 0
+            self._there, self._missing = 0.0, float(missing[edge]) if begins and not self._starts_are_seen else 0.0
+            missing[edge : edge + begins] = 0
+            start = edge
         self._there += float(sizes[start:].sum())
         self._missing += float(missing[start:].sum())
         return judged

@@ -206,7 +206,7 @@ def test_packets_that_stay_where_they_were_read_give_the_same_points(name: str, 
 @pytest.mark.parametrize("backend", ["numpy", "construct"])
 def test_a_scan_whose_packets_are_mostly_lost_is_not_complete(backend: str) -> None:
     sensor = ls.sensor("cspc-m1c1-mini")
-    frames = simulate(sensor, 400)
+    frames = simulate(sensor, 1500)
     noise = random.Random(5)
 
     def scans_with(share: float, pieces: int) -> list[Scan]:
@@ -222,7 +222,7 @@ def test_a_scan_whose_packets_are_mostly_lost_is_not_complete(backend: str) -> N
     for pieces in (1, 7):
         noise.seed(6)
         damaged = scans_with(0.9, pieces)
-        assert damaged
+        assert len(damaged) > 3
         assert not any(scan.complete or np.isfinite(scan.rate_hz) for scan in damaged)
 
 
