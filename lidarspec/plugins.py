@@ -441,13 +441,17 @@ def sensors() -> dict[str, Sensor]:
     return registry().sensors()
 
 
-def sensor(name: str | Path) -> Sensor:
+def sensor(name: str | Path | Sensor) -> Sensor:
     """One sensor: an installed one by id or alias, or one out of a file, "./mysensor.py" ("./mysensor.py:id" if it has several).
+
+    A sensor is given back as it is.
 
     Raises:
         UnknownSensor: with a suggestion.
         SourceError, SpecError: for a file that cannot be read, or describes no sensor.
     """
+    if isinstance(name, Sensor):
+        return name
     text = str(name)
     if "/" in text or "\\" in text or text.endswith(".py"):
         return _from_file(text)

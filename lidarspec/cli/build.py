@@ -187,7 +187,7 @@ def send(
     source: str,
     command: str | None,
     assignments: Sequence[str],
-    sensor_id: str | None,
+    sensor_id: str | Sensor | None,
     digits: str | None,
     timeout: float | None,
     as_json: bool,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import itertools
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
@@ -10,24 +9,19 @@ from pathlib import Path
 
 import click
 
-from lidarspec.cli.inputs import conclude, nearest_fault, no_frame, nothing_came, refuse_overwriting, scans_of
+from lidarspec.cli.inputs import again, conclude, fits_instead, nearest_fault, no_frame, nothing_came, refuse_overwriting, scans_of
 from lidarspec.cli.options import colour_option, count_option, sensor_option
 from lidarspec.cli.output import Progress, emit, emit_json, note, size
 from lidarspec.device.device import Device, open as open_device
-from lidarspec.discovery.detect import detected, scores
-from lidarspec.discovery.listen import Heard, beginning
-from lidarspec.errors import LidarSpecError, UsageError, WireError, suggest
+from lidarspec.discovery.detect import detected
+from lidarspec.errors import UsageError, WireError, suggest, suggestion
 from lidarspec.formats import format_of, write
 from lidarspec.plugins import sensor as named_sensor
 from lidarspec.scans.scans import Scan
 from lidarspec.spec.sensor import Sensor
-from lidarspec.transports.open_url import transport
 from lidarspec.transports.protocol import no_bytes
 from lidarspec.view.polar import look
 from lidarspec.view.svg import svg
-
-#: datagrams and bytes looked at again to say why there is no data in a file.
-LOOKED_AT = 1 << 16
 
 
 @dataclass
@@ -59,7 +53,9 @@ class Written:
 @click.option("--all", "every_point", is_flag=True, help="Keep points without a valid return.")
 @click.option("--force", is_flag=True, help="Overwrite OUT.")
 @click.option("--json", "as_json", is_flag=True, help="Print a summary as JSON.")
-def convert(source: str, target: str, sensor_id: str | None, count: int | None, every_point: bool, force: bool, as_json: bool) -> None:
+def convert(
+    source: str, target: str, sensor_id: str | Sensor | None, count: int | None, every_point: bool, force: bool, as_json: bool
+) -> None:
     """Write the points of a capture or raw file to a file, in the format of its suffix.
 
     .csv and .npz hold x y z range azimuth elevation intensity time ring return_index, those that the sensor has, and the
@@ -86,7 +82,7 @@ def _detected(source: str, target: str) -> Sensor:
     except UsageError as error:
         raise suggest(error, f"lidarspec convert {source} {target} -s ID") from None
     except WireError as error:
-        given = _again(source)
+        given = None if suggestion(error) else again(source)
         raise error if given is None else nearest_fault(given) from None
 
 
@@ -105,27 +101,13 @@ def _no_data(device: Device, source: str, target: str) -> Exception:
         return suggest(WireError(no_bytes(source, device.warnings), sensor=sensor.id), f"lidarspec show {sensor.id}")
     if (failure := stats.failure(sensor.id)) is not None:
         return failure
-    given = _again(source)
+    instead = fits_instead(sensor, source)
+    if instead is not None:
+        return suggest(WireError(f"{source} {instead[0]}", sensor=sensor.id), f"lidarspec convert {source} {target} {instead[1]}")
+    given = again(source) if not stats.frames else None
     if given is not None:
-        others = [score.sensor.id for score in scores(list(given.chunks), datagrams=given.datagrams) if score.sensor.id != sensor.id]
-        if others:
-            error = WireError(f"no data frame in {source}; its frames are those of {', '.join(others)}", sensor=sensor.id)
-            return suggest(error, f"lidarspec convert {source} {target} -s {others[0]}")
-        if not stats.frames:
-            return no_frame(sensor, given)
+        return no_frame(sensor, given)
     return suggest(WireError(f"no data frame in {source}: {stats}", sensor=sensor.id), f"lidarspec explain {source} -s {sensor.id}")
-
-
-def _again(source: str) -> Heard | None:
-    """The beginning of a file once more; None for what can be read only once."""
-    if not Path(source.partition("?")[0]).is_file():
-        return None
-    with contextlib.closing(transport(source)) as opened:
-        try:
-            chunks = tuple(chunk.data for chunk in beginning(opened, LOOKED_AT))
-            return Heard(source, chunks, opened.datagrams, warnings=tuple(opened.warnings))
-        except LidarSpecError:
-            return None
 
 
 @click.command()
@@ -135,7 +117,7 @@ def _again(source: str) -> Heard | None:
 @click.option("--scan", "number", type=click.IntRange(min=1), metavar="NUMBER", default=1, show_default=True, help="Which whole scan.")
 @colour_option
 @click.option("--max-range", type=click.FloatRange(min=0, min_open=True), metavar="METRES", help="From the middle to the edge.")
-def plot(source: str, output: str, sensor_id: str | None, number: int, ramp: str, max_range: float | None) -> None:
+def plot(source: str, output: str, sensor_id: str | Sensor | None, number: int, ramp: str, max_range: float | None) -> None:
     """A scan as an SVG picture.
 
     From above, and from the side where the points are not in one plane.

@@ -15,7 +15,7 @@ from lidarspec.cli.inputs import read
 from lidarspec.cli.options import DURATION, output_options, sensor_option
 from lidarspec.cli.output import emit, emit_json, note, table
 from lidarspec.discovery.checksum_search import search
-from lidarspec.discovery.detect import Verdict, best, verdict, verdicts
+from lidarspec.discovery.detect import Verdict, best, chosen, names, others_named, verdict, verdicts
 from lidarspec.discovery.doctor import computer, examined
 from lidarspec.discovery.listen import LISTEN, Heard, everywhere, hear, probe, started_first, udp_ports
 from lidarspec.discovery.periods import Structure, cut, structure
@@ -23,6 +23,7 @@ from lidarspec.discovery.samples import Match
 from lidarspec.errors import NO_SENSORS, SourceError, UsageError, WireError, suggest
 from lidarspec.plugins import sensor as named_sensor, sensors
 from lidarspec.spec.links import Serial, Udp
+from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.base import data_link, with_option
 from lidarspec.transports.open_url import live_address, resolved
 from lidarspec.transports.ports import SerialPort, User, serial_ports, udp_users
@@ -179,7 +180,7 @@ def detect(source: str | None, duration: float, start: bool, as_json: bool, outp
     source = None if source is None else resolved(source)
     found = list(_everywhere(duration, start=start)) if source is None else _one(source, duration, start=start)
     fitting = [one for one in found if one.scores]
-    unknown = None if fitting else _unknown(found)
+    unknown = None if fitting or any(one.fault for one in found) else _unknown(found)
     if as_json:
         emit_json({"sources": [_told(one) for one in found], "structure": _structure_told(unknown)}, output)
     elif fitting:
@@ -188,7 +189,7 @@ def detect(source: str | None, duration: float, start: bool, as_json: bool, outp
         emit(_structure_text(unknown), output)
     for line in _conclusions(source, found, unknown, start=start):
         note(line)
-    if not fitting:
+    if not any(one.alike for one in fitting):
         raise click.exceptions.Exit(_code(source, found))
 
 
@@ -215,7 +216,7 @@ def _everywhere(duration: float, *, start: bool) -> Iterator[Verdict]:
         try:
             yield from _one(port, duration, start=start)
         except SourceError as error:
-            yield Verdict(Heard(port, failure=error), (), ())
+            yield Verdict(Heard(port, failure=error))
     for heard in everywhere([], seconds=duration):
         yield verdict(heard)
 
@@ -231,8 +232,10 @@ def _detected_text(found: Sequence[Verdict], output: str | None) -> str:
     for one in found:
         alike = {score.sensor.id for score in one.alike}
         for score in one.scores:
-            verdict_of = "no" if score.sensor.id not in alike else "yes" if len(alike) == 1 else "perhaps"
+            verdict_of = "no" if score.sensor.id not in alike else "yes" if one.sensor is not None else "perhaps"
             rows.append([_place(one.heard), score.sensor.id, verdict_of, f"{score.share:.1%}", str(score.data_frames), score.why])
+        verdict_of = "perhaps" if alike else "yes"
+        rows += [[_place(one.heard), f"{name}, not installed", verdict_of, "", "", why] for name, why in one.others.items()]
     return table(["source", "sensor", "is it", "in frames", "data frames", "told by"], rows, output)
 
 
@@ -249,14 +252,21 @@ def _conclusions(source: str | None, found: Sequence[Verdict], unknown: Structur
         if one.heard.failure is not None:
             yield f"{one.heard.failure}"
         elif one.sensor is not None:
-            yield f"next: lidarspec {_verb(one)} {_again(one)} -s {one.sensor.id}"
+            yield f"next: lidarspec {_verb(one)} {_again(one)} {chosen(one.sensor)}"
         elif one.alike:
-            ids = [score.sensor.id for score in one.alike]
-            yield f"{_place(one.heard)}: {', '.join(ids)} send the same frames, and nothing in these tells them apart: choose one"
-            yield f"next: lidarspec {_verb(one)} {_again(one)} -s {ids[0]}"
+            yield f"{_place(one.heard)}: {', '.join(names(one))} send the same frames, and nothing in these tells them apart: choose one"
+            yield f"next: lidarspec {_verb(one)} {_again(one)} {chosen(one.alike[0].sensor)}"
+        elif one.others:
+            yield f"{_place(one.heard)}: {others_named(one)}"
+            yield f"next: lidarspec new {next(iter(one.others))} --from-capture {quote(one.heard.source)}"
     if any(one.scores for one in found):
         return
     size = sum(one.heard.size for one in found)
+    for one in (faulty := [one for one in found if one.fault]):
+        yield f"{_place(one.heard)}: {one.fault}"
+        yield f"next: lidarspec crc {quote(one.heard.source)}"
+    if faulty:
+        return
     if size:
         yield f"{size} bytes, and no frame of an installed sensor" + ("" if unknown else "; nor can frames of one kind be seen in them")
         yield f"next: {_following(source, unknown)}"
@@ -309,6 +319,8 @@ def _told(one: Verdict) -> dict[str, Any]:
         "failure": str(heard.failure) if heard.failure else None,
         "sensor": one.sensor.id if one.sensor is not None else None,
         "alike": [score.sensor.id for score in one.alike],
+        "not_installed": dict(one.others),
+        "fault": one.fault or None,
         "fits": [
             {"sensor": score.sensor.id, "share": round(score.share, 4), "data_frames": score.data_frames, "told_by": score.why}
             for score in one.scores
@@ -347,7 +359,7 @@ def _structure_text(found: Structure) -> str:
 @sensor_option
 @click.option("-t", "--duration", type=DURATION, default=LISTEN, metavar="TIME", help="How long to listen for, each time.")
 @output_options
-def doctor(source: str | None, sensor_id: str | None, duration: float, as_json: bool, output: str | None) -> None:
+def doctor(source: str | None, sensor_id: str | Sensor | None, duration: float, as_json: bool, output: str | None) -> None:
     """What keeps a sensor's bytes from coming, and the command that mends it.
 
     Looks for missing ports and rights, ports in use, small buffers, silence, a wrong baud rate, a wrong interface. Without SOURCE

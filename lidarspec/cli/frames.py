@@ -31,7 +31,7 @@ words_argument = click.argument("words", metavar="HEX|FILE|-", nargs=-1, require
 @sensor_option
 @count_option("frames")
 @output_options
-def parse(words: Sequence[str], sensor_id: str | None, count: int | None, as_json: bool, output: str | None) -> None:
+def parse(words: Sequence[str], sensor_id: str | Sensor | None, count: int | None, as_json: bool, output: str | None) -> None:
     """The fields of each frame in some bytes."""
     with opened(words) as (given, chunks):
         sensor, fits = _sensor(given, sensor_id)
@@ -77,7 +77,7 @@ def _tables(sensor: Sensor, frames: Iterable[Piece], output: str | None) -> Iter
 @output_options
 def explain(
     words: Sequence[str],
-    sensor_id: str | None,
+    sensor_id: str | Sensor | None,
     frame: str | None,
     count: int | None,
     bad: bool,
@@ -275,7 +275,7 @@ def _compare(
         emit_lines([(Span(f"{sensor.id} {before.frame}", "title"),), *told(differing, (len(before.data), len(after.data)))], output)
 
 
-def _sensor(given: Heard, sensor_id: str | None, *, damaged: bool = False) -> tuple[Sensor, list[str]]:
+def _sensor(given: Heard, sensor_id: str | Sensor | None, *, damaged: bool = False) -> tuple[Sensor, list[str]]:
     """The sensor named, or the one whose bytes these are, and the ids of all whose bytes they could be."""
     if sensor_id is not None:
         return named_sensor(sensor_id), []

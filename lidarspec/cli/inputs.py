@@ -10,6 +10,7 @@ import sys
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from pathlib import Path
 from shlex import quote
 
 import click
@@ -18,8 +19,8 @@ from lidarspec.cli.failures import FINDINGS
 from lidarspec.cli.output import note
 from lidarspec.device.device import Device
 from lidarspec.device.settings import devices
-from lidarspec.discovery.detect import nearest
-from lidarspec.discovery.listen import LOOKED_AT, Heard
+from lidarspec.discovery.detect import chosen, nearest, never_right, verdict
+from lidarspec.discovery.listen import LOOKED_AT, Heard, beginning
 from lidarspec.errors import CommandError, LidarSpecError, SourceError, UsageError, WireError, suggest, system_errors
 from lidarspec.plugins import sensors
 from lidarspec.scans.scans import Scan
@@ -146,6 +147,8 @@ def no_frame(sensor: Sensor, given: Heard) -> WireError:
     command = f"lidarspec explain {given.source} -s {sensor.id}"
     if not data:
         return suggest(WireError(no_bytes(given.source, given.warnings), sensor=sensor.id), f"lidarspec build {sensor.id} --help")
+    if (fault := _never_right(given)) is not None:
+        return fault
     if len(data) > longest:
         error = WireError(f"no frame in {len(data)} bytes", sensor=sensor.id, expected="a frame", data=data[:longest])
         return suggest(error, "lidarspec sensors")
@@ -160,11 +163,19 @@ def nearest_fault(given: Heard) -> WireError:
     """No sensor fits: what the one that came farthest says, with its id, or that none came far."""
     if not given.data:
         return suggest(WireError(no_bytes(given.source, given.warnings)), "lidarspec sensors")
+    if (fault := _never_right(given)) is not None:
+        return fault
     best = nearest(given.data)
     if best is None:
         text = f"no frame of any of the {len(sensors())} installed sensors" if sensors() else "no frame of an installed sensor"
         return suggest(WireError(text, data=given.data[:QUOTED]), "lidarspec sensors")
     return suggest(best, f"lidarspec explain {given.source} -s {best.sensor}")
+
+
+def _never_right(given: Heard) -> WireError | None:
+    """That the input is frames of a sensor whose checksums are never right; None where it is not."""
+    fault = never_right(given.chunks, datagrams=given.datagrams)
+    return suggest(WireError(f"{given.source}: {fault}"), f"lidarspec crc {given.source}") if fault else None
 
 
 def nothing_came(device: Device, source: str, seconds: float | None = None) -> LidarSpecError:
@@ -173,6 +184,10 @@ def nothing_came(device: Device, source: str, seconds: float | None = None) -> L
     if (failure := stats.failure(sensor.id)) is not None:
         return failure
     if not device.is_live:
+        if stats.bytes_in and (instead := fits_instead(sensor, source)):
+            return suggest(WireError(f"{source} {instead[0]}", sensor=sensor.id), f"the same with {instead[1]}")
+        if not stats.frames and (given := again(source)) is not None and (fault := _never_right(given)) is not None:
+            return fault
         said = (
             "; ".join([f"{source} has no data frame: {stats}", *device.warnings]) if stats.bytes_in else no_bytes(source, device.warnings)
         )
@@ -198,6 +213,32 @@ def conclude(device: Device) -> None:
         raise failure
     if device.stats.unread:
         raise click.exceptions.Exit(FINDINGS)
+
+
+def again(source: str) -> Heard | None:
+    """The beginning of a file once more; None for what can be read only once."""
+    if not Path(source.partition("?")[0]).is_file():
+        return None
+    with contextlib.closing(transport(source)) as file:
+        try:
+            chunks = tuple(chunk.data for chunk in beginning(file, LOOKED_AT))
+            return Heard(source, chunks, file.datagrams, warnings=tuple(file.warnings))
+        except LidarSpecError:
+            return None
+
+
+def fits_instead(sensor: Sensor, source: str) -> tuple[str, str] | None:
+    """What a file holds that has no data frame of a sensor, and the options with which it is read; None where nothing fits."""
+    given = again(source)
+    found = verdict(given).scores if given is not None else ()
+    own = next((score.sensor.options for score in found if score.sensor.id == sensor.id), None)
+    if own:
+        told = " and ".join(f"{name}={value}" for name, value in own.items())
+        return f"does not say which data frames it holds: they are found with {told}", chosen(sensor.configure(**own))
+    others = [score.sensor for score in found if score.sensor.id != sensor.id]
+    if not others:
+        return None
+    return f"has no data frame of it; its frames are those of {', '.join(other.id for other in others)}", chosen(others[0])
 
 
 class Patience:

@@ -2,21 +2,53 @@
 
 from __future__ import annotations
 
+import functools
 import math
-from collections.abc import Callable
+import tomllib
+from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
 
 import click
 
 from lidarspec.errors import UsageError
+from lidarspec.plugins import sensor
 from lidarspec.spec.fields import duration, share
+from lidarspec.spec.sensor import Sensor
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 def sensor_option(function: Function) -> Function:
-    """``-s/--sensor``."""
-    return click.option("-s", "--sensor", "sensor_id", metavar="ID", help="The sensor: an id, an alias, or a file ./mysensor.py.")(function)
+    """``-s/--sensor``, and ``-O`` for what it is configured with: the verb is given an id, or the sensor so configured."""
+
+    @functools.wraps(function)
+    def configured(*args: Any, sensor_id: str | None, options: Sequence[str], **others: Any) -> Any:
+        return function(*args, sensor_id=_configured(sensor_id, options), **others)
+
+    told = "An option of the sensor, such as calibration=FILE or answer=FRAME; may be given again."
+    chosen = click.option("-O", "--option", "options", metavar="NAME=VALUE", multiple=True, help=told)(configured)
+    named = click.option("-s", "--sensor", "sensor_id", metavar="ID", help="The sensor: an id, an alias, or a file ./mysensor.py.")
+    return named(chosen)  # type: ignore[return-value]
+
+
+def _configured(sensor_id: str | None, options: Sequence[str]) -> str | Sensor | None:
+    if not options:
+        return sensor_id
+    if sensor_id is None:
+        raise UsageError("-O is an option of a sensor: name the sensor with -s")
+    given = dict(option.partition("=")[::2] for option in options)
+    if unset := [option for option in options if "=" not in option]:
+        raise UsageError(f"-O {unset[0]}: an option has a value: NAME=VALUE")
+    configured: Sensor = sensor(sensor_id).configure(**{name: _value(text) for name, text in given.items()})
+    return configured
+
+
+def _value(text: str) -> Any:
+    """A number, true or false as in `lidarspec.toml`; all else is text."""
+    try:
+        return tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        return text
 
 
 def count_option(what: str, **more: Any) -> Callable[[Function], Function]:

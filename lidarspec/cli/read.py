@@ -21,6 +21,7 @@ from lidarspec.cli.output import note
 from lidarspec.device.device import Device, open as open_device
 from lidarspec.errors import UnknownFrame
 from lidarspec.scans.scans import Scan
+from lidarspec.spec.sensor import Sensor
 from lidarspec.view.feed import LOOK, Feed, Reading, told
 
 #: unit, width and decimals of the columns of points.
@@ -60,7 +61,7 @@ ROUNDED = 1e-6
 @click.option("--json", "as_json", is_flag=True, help="Print a JSON object on each line.")
 def read(
     source: str,
-    sensor_id: str | None,
+    sensor_id: str | Sensor | None,
     whole: bool,
     frame: str | None,
     count: int | None,
@@ -236,7 +237,13 @@ class Lines:
 @click.option("--max-errors", type=SHARE, help="Exit code 1 where more of the frames are wrong or lost, such as 1%.")
 @click.option("--json", "as_json", is_flag=True, help="Print a JSON object on each line.")
 def stats(
-    source: str, sensor_id: str | None, count: int | None, duration: float | None, interval: float, max_errors: float | None, as_json: bool
+    source: str,
+    sensor_id: str | Sensor | None,
+    count: int | None,
+    duration: float | None,
+    interval: float,
+    max_errors: float | None,
+    as_json: bool,
 ) -> None:
     """How a sensor is doing: speed, rates, errors, loss, jitter, queue.
 

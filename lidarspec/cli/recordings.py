@@ -40,7 +40,7 @@ from lidarspec.transports.serving import LATE, Replay
 def record(
     source: str,
     target: str,
-    sensor_id: str | None,
+    sensor_id: str | Sensor | None,
     seconds: float | None,
     count: int | None,
     no_start: bool,
@@ -134,7 +134,7 @@ def _view_of(kept: Appender, sensor: Sensor | None) -> str:
 @click.option("--force", is_flag=True, help="Overwrite a file to play to.")
 @sensor_option
 @click.option("--json", "as_json", is_flag=True, help="Print a summary as JSON, with the SHA-256 of all bytes.")
-def replay(file: str, place: str, speed: float | None, loop: bool, force: bool, sensor_id: str | None, as_json: bool) -> None:
+def replay(file: str, place: str, speed: float | None, loop: bool, force: bool, sensor_id: str | Sensor | None, as_json: bool) -> None:
     """A recording or capture, sent again as it came: bit for bit, and by the clock.
 
     To a pty or tcp:// it begins when somebody opens it. udp:// without a port uses those of the recording. A new .lsr or .pcap
@@ -177,7 +177,7 @@ def _run(played: Replay, outlet: Outlet, file: str) -> bool:
     return False
 
 
-def _sensor(source: Transport, sensor_id: str | None) -> Sensor | None:
+def _sensor(source: Transport, sensor_id: str | Sensor | None) -> Sensor | None:
     """The sensor that is named, or the one of the recording if it is installed; None where nobody knows."""
     if sensor_id:
         return named_sensor(sensor_id)

@@ -148,7 +148,7 @@ def _ended_by_terminate() -> Iterator[None]:
 @count_option("whole scans", default=5, show_default=True)
 @click.option("--errors", type=SHARE, default="1%", show_default=True, help="Share of the bytes that the line damages.")
 @click.option("--json", "as_json", is_flag=True, help="Print the summary as JSON.")
-def demo(sensor_id: str | None, count: int, errors: float, as_json: bool) -> None:
+def demo(sensor_id: str | Sensor | None, count: int, errors: float, as_json: bool) -> None:
     """A simulated sensor on a port: started, read through a bad line, recorded, read again, drawn."""
     simulated = (one for one in registry().sensors().values() if any(one.simulation_of(name).sweep for name in one.data_frames))
     sensor = named_sensor(sensor_id) if sensor_id else next(simulated, None)

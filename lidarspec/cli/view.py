@@ -13,6 +13,7 @@ from lidarspec.cli.inputs import PATIENCE, conclude, nothing_came
 from lidarspec.cli.options import DURATION, colour_option, sensor_option
 from lidarspec.cli.output import drawn, note
 from lidarspec.device.device import Device, open as open_device
+from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.open_url import is_live
 from lidarspec.view.canvas import Cells
 from lidarspec.view.feed import LOOK, Feed
@@ -27,7 +28,7 @@ from lidarspec.view.screen import Screen, Terminated, encodable, interactive, ke
 @click.option("-t", "--duration", type=DURATION, help="How long at most, such as 30s; for a first picture 10s.")
 @click.option("--once", is_flag=True, help="Print one picture and end, as where standard output is no terminal.")
 @colour_option
-def view(source: str, sensor_id: str | None, duration: float | None, once: bool, ramp: str) -> None:
+def view(source: str, sensor_id: str | Sensor | None, duration: float | None, once: bool, ramp: str) -> None:
     """A sensor at work, drawn in the terminal.
 
     From above, and from the side where the points are not in one plane. A file is played at its own speed. One picture is printed

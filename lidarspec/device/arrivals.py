@@ -10,6 +10,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import accumulate
 from pathlib import Path
+from shlex import quote
 from typing import Any, Protocol
 
 import numpy as np
@@ -248,7 +249,11 @@ class FileInput(Input):
 
     @property
     def warnings(self) -> list[str]:
-        return list(self._transport.warnings)
+        said, stats = list(self._transport.warnings), self.decoder.stats
+        if self.state == "ended" and stats.bytes_in and not any(name in stats.frames for name in self._sensor.data_frames):
+            text = f"{self._source}: {stats.bytes_in} bytes, and no data frame of {self._sensor.id} among them"
+            said.append(f"{text}; next: lidarspec detect {quote(str(self._source))}")
+        return said
 
     @property
     def stats(self) -> Counters:

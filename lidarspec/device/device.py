@@ -11,16 +11,17 @@ import weakref
 from collections import deque
 from collections.abc import Iterator, Mapping
 from pathlib import Path
+from shlex import quote
 from typing import Any, overload
 
 from lidarspec.device.arrivals import Arrival, FileInput, Input
 from lidarspec.device.live_input import PERIOD, LiveInput
 from lidarspec.device.session import Reply
 from lidarspec.device.settings import named
-from lidarspec.discovery.detect import detected
+from lidarspec.discovery.detect import contradiction, detected
 from lidarspec.errors import SourceError, UsageError, suggest
 from lidarspec.framing.decoder import Decoder
-from lidarspec.framing.results import Counters, Frames
+from lidarspec.framing.results import Counters, Found, Frames
 from lidarspec.packets.packets import Packets
 from lidarspec.packets.stream import PacketStream, data_frame
 from lidarspec.plugins import sensor as named_sensor
@@ -34,6 +35,8 @@ from lidarspec.transports.protocol import Closing, LiveTransport, Transport
 
 #: batches kept while nobody knows yet which data frame the sensor answers in.
 UNDECIDED = 256
+#: frames that are asked whether they are another sensor's.
+EXAMINED = 64
 #: seconds that one wait for data takes where there is no end to waiting.
 LONG = 3600.0
 
@@ -116,6 +119,8 @@ class Device(Closing):
         self._streams: dict[str | None, PacketReader] = {}
         self._latest, self._unseen = ScanStream(sensor, mount), deque[Scan]()
         self._ahead: Arrival | None = None
+        self._examined: list[Found] | None = [] if sensor.relatives else None
+        self._doubts: list[str] = []
         self._own_recorder: Log | None = None
         self._input = self._opened(backend, record, overflow, period)
         self._finalizer = weakref.finalize(self, _close, self._input, self._own_recorder)
@@ -133,10 +138,11 @@ class Device(Closing):
 
     @property
     def warnings(self) -> list[str]:
-        """What is to be said about the source now: a file that is cut off, silence, a likely wrong baud rate, a small buffer; and what
-        the plugin failed at."""
+        """What is to be said about the source now: a file that is cut off, silence, a likely wrong baud rate, a small buffer, frames
+        that are another sensor's, a nominal calibration; and what the plugin failed at."""
         failure = self.stats.failure(self.sensor.id)
-        return self._input.warnings if failure is None else [*self._input.warnings, str(failure)]
+        nominal = [_nominal(self.sensor)] if self.stats.nominal else []
+        return [*self._input.warnings, *self._doubts, *nominal, *([] if failure is None else [str(failure)])]
 
     @property
     def state(self) -> str:
@@ -231,7 +237,7 @@ class Device(Closing):
         while not (self._unseen and self._input.caught_up(mark)):
             if self._input.ended:
                 raise SourceError(f"{self._source}: no further scan, since the input is {self._input.state}")
-            arrival = self._input.next(max(deadline - time.monotonic(), 0.0))
+            arrival = self._next(max(deadline - time.monotonic(), 0.0))
             if arrival is None and time.monotonic() >= deadline:
                 return None
             if arrival is not None:
@@ -323,9 +329,30 @@ class Device(Closing):
         if ahead is not None:
             yield ahead
         while not self._input.ended:
-            arrival = self._input.next(LONG if wait is None else wait)
+            arrival = self._next(LONG if wait is None else wait)
             if arrival is not None or not self._input.ended:
                 yield arrival
+
+    def _next(self, wait: float) -> Arrival | None:
+        """What arrives next; the first frames are asked whether they are another sensor's."""
+        arrival = self._input.next(wait)
+        if self._examined is not None:
+            for frames in arrival.found if arrival is not None else ():
+                self._examined += frames.only(slice(0, EXAMINED)).found()
+            if len(self._examined) >= EXAMINED or self._input.ended:
+                other, self._examined = contradiction(self.sensor, self._examined), None
+                if other:
+                    text = f"{self._source}: read as {self.sensor.id}, and the frames are those of {other}"
+                    self._doubts.append(f"{text}; next: lidarspec detect {quote(str(self._source))}")
+        return arrival
+
+
+def _nominal(sensor: Sensor) -> str:
+    """That a default calibration stood in, and how the sensor's own is given."""
+    text = f"{sensor.id}: points by the nominal calibration of the model, not of this unit"
+    if files := [name for name in sensor.configure.files if name not in sensor.options]:
+        return f"{text}; its own: -O {files[0]}=FILE, in Python sensor.configure({files[0]}=FILE)"
+    return text + (f", where no {' or '.join(sensor.state)} frame had come" if sensor.state else "")
 
 
 def _close(source: Input | Transport, recorder: Log | None) -> None:
@@ -368,5 +395,5 @@ def open(
     device = named(source)
     if sensor is None:
         sensor = detected(source)
-    known, mount = sensor if isinstance(sensor, Sensor) else named_sensor(sensor), None if device is None else device.mount
-    return Device(source, known, backend=backend, start=start, record=record, overflow=overflow, period=period, mount=mount)
+    mount = None if device is None else device.mount
+    return Device(source, named_sensor(sensor), backend=backend, start=start, record=record, overflow=overflow, period=period, mount=mount)

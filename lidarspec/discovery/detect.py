@@ -1,8 +1,8 @@
 """Which installed sensor sent these bytes: each is tried, and what passes checksum and plausibility is counted.
 
-Sensors with the same frames are told apart by how fast their clocks run, and by the names that their frames hold. A clock that advances
-from packet to packet as the sensor's own `sweep` says tells models apart that differ in speed. A name is what a field of text holds, or
-what the author's remark calls the value of a field ("0x22 NAME"). The clock comes first: bytes that name a model are not always true.
+Sensors with the same frames are told apart by what they declare of their `relatives`: by packets that only one of them sends, by how fast
+their clocks run, and by the model that their frames name, in a text or by the author's remark on the value of a field ("0x22 NAME"). Where
+nothing of that was seen, each may be it, and so may relatives that are not installed.
 
 Bytes that were given to be looked at, frame by frame, and are exactly one frame of a sensor are that sensor's (`fitting`). Where no
 sensor fits, the one whose frame they begin like is said to be nearest.
@@ -13,22 +13,26 @@ from __future__ import annotations
 import functools
 import itertools
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lidarspec.columns.columns import Fields
 from lidarspec.device.settings import named
+from lidarspec.discovery.checksum_search import search
 from lidarspec.discovery.listen import Heard, hear
 from lidarspec.errors import CommandError, LidarSpecError, UsageError, WireError, suggest
+from lidarspec.framing.decoder import Decoder
 from lidarspec.framing.frame_engine import codec
 from lidarspec.framing.results import VALID, Found
+from lidarspec.packets.packets import Packets
 from lidarspec.plugins import sensors
 from lidarspec.simulation.simulator import simulate
-from lidarspec.spec.construct_layer import leaves
+from lidarspec.spec.description import Relative
 from lidarspec.spec.links import Serial
 from lidarspec.spec.sensor import Sensor
 from lidarspec.spec.tree import FieldInfo
@@ -37,6 +41,7 @@ from lidarspec.transports.files import RecordingTransport
 from lidarspec.transports.open_url import live_address, resolved, transport
 from lidarspec.transports.protocol import no_bytes
 from lidarspec.transports.simulated import SimulatedTransport
+from lidarspec.wire.layout import Bytes2D, Seal, Sums
 from lidarspec.wire.parse import parse_typed
 from lidarspec.wire.schema import schema
 
@@ -47,81 +52,124 @@ _VALUE = re.compile(r"\b(0x[0-9a-fA-F]+|\d+)\s+([^,;:]+)")
 SHOWN = 16
 #: share of the bytes that has to be in a sensor's frames for it to fit, how close to the best another is as good, and what is beyond doubt.
 FITS, AS_GOOD, CLEAR = 0.2, 0.01, 0.9
+#: data frames one after another that are no chance even where no checksum is right.
+RHYTHM = 3
 
 
-def told_apart(candidates: Sequence[Sensor], found: Sequence[Found]) -> dict[str, str]:
-    """The candidates that the frames speak for, by id, each with why; empty where the frames say nothing.
+class Told(NamedTuple):
+    """What frames say of the sensors that send such.
+
+    Attributes:
+        alike: those of the candidates that they may be of, by id, each with why; where it is one alone, what differs was seen.
+        others: relatives of theirs that are not installed, and whose frames these may be; are, where `alike` is empty.
+    """
+
+    alike: dict[str, str]
+    others: dict[str, str]
+
+
+def told_apart(candidates: Sequence[Sensor], found: Sequence[Found]) -> Told:
+    """What tells sensors with the same frames apart: single packets that only one sends, then the pace of the clock, then names.
 
     Args:
         candidates: sensors whose frames these are alike.
         found: frames in the order of their arrival.
     """
-    by_clock = {sensor.id: why for sensor in candidates if (why := _by_clock(sensor, found))}
-    if by_clock and len(by_clock) < len(candidates):
-        return by_clock
-    by_name = {sensor.id: why for sensor in candidates if (why := _by_name(sensor, found))}
-    return by_name if len(by_name) < len(candidates) else {}
+    ids, shown = {sensor.id for sensor in candidates}, {sensor.id: _shown(sensor, found) for sensor in candidates}
+    left = [sensor for sensor in candidates if not shown[sensor.id]]
+    if not left:
+        return Told({}, {name: why for seen in shown.values() for name, why in seen.items() if name not in ids})
+    spoken_for = _spoken_for(left, _by_clock, found) or _spoken_for(left, _by_name, found)
+    if spoken_for:
+        return Told(spoken_for, {})
+    reasons = {name: why for seen in shown.values() for name, why in seen.items()}
+    told = {name: text for sensor in left for name, text in sensor.relatives.items() if isinstance(text, str) and name not in ids}
+    return Told(
+        {sensor.id: reasons.get(sensor.id, "") for sensor in left}, {name: text for name, text in told.items() if name not in sensors()}
+    )
+
+
+def contradiction(sensor: Sensor, found: Sequence[Found]) -> str:
+    """The relatives whose frames these are and not the sensor's, each with what says so; "" where nothing does."""
+    known = sensors()
+    told = told_apart([sensor, *(known[name] for name in sensor.relatives if name in known)], found)
+    return "" if sensor.id in told.alike else " or ".join(f"{name} ({why})" for name, why in (told.alike or told.others).items())
+
+
+def _shown(sensor: Sensor, found: Sequence[Found]) -> dict[str, str]:
+    """The relatives that most of the data frames can only be of, by id, each with what tells it."""
+    single = {name: relative for name, relative in sensor.relatives.items() if isinstance(relative, Relative)}
+    data = [item.data for item in found if item.frame == sensor.data_frame] if single else []
+    if not data:
+        return {}
+    fields = Fields(sensor.decode(data).batch())
+    return {name: relative.told_by for name, relative in single.items() if np.mean(np.asarray(relative.sends(fields))) > 0.5}
+
+
+def _spoken_for(left: Sequence[Sensor], why: Callable[[Sensor, Sequence[Found]], str], found: Sequence[Found]) -> dict[str, str]:
+    """Those that the frames speak for in one way, by id, each with why; none where nothing does, or for all of several."""
+    if len(left) == 1 and not left[0].relatives:
+        return {}
+    reasons = {sensor.id: reason for sensor in left if (reason := why(sensor, found))}
+    return reasons if len(left) == 1 or len(reasons) < len(left) else {}
 
 
 def _by_clock(sensor: Sensor, found: Sequence[Found]) -> str:
     """Why the clock in the frames is this sensor's, "" where it is not."""
-    expected = _pace(sensor.id, sensor) if sensor.clock is not None else None
     data = [item for item in found if item.frame == sensor.data_frame]
-    if expected is None or len(data) < 3:
+    if sensor.clock is None or len(data) < 3:
         return ""
-    follows = np.array([after.offset == item.offset + len(item.data) for item, after in itertools.pairwise(data)])
-    steps = _steps(sensor, [item.data for item in data])[follows]
-    steps = steps[(steps >= 0) & (steps <= 10 * expected)]
-    if len(steps) < 2 or steps.mean() <= 0:
+    packets = sensor.decode(list(dict.fromkeys(item.data for item in data) if sensor.datagrams else [item.data for item in data]))
+    expected = _pace(sensor.id, sensor) if sensor.clock.pace is None else _declared_pace(sensor.clock.pace, packets)
+    if expected is None or len(packets) < 3:
         return ""
-    step, grain = float(steps.mean()), min(float(np.ptp(steps)), expected)  # a coarse clock is as uneven as its steps
-    if abs(step - expected) > OFF * expected + grain / (2 * len(steps) ** 0.5):
+    if sensor.datagrams:  # lost, doubled and swapped ones leave most steps as they were
+        step, grain = float(np.median(np.diff(np.sort(packets.time_ns)))), 0.0
+    else:  # a clock may be coarse, and what is lost is seen
+        follows = np.array([after.offset == item.offset + len(item.data) for item, after in itertools.pairwise(data)])
+        steps = np.diff(packets.time_ns)[follows]
+        steps = steps[(steps >= 0) & (steps <= 10 * expected)]
+        if len(steps) < 2:
+            return ""
+        step, grain = float(steps.mean()), min(float(np.ptp(steps)), expected) / (2 * len(steps) ** 0.5)  # as uneven as its steps
+    if abs(step - expected) > OFF * expected + grain:
         return ""
     return f"its clock advances by {step / 1e6:.3g} ms a packet"
 
 
 @functools.lru_cache(maxsize=256)
 def _pace(sensor_id: str, sensor: Sensor) -> float | None:
-    """Nanoseconds by which the sensor's clock advances a packet, None where nobody knows."""
+    """Nanoseconds by which the sensor's clock advances a packet in a simulation, None where it has none."""
     try:
-        steps = _steps(sensor, simulate(sensor, PACKETS))
+        steps = np.diff(sensor.decode(simulate(sensor, PACKETS)).time_ns)
     except LidarSpecError:
         return None
     steps = steps[steps >= 0]
     return float(steps.mean()) if len(steps) and steps.mean() > 0 else None
 
 
-def _steps(sensor: Sensor, data: Sequence[bytes]) -> NDArray[np.int64]:
-    """By how many ns the clock advances from packet to packet."""
-    return np.diff(sensor.decode(list(data)).time_ns)
+def _declared_pace(pace: Callable[[Any], Any], packets: Packets) -> float:
+    """Nanoseconds by which the clock advances a packet, as most of the packets say."""
+    return float(np.median(np.asarray(pace(Fields(packets.batch())), np.float64))) * 1e9
 
 
 def _by_name(sensor: Sensor, found: Sequence[Found]) -> str:
-    """Why the frames name this sensor, "" where they do not."""
-    model, read = _plain(sensor.model), dict.fromkeys(sensor.frames, 0)
-    for item in found:
-        if read.get(item.frame, READ) >= READ:
-            continue
-        read[item.frame] += 1
-        for path, text in _texts(sensor.parse(item.data, item.frame), schema(sensor.frames[item.frame].tree).fields):
-            if _plain(text) == model:
-                return f"{item.frame}.{path} says {text}"
+    """Why the frames name this sensor as their model, "" where they do not."""
+    frame, _, field = sensor.info.get("model", "").partition(".")
+    for item in itertools.islice((item for item in found if item.frame == frame), READ):
+        value = functools.reduce(lambda parsed, name: parsed[name], field.split("."), sensor.parse(item.data, frame))
+        text = _text(value, schema(sensor.frames[frame].tree).fields[field])
+        if _plain(text) == _plain(sensor.model):
+            return f"{frame}.{field} says {text}"
     return ""
 
 
-def _texts(parsed: Any, fields: Mapping[str, FieldInfo]) -> Iterator[tuple[str, str]]:
-    """The fields outside arrays that hold a text, or a number with a meaning, and what they say."""
-    for keys, value in leaves(parsed):
-        path = ".".join(map(str, keys))
-        if isinstance(value, bytes) and path in fields:
-            text = value.split(b"\0")[0].decode("ascii", "replace")
-            if text.isprintable() and text:
-                yield path, text
-        elif isinstance(value, int) and path in fields:
-            info = fields[path]
-            meanings = {int(number, 0): text.strip() for number, text in _VALUE.findall(info.docs)} | dict(info.labels)
-            if value in meanings:
-                yield path, str(meanings[value])
+def _text(value: Any, info: FieldInfo) -> str:
+    """What a field says: its text, or the meaning of its number."""
+    if isinstance(value, bytes):
+        return value.split(b"\0")[0].decode("ascii", "replace")
+    meanings = {int(number, 0): text.strip() for number, text in _VALUE.findall(info.docs)} | dict(info.labels)
+    return str(meanings.get(value, ""))
 
 
 def _plain(text: str) -> str:
@@ -146,17 +194,22 @@ class Verdict:
     Attributes:
         heard: the bytes.
         scores: every sensor that fits, the best first.
-        alike: those that cannot be told apart from the first one; one alone is it.
+        alike: those that it may be.
+        others: relatives of theirs, by id, each with what tells it apart, that are not installed: it may be one of them too; where `alike`
+            is empty it is one.
+        fault: what is wrong with frames that are a sensor's but for their checksums; "" where there are none.
     """
 
     heard: Heard
-    scores: tuple[Score, ...]
-    alike: tuple[Score, ...]
+    scores: tuple[Score, ...] = ()
+    alike: tuple[Score, ...] = ()
+    others: Mapping[str, str] = field(default_factory=dict)
+    fault: str = ""
 
     @property
     def sensor(self) -> Sensor | None:
         """The sensor, None where none fits or several do."""
-        return self.alike[0].sensor if len(self.alike) == 1 else None
+        return self.alike[0].sensor if len(self.alike) == 1 and not self.others else None
 
     @property
     def is_clear(self) -> bool:
@@ -166,11 +219,41 @@ class Verdict:
 
 def scores(chunks: Sequence[bytes], *, datagrams: bool) -> list[Score]:
     """Every installed sensor of which a data frame was found, the best first."""
-    known = [sensor for sensor in sensors().values() if any(frame.direction == "in" for frame in sensor.frames.values())]
+    known = _readable()
     found = _each(known, lambda sensor: _score(sensor, chunks, datagrams=datagrams))
     if not any(score.share >= FITS for score in found):
         found += _each(known, lambda sensor: _from_the_middle(sensor, chunks, datagrams=datagrams))
     return sorted(found, key=lambda score: (-score.share, score.sensor.id))
+
+
+def _readable() -> list[Sensor]:
+    """The installed sensors that have frames before they are configured."""
+    return [sensor for sensor in sensors().values() if sensor.incoming]
+
+
+def never_right(chunks: Sequence[bytes], *, datagrams: bool) -> str:
+    """What to say of bytes that are the frames of a sensor but for their checksums, which are never right; "" of all others."""
+    as_stored = _each(_readable(), lambda sensor: _score(sensor, chunks, datagrams=datagrams, sums=_stored))
+    found = [score for score in as_stored if score.share >= CLEAR and score.data_frames >= RHYTHM]
+    if not found or _score(found[0].sensor, chunks, datagrams=datagrams) is not None:
+        return ""
+    kinds = [item.frame for item in found[0].found]
+    most = max(set(kinds), key=kinds.count)
+    frames = [item.data for item in found[0].found if item.frame == most]
+    ids = " or ".join(score.sensor.id for score in found)
+    text = f"{len(frames)} {most} frames of {ids} by their constants, lengths and rhythm, and their checksums are never right"
+    match = next(iter(search(frames)), None)
+    if match is None:
+        return f"{text}; no other checksum fits either"
+    length = len(frames[0])
+    covered = sum(last - first for first, last in match.span.ranges(match.place, length))
+    where = f"{match.algorithm.describe()} in {match.place} is right in {match.right} of {match.total}"
+    return f"{text}: {where}, over {covered} of the {length - match.place.size} other bytes ({match.span.told(match.place, length)})"
+
+
+def _stored(seal: Seal, rows: Bytes2D) -> NDArray[np.uint64]:
+    """The checksums that stand in the frames, whatever they are, in place of those that should."""
+    return seal.stored(rows)
 
 
 def _each(known: Sequence[Sensor], scored: Callable[[Sensor], Score | None]) -> list[Score]:
@@ -181,39 +264,38 @@ def _each(known: Sequence[Sensor], scored: Callable[[Sensor], Score | None]) -> 
         if frames not in shared:
             shared[frames] = scored(sensor)
         if (score := shared[frames]) is not None:
-            shared[sensor.id] = replace(score, sensor=sensor)
+            shared[sensor.id] = replace(score, sensor=sensor.configure(**score.sensor.options) if score.sensor.options else sensor)
     return [score for key, score in shared.items() if isinstance(key, str) and score is not None]
 
 
-def _score(sensor: Sensor, chunks: Sequence[bytes], *, datagrams: bool) -> Score | None:
-    decoder = sensor.decoder(stream=not datagrams)
+def _score(sensor: Sensor, chunks: Sequence[bytes], *, datagrams: bool, sums: Sums | None = None) -> Score | None:
+    decoder = Decoder(sensor, stream=not datagrams, sums=sums)
     items = [item for chunk in chunks for item in decoder.feed(chunk)] + decoder.finish()
     number = sum(decoder.stats.frames.get(name, 0) for name in sensor.data_frames)
     return Score(sensor, 1 - decoder.stats.bytes_skipped / decoder.stats.bytes_in, number, tuple(items)) if number else None
 
 
 def _from_the_middle(sensor: Sensor, chunks: Sequence[bytes], *, datagrams: bool) -> Score | None:
-    """The best score of a sensor whose data frames come after others, as if one of those had been seen before."""
+    """The best score of a sensor whose data frames come after others, configured as if one of those had been seen before."""
     answers = [name for name in sensor.data_frames if sensor.frames[name].after is not None]
     scored = [_score(sensor.configure(answer=name), chunks, datagrams=datagrams) for name in answers]
-    best = max((score for score in scored if score is not None), key=lambda score: score.share, default=None)
-    return None if best is None else replace(best, sensor=sensor)
+    return max((score for score in scored if score is not None), key=lambda score: score.share, default=None)
 
 
 def verdict(heard: Heard) -> Verdict:
     """Whose bytes were heard: by the frames, then by clocks and names in them, then by the baud rate."""
     fitting = [score for score in scores(heard.chunks, datagrams=heard.datagrams) if score.share >= FITS]
     best = [score for score in fitting if score.share >= fitting[0].share - AS_GOOD]
-    alike = best
-    if len(best) > 1:
-        reasons = told_apart([score.sensor for score in best], best[0].found)
-        alike = [replace(score, why=reasons[score.sensor.id]) for score in best if score.sensor.id in reasons] or best
-        if len(alike) > 1 and heard.baud is not None:
-            why = f"it runs at {heard.baud} baud"
-            links = [(score, data_link(score.sensor, Serial)) for score in alike]
-            alike = [replace(score, why=why) for score, link in links if link and heard.baud in link.bauds] or alike
-    others = [score for score in fitting if score.sensor.id not in {one.sensor.id for one in alike}]
-    return Verdict(heard, (*alike, *others), tuple(alike))
+    if not best:
+        return Verdict(heard, fault=never_right(heard.chunks, datagrams=heard.datagrams))
+    told = told_apart([score.sensor for score in best], best[0].found)
+    alike = [replace(score, why=told.alike[score.sensor.id]) for score in best if score.sensor.id in told.alike]
+    if len(alike) > 1 and heard.baud is not None:
+        why = f"it runs at {heard.baud} baud"
+        links = [(score, data_link(score.sensor, Serial)) for score in alike]
+        alike = [replace(score, why=why) for score, link in links if link and heard.baud in link.bauds] or alike
+    ruled_out = [score for score in fitting if score.sensor.id not in {one.sensor.id for one in alike}]
+    return Verdict(heard, (*alike, *ruled_out), tuple(alike), told.others)
 
 
 def verdicts(source: str | Path, *, seconds: float | None = None) -> list[Verdict]:
@@ -253,13 +335,30 @@ def detected(source: str | Path) -> Sensor:
     fitting = [one for one in found if one.scores]
     if not fitting:
         raise _nothing(str(source), found)
+    if not any(one.alike for one in fitting):
+        raise suggest(WireError(f"{source}: {others_named(fitting[0])}"), f"lidarspec detect {source}")
     if len({one.sensor.id for one in fitting if one.sensor}) > 1:
         listed = ", ".join(f"{one.sensor.id} ({one.heard.sender})" for one in fitting if one.sensor)
         raise UsageError(f"{source}: several sensors send, {listed}; choose one with ?src=ADDRESS and -s")
-    alike = fitting[0].alike
-    if len(alike) > 1:
-        raise UsageError(f"{source}: {', '.join(one.sensor.id for one in alike)} send the same frames; name the sensor with -s")
-    return alike[0].sensor
+    if fitting[0].sensor is None:
+        example = chosen(fitting[0].alike[0].sensor)
+        raise UsageError(f"{source}: {', '.join(names(fitting[0]))} send the same frames; name one, as with {example}")
+    return fitting[0].sensor
+
+
+def chosen(sensor: Sensor) -> str:
+    """What to type for a sensor and what it is configured with."""
+    return " ".join([f"-s {sensor.id}", *(f"-O {name}={value}" for name, value in sensor.options.items())])
+
+
+def names(found: Verdict) -> list[str]:
+    """The ids of all that it may be, with a remark on those that are not installed."""
+    return [*(score.sensor.id for score in found.alike), *(f"{name} (not installed)" for name in found.others)]
+
+
+def others_named(found: Verdict) -> str:
+    """What to say of frames that are of a sensor that is recognised, and not installed."""
+    return " or ".join(f"these are frames of {name} ({why})" for name, why in found.others.items()) + ", which no installed plugin reads"
 
 
 def declared(source: str | Path) -> Sensor | None:
@@ -288,6 +387,8 @@ def declared(source: str | Path) -> Sensor | None:
 def _nothing(source: str, found: Sequence[Verdict]) -> Exception:
     """What to say where no sensor fits."""
     heard = max((one.heard for one in found), key=lambda one: one.size, default=Heard(source))
+    if fault := next((one.fault for one in found if one.fault), ""):
+        return suggest(WireError(f"{source}: {fault}"), f"lidarspec crc {source}")
     if heard.size:
         return WireError(f"{source}: no installed sensor's frames are in it", data=heard.chunks[0][:SHOWN])
     if live_address(source) is None:
@@ -308,7 +409,7 @@ def fitting(chunks: Sequence[bytes], *, datagrams: bool) -> list[Sensor]:
     if whole:
         return whole
     found = scores(chunks, datagrams=datagrams) if data else []
-    return [score.sensor for score in found if score.share >= found[0].share - AS_GOOD]
+    return [score.sensor for score in found if score.share >= max(found[0].share - AS_GOOD, FITS)]
 
 
 def nearest(data: bytes) -> WireError | None:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from shlex import quote
 
-from lidarspec.discovery.detect import Verdict, verdict, verdicts
+from lidarspec.discovery.detect import CLEAR, Verdict, verdict, verdicts
 from lidarspec.discovery.listen import LISTEN, bauds, heard_as, started_first, udp_ports
 from lidarspec.errors import LidarSpecError, UsageError, suggestion
 from lidarspec.spec.links import Serial, Udp
@@ -20,8 +20,6 @@ from lidarspec.transports.open_url import live_address, resolved
 from lidarspec.transports.protocol import no_bytes
 from lidarspec.transports.udp import BUFFER, shortfall
 
-#: share of the bytes outside frames from which on a line is bad.
-BAD = 0.02
 LOOPBACK = "lo"
 
 
@@ -50,7 +48,7 @@ def examined(source: str | Path, sensor: Sensor | None = None, *, seconds: float
     text = resolved(source)
     address = live_address(text)
     if address is None:
-        yield from _file(text)
+        yield from _file(text, sensor)
     elif address.scheme == "serial":
         yield from _serial(text, address, sensor, seconds)
     elif address.scheme == "udp":
@@ -72,7 +70,7 @@ def computer() -> Iterator[Finding]:
     yield from _buffer()
 
 
-def _file(path: str) -> Iterator[Finding]:
+def _file(path: str, sensor: Sensor | None) -> Iterator[Finding]:
     name = path if os.path.exists(path) else path.rpartition("?")[0]  # what stands behind it chooses a sender
     if not os.path.exists(name):
         yield Finding(False, f"{path}: no such file or port", "lidarspec ports")
@@ -84,7 +82,7 @@ def _file(path: str) -> Iterator[Finding]:
         tried = verdicts(path)
         found = max(tried, key=lambda one: one.heard.size)
         if found.heard.size:
-            yield _verdict(path, found, None)
+            yield _verdict(path, found, sensor)
         yield from _several(path, tried)
         for text in found.heard.warnings or [no_bytes(path, ())] * (not found.heard.size):
             yield Finding(False, text)
@@ -212,9 +210,12 @@ def _several(source: str, found: Sequence[Verdict]) -> Iterator[Finding]:
 def _verdict(source: str, found: Verdict, sensor: Sensor | None) -> Finding:
     """One finding on what was heard."""
     heard, ids = found.heard, [score.sensor.id for score in found.scores]
+    may_be = {score.sensor.id: score.why for score in found.alike} or dict(found.others)
     quoted = quote(source)
     if not heard.size:
         return _nothing(source, sensor)
+    if found.fault:
+        return Finding(False, found.fault, f"lidarspec crc {quoted}")
     if not found.scores:
         at = " at any baud rate" if heard.baud is not None and len(bauds()) > 1 else ""
         return Finding(False, f"{heard.size} bytes came, and no frame of an installed sensor{at}", f"lidarspec detect {quoted}")
@@ -222,12 +223,17 @@ def _verdict(source: str, found: Verdict, sensor: Sensor | None) -> Finding:
     if sensor is not None and sensor.id not in ids:
         return Finding(False, f"it sends frames of {ids[0]}{at}, not of {sensor.id}", f"lidarspec view {quoted} -s {ids[0]}")
     name = sensor.id if sensor is not None else ids[0]
+    if name not in may_be:
+        other, why = next(iter(may_be.items()))
+        command = f"lidarspec view {quoted} -s {other}" if found.alike else f"lidarspec detect {quoted}"
+        return Finding(False, f"it sends frames of {other} ({why}){at}, not of {name}", command)
     score = next(score for score in found.scores if score.sensor.id == name)
     link = data_link(score.sensor, Serial)
     if heard.baud is not None and link and heard.baud not in link.bauds:
         again = quote(with_option(source, "baud", heard.baud))
         return Finding(False, f"{name} sends{at}, and {link.baud} is declared", f"lidarspec view {again} -s {name}")
-    if 1 - score.share > BAD and heard.size > 4096:
+    cut_off = 2 * max(frame.max_length for frame in score.sensor.incoming.values()) / heard.size  # the first frame, and the last
+    if score.share + (0 if heard.datagrams else cut_off) < CLEAR:
         return Finding(False, f"{name} sends{at}, and {1 - score.share:.0%} of the bytes are in no frame: cable, ground or baud rate")
     return Finding(True, f"{name} sends{at}: {score.data_frames} data frames, {score.share:.0%} of the bytes in frames")
 

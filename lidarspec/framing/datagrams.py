@@ -133,7 +133,8 @@ class _Batch:
             if self._framing.switches(alone.kinds.item(0), mode):
                 frames = frames.only(slice(0, begun))
                 break
-        self._count(reasons[(reasons != PLUGIN) & (lost < len(frames))])
+        counted = (reasons != PLUGIN) & (lost < len(frames))
+        self._count(reasons[counted], frames.sizes[lost[counted]], mode)
         return Frames.joined([*parts, frames.only(slice(begun, None))]) if parts else frames
 
     def _refused(self, starts: Indices, sizes: Indices, mode: Mode) -> NDArray[np.uint8]:
@@ -146,7 +147,7 @@ class _Batch:
             if len(marked):
                 frames, own = self._framing.survey(kind, self._buffer, starts[marked], gathered=False), sizes[marked]
                 status = np.where(frames.sizes > own, np.uint8(SHORT), frames.status)
-                status[(status == VALID) & (frames.sizes == own)] = PLUGIN
+                status[status == VALID] = np.where(frames.sizes == own, PLUGIN, LENGTH)[status == VALID]
                 reasons[marked] = np.maximum(reasons[marked], status)
         return reasons
 
@@ -160,14 +161,19 @@ class _Batch:
             frame = self._framing.survey(kind, data, np.zeros(1, np.intp))
             if frame.status[0] == VALID and frame.sizes[0] == len(data):
                 return Frames(self._buffer, frame.kinds, start, size, layouts=frame.layouts, forms=frame.forms)
-            rejected = max(rejected, int(frame.status[0]))
+            rejected = max(rejected, int(frame.status[0]) or LENGTH)
             self._piece.errors += frame.errors
-        self._count(np.array([rejected], np.uint8))
+        self._count(np.array([rejected], np.uint8), size, mode)
         return None
 
-    def _count(self, reasons: NDArray[np.uint8]) -> None:
-        """Count datagrams as rejected; those that resemble no frame, too, as none has their length."""
-        self._piece.reject(np.bincount(np.where(np.isin(reasons, (VALID, CONSTANT)), LENGTH, reasons)).tolist(), ())
+    def _count(self, reasons: NDArray[np.uint8], sizes: Indices, mode: Mode) -> None:
+        """Count datagrams as rejected: those that resemble no frame by their constants, or their length where it is too short for these."""
+        least = min(self._framing.ends[kind] for kind in self._framing.active(mode))
+        unknown = np.isin(reasons, (VALID, CONSTANT))
+        others = unknown & (sizes >= max(least, 1))
+        if number := int(np.count_nonzero(others)):
+            self._piece.rejected["bad_constant"] = self._piece.rejected.get("bad_constant", 0) + number
+        self._piece.reject(np.bincount(np.where(unknown, LENGTH, reasons)[~others]).tolist(), ())
 
     def _marked(self, kind: int, starts: Indices, sizes: Indices) -> NDArray[np.bool_]:
         """Which datagrams have the constants of a type."""

@@ -47,10 +47,12 @@ class Counters:
         bytes_filler: declared fillers among the skipped bytes.
         pending: bytes held because a candidate needs more.
         bad_checksum, bad_length, implausible: rejected candidates.
+        bad_constant: datagrams without the constants of any frame; in a stream such bytes are skipped, and are no candidate.
         lost, duplicates, late: packets, by the sensor's sequence.
         kernel_drops, queue_dropped, foreign, disconnects: counted by the transports.
         unread: bytes of a damaged file that could not be read.
         plugin_errors: packets, or candidates, at which a function of the plugin raised; `failures` keeps the first ones.
+        nominal: whether a default calibration stood in for the sensor's own in any scan.
     """
 
     bytes_in: int = 0
@@ -60,6 +62,7 @@ class Counters:
     pending: int = 0
     bad_checksum: int = 0
     bad_length: int = 0
+    bad_constant: int = 0
     implausible: int = 0
     lost: int = 0
     duplicates: int = 0
@@ -71,10 +74,11 @@ class Counters:
     disconnects: int = 0
     unread: int = 0
     failures: list[PluginError] = field(default_factory=list, repr=False, compare=False)
+    nominal: bool = field(default=False, repr=False, compare=False)
 
     def to_dict(self) -> dict[str, Any]:
         """The counters by name."""
-        return {f.name: getattr(self, f.name) for f in fields(self) if f.name != "failures"}
+        return {f.name: getattr(self, f.name) for f in fields(self) if f.compare}
 
     def error(self, failure: PluginError, number: int) -> None:
         """Count so many packets at which a function of the plugin raised, and keep the first few failures."""

@@ -120,10 +120,12 @@ def guarded(packets: PacketBatch, carry: Carry | None = None, *, final: bool, ep
         epoch: the time that the cloud's stamp is, int64 ns.
     """
     try:
-        return evaluated(packets, carry, final=final, epoch=epoch)
+        points = evaluated(packets, carry, final=final, epoch=epoch)
     except SpecError as error:
         packets.stats.error(PluginError.of(error, f"points of {packets.frame}"), len(packets))
         return None
+    packets.stats.nominal |= bool(points.cloud.nominal)
+    return points
 
 
 def cloud_of(packets: PacketBatch) -> PointCloud:

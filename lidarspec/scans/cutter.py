@@ -147,7 +147,7 @@ class Cutter:
         period = (times - self._start) // int(rule.seconds * 1e9)
         before = _before(period.astype(np.float64), self._before)
         self._before = float(period[-1])
-        starts = _starts(_sums(found.counts, 1))
+        starts = first_points(found)
         return starts[np.flatnonzero(period > before)].tolist()  # type: ignore[no-any-return]
 
 
@@ -179,6 +179,11 @@ def _rows(column: Column, found: Evaluated) -> tuple[NDArray[np.float64], NDArra
     starts = _starts(points)
     kept = points > 0 if levels else np.ones(len(points), np.bool_)
     return values[kept], starts[kept]
+
+
+def first_points(found: Evaluated) -> NDArray[np.intp]:
+    """The index of the first point of each packet, (ready,)."""
+    return _starts(_sums(found.counts, 1))
 
 
 def _sums(counts: NDArray[Any], kept: int) -> NDArray[np.intp]:

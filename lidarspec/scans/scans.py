@@ -16,8 +16,9 @@ from lidarspec.packets.sequences import Reorder
 from lidarspec.points.cloud import ColumnSource, LazyCloud, Mount, PointCloud, Stretch, Stretches, source_of
 from lidarspec.points.evaluate import guarded
 from lidarspec.points.plain import Evaluated
-from lidarspec.scans.cutter import Cutter
+from lidarspec.scans.cutter import Cutter, first_points
 from lidarspec.spec.description import Spec
+from lidarspec.spec.timing import OnFlag
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +52,8 @@ class Scan:
     Attributes:
         points: in stream order.
         rate_hz: one over the time to the next scan; nan where that is not known.
-        complete: whether both ends were seen; the first and the last piece of a stream are not complete.
+        complete: whether both ends were seen, and no more is missing between them than is there; the first and the last piece of a stream
+            are not complete.
         sensor: whose.
     """
 
@@ -72,7 +74,8 @@ class Scan:
         ranges = self.points.range[self.points.valid]
         span = f"{ranges.min():.2f}..{ranges.max():.2f} m" if len(ranges) else "no returns"
         rate = f"{self.rate_hz:.1f} Hz, " if np.isfinite(self.rate_hz) else ""
-        return f"Scan({len(self)} points, {rate}{span}, {'complete' if self.complete else 'partial'})"
+        nominal = ", nominal calibration" if self.points.nominal else ""
+        return f"Scan({len(self)} points, {rate}{span}, {'complete' if self.complete else 'partial'}{nominal})"
 
     def to_bins(self, n: int) -> NDArray[np.float32]:
         """The nearest return in each of n equal sectors from -pi on: (n,) float32 metres, inf where there is none.
@@ -119,6 +122,51 @@ def _sectors(number: Any, place: str) -> int:
     return int(number)
 
 
+class Losses:
+    """What is missing of each scan: bytes of a stream that are in no frame, datagrams that are missing by their numbers."""
+
+    def __init__(self, sensor: Spec) -> None:
+        self._by_number, self._starts_are_seen = sensor.datagrams, isinstance(sensor.scan, OnFlag)
+        self._last: tuple[int, int] | None = None  # where the last packet ends in the input, and its number
+        self._there = self._missing = 0.0  # bytes of the scan under way
+
+    def judged(self, packets: Packets, points: Evaluated, cuts: Sequence[int]) -> list[bool]:
+        """Whether at least half of each scan is there that ends in these packets: one for each of the `cuts`, which are between points."""
+        sizes = packets.table.sizes[: points.ready]
+        missing = self._missing_before(packets, sizes)
+        first = first_points(points) if len(cuts) else sizes
+        judged, start = list[bool](), 0
+        for cut in cuts:
+            edge = int(np.searchsorted(first, cut, side="right")) - 1  # the packet that the cut is in
+            begins = bool(first[edge] == cut)
+            edge += not begins
+            self._there += float(sizes[start:edge].sum())
+            self._missing += float(missing[start : edge + begins].sum())
+            judged.append(self._missing <= self._there)
+            # of what is missing at the cut nobody knows to which scan it belongs, unless the packet there says that it is the first
+            self._there, self._missing = 0.0, float(missing[edge]) if begins and not self._starts_are_seen else 0.0
+            missing[edge : edge + begins] = 0
+            start = edge
+        self._there += float(sizes[start:].sum())
+        self._missing += float(missing[start:].sum())
+        return judged
+
+    def _missing_before(self, packets: Packets, sizes: NDArray[np.intp]) -> NDArray[np.float64]:
+        """The bytes that are missing before each of the packets, (k,)."""
+        number, missing, last = len(sizes), np.zeros(len(sizes)), self._last
+        if not number:
+            return missing
+        self._last = int(packets.offset[number - 1] + sizes[-1]), int(packets.index[number - 1])
+        spots = np.flatnonzero(packets.breaks[:number])
+        if len(spots) and self._by_number:
+            before = np.append(packets.index[0] - 1 if last is None else last[1], packets.index[: number - 1])
+            missing[spots] = ((packets.index[:number] - before - 1) * sizes)[spots]
+        elif len(spots):
+            ends = packets.offset[:number] + sizes
+            missing[spots] = (packets.offset[:number] - np.append(ends[0] - sizes[0] if last is None else last[0], ends[:-1]))[spots]
+        return np.maximum(missing, 0, out=missing)
+
+
 class ScanStream:
     """Scans out of batches of packets; remembers what the next batch needs.
 
@@ -136,6 +184,7 @@ class ScanStream:
         self._parts: list[Stretch] = []
         self._started = False
         self._epoch: int | None = None
+        self._losses = Losses(sensor)
         self._begins: int | None = None  # time of the first point of the scan under way, ns, where it is known
 
     def add(self, packets: Packets) -> list[Scan]:
@@ -169,9 +218,10 @@ class ScanStream:
         start, source, cuts = 0, source_of(points.cloud), self._cutter.cuts(packets, points)
         first, *times = _times_ns(source, [0, *cuts])
         self._begins = first if self._begins is None else self._begins
-        for cut, ends in zip(cuts, times, strict=True):
+        mostly_there = self._losses.judged(packets, points, cuts)
+        for cut, ends, is_there in zip(cuts, times, mostly_there, strict=True):
             self._take(source, start, cut)
-            scan = self._close(ends, complete=self._started)
+            scan = self._close(ends, complete=self._started and is_there)
             self._begins = ends
             if scan is not None:
                 self._started = True

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
         Xor as Xor,
         ZeroPadded as ZeroPadded,
     )
-    from lidarspec.spec.description import Command as Command, Frame as Frame, Simulation as Simulation
+    from lidarspec.spec.description import Command as Command, Frame as Frame, Relative as Relative, Simulation as Simulation
     from lidarspec.spec.fields import Checksummed as Checksummed, Scaled as Scaled
     from lidarspec.spec.links import Serial as Serial, Tcp as Tcp, Udp as Udp
     from lidarspec.spec.results import Cartesian as Cartesian, Points as Points, Polar as Polar
@@ -67,7 +67,7 @@ if TYPE_CHECKING:
 
 _NAMES = {
     "spec.sensor": ("Sensor",),
-    "spec.description": ("Frame", "Command", "Simulation"),
+    "spec.description": ("Frame", "Command", "Relative", "Simulation"),
     "spec.fields": ("Scaled", "Checksummed"),
     "spec.checksums": ("Checksum", "Crc", "Xor", "Sum", "WordXor", "Fold15", "ZeroPadded"),
     "spec.links": ("Serial", "Udp", "Tcp"),

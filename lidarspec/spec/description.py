@@ -171,6 +171,19 @@ class Command:
         return (self.reply,) if isinstance(self.reply, str) else tuple(self.reply or ())
 
 
+@dataclass(frozen=True)
+class Relative:
+    """Another sensor, installed or not, whose packets have the same form.
+
+    Args:
+        told_by: what tells it apart, in words.
+        sends: a function of the data frame's `Fields`: whether a packet is the other's, and cannot be this sensor's.
+    """
+
+    told_by: str
+    sends: Callable[[Any], Any]
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class Spec:
     """One sensor as its manual describes it: facts, without the methods of a `Sensor`.
@@ -201,7 +214,7 @@ class Spec:
     vendor_axes: tuple[str, str, str] | None = field(default=None, kw_only=True)
     beams: int | None = field(default=None, kw_only=True)
     turn: tuple[float, float] | None = field(default=None, kw_only=True)
-    relatives: Mapping[str, str] = field(default_factory=dict, kw_only=True)
+    relatives: Mapping[str, str | Relative] = field(default_factory=dict, kw_only=True)
     info: Mapping[str, str] = field(default_factory=dict, kw_only=True)
     status: str = field(kw_only=True)
     source: str = field(kw_only=True)

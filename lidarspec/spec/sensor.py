@@ -47,7 +47,8 @@ class Sensor(Spec):
         vendor_axes: where the vendor's x, y and z point, of forward, back, left, right, up and down, for ``frame="vendor"``.
         beams: points of a scan, where their number is constant.
         turn: the slowest and the fastest number of scans a second.
-        relatives: ids of sensors that it can be mistaken for -> the field or the rhythm that tells them apart.
+        relatives: ids of sensors that it can be mistaken for, installed or not -> what tells them apart: a text, where it is the pace of
+            the clock or what `info` names as model; a `Relative`, where single packets show it.
         info: what frames say of the device ("serial", "firmware", "model", "temperature") -> the field, as "frame.path".
         status: how far it is proven: "manual", "vectors", "capture" or "hardware".
         source: the manual with its revision and sections, the captures.
@@ -204,6 +205,12 @@ class Configure:
         _check_shared(sensor, options)
         configured = self._by_function(own) if own else sensor
         return replace(configured, options={**sensor.options, **options}, configure=self.function)
+
+    @property
+    def files(self) -> tuple[str, ...]:
+        """The names of the sensor's own options that take a path."""
+        known = inspect.signature(self.function).parameters if self.function is not None else {}
+        return tuple(name for name, parameter in known.items() if "Path" in str(parameter.annotation))
 
     def _by_function(self, options: Mapping[str, Any]) -> Sensor:
         if self.function is None:

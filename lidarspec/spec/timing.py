@@ -63,10 +63,13 @@ class Clock:
         source: the field, the fields that add up (seconds and microseconds), or a function of `Fields` that returns
             a column, or several that add up, in seconds. Terms are summed as integer nanoseconds.
         wraps_at: seconds after which it starts again at 0; None if it does not.
+        pace: a function of `Fields`: by how many seconds it advances from a packet to the next; left out, by as much as in a simulation.
+            It tells relatives apart, and is needed where it depends on a mode that the packets name.
     """
 
     source: Source
     wraps_at: float | None = None
+    pace: Callable[[Any], Any] | None = None
 
 
 @dataclass(frozen=True)

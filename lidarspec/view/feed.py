@@ -167,7 +167,7 @@ def totals(counters: Counters) -> dict[str, int]:
     return {
         "bytes_in": counters.bytes_in,
         "frames": sum(counters.frames.values()),
-        "rejected": counters.bad_checksum + counters.bad_length + counters.implausible,
+        "rejected": counters.bad_checksum + counters.bad_length + counters.bad_constant + counters.implausible,
         "skipped": counters.bytes_skipped - counters.bytes_filler,
         "lost": counters.lost,
     }

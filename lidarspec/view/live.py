@@ -363,6 +363,7 @@ class Window:
             ("speed", told(reading.speed_hz, "{:.1f} Hz"), STRONG),
             ("packets", told(reading.packet_rate_hz, "{:.0f} /s"), PLAIN),
             ("input", told(reading.bytes_per_s, "{:.1f} kB/s", 1e-3), PLAIN),
+            *([("calibration", "nominal", ALARM)] if self._scan is not None and self._scan.points.nominal else []),
             ("points", str(points), PLAIN),
             ("valid", told(len(valid) / points if points else None, "{:.1f} %", 100), PLAIN),
             ("nearest", told(near, "{:.2f} m"), PLAIN),

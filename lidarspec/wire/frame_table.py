@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from lidarspec.errors import SpecError
 from lidarspec.spec.construct_layer import leaves
-from lidarspec.wire.arrays import counted, is_counted
+from lidarspec.wire.arrays import counted, is_counted, repeated
 from lidarspec.wire.layout import Bytes2D, Layout
 from lidarspec.wire.schema import Schema
 
@@ -36,6 +36,10 @@ class Table(Protocol):
 
     def counts(self, axis: str) -> NDArray[np.intp]:
         """The length of an array in each frame, (n,)."""
+
+    @property
+    def sizes(self) -> NDArray[np.intp]:
+        """The bytes of each frame, (n,)."""
 
     def frame(self, index: int) -> bytes:
         """The bytes of one frame."""
@@ -103,6 +107,15 @@ class Rows:
         if isinstance(declared, int):
             return declared
         return max((group.layout.lengths.get(axis, 0) for group in self.groups), default=0)
+
+    @property
+    def sizes(self) -> NDArray[np.intp]:
+        if len(self.groups) == 1:
+            return repeated(self.groups[0].layout.size, len(self))
+        found = np.empty(len(self), np.intp)
+        for group in self.groups:
+            found[group.where] = group.layout.size
+        return found
 
     def frame(self, index: int) -> bytes:
         for group in self.groups:
@@ -221,6 +234,10 @@ class Records:
         brackets = axis.count("[]")
         names = axis.removesuffix("[]" * brackets).split(".")
         return [_counts(parsed, names, brackets) for parsed in self._parsed]
+
+    @property
+    def sizes(self) -> NDArray[np.intp]:
+        return np.array([len(frame) for frame in self._frames], np.intp)
 
     def frame(self, index: int) -> bytes:
         return self._frames[index]

@@ -108,6 +108,57 @@ def test_several_sensors_with_the_same_frames_have_to_be_chosen_from(tmp_path: P
     assert "ldrobot-ld06, ldrobot-stl27l send the same frames" in result.stderr
 
 
+def test_points_of_a_sensor_that_the_frames_contradict_come_with_a_word(tmp_path: Path) -> None:
+    (tmp_path / "vlp16.bin").write_bytes(b"".join(simulate(ls.sensor("velodyne-vlp16"), 60)))
+    told = ran("convert", tmp_path / "vlp16.bin", tmp_path / "out.csv", "-s", "velodyne-hdl32e").stderr
+    assert "the frames are those of velodyne-vlp16 (its clock advances by 1.33 ms a packet)" in told
+
+
+def test_every_verb_that_shows_points_says_where_their_angles_are_nominal(tmp_path: Path) -> None:
+    path = tmp_path / "xt32.bin"
+    path.write_bytes(b"".join(simulate(ls.sensor("hesai-xt32"), 300)))
+    picture, table = tmp_path / "out.svg", tmp_path / "out.csv"
+    for words in (
+        ["convert", path, table],
+        ["read", path, "-n", 1],
+        ["view", path, "--once"],
+        ["plot", path, "-o", picture],
+        ["stats", path],
+    ):
+        assert ran(*words, "-s", "hesai-xt32").stderr.count("-O calibration=FILE") == 1
+
+
+def test_a_log_without_its_descriptor_is_led_to_the_option_that_reads_it(tmp_path: Path) -> None:
+    sensor, log, out = ls.sensor("slamtec-rplidar-a1"), tmp_path / "nodes.bin", tmp_path / "out.csv"
+    log.write_bytes(b"".join(simulate(sensor, 900)))
+    assert "name one, as with -s slamtec-rplidar-a1 -O answer=node" in ran("convert", log, out, code=2).stderr
+    told = ran("convert", log, out, "-s", "slamtec-rplidar-s2", code=4).stderr
+    assert "they are found with answer=node" in told
+    following = next(line for line in told.splitlines() if "next: " in line).split("next: lidarspec ")[1]
+    ran(*following.split())
+    assert len(out.read_text().splitlines()) > 700
+    assert "-s slamtec-rplidar-a1 -O answer=node" in ran("detect", log).stderr
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["-O", "answer=node"], "name the sensor with -s"),
+        (["-s", "slamtec-rplidar-a1", "-O", "answer"], "an option has a value: NAME=VALUE"),
+        (["-s", "slamtec-rplidar-a1", "-O", "answr=node"], "answr"),
+        (["-s", "slamtec-rplidar-a1", "-O", "mode=7000"], "mode is a number from 0 to 255, not 7000"),
+    ],
+)
+def test_options_of_a_sensor_that_cannot_be(tmp_path: Path, options: list[str], said: str) -> None:
+    (tmp_path / "nodes.bin").write_bytes(EXAMPLE)
+    for words in (
+        ["convert", tmp_path / "nodes.bin", tmp_path / "out.csv"],
+        ["read", tmp_path / "nodes.bin"],
+        ["parse", tmp_path / "nodes.bin"],
+    ):
+        assert said in ran(*words, *options, code=2).stderr
+
+
 def test_scans_can_be_limited(tmp_path: Path) -> None:
     name = "velodyne/vlp16_dual/packets.derived.pcap"
     sensor = ("-s", "velodyne-vlp16")

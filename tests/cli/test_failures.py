@@ -11,7 +11,9 @@ from pathlib import Path
 
 import pytest
 
-import lidarspec
+import lidarspec as ls
+from lidarspec.simulation.simulator import simulate
+from lidarspec.spec import Crc
 from tests.broken import points_fail, sound
 from tests.cli.running import EXAMPLE, process, ran
 
@@ -106,6 +108,18 @@ def test_wrong_input(folder: Path, words: tuple[str, ...], code: int, told: list
 def test_a_program_says_and_ends_with_the_same(folder: Path, words: tuple[str, ...], code: int) -> None:
     done = process(*words, cwd=folder)
     assert (done.returncode, done.stdout, done.stderr.decode()) == (code, b"", ran(*words, code=code).stderr)
+
+
+def test_every_verb_says_that_checksums_are_never_right(tmp_path: Path) -> None:
+    crc, path, chosen = Crc(width=8, poly=0x4D), tmp_path / "bug.bin", ["-s", "ldrobot-stl27l"]
+    frames = simulate(ls.sensor("ldrobot-stl27l"), 20)
+    path.write_bytes(b"".join(frame[:46] + bytes([crc(frame[1:46])]) for frame in frames))
+    out = tmp_path / "out.csv"
+    for words in (["detect", path], ["convert", path, out], ["parse", path], ["parse", path, *chosen], ["read", path, *chosen]):
+        told = ran(*words, code=4).stderr
+        assert "over 45 of the 46 other bytes" in told
+        assert f"next: lidarspec crc {path}" in told
+    assert "over 45 of the 46 other bytes" in ran("doctor", path, code=1).stdout
 
 
 def test_the_place_of_an_error_is_marked() -> None:

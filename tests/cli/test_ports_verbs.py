@@ -168,6 +168,22 @@ class TestDoctor:
         assert "it sends frames of ldrobot-stl27l, not of cspc-coin-d4" in found
         assert f"next: lidarspec view {made.path} -s ldrobot-stl27l" in found
 
+    def test_a_file_is_held_against_the_sensor_that_is_named(self, tmp_path: Path) -> None:
+        path = tmp_path / "vlp16.bin"
+        path.write_bytes(b"".join(simulate(ls.sensor("velodyne-vlp16"), 60)))
+        assert "ok     velodyne-vlp16 sends: 60 data frames" in ran("doctor", path, "-s", "velodyne-vlp16").stdout
+        for name in ("velodyne-hdl32e", "robosense-m1"):
+            assert f", not of {name}\n" in ran("doctor", path, "-s", name, code=1).stdout
+
+    @pytest.mark.parametrize(("damaged", "code"), [(0.03, 0), (0.3, 1), (0.6, 1)])
+    def test_a_line_is_bad_where_more_than_a_tenth_of_its_bytes_is_in_no_frame(self, tmp_path: Path, damaged: float, code: int) -> None:
+        frames = simulate(ls.sensor("ldrobot-stl27l"), 60)
+        for size in (60, 300):
+            data = [bytes(47) if (i * damaged) % 1 < damaged else frame for i, frame in enumerate((frames * 5)[:size])]
+            (tmp_path / "line.bin").write_bytes(b"".join(data))
+            said = ran("doctor", tmp_path / "line.bin", "-s", "ldrobot-stl27l", code=code).stdout
+            assert said.startswith("wrong" if code else "ok")
+
     def test_one_that_waits_to_be_started(self) -> None:
         with virtual_port("cspc-m1c1-mini") as made:
             found = ran("doctor", made.path, "-s", "cspc-m1c1-mini", "-t", "300ms", code=1).stdout

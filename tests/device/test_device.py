@@ -17,7 +17,9 @@ import lidarspec as ls
 from lidarspec.device.arrivals import fed
 from lidarspec.errors import SourceError, UsageError
 from lidarspec.recording.format import Recording
+from lidarspec.simulation.simulator import simulate
 from lidarspec.spec import Chunk, Udp
+from lidarspec.testing.fixtures import virtual_port
 from tests.lines import SLACK, Port, free_port, paced, port, turning, udp, until, working
 from tests.shapes import SHAPES
 
@@ -356,6 +358,52 @@ def test_a_file_is_not_recorded(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="nothing to record"):
         ls.open(path, TURNING, record=tmp_path / "more.lsr")
     assert not (tmp_path / "more.lsr").exists()
+
+
+@pytest.mark.parametrize("number", [5, 300])
+def test_a_sensor_that_the_frames_contradict_is_told_of(tmp_path: Path, number: int) -> None:
+    path = tmp_path / "vlp16.bin"
+    path.write_bytes(b"".join(simulate(ls.sensor("velodyne-vlp16"), number)))
+    with ls.open(path, "velodyne-hdl32e") as device:
+        assert list(device.scans())
+        (warning,) = device.warnings
+        assert f"{path}: read as velodyne-hdl32e, and the frames are those of velodyne-vlp16 (" in warning
+        assert f"next: lidarspec detect {path}" in warning
+    with ls.open(path, "velodyne-vlp16") as device:
+        assert list(device.scans())
+        assert device.warnings == []
+
+
+def test_a_live_sensor_that_the_frames_contradict_is_told_of() -> None:
+    with virtual_port("ldrobot-stl27l") as made, ls.open(made.path, "ldrobot-ld06") as device:
+        for _ in zip(range(3), device.scans(), strict=False):
+            pass
+        assert any("those of ldrobot-stl27l" in warning for warning in device.warnings)
+
+
+def test_a_nominal_calibration_is_told_of_once_with_the_way_to_give_the_units_own(tmp_path: Path) -> None:
+    path, angles = tmp_path / "xt32.bin", tmp_path / "angles.csv"
+    path.write_bytes(b"".join(simulate(ls.sensor("hesai-xt32"), 300)))
+    angles.write_text("\n".join(f"{channel + 1},{15 - channel},0.1" for channel in range(32)), encoding="utf-8")
+    with ls.open(path) as device:
+        assert all("nominal calibration" in repr(scan) for scan in device.scans())
+        (warning,) = device.warnings
+        assert "-O calibration=FILE, in Python sensor.configure(calibration=FILE)" in warning
+    with ls.open(path, ls.sensor("hesai-xt32").configure(calibration=angles)) as device:
+        assert not any("nominal" in repr(scan) for scan in device.scans())
+        assert device.warnings == []
+    path.write_bytes(b"".join(simulate(ls.sensor("robosense-helios16p"), 300)))
+    with ls.open(path) as device:
+        assert list(device.scans())
+        assert "where no difop frame had come" in device.warnings[0]
+
+
+def test_a_file_without_a_frame_of_the_sensor_says_so(tmp_path: Path) -> None:
+    path = tmp_path / "vlp16.bin"
+    path.write_bytes(b"".join(simulate(ls.sensor("velodyne-vlp16"), 5)))
+    with ls.open(path, "robosense-m1") as device:
+        assert list(device.scans()) == []
+        assert device.warnings == [f"{path}: 6030 bytes, and no data frame of robosense-m1 among them; next: lidarspec detect {path}"]
 
 
 def test_a_file_gives_one_scan_after_another(tmp_path: Path) -> None:

@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
+import gzip
 import random
 import socket
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 import lidarspec as ls
 from lidarspec import CommandError, SourceError, UsageError, WireError
-from lidarspec.discovery.detect import detected, scores, verdict, verdicts
+from lidarspec.discovery.detect import detected, fitting, scores, verdict, verdicts
 from lidarspec.discovery.listen import Heard, bauds, hear, probe, started_first, udp_ports
 from lidarspec.discovery.periods import structure
 from lidarspec.simulation.simulator import simulate
+from lidarspec.spec import Crc
 from lidarspec.testing.fixtures import virtual_port
 from tests.lines import Port, paced, port, working
 from tests.sensors.evidence import capture
@@ -80,6 +83,62 @@ def test_clocks_tell_twins_apart(name: str) -> None:
     assert "its clock advances by" in found.alike[0].why
 
 
+def old_firmware(number: int, *, period: float = 12 * 110.592e-6, mode: int = 0x37, product: int = 0x21) -> list[bytes]:
+    """Packets of the Velodyne form with the product byte that both an HDL-32E and a VLP-16 with old firmware send."""
+    data = simulate(ls.sensor("velodyne-vlp16"), number)
+    tails = (round(i * period * 1e6).to_bytes(4, "little") + bytes([mode, product]) for i in range(number))
+    return [packet[:1200] + tail for packet, tail in zip(data, tails, strict=True)]
+
+
+def swapped(data: list[bytes]) -> list[bytes]:
+    return [data[i ^ 1] for i in range(len(data) & ~1)]
+
+
+@pytest.mark.parametrize(
+    "as_it_comes",
+    [
+        lambda data: [packet for packet in data if random.Random(packet[1200:1204]).random() > 0.1],
+        lambda data: [packet for packet in data for _ in range(2)],
+        swapped,
+    ],
+    ids=["a tenth lost", "doubled", "swapped"],
+)
+def test_a_network_does_not_change_what_the_clock_says(as_it_comes: Callable[[list[bytes]], list[bytes]]) -> None:
+    found = verdict(Heard("", tuple(as_it_comes(old_firmware(200))), datagrams=True))
+    assert (found.sensor and found.sensor.id, found.alike[0].why) == ("velodyne-vlp16", "its clock advances by 1.33 ms a packet")
+
+
+def test_the_pace_of_a_clock_is_that_of_the_mode_that_the_packets_name() -> None:
+    dual = old_firmware(60, period=6 * 110.592e-6, mode=0x39)
+    assert (found := verdict(Heard("", tuple(dual), datagrams=True)).sensor) is not None
+    assert found.id == "velodyne-vlp16"
+
+
+def test_a_name_that_is_not_to_be_trusted_tells_nothing() -> None:
+    found = verdict(Heard("", tuple(old_firmware(2)), datagrams=True))
+    assert (found.sensor, {score.sensor.id for score in found.alike}) == (None, {"velodyne-hdl32e", "velodyne-vlp16"})
+
+
+def test_relatives_that_are_not_installed_are_recognised(tmp_path: Path) -> None:
+    xt32 = ls.sensor("hesai-xt32")
+    xt32m = [xt32.build("data", xt32.parse(packet), block_count=6, blocks=xt32.parse(packet).blocks[:6]) for packet in simulate(xt32, 5)]
+    for data, name in ((xt32m, "hesai-xt32m"), (old_firmware(60, period=6 * 110.592e-6, product=0x28), "velodyne-vlp32c")):
+        found = verdict(Heard("", tuple(data), datagrams=True))
+        assert (found.alike, [*found.others]) == ((), [name])
+        (tmp_path / "one.bin").write_bytes(data[0])
+        with pytest.raises(WireError, match=f"these are frames of {name} .*, which no installed plugin reads"):
+            detected(tmp_path / "one.bin")
+
+
+def test_a_relative_that_only_its_start_would_tell_leaves_a_doubt() -> None:
+    sensor = ls.sensor("cspc-coin-d4")
+    data = b"".join(simulate(sensor, 60))
+    at_its_baud_rate = verdict(Heard("", (data,), baud=230_400))
+    assert (at_its_baud_rate.sensor, [*at_its_baud_rate.others]) == (None, ["ydlidar-t-mini"])
+    named = sensor.build("info", model=b"COIN-D4".ljust(12, b"\0"), zero_angle=0, direction=0, correction=0, reserved=bytes(3), revision=1)
+    assert verdict(Heard("", (named + data,))).sensor is sensor
+
+
 def test_a_baud_rate_decides_where_the_bytes_do_not() -> None:
     sensor = ls.sensor("slamtec-rplidar-s2")
     data = (sensor.build("scan_descriptor"), *simulate(sensor, 300))
@@ -91,6 +150,48 @@ def test_a_baud_rate_decides_where_the_bytes_do_not() -> None:
 def test_a_scan_that_is_met_in_its_middle_is_known_all_the_same() -> None:
     sensor = ls.sensor("slamtec-rplidar-a1")
     assert "slamtec-rplidar-a1" in {score.sensor.id for score in scores([b"".join(simulate(sensor, 300))], datagrams=False)}
+
+
+def test_the_middle_of_a_scan_is_read_with_the_answer_that_began_it() -> None:
+    data = b"".join(simulate(ls.sensor("slamtec-rplidar-a1"), 300))
+    found = verdict(Heard("", (data,)))
+    assert {(score.sensor.id, score.sensor.options["answer"]) for score in found.alike} == {
+        (f"slamtec-rplidar-{model}", "node") for model in ("a1", "a3", "c1", "s2")
+    }
+    assert len(found.alike[0].sensor.decode(data)) == 300
+
+
+def test_what_is_no_fit_for_one_question_is_none_for_another() -> None:
+    packed = gzip.compress(b"".join(b"%d\n" % number for number in range(40_000)))
+    assert scores([packed], datagrams=False)
+    assert verdict(Heard("", (packed,))).scores == ()
+    assert fitting([packed], datagrams=False) == []
+
+
+def firmware_bug(number: int) -> list[bytes]:
+    """Frames of an STL-27L whose checksum leaves out their first byte."""
+    crc = Crc(width=8, poly=0x4D)
+    return [frame[:46] + bytes([crc(frame[1:46])]) for frame in simulate(ls.sensor("ldrobot-stl27l"), number)]
+
+
+def test_frames_whose_checksums_are_never_right_are_found_and_answered(tmp_path: Path) -> None:
+    data, path = b"".join(firmware_bug(60)), tmp_path / "bug.bin"
+    found = verdict(Heard("", (data,)))
+    assert (found.scores, found.sensor) == ((), None)
+    assert found.fault.startswith("60 data frames of ldrobot-ld06 or ldrobot-stl27l by their constants, lengths and rhythm")
+    assert "CRC-8 poly 0x4d in the last byte is right in 60 of 60, over 45 of the 46 other bytes" in found.fault
+    path.write_bytes(data)
+    with pytest.raises(WireError, match="their checksums are never right") as error:
+        detected(path)
+    assert error.value.__notes__ == [f"next: lidarspec crc {path}"]
+    noise = random.Random(2)
+    sealed_by_chance = [frame[:46] + noise.randbytes(1) for frame in firmware_bug(60)]
+    assert "no other checksum fits either" in verdict(Heard("", (b"".join(sealed_by_chance[:12]),))).fault
+
+
+def test_a_wrong_checksum_now_and_then_is_damage_and_no_bug() -> None:
+    good, bad = simulate(ls.sensor("ldrobot-stl27l"), 60), firmware_bug(60)
+    assert verdict(Heard("", (b"".join(bad[:58] + good[58:]),))).fault == ""
 
 
 def test_chance_frames_in_much_noise_are_no_fit() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import random
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
@@ -9,6 +10,7 @@ import pytest
 import lidarspec as ls
 import lidarspec.spec
 from lidarspec import Sensor
+from lidarspec.simulation.simulator import simulate
 from lidarspec.testing.agreement import assert_backends_agree
 from lidarspec.testing.subject import Subject
 from tests.all_sensors import streams
@@ -112,6 +114,22 @@ def test_rejections_are_counted_by_their_reason() -> None:
     stats = sensor.decode(good + far + wrong + good[:5] + good).stats
     assert (stats.frames, stats.implausible, stats.bad_checksum) == ({"data": 2}, 1, 2)
     assert stats.bytes_skipped == len(far) + len(wrong) + 5
+
+
+def test_a_datagram_with_a_wrong_constant_is_not_one_of_wrong_length() -> None:
+    sensor = ls.sensor("velodyne-vlp16")
+    (good,) = simulate(sensor, 1)
+    first, inner = b"\xff\xef" + good[2:], good[:100] + b"\xff\xef" + good[102:]
+    for data, wrong in (([first], "bad_constant"), ([inner], "bad_constant"), ([good[:-1]], "bad_length"), ([b"\xff"], "bad_length")):
+        for backend in ("numpy", "construct"):
+            decoder = sensor.decoder(stream=False, backend=backend)
+            assert decoder.feed(data[0]) == []
+            counted = {name: number for name, number in decoder.stats.to_dict().items() if name.startswith("bad_") and number}
+            assert counted == {wrong: 1}, (backend, data[0][:4])
+    for name in ("velodyne-vlp16", "slamtec-rplidar-a1"):
+        noisy = ls.sensor(name).configure(**({"answer": "node"} if name.endswith("a1") else {})).decoder(stream=True)
+        noisy.feed(b"\xff\xee" * 2000 + random.Random(1).randbytes(20_000))
+        assert noisy.stats.bad_constant == 0
 
 
 def test_fillers_are_skipped_bytes_with_a_count_of_their_own() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import gc
 import itertools
+import random
 import weakref
 from collections import Counter
 from pathlib import Path
@@ -22,7 +23,7 @@ from lidarspec.errors import UsageError
 from lidarspec.packets.stream import PacketStream
 from lidarspec.points import lazy_columns
 from lidarspec.points.cloud import COLUMNS
-from lidarspec.scans.scans import scans_of
+from lidarspec.scans.scans import ScanStream, scans_of
 from lidarspec.simulation.simulator import simulate
 from lidarspec.spec import OnChange, OnWrap
 from lidarspec.wire.frame_table import Rows
@@ -212,3 +213,34 @@ def test_a_number_of_sectors_that_is_none_is_refused_by_name(number: Any) -> Non
         with pytest.raises(UsageError, match=f"{bins.__name__} takes how many sectors the turn has"):
             bins(number)
     assert scan.to_bins(np.int32(4)).shape == (4,)
+
+
+@pytest.mark.parametrize("backend", ["numpy", "construct"])
+def test_a_scan_whose_packets_are_mostly_lost_is_not_complete(backend: str) -> None:
+    sensor = ls.sensor("cspc-m1c1-mini")
+    frames = simulate(sensor, 1500)
+    noise = random.Random(5)
+
+    def scans_with(share: float, pieces: int) -> list[Scan]:
+        """The scans where a share of the packets is damaged, read in so many pieces."""
+        data = b"".join(bytes(len(frame)) if noise.random() < share else frame for frame in frames)
+        stream, decoder = ScanStream(sensor), sensor.decoder(stream=True, backend=backend)
+        packets = PacketStream(sensor, "data", decoder.stats, backend=backend)
+        step = len(data) // pieces + 1
+        cut = [stream.add(packets.add(decoder.frames(data[at : at + step]))) for at in range(0, len(data), step)]
+        return [scan for scans in cut for scan in scans]
+
+    assert all(scan.complete for scan in scans_with(0.2, 1)[1:])
+    for pieces in (1, 7):
+        noise.seed(6)
+        damaged = scans_with(0.9, pieces)
+        assert len(damaged) > 3
+        assert not any(scan.complete or np.isfinite(scan.rate_hz) for scan in damaged)
+
+
+def test_a_scan_whose_datagrams_are_mostly_lost_is_not_complete() -> None:
+    sensor = ls.sensor("hesai-xt32")
+    frames = simulate(sensor, 2000)
+    few = [frame for index, frame in enumerate(frames) if not 510 < index < 690]
+    assert {scan.complete for scan in list(sensor.scans(frames))[1:-1]} == {True}
+    assert [scan.complete for scan in sensor.scans(few)].count(False) == 3

@@ -204,6 +204,9 @@ def started(firmware: int, model: bytes, revision: int, *noise: bytes) -> tuple[
     return ("ack", {"firmware": firmware}), SETTLING, *noise, ("info", {"model": model, "revision": revision}), "scan_start"
 
 
+# the point packet is the same; only what is sent before the first one differs (YDLIDAR SDK, communication protocol)
+OTHERS = {"ydlidar-t-mini": "info.model, which is sent when it is started"}
+
 VERSION = (("ack", {"firmware": 3}),)
 
 M1C1_MINI = Sensor(
@@ -237,7 +240,7 @@ M1C1_MINI = Sensor(
     range_limits=(0.001, 16.383),  # what the field can hold; the manual gives none
     vendor_axes=("forward", "right", "up"),
     turn=(LOW_SPEED, 7.0),  # manual 1c
-    relatives={"cspc-coin-d4": "info.model"},
+    relatives={"cspc-coin-d4": "info.model", **OTHERS},
     info={"model": "info.model", "firmware": "info.revision"},  # ack.firmware is 0 but in the answer to start (manual 2.1.3)
     aliases=("m1c1-mini", "m1c1"),
     status="vectors",
@@ -253,7 +256,7 @@ COIN_D4 = dataclasses.replace(
     simulation=Simulation(sweep, answers={"start": started(1, b"COIN-D4", 1, b"\xfa\xfa"), "get_version": VERSION}),
     state={"info": {"correction": 0, "zero_angle": 0}},  # the device information of a live unit
     turn=None,  # the manual's two speeds are the M1C1_Mini's
-    relatives={"cspc-m1c1-mini": "info.model"},
+    relatives={"cspc-m1c1-mini": "info.model", **OTHERS},
     status="capture",
     acknowledged={"LS710": "the start-up is another's capture: the project's tests read it where it is"},
     source="the M1C1_Mini's manual; baud rate from the vendor's SDK; a captured start-up of a COIN-D4",

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from construct import Bytes, Int8ul, Int16ul, Int32ul
 
-from lidarspec.spec import Clock, Fields, Frame, OnWrap, Polar, Scaled, Sensor, Sequence, Simulation, Udp
+from lidarspec.spec import Clock, Fields, Frame, OnWrap, Polar, Relative, Scaled, Sensor, Sequence, Simulation, Udp
 from lidarspec_hesai.calibration import Calibration, configure, nominal
 from lidarspec_hesai.headed import block_numbers, distance, header, longest, packet, plausible
 from lidarspec_hesai.parts import FACTORY, RETURN_MODES, TURN, UNPUBLISHED, UTC, beams, clock, turning
@@ -62,6 +62,7 @@ XT32 = Sensor(
     vendor_axes=("right", "forward", "up"),
     turn=TURN,
     aliases=("xt32", "pandarxt-32"),
+    relatives={"hesai-xt32m": Relative("6 blocks in a packet, an XT32 sends 8", lambda f: f.block_count == 6)},
     status="capture",
     acknowledged=UNPUBLISHED,
     source="HesaiLidar_SDK_2.0 (udp_protocol_v6_1.h, PandarXT correction files); capture of tier4/nebula",
@@ -75,6 +76,7 @@ XT16 = dataclasses.replace(
     points=partial(points, channels=TABLE_16),
     configure=partial(configure, points, TABLE_16),
     aliases=("xt16", "pandarxt-16"),
+    relatives={},
     status="vectors",
     source="HesaiLidar_SDK_2.0 (udp_protocol_v6_1.h, PandarXT-16 correction files); one captured packet of tier4/nebula",
 )

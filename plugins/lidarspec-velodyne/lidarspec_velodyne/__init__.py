@@ -14,8 +14,8 @@ from functools import partial
 
 import numpy as np
 
-from lidarspec.spec import Clock, OnWrap, Sensor, Simulation, Udp, hookimpl
-from lidarspec_velodyne.firings import Firings, configure, points, sweep
+from lidarspec.spec import Clock, OnWrap, Relative, Sensor, Simulation, Udp, hookimpl
+from lidarspec_velodyne.firings import Firings, configure, pace, points, sweep
 from lidarspec_velodyne.frames import FRAMES, HOUR, SLOTS, TURN
 
 SLOT = np.arange(SLOTS)
@@ -41,6 +41,12 @@ HDL32E_FIRINGS = Firings(
     product=0x21,
 )
 
+# the same packets by other products (velodyne_decoder, types.h); 0x21 tells nothing: a VLP-16 with old firmware sends it too
+OTHERS = {
+    "velodyne-puck-hi-res": Relative("product 0x24", lambda f: f.product == 0x24),
+    "velodyne-vlp32c": Relative("product 0x28", lambda f: f.product == 0x28),
+}
+
 
 VLP16 = Sensor(
     "velodyne-vlp16",
@@ -50,14 +56,14 @@ VLP16 = Sensor(
     points=partial(points, model=VLP16_FIRINGS),
     scan=OnWrap("blocks.azimuth"),
     links={"data": Udp(2368, 8308)},
-    clock=Clock("timestamp", wraps_at=HOUR),
+    clock=Clock("timestamp", wraps_at=HOUR, pace=partial(pace, model=VLP16_FIRINGS)),
     simulation=Simulation(partial(sweep, model=VLP16_FIRINGS)),
     configure=partial(configure, VLP16_FIRINGS),
     range_limits=(0.4, 130.0),  # the default of ros-drivers/velodyne for this model
     vendor_axes=("right", "forward", "up"),
     turn=TURN,
     # 12 blocks, or 6 shots: periods of 110.592 and 46.080 us
-    relatives={"velodyne-hdl32e": "timestamp: a packet each 1327 us, with dual return 664 us; an HDL-32E's 553 and 276 us"},
+    relatives={"velodyne-hdl32e": "timestamp: a packet each 1327 us, with dual return 664 us; an HDL-32E's 553 and 276 us", **OTHERS},
     info={"temperature": "position.top_board_temperature"},  # the product byte is not to be trusted
     aliases=("vlp16", "puck"),
     status="capture",
@@ -71,10 +77,11 @@ HDL32E = dataclasses.replace(
     model="HDL-32E",
     aliases=("hdl32e",),
     points=partial(points, model=HDL32E_FIRINGS),
+    clock=Clock("timestamp", wraps_at=HOUR, pace=partial(pace, model=HDL32E_FIRINGS)),
     simulation=Simulation(partial(sweep, model=HDL32E_FIRINGS)),
     configure=partial(configure, HDL32E_FIRINGS),
     range_limits=(0.9, 130.0),  # likewise
-    relatives={"velodyne-vlp16": "timestamp: a packet each 553 us, with dual return 276 us; a VLP-16's 1327 and 664 us"},
+    relatives={"velodyne-vlp16": Relative("product 0x22; or a packet each 1327 us", lambda f: f.product == 0x22), **OTHERS},
     source="velodyne_decoder and ros-drivers/velodyne, citing the HDL-32E user manual; one capture",
 )
 

@@ -107,6 +107,11 @@ def configure(model: Firings, sensor: Sensor, /, *, last_block: str) -> Sensor:
     return dataclasses.replace(sensor, points=partial(points, model=model, last_block=last_block))
 
 
+def pace(f: Fields, model: Firings) -> Any:
+    """Seconds from a packet to the next: 12 blocks, or the 6 shots of dual return."""
+    return np.where(f.return_mode == DUAL, BLOCKS // 2, BLOCKS) * model.period
+
+
 def sweep(i: int, model: Firings) -> dict[str, Any]:
     """Packet i with single return, at 10 turns a second."""
     block = i * BLOCKS + np.arange(BLOCKS)
