@@ -340,9 +340,9 @@ class Simulation:
             raise UsageError(f"{sensor.id} declares no sweep for {frame!r} frames, and cannot be simulated")
         self._sensor, self._frame, self._sweep = sensor, frame, sweep
         self._maker = FrameMaker(sensor, frame)
-        swept: set[str] = set().union(*(sweep(index) for index in range(PROBED)))
-        table = self._table(range(PROBED))
-        self._measurement = Measurement(sensor, frame, table, swept)
+        swept = self._swept(range(PROBED))
+        table = self._maker.table(swept)
+        self._measurement = Measurement(sensor, frame, table, {path for values in swept for path in values})
         self._pace = Pace(sensor, frame, table, self._measurement.beams(table))
         self.interval = self._pace.interval
 
@@ -352,15 +352,15 @@ class Simulation:
         Args:
             since: seconds since the scene began at the first of them.
         """
-        table = self._table(range(start, start + count + AHEAD))
+        table = self._maker.table(self._swept(range(start, start + count + AHEAD)))
         times = self._pace.times(table, functools.partial(self._measurement.beams, table))
         self._measurement.fill(table, scene, since + times / 1e9)
         return Block(sealed(table)[:count], times[: count + 1])
 
-    def _table(self, numbers: range) -> Rows:
-        """The packets of these numbers, before anything is measured."""
+    def _swept(self, numbers: range) -> list[Mapping[str, Any]]:
+        """The values of the packets of these numbers, before anything is measured."""
         with plugin_errors(f"sweep of {self._frame}", self._sensor.id, self._sweep):
-            return self._maker.table([self._sweep(number) for number in numbers])
+            return [self._sweep(number) for number in numbers]
 
 
 @functools.lru_cache(maxsize=64)

@@ -45,7 +45,7 @@ def test_a_damaged_capture_is_read_on_and_said_to_be_damaged(verb: str, tmp_path
     some = records(1300)
     some[700] = some[700][:10] + b"\x7f" + some[700][11:]
     path = capture(tmp_path / "it.pcap", *some)
-    target = {"convert": [tmp_path / "out.csv"], "plot": ["-o", tmp_path / "out.svg", "-n", 9]}.get(verb, [])
+    target = {"convert": [tmp_path / "out.csv"], "plot": ["-o", tmp_path / "out.svg", "--scan", 9]}.get(verb, [])
     done = ran(verb, path, *target, "-s", M1, *(["--packets", "--json"] if verb == "read" else []), code=1)
     assert f"{path} is damaged in 1 place: {len(some[700])} bytes were not read, everything else was" in done.stderr
     if verb == "read":

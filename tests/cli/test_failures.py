@@ -209,7 +209,7 @@ RAISES = Path(points_fail.__file__)
 def test_a_plugin_that_raises_is_named_alike_by_every_verb(words: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Its id, what raised, the file and line, the number of packets where some were read; exit code 1."""
     monkeypatch.chdir(tmp_path)
-    Path("frames.bin").write_bytes(b"".join(lidarspec.simulate(sound.sensor(), 12)))
+    Path("frames.bin").write_bytes(b"".join(ls.simulate(sound.sensor(), 12)))
     said = ran(*words, *(() if words[0] == "sim" else ("-s", RAISES)), code=1).stderr
     line = next(number for number, text in enumerate(RAISES.read_text(encoding="utf-8").splitlines(), 1) if "distnace" in text)
     assert "broken-one: points of data: UnknownField: unknown field 'samples.distnace'" in said
@@ -235,10 +235,10 @@ def lidarspec_sensors():
 
 def test_a_plugin_that_raises_now_and_then_ends_with_its_message_and_in_python_is_a_warning(tmp_path: Path) -> None:
     (file := tmp_path / "sometimes.py").write_text(SOMETIMES, encoding="utf-8")
-    (tmp_path / "packets.hex").write_text("\n".join(frame.hex() for frame in lidarspec.simulate(sound.sensor(), 12)), encoding="utf-8")
+    (tmp_path / "packets.hex").write_text("\n".join(frame.hex() for frame in ls.simulate(sound.sensor(), 12)), encoding="utf-8")
     said = ran("plot", tmp_path / "packets.hex", "-o", "-", "-s", file, code=1).stderr
     assert f"broken-one: points of data: ArithmeticError: by hand ({file}:7), at " in said
-    with lidarspec.open(tmp_path / "packets.hex", str(file)) as device:
+    with ls.open(tmp_path / "packets.hex", str(file)) as device:
         list(device.scans())
     assert [warning for warning in device.warnings if f"({file}:7), at" in warning]
 
