@@ -97,6 +97,12 @@ def _duration(text: str) -> float:
     return seconds
 
 
+def _share(text: str) -> float:
+    if not 0 <= (number := share(text)) <= 1:
+        raise ValueError(text)
+    return number
+
+
 def _offset(text: str) -> int:
     offset = int(text, 0)
     if offset < 0:
@@ -114,7 +120,7 @@ def _speed(text: str) -> float:
 #: seconds from "10s", "500ms", "2min", "1h" or a bare number.
 DURATION = Number("duration", _duration, "duration above 0, such as 10s, 500ms, 2min or 1h")
 #: a number from 0 to 1, from "1%" or "0.01".
-SHARE = Number("share", share, "share, such as 1% or 0.01")
+SHARE = Number("share", _share, "share, such as 1% or 0.01")
 #: bytes, from "940" or "0x3ac".
 OFFSET = Number("offset", _offset, "offset of a byte, such as 940 or 0x3ac")
 #: a factor above 0; 0 for "max".

@@ -21,6 +21,9 @@ from lidarspec.spec.tree import Blob, Block, Empty, FieldInfo, Node, Number, Opa
 from lidarspec.wire.schema import schema
 from lidarspec.wire.wire_table import meaning, unit_text
 
+#: what `parse` takes besides the bytes and the frame.
+PARSING = "verify: bool = True, units: bool = False"
+
 
 def pyi(sensor: Sensor) -> str:
     """The stub of a sensor.
@@ -108,7 +111,7 @@ class _Classes:
 def _sensor(sensor: Sensor, frames: tuple[Message, ...], names: dict[str, str]) -> str:
     """The class of the sensor: what `parse`, `build`, `example` and `command` take and give."""
     parses = "\n".join(
-        f'    @overload\n    def parse(self, data: bytes, frame: Literal["{frame}"], *, verify: bool = True) -> {name}: ...'
+        f'    @overload\n    def parse(self, data: bytes, frame: Literal["{frame}"], *, {PARSING}) -> {name}: ...'
         for frame, name in names.items()
     )
     builds = "\n".join(_build(message) for message in frames)
@@ -125,7 +128,7 @@ class {camel(sensor.id)}(Sensor):
 
 {parses}
     @overload
-    def parse(self, data: bytes, frame: str | None = None, *, verify: bool = True) -> Any: ...
+    def parse(self, data: bytes, frame: str | None = None, *, {PARSING}) -> Any: ...
 {builds}
     @overload
     def build(self, _frame: str, _value: Any = None, /, *, units: bool = False, **values: Any) -> bytes: ...

@@ -82,15 +82,12 @@ def duration(text: str) -> float:
 
 
 def share(text: str) -> float:
-    """A number from 0 to 1 out of "1%" or "0.01".
+    """The number that "1%" or "0.01" says.
 
     Raises:
         ValueError: where it is none.
     """
-    number = float(text.removesuffix("%")) / (100 if text.endswith("%") else 1)
-    if not 0 <= number <= 1:
-        raise ValueError(text)
-    return number
+    return float(text.removesuffix("%")) / (100 if text.endswith("%") else 1)
 
 
 class Scaled(layer.Describing):

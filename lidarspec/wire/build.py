@@ -75,7 +75,7 @@ class _Values:
 
     def checked(self, value: Any, path: str, shown: str = "") -> Any:
         info = self._table.fields.get(path)
-        if info is not None and info.kind == "other":
+        if info is not None and info.kind == "other" and not (self._units and info.scaled):
             return value  # construct alone knows what it takes
         if isinstance(value, Mapping):
             return self._mapping(value, path, shown)
