@@ -119,8 +119,7 @@ class Device(Closing):
         self._streams: dict[str | None, PacketReader] = {}
         self._latest, self._unseen = ScanStream(sensor, mount), deque[Scan]()
         self._ahead: Arrival | None = None
-        self._examined: list[Found] | None = [] if sensor.relatives else None
-        self._doubts: list[str] = []
+        self._first, self._another = list[Found](), "" if not sensor.relatives else None
         self._own_recorder: Log | None = None
         self._input = self._opened(backend, record, overflow, period)
         self._finalizer = weakref.finalize(self, _close, self._input, self._own_recorder)
@@ -142,7 +141,7 @@ class Device(Closing):
         that are another sensor's, a nominal calibration; and what the plugin failed at."""
         failure = self.stats.failure(self.sensor.id)
         nominal = [_nominal(self.sensor)] if self.stats.nominal else []
-        return [*self._input.warnings, *self._doubts, *nominal, *([] if failure is None else [str(failure)])]
+        return [*self._input.warnings, *self._doubts(), *nominal, *([] if failure is None else [str(failure)])]
 
     @property
     def state(self) -> str:
@@ -334,17 +333,21 @@ class Device(Closing):
                 yield arrival
 
     def _next(self, wait: float) -> Arrival | None:
-        """What arrives next; the first frames are asked whether they are another sensor's."""
+        """What arrives next; the first frames are kept until somebody asks whether they are another sensor's."""
         arrival = self._input.next(wait)
-        if self._examined is not None:
-            for frames in arrival.found if arrival is not None else ():
-                self._examined += frames.only(slice(0, EXAMINED)).found()
-            if len(self._examined) >= EXAMINED or self._input.ended:
-                other, self._examined = contradiction(self.sensor, self._examined), None
-                if other:
-                    text = f"{self._source}: read as {self.sensor.id}, and the frames are those of {other}"
-                    self._doubts.append(f"{text}; next: lidarspec detect {quote(str(self._source))}")
+        if self._another is None and arrival is not None and len(self._first) < EXAMINED:
+            for frames in arrival.found:
+                self._first += frames.only(slice(0, EXAMINED)).found()
         return arrival
+
+    def _doubts(self) -> list[str]:
+        """That the first frames are another sensor's: found out once, when there are enough of them."""
+        if self._another is None and (len(self._first) >= EXAMINED or self._input.ended):
+            self._another = contradiction(self.sensor, self._first)
+        if not self._another:
+            return []
+        text = f"{self._source}: read as {self.sensor.id}, and the frames are those of {self._another}"
+        return [f"{text}; next: lidarspec detect {quote(str(self._source))}"]
 
 
 def _nominal(sensor: Sensor) -> str:
