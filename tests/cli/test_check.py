@@ -122,4 +122,4 @@ def test_one_sensor_of_a_file_is_checked_by_its_id(tmp_path: Path) -> None:
     text = STRANGER.read_text(encoding="utf-8").replace("return [X1]", "return [X1, dataclasses.replace(X1, id='acme-x2', aliases=())]")
     file.write_text(text, encoding="utf-8")
     assert ran("check", f"{file}:acme-x2", "--max-examples", "4").output.startswith("acme-x2: clean")
-    assert "unknown sensor 'acme-x3'; did you mean 'acme-x2'?" in ran("check", f"{file}:acme-x3", code=2).output
+    assert "unknown sensor 'acme-x3'; did you mean 'acme-x2'?" in ran("check", f"{file}:acme-x3", code=2).stderr
