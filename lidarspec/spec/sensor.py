@@ -7,6 +7,7 @@ scans. They are imported when a method is called first: a sensor is found and lo
 from __future__ import annotations
 
 import inspect
+import warnings
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
@@ -174,6 +175,8 @@ class Sensor(Spec):
     def scans(self, data: Any, *, backend: str = "auto") -> Iterator[Scan]:
         """Every scan of the data; the first and last piece are marked ``complete=False``.
 
+        Where there is no data frame in the data, or `points` raises at some of the packets, a Python warning says so.
+
         Args:
             data: bytes (a stream), an iterable of datagrams, or an (n, size) uint8 array of datagrams.
             backend: "auto", "numpy", "jit" or "construct": the same results.
@@ -183,7 +186,16 @@ class Sensor(Spec):
         """
         from lidarspec.scans.scans import scans_of
 
-        return scans_of(self, [self.decode(data, backend=backend)])
+        packets = self.decode(data, backend=backend)
+        if packets.stats.bytes_in and not len(packets):
+            warnings.warn(f"{self.id}: no {packets.frame} frame in the data ({packets.stats}): is it of another sensor?", stacklevel=2)
+        return self._followed(scans_of(self, [packets]), packets)
+
+    def _followed(self, scans: Iterator[Scan], packets: Packets) -> Iterator[Scan]:
+        """Scans, and behind them what the plugin failed at."""
+        yield from scans
+        if (failure := packets.stats.failure(self.id)) is not None:
+            warnings.warn(str(failure), stacklevel=2)
 
 
 @dataclass(frozen=True)

@@ -80,7 +80,7 @@ def physical(sensor: Sensor, name: str, data: bytes) -> Any:
     parsed = sensor.parse(data, frame=name)
     for holder, key, path in list(integers(parsed, kinds=(int, float))):
         info = fields.get(path)
-        if info is not None and info.scaled and info.kind in ("int", "float"):
+        if info is not None and info.scaled:
             value = info.physical(holder[key])
             if info.kind == "float" and info.dtype is not None and info.dtype.type(info.raw(value)) != holder[key]:
                 return None

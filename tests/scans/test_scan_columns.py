@@ -27,6 +27,7 @@ from lidarspec.scans.scans import ScanStream, scans_of
 from lidarspec.simulation.simulator import simulate
 from lidarspec.spec import OnChange, OnWrap
 from lidarspec.wire.frame_table import Rows
+from tests.broken import points_fail, sound
 from tests.shapes import SHAPES
 
 BACKENDS = ["numpy", "jit"]
@@ -244,3 +245,11 @@ def test_a_scan_whose_datagrams_are_mostly_lost_is_not_complete() -> None:
     few = [frame for index, frame in enumerate(frames) if not 510 < index < 690]
     assert {scan.complete for scan in list(sensor.scans(frames))[1:-1]} == {True}
     assert [scan.complete for scan in sensor.scans(few)].count(False) == 3
+
+
+def test_scans_of_a_wrong_sensor_and_of_a_plugin_that_raises_are_warned_of() -> None:
+    other = b"".join(simulate(ls.sensor("cspc-m1c1-mini"), 40))
+    with pytest.warns(UserWarning, match=r"ldrobot-stl27l: no data frame in the data .*is it of another sensor\?"):
+        assert not list(ls.sensor("ldrobot-stl27l").scans(other))
+    with pytest.warns(UserWarning, match=r"distnace.*, at 12 packets"):
+        list(sound.sensor(points=points_fail.points).scans(b"".join(simulate(sound.sensor(), 12))))
