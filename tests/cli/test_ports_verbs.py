@@ -247,7 +247,7 @@ def test_bytes_sent_by_hand_are_answered_and_the_answer_is_explained() -> None:
     assert said.stdout.startswith("slamtec-rplidar-a1 info, 27 bytes\n0000  a5 5a ")
     assert said.stderr == "sent 2 bytes: a5 50\n"
     told = printed("send", "sim:cspc-m1c1-mini", "--hex", "aa55f00f", "-s", "cspc-m1c1-mini")
-    assert (told["sent"], [frame["frame"] for frame in told["frames"]]) == ("aa 55 f0 0f", ["ack"])
+    assert (told["sent"], told["frames"][0]["frame"]) == ("aa 55 f0 0f", "ack")  # what follows it comes sooner or later
     streaming = ran("send", "sim:ldrobot-stl27l", "--hex", "00", "--timeout", "300ms")
     assert streaming.stdout == ""
     assert "data frames came meanwhile\nnothing came back\n" in streaming.stderr
