@@ -98,7 +98,8 @@ def test_a_hook_that_fails_is_a_spec_error_of_its_sensor(registry: Registry) -> 
     packets = sensor.decode(sensor.example("data"))
     with pytest.raises(SpecError, match="the site's file is gone"):
         packets.points()
-    assert list(sensor.scans(sensor.example("data"))) == []
+    with pytest.warns(UserWarning, match="the site's file is gone"):
+        assert list(sensor.scans(sensor.example("data"))) == []
     assert list(scans_of(sensor, [packets])) == []
     assert packets.stats.plugin_errors == 1
     assert "the site's file is gone" in packets.stats.tracebacks[0]
