@@ -453,9 +453,12 @@ def sensor(name: str | Path | Sensor) -> Sensor:
     if isinstance(name, Sensor):
         return name
     text = str(name)
-    if "/" in text or "\\" in text or text.endswith(".py"):
-        return _from_file(text)
-    return registry().sensor(text)
+    return _from_file(text) if names_file(text) else registry().sensor(text)
+
+
+def names_file(text: str) -> bool:
+    """Whether the name of a sensor is that of a file, which would be run, and not an id."""
+    return "/" in text or "\\" in text or text.endswith(".py")
 
 
 def file_and_id(text: str) -> tuple[Path, str]:

@@ -18,7 +18,7 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 #: variables that change what a program does; those of the tests themselves (LIDARSPEC_CAPTURES, LIDARSPEC_EXAMPLES, LIDARSPEC_KSC) stay.
-CHANGING = ("LIDARSPEC_BACKEND", "LIDARSPEC_THREADS", "LIDARSPEC_DEBUG")
+CHANGING = ("LIDARSPEC_BACKEND", "LIDARSPEC_THREADS", "LIDARSPEC_DEBUG", "LIDARSPEC_TRUST")
 
 
 @pytest.fixture(autouse=True, scope="session")

@@ -9,6 +9,7 @@ from __future__ import annotations
 import functools
 import glob
 import os
+import warnings
 from collections.abc import Callable, Iterable
 
 import click
@@ -59,7 +60,8 @@ class Bash(BashComplete):
 def completed(group: click.Command, instruction: str) -> int:
     """Print what a shell asks for; the exit code."""
     try:
-        return shell_complete(group, {}, "lidarspec", VARIABLE, instruction)
+        with warnings.catch_warnings(action="ignore"):  # the verb itself will say what there is to say
+            return shell_complete(group, {}, "lidarspec", VARIABLE, instruction)
     except LidarSpecError:  # settings or plugins with a mistake, which the verb itself will name
         return 1
 
@@ -150,5 +152,7 @@ BY_NAME: dict[str, Callable[[click.Context, str], Iterable[str]]] = {
     "assignments": _assignments,
     "name": _either,
     "verb": _verbs,
-    **dict.fromkeys(("file", "words", "target", "output", "scene", "vectors", "capture", "into", "diff", "link", "place", "to"), _files),
+    **dict.fromkeys(
+        ("file", "words", "target", "output", "scene", "vectors", "capture", "into", "diff", "link", "place", "to", "folder"), _files
+    ),
 }

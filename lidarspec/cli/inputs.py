@@ -18,7 +18,7 @@ import click
 from lidarspec.cli.failures import FINDINGS
 from lidarspec.cli.output import note
 from lidarspec.device.device import Device
-from lidarspec.device.settings import devices
+from lidarspec.device.settings import named
 from lidarspec.discovery.detect import chosen, nearest, never_right, verdict
 from lidarspec.discovery.listen import LOOKED_AT, Heard, beginning
 from lidarspec.errors import CommandError, LidarSpecError, SourceError, UsageError, WireError, suggest, system_errors
@@ -57,10 +57,9 @@ def opened(words: Sequence[str]) -> Iterator[tuple[Heard, Iterator[Chunk]]]:
                 raise ValueError("there are no digits")
             reading = _beginning(text if len(text) <= REPEATED else "-", iter([Chunk(data)]), datagrams=False)
         except ValueError as error:
-            known = devices()
-            if text not in known:
+            if (device := named(text)) is None:
                 raise _no_bytes(words, error) from None
-            reading = opened([known[text].source])
+            reading = opened([device.source])
     with reading as given:
         yield given
 

@@ -39,16 +39,18 @@ def _configured(sensor_id: str | None, options: Sequence[str]) -> str | Sensor |
     given = dict(option.partition("=")[::2] for option in options)
     if unset := [option for option in options if "=" not in option]:
         raise UsageError(f"-O {unset[0]}: an option has a value: NAME=VALUE")
-    configured: Sensor = sensor(sensor_id).configure(**{name: _value(text) for name, text in given.items()})
+    known: Sensor = sensor(sensor_id)
+    configured: Sensor = known.configure(**{name: _value(known, name, text) for name, text in given.items()})
     return configured
 
 
-def _value(text: str) -> Any:
-    """A number, true or false as in `lidarspec.toml`; all else is text."""
+def _value(sensor: Sensor, name: str, text: str) -> Any:
+    """A number, true or false as in `lidarspec.toml`, where the option takes one; all else is text."""
     try:
-        return tomllib.loads(f"value = {text}")["value"]
-    except tomllib.TOMLDecodeError:
+        value = tomllib.loads(f"value = {text}")["value"]
+    except (ValueError, RecursionError):
         return text
+    return value if sensor.configure.takes(name, value) else text
 
 
 def count_option(what: str, **more: Any) -> Callable[[Function], Function]:

@@ -182,7 +182,7 @@ def _sensor(source: Transport, sensor_id: str | Sensor | None) -> Sensor | None:
     if sensor_id:
         return named_sensor(sensor_id)
     with contextlib.suppress(LidarSpecError):
-        return source.header.known_sensor() if isinstance(source, RecordingTransport) else None
+        return source.known_sensor() if isinstance(source, RecordingTransport) else None
     return None
 
 

@@ -9,7 +9,8 @@ import contextlib
 import importlib
 import os
 import sys
-from collections.abc import Sequence
+import warnings
+from collections.abc import Iterator, Sequence
 from typing import Any, NoReturn
 
 import click
@@ -27,6 +28,7 @@ GROUPS = {
         "detect": ("finding", "Which installed sensor sends, and at which port and baud rate."),
         "doctor": ("finding", "What keeps a sensor's bytes from coming, and the command that mends it."),
         "plugins": ("sensors", "The plugins that were found, and what is wrong with those that do not load."),
+        "trust": ("sensors", "Allow a folder: its lidarspec.toml may name Python files, and files elsewhere."),
         "demo": ("sim", "A simulated sensor on a port: started, read through a bad line, recorded, read again, drawn."),
         "help": ("root", "What a verb does, and its options; without a verb, all of them."),
     },
@@ -107,7 +109,7 @@ def _run(group: click.Group, words: list[str]) -> int:
         with contextlib.suppress(AttributeError):
             stream.reconfigure(errors="replace")  # type: ignore[union-attr]
     try:
-        with group.make_context("lidarspec", words) as ctx:
+        with _warnings_told(), group.make_context("lidarspec", words) as ctx:
             group.invoke(ctx)
         sys.stdout.flush()
         return 0
@@ -124,6 +126,25 @@ def _run(group: click.Group, words: list[str]) -> int:
             return report(error, next((word for word in words if word in VERBS), ""))
         _silence()
         return 0
+
+
+@contextlib.contextmanager
+def _warnings_told() -> Iterator[None]:
+    """Within, what the package warns a program of in Python is a line on stderr, said once."""
+    told: set[str] = set()
+    with warnings.catch_warnings():
+        plain = warnings.showwarning
+
+        def tell(message: Warning | str, category: type[Warning], *place: Any, **more: Any) -> None:
+            if category is not UserWarning:
+                plain(message, category, *place, **more)
+            elif str(message) not in told:
+                told.add(str(message))
+                click.echo(str(message), err=True)
+
+        warnings.showwarning = tell
+        warnings.simplefilter("always", UserWarning)
+        yield
 
 
 def _silence() -> None:

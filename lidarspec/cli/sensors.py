@@ -1,4 +1,4 @@
-"""The verbs that look at what is installed."""
+"""The verbs that look at what is installed, and the one that says what is believed beside it."""
 
 from __future__ import annotations
 
@@ -25,6 +25,7 @@ from lidarspec.spec.description import Frame
 from lidarspec.spec.links import Link, Serial, Udp
 from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.ports import serial_ports
+from lidarspec.trust import TRUSTED, trust as trusted, user_folder
 from lidarspec.wire.wire_table import frame_size, wire_table
 
 #: packets that a plan is shown for: as many as a turn may take, since some of them are shorter.
@@ -136,6 +137,17 @@ def plugins(ctx: click.Context, as_json: bool, output: str | None) -> None:
         emit(table(["distribution", "version", "entry point", "sensors"], rows, output) if rows else NO_SENSORS, output)
     if any(plugin.error for plugin in found):
         ctx.exit(FINDINGS)
+
+
+@click.command()
+@click.argument("folder", default=".")
+def trust(folder: str) -> None:
+    """Allow a folder: its lidarspec.toml may name Python files, and files elsewhere.
+
+    It is for folders of your own whose files you know; it is kept, and holds for this folder alone. For a single run the
+    variable LIDARSPEC_TRUST names one.
+    """
+    click.echo(f"{trusted(folder)}: what its {FILE} names is believed from now on; a line in {user_folder() / TRUSTED} says so")
 
 
 def _facts(sensor: Sensor) -> dict[str, Any]:

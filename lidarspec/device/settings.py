@@ -6,24 +6,29 @@
     mount = {x = 0.2, yaw_deg = 90, inverted = true}
     options = {calibration = "./angles.csv"}
 
-The nearest file in the working directory or above counts, then the one in the user's configuration directory. A name
-stands for its device wherever a SOURCE is asked for; ``./front`` is the file of that name.
+A name stands for its device wherever a SOURCE is asked for; ``./front`` is the file of that name. The file in the user's configuration
+directory comes first, and then the nearest one, in the working directory or above it, that belongs to the user: it adds names, and hides
+none. A project may come from anybody, so its file runs no Python and leads to no path outside its folder, unless the user has allowed
+that folder. A file with a mistake takes away its own devices, and no others.
 """
 
 from __future__ import annotations
 
 import os
 import re
-import tomllib
+import warnings
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
+from reprlib import repr as shown
+from shlex import quote
 from typing import Any
 
-from lidarspec.errors import UsageError, did_you_mean, system_errors
-from lidarspec.plugins import sensor as named_sensor
+from lidarspec.errors import LidarSpecError, UsageError, did_you_mean, suggest
+from lidarspec.plugins import names_file, sensor as named_sensor
 from lidarspec.points.cloud import Mount
 from lidarspec.spec.sensor import Sensor
+from lidarspec.trust import beside, document, foreign, is_trusted, user_folder
 
 FILE = "lidarspec.toml"
 #: what can be a name: nothing that has a suffix, a scheme or a folder, and no port of a system that calls them by letters.
@@ -42,6 +47,8 @@ class Named:
         mount: how it is mounted; None where nothing is said.
         options: what the sensor is configured with.
         file: where it stands.
+        hidden: another file that has a device of this name, which is not used.
+        believed: whether the file is the user's own, or in a folder that the user has allowed.
     """
 
     name: str
@@ -50,6 +57,8 @@ class Named:
     mount: Mount | None = None
     options: Mapping[str, Any] = field(default_factory=dict)
     file: str = ""
+    hidden: str = ""
+    believed: bool = True
 
     def configured(self) -> Sensor | None:
         """The sensor with its options; None where it is to be detected.
@@ -60,51 +69,100 @@ class Named:
         if self.sensor is None:
             return None
         found = named_sensor(self.sensor)
-        return found.configure(**self.options) if self.options else found
+        if not self.options:
+            return found
+        place = f"{self.file}: [device.{self.name}]"
+        try:
+            options = self.options if self.believed else found.configure.options_of_file(self.options, Path(self.file).parent)
+        except UsageError as error:
+            raise self._asking(UsageError(f"{place}: {error}")) from None
+        try:
+            configured: Sensor = found.configure(**options)
+        except UsageError as error:
+            raise UsageError(f"{place}: {error}") from None
+        return configured
+
+    def refused(self) -> UsageError | None:
+        """Why a file that is not believed cannot have this device; None where it can."""
+        if self.believed:
+            return None
+        folder, file, reason = Path(self.file).parent, self.source.partition("?")[0], ""
+        if self.sensor is not None and names_file(self.sensor):
+            reason = f"sensor {self.sensor!r} is Python, which would run"
+        elif os.path.isfile(file):
+            try:
+                beside(folder, os.path.abspath(file))
+            except UsageError:
+                reason = f"source {self.source!r} is a file outside {folder}"
+        error = UsageError(f"{self.file}: [device.{self.name}]: {reason}: that takes a folder that you have allowed")
+        return self._asking(error) if reason else None
+
+    def _asking(self, error: UsageError) -> UsageError:
+        """The error, with the command that allows the folder of the file."""
+        return suggest(error, f"lidarspec trust {quote(str(Path(self.file).parent))}")
 
 
 def named(source: str | Path) -> Named | None:
     """The device of this name; None for every other SOURCE.
 
     Raises:
-        UsageError: for a mistake in a settings file, with file, table and key, and for a word that is neither a name nor a file.
+        UsageError: for a device of a file with a mistake, which is named with table and key, or with something that only a folder may name
+            that the user has allowed; and for a word that is neither a name nor a file.
         SourceError: for a settings file that cannot be read.
     """
     word = str(source)
     if not isinstance(source, str) or not _NAME.fullmatch(word):
         return None
-    known = devices()
-    if word in known:
-        return known[word]
-    if known and not Path(word).exists():
-        places = sorted({device.file for device in known.values()})
-        raise UsageError(f"{word!r} is no file, and no device of {', '.join(places)}{_closest(word, known)}")
-    return None
+    known, faults = _known()
+    if word not in known and not Path(word).exists():
+        if faults:
+            raise faults[0]
+        if known:
+            places = sorted({device.file for device in known.values()})
+            raise UsageError(f"{word!r} is no file, and no device of {', '.join(places)}{_closest(word, known)}")
+    for fault in faults:
+        warnings.warn(f"{fault}; its devices are left out", stacklevel=2)
+    device = known.get(word)
+    if device is None:
+        return None
+    if refused := device.refused():
+        raise refused
+    if device.hidden:
+        warnings.warn(f"{word}: the device of {device.file}, not that of {device.hidden}", stacklevel=2)
+    return device
 
 
 def devices() -> dict[str, Named]:
-    """Every device that is named here; the nearest file counts before the user's."""
+    """Every device that is named here, of files without a mistake; the user's own come first."""
+    return _known()[0]
+
+
+def _known() -> tuple[dict[str, Named], list[LidarSpecError]]:
+    """Every device that is named here, and what is wrong with files that could not be read."""
     found: dict[str, Named] = {}
+    faults = []
     for path in files():
-        for name, device in read(path).items():
-            found.setdefault(name, device)
-    return found
+        try:
+            devices = read(path)
+        except LidarSpecError as fault:
+            faults.append(fault)
+            continue
+        for name, device in devices.items():
+            found[name] = replace(found[name], hidden=device.file) if name in found else device
+    return found, faults
 
 
 def files() -> list[Path]:
-    """The settings files that count here, the nearest first."""
-    here = Path.cwd()
-    near = [folder / FILE for folder in (here, *here.parents)]
-    found = [path for path in near if path.is_file()][:1]
-    user = user_folder() / FILE
-    return found + [user for _ in (1,) if user.is_file() and user not in found]
-
-
-def user_folder() -> Path:
-    """The folder of the user's own settings."""
-    if os.name == "nt":
-        return Path(os.environ.get("APPDATA") or Path.home() / "AppData" / "Roaming") / "lidarspec"
-    return Path(os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config") / "lidarspec"
+    """The settings files that count here: the user's own, then the nearest one of a project; others' are passed over, with a warning."""
+    own, here = user_folder() / FILE, Path.cwd()
+    found = [own] if os.path.isfile(own) else []
+    for path in (folder / FILE for folder in (here, *here.parents)):
+        if path == own or not os.path.isfile(path):
+            continue
+        if not (reason := foreign(path)):
+            return [*found, path]
+        warnings.warn(f"{path} is not read: {reason}", stacklevel=2)
+    return found
 
 
 def read(path: Path) -> dict[str, Named]:
@@ -114,16 +172,13 @@ def read(path: Path) -> dict[str, Named]:
         UsageError: for a mistake in it, with table and key.
         SourceError: where it cannot be read.
     """
-    try:
-        with system_errors(path):
-            content = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise UsageError(f"{path}: not TOML: {error}") from None
+    content = document(path)
     _check_keys(path, "", content, ["device"])
     tables = content.get("device", {})
     if not isinstance(tables, dict) or not all(isinstance(table, dict) for table in tables.values()):
         raise UsageError(f"{path}: devices are tables of their own: [device.front]")
-    return {name: _device(path, name, table) for name, table in tables.items()}
+    believed = path == user_folder() / FILE or is_trusted(path.parent)
+    return {name: replace(_device(path, name, table), believed=believed) for name, table in tables.items()}
 
 
 def _device(path: Path, name: str, table: Mapping[str, Any]) -> Named:
@@ -135,7 +190,7 @@ def _device(path: Path, name: str, table: Mapping[str, Any]) -> Named:
         raise UsageError(f'{path}: {place}: source is missing, such as source = "serial:///dev/ttyUSB0"')
     for key, kind, told in (("source", str, "text"), ("sensor", str, "text"), ("mount", dict, "a table"), ("options", dict, "a table")):
         if key in table and not isinstance(table[key], kind):
-            raise UsageError(f"{path}: {place}: {key} is {told}, not {table[key]!r}")
+            raise UsageError(f"{path}: {place}: {key} is {told}, not {shown(table[key])}")
     options = {key: _beside(path, value) for key, value in table.get("options", {}).items()}
     mount = _mount(path, place, table["mount"]) if "mount" in table else None
     sensor = table.get("sensor")
@@ -154,7 +209,7 @@ def _mount(path: Path, place: str, given: Mapping[str, Any]) -> Mount:
         right = isinstance(value, bool) if kinds[key] is bool else isinstance(value, int | float) and not isinstance(value, bool)
         if not right or value in (float("inf"), float("-inf")) or value != value:
             wanted = "true or false" if kinds[key] is bool else "a number"
-            raise UsageError(f"{path}: {place}: mount.{key} is {wanted}, not {value!r}")
+            raise UsageError(f"{path}: {place}: mount.{key} is {wanted}, not {shown(value)}")
     return Mount(**given)
 
 

@@ -380,7 +380,7 @@ def declared(source: str | Path) -> Sensor | None:
     opened = transport(source)
     opened.close()
     if isinstance(opened, RecordingTransport) and opened.header.sensor:
-        return opened.header.known_sensor()
+        return opened.known_sensor()
     return opened.sensor if isinstance(opened, SimulatedTransport) else None
 
 

@@ -38,7 +38,6 @@ from lidarspec.transports.protocol import Closing
 
 VERSION = 1
 _ID = re.compile(r"[a-z0-9]+(-[a-z0-9]+)*")
-_WORD = re.compile(r"[A-Za-z0-9_+-]{1,40}")
 MAGIC = b"\x89LSR\r\n\x1a\n"
 MARK = b"\xb5LS\x1e"
 HEADER, RECEIVED, SENT, EVENT = range(4)
@@ -85,20 +84,23 @@ class Header:
         """The header as it stands in the file; an option that JSON does not know stands as its text."""
         return json.dumps({item.name: getattr(self, item.name) for item in fields(self)}, default=_plain).encode()
 
-    def known_sensor(self) -> Sensor:
-        """The installed sensor that it names, with the options of then.
+    def known_sensor(self, folder: Path) -> Sensor:
+        """The installed sensor that it names, with the options of then, as far as anybody may give them.
+
+        Args:
+            folder: where the recording is; of paths in it those alone are opened that lead to a file there.
 
         Raises:
-            UsageError: where it names none, or one with an option that only the caller should give, such as a file.
+            UsageError: where it names none, or one with an option that only the caller should give, such as a file elsewhere.
             UnknownSensor: where that one is not installed.
         """
         if not _ID.fullmatch(self.sensor):
             raise UsageError(f"its header gives {self.sensor[:40]!r} for the id of a sensor" if self.sensor else "it names no sensor")
-        for name, value in self.options.items():
-            if not isinstance(value, bool | int | float) and not (isinstance(value, str) and _WORD.fullmatch(value)):
-                raise UsageError(f"it was recorded with {name}={value!r}: give the sensor, configured so")
         found = named_sensor(self.sensor)
-        return found.configure(**self.options) if self.options else found
+        try:
+            return found.configure(**found.configure.options_of_file(self.options, folder)) if self.options else found
+        except UsageError as error:
+            raise UsageError(f"it was recorded with an option that has to be given again, as -s {self.sensor} -O ...: {error}") from None
 
 
 _BLANK = Header()

@@ -7,15 +7,22 @@ scans. They are imported when a method is called first: a sensor is found and lo
 from __future__ import annotations
 
 import inspect
+import re
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from numbers import Integral, Real
+from os import PathLike
+from reprlib import repr as shown
 from typing import TYPE_CHECKING, Any
 
 from lidarspec.errors import UnknownOption, UsageError
 from lidarspec.spec.description import Spec
+from lidarspec.trust import beside
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from lidarspec.framing.decoder import Decoder
     from lidarspec.framing.results import Found
     from lidarspec.packets.packets import Packets
@@ -24,6 +31,8 @@ if TYPE_CHECKING:
 #: options that every sensor has.
 OPTIONS = ("frame", "answer")
 FRAMES_OF_REFERENCE = ("rep103", "vendor")
+#: what a file may give as an option without naming a path.
+_WORD = re.compile(r"[A-Za-z0-9_+-]{1,40}")
 
 
 class Sensor(Spec):
@@ -221,8 +230,34 @@ class Configure:
     @property
     def files(self) -> tuple[str, ...]:
         """The names of the sensor's own options that take a path."""
+        return tuple(name for name, kinds in self._kinds.items() if "Path" in kinds)
+
+    def takes(self, name: str, value: object) -> bool:
+        """Whether a value is of a type that the option is declared with, by the annotation of its parameter; of others nobody knows."""
+        return any(_TYPES.get(kind, _anything)(value) for kind in self._kinds.get(name, {""}))
+
+    def options_of_file(self, options: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+        """The options that stand in a file in `folder` that anybody may have written: numbers, words, and files beside it.
+
+        Raises:
+            UsageError: for a path that leads anywhere else, and for other values.
+        """
+        given = dict(options)
+        for name, value in options.items():
+            if name in self.files and value is not None:
+                try:
+                    given[name] = beside(folder, value)
+                except UsageError as error:
+                    raise UsageError(f"{name}: {error}") from None
+            elif not isinstance(value, bool | int | float | None) and not (isinstance(value, str) and _WORD.fullmatch(value)):
+                raise UsageError(f"{name}: {shown(value)} is neither a number nor a word")
+        return given
+
+    @property
+    def _kinds(self) -> dict[str, set[str]]:
+        """The names of the types that the sensor's own options are declared with, by option."""
         known = inspect.signature(self.function).parameters if self.function is not None else {}
-        return tuple(name for name, parameter in known.items() if "Path" in str(parameter.annotation))
+        return {name: _type_names(parameter.annotation) for name, parameter in known.items()}
 
     def _by_function(self, options: Mapping[str, Any]) -> Sensor:
         if self.function is None:
@@ -231,9 +266,39 @@ class Configure:
             inspect.signature(self.function).bind(self.sensor, **options)
         except TypeError as error:
             raise UnknownOption(min(options), OPTIONS, place=self.sensor.id, hint=f": {error}") from None
+        for name, value in options.items():
+            if not self.takes(name, value):
+                kinds = " or ".join(_TOLD[kind] for kind in sorted(self._kinds[name]) if kind in _TOLD)
+                raise UsageError(f"{self.sensor.id}: {name} is {kinds}, not {shown(value)}")
         configured = self.function(self.sensor, **options)
         hooked: Sensor = self.sensor.hooked(configured) if self.sensor.hooked else configured
         return hooked
+
+
+def _anything(value: object) -> bool:
+    return True
+
+
+#: a type that an option is declared with -> whether a value is of it; what it is called, in the order of the alphabet.
+_TYPES: dict[str, Callable[[object], bool]] = {
+    "Path": lambda value: isinstance(value, str | PathLike),
+    "bool": lambda value: isinstance(value, bool),
+    "float": lambda value: isinstance(value, Real) and not isinstance(value, bool),
+    "int": lambda value: isinstance(value, Integral) and not isinstance(value, bool),
+    "str": lambda value: isinstance(value, str),
+    "None": lambda value: value is None,
+    "Optional": lambda value: value is None,
+    "Union": lambda value: False,
+}
+_TOLD = {"Path": "a path", "bool": "true or false", "float": "a number", "int": "a whole number", "str": "a text"}
+
+
+def _type_names(annotation: object) -> set[str]:
+    """The names in an annotation, such as {"str", "Path"} of `str | pathlib.Path`; {""} of none."""
+    if annotation is inspect.Parameter.empty:
+        return {""}
+    text = annotation.__name__ if isinstance(annotation, type) else str(annotation)
+    return {word.rpartition(".")[2] for word in re.findall(r"[\w.]+", text)}
 
 
 def _check_shared(sensor: Spec, options: Mapping[str, Any]) -> None:

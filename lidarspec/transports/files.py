@@ -19,8 +19,9 @@ from typing import BinaryIO
 from lidarspec.captures.bulk import Batch, CaptureBatches
 from lidarspec.captures.pcap import CaptureReader, CaptureStats, StreamReader, is_stream_capture
 from lidarspec.captures.records import is_capture
-from lidarspec.errors import SourceError, WireError, suggest, system_errors
+from lidarspec.errors import SourceError, UnknownSensor, UsageError, WireError, suggest, system_errors
 from lidarspec.recording.format import MAGIC, Header, Record, Recording
+from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.protocol import Chunk, Origin, Transport
 
 #: events behind which a frame begun earlier does not go on.
@@ -69,6 +70,20 @@ class RecordingTransport(Transport):
         self.datagrams, self._origin = self.header.datagrams, None if sender is None else Origin.parse(sender)
         self.warnings: list[str] = []
 
+    def known_sensor(self) -> Sensor:
+        """The installed sensor that the recording names, with the options of then.
+
+        Raises:
+            UsageError: where it names none, or an option that has to be given again.
+            UnknownSensor: where that one is not installed.
+        """
+        try:
+            return self.header.known_sensor(Path(self._recording.path).parent)
+        except UnknownSensor:
+            raise
+        except UsageError as error:
+            raise UsageError(f"{self._recording.path}: {error}") from None
+
     def chunks(self) -> Iterator[Chunk]:
         """What was received, in order, with the arrival times of then."""
         interrupted, damaged = False, 0
@@ -101,7 +116,7 @@ class RecordingTransport(Transport):
             event = json.loads(record.data)
         except (ValueError, RecursionError):
             return False
-        name = event.get("event") if isinstance(event, dict) else None
+        name = str(event.get("event")) if isinstance(event, dict) else ""
         self.disconnects += name == "disconnect"
         return name in INTERRUPTIONS
 

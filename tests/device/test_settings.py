@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import numpy as np
@@ -91,16 +92,112 @@ def test_hexadecimal_digits_are_no_name(folder: Path) -> None:
     assert "is cut off" in ran("parse", "aa5500", code=4).stderr
 
 
-def test_the_nearest_file_counts_and_the_users_fills_in(folder: Path) -> None:
-    user = folder.parent / "home" / "lidarspec"
-    user.mkdir(parents=True)
-    (user / "lidarspec.toml").write_text('[device.front]\nsource = "a.bin"\n[device.desk]\nsource = "tcp://desk:2"\n', encoding="utf-8")
+def settings_of_the_user(folder: Path, text: str) -> Path:
+    """The user's own settings file, with this text."""
+    file = folder.parent / "home" / "lidarspec" / "lidarspec.toml"
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_text(text, encoding="utf-8")
+    return file
+
+
+def test_the_users_own_file_comes_first_and_the_nearest_one_adds_to_it(folder: Path) -> None:
+    user = settings_of_the_user(folder, '[device.front]\nsource = "sim:ldrobot-stl27l"\n[device.desk]\nsource = "tcp://desk:2"\n')
     found = settings.devices()
-    assert list(found) == ["front", "rear", "desk"]
-    assert found["front"].sensor == SENSOR
-    assert found["desk"].file == str(user / "lidarspec.toml")
+    assert list(found) == ["front", "desk", "rear"]
+    assert found["front"].sensor is None
+    assert found["desk"].file == str(user)
+    project = folder / "lidarspec.toml"
+    with pytest.warns(UserWarning, match=f"front: the device of {user}, not that of {project}"):
+        assert settings.named("front") == found["front"]
+    said = ran("stats", "front", "-t", "100ms").stderr
+    assert said.count(f"front: the device of {user}, not that of {project}") == 1
     (folder / "deep" / "lidarspec.toml").write_text("", encoding="utf-8")
     assert list(settings.devices()) == ["front", "desk"]
+
+
+@pytest.mark.parametrize("text", ["[device.front", "x = " + "[" * 10_000, "[" + "a." * 20_000 + "b]", "#" * (1 << 18) + "\n"])
+def test_a_file_with_a_mistake_takes_away_its_own_devices_alone(folder: Path, text: str) -> None:
+    broken = folder / "lidarspec.toml"
+    broken.write_text(text, encoding="utf-8")
+    settings_of_the_user(folder, f'[device.desk]\nsource = "{folder / "front.bin"}"\nsensor = "{SENSOR}"\n')
+    with pytest.warns(UserWarning, match=rf"{broken}: not TOML: .*; its devices are left out"):
+        assert ls.open("desk").sensor.id == SENSOR
+    assert ran("stats", "desk").stderr.count(f"{broken}: not TOML") == 1
+    assert ran("stats", "front", code=2).stderr.startswith(f"{broken}: not TOML")
+    assert "devices of lidarspec.toml: desk" in ran().stdout
+
+
+@pytest.mark.parametrize("whose", ["another's", "everybody's", "everybody's folder"])
+def test_a_file_that_is_not_the_users_is_passed_over_and_said_once(folder: Path, whose: str) -> None:
+    file = folder / "deep" / "lidarspec.toml"
+    file.write_text('[device.front]\nsource = "sim:velodyne-vlp16"\n', encoding="utf-8")
+    if whose == "another's":
+        if os.getuid():
+            pytest.skip("only root gives files away")
+        os.chown(file, 12345, -1)
+        reason = f"{file} belongs to user 12345"
+    else:
+        place = file if whose == "everybody's" else file.parent
+        place.chmod(0o777)
+        reason = f"everybody may write to {place}"
+    with pytest.warns(UserWarning, match=f"{file} is not read: {reason}"):
+        device = settings.named("front")
+    assert device is not None
+    assert device.sensor == SENSOR  # that of the folder above, which is the user's
+    assert ran("stats", "front").stderr.count(f"{file} is not read: {reason}") == 1
+
+
+EVIL = "from pathlib import Path\nPath(__file__).with_name('ran').touch()\nfrom {} import lidarspec_sensors\n"
+
+
+@pytest.mark.parametrize("how", ["verb", "variable"])
+def test_a_project_runs_no_python_until_its_folder_is_allowed(folder: Path, monkeypatch: pytest.MonkeyPatch, how: str) -> None:
+    (folder / "evil.py").write_text(EVIL.format("tests.shapes.stranger.acme_lidars"), encoding="utf-8")
+    (folder / "lidarspec.toml").write_text('[device.front]\nsource = "./front.bin"\nsensor = "./evil.py"\n', encoding="utf-8")
+    for verb, *words in (["stats"], ["view"], ["record", "-o", "x.lsr"], ["detect"], ["doctor"], ["parse"]):
+        said = ran(verb, "front", *words, code=2).stderr
+        assert f"{folder / 'lidarspec.toml'}: [device.front]: sensor" in said
+        assert f"next: lidarspec trust {folder}" in said
+    with monkeypatch.context() as shell:
+        for name, value in {"_LIDARSPEC_COMPLETE": "bash_complete", "COMP_WORDS": "lidarspec send front ", "COMP_CWORD": "3"}.items():
+            shell.setenv(name, value)
+        assert ran(code=1).output == ""
+    with pytest.raises(ls.UsageError, match="is Python, which would run"):
+        ls.open("front")
+    assert not (folder / "ran").exists()
+    if how == "verb":
+        assert str(folder) in ran("trust", folder).stdout
+        ran("trust", folder)
+        assert (folder.parent / "home" / "lidarspec" / "trusted").read_text(encoding="utf-8") == f"{folder}\n"
+    else:
+        monkeypatch.setenv("LIDARSPEC_TRUST", str(folder))
+    with ls.open("front") as device:
+        assert device.sensor.id == "acme-x1"
+    assert (folder / "ran").exists()
+
+
+@pytest.mark.parametrize("place", ["/etc/hostname", "../outside.csv", "./link.csv", "/dev/stdin"])
+def test_a_project_names_no_files_elsewhere_until_its_folder_is_allowed(folder: Path, place: str) -> None:
+    (folder.parent / "outside.csv").write_text("-10 0 10 20", encoding="utf-8")
+    (folder / "inside.csv").write_text("-10 0 10 20", encoding="utf-8")
+    (folder / "link.csv").symlink_to(folder.parent / "outside.csv")
+    text = '[device.front]\nsource = "./front.bin"\nsensor = "hesai-xt16"\noptions = {{calibration = "{}"}}\n[device.rear]\nsource = "{}"\n'
+    (folder / "lidarspec.toml").write_text(text.format(place, place), encoding="utf-8")
+    said = ran("stats", "front", code=2).stderr
+    assert f"{folder / 'lidarspec.toml'}: [device.front]: calibration: " in said
+    assert "is no file beside it" in said
+    if place != "/dev/stdin":
+        assert "is a file outside" in ran("stats", "rear", code=2).stderr
+    (folder / "lidarspec.toml").write_text(text.format("./inside.csv", place), encoding="utf-8")
+    assert "inside.csv" in (said := ran("stats", "front", code=2).stderr)
+    assert "beside it" not in said  # it is read, and says something else than the sensor asks for
+    assert "lidarspec trust" not in said
+
+
+def test_only_a_folder_of_ones_own_can_be_allowed(folder: Path) -> None:
+    folder.chmod(0o777)
+    assert f"everybody may write to {folder}: whoever writes there could run programs as you" in ran("trust", folder, code=2).stderr
+    assert "is no folder" in ran("trust", folder / "front.bin", code=2).stderr
 
 
 def test_paths_that_begin_with_a_dot_are_from_the_files_folder(folder: Path) -> None:

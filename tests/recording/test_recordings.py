@@ -84,7 +84,7 @@ def test_the_header_tells_where_it_came_from(path: Path) -> None:
     assert header.versions == {"lidarspec": ls.__version__, "lidarspec-ldrobot": header.versions["lidarspec-ldrobot"]}
     assert before <= header.wall_ns <= time.time_ns()
     assert not header.datagrams
-    assert header.known_sensor().options == {"frame": "vendor"}
+    assert header.known_sensor(path.parent).options == {"frame": "vendor"}
 
 
 def test_long_reads_become_several_records(path: Path) -> None:
@@ -184,7 +184,7 @@ def test_hostile_headers_are_told_as_such(text: bytes) -> None:
 )
 def test_a_header_opens_no_file(text: str) -> None:
     with pytest.raises(UsageError):
-        read_header(text.encode()).known_sensor()
+        read_header(text.encode()).known_sensor(Path())
 
 
 def test_nothing_is_overwritten_unasked(path: Path) -> None:

@@ -1,0 +1,114 @@
+"""Whose files are believed, and what the others may say.
+
+Plugins that are installed and the user's own settings are believed; so is a folder that the user has allowed once. Whatever else is
+read is data: no code runs because a file names it, and paths in it lead to what lies beside it and nowhere else.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import tomllib
+from pathlib import Path
+from typing import Any
+
+from lidarspec.errors import UsageError, system_errors
+
+#: bytes of a file that are read at most: of JSON, which has frames in it, and of TOML, where the time to read grows faster than the file.
+LARGEST = {"JSON": 1 << 22, "TOML": 1 << 18}
+#: a key of so many parts that reading it would take minutes.
+_ENDLESS_KEY = re.compile(rb"(?:\.[^.=,\]\n]{0,80}){32}")
+#: the file of the folders that are allowed, a line each, and the variable that names one for a single run.
+TRUSTED, VARIABLE = "trusted", "LIDARSPEC_TRUST"
+_WRITABLE_BY_ALL = 0o002
+
+
+def user_folder() -> Path:
+    """The folder of the user's own settings."""
+    if os.name == "nt":
+        return Path(os.environ.get("APPDATA") or Path.home() / "AppData" / "Roaming") / "lidarspec"
+    return Path(os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config") / "lidarspec"
+
+
+def foreign(path: Path) -> str:
+    """Why a file is not the user's own, such as "/tmp belongs to user 0"; "" where it is.
+
+    It and its folder have to belong to the user, and nobody else may write there; a group may, which is often the user's alone. Where a
+    system has no such owners, the user's own is what lies in the user's folder.
+    """
+    if not hasattr(os, "getuid"):
+        return "" if path.resolve().is_relative_to(Path.home()) else f"{path} is not in {Path.home()}"
+    for place in (path, path.parent):
+        with system_errors(place):
+            status = place.stat()
+        if status.st_uid != os.getuid():
+            return f"{place} belongs to user {status.st_uid}"
+        if status.st_mode & _WRITABLE_BY_ALL:
+            return f"everybody may write to {place}"
+    return ""
+
+
+def is_trusted(folder: Path) -> bool:
+    """Whether the user has allowed what the files of a folder name."""
+    file = user_folder() / TRUSTED
+    with system_errors(file):
+        allowed = file.read_text(encoding="utf-8").splitlines() if file.is_file() else []
+    once = os.environ.get(VARIABLE)
+    return str(folder.resolve()) in (*allowed, *([str(Path(once).resolve())] if once else []))
+
+
+def trust(folder: str | Path) -> Path:
+    """The folder, by its whole path, whose files may from now on name Python files, and paths anywhere.
+
+    Raises:
+        UsageError: where it is no folder of the user's own.
+        SourceError: where this cannot be written down.
+    """
+    found = Path(folder).resolve()
+    if not found.is_dir() or len(str(found).splitlines()) > 1:
+        raise UsageError(f"{folder} is no folder")
+    if reason := foreign(found / "."):
+        raise UsageError(f"{reason}: whoever writes there could run programs as you")
+    file = user_folder() / TRUSTED
+    if not is_trusted(found):
+        with system_errors(file):
+            file.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+            with file.open("a", encoding="utf-8") as lines:
+                lines.write(f"{found}\n")
+    return found
+
+
+def beside(folder: Path, value: object) -> Path:
+    """The file that a file in `folder` names: one in it or below it.
+
+    Raises:
+        UsageError: for any other path, and for what is no path or no regular file.
+    """
+    found = folder / value if isinstance(value, str) and "\0" not in value else folder
+    if not found.is_file() or not found.resolve().is_relative_to(folder.resolve()):
+        raise UsageError(f"{value!r} is no file beside it")
+    return found
+
+
+def document(path: Path) -> Any:
+    """What a TOML file holds, or by its suffix a JSON file.
+
+    Raises:
+        UsageError: where it is none, or none of a reasonable size.
+        SourceError: where it cannot be read.
+    """
+    name, parse = ("JSON", json.loads) if path.suffix == ".json" else ("TOML", tomllib.loads)
+    with system_errors(path), path.open("rb") as file:
+        data = file.read(LARGEST[name] + 1)
+    reason: object = f"it is longer than {LARGEST[name] >> 10} kB"
+    try:
+        if len(data) <= LARGEST[name]:
+            if name == "TOML" and _ENDLESS_KEY.search(data):
+                raise ValueError("a key has more than 32 parts")
+            return parse(data.decode())
+    except RecursionError:
+        reason = "its brackets are nested too deeply"
+    except ValueError as error:
+        reason = error
+    raise UsageError(f"{path}: not {name}: {reason}")
