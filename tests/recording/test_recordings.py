@@ -22,7 +22,18 @@ import pytest
 import lidarspec as ls
 from lidarspec.errors import SourceError, UsageError, WireError
 from lidarspec.recording import appending
-from lidarspec.recording.format import _HEAD, HEADER, LARGEST, MAGIC, Record, Recording, packed, read_header
+from lidarspec.recording.format import (
+    _HEAD,
+    HEADER,
+    LARGEST,
+    MAGIC,
+    Header,
+    Record,
+    Recording,
+    packed,
+    read_header,
+    size_at,
+)
 from lidarspec.recording.recorders import Recorder
 from lidarspec.spec import Chunk
 from lidarspec.transports.open_url import transport
@@ -399,3 +410,49 @@ def test_damage_is_told_when_a_recording_is_read(path: Path) -> None:
     with ls.open(path) as device:
         assert sum(len(packets) for packets in device.packets()) == 3
         assert device.warnings == [f"{path} is cut off in its last record: 3 bytes were not read, everything before them was"]
+
+
+HESAI = "hesai-xt16"
+ANGLES = "Channel,Elevation,Azimuth\n" + "".join(f"{channel},{16 - channel},0\n" for channel in range(1, 17))
+
+
+@pytest.mark.parametrize(
+    ("value", "told"),
+    [
+        (1, "calibration: 1 is no file beside it"),
+        ("1", "calibration: '1' is no file beside it"),
+        ("/dev/stdout", "is no file beside it"),
+        ("../angles.csv", "is no file beside it"),
+        ("link.csv", "is no file beside it"),
+        (["angles.csv"], r"calibration: \['angles.csv'\] is no file beside it"),
+        ("a\0b", "is no file beside it"),
+        ("here.csv", "is no file beside it"),
+    ],
+)
+def test_a_recording_opens_no_descriptor_and_no_file_elsewhere(
+    path: Path, monkeypatch: pytest.MonkeyPatch, value: object, told: str
+) -> None:
+    folder, here = path.parent / "recordings", path.parent / "here"
+    folder.mkdir()
+    here.mkdir()
+    for file in (path.parent / "angles.csv", here / "here.csv", here / "1"):
+        file.write_text(ANGLES, encoding="utf-8")
+    (folder / "link.csv").symlink_to(path.parent / "angles.csv")
+    monkeypatch.chdir(here)
+    with Recorder(folder / "a.lsr", ls.sensor(HESAI), "udp://") as recorder:
+        recorder.write(Chunk(b"x", 1))
+    data = (folder / "a.lsr").read_bytes()
+    header = Header(sensor=HESAI, options={"calibration": value}, datagrams=True).to_json()
+    (folder / "a.lsr").write_bytes(MAGIC + packed(0, header) + data[len(MAGIC) + size_at(data, len(MAGIC)) :])
+    with pytest.raises(UsageError, match=rf"a\.lsr: it was recorded with an option .*-s {HESAI} -O .*{told}"):
+        ls.open(folder / "a.lsr")
+
+
+def test_a_file_beside_the_recording_is_taken(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (path.parent / "angles.csv").write_text(ANGLES, encoding="utf-8")
+    monkeypatch.chdir(path.parent)
+    with Recorder(path, ls.sensor(HESAI).configure(calibration="angles.csv"), "udp://") as recorder:
+        recorder.write(Chunk(ls.sensor(HESAI).example("data"), 1))
+    monkeypatch.chdir("/")
+    with ls.open(path) as device:
+        assert device.sensor.options["calibration"] == path.parent / "angles.csv"

@@ -1,0 +1,59 @@
+"""The options of a sensor, wherever they are given: of the types that are declared, and no others."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any, Literal, Optional
+
+import numpy as np
+import pytest
+
+import lidarspec as ls
+from tests.cli.running import ran
+from tests.shapes import SHAPES
+
+
+def configure(
+    sensor: ls.Sensor,
+    *,
+    file: str | Path | None = None,
+    turned: float = 0,
+    mode: Optional[int] = None,  # noqa: UP045  plugins are written so too
+    upside: bool = False,
+    kind: Literal["a", "b"] = "a",
+    plain=None,  # type: ignore[no-untyped-def]
+) -> ls.Sensor:
+    return sensor
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        ({"file": 1}, "file is a path or a text, not 1"),
+        ({"file": True}, "file is a path or a text, not True"),
+        ({"file": ["a"]}, r"file is a path or a text, not \['a'\]"),
+        ({"turned": "1"}, "turned is a number, not '1'"),
+        ({"turned": True}, "turned is a number, not True"),
+        ({"mode": 1.5}, "mode is a whole number, not 1.5"),
+        ({"upside": 1}, "upside is true or false, not 1"),
+        ({"file": None, "turned": 1, "mode": np.int64(3), "upside": True, "kind": 3, "plain": [1]}, ""),
+        ({"file": Path("a"), "turned": np.float32(1), "mode": None}, ""),
+    ],
+)
+def test_an_option_is_of_the_type_that_its_parameter_declares(options: dict[str, Any], told: str) -> None:
+    sensor = dataclasses.replace(SHAPES["shape-count"], configure=configure)
+    if not told:
+        assert sensor.configure(**options).options == options
+        return
+    with pytest.raises(ls.UsageError, match=f"shape-count: {told}"):
+        sensor.configure(**options)
+
+
+def test_on_the_command_line_a_digit_can_be_the_name_of_a_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("1").write_text("nothing of the kind", encoding="utf-8")
+    Path("x.bin").touch()
+    for name in ("1", "[" * 5000):  # which tomllib takes for a number, and for a list too deep
+        said = ran("stats", "x.bin", "-s", "hesai-xt16", "-O", f"calibration={name}", code=2).stderr
+        assert said.startswith(f"{name}: ")
