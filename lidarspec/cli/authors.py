@@ -10,7 +10,8 @@ from shlex import quote
 import click
 
 from lidarspec.cli.failures import FINDINGS
-from lidarspec.cli.output import Progress, emit, emit_json, note
+from lidarspec.cli.output import Progress, emit, emit_json
+from lidarspec.cli.terminal import note, say
 from lidarspec.discovery.draft import Link, Names, captured, draft, invented, joining, write
 from lidarspec.discovery.listen import beginning
 from lidarspec.errors import UsageError, WireError, suggest
@@ -47,15 +48,15 @@ def new(
     """
     names = Names(sensor_id, distribution or "", vendor or "", model or "")
     if sensor_id in sensors():
-        raise suggest(UsageError(f"{sensor_id} is installed already: choose another id"), f"lidarspec show {sensor_id}")
+        raise suggest(UsageError(f"{sensor_id} is installed already: choose another id"), f"lidarspec show {quote(sensor_id)}")
     folder = Path(into) / names.distribution
     if folder.exists() and distribution is None:
-        raise suggest(UsageError(f"{folder} exists already: nothing was written"), f"lidarspec new {sensor_id} --distribution NAME")
+        raise suggest(UsageError(f"{folder} exists already: nothing was written"), f"lidarspec new {quote(sensor_id)} --distribution NAME")
     texts = invented(names, "udp" if link == "udp" else "serial") if capture is None else _drafted(names, link, capture)
     texts = joining(folder, names, texts) if folder.exists() else texts
     write(folder, texts)
     for name in texts:
-        click.echo(folder / name)
+        say(str(folder / name))
     look = f"demo -s {sensor_id}" if capture is None else f"explain {quote(capture)} -s {sensor_id}"
     note(f"next: pip install -e {quote(f'{folder}[test]')} && pytest {quote(str(folder))} && lidarspec {look}")
 

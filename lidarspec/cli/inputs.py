@@ -16,7 +16,7 @@ from shlex import quote
 import click
 
 from lidarspec.cli.failures import FINDINGS
-from lidarspec.cli.output import note
+from lidarspec.cli.terminal import note
 from lidarspec.device.device import Device
 from lidarspec.device.settings import devices
 from lidarspec.discovery.detect import chosen, nearest, never_right, verdict
@@ -144,7 +144,7 @@ def no_frame(sensor: Sensor, given: Heard) -> WireError:
     """Why there is no frame of this sensor in the input, with the next command."""
     data = given.data
     longest = max((frame.max_length for frame in sensor.frames.values()), default=0)
-    command = f"lidarspec explain {given.source} -s {sensor.id}"
+    command = f"lidarspec explain {quote(given.source)} -s {sensor.id}"
     if not data:
         return suggest(WireError(no_bytes(given.source, given.warnings), sensor=sensor.id), f"lidarspec build {sensor.id} --help")
     if (fault := _never_right(given)) is not None:
@@ -169,13 +169,13 @@ def nearest_fault(given: Heard) -> WireError:
     if best is None:
         text = f"no frame of any of the {len(sensors())} installed sensors" if sensors() else "no frame of an installed sensor"
         return suggest(WireError(text, data=given.data[:QUOTED]), "lidarspec sensors")
-    return suggest(best, f"lidarspec explain {given.source} -s {best.sensor}")
+    return suggest(best, f"lidarspec explain {quote(given.source)} -s {best.sensor}")
 
 
 def _never_right(given: Heard) -> WireError | None:
     """That the input is frames of a sensor whose checksums are never right; None where it is not."""
     fault = never_right(given.chunks, datagrams=given.datagrams)
-    return suggest(WireError(f"{given.source}: {fault}"), f"lidarspec crc {given.source}") if fault else None
+    return suggest(WireError(f"{given.source}: {fault}"), f"lidarspec crc {quote(given.source)}") if fault else None
 
 
 def nothing_came(device: Device, source: str, seconds: float | None = None) -> LidarSpecError:
@@ -191,12 +191,12 @@ def nothing_came(device: Device, source: str, seconds: float | None = None) -> L
         said = (
             "; ".join([f"{source} has no data frame: {stats}", *device.warnings]) if stats.bytes_in else no_bytes(source, device.warnings)
         )
-        return suggest(WireError(said, sensor=sensor.id), f"lidarspec explain {source} -s {sensor.id}")
+        return suggest(WireError(said, sensor=sensor.id), f"lidarspec explain {quote(source)} -s {sensor.id}")
     waited = "" if seconds is None else f" within {seconds:.1f} s".replace(".0 s", " s")
     if stats.bytes_in == 0:
-        return suggest(CommandError(f"{sensor.id} on {source} sent nothing{waited}"), f"lidarspec doctor {source} -s {sensor.id}")
+        return suggest(CommandError(f"{sensor.id} on {source} sent nothing{waited}"), f"lidarspec doctor {quote(source)} -s {sensor.id}")
     error = WireError(f"{source}: {stats.bytes_in} bytes{waited}, and not a scan of data frames among them: {stats}", sensor=sensor.id)
-    return suggest(error, f"lidarspec detect {source}")
+    return suggest(error, f"lidarspec detect {quote(source)}")
 
 
 def conclude(device: Device) -> None:

@@ -11,7 +11,8 @@ import click
 from lidarspec.cli.failures import INTERRUPTED
 from lidarspec.cli.inputs import nothing_came, refuse_overwriting
 from lidarspec.cli.options import DURATION, SPEED, count_option, sensor_option
-from lidarspec.cli.output import Progress, emit_json, note, size
+from lidarspec.cli.output import Progress, emit_json, size
+from lidarspec.cli.terminal import note, say
 from lidarspec.device.settings import named
 from lidarspec.device.source_recording import SourceRecording, recorder_like
 from lidarspec.discovery.detect import declared
@@ -141,7 +142,9 @@ def replay(file: str, place: str, speed: float | None, loop: bool, force: bool, 
     file keeps the times of the recording.
     """
     if is_live(file):
-        raise suggest(UsageError(f"{file} is live: only what was recorded can be replayed"), f"lidarspec record {file} -o recording.lsr")
+        raise suggest(
+            UsageError(f"{file} is live: only what was recorded can be replayed"), f"lidarspec record {shlex.quote(file)} -o recording.lsr"
+        )
     is_file = place.endswith(SUFFIXES) and "://" not in place
     if is_file and loop:
         raise UsageError("a file cannot take a replay that never ends: leave out --loop")
@@ -171,7 +174,7 @@ def _run(played: Replay, outlet: Outlet, file: str) -> bool:
         except KeyboardInterrupt:
             return True
         except WireError as error:
-            raise suggest(error, f"lidarspec show {file}") from None
+            raise suggest(error, f"lidarspec show {shlex.quote(file)}") from None
         finally:
             outlet.finish()
     return False
@@ -203,7 +206,7 @@ def _announce(file: str, outlet: Outlet, sensor: Sensor | None, *, as_json: bool
         place = "udp://" if sensor else "udp://:PORT"
     waits = "" if place.startswith("udp:") else ", as soon as it is opened"
     if not as_json:
-        click.echo(outlet.place)
+        say(outlet.place)
     note(f"playing {file} to {outlet.place}{waits}")
     note(f"next: lidarspec {_shown(sensor, place)}")
 
