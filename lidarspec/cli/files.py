@@ -64,7 +64,7 @@ def convert(
     number of the scan; metres, radians, and seconds since the scan's stamp.
     """
     format_of(target)
-    refuse_overwriting(source, target, "input", force=force)
+    refuse_overwriting(target, source, sensor_id, force=force)
     sensor = _detected(source, target) if sensor_id is None else named_sensor(sensor_id)
     with open_device(source, sensor) as device, Progress() as progress:
         written = Written(device, target)
@@ -128,6 +128,7 @@ def plot(source: str, output: str, sensor_id: str | Sensor | None, number: int, 
     """
     if output != "-" and Path(output).suffix.lower() != ".svg":
         raise UsageError(f"{output}: pictures are written as .svg; browsers show them, Inkscape and rsvg-convert turn them into others")
+    refuse_overwriting(output, source, sensor_id)
     with open_device(source, sensor_id) as device:
         chosen: Scan | None = None
         whole = 0

@@ -126,18 +126,36 @@ def _no_bytes(words: Sequence[str], error: ValueError) -> LidarSpecError:
     return UsageError(f"{text[:QUOTED]!r} is no file, and not hexadecimal: {error}")
 
 
-def refuse_overwriting(source: str, target: str, what: str = "source", *, force: bool = True) -> None:
-    """Nothing, where a file is written to that is not the one that is read, and with `force` off is new.
+def refuse_overwriting(target: str | None, *inputs: str | Path | Sensor | None, force: bool = True) -> None:
+    """Nothing, where a file is written to that is none of those that are read, by whatever name, and with `force` off is new.
+
+    Args:
+        inputs: words that may be a SOURCE or a file; sensors, whose options may be.
 
     Raises:
         UsageError: where it is not.
     """
-    path = source.partition("?")[0]
-    if os.path.exists(path) and os.path.exists(target) and os.path.samefile(path, target):
-        raise UsageError(f"{target} is the {what}: it would be overwritten")
-    if not force and os.path.exists(target):
+    if target is None or not os.path.exists(target):
+        return
+    for path in [path for given in inputs for path in _read_for(given)] if os.path.isfile(target) else ():
+        if os.path.exists(path) and os.path.samefile(path, target):
+            name = "standard input" if path == 0 else f"read as {path}" if path != target else "read"
+            raise UsageError(f"{target} is {name}: it would be overwritten")
+    if not force:
         error = UsageError(f"{target} exists already; it is not overwritten unless asked for")
         raise suggest(error, "the same with --force, or with another file")
+
+
+def _read_for(given: str | Path | Sensor | None) -> Iterator[str | int]:
+    """The files that may be read where this is given."""
+    if isinstance(given, Sensor):
+        yield from (str(value) for value in given.options.values() if isinstance(value, str | Path))
+        return
+    word = str(given or "")
+    yield from [0] if word == "-" else [word, word.partition("?")[0], word.rpartition(":")[0], word.partition("=")[2]]
+    with contextlib.suppress(LidarSpecError):  # settings that are wrong are told of where a name is looked up
+        known = devices().get(word)
+        yield from (known.source.partition("?")[0], *map(str, known.options.values())) if known else ()
 
 
 def no_frame(sensor: Sensor, given: Heard) -> WireError:

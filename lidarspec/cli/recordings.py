@@ -55,7 +55,7 @@ def record(
     recorded as they come.
     """
     check_suffix(target)
-    refuse_overwriting(source, target)
+    refuse_overwriting(target, source, sensor_id)
     known = named(source)
     sensor = named_sensor(sensor_id) if sensor_id else declared(source) if is_live(source) else known.configured() if known else None
     task = SourceRecording(source, target, sensor, seconds=seconds, count=count, start=not no_start, overwrite=force, salvage=salvage)
@@ -100,8 +100,8 @@ def _sum_up_recording(task: SourceRecording, kept: Appender, source: str, sensor
     """What was recorded, and what can be done with it; an empty file is not left behind."""
     device = task.device
     if not kept.records:
-        with contextlib.suppress(OSError):
-            os.unlink(kept.path)
+        if not kept.discard():
+            note(f"{kept.path} is left as it was")
         if device is not None:
             raise nothing_came(device, source, task.elapsed)
         if live_address(source) is not None:
@@ -149,7 +149,7 @@ def replay(file: str, place: str, speed: float | None, loop: bool, force: bool, 
     if is_file and loop:
         raise UsageError("a file cannot take a replay that never ends: leave out --loop")
     if is_file:
-        refuse_overwriting(file, place)
+        refuse_overwriting(place, file, sensor_id)
     with contextlib.closing(transport(file)) as source:
         sensor = _sensor(source, sensor_id)
         outlet = (
