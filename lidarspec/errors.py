@@ -75,6 +75,16 @@ class PluginError(SpecError):
         return cls(reason, path=what, sensor=sensor, rule=getattr(error, "rule", ""), file=file, line=line, traceback=text)
 
 
+def printable(text: str) -> str:
+    """The text with all spelled out (`\\x1b`) that would steer a terminal or turn the direction of writing, but for ends of lines."""
+    if text.isascii() and text.replace("\n", "").isprintable():
+        return text
+    from unicodedata import category  # control, format and half characters; separators of lines and paragraphs
+
+    steering = {character for character in text if category(character) in ("Cc", "Cf", "Cs", "Zl", "Zp")} - {"\n", "\t"}
+    return text.translate({ord(one): one.encode("unicode_escape").decode("ascii") for one in steering})
+
+
 def shown_path(file: str) -> str:
     """A path as it is typed in the folder that one is in; as it is where it lies elsewhere."""
     return os.path.relpath(file) if os.path.abspath(file).startswith(os.path.join(os.getcwd(), "")) else file

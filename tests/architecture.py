@@ -48,7 +48,7 @@ TOP = len(FLOORS) - 1
 IO = {"asyncio", "logging", "serial", "socket", "threading", "time"}
 #: who may import a library; whoever is not named here may not.
 CONFINED = {
-    "numba": {"points.numba_kernels.arithmetic"},
+    "numba": {"points.numba_kernels.arithmetic", "points.numba_kernels.cache"},
     "llvmlite": {"points.numba_kernels.arithmetic"},
     "construct": {"spec.construct_layer", "spec.fields", "spec.description", "framing.frame_engine", "wire.parse", "wire.build"},
     "pluggy": {"plugins"},

@@ -6,7 +6,8 @@ order:
 * `root`: the verbs, each loaded when it is asked for; `main`, the entry point.
 * `completion`: what can stand at a place, for the shell.
 * `options`, `inputs`: words as arguments: what verbs share, and where bytes come from.
-* `output`, `failures`: results as text, tables or JSON; failures as one message and an exit code.
+* `terminal`, `output`, `failures`: what is printed, and where it is lost; results as text, tables or JSON; failures as one message
+  and an exit code.
 * `sensors`, `frames`, `build`: what is installed, what a frame says, a frame out of values.
 * `read`, `view`: a sensor at work: rows and figures, a picture.
 * `recordings`, `files`: into a file and out again; from file to file.

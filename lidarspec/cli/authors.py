@@ -10,7 +10,9 @@ from shlex import quote
 import click
 
 from lidarspec.cli.failures import FINDINGS
-from lidarspec.cli.output import Progress, emit, emit_json, note
+from lidarspec.cli.options import output_option
+from lidarspec.cli.output import Progress, emit, emit_json
+from lidarspec.cli.terminal import note, say
 from lidarspec.discovery.draft import Link, Names, captured, draft, invented, joining, write
 from lidarspec.discovery.listen import beginning
 from lidarspec.errors import UsageError, WireError, suggest
@@ -47,15 +49,15 @@ def new(
     """
     names = Names(sensor_id, distribution or "", vendor or "", model or "")
     if sensor_id in sensors():
-        raise suggest(UsageError(f"{sensor_id} is installed already: choose another id"), f"lidarspec show {sensor_id}")
+        raise suggest(UsageError(f"{sensor_id} is installed already: choose another id"), f"lidarspec show {quote(sensor_id)}")
     folder = Path(into) / names.distribution
     if folder.exists() and distribution is None:
-        raise suggest(UsageError(f"{folder} exists already: nothing was written"), f"lidarspec new {sensor_id} --distribution NAME")
+        raise suggest(UsageError(f"{folder} exists already: nothing was written"), f"lidarspec new {quote(sensor_id)} --distribution NAME")
     texts = invented(names, "udp" if link == "udp" else "serial") if capture is None else _drafted(names, link, capture)
     texts = joining(folder, names, texts) if folder.exists() else texts
     write(folder, texts)
     for name in texts:
-        click.echo(folder / name)
+        say(str(folder / name))
     look = f"demo -s {sensor_id}" if capture is None else f"explain {quote(capture)} -s {sensor_id}"
     note(f"next: pip install -e {quote(f'{folder}[test]')} && pytest {quote(str(folder))} && lidarspec {look}")
 
@@ -82,7 +84,7 @@ def _drafted(names: Names, link: str | None, capture: str) -> dict[str, str]:
 @click.option("--vectors", metavar="FILE", help="Golden vectors; by default vectors.json beside the modules.")
 @click.option("-v", "--verbose", is_flag=True, help="Also what was skipped and why, and what was measured.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
-@click.option("-o", "--output", metavar="FILE", help="Write to a file instead of standard output.")
+@output_option
 @click.pass_context
 def check(ctx: click.Context, name: str, max_examples: int, vectors: str | None, verbose: bool, as_json: bool, output: str | None) -> None:
     """What is wrong with a sensor, a file or a distribution: every promise, and mistakes in its spec.
@@ -120,7 +122,7 @@ def _told(report: Report, *, verbose: bool) -> list[str]:
 @click.command()
 @click.argument("kind", metavar="KIND", type=click.Choice(list(EXPORTS)))
 @click.argument("sensor_id", metavar="SENSOR")
-@click.option("-o", "--output", metavar="FILE", help="Write to a file instead of standard output.")
+@output_option
 @click.option("-f", "--frame", metavar="NAME", help="One frame type alone; by default all, or the one that carries the points.")
 def export(kind: str, sensor_id: str, output: str | None, frame: str | None) -> None:
     """A sensor's spec for another tool: wireshark, c, ksy (Kaitai), md, svg, json, pyi.

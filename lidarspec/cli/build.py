@@ -15,7 +15,8 @@ import click
 
 from lidarspec.cli.frames import listing, plain
 from lidarspec.cli.options import DURATION, output_options, sensor_option
-from lidarspec.cli.output import emit, emit_json, emit_lines, note, table
+from lidarspec.cli.output import emit, emit_json, emit_lines, table
+from lidarspec.cli.terminal import note
 from lidarspec.device.device import Device, open as open_device
 from lidarspec.device.session import Reply
 from lidarspec.errors import CommandError, LidarSpecError, OutOfRange, UnknownCommand, UnknownField, UnknownFrame, UsageError, suggest
@@ -53,11 +54,11 @@ def build(sensor_id: str, frame: str, assignments: Sequence[str], as_json: bool,
     """
     sensor = named_sensor(sensor_id)
     if frame not in sensor.frames:
-        raise suggest(UnknownFrame(frame, sensor.frames, place=sensor.id), f"lidarspec show {sensor_id}")
+        raise suggest(UnknownFrame(frame, sensor.frames, place=sensor.id), f"lidarspec show {quote(str(sensor_id))}")
     try:
         data = sensor.build(frame, values(schema(sensor.frames[frame].tree), assignments, f"{sensor.id} {frame}"))
     except LidarSpecError as error:
-        raise suggest(error, f"lidarspec show {sensor_id}") from None
+        raise suggest(error, f"lidarspec show {quote(str(sensor_id))}") from None
     if as_json:
         emit_json({"sensor": sensor.id, "frame": frame, "size": len(data), "hex": data.hex(" ")}, output)
     else:

@@ -9,6 +9,7 @@ import traceback
 import click
 
 from lidarspec import errors
+from lidarspec.cli.terminal import note
 
 FINDINGS, USAGE, SOURCE, NO_DATA, DEVICE, INTERRUPTED = 1, 2, 3, 4, 5, 130
 
@@ -29,21 +30,21 @@ def report(error: Exception, verb: str) -> int:
     """Print what went wrong and what to do next; the exit code."""
     code, command = next(((code, command) for kind, code, command in CODES if isinstance(error, kind)), (FINDINGS, ""))
     if not command:
-        click.echo(f"a bug in lidarspec: {type(error).__name__}: {error}", err=True)
+        note(f"a bug in lidarspec: {type(error).__name__}: {error}")
         if os.environ.get("LIDARSPEC_DEBUG"):
-            click.echo("".join(traceback.format_exception(error)), err=True)
-        click.echo("  next: the same with LIDARSPEC_DEBUG=1, and report it with what that prints", err=True)
+            note("".join(traceback.format_exception(error)))
+        note("  next: the same with LIDARSPEC_DEBUG=1, and report it with what that prints")
         return code
     message = _message(error)
-    click.echo(message, err=True)
+    note(message)
     if errors.NO_SENSORS in message:
         return code
     if _lacks_sensors(error):
-        click.echo(f"  {errors.NO_SENSORS}", err=True)
+        note(f"  {errors.NO_SENSORS}")
         return code
     errors.suggest(error, _following(error, command, verb))
-    for note in error.__notes__:
-        click.echo(f"  {note}", err=True)
+    for remark in error.__notes__:
+        note(f"  {remark}")
     return code
 
 
@@ -77,9 +78,9 @@ def _following(error: Exception, command: str, verb: str) -> str:
         return "lidarspec plugins" if any(plugin.error for plugin in registry().plugins) else command
     sensor = str(getattr(error, "sensor", "") or getattr(error, "place", "")).partition(" ")[0]
     if isinstance(error, errors.SpecError) and error.path.endswith(".py"):
-        return f"lidarspec check {error.path}"
+        return f"lidarspec check {shlex.quote(error.path)}"
     if isinstance(error, errors.PluginError) and error.file and sensor not in registry():  # one of a file that was named
         return f"lidarspec check {shlex.quote(errors.shown_path(error.file))}"
     if "{sensor}" in command and not sensor:
         return "lidarspec plugins" if isinstance(error, errors.SpecError) else "lidarspec sensors"
-    return command.format(sensor=sensor, verb=verb).replace("  ", " ")
+    return command.format(sensor=shlex.quote(sensor) if sensor else "", verb=verb).replace("  ", " ")

@@ -6,12 +6,14 @@ import itertools
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from shlex import quote
 
 import click
 
 from lidarspec.cli.inputs import again, conclude, fits_instead, nearest_fault, no_frame, nothing_came, refuse_overwriting, scans_of
 from lidarspec.cli.options import colour_option, count_option, sensor_option
-from lidarspec.cli.output import Progress, emit, emit_json, note, size
+from lidarspec.cli.output import Progress, emit, emit_json, size
+from lidarspec.cli.terminal import note
 from lidarspec.device.device import Device, open as open_device
 from lidarspec.discovery.detect import detected
 from lidarspec.errors import UsageError, WireError, suggest, suggestion
@@ -62,7 +64,7 @@ def convert(
     number of the scan; metres, radians, and seconds since the scan's stamp.
     """
     format_of(target)
-    refuse_overwriting(source, target, "input", force=force)
+    refuse_overwriting(target, source, sensor_id, force=force)
     sensor = _detected(source, target) if sensor_id is None else named_sensor(sensor_id)
     with open_device(source, sensor) as device, Progress() as progress:
         written = Written(device, target)
@@ -80,7 +82,7 @@ def _detected(source: str, target: str) -> Sensor:
     try:
         return detected(source)
     except UsageError as error:
-        raise suggest(error, f"lidarspec convert {source} {target} -s ID") from None
+        raise suggest(error, f"lidarspec convert {quote(source)} {quote(target)} -s ID") from None
     except WireError as error:
         given = None if suggestion(error) else again(source)
         raise error if given is None else nearest_fault(given) from None
@@ -103,11 +105,13 @@ def _no_data(device: Device, source: str, target: str) -> Exception:
         return failure
     instead = fits_instead(sensor, source)
     if instead is not None:
-        return suggest(WireError(f"{source} {instead[0]}", sensor=sensor.id), f"lidarspec convert {source} {target} {instead[1]}")
+        return suggest(
+            WireError(f"{source} {instead[0]}", sensor=sensor.id), f"lidarspec convert {quote(source)} {quote(target)} {instead[1]}"
+        )
     given = again(source) if not stats.frames else None
     if given is not None:
         return no_frame(sensor, given)
-    return suggest(WireError(f"no data frame in {source}: {stats}", sensor=sensor.id), f"lidarspec explain {source} -s {sensor.id}")
+    return suggest(WireError(f"no data frame in {source}: {stats}", sensor=sensor.id), f"lidarspec explain {quote(source)} -s {sensor.id}")
 
 
 @click.command()
@@ -124,6 +128,7 @@ def plot(source: str, output: str, sensor_id: str | Sensor | None, number: int, 
     """
     if output != "-" and Path(output).suffix.lower() != ".svg":
         raise UsageError(f"{output}: pictures are written as .svg; browsers show them, Inkscape and rsvg-convert turn them into others")
+    refuse_overwriting(output, source, sensor_id)
     with open_device(source, sensor_id) as device:
         chosen: Scan | None = None
         whole = 0

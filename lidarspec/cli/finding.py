@@ -13,7 +13,8 @@ import click
 from lidarspec.cli.failures import DEVICE, FINDINGS, NO_DATA
 from lidarspec.cli.inputs import read
 from lidarspec.cli.options import DURATION, output_options, sensor_option
-from lidarspec.cli.output import emit, emit_json, note, table
+from lidarspec.cli.output import emit, emit_json, table
+from lidarspec.cli.terminal import note
 from lidarspec.discovery.checksum_search import search
 from lidarspec.discovery.detect import Verdict, best, chosen, names, others_named, verdict, verdicts
 from lidarspec.discovery.doctor import computer, examined
@@ -128,7 +129,9 @@ def _of_file(path: str, period: int | None, offset: int) -> list[bytes]:
         return list(chunks)
     found = structure(chunks, datagrams=datagrams)
     if found is None:
-        raise suggest(UsageError(f"{path}: where its frames begin cannot be seen"), f"lidarspec crc {path} --period BYTES --offset BYTES")
+        raise suggest(
+            UsageError(f"{path}: where its frames begin cannot be seen"), f"lidarspec crc {quote(path)} --period BYTES --offset BYTES"
+        )
     length = f"{found.period} bytes" if found.period else f"{found.length} bytes"
     note(f"{len(found.frames)} frames that begin with {found.sync.hex(' ')}, {length} long")
     return list(found.frames)
@@ -293,7 +296,7 @@ def _following(source: str | None, unknown: Structure | None) -> str:
     if source is None or live_address(source) is not None:
         return f"lidarspec doctor {quote(source) if source else ''}".rstrip()
     if unknown is not None and unknown.period and not unknown.checksums:
-        return f"lidarspec crc {source} --period {unknown.period}"
+        return f"lidarspec crc {quote(source)} --period {unknown.period}"
     return "lidarspec sensors"
 
 

@@ -12,7 +12,8 @@ import click
 from lidarspec.cli.failures import FINDINGS
 from lidarspec.cli.inputs import nearest_fault, no_frame, opened
 from lidarspec.cli.options import OFFSET, count_option, output_options, sensor_option
-from lidarspec.cli.output import emit_json, emit_json_list, emit_lines, emit_parts, note, table
+from lidarspec.cli.output import emit_json, emit_json_list, emit_lines, emit_parts, table
+from lidarspec.cli.terminal import note
 from lidarspec.discovery.detect import fitting
 from lidarspec.discovery.listen import Heard
 from lidarspec.errors import UsageError, WireError, suggest

@@ -16,7 +16,7 @@ from shlex import quote
 import click
 
 from lidarspec.cli.failures import FINDINGS
-from lidarspec.cli.output import note
+from lidarspec.cli.terminal import note
 from lidarspec.device.device import Device
 from lidarspec.device.settings import named
 from lidarspec.discovery.detect import chosen, nearest, never_right, verdict
@@ -125,25 +125,43 @@ def _no_bytes(words: Sequence[str], error: ValueError) -> LidarSpecError:
     return UsageError(f"{text[:QUOTED]!r} is no file, and not hexadecimal: {error}")
 
 
-def refuse_overwriting(source: str, target: str, what: str = "source", *, force: bool = True) -> None:
-    """Nothing, where a file is written to that is not the one that is read, and with `force` off is new.
+def refuse_overwriting(target: str | None, *inputs: str | Path | Sensor | None, force: bool = True) -> None:
+    """Nothing, where a file is written to that is none of those that are read, by whatever name, and with `force` off is new.
+
+    Args:
+        inputs: words that may be a SOURCE or a file; sensors, whose options may be.
 
     Raises:
         UsageError: where it is not.
     """
-    path = source.partition("?")[0]
-    if os.path.exists(path) and os.path.exists(target) and os.path.samefile(path, target):
-        raise UsageError(f"{target} is the {what}: it would be overwritten")
-    if not force and os.path.exists(target):
+    if target is None or not os.path.exists(target):
+        return
+    for path in [path for given in inputs for path in _read_for(given)] if os.path.isfile(target) else ():
+        if os.path.exists(path) and os.path.samefile(path, target):
+            name = "standard input" if path == 0 else f"read as {path}" if path != target else "read"
+            raise UsageError(f"{target} is {name}: it would be overwritten")
+    if not force:
         error = UsageError(f"{target} exists already; it is not overwritten unless asked for")
         raise suggest(error, "the same with --force, or with another file")
+
+
+def _read_for(given: str | Path | Sensor | None) -> Iterator[str | int]:
+    """The files that may be read where this is given."""
+    if isinstance(given, Sensor):
+        yield from (str(value) for value in given.options.values() if isinstance(value, str | Path))
+        return
+    word = str(given or "")
+    yield from [0] if word == "-" else [word, word.partition("?")[0], word.rpartition(":")[0], word.partition("=")[2]]
+    with contextlib.suppress(LidarSpecError):  # settings that are wrong are told of where a name is looked up
+        known = devices().get(word)
+        yield from (known.source.partition("?")[0], *map(str, known.options.values())) if known else ()
 
 
 def no_frame(sensor: Sensor, given: Heard) -> WireError:
     """Why there is no frame of this sensor in the input, with the next command."""
     data = given.data
     longest = max((frame.max_length for frame in sensor.frames.values()), default=0)
-    command = f"lidarspec explain {given.source} -s {sensor.id}"
+    command = f"lidarspec explain {quote(given.source)} -s {sensor.id}"
     if not data:
         return suggest(WireError(no_bytes(given.source, given.warnings), sensor=sensor.id), f"lidarspec build {sensor.id} --help")
     if (fault := _never_right(given)) is not None:
@@ -168,13 +186,13 @@ def nearest_fault(given: Heard) -> WireError:
     if best is None:
         text = f"no frame of any of the {len(sensors())} installed sensors" if sensors() else "no frame of an installed sensor"
         return suggest(WireError(text, data=given.data[:QUOTED]), "lidarspec sensors")
-    return suggest(best, f"lidarspec explain {given.source} -s {best.sensor}")
+    return suggest(best, f"lidarspec explain {quote(given.source)} -s {best.sensor}")
 
 
 def _never_right(given: Heard) -> WireError | None:
     """That the input is frames of a sensor whose checksums are never right; None where it is not."""
     fault = never_right(given.chunks, datagrams=given.datagrams)
-    return suggest(WireError(f"{given.source}: {fault}"), f"lidarspec crc {given.source}") if fault else None
+    return suggest(WireError(f"{given.source}: {fault}"), f"lidarspec crc {quote(given.source)}") if fault else None
 
 
 def nothing_came(device: Device, source: str, seconds: float | None = None) -> LidarSpecError:
@@ -190,12 +208,12 @@ def nothing_came(device: Device, source: str, seconds: float | None = None) -> L
         said = (
             "; ".join([f"{source} has no data frame: {stats}", *device.warnings]) if stats.bytes_in else no_bytes(source, device.warnings)
         )
-        return suggest(WireError(said, sensor=sensor.id), f"lidarspec explain {source} -s {sensor.id}")
+        return suggest(WireError(said, sensor=sensor.id), f"lidarspec explain {quote(source)} -s {sensor.id}")
     waited = "" if seconds is None else f" within {seconds:.1f} s".replace(".0 s", " s")
     if stats.bytes_in == 0:
-        return suggest(CommandError(f"{sensor.id} on {source} sent nothing{waited}"), f"lidarspec doctor {source} -s {sensor.id}")
+        return suggest(CommandError(f"{sensor.id} on {source} sent nothing{waited}"), f"lidarspec doctor {quote(source)} -s {sensor.id}")
     error = WireError(f"{source}: {stats.bytes_in} bytes{waited}, and not a scan of data frames among them: {stats}", sensor=sensor.id)
-    return suggest(error, f"lidarspec detect {source}")
+    return suggest(error, f"lidarspec detect {quote(source)}")
 
 
 def conclude(device: Device) -> None:

@@ -14,11 +14,11 @@ from pathlib import Path
 from textwrap import indent
 from typing import Any
 
-import click
 from rich.console import Console
 from rich.text import Text
 
-from lidarspec.errors import system_errors
+from lidarspec.cli.terminal import note, say
+from lidarspec.errors import printable, system_errors
 from lidarspec.explaining.listing import Line, folded, text as plain_text
 
 #: seconds between two lines.
@@ -52,7 +52,7 @@ class Progress(contextlib.AbstractContextManager["Progress"]):
             return
         self._due = time.monotonic() + PERIOD
         line = text()[: shutil.get_terminal_size().columns - 1]
-        click.echo(f"\r{line.ljust(self._width)}", err=True, nl=False)
+        note(line.ljust(self._width), begin="\r", nl=False)
         self._width = len(line)
 
     def follow(self, remarks: Iterable[str], text: Callable[[], str]) -> None:
@@ -70,7 +70,7 @@ class Progress(contextlib.AbstractContextManager["Progress"]):
     def clear(self) -> None:
         """Take the line away."""
         if self._width:
-            click.echo(f"\r{' ' * self._width}\r", err=True, nl=False)
+            note("", begin=f"\r{' ' * self._width}\r", nl=False)
             self._width, self._due = 0, 0.0
 
     def __exit__(self, *_: object) -> None:
@@ -96,7 +96,7 @@ def emit_parts(parts: Iterable[str | bytes], output: str | None, *, colour: bool
     """Texts, a line or more each, or bytes, as they are made; the same places as `emit`; `colour`: whether colours stay in a pipe."""
     if output is None or output == "-":
         for part in parts:
-            click.echo(part, nl=isinstance(part, str), color=colour)
+            say(part, nl=isinstance(part, str), colour=colour)
         return
     from lidarspec.formats import replacing  # and all that scans are made of, for the verbs that write a file
 
@@ -123,7 +123,7 @@ def emit_lines(lines: Iterable[Line], output: str | None) -> None:
 def _coloured(line: Line, width: int | None) -> str:
     drawing = Text()
     for span in line if width is None else folded(line, width):
-        drawing.append(span.text, STYLES.get(span.role))
+        drawing.append(printable(span.text), STYLES.get(span.role))
     return drawn(drawing)
 
 
@@ -145,11 +145,6 @@ def _items(beginning: str, items: Iterable[Any]) -> Iterator[str]:
         yield held + "," * bool(number)
         held = indent(json.dumps(item, indent=2, allow_nan=False), "    ")
     yield held
-
-
-def note(text: str) -> None:
-    """A remark beside the data, on stderr."""
-    click.echo(text, err=True)
 
 
 def table(headers: Sequence[str], rows: Sequence[Sequence[str]], output: str | None = None) -> str:

@@ -17,7 +17,7 @@ import numpy as np
 from lidarspec.cli.failures import FINDINGS
 from lidarspec.cli.inputs import Patience, conclude, nothing_came
 from lidarspec.cli.options import DURATION, SHARE, count_option, sensor_option
-from lidarspec.cli.output import note
+from lidarspec.cli.terminal import note, say
 from lidarspec.device.device import Device, open as open_device
 from lidarspec.errors import UnknownFrame
 from lidarspec.scans.scans import Scan
@@ -83,7 +83,7 @@ def read(
         rows = _packets(device, frame, until, patience) if whole or frame else _points(device, until, patience, every_point=every_point)
         printed = 0
         for line in _lines(itertools.islice(rows, count), as_json=as_json):
-            click.echo(line)
+            say(line)
             printed += 1
         if not printed and not device.stats.frames:
             raise nothing_came(device, source, duration)
@@ -202,11 +202,11 @@ class Lines:
             self._emit({"kind": "interval", "at_s": at, **self._figures(reading)})
             return
         if self.printed % AGAIN == 0:
-            click.echo(_row(["time", *(name for name, _, _, _ in COLUMNS), "queue"], WIDTHS))
-            click.echo(_row(["s", *(unit for _, unit, _, _ in COLUMNS), ""], WIDTHS))
+            say(_row(["time", *(name for name, _, _, _ in COLUMNS), "queue"], WIDTHS))
+            say(_row(["s", *(unit for _, unit, _, _ in COLUMNS), ""], WIDTHS))
         self.printed += 1
         figures = [text(reading) for _, _, _, text in COLUMNS]
-        click.echo(_row([told(at, "{:.1f}"), *figures, told(self.device.queued, "{}")], WIDTHS))
+        say(_row([told(at, "{:.1f}"), *figures, told(self.device.queued, "{}")], WIDTHS))
         sys.stdout.flush()
 
     def summary(self, reading: Reading) -> None:
@@ -215,16 +215,16 @@ class Lines:
             self._emit({"kind": "summary", **self._figures(reading), "stats": self.device.stats.to_dict()})
             return
         lasted = f" in {reading.seconds:.1f} s" if reading.seconds else ""
-        click.echo(f"\n{self.device.sensor.id}: {reading.packets} packets, {reading.scans} whole scans{lasted}; {self.device.stats}")
+        say(f"\n{self.device.sensor.id}: {reading.packets} packets, {reading.scans} whole scans{lasted}; {self.device.stats}")
         for name, unit, _, text in FIGURES:
             if text(reading) != "-":
-                click.echo(f"  {name:<8} {text(reading):>10} {unit}")
+                say(f"  {name:<8} {text(reading):>10} {unit}")
 
     def _figures(self, reading: Reading) -> dict[str, Any]:
         return {"sensor": self.device.sensor.id, **reading.to_dict(), "queue": self.device.queued, "state": self.device.state}
 
     def _emit(self, value: dict[str, Any]) -> None:
-        click.echo(json.dumps(value, allow_nan=False))
+        say(json.dumps(value, allow_nan=False))
         sys.stdout.flush()
 
 

@@ -11,7 +11,8 @@ import click
 from lidarspec.cli.failures import INTERRUPTED
 from lidarspec.cli.inputs import nothing_came, refuse_overwriting
 from lidarspec.cli.options import DURATION, SPEED, count_option, sensor_option
-from lidarspec.cli.output import Progress, emit_json, note, size
+from lidarspec.cli.output import Progress, emit_json, size
+from lidarspec.cli.terminal import note, say
 from lidarspec.device.settings import named
 from lidarspec.device.source_recording import SourceRecording, recorder_like
 from lidarspec.discovery.detect import declared
@@ -54,7 +55,7 @@ def record(
     recorded as they come.
     """
     check_suffix(target)
-    refuse_overwriting(source, target)
+    refuse_overwriting(target, source, sensor_id)
     known = named(source)
     sensor = named_sensor(sensor_id) if sensor_id else declared(source) if is_live(source) else known.configured() if known else None
     task = SourceRecording(source, target, sensor, seconds=seconds, count=count, start=not no_start, overwrite=force, salvage=salvage)
@@ -99,8 +100,8 @@ def _sum_up_recording(task: SourceRecording, kept: Appender, source: str, sensor
     """What was recorded, and what can be done with it; an empty file is not left behind."""
     device = task.device
     if not kept.records:
-        with contextlib.suppress(OSError):
-            os.unlink(kept.path)
+        if not kept.discard():
+            note(f"{kept.path} is left as it was")
         if device is not None:
             raise nothing_came(device, source, task.elapsed)
         if live_address(source) is not None:
@@ -141,12 +142,14 @@ def replay(file: str, place: str, speed: float | None, loop: bool, force: bool, 
     file keeps the times of the recording.
     """
     if is_live(file):
-        raise suggest(UsageError(f"{file} is live: only what was recorded can be replayed"), f"lidarspec record {file} -o recording.lsr")
+        raise suggest(
+            UsageError(f"{file} is live: only what was recorded can be replayed"), f"lidarspec record {shlex.quote(file)} -o recording.lsr"
+        )
     is_file = place.endswith(SUFFIXES) and "://" not in place
     if is_file and loop:
         raise UsageError("a file cannot take a replay that never ends: leave out --loop")
     if is_file:
-        refuse_overwriting(file, place)
+        refuse_overwriting(place, file, sensor_id)
     with contextlib.closing(transport(file)) as source:
         sensor = _sensor(source, sensor_id)
         outlet = (
@@ -171,7 +174,7 @@ def _run(played: Replay, outlet: Outlet, file: str) -> bool:
         except KeyboardInterrupt:
             return True
         except WireError as error:
-            raise suggest(error, f"lidarspec show {file}") from None
+            raise suggest(error, f"lidarspec show {shlex.quote(file)}") from None
         finally:
             outlet.finish()
     return False
@@ -203,7 +206,7 @@ def _announce(file: str, outlet: Outlet, sensor: Sensor | None, *, as_json: bool
         place = "udp://" if sensor else "udp://:PORT"
     waits = "" if place.startswith("udp:") else ", as soon as it is opened"
     if not as_json:
-        click.echo(outlet.place)
+        say(outlet.place)
     note(f"playing {file} to {outlet.place}{waits}")
     note(f"next: lidarspec {_shown(sensor, place)}")
 

@@ -17,6 +17,7 @@ import click
 
 from lidarspec._version import __version__
 from lidarspec.cli.failures import INTERRUPTED, report
+from lidarspec.cli.terminal import note, say, silence, streams
 from lidarspec.errors import did_you_mean
 
 #: group -> verb -> (module, what it does); the texts are those of the verbs' own help.
@@ -105,27 +106,20 @@ class Verbs(click.Group):
 
 
 def _run(group: click.Group, words: list[str]) -> int:
-    for stream in (sys.stdout, sys.stderr):
-        with contextlib.suppress(AttributeError):
-            stream.reconfigure(errors="replace")  # type: ignore[union-attr]
     try:
-        with _warnings_told(), group.make_context("lidarspec", words) as ctx:
+        with streams(), _warnings_told(), group.make_context("lidarspec", words) as ctx:
             group.invoke(ctx)
-        sys.stdout.flush()
         return 0
     except click.exceptions.Exit as done:
         return done.exit_code
     except (KeyboardInterrupt, click.Abort):
-        click.echo("interrupted", err=True)
+        note("interrupted")
         return INTERRUPTED
     except BrokenPipeError:
-        _silence()
+        silence()
         return 0
     except Exception as error:
-        with contextlib.suppress(BrokenPipeError):
-            return report(error, next((word for word in words if word in VERBS), ""))
-        _silence()
-        return 0
+        return report(error, next((word for word in words if word in VERBS), ""))
 
 
 @contextlib.contextmanager
@@ -140,18 +134,11 @@ def _warnings_told() -> Iterator[None]:
                 plain(message, category, *place, **more)
             elif str(message) not in told:
                 told.add(str(message))
-                click.echo(str(message), err=True)
+                note(str(message))
 
         warnings.showwarning = tell
         warnings.simplefilter("always", UserWarning)
         yield
-
-
-def _silence() -> None:
-    """Nobody reads any more: what is still buffered goes nowhere, without a complaint at exit."""
-    with contextlib.suppress(OSError, ValueError):
-        nowhere = os.open(os.devnull, os.O_WRONLY)
-        os.dup2(nowhere, sys.stdout.fileno())
 
 
 @click.group(cls=Verbs, invoke_without_command=True, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 120})
@@ -166,7 +153,7 @@ def main(ctx: click.Context) -> None:
     if ctx.invoked_subcommand is None:
         from lidarspec.cli.sensors import guide
 
-        click.echo(guide())
+        say(guide())
 
 
 @click.command()
@@ -176,8 +163,8 @@ def help(ctx: click.Context, verb: str | None) -> None:
     """What a verb does, and its options; without a verb, all of them."""
     root = ctx.find_root()
     if verb is None:
-        click.echo(root.get_help())
+        say(root.get_help())
         return
     _, command, _ = main.resolve_command(root, [verb])
     assert command is not None
-    click.echo(command.get_help(click.Context(command, info_name=verb, parent=root)))
+    say(command.get_help(click.Context(command, info_name=verb, parent=root)))

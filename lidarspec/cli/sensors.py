@@ -11,7 +11,8 @@ import numpy as np
 from lidarspec._version import __version__
 from lidarspec.cli.failures import FINDINGS
 from lidarspec.cli.options import output_options
-from lidarspec.cli.output import emit, emit_json, note, table
+from lidarspec.cli.output import emit, emit_json, table
+from lidarspec.cli.terminal import note
 from lidarspec.columns.columns import Batch
 from lidarspec.device.settings import FILE, devices
 from lidarspec.errors import NO_SENSORS, SpecError

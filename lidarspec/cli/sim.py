@@ -16,7 +16,8 @@ from rich.text import Text
 
 from lidarspec.cli.failures import FINDINGS
 from lidarspec.cli.options import DURATION, SHARE, count_option, sensor_option
-from lidarspec.cli.output import Progress, drawn, emit_json, note, size
+from lidarspec.cli.output import Progress, drawn, emit_json, size
+from lidarspec.cli.terminal import note, say
 from lidarspec.device.demo import Demonstration, demonstrate
 from lidarspec.errors import NO_SENSORS, UsageError, suggest
 from lidarspec.plugins import registry, sensor as named_sensor
@@ -90,7 +91,7 @@ def sim(
     try:
         opened = simulated_outlet(sensor, place, link)
     except UsageError as error:
-        raise suggest(error, f"lidarspec sim {sensor_id} --to {'udp://' + HERE if sensor.datagrams else 'pty'}") from None
+        raise suggest(error, f"lidarspec sim {shlex.quote(str(sensor_id))} --to {'udp://' + HERE if sensor.datagrams else 'pty'}") from None
     try:
         _tell(sensor, opened.place, opened.source, as_json=as_json)
         with _ended_by_terminate(), Progress() as progress:
@@ -107,7 +108,7 @@ def _tell(sensor: Sensor, where: str, source: str, *, as_json: bool) -> None:
     if as_json:
         emit_json({"sensor": sensor.id, "place": where, "source": source, "next": following}, None)
         return
-    click.echo(where)
+    say(where)
     note(f"{sensor.id}, simulated\n  next: {following}")
 
 
@@ -159,7 +160,7 @@ def demo(sensor_id: str | Sensor | None, count: int, errors: float, as_json: boo
     if as_json:
         emit_json(_facts(result, whole), None)
     else:
-        click.echo("\n".join([drawn(_picture(whole[-1])), *_summary(result, whole, errors)]), color=True)
+        say("\n".join([drawn(_picture(whole[-1])), *_summary(result, whole, errors)]), colour=True)
     if result.digest != result.again:
         click.get_current_context().exit(FINDINGS)
 

@@ -11,7 +11,8 @@ import click
 
 from lidarspec.cli.inputs import PATIENCE, conclude, nothing_came
 from lidarspec.cli.options import DURATION, colour_option, sensor_option
-from lidarspec.cli.output import drawn, note
+from lidarspec.cli.output import drawn
+from lidarspec.cli.terminal import note, say
 from lidarspec.device.device import Device, open as open_device
 from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.open_url import is_live
@@ -38,7 +39,7 @@ def view(source: str, sensor_id: str | Sensor | None, duration: float | None, on
     """
     if once or not interactive():
         with open_device(source, sensor_id) as device:
-            click.echo(_printed(device, source, ramp, duration or PATIENCE), color=True)
+            say(_printed(device, source, ramp, duration or PATIENCE), colour=True)
             conclude(device)
         return
     switch = Switch(source, Path.cwd()) if is_live(source) else None

@@ -253,7 +253,7 @@ class Device(Closing):
     def overdue(self) -> SourceError:
         """What to say when a scan did not come in time."""
         error = SourceError(f"{self._source}: no scan in time; the source is {self.state}")
-        return suggest(error, f"lidarspec doctor '{self._source}' -s {self.sensor.id}")
+        return suggest(error, f"lidarspec doctor {quote(str(self._source))} -s {self.sensor.id}")
 
     def send(self, name: str, *, timeout: float | None = None, **arguments: Any) -> Reply:
         """The reply to a command; at once with ``confirmed=False`` where none is documented.

@@ -14,6 +14,7 @@ import time
 from collections import deque
 from collections.abc import Sequence
 from pathlib import Path
+from shlex import quote
 from typing import Any
 
 from lidarspec.device.arrivals import Arrival, Input, Senders, answers, fed
@@ -92,8 +93,8 @@ class Watch:
     def following(self) -> str:
         """The command that finds out more."""
         if self._decoder.stats.bytes_in and not self._decoder.stats.frames:
-            return f"lidarspec detect '{str(self._source).partition('?')[0]}'"
-        return f"lidarspec doctor '{self._source}' -s {self._sensor.id}"
+            return f"lidarspec detect {quote(str(self._source).partition('?')[0])}"
+        return f"lidarspec doctor {quote(str(self._source))} -s {self._sensor.id}"
 
     @property
     def _unframed(self) -> int:

@@ -16,6 +16,7 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from shlex import quote
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -336,7 +337,7 @@ def detected(source: str | Path) -> Sensor:
     if not fitting:
         raise _nothing(str(source), found)
     if not any(one.alike for one in fitting):
-        raise suggest(WireError(f"{source}: {others_named(fitting[0])}"), f"lidarspec detect {source}")
+        raise suggest(WireError(f"{source}: {others_named(fitting[0])}"), f"lidarspec detect {quote(str(source))}")
     if len({one.sensor.id for one in fitting if one.sensor}) > 1:
         listed = ", ".join(f"{one.sensor.id} ({one.heard.sender})" for one in fitting if one.sensor)
         raise UsageError(f"{source}: several sensors send, {listed}; choose one with ?src=ADDRESS and -s")
@@ -388,13 +389,13 @@ def _nothing(source: str, found: Sequence[Verdict]) -> Exception:
     """What to say where no sensor fits."""
     heard = max((one.heard for one in found), key=lambda one: one.size, default=Heard(source))
     if fault := next((one.fault for one in found if one.fault), ""):
-        return suggest(WireError(f"{source}: {fault}"), f"lidarspec crc {source}")
+        return suggest(WireError(f"{source}: {fault}"), f"lidarspec crc {quote(str(source))}")
     if heard.size:
         return WireError(f"{source}: no installed sensor's frames are in it", data=heard.chunks[0][:SHOWN])
     if live_address(source) is None:
         return WireError(no_bytes(source, heard.warnings))
     error = CommandError(f"{source}: nothing comes; a sensor that has to be started first is named with -s")
-    return suggest(error, f"lidarspec doctor {source}")
+    return suggest(error, f"lidarspec doctor {quote(str(source))}")
 
 
 #: constant bits that make bytes look like a frame.

@@ -15,7 +15,7 @@ import importlib
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from lidarspec.errors import SpecError, UnknownFrame, UnknownName, UsageError
+from lidarspec.errors import SpecError, UnknownFrame, UnknownName, UsageError, printable
 from lidarspec.spec import tree
 from lidarspec.spec.description import Frame, with_frames
 
@@ -68,8 +68,14 @@ def export(sensor: Sensor, kind: str) -> str:
     if kind not in EXPORTS:
         raise UnknownExport(kind, EXPORTS)
     module, _, function = EXPORTS[kind].partition(":")
-    text: str = getattr(importlib.import_module(module), function)(sensor)
+    plain = replace(sensor, vendor=_line(sensor.vendor), model=_line(sensor.model), source=_line(sensor.source))
+    text: str = getattr(importlib.import_module(module), function)(plain)
     return text
+
+
+def _line(text: str) -> str:
+    """What stands in a heading, a comment or a string of any language as one line; its own marks each export escapes itself."""
+    return printable(" ".join(text.split()))
 
 
 @dataclass(frozen=True, eq=False)

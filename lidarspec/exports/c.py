@@ -315,7 +315,7 @@ def header(sensor: Sensor) -> str:
         Refused: where only Python code can decide what a frame is made of, or its layout cannot be computed in C.
     """
     prefix = identifier(sensor.id if sensor.id[0].isalpha() else f"lidar_{sensor.id}")
-    title, source = f"{sensor.vendor} {sensor.model}", " ".join(sensor.source.split()).replace("*/", "* /")
+    title, source = (text.replace("*/", "* /").replace("/*", "/ *") for text in (f"{sensor.vendor} {sensor.model}", sensor.source))
     found = messages(sensor)
     algorithms = dict.fromkeys(seal.algorithm for message in found for seal in message.seals.values())
     names = {algorithm: f"{prefix}_checksum_{number}" for number, algorithm in enumerate(algorithms, 1)}

@@ -7,6 +7,7 @@ columns there are, and in which directions the channels look.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from xml.sax.saxutils import escape
 
 import numpy as np
 
@@ -44,7 +45,7 @@ def page(sensor: Sensor, pictures: Mapping[str, str] | None = None) -> str:
     Args:
         pictures: where the packet diagram of a frame type is, for those that have one.
     """
-    parts = [f"# {sensor.vendor} {sensor.model}", "\n".join(_facts(sensor))]
+    parts = [f"# {escape(f'{sensor.vendor} {sensor.model}')}", "\n".join(_facts(sensor))]
     if sensor.commands:
         parts += ["## Commands", "\n".join(_commands(sensor))]
     for name, frame in sensor.frames.items():
@@ -60,7 +61,7 @@ def _facts(sensor: Sensor) -> Iterator[str]:
     rows += [("clock", _clock(sensor.clock))] if sensor.clock else []
     rows += [("counter", f"`{sensor.sequence.field}`; a jump is a loss")] if sensor.sequence else []
     rows += [("fillers", f"`{sensor.fillers.hex(' ')}` between frames")] if sensor.fillers else []
-    rows += [("proven", f"{sensor.status}: {STATUSES[sensor.status]}"), ("source", sensor.source)]
+    rows += [("proven", f"{sensor.status}: {STATUSES[sensor.status]}"), ("source", escape(sensor.source))]
     return _table(["", ""], rows)
 
 

@@ -38,7 +38,7 @@ def pyi(sensor: Sensor) -> str:
     classes = _Classes({camel(sensor.id)})
     for message in frames:
         names[message.name] = classes.add(message.root, names[message.name], f"A frame of the type {message.name}.")
-    parts = [_HEAD.format(id=sensor.id, title=f"{sensor.vendor} {sensor.model}"), *classes.done, _sensor(sensor, frames, names)]
+    parts = [_HEAD.format(id=sensor.id, title=_quoted(f"{sensor.vendor} {sensor.model}")), *classes.done, _sensor(sensor, frames, names)]
     return "\n\n".join(part.rstrip() + "\n" for part in parts)
 
 

@@ -322,8 +322,7 @@ def dissector(sensor: Sensor) -> str:
         "places": _patterns(sensor),
         "frames": [_frame(message, name) for message in by_direction],
     }
-    source = " ".join(sensor.source.split())
-    head = _HEAD.format(title=title, version=__version__, source=source, name=quoted(name), title_quoted=quoted(title))
+    head = _HEAD.format(title=title, version=__version__, source=sensor.source, name=quoted(name), title_quoted=quoted(title))
     walker = resources.files("lidarspec.exports").joinpath("wireshark.lua").read_text(encoding="utf-8")
     return "\n".join([head, f"local sensor = {lua(about)}\n", walker])
 

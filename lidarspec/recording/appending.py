@@ -1,5 +1,7 @@
 """A file that grows by whole records, written by a thread of its own, so that a slow disk holds up no capture.
 
+A file that is overwritten stays until the new one has its first record.
+
 What is put in waits in memory. The thread writes it out every 0.2 s or 64 KiB, and has it put on the disk every second. Short
 writes are gone on with; what a full disk takes of a record that it does not take whole is cut off again.
 """
@@ -32,7 +34,7 @@ Size = Callable[[bytes | bytearray, int], int]
 
 
 class RecordFile:
-    """A new file, opened at once.
+    """A new file, opened at once; one that it is to replace stays in its place until `settle`.
 
     Args:
         size_at: how long records are, since a piece of the file may be cut behind each; None where it may be anywhere.
@@ -43,8 +45,11 @@ class RecordFile:
     """
 
     def __init__(self, path: str, size_at: Size | None, *, overwrite: bool) -> None:
+        self._place = Path(os.path.realpath(path))
+        self.replaces = overwrite and self._place.is_file() and os.name != "nt"  # where open files keep their names
+        self._opened = self._place.with_name(f".{self._place.name}.{os.getpid()}.part") if self.replaces else self._place
         try:
-            self._file = open(path, "wb" if overwrite else "xb", buffering=0)  # noqa: SIM115  closed by `close`
+            self._file = open(self._opened, "wb" if overwrite else "xb", buffering=0)  # noqa: SIM115  closed by `close`
         except FileExistsError:
             raise UsageError(f"{path} exists already; it is not overwritten unless asked for") from None
         except OSError as error:
@@ -79,6 +84,21 @@ class RecordFile:
             end += size
         return end
 
+    @property
+    def is_settled(self) -> bool:
+        """Whether it stands in its place."""
+        return self._opened == self._place
+
+    def settle(self) -> None:
+        """Take the place of the file that it replaces, if there is one and it stands there still.
+
+        Raises:
+            OSError: where that cannot be done.
+        """
+        if not self.is_settled:
+            os.replace(self._opened, self._place)
+            self._opened = self._place
+
     def keep(self) -> None:
         """Returns when all of it is on the disk; pipes and devices have none."""
         try:
@@ -88,9 +108,11 @@ class RecordFile:
                 raise
 
     def close(self) -> None:
-        """Close the file."""
+        """Close the file; without `settle`, the one that it was to replace stays, and this one is gone."""
         with contextlib.suppress(OSError):
             self._file.close()
+            if not self.is_settled:
+                self._opened.unlink()
 
 
 class Log(Protocol):
@@ -181,6 +203,13 @@ class Appender:
         self._finish()
         self._complain()
 
+    def discard(self) -> bool:
+        """Take away a closed file that got no record; False where one that it was to replace stays in its place."""
+        if not self._file.replaces:
+            with contextlib.suppress(OSError):
+                os.unlink(self.path)
+        return not self._file.replaces
+
     def __enter__(self) -> Self:
         return self
 
@@ -236,8 +265,10 @@ class Appender:
                     self._changed.wait_for(lambda: self._waiting or self._kept < self._taken or self._closing)
                     self._changed.wait_for(self._is_urgent, FLUSH_SECONDS)
                     waiting, self._waiting, taken = self._waiting, bytearray(), self._taken
-                    asked = self._asked > self._kept or self._closing
+                    asked, is_begun = self._asked > self._kept or self._closing, self.records > 0
                 self._file.append(waiting)
+                if is_begun:
+                    self._file.settle()
                 if asked or time.monotonic() >= due:
                     self._file.keep()
                     due = time.monotonic() + DISK_SECONDS
@@ -247,7 +278,8 @@ class Appender:
         except Exception as error:
             with self._changed:
                 reason = (error.strerror if isinstance(error, OSError) else None) or error
-                self.error = SourceError(f"{self.path}: {reason}; the recording is whole up to byte {self._file.size}")
+                held = f"the recording is whole up to byte {self._file.size}" if self._file.is_settled else "what was there before is kept"
+                self.error = SourceError(f"{self.path}: {reason}; {held}")
                 self._changed.notify_all()
         finally:
             self._file.close()

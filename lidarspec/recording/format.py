@@ -29,6 +29,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, fields
 from functools import lru_cache
 from pathlib import Path
+from shlex import quote
 from typing import Any, Literal
 
 from lidarspec.errors import SourceError, UsageError, WireError, suggest, system_errors
@@ -240,7 +241,7 @@ class Recording(Closing):
             return self._known(pairs)
         if not self.salvage:
             damage = WireError(f"{self.path}: the header of the recording is damaged or cut off")
-            raise suggest(damage, f"lidarspec record {self.path} --salvage -o mended.lsr")
+            raise suggest(damage, f"lidarspec record {quote(str(self.path))} --salvage -o mended.lsr")
         self.header = Header()
         return self._known(itertools.chain([] if first is None else [first], pairs))
 

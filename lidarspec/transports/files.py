@@ -128,7 +128,7 @@ def _damage(recording: Recording) -> str:
         return _passed_over(str(recording.path), recording.damaged, recording.leftover)
     if recording.is_cut:
         return f"{recording.path} is cut off in its last record: {lost}, everything before them was"
-    mending = f"lidarspec record {recording.path} --salvage -o mended.lsr"
+    mending = f"lidarspec record {quote(str(recording.path))} --salvage -o mended.lsr"
     return f"{recording.path} is damaged at byte {recording.offset}: {lost}; next: {mending}"
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import os
+from shlex import quote
 
 import serial
 
@@ -101,11 +102,11 @@ class SerialTransport(StreamTransport):
         if number == errno.ENOENT or "FileNotFoundError" in str(error):
             return failure(f"{self.label}: no such port", "lidarspec ports")
         if number == errno.EACCES:
-            return failure(f"{self.label}: permission denied", f"lidarspec doctor {source}")
+            return failure(f"{self.label}: permission denied", f"lidarspec doctor {quote(source)}")
         if number in (errno.EBUSY, errno.EAGAIN) or "exclusively lock" in str(error) or "PermissionError" in str(error):
-            return failure(f"{self.label}: in use by another program", f"lidarspec doctor {source}")
+            return failure(f"{self.label}: in use by another program", f"lidarspec doctor {quote(source)}")
         if isinstance(error, ValueError) or "baud" in str(error).lower():
-            return failure(f"{self.label}: it cannot run at {self.baud} baud: {error}", f"lidarspec detect {self.label}")
+            return failure(f"{self.label}: it cannot run at {self.baud} baud: {error}", f"lidarspec detect {quote(self.label)}")
         return failure(f"{self.label}: {reason(error)}", "lidarspec ports")
 
     def _received(self, timeout: float) -> bytes:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import socket
+from shlex import quote
 
 from lidarspec.errors import SourceError, UsageError
 from lidarspec.spec.links import Tcp
@@ -68,7 +69,7 @@ class TcpTransport(StreamTransport):
 
     def _refused(self, error: OSError) -> SourceError:
         host, port = self._address
-        doctor = f"lidarspec doctor {self.label}{named(self._sensor)}"
+        doctor = f"lidarspec doctor {quote(self.label)}{named(self._sensor)}"
         if isinstance(error, socket.gaierror):
             return failure(f"{self.label}: there is no host {host!r}", doctor)
         if error.errno == errno.ECONNREFUSED:

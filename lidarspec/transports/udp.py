@@ -23,6 +23,7 @@ import struct
 import sys
 import time
 from collections.abc import Iterable, Iterator, Sequence
+from shlex import quote
 
 from lidarspec.errors import SourceError, UsageError
 from lidarspec.spec.links import Udp, is_datagram
@@ -222,7 +223,9 @@ class UdpTransport(LiveTransport):
 
     def write(self, data: bytes) -> None:
         if self._last is None:
-            raise failure(f"{self.label}: nothing has arrived yet, so nobody knows the sensor's address", f"lidarspec doctor {self.label}")
+            raise failure(
+                f"{self.label}: nothing has arrived yet, so nobody knows the sensor's address", f"lidarspec doctor {quote(self.label)}"
+            )
         try:
             self._sockets[0].socket.sendto(data, self._last)
         except OSError as error:
@@ -277,7 +280,7 @@ class UdpTransport(LiveTransport):
         return found
 
     def _refused(self, error: OSError, host: str, port: int, group: str | None) -> SourceError:
-        doctor = f"lidarspec doctor '{self.label}'{named(self._sensor)}"
+        doctor = f"lidarspec doctor {quote(self.label)}{named(self._sensor)}"
         if error.errno == errno.EADDRINUSE:
             return failure(f"{self.label}: UDP port {port} is in use by another program", doctor)
         if error.errno == errno.EACCES:

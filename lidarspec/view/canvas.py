@@ -17,6 +17,8 @@ from numpy.typing import NDArray
 from rich.color import Color, ColorSystem
 from rich.text import Text
 
+from lidarspec.errors import printable
+
 Depth = Literal["truecolor", "256", "standard", "none"]
 Rgb = tuple[int, int, int]
 
@@ -123,6 +125,7 @@ class Cells:
         width, height = self.size
         if not 0 <= row < height or column >= width:
             return
+        text = printable(text).replace("\n", " ")
         text = text[max(-column, 0) :][: width - max(column, 0)]
         column = max(column, 0)
         self.codes[row, column : column + len(text)] = [ord(character) for character in text]

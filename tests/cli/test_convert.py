@@ -6,6 +6,8 @@ import csv
 import json
 import os
 import re
+import subprocess
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -169,11 +171,31 @@ def test_scans_can_be_limited(tmp_path: Path) -> None:
         np.testing.assert_array_equal(first["x"], every["x"][every["scan"] < 2])
 
 
-@pytest.mark.parametrize("suffix", ["csv", "npz"])
-def test_the_input_is_never_overwritten(tmp_path: Path, suffix: str) -> None:
-    source = tmp_path / f"in.{suffix}"
+@pytest.mark.parametrize("name", ["in.csv", "link.csv", "same.csv"])
+@pytest.mark.parametrize(
+    ("words"), [("convert", "--force", "IN"), ("parse", "IN", "-o"), ("explain", "54", "2c", "--diff", "IN", "-o"), ("plot", "IN", "-o")]
+)
+def test_the_input_is_never_overwritten_by_whatever_name(tmp_path: Path, words: tuple[str, ...], name: str) -> None:
+    name = name.replace("csv", "svg") if words[0] == "plot" else name
+    source = tmp_path / f"in{name[-4:]}"
     source.write_bytes(EXAMPLE)
-    assert "is the input" in ran("convert", source, source, "-s", "ldrobot-stl27l", code=2).stderr
+    (tmp_path / f"link{name[-4:]}").symlink_to(source)
+    os.link(source, tmp_path / f"same{name[-4:]}")
+    typed = [source if word == "IN" else word for word in words]
+    assert "would be overwritten" in ran(*typed, tmp_path / name, "-s", "ldrobot-stl27l", code=2).stderr
+    assert source.read_bytes() == EXAMPLE
+
+
+def test_files_of_options_and_standard_input_are_inputs_too(tmp_path: Path) -> None:
+    source, angles = tmp_path / "in.bin", tmp_path / "angles.csv"
+    source.write_bytes(EXAMPLE)
+    angles.write_text("channel,elevation,azimuth\n" + "".join(f"{channel},1,1\n" for channel in range(1, 17)))
+    words = ("convert", source, angles, "--force", "-s", "hesai-xt16", "-O", f"calibration={angles}")
+    assert "would be overwritten" in ran(*words, code=2).stderr
+    with source.open("rb") as given:
+        command = [sys.executable, "-m", "lidarspec", "parse", "-", "-o", str(source), "-s", "ldrobot-stl27l"]
+        done = subprocess.run(command, stdin=given, capture_output=True, check=False)
+    assert (done.returncode, b"is standard input: it would be overwritten" in done.stderr) == (2, True)
     assert source.read_bytes() == EXAMPLE
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 import signal
 import subprocess
 import sys
@@ -128,14 +129,14 @@ def test_the_place_of_an_error_is_marked() -> None:
         "ldrobot-stl27l data: frame ends at byte 11 of 47: points[1].intensity needs 1 byte, 0 left",
         "  0000  54 2c 10 0e 00 00 e8 03  c8 e9 03",
         "                                          ^^ points[1].intensity",
-        "  next: lidarspec explain 54 2c 10 0e 00 00 e8 03 c8 e9 03 -s ldrobot-stl27l",
+        "  next: lidarspec explain '54 2c 10 0e 00 00 e8 03 c8 e9 03' -s ldrobot-stl27l",
     ]
 
 
 def test_the_next_command_can_be_typed() -> None:
     first = process("parse", EXAMPLE[:30].hex(" "), *SENSOR)
     following = first.stderr.decode().rstrip().rpartition("next: lidarspec ")[2]
-    assert process(*following.split()).stdout.startswith(b"ldrobot-stl27l data, 30 bytes\n0000  54 2c")
+    assert process(*shlex.split(following)).stdout.startswith(b"ldrobot-stl27l data, 30 bytes\n0000  54 2c")
 
 
 def test_a_truncated_frame_is_explained_before_it_fails() -> None:

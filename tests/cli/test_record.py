@@ -234,6 +234,17 @@ def test_damaged_recordings_are_mended(stream: Path, tmp_path: Path) -> None:
         assert sum(len(packets) for packets in device.packets()) == 39
 
 
+def test_an_old_recording_stays_where_the_source_is_silent(tmp_path: Path) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
+        free.bind(("127.0.0.1", 0))
+        source = f"udp://127.0.0.1:{free.getsockname()[1]}"
+    target = tmp_path / "it.lsr"
+    target.write_bytes(b"precious")
+    said = ran("record", source, "-o", target, "--force", "-t", "0.2s", code=5).stderr
+    assert f"{target} is left as it was\n{source} sent nothing" in said
+    assert (target.read_bytes(), list(tmp_path.iterdir())) == (b"precious", [target])
+
+
 @pytest.mark.parametrize("verb", [("record", "-o"), ("replay", "--to")])
 def test_nothing_is_overwritten_without_force(stream: Path, tmp_path: Path, verb: tuple[str, str]) -> None:
     target = tmp_path / "it.lsr"

@@ -203,8 +203,34 @@ def test_nothing_is_overwritten_unasked(path: Path) -> None:
     with pytest.raises(UsageError, match="exists already"):
         Recorder(path)
     assert path.read_bytes() == b"precious"
-    Recorder(path, overwrite=True).close()
-    assert read(path) == []
+
+
+def test_an_old_file_stays_until_the_new_one_has_its_first_record(path: Path) -> None:
+    path.write_bytes(b"precious")
+    link = path.with_name("link.lsr")
+    link.symlink_to(path)
+    with Recorder(link, overwrite=True) as recorder:
+        recorder.event("disconnect")
+        recorder.sync()
+        assert path.read_bytes() == b"precious"
+    assert (path.read_bytes(), sorted(path.parent.iterdir())) == (b"precious", sorted([path, link]))
+    with Recorder(link, overwrite=True) as recorder:
+        recorder.write(Chunk(b"new"))
+        recorder.sync()
+        assert [item.data for item in read(path)] == [b"new"]
+    assert link.is_symlink()
+    assert sorted(path.parent.iterdir()) == sorted([path, link])
+
+
+def test_an_old_file_stays_where_the_disk_takes_no_new_one(path: Path) -> None:
+    path.write_bytes(b"precious")
+    with (
+        file_size_limit(600),
+        pytest.raises(SourceError, match="; what was there before is kept"),
+        Recorder(path, overwrite=True) as recorder,
+    ):
+        recorder.write(Chunk(bytes(10_000)))
+    assert (path.read_bytes(), list(path.parent.iterdir())) == (b"precious", [path])
 
 
 def test_records_reach_the_file_by_themselves_and_at_once_when_asked(path: Path) -> None:

@@ -191,7 +191,7 @@ def test_the_buffer_is_read_back() -> None:
 @pytest.mark.parametrize(
     ("source", "error", "text", "following"),
     [
-        ("udp://:{busy}", SourceError, "UDP port {busy} is in use by another program", "lidarspec doctor 'udp://:{busy}'"),
+        ("udp://:{busy}", SourceError, "UDP port {busy} is in use by another program", "lidarspec doctor udp://:{busy}"),
         ("udp://192.0.2.1:{free}", SourceError, "192.0.2.1 is no address of this computer", "lidarspec doctor udp://:{free}"),
         ("udp://", UsageError, "which port", ""),
         ("udp://:2368?group=10.0.0.1", UsageError, "no multicast group", ""),

@@ -19,6 +19,12 @@ def test_each_dot_has_its_bit(bit: int, place: tuple[int, int]) -> None:
     assert canvas.cells().lines() == [chr(BLANK + bit)]
 
 
+def test_texts_of_others_steer_no_terminal() -> None:
+    cells = Cells.blank(16, 1)
+    cells.write(0, 0, "a\x1b[2J\u202eb\n")
+    assert cells.lines() == [r"a\x1b[2J\u202eb "]
+
+
 def test_the_canvas_sets_single_dots_and_labels_around_them() -> None:
     canvas = Canvas(2, 1)
     canvas.plot(np.array([3.2]), np.array([2.9]), np.array([0.5]))

@@ -7,7 +7,8 @@ that runs, not with this package. Modules in reading order:
 * `arithmetic`: what kernels are written with; the only module that imports Numba as it is imported.
 * `writer`: fields, tables and places as text, each in the loop in which it varies.
 * `source`: expressions as text, and the whole of a kernel.
-* `kernels`: the text compiled, kept on disk, and called by one thread or several.
+* `cache`: compiled code on disk, between runs.
+* `kernels`: the text compiled, and called by one thread or several.
 * `checksums`: kernels of their own for checksums that are XORed byte by byte.
 """
 

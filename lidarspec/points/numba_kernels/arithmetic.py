@@ -35,6 +35,19 @@ _FAR = 1e6
 _IS_BIG = sys.byteorder == "big"
 
 
+def compiled(kept, signature, **options):
+    """The decorator of a kernel: compiled for its one signature, or as an earlier run kept it."""
+
+    def make(function):
+        dispatcher = njit(nogil=True, **options)(function)
+        dispatcher._cache = kept  # Numba's own unpickles what lies in its folder, whoever put it there
+        dispatcher.compile(signature)
+        dispatcher.disable_compile()
+        return dispatcher
+
+    return make
+
+
 @intrinsic
 def byte_at(context, array, index):
     """A byte as an integer."""

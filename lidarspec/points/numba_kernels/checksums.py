@@ -26,7 +26,7 @@ LONGEST = 128
 _SHARES = (
     HEAD
     + """\
-@njit([(BYTES, INTEGER, PLACES, WORDS, INTEGER, MADE_PLACES)], cache=True, nogil=True)
+@compiled(KEPT, (BYTES, INTEGER, PLACES, WORDS, INTEGER, MADE_PLACES))
 def kernel(rows, size, places, tables, start, found):
     for i in range(len(found)):
         total, base = start, i * size
@@ -42,7 +42,7 @@ def kernel(rows, size, places, tables, start, found):
 _XORED = (
     HEAD
     + """\
-@njit([(BYTES, INTEGER, PLACES, PLACES, PLACES, INTEGER, MADE_PLACES)], cache=True, nogil=True)
+@compiled(KEPT, (BYTES, INTEGER, PLACES, PLACES, PLACES, INTEGER, MADE_PLACES))
 def kernel(rows, size, places, lows, highs, start, found):
     for i in range(len(found)):
         low, high, base = 0, 0, i * size

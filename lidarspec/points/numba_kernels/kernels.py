@@ -1,7 +1,6 @@
-"""Kernels at work: compiled by Numba, kept on disk between runs, called by one thread or several; and when that pays.
+"""Kernels at work: compiled by Numba, or as an earlier run kept them; called by one thread or several; and when that pays.
 
-Nothing here imports Numba before a kernel is wanted. The text of a kernel is a file in the cache folder, since Numba keeps compiled code
-only for functions that come from files; its name is a hash of all that the code depends on.
+Nothing here imports Numba before a kernel is wanted. The name of a kernel is a hash of all that its code depends on.
 """
 
 from __future__ import annotations
@@ -24,11 +23,12 @@ from numpy.typing import NDArray
 
 from lidarspec._version import __version__
 from lidarspec.errors import UsageError
+from lidarspec.points.numba_kernels.cache import Kept, is_kept
 from lidarspec.points.numba_kernels.source import Text, written
 from lidarspec.points.plan import Maker, Plan, PointsFunction, Values
 from lidarspec.wire.layout import Bytes2D, span
 
-CACHE, THREADS = "LIDARSPEC_CACHE", "LIDARSPEC_THREADS"
+THREADS = "LIDARSPEC_THREADS"
 
 #: points below which a second thread costs more than it saves.
 SHARE = 1 << 16
@@ -170,20 +170,6 @@ def require() -> None:
         raise UsageError(f"backend 'jit' needs Numba: pip install 'lidarspec[jit]' ({error})") from error
 
 
-def cache_folder() -> Path:
-    """Where kernels are kept: LIDARSPEC_CACHE, or what the system calls the user's cache."""
-    named = os.environ.get(CACHE)
-    if named:
-        return Path(named)
-    if sys.platform == "win32":
-        base = Path(os.environ.get("LOCALAPPDATA") or Path.home() / "AppData" / "Local")
-    elif sys.platform == "darwin":
-        base = Path.home() / "Library" / "Caches"
-    else:
-        base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    return base / "lidarspec"
-
-
 @functools.cache
 def _module_name(source: str) -> str:
     """A name by all that the compiled code depends on, but for the processor, which Numba looks after."""
@@ -196,45 +182,21 @@ def _module_name(source: str) -> str:
 
 
 def compiled_before(source: str) -> bool:
-    """Whether compiled code of a kernel is in the cache folder."""
+    """Whether compiled code of a kernel is at hand, or in the cache folder."""
     name = _module_name(source)
-    if name in sys.modules:
-        return True
-    try:
-        return any((cache_folder() / "__pycache__").glob(f"{name}.kernel-*.nbi"))
-    except OSError:
-        return False
+    return name in sys.modules or is_kept(name)
 
 
 @functools.lru_cache(maxsize=256)
 def function_of(source: str) -> Any:
-    """The compiled function of a kernel's text; where the cache folder cannot be written, compiled for this run only."""
+    """The compiled function of a kernel's text; where it cannot be kept on disk, compiled for this run only."""
     name = _module_name(source)
-    path = _kept(name, source)
     module = types.ModuleType(name)
-    if path is not None:
-        module.__file__ = str(path)
+    module.__dict__["KEPT"] = Kept(name)
     sys.modules[name] = module  # Numba looks it up by its name as it loads compiled code
-    text = source if path is not None else source.replace("cache=True, ", "")
     try:
-        exec(compile(text, str(path or name), "exec"), module.__dict__)
+        exec(compile(source, name, "exec"), module.__dict__)
     except BaseException:
         del sys.modules[name]
         raise
     return module.kernel
-
-
-def _kept(name: str, source: str) -> Path | None:
-    """The file of a kernel's text, written if it is not there; None where that cannot be done."""
-    folder = cache_folder()
-    path = folder / f"{name}.py"
-    try:
-        if path.is_file() and path.read_text(encoding="utf-8") == source:
-            return path if os.access(folder, os.W_OK) or (folder / "__pycache__").is_dir() else None
-        folder.mkdir(parents=True, exist_ok=True, mode=0o700)
-        unfinished = folder / f"{name}.{os.getpid()}.tmp"
-        unfinished.write_text(source, encoding="utf-8")
-        os.replace(unfinished, path)
-        return path
-    except OSError:
-        return None

@@ -217,15 +217,13 @@ class Expressions(Writer):
 
 
 HEAD = """\
-# Made by lidarspec; kept so that it is compiled only once.
 import math
 
 import numpy as np
-from numba import njit
 
 from lidarspec.points.numba_kernels.arithmetic import (
     BYTES, DOUBLES, INTEGER, MADE_PLACES, MADE_SINGLES, PLACES, SINGLES, WORDS,
-    at, byte_at, cos_sin, larger, looked_up, modulo, narrowed, number, put, smaller, word_at,
+    at, byte_at, compiled, cos_sin, larger, looked_up, modulo, narrowed, number, put, smaller, word_at,
 )
 
 nan, inf = np.nan, np.inf
@@ -361,7 +359,7 @@ def _function(writer: Writer, assembly: Assembly, turns: list[str], names: tuple
     if turns:
         body += [f"    for k in range((end - begin) * {width}):", "        o = start + k"]
         body += [f"        {text}" for text in (*turns, *assembly.flat)]
-    head = f'@njit([({types},)], cache=True, nogil=True, error_model="numpy")\ndef kernel({arguments}):\n'
+    head = f'@compiled(KEPT, ({types},), error_model="numpy")\ndef kernel({arguments}):\n'
     return head + "".join(f"    {text}\n" for text in body)
 
 

@@ -1,0 +1,105 @@
+"""Standard output and standard error: all that verbs print goes through here, whatever it is made of and whether or not anybody reads it.
+
+Addresses, file names and texts of devices and plugins are others': what would steer a terminal is spelled out. Remarks that nobody can
+read end no verb, a recording least of all; data that cannot be written are a failure.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import sys
+import warnings
+from collections.abc import Iterator
+from typing import Any
+
+import click
+
+from lidarspec.errors import SourceError, printable
+
+#: what a line changes about colours, and nothing else.
+_COLOURS = re.compile(r"(\x1b\[[0-9;]*m)")
+
+
+def say(content: str | bytes, *, nl: bool = True, colour: bool | None = None) -> None:
+    """Print data on standard output; bytes as they are.
+
+    Args:
+        colour: whether colours in the text stay in a pipe; None: it has none of ours.
+
+    Raises:
+        BrokenPipeError: where nobody reads any more.
+        SourceError: where it cannot be written otherwise.
+    """
+    if isinstance(content, str):
+        content = printable(content) if colour is None else "".join(map(_coloured, _COLOURS.split(content)))
+    with _written():
+        click.echo(content, nl=nl, color=colour)
+
+
+def note(text: str, *, nl: bool = True, begin: str = "") -> None:
+    """Print a remark beside the data on standard error, if anybody reads there.
+
+    Args:
+        begin: what goes before it as it stands.
+    """
+    try:
+        click.echo(begin + printable(text), nl=nl, err=True)
+    except (OSError, ValueError):
+        _lose(sys.stderr)
+
+
+@contextlib.contextmanager
+def streams() -> Iterator[None]:
+    """What a verb needs around it: all three streams, also where the shell has closed one; warnings as remarks; everything printed.
+
+    Raises:
+        BrokenPipeError, SourceError: as `say`.
+    """
+    for name, flags in (("stdin", os.O_RDONLY), ("stdout", os.O_RDONLY), ("stderr", os.O_WRONLY)):
+        if getattr(sys, name) is None:  # a file opened later would take its number, and what is printed; output that was closed is refused
+            setattr(sys, name, open(os.open(os.devnull, flags), "r" if name == "stdin" else "w", closefd=False))  # noqa: SIM115
+    for stream in (sys.stdout, sys.stderr):
+        with contextlib.suppress(AttributeError):
+            stream.reconfigure(errors="replace")  # type: ignore[union-attr]
+    with warnings.catch_warnings():
+        shown = warnings.showwarning
+
+        def told(message: Warning | str, category: type[Warning], *rest: Any, **more: Any) -> None:
+            if category is UserWarning:
+                note(str(message))
+            else:
+                shown(message, category, *rest, **more)
+
+        warnings.showwarning = told
+        yield
+    with _written():
+        sys.stdout.flush()
+
+
+def silence() -> None:
+    """Nobody reads any more: what is still buffered goes nowhere, without a complaint at exit."""
+    _lose(sys.stdout)
+
+
+def _coloured(part: str) -> str:
+    return part if _COLOURS.fullmatch(part) else printable(part)
+
+
+@contextlib.contextmanager
+def _written() -> Iterator[None]:
+    try:
+        yield
+    except BrokenPipeError:
+        raise
+    except OSError as error:
+        silence()
+        raise SourceError(f"standard output: {error.strerror or error}") from None
+
+
+def _lose(stream: Any) -> None:
+    with contextlib.suppress(OSError, ValueError):
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, stream.fileno())
+        os.close(nowhere)

@@ -1,0 +1,182 @@
+"""Compiled kernels kept on disk between runs, in a folder that is its user's alone: what is read from there is run.
+
+A kernel is one file: a keyed digest (HMAC), and behind it what Numba made of the kernel, a pickle, which is opened only where the digest
+is right. The key is a file that its user alone can read, and names come out of it too. So nothing that somebody else, a full disk or a
+crash left in the folder is ever run; whatever is wrong there means compiling again.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import hashlib
+import hmac
+import os
+import pickle
+import secrets
+import stat
+import sys
+import tempfile
+import warnings
+from pathlib import Path
+from typing import Any
+
+# mypy: disable-error-code="no-untyped-call"
+
+CACHE = "LIDARSPEC_CACHE"
+
+#: bytes of the key, and of a digest.
+SIZE = 32
+#: what a file or folder has to lack, so that it is its user's alone.
+_OTHERS = stat.S_IRWXG | stat.S_IRWXO
+#: neither through a link nor waiting for a pipe's other end, where the system knows such things.
+_PLAINLY = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
+
+
+class Kept:
+    """The compiled code of one kernel, as a dispatcher of Numba asks for it and hands it over.
+
+    Args:
+        name: of the kernel, by all that its code depends on but for the processor.
+    """
+
+    cache_path = None
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+
+    def load_overload(self, signature: object, target: Any) -> Any:
+        """What Numba made of the kernel in an earlier run; None where that is not at hand, or not beyond doubt."""
+        from numba.core.compiler import CompileResult
+
+        with contextlib.suppress(Exception):  # Numba compiles what it cannot use
+            folder = _own(cache_folder())
+            key = _key(folder)
+            if key is not None:
+                path = _path(folder, key, self._name, target)
+                data = _read(path)
+                if hmac.compare_digest(data[:SIZE], _digest(key, path.name, data[SIZE:])):
+                    target.refresh()  # it knows of nothing before
+                    return CompileResult._rebuild(target, *pickle.loads(data[SIZE:]))
+        return None
+
+    def save_overload(self, signature: object, result: Any) -> None:
+        """Keep what Numba made of the kernel; where that cannot be done, it is said once."""
+        from numba.core.serialize import dumps
+
+        try:
+            folder = _made(cache_folder())
+            key = _key(folder) or _new_key(folder)
+            data = dumps(result._reduce())
+            path = _path(folder, key, self._name, result.target_context)
+            _write(path, _digest(key, path.name, data) + data)
+        except Exception as error:  # the kernel is at hand all the same
+            _warn(f"compiled code is not kept between runs: {error}")
+
+
+def is_kept(name: str) -> bool:
+    """Whether there is a file of this kernel, for one processor or another."""
+    try:
+        folder = _own(cache_folder())
+        key = _key(folder)
+        return key is not None and any(folder.glob(f"{_digest(key, name).hex()}-*"))
+    except OSError:
+        return False
+
+
+def cache_folder() -> Path:
+    """Where kernels are kept: LIDARSPEC_CACHE, or what the system calls the user's cache."""
+    named = os.environ.get(CACHE)
+    if named:
+        return Path(named)
+    if sys.platform == "win32":
+        base = Path(os.environ.get("LOCALAPPDATA") or Path.home() / "AppData" / "Local")
+    elif sys.platform == "darwin":
+        base = Path.home() / "Library" / "Caches"
+    else:
+        base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    return base / "lidarspec"
+
+
+def _made(folder: Path) -> Path:
+    """The folder, made where it is missing.
+
+    Raises:
+        OSError: where it cannot be made, or is not its user's alone.
+    """
+    folder.mkdir(parents=True, exist_ok=True, mode=stat.S_IRWXU)
+    return _own(folder)
+
+
+def _own(folder: Path) -> Path:
+    """The folder that is given.
+
+    Raises:
+        OSError: where it is missing, or not its user's alone.
+    """
+    if fault := _fault(folder.stat()):
+        raise PermissionError(f"{folder} {fault}")
+    return folder
+
+
+def _fault(status: os.stat_result) -> str:
+    """Why something is not its user's alone, "" where it is; on Windows, folders of a user are."""
+    if sys.platform == "win32":
+        return ""
+    if status.st_uid != os.geteuid():
+        return f"belongs to another user (uid {status.st_uid})"
+    return "is open to other users: chmod 700 makes it yours alone" if status.st_mode & _OTHERS else ""
+
+
+def _key(folder: Path) -> bytes | None:
+    """The key of a folder; None where it has none, or not a whole one that is its user's alone."""
+    with contextlib.suppress(OSError):
+        key = _read(folder / "key")
+        return key if len(key) == SIZE else None
+    return None
+
+
+def _new_key(folder: Path) -> bytes:
+    _write(folder / "key", secrets.token_bytes(SIZE))
+    return _read(folder / "key")  # of whoever wrote it last
+
+
+def _digest(key: bytes, name: str, data: bytes = b"") -> bytes:
+    return hmac.digest(key, name.encode() + b"\0" + data, hashlib.sha256)
+
+
+def _path(folder: Path, key: bytes, name: str, target: Any) -> Path:
+    """The file of a kernel, for the processor that Numba compiles for here."""
+    processor = _digest(key, repr(target.codegen().magic_tuple())).hex()[:16]
+    return folder / f"{_digest(key, name).hex()}-{processor}"
+
+
+def _read(path: Path) -> bytes:
+    """What a file holds that is its user's alone.
+
+    Raises:
+        OSError: where it is not, or cannot be read.
+    """
+    with open(path, "rb", opener=lambda name, flags: os.open(name, flags | _PLAINLY)) as file:
+        status = os.fstat(file.fileno())
+        if _fault(status) or not stat.S_ISREG(status.st_mode):
+            raise PermissionError(f"{path} is not its user's alone")
+        return file.read()
+
+
+def _write(path: Path, data: bytes) -> None:
+    """Put a file in its place once it is whole; its user alone can read it."""
+    number, unfinished = tempfile.mkstemp(dir=path.parent)
+    try:
+        with open(number, "wb") as file:
+            file.write(data)
+        os.replace(unfinished, path)
+    except BaseException:
+        os.unlink(unfinished)
+        raise
+
+
+@functools.cache
+def _warn(text: str) -> None:
+    """Say it, once a run."""
+    warnings.warn(text, stacklevel=2)

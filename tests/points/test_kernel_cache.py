@@ -1,0 +1,139 @@
+"""What lies in the folder of compiled code is run only where nobody but its user can have put it there, and is never in the way."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import pickle
+import shutil
+import stat
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from lidarspec.points.numba_kernels import cache
+from lidarspec.points.numba_kernels.kernels import _module_name, compiled_before, function_of
+from lidarspec.points.numba_kernels.source import HEAD
+
+pytest.importorskip("numba", reason="the fused back end needs Numba: pip install 'lidarspec[jit]'")
+pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="folders of a user are the user's alone there")
+
+SOURCE = HEAD + "@compiled(KEPT, (INTEGER,))\ndef kernel(number):\n    return number + 1\n"
+ROOT = pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() != 0, reason="only root can give files away")
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    monkeypatch.setenv(cache.CACHE, str(tmp_path / "kernels"))
+    cache._warn.cache_clear()
+    yield tmp_path / "kernels"
+    _forget()
+
+
+def _forget() -> None:
+    function_of.cache_clear()
+    sys.modules.pop(_module_name(SOURCE), None)
+
+
+def _is_read() -> bool:
+    """Whether the kernel, as in a new process, comes out of the folder; right it is in any case."""
+    _forget()
+    kernel = function_of(SOURCE)
+    assert kernel(41) == 42
+    return bool(kernel.stats.cache_hits)
+
+
+def _file(folder: Path) -> Path:
+    return next(path for path in folder.iterdir() if path.name != "key")
+
+
+def test_a_kernel_is_read_in_the_next_run(folder: Path) -> None:
+    assert not compiled_before(SOURCE)
+    assert [_is_read(), _is_read()] == [False, True]
+    _forget()
+    assert compiled_before(SOURCE)
+    assert stat.S_IMODE(folder.stat().st_mode) == 0o700
+    assert {stat.S_IMODE(path.stat().st_mode) for path in folder.iterdir()} == {0o600}
+
+
+def test_names_tell_nothing_without_the_key(folder: Path) -> None:
+    _is_read()
+    name = _file(folder).name
+    assert _module_name(SOURCE).removeprefix("lidarspec_kernel_") not in name
+    shutil.rmtree(folder)
+    _is_read()
+    assert _file(folder).name.partition("-")[0] != name.partition("-")[0]
+
+
+class Bomb:
+    """A pickle that runs something."""
+
+    def __reduce__(self) -> tuple[Callable[..., object], tuple[object, ...]]:
+        return pytest.fail, ("what lay in the folder was run",)
+
+
+def _bomb(path: Path) -> None:
+    data = pickle.dumps(Bomb())
+    path.write_bytes(hashlib.sha256(data).digest() + data)
+
+
+DAMAGE: dict[str, Callable[[Path], object]] = {
+    "cut short": lambda path: os.truncate(path, path.stat().st_size - 1),
+    "empty": lambda path: os.truncate(path, 0),
+    "not the user's bytes": _bomb,
+    "writable for others": lambda path: path.chmod(0o666),
+    "a link": lambda path: path.rename(path.parent / "moved") and path.symlink_to("moved"),
+    "a pipe": lambda path: (path.unlink(), os.mkfifo(path)),
+}
+
+
+@pytest.mark.parametrize("name", ["kernel", "key"])
+@pytest.mark.parametrize("what", DAMAGE)
+def test_a_damaged_file_is_replaced(folder: Path, what: str, name: str) -> None:
+    _is_read()
+    DAMAGE[what](folder / "key" if name == "key" else _file(folder))
+    assert [_is_read(), _is_read()] == [False, True]
+
+
+@ROOT
+def test_a_file_of_another_user_is_not_read(folder: Path) -> None:
+    _is_read()
+    os.chown(_file(folder), 1234, 1234)
+    assert [_is_read(), _is_read()] == [False, True]
+
+
+def test_a_folder_that_is_open_to_others_is_not_used_and_that_is_said_once(folder: Path) -> None:
+    _is_read()
+    folder.chmod(0o777)
+    with pytest.warns(UserWarning, match="kernels is open to other users: chmod 700 makes it yours alone") as said:
+        assert [_is_read(), _is_read()] == [False, False]
+    assert len(said) == 1
+    _forget()
+    assert not compiled_before(SOURCE)
+
+
+@ROOT
+def test_a_folder_of_another_user_is_not_used(folder: Path) -> None:
+    _is_read()
+    os.chown(folder, 1234, 1234)
+    with pytest.warns(UserWarning, match=r"kernels belongs to another user \(uid 1234\)"):
+        assert not _is_read()
+
+
+FULL = """
+import resource, signal
+resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))
+from lidarspec.points.numba_kernels.kernels import function_of
+print(function_of({source!r})(41))
+"""
+
+
+def test_a_full_disk_means_compiling_again_and_leaves_nothing_behind(folder: Path) -> None:
+    command = [sys.executable, "-B", "-c", FULL.format(source=SOURCE)]  # or Python itself keeps half a module
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.stdout == "42\n", done.stderr
+    assert "compiled code is not kept between runs: [Errno 27] File too large" in done.stderr
+    assert [path.name for path in folder.iterdir()] == ["key"]
