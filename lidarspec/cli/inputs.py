@@ -194,7 +194,10 @@ def nothing_came(device: Device, source: str, seconds: float | None = None) -> L
         return suggest(WireError(said, sensor=sensor.id), f"lidarspec explain {source} -s {sensor.id}")
     waited = "" if seconds is None else f" within {seconds:.1f} s".replace(".0 s", " s")
     if stats.bytes_in == 0:
-        return suggest(CommandError(f"{sensor.id} on {source} sent nothing{waited}"), f"lidarspec doctor {source} -s {sensor.id}")
+        others = f", and others {stats.foreign} datagrams" * bool(stats.foreign)
+        return suggest(
+            CommandError(f"{sensor.id} on {source} sent nothing{waited}{others}"), f"lidarspec doctor {quote(source)} -s {sensor.id}"
+        )
     error = WireError(f"{source}: {stats.bytes_in} bytes{waited}, and not a scan of data frames among them: {stats}", sensor=sensor.id)
     return suggest(error, f"lidarspec detect {source}")
 

@@ -315,7 +315,7 @@ def test_a_sensor_that_nothing_was_heard_of_cannot_be_sent_to() -> None:
     number = free_port()
     with ls.open(f"udp://127.0.0.1:{number}", datagram_sensor(number), start=False) as opened:
         began = time.monotonic()
-        with pytest.raises(CommandError, match="nothing has arrived yet, so nobody knows the sensor's address"):
+        with pytest.raises(CommandError, match="no frame of the sensor has arrived yet, so nobody knows its address"):
             opened.send("speed", rate=10.0, trim=0.0, timeout=0.2)
         assert 0.2 <= time.monotonic() - began < 0.2 + SLACK
 
