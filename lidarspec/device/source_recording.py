@@ -88,7 +88,7 @@ class SourceRecording:
         return self._driven(self._sensor) if self._sensor is not None and is_live(self._source) else self._received()
 
     def _driven(self, sensor: Sensor) -> Generator[str, None, None]:
-        """What a sensor sends is recorded by a thread; here it is decoded to be counted, and whatever that fails at, the recording goes on."""
+        """What a sensor sends is recorded by a thread; here it is decoded to be counted, whatever that fails at."""
         news, failures, known = list[str](), dict[str, None](), set[str]()
         with Device(self._source, sensor, start=self._start, record=self._opened) as self.device:
             while self._goes_on():
