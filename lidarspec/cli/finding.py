@@ -278,7 +278,7 @@ def _conclusions(source: str | None, found: Sequence[Verdict], unknown: Structur
         yield from [no_bytes(source, ())] * (not any(one.heard.warnings for one in found))
         yield "next: lidarspec sensors"
         return
-    yield "nothing came"
+    yield from [] if any(one.heard.warnings for one in found) else ["nothing came"]
     is_serial = source is None or ((address := live_address(source)) is not None and address.scheme == "serial")
     if is_serial and not start and started_first():
         yield f"{', '.join(sensor.id for sensor in started_first())} send nothing before they are started"

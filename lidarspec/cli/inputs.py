@@ -153,7 +153,7 @@ def _read_for(given: str | Path | Sensor | None) -> Iterator[str | int]:
     word = str(given or "")
     yield from [0] if word == "-" else [word, word.partition("?")[0], word.rpartition(":")[0], word.partition("=")[2]]
     with contextlib.suppress(LidarSpecError):  # settings that are wrong are told of where a name is looked up
-        known = devices().get(word)
+        known = named(word)
         yield from (known.source.partition("?")[0], *map(str, known.options.values())) if known else ()
 
 
@@ -211,7 +211,10 @@ def nothing_came(device: Device, source: str, seconds: float | None = None) -> L
         return suggest(WireError(said, sensor=sensor.id), f"lidarspec explain {quote(source)} -s {sensor.id}")
     waited = "" if seconds is None else f" within {seconds:.1f} s".replace(".0 s", " s")
     if stats.bytes_in == 0:
-        return suggest(CommandError(f"{sensor.id} on {source} sent nothing{waited}"), f"lidarspec doctor {quote(source)} -s {sensor.id}")
+        others = f", and others {stats.foreign} datagrams" * bool(stats.foreign)
+        return suggest(
+            CommandError(f"{sensor.id} on {source} sent nothing{waited}{others}"), f"lidarspec doctor {quote(source)} -s {sensor.id}"
+        )
     error = WireError(f"{source}: {stats.bytes_in} bytes{waited}, and not a scan of data frames among them: {stats}", sensor=sensor.id)
     return suggest(error, f"lidarspec detect {quote(source)}")
 

@@ -5,12 +5,10 @@ Nothing here imports NumPy or construct, so that ``lidarspec --help`` is quick.
 
 from __future__ import annotations
 
-import contextlib
 import importlib
 import os
 import sys
-import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any, NoReturn
 
 import click
@@ -107,7 +105,7 @@ class Verbs(click.Group):
 
 def _run(group: click.Group, words: list[str]) -> int:
     try:
-        with streams(), _warnings_told(), group.make_context("lidarspec", words) as ctx:
+        with streams(), group.make_context("lidarspec", words) as ctx:
             group.invoke(ctx)
         return 0
     except click.exceptions.Exit as done:
@@ -120,25 +118,6 @@ def _run(group: click.Group, words: list[str]) -> int:
         return 0
     except Exception as error:
         return report(error, next((word for word in words if word in VERBS), ""))
-
-
-@contextlib.contextmanager
-def _warnings_told() -> Iterator[None]:
-    """Within, what the package warns a program of in Python is a line on stderr, said once."""
-    told: set[str] = set()
-    with warnings.catch_warnings():
-        plain = warnings.showwarning
-
-        def tell(message: Warning | str, category: type[Warning], *place: Any, **more: Any) -> None:
-            if category is not UserWarning:
-                plain(message, category, *place, **more)
-            elif str(message) not in told:
-                told.add(str(message))
-                note(str(message))
-
-        warnings.showwarning = tell
-        warnings.simplefilter("always", UserWarning)
-        yield
 
 
 @click.group(cls=Verbs, invoke_without_command=True, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 120})

@@ -12,7 +12,7 @@ from lidarspec._version import __version__
 from lidarspec.cli.failures import FINDINGS
 from lidarspec.cli.options import output_options
 from lidarspec.cli.output import emit, emit_json, table
-from lidarspec.cli.terminal import note
+from lidarspec.cli.terminal import note, say
 from lidarspec.columns.columns import Batch
 from lidarspec.device.settings import FILE, devices
 from lidarspec.errors import NO_SENSORS, SpecError
@@ -148,7 +148,7 @@ def trust(folder: str) -> None:
     It is for folders of your own whose files you know; it is kept, and holds for this folder alone. For a single run the
     variable LIDARSPEC_TRUST names one.
     """
-    click.echo(f"{trusted(folder)}: what its {FILE} names is believed from now on; a line in {user_folder() / TRUSTED} says so")
+    say(f"{trusted(folder)}: what its {FILE} names is believed from now on; a line in {user_folder() / TRUSTED} says so")
 
 
 def _facts(sensor: Sensor) -> dict[str, Any]:

@@ -52,7 +52,7 @@ def note(text: str, *, nl: bool = True, begin: str = "") -> None:
 
 @contextlib.contextmanager
 def streams() -> Iterator[None]:
-    """What a verb needs around it: all three streams, also where the shell has closed one; warnings as remarks; everything printed.
+    """What a verb needs around it: all three streams, also closed ones; warnings as remarks, once each; everything printed.
 
     Raises:
         BrokenPipeError, SourceError: as `say`.
@@ -63,16 +63,19 @@ def streams() -> Iterator[None]:
     for stream in (sys.stdout, sys.stderr):
         with contextlib.suppress(AttributeError):
             stream.reconfigure(errors="replace")  # type: ignore[union-attr]
+    told: set[str] = set()
     with warnings.catch_warnings():
         shown = warnings.showwarning
 
-        def told(message: Warning | str, category: type[Warning], *rest: Any, **more: Any) -> None:
-            if category is UserWarning:
-                note(str(message))
-            else:
+        def tell(message: Warning | str, category: type[Warning], *rest: Any, **more: Any) -> None:
+            if category is not UserWarning:
                 shown(message, category, *rest, **more)
+            elif str(message) not in told:
+                told.add(str(message))
+                note(str(message))
 
-        warnings.showwarning = told
+        warnings.showwarning = tell
+        warnings.simplefilter("always", UserWarning)
         yield
     with _written():
         sys.stdout.flush()

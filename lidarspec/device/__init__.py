@@ -3,7 +3,8 @@
 In: a SOURCE and a sensor. Out: packets and scans as they come, replies to commands, counters, warnings. Modules in reading order:
 
 * `device`: `Device`, which users hold: packets and scans out of what its input gives.
-* `arrivals`: what an input is, live or not, and that of a file; who may have sent what arrived.
+* `arrivals`: what an input is, live or not, and that of a file.
+* `senders`: whose datagrams these are, and which of them are read.
 * `live_input`: frames as they come, decoded every few milliseconds; how the source is doing.
 * `capture_thread`: the thread behind it, which reads, records and queues.
 * `session`: commands and their replies, sans-IO.

@@ -1,4 +1,4 @@
-"""What a device reads from, live or not: an input that gives frames in batches, and who may have sent them.
+"""What a device reads from, live or not: an input that gives frames in batches.
 
 `FileInput` is that of a file or standard input, which are read as fast as they are asked for; `live_input` has the other.
 """
@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import accumulate
 from pathlib import Path
@@ -16,18 +16,15 @@ from typing import Any, Protocol
 import numpy as np
 
 from lidarspec.captures.bulk import first_frames
+from lidarspec.device.senders import Senders, frame_senders
 from lidarspec.device.session import Reply
-from lidarspec.errors import CommandError, SourceError, UsageError, suggest
+from lidarspec.errors import CommandError, SourceError
 from lidarspec.framing.decoder import Decoder
 from lidarspec.framing.results import Counters, Found, Frames
 from lidarspec.spec.sensor import Sensor
-from lidarspec.transports.base import with_option
 from lidarspec.transports.files import CaptureTransport
 from lidarspec.transports.open_url import transport
-from lidarspec.transports.protocol import Chunk, Sender, Transport, endpoint
-
-#: other senders of a stream that are looked at; datagrams of further ones are foreign unseen.
-SENDERS = 16
+from lidarspec.transports.protocol import Chunk, Transport
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,10 +34,12 @@ class Arrival:
     Attributes:
         found: the frames of every incoming type.
         interrupted: whether input is missing behind them: no frame, packet or scan goes on there.
+        replaced: whether these are the frames of another sensor than those before, of which nothing counts any more.
     """
 
     found: list[Frames] = field(default_factory=list)
     interrupted: bool = False
+    replaced: bool = False
 
 
 class Input(Protocol):
@@ -122,84 +121,6 @@ class Input(Protocol):
 
     def close(self) -> None:
         """Stop the sensor where it was started, and give everything back; a second call does nothing."""
-
-
-class Senders:
-    """Frames of several senders must not be mixed into one cloud.
-
-    Args:
-        source: for messages.
-    """
-
-    def __init__(self, source: str | Path, sensor: Sensor) -> None:
-        self._source, self._sensor = source, sensor
-        self._now: dict[str, Sender] = {}  # who sends the frames of a type, and who did before
-        self._before: dict[str, set[Sender]] = {}
-        self._others: dict[Sender, Decoder] = {}  # of streams: what senders send, and who has sent frames
-        self._framed: set[Sender] = set()
-
-    def check(self, chunks: Sequence[Chunk], found: Frames) -> None:
-        """Look who sent the frames of these datagrams.
-
-        Raises:
-            UsageError: where two senders send frames of one type.
-        """
-        senders = {chunk.sender for chunk in chunks}
-        if len(senders) == 1:
-            self.see((found.names[kind], sender) for sender in senders if sender for kind in np.unique(found.kinds).tolist())
-            return
-        sizes = np.array([len(chunk.data) for chunk in chunks])
-        places = np.searchsorted(np.cumsum(sizes) - sizes, found.starts, side="right") - 1
-        sent = zip(found.kinds.tolist(), (chunks[place].sender for place in places.tolist()), strict=True)
-        self.see((found.names[kind], sender) for kind, sender in sent if sender is not None)
-
-    def see(self, sent: Iterable[tuple[str, Sender]]) -> None:
-        """Look who sent frames: the type of each, and the sender.
-
-        A sensor that was started anew may send from another port of its address than before; two sensors there take turns.
-
-        Raises:
-            UsageError: where two senders send frames of one type.
-        """
-        for name, sender in sent:
-            known = self._now.setdefault(name, sender)
-            if sender == known:
-                continue
-            before = self._before.setdefault(name, set())
-            if sender[0] != known[0] or sender in before or len(before) == SENDERS:
-                raise self._several(known, sender, f"{name} frames" if name else f"frames of {self._sensor.id}")
-            before.add(known)
-            self._now[name] = sender
-
-    def ours(self, chunks: Sequence[Chunk], main: Decoder) -> list[Chunk]:
-        """Those pieces of a stream in datagrams that come from the sender which is listened to, the first that sends frames.
-
-        Raises:
-            UsageError: where another one sends frames as well.
-        """
-        mine: list[Chunk] = []
-        for chunk in chunks:
-            known = self._now.setdefault("", chunk.sender) if chunk.sender else None
-            has_begun = bool(main.stats.frames)
-            if chunk.sender and (chunk.sender != known or not has_begun) and self._sends_frames(chunk.sender, chunk):
-                if has_begun or known in self._framed:
-                    self.see([("", chunk.sender)])
-                self._now[""] = chunk.sender
-                self._framed.add(chunk.sender)
-            mine += [chunk] if not chunk.sender or chunk.sender == self._now[""] else []
-        return mine
-
-    def _sends_frames(self, sender: Sender, chunk: Chunk) -> bool:
-        if sender not in self._others and len(self._others) >= SENDERS:
-            return False
-        decoder = self._others.setdefault(sender, self._sensor.decoder(stream=True))
-        return bool(decoder.feed(chunk.data))
-
-    def _several(self, first: Sender, other: Sender, what: str) -> UsageError:
-        one, two = (endpoint(sender) if first[0] == other[0] else sender[0] for sender in (first, other))
-        mark = "&" if "?" in str(self._source) else "?"
-        error = UsageError(f"{self._source}: {one} and {two} both send {what}; choose one with {mark}src={one}")
-        return suggest(error, f"the same with '{with_option(self._source, 'src', one)}'")
 
 
 def fed(decoder: Decoder, chunks: Sequence[Chunk]) -> list[Frames]:
@@ -311,7 +232,7 @@ class FileInput(Input):
                 yield Arrival(self.decoder.rest(), interrupted=batch[0].gap)
             found = fed(self.decoder, batch)
             if not self.decoder.stream:
-                self._senders.check(batch, found[0])
+                self._senders.see(frame_senders(batch, found[0], self.decoder.stats.bytes_in))
             yield Arrival(found)
         yield Arrival(self.decoder.rest())
 

@@ -54,13 +54,16 @@ class PacketReader:
     """
 
     def __init__(self, sensor: Sensor, frame: str | None, decoder: Decoder, state: Mapping[str, bytes]) -> None:
-        self._sensor, self._decoder, self._state = sensor, decoder, state
+        self._sensor, self._decoder, self._state, self._named = sensor, decoder, state, frame
         self._waiting: deque[Frames] = deque(maxlen=UNDECIDED)
         self._stream = self._made(frame) if frame is not None else None
         self.last: Packets | None = None
 
     def add(self, arrival: Arrival) -> Packets | None:
         """The packets among these frames; None while nobody knows of which type."""
+        if arrival.replaced:
+            self._waiting.clear()
+            self._stream = None if self._named is None else self._made(self._named)
         self._waiting += arrival.found
         found = list(self._waiting)
         if self._stream is None:

@@ -17,16 +17,18 @@ from pathlib import Path
 from shlex import quote
 from typing import Any
 
-from lidarspec.device.arrivals import Arrival, Input, Senders, answers, fed
+from lidarspec.device.arrivals import Arrival, Input, answers, fed
 from lidarspec.device.capture_thread import BoundedQueue, Capture, Event, Mark
+from lidarspec.device.senders import Kept, frame_senders
 from lidarspec.device.session import Outgoing, Pending, Reply, Session
 from lidarspec.errors import CommandError, LidarSpecError, ReplyTimeout, SourceError, UsageError, refuse_text, suggest
 from lidarspec.framing.decoder import Decoder, backend as backend_named
 from lidarspec.framing.results import Counters, Frames
 from lidarspec.recording.appending import Log
 from lidarspec.spec.sensor import Sensor
+from lidarspec.transports.base import with_option
 from lidarspec.transports.open_url import control_link, has_control
-from lidarspec.transports.protocol import Chunk, LiveTransport
+from lidarspec.transports.protocol import Chunk, LiveTransport, Sender, endpoint
 
 #: seconds after which silence, or bytes without a frame, are worth a word.
 PATIENCE = 0.9
@@ -47,11 +49,17 @@ class Watch:
         streams: whether a data frame has come, ever.
     """
 
-    def __init__(self, source: str | Path, sensor: Sensor, opened: LiveTransport, capture: Capture, decoder: Decoder) -> None:
+    def __init__(self, source: str | Path, sensor: Sensor, opened: LiveTransport, capture: Capture, decoder: Decoder, kept: Kept) -> None:
         self._source, self._sensor, self._transport, self._capture, self._decoder = source, sensor, opened, capture, decoder
+        self._kept = kept
         self._framed, self._bytes = time.monotonic(), 0
         self._unframed_since: float | None = None
+        self._strangers_since: float | None = None
         self.streams = False
+
+    def heard(self, *, ours: bool) -> None:
+        """Take note that something came: of the sensor, or of strangers alone."""
+        self._strangers_since = None if ours else self._strangers_since or time.monotonic()
 
     def saw(self, found: Sequence[Frames]) -> None:
         """Take note of what was decoded."""
@@ -64,8 +72,8 @@ class Watch:
 
     @property
     def silent_for(self) -> float:
-        """Seconds since something last arrived."""
-        return time.monotonic() - self._capture.last
+        """Seconds since something last arrived from the sensor."""
+        return time.monotonic() - min(self._capture.last, self._strangers_since or self._capture.last)
 
     @property
     def state(self) -> str:
@@ -85,16 +93,34 @@ class Watch:
         baud = f": {self._transport.baud} baud is likely wrong" if self._transport.baud else ""
         text = {
             "disconnected": f"{self._source}: the device is gone; waiting for it to come back",
-            "silent": f"{self._source}: nothing has arrived for {self.silent_for:.1f} s",
+            "silent": f"{self._source}: nothing has arrived{self._from_others} for {self.silent_for:.1f} s",
             "no frames": f"{self._source}: {self._unframed} bytes, and no frame of {self._sensor.id} among them{baud}",
         }.get(self.state)
         return [f"{text}; next: {self.following()}"] if text else []
 
     def following(self) -> str:
         """The command that finds out more."""
+        if self._stranger is not None and self.state == "silent":
+            return f"the same with {quote(with_option(self._source, 'src', endpoint(self._stranger)))} to read that one"
         if self._decoder.stats.bytes_in and not self._decoder.stats.frames:
             return f"lidarspec detect {quote(str(self._source).partition('?')[0])}"
         return f"lidarspec doctor {quote(str(self._source))} -s {self._sensor.id}"
+
+    @property
+    def foreign(self) -> int:
+        """Datagrams of others than the sensor, so far."""
+        return self._kept.foreign + self._transport.foreign
+
+    @property
+    def _stranger(self) -> Sender | None:
+        return self._kept.stranger or self._transport.stranger
+
+    @property
+    def _from_others(self) -> str:
+        """What else has come, in words."""
+        if self._stranger is None:
+            return ""
+        return f" from the sensor, and {self.foreign} datagrams from others, such as {endpoint(self._stranger)},"
 
     @property
     def _unframed(self) -> int:
@@ -130,15 +156,15 @@ class LiveInput(Input):
         self.queue, self._session = BoundedQueue(policy), Session(sensor)
         self.decoder: Decoder = sensor.decoder(stream=not opened.datagrams, backend=self._backend)
         self._decoders, self._captures = {"data": self.decoder}, {}
-        self._senders, self._ready = Senders(source, sensor), deque[Arrival]()
+        self._kept, self._ready = Kept(source, sensor, datagrams=opened.datagrams), deque[Arrival]()
         self._offset = time.time_ns() - time.monotonic_ns()
         self._turn, self._talk = threading.RLock(), threading.RLock()
-        self._due, self._stops, self._closed, self._foreign = 0.0, False, False, 0
+        self._due, self._stops, self._closed = 0.0, False, False
         self._failure: BaseException | None = None
         self.stays_on = False
         self._said: list[str] = []
         self._captures["data"] = Capture(opened, self.queue, log=recorder, silence=_silence(sensor, opened))
-        self._watch = Watch(source, sensor, opened, self._captures["data"], self.decoder)
+        self._watch = Watch(source, sensor, opened, self._captures["data"], self.decoder, self._kept)
 
     @property
     def ended(self) -> bool:
@@ -152,7 +178,8 @@ class LiveInput(Input):
 
     @property
     def warnings(self) -> list[str]:
-        said = [warning for capture in self._captures.values() for warning in capture.transport.warnings] + self._said
+        said = [warning for capture in self._captures.values() for warning in capture.transport.warnings]
+        said += self._kept.warnings + self._said
         if self._recorder is not None and self._recorder.error is not None:
             said.append(f"the recording has stopped: {self._recorder.error}")
         return said if self._closed else said + self._watch.warnings
@@ -161,7 +188,7 @@ class LiveInput(Input):
     def stats(self) -> Counters:
         stats, captures = self.decoder.stats, list(self._captures.values())
         stats.kernel_drops = sum(capture.transport.kernel_drops for capture in captures)
-        stats.foreign = self._foreign + sum(capture.transport.foreign for capture in captures)
+        stats.foreign = self._kept.foreign + sum(capture.transport.foreign for capture in captures)
         stats.disconnects = sum(capture.disconnects for capture in captures)
         stats.queue_dropped = self.queue.dropped
         return stats
@@ -308,16 +335,25 @@ class LiveInput(Input):
         decoder = self._decoders[link]
         if chunks[0].gap:
             self._hand_on(link, decoder.rest(), interrupted=True)
-        if decoder.stream and chunks[0].sender is not None:
-            number = len(chunks)
-            chunks = self._senders.ours(chunks, decoder)
-            self._foreign += number - len(chunks)
+        if link == "data":
+            chunks = self._of_the_sensor(chunks)
         if not chunks:
             return
         found = fed(decoder, chunks)
-        if not decoder.stream:
-            self._senders.check(chunks, found[0])
+        if link == "data" and not decoder.stream:
+            found = [self._kept.of_ports(frame_senders(chunks, found[0], decoder.stats.bytes_in), found[0])]
+        if link == "data" and self._kept.address is not None:
+            self._captures[link].transport.accept(self._kept.address)
         self._hand_on(link, found)
+
+    def _of_the_sensor(self, chunks: list[Chunk]) -> list[Chunk]:
+        """What of it the sensor sent; where it turns out to be another one than was thought, that one's frames are no longer waited for."""
+        mine = self._kept.ours(chunks)
+        self._watch.heard(ours=bool(mine))
+        if self._kept.has_changed:
+            self.decoder.rest()
+            self._ready.append(Arrival(interrupted=True, replaced=True))
+        return mine
 
     def _hand_on(self, link: str, found: list[Frames], *, interrupted: bool = False) -> None:
         with self._talk:

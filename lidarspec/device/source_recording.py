@@ -8,13 +8,14 @@ carries.
 from __future__ import annotations
 
 import contextlib
+import re
 import time
 from collections.abc import Generator
 from dataclasses import replace
 
 from lidarspec.device.capture_thread import BoundedQueue, Capture, Mark
 from lidarspec.device.device import Device
-from lidarspec.errors import UsageError
+from lidarspec.errors import SourceError, UsageError
 from lidarspec.recording.appending import Appender
 from lidarspec.recording.format import Header
 from lidarspec.recording.recorders import recorder
@@ -25,6 +26,8 @@ from lidarspec.transports.protocol import Chunk, LiveTransport, Transport
 
 #: seconds between two looks at the time and at the disk.
 TURN = 0.1
+#: what may change in a warning that has been said.
+_FIGURES = re.compile(r"[\d.]+")
 
 
 def recorder_like(opened: Transport, source: str, target: str, sensor: Sensor | None, *, overwrite: bool) -> Appender:
@@ -85,14 +88,21 @@ class SourceRecording:
         return self._driven(self._sensor) if self._sensor is not None and is_live(self._source) else self._received()
 
     def _driven(self, sensor: Sensor) -> Generator[str, None, None]:
-        state = ""
+        """What a sensor sends is recorded by a thread; here it is decoded to be counted, whatever that fails at."""
+        news, failures, known = list[str](), dict[str, None](), set[str]()
         with Device(self._source, sensor, start=self._start, record=self._opened) as self.device:
-            for packets in self.device.packets(wait=TURN):
-                self.packets += len(packets)
-                if not self._goes_on():
-                    return
-                yield "\n".join(self.device.warnings) if self.device.state != state else ""
-                state = self.device.state
+            while self._goes_on():
+                try:
+                    self.packets += len(next(self.device.packets(wait=TURN), ()))
+                    news = self.device.warnings
+                except SourceError:
+                    raise
+                except (Exception, SystemExit) as error:
+                    failures[f"{sensor.id}: decoding fails ({type(error).__name__}: {error}); the recording goes on"] = None
+                    time.sleep(TURN)
+                told = {_FIGURES.sub("", text): text for text in [*news, *failures]}
+                yield "\n".join(text for what, text in told.items() if what not in known)
+                known = set(told)
 
     def _received(self) -> Generator[str, None, None]:
         source = RecordingTransport(self._source, salvage=True) if self._salvage else transport(self._source, self._sensor)

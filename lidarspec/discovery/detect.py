@@ -394,8 +394,8 @@ def _nothing(source: str, found: Sequence[Verdict]) -> Exception:
         return WireError(f"{source}: no installed sensor's frames are in it", data=heard.chunks[0][:SHOWN])
     if live_address(source) is None:
         return WireError(no_bytes(source, heard.warnings))
-    error = CommandError(f"{source}: nothing comes; a sensor that has to be started first is named with -s")
-    return suggest(error, f"lidarspec doctor {quote(str(source))}")
+    why = heard.warnings[0] if heard.warnings else f"{source}: nothing comes; a sensor that has to be started first is named with -s"
+    return suggest(CommandError(why), f"lidarspec doctor {quote(source)}")
 
 
 #: constant bits that make bytes look like a frame.

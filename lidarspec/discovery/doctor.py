@@ -212,6 +212,8 @@ def _verdict(source: str, found: Verdict, sensor: Sensor | None) -> Finding:
     heard, ids = found.heard, [score.sensor.id for score in found.scores]
     may_be = {score.sensor.id: score.why for score in found.alike} or dict(found.others)
     quoted = quote(source)
+    if not heard.size and heard.warnings:
+        return Finding(False, heard.warnings[0], f"lidarspec detect {quote(source.partition('?')[0])}")
     if not heard.size:
         return _nothing(source, sensor)
     if found.fault:

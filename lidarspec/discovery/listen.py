@@ -21,7 +21,7 @@ from lidarspec.spec.links import Serial, Udp
 from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.base import data_link, with_option
 from lidarspec.transports.open_url import live, live_address, transport
-from lidarspec.transports.protocol import Chunk, Disconnected, LiveTransport, Transport, sender_names
+from lidarspec.transports.protocol import Chunk, Disconnected, LiveTransport, Transport, endpoint, sender_names
 
 #: bytes and datagrams that are looked at; of a live source, bytes that are enough.
 LOOKED_AT, DATAGRAMS, PLENTY = 1 << 17, 400, 1 << 14
@@ -109,8 +109,16 @@ def _heard(source: str, seconds: float, baud: int | None, name: str) -> Iterator
     with contextlib.closing(transport(source)) as opened:
         number = DATAGRAMS if opened.datagrams else None
         chunks = _listened(opened, seconds) if isinstance(opened, LiveTransport) else beginning(opened, LOOKED_AT, number=number)
-        said = () if isinstance(opened, LiveTransport) else tuple(opened.warnings)
+        said = tuple(opened.warnings) if not isinstance(opened, LiveTransport) else () if chunks else _strangers(opened)
     yield from _by_sender(Heard(name, (), opened.datagrams, baud, warnings=said), chunks)
+
+
+def _strangers(opened: LiveTransport) -> tuple[str, ...]:
+    """That others send, and not the one that is asked for."""
+    if opened.stranger is None:
+        return ()
+    others = f"{opened.foreign} datagrams came from others, such as {endpoint(opened.stranger)}"
+    return (f"{opened.label}: nothing came from the sender that is asked for, and {others}",)
 
 
 def _by_sender(heard: Heard, chunks: Sequence[Chunk]) -> Iterator[Heard]:

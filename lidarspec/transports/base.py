@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 import select
+import socket
 import sys
 import time
 from abc import abstractmethod
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TypeVar
 from urllib.parse import parse_qs
@@ -18,7 +20,7 @@ from lidarspec.errors import SourceError, UnknownOption, UsageError, suggest
 from lidarspec.spec.description import Spec
 from lidarspec.spec.links import Link
 from lidarspec.spec.sensor import Sensor
-from lidarspec.transports.protocol import Chunk, Disconnected, LiveTransport
+from lidarspec.transports.protocol import Chunk, Disconnected, LiveTransport, Origin
 
 #: options that every live SOURCE takes: the address of the link that commands go over, where it is not that of the data.
 COMMON = frozenset({"control"})
@@ -104,8 +106,40 @@ class Address:
 
 
 def with_option(source: str | Path, name: str, value: object) -> str:
-    """A SOURCE with an option more behind its question mark."""
-    return f"{source}{'&' if '?' in str(source) else '?'}{name}={value}"
+    """A SOURCE with an option behind its question mark, in the place of one that is there."""
+    place, _, query = str(source).partition("?")
+    options = [option for option in query.split("&") if option and not option.startswith(f"{name}=")]
+    return f"{place}?{'&'.join([*options, f'{name}={value}'])}"
+
+
+def origin(text: str) -> Origin:
+    """Whose datagrams `src=` asks for, by address.
+
+    Raises:
+        UsageError: for a port that is none, and a host that nobody knows.
+    """
+    found = Origin.parse(text)
+    return replace(found, host=numeric(found.host, f"src={text}"))
+
+
+def numeric(host: str, place: str) -> str:
+    """The address that a host's address or name stands for; the IPv4 one where it has both.
+
+    Args:
+        place: for the message.
+
+    Raises:
+        UsageError: where nobody knows it.
+    """
+    for family in (socket.AF_INET, socket.AF_INET6):
+        with contextlib.suppress(OSError):
+            return socket.inet_ntop(family, socket.inet_pton(family, host.partition("%")[0]))
+    if not re.fullmatch(r"[\d.]*", host):  # which are addresses that are not whole
+        for family in (socket.AF_INET, socket.AF_INET6):
+            with contextlib.suppress(OSError, UnicodeError):
+                return str(socket.getaddrinfo(host, None, family, socket.SOCK_DGRAM)[0][4][0])
+    error = UsageError(f"{place}: there is no host {host!r}; name one, or its address, such as 192.168.1.200")
+    raise suggest(error, "lidarspec detect udp://")
 
 
 class HostClock:

@@ -22,7 +22,8 @@ from lidarspec.captures.records import is_capture
 from lidarspec.errors import SourceError, UnknownSensor, UsageError, WireError, suggest, system_errors
 from lidarspec.recording.format import MAGIC, Header, Record, Recording
 from lidarspec.spec.sensor import Sensor
-from lidarspec.transports.protocol import Chunk, Origin, Transport
+from lidarspec.transports.base import origin
+from lidarspec.transports.protocol import Chunk, Transport
 
 #: events behind which a frame begun earlier does not go on.
 INTERRUPTIONS = frozenset({"disconnect", "reconnect", "dropped"})
@@ -67,7 +68,7 @@ class RecordingTransport(Transport):
     def __init__(self, path: str | Path, *, sender: str | None = None, salvage: bool = False) -> None:
         self._recording = Recording(path, salvage=salvage)
         self.header: Header = self._recording.header
-        self.datagrams, self._origin = self.header.datagrams, None if sender is None else Origin.parse(sender)
+        self.datagrams, self._origin = self.header.datagrams, None if sender is None else origin(sender)
         self.warnings: list[str] = []
 
     def known_sensor(self) -> Sensor:
@@ -230,7 +231,7 @@ class CaptureTransport(FileTransport):
 
     def __init__(self, path: str, file: BinaryIO, *, sender: str | None = None) -> None:
         super().__init__(path, file)
-        self._origin = None if sender is None else Origin.parse(sender)
+        self._origin = None if sender is None else origin(sender)
 
     def chunks(self) -> Iterator[Chunk]:
         reader = CaptureReader(self._file)

@@ -12,7 +12,7 @@ from lidarspec.errors import SpecError, UnknownOption, UsageError
 from lidarspec.plugins import registry
 from lidarspec.spec.links import Link, Tcp, Udp
 from lidarspec.spec.sensor import Sensor
-from lidarspec.transports.base import Address, failure
+from lidarspec.transports.base import Address, failure, numeric
 from lidarspec.transports.files import open_file
 from lidarspec.transports.protocol import LiveTransport, Transport
 
@@ -124,8 +124,9 @@ def control_link(source: str | Path, name: str, link: Link, host: str | None) ->
     if isinstance(link, Udp) and known and (port or link.ports):
         from lidarspec.transports.udp import UdpTransport
 
-        remote = (known, port or link.ports[0])
-        return UdpTransport(f"udp://{_bracketed(known)}:{remote[1]}", [0], sender=known, remote=remote)
+        remote = (numeric(known, str(source)), port or link.ports[0])
+        own = "::" if ":" in remote[0] else ""
+        return UdpTransport(f"udp://{_bracketed(known)}:{remote[1]}", [0], host=own, sender=remote[0], remote=remote)
     raise failure(f"{source}: nobody knows the address of the {name} link", f"the same with ?control=ADDRESS in {source}")
 
 

@@ -181,16 +181,21 @@ class LiveTransport(Transport):
         closed: whether it was closed, which ends `chunks`.
         overflow: what a reader's queue should do when it is full: "drop_oldest", or "block" for a source without a pace of its own.
         addressed: whether what is written has somewhere to go.
+        stranger: who sent the last of the datagrams that are `foreign`.
     """
 
     label: str = ""
     closed: bool = False
+    stranger: Sender | None = None
     overflow: str = "drop_oldest"
 
     @property
     def addressed(self) -> bool:
-        """Whether what is written has somewhere to go: always, but for datagrams before the first one has come."""
+        """Whether what is written has somewhere to go: always, but for datagrams while nobody knows where the sensor is."""
         return True
+
+    def accept(self, sender: Sender) -> None:
+        """Take a sender for the sensor: what is written goes there. Lines that know their other end have nothing to learn."""
 
     @abstractmethod
     def read(self, timeout: float) -> list[Chunk]:

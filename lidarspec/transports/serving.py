@@ -33,6 +33,47 @@ PIECE = SECOND // 100
 LATE = 20_000_000
 
 
+class Turns:
+    """Whose turn it is to compute, of the threads that simulate: one at a time, in the order in which they asked.
+
+    Left to themselves a hundred of them hardly go on, and do not end: each waits for all others whenever it wants the interpreter back.
+    """
+
+    def __init__(self) -> None:
+        self._lock, self._tickets = threading.Lock(), dict[threading.Event, threading.Event]()
+
+    @contextlib.contextmanager
+    def turn(self, stop: threading.Event) -> Iterator[bool]:
+        """A turn, once it has come; whether it has, and one was not told to `end` meanwhile."""
+        ticket = threading.Event()
+        with self._lock:
+            self._tickets[stop] = ticket
+            self._call()
+        ticket.wait()
+        try:
+            yield not stop.is_set()
+        finally:
+            with self._lock:
+                del self._tickets[stop]
+                self._call()
+
+    def end(self, stop: threading.Event) -> None:
+        """Tell somebody to stop, who may wait for his turn."""
+        stop.set()
+        with self._lock:
+            if stop in self._tickets:
+                self._tickets[stop].set()
+
+    def _call(self) -> None:
+        """Let the first one know."""
+        for ticket in self._tickets.values():
+            ticket.set()
+            break
+
+
+TURNS = Turns()
+
+
 def serve(
     device: SimulatedDevice,
     outlet: Outlet,
@@ -53,22 +94,24 @@ def serve(
     Raises:
         SourceError: where nothing can be sent any more.
     """
-    early: list[bytes] = []
-    while patient and not outlet.heard and not (stop is not None and stop.is_set()):
+    stop, early = stop or threading.Event(), list[bytes]()
+    while patient and not outlet.heard and not stop.is_set():
         early = outlet.receive(POLL)
     began, present, endless = time.monotonic_ns(), True, math.isinf(device.rate)
     device.start(began)
     for data in early:
         device.receive(data, began)
     end = began + int(seconds * SECOND) if seconds is not None else None
-    while not (stop is not None and stop.is_set()):
+    while not stop.is_set():
         if turn is not None:
             turn()
         now = time.monotonic_ns()
         if end is not None and now >= end:
             break
         if outlet.heard or not endless:
-            outlet.send(_chunks(device, now), patient=endless)
+            with TURNS.turn(stop) as is_ours:
+                chunks = _chunks(device, now) if is_ours else []
+            outlet.send(chunks, patient=endless)
         if device.present != present:
             present = device.present
             outlet.plug() if present else outlet.unplug()
@@ -113,7 +156,7 @@ class Served(Closing):
 
     def rest(self) -> None:
         """Send nothing more; what was sent can still be read."""
-        self._stop.set()
+        TURNS.end(self._stop)
         self._thread.join()
 
     def close(self) -> None:

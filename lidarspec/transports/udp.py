@@ -28,8 +28,8 @@ from shlex import quote
 from lidarspec.errors import SourceError, UsageError
 from lidarspec.spec.links import Udp, is_datagram
 from lidarspec.spec.sensor import Sensor
-from lidarspec.transports.base import Address, HostClock, failure, lost, named, reason, rest
-from lidarspec.transports.protocol import Chunk, LiveTransport, Origin
+from lidarspec.transports.base import Address, HostClock, failure, lost, named, numeric, origin, reason, rest, with_option
+from lidarspec.transports.protocol import Chunk, LiveTransport, Sender
 
 #: datagrams in one call, and the room for each: memory that is not written to costs nothing.
 MANY, LARGEST = 256, 1 << 16
@@ -167,9 +167,10 @@ class UdpTransport(LiveTransport):
         ports: where to listen; 0 takes any that is free.
         host: address of the interface, "" for all.
         group: multicast group to join.
-        sender: only datagrams from this address, or "ADDRESS:PORT"; others are counted as foreign.
+        sender: only datagrams from this host, or "HOST:PORT"; others are counted as foreign.
         datagrams: whether each is a whole frame, not a piece of a stream.
         sensor: for the next command in messages.
+        remote: where to send to; by default the sender that is asked for with its port, or accepted.
 
     Attributes:
         ports: those that are open.
@@ -192,7 +193,9 @@ class UdpTransport(LiveTransport):
     ) -> None:
         self.clock = HostClock()
         self.label, self.datagrams = label, datagrams
-        self._origin, self._last, self._sensor = None if sender is None else Origin.parse(sender), remote, sensor
+        self._origin, self._remote, self._sensor = None if sender is None else origin(sender), remote, sensor
+        if self._origin is not None and self._origin.port is not None:
+            self._remote = (self._origin.host, self._origin.port)
         self._selector = selectors.DefaultSelector()
         self._sockets: list[_Socket] = []
         self._rested = 0.0
@@ -222,25 +225,28 @@ class UdpTransport(LiveTransport):
         return found
 
     def write(self, data: bytes) -> None:
-        if self._last is None:
-            raise failure(
-                f"{self.label}: nothing has arrived yet, so nobody knows the sensor's address", f"lidarspec doctor {quote(self.label)}"
-            )
+        if self._remote is None:
+            text = f"{self.label}: no frame of the sensor has arrived yet, so nobody knows its address"
+            raise failure(text, f"the same with {with_option(self.label, 'src', 'ADDRESS:PORT')}")
         try:
-            self._sockets[0].socket.sendto(data, self._last)
+            self._sockets[0].socket.sendto(data, self._remote)
         except OSError as error:
             raise lost(self.label, error) from None
 
     @property
     def addressed(self) -> bool:
-        """Whether what is written has somewhere to go: to whom the last datagram came from."""
-        return self._last is not None
+        """Whether what is written has somewhere to go: to the address that was given, or a sender that was accepted."""
+        return self._remote is not None
+
+    def accept(self, sender: Sender) -> None:
+        if self._origin is None or self._origin.port is None:
+            self._remote = sender
 
     def reopen(self) -> None:
         """Sockets stay open, whatever becomes of the sensor."""
 
     def peer(self) -> str | None:
-        return self._origin.host if self._origin else self._last[0] if self._last else None
+        return self._origin.host if self._origin else self._remote[0] if self._remote else None
 
     def close(self) -> None:
         self.closed = True
@@ -254,9 +260,8 @@ class UdpTransport(LiveTransport):
             own = self._origin
             for data, sender, at in one.datagrams(self.clock.now()):
                 if own is not None and sender not in own:
-                    self.foreign += 1
+                    self.foreign, self.stranger = self.foreign + 1, sender
                     continue
-                self._last = sender
                 found.append(Chunk(data, at, sender, one.address))
         except ConnectionRefusedError:
             return  # somebody's answer to what was sent, not to be read as the end
@@ -285,7 +290,7 @@ class UdpTransport(LiveTransport):
             return failure(f"{self.label}: UDP port {port} is in use by another program", doctor)
         if error.errno == errno.EACCES:
             return failure(f"{self.label}: UDP port {port} needs rights that you do not have", doctor)
-        if error.errno == errno.EADDRNOTAVAIL or isinstance(error, socket.gaierror):
+        if error.errno == errno.EADDRNOTAVAIL:
             return failure(f"{self.label}: {host or group} is no address of this computer", f"lidarspec doctor udp://:{port}")
         if group is not None and error.errno in (errno.ENODEV, errno.ENETUNREACH):
             return failure(f"{self.label}: no interface has a route to the group {group}; name one, as in udp://ADDRESS:{port}", doctor)
@@ -375,6 +380,7 @@ def connect(address: Address, sensor: Sensor | None = None) -> UdpTransport:
     """
     address.check(OPTIONS)
     host, port = address.host_and_port()
+    host = host and numeric(host, address.text)
     link = sensor.links.get("data") if sensor is not None else None
     ports = _ports(address) or ([port] if port else list(link.ports) if isinstance(link, Udp) else [])
     if not ports:

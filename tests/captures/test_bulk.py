@@ -21,9 +21,14 @@ import pytest
 
 import lidarspec as ls
 from lidarspec.captures.bulk import Batch, CaptureBatches
-from lidarspec.captures.pcap import CaptureReader, Datagram
+from lidarspec.captures.ip import ETHERNET
+from lidarspec.captures.pcap import CaptureReader, Datagram, datagram_record
+from lidarspec.captures.records import capture_head
+from lidarspec.simulation.simulator import simulate
 from lidarspec.transports.files import CaptureTransport, open_file
 from tests import made_captures as made
+from tests.lines import turning
+from tests.shapes import SHAPES
 
 Read = tuple[list[tuple[bytes, int, tuple[str, int]]], object]
 
@@ -347,11 +352,6 @@ def test_one_sender_of_several(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("other", [("10.0.0.2", 6699), ("10.0.0.1", 6700)], ids=["address", "port"])
 def test_frames_of_two_senders_are_not_mixed(other: tuple[str, int], tmp_path: Path) -> None:
-    from lidarspec.captures.ip import ETHERNET
-    from lidarspec.captures.pcap import datagram_record
-    from lidarspec.captures.records import capture_head
-    from lidarspec.simulation.simulator import simulate
-
     path = tmp_path / "two.pcap"
     with path.open("wb") as file:
         file.write(capture_head(ETHERNET))
@@ -364,6 +364,17 @@ def test_frames_of_two_senders_are_not_mixed(other: tuple[str, int], tmp_path: P
     with ls.open(f"{path}?src={two}", "robosense-m1") as device:
         assert sum(map(len, device.packets())) == 20
         assert device.stats.foreign == 20
+
+
+def test_a_calibration_of_another_address_is_not_mixed_in(tmp_path: Path) -> None:
+    sensor, path = SHAPES["shape-datagrams"], tmp_path / "two.pcap"
+    sent = [(turning(sensor, 1)[0], "10.0.0.1"), (sensor.build("info", elevation=[1, 2, 3]), "10.0.0.2")]
+    data = [datagram_record(Datagram(frame, 0, (host, 7001), made.DESTINATION)) for frame, host in sent]
+    path.write_bytes(capture_head(ETHERNET) + b"".join(data))
+    with ls.open(path, sensor) as device, pytest.raises(ls.UsageError, match=r"10\.0\.0\.1 and 10\.0\.0\.2 both send frames"):
+        list(device.packets())
+    with ls.open(f"{path}?src=10.0.0.1", sensor) as device:
+        assert sum(map(len, device.packets())) == 1
 
 
 HUGE = struct.pack("<I", 0x7FFFFFFC)

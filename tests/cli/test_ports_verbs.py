@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import random
+import re
 import socket
 import subprocess
 import sys
@@ -228,7 +229,13 @@ class TestDoctor:
             frames = simulate(ls.sensor("robosense-m1"), 40)
             with working(lambda stop: paced(lambda data: sender.sendto(data, ("127.0.0.1", number)), frames, 200, stop)):
                 well = self._told(f"udp://127.0.0.1:{number}", "-t", "500ms")
+                other = f"udp://127.0.0.1:{number}?src=127.0.0.9"
+                instead, detected = self._told(other, "-t", "500ms"), ran("detect", other, "-t", "500ms", code=5).stderr
         assert any(finding["ok"] and "robosense-m1 sends" in finding["text"] for finding in well)
+        for said in (detected, "".join(finding["text"] for finding in instead)):
+            assert re.search(
+                r"nothing came from the sender that is asked for, and \d+ datagrams came from others, such as 127.0.0.1:", said
+            )
 
     def test_files(self, tmp_path: Path) -> None:
         (tmp_path / "empty.bin").write_bytes(b"")

@@ -311,11 +311,37 @@ def test_a_command_waits_for_the_first_datagram_that_says_where_the_sensor_is() 
         assert sum(len(batch) for batch, _ in zip(opened.packets(wait=0.3), range(3), strict=False)) > 0
 
 
+def test_a_command_goes_to_the_sensor_and_a_strangers_answer_is_none() -> None:
+    number = free_port()
+    frames, ack = turning(SENSOR, 2), SENSOR.build("ack", code=SPEED, result=0)
+    with (
+        udp("127.0.0.2") as own,
+        udp("127.0.0.3") as other,
+        ls.open(f"udp://:{number}", datagram_sensor(number), start=False) as opened,
+    ):
+        own.sendto(frames[0], ("127.0.0.1", number))
+        until(lambda: opened.newest(0.01) or opened.stats.frames)
+        other.sendto(frames[1], ("127.0.0.1", number))
+        until(lambda: opened.newest(0.01) or opened.stats.foreign)
+
+        def answer(stop: threading.Event) -> None:
+            who = own.recvfrom(100)[1]
+            other.sendto(ack, ("127.0.0.1", number))
+            own.sendto(SENSOR.build("ack", code=SPEED, result=7), who)
+
+        own.settimeout(SLACK)
+        with working(answer), pytest.raises(CommandError, match="result 7 instead of 0"):  # which is the sensor's own
+            opened.send("speed", rate=10.0, trim=0.0, timeout=1.0)
+        other.setblocking(False)
+        with pytest.raises(BlockingIOError):
+            other.recv(100)
+
+
 def test_a_sensor_that_nothing_was_heard_of_cannot_be_sent_to() -> None:
     number = free_port()
     with ls.open(f"udp://127.0.0.1:{number}", datagram_sensor(number), start=False) as opened:
         began = time.monotonic()
-        with pytest.raises(CommandError, match="nothing has arrived yet, so nobody knows the sensor's address"):
+        with pytest.raises(CommandError, match="no frame of the sensor has arrived yet, so nobody knows its address"):
             opened.send("speed", rate=10.0, trim=0.0, timeout=0.2)
         assert 0.2 <= time.monotonic() - began < 0.2 + SLACK
 

@@ -25,8 +25,8 @@ from lidarspec.simulation.scenes import Room, read_scene
 from lidarspec.spec import Udp
 from lidarspec.testing.fixtures import virtual_port
 from lidarspec.transports.outlets import simulated_outlet
-from lidarspec.transports.serving import Served, write_file
-from tests.lines import SLACK, free_port
+from lidarspec.transports.serving import Served, Turns, write_file
+from tests.lines import SLACK, free_port, until
 from tests.simulation.test_simulator import off
 
 posix = pytest.mark.skipif(os.name != "posix", reason="pseudo terminals are POSIX")
@@ -278,6 +278,43 @@ def test_what_goes_wrong_in_the_thread_of_a_port_is_raised_at_its_end() -> None:
     assert tried.wait(10)
     with pytest.raises(ZeroDivisionError):
         port.close()
+
+
+@posix
+def test_many_simulators_take_turns_and_end() -> None:
+    """Of 50 in one process, more than it can keep up with, each is heard, and all end in no time."""
+    ports = [Served(SimulatedDevice(STL), simulated_outlet(STL, "pty")) for _ in range(50)]
+    until(lambda: all(port.device.sent["data"] for port in ports), 60)
+
+    def end() -> None:
+        for port in ports:
+            port.close()
+
+    ending = threading.Thread(target=end, daemon=True)
+    ending.start()
+    until(lambda: not ending.is_alive(), 20)
+
+
+def test_turns_come_in_the_order_of_asking_and_nobody_waits_who_is_to_end() -> None:
+    turns, came = Turns(), list[tuple[int, bool]]()
+    stops = [threading.Event() for _ in range(4)]
+
+    def work(number: int) -> None:
+        with turns.turn(stops[number]) as is_ours:
+            came.append((number, is_ours))
+
+    waiting = [threading.Thread(target=work, args=(number,)) for number in (1, 2, 3)]
+    with turns.turn(stops[0]) as is_ours:
+        assert is_ours
+        for number, thread in enumerate(waiting, start=2):
+            thread.start()
+            until(lambda number=number: len(turns._tickets) == number)  # type: ignore[misc]
+        turns.end(stops[2])
+        waiting[1].join(SLACK)
+        assert came == [(2, False)]
+    for thread in waiting:
+        thread.join(SLACK)
+    assert came == [(2, False), (1, True), (3, True)]
 
 
 PAGE = (Path(__file__).parents[2] / "docs" / "how-to" / "simulate.md").read_text(encoding="utf-8")

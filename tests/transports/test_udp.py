@@ -11,6 +11,7 @@ import pytest
 import lidarspec as ls
 from lidarspec.errors import SourceError, UsageError
 from lidarspec.spec import Chunk
+from lidarspec.transports.base import origin
 from lidarspec.transports.open_url import transport
 from lidarspec.transports.protocol import Origin, endpoint
 from lidarspec.transports.udp import BUFFER, UdpTransport, _Socket, shortfall
@@ -45,6 +46,8 @@ def test_datagrams_of_several_ports_with_their_senders_and_times() -> None:
         assert {chunk.sender for chunk in found} == {sender.getsockname()}
         assert {chunk.receiver[1] for chunk in found if chunk.receiver} == set(ports)
         assert all(abs((chunk.at or 0) - time.time_ns()) < 5e9 for chunk in found)
+        assert not one.addressed
+        one.accept(sender.getsockname())
         one.write(b"hello")
         assert sender.recv(16) == b"hello"
     assert one.peer() == "127.0.0.1"
@@ -83,6 +86,30 @@ def test_a_sender_is_an_address_or_a_port_of_it(text: str, origin: Origin) -> No
     assert (origin.host, 2368) in origin
     assert ((origin.host, 2369) in origin) == (origin.port is None)
     assert Origin.parse(endpoint((origin.host, 7))) == Origin(origin.host, 7)
+
+
+@pytest.mark.parametrize("name", ["localhost", "0:0:0:0:0:0:0:1", "[::1]:2368"])
+def test_a_sender_is_asked_for_by_any_name_of_its_address(name: str) -> None:
+    assert origin(name).host in ("127.0.0.1", "::1")
+
+
+@pytest.mark.parametrize("source", ["udp://:{port}?src=localhots.invalid", "udp://:{port}?src=192.168.1", "udp://10.0.0.256:{port}"])
+def test_a_host_that_nobody_knows_is_refused(source: str) -> None:
+    with pytest.raises(UsageError, match=r"there is no host '(localhots.invalid|192.168.1|10.0.0.256)'"):
+        opened(source.format(port=free_port()))
+
+
+def test_what_is_sent_goes_to_the_sender_that_is_asked_for_and_no_other() -> None:
+    port = free_port()
+    with udp("127.0.0.2") as wanted, udp("127.0.0.3") as other:
+        one = opened(f"udp://:{port}?src=127.0.0.2:{wanted.getsockname()[1]}")
+        other.sendto(b"here!", ("127.0.0.1", port))
+        until(lambda: one.read(0.01) or one.foreign)
+        assert one.stranger == other.getsockname()
+        one.accept(other.getsockname())
+        one.write(b"hello")
+        assert wanted.recv(16) == b"hello"
+    one.close()
 
 
 def test_a_port_that_is_none_is_refused() -> None:

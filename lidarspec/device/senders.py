@@ -1,0 +1,199 @@
+"""Whose datagrams a device is made of: those of one sensor, since the frames of two must not be mixed into one cloud.
+
+A sensor is an address: its data, calibration and answers come from there. The frames of one type come from one port of it, from another
+one only after a restart; two ports that take turns are two sensors. A file with frames of two is refused (`Senders`), since one can be
+chosen at leisure. Of a live source the first that sends data is kept (`Kept`): what others send is left out before it is decoded.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from shlex import quote
+
+import numpy as np
+
+from lidarspec.errors import UsageError, suggest
+from lidarspec.framing.decoder import Decoder
+from lidarspec.framing.results import Frames
+from lidarspec.spec.sensor import Sensor
+from lidarspec.transports.base import with_option
+from lidarspec.transports.protocol import Chunk, Sender, endpoint
+
+#: senders that are looked at while nobody knows the sensor, and ports that are remembered of it.
+SENDERS = 16
+
+
+class Senders:
+    """Who sends the frames of a file.
+
+    Args:
+        source: for messages.
+    """
+
+    def __init__(self, source: str | Path, sensor: Sensor) -> None:
+        self._source, self._sensor = source, sensor
+        self._owner: Sender | None = None
+        self._now: dict[str, Sender] = {}  # who sends the frames of a type, and who did before
+        self._before: dict[str, dict[Sender, None]] = {}
+
+    def see(self, sent: Iterable[tuple[str, Sender]]) -> None:
+        """Look who sent frames: the type of each, and the sender.
+
+        Raises:
+            UsageError: where two sensors send frames.
+        """
+        for name, sender in sent:
+            self._owner = self._owner or sender
+            other = self._owner if sender[0] != self._owner[0] else self._younger(name, sender)
+            if other is not None:
+                raise self._several(other, sender)
+
+    def _younger(self, name: str, sender: Sender) -> Sender | None:
+        """The port that frames of a type came from until now, where it took turns with this one; else None, and they come from this one."""
+        known, before = self._now.setdefault(name, sender), self._before.setdefault(name, {})
+        if sender == known or sender in before:
+            return None if sender == known else known
+        if len(before) == SENDERS:
+            del before[next(iter(before))]
+        before[known], self._now[name] = None, sender
+        return None
+
+    def _several(self, first: Sender, other: Sender) -> UsageError:
+        one, two = (endpoint(sender) if first[0] == other[0] else sender[0] for sender in (first, other))
+        chosen = with_option(self._source, "src", one)
+        error = UsageError(f"{self._source}: {one} and {two} both send frames of {self._sensor.id}; choose one with {chosen}")
+        return suggest(error, f"the same with {quote(chosen)}")
+
+
+class Kept(Senders):
+    """The sensor that is read of a live source: the first that sends data frames, and before that the first that sends any.
+
+    Args:
+        datagrams: whether each datagram is a whole frame, not a piece of a stream.
+
+    Attributes:
+        foreign: datagrams of others, so far; `stranger` sent the first of them.
+        has_changed: whether the last call of `ours` has found that it is another one than what was read before.
+    """
+
+    def __init__(self, source: str | Path, sensor: Sensor, *, datagrams: bool) -> None:
+        super().__init__(source, sensor)
+        self.foreign, self.has_changed = 0, False
+        self.stranger: Sender | None = None
+        self._is_sure, self._datagrams = False, datagrams
+        self._first: Sender | None = None  # whose stream is read while nobody has sent a frame
+        self._probes: dict[Sender, Decoder] = {}
+        self._strangers: dict[Sender, None] = {}  # other sensors' ports at the address of the sensor
+
+    @property
+    def address(self) -> Sender | None:
+        """Where the sensor is, None while nobody has sent a frame."""
+        return self._owner
+
+    @property
+    def warnings(self) -> list[str]:
+        """Whom the device is made of, where others send as well."""
+        if self.stranger is None or self._owner is None:
+            return []
+        text = f"{self._source}: {endpoint(self._owner)} is read; {endpoint(self.stranger)} sends as well, and is left out"
+        return [f"{text}; next: the same with {quote(with_option(self._source, 'src', endpoint(self.stranger)))} to read that one"]
+
+    def ours(self, chunks: Sequence[Chunk]) -> list[Chunk]:
+        """Those of these datagrams that the sensor sent; while nobody has sent a frame, all (of a stream the first sender's)."""
+        mine: list[Chunk] = []
+        self.has_changed = False
+        for chunk in chunks:
+            if chunk.sender is not None and self._replaces(chunk.sender, chunk):
+                self.has_changed = True
+                for one in mine:
+                    self._leave_out(one.sender)
+                mine = []
+            if chunk.sender is None or self._is_ours(chunk.sender):
+                mine.append(chunk)
+            else:
+                self._leave_out(chunk.sender)
+        return mine
+
+    def of_ports(self, sent: Sequence[tuple[str, Sender]], found: Frames) -> Frames:
+        """Those of these frames, of the sensor's address, that come from its ports.
+
+        Args:
+            sent: the type and the sender of each frame, or, where one sender sent them all, of each type.
+        """
+        known = len(self._strangers)
+        for name, sender in sent:
+            if sender not in self._strangers:
+                self._take_turns(name, sender)
+                self._owner = sender if self._sensor.frames[name].data else self._owner
+        if len(self._strangers) == known or len(sent) < len(found):
+            return found
+        mine = [sender not in self._strangers for _, sender in sent]
+        for (_, sender), is_mine in zip(sent, mine, strict=True):
+            if not is_mine:
+                self._leave_out(sender)
+        return found.only(np.array(mine, np.bool_))
+
+    def _replaces(self, sender: Sender, chunk: Chunk) -> bool:
+        """Look at what a sender sends while it is open who is the sensor; whether it takes the place of another."""
+        owner = self._owner
+        if self._is_sure and owner is not None and (self._datagrams or sender == owner or not self._is_near(sender, owner)):
+            return False
+        names = self._names(sender, chunk)
+        if self._is_sure:
+            if names:  # of a stream that comes from another port
+                self._owner = self._take_turns("", sender)
+            return False
+        self._is_sure = any(self._sensor.frames[name].data for name in names)
+        if self._is_sure or (names and owner is None):
+            self._owner = self._now[""] = sender
+        known = owner or self._first
+        return known is not None and self._owner is not None and not self._is_ours(known)
+
+    def _is_ours(self, sender: Sender) -> bool:
+        if self._owner is None:
+            self._first = self._first or (None if self._datagrams else sender)
+            return self._first in (None, sender)
+        return self._is_near(sender, self._owner) if self._datagrams else sender == self._owner
+
+    def _is_near(self, sender: Sender, owner: Sender) -> bool:
+        """Whether a sender may be the sensor at another port."""
+        return sender[0] == owner[0] and sender not in self._strangers
+
+    def _names(self, sender: Sender, chunk: Chunk) -> set[str]:
+        """The types of the frames that a datagram completes, of the first few senders."""
+        if sender not in self._probes and len(self._probes) >= SENDERS:
+            return set()
+        decoder = self._probes.setdefault(sender, self._sensor.decoder(stream=not self._datagrams))
+        return {item.frame for item in decoder.feed(chunk.data)}
+
+    def _take_turns(self, name: str, sender: Sender) -> Sender:
+        """The port that frames of a type come from: of those that take turns the one that was there first."""
+        younger = self._younger(name, sender)
+        if younger is not None:
+            self._strangers |= dict.fromkeys([*self._before[name], younger])
+            del self._strangers[sender]
+            while len(self._strangers) > SENDERS:
+                del self._strangers[next(iter(self._strangers))]
+            self._now[name], self._before[name] = sender, {}
+        return self._now[name]
+
+    def _leave_out(self, sender: Sender | None) -> None:
+        self.foreign, self.stranger = self.foreign + 1, self.stranger or sender
+
+
+def frame_senders(chunks: Sequence[Chunk], found: Frames, end: int) -> list[tuple[str, Sender]]:
+    """The type and the sender of each frame found in datagrams; where one sent them all, of each type; [] where senders are not known.
+
+    Args:
+        end: where these datagrams end in everything that was decoded.
+    """
+    senders = {chunk.sender for chunk in chunks}
+    if None in senders:
+        return []
+    if len(senders) == 1:
+        return [(found.names[kind], sender) for sender in senders if sender for kind in np.unique(found.kinds).tolist()]
+    ends = end - np.cumsum([len(chunk.data) for chunk in reversed(chunks)])[::-1]
+    places = np.searchsorted(ends, found.offsets, side="right") - 1
+    known = [chunk.sender for chunk in chunks if chunk.sender is not None]
+    return [(found.names[kind], known[place]) for kind, place in zip(found.kinds.tolist(), places.tolist(), strict=True)]
