@@ -149,7 +149,6 @@ class Capture:
         queue: where it goes to.
         link: the name of the link.
         log: the recording, if there is one.
-        silence: seconds without a byte after which the line counts as silent.
 
     Attributes:
         transport: the transport.
@@ -158,11 +157,9 @@ class Capture:
         last: when something last arrived, by `time.monotonic`; the time of opening before that.
     """
 
-    def __init__(
-        self, transport: LiveTransport, queue: BoundedQueue, *, link: str = "data", log: Log | None = None, silence: float = 0.1
-    ) -> None:
+    def __init__(self, transport: LiveTransport, queue: BoundedQueue, *, link: str = "data", log: Log | None = None) -> None:
         self.transport, self.connected, self.disconnects, self.last = transport, True, 0, time.monotonic()
-        self._queue, self._link, self._log, self._silence = queue, link, log, silence
+        self._queue, self._link, self._log = queue, link, log
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name=f"capture of {link}", daemon=True)
         self._thread.start()
@@ -192,7 +189,7 @@ class Capture:
                     silence, gap, quiet = 0.0, False, False
                     continue
                 silence += time.monotonic() - began
-                if silence >= self._silence and not quiet:
+                if silence >= self.transport.silence and not quiet:
                     quiet = True
                     self._queue.put(self._link, [Mark.SILENT])
         except BaseException as error:

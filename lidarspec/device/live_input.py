@@ -163,7 +163,7 @@ class LiveInput(Input):
         self._failure: BaseException | None = None
         self.stays_on = False
         self._said: list[str] = []
-        self._captures["data"] = Capture(opened, self.queue, log=recorder, silence=_silence(sensor, opened))
+        self._captures["data"] = Capture(opened, self.queue, log=recorder)
         self._watch = Watch(source, sensor, opened, self._captures["data"], self.decoder, self._kept)
 
     @property
@@ -421,9 +421,3 @@ def _runs(events: list[Event]) -> list[tuple[str, list[Chunk] | Mark | BaseExcep
             run = [item]
             found.append((link, run))
     return found
-
-
-def _silence(sensor: Sensor, opened: LiveTransport) -> float:
-    """Seconds without a byte after which nothing of a frame can be under way: longer than a frame takes on the line."""
-    longest = max((frame.max_length for frame in sensor.frames.values()), default=0)
-    return max(0.1, 2 * longest * 10 / opened.baud) if opened.baud else 0.1

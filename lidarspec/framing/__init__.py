@@ -6,9 +6,10 @@ every other byte. No clock, port or thread in here, and no exception for any byt
 * `results`: `Frames`, which each module passes on to the next; frames one by one; the counters.
 * `plausibility`: whether candidates of one layout are frames, many at a time.
 * `frame_engine`: one frame type: its candidates judged, and its frames as columns; compiled, and interpreted by construct.
+* `candidates`: the candidates in a piece of a stream, of the types that are looked for.
+* `weak_frames`: types that are believed in runs alone.
 * `search`: the rule of a stream: the leftmost valid candidate, then on after its last byte.
 * `steady`: frames at one distance, which need no search: in streams, in datagrams, in arrays.
-* `weak_frames`: types that are believed in runs alone.
 * `datagrams`: datagrams of several types.
 * `decoder`: all of it, incrementally: what is undecided is looked at again with the next bytes.
 * `examples`: valid frames with random content.

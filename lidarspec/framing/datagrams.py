@@ -16,9 +16,9 @@ import bisect
 import numpy as np
 from numpy.typing import NDArray
 
+from lidarspec.framing.candidates import Bytes1D, Framing, Mode, Piece
 from lidarspec.framing.frame_engine import CompiledCodec
 from lidarspec.framing.results import CONSTANT, LENGTH, PLUGIN, SHORT, VALID, Frames, Indices, Numbers, array_of
-from lidarspec.framing.search import Bytes1D, Framing, Mode, Piece
 from lidarspec.framing.steady import steady_datagrams, step_between
 from lidarspec.wire.arrays import alike, repeated
 from lidarspec.wire.layout import Layout, equal

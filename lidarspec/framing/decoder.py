@@ -15,12 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.errors import PluginError, UsageError, refuse_text
+from lidarspec.framing.candidates import Bytes1D, Framing, Mode, Piece
 from lidarspec.framing.datagrams import sorted_datagrams
 from lidarspec.framing.frame_engine import codec
 from lidarspec.framing.results import Counters, Found, Frames, Numbers, array_of
-from lidarspec.framing.search import Bytes1D, Framing, Mode, Piece, leftmost
+from lidarspec.framing.search import leftmost
 from lidarspec.framing.steady import steady_stream
-from lidarspec.framing.weak_frames import Runs
 from lidarspec.spec.description import Frame, Spec
 from lidarspec.wire.arrays import alike, keep_freed_memory, repeated
 from lidarspec.wire.layout import Sums
@@ -194,12 +194,11 @@ class Decoder:
         return start
 
     def _piece(self, buffer: Bytes1D, *, final: bool) -> Piece:
-        """A piece of a stream cut into frames: by runs where a weak type is looked for, as rows while nothing disturbs; else by search."""
+        """A piece of a stream cut into frames: as rows while nothing disturbs and no weak type is looked for; else by search."""
         framing, mode = self._framing, self._mode
-        if any(framing.weak(kind) for kind in framing.active(mode)):
-            return Runs(framing, buffer, mode, self._base, final=final).cut()
-        piece = None if final else steady_stream(framing, buffer, mode)
-        return leftmost(framing, buffer, mode, final=final) if piece is None else piece
+        is_plain = not final and not any(map(framing.weak, framing.active(mode)))
+        piece = steady_stream(framing, buffer, mode) if is_plain else None
+        return leftmost(framing, buffer, mode, self._base, final=final) if piece is None else piece
 
     def _entered(self, buffer: NDArray[np.uint8], piece: Piece, at: int | None) -> Frames:
         """The frames of a piece with their place in the input, and all that was found in it counted."""

@@ -105,7 +105,7 @@ class CompiledCodec(Codec):
         for layout, which in groups:
             if isinstance(layout, Refused):
                 status[which] = PLUGIN if layout.error else LENGTH
-                errors += [layout.error] * len(which) if layout.error else []
+                errors += [layout.error] if layout.error else []
                 continue
             status[which], own, _ = self._judged(buffer, offsets[which], layout, errors, gathered=gathered, sums=sums)
             forms[which] = len(layouts)

@@ -94,7 +94,7 @@ def intactness(seal: Seal, errors: list[PluginError], sums: Sums | None, rows: B
         wrong = ~seal.intact(rows, sums)
         return np.multiply(wrong.view(np.uint8), np.uint8(CHECKSUM))
     except Exception as error:
-        errors += [PluginError.of(error, "checksum")] * len(rows)
+        errors.append(PluginError.of(error, "checksum"))
         return np.full(len(rows), PLUGIN, np.uint8)
 
 
@@ -108,7 +108,7 @@ def plausibility(frame: Frame, table: Table, errors: list[PluginError]) -> NDArr
         array = np.broadcast_to(np.asarray(answer), (len(table), *np.shape(answer)[1:])) if np.ndim(answer) else np.full(len(table), answer)
         return np.where(_all(array, answer, batch), VALID, IMPLAUSIBLE).astype(np.uint8)
     except Exception as error:
-        errors += [PluginError.of(error, "plausible", function=frame.plausible)] * len(table)
+        errors.append(PluginError.of(error, "plausible", function=frame.plausible))
         return np.full(len(table), PLUGIN, np.uint8)
 
 

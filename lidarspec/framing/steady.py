@@ -11,8 +11,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from lidarspec.framing.candidates import Framing, Mode, Piece
 from lidarspec.framing.results import Frames, Indices, Numbers
-from lidarspec.framing.search import Framing, Mode, Piece
 from lidarspec.wire.arrays import alike, repeated
 from lidarspec.wire.layout import Bytes2D, Layout, Marks, exclude, right
 

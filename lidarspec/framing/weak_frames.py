@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.errors import PluginError
+from lidarspec.framing.candidates import Bytes1D, Candidates, Framing, Mode, Offsets, Piece, fitting
 from lidarspec.framing.results import CONSTANT, IMPLAUSIBLE, PLUGIN, SHORT, VALID, Frames
-from lidarspec.framing.search import Bytes1D, Framing, Mode, Offsets, Piece, count_rejected, fitting, merged
 from lidarspec.wire.arrays import repeated
 from lidarspec.wire.layout import Layout, right
 
@@ -231,42 +231,38 @@ class Lane:
 
 
 class Runs:
-    """One pass over a piece of a stream in which a weak type is looked for.
+    """What goes through a piece of a stream while weak types are looked for: a `Walk` of the search.
 
     Args:
-        buffer: the bytes not yet decided and those after them.
+        candidates: of the strong types.
+        live: those that are looked for with the weak ones, and are valid or wait for bytes.
         mode: remembered between pieces, changed here.
-        base: offset of the buffer in the stream.
-        final: give up candidates that need more bytes than there are.
+        base: offset of the piece in the stream.
     """
 
-    def __init__(self, framing: Framing, buffer: Bytes1D, mode: Mode, base: int, *, final: bool) -> None:
-        self._framing, self._mode, self._base = framing, mode, base
-        whole = len(buffer)
-        buffer, self._candidates = framing.candidates(buffer, mode)
-        self._buffer, self._length, self._all = buffer, len(buffer), len(buffer) == whole
-        self._final = final and self._all
-        self._live = merged(self._candidates, final=self._final) if self._candidates else Frames.none(buffer)
-        facts = zip(self._live.kinds.tolist(), self._live.sizes.tolist(), (self._live.status == SHORT).tolist(), strict=True)
-        self._strong: dict[int, tuple[int, int, bool]] = dict(zip(self._live.starts.tolist(), facts, strict=True))
+    def __init__(self, framing: Framing, candidates: Candidates, live: Frames, mode: Mode, base: int) -> None:
+        self._framing, self._mode, self._base, self._live = framing, mode, base, live
+        self._buffer, self._length, self._is_whole = candidates.buffer, len(candidates.buffer), candidates.is_whole
+        facts = zip(live.kinds.tolist(), live.sizes.tolist(), (live.status == SHORT).tolist(), strict=True)
+        self._strong: dict[int, tuple[int, int, bool]] = dict(zip(live.starts.tolist(), facts, strict=True))
         self._spots = list(self._strong)
         self._lanes: list[Lane] = []
+        self._taken: list[tuple[int, int, int, int]] = []
         for kind in filter(framing.weak, framing.active(mode)):
             others = {spot: short for spot, (other, _, short) in self._strong.items() if other < kind}
             before = list(self._lanes)
-            self._lanes.append(Lane(framing, kind, buffer, others, before, final=self._final))
+            self._lanes.append(Lane(framing, kind, self._buffer, others, before, final=candidates.final))
 
-    def cut(self) -> Piece:
-        """Take what is valid from left to right, until the end, a frame that changes what is looked for, or one that needs more bytes."""
-        piece, taken, position = Piece(Frames.none(self._buffer), self._length), list[tuple[int, int, int, int]](), 0
-        counted = 0
+    def advance(self, position: int, piece: Piece) -> int:
+        """Take what is valid from an offset on, until the end or a frame that changes what is looked for; where that frame ends."""
+        counted = position
         while position < self._length:
             spot = self._next(position)
             if spot is None:
                 break
             answer = self._at(spot)
             if answer is None:
-                piece.end, piece.waiting = spot, self._all
+                piece.end, piece.waiting = spot, self._is_whole
                 piece.need = self._strong[spot][1] if spot in self._strong else 0
                 break
             kind, number, size = answer
@@ -274,16 +270,16 @@ class Runs:
                 position = spot + 1
                 continue
             self._count(piece, counted, spot, before=kind)
-            taken.append((kind, spot, number, size))
+            self._taken.append((kind, spot, number, size))
             position = counted = spot + number * size
             if self._accepted(kind, position):
-                piece.end = position
-                break
+                return position
         self._count(piece, counted, piece.end)
-        if taken:
-            piece.frames = self._frames(taken)
-        count_rejected(piece, self._candidates, final=self._final)
-        return piece
+        return piece.end
+
+    def frames(self) -> Frames:
+        """All that were taken."""
+        return self._frames(self._taken) if self._taken else Frames.none(self._buffer)
 
     def _next(self, position: int) -> int | None:
         """The first offset from here on where something may stand."""

@@ -180,12 +180,14 @@ class LiveTransport(Transport):
         label: how the user called it, for messages.
         closed: whether it was closed, which ends `chunks`.
         overflow: what a reader's queue should do when it is full: "drop_oldest", or "block" for a source without a pace of its own.
+        silence: seconds without a byte after which nothing of a frame can be under way: what waits for more is given up then.
         addressed: whether what is written has somewhere to go.
         stranger: who sent the last of the datagrams that are `foreign`.
     """
 
     label: str = ""
     closed: bool = False
+    silence: float = 0.1
     stranger: Sender | None = None
     overflow: str = "drop_oldest"
 

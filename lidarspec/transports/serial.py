@@ -51,6 +51,8 @@ class SerialTransport(StreamTransport):
     def __init__(self, port: str, baud: int, *, dtr: bool | None = None, rts: bool | None = None, sensor: Sensor | None = None) -> None:
         super().__init__(port, sensor)
         self.baud, self._levels = baud, {"dtr": dtr, "rts": rts}
+        longest = max((frame.max_length for frame in sensor.frames.values()), default=0) if sensor else 0
+        self.silence = max(self.silence, 2 * longest * 10 / baud)  # longer than a frame takes on the line
         self._port = self._open()
 
     def write(self, data: bytes) -> None:

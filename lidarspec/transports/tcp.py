@@ -17,6 +17,8 @@ from lidarspec.transports.protocol import Disconnected
 BLOCK = 1 << 18
 #: seconds that a connection may take at first, and when it is tried again.
 PATIENCE, AGAIN = 5.0, 0.5
+#: seconds without a byte that a connection may need to bring what was sent: lost segments are sent again after 0.2 s, 0.4 s, 0.8 s ...
+SILENCE = 10.0
 
 
 class TcpTransport(StreamTransport):
@@ -25,6 +27,8 @@ class TcpTransport(StreamTransport):
     Raises:
         SourceError: where nobody answers.
     """
+
+    silence = SILENCE
 
     def __init__(self, label: str, host: str, port: int, *, sensor: Sensor | None = None) -> None:
         super().__init__(label, sensor)

@@ -11,6 +11,7 @@ frame is then interpreted by construct.
 
 from __future__ import annotations
 
+import bisect
 import contextlib
 import functools
 import math
@@ -354,6 +355,76 @@ class _Node:
 Group = tuple[Layout | Refused, NDArray[np.intp]]
 
 
+@dataclass(frozen=True)
+class _Told:
+    """Which values of a header field the layout tells apart: all from `low` to `high`, or `keys` and any other.
+
+    A header may claim any of some billion lengths, or have any key, and garbage does: those that mean the same are one branch.
+    """
+
+    low: int
+    high: int
+    keys: frozenset[int] = frozenset()
+    other: int = 0
+
+    @classmethod
+    def of(cls, info: tree.FieldInfo, root: tree.Node, limit: int) -> _Told:
+        """What the formulas of a frame tell apart of a field; all its values, where that is not seen from their form."""
+        (low, high), known = info.limits, list(tree.nodes(root))
+        asking = [(node, formula) for node in known for formula in tree.formulas(node) if _asks(formula, info)]
+        if any(own.rebuilt is not None and _asks(own.rebuilt, info) for node in known for own in tree.infos(node)):
+            return cls(low, high)
+        if all(isinstance(node, tree.Select) and isinstance(formula, tree.Ref) for node, formula in asking):
+            keys = frozenset(key for node, _ in asking if isinstance(node, tree.Select) for key, _ in node.cases if low <= key <= high)
+            other = next((value for value in range(low, high + 1) if value not in keys), None)
+            return cls(low, high) if other is None else cls(low, high, keys, other)
+        if high - low < 1 << 62 and all(isinstance(node, tree.Repeat | tree.Blob) and _rises(formula) for node, formula in asking):
+            values, spans = range(low, high + 1), []
+            for _, formula in asking:
+                count = functools.partial(_with_value, formula)
+                spans.append((bisect.bisect_left(values, 0, key=count) - 1, bisect.bisect_right(values, limit, key=count)))
+            return cls(max(min(first for first, _ in spans) + low, low), min(max(last for _, last in spans) + low, high))
+        return cls(low, high)
+
+    def one(self, value: int) -> int:
+        """The value that stands for one that means the same."""
+        if self.keys:
+            return value if value in self.keys else self.other
+        return min(max(value, self.low), self.high)
+
+    def all(self, values: NDArray[Any]) -> NDArray[Any]:
+        """Those that stand for many, of their shape and type."""
+        if self.keys:
+            return np.where(np.isin(values, np.array(list(self.keys), values.dtype)), values, values.dtype.type(self.other))
+        return np.asarray(np.clip(values, self.low, self.high))
+
+
+def _asks(formula: tree.Formula, info: tree.FieldInfo) -> bool:
+    """Whether a formula may ask for a field; nobody knows all that Python asks for."""
+    match formula:
+        case tree.Op():
+            return any(_asks(arg, info) for arg in formula.args)
+        case tree.Ref():
+            return formula.path == info.path
+    return isinstance(formula, tree.Code)
+
+
+def _rises(formula: tree.Formula) -> bool:
+    """Whether a formula is of one field, and never falls as that grows."""
+    match formula:
+        case tree.Ref() | tree.Op("+", (int(), tree.Ref())):
+            return True
+        case tree.Op("+" | "-" | "*" | "//" | ">>" as symbol, (first, int() as second)):
+            return _rises(first) and (second > 0 or symbol in "+-")
+    return False
+
+
+def _with_value(formula: tree.Formula, value: int) -> int:
+    """A formula of one field, where that has this value."""
+    ref, *_ = tree.refs(formula)
+    return int(tree.evaluated(formula, lambda _: (ref.info, value)))
+
+
 def rows_at(buffer: NDArray[np.uint8], offsets: NDArray[np.intp], size: int, *, gathered: bool = True) -> NDArray[np.uint8]:
     """`size` bytes from each of these offsets on, one a row, (n, size); no copy where they stand back to back.
 
@@ -383,6 +454,7 @@ class HeaderTree:
     def __init__(self, frame: tree.Node, limit: int) -> None:
         self._frame, self._limit = frame, limit
         self._root, self._size = _Node(), 0
+        self._told: dict[str, _Told] = {}
 
     def classify(self, buffer: NDArray[np.uint8], offsets: NDArray[np.intp]) -> list[Group]:
         """The candidates at `offsets`, sorted by layout: (layout or refusal, indices) for each, without those whose header is cut off."""
@@ -415,7 +487,7 @@ class HeaderTree:
         """The layout of one frame, or None where its header is not all there."""
         node: _Node | None = self._root
         while node is not None and node.leaf is not None and node.leaf.offset + node.leaf.size <= len(frame):
-            node = node.children.get(node.leaf.scalar(frame))
+            node = node.children.get(self._value(node.leaf, frame))
         if node is not None and node.result is not None:
             return node.result
         groups = self.classify(np.frombuffer(frame, np.uint8), np.zeros(1, np.intp))
@@ -426,7 +498,7 @@ class HeaderTree:
         found, node = [], self._root
         while node.leaf is not None:
             found.append(node.leaf)
-            node = node.children[node.leaf.scalar(frame)]
+            node = node.children[self._value(node.leaf, frame)]
         return found
 
     def choose(self, source: random.Random, drawn: Mapping[str, Draw] | None = None) -> tuple[Layout, dict[str, int]]:
@@ -461,10 +533,20 @@ class HeaderTree:
         which = which if there.all() else which[there]
         if not len(which):
             return []
-        values = leaf.at(leaf.offset).load(rows_at(buffer, offsets[which] + leaf.offset, leaf.size))
+        values = self._telling(leaf).all(leaf.at(leaf.offset).load(rows_at(buffer, offsets[which] + leaf.offset, leaf.size)))
         if np.count_nonzero(values == values[0]) == len(values):
             return [(node.children.setdefault(values.item(0), _Node()), which)]
         return [(node.children.setdefault(value, _Node()), which[places]) for value, places in by_value(values, FEW)]
+
+    def _value(self, leaf: Leaf, frame: bytes) -> int:
+        """The value of a header field of a frame, or the one that stands for it."""
+        return self._telling(leaf).one(leaf.scalar(frame))
+
+    def _telling(self, leaf: Leaf) -> _Told:
+        path = leaf.info.path
+        if path not in self._told:
+            self._told[path] = _Told.of(leaf.info, self._frame, self._limit)
+        return self._told[path]
 
     def _explore(self, sample: NDArray[np.uint8]) -> None:
         """Find the layout of one sample, and add the fields that decide it to the tree; as far as the sample goes."""
@@ -478,7 +560,7 @@ class HeaderTree:
             elif leaf.offset + leaf.size > len(frame):
                 break
             else:
-                values[leaf.info.path] = value = leaf.scalar(frame)
+                values[leaf.info.path] = value = self._value(leaf, frame)
                 node = node.children.setdefault(value, _Node())
 
     def _next(self, values: Mapping[str, int]) -> tuple[Leaf | None, Layout | Refused | None]:

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 import os
+import socket
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -106,6 +107,32 @@ def test_a_frame_is_out_when_the_line_falls_silent(line: Port) -> None:
         line.send(prefix + frame)
         assert len(packets(device, 1)[0]) == 1
         assert device.stats.pending == 0
+
+
+def test_a_pause_inside_a_frame_costs_it_on_a_line_and_not_over_tcp(line: Port, tmp_path: Path) -> None:
+    """TCP brings every byte, a lost segment 0.2 s later or more; what a serial line has lost never comes."""
+    first, second = turning(TURNING, 2)
+    recorded = tmp_path / "turn.lsr"
+    with (
+        socket.create_server(("127.0.0.1", 0)) as server,
+        ls.open(f"tcp://127.0.0.1:{server.getsockname()[1]}", TURNING, start=False, record=recorded) as device,
+        server.accept()[0] as peer,
+    ):
+        _paused(peer.sendall, first, second)
+        assert sum(map(len, packets(device, 2))) == 2
+    with ls.open(recorded, TURNING) as again:
+        assert sum(map(len, again.packets())) == 2
+    with ls.open(f"serial://{line.name}", TURNING, start=False) as device:
+        _paused(line.send, first, second)
+        assert sum(map(len, packets(device, 1))) == 1
+        assert device.stats.bytes_skipped == len(first)
+
+
+def _paused(send: Callable[[bytes], object], first: bytes, second: bytes) -> None:
+    """Send two frames, with a pause in the first."""
+    send(first[:5])
+    time.sleep(0.4)
+    send(first[5:] + second)
 
 
 def test_silence_is_noticed_and_told(line: Port) -> None:

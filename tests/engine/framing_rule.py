@@ -5,6 +5,7 @@ They are functions, not tests, so that parsers with a mistake put in on purpose 
 
 from __future__ import annotations
 
+from lidarspec import Sensor
 from lidarspec.testing import subject as material
 from lidarspec.testing.agreement import cuts
 from lidarspec.testing.subject import Subject
@@ -26,11 +27,16 @@ def any_split_gives_the_same(subject: Subject) -> None:
     """Every 2-way split, byte by byte, and random splits give the same frames and counters."""
     sensor, source = subject.sensor, subject.source("splits")
     data = material.mutated(subject.stream(rounds=1), source) + subject.stream(seed=1, rounds=1)
-    books = Books(sensor).feed(data)
-    expected, whole = books.finish(), books.decoder
     splits = [[data[:spot], data[spot:]] for spot in material.places(len(data), source)]
     splits += [list(material.pieces(data, source)) for _ in range(20)]
-    for split in [*splits, [data[spot : spot + 1] for spot in range(len(data))]]:
+    _same_in_pieces(sensor, data, [*splits, [data[spot : spot + 1] for spot in range(len(data))]])
+
+
+def _same_in_pieces(sensor: Sensor, data: bytes, splits: list[list[bytes]]) -> None:
+    """Fail unless each split of a stream gives the frames and counters of the whole."""
+    books = Books(sensor).feed(data)
+    expected, whole = books.finish(), books.decoder
+    for split in splits:
         parts = Books(sensor)
         for chunk in split:
             parts.feed(chunk)
@@ -83,6 +89,21 @@ def noise_is_cut_as_the_rule_says(subject: Subject) -> None:
     hold(subject, data, "noise made of headers")
 
 
+def what_is_looked_for_may_change_with_every_frame(subject: Subject, length: int = LENGTH) -> None:
+    """Announcements in any order, frames behind their own and behind others', whole, cut off and damaged, in one piece and in many."""
+    sensor, source = subject.sensor, subject.source("changes")
+    named = sorted({frame.after for frame in sensor.incoming.values() if frame.after})
+    parts, size = list[bytes](), 0
+    while named and size < length:
+        name = source.choice([*sensor.incoming, *named, *named])
+        frame = subject.example(name, seed=source.randrange(6)) * source.choice((1, sensor.frames[name].confirm))
+        parts.append(source.choice((frame, frame, frame[: source.randint(1, 5)], material.mutated(frame, source))))
+        size += len(parts[-1])
+    data = b"".join(parts)
+    hold(subject, data, "announcements in any order")
+    _same_in_pieces(sensor, data, [list(material.pieces(data, source)) for _ in range(10)])
+
+
 def the_longest_frame_is_a_frame(subject: Subject) -> None:
     """The longest of many examples is found in a stream."""
     for name in subject.sensor.incoming:
@@ -129,6 +150,7 @@ RULES = (
     a_claimed_length_is_not_believed,
     the_start_of_a_header_is_looked_for_at_every_byte,
     noise_is_cut_as_the_rule_says,
+    what_is_looked_for_may_change_with_every_frame,
     the_longest_frame_is_a_frame,
     idle_gives_up_what_waits,
     decoders_do_not_know_of_each_other,

@@ -39,6 +39,10 @@ def test_every_recoverable_frame_of_every_sensor_is_recovered(sensor: Sensor) ->
     rule.every_recoverable_frame_is_recovered(Subject(sensor), FEW)
 
 
+def test_what_a_sensor_announces_may_change_with_every_frame() -> None:
+    rule.what_is_looked_for_may_change_with_every_frame(Subject(INSTALLED["slamtec-rplidar-s2"]), 4000)
+
+
 @pytest.mark.parametrize("holds", rule.RULES, ids=lambda holds: holds.__name__)
 def test_a_parser_without_a_mistake_keeps_the_rule(holds: Callable[[Subject], None]) -> None:
     holds(Subject(mutants.read_by(mutants.Parser)))

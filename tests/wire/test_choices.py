@@ -10,6 +10,7 @@ from construct import (
     Array,
     BitsInteger,
     BitStruct,
+    Bytes,
     Const,
     Enum,
     GreedyBytes,
@@ -64,6 +65,24 @@ def test_named_values_choose_as_in_construct(name: str) -> None:
     frames = {bytes([head, *source.randbytes(size)]) for head in (*range(10), 0x21, 0x22, 255) for size in range(1, 6) for _ in range(3)}
     examples = {ours.example("data", seed=seed) for seed in range(20)}
     assert agree(struct, sorted(frames | examples)) > len(examples) / 2
+
+
+def test_headers_that_mean_the_same_have_one_layout() -> None:
+    """Some billion lengths are too long alike, and some billion keys are no key: garbage has a new one in each header."""
+    body = Switch(this.key, {5: Int8ub, 70_000: Int16ub}, default=Struct("data" / Bytes(this._.length * 2 - 3)))
+    ours = sensor(Struct("length" / Int32ub, "key" / Int32ub, "body" / body, "tail" / Array(this.length + 1, Int16ub)), max_length=100)
+    engine, source = codec(ours.frames["data"]), random.Random(1)
+    assert isinstance(engine, CompiledCodec)
+    found = set[object]()
+    for number in range(3000):
+        length = source.choice((number % 60, source.randrange(1 << 32)))
+        key = source.choice((5, 70_000, number, source.randrange(1 << 32)))
+        layout = engine.tree.layout(length.to_bytes(4) + key.to_bytes(4))
+        size = 10 + 2 * length + {5: 1, 70_000: 2}.get(key, 2 * length - 3)
+        is_frame = size <= 100 and (length > 1 or key in (5, 70_000))
+        assert getattr(layout, "size", None) == (size if is_frame else None), (length, key)
+        found.add(layout)
+    assert len(found) < 200, "frames of each length for three kinds of keys, and the refused"
 
 
 def test_a_number_is_built_as_its_name_is() -> None:
