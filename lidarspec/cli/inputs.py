@@ -262,10 +262,11 @@ def fits_instead(sensor: Sensor, source: str) -> tuple[str, str] | None:
 
 
 class Patience:
-    """The time in which a live source has to send its first frame."""
+    """The time in which a live source has to send its first data frame, or first one of another type."""
 
-    def __init__(self, device: Device, source: str) -> None:
+    def __init__(self, device: Device, source: str, frame: str | None = None) -> None:
         self._device, self._source, self._began = device, source, time.monotonic()
+        self._awaited = device.sensor.data_frames if frame is None else (frame,)
 
     def check(self) -> None:
         """Nothing, while there is hope.
@@ -274,12 +275,12 @@ class Patience:
             CommandError, WireError: where the device has sent nothing, or nothing of the sensor's, for too long.
         """
         waited = time.monotonic() - self._began
-        if waited > PATIENCE and self._device.is_live and not self._device.stats.frames:
+        if waited > PATIENCE and self._device.is_live and not any(name in self._device.stats.frames for name in self._awaited):
             raise nothing_came(self._device, self._source, waited)
 
 
 def scans_of(device: Device, source: str) -> Iterator[Scan]:
-    """The scans of a device, which has to send its first frame in time.
+    """The scans of a device, which has to send its first data frame in time.
 
     Raises:
         CommandError, WireError: where the device has sent nothing, or nothing of the sensor's, for too long.

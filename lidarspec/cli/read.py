@@ -79,7 +79,7 @@ def read(
         if frame is not None and frame not in device.sensor.frames:
             raise UnknownFrame(frame, device.sensor.frames, place=device.sensor.id)
         until = time.monotonic() + duration if duration else math.inf
-        patience = Patience(device, source)
+        patience = Patience(device, source, frame)
         rows = _packets(device, frame, until, patience) if whole or frame else _points(device, until, patience, every_point=every_point)
         printed = 0
         for line in _lines(itertools.islice(rows, count), as_json=as_json):

@@ -24,7 +24,7 @@ from lidarspec.plugins import registry, sensor as named_sensor
 from lidarspec.recording.recorders import SUFFIXES
 from lidarspec.scans.scans import Scan
 from lidarspec.simulation.device import SimulatedDevice
-from lidarspec.simulation.faults import Faults
+from lidarspec.simulation.faults import BLOCKED, Faults
 from lidarspec.simulation.scenes import read_scene
 from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.outlets import HERE, Outlet, has_terminals, simulated_outlet
@@ -51,6 +51,7 @@ WIDEST, HIGHEST, SUMMARY = 100, 42, 8
 @click.option("--reorder", type=click.IntRange(0, 1000), default=0, show_default=True, help="How many places late a datagram may come.")
 @click.option("--unplug", type=DURATION, help="Pull the plug after so long, again and again.")
 @click.option("--absent", type=DURATION, default="2s", show_default=True, help="How long it is out then.")
+@click.option("--rotor", type=click.Choice([BLOCKED]), help="It does not turn.")
 @click.option("--force", is_flag=True, help="Write over a file that exists.")
 @click.option("--json", "as_json", is_flag=True, help="Print as JSON where the sensor is.")
 def sim(
@@ -66,6 +67,7 @@ def sim(
     reorder: int,
     unplug: float | None,
     absent: float,
+    rotor: str | None,
     force: bool,
     as_json: bool,
 ) -> None:
@@ -75,7 +77,7 @@ def sim(
     output, all else to standard error.
     """
     sensor = named_sensor(sensor_id)
-    faults = Faults(errors, loss, reorder, unplug or 0.0, absent)
+    faults = Faults(errors, loss, reorder, unplug or 0.0, absent, rotor or "")
     seen = read_scene(scene) if scene is not None else None
     device = SimulatedDevice(sensor, scene=seen, seed=seed, rate=rate_of(rate), faults=faults)
     place = to or ("udp://" if sensor.datagrams else "pty")

@@ -141,10 +141,11 @@ class Device(Closing):
     @property
     def warnings(self) -> list[str]:
         """What is to be said about the source now: a file that is cut off, silence, a likely wrong baud rate, a small buffer, frames
-        that are another sensor's, a nominal calibration; and what the plugin failed at."""
+        that are another sensor's, scans without an end, a nominal calibration; and what the plugin failed at."""
         failure = self.stats.failure(self.sensor.id)
         nominal = [_nominal(self.sensor)] if self.stats.nominal else []
-        return [*self._input.warnings, *self._doubts(), *nominal, *([] if failure is None else [str(failure)])]
+        unended = [f"{self._source}: {self.stats.unended}"] if self.stats.unended else []
+        return [*self._input.warnings, *self._doubts(), *unended, *nominal, *([] if failure is None else [str(failure)])]
 
     @property
     def state(self) -> str:
@@ -175,16 +176,17 @@ class Device(Closing):
 
         Args:
             frame: the name of a frame type.
-            wait: yield a batch of no packets where nothing has come for so many seconds, so that the caller has a turn.
+            wait: yield a batch of no packets where none have come for so many seconds, so that the caller has a turn.
 
         Raises:
             SourceError: where a file has been read to its end before.
         """
-        reader, ahead = self._reader(frame), self._taken_back()
+        reader, ahead, turn = self._reader(frame), self._taken_back(), time.monotonic()
         for arrival in self._arrivals(wait, ahead):
-            packets = reader.none() if arrival is None else reader.last if arrival is ahead and frame is None else reader.add(arrival)
-            if packets is not None and (len(packets) or arrival is None):
-                yield packets
+            packets = None if arrival is None else reader.last if arrival is ahead and frame is None else reader.add(arrival)
+            if (packets is not None and len(packets)) or arrival is None or (wait is not None and time.monotonic() - turn >= wait):
+                yield reader.none() if packets is None else packets
+                turn = time.monotonic()
 
     @overload
     def scans(self) -> Iterator[Scan]: ...
@@ -195,21 +197,26 @@ class Device(Closing):
     def scans(self, *, wait: float | None = None) -> Iterator[Any]:
         """Every scan; the first and last piece, and those before and after an interruption, are marked ``complete=False``.
 
+        Where a scan does not end within twice the slowest turn, what there is of it is handed out, and `warnings` says so.
+
         A file is read once, whoever reads it. After `latest` they begin with the batch in which its scan was found.
 
         Args:
-            wait: yield None where nothing has come for so many seconds, so that the caller has a turn.
+            wait: yield None where no scan has come for so many seconds, so that the caller has a turn.
 
         Raises:
             SourceError: where a file has been read to its end before.
         """
-        stream, reader, ahead = ScanStream(self.sensor, self.mount), self._reader(None), self._taken_back()
+        stream, reader, ahead, turn = ScanStream(self.sensor, self.mount), self._reader(None), self._taken_back(), time.monotonic()
         for arrival in self._arrivals(wait, ahead):
-            if arrival is None:
+            for scan in () if arrival is None else reader.scans(stream, arrival, read=arrival is ahead):
+                yield scan
+                del scan  # nobody is to keep it but the caller
+                turn = time.monotonic()
+            if wait is not None and (arrival is None or time.monotonic() - turn >= wait):
                 yield None
-                continue
-            yield from reader.scans(stream, arrival, read=arrival is ahead)
-            stream = ScanStream(self.sensor, self.mount) if arrival.interrupted else stream
+                turn = time.monotonic()
+            stream = ScanStream(self.sensor, self.mount) if arrival is not None and arrival.interrupted else stream
         yield from stream.finish()
 
     def latest(self, timeout: float | None = None) -> Scan:
@@ -240,13 +247,13 @@ class Device(Closing):
             if self._input.ended:
                 raise SourceError(f"{self._source}: no further scan, since the input is {self._input.state}")
             arrival = self._next(max(deadline - time.monotonic(), 0.0))
-            if arrival is None and time.monotonic() >= deadline:
-                return None
             if arrival is not None:
                 found = [scan for scan in reader.scans(self._latest, arrival) if scan.complete]
                 self._ahead = arrival if found and not self.is_live else None
                 self._unseen += found
                 self._latest = ScanStream(self.sensor, self.mount) if arrival.interrupted else self._latest
+            if not self._unseen and time.monotonic() >= deadline and (arrival is None or self._input.caught_up(mark)):
+                return None
         if not self.is_live:
             return self._unseen.popleft()
         newest = self._unseen[-1]

@@ -53,6 +53,7 @@ class Counters:
         unread: bytes of a damaged file that could not be read.
         plugin_errors: packets, or candidates, at which a function of the plugin raised; `failures` keeps the first ones.
         nominal: whether a default calibration stood in for the sensor's own in any scan.
+        unended: what to say of scans that were handed out without an end; "" where there were none.
     """
 
     bytes_in: int = 0
@@ -75,6 +76,7 @@ class Counters:
     unread: int = 0
     failures: list[PluginError] = field(default_factory=list, repr=False, compare=False)
     nominal: bool = field(default=False, repr=False, compare=False)
+    unended: str = field(default="", repr=False, compare=False)
 
     def to_dict(self) -> dict[str, Any]:
         """The counters by name."""

@@ -18,7 +18,14 @@ from lidarspec.points.evaluate import guarded
 from lidarspec.points.plain import Evaluated
 from lidarspec.scans.cutter import Cutter, first_points
 from lidarspec.spec.description import Spec
-from lidarspec.spec.timing import OnFlag
+from lidarspec.spec.links import Serial
+from lidarspec.spec.timing import Every, OnFlag, OnWrap, Split
+from lidarspec.wire.arrays import alike
+
+#: seconds that a turn takes at the slowest where no sensor says so; of a scan at least where packets bear the host's time, which may pause.
+SLOWEST, UNTIMED = 1.0, 1.0
+#: bytes of a scan at the most where neither points nor a line say so, and packets looked at together.
+LARGEST, TOGETHER = 1 << 26, 1024
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,6 +174,74 @@ class Losses:
         return np.maximum(missing, 0, out=missing)
 
 
+class Limits:
+    """How long and how large a scan may become whose end does not come: the rotor may be blocked, or the start of a scan be missing.
+
+    Twice the slowest turn, by the packets' time; and twice the points of a scan where their number is constant, else the bytes that a
+    serial line carries in that time, else `LARGEST`.
+    """
+
+    def __init__(self, sensor: Spec) -> None:
+        rule, link = sensor.scan, sensor.links.get("data")
+        turn = rule.seconds if isinstance(rule, Every) else 1 / sensor.turn[0] if sensor.turn else SLOWEST
+        self.seconds = 2 * turn if sensor.clock is not None else max(2 * turn, UNTIMED)
+        self._longest, self._by_points = int(self.seconds * 1e9), sensor.beams is not None
+        self._most = 2 * sensor.beams if sensor.beams else self.seconds * link.baud / 10 if isinstance(link, Serial) else LARGEST
+        self._reason, self._has_ended = _without_end(rule), False
+        self._since = self._last = 0  # times of the first and the last packet of the scan under way, ns
+        self._held: float = 0  # what there is of it
+
+    def overdue(self, packets: Packets, points: Evaluated, cuts: Sequence[int]) -> list[int]:
+        """Before which points to cut because no end came in time, beside those where one did."""
+        times, sizes = packets.time_ns[: points.ready], packets.table.sizes[: points.ready]
+        first = first_points(points) if len(cuts) or self._by_points else sizes
+        if self._by_points:
+            sizes = np.diff(first, append=source_of(points.cloud).size)
+        found, start = list[int](), 0
+        for cut in cuts:
+            edge = int(np.searchsorted(first, cut, side="right")) - 1
+            found += self._without_end(packets, times, sizes, start, edge)
+            self._held, start = 0, edge
+        if len(cuts) and not self._has_ended:  # a rotor that spins up
+            packets.stats.unended, self._has_ended = "", True
+        found += self._without_end(packets, times, sizes, start, len(times))
+        return first_points(points)[found].tolist() if found else []
+
+    def _without_end(self, packets: Packets, times: NDArray[np.int64], sizes: NDArray[np.intp], start: int, stop: int) -> list[int]:
+        """Before which packets of a part of one scan it has become too long, or too large."""
+        found = list[int]()
+        if start < stop:
+            self._since = self._since if self._held else times.item(start)
+            farthest = max(int(times[start:stop].max()) - self._since, self._since - int(times[start:stop].min()))
+            held = self._held + (int(sizes[start:stop].sum()) if (size := alike(sizes)) is None else size * (stop - start))
+            if farthest <= self._longest and held <= self._most:
+                self._held, start = held, stop
+        while start < stop:
+            part = slice(start, min(start + TOGETHER, stop))
+            self._since = self._since if self._held else times.item(start)
+            sums = self._held + np.cumsum(sizes[part])
+            over = (np.abs(times[part] - self._since) > self._longest) | (sums > self._most)
+            over[0] &= bool(self._held)
+            spot = int(over.argmax())
+            if not over[spot]:
+                start, self._held = part.stop, float(sums[-1])
+                continue
+            start, self._held = start + spot, 0
+            found.append(start)
+            step = times.item(start) - (times.item(start - 1) if start else self._last)
+            if abs(step) < self._longest / 2:  # else nothing came for so long
+                packets.stats.unended = f"{self._reason} within {self.seconds:.3g} s"
+        self._last = times.item(stop - 1) if stop else self._last
+        return found
+
+
+def _without_end(rule: Split) -> str:
+    """What did not come where a scan has no end."""
+    if isinstance(rule, OnWrap):
+        return f"the angle does not pass {rule.at:g} ({rule.name}): is the rotor blocked? No scan has ended"
+    return f"no scan has begun or ended by {'time' if isinstance(rule, Every) else rule.name}"
+
+
 class ScanStream:
     """Scans out of batches of packets; remembers what the next batch needs.
 
@@ -186,6 +261,7 @@ class ScanStream:
         self._epoch: int | None = None
         self._losses = Losses(sensor)
         self._begins: int | None = None  # time of the first point of the scan under way, ns, where it is known
+        self._limits = Limits(sensor)
 
     def add(self, packets: Packets) -> list[Scan]:
         """The scans that these packets complete."""
@@ -215,16 +291,18 @@ class ScanStream:
         return list(self._cut(packets, points))
 
     def _cut(self, packets: Packets, points: Evaluated) -> Iterator[Scan]:
-        start, source, cuts = 0, source_of(points.cloud), self._cutter.cuts(packets, points)
+        start, source, seen = 0, source_of(points.cloud), self._cutter.cuts(packets, points)
+        overdue = set(self._limits.overdue(packets, points, seen)).difference(seen)
+        cuts = sorted([*seen, *overdue]) if overdue else seen
         first, *times = _times_ns(source, [0, *cuts])
         self._begins = first if self._begins is None else self._begins
         mostly_there = self._losses.judged(packets, points, cuts)
         for cut, ends, is_there in zip(cuts, times, mostly_there, strict=True):
             self._take(source, start, cut)
-            scan = self._close(ends, complete=self._started and is_there)
+            scan = self._close(ends, complete=self._started and is_there and cut not in overdue)
             self._begins = ends
             if scan is not None:
-                self._started = True
+                self._started = cut not in overdue
                 yield scan
             start = cut
         self._take(source, start, source.size)

@@ -337,7 +337,7 @@ class SimulatedDevice:
         self._stream = _Stream(self._simulation(frame), frame, self._scene, at)
 
     def _simulation(self, frame: str) -> Simulation:
-        made = simulation(self.sensor, frame)
+        made = simulation(self.sensor, frame, blocked=bool(self.faults.rotor))
         if not made.interval:
             raise SpecError("nothing says how often it is sent: declare its `rate`", path=frame, sensor=self.sensor.id)
         return made

@@ -1,4 +1,5 @@
-"""What goes wrong between a simulated sensor and its reader, on request: damaged bytes, lost and reordered packets, a pulled plug.
+"""What goes wrong with a simulated sensor, and between it and its reader, on request: damaged bytes, lost and reordered packets, a
+pulled plug, a blocked rotor.
 
 The same seed does the same harm to the same packets, however they are cut into batches.
 """
@@ -17,6 +18,8 @@ from lidarspec.spec.fields import duration, share
 
 #: share of the datagrams that come late where any are reordered.
 LATE = 0.1
+#: what a rotor can be that does not turn.
+BLOCKED = "blocked"
 
 
 @dataclass(frozen=True)
@@ -30,9 +33,11 @@ class Faults:
         reorder: how many places late a datagram may come, one in ten does.
         unplug: seconds after which the sensor is unplugged, again and again; 0: never.
         absent: seconds that it is away then.
+        rotor: "blocked": it does not turn, and the angles stay as they are; "" where it does.
 
     Raises:
         OutOfRange: for a share that is none, or a negative number.
+        UsageError: for a rotor that is something else.
     """
 
     errors: float = 0.0
@@ -40,12 +45,15 @@ class Faults:
     reorder: int = 0
     unplug: float = 0.0
     absent: float = 2.0
+    rotor: str = ""
 
     def __post_init__(self) -> None:
         for name, high in (("errors", 1.0), ("loss", 1.0), ("reorder", 1000), ("unplug", math.inf), ("absent", math.inf)):
             value = getattr(self, name)
             if not 0 <= value <= high:
                 raise OutOfRange(name, value, 0, high, place="faults")
+        if self.rotor not in ("", BLOCKED):
+            raise UsageError(f"the rotor turns, or is {BLOCKED!r}, not {self.rotor!r}")
 
 
 def faults_of(options: Mapping[str, str]) -> Faults:
@@ -54,7 +62,7 @@ def faults_of(options: Mapping[str, str]) -> Faults:
     Raises:
         UsageError: for a value that is not of its kind.
     """
-    read: dict[str, Any] = {"errors": share, "loss": share, "reorder": int, "unplug": duration, "absent": duration}
+    read: dict[str, Any] = {"errors": share, "loss": share, "reorder": int, "unplug": duration, "absent": duration, "rotor": str}
     values = {}
     for name, text in options.items():
         try:

@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from lidarspec.columns.columns import Batch, Column, Fields, of_points
 from lidarspec.errors import SpecError, UsageError, plugin_errors
 from lidarspec.framing.examples import example
+from lidarspec.framing.frame_engine import codec
 from lidarspec.packets.clocks import clock_ns
 from lidarspec.simulation.frame_maker import FrameMaker, sealed
 from lidarspec.simulation.scenes import Room, Scene
@@ -32,6 +33,7 @@ from lidarspec.spec.description import Spec
 from lidarspec.spec.fields import factor
 from lidarspec.spec.links import Serial
 from lidarspec.spec.results import Polar
+from lidarspec.spec.timing import Every
 from lidarspec.spec.tree import exact
 from lidarspec.wire.frame_table import Rows
 
@@ -326,6 +328,9 @@ class Block:
 class Simulation:
     """A data frame type of a sensor, ready to be simulated.
 
+    Args:
+        blocked: whether the rotor stands still: angles, and what else a scan is cut by, stay as in the second frame.
+
     Attributes:
         interval: ns from one packet to the next, on average; 0 where the spec says nothing of time.
 
@@ -334,12 +339,13 @@ class Simulation:
         SpecError: where its ranges cannot be traced back to fields.
     """
 
-    def __init__(self, sensor: Spec, frame: str) -> None:
+    def __init__(self, sensor: Spec, frame: str, *, blocked: bool = False) -> None:
         sweep = sensor.simulation_of(frame).sweep
         if sweep is None:
             raise UsageError(f"{sensor.id} declares no sweep for {frame!r} frames, and cannot be simulated")
         self._sensor, self._frame, self._sweep = sensor, frame, sweep
         self._maker = FrameMaker(sensor, frame)
+        self._stuck = self._turning(sweep(1)) if blocked else {}
         swept = self._swept(range(PROBED))
         table = self._maker.table(swept)
         self._measurement = Measurement(sensor, frame, table, {path for values in swept for path in values})
@@ -360,13 +366,19 @@ class Simulation:
     def _swept(self, numbers: range) -> list[Mapping[str, Any]]:
         """The values of the packets of these numbers, before anything is measured."""
         with plugin_errors(f"sweep of {self._frame}", self._sensor.id, self._sweep):
-            return [self._sweep(number) for number in numbers]
+            return [{**self._sweep(number), **self._stuck} for number in numbers]
+
+    def _turning(self, values: Mapping[str, Any]) -> dict[str, Any]:
+        """Those of a frame's values that change because the rotor turns."""
+        fields, rule = codec(self._sensor.frames[self._frame]).schema.fields, self._sensor.scan
+        cut_by = "" if isinstance(rule, Every) else rule.name
+        return {path: value for path, value in values.items() if path == cut_by or fields[path].unit in ("deg", "rad")}
 
 
 @functools.lru_cache(maxsize=64)
-def simulation(sensor: Spec, frame: str) -> Simulation:
+def simulation(sensor: Spec, frame: str, *, blocked: bool = False) -> Simulation:
     """The simulation of a data frame type; kept, since it takes a while to find out how a sensor carries its ranges."""
-    return Simulation(sensor, frame)
+    return Simulation(sensor, frame, blocked=blocked)
 
 
 def simulate(sensor: Spec, packets: int = 100, *, start: int = 0, scene: Scene | None = None) -> list[bytes]:

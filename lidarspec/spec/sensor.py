@@ -201,8 +201,10 @@ class Sensor(Spec):
         return self._followed(scans_of(self, [packets]), packets)
 
     def _followed(self, scans: Iterator[Scan], packets: Packets) -> Iterator[Scan]:
-        """Scans, and behind them what the plugin failed at."""
+        """Scans, and behind them what the plugin failed at, and that they have no end."""
         yield from scans
+        if packets.stats.unended:
+            warnings.warn(f"{self.id}: {packets.stats.unended}", stacklevel=2)
         if (failure := packets.stats.failure(self.id)) is not None:
             warnings.warn(str(failure), stacklevel=2)
 

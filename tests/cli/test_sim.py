@@ -137,3 +137,10 @@ def test_a_link_that_stands_already_is_the_systems_fault(tmp_path: Path) -> None
 def test_a_duration_reads_the_same_as_an_option_and_in_a_source(text: str) -> None:
     assert DURATION.convert(text, None, None) == duration(text) == faults_of({"unplug": text}).unplug
     assert connect(Address.parse(f"sim:ldrobot-stl27l?unplug={text}")).device.faults.unplug == duration(text)
+
+
+def test_a_blocked_rotor_is_simulated_and_said_at_the_end_of_its_file(tmp_path: Path) -> None:
+    path = tmp_path / "blocked.bin"
+    ran("sim", "ldrobot-ld06", "--rotor", "blocked", "--to", path, "-t", "1.5s")
+    done = ran("convert", path, tmp_path / "points.csv", "-s", "ldrobot-ld06")
+    assert "the angle does not pass 0 (azimuth): is the rotor blocked? No scan has ended within 0.4 s" in " ".join(done.stderr.split())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import os
 import socket
 import sys
@@ -554,3 +555,22 @@ def test_what_fails_while_opening_leaves_nothing_behind(tmp_path: Path, line: Po
     with pytest.raises(UsageError):
         ls.open(f"serial://{line.name}", TURNING, backend="magic")
     assert (len(os.listdir("/dev/fd")), threading.active_count()) == (before, threads)
+
+
+@pytest.mark.parametrize("given", ["scans", "packets"])
+def test_the_caller_has_its_turn_though_something_else_comes_all_the_time(given: str) -> None:
+    """No scan ends where the rotor is blocked, and frames of another type are no packets of the data."""
+    with ls.open("sim:slamtec-rplidar-a1?rotor=blocked") as device:
+        came = (device.scans if given == "scans" else lambda wait: device.packets("health", wait=wait))(wait=0.05)
+        assert all(item is None or not len(item) for item in itertools.takewhile(lambda _: device.stats.frames.get("node", 0) < 500, came))
+        assert not next(came)
+        with pytest.raises(SourceError, match="no scan in time"):
+            device.latest(0.05)
+
+
+def test_a_blocked_rotor_is_said() -> None:
+    with ls.open("sim:ldrobot-ld06?rotor=blocked&rate=max") as device:
+        scans = list(itertools.islice(device.scans(wait=1.0), 3))
+        assert [scan is not None and scan.complete for scan in scans] == [False] * 3
+        said = "the angle does not pass 0 (azimuth): is the rotor blocked? No scan has ended within 0.4 s"
+        assert device.warnings == [f"sim:ldrobot-ld06?rotor=blocked&rate=max: {said}"]
