@@ -34,8 +34,9 @@ test: $(DEVELOPERS)
 test-long: $(DEVELOPERS)
 	@LIDARSPEC_EXAMPLES=4000 $(BIN)/python -m pytest -n auto tests/sensors/test_conformance.py $(ARGS)
 
+# Every promise and every other long test, and the table in docs/explanation/reliability.md: most of an hour.
 soak: $(DEVELOPERS)
-	@$(BIN)/python -m pytest -m soak $(ARGS)
+	@$(BIN)/python -m tests.soak $(ARGS)
 
 # Hostile input for everything that reads; the same command goes on where it was stopped. 10,000,000 inputs take about two hours on two cores.
 fuzz: $(FUZZERS)
@@ -96,5 +97,5 @@ $(PEERS): $(USERS)
 	@touch $@
 
 $(FUZZERS): $(DEVELOPERS)
-	@$(PIP) install --quiet 'atheris>=3.0' || echo "atheris cannot be installed here: inputs are chosen by seed and by the lines that a sample reaches" >&2
+	@$(PIP) install --quiet 'atheris>=3.0' || echo "atheris cannot be installed here: inputs are chosen by seed" >&2
 	@touch $@
