@@ -1,12 +1,14 @@
 # From a fresh clone, with Python 3.11 or later and a package index: `make demo` and `make test`.
 # PYTHON names the interpreter for a new environment, VENV its folder, DIST the folder for wheels, SITE that for the documentation;
-# ARGS goes to pytest or the benchmarks.
+# ARGS goes to pytest, the benchmarks or the fuzzing; INPUTS and SEED to the last alone.
 
 PYTHON ?= python3
 VENV ?= .venv
 DIST ?= dist
 SITE ?= site
 ARGS ?=
+INPUTS ?= 1000000
+SEED ?= 0
 
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check
@@ -17,9 +19,10 @@ USERS := $(VENV)/.installed
 DEVELOPERS := $(VENV)/.installed-dev
 WRITERS := $(VENV)/.installed-docs
 PEERS := $(VENV)/.installed-bench
+FUZZERS := $(VENV)/.installed-fuzz
 RECENT := import sys; sys.exit(sys.version_info < (3, 11))
 
-.PHONY: demo test test-long soak lint types docs wheels reference bench bench-here clean
+.PHONY: demo test test-long soak fuzz lint types docs wheels reference bench bench-here clean
 
 demo: $(USERS)
 	@$(BIN)/lidarspec demo -s ldrobot-stl27l
@@ -31,8 +34,13 @@ test: $(DEVELOPERS)
 test-long: $(DEVELOPERS)
 	@LIDARSPEC_EXAMPLES=4000 $(BIN)/python -m pytest -n auto tests/sensors/test_conformance.py $(ARGS)
 
+# Every promise and every other long test, and the table in docs/explanation/reliability.md: most of an hour.
 soak: $(DEVELOPERS)
-	@$(BIN)/python -m pytest -m soak $(ARGS)
+	@$(BIN)/python -m tests.soak $(ARGS)
+
+# Hostile input for everything that reads; the same command goes on where it was stopped. 10,000,000 inputs take about two hours on two cores.
+fuzz: $(FUZZERS)
+	@$(BIN)/python -m tests.fuzz --inputs $(INPUTS) --seed $(SEED) $(ARGS)
 
 lint: $(DEVELOPERS)
 	@$(BIN)/ruff check .
@@ -61,7 +69,7 @@ bench-here: $(PEERS)
 	@$(BIN)/python benchmarks/run.py $(ARGS)
 
 clean:
-	rm -rf .venv .venv-bench dist site .hypothesis .mypy_cache .pytest_cache .ruff_cache
+	rm -rf .venv .venv-bench .fuzz dist site .hypothesis .mypy_cache .pytest_cache .ruff_cache
 	find lidarspec plugins tests -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # An environment without a working pip, as a failed attempt leaves it behind, is made again.
@@ -86,4 +94,8 @@ $(WRITERS): $(USERS)
 $(PEERS): $(USERS)
 	@echo "installing what lidarspec is measured beside into $(VENV), this once"
 	@$(PIP) install --quiet --editable '.[bench]' || echo "not all of it can be installed here; the table says what is missing" >&2
+	@touch $@
+
+$(FUZZERS): $(DEVELOPERS)
+	@$(PIP) install --quiet 'atheris>=3.0' || echo "atheris cannot be installed here: inputs are chosen by seed" >&2
 	@touch $@

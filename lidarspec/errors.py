@@ -284,7 +284,9 @@ class ReplyTimeout(CommandError):
 
 @contextmanager
 def system_errors(place: object) -> Iterator[None]:
-    """What the system refuses within, an OSError, as the `SourceError` of a place, such as a path."""
+    """What the system refuses within, an OSError, as the `SourceError` of a place, such as a path; what can be none is refused at once."""
+    if "\0" in str(place):
+        raise SourceError(f"{str(place)!r}: no path has a zero byte in it")
     try:
         yield
     except OSError as error:

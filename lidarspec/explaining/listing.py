@@ -56,7 +56,7 @@ class Listing:
     def __init__(self, rows: Sequence[Row], *, every: bool) -> None:
         self._rows = rows
         self._drawn = [any(value.bits for value in row.values) and (every or row.first) for row in rows]
-        self._bytes = min(max((len(row.data) for row in rows), default=1), LINED)
+        self._bytes = min(max([1, *(len(row.data) for row in rows)]), LINED)
         pictures = [bit_picture(*part) for row, drawn in zip(rows, self._drawn, strict=True) if drawn for part in _bits(row)]
         self._left = max([3 * self._bytes - 1, *(len(picture) for picture in pictures if len(picture) <= PICTURES)])
         self._paths = min(max((len(name) for index in range(len(rows)) for name in self._names(index)), default=0), NAMES)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import random
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -44,12 +44,17 @@ def pieces(data: bytes, source: random.Random) -> Iterator[bytes]:
         start += size
 
 
-def mutated(data: bytes, source: random.Random) -> bytes:
-    """The bytes with a few of them changed, dropped, doubled or put in, or cut short."""
+def mutated(data: bytes, source: random.Random, words: Sequence[bytes] = (), spots: Sequence[int] = ()) -> bytes:
+    """The bytes with a few of them changed, dropped, doubled or put in, or cut short.
+
+    Args:
+        words: what is put in or written over as a whole, such as values at the edge of a range, or pieces of other inputs.
+        spots: where half of the changes are made, such as the offsets of fields; without them anywhere.
+    """
     found = bytearray(data)
     for _ in range(source.choice((1, 1, 2, 4))):
-        spot = source.randrange(len(found) + 1)
-        kind = source.randrange(5)
+        spot = source.choice(spots) if spots and source.random() < 0.5 else source.randrange(len(found) + 1)
+        kind = source.randrange(6 if words else 5)
         if kind == 0:
             found[spot : spot + 1] = source.randbytes(1)
         elif kind == 1:
@@ -58,8 +63,11 @@ def mutated(data: bytes, source: random.Random) -> bytes:
             found[spot:spot] = source.randbytes(source.randint(1, 3))
         elif kind == 3:
             found[spot : spot + 1] = source.choice((b"\x00", b"\xff", b"\x7f", b"\x80"))
-        else:
+        elif kind == 4:
             found[spot:spot] = found[max(spot - 4, 0) : spot]
+        else:
+            word = source.choice(words)
+            found[spot : spot + source.choice((0, len(word)))] = word
     return bytes(found)
 
 

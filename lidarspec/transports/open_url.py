@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import os
 import re
 from pathlib import Path
 from urllib.parse import parse_qs
@@ -41,7 +42,7 @@ def transport(source: str | Path, sensor: Sensor | None = None) -> Transport:
     if address is not None:
         return _opened(address, sensor)
     path, mark, query = text.rpartition("?")
-    if mark and not Path(text).exists():
+    if mark and not os.path.exists(text):
         options = parse_qs(query, keep_blank_values=True)
         unknown = set(options) - {"src"}
         if unknown:
@@ -84,16 +85,16 @@ def live_address(source: str | Path) -> Address | None:
     if is_port(text):
         return Address.parse(text, scheme="serial")
     scheme = _SCHEME.match(text)
-    return Address.parse(text) if scheme is not None and not Path(text).exists() else None
+    return Address.parse(text) if scheme is not None and not os.path.exists(text) else None
 
 
 def is_port(text: str) -> bool:
     """Whether a SOURCE without a scheme names a serial port."""
     name = text.partition("?")[0]
     path = Path(name)
-    if path.is_char_device():
+    if os.path.exists(name) and path.is_char_device():
         return path.name not in _NO_PORTS and path.resolve().name not in _NO_PORTS
-    return _PORT.fullmatch(name) is not None and not path.is_file()
+    return _PORT.fullmatch(name) is not None and not os.path.isfile(name)
 
 
 def has_control(source: str | Path) -> bool:

@@ -341,3 +341,8 @@ def test_a_value_has_the_decimals_that_its_steps_need(scale: float, offset: floa
     assert said(19_201) == shown
     assert said(19_202) != shown
     assert sensor.parse(sensor.build("data", x=float(shown), units=True)).x == 19_201
+
+
+def test_no_bytes_at_all_are_explained() -> None:
+    listing = str(explain(b"", ls.sensor("ldrobot-stl27l")))
+    assert "header" in listing

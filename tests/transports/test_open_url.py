@@ -51,3 +51,9 @@ def test_anything_else_is_the_fault_of_the_plugin() -> None:
         transport("other:")
     with pytest.raises(ls.UsageError, match="no transport is installed"):
         transport("unknown:")
+
+
+@pytest.mark.parametrize("name", ["a" * 5000, "udp:/" + "a" * 5000, "a" * 5000 + "?src=x", "a\0b"])
+def test_a_name_that_no_file_can_have_is_no_file(name: str) -> None:
+    with pytest.raises((ls.SourceError, ls.UsageError)):
+        transport(name)

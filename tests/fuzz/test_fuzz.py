@@ -1,0 +1,103 @@
+"""Every target reads its examples and neighbours of theirs, and what does harm is found; `make fuzz` does it by the million."""
+
+from __future__ import annotations
+
+import random
+import subprocess
+import sys
+import warnings
+from pathlib import Path
+
+import pytest
+
+from tests.fuzz import trial
+from tests.fuzz.__main__ import ROOT, spread
+from tests.fuzz.campaign import Job, keep, seeded
+from tests.fuzz.targets import SHARES, Target, targets
+
+#: mutations of each target that the test suite reads.
+FEW = 12
+
+
+@pytest.fixture
+def known(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Target]:
+    monkeypatch.chdir(tmp_path)
+    return targets(tmp_path)
+
+
+@pytest.mark.parametrize("group", SHARES)
+def test_neighbours_of_valid_input_do_no_harm(known: dict[str, Target], group: str) -> None:
+    mine = [target for target in known.values() if target.group == group]
+    assert mine
+    for target in mine:
+        source, examples, read = random.Random(f"{target.name} 1"), target.examples(), 0
+        neighbours = [target.mutation(source.choice(examples), source.choice(examples), source) for _ in range(FEW)]
+        for data in (*examples, *neighbours):
+            with warnings.catch_warnings(action="ignore"):
+                try:
+                    target.run(data)
+                    read += 1
+                except target.documented:
+                    pass
+        assert read, f"no example of {target.name} is valid"
+
+
+def raising(data: bytes) -> None:
+    raise ValueError(f"{len(data)} bytes")
+
+
+def endless(data: bytes) -> None:
+    while True:
+        pass
+
+
+def greedy(data: bytes) -> None:
+    bytearray(3 * trial.MEMORY)
+
+
+@pytest.mark.parametrize(("run", "what"), [(raising, "ValueError"), (endless, "TooLong"), (greedy, "MemoryError")])
+def test_harm_is_found_and_kept_for_another_look(run: object, what: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(trial, "BUSY", 0.05)
+    target = Target("invented one", run, lambda: [b"abc"])  # type: ignore[arg-type]
+    with trial.limits():
+        found = trial.judged(target, b"abc")
+        assert found is not None
+        assert trial.judged(Target("invented", lambda data: None, list), b"") is None
+    assert found.what.startswith(what)
+    path = keep(tmp_path, found)
+    assert (path.read_bytes(), path.parent.name) == (b"abc", "invented.one")
+    assert found.place in path.with_suffix(".txt").read_text()
+
+
+def test_an_input_that_reaches_new_lines_is_mutated_further(known: dict[str, Target], tmp_path: Path) -> None:
+    job = Job(known["frame shape-count data"], tmp_path / "kept", seed=1)
+    seeded(job, 300)
+    assert job.inputs == 300
+    assert job.lines > 50
+    assert len(list(job.corpus.iterdir())) > 0
+    assert not job.findings
+
+
+def test_a_run_spreads_its_inputs_reports_them_and_goes_on_where_it_stopped(tmp_path: Path) -> None:
+    assert spread({"frame a": 100.0, "frame b": 300.0, "hex": 1.0}, 1000) == {"frame a": 682, "frame b": 227, "hex": 91}
+    words = [
+        sys.executable,
+        "-m",
+        "tests.fuzz",
+        "--engine",
+        "seeded",
+        "--inputs",
+        "200",
+        "--only",
+        "hex",
+        "--only",
+        "source",
+        "--folder",
+        str(tmp_path),
+    ]
+    first, second = (subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=False) for _ in range(2))
+    assert first.returncode == second.returncode == 0, first.stdout + first.stderr
+    assert "0 targets done before" in first.stdout
+    assert "2 targets done before" in second.stdout
+    assert first.stdout.splitlines()[-1].split() == second.stdout.splitlines()[-1].split()
+    assert first.stdout.splitlines()[-1].split()[:2] == ["all", "200"]

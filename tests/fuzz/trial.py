@@ -1,0 +1,88 @@
+"""One input, read within its limits: what comes of it is nothing, a documented exception, or a finding."""
+
+from __future__ import annotations
+
+import contextlib
+import resource
+import signal
+import traceback
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from types import FrameType
+from typing import NoReturn
+
+import lidarspec
+from tests.fuzz.targets import Target
+
+#: processor seconds that an input may take; what only waits is given the longer time, since other jobs may have the processor.
+BUSY, WAITING = 1.0, 30.0
+#: bytes that an input may add to the process.
+MEMORY = 500_000_000
+_OURS = (str(Path(lidarspec.__file__).parent), "lidarspec_")
+
+
+class TooLong(BaseException):
+    """An input took longer than it may; no `except Exception` on the way holds it up."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """An input that did harm.
+
+    Attributes:
+        target: the name of what read it.
+        data: it.
+        what: the exception.
+        place: the innermost line of lidarspec or of a plugin that it came out of: the same for the same fault.
+    """
+
+    target: str
+    data: bytes
+    what: str
+    place: str
+
+
+@contextlib.contextmanager
+def limits() -> Iterator[None]:
+    """A process in which no input takes more memory than it may, and in which `judged` can count its time."""
+    pages = int(Path("/proc/self/statm").read_text().split()[0])
+    before = resource.getrlimit(resource.RLIMIT_AS)
+    resource.setrlimit(resource.RLIMIT_AS, (pages * resource.getpagesize() + MEMORY, before[1]))
+    handlers = {kind: signal.signal(kind, _late) for kind in (signal.SIGPROF, signal.SIGALRM)}
+    try:
+        yield
+    finally:
+        for kind, handler in handlers.items():
+            signal.signal(kind, handler)
+        resource.setrlimit(resource.RLIMIT_AS, before)
+
+
+def _late(number: int, frame: FrameType | None) -> NoReturn:
+    told = f"{BUSY:g} s of work" if number == signal.SIGPROF else f"{WAITING:g} s"
+    raise TooLong(f"more than {told}")
+
+
+def judged(target: Target, data: bytes) -> Finding | None:
+    """What is wrong with how an input is read; None where nothing is."""
+    signal.setitimer(signal.ITIMER_PROF, BUSY)
+    signal.setitimer(signal.ITIMER_REAL, WAITING)
+    try:
+        target.run(data)
+        return None
+    except target.documented:
+        return None
+    except (Exception, TooLong, SystemExit) as error:
+        signal.setitimer(signal.ITIMER_PROF, 0)
+        return Finding(target.name, data, f"{type(error).__name__}: {error}"[:300], _place(error))
+    finally:
+        signal.setitimer(signal.ITIMER_PROF, 0)
+        signal.setitimer(signal.ITIMER_REAL, 0)
+
+
+def _place(error: BaseException) -> str:
+    """The innermost line of ours, else the innermost of all."""
+    spots = traceback.extract_tb(error.__traceback__)
+    ours = [spot for spot in spots if any(part in spot.filename for part in _OURS)]
+    spot = (ours or spots)[-1]
+    return f"{'/'.join(Path(spot.filename).parts[-3:])}:{spot.lineno}"

@@ -1,0 +1,99 @@
+"""`make soak`: every promise held and measured, and the table of the figures, written into docs/explanation/reliability.md."""
+
+from __future__ import annotations
+
+import argparse
+import datetime
+import os
+import platform
+import re
+import subprocess
+import sys
+import tempfile
+import time
+import traceback
+import xml.etree.ElementTree as xml
+from pathlib import Path
+
+import lidarspec
+from tests.soak.figures import ROOT, Figure
+from tests.soak.promises import EVERY, Promise
+
+PAGE = ROOT / "docs" / "explanation" / "reliability.md"
+BEGIN, END = "<!-- written by make soak -->", "<!-- to here -->"
+
+
+def arguments() -> argparse.Namespace:
+    """The command line."""
+    parser = argparse.ArgumentParser(prog="make soak", description=__doc__)
+    parser.add_argument(
+        "--only", metavar="NAME", action="append", help="these promises alone, such as P3; the table is printed and not written"
+    )
+    parser.add_argument("--share", metavar="SHARE", type=float, default=1.0, help="of the full effort; below 1 the table is not written")
+    parser.add_argument("--no-tests", action="store_true", help="measure alone, and run no tests; the table is not written")
+    return parser.parse_args()
+
+
+def main() -> int:
+    """1 where a promise is not kept, else 0."""
+    given = arguments()
+    chosen = [promise for promise in EVERY if not given.only or promise.name in given.only]
+    figures, began = {}, time.monotonic()
+    for promise in chosen:
+        figures[promise] = held(promise, given.share, tests=not given.no_tests)
+        print(f"{promise.name} {'kept' if figures[promise].kept else 'NOT KEPT'}: {figures[promise].words}", flush=True)
+    text = table(figures, time.monotonic() - began)
+    if given.only or given.share < 1 or given.no_tests:
+        print(text)
+    else:
+        written(text)
+    return int(not all(figure.kept for figure in figures.values()))
+
+
+def held(promise: Promise, share: float, *, tests: bool = True) -> Figure:
+    """What is to be said of a promise, by its tests and what is measured."""
+    parts = [ran(promise, long=share == 1)] if promise.tests and tests else []
+    if promise.measured is not None:
+        try:
+            parts.append(promise.measured(share))
+        except Exception as error:
+            traceback.print_exc()
+            parts.append(Figure(f"could not be measured: {type(error).__name__}: {error}"[:200], False))
+    return Figure("; ".join(part.words for part in parts if part.words), all(part.kept for part in parts))
+
+
+def ran(promise: Promise, *, long: bool) -> Figure:
+    """What the tests of a promise say: their number, and what they show where all of them pass."""
+    with tempfile.TemporaryDirectory() as folder:
+        report = Path(folder, "report.xml")
+        words = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "-n", "2", f"--junitxml={report}", *promise.tests]
+        subprocess.run([*words, *(["-m", "soak or not soak"] if long else [])], cwd=ROOT, stdout=subprocess.DEVNULL, check=False)
+        cases = list(xml.parse(report).getroot().iter("testcase")) if report.is_file() else []
+    failed = [str(case.get("name")) for case in cases if case.find("failure") is not None or case.find("error") is not None]
+    passed = len(cases) - len(failed) - sum(case.find("skipped") is not None for case in cases)
+    if failed or not passed:
+        return Figure(f"{len(failed)} of {len(cases)} tests fail: {', '.join(failed[:3])}", False)
+    return Figure("; ".join(part for part in (promise.told if long else "", f"{passed} tests") if part), True)
+
+
+def table(figures: dict[Promise, Figure], seconds: float) -> str:
+    """The table, with the day, the version and the kind of machine."""
+    day, machine = datetime.date.today().isoformat(), f"{os.cpu_count()} cores, {platform.machine()}, {platform.system()}"
+    what = f"{day}, lidarspec {lidarspec.__version__}, Python {platform.python_version()}, {machine}; {seconds / 60:.0f} minutes."
+    rows = [
+        f"| {promise.name} | {promise.words} | {figure.words.replace('|', '/')} | {'yes' if figure.kept else '**no**'} |"
+        for promise, figure in figures.items()
+    ]
+    return "\n".join([what, "", "| | promise | today | kept |", "|---|---|---|---|", *rows])
+
+
+def written(text: str) -> None:
+    """Put the table into the page, between its marks."""
+    page = PAGE.read_text(encoding="utf-8")
+    found = re.sub(f"{BEGIN}.*{END}", lambda _: f"{BEGIN}\n\n{text}\n\n{END}", page, flags=re.DOTALL)
+    PAGE.write_text(found, encoding="utf-8")
+    print(f"written into {PAGE.relative_to(ROOT)}")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

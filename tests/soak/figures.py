@@ -1,0 +1,317 @@
+"""What is measured of a promise, as functions that return it in words and whether it is as good as promised."""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import json
+import os
+import random
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+import tracemalloc
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import lidarspec as ls
+from lidarspec import Scan, Sensor
+from lidarspec.recording.format import DATAGRAM, HEADER, MAGIC, RECEIVED, Header, packed
+from lidarspec.simulation.simulator import simulate
+from lidarspec.spec import Serial
+from lidarspec.testing import subject as material
+from lidarspec.testing.subject import Subject
+from tests import made_captures as made
+from tests.all_sensors import EVERY, FRAMES, STREAMS
+from tests.engine.oracle import Oracle
+from tests.engine.streams import Books, clean, damaged, decoded, worst
+from tests.engine.test_limits import fed, garbage, peak
+from tests.engine.test_linear_time import seconds
+from tests.lines import free_port
+
+ROOT = Path(__file__).parents[2]
+#: byte error rates, and lengths of bursts.
+RATES, BURSTS = (0.0, 1e-5, 1e-4, 1e-3, 5e-3), (1, 8, 16, 64)
+
+
+@dataclass(frozen=True)
+class Figure:
+    """What was measured, in words, and whether the promise is kept."""
+
+    words: str
+    kept: bool
+
+
+def installed(sensors: dict[str, Sensor]) -> dict[str, Sensor]:
+    """Those that are no invented shapes."""
+    return {name: sensor for name, sensor in sensors.items() if name in ls.sensors()}
+
+
+def splits(share: float) -> Figure:
+    """P1: two-way splits at every byte, and random ones, against the whole."""
+    tried = differing = 0
+    for sensor in STREAMS.values():
+        subject = Subject(sensor)
+        data, source = clean(subject, length=max(int(3000 * share), 300)), subject.source("soak")
+        books = Books(sensor).feed(data)
+        whole, stats = books.finish(), books.decoder.stats
+        cuts = [[data[:spot], data[spot:]] for spot in range(0, len(data), 1 if share == 1 else 7)]
+        for parts in [*cuts, *(list(material.pieces(data, source)) for _ in range(50))]:
+            books = Books(sensor)
+            for part in parts:
+                books.feed(part)
+            tried += 1
+            differing += books.finish() != whole or books.decoder.stats != stats
+    return Figure(f"{tried:,} splits of the streams of {len(STREAMS)} sensors and shapes: {differing} differ", not differing)
+
+
+def recovered(share: float) -> Figure:
+    """P2: the frames of the engine against those of the oracle, whatever is damaged."""
+    frames = missed = extra = 0
+    for sensor, seed in itertools.product(STREAMS.values(), range(max(int(3 * share), 1))):
+        data = clean(Subject(sensor), seed=seed, length=int(2000 * share) + 200)[:4000]
+        for rate, burst in itertools.product(RATES, BURSTS) if share == 1 else [(1e-3, 1)]:
+            noisy = damaged(data, rate, seed, burst=burst)
+            found, wanted = set(decoded(sensor, noisy)), set(Oracle(sensor, noisy).frames())
+            frames, missed, extra = frames + len(wanted), missed + len(wanted - found), extra + len(found - wanted)
+    return Figure(f"{frames:,} frames in damaged streams, by brute force: {missed} missed, {extra} found besides", not missed + extra)
+
+
+def documented(share: float) -> Figure:
+    """P3: hostile inputs to everything that reads."""
+    number = int(400_000 * share) + 300
+    only = [] if share == 1 else ["--only", "hex", "--only", "recording"]
+    with tempfile.TemporaryDirectory() as folder:
+        words = [sys.executable, "-m", "tests.fuzz", "--engine", "seeded", "--inputs", str(number), "--folder", folder, *only]
+        done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=False)
+    found = next((line.split() for line in done.stdout.splitlines() if line.startswith("all ")), ["all", "0", "0", "0", "1"])
+    return Figure(f"{int(found[1]):,} hostile inputs of `make fuzz`: {found[-1]} findings", done.returncode == 0)
+
+
+def bounded(share: float) -> Figure:
+    """P4: what a decoder holds while garbage goes through it, beyond the input."""
+    size = int(50 * share) + 1
+    data, held = garbage(1 << 20), {}
+    for name, sensor in few(installed(STREAMS), share):
+        fed(sensor, data, chunk=1 << 16)  # what is made once, and for all decoders
+        held[name] = peak(lambda sensor=sensor: fed(sensor, data, size, 1 << 16))
+    most = max(held, key=lambda name: held[name])
+    return Figure(f"{size} MB of garbage: at most {held[most] / 1e3:,.0f} kB held ({most})", held[most] < 1 << 20)
+
+
+def linear(share: float) -> Figure:
+    """P5: twice the input, how many times the seconds."""
+    length, ratios = int(400_000 * share) + 20_000, {}
+    for name, sensor in few(installed(STREAMS), share):
+        for what, data in (("garbage", garbage(length)), ("worst stream", worst(sensor, length))):
+            half, whole = (min(seconds(sensor, data[:size]) for _ in range(5)) for size in (length // 2, length))
+            ratios[f"{name}, {what}"] = whole / max(half, 1e-3)
+    most = max(ratios, key=lambda name: ratios[name])
+    return Figure(f"twice the bytes take at most {ratios[most]:.2f} times as long ({most})", ratios[most] <= 2.5)
+
+
+def delay(share: float) -> Figure:
+    """P6: bytes that come after a frame's last one before it is out, by the longest frame."""
+    worst_share = 0.0
+    for sensor in STREAMS.values():
+        data = Subject(sensor).stream(rounds=3)[: int(20_000 * share) + 3000]
+        bound = max(frame.max_length * frame.confirm for frame in sensor.frames.values() if frame.direction == "in")
+        decoder = sensor.decoder()
+        for spot in range(len(data)):
+            for found in decoder.feed(data[spot : spot + 1]):
+                worst_share = max(worst_share, (spot + 1 - found.offset - len(found.data)) / bound)
+    return Figure(f"a frame is out {worst_share:.2f} longest frames after its last byte, or earlier", worst_share < 1)
+
+
+def round_trips(share: float) -> Figure:
+    """P7: frames that are parsed and built again."""
+    tried = lost = 0
+    for name, kind in FRAMES:
+        sensor = EVERY[name]
+        until_then = time.monotonic() + 3 * share + 0.01
+        for seed in range(10_000):
+            data = sensor.example(kind, seed=seed)
+            tried, lost = tried + 1, lost + (sensor.build(kind, sensor.parse(data, frame=kind)) != data)
+            if time.monotonic() > until_then:
+                break
+    return Figure(f"{tried:,} frames of {len(FRAMES)} types: {lost} come back as other bytes", not lost)
+
+
+def in_any_order(share: float) -> Figure:
+    """P17: packets late, doubled and out of order, against the same in order."""
+    differing = []
+    sensors = {name: sensor for name, sensor in ls.sensors().items() if sensor.datagrams}
+    for name, sensor in few(sensors, share):
+        frames, source = simulate(sensor, 3000), random.Random(name)
+        places = sorted(range(len(frames)), key=lambda place: place + source.choice((0, 0, 0, 2.5)))
+        mixed = [frames[place] for place in places for _ in range(1 + (source.random() < 0.02))]
+        first, second = (whole(sensor, part) for part in (frames, mixed))
+        same = len(first) == len(second) and all(
+            np.array_equal(a.points.x, b.points.x, equal_nan=True) for a, b in zip(first, second, strict=True)
+        )
+        differing += [] if same else [name]
+    words = f"{len(few(sensors, share))} sensors, a quarter of 3,000 packets late, 2 % doubled: "
+    return Figure(words + (f"other scans of {', '.join(differing)}" if differing else "the scans are the same"), not differing)
+
+
+def whole(sensor: Sensor, frames: Sequence[bytes]) -> list[Scan]:
+    """The complete scans of some frames."""
+    with warnings.catch_warnings(action="ignore"):
+        return [scan for scan in sensor.scans(frames if sensor.datagrams else b"".join(frames)) if scan.complete]
+
+
+def blocked(share: float) -> Figure:
+    """P19: sensors whose angle stands still."""
+    told, kept = [], True
+    cases: list[tuple[str, Callable[[Any], object]]] = [
+        ("ldrobot-ld06", lambda frame: frame.update({"start_angle": 9000, "end_angle": 9000})),
+        ("velodyne-vlp16", lambda frame: [block.update({"azimuth": 9000}) for block in frame.blocks]),
+    ]
+    for name, stop in cases:
+        sensor, frames = ls.sensor(name), []
+        for data in simulate(sensor, int(2000 * share) + 1500):
+            parsed = sensor.parse(data)
+            stop(parsed)
+            frames.append(sensor.build(sensor.data_frame, parsed))
+        with warnings.catch_warnings(action="ignore"):
+            scans = list(sensor.scans(frames if sensor.datagrams else b"".join(frames)))
+        packets = len(frames) / max(len(scans), 1)
+        told.append(f"{name}: {len(scans)} scans of {len(frames)} packets, {sum(scan.complete for scan in scans)} said to be complete")
+        kept &= len(scans) > 1 and packets < 1000 and not any(scan.complete for scan in scans)
+    return Figure("rotor blocked, " + "; ".join(told), kept)
+
+
+def slowest(share: float) -> Figure:
+    """P20: frame types in turn, with the frames that announce them, against the line's rate; and what is kept of them."""
+    rates, held = {}, {}
+    for name, sensor in few(installed(STREAMS), share):
+        line = next((link.baud / 10 for link in sensor.links.values() if isinstance(link, Serial)), None)
+        data = (Subject(sensor).stream(rounds=2) * 200)[: int(120_000 * share) + 4000]
+        decoder, began, size = sensor.decoder(), time.process_time(), 0
+        while size < len(data) and time.process_time() - began < 5:
+            decoder.feed(data[size : size + 1024])
+            size += 1024
+        rates[name] = min(size, len(data)) / (time.process_time() - began) / (line or 1e6)
+        tracemalloc.start()
+        found = sensor.decoder().feed(data[:16_000])
+        held[name] = tracemalloc.get_traced_memory()[0] / min(len(data), 16_000)
+        tracemalloc.stop()
+        del found
+    slow, fat = min(rates, key=lambda name: rates[name]), max(held, key=lambda name: held[name])
+    words = f"types in turn: at least {rates[slow]:.2g} times the line's rate ({slow}), at most {held[fat]:.0f} bytes kept for each ({fat})"
+    return Figure(words, rates[slow] >= 10 and held[fat] < 64)
+
+
+def strangers(share: float) -> Figure:
+    """P21: valid frames and calibration frames of another address among those of the sensor, while it is recorded."""
+    sensor, number = ls.sensor("robosense-helios16p"), int(300 * share) + 50
+    frames, port = simulate(sensor, number), free_port()
+    others = [frames[0], sensor.example("difop", seed=9)]
+    with contextlib.ExitStack() as stack:
+        path = Path(stack.enter_context(tempfile.TemporaryDirectory()), "all.lsr")
+        own, other = (stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) for _ in range(2))
+        own.bind(("127.0.0.1", 0))
+        other.bind(("127.0.0.2", 0))
+        device = stack.enter_context(ls.open(f"udp://127.0.0.1:{port}", sensor, record=path))
+        points, batches = 0, device.packets(wait=0.05)
+        for index, frame in enumerate(frames):
+            own.sendto(frame, ("127.0.0.1", port))
+            if index:
+                other.sendto(others[index % 2], ("127.0.0.1", port))
+            time.sleep(0.001)
+        try:
+            quiet = 0
+            while quiet < 10:
+                batch = next(batches)
+                points, quiet = points + len(batch), 0 if len(batch) else quiet + 1
+        except ls.LidarSpecError as error:
+            return Figure(f"the session ended: {error}"[:160], False)
+        foreign = device.stats.foreign
+    return Figure(
+        f"{number - 1} frames of a stranger among {number}: {points} read, {foreign} counted as foreign",
+        (points, foreign) == (number, number - 1),
+    )
+
+
+def nothing_runs(share: float) -> Figure:
+    """P22: a settings file in a parent folder that names Python, and recordings whose header names a descriptor or a file."""
+    with tempfile.TemporaryDirectory() as place:
+        folder, home = Path(place, "project", "below"), Path(place, "home")
+        folder.mkdir(parents=True)
+        home.mkdir()
+        (folder.parent / "evil.py").write_text(f"open({str(Path(place, 'ran'))!r}, 'w').close()\n")
+        (folder.parent / "lidarspec.toml").write_text('[device.front]\nsource = "x.bin"\nsensor = "./evil.py"\n')
+        frame = ls.sensor("hesai-xt16").example("data")
+        for index, value in enumerate((0, "angles.csv", "/etc/passwd", "../x")):
+            header = Header("hesai-xt16", {"calibration": value}, datagrams=True).to_json()
+            parts = [MAGIC, packed(HEADER, header, 1), packed(RECEIVED, frame, 2, flags=DATAGRAM)]
+            (folder / f"{index}.lsr").write_bytes(b"".join(parts))
+        ran = opened = 0
+        for source in ("front", "0.lsr", "1.lsr", "2.lsr", "3.lsr"):
+            words = [sys.executable, "-c", TRIED, source]
+            environment = {**os.environ, "XDG_CONFIG_HOME": str(home), "PYTHONPATH": str(ROOT)}
+            done = subprocess.run(words, input="of the terminal", cwd=folder, env=environment, capture_output=True, text=True, check=False)
+            opened += json.loads(done.stdout.splitlines()[-1])["left"] != "of the terminal" if done.stdout else 1
+        ran = Path(place, "ran").exists()
+    words = f"5 files of others: {'Python ran' if ran else 'no Python ran'}, {opened} read a descriptor or failed"
+    return Figure(words, not ran and not opened)
+
+
+#: opens a source, and says what is left on standard input.
+TRIED = """
+import json, sys, lidarspec as ls
+try:
+    with ls.open(sys.argv[1]) as device:
+        list(device.packets())
+except (ls.LidarSpecError, OSError):
+    pass
+print(json.dumps({"left": sys.stdin.read()}))
+"""
+
+
+def complete(share: float) -> Figure:
+    """P23: packets missing within a scan, and one damaged counter."""
+    told, kept = [], True
+    for name, number in (("velodyne-vlp16", 50), ("robosense-m1", 315)):
+        sensor = ls.sensor(name)
+        frames = simulate(sensor, 3000)
+        left = frames[:1400] + frames[1400 + number :]
+        lost, before, after = sensor.decode(left).stats.lost, len(whole(sensor, frames)), len(whole(sensor, left))
+        told.append(f"{name} without {number} packets: lost {lost}, {before - after} scans fewer are complete")
+        kept &= abs(lost - number) <= 1 and after < before
+    return Figure("; ".join(told), kept)
+
+
+def not_in_silence(share: float) -> Figure:
+    """P24: what is said, and the exit code, where data are damaged, guessed or cut off."""
+    velodyne = [ls.sensor("velodyne-vlp16").example("data", seed=seed) for seed in range(3)]
+    blocks = [made.packet(made.frame(data)) for data in velodyne]
+    cases = {
+        "cut.pcap": (made.pcap(*map(made.frame, velodyne))[:-40], "velodyne-vlp16", 0),
+        "damaged.pcap": (
+            made.section() + made.interface() + b"".join([*blocks[:2], blocks[2][:-4] + bytes(4), *blocks[2:]]),
+            "velodyne-vlp16",
+            1,
+        ),
+        "guessed.pcap": (made.pcap(*map(made.frame, simulate(ls.sensor("hesai-xt32"), 300))), "hesai-xt32", 0),
+    }
+    silent = []
+    with tempfile.TemporaryDirectory() as folder:
+        for name, (data, sensor, code) in cases.items():
+            Path(folder, name).write_bytes(data)
+            words = [sys.executable, "-m", "lidarspec", "convert", name, "out.csv", "-s", sensor, "--force"]
+            done = subprocess.run(words, cwd=folder, capture_output=True, text=True, check=False)
+            silent += [] if done.returncode == code and done.stderr else [f"{name} (exit code {done.returncode})"]
+    return Figure(f"{len(cases)} files, cut off, damaged, and with guessed angles: {', '.join(silent) or 'each said'}", not silent)
+
+
+def few(sensors: dict[str, Sensor], share: float) -> list[tuple[str, Sensor]]:
+    """All of them, or in a short run one."""
+    return list(sensors.items())[: None if share == 1 else 1]

@@ -1,0 +1,104 @@
+"""The promises: what is said, the tests that hold it, the long ones among them too, and what is measured besides."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from tests.soak import figures
+from tests.soak.figures import Figure
+
+
+@dataclass(frozen=True)
+class Promise:
+    """A promise.
+
+    Attributes:
+        name: "P1" and so on.
+        words: what is promised.
+        tests: files, or tests of them, that hold it.
+        told: what those tests show, said where all of them pass.
+        measured: makes a figure; given the share of the full effort, from 0 to 1.
+    """
+
+    name: str
+    words: str
+    tests: tuple[str, ...] = ()
+    told: str = ""
+    measured: Callable[[float], Figure] | None = None
+
+
+RULE, LIMITS, PROMISES = "tests/engine/test_framing_rule.py", "tests/engine/test_limits.py", "tests/engine/test_promises.py"
+RECORDINGS, DEVICE = "tests/recording/test_recordings.py", "tests/device/test_device.py"
+HOSTILE = "tests/captures/test_pcap_hostile.py"
+
+EVERY = (
+    Promise("P1", "any split of a stream gives the same result", (RULE,), "", figures.splits),
+    Promise("P2", "every recoverable frame is recovered", (RULE,), "", figures.recovered),
+    Promise("P3", "only documented exceptions", ("tests/fuzz",), "", figures.documented),
+    Promise("P4", "memory is bounded: under 1 MiB for 50 MB of garbage", (LIMITS,), "", figures.bounded),
+    Promise(
+        "P5",
+        "time grows with the input and no faster: at most 2.5 times for twice",
+        ("tests/engine/test_linear_time.py",),
+        "",
+        figures.linear,
+    ),
+    Promise("P6", "a frame is out before one longest frame more has come", (LIMITS,), "", figures.delay),
+    Promise("P7", "exact round trip", ("tests/sensors/test_conformance.py",), "", figures.round_trips),
+    Promise(
+        "P8",
+        "a recording survives kill -9 at any byte",
+        (f"{RECORDINGS}",),
+        "killed 100 times: no acknowledged record lost; cut at every byte",
+    ),
+    Promise("P9", "replay is bit-exact", (f"{PROMISES}::TestReplay", "tests/recording/test_replay.py"), "the same SHA-256 at every speed"),
+    Promise("P10", "survives unplug and replug", (f"{DEVICE}",), "unplugged 100 times: no frame spliced, no descriptor or thread left"),
+    Promise(
+        "P11",
+        "UDP at full rate without loss",
+        ("tests/device/test_rates.py",),
+        "378,000 datagrams in 60 s, in bursts beside a thread that computes and stalls of 250 ms: 0 lost",
+    ),
+    Promise(
+        "P12",
+        "a slow consumer is handled openly",
+        (f"{PROMISES}::TestQueue",),
+        "1,000,000 chunks, both policies: produced = consumed + dropped",
+    ),
+    Promise(
+        "P13", "a broken plugin is isolated", ("tests/plugins/test_plugins.py",), "each kind of broken plugin is named, the others work"
+    ),
+    Promise(
+        "P14",
+        "hostile captures take no memory, and move on or stop",
+        (HOSTILE, "tests/captures/test_memory.py"),
+        "10,000 mutations of each format: no exception but SourceError; a capture of 1 GB below 200 MB",
+    ),
+    Promise(
+        "P15",
+        "disk full, short writes: one error, a whole file",
+        (f"{PROMISES}::TestFiles", RECORDINGS),
+        "whole to the last record on a full disk",
+    ),
+    Promise(
+        "P16",
+        "clocks run on",
+        (f"{PROMISES}::TestClocks", "tests/packets/test_clocks.py"),
+        "100 turns of 30 s, an hour, and 16 bits, late packets among them: exact",
+    ),
+    Promise("P17", "late, doubled and reordered packets give the same scan", (), "", figures.in_any_order),
+    Promise("P18", "decoders are independent", ("tests/framing/test_framing.py",), "in turn, and in 8 threads: as alone"),
+    Promise("P19", "a scan always ends", (), "", figures.blocked),
+    Promise("P20", "no stream is slower than its line: 10 times its rate, under 64 bytes kept for each", (), "", figures.slowest),
+    Promise("P21", "strangers do not disturb", (), "", figures.strangers),
+    Promise("P22", "other people's files run nothing", (), "", figures.nothing_runs),
+    Promise("P23", "complete means complete, lost is what was lost", (), "", figures.complete),
+    Promise("P24", "nothing is lost in silence", ("tests/cli/test_captures.py",), "", figures.not_in_silence),
+    Promise(
+        "",
+        "the other long tests: exports, engines and points agree on what is drawn at random",
+        ("tests/exports", "tests/engine/test_random_specs.py", "tests/points", "tests/cli/test_new.py"),
+        "thousands of specs, 60 points functions",
+    ),
+)
