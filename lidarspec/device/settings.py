@@ -114,7 +114,7 @@ def named(source: str | Path) -> Named | None:
     if not isinstance(source, str) or not _NAME.fullmatch(word):
         return None
     known, faults = _known()
-    if word not in known and not Path(word).exists():
+    if word not in known and not os.path.exists(word):
         if faults:
             raise faults[0]
         if known:

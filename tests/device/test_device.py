@@ -142,7 +142,7 @@ def test_silence_is_noticed_and_told(line: Port) -> None:
         assert took > 0.5
         (warning,) = device.warnings
         assert "nothing has arrived for" in warning
-        assert warning.endswith(f"next: lidarspec doctor 'serial://{line.name}' -s {TURNING.id}")
+        assert warning.endswith(f"next: lidarspec doctor serial://{line.name} -s {TURNING.id}")
         line.send(turning(TURNING, 1)[0])
         packets(device, 1)
         assert device.state == "streaming"
@@ -157,7 +157,7 @@ def test_bytes_without_frames_name_the_baud_rate(line: Port) -> None:
         until(lambda: device.newest(0.01) or device.state == "no frames")
         (warning,) = device.warnings
         assert "9600 baud is likely wrong" in warning
-        assert warning.endswith(f"next: lidarspec detect 'serial://{line.name}'")
+        assert warning.endswith(f"next: lidarspec detect serial://{line.name}")
 
 
 def test_latest_never_falls_behind(line: Port) -> None:
