@@ -197,7 +197,7 @@ def _by_metadata(group: str) -> list[EntryPoint]:
 GROUP = "lidarspec"
 SENSORS = "lidarspec.sensors"
 #: seconds after which a plugin that is being loaded is named, and after which one that is tried counts as hanging.
-PATIENCE, LIMIT = 5.0, 20.0
+PATIENCE, LIMIT = 5.0, 10.0
 HOOKS = tuple(name for name in globals() if name.startswith("lidarspec_"))
 
 
@@ -592,25 +592,27 @@ def _trial(home: Home) -> tuple[str, str]:
     mark = f"{os.urandom(8).hex()}:"
     code = "from lidarspec.plugins import load_alone; load_alone()"
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
-    command = [sys.executable, "-P", "-c", code, *home, mark]
-    pipe = subprocess.PIPE
+    command = [sys.executable, "-P", "-c", code, *home, mark, str(LIMIT)]
+    hangs, pipe = f"it hangs: not loaded after {LIMIT:g} s", subprocess.PIPE
     try:
-        done = subprocess.run(
-            command, env=environment, check=False, timeout=LIMIT, encoding="utf-8", errors="replace", stdin=pipe, stdout=pipe, stderr=pipe
-        )
-    except subprocess.TimeoutExpired:
-        return f"it hangs: not loaded after {LIMIT:g} s", ""
-    printed, ended, threads = done.stdout.partition(mark)
+        done = subprocess.run(command, env=environment, timeout=9 * LIMIT, stdin=pipe, stdout=pipe, stderr=pipe, check=False)
+    except subprocess.TimeoutExpired:  # something that it began holds its output
+        return hangs, ""
+    output, complaints = (stream.decode(errors="replace") for stream in (done.stdout, done.stderr))
+    printed, ended, threads = output.partition(mark)
     if not ended:
-        return f"it ends the process, with code {done.returncode}", ""
-    text = " ".join((printed + done.stderr).split())
+        return hangs if "Timeout (" in complaints else f"it ends the process, with code {done.returncode}", ""
+    text = " ".join((printed + complaints).split())
     said = [f"it prints {shown(text)}"] * bool(text) + [f"it leaves a thread: {threads}"] * bool(threads)
     return "", "; ".join(said)
 
 
 def load_alone() -> None:
     """Load the plugin that the arguments name, print a mark and the threads that it leaves, and end the process, which is for this."""
-    *home, mark = sys.argv[1:]
+    import faulthandler
+
+    *home, mark, limit = sys.argv[1:]
+    faulthandler.dump_traceback_later(float(limit), exit=True)
     modules, offered = ([one for one in entry_points(group) if [one.distribution, one.module] == home] for group in (GROUP, SENSORS))
     before = set(threading.enumerate())
     Registry(modules, offered)._load_all()
