@@ -23,22 +23,26 @@ import inspect
 import os
 import re
 import sys
+import threading
 import traceback
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from importlib.machinery import PathFinder
+from reprlib import repr as shown
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, NamedTuple
 from zlib import crc32
 
 import pluggy
 
-from lidarspec.errors import NO_SENSORS, LidarSpecError, SourceError, SpecError, UnknownSensor, UsageError
+from lidarspec.errors import NO_SENSORS, LidarSpecError, SourceError, SpecError, UnknownSensor, UsageError, suggest
 from lidarspec.spec.checksums import Checksum
 from lidarspec.spec.construct_layer import prepare, seals
 from lidarspec.spec.description import Frame
 from lidarspec.spec.results import Points
 from lidarspec.spec.sensor import Sensor
+from lidarspec.trust import document, own_settings
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -95,7 +99,14 @@ class EntryPoint(NamedTuple):
         return self.value.partition("[")[0].partition(":")[0].strip()
 
     def load(self) -> Any:
-        """The module, or the object in it, imported."""
+        """The module, or the object in it, imported.
+
+        Raises:
+            SpecError: where a file of entry points cannot be read.
+            Exception: whatever the import fails with.
+        """
+        if not self.module:
+            raise SpecError("its entry_points.txt is not UTF-8, or has an entry without a module")
         attributes = self.value.partition("[")[0].partition(":")[2]
         names = [name for name in attributes.strip().split(".") if name]
         return functools.reduce(getattr, names, importlib.import_module(self.module))
@@ -119,10 +130,15 @@ def _distributions() -> Iterator[str]:
         for name in _listed(place or os.curdir):
             stem, kind = os.path.splitext(name)
             if kind.lower() in _FOLDERS:
-                normal = re.sub(r"[-_.]+", "_", stem.partition("-")[0]).lower()
+                normal = _normal(stem.partition("-")[0])
                 if normal not in seen:
                     seen.add(normal)
                     yield os.path.join(place, name)
+
+
+def _normal(distribution: str) -> str:
+    """The name of a distribution, in the one way of the several that people write it in."""
+    return re.sub(r"[-_.]+", "-", distribution).lower()
 
 
 def _listed(place: str) -> list[str]:
@@ -137,9 +153,11 @@ def _listed(place: str) -> list[str]:
 
 
 def _declared(folder: str, group: str) -> Iterator[EntryPoint]:
-    """The entry points of a group that one distribution declares."""
-    section = ""
-    for line in map(str.strip, _text(folder, "entry_points.txt").splitlines()):
+    """The entry points of a group that one distribution declares; where not all can be read, one that says so among the modules."""
+    section, text = "", _text(folder, "entry_points.txt")
+    if "\ufffd" in text and group == GROUP:
+        yield EntryPoint("entry_points.txt", "", *_name_and_version(folder))
+    for line in map(str.strip, text.splitlines()):
         if line.startswith("[") and line.endswith("]"):
             section = line[1:-1]
         elif section == group and line and not line.startswith("#"):
@@ -155,7 +173,7 @@ def _name_and_version(folder: str) -> tuple[str, str]:
 
 def _text(folder: str, name: str) -> str:
     try:
-        with open(os.path.join(folder, name), encoding="utf-8") as file:
+        with open(os.path.join(folder, name), encoding="utf-8", errors="replace") as file:
             return file.read()
     except OSError:
         return ""
@@ -164,13 +182,27 @@ def _text(folder: str, name: str) -> str:
 def _by_metadata(group: str) -> list[EntryPoint]:
     import importlib.metadata
 
-    found = importlib.metadata.entry_points(group=group)
-    return [EntryPoint(e.name, e.value, e.dist.name if e.dist else "?", e.dist.version if e.dist else "?") for e in found]
+    found: dict[str, list[EntryPoint]] = {}
+    for distribution in importlib.metadata.distributions():
+        name, version = str(getattr(distribution, "_path", "?")), "?"
+        try:
+            name, version = distribution.name or name, distribution.version
+            entries = [EntryPoint(e.name, e.value, name, version) for e in distribution.entry_points.select(group=group)]
+        except UnicodeDecodeError:
+            entries = [EntryPoint("entry_points.txt", "", name, version)] if group == GROUP else []
+        found.setdefault(_normal(name), entries)
+    return [entry for entries in found.values() for entry in entries]
 
 
 GROUP = "lidarspec"
 SENSORS = "lidarspec.sensors"
+#: seconds after which a plugin that is being loaded is named, and after which one that is tried counts as hanging.
+PATIENCE, LIMIT = 5.0, 10.0
 HOOKS = tuple(name for name in globals() if name.startswith("lidarspec_"))
+
+
+#: who has a sensor: a distribution, and a module of it.
+Home = tuple[str, str]
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,7 +220,7 @@ class HookedPoints:
 
 @dataclass(frozen=True)
 class Plugin:
-    """A plugin that was found: where it comes from, the ids it adds, and its error if it was not loaded."""
+    """A plugin that was found: where it comes from, the ids it adds, what kept it or one of its ids out, and what it does besides."""
 
     distribution: str
     version: str
@@ -196,38 +228,68 @@ class Plugin:
     sensors: tuple[str, ...] = ()
     error: str = ""
     traceback: str = ""
+    remark: str = ""
+
+    @property
+    def home(self) -> Home:
+        """Its distribution and module."""
+        return self.distribution, EntryPoint("", self.entry_point.partition(" = ")[2], self.distribution, self.version).module
 
 
 class Registry:
     """The plugins of this environment, and the sensors with their hooks applied.
+
+    Several plugins may claim one name, an id or an alias. An entry point of this name, or a module that is always loaded, counts before a
+    sensor that merely has it. Of several distributions the owner has it: whom the user's own settings name, else `lidarspec-VENDOR` for
+    ids that begin with this vendor, and for the aliases of such a sensor; of two modules of one distribution the first. Where there is no
+    owner, to ask for the name is an error. All else of a plugin that loses a name stays.
 
     Two threads may load the same sensor at the same time: it is then added twice, and is the same.
 
     Args:
         modules: entry points of modules with hooks; each is loaded at once.
         offered: entry points of sensors, by id and alias; each is loaded when it is asked for.
+        owners: gives the distributions that the user names as owners, by id; asked where several claim a name.
     """
 
-    def __init__(self, modules: Iterable[EntryPoint] = (), offered: Iterable[EntryPoint] = ()) -> None:
+    def __init__(
+        self,
+        modules: Iterable[EntryPoint] = (),
+        offered: Iterable[EntryPoint] = (),
+        owners: Callable[[], Mapping[str, str]] = dict,
+    ) -> None:
         self._manager = pluggy.PluginManager(NAMESPACE)
         self._manager.add_hookspecs(sys.modules[__name__])
-        self._loaded: dict[str, Sensor] = {}
-        self._aliases: dict[str, str] = {}
-        self._owners: dict[str, Any] = {}
+        self._named_owners = functools.cache(owners)
+        self._sensors: dict[Home, dict[str, Sensor]] = {}
+        self._claims: dict[str, dict[Home, bool]] = {}  # name -> who claims it, and whether before being loaded
         self._ready: dict[str, Sensor] = {}
-        self._offered: dict[tuple[str, str], list[EntryPoint]] = {}
-        for entry in offered:
-            self._offered.setdefault((entry.distribution, entry.module), []).append(entry)
+        self._offered: dict[Home, list[EntryPoint]] = {}
         self._tried: dict[EntryPoint, Plugin] = {}
-        self._modules = [
-            _loaded(entry, entry.name, functools.partial(self.add, name=f"{entry.distribution}:{entry.name}")) for entry in modules
-        ]
+        self._modules = [_loaded(entry, entry.name, functools.partial(self._add_module, entry)) for entry in modules]
+        for entry in offered:
+            home = (entry.distribution, entry.module)
+            self._offered.setdefault(home, []).append(entry)
+            self._claims.setdefault(entry.name, {})[home] = True
 
     @property
     def plugins(self) -> list[Plugin]:
-        """Every plugin that was found; those that could not be loaded say why."""
+        """Every plugin that was found; those that could not be loaded, or lost a name to another, say why."""
         self._load_all()
-        return self._modules + [self._together(entries) for entries in self._offered.values()]
+        offered = [self._together(entries) for entries in self._offered.values()]
+        return [self._judged(plugin) for plugin in (*self._modules, *offered)]
+
+    def _judged(self, plugin: Plugin) -> Plugin:
+        """The plugin with the ids that it has, and the first name that another has, or that nobody can be said to have."""
+        home = plugin.home
+        own = sorted(name for name in self._sensors.get(home, {}) if self._holder(name) == home)
+        lost = [name for name, homes in self._claims.items() if home in homes and self._holder(name) != home]
+        if lost and not plugin.error:
+            holder = self._holder(lost[0])
+            others = [holder] if holder else [other for other in self._claims[lost[0]] if other != home]
+            whose = ", ".join(":".join(other) for other in others)
+            plugin = replace(plugin, error=f"{lost[0]}: another sensor has this id already: that of {whose}")
+        return replace(plugin, sensors=tuple(own))
 
     def add(self, plugin: Any, *, name: str) -> list[str]:
         """Register one plugin (a module or object with hooks) and return the ids that it adds.
@@ -245,9 +307,13 @@ class Registry:
             if isinstance(error, pluggy.PluginValidationError):
                 raise SpecError(" ".join(str(error).split()), path=name) from None
             raise
-        self._keep(plugin, sensors)
+        distribution, _, module = name.partition(":")
+        self._keep((distribution, module), sensors, claimed=True)
         self._ready.clear()
         return [sensor.id for sensor in sensors]
+
+    def _add_module(self, entry: EntryPoint, plugin: Any) -> list[str]:
+        return self.add(plugin, name=f"{entry.distribution}:{entry.module}")
 
     def _load(self, entry: EntryPoint) -> None:
         if entry not in self._tried:
@@ -260,67 +326,111 @@ class Registry:
 
     def _add_offered(self, entry: EntryPoint, sensor: Any) -> list[str]:
         """Keep a sensor that an entry point names by its id or one of its aliases."""
-        owner = (entry.distribution, entry.module)
-        self._check(sensor, [sensor], owner)
+        self._check(sensor, [sensor])
         if entry.name not in (sensor.id, *sensor.aliases):
             raise SpecError(f"its entry point is called {entry.name!r}, which is none of its names", sensor=sensor.id)
-        self._keep(owner, [sensor])
+        self._keep((entry.distribution, entry.module), [sensor])
         return [sensor.id]
 
     def _together(self, entries: list[EntryPoint]) -> Plugin:
         """What became of all sensors that a module offers."""
         tried = [self._tried[entry] for entry in entries]
-        ids = dict.fromkeys(name for plugin in tried for name in plugin.sensors)
         failed = next((plugin for plugin in tried if plugin.error), tried[0])
-        return replace(failed, entry_point=f"{SENSORS} = {entries[0].module}", sensors=tuple(ids))
+        return replace(failed, entry_point=f"{SENSORS} = {entries[0].module}")
 
     def _sensors_of(self, plugin: Any) -> list[Sensor]:
         function = getattr(plugin, "lidarspec_sensors", None)
         sensors = list(function()) if function is not None and _is_hook(function) else []
         for sensor in sensors:
-            self._check(sensor, sensors, plugin)
+            self._check(sensor, sensors)
         return sensors
 
-    def _keep(self, plugin: Any, sensors: list[Sensor]) -> None:
+    def _keep(self, home: Home, sensors: list[Sensor], *, claimed: bool = False) -> None:
         for sensor in sensors:
-            self._loaded[sensor.id] = sensor
-            self._aliases |= dict.fromkeys(sensor.aliases, sensor.id)
-            self._owners |= dict.fromkeys((sensor.id, *sensor.aliases), plugin)
+            self._sensors.setdefault(home, {})[sensor.id] = sensor
+            for name in (sensor.id, *sensor.aliases):
+                self._claims.setdefault(name, {}).setdefault(home, claimed)
+
+    def _holder(self, name: str) -> Home | None:
+        """Who has a name, of those who claim it; None where nobody can be said to."""
+        claims = self._claims.get(name, {})
+        homes = [home for home, claimed in claims.items() if claimed] or list(claims)
+        first = {_normal(home[0]): home for home in reversed(homes)}
+        if len(first) < 2:
+            return next(iter(first.values()), None)
+        alike = {home: self._alike(home, name) for home in first.values()}
+        named = self._named_owners()
+        wanted = {home: {_normal(named[one]) for one in names if one in named} for home, names in alike.items()}
+        chosen = [home for home in alike if _normal(home[0]) in wanted[home]]
+        owners = chosen or [home for home, names in alike.items() if not wanted[home] and _is_vendor(home[0], names)]
+        return owners[0] if len(owners) == 1 else None
+
+    def _alike(self, home: Home, name: str) -> set[str]:
+        """All names of the sensor that somebody claims this one for, as far as they are known before it is loaded."""
+        entries = self._offered.get(home, [])
+        values = {entry.value for entry in entries if entry.name == name}
+        loaded = [{one.id, *one.aliases} for one in self._sensors.get(home, {}).values()]
+        return {entry.name for entry in entries if entry.value in values}.union(*(names for names in loaded if name in names))
+
+    def _find(self, name: str) -> Sensor | None:
+        """The sensor that has a name; None where there is none, or it does not load.
+
+        Raises:
+            UsageError: where several distributions claim it, and none owns it.
+        """
+        home = self._holder(name)
+        if home is None:
+            if name not in self._claims:
+                return None
+            whose = [home[0] for home in self._claims[name]]
+            told = f"{' and '.join(dict.fromkeys(whose))} each have a sensor of this name"
+            error = UsageError(f'{name}: {told}; say whose it is in {own_settings()}: [owners] {name} = "{whose[0]}"')
+            raise suggest(error, "lidarspec plugins")
+        for entry in self._offered.get(home, []):
+            if entry.name == name:
+                self._load(entry)
+        return next((one for one in self._sensors.get(home, {}).values() if name in (one.id, *one.aliases)), None)
+
+    def _found(self) -> dict[str, Sensor]:
+        """Every sensor that is loaded, by id, with those left out whose id is another's."""
+        return {name: one for home, own in self._sensors.items() for name, one in own.items() if self._holder(name) == home}
 
     def names(self) -> list[str]:
         """Every id and alias, sorted; what only has an entry point is not loaded for it."""
-        offered = {entry.name for entries in self._offered.values() for entry in entries}
-        return sorted(offered | set(self._loaded) | set(self._aliases))
+        return sorted(self._claims)
 
     def __contains__(self, name: str) -> bool:
         """Whether there is a sensor of this id or alias."""
         self._load_all()
-        return name in self._loaded or name in self._aliases
+        return self._holder(name) is not None and self._find(name) is not None
 
     def sensors(self) -> dict[str, Sensor]:
-        """Every sensor by id, sorted, with its hooks applied."""
+        """Every sensor by id, sorted, with its hooks applied; those whose id several claim, and nobody owns, are left out."""
         self._load_all()
-        return {name: self.sensor(name) for name in sorted(self._loaded)}
+        return {name: self.sensor(name) for name in sorted(self._found())}
 
     def sensor(self, name: str) -> Sensor:
         """One sensor by id or alias, in capitals and with other hyphens too, with its hooks applied.
 
         Raises:
             UnknownSensor: with a suggestion, or with what to install where there is no sensor at all.
+            UsageError: where several distributions claim the name, and none owns it.
         """
-        for entries in self._offered.values():
-            for entry in entries:
-                if entry.name == name:
-                    self._load(entry)
-        if name not in self._loaded and name not in self._aliases:
+        found = self._find(name)
+        if found is None:
             self._load_all()
-            name = next((known for known in (*self._loaded, *self._aliases) if _letters(known) == _letters(name)), name)
-        name = self._aliases.get(name, name)
-        if name not in self._loaded:
-            hint = "" if self._loaded else f"; {NO_SENSORS}"
-            raise UnknownSensor(name, self._loaded, hint=hint, aliases=self._aliases)
+            name = next((known for known in self._claims if _letters(known) == _letters(name)), name)
+            found = self._find(name)
+        if found is not None and found.id != name:
+            own, name = found, found.id  # whoever has the id has its aliases too
+            found = self._find(name)
+            found = found if found is not None and found.id == own.id else None
+        if found is None:
+            known = self._found()
+            aliases = {alias: one.id for one in known.values() for alias in one.aliases}
+            raise UnknownSensor(name, known, hint="" if known else f"; {NO_SENSORS}", aliases=aliases)
         if name not in self._ready:
-            self._ready[name] = self.hooked(self._loaded[name])
+            self._ready[name] = self.hooked(found)
         return self._ready[name]
 
     def hooked(self, sensor: Sensor) -> Sensor:
@@ -354,28 +464,59 @@ class Registry:
 
     def _failed(self, name: str, reason: str) -> None:
         for index, plugin in enumerate(self._modules):
-            if f"{plugin.distribution}:{plugin.entry_point.partition(' = ')[0]}" == name and not plugin.error:
+            if ":".join(plugin.home) == name and not plugin.error:
                 self._modules[index] = replace(plugin, error=reason, traceback=traceback.format_exc())
 
-    def _check(self, sensor: Any, own: list[Any], plugin: Any) -> None:
+    def _check(self, sensor: Any, own: list[Any]) -> None:
         if not isinstance(sensor, Sensor):
             raise SpecError(f"lidarspec_sensors returns sensors, not {type(sensor).__name__}")
         for name in (sensor.id, *sensor.aliases):
-            owner = self._owners.get(name, plugin)
-            if owner != plugin or sum(name in (s.id, *s.aliases) for s in own) > 1:
-                whose = "one of the same plugin" if owner == plugin else f"that of {self._place(owner)}"
-                raise SpecError(f"another sensor has this id already: {whose}", sensor=name)
+            if sum(name in (s.id, *s.aliases) for s in own) > 1:
+                raise SpecError("another sensor has this id already: one of the same plugin", sensor=name)
 
-    def _place(self, plugin: Any) -> str:
-        """A plugin that is loaded, as "distribution:module" or "distribution:entry"."""
-        return ":".join(plugin) if isinstance(plugin, tuple) else str(self._manager.get_name(plugin))
+
+def _is_vendor(distribution: str, names: Iterable[str]) -> bool:
+    """Whether a distribution is `lidarspec-VENDOR`, of the vendor that one of the names begins with."""
+    prefix, _, vendor = _normal(distribution).partition("-")
+    return prefix == NAMESPACE and bool(vendor) and any(name.startswith(f"{vendor}-") for name in names)
+
+
+def _owners() -> dict[str, str]:
+    """The distributions that the user's own settings name as the owners of ids; what is wrong there is warned of."""
+    file = own_settings()
+    try:
+        named = document(file).get("owners", {}) if file.is_file() else {}
+        if not isinstance(named, dict) or not all(isinstance(value, str) for value in named.values()):
+            raise UsageError(f'{file}: [owners]: ids and distributions, such as acme-x1 = "acme-lidars"')
+    except LidarSpecError as error:
+        warnings.warn(f"{error}; its [owners] are left out", stacklevel=2)
+        return {}
+    return named
+
+
+@contextlib.contextmanager
+def _watched(entry: EntryPoint) -> Iterator[None]:
+    """Within, a plugin that takes long is named: one that hangs keeps everything else from going on."""
+    if entry.module in sys.modules:
+        yield
+        return
+    text = f"{entry.distribution}: {entry.module} has been loading for {PATIENCE:g} s; next: lidarspec plugins"
+    timer = threading.Timer(PATIENCE, warnings.warn, [text])
+    timer.daemon = True
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
+        timer.join()
 
 
 def _loaded(entry: EntryPoint, names: str, add: Callable[[Any], list[str]]) -> Plugin:
     """What became of an entry point that is loaded and added; whatever it raises disturbs no other."""
     plugin = Plugin(entry.distribution, entry.version, f"{names} = {entry.value}")
     try:
-        return replace(plugin, sensors=tuple(add(entry.load())))
+        with _watched(entry):
+            return replace(plugin, sensors=tuple(add(entry.load())))
     except KeyboardInterrupt:
         raise
     except BaseException as error:
@@ -421,8 +562,63 @@ _registries: list[Registry] = []
 def registry() -> Registry:
     """The registry of this environment."""
     if not _registries:
-        _registries.append(Registry(entry_points(GROUP), entry_points(SENSORS)))
+        _registries.append(Registry(entry_points(GROUP), entry_points(SENSORS), _owners))
     return _registries[-1]
+
+
+def tried() -> list[Plugin]:
+    """Every plugin that was found: loaded in a process of its own, and here where it neither hangs there nor ends the process."""
+    from concurrent.futures import ThreadPoolExecutor
+
+    if len(_registries) > 1:  # one stands in for what is installed
+        return registry().plugins
+    groups = [entry_points(GROUP), entry_points(SENSORS)]
+    entries = {(entry.distribution, entry.module): entry for group in groups for entry in group}
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        trials = dict(zip(entries, pool.map(_trial, entries), strict=True))
+    lost = [
+        Plugin(entry.distribution, entry.version, f"{entry.name} = {entry.value}", error=trials[home][0])
+        for home, entry in entries.items()
+        if trials[home][0]
+    ]
+    modules, offered = ([entry for entry in group if not trials[entry.distribution, entry.module][0]] for group in groups)
+    return [replace(plugin, remark=trials[plugin.home][1]) for plugin in Registry(modules, offered, _owners).plugins] + lost
+
+
+def _trial(home: Home) -> tuple[str, str]:
+    """Why a plugin cannot be loaded in this process, and what it does besides being loaded."""
+    import subprocess
+
+    mark = f"{os.urandom(8).hex()}:"
+    code = "from lidarspec.plugins import load_alone; load_alone()"
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    command = [sys.executable, "-P", "-c", code, *home, mark, str(LIMIT)]
+    hangs, pipe = f"it hangs: not loaded after {LIMIT:g} s", subprocess.PIPE
+    try:
+        done = subprocess.run(command, env=environment, timeout=9 * LIMIT, stdin=pipe, stdout=pipe, stderr=pipe, check=False)
+    except subprocess.TimeoutExpired:  # something that it began holds its output
+        return hangs, ""
+    output, complaints = (stream.decode(errors="replace") for stream in (done.stdout, done.stderr))
+    printed, ended, threads = output.partition(mark)
+    if not ended:
+        return hangs if "Timeout (" in complaints else f"it ends the process, with code {done.returncode}", ""
+    text = " ".join((printed + complaints).split())
+    said = [f"it prints {shown(text)}"] * bool(text) + [f"it leaves a thread: {threads}"] * bool(threads)
+    return "", "; ".join(said)
+
+
+def load_alone() -> None:
+    """Load the plugin that the arguments name, print a mark and the threads that it leaves, and end the process, which is for this."""
+    import faulthandler
+
+    *home, mark, limit = sys.argv[1:]
+    faulthandler.dump_traceback_later(float(limit), exit=True)
+    modules, offered = ([one for one in entry_points(group) if [one.distribution, one.module] == home] for group in (GROUP, SENSORS))
+    before = set(threading.enumerate())
+    Registry(modules, offered)._load_all()
+    left = [thread.name for thread in threading.enumerate() if thread not in before]
+    print(mark, ", ".join(left), sep="", end="", flush=True)
+    os._exit(0)  # whatever is left behind
 
 
 @contextlib.contextmanager
@@ -479,10 +675,10 @@ def _from_file(text: str) -> Sensor:
         raise SpecError("there is no function lidarspec_sensors, marked @hookimpl, that returns a sensor", path=str(file))
     if len(ids) > 1 and not wanted:
         raise UsageError(f"{file} describes several sensors, name one: {', '.join(f'{file}:{name}' for name in ids)}")
-    chosen = local._loaded.get(wanted or ids[0])
-    if chosen is None:
+    if wanted and wanted not in ids:
         raise UnknownSensor(wanted, ids, place=str(file))
-    return registry().hooked(local.hooked(chosen))
+    chosen = local.sensor(wanted or ids[0])
+    return registry().hooked(chosen)
 
 
 def file_module(file: Path) -> ModuleType:

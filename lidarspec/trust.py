@@ -6,19 +6,21 @@ read is data: no code runs because a file names it, and paths in it lead to what
 
 from __future__ import annotations
 
-import json
 import os
 import re
-import tomllib
-from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from lidarspec.errors import UsageError, system_errors
+
+if TYPE_CHECKING:
+    from pathlib import Path
 
 #: bytes of a file that are read at most: of JSON, which has frames in it, and of TOML, where the time to read grows faster than the file.
 LARGEST = {"JSON": 1 << 22, "TOML": 1 << 18}
 #: a key of so many parts that reading it would take minutes.
 _ENDLESS_KEY = re.compile(rb"(?:\.[^.=,\]\n]{0,80}){32}")
+#: the name of a settings file.
+FILE = "lidarspec.toml"
 #: the file of the folders that are allowed, a line each, and the variable that names one for a single run.
 TRUSTED, VARIABLE = "trusted", "LIDARSPEC_TRUST"
 _WRITABLE_BY_ALL = 0o002
@@ -26,9 +28,16 @@ _WRITABLE_BY_ALL = 0o002
 
 def user_folder() -> Path:
     """The folder of the user's own settings."""
+    from pathlib import Path
+
     if os.name == "nt":
         return Path(os.environ.get("APPDATA") or Path.home() / "AppData" / "Roaming") / "lidarspec"
     return Path(os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config") / "lidarspec"
+
+
+def own_settings() -> Path:
+    """The user's own settings file, which need not be there."""
+    return user_folder() / FILE
 
 
 def foreign(path: Path) -> str:
@@ -38,7 +47,8 @@ def foreign(path: Path) -> str:
     system has no such owners, the user's own is what lies in the user's folder.
     """
     if not hasattr(os, "getuid"):
-        return "" if path.resolve().is_relative_to(Path.home()) else f"{path} is not in {Path.home()}"
+        home = os.path.expanduser("~")
+        return "" if path.resolve().is_relative_to(home) else f"{path} is not in {home}"
     for place in (path, path.parent):
         with system_errors(place):
             status = place.stat()
@@ -55,7 +65,7 @@ def is_trusted(folder: Path) -> bool:
     with system_errors(file):
         allowed = file.read_text(encoding="utf-8").splitlines() if file.is_file() else []
     once = os.environ.get(VARIABLE)
-    return str(folder.resolve()) in (*allowed, *([str(Path(once).resolve())] if once else []))
+    return str(folder.resolve()) in (*allowed, *([os.path.realpath(once)] if once else []))
 
 
 def trust(folder: str | Path) -> Path:
@@ -65,6 +75,8 @@ def trust(folder: str | Path) -> Path:
         UsageError: where it is no folder of the user's own.
         SourceError: where this cannot be written down.
     """
+    from pathlib import Path
+
     found = Path(folder).resolve()
     if not found.is_dir() or len(str(found).splitlines()) > 1:
         raise UsageError(f"{folder} is no folder")
@@ -98,6 +110,9 @@ def document(path: Path) -> Any:
         UsageError: where it is none, or none of a reasonable size.
         SourceError: where it cannot be read.
     """
+    import json  # where only an installed sensor is looked for, nobody waits for these
+    import tomllib
+
     name, parse = ("JSON", json.loads) if path.suffix == ".json" else ("TOML", tomllib.loads)
     with system_errors(path), path.open("rb") as file:
         data = file.read(LARGEST[name] + 1)

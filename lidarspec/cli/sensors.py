@@ -14,11 +14,11 @@ from lidarspec.cli.options import output_options
 from lidarspec.cli.output import emit, emit_json, table
 from lidarspec.cli.terminal import note, say
 from lidarspec.columns.columns import Batch
-from lidarspec.device.settings import FILE, devices
+from lidarspec.device.settings import devices
 from lidarspec.errors import NO_SENSORS, SpecError
 from lidarspec.explaining.wording import limits
 from lidarspec.exports.json import facts, link_data
-from lidarspec.plugins import registry, sensor as named_sensor
+from lidarspec.plugins import Plugin, registry, sensor as named_sensor, tried
 from lidarspec.points.numpy_plan import describe
 from lidarspec.points.plan import Plan, plan_for
 from lidarspec.simulation.frame_maker import FrameMaker
@@ -26,7 +26,7 @@ from lidarspec.spec.description import Frame
 from lidarspec.spec.links import Link, Serial, Udp
 from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.ports import serial_ports
-from lidarspec.trust import TRUSTED, trust as trusted, user_folder
+from lidarspec.trust import FILE, TRUSTED, trust as trusted, user_folder
 from lidarspec.wire.wire_table import frame_size, wire_table
 
 #: packets that a plan is shown for: as many as a turn may take, since some of them are shorter.
@@ -128,16 +128,22 @@ def _plan(sensor: Sensor, frame: str) -> list[str]:
 def plugins(ctx: click.Context, as_json: bool, output: str | None) -> None:
     """The plugins that were found, and what is wrong with those that do not load.
 
-    Exit code 1 where one does not.
+    Each is loaded in a process of its own first, so that one that hangs or ends the program is named. Exit code 1 where something is wrong.
     """
-    found = registry().plugins
-    rows = [[p.distribution, p.version, p.entry_point, f"not loaded: {p.error}" if p.error else ", ".join(p.sensors)] for p in found]
+    found = tried()
+    rows = [[p.distribution, p.version, p.entry_point, _told(p)] for p in found]
     if as_json:
         emit_json([{**vars(plugin), "sensors": list(plugin.sensors)} for plugin in found], output)
     else:
         emit(table(["distribution", "version", "entry point", "sensors"], rows, output) if rows else NO_SENSORS, output)
-    if any(plugin.error for plugin in found):
+    if any(plugin.error or plugin.remark for plugin in found):
         ctx.exit(FINDINGS)
+
+
+def _told(plugin: Plugin) -> str:
+    """The sensors of a plugin, and what is wrong with it."""
+    error = f"not loaded: {plugin.error}" if plugin.error and not plugin.sensors else plugin.error
+    return "; ".join(part for part in (", ".join(plugin.sensors), error, plugin.remark) if part)
 
 
 @click.command()

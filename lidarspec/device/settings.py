@@ -28,9 +28,8 @@ from lidarspec.errors import LidarSpecError, UsageError, did_you_mean, suggest
 from lidarspec.plugins import names_file, sensor as named_sensor
 from lidarspec.points.cloud import Mount
 from lidarspec.spec.sensor import Sensor
-from lidarspec.trust import beside, document, foreign, is_trusted, user_folder
+from lidarspec.trust import FILE, beside, document, foreign, is_trusted, own_settings
 
-FILE = "lidarspec.toml"
 #: what can be a name: nothing that has a suffix, a scheme or a folder, and no port of a system that calls them by letters.
 _NAME = re.compile(r"(?!(?i:com|lpt)\d+$)[A-Za-z][A-Za-z0-9_-]*")
 _KEYS = ("source", "sensor", "mount", "options")
@@ -154,7 +153,7 @@ def _known() -> tuple[dict[str, Named], list[LidarSpecError]]:
 
 def files() -> list[Path]:
     """The settings files that count here: the user's own, then the nearest one of a project; others' are passed over, with a warning."""
-    own, here = user_folder() / FILE, Path.cwd()
+    own, here = own_settings(), Path.cwd()
     found = [own] if os.path.isfile(own) else []
     for path in (folder / FILE for folder in (here, *here.parents)):
         if path == own or not os.path.isfile(path):
@@ -173,11 +172,14 @@ def read(path: Path) -> dict[str, Named]:
         SourceError: where it cannot be read.
     """
     content = document(path)
-    _check_keys(path, "", content, ["device"])
+    is_own = path == own_settings()
+    if "owners" in content and not is_own:
+        raise UsageError(f"{path}: [owners] stands in your own settings alone, {own_settings()}")
+    _check_keys(path, "", content, ["device", "owners"])
     tables = content.get("device", {})
     if not isinstance(tables, dict) or not all(isinstance(table, dict) for table in tables.values()):
         raise UsageError(f"{path}: devices are tables of their own: [device.front]")
-    believed = path == user_folder() / FILE or is_trusted(path.parent)
+    believed = is_own or is_trusted(path.parent)
     return {name: replace(_device(path, name, table), believed=believed) for name, table in tables.items()}
 
 
@@ -197,7 +199,7 @@ def _device(path: Path, name: str, table: Mapping[str, Any]) -> Named:
     if options and sensor is None:
         raise UsageError(f"{path}: {place}: options are a sensor's: name the sensor as well")
     source = _beside(path, table["source"])
-    if _NAME.fullmatch(source) and not Path(source).exists():
+    if _NAME.fullmatch(source) and not os.path.exists(source):
         raise UsageError(f"{path}: {place}: source {source!r} is a name again; a device names its port, address or file")
     return Named(name, source, None if sensor is None else _beside(path, sensor), mount, options, str(path))
 

@@ -115,7 +115,8 @@ def test_a_checksum_hook_that_fails_disturbs_no_sensor(registry: Registry, answe
 
 def test_a_refused_plugin_leaves_no_trace(registry: Registry) -> None:
     before = registry.sensors().keys()
-    broken = Plugin(lidarspec_sensors=lambda: [SHAPES["shape-bits"], SHAPES["shape-count"]], lidarspec_points=lambda sensor, fields: 1 / 0)
+    twice = [SHAPES["shape-bits"], SHAPES["shape-count"], SHAPES["shape-count"]]
+    broken = Plugin(lidarspec_sensors=lambda: twice, lidarspec_points=lambda sensor, fields: 1 / 0)
     with pytest.raises(SpecError, match="shape-count"):
         registry.add(broken, name="late")
     assert registry.sensors().keys() == before

@@ -15,7 +15,7 @@ import lidarspec as ls
 ALLOWED = {
     *("_version", "columns", "columns.columns", "errors", "plugins", "spec", "spec.bits", "spec.checksums", "spec.construct_layer"),
     *("spec.description", "spec.fields", "spec.links", "spec.results", "spec.sensor", "spec.timing", "spec.tree"),
-    *("spec.vocabulary", "wire", "wire.arrays", "wire.frame_table", "wire.layout", "wire.row_checksums", "wire.schema"),
+    *("spec.vocabulary", "trust", "wire", "wire.arrays", "wire.frame_table", "wire.layout", "wire.row_checksums", "wire.schema"),
 }
 #: of the standard library, what takes long to import; NumPy and construct may bring it along, lidarspec does not.
 SLOW = {"difflib", "email", "importlib.metadata", "pathlib", "random", "socket", "zipfile"}

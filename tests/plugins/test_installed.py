@@ -5,6 +5,8 @@ from __future__ import annotations
 import contextlib
 import importlib.metadata
 import sys
+import threading
+import warnings
 import zipfile
 from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
@@ -15,9 +17,9 @@ from typing import Any
 
 import pytest
 
-from lidarspec import Sensor, SpecError
+from lidarspec import Sensor, UsageError
 from lidarspec.errors import UnknownSensor
-from lidarspec.plugins import EntryPoint, HookedPoints, Registry, entry_points
+from lidarspec.plugins import EntryPoint, HookedPoints, Registry, entry_points, tried
 from lidarspec.spec import hookimpl
 from tests.shapes import SHAPES
 
@@ -203,7 +205,7 @@ def test_an_entry_that_names_no_such_sensor_is_named_and_leaves_nothing(
 def test_a_sensor_cannot_take_an_id_from_a_module_that_is_always_loaded(plugins: dict[str, SimpleNamespace]) -> None:
     found = registry("zz = again", offered="acme-x2 = acme")
     assert found.sensor("acme-x2").model == "again"
-    assert [plugin.error for plugin in found.plugins] == ["", "acme-x2: another sensor has this id already: that of dist:zz"]
+    assert [plugin.error for plugin in found.plugins] == ["", "acme-x2: another sensor has this id already: that of dist:again"]
 
 
 def test_threads_that_ask_at_once_get_the_same_sensor(plugins: dict[str, SimpleNamespace]) -> None:
@@ -219,5 +221,138 @@ def test_a_hook_that_is_always_loaded_reaches_the_sensors_that_are_offered(plugi
     found = registry("meddler = meddler", offered="acme-x1 = acme")
     assert isinstance(found.sensor("acme-x1").points, HookedPoints)
     found.sensor("acme-x1")
-    with pytest.raises(SpecError):
-        found.add(plugins["acme"], name="again")
+    found.add(plugins["acme"], name="again")
+    with pytest.raises(UsageError, match="acme-x1: dist and again each have a sensor of this name"):
+        found.sensor("acme-x1")
+
+
+def claimed(*claims: str, owners: dict[str, str] | None = None) -> Registry:
+    """A registry of sensors that distributions offer, each given as "distribution: name = module, ..."; an alias as "name = module:id"."""
+    offered = []
+    for claim in claims:
+        distribution, _, entries = claim.partition(": ")
+        for entry in entries.split(", "):
+            name, _, value = entry.partition(" = ")
+            module, _, attribute = value.partition(":")
+            offered.append(EntryPoint(name, f"{module}:{(attribute or name).replace('-', '_')}", distribution, "1"))
+    return Registry([], offered, lambda: owners or {})
+
+
+OWNED = "lidarspec-acme: acme-x1 = acme, acme-x2 = acme"
+
+
+@pytest.mark.parametrize("asked", [[], ["acme-x3"], ["acme-x2"], ["acme-x1"]])
+@pytest.mark.parametrize("stranger", ["a-stranger", "lidarspec-beta", "lidarspec", "lidarspec-acm"])
+def test_the_owner_of_an_id_has_it_and_the_other_keeps_the_rest(
+    plugins: dict[str, SimpleNamespace], asked: list[str], stranger: str
+) -> None:
+    found = claimed(f"{stranger}: acme-x2 = again, acme-x3 = again", OWNED)
+    for name in asked:
+        found.sensor(name)
+    assert {name: sensor.model for name, sensor in found.sensors().items()} == {"acme-x1": "acme", "acme-x2": "acme", "acme-x3": "again"}
+    assert found.sensor("ACME X2").model == "acme"
+    assert [(plugin.distribution, plugin.sensors, plugin.error) for plugin in found.plugins] == [
+        (stranger, ("acme-x3",), "acme-x2: another sensor has this id already: that of lidarspec-acme:acme"),
+        ("lidarspec-acme", ("acme-x1", "acme-x2"), ""),
+    ]
+
+
+def test_whom_the_user_names_comes_before_the_vendor(plugins: dict[str, SimpleNamespace]) -> None:
+    found = claimed("my-fork: acme-x2 = again, acme-x3 = again", OWNED, owners={"acme-x2": "My_Fork"})
+    assert {name: sensor.model for name, sensor in found.sensors().items()} == {"acme-x1": "acme", "acme-x2": "again", "acme-x3": "again"}
+    assert [plugin.error for plugin in found.plugins] == ["", "acme-x2: another sensor has this id already: that of my-fork:again"]
+
+
+def test_an_alias_goes_to_the_sensor_of_its_owner_also_where_no_entry_point_says_so(plugins: dict[str, SimpleNamespace]) -> None:
+    plugins["liar"].by_name["liar_x1"] = replace(plugins["liar"].by_name["liar_x1"], aliases=("b-one", "acme-x1"))
+    strangers = "a-stranger: liar-x1 = liar"
+    found = claimed(strangers, "lidarspec-beta: beta-x1 = beta, b-one = beta:beta-x1", OWNED)
+    for _ in range(2):  # before the stranger's is loaded, and after
+        assert (found.sensor("b-one").id, found.sensor("acme-x1").model) == ("beta-x1", "acme")
+        assert found.sensor("liar-x1").id == "liar-x1"
+    assert sorted(found.sensors()) == ["acme-x1", "acme-x2", "beta-x1", "liar-x1"]
+    plugins["again"].by_name["b_one"] = replace(plugins["again"].by_name["acme_x3"], aliases=("b-one",))
+    found = claimed("a-stranger: b-one = again, acme-x3 = again", "lidarspec-beta: beta-x1 = beta, b-one = beta:beta-x1")
+    assert found.sensor("b-one").id == "beta-x1"
+    assert sorted(found.sensors()) == ["acme-x3", "beta-x1"]
+
+
+def test_an_id_that_nobody_owns_is_an_error_when_it_is_used_and_no_other_is(plugins: dict[str, SimpleNamespace]) -> None:
+    found = claimed("one-lidars: acme-x2 = again, acme-x3 = again", "two-lidars: acme-x1 = acme, acme-x2 = acme")
+    with pytest.raises(UsageError, match=r'one-lidars and two-lidars each have .*\[owners\] acme-x2 = "one-lidars"'):
+        found.sensor("acme-x2")
+    assert sorted(found.sensors()) == ["acme-x1", "acme-x3"]
+    assert [(plugin.sensors, plugin.error) for plugin in found.plugins] == [
+        (("acme-x3",), "acme-x2: another sensor has this id already: that of two-lidars:acme"),
+        (("acme-x1",), "acme-x2: another sensor has this id already: that of one-lidars:again"),
+    ]
+    assert "acme-x2" not in found
+    assert "acme-x3" in found
+
+
+def test_an_owner_that_does_not_load_is_not_replaced_by_a_stranger(plugins: dict[str, SimpleNamespace]) -> None:
+    found = claimed("a-stranger: acme-x2 = again", "lidarspec-acme: acme-x2 = a_module_that_nobody_has")
+    with pytest.raises(UnknownSensor):
+        found.sensor("acme-x2")
+
+
+@pytest.mark.parametrize("zipped", [False, True])
+def test_entry_points_that_are_not_text_are_named_and_keep_nothing_else_away(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, zipped: bool
+) -> None:
+    distribution(tmp_path, "good", "1", "[odd.group]\na = json\n")
+    distribution(tmp_path, "bad", "2", "")
+    (tmp_path / "bad-2.dist-info" / "entry_points.txt").write_bytes(b"[odd.group]\nb = json\n[console_scripts]\nm\xfcller = bad:main\n")
+    distribution(tmp_path, "worse", "3", "[odd.group]\nc = json\n")
+    (tmp_path / "worse-3.dist-info" / "METADATA").write_bytes(b"Name: worse\nVersion: 3\nAuthor: M\xfcller\n")
+    if zipped:
+        with zipfile.ZipFile(tmp_path / "other.zip", "w") as archive:
+            archive.writestr("packed-4.dist-info/METADATA", "Name: packed\nVersion: 4\n")
+    monkeypatch.setattr(sys, "path", [str(tmp_path), *([str(tmp_path / "other.zip")] * zipped), *sys.path])
+    assert {entry.distribution for entry in entry_points("odd.group")} >= {"good"}
+    (named,) = [plugin for plugin in Registry(entry_points("lidarspec")).plugins if "bad" in plugin.distribution]
+    assert "its entry_points.txt is not UTF-8" in named.error
+
+
+def test_a_plugin_that_takes_long_is_named_while_it_does(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "slow_lidars.py").write_text("import its_end\nits_end.come.wait(60)\n", encoding="utf-8")
+    end = threading.Event()
+    monkeypatch.setitem(sys.modules, "its_end", SimpleNamespace(come=end))  # type: ignore[arg-type]
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr("lidarspec.plugins.PATIENCE", 0.01)
+    told: list[str] = []
+
+    def tell(message: Warning | str, *_: Any, **more: Any) -> None:
+        told.append(str(message))
+        end.set()
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("always")
+        monkeypatch.setattr(warnings, "showwarning", tell)
+        Registry([EntryPoint("slow", "slow_lidars", "slow-lidars", "1")])
+    assert told == ["slow-lidars: slow_lidars has been loading for 0.01 s; next: lidarspec plugins"]
+
+
+ODD = {
+    "hangs": ("import time\ntime.sleep(600)", "it hangs: not loaded after 3 s", ""),
+    "ends": ("import os\nos._exit(7)", "it ends the process, with code 7", ""),
+    "exits": ("import sys\nsys.exit('leaving')", "SystemExit: leaving", ""),
+    "prints": ("import sys\nprint('hello')\nprint('\\x1b[2J', file=sys.stderr)", "", r"it prints 'hello \x1b[2J'"),
+    "threads": ("import threading\nthreading.Thread(target=threading.Event().wait, name='mine').start()", "", "it leaves a thread: mine"),
+}
+
+
+def test_each_plugin_is_tried_in_a_process_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, (code, _, _) in ODD.items():
+        (tmp_path / f"odd_{name}.py").write_text(code, encoding="utf-8")
+        distribution(tmp_path, f"odd_{name}", "1", f"[lidarspec]\n{name} = odd_{name}\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr("lidarspec.plugins.LIMIT", 3)
+    entries = entry_points("lidarspec")
+    monkeypatch.setattr("lidarspec.plugins.entry_points", lambda group: entries if group == "lidarspec" else [])
+    monkeypatch.setattr(threading.Thread, "start", lambda thread: None if thread.name == "mine" else START(thread))  # not here too
+    found = {plugin.distribution.removeprefix("odd_"): (plugin.error, plugin.remark) for plugin in tried()}
+    assert found == {name: (error, remark) for name, (_, error, remark) in ODD.items()}
+
+
+START = threading.Thread.start
