@@ -178,20 +178,29 @@ def address(packed: bytes) -> str:
 
 
 def udp_frame(payload: bytes, source: tuple[bytes, int], destination: tuple[bytes, int]) -> bytes:
-    """An Ethernet frame with an IPv4 and a UDP header before `payload`, the UDP checksum 0 (not computed).
+    """An Ethernet frame with an IP and a UDP header before `payload`; over IPv4 the UDP checksum is 0 (not computed).
 
     Args:
-        payload: at most `LARGEST_PAYLOAD` bytes.
-        source, destination: address of 4 bytes, and port.
+        payload: at most `LARGEST_PAYLOAD` bytes, over IPv6 20 more.
+        source, destination: address, of 4 bytes both or of 16, and port.
     """
-    length = _UDP_HEADER.size + len(payload)
-    fields = (0x45, _IPV4_HEADER.size + length, 0, _DO_NOT_FRAGMENT, _TIME_TO_LIVE, _UDP)
-    blank = _IPV4_HEADER.pack(*fields, b"\0\0", source[0], destination[0])
-    # The ones' complement sum of 16-bit words is the whole header as one number modulo 0xFFFF, where 0xFFFF stands for 0.
-    checksum = 0xFFFF - (int.from_bytes(blank) % 0xFFFF or 0xFFFF)
-    ip_header = _IPV4_HEADER.pack(*fields, checksum.to_bytes(2), source[0], destination[0])
-    udp_header = _UDP_HEADER.pack(source[1], destination[1], length, 0)
-    return _ETHERNET_HEADER.pack(_TO_MAC, _FROM_MAC, 0x0800) + ip_header + udp_header + payload
+    ends, length = source[0] + destination[0], _UDP_HEADER.size + len(payload)
+    if len(ends) == 32:
+        kind, ip_header = 0x86DD, struct.pack(">IHBB", 6 << 28, length, _UDP, _TIME_TO_LIVE) + ends
+        parts = ends, struct.pack(">II", length, _UDP), _UDP_HEADER.pack(source[1], destination[1], length, 0), payload
+        checksum = _checksum(b"".join(parts) + bytes(len(payload) % 2)) or 0xFFFF
+    else:
+        kind, checksum = 0x0800, 0
+        fields = (0x45, _IPV4_HEADER.size + length, 0, _DO_NOT_FRAGMENT, _TIME_TO_LIVE, _UDP)
+        blank = _IPV4_HEADER.pack(*fields, b"\0\0", source[0], destination[0])
+        ip_header = _IPV4_HEADER.pack(*fields, _checksum(blank).to_bytes(2), source[0], destination[0])
+    udp_header = _UDP_HEADER.pack(source[1], destination[1], length, checksum)
+    return _ETHERNET_HEADER.pack(_TO_MAC, _FROM_MAC, kind) + ip_header + udp_header + payload
+
+
+def _checksum(words: bytes) -> int:
+    """The ones' complement of the ones' complement sum of 16-bit words: all of it as one number modulo 0xFFFF, which stands for 0."""
+    return 0xFFFF - (int.from_bytes(words) % 0xFFFF or 0xFFFF)
 
 
 def _ip_start(frame: bytes, link: int) -> int:

@@ -39,6 +39,8 @@ USER_LINKS = range(147, 163)
 MOST_KINDS = 16
 #: who sent a datagram, and to whom, where nobody knows.
 NOBODY = ("0.0.0.0", 0)
+#: what an IPv4 address has before it as an IPv6 one.
+_MAPPED = bytes.fromhex("00000000000000000000ffff")
 
 
 @dataclass(frozen=True, slots=True)
@@ -219,14 +221,16 @@ class StreamReader(CaptureReader):
 
 
 def datagram_record(datagram: Datagram) -> bytes:
-    """The record of one datagram, unfragmented, as Ethernet, IPv4 and UDP.
+    """The record of one datagram, unfragmented, as Ethernet, IP and UDP.
 
     Raises:
-        UsageError: more than 65,507 bytes, an address that is not IPv4, or a port or time that no record can hold.
+        UsageError: more bytes than UDP carries, an address that is none, or a port or time that no record can hold.
     """
-    if len(datagram.data) > LARGEST_PAYLOAD:
-        raise UsageError(f"a datagram of {len(datagram.data)} bytes: UDP over IPv4 carries at most {LARGEST_PAYLOAD}")
-    return packet_record(udp_frame(datagram.data, _endpoint(*datagram.source), _endpoint(*datagram.destination)), datagram.at)
+    source, destination = _endpoints(datagram.source, datagram.destination)
+    most = LARGEST_PAYLOAD + 20 * (len(source[0]) == 16)
+    if len(datagram.data) > most:
+        raise UsageError(f"a datagram of {len(datagram.data)} bytes: UDP carries at most {most}")
+    return packet_record(udp_frame(datagram.data, source, destination), datagram.at)
 
 
 def is_stream_capture(head: bytes) -> bool:
@@ -235,11 +239,16 @@ def is_stream_capture(head: bytes) -> bool:
 
 
 @lru_cache(maxsize=256)
-def _endpoint(host: str, port: int) -> tuple[bytes, int]:
-    try:
-        packed = ipaddress.IPv4Address(host).packed
-    except ValueError:
-        raise UsageError(f"{host!r} is not an IPv4 address, which is all that the pcap writer knows") from None
-    if not 0 <= port < 1 << 16:
-        raise UsageError(f"{port} is not a UDP port")
-    return packed, port
+def _endpoints(*ends: tuple[str, int]) -> list[tuple[bytes, int]]:
+    """Addresses, of 4 bytes or 16 as the longest of them is, and ports."""
+    packed = []
+    for host, port in ends:
+        try:
+            packed.append(ipaddress.ip_address(host).packed)
+        except ValueError:
+            raise UsageError(f"{host!r} is no address, which is what a capture holds") from None
+        if not 0 <= port < 1 << 16:
+            raise UsageError(f"{port} is not a UDP port")
+    if len({len(address) for address in packed}) > 1:
+        packed = [address if len(address) == 16 else _MAPPED + address if any(address) else bytes(16) for address in packed]
+    return [(address, port) for address, (_, port) in zip(packed, ends, strict=True)]

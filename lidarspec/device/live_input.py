@@ -160,7 +160,7 @@ class LiveInput(Input):
         self._offset = time.time_ns() - time.monotonic_ns()
         self._turn, self._talk = threading.RLock(), threading.RLock()
         self._due, self._stops, self._closed = 0.0, False, False
-        self._failure: BaseException | None = None
+        self._failure: SourceError | None = None
         self.stays_on = False
         self._said: list[str] = []
         self._captures["data"] = Capture(opened, self.queue, log=recorder)
@@ -329,7 +329,8 @@ class LiveInput(Input):
             elif run is Mark.BACK and link == "data":
                 self._start_again()
         elif self._failure is None and not self._closed:
-            self._failure = run
+            self._failure = run if isinstance(run, SourceError) else SourceError(f"{self._source}: nothing is read any more: {run}")
+            self._failure.__cause__ = None if run is self._failure else run
 
     def _decode(self, link: str, chunks: list[Chunk]) -> None:
         decoder = self._decoders[link]

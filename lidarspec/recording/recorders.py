@@ -110,7 +110,7 @@ class PcapRecorder(Appender):
         """Take a datagram that was received; one that was sent is none of the sensor's, and is left out.
 
         Raises:
-            UsageError: for addresses that are not IPv4.
+            UsageError: for addresses that are none.
         """
         if direction == "in":
             datagram = Datagram(chunk.data, chunk.at or 0, chunk.sender or NOBODY, chunk.receiver or self._receiver)

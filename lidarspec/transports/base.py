@@ -5,15 +5,14 @@ from __future__ import annotations
 import contextlib
 import os
 import re
-import select
+import selectors
 import socket
-import sys
 import time
 from abc import abstractmethod
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 from urllib.parse import parse_qs
 
 from lidarspec.errors import SourceError, UnknownOption, UsageError, suggest
@@ -27,6 +26,9 @@ COMMON = frozenset({"control"})
 #: seconds between two reads, in which a fast line gathers some bytes: it would wake us for every one.
 PAUSE = 0.002
 L = TypeVar("L", bound=Link)
+_Descriptor = int | socket.socket
+#: `select` knows no descriptor above 1,023; Windows, which has nothing else, does not number them so.
+_Poll = getattr(selectors, "PollSelector", selectors.SelectSelector)
 _SWITCH = {"0": False, "1": True, "false": False, "true": True, "off": False, "on": True}
 
 
@@ -189,11 +191,17 @@ class StreamTransport(LiveTransport):
 
 def readable(descriptor: int, timeout: float) -> bool:
     """Whether there is something to read, or the other side has hung up, within so many seconds."""
-    if sys.platform == "win32":  # which has no poll
-        return bool(select.select([descriptor], [], [], timeout)[0])
-    poller = select.poll()
-    poller.register(descriptor, select.POLLIN)
-    return bool(poller.poll(timeout * 1000))
+    return bool(ready([descriptor], [], timeout)[0])
+
+
+def ready(reading: Collection[_Descriptor], writing: Collection[_Descriptor], timeout: float) -> tuple[list[Any], list[Any]]:
+    """What of these can be read, or has hung up, and what can be written to, within so many seconds; descriptors may have any number."""
+    with _Poll() as poll:
+        for one in {*reading, *writing}:
+            poll.register(one, selectors.EVENT_READ * (one in reading) | selectors.EVENT_WRITE * (one in writing))
+        found = poll.select(timeout)
+    to_read, to_write = ([key.fileobj for key, events in found if events & kind] for kind in (selectors.EVENT_READ, selectors.EVENT_WRITE))
+    return to_read, to_write
 
 
 def failure(text: str, following: str) -> SourceError:

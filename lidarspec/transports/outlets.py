@@ -21,7 +21,7 @@ from lidarspec.errors import SourceError, UsageError
 from lidarspec.recording.appending import Appender
 from lidarspec.spec.links import Tcp, Udp
 from lidarspec.spec.sensor import Sensor
-from lidarspec.transports.base import Address, failure, reason
+from lidarspec.transports.base import Address, failure, ready, reason
 from lidarspec.transports.protocol import POLL, Chunk
 
 try:
@@ -126,7 +126,7 @@ class UdpOutlet(Outlet):
         return self.place if self.host == HERE else "udp://" + self.place.removeprefix(f"udp://{self.host}")
 
     def receive(self, wait: float) -> list[bytes]:
-        if select.select([self._socket], [], [], wait)[0]:
+        if ready([self._socket], [], wait)[0]:
             with contextlib.suppress(OSError):  # what a destination that does not listen is told with
                 data, sender = self._socket.recvfrom(BLOCK)
                 return [data] if sender[0] == self.host else []
@@ -152,7 +152,7 @@ class UdpOutlet(Outlet):
             self._socket.sendto(data, (self.host, port))
         except OSError as error:
             if error.errno in (errno.EAGAIN, errno.EWOULDBLOCK):
-                select.select([], [self._socket], [], POLL)
+                ready([], [self._socket], POLL)
             elif error.errno == errno.ENOBUFS:
                 time.sleep(LOOK)
             elif error.errno != errno.ECONNREFUSED:  # which is the answer to an earlier datagram
@@ -184,7 +184,7 @@ class TcpOutlet(Outlet):
             return []
         behind = [client for client, waiting in self._clients.items() if waiting]
         doors = [] if self._sole and self._clients else [self._listener]
-        readable, writable, _ = select.select([*doors, *self._clients], behind, [], wait)
+        readable, writable = ready([*doors, *self._clients], behind, wait)
         for client in writable:
             self._flush(client)
         commands = [self._read(client) for client in readable if client in self._clients]
@@ -203,7 +203,7 @@ class TcpOutlet(Outlet):
             waiting.extend(data)
             self._flush(client)
             while patient and self._clients.get(client):
-                select.select([], [client], [], POLL)
+                ready([], [client], POLL)
                 self._flush(client)
 
     def await_listener(self) -> None:
@@ -220,13 +220,18 @@ class TcpOutlet(Outlet):
         self._listener = listener(*self._address)
 
     def finish(self) -> None:
-        """Hang up when the last bytes have been sent: closing with something unread would take back what is on its way."""
+        """Hang up when the last bytes have been sent: closing with something unread would take back what is on its way.
+
+        Whoever goes on sending is not waited for longer than who keeps silent.
+        """
+        limit = time.monotonic() + FAREWELL
         for client in list(self._clients):
             with contextlib.suppress(OSError):
-                client.settimeout(FAREWELL)
                 client.shutdown(socket.SHUT_WR)
-                while client.recv(BLOCK):
-                    pass
+                while (left := limit - time.monotonic()) > 0:
+                    client.settimeout(left)
+                    if not client.recv(BLOCK):
+                        break
             self._forget(client)
 
     def _accept(self) -> None:
@@ -314,7 +319,7 @@ class PtyOutlet(Outlet):
             return []
         if not self.heard:
             time.sleep(min(wait, UNHEARD))
-        elif not any(select.select([self._master], [self._master] if self._waiting else [], [], wait)):
+        elif not any(ready([self._master], [self._master] if self._waiting else [], wait)):
             return []
         self._flush()
         try:
@@ -337,7 +342,7 @@ class PtyOutlet(Outlet):
         self._waiting += data
         self._flush()
         while patient and self._waiting and self.heard:
-            select.select([], [self._master], [], POLL)
+            ready([], [self._master], POLL)
             if self._is_alone():
                 self._left()
             self._flush()

@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import os
+import time
 from shlex import quote
 
 import serial
@@ -17,7 +18,7 @@ import serial
 from lidarspec.errors import SourceError, UsageError
 from lidarspec.spec.links import Serial
 from lidarspec.spec.sensor import Sensor
-from lidarspec.transports.base import Address, StreamTransport, data_link, error_numbers, failure, lost, named, readable, reason
+from lidarspec.transports.base import Address, StreamTransport, data_link, error_numbers, failure, lost, named, readable, ready, reason
 
 try:
     from termios import error as TermiosError
@@ -57,9 +58,21 @@ class SerialTransport(StreamTransport):
 
     def write(self, data: bytes) -> None:
         try:
-            self._port.write(data)
+            if os.name == "posix":
+                self._send(self._port.fileno(), memoryview(data))
+            else:
+                self._port.write(data)
         except GONE as error:
             raise lost(self.label, error) from None
+
+    def _send(self, descriptor: int, left: memoryview) -> None:
+        """Write through the descriptor, of whatever number: pyserial asks `select`, which knows none above 1,023."""
+        limit = time.monotonic() + WRITE_TIMEOUT
+        while left:
+            if not ready([], [descriptor], max(limit - time.monotonic(), 0.0))[1]:
+                raise TimeoutError(errno.ETIMEDOUT, os.strerror(errno.ETIMEDOUT))
+            with contextlib.suppress(BlockingIOError):
+                left = left[os.write(descriptor, left) :]
 
     def lines(self, *, dtr: bool | None = None, rts: bool | None = None) -> None:
         for name, level in (("dtr", dtr), ("rts", rts)):

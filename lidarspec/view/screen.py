@@ -18,6 +18,7 @@ from typing import Any, Self, TextIO
 import numpy as np
 from rich.console import Console
 
+from lidarspec.transports.base import readable
 from lidarspec.view.canvas import Cells, Depth, sgr
 
 #: what the cursor keys send on POSIX, after escape, and on Windows, after a byte of their own.
@@ -80,7 +81,6 @@ if sys.platform == "win32":
         return Keyboard() if sys.stdin.isatty() and not taken else Keys()
 
 else:
-    import select
     import termios
     import tty
 
@@ -93,8 +93,7 @@ else:
 
         def read(self, timeout: float) -> list[str]:
             """The keys that came within some seconds."""
-            ready, _, _ = select.select([self._descriptor], [], [], timeout)
-            if not ready:
+            if not readable(self._descriptor, timeout):
                 return []
             data = os.read(self._descriptor, 1024)
             if not data:  # the terminal went away

@@ -48,11 +48,26 @@ def test_written_datagrams_come_back_with_right_checksums() -> None:
     assert made.read(capture_head(ETHERNET) + b"".join(records)) == (written, CaptureStats(packets=len(written), datagrams=len(written)))
 
 
+def test_ipv6_is_written_with_its_checksum() -> None:
+    draw = random.Random(2)
+    some = [(draw.randrange(99), "::1") for _ in range(99)]
+    for size, destination in [(0, "::"), (3, "ff02::1"), (1248, "10.0.0.1"), (65_527, "0.0.0.0"), *some]:
+        datagram = Datagram(draw.randbytes(size), 10**18, ("fe80::1:2", 2368), (destination, 6699))
+        record = datagram_record(datagram)
+        ((read,), _) = made.read(capture_head(ETHERNET) + record)
+        assert (read.data, read.at, read.source, read.destination[1]) == (datagram.data, datagram.at, datagram.source, 6699)
+        assert read.destination[0] in (destination, "::", "::ffff:a00:1", "::ffff:10.0.0.1")
+        packet = record[16 + 14 :]
+        words = packet[8:40] + struct.pack(">II", size + 8, 17) + packet[40:] + bytes(size % 2)
+        total = sum(struct.unpack(f">{len(words) // 2}H", words))
+        assert (total & 0xFFFF) + (total >> 16) in (0xFFFF, 0x1FFFE), "the checksum is right"
+
+
 @pytest.mark.parametrize(
     ("datagram", "reason"),
     [
         (Datagram(bytes(65_508), 0, made.SOURCE, made.DESTINATION), "65508 bytes"),
-        (Datagram(b"", 0, ("fe80::1", 1), made.DESTINATION), "fe80::1"),
+        (Datagram(bytes(65_528), 0, ("fe80::1", 1), ("::", 1)), "65528 bytes"),
         (Datagram(b"", 0, made.SOURCE, ("sensor.local", 1)), "sensor.local"),
         (Datagram(b"", 0, made.SOURCE, ("10.0.0.1", 65_536)), "65536"),
         (Datagram(b"", -1, made.SOURCE, made.DESTINATION), "-1 ns"),

@@ -202,6 +202,24 @@ def test_a_blocking_queue_loses_nothing(line: Port) -> None:
         assert device.stats.queue_dropped == 0
 
 
+def test_what_ends_the_thread_that_reads_is_raised_as_the_end_of_the_source(line: Port) -> None:
+    class Forgetful:
+        error = None
+
+        def write(self, chunk: Chunk, direction: str = "in") -> None:
+            raise UsageError("no room for that")
+
+        def event(self, name: str, at: int | None = None, **details: object) -> None: ...
+
+        def close(self) -> None: ...
+
+    with ls.open(f"serial://{line.name}", TURNING, record=lambda opened: Forgetful()) as device:
+        line.send(b"1")
+        for _ in range(2):
+            with pytest.raises(SourceError, match="nothing is read any more: no room for that"):
+                packets(device, 1)
+
+
 def test_an_unknown_policy_is_refused(line: Port) -> None:
     with pytest.raises(UsageError, match="drop_oldest or block"):
         ls.open(f"serial://{line.name}", TURNING, overflow="forget")

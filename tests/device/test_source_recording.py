@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import contextlib
+import socket
 from dataclasses import replace
 from pathlib import Path
 
+import pytest
+
+from lidarspec.captures.pcap import CaptureReader
 from lidarspec.device.source_recording import SourceRecording
 from lidarspec.recording.format import Recording
 from lidarspec.spec import Fields
@@ -49,3 +53,20 @@ def test_strangers_are_told_of_once_while_a_recording_goes_on(tmp_path: Path) ->
             other.sendto(frame, ("127.0.0.1", number))
         said += running
     assert "\n".join(said).count("sends as well, and is left out") == 1
+
+
+def test_a_sensor_that_sends_over_ipv6_is_recorded_for_wireshark(tmp_path: Path) -> None:
+    sensor, path = SHAPES["shape-datagrams"], tmp_path / "six.pcap"
+    with socket.socket(socket.AF_INET6, socket.SOCK_DGRAM) as sender:
+        try:
+            sender.bind(("::1", 0))
+        except OSError:
+            pytest.skip("this system has no IPv6")
+        number, sent = free_port(), turning(sensor, 20)
+        with contextlib.closing(SourceRecording(f"udp://[::1]:{number}", str(path), sensor, count=20).run()) as running:
+            next(running)
+            for frame in sent:
+                sender.sendto(frame, ("::1", number))
+            list(running)
+        assert [datagram.data for datagram in CaptureReader(path)] == sent
+        assert {datagram.source for datagram in CaptureReader(path)} == {sender.getsockname()[:2]}

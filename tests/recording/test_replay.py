@@ -20,10 +20,11 @@ import lidarspec as ls
 from lidarspec.errors import SourceError, UsageError
 from lidarspec.recording.recorders import Recorder, recorder
 from lidarspec.spec import Chunk, Disconnected
+from lidarspec.transports import outlets
 from lidarspec.transports.open_url import transport
 from lidarspec.transports.outlets import FileOutlet, Outlet, PtyOutlet, TcpOutlet, UdpOutlet, replay_outlet
 from lidarspec.transports.serving import Deadlines, replayed
-from tests.lines import SLACK
+from tests.lines import SLACK, until, working
 
 STREAM, DATAGRAMS = "ldrobot-stl27l", "velodyne-vlp16"
 MS, SECOND = 1_000_000, 1_000_000_000
@@ -257,6 +258,24 @@ def test_a_reader_that_leaves_is_noticed(stream: Path) -> None:
     with playing(stream, server, speed=1.0) as failed, socket.create_connection(("127.0.0.1", int(server.place.split(":")[2]))) as reader:
         reader.recv(1)
     assert [type(error) for error in failed] == [Disconnected]
+
+
+def test_a_reader_that_floods_does_not_hold_up_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(outlets, "FAREWELL", 0.2)
+    target = TcpOutlet("127.0.0.1", 0, sole=True)
+    with socket.create_connection(("127.0.0.1", int(target.place.split(":")[2]))) as reader:
+        target.await_listener()
+
+        def flood(stop: threading.Event) -> None:
+            with contextlib.suppress(OSError):
+                while not stop.is_set():
+                    reader.sendall(bytes(1 << 16))
+
+        with working(flood):
+            ending = threading.Thread(target=target.finish, daemon=True)
+            ending.start()
+            until(lambda: not ending.is_alive())
+    target.close()
 
 
 @posix

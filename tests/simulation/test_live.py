@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import itertools
 import os
@@ -11,6 +12,7 @@ import subprocess
 import sys
 import threading
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -26,11 +28,12 @@ from lidarspec.spec import Udp
 from lidarspec.testing.fixtures import virtual_port
 from lidarspec.transports.outlets import simulated_outlet
 from lidarspec.transports.serving import Served, Turns, write_file
+from lidarspec.view.screen import Keyboard
 from tests.lines import SLACK, free_port, until
 from tests.simulation.test_simulator import off
 
 posix = pytest.mark.skipif(os.name != "posix", reason="pseudo terminals are POSIX")
-STL, VLP = ls.sensor("ldrobot-stl27l"), ls.sensor("velodyne-vlp16")
+STL, VLP, A1 = ls.sensor("ldrobot-stl27l"), ls.sensor("velodyne-vlp16"), "slamtec-rplidar-a1"
 
 
 def scans(device: ls.Device, number: int) -> list[ls.Scan]:
@@ -278,6 +281,42 @@ def test_what_goes_wrong_in_the_thread_of_a_port_is_raised_at_its_end() -> None:
     assert tried.wait(10)
     with pytest.raises(ZeroDivisionError):
         port.close()
+
+
+@pytest.fixture
+def above_1023() -> Iterator[None]:
+    """Whatever is opened gets a descriptor that `select` does not know."""
+    resource = pytest.importorskip("resource")
+    limits = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if limits[1] < 2048:
+        pytest.skip("this user may not open so many files")
+    resource.setrlimit(resource.RLIMIT_NOFILE, (2048, limits[1]))
+    with contextlib.ExitStack() as stack:
+        while stack.enter_context(open(os.devnull, "rb")).fileno() < 1024:
+            pass
+        yield
+    resource.setrlimit(resource.RLIMIT_NOFILE, limits)
+
+
+@posix
+@pytest.mark.usefixtures("above_1023")
+@pytest.mark.parametrize(("name", "to"), [(A1, "pty"), (A1, "tcp://127.0.0.1:0"), ("velodyne-vlp16", "udp")])
+def test_descriptors_may_have_any_number(name: str, to: str) -> None:
+    place = f"udp://127.0.0.1:{free_port()}" if to == "udp" else to
+    with virtual_port(name, to=place) as port, ls.open(port.path, name) as device:
+        scans(device, 1)
+        assert bool(port.device.heard) == (name == A1)
+
+
+@posix
+@pytest.mark.usefixtures("above_1023")
+def test_keys_come_over_any_descriptor() -> None:
+    master, slave = os.openpty()
+    with Keyboard(slave) as keyboard:
+        os.write(master, b"q")
+        assert keyboard.read(SLACK) == ["q"]
+    os.close(master)
+    os.close(slave)
 
 
 @posix
