@@ -7,6 +7,7 @@ import functools
 import io
 import json
 import random
+import re
 import struct
 import zlib
 from collections.abc import Callable, Iterable, Sequence
@@ -33,6 +34,7 @@ from lidarspec.wire.layout import Layout
 from tests import made_captures as made
 from tests.all_sensors import DISTINCT, EVERY, FRAMES
 from tests.fuzz.words import HOSTILE, commanded, spoken
+from tests.shapes import SHAPES
 
 #: longest input.
 LONGEST = 1 << 16
@@ -43,6 +45,8 @@ EDGES: tuple[bytes, ...] = tuple(
     for value in (0, 1, -1, -2, (1 << 8 * width - 1) - 1, 1 << 8 * width - 1, 100, 36_000)
     for order in ("little", "big")
 )
+#: a number, a text or a list of TOML, JSON or CSV.
+VALUE = re.compile(rb'"[^"\n]*"|-?\d[\w.]*|\[[^\[\]]*\]|\{[^{}]*\}')
 STL, VLP = "ldrobot-stl27l", "velodyne-vlp16"
 
 
@@ -58,6 +62,7 @@ class Target:
         words: what mutations put in as a whole; `EDGES` where there are none of its own.
         spots: where the fields of an input begin.
         mended: the input with its checksums right again, as far as it has some.
+        is_text: whether it has numbers, texts and lists, any of which becomes a word at times.
         cost: of an input, beside those of others of its group: what is dear is read less often.
     """
 
@@ -68,6 +73,7 @@ class Target:
     words: Sequence[bytes] = field(default=EDGES, repr=False)
     spots: Callable[[bytes], Sequence[int]] = lambda data: ()
     mended: Callable[[bytes], bytes] = lambda data: data
+    is_text: bool = False
     cost: float = 1.0
 
     @property
@@ -76,6 +82,9 @@ class Target:
 
     def mutation(self, data: bytes, other: bytes, source: random.Random) -> bytes:
         """A neighbour of an input, with a piece of another one in it at times; half of them have their checksums mended."""
+        if self.is_text and source.random() < 0.5 and (values := list(VALUE.finditer(data))):
+            start, end = source.choice(values).span()
+            return data[:start] + source.choice(self.words) + data[end:]
         start = source.randrange(len(other) + 1)
         words = self.words if source.random() < 0.8 else [other[start : start + source.choice((4, 64, LONGEST))]]
         found = material.mutated(data, source, words, self.spots(data))[:LONGEST]
@@ -317,7 +326,7 @@ source = "./rear.lsr"
 sensor = "{VLP}"
 options = {{calibration = "./angles.csv"}}
 """
-    return Target("settings", run, lambda: [text.encode()], (ls.UsageError, ls.SourceError), TOML)
+    return Target("settings", run, lambda: [text.encode()], (ls.UsageError, ls.SourceError), TOML, is_text=True)
 
 
 #: pieces of TOML and JSON that make trouble.
@@ -362,11 +371,11 @@ def _scene(folder: Path) -> Target:
 
     text = b"[room]\nlow=[-3.0,-2.2,-1.2]\nhigh=[4.6,3.1,1.6]\n[[box]]\nlow=[2.0,0.8,-1.2]\nhigh=[2.7,1.6,0.9]\n"
     mover = b"[[mover]]\nsize=[0.4,0.5,1.7]\npath=[[1.4,-1.5],[0.8,1.9]]\nspeed=0.8\nfloor=-1.2\n"
-    return Target("scene", run, lambda: [text + mover], (ls.UsageError, ls.SourceError), TOML)
+    return Target("scene", run, lambda: [text + mover], (ls.UsageError, ls.SourceError), TOML, is_text=True)
 
 
 def _vectors(folder: Path) -> Target:
-    path, sensor = folder / "vectors.json", ls.sensor(STL)
+    path, sensor = folder / "vectors.json", SHAPES["shape-datagrams"]  # without a checksum, which would be searched for
     subject = Subject(sensor, vectors=path)
 
     def run(data: bytes) -> None:
@@ -374,10 +383,11 @@ def _vectors(folder: Path) -> Target:
         vectors_hold(subject)
 
     frame = sensor.example("data", seed=1)
-    vector = {"source": "manual 3.2", "frame": "data", "hex": frame.hex(" "), "values": {"speed": sensor.parse(frame).speed}}
-    cloud = sensor.decode(frame).points()
+    vector = {"source": "manual 3.2", "frame": "data", "hex": frame.hex(" "), "values": {"number": sensor.parse(frame).number}}
+    cloud = sensor.decode([frame]).points()
     points = {str(index): {name: float(getattr(cloud, name)[index]) for name in ("range", "x", "y")} for index in (0, 3)}
-    more = {"units": {"start_angle": sensor.parse(frame, units=True).start_angle}, "points": points, "sensor": [STL], "note": "x"}
+    units = {"blocks[0].azimuth": sensor.parse(frame, units=True).blocks[0].azimuth}
+    more = {"units": units, "points": points, "sensor": [sensor.id], "note": "x"}
     words = [
         *TOML,
         b'"command":"start"',
@@ -387,7 +397,7 @@ def _vectors(folder: Path) -> Target:
         b'"values":{"points[0]":1}',
     ]
     words += [b'"frame":[]', b'"sensor":1', b'"hex":1', b'"units":[]', b'"reply":"54"', b"NaN", b"null", b"1e999"]
-    return Target("vectors", run, lambda: [json.dumps([vector, {**vector, **more}]).encode()], (Violation,), words)
+    return Target("vectors", run, lambda: [json.dumps([vector, {**vector, **more}]).encode()], (Violation,), words, is_text=True)
 
 
 def _calibration(sensor: Sensor, option: str, folder: Path) -> Target:
@@ -407,7 +417,7 @@ def _calibration(sensor: Sensor, option: str, folder: Path) -> Target:
         word.encode()
         for word in ("nan", "inf", "-inf", "1e999", ",", "\n", '"', "\x00", "1_0", "\u0661", "EEFF", "414", "0", "-0", ",,,,", "9" * 5000)
     ]
-    return Target(f"calibration {sensor.id} {option}", run, examples, (ls.UsageError, ls.SourceError), words)
+    return Target(f"calibration {sensor.id} {option}", run, examples, (ls.UsageError, ls.SourceError), words, is_text=True)
 
 
 def _named(data: bytes) -> None:

@@ -176,7 +176,7 @@ def blocked(share: float) -> Figure:
     ]
     for name, stop in cases:
         sensor, frames = ls.sensor(name), []
-        for data in simulate(sensor, int(2000 * share) + 1500):
+        for data in simulate(sensor, int(2000 * share) + 600):
             parsed = sensor.parse(data)
             stop(parsed)
             frames.append(sensor.build(sensor.data_frame, parsed))
@@ -184,7 +184,7 @@ def blocked(share: float) -> Figure:
             scans = list(sensor.scans(frames if sensor.datagrams else b"".join(frames)))
         packets = len(frames) / max(len(scans), 1)
         told.append(f"{name}: {len(scans)} scans of {len(frames)} packets, {sum(scan.complete for scan in scans)} said to be complete")
-        kept &= len(scans) > 1 and packets < 1000 and not any(scan.complete for scan in scans)
+        kept &= len(scans) > 1 and packets < 500 and not any(scan.complete for scan in scans)
     return Figure("rotor blocked, " + "; ".join(told), kept)
 
 
