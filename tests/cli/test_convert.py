@@ -189,7 +189,7 @@ def test_the_input_is_never_overwritten_by_whatever_name(tmp_path: Path, words: 
 def test_files_of_options_and_standard_input_are_inputs_too(tmp_path: Path) -> None:
     source, angles = tmp_path / "in.bin", tmp_path / "angles.csv"
     source.write_bytes(EXAMPLE)
-    angles.write_text("channel,elevation,azimuth\n" + "".join(f"{channel},1,1\n" for channel in range(1, 17)))
+    angles.write_text("channel,elevation,azimuth\n" + "".join(f"{channel},{2 * channel - 17},0\n" for channel in range(1, 17)))
     words = ("convert", source, angles, "--force", "-s", "hesai-xt16", "-O", f"calibration={angles}")
     assert "would be overwritten" in ran(*words, code=2).stderr
     with source.open("rb") as given:

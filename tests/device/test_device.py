@@ -114,7 +114,7 @@ def test_silence_is_noticed_and_told(line: Port) -> None:
         assert took > 0.5
         (warning,) = device.warnings
         assert "nothing has arrived for" in warning
-        assert warning.endswith(f"next: lidarspec doctor 'serial://{line.name}' -s {TURNING.id}")
+        assert warning.endswith(f"next: lidarspec doctor serial://{line.name} -s {TURNING.id}")
         line.send(turning(TURNING, 1)[0])
         packets(device, 1)
         assert device.state == "streaming"
@@ -129,7 +129,7 @@ def test_bytes_without_frames_name_the_baud_rate(line: Port) -> None:
         until(lambda: device.newest(0.01) or device.state == "no frames")
         (warning,) = device.warnings
         assert "9600 baud is likely wrong" in warning
-        assert warning.endswith(f"next: lidarspec detect 'serial://{line.name}'")
+        assert warning.endswith(f"next: lidarspec detect serial://{line.name}")
 
 
 def test_latest_never_falls_behind(line: Port) -> None:
@@ -384,7 +384,8 @@ def test_a_live_sensor_that_the_frames_contradict_is_told_of() -> None:
 def test_a_nominal_calibration_is_told_of_once_with_the_way_to_give_the_units_own(tmp_path: Path) -> None:
     path, angles = tmp_path / "xt32.bin", tmp_path / "angles.csv"
     path.write_bytes(b"".join(simulate(ls.sensor("hesai-xt32"), 300)))
-    angles.write_text("\n".join(f"{channel + 1},{15 - channel},0.1" for channel in range(32)), encoding="utf-8")
+    rows = (f"{channel + 1},{15 - channel},0.1" for channel in range(32))
+    angles.write_text("\n".join(["Channel,Elevation,Azimuth", *rows]), encoding="utf-8")
     with ls.open(path) as device:
         assert all("nominal calibration" in repr(scan) for scan in device.scans())
         (warning,) = device.warnings

@@ -208,10 +208,58 @@ def test_a_file_of_another_model_is_refused(rows: str, tmp_path: Path) -> None:
 def test_a_file_that_is_missing_or_has_no_numbers_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ls.UsageError, match=r"none\.csv"):
         P40.configure(calibration=tmp_path / "none.csv")
-    with pytest.raises(ls.UsageError, match="finite"):
+    with pytest.raises(ls.UsageError, match="line 2, column 2: elevation nan is not within"):
         XT16.configure(calibration=angles(tmp_path / "nan.csv", 16, rows="".join(f"{i},nan,0\n" for i in range(1, 17))))
     with pytest.raises(ls.UsageError):
         P40.configure(angles=tmp_path / "none.csv")
+
+
+HEAD, ROWS = "Channel,Elevation,Azimuth", [f"{i},{2 * i - 17},{i / 4}" for i in range(1, 17)]
+RADIANS = [f"{i},{np.deg2rad(2 * i - 17)},0" for i in range(1, 17)]
+FAULTY = {
+    "a channel twice": ([HEAD, *ROWS, ROWS[4]], "line 18, column 1: channel 5 stands in line 6 already"),
+    "a channel of others": ([HEAD, *ROWS, "17,1,1"], "line 18, column 1: channel 17, and this model has channels 1 to 16"),
+    "half a channel": ([HEAD, "1.5,1,1"], "line 2, column 1: channel 1.5, and"),
+    "a channel missing": ([HEAD, *ROWS[1:]], "lists 15 channels, and this model has channels 1 to 16; 1 is the first missing"),
+    "radians": (
+        [HEAD, *RADIANS],
+        "line 2, column 2: the elevations spread over 0.523599, those of this model over 30 degrees: is it another",
+    ),
+    "radians said": (["Channel,Elevation(rad),Azimuth", *RADIANS], r"line 1, column 2: 'Elevation\(rad\)' is not in degrees"),
+    "too high": ([HEAD, ROWS[0], "2,414,0"], "line 3, column 2: elevation 414 is not within -90 .. 90 degrees"),
+    "too far around": ([HEAD, ROWS[0], "2,1,-414"], "line 3, column 3: azimuth -414 is not within"),
+    "zeros": ([HEAD, *(f"{i},0,0" for i in range(1, 17))], "line 2, column 2: the elevations are all 0, those"),
+    "no number": ([HEAD, "1,x,0"], "line 2, column 2: elevation is 'x', no number"),
+    "a cell short": ([HEAD, "1,2"], "line 2, column 3: azimuth is '', no number"),
+    "no headings": (ROWS, "line 1: no column is headed 'channel'; the headings are '1, -15, 0.25'"),
+    "another kind": (["Channel,fire time(us)", "1,2"], "line 1: no column is headed 'elevation'; the headings are 'Channel, fire time"),
+    "a picture": (["\x89PNG\r\n\x1a\n\0\0\0"], "no column is headed 'channel'"),
+    "empty": ([], "it is empty"),
+    "huge": ([HEAD, *ROWS, " " * 1_000_000], "it has more than 1 MB"),
+}
+
+
+@pytest.mark.parametrize("what", FAULTY)
+def test_a_faulty_correction_file_is_refused_with_its_place(what: str, tmp_path: Path) -> None:
+    file, (lines, message) = tmp_path / "angles.csv", FAULTY[what]
+    file.write_text("".join(f"{line}\n" for line in lines), encoding="utf-8")
+    with pytest.raises(ls.UsageError, match=rf"angles\.csv: .*{message}"):
+        XT16.configure(calibration=file)
+
+
+def test_columns_are_found_by_their_headings(tmp_path: Path) -> None:
+    file, data = tmp_path / "angles.csv", [packet("xt16", {}, {(0, 4): 1000})]
+    lines = ["Azimuth (deg),note,Elevation(°),Laser ID", *(f"{i / 4},?,{2 * i - 17},{i}" for i in range(1, 17))]
+    file.write_text("\ufeff" + "\n".join(lines), encoding="utf-8")
+    cloud = XT16.configure(calibration=file).decode(data).points()
+    assert np.rad2deg((cloud.elevation[4], cloud.azimuth[4])) == pytest.approx((-7, -1.25))
+
+
+def test_firing_times_are_microseconds(tmp_path: Path) -> None:
+    file = tmp_path / "times.csv"
+    file.write_text("Channel,fire time(μs)\n" + "".join(f"{i},{i * 1e-6}\n" for i in range(1, 17)), encoding="utf-8")
+    with pytest.raises(ls.UsageError, match=r"column 2: the fire times spread over 1\.5e-05, those of this model over 45\.36 microseconds"):
+        XT16.configure(firing_times=file)
 
 
 @pytest.mark.parametrize("name", SENSORS)

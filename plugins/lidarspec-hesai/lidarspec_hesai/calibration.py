@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import csv
 import dataclasses
-import math
-from collections.abc import Callable, Iterable
+import io
+import re
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -20,6 +21,37 @@ from lidarspec import UsageError
 from lidarspec.spec import Points, Sensor
 
 Table = NDArray[np.float64]
+
+#: bytes of a correction file at most; characters of it that a message repeats.
+LARGEST, QUOTED = 1_000_000, 60
+#: what stands above the headings of some files, and below the table.
+MARK, HASH = "EEFF", re.compile(r"[0-9a-fA-F]{8,}")
+#: how many times as far as the model's own values those of a unit may spread, or how little: radians do 57 times less than degrees.
+UNLIKE = 10
+
+
+@dataclass(frozen=True)
+class Column:
+    """What a file says of each channel.
+
+    Attributes:
+        name: in words.
+        headings: its letters, in small ones and without what stands in parentheses.
+        low, high: between which values are.
+        units: spellings of the one that they are in, which may stand in parentheses.
+    """
+
+    name: str
+    headings: tuple[str, ...]
+    low: float
+    high: float
+    units: tuple[str, ...]
+
+
+CHANNEL = Column("channel", ("channel", "laserid", "laser"), 0, 1 << 16, ("numbers",))
+ELEVATION = Column("elevation", ("elevation",), -90, 90, ("degrees", "degree", "deg", "°"))
+AZIMUTH = Column("azimuth", ("azimuth",), -360, 360, ELEVATION.units)
+FIRING = Column("fire time", ("firetime", "firingtime"), -10_000, 10_000, ("microseconds", "us", "µs", "μs"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,37 +92,101 @@ def configure(
     Args:
         points: the model's function of `Fields` and the channels' `Calibration`.
         table: the model's channels.
-        calibration: CSV of channel, elevation and azimuth in degrees.
-        firing_times: CSV of channel and firing time in microseconds.
+        calibration: CSV with the headings Channel (or Laser id), Elevation and Azimuth, in degrees; in any order.
+        firing_times: CSV with the headings Channel and Fire time, in microseconds.
 
     Raises:
-        UsageError: for a file that cannot be read, or does not list the channels of this model.
+        UsageError: for a file that cannot be read, or is none of this model; with line and column.
     """
     angles, times = calibration or sensor.options.get("calibration"), firing_times or sensor.options.get("firing_times")
     if angles:
-        elevation, azimuth = columns(angles, len(table), 2)
+        elevation, azimuth = columns(angles, {ELEVATION: table.elevation, AZIMUTH: table.azimuth})
         table = dataclasses.replace(table, elevation=elevation, azimuth=azimuth, nominal=False)
     if times:
-        table = dataclasses.replace(table, firing=columns(times, len(table), 1)[0] * 1e-6)
+        table = dataclasses.replace(table, firing=columns(times, {FIRING: table.firing * 1e6})[0] * 1e-6)
     return dataclasses.replace(sensor, points=partial(points, channels=table))
 
 
-def columns(path: str | Path, channels: int, number: int) -> list[Table]:
-    """The numbers after the channel in a correction file, by channel.
+def columns(path: str | Path, wanted: Mapping[Column, Table]) -> list[Table]:
+    """Columns of a correction file by their headings, each (channels,), in the order of the channels.
 
-    Headings, the mark EEFF above the table and the hash below it are passed over, as the vendor's reader does.
+    The mark EEFF above the headings and the hash below the table are passed over, as the vendor's reader does.
+
+    Args:
+        wanted: the model's own values of each column, which those of a unit are of a kind with.
 
     Raises:
-        UsageError: where the file cannot be read, or its channels are not 1 to `channels`, each with finite numbers.
+        UsageError: with line and column, where the file cannot be read, or does not hold these columns for every channel of the model once.
     """
+    (line, headings), *rows = _rows(path)
+    places = [_place(path, line, headings, column) for column in (CHANNEL, *wanted)]
+    channels = len(next(iter(wanted.values())))
+    listed: dict[int, tuple[int, list[float]]] = {}
+    for line, cells in rows:
+        channel, *values = (_value(path, line, cells, place, column) for place, column in zip(places, (CHANNEL, *wanted), strict=True))
+        if channel != int(channel) or not 1 <= channel <= channels:
+            raise _fault(path, line, places[0], f"channel {channel:g}, and this model has channels 1 to {channels}")
+        if channel in listed:
+            raise _fault(path, line, places[0], f"channel {channel:g} stands in line {listed[int(channel)][0]} already")
+        listed[int(channel)] = line, values
+    if missing := [channel for channel in range(1, channels + 1) if channel not in listed]:
+        raise UsageError(
+            f"{path}: lists {len(listed)} channels, and this model has channels 1 to {channels}; {missing[0]} is the first missing"
+        )
+    tables = list(np.array([listed[channel][1] for channel in sorted(listed)]).T)
+    for (column, own), table, place in zip(wanted.items(), tables, places[1:], strict=True):
+        _compare(path, rows[0][0], place, column, table, own)
+    return tables
+
+
+def _rows(path: str | Path) -> list[tuple[int, list[str]]]:
+    """The headings and the table, each row with its line."""
     try:
-        with open(path, encoding="utf-8", errors="replace", newline="") as file:
-            rows = [[cell.strip() for cell in row] for row in csv.reader(file)]
-        listed = {int(row[0]): [float(cell) for cell in row[1 : 1 + number]] for row in rows if len(row) > number and row[0].isdecimal()}
-    except (OSError, ValueError, csv.Error) as error:
+        with open(path, "rb") as file:
+            data = file.read(LARGEST + 1)
+        if len(data) > LARGEST:
+            raise UsageError(f"{path}: not a correction file: it has more than {LARGEST // 1_000_000} MB")
+        reader = csv.reader(io.StringIO(data.decode("utf-8-sig", "replace"), newline=""))
+        rows = [(reader.line_num, [cell.strip() for cell in cells]) for cells in reader if any(map(str.strip, cells))]
+    except (OSError, csv.Error) as error:
         raise UsageError(f"{path}: not a correction file: {error}") from error
-    if sorted(listed) != list(range(1, channels + 1)):
-        raise UsageError(f"{path}: lists {len(listed)} channels, and this model has channels 1 to {channels}")
-    if not all(math.isfinite(value) for values in listed.values() for value in values):
-        raise UsageError(f"{path}: has a value that is not a finite number")
-    return list(np.array([listed[channel] for channel in sorted(listed)]).T)
+    rows = rows[1:] if rows and rows[0][1][0] == MARK else rows
+    if not rows:
+        raise UsageError(f"{path}: not a correction file: it is empty")
+    return rows[:-1] if len(rows) > 1 and HASH.fullmatch(",".join(rows[-1][1])) else rows
+
+
+def _place(path: str | Path, line: int, headings: list[str], column: Column) -> int:
+    """Where a column stands, from 0."""
+    for place, heading in enumerate(headings):
+        name, _, unit = heading.lower().partition("(")
+        if re.sub(r"[^a-z]", "", name) in column.headings:
+            if unit.strip(" )") not in ("", *column.units):
+                raise _fault(path, line, place, f"{heading!r} is not in {column.units[0]}")
+            return place
+    raise UsageError(f"{path}: line {line}: no column is headed {column.name!r}; the headings are {', '.join(headings)[:QUOTED]!r}")
+
+
+def _value(path: str | Path, line: int, cells: list[str], place: int, column: Column) -> float:
+    text = cells[place] if place < len(cells) else ""
+    try:
+        value = float(text)
+    except ValueError:
+        raise _fault(path, line, place, f"{column.name} is {text[:QUOTED]!r}, no number") from None
+    if not column.low <= value <= column.high:  # nor nan
+        raise _fault(path, line, place, f"{column.name} {value:g} is not within {column.low:g} .. {column.high:g} {column.units[0]}")
+    return value
+
+
+def _compare(path: str | Path, line: int, place: int, column: Column, table: Table, own: Table) -> None:
+    """Nothing, where the values spread like the model's own, to a factor of ten."""
+    spread, usual = float(np.ptp(table)), float(np.ptp(own))
+    if usual and not usual / UNLIKE < spread < usual * UNLIKE:
+        told = f"spread over {spread:g}" if spread else f"are all {table[0]:g}"
+        raise _fault(
+            path, line, place, f"the {column.name}s {told}, those of this model over {usual:g} {column.units[0]}: is it another unit?"
+        )
+
+
+def _fault(path: str | Path, line: int, place: int, reason: str) -> UsageError:
+    return UsageError(f"{path}: line {line}, column {place + 1}: {reason}")
