@@ -472,7 +472,8 @@ def test_a_live_sensor_that_the_frames_contradict_is_told_of() -> None:
 def test_a_nominal_calibration_is_told_of_once_with_the_way_to_give_the_units_own(tmp_path: Path) -> None:
     path, angles = tmp_path / "xt32.bin", tmp_path / "angles.csv"
     path.write_bytes(b"".join(simulate(ls.sensor("hesai-xt32"), 300)))
-    angles.write_text("\n".join(f"{channel + 1},{15 - channel},0.1" for channel in range(32)), encoding="utf-8")
+    rows = (f"{channel + 1},{15 - channel},0.1" for channel in range(32))
+    angles.write_text("\n".join(["Channel,Elevation,Azimuth", *rows]), encoding="utf-8")
     with ls.open(path) as device:
         assert all("nominal calibration" in repr(scan) for scan in device.scans())
         (warning,) = device.warnings

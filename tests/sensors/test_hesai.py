@@ -258,7 +258,7 @@ def test_columns_are_found_by_their_headings(tmp_path: Path) -> None:
 def test_firing_times_are_microseconds(tmp_path: Path) -> None:
     file = tmp_path / "times.csv"
     file.write_text("Channel,fire time(μs)\n" + "".join(f"{i},{i * 1e-6}\n" for i in range(1, 17)), encoding="utf-8")
-    with pytest.raises(ls.UsageError, match="column 2: the fire times spread over 1.5e-05, those of this model over 45.36 microseconds"):
+    with pytest.raises(ls.UsageError, match=r"column 2: the fire times spread over 1\.5e-05, those of this model over 45\.36 microseconds"):
         XT16.configure(firing_times=file)
 
 
