@@ -481,7 +481,7 @@ def _is_vendor(distribution: str, names: Iterable[str]) -> bool:
     return prefix == NAMESPACE and bool(vendor) and any(name.startswith(f"{vendor}-") for name in names)
 
 
-def _owners() -> dict[str, str]:
+def named_owners() -> dict[str, str]:
     """The distributions that the user's own settings name as the owners of ids; what is wrong there is warned of."""
     file = own_settings()
     try:
@@ -562,7 +562,7 @@ _registries: list[Registry] = []
 def registry() -> Registry:
     """The registry of this environment."""
     if not _registries:
-        _registries.append(Registry(entry_points(GROUP), entry_points(SENSORS), _owners))
+        _registries.append(Registry(entry_points(GROUP), entry_points(SENSORS), named_owners))
     return _registries[-1]
 
 
@@ -582,7 +582,7 @@ def tried() -> list[Plugin]:
         if trials[home][0]
     ]
     modules, offered = ([entry for entry in group if not trials[entry.distribution, entry.module][0]] for group in groups)
-    return [replace(plugin, remark=trials[plugin.home][1]) for plugin in Registry(modules, offered, _owners).plugins] + lost
+    return [replace(plugin, remark=trials[plugin.home][1]) for plugin in Registry(modules, offered, named_owners).plugins] + lost
 
 
 def _trial(home: Home) -> tuple[str, str]:

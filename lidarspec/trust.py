@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import re
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from lidarspec.errors import UsageError, system_errors
 
@@ -103,8 +103,8 @@ def beside(folder: Path, value: object) -> Path:
     return found
 
 
-def document(path: Path) -> Any:
-    """What a TOML file holds, or by its suffix a JSON file.
+def document(path: Path, kind: Literal["TOML", "JSON"] = "TOML") -> Any:
+    """What a TOML or JSON file holds.
 
     Raises:
         UsageError: where it is none, or none of a reasonable size.
@@ -113,17 +113,19 @@ def document(path: Path) -> Any:
     import json  # where only an installed sensor is looked for, nobody waits for these
     import tomllib
 
-    name, parse = ("JSON", json.loads) if path.suffix == ".json" else ("TOML", tomllib.loads)
+    parse = json.loads if kind == "JSON" else tomllib.loads
     with system_errors(path), path.open("rb") as file:
-        data = file.read(LARGEST[name] + 1)
-    reason: object = f"it is longer than {LARGEST[name] >> 10} kB"
+        data = file.read(LARGEST[kind] + 1)
+    reason: object = f"it is longer than {LARGEST[kind] >> 10} kB"
     try:
-        if len(data) <= LARGEST[name]:
-            if name == "TOML" and _ENDLESS_KEY.search(data):
+        if len(data) <= LARGEST[kind]:
+            if kind == "TOML" and _ENDLESS_KEY.search(data):
                 raise ValueError("a key has more than 32 parts")
             return parse(data.decode())
     except RecursionError:
         reason = "its brackets are nested too deeply"
+    except UnicodeDecodeError:
+        reason = "it is no text in UTF-8"
     except ValueError as error:
         reason = error
-    raise UsageError(f"{path}: not {name}: {reason}")
+    raise UsageError(f"{path}: not {kind}: {reason}")

@@ -319,15 +319,15 @@ class _Records:
         if found is not None:
             self._learnt += 1
             self._known = [*self._known, found]
-            self._match(len(self._known) - 1)
+            self._match(len(self._known) - 1, since=index)
             if self._kinds[index] >= 0:
                 del self._plain[index]
                 self._counted += 1
 
-    def _match(self, kind: int) -> bool:
-        """Whether all records are now known."""
+    def _match(self, kind: int, since: int = 0) -> bool:
+        """Whether all records are now known; those before `since` were read: what was malformed there may be right by now."""
         alike, number = self._known[kind], len(self._kinds)
-        if kind == 0 and self._are_whole:
+        if kind == since == 0 and self._are_whole:
             found, at = alike.find(self._storage, self._starts[:number], self._lengths)
             if found is None:
                 self._only, self._at = alike, at
@@ -335,9 +335,9 @@ class _Records:
                 return True
             left = np.flatnonzero(found)
         else:
-            left = np.flatnonzero(self._kinds < 0)
+            left = since + np.flatnonzero(self._kinds[since:] < 0)
             found, at = alike.find(self._storage, self._starts[left], self._lengths[left])
             left = left if found is None else left[found]
         self._kinds[left] = kind
         self._at[left] = at
-        return found is None
+        return found is None and not since

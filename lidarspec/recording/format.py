@@ -29,6 +29,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, fields
 from functools import lru_cache
 from pathlib import Path
+from reprlib import repr as shown
 from shlex import quote
 from typing import Any, Literal
 
@@ -123,7 +124,7 @@ def read_header(data: bytes) -> Header:
     for name, value in known.items():
         kind = (int, type(None)) if name == "baud" else type(getattr(_BLANK, name))
         if not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool):
-            raise WireError(f"the header of the recording has {name} = {str(value)[:40]!r}", path=name, got=value)
+            raise WireError(f"the header of the recording has {name} = {shown(value)}", path=name, got=value)
     return Header(**known)
 
 

@@ -21,16 +21,17 @@ the origin, and what moves stands elsewhere at another time, so both can be give
 from __future__ import annotations
 
 import random
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from reprlib import repr as shown
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.errors import UsageError, did_you_mean, system_errors
+from lidarspec.errors import UsageError, did_you_mean
+from lidarspec.trust import document
 
 Floats = NDArray[np.float64]
 #: what broadcasts against the beams: an array, or one number for all.
@@ -190,13 +191,7 @@ def read_scene(path: str | Path) -> Room:
         SourceError: where it cannot be read.
         UsageError: where it is no TOML, or says something that is no scene: the key is named.
     """
-    try:
-        with system_errors(path):
-            return scene_of(tomllib.loads(Path(path).read_text(encoding="utf-8")), str(path))
-    except UnicodeDecodeError:
-        raise UsageError(f"{path}: no TOML, since it is no text in UTF-8") from None
-    except tomllib.TOMLDecodeError as error:
-        raise UsageError(f"{path}: {error}") from None
+    return scene_of(document(Path(path)), str(path))
 
 
 def scene_of(table: Mapping[str, Any], place: str = "scene") -> Room:
@@ -261,11 +256,11 @@ def _known(table: Mapping[str, Any], names: tuple[str, ...], place: str) -> None
 def _numbers(table: Mapping[str, Any], name: str, count: int, place: str) -> list[float]:
     values = table.get(name)
     if not isinstance(values, list) or len(values) != count:
-        raise UsageError(f"{place}.{name}: {count} numbers in brackets, not {values!r}")
+        raise UsageError(f"{place}.{name}: {count} numbers in brackets, not {shown(values)}")
     return [_number(value, f"{place}.{name}") for value in values]
 
 
 def _number(value: Any, place: str) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e6:
-        raise UsageError(f"{place}: a number, not {value!r}")
+        raise UsageError(f"{place}: a number, not {shown(value)}")
     return float(value)

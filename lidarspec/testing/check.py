@@ -14,7 +14,6 @@ import functools
 import importlib.util
 import inspect
 import re
-import tomllib
 import traceback
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
@@ -29,6 +28,7 @@ from lidarspec.testing.declared import declared
 from lidarspec.testing.findings import Finding, left_over
 from lidarspec.testing.subject import EXAMPLES, Subject
 from lidarspec.testing.vectors import lacking
+from lidarspec.trust import document
 
 #: the name of a file of golden vectors.
 VECTORS = "vectors.json"
@@ -112,10 +112,11 @@ def _file(file: Path, wanted: str) -> Target:
 
 def _folder(folder: Path) -> Target:
     """The distribution whose source is in a folder."""
-    try:
-        name = str(tomllib.loads((folder / "pyproject.toml").read_text(encoding="utf-8"))["project"]["name"])
-    except (ValueError, KeyError) as error:
-        raise SourceError(f"{folder / 'pyproject.toml'} names no project: {error}") from None
+    file = folder / "pyproject.toml"
+    project = document(file).get("project")
+    name = project.get("name") if isinstance(project, dict) else None
+    if not isinstance(name, str):
+        raise SourceError(f"{file} names no project")
     entries = _entries(name)
     if not entries:
         raise SourceError(f"{name} is not installed, or has no sensors: pip install -e {folder}")

@@ -77,7 +77,8 @@ class Property:
             try:
                 self.function(subject, *case)
             except Violation as error:
-                found.append(Finding(error.code, error.what, error.path, subject.sensor.id))
+                file = str(subject.vectors) if error.code == "LS702" else ""  # a fault of that file
+                found.append(Finding(error.code, error.what, error.path, subject.sensor.id, file))
             except AssertionError as error:
                 code = "LS414" if "Traceback" in str(error) else self.rule
                 found.append(Finding(code, _gist(error), ".".join(case), subject.sensor.id))

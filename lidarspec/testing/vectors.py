@@ -15,12 +15,12 @@ What the vectors leave open is looked at as well: a status that claims more than
 
 from __future__ import annotations
 
-import json
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from reprlib import repr as shown
+from typing import Any, cast
 
 import numpy as np
 
@@ -35,11 +35,11 @@ from lidarspec.testing.frames import leaves
 from lidarspec.testing.geometry import read
 from lidarspec.testing.subject import SHORT, Subject, seals
 from lidarspec.transports.files import unhexed
+from lidarspec.trust import document
 from lidarspec.wire.layout import Layout
 
 #: what a point may differ by: metres and radians as manuals print them.
 NEAR = 2e-4
-KEYS = {"sensor", "command", "args", "reply", "source", "frame", "hex", "values", "units", "points", "note"}
 #: names of fields that hold a checksum.
 CHECK = re.compile(
     r"(\w+_)?(crc|checksum|check_?sum|check|chk|chksum|cksum|cs|bcc|lrc|fcs|xor|sum)_?(8|16|32)?(_(lo|hi|low|high|lsb|msb))?"
@@ -48,7 +48,40 @@ CHECK = re.compile(
 PROVEN = 12
 #: names of fields that say nothing, and have nothing to be pinned down to.
 IDLE = re.compile(r"reserved|unused|unknown|spare|padding|filler", re.IGNORECASE)
+#: more than any field of the wire holds.
+_HUGE = 1 << 65
 COLUMNS = ("range", "x", "y", "z", "azimuth", "elevation", "intensity", "ring", "return_index")
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and -_HUGE < value < _HUGE
+
+
+def _is_value(value: object) -> bool:
+    return isinstance(value, str) or _is_number(value)
+
+
+def _is_table(value: object, one: Callable[[object], bool]) -> bool:
+    return isinstance(value, dict) and all(map(one, value.values()))
+
+
+def _are_points(value: object) -> bool:
+    return _is_table(value, lambda one: _is_table(one, _is_number)) and all(re.fullmatch(r"-?\d{1,9}", index) for index in cast(Any, value))
+
+
+def _is_text(value: object) -> bool:
+    return isinstance(value, str)
+
+
+#: the keys of an entry -> what may stand there, in words and as a test.
+KEYS: dict[str, tuple[str, Callable[[object], bool]]] = {
+    "sensor": ("an id, or a list of ids", lambda one: _is_text(one) or (isinstance(one, list) and all(map(_is_text, one)))),
+    **dict.fromkeys(("command", "reply", "source", "frame", "hex"), ("a text", _is_text)),
+    "note": ("anything", lambda one: True),
+    **dict.fromkeys(("args", "values"), ("an object of numbers and texts", lambda one: _is_table(one, _is_value))),
+    "units": ("an object of numbers", lambda one: _is_table(one, _is_number)),
+    "points": ("an object of points, by their numbers, with numbers", _are_points),
+}
 
 
 def vectors_hold(subject: Subject) -> None:
@@ -172,8 +205,8 @@ def entries(subject: Subject) -> dict[str, Any]:
     if subject.vectors is None:
         return {}
     try:
-        found = json.loads(Path(subject.vectors).read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
+        found = document(Path(subject.vectors), "JSON")
+    except LidarSpecError as error:
         raise Violation("LS702", str(error), str(subject.vectors)) from None
     if not isinstance(found, list):
         raise Violation("LS702", "the file is no list of vectors", str(subject.vectors))
@@ -181,9 +214,13 @@ def entries(subject: Subject) -> dict[str, Any]:
     for index, vector in enumerate(found):
         place = f"vectors[{index}]"
         require(isinstance(vector, dict), "LS702", "it is no object", place)
+        unknown = sorted(vector.keys() - KEYS.keys())
+        require(not unknown, "LS702", f"unknown keys {unknown}; known are {sorted(KEYS)}", place)
+        for key, value in vector.items():
+            told, fits = KEYS[key]
+            require(fits(value), "LS702", f"{key} is {told}, not {shown(value)}", place)
         if not _is_of(subject, vector, place):
             continue
-        require(not vector.keys() - KEYS, "LS702", f"unknown keys {sorted(vector.keys() - KEYS)}; known are {sorted(KEYS)}", place)
         if "command" in vector:
             known = subject.sensor.commands.get(vector["command"])
             vector.setdefault("frame", known.frame if known is not None else None)
@@ -193,7 +230,7 @@ def entries(subject: Subject) -> dict[str, Any]:
         try:
             unhexed(vector.get("hex", "-"))
             unhexed(vector.get("reply", ""))
-        except (ValueError, TypeError):
+        except ValueError:
             raise Violation("LS702", "its `hex`, or its `reply`, is no hex text", place) from None
         mine[place] = vector
     return mine
@@ -233,12 +270,12 @@ def _values(subject: Subject, name: str, data: bytes, parsed: Any, vector: Mappi
     for path, value, in_units in wanted:
         require(path in found, "LS702", f"the frame has no field {path!r}", f"{place} {name}")
         info, raw = fields.get(re.sub(r"\[\d+\]", "", path)), found[path]
-        shown: Any = raw.hex(" ") if isinstance(raw, bytes) else info.physical(raw) if in_units and info is not None else raw
+        plain: Any = raw.hex(" ") if isinstance(raw, bytes) else info.physical(raw) if in_units and info is not None else raw
         near = abs(info.scale) * 0.5001 if in_units and info is not None else 0
-        if shown == value or (isinstance(value, int | float) and isinstance(shown, int | float) and abs(shown - value) <= near):
+        if plain == value or (isinstance(value, int | float) and isinstance(plain, int | float) and abs(plain - value) <= near):
             continue
         expected = info.raw(value) if in_units and info is not None else value
-        raise Violation(_reading(info, raw, expected), f"{shown} is read, and {value} is printed", f"{place} {name}.{path}")
+        raise Violation(_reading(info, raw, expected), f"{plain} is read, and {value} is printed", f"{place} {name}.{path}")
 
 
 def _reading(info: FieldInfo | None, raw: Any, wanted: Any) -> str:

@@ -70,6 +70,7 @@ class RecordingTransport(Transport):
         self.header: Header = self._recording.header
         self.datagrams, self._origin = self.header.datagrams, None if sender is None else origin(sender)
         self.warnings: list[str] = []
+        self._no_events = 0
 
     def known_sensor(self) -> Sensor:
         """The installed sensor that the recording names, with the options of then.
@@ -98,6 +99,8 @@ class RecordingTransport(Transport):
         if self._recording.damaged:
             self.warnings.append(_damage(self._recording))
             self.unread = 0 if self._recording.is_cut else self._recording.leftover
+        if self._no_events:
+            self.warnings.append(f"{self._recording.path}: {self._no_events} events were passed over, which have no name")
 
     def write(self, data: bytes) -> None:
         raise SourceError(f"{self._recording.path} is a recording: nothing can be sent to it")
@@ -115,11 +118,12 @@ class RecordingTransport(Transport):
         """Whether an event says that the line was interrupted; counts disconnects."""
         try:
             event = json.loads(record.data)
-        except (ValueError, RecursionError):
+            name = event["event"]
+            self.disconnects += name == "disconnect"
+            return name in INTERRUPTIONS
+        except (ValueError, RecursionError, TypeError, KeyError):
+            self._no_events += 1
             return False
-        name = str(event.get("event")) if isinstance(event, dict) else ""
-        self.disconnects += name == "disconnect"
-        return name in INTERRUPTIONS
 
 
 def _damage(recording: Recording) -> str:

@@ -145,6 +145,12 @@ def test_sections_interfaces_and_damage_between_packets() -> None:
     assert getattr(stats, "malformed", None) == 4
 
 
+def test_a_packet_before_its_interface_is_malformed_however_many_follow() -> None:
+    packets = [made.packet(each, ticks=index) for index, each in enumerate(stream(60, 8))]
+    found, stats = check(b"".join([made.section(), packets[0], made.interface(), *packets[1:]]))
+    assert (len(found), getattr(stats, "malformed", None)) == (59, 1)
+
+
 @pytest.mark.parametrize("link", [1, 101, 113, 276, 0, 12, 228, 108, 9, 51, 127, 147])
 def test_link_layers(link: int) -> None:
     heads = {

@@ -247,6 +247,7 @@ def test_without_settings_a_word_is_a_file(tmp_path: Path, monkeypatch: pytest.M
         ('[device.COM4]\nsource = "x.bin"', r"\[device.COM4\]: a name is a letter"),
         ('[device."a.bin"]\nsource = "x.bin"', r"\[device.a.bin\]: a name is a letter"),
         ("[device.front", r"not TOML: "),
+        ('[owners]\nacme-x1 = "evil"', r"\[owners\] stands in your own settings alone"),
     ],
 )
 def test_a_mistake_is_named_with_its_place(folder: Path, text: str, told: str) -> None:

@@ -19,8 +19,9 @@ import pytest
 
 from lidarspec import Sensor, UsageError
 from lidarspec.errors import UnknownSensor
-from lidarspec.plugins import EntryPoint, HookedPoints, Registry, entry_points, tried
+from lidarspec.plugins import EntryPoint, HookedPoints, Registry, entry_points, named_owners, tried
 from lidarspec.spec import hookimpl
+from lidarspec.trust import own_settings
 from tests.shapes import SHAPES
 
 
@@ -261,6 +262,16 @@ def test_whom_the_user_names_comes_before_the_vendor(plugins: dict[str, SimpleNa
     found = claimed("my-fork: acme-x2 = again, acme-x3 = again", OWNED, owners={"acme-x2": "My_Fork"})
     assert {name: sensor.model for name, sensor in found.sensors().items()} == {"acme-x1": "acme", "acme-x2": "again", "acme-x3": "again"}
     assert [plugin.error for plugin in found.plugins] == ["", "acme-x2: another sensor has this id already: that of my-fork:again"]
+
+
+@pytest.mark.parametrize("text", ["[owners", "owners = 3", "[owners]\nacme-x1 = 3"])
+def test_owners_that_cannot_be_read_are_warned_of(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: str) -> None:
+    for name in ("XDG_CONFIG_HOME", "APPDATA"):
+        monkeypatch.setenv(name, str(tmp_path))
+    (file := own_settings()).parent.mkdir()
+    file.write_text(text, encoding="utf-8")
+    with pytest.warns(UserWarning, match=rf"{file}: .*; its \[owners\] are left out"):
+        assert named_owners() == {}
 
 
 def test_an_alias_goes_to_the_sensor_of_its_owner_also_where_no_entry_point_says_so(plugins: dict[str, SimpleNamespace]) -> None:

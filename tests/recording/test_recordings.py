@@ -482,3 +482,15 @@ def test_a_file_beside_the_recording_is_taken(path: Path, monkeypatch: pytest.Mo
     monkeypatch.chdir("/")
     with ls.open(path) as device:
         assert device.sensor.options["calibration"] == path.parent / "angles.csv"
+
+
+NO_EVENTS = [b'{"event": ["disconnect"]}', b"[" * 60_000, b'{"event": {}}', b"[1]", b"3", b'"disconnect"', b"\xff", b"{}"]
+
+
+def test_an_event_that_is_none_is_a_fault_of_its_recording(path: Path) -> None:
+    record(path, CHUNKS[:2])
+    with path.open("ab") as file:
+        file.write(b"".join(packed(3, event) for event in NO_EVENTS))
+    with contextlib.closing(transport(path)) as opened:
+        assert len(list(opened.chunks())) == 2
+    assert opened.warnings == [f"{path}: {len(NO_EVENTS)} events were passed over, which have no name"]

@@ -252,6 +252,13 @@ def test_a_mistake_in_a_scene_is_named_by_its_key(tmp_path: Path, old: str, new:
         read_scene(path)
 
 
+@pytest.mark.parametrize("text", [b"x = " + b"[" * 10_000, b"a." * 30_000 + b"b = 1", b"x = " + b"9" * 5000, b"\xff", b"#" * (1 << 19)])
+def test_what_is_no_scene_is_a_fault_of_its_file(text: bytes, tmp_path: Path) -> None:
+    (path := tmp_path / "strange.toml").write_bytes(text)
+    with pytest.raises(UsageError, match=r"strange\.toml: not TOML: "):
+        read_scene(path)
+
+
 def test_a_scene_that_cannot_be_read_is_the_systems_fault(tmp_path: Path) -> None:
     with pytest.raises(SourceError, match="No such file"):
         read_scene(tmp_path / "none.toml")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 import tempfile
@@ -273,3 +274,35 @@ def test_scaled_floats_are_read_and_built_in_their_unit() -> None:
         fields = sound.sealed(warmth=Scaled(kind, 0.1, "degC", offset=offset))
         subject = Subject(sound.sensor(sound.frame(fields, max_length=sound.SIZE + kind.sizeof())))
         values_in_units_build_the_same_bytes(subject, "data")
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("[" * 100_000, "not JSON: its brackets are nested too deeply"),
+        ("[" + "9" * 5000 + "]", "not JSON: "),
+        (b"\xff", "not JSON: "),
+        (" " * (1 << 22) + "[]", "not JSON: it is longer than 4096 kB"),
+        ('[{"hex": 1}]', "hex is a text, not 1"),
+        ('[{"frame": ["data"]}]', r"frame is a text, not \['data'\]"),
+        ('[{"command": {}}]', "command is a text, not {}"),
+        ('[{"sensor": 3}]', "sensor is an id, or a list of ids, not 3"),
+        ('[{"sensor": [[]]}]', "sensor is an id, or a list of ids"),
+        ('[{"values": [1]}]', "values is an object of numbers and texts"),
+        ('[{"values": {"a": {}}}]', "values is an object of numbers and texts"),
+        ('[{"values": {"a": 1e400}}]', "values is an object of numbers and texts"),
+        ('[{"values": {"a": ' + "9" * 400 + "}}]", "values is an object of numbers and texts"),
+        ('[{"units": {"a": "1"}}]', "units is an object of numbers"),
+        ('[{"units": {"a": NaN}}]', "units is an object of numbers"),
+        ('[{"points": {"a": {}}}]', "points is an object of points, by their numbers"),
+        ('[{"points": {"0": [1]}}]', "points is an object of points, by their numbers"),
+        ('[{"args": 1}]', "args is an object of numbers and texts"),
+    ],
+)
+def test_vectors_of_any_shape_are_a_fault_of_their_file(text: str | bytes, said: str, tmp_path: Path) -> None:
+    file = tmp_path / "strange.txt"
+    file.write_bytes(text if isinstance(text, bytes) else text.encode())
+    (holding,) = [one for one in PROPERTIES if one.function is vectors_hold]
+    (found,) = holding.findings(Subject(sound.sensor(), vectors=file))
+    assert (found.code, found.file) == ("LS702", str(file))
+    assert re.search(said, found.what)
