@@ -39,7 +39,12 @@ from lidarspec.wire.layout import Layout
 
 #: what a point may differ by: metres and radians as manuals print them.
 NEAR = 2e-4
-KEYS = {"sensor", "command", "args", "reply", "source", "frame", "hex", "values", "units", "points", "note"}
+#: what an entry may have, and what that is.
+KEYS: dict[str, tuple[type, ...]] = {
+    **dict.fromkeys(("command", "reply", "source", "frame", "hex", "note"), (str,)),
+    **dict.fromkeys(("args", "values", "units", "points"), (dict,)),
+    "sensor": (str, list),
+}
 #: names of fields that hold a checksum.
 CHECK = re.compile(
     r"(\w+_)?(crc|checksum|check_?sum|check|chk|chksum|cksum|cs|bcc|lrc|fcs|xor|sum)_?(8|16|32)?(_(lo|hi|low|high|lsb|msb))?"
@@ -173,7 +178,7 @@ def entries(subject: Subject) -> dict[str, Any]:
         return {}
     try:
         found = json.loads(Path(subject.vectors).read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise Violation("LS702", str(error), str(subject.vectors)) from None
     if not isinstance(found, list):
         raise Violation("LS702", "the file is no list of vectors", str(subject.vectors))
@@ -181,9 +186,11 @@ def entries(subject: Subject) -> dict[str, Any]:
     for index, vector in enumerate(found):
         place = f"vectors[{index}]"
         require(isinstance(vector, dict), "LS702", "it is no object", place)
+        require(not vector.keys() - KEYS, "LS702", f"unknown keys {sorted(vector.keys() - KEYS)}; known are {sorted(KEYS)}", place)
+        for key, value in vector.items():
+            _require_kind(key, value, place)
         if not _is_of(subject, vector, place):
             continue
-        require(not vector.keys() - KEYS, "LS702", f"unknown keys {sorted(vector.keys() - KEYS)}; known are {sorted(KEYS)}", place)
         if "command" in vector:
             known = subject.sensor.commands.get(vector["command"])
             vector.setdefault("frame", known.frame if known is not None else None)
@@ -193,10 +200,22 @@ def entries(subject: Subject) -> dict[str, Any]:
         try:
             unhexed(vector.get("hex", "-"))
             unhexed(vector.get("reply", ""))
-        except (ValueError, TypeError):
+        except ValueError:
             raise Violation("LS702", "its `hex`, or its `reply`, is no hex text", place) from None
         mine[place] = vector
     return mine
+
+
+def _require_kind(key: str, value: Any, place: str) -> None:
+    """Refuse a value that is not what its key stands for; points are numbers by index and column."""
+    told = {str: "a text", dict: "an object", list: "a list of texts"}
+    wanted = " or ".join(told[kind] for kind in KEYS[key])
+    right = isinstance(value, KEYS[key]) and (not isinstance(value, list) or all(isinstance(one, str) for one in value))
+    require(right, "LS702", f"`{key}` is {wanted}, not {str(value)[:40]!r}", place)
+    for index, columns in value.items() if key == "points" else ():
+        numbers = columns.values() if isinstance(columns, dict) else (None,)
+        right = index.removeprefix("-").isdecimal() and len(index) < 9 and all(type(number) in (int, float) for number in numbers)
+        require(right, "LS702", f"`points` are numbers by column, and {index[:40]!r}: {str(columns)[:40]!r} is none", place)
 
 
 def _is_of(subject: Subject, vector: Mapping[str, Any], place: str) -> bool:
