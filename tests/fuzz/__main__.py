@@ -127,7 +127,15 @@ def ended(given: argparse.Namespace, name: str, asked: int, process: subprocess.
     if current.is_file():
         held = current.read_bytes()
         data = held[4 : 4 + int.from_bytes(held[:4], "little")]
-        keep(given.folder, Finding(name, data, f"the process ended with {process.returncode}", "the process"))
+        keep(
+            given.folder,
+            Finding(
+                name,
+                data,
+                f"the process ended with {process.returncode}; -9: it was stopped after {SILENCE:g} s without a word",
+                "the process",
+            ),
+        )
         current.unlink()
         did["findings"].append("the process")
     elif did["inputs"] < asked:

@@ -21,8 +21,8 @@ from tests.fuzz.trial import Finding, judged, limits
 
 #: one input in so many is traced for the lines that it reaches, which makes it ten times as slow.
 TRACED = 20
-#: inputs after which a job says how far it is.
-TOLD = 1000
+#: seconds after which a job says how far it is.
+TOLD = 1.0
 
 
 @dataclass
@@ -66,7 +66,7 @@ class Job:
         if found is not None and found.place not in self.findings:
             self.findings[found.place] = found
             keep(self.folder, found)
-        if self.inputs % TOLD == 0:
+        if time.monotonic() - self._began - self.seconds > TOLD:
             self.tell()
 
     def tell(self) -> None:

@@ -30,7 +30,7 @@ def test_neighbours_of_valid_input_do_no_harm(known: dict[str, Target], group: s
     mine = [target for target in known.values() if target.group == group]
     assert mine
     for target in mine:
-        source, examples, read = random.Random(f"{target.name} 1"), target.examples(), 0
+        source, examples, read = random.Random(f"{target.name} few"), target.examples(), 0
         neighbours = [target.mutation(source.choice(examples), source.choice(examples), source) for _ in range(FEW)]
         for data in (*examples, *neighbours):
             with warnings.catch_warnings(action="ignore"):

@@ -29,8 +29,8 @@ def arguments() -> argparse.Namespace:
     parser.add_argument(
         "--only", metavar="NAME", action="append", help="these promises alone, such as P3; the table is printed and not written"
     )
-    parser.add_argument("--share", metavar="SHARE", type=float, default=1.0, help="of the full effort; below 1 the table is not written")
-    parser.add_argument("--no-tests", action="store_true", help="measure alone, and run no tests; the table is not written")
+    parser.add_argument("--share", metavar="SHARE", type=float, default=1.0, help="of the full effort, up to 1; the table says it")
+    parser.add_argument("--no-tests", action="store_true", help="measure alone, and run no tests; the table says what was not run")
     return parser.parse_args()
 
 
@@ -41,9 +41,10 @@ def main() -> int:
     figures, began = {}, time.monotonic()
     for promise in chosen:
         figures[promise] = held(promise, given.share, tests=not given.no_tests)
-        print(f"{promise.name} {'kept' if figures[promise].kept else 'NOT KEPT'}: {figures[promise].words}", flush=True)
-    text = table(figures, time.monotonic() - began)
-    if given.only or given.share < 1 or given.no_tests:
+        print(f"{promise.name}: {verdict(figures[promise])}: {figures[promise].words}", flush=True)
+    effort = "" if given.share == 1 else f" and {100 * given.share:g} % of the full effort"
+    text = table(figures, time.monotonic() - began, effort)
+    if given.only:
         print(text)
     else:
         written(text)
@@ -59,7 +60,7 @@ def held(promise: Promise, share: float, *, tests: bool = True) -> Figure:
         except Exception as error:
             traceback.print_exc()
             parts.append(Figure(f"could not be measured: {type(error).__name__}: {error}"[:200], False))
-    return Figure("; ".join(part.words for part in parts if part.words), all(part.kept for part in parts))
+    return Figure("; ".join(part.words for part in parts if part.words) or "not run", all(part.kept for part in parts))
 
 
 def ran(promise: Promise, *, long: bool) -> Figure:
@@ -76,15 +77,17 @@ def ran(promise: Promise, *, long: bool) -> Figure:
     return Figure("; ".join(part for part in (promise.told if long else "", f"{passed} tests") if part), True)
 
 
-def table(figures: dict[Promise, Figure], seconds: float) -> str:
-    """The table, with the day, the version and the kind of machine."""
+def table(figures: dict[Promise, Figure], seconds: float, effort: str = "") -> str:
+    """The table, with the day, the version, the kind of machine, and the effort where it was not the full one."""
     day, machine = datetime.date.today().isoformat(), f"{os.cpu_count()} cores, {platform.machine()}, {platform.system()}"
-    what = f"{day}, lidarspec {lidarspec.__version__}, Python {platform.python_version()}, {machine}; {seconds / 60:.0f} minutes."
-    rows = [
-        f"| {promise.name} | {promise.words} | {figure.words.replace('|', '/')} | {'yes' if figure.kept else '**no**'} |"
-        for promise, figure in figures.items()
-    ]
-    return "\n".join([what, "", "| | promise | today | kept |", "|---|---|---|---|", *rows])
+    what = f"{day}, lidarspec {lidarspec.__version__}, Python {platform.python_version()}, {machine}; {seconds / 60:.0f} minutes{effort}."
+    rows = [[promise.name, promise.words, figure.words.replace("|", "/"), verdict(figure)] for promise, figure in figures.items()]
+    return "\n".join([what, "", "| | promise | today | kept |", "|---|---|---|---|", *(f"| {' | '.join(row)} |" for row in rows)])
+
+
+def verdict(figure: Figure) -> str:
+    """Whether a promise is kept, as the table says it."""
+    return "" if figure.words == "not run" else "yes" if figure.kept else "**no**"
 
 
 def written(text: str) -> None:

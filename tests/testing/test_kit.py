@@ -241,6 +241,12 @@ def test_vectors_that_prove_nothing_are_findings(tmp_path: Path) -> None:
         '[{"frame": "none", "hex": "", "source": "x"}]': "LS702",
         '[{"frame": "data", "hex": "zz", "source": "x"}]': "LS702",
         '[{"frame": "data", "hex": "", "value": {}, "source": "x"}]': "LS702",
+        "[" * 100_000: "LS702",
+        '[{"frame": ["data"], "hex": "", "source": "x"}]': "LS702",
+        '[{"frame": "data", "hex": "", "sensor": [1], "source": "x"}]': "LS702",
+        '[{"frame": "data", "hex": "", "units": 1, "source": "x"}]': "LS702",
+        '[{"frame": "data", "hex": "", "points": {"first": {"x": 1}}, "source": "x"}]': "LS702",
+        '[{"frame": "data", "hex": "", "points": {"0": {"x": [1]}}, "source": "x"}]': "LS702",
         f'[{{"frame": "data", "hex": "{sound.sensor().example("data").hex()}", "source": " "}}]': "LS701",
     }.items():
         file.write_text(text, encoding="utf-8")
