@@ -34,7 +34,7 @@ from lidarspec.transports.protocol import no_bytes
 WEAK = 12
 #: matches that are printed, and the texts that read as hexadecimal.
 PRINTED = 4
-HEX = (".hex", ".txt")
+HEX, LONGEST = (".hex", ".txt"), 1 << 16
 #: checksums that are told of unknown bytes.
 TOLD = 2
 
@@ -84,7 +84,8 @@ def crc(words: Sequence[str], period: int | None, offset: int, as_json: bool, ou
     """Which checksum seals some sample frames: XOR, sums, or a CRC of 8, 16 or 32 bits.
 
     Frames are words of hexadecimal digits, one each; a text file with a frame in each line (.hex, .txt); or a capture. Of raw
-    bytes the frames are found out, or --period says how long they are. The more frames, the surer the answer: a dozen is plenty.
+    bytes the frames are found out, or --period says how long they are. The more frames, the surer the answer: a dozen is plenty. Of a long
+    file the beginning is looked at.
     """
     frames = _frames(words, period, offset)
     found = search(frames)
@@ -122,7 +123,8 @@ def _of_file(path: str, period: int | None, offset: int) -> list[bytes]:
         chunks, datagrams = heard.chunks, heard.datagrams
     else:
         given = read([path])
-        chunks, datagrams = tuple(chunk for chunk in given.chunks if chunk), len(given.chunks) > 1
+        chunks = tuple(chunk for chunk in given.chunks if chunk)
+        datagrams = path.endswith(HEX) and len(chunks) > 1 and max(map(len, chunks)) < LONGEST
     if period is not None:
         return cut(b"".join(chunks), period, offset)
     if datagrams and path.endswith(HEX):

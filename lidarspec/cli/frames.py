@@ -17,7 +17,7 @@ from lidarspec.cli.terminal import note
 from lidarspec.discovery.detect import fitting
 from lidarspec.discovery.listen import Heard
 from lidarspec.errors import UsageError, WireError, suggest
-from lidarspec.explaining.explanation import Explanation, explain as explain_frame
+from lidarspec.explaining.explanation import Explanation, values
 from lidarspec.explaining.listing import LINED, Line, told
 from lidarspec.explaining.pieces import Piece, explained, pieces
 from lidarspec.explaining.wording import Span, number
@@ -58,8 +58,8 @@ def _fields(sensor: Sensor, piece: Piece) -> dict[str, Any]:
 
 def _tables(sensor: Sensor, frames: Iterable[Piece], output: str | None) -> Iterator[str]:
     for index, piece in enumerate(frames):
-        values = explain_frame(piece.data, sensor, piece.frame).fields.values()
-        rows = [[value.path, _raw_text(value.raw), str(value) if value.unit or value.label else ""] for value in values]
+        found = values(piece.data, sensor, piece.frame).values()
+        rows = [[value.path, _raw_text(value.raw), str(value) if value.unit or value.label else ""] for value in found]
         yield "\n" * bool(index) + _title(sensor, piece, piece.frame) + "\n" + table(["field", "raw", "value"], rows, output)
 
 

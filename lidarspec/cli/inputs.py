@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import io
 import itertools
 import os
 import re
@@ -20,18 +21,20 @@ from lidarspec.cli.terminal import note
 from lidarspec.device.device import Device
 from lidarspec.device.settings import named
 from lidarspec.discovery.detect import chosen, nearest, never_right, verdict
-from lidarspec.discovery.listen import LOOKED_AT, Heard, beginning
+from lidarspec.discovery.listen import LOOKED_AT, Heard, beginning, leading
 from lidarspec.errors import CommandError, LidarSpecError, SourceError, UsageError, WireError, suggest, system_errors
 from lidarspec.plugins import sensors
 from lidarspec.scans.scans import Scan
 from lidarspec.spec.sensor import Sensor
-from lidarspec.transports.files import refuse_piped, unhexed
+from lidarspec.transports.files import between, hex_chunks, refuse_piped, unhexed
 from lidarspec.transports.open_url import is_port, live_address, transport
 from lidarspec.transports.protocol import Chunk, no_bytes
 from lidarspec.wire.parse import parse_typed
 
 #: longest hexadecimal text that is repeated in the next command, and of other text in a message.
 REPEATED, QUOTED = 400, 64
+#: bytes of an input of which the beginning is enough.
+MOST = 1 << 20
 #: seconds that a device is given for its first frame.
 PATIENCE = 10.0
 #: seconds between two looks at a source that sends nothing.
@@ -77,12 +80,8 @@ def _file(path: str) -> Iterator[tuple[Heard, Iterator[Chunk]]]:
 def _beginning(
     source: str, chunks: Iterator[Chunk], *, datagrams: bool, warnings: Sequence[str] = ()
 ) -> Iterator[tuple[Heard, Iterator[Chunk]]]:
-    head, size = list[Chunk](), 0
     with system_errors(source):
-        for chunk in chunks:
-            head.append(chunk)
-            if (size := size + len(chunk.data)) >= LOOKED_AT:
-                break
+        head = leading(chunks, LOOKED_AT)
     data = tuple(chunk.data for chunk in head)
     yield Heard(source, data, datagrams, warnings=tuple(warnings)), itertools.chain(head, _rest(source, chunks))
 
@@ -94,25 +93,39 @@ def _rest(source: str, chunks: Iterator[Chunk]) -> Iterator[Chunk]:
 
 def _standard_input() -> Iterator[Chunk]:
     """What comes over standard input, as it comes; hexadecimal text as the bytes that it stands for."""
-    head = sys.stdin.buffer.read(LOOKED_AT)
+    head, stdin = sys.stdin.buffer.read(LOOKED_AT), sys.stdin.buffer
     refuse_piped(head)
-    if head.isascii():
-        head += sys.stdin.buffer.read()
-        with contextlib.suppress(ValueError):
-            head = unhexed(head.decode("ascii"))
-    yield Chunk(head)
-    yield from transport("-").chunks()
+    if not _is_hexadecimal(head):
+        yield Chunk(head)
+        yield from transport("-").chunks()
+        return
+    looked_at = io.BytesIO(head)
+
+    def readline(size: int) -> bytes:
+        line = looked_at.readline(size)
+        return line if line.endswith(b"\n") or len(line) == size else line + stdin.readline(size - len(line))
+
+    yield from hex_chunks("standard input", readline)
+
+
+def _is_hexadecimal(head: bytes) -> bool:
+    """Whether input begins as hexadecimal text."""
+    try:
+        text = head.decode("ascii")
+        return bool(unhexed(text[: between(text)] if len(head) == LOOKED_AT else text))
+    except ValueError:
+        return False
 
 
 def read(words: Sequence[str]) -> Heard:
-    """The whole input that the words of a command line stand for.
+    """The input that the words of a command line stand for; of a long one the beginning.
 
     Raises:
         UsageError: for text that is neither hexadecimal nor a file.
         SourceError: for a file that cannot be read.
     """
     with opened(words) as (given, chunks):
-        return replace(given, chunks=tuple(chunk.data for chunk in chunks))
+        return replace(given, chunks=tuple(chunk.data for chunk in leading(chunks, MOST)))
 
 
 def _no_bytes(words: Sequence[str], error: ValueError) -> LidarSpecError:

@@ -9,7 +9,7 @@ import contextlib
 import itertools
 import os
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -144,14 +144,18 @@ def heard_as(source: str | Path, sensor: Sensor, seconds: float) -> list[Heard]:
 
 def beginning(opened: Transport, most: int, *, number: int | None = None) -> list[Chunk]:
     """The beginning of a file: what holds `most` bytes, or `number` chunks if these are fewer."""
-    chunks: list[Chunk] = []
-    size = 0
-    for chunk in itertools.islice(opened.chunks(), number):
-        chunks.append(replace(chunk, data=chunk.data[:most]))
+    return [replace(chunk, data=chunk.data[:most]) for chunk in leading(itertools.islice(opened.chunks(), number), most)]
+
+
+def leading(chunks: Iterable[Chunk], most: int) -> list[Chunk]:
+    """The first chunks, up to the one with which there are so many bytes."""
+    found, size = list[Chunk](), 0
+    for chunk in chunks:
+        found.append(chunk)
         size += len(chunk.data)
         if size >= most:
             break
-    return chunks
+    return found
 
 
 def _listened(opened: LiveTransport, seconds: float) -> list[Chunk]:

@@ -9,6 +9,7 @@ the damage, a valid one goes on to its points.
 from __future__ import annotations
 
 import contextlib
+import functools
 import io
 import itertools
 import re
@@ -123,14 +124,16 @@ def explain(data: bytes, sensor: Sensor, frame: str | None = None) -> Explanatio
     trail = _Trail(sensor.frames[name], data)
     rows = (*trail.rows(), *trail.rest(fault))
     if fault is not None and not fits(sensor, data[: trail.end], name):
-
-        def values(sent: bytes) -> dict[str, Value]:
-            return _Trail(sensor.frames[name], sent).values()
-
-        return Explanation(sensor.id, name, data, rows, fault, tuple(told(sensor.frames[name], data, values)))
+        guessed = told(sensor.frames[name], data, lambda sent: values(sent, sensor, name))
+        return Explanation(sensor.id, name, data, rows, fault, tuple(guessed))
     points, notes = _points(sensor, name, data[: trail.end], rows)
     rows = tuple(replace(row, points=given) for row, given in zip(rows, points, strict=True))
     return Explanation(sensor.id, name, data, rows, fault, notes)
+
+
+def values(data: bytes, sensor: Sensor, frame: str) -> dict[str, Value]:
+    """Every value of one frame of this type, by its path with array indices, in the order of the wire."""
+    return _Trail(sensor.frames[frame], data).values()
 
 
 def fits(sensor: Sensor, data: bytes, name: str) -> bool:
@@ -218,7 +221,7 @@ class _Trail:
         bits = self._blocks.get(kind(part), {}).get(keys)
         physical = float(info.physical(raw)) if isinstance(raw, int | float) else None
         label = info.labels.get(raw, "") if isinstance(raw, int) else ""
-        digits = None if info.kind == "float" else _digits(info)
+        digits = None if info.kind == "float" else _digits(info.scale, info.offset)
         masks = bits.masks(seen.end - seen.start) if bits else b"\xff" * (seen.end - seen.start)
         return Value(path, raw, physical, info.unit, digits, label, bit_text(bits) if bits else "", info.docs, seen.start, masks), info
 
@@ -233,9 +236,10 @@ def kind(path: str) -> str:
     return re.sub(r"\[\d+\]", "[]", path)
 
 
-def _digits(info: FieldInfo) -> int:
+@functools.lru_cache
+def _digits(scale: float, offset: float) -> int:
     """Decimals that tell every step of a field from the next; a few more where these show it in full."""
-    steps = (exact(info.scale), exact(info.offset))
+    steps = (exact(scale), exact(offset))
     apart = next((digits for digits in range(DIGITS) if abs(steps[0]) * 10**digits >= 1), DIGITS)
     return next((digits for digits in range(apart, apart + SPARE + 1) if all(step * 10**digits % 1 == 0 for step in steps)), apart)
 

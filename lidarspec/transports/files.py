@@ -11,7 +11,7 @@ import json
 import os
 import re
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from shlex import quote
 from typing import BinaryIO
@@ -29,9 +29,12 @@ from lidarspec.transports.protocol import Chunk, Transport
 INTERRUPTIONS = frozenset({"disconnect", "reconnect", "dropped"})
 #: in hexadecimal text: offsets and comments, what may stand between bytes, and what may not stand anywhere else.
 _BESIDE = re.compile(r"^\s*(?:0[xX])?[0-9a-fA-F]{3,}:(?=\s)|(?:#|//).*", re.MULTILINE)
+_COMMENT = re.compile("#|//")
 _BETWEEN, _NO_DIGIT = re.compile(r"[\s,;:{}]+"), re.compile(r"[^0-9a-fA-F]")
 #: bytes read at once, and bytes that say what a file is.
 BLOCK, HEAD = 1 << 18, 512
+#: digits of a word that a message shows.
+QUOTED = 64
 #: how files begin that hold no bytes as a sensor sent them, or these in a shape of their own; what they are, and what takes the bytes out.
 CONTAINERS = {
     rb"\x1f\x8b\x08[\x00-\x1f]": ("compressed by gzip", "gunzip -k {}"),
@@ -197,12 +200,37 @@ class HexTransport(FileTransport):
     """Bytes written as hexadecimal text, in any way that `unhexed` reads; lines without digits are passed over."""
 
     def chunks(self) -> Iterator[Chunk]:
-        for number, line in enumerate(self._file, start=1):
-            text = line.decode("ascii", "replace")
-            try:
-                yield Chunk(unhexed(text))
-            except ValueError as error:
-                raise WireError(f"{self._path}, line {number}: not hexadecimal: {error}") from None
+        return hex_chunks(self._path, self._file.readline)
+
+
+def hex_chunks(name: str, readline: Callable[[int], bytes]) -> Iterator[Chunk]:
+    """The bytes of hexadecimal text, a chunk for each line; one that is longer than a block comes in several.
+
+    Args:
+        name: of the file, for messages.
+        readline: the next line, or so many bytes of it.
+
+    Raises:
+        WireError: where something else is in it.
+    """
+    text, goes_on, number = "", "", 1
+    while (block := readline(BLOCK)) or text:
+        text += block.decode("ascii", "replace")
+        end = len(text) if len(block) < BLOCK or block.endswith(b"\n") else between(text)
+        try:
+            yield Chunk(unhexed(goes_on + text[:end]))
+        except ValueError as error:
+            raise WireError(f"{name}, line {number}: not hexadecimal: {error}") from None
+        if block.endswith(b"\n"):
+            goes_on, number = "", number + 1
+        else:  # so does a comment in the line; an offset is at its beginning alone
+            goes_on = "#" if _COMMENT.search(goes_on + text[:end]) else ","
+        text = text[end:]
+
+
+def between(text: str) -> int:
+    """Where hexadecimal text can be cut: behind or before its last mark, else between two bytes."""
+    return max(*(text.rfind(mark) + 1 for mark in " \t\n,;:{}"), *(text.rfind(mark) for mark in "\\/#")) or len(text) // 2 * 2
 
 
 def unhexed(text: str) -> bytes:
@@ -224,7 +252,7 @@ def _whole_bytes(word: str) -> bytes:
     if len(digits) == 1 and digits != word:
         digits = f"0{digits}"
     if not digits or len(digits) % 2:
-        raise ValueError(f"{word!r} makes no whole bytes")
+        raise ValueError(f"{word[:QUOTED]!r}{' ...' * (len(word) > QUOTED)} makes no whole bytes")
     return bytes.fromhex(digits)
 
 

@@ -11,6 +11,7 @@ import pytest
 
 import lidarspec as ls
 from tests.cli.running import COIN_D4, EXAMPLE, LD06, printed, process, ran
+from tests.engine.streams import MEGABYTE, peak
 from tests.sensors.evidence import capture
 
 SENSOR = ("-s", "ldrobot-stl27l")
@@ -229,3 +230,27 @@ def test_built_frames_go_to_files_and_back(tmp_path: Path) -> None:
     assert ran("build", "cspc-m1c1-mini", "command", "mode=0xf0", "-o", "-").stdout_bytes == raw.read_bytes()
     assert printed("build", "cspc-m1c1-mini", "command", "mode=240")["hex"] == "aa 55 f0 0f"
     assert "0x0f ok (XOR-8 over 3 bytes)" in ran("explain", raw, "-s", "cspc-m1c1-mini").stdout
+
+
+@pytest.mark.parametrize(
+    ("words", "code"),
+    [
+        (("parse", "zeros.bin", *SENSOR), 4),
+        (("parse", "zeros.hex", *SENSOR), 4),
+        (("parse", "-", *SENSOR), 4),
+        (("explain", "few.bin", *SENSOR, "-o", "text"), 4),
+        (("detect", "zeros.bin"), 4),
+        (("doctor", "zeros.bin", *SENSOR), 1),
+        (("convert", "zeros.hex", "points.csv", *SENSOR), 4),
+        (("crc", "zeros.hex"), 2),
+    ],
+)
+def test_an_input_is_held_in_pieces(words: tuple[str, ...], code: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a file, of hexadecimal text in one line, and of what comes through a pipe, no more is held than a piece."""
+    monkeypatch.chdir(tmp_path)
+    for data in (bytes(2000), bytes(4 * MEGABYTE)):  # first what is imported and remembered
+        text = data.hex().encode()
+        for name, given in (("zeros.bin", data), ("zeros.hex", text), ("few.bin", data[: MEGABYTE // 2])):
+            Path(name).write_bytes(given)
+        most = peak(lambda given=text if "-" in words else b"": ran(*words, code=code, given=given))
+    assert most - len(text) * ("-" in words) < 16 * MEGABYTE, f"{most} bytes"

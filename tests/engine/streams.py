@@ -1,9 +1,12 @@
-"""Streams that the framing is held to, damaged by seed or made of false headers, and decoders whose books are kept."""
+"""Streams that the framing is held to, damaged by seed or made of false headers; decoders whose books are kept; what a task holds."""
 
 from __future__ import annotations
 
 import contextlib
+import gc
 import random
+import tracemalloc
+from collections.abc import Callable
 
 from lidarspec import Counters, Sensor, SpecError
 from lidarspec.framing.examples import examples
@@ -15,6 +18,7 @@ from tests.engine.oracle import Cut
 
 #: about so many bytes to a stream: the oracle takes its time.
 LENGTH = 1500
+MEGABYTE = 1 << 20
 
 
 def damaged(data: bytes, rate: float, seed: int, *, burst: int = 1) -> bytes:
@@ -93,3 +97,16 @@ def decoded(sensor: Sensor, data: bytes) -> list[Cut]:
     for chunk in material.pieces(data, random.Random(len(data))):
         books.feed(chunk)
     return books.finish()
+
+
+def peak(task: Callable[[], object]) -> int:
+    """Bytes that a task holds at most beyond those held before."""
+    gc.collect()
+    tracemalloc.start()
+    try:
+        before = tracemalloc.get_traced_memory()[0]
+        tracemalloc.reset_peak()
+        task()
+        return tracemalloc.get_traced_memory()[1] - before
+    finally:
+        tracemalloc.stop()

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import gc
 import random
-import tracemalloc
-from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -16,30 +13,16 @@ from lidarspec.framing.frame_engine import CompiledCodec, codec
 from lidarspec.testing import subject as material
 from lidarspec.testing.subject import Subject
 from tests.all_sensors import STREAMS
-from tests.engine.streams import worst
+from tests.engine.streams import MEGABYTE, peak, worst
 from tests.shapes import SHAPES
 
 COMPILED = {name: sensor for name, sensor in STREAMS.items() if isinstance(codec(sensor.frames[sensor.data_frame]), CompiledCodec)}
-MEGABYTE = 1 << 20
 
 each_stream = pytest.mark.parametrize("sensor", STREAMS.values(), ids=STREAMS)
 
 
 def garbage(length: int, seed: int = 0) -> bytes:
     return np.random.default_rng(seed).bytes(length)
-
-
-def peak(task: Callable[[], object]) -> int:
-    """Bytes that a task holds at most beyond those held before."""
-    gc.collect()
-    tracemalloc.start()
-    try:
-        before = tracemalloc.get_traced_memory()[0]
-        tracemalloc.reset_peak()
-        task()
-        return tracemalloc.get_traced_memory()[1] - before
-    finally:
-        tracemalloc.stop()
 
 
 def fed(sensor: Sensor, data: bytes, times: int = 1, chunk: int = 4096) -> None:

@@ -9,7 +9,7 @@ import pytest
 
 import lidarspec as ls
 from lidarspec.errors import WireError
-from lidarspec.transports.files import unhexed
+from lidarspec.transports.files import BLOCK, unhexed
 from lidarspec.transports.open_url import transport
 
 
@@ -33,6 +33,16 @@ def test_bytes_are_read_as_people_print_them(text: str, tmp_path: Path) -> None:
     (tmp_path / "a.hex").write_text(text, encoding="ascii")
     with contextlib.closing(transport(tmp_path / "a.hex")) as opened:
         assert b"".join(chunk.data for chunk in opened.chunks()) == b"\x8b\x13\x5a"
+
+
+@pytest.mark.parametrize("form", ["8b135a", "8B 13 5a ", "0x8B,0x13,0x5A,", "8b:13:5a:", r"\x8b\x13\x5a", "  8b 135a\t"])
+def test_a_line_without_end_is_read_in_pieces(form: str, tmp_path: Path) -> None:
+    line = form * (3 * BLOCK // len(form))
+    (tmp_path / "a.hex").write_text(f"0000: {line}# {line}\n{line}\n{line[: BLOCK // len(form) * len(form)]}", encoding="ascii")
+    with contextlib.closing(transport(tmp_path / "a.hex")) as opened:
+        found = [chunk.data for chunk in opened.chunks()]
+    assert b"".join(found) == unhexed(line) * 2 + unhexed(form) * (BLOCK // len(form))
+    assert max(map(len, found)) <= BLOCK
 
 
 def test_a_single_digit_is_a_byte_where_it_says_so_alone() -> None:
