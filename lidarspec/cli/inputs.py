@@ -26,7 +26,7 @@ from lidarspec.errors import CommandError, LidarSpecError, SourceError, UsageErr
 from lidarspec.plugins import sensors
 from lidarspec.scans.scans import Scan
 from lidarspec.spec.sensor import Sensor
-from lidarspec.transports.files import between, hex_chunks, refuse_piped, unhexed
+from lidarspec.transports.files import FileTransport, between, hex_chunks, unhexed
 from lidarspec.transports.open_url import is_port, live_address, transport
 from lidarspec.transports.protocol import Chunk, no_bytes
 from lidarspec.wire.parse import parse_typed
@@ -50,9 +50,7 @@ def opened(words: Sequence[str]) -> Iterator[tuple[Heard, Iterator[Chunk]]]:
         SourceError: for a file that cannot be read.
     """
     text = " ".join(words)
-    if text == "-":
-        reading = _beginning(text, _standard_input(), datagrams=False)
-    elif len(words) == 1 and os.path.exists(text) and not is_port(text):
+    if text == "-" or (len(words) == 1 and os.path.exists(text) and not is_port(text)):
         reading = _file(text)
     else:
         try:
@@ -70,7 +68,8 @@ def opened(words: Sequence[str]) -> Iterator[tuple[Heard, Iterator[Chunk]]]:
 @contextlib.contextmanager
 def _file(path: str) -> Iterator[tuple[Heard, Iterator[Chunk]]]:
     with contextlib.closing(transport(path)) as file:
-        with _beginning(path, file.chunks(), datagrams=file.datagrams, warnings=file.warnings) as given:
+        chunks = _standard_input(file) if path == "-" and type(file) is FileTransport else file.chunks()
+        with _beginning(path, chunks, datagrams=file.datagrams, warnings=file.warnings) as given:
             yield given
         for warning in file.warnings if given[0].chunks else ():
             note(warning)
@@ -91,13 +90,12 @@ def _rest(source: str, chunks: Iterator[Chunk]) -> Iterator[Chunk]:
         yield from chunks
 
 
-def _standard_input() -> Iterator[Chunk]:
+def _standard_input(file: FileTransport) -> Iterator[Chunk]:
     """What comes over standard input, as it comes; hexadecimal text as the bytes that it stands for."""
     head, stdin = sys.stdin.buffer.read(LOOKED_AT), sys.stdin.buffer
-    refuse_piped(head)
     if not _is_hexadecimal(head):
         yield Chunk(head)
-        yield from transport("-").chunks()
+        yield from file.chunks()
         return
     looked_at = io.BytesIO(head)
 

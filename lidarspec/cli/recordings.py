@@ -148,18 +148,22 @@ def replay(file: str, place: str, speed: float | None, loop: bool, force: bool, 
     is_file = place.endswith(SUFFIXES) and "://" not in place
     if is_file and loop:
         raise UsageError("a file cannot take a replay that never ends: leave out --loop")
+    if file == "-" and loop:
+        raise UsageError("standard input can be read only once: leave out --loop")
     if is_file:
         refuse_overwriting(place, file, sensor_id)
-    with contextlib.closing(transport(file)) as source:
+    with contextlib.ExitStack() as undo:
+        source = undo.enter_context(contextlib.closing(transport(file)))
         sensor = _sensor(source, sensor_id)
         outlet = (
             _file(source, file, place, sensor, force=force)
             if is_file
             else replay_outlet(place, datagrams=source.datagrams, port=declared_port(sensor))
         )
+        undo.pop_all()  # the replay closes it
     _announce(file, outlet, sensor, as_json=as_json)
     factor = (None if is_file else 1.0) if speed is None else speed or None
-    played = Replay(file, outlet, speed=factor, needs_times=speed is not None, loop=loop)
+    played = Replay(file, outlet, speed=factor, needs_times=speed is not None, loop=loop, source=source)
     is_interrupted = _run(played, outlet, file)
     _sum_up(file, outlet, sensor, played, as_json=as_json)
     if is_interrupted:

@@ -24,6 +24,7 @@ import json
 import os
 import re
 import struct
+import sys
 import zlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, fields
@@ -190,7 +191,7 @@ class Recording(Closing):
     Memory is bounded by a block and a record.
 
     Args:
-        path: the file.
+        path: the file; "-" is standard input.
         salvage: look for the next good record behind a damaged place, even the header, instead of stopping there.
 
     Attributes:
@@ -212,7 +213,7 @@ class Recording(Closing):
         self.records = self.damaged = self.leftover = 0
         self.is_cut, self.offset = False, len(MAGIC)
         with system_errors(path):
-            self._file = open(path, "rb")  # noqa: SIM115  closed by `close`
+            self._file = sys.stdin.buffer if self.path == "-" else open(path, "rb")  # noqa: SIM115  closed by `close`
         try:
             self._records = self._begin()
         except BaseException:
@@ -221,7 +222,8 @@ class Recording(Closing):
 
     def close(self) -> None:
         """Close the file."""
-        self._file.close()
+        if self.path != "-":
+            self._file.close()
 
     def __iter__(self) -> Iterator[Record]:
         return self._records

@@ -7,6 +7,7 @@ what they leave out; bytes alone have no times. `open_file` tells them apart by 
 from __future__ import annotations
 
 import contextlib
+import io
 import json
 import os
 import re
@@ -186,16 +187,6 @@ class FileTransport(Transport):
             self.warnings.append(f"{self._path}: {contradicting} packets were left out, since their headers contradict themselves")
 
 
-class PipeTransport(FileTransport):
-    """The bytes of standard input."""
-
-    def chunks(self) -> Iterator[Chunk]:
-        for number, chunk in enumerate(super().chunks()):
-            if not number:
-                refuse_piped(chunk.data)
-            yield chunk
-
-
 class HexTransport(FileTransport):
     """Bytes written as hexadecimal text, in any way that `unhexed` reads; lines without digits are passed over."""
 
@@ -313,35 +304,33 @@ def refuse_container(path: str, head: bytes) -> None:
             raise suggest(error, command.format(quote(path))) if command and os.path.exists(path) else error
 
 
-def refuse_piped(data: bytes) -> None:
-    """Nothing, for standard input that is read as the bytes it holds.
-
-    Raises:
-        SourceError: where it begins as a file that is read otherwise, or not at all.
-    """
-    refuse_container("standard input", data[:HEAD])
-    if is_capture(data[:4]) or data.startswith(MAGIC):
-        raise SourceError("standard input is a capture or a recording, which are read from files: give the path of one")
-
-
 def open_file(path: str, *, sender: str | None = None) -> FileTransport | RecordingTransport:
-    """The transport for a file, by what it holds; "-" is standard input.
+    """The transport for a file, by what it holds; "-" is standard input, which is told by its beginning too.
 
     Raises:
         SourceError: where it cannot be opened, or is a file of another kind, such as an archive or a bag.
     """
-    if path == "-":
-        return PipeTransport("standard input", sys.stdin.buffer)
     with system_errors(path), contextlib.ExitStack() as undo:
-        file = undo.enter_context(open(path, "rb"))
-        head = file.peek(HEAD)[:HEAD]
+        file = sys.stdin.buffer if path == "-" else undo.enter_context(open(path, "rb"))
+        head = _head(file)
+        path = "standard input" if path == "-" else path
         refuse_container(path, head)
         undo.pop_all()  # the transport closes it
     if head.startswith(MAGIC):
-        file.close()
-        return RecordingTransport(path, sender=sender)
+        if file is not sys.stdin.buffer:
+            file.close()
+        return RecordingTransport("-" if file is sys.stdin.buffer else path, sender=sender)
     if is_stream_capture(head):
         return StreamCaptureTransport(path, file)
     if is_capture(head):
         return CaptureTransport(path, file, sender=sender)
     return HexTransport(path, file) if Path(path).suffix in (".hex", ".txt") else FileTransport(path, file)
+
+
+def _head(file: BinaryIO) -> bytes:
+    """How a file begins; of a pipe what is there first, which stays there."""
+    if isinstance(file, io.BufferedReader):
+        return file.peek(HEAD)[:HEAD]
+    head = file.read(HEAD)
+    file.seek(-len(head), os.SEEK_CUR)
+    return head

@@ -22,7 +22,7 @@ from lidarspec.simulation.device import SECOND, SimulatedDevice
 from lidarspec.spec.links import Udp
 from lidarspec.transports.open_url import transport
 from lidarspec.transports.outlets import HERE, Outlet
-from lidarspec.transports.protocol import POLL, Chunk, Closing, Disconnected, Sender, sender_names
+from lidarspec.transports.protocol import POLL, Chunk, Closing, Disconnected, Sender, Transport, sender_names
 from lidarspec.wire.build import build_command
 
 #: seconds at least between two sendings.
@@ -309,6 +309,7 @@ class Replay:
         speed: 2.0 is twice as fast; None as fast as possible.
         needs_times: whether a file without times is refused, rather than sent as fast as it is taken.
         loop: begin again at the end, for every listener from the beginning.
+        source: the file where it is open already, as standard input has to be; read first, and closed then.
 
     Attributes:
         chunks, bytes: sent so far.
@@ -319,11 +320,20 @@ class Replay:
         seconds: since the first listener came.
     """
 
-    def __init__(self, file: str, outlet: Outlet, *, speed: float | None = 1.0, needs_times: bool = False, loop: bool = False) -> None:
+    def __init__(
+        self,
+        file: str,
+        outlet: Outlet,
+        *,
+        speed: float | None = 1.0,
+        needs_times: bool = False,
+        loop: bool = False,
+        source: Transport | None = None,
+    ) -> None:
         self._file, self._outlet, self._speed, self._needs_times, self._loop = file, outlet, speed, needs_times, loop
         self.chunks = self.bytes = self.late = self.latest = 0
         self._ends, self.is_timed, self.digest = set[tuple[Sender | None, Sender | None]](), True, hashlib.sha256()
-        self._began = time.monotonic()
+        self._began, self._source = time.monotonic(), source
 
     @property
     def seconds(self) -> float:
@@ -341,7 +351,8 @@ class Replay:
             self._outlet.await_listener()
             if not self.chunks:
                 self._began = time.monotonic()
-            with contextlib.closing(transport(self._file)) as source:
+            opened, self._source = self._source or transport(self._file), None
+            with contextlib.closing(opened) as source:
                 try:
                     for chunk, late in replayed(self._checked(source.chunks()), self._outlet, speed=self._speed):
                         self._count(chunk, late)

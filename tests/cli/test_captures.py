@@ -18,6 +18,7 @@ import lidarspec as ls
 from lidarspec.captures.ip import ETHERNET
 from lidarspec.captures.pcap import Datagram, datagram_record
 from lidarspec.captures.records import capture_head
+from lidarspec.recording.format import Record, Recording
 from lidarspec.simulation.simulator import simulate
 from tests import made_captures as made
 from tests.cli.running import process, ran
@@ -165,8 +166,37 @@ def test_standard_input_is_no_way_around_it(tmp_path: Path) -> None:
     for words in (("convert", "-", tmp_path / "out.csv"), ("parse", "-")):
         done = process(*words, "-s", M1, given=packed)
         assert (done.returncode, b"standard input is compressed by gzip" in done.stderr) == (3, True)
-    done = process("record", "-", "-o", tmp_path / "it.bin", given=(tmp_path / "held.pcap").read_bytes())
-    assert (done.returncode, b"give the path" in done.stderr) == (3, True)
+
+
+def recorded(path: Path) -> list[Record]:
+    with Recording(path) as recording:
+        return list(recording)
+
+
+def test_captures_and_recordings_on_standard_input_are_read_as_from_files(tmp_path: Path) -> None:
+    path, recording, copy = capture(tmp_path / "it.pcap", *records(40)), tmp_path / "it.lsr", tmp_path / "copy.lsr"
+    blocks = tmp_path / "it.pcapng"
+    blocks.write_bytes(made.section() + made.interface() + b"".join(made.packet(made.frame(each)) for each in simulate(ls.sensor(M1), 40)))
+    ran("record", path, "-o", recording, "-s", M1)
+    for file in (path, blocks, recording):
+        held = file.read_bytes()
+        for words in (("read", "-", "--packets", "--json"), ("parse", "-", "--json"), ("explain", "-", "--json")):
+            named = [str(file) if word == "-" else word for word in words]
+            assert ran(*words, "-s", M1, given=held).stdout == ran(*named, "-s", M1).stdout.replace(str(file), "-"), words
+        ran("record", "-", "-o", copy, "--force", given=held)
+        ran("record", file, "-o", recording, "--force") if file != recording else None
+        assert recorded(copy) == recorded(recording)
+        said = ran("replay", "-", "--to", tmp_path / "played.lsr", "--force", given=held).stderr
+        assert "40 chunks" in said
+        assert [each.data for each in recorded(tmp_path / "played.lsr")] == [each.data for each in recorded(recording)]
+    assert "only once" in ran("replay", "-", "--loop", given=held, code=2).stderr
+    done = process("read", "-", "--packets", "--json", "-s", M1, given=path.read_bytes())
+    assert done.stdout.decode() == ran("read", path, "--packets", "--json", "-s", M1).stdout
+
+
+def test_what_is_cut_off_on_standard_input_is_said(tmp_path: Path) -> None:
+    path = capture(tmp_path / "it.pcap", *records(3))
+    assert "standard input is cut off in its last record" in ran("read", "-", "--packets", "-s", M1, given=path.read_bytes()[:-5]).stderr
 
 
 def test_bytes_that_only_begin_a_little_like_an_archive_are_bytes(tmp_path: Path) -> None:
