@@ -70,6 +70,7 @@ class RecordingTransport(Transport):
         self.header: Header = self._recording.header
         self.datagrams, self._origin = self.header.datagrams, None if sender is None else origin(sender)
         self.warnings: list[str] = []
+        self._was_set = False
 
     def chunks(self) -> Iterator[Chunk]:
         """What was received, in order, with the arrival times of then."""
@@ -98,13 +99,17 @@ class RecordingTransport(Transport):
         return False
 
     def _interrupts(self, record: Record) -> bool:
-        """Whether an event says that the line was interrupted; counts disconnects."""
+        """Whether an event says that the line was interrupted; counts disconnects, and takes down that the clock was set."""
         try:
             event = json.loads(record.data)
         except (ValueError, RecursionError):
             return False
         name = event.get("event") if isinstance(event, dict) else None
         self.disconnects += name == "disconnect"
+        if name == "clock" and not self._was_set:
+            self._was_set = True
+            text = "the clock of the computer was set while it recorded; the arrival times go on evenly, as it was at first"
+            self.warnings.append(f"{self._recording.path}: {text}")
         return name in INTERRUPTIONS
 
 
