@@ -19,6 +19,7 @@ from enum import Enum
 
 from lidarspec.errors import SourceError, UsageError
 from lidarspec.recording.appending import Log
+from lidarspec.transports.base import HostClock
 from lidarspec.transports.protocol import POLL, Chunk, Disconnected, LiveTransport
 
 #: what waits in a queue at most: chunks, and bytes in them; several seconds of the fastest sensors.
@@ -149,17 +150,22 @@ class Capture:
         queue: where it goes to.
         link: the name of the link.
         log: the recording, if there is one.
+        clock: of the host, for what is recorded besides data.
 
     Attributes:
         transport: the transport.
         connected: whether the device is there.
         disconnects: how often it went away.
         last: when something last arrived, by `time.monotonic`; the time of opening before that.
+        warnings: what is to be said of the host's clock.
     """
 
-    def __init__(self, transport: LiveTransport, queue: BoundedQueue, *, link: str = "data", log: Log | None = None) -> None:
+    def __init__(
+        self, transport: LiveTransport, queue: BoundedQueue, *, link: str = "data", log: Log | None = None, clock: HostClock | None = None
+    ) -> None:
         self.transport, self.connected, self.disconnects, self.last = transport, True, 0, time.monotonic()
         self._queue, self._link, self._log = queue, link, log
+        self._clock, self.warnings = clock or HostClock(), list[str]()
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name=f"capture of {link}", daemon=True)
         self._thread.start()
@@ -199,10 +205,20 @@ class Capture:
         """Record and queue what arrived, with what happened before it."""
         if gap or quiet:
             chunks[0] = replace(chunks[0], gap=gap, quiet=quiet)
+        self._look_at_the_clock(chunks[0])
         if self._log is not None:
             for chunk in chunks:
                 self._log.write(chunk)
         self._queue.put(self._link, chunks)
+
+    def _look_at_the_clock(self, chunk: Chunk) -> None:
+        """Where the wall clock was set before a chunk came, arrival times go on as before; it is said once, and recorded each time."""
+        ahead = self._clock.parted()
+        if ahead is None:
+            return
+        self.warnings = [f"the clock of this computer was set, and is {ahead / 1e9:+.3f} s from the arrival times, which go on evenly"]
+        if self._log is not None:
+            self._log.event("clock", chunk.at, ahead_ns=ahead)
 
     def _found_again(self) -> bool:
         """Say that the device is gone, and wait until it is back; False where somebody wants to stop meanwhile."""
@@ -223,5 +239,5 @@ class Capture:
 
     def _tell(self, mark: Mark, event: str) -> None:
         if self._log is not None:
-            self._log.event(event)
+            self._log.event(event, self._clock.now())
         self._queue.put(self._link, [mark])

@@ -26,7 +26,7 @@ from lidarspec.framing.decoder import Decoder, backend as backend_named
 from lidarspec.framing.results import Counters, Frames
 from lidarspec.recording.appending import Log
 from lidarspec.spec.sensor import Sensor
-from lidarspec.transports.base import with_option
+from lidarspec.transports.base import HostClock, with_option
 from lidarspec.transports.open_url import control_link, has_control
 from lidarspec.transports.protocol import Chunk, LiveTransport, Sender, endpoint
 
@@ -157,7 +157,7 @@ class LiveInput(Input):
         self.decoder: Decoder = sensor.decoder(stream=not opened.datagrams, backend=self._backend)
         self._decoders, self._captures = {"data": self.decoder}, {}
         self._kept, self._ready = Kept(source, sensor, datagrams=opened.datagrams), deque[Arrival]()
-        self._offset = time.time_ns() - time.monotonic_ns()
+        self._clock = HostClock()
         self._turn, self._talk = threading.RLock(), threading.RLock()
         self._due, self._stops, self._closed = 0.0, False, False
         self._failure: SourceError | None = None
@@ -178,7 +178,7 @@ class LiveInput(Input):
 
     @property
     def warnings(self) -> list[str]:
-        said = [warning for capture in self._captures.values() for warning in capture.transport.warnings]
+        said = [warning for capture in self._captures.values() for warning in (*capture.transport.warnings, *capture.warnings)]
         said += self._kept.warnings + self._said
         if self._recorder is not None and self._recorder.error is not None:
             said.append(f"the recording has stopped: {self._recorder.error}")
@@ -233,7 +233,7 @@ class LiveInput(Input):
             command = self.sensor.commands[name]
             self._await_sender(command.link, command.timeout * (1 + command.retries) if timeout is None else timeout)
         with self._talk:
-            pending = self._session.request(name, time.monotonic_ns(), timeout=timeout, **arguments)
+            pending = self._session.request(name, self._clock.now(), timeout=timeout, **arguments)
             self._speak()
         while not pending.done:
             if self._failure is not None:
@@ -281,7 +281,7 @@ class LiveInput(Input):
         with self._talk:
             self._session.abandon("the device is being closed")
             names = self.sensor.on_close or stopping
-            waiting = [self._session.request(name, time.monotonic_ns()) for name in names]
+            waiting = [self._session.request(name, self._clock.now()) for name in names]
             self._speak()
         limit = time.monotonic() + FAREWELL
         while not all(pending.done for pending in waiting) and time.monotonic() < limit:
@@ -306,11 +306,11 @@ class LiveInput(Input):
     def _pump(self, wait: float) -> None:
         """Take what has arrived within `wait` seconds, decode it, and let the session know."""
         with self._talk:
-            self._session.tick(time.monotonic_ns())
+            self._session.tick(self._clock.now())
             self._speak()
             deadline = self._session.deadline
         if deadline is not None:
-            wait = min(wait, max(deadline - time.monotonic_ns(), 0) / 1e9)
+            wait = min(wait, max(deadline - self._clock.now(), 0) / 1e9)
         events = self.queue.take(wait, until=self._due, chunks=TOGETHER)
         if events:
             self._due = time.monotonic() + self._period
@@ -360,7 +360,7 @@ class LiveInput(Input):
         with self._talk:
             awaited = self._session.awaited(link)
             for item in answers(found, awaited) if awaited else ():
-                at = time.monotonic_ns() if item.at is None else item.at - self._offset
+                at = self._clock.now() if item.at is None else item.at
                 self._session.receive([item], at, link=link)
             if awaited:
                 self._speak()
@@ -373,7 +373,7 @@ class LiveInput(Input):
         """The device is back: it has forgotten what it was told."""
         with self._talk:
             for name in self.sensor.on_open if self._stops else ():
-                self._session.request(name, time.monotonic_ns())
+                self._session.request(name, self._clock.now())
             self._speak()
 
     def _speak(self) -> None:
@@ -396,7 +396,7 @@ class LiveInput(Input):
         if outgoing.data:
             transport.write(outgoing.data)
             if self._recorder is not None:
-                self._recorder.write(Chunk(outgoing.data, time.monotonic_ns() + self._offset), "out")
+                self._recorder.write(Chunk(outgoing.data, self._clock.now()), "out")
 
     def _opened(self, link: str) -> LiveTransport:
         """The transport of a link; one apart from the data's is opened when it is first needed."""

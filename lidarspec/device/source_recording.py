@@ -20,6 +20,7 @@ from lidarspec.recording.appending import Appender
 from lidarspec.recording.format import Header
 from lidarspec.recording.recorders import recorder
 from lidarspec.spec.sensor import Sensor
+from lidarspec.transports.base import HostClock
 from lidarspec.transports.files import RecordingTransport
 from lidarspec.transports.open_url import is_live, transport
 from lidarspec.transports.protocol import Chunk, LiveTransport, Transport
@@ -113,7 +114,7 @@ class SourceRecording:
     def _captured(self, source: LiveTransport, file: Appender) -> Generator[str, None, None]:
         """What arrives is recorded by a thread; here it is counted and thrown away."""
         queue = BoundedQueue()
-        with contextlib.closing(Capture(source, queue, log=file)):
+        with contextlib.closing(Capture(source, queue, log=file)) as capture:
             while self._goes_on():
                 yield ""
                 for _, item in queue.take(TURN):
@@ -123,12 +124,13 @@ class SourceRecording:
                         self.packets += source.datagrams
                     elif item is not Mark.SILENT:
                         yield f"{self._source}: the device is {'gone; waiting for it to come back' if item is Mark.LOST else 'back'}"
+            yield from capture.warnings
 
     def _copied(self, source: Transport, file: Appender) -> Generator[str, None, None]:
         """What is in a file; standard input gets the time of its arrival."""
-        first: int | None = None
+        first, clock = None, HostClock()
         for chunk in source.chunks():
-            at = time.time_ns() if chunk.at is None and self._source == "-" else chunk.at
+            at = clock.now() if chunk.at is None and self._source == "-" else chunk.at
             first = at if first is None else first
             is_late = self._seconds is not None and at is not None and first is not None and at - first >= self._seconds * 1e9
             if is_late or not self._goes_on(timed=False):

@@ -11,6 +11,9 @@
     17+a    n     data
     17+a+n  4     CRC-32 (zlib) of everything before
 
+An event is a JSON object, with its name as "event": "disconnect", "reconnect", "dropped" (so many "records"), or "clock": the wall clock
+was set, and is "ahead_ns" ahead of the arrival times, which go on evenly. What a reader does not know it passes over.
+
 Theory of operation: a length is at most what its one or two bytes can say, so no record claims more than 66 kB, and none is
 believed before its checksum passes. The reader keeps a window of the file that holds one record and what was read with it. It stops at
 the first damaged record, or salvages what lies behind it; what a killed process leaves behind is whole records and at most one that is

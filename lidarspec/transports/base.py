@@ -9,7 +9,7 @@ import selectors
 import socket
 import time
 from abc import abstractmethod
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypeVar
@@ -25,6 +25,11 @@ from lidarspec.transports.protocol import Chunk, Disconnected, LiveTransport, Or
 COMMON = frozenset({"control"})
 #: seconds between two reads, in which a fast line gathers some bytes: it would wake us for every one.
 PAUSE = 0.002
+#: ns by which a wall clock may go differently; more is a clock that was set.
+PARTED = 50_000_000
+#: times that both are read where something comes between; what may come between is a part of that.
+TRIES = 10
+_BOOTTIME: int | None = getattr(time, "CLOCK_BOOTTIME", None)
 L = TypeVar("L", bound=Link)
 _Descriptor = int | socket.socket
 #: `select` knows no descriptor above 1,023; Windows, which has nothing else, does not number them so.
@@ -145,14 +150,41 @@ def numeric(host: str, place: str) -> str:
 
 
 class HostClock:
-    """Wall-clock times that the monotonic clock carries on: no interval between two of them jumps when the clock is set."""
+    """Times of the wall clock that a steady clock carries on: none of their intervals jumps when the clock is set, or lacks a suspend.
 
-    def __init__(self) -> None:
-        self._offset = time.time_ns() - time.monotonic_ns()
+    Args:
+        wall: the wall clock, ns since 1970.
+    """
+
+    def __init__(self, wall: Callable[[], int] = time.time_ns) -> None:
+        self._wall, self._offset, self._ahead = wall, 0, 0
+        for _ in range(TRIES):
+            self._offset, doubt = self._difference()
+            if doubt < PARTED // TRIES:
+                break
 
     def now(self) -> int:
         """Nanoseconds since 1970."""
-        return time.monotonic_ns() + self._offset
+        return steady_ns() + self._offset
+
+    def parted(self) -> int | None:
+        """By how many ns the wall clock is ahead of these times, where it was set by more than 50 ms since the last call; else None."""
+        difference, doubt = self._difference()
+        ahead = difference - self._offset
+        if abs(ahead - self._ahead) <= PARTED or doubt > PARTED // TRIES:
+            return None
+        self._ahead = ahead
+        return ahead
+
+    def _difference(self) -> tuple[int, int]:
+        """By how much the wall clock is ahead of the steady one, and how wrong that may be: one is read after the other."""
+        before, wall = steady_ns(), self._wall()
+        return wall - before, steady_ns() - before
+
+
+def steady_ns() -> int:
+    """A clock that nobody sets, in ns; where the system has one, one that goes on while it is suspended."""
+    return time.monotonic_ns() if _BOOTTIME is None else time.clock_gettime_ns(_BOOTTIME)
 
 
 def rest(until: float) -> None:

@@ -74,7 +74,7 @@ class RecordingTransport(Transport):
         self.header: Header = self._recording.header
         self.datagrams, self._origin = self.header.datagrams, None if sender is None else origin(sender)
         self.warnings: list[str] = []
-        self._no_events = 0
+        self._no_events, self._was_set = 0, False
 
     def known_sensor(self) -> Sensor:
         """The installed sensor that the recording names, with the options of then.
@@ -119,15 +119,20 @@ class RecordingTransport(Transport):
         return False
 
     def _interrupts(self, record: Record) -> bool:
-        """Whether an event says that the line was interrupted; counts disconnects."""
+        """Whether an event says that the line was interrupted; counts disconnects, and takes down that the clock was set."""
         try:
             event = json.loads(record.data)
             name = event["event"]
             self.disconnects += name == "disconnect"
-            return name in INTERRUPTIONS
+            is_interruption = name in INTERRUPTIONS
         except (ValueError, RecursionError, TypeError, KeyError):
             self._no_events += 1
             return False
+        if name == "clock" and not self._was_set:
+            self._was_set = True
+            text = "the clock of the computer was set while it recorded; the arrival times go on evenly, as it was at first"
+            self.warnings.append(f"{self._recording.path}: {text}")
+        return is_interruption
 
 
 def _damage(recording: Recording) -> str:

@@ -3,17 +3,27 @@
 from __future__ import annotations
 
 import contextlib
+import json
+import shutil
 import socket
+import subprocess
+import sys
+import time
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
+import lidarspec as ls
 from lidarspec.captures.pcap import CaptureReader
+from lidarspec.device.capture_thread import BoundedQueue, Capture
 from lidarspec.device.source_recording import SourceRecording
 from lidarspec.recording.format import Recording
+from lidarspec.recording.recorders import Recorder
 from lidarspec.spec import Fields
-from tests.lines import free_port, turning, udp
+from lidarspec.transports.base import HostClock
+from lidarspec.transports.open_url import live
+from tests.lines import free_port, turning, udp, until
 from tests.shapes import SHAPES
 
 
@@ -70,3 +80,38 @@ def test_a_sensor_that_sends_over_ipv6_is_recorded_for_wireshark(tmp_path: Path)
             list(running)
         assert [datagram.data for datagram in CaptureReader(path)] == sent
         assert {datagram.source for datagram in CaptureReader(path)} == {sender.getsockname()[:2]}
+
+
+def test_a_clock_that_is_set_changes_no_time_and_is_recorded(tmp_path: Path) -> None:
+    path, number, wall = tmp_path / "all.lsr", free_port(), [0]
+    sensor = SHAPES["shape-datagrams"]
+    frames, queue = turning(sensor, 4), BoundedQueue()
+    with udp() as sender, Recorder(path, sensor) as kept:
+        clock = HostClock(wall=lambda: time.time_ns() + wall[0])
+        with contextlib.closing(Capture(live(f"udp://:{number}", sensor), queue, log=kept, clock=clock)) as capture:
+            for index, step in enumerate((0, 20_000_000, 3_000_000_000, 3_000_000_000)):
+                wall[0] = step
+                sender.sendto(frames[index], ("127.0.0.1", number))
+                until(lambda index=index: queue.produced == index + 1)  # type: ignore[misc]
+            (said,) = capture.warnings
+    assert said.startswith("the clock of this computer was set, and is +3.")
+    with Recording(path) as recording:
+        found = list(recording)
+    assert [record.direction for record in found] == ["in", "in", "event", "in", "in"]
+    assert abs(json.loads(found[2].data)["ahead_ns"] - 3_000_000_000) < 50_000_000
+    times = [record.at for record in found if record.at]
+    assert times == sorted(times)
+    assert times[-1] - times[0] < 2_000_000_000, "no step"
+    with ls.open(path, sensor) as device:
+        assert sum(map(len, device.packets())) == 4
+        (said,) = (warning for warning in device.warnings if "clock" in warning)
+        assert said == f"{path}: the clock of the computer was set while it recorded; the arrival times go on evenly, as it was at first"
+
+
+def test_arrival_times_count_a_suspend() -> None:
+    """In a namespace in which the computer seems to have slept for 100 s."""
+    slept = ["unshare", "--fork", "--user", "--map-root-user", "--time", "--boottime", "100"]
+    if shutil.which("unshare") is None or subprocess.run([*slept, "true"], capture_output=True, check=False).returncode:
+        pytest.skip("this system has no namespaces of time")
+    program = "import time; from lidarspec.transports.base import steady_ns; print((steady_ns() - time.monotonic_ns()) // 10**9)"
+    assert int(subprocess.run([*slept, sys.executable, "-c", program], capture_output=True, check=True).stdout) >= 99
