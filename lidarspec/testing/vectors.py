@@ -208,13 +208,15 @@ def entries(subject: Subject) -> dict[str, Any]:
 
 def _require_kind(key: str, value: Any, place: str) -> None:
     """Refuse a value that is not what its key stands for; points are numbers by index and column."""
-    told = {str: "a text", dict: "an object", list: "a list of texts"}
+    told: dict[type, str] = {str: "a text", dict: "an object", list: "a list of texts"}
     wanted = " or ".join(told[kind] for kind in KEYS[key])
     right = isinstance(value, KEYS[key]) and (not isinstance(value, list) or all(isinstance(one, str) for one in value))
     require(right, "LS702", f"`{key}` is {wanted}, not {str(value)[:40]!r}", place)
     for index, columns in value.items() if key == "points" else ():
         numbers = columns.values() if isinstance(columns, dict) else (None,)
-        right = index.removeprefix("-").isdecimal() and len(index) < 9 and all(type(number) in (int, float) for number in numbers)
+        right = (
+            index.removeprefix("-").isdecimal() and len(index) < 9 and all(type(one) in (int, float) and abs(one) < 1e9 for one in numbers)
+        )
         require(right, "LS702", f"`points` are numbers by column, and {index[:40]!r}: {str(columns)[:40]!r} is none", place)
 
 
