@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -213,7 +213,7 @@ def _require_kind(key: str, value: Any, place: str) -> None:
     right = isinstance(value, KEYS[key]) and (not isinstance(value, list) or all(isinstance(one, str) for one in value))
     require(right, "LS702", f"`{key}` is {wanted}, not {str(value)[:40]!r}", place)
     for index, columns in value.items() if key == "points" else ():
-        numbers = columns.values() if isinstance(columns, dict) else (None,)
+        numbers: Iterable[Any] = columns.values() if isinstance(columns, dict) else (None,)
         right = (
             index.removeprefix("-").isdecimal() and len(index) < 9 and all(type(one) in (int, float) and abs(one) < 1e9 for one in numbers)
         )
