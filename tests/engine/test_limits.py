@@ -46,7 +46,7 @@ def test_a_decoder_holds_less_than_its_longest_frame(sensor: Sensor) -> None:
 @each_stream
 def test_garbage_takes_no_memory(sensor: Sensor) -> None:
     data = garbage(MEGABYTE // 8)
-    fed(sensor, data[:8192])
+    fed(sensor, data)  # what is imported and made once, for all decoders
     assert peak(lambda: fed(sensor, data)) < MEGABYTE // 2
 
 

@@ -7,6 +7,7 @@ import itertools
 import json
 import os
 import random
+import re
 import socket
 import subprocess
 import sys
@@ -87,12 +88,19 @@ def recovered(share: float) -> Figure:
 def documented(share: float) -> Figure:
     """P3: hostile inputs to everything that reads."""
     number = int(400_000 * share) + 300
-    only = [] if share == 1 else ["--only", "hex", "--only", "recording"]
+    only = [] if share >= 0.1 else ["--only", "hex", "--only", "recording"]
     with tempfile.TemporaryDirectory() as folder:
         words = [sys.executable, "-m", "tests.fuzz", "--engine", "seeded", "--inputs", str(number), "--folder", folder, *only]
         done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=False)
     found = next((line.split() for line in done.stdout.splitlines() if line.startswith("all ")), ["all", "0", "0", "0", "1"])
-    return Figure(f"{int(found[1]):,} hostile inputs of `make fuzz`: {found[-1]} findings", done.returncode == 0)
+    names = sorted(
+        {
+            place.partition(":")[0]
+            for place in re.findall(r"^(?!make)\w[^:\n]*: \S+:\d+$", done.stdout.rpartition("\nall ")[2], re.MULTILINE)
+        }
+    )
+    where = f" ({', '.join(names)})" if names else ""
+    return Figure(f"{int(found[1]):,} hostile inputs of `make fuzz`: {found[-1]} findings{where}", done.returncode == 0)
 
 
 def bounded(share: float) -> Figure:
