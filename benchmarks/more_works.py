@@ -21,9 +21,13 @@ import lidarspec as ls
 from lidarspec.captures.bulk import CaptureBatches
 from lidarspec.captures.pcap import CaptureReader
 from lidarspec.packets.stream import PacketStream
+from lidarspec.spec import Serial
+from lidarspec.testing.hostile import streams
+from lidarspec.testing.subject import Subject
 
 RATE = 6300  # packets per second of an RS-LiDAR-M1
 TOGETHER = 63  # of them in 10 ms
+HOSTILE = 100_000  # bytes of a hostile stream
 
 
 def from_capture(inputs: Inputs, key: str, title: str, more: Others | None = None) -> Work:
@@ -153,6 +157,38 @@ def one_by_one(function: Callable[[bytes], Any], frames: list[bytes]) -> Callabl
     return run
 
 
+def hostile(inputs: Inputs) -> Work:
+    """Finding the frames of streams that cost most, of each family on its fastest serial line, against the rate of that line."""
+    families = {tuple(sensor.frames): sensor for sensor in sorted(ls.sensors().values(), key=line_rate) if line_rate(sensor)}
+    tasks: dict[str, tuple[ls.Sensor, list[bytes]]] = {}
+    for sensor in families.values():
+        for name, parts in streams(Subject(sensor), length=HOSTILE).items():
+            tasks[f"{name} of {sensor.id}"] = sensor, parts
+
+    def finding(sensor: ls.Sensor, parts: list[bytes]) -> Callable[[], Any]:
+        return lambda: sensor.decoder().frames(b"".join(parts))
+
+    own = {name: Contender(finding(*task), sum(map(len, task[1]))) for name, task in tasks.items()}
+
+    def run() -> None:
+        for contender in own.values():
+            contender.run()
+
+    def facts(backend: str, rates: Rates) -> Facts:
+        least, name = min((1 / median(rates[name]) / line_rate(sensor), name) for name, (sensor, _) in tasks.items())
+        return {f"times its line's rate at least, in {name}": least}
+
+    size = sum(contender.amount for contender in own.values())
+    title = "Hostile streams of serial sensors"
+    return Work(title, "bytes", size, size, lambda _: run, own=lambda _: own, facts=facts, has_backends=False)
+
+
+def line_rate(sensor: ls.Sensor) -> float:
+    """Bytes per second of a sensor's serial line; 0 where it has none."""
+    link = sensor.links.get("data")
+    return max(link.bauds) / 10 if isinstance(link, Serial) else 0.0
+
+
 def importing(inputs: Inputs) -> Work:
     """A new process that imports lidarspec and finds a sensor, against one that imports what this needs at least."""
 
@@ -183,5 +219,6 @@ ELSEWHERE: Mapping[str, Callable[[Inputs], Work]] = {
     "parse-vlp16": lambda inputs: parse(inputs, "vlp16", "parse one VLP-16 packet"),
     "parse-xt32": lambda inputs: parse(inputs, "xt32", "parse one Pandar XT32 packet"),
     "parse-m1": lambda inputs: parse(inputs, "m1", "parse one RS-LiDAR-M1 packet"),
+    "hostile": hostile,
     "import": importing,
 }

@@ -15,6 +15,7 @@ In: a sensor. Out: passed tests, or findings with place, reason and what to writ
 * `geometry`: whether points are where the manual has them.
 * `commands`: requests, replies, and the simulated sensor's answers.
 * `agreement`: two ways to the same result.
+* `hostile`: streams that cost most, made of the sensor's own frames.
 * `vectors`: golden frames out of a manual or capture.
 * `check`: all of it without pytest, for a name, file, distribution or folder.
 * `plugin`, `fixtures`: fixtures for pytest; simulated sensors on real ports.

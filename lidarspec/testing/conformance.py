@@ -19,7 +19,7 @@ from lidarspec.errors import SpecError
 from lidarspec.framing.frame_engine import CompiledCodec, codec
 from lidarspec.plugins import sensor as named_sensor
 from lidarspec.spec.sensor import Sensor
-from lidarspec.testing import agreement, commands, frames, geometry, vectors
+from lidarspec.testing import agreement, commands, frames, geometry, hostile, vectors
 from lidarspec.testing.declared import declared
 from lidarspec.testing.findings import Finding, Violation, left_over
 from lidarspec.testing.subject import EXAMPLES, Subject
@@ -120,6 +120,7 @@ PROPERTIES = (
     Property(agreement.the_same_bytes_give_the_same_points, "sensor", "LS415", unless=FAILS),
     Property(agreement.a_clean_input_loses_nothing, "sensor", "LS401"),
     Property(agreement.parse_decode_and_any_cutting_agree, "sensor", "LS402", unless=("LS308", "LS306", "LS401", *FAILS, "LS415")),
+    Property(hostile.no_stream_costs_much_more_than_frames, "sensor", "LS416", unless=("LS301", *FAILS)),
     Property(agreement.single_packets_equal_a_batch, "sensor", "LS403", unless=("LS415",)),
     Property(agreement.scans_do_not_depend_on_batches, "sensor", "LS404", unless=(*FAILS, "LS415")),
     Property(geometry.a_simulated_scene_comes_back, "data", "LS507", lacks=_no_sweep, unless=("LS201", *FAILS, "LS502", "LS415", "LS503")),

@@ -348,8 +348,14 @@ class Refused:
 @dataclass(eq=False)
 class _Node:
     leaf: Leaf | None = None
+    told: _Told | None = None
     children: dict[int, _Node] = field(default_factory=dict)
     result: Layout | Refused | None = None
+
+    def value(self, leaf: Leaf, frame: bytes) -> int:
+        """The value of its field in a frame, or the one that stands for it."""
+        value = leaf.scalar(frame)
+        return value if self.told is None else self.told.one(value)
 
 
 Group = tuple[Layout | Refused, NDArray[np.intp]]
@@ -360,12 +366,16 @@ class _Told:
     """Which values of a header field the layout tells apart: all from `low` to `high`, or `keys` and any other.
 
     A header may claim any of some billion lengths, or have any key, and garbage does: those that mean the same are one branch.
+
+    Attributes:
+        rises: the value from which on a frame never gets shorter, so that what is too long stays so; None where there is none.
     """
 
     low: int
     high: int
     keys: frozenset[int] = frozenset()
     other: int = 0
+    rises: int | None = None
 
     @classmethod
     def of(cls, info: tree.FieldInfo, root: tree.Node, limit: int) -> _Told:
@@ -383,8 +393,13 @@ class _Told:
             for _, formula in asking:
                 count = functools.partial(_with_value, formula)
                 spans.append((bisect.bisect_left(values, 0, key=count) - 1, bisect.bisect_right(values, limit, key=count)))
-            return cls(max(min(first for first, _ in spans) + low, low), min(max(last for _, last in spans) + low, high))
+            firsts, lasts = zip(*spans, strict=True)
+            return cls(max(min(firsts) + low, low), min(max(lasts) + low, high), rises=max(firsts) + low + 1)
         return cls(low, high)
+
+    def refused(self, value: int) -> _Told:
+        """The same, where the frame of a value is known to be too long."""
+        return replace(self, high=value) if self.rises is not None and self.rises <= value < self.high else self
 
     def one(self, value: int) -> int:
         """The value that stands for one that means the same."""
@@ -487,7 +502,7 @@ class HeaderTree:
         """The layout of one frame, or None where its header is not all there."""
         node: _Node | None = self._root
         while node is not None and node.leaf is not None and node.leaf.offset + node.leaf.size <= len(frame):
-            node = node.children.get(self._value(node.leaf, frame))
+            node = node.children.get(node.value(node.leaf, frame))
         if node is not None and node.result is not None:
             return node.result
         groups = self.classify(np.frombuffer(frame, np.uint8), np.zeros(1, np.intp))
@@ -498,7 +513,7 @@ class HeaderTree:
         found, node = [], self._root
         while node.leaf is not None:
             found.append(node.leaf)
-            node = node.children[self._value(node.leaf, frame)]
+            node = node.children[node.value(node.leaf, frame)]
         return found
 
     def choose(self, source: random.Random, drawn: Mapping[str, Draw] | None = None) -> tuple[Layout, dict[str, int]]:
@@ -533,35 +548,34 @@ class HeaderTree:
         which = which if there.all() else which[there]
         if not len(which):
             return []
-        values = self._telling(leaf).all(leaf.at(leaf.offset).load(rows_at(buffer, offsets[which] + leaf.offset, leaf.size)))
+        values = leaf.at(leaf.offset).load(rows_at(buffer, offsets[which] + leaf.offset, leaf.size))
+        values = values if node.told is None else node.told.all(values)
         if np.count_nonzero(values == values[0]) == len(values):
             return [(node.children.setdefault(values.item(0), _Node()), which)]
         return [(node.children.setdefault(value, _Node()), which[places]) for value, places in by_value(values, FEW)]
 
-    def _value(self, leaf: Leaf, frame: bytes) -> int:
-        """The value of a header field of a frame, or the one that stands for it."""
-        return self._telling(leaf).one(leaf.scalar(frame))
-
-    def _telling(self, leaf: Leaf) -> _Told:
-        path = leaf.info.path
-        if path not in self._told:
-            self._told[path] = _Told.of(leaf.info, self._frame, self._limit)
-        return self._told[path]
-
     def _explore(self, sample: NDArray[np.uint8]) -> None:
         """Find the layout of one sample, and add the fields that decide it to the tree; as far as the sample goes."""
-        frame, node = sample.tobytes(), self._root
+        frame, node, above, value = sample.tobytes(), self._root, self._root, 0
         values: dict[str, int] = {}
         while node.result is None:
             leaf = node.leaf
             if leaf is None:
                 node.leaf, node.result = self._next(values)
+                node.told = None if node.leaf is None else self._telling(node.leaf.info)
                 self._size += 1
+                if values and isinstance(node.result, Refused) and not node.result.error and above.told is not None:
+                    above.told = above.told.refused(value)
             elif leaf.offset + leaf.size > len(frame):
                 break
             else:
-                values[leaf.info.path] = value = self._value(leaf, frame)
-                node = node.children.setdefault(value, _Node())
+                values[leaf.info.path] = value = node.value(leaf, frame)
+                node, above = node.children.setdefault(value, _Node()), node
+
+    def _telling(self, info: tree.FieldInfo) -> _Told:
+        if info.path not in self._told:
+            self._told[info.path] = _Told.of(info, self._frame, self._limit)
+        return self._told[info.path]
 
     def _next(self, values: Mapping[str, int]) -> tuple[Leaf | None, Layout | Refused | None]:
         """The field that decides next, or what these values lead to."""

@@ -92,6 +92,7 @@ DECLARED = {
     "not_held": {"LS312"},
     "blind_checksum": {"LS310"},
     "points_fail": {"LS414"},
+    "dear_headers": {"LS416"},
     "with_memory": {"LS415"},
     "degrees": {"LS502"},
     "against_its_axes": {"LS511"},

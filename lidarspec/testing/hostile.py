@@ -1,0 +1,155 @@
+"""Hostile streams: what costs a sensor's frames most to find, made of its own frames, and what they cost.
+
+The engine's work is linear in the input, whatever that is; how much a byte costs depends on the declaration, on frame types that follow one
+another, on headers that make a new layout each, on functions of the author's own that are called for every false header. So streams are
+made for each sensor of all that: frames of all types in any order, announcements alone and with what they announce, heads of frames,
+random headers, damaged frames, and of all of these in turn. Each is held to the sensor's own data frames, one after another.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import gc
+import itertools
+import random
+import time
+import tracemalloc
+from collections.abc import Callable
+
+from lidarspec.errors import SpecError
+from lidarspec.framing.examples import examples
+from lidarspec.framing.frame_engine import CompiledCodec, codec
+from lidarspec.framing.results import Frames
+from lidarspec.spec.sensor import Sensor
+from lidarspec.testing.findings import require
+from lidarspec.testing.subject import Subject
+
+#: bytes of a stream, and how many of each kind are tried.
+LENGTH, TRIES = 16_000, 2
+#: how many times as long as its own frames a stream may take, and how many bytes may be kept for each of its bytes.
+DEARER, KEPT = 250, 64
+#: seeds of the examples that streams are made of, frames with random headers, bytes of a head, and of noise behind it.
+SEEDS, HEADERS, HEAD, NOISE = 6, 60, 12, 3
+#: one in so many frames comes behind its announcement, where the others of its type need one.
+ANNOUNCED = 40
+
+
+def no_stream_costs_much_more_than_frames(subject: Subject) -> None:
+    """No stream takes hundreds of times as long as data frames of the same size, or is kept in more than 64 bytes for each of its own."""
+    tries = [streams(subject, seed) for seed in range(TRIES)]  # what is remembered of one does not help with the next
+    taken = {name: min(seconds(subject.sensor, made[name]) for made in tries) for name in tries[0]}
+    smooth = taken.pop(SMOOTH)
+    name = max(taken, key=lambda name: taken[name])
+    worst = taken[name] / smooth
+    subject.measured["the dearest stream"] = f"{name}, {worst:.0f} times as dear as data frames"
+    require(worst < DEARER, "LS416", f"{name}: {worst:.0f} times as dear as data frames of as many bytes")
+    held, name = max((kept(subject.sensor, tries[0][name]) / LENGTH, name) for name in taken)
+    require(held < KEPT, "LS416", f"{name}: {held:.0f} bytes are kept for each byte")
+
+
+SMOOTH = "data frames"
+
+
+def streams(subject: Subject, seed: int = 0, *, length: int = LENGTH) -> dict[str, list[bytes]]:
+    """Streams of at least so many bytes by what they are made of, in pieces: frames, and what looks like them; one of data frames alone."""
+    source, makers = subject.source(f"hostile {seed}"), _makers(subject)
+    found = {name: _of_length(length, functools.partial(make, source)) for name, make in makers.items()}
+    found["all of these in turn"] = _of_length(length, lambda: source.choice(list(makers.values()))(source))
+    sensor = subject.sensor
+    data = sensor.frames[sensor.data_frame]
+    numbers = itertools.count()
+    frames = _of_length(length, lambda: subject.example(sensor.data_frame, seed=next(numbers) % SEEDS))
+    return {**found, SMOOTH: [*([subject.example(data.after)] if data.after else []), *frames]}
+
+
+def seconds(sensor: Sensor, parts: list[bytes]) -> float:
+    """CPU seconds that finding the frames of a stream takes."""
+    start = time.process_time()
+    _frames(sensor, parts)
+    return max(time.process_time() - start, 1e-6)
+
+
+def kept(sensor: Sensor, parts: list[bytes]) -> int:
+    """Bytes that the frames of a stream are kept in, beside its own."""
+    _frames(sensor, parts)  # what is remembered of a sensor
+    gc.collect()
+    tracemalloc.start()
+    try:
+        before = tracemalloc.get_traced_memory()[0]
+        found = _frames(sensor, parts)
+        held = tracemalloc.get_traced_memory()[0] - before
+        return held * bool(found)
+    finally:
+        tracemalloc.stop()
+
+
+def _frames(sensor: Sensor, parts: list[bytes]) -> list[Frames]:
+    decoder = sensor.decoder()
+    return [decoder.datagrams(parts)] if sensor.datagrams else [*decoder.frames(b"".join(parts)), *decoder.rest()]
+
+
+def _of_length(length: int, make: Callable[[], bytes]) -> list[bytes]:
+    parts, size = list[bytes](), 0
+    while size < length:
+        parts.append(make() or b"\0")
+        size += len(parts[-1])
+    return parts
+
+
+def _makers(subject: Subject) -> dict[str, Callable[[random.Random], bytes]]:
+    """What makes a piece of each kind of stream."""
+    incoming = subject.sensor.incoming
+    names, after = list(incoming), {name: frame.after for name, frame in incoming.items()}
+    announcing = sorted({name for name in after.values() if name})
+    with_headers = [frame for name in names for frame in _of_random_headers(subject, name)]
+
+    def example(source: random.Random, name: str) -> bytes:
+        return subject.example(name, seed=source.randrange(SEEDS))
+
+    def behind(source: random.Random, name: str, data: bytes) -> bytes:
+        """Some bytes like a frame, once in a while behind the announcement that they need."""
+        announced = after[name]
+        return example(source, announced) + data if announced and not source.randrange(ANNOUNCED) else data
+
+    def any_frame(source: random.Random) -> bytes:
+        return example(source, source.choice(names))
+
+    def announced(source: random.Random) -> bytes:
+        name = source.choice([name for name in names if after[name]])
+        return example(source, after[name] or "") + example(source, name) * source.choice((1, incoming[name].confirm))
+
+    def head(source: random.Random) -> bytes:
+        name = source.choice(names)
+        return behind(source, name, example(source, name)[: source.randint(1, HEAD)] + source.randbytes(source.randint(0, NOISE)))
+
+    def header(source: random.Random) -> bytes:
+        name = source.choice(names)
+        data = bytearray(source.randbytes(source.randint(HEAD, 3 * HEAD)))
+        for spot, (mask, value) in codec(incoming[name]).prefix.items():
+            data[spot : spot + 1] = bytes([data[spot] & ~mask | value]) if spot < len(data) else b""
+        return behind(source, name, bytes(data))
+
+    def damaged(source: random.Random) -> bytes:
+        name = source.choice(names)
+        data = bytearray(example(source, name))
+        data[source.randrange(len(data))] ^= 1 << source.randrange(8)
+        return behind(source, name, bytes(data))
+
+    makers: dict[str, Callable[[random.Random], bytes]]
+    makers = {"frames of all types": any_frame, "heads of frames": head, "random headers": header, "damaged frames": damaged}
+    if announcing:
+        makers |= {"announcements": lambda source: example(source, source.choice(announcing)), "what was announced": announced}
+    if with_headers:
+        makers["frames with random headers"] = lambda source: source.choice(with_headers)
+    return makers
+
+
+def _of_random_headers(subject: Subject, name: str) -> list[bytes]:
+    """Frames of a type whose header says how long they are, or what is in them."""
+    frame, source, found = subject.sensor.frames[name], subject.source(f"headers {name}"), list[bytes]()
+    engine = codec(frame)
+    if isinstance(engine, CompiledCodec) and engine.size is None:
+        with contextlib.suppress(SpecError):  # none is plausible: the examples are along its sweep
+            found = [examples(subject.sensor, name, source, subject.drawers(name))[0] for _ in range(HEADERS)]
+    return found
