@@ -133,8 +133,8 @@ def plot(source: str, output: str, sensor_id: str | Sensor | None, number: int, 
         chosen: Scan | None = None
         whole = 0
         for scan in scans_of(device, source):
-            whole += scan.complete
-            chosen = scan if scan.complete or chosen is None or not chosen.complete else chosen
+            whole += scan.whole
+            chosen = scan if scan.whole or chosen is None or not chosen.whole else chosen
             if whole == number:
                 break
         if chosen is None:

@@ -248,7 +248,7 @@ def stats(
     """How a sensor is doing: speed, rates, errors, loss, jitter, queue.
 
     A line for each interval, and a summary at the end. Errors are frames whose checksum, length or values are wrong; loss counts
-    what is missing by the sensor's own numbers. A file is read as fast as possible, in batches, and by the time of its packets:
+    what is missing by the sensor's own numbers or clock. A file is read as fast as possible, in batches, and by the time of its packets:
     there an interval can be longer than asked for.
     """
     with open_device(source, sensor_id, period=LOOK) as device:

@@ -158,7 +158,7 @@ def demo(sensor_id: str | Sensor | None, count: int, errors: float, as_json: boo
     if sensor is None:
         raise UsageError(NO_SENSORS)
     result = demonstrate(sensor, turns=count, errors=errors)
-    whole = [scan for scan in result.scans if scan.complete]
+    whole = [scan for scan in result.scans if scan.whole]
     if as_json:
         emit_json(_facts(result, whole), None)
     else:

@@ -74,7 +74,7 @@ def _printed(device: Device, source: str, ramp: str, patience: float) -> str:
         WireError, CommandError: where none comes.
     """
     feed, end = Feed(device), time.monotonic() + patience
-    while not feed.ended and time.monotonic() < end and not (feed.scan is not None and feed.scan.complete):
+    while not feed.ended and time.monotonic() < end and not (feed.scan is not None and feed.scan.whole):
         feed.pump(0.0)
     if feed.scan is None:
         raise nothing_came(device, source, patience)

@@ -97,7 +97,7 @@ class AsyncDevice:
             yield scan
 
     async def latest(self, timeout: float | None = None) -> Scan:
-        """The newest complete scan, newer than the one that the last call gave; from a file the next.
+        """The newest whole scan, newer than the one that the last call gave; from a file the next.
 
         Args:
             timeout: seconds to wait.

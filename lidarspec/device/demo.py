@@ -77,8 +77,8 @@ def demonstrate(sensor: Sensor, *, turns: int = 5, errors: float = 0.01, seed: i
         place, replies, scans, stats = _live(sensor, simulated, path, turns)
         line, recorded = simulated.lines["data"], path.stat().st_size
         with open_device(path, sensor) as recording:
-            again = digest(list(itertools.islice((scan for scan in recording.scans() if scan.complete), turns)))
-    digested = digest([scan for scan in scans if scan.complete])
+            again = digest(list(itertools.islice((scan for scan in recording.scans() if scan.whole), turns)))
+    digested = digest([scan for scan in scans if scan.whole])
     return Demonstration(sensor, place, replies, scans, stats, line.sent, line.intact, digested, again, recorded)
 
 
@@ -113,7 +113,7 @@ def _read(device: Device, served: Served, turns: int) -> tuple[tuple[Reply, ...]
     scans: list[Scan] = []
     for scan in device.scans(wait=0.1):
         scans += [scan] if scan is not None else []
-        if sum(one.complete for one in scans) >= turns:
+        if sum(one.whole for one in scans) >= turns:
             served.rest()
             while device.newest(QUIET) is not None:
                 pass  # what is still on the way counts as sent, so it is read too
@@ -122,7 +122,7 @@ def _read(device: Device, served: Served, turns: int) -> tuple[tuple[Reply, ...]
             break
     if (failure := device.stats.failure(device.sensor.id)) is not None:
         raise failure
-    if sum(one.complete for one in scans) >= turns:
+    if sum(one.whole for one in scans) >= turns:
         return replies, tuple(scans), device.stats
     number = f"{len(scans)} scans in {PATIENCE + turns:g} s, and not {turns}"
     raise SourceError(f"the simulated {device.sensor.id} gave {number}: {device.stats}")

@@ -220,7 +220,7 @@ class Device(Closing):
         yield from stream.finish()
 
     def latest(self, timeout: float | None = None) -> Scan:
-        """The newest complete scan, newer than the one that the last call gave; waits for it. Older ones are passed over.
+        """The newest whole scan, newer than the one that the last call gave; waits for it. Older ones are passed over.
 
         A file has no newest scan: it gives one after another.
 
@@ -237,7 +237,7 @@ class Device(Closing):
         return found
 
     def newest(self, wait: float) -> Scan | None:
-        """The newest complete scan, newer than the one given last; None where none comes within `wait` seconds.
+        """The newest whole scan, newer than the one given last; None where none comes within `wait` seconds.
 
         Raises:
             SourceError: where the input has ended or the device was closed.
@@ -248,7 +248,7 @@ class Device(Closing):
                 raise SourceError(f"{self._source}: no further scan, since the input is {self._input.state}")
             arrival = self._next(max(deadline - time.monotonic(), 0.0))
             if arrival is not None:
-                found = [scan for scan in reader.scans(self._latest, arrival) if scan.complete]
+                found = [scan for scan in reader.scans(self._latest, arrival) if scan.whole]
                 self._ahead = arrival if found and not self.is_live else None
                 self._unseen += found
                 self._latest = ScanStream(self.sensor, self.mount) if arrival.interrupted else self._latest

@@ -48,7 +48,7 @@ class Counters:
         pending: bytes held because a candidate needs more.
         bad_checksum, bad_length, implausible: rejected candidates.
         bad_constant: datagrams without the constants of any frame; in a stream such bytes are skipped, and are no candidate.
-        lost, duplicates, late: packets, by the sensor's sequence.
+        lost, duplicates, late: packets, by the sensor's counter and clock.
         kernel_drops, queue_dropped, foreign, disconnects: counted by the transports.
         unread: bytes of a damaged file that could not be read.
         plugin_errors: packets, or candidates, at which a function of the plugin raised; `failures` keeps the first ones.

@@ -64,7 +64,7 @@ class Packets:
 
     @cached_property
     def index(self) -> NDArray[np.int64]:
-        """The unwrapped sequence number of each, (n,); 0, 1, 2 ... where the sensor has none."""
+        """The number of each, (n,), which runs on over what is missing: the sensor's, unwrapped, where it counts its packets."""
         return array_of(self._index)
 
     def __len__(self) -> int:

@@ -1,4 +1,4 @@
-"""From frames to packets: clocks unwrapped, sequences checked, other frames kept as state.
+"""From frames to packets: clocks unwrapped, their continuity judged, other frames kept as state.
 
 A `PacketStream` remembers between batches what the next one needs: the last clock reading, the last sequence number,
 the last frame of each other type, and whether bytes were skipped since the last packet.
@@ -20,8 +20,8 @@ from lidarspec.errors import PluginError, UnknownFrame
 from lidarspec.framing.frame_engine import Codec, codec
 from lidarspec.framing.results import Counters, Frames, Numbers
 from lidarspec.packets.clocks import Unwrapper, clock_ns, clock_terms, paths
+from lidarspec.packets.continuity import Continuity
 from lidarspec.packets.packets import Packets, StateOf, joined_tables
-from lidarspec.packets.sequences import SequenceTracker
 from lidarspec.spec.description import Spec
 from lidarspec.wire.arrays import alike, repeated, some
 from lidarspec.wire.frame_table import Table
@@ -54,12 +54,12 @@ class PacketStream:
         self._state: dict[str, bytes] = dict(state or {})
         data = sensor.frames[frame].data
         counted = sensor.sequence is not None and data and _has(sensor, frame, sensor.sequence.field)
-        self._sequence = SequenceTracker(sensor.sequence, stats) if sensor.sequence and counted else None
         timed = sensor.clock is not None and data and all(_has(sensor, frame, path) for path in paths(sensor.clock))
         self._clock = Unwrapper(sensor.clock.wraps_at) if sensor.clock and timed else None
-        if sensor.clock and timed:
-            clock_terms(paths(sensor.clock), self._codec.schema, sensor.id)
-        self._gap, self._number = False, 0
+        terms = clock_terms(paths(sensor.clock), self._codec.schema, sensor.id) if sensor.clock and timed else []
+        grain = float(min((step for _, step, _, _ in terms), default=0))
+        self._continuity = Continuity(sensor, stats, counted=counted, timed=timed, grain=grain)
+        self._skipped = 0  # bytes since the last packet
         self._tables: dict[str, tuple[bytes, Table]] = {}
 
     def add(self, found: Sequence[Frames], *, whole: bool = False) -> Packets:
@@ -69,27 +69,25 @@ class PacketStream:
             whole: the frames are a whole input: packets before the first frame of another type see that one as state.
         """
         parts = [_Part.of(frames, self.frame) for frames in found if len(frames)]
-        breaks = _joined([self._breaks(part) for part in parts], np.bool_)
+        skipped = _joined([self._bytes_skipped(part) for part in parts], np.int64)
         table = self._table(parts)
         state = self._states(parts, len(table), whole=whole)
         offset, host = _offsets(parts), _times([part.column(part.frames.at) for part in parts])
-        index: Numbers = range(self._number, self._number + len(table))
-        time = host
-        self._number += len(table)
-        if len(table) and (self._sequence is not None or self._clock is not None):
-            batch = Batch(table, breaks, state, self.sensor.state)
+        index: Numbers = range(0)
+        breaks, time = skipped > 0, None
+        if len(table):
+            batch, otherwise = Batch(table, breaks, state, self.sensor.state), (np.arange(len(table)), breaks)
             with np.errstate(all="ignore"):
-                if self._sequence is not None:
-                    index, jumps = self._guarded("sequence", self._sequence.push, (index, None), batch)
-                    breaks = breaks if jumps is None else breaks | jumps
-                if self._clock is not None:
-                    time = self._guarded("clock", self._times, host, batch, host)
+                time = self._guarded("clock", self._times, None, batch, host) if self._clock is not None else None
+                index, breaks = self._guarded("sequence", self._continuity.push, otherwise, batch, time, skipped)
+        time = host if time is None else time
         columns: dict[str, Any] = {"offset": offset, "time_ns": time, "host_ns": host, "index": index, "breaks": breaks}
         return Packets(self.sensor, self.frame, table, **columns, state=state, stats=self.stats, backend=self._backend)
 
     def interrupt(self) -> None:
         """Input was lost here: there is a break before the next packet."""
-        self._gap = True
+        self._skipped = max(self._skipped, 1)
+        self._continuity.forget()
 
     def _guarded(self, what: str, function: Callable[..., Any], otherwise: Any, batch: Batch, *args: Any) -> Any:
         try:
@@ -102,19 +100,15 @@ class PacketStream:
         assert self._clock is not None
         return self._clock.push(clock_ns(self.sensor, batch), host)
 
-    def _breaks(self, part: _Part) -> NDArray[np.bool_]:
-        """Whether something was lost before each of our frames, since ours before it."""
-        breaks, left, gaps = np.zeros(part.number, np.bool_), False, part.frames.gaps
-        if alike(gaps) != 0 and gaps.any():
-            losses = np.cumsum(gaps > 0)
-            marks = losses[part.own]
-            breaks[:1] = marks[:1] > 0
-            breaks[1:] = marks[1:] > marks[:-1]
-            left = int(losses[-1]) > (int(marks[-1]) if part.number else 0)
-        if part.number:
-            breaks[0] |= self._gap
-        self._gap = left or (self._gap and not part.number)
-        return breaks
+    def _bytes_skipped(self, part: _Part) -> NDArray[np.int64]:
+        """The bytes in no frame before each of our frames, since ours before it, (n,)."""
+        gaps = part.frames.gaps
+        if alike(gaps) == 0 and not self._skipped:
+            return repeated(0, part.number)
+        sums = self._skipped + np.cumsum(gaps)
+        marks = sums[part.own]
+        self._skipped = int(sums[-1]) - (int(marks[-1]) if part.number else 0)
+        return np.diff(marks, prepend=0)
 
     def _table(self, parts: Sequence[_Part]) -> Table:
         tables = [self._codec.gather(part.frames if part.where is None else part.frames.only(part.own)) for part in parts if part.number]

@@ -75,30 +75,44 @@ class Turning:
 
 
 class Cutter:
-    """The cuts of one stream of points."""
+    """The cuts of one stream of points.
+
+    Attributes:
+        leaps: those of the last batch's at which the angle leaps by more than `AWAY`, and twice as far as at the one before: something is
+            missing there, or no angle.
+    """
 
     def __init__(self, rule: Split) -> None:
         self._rule = rule
         self._before: float | None = None
         self._armed, self._turning = True, Turning()
         self._start: int | None = None
+        self._leap = 0.0  # by how much of a turn the angle went on at the last cut
+        self.leaps = set[int]()
 
     def cuts(self, packets: Packets, found: Evaluated) -> list[int]:
         """Indices of the points of this batch before which to cut, ascending."""
-        rule = self._rule
+        rule, self.leaps = self._rule, set()
         if isinstance(rule, Every):
             return self._periods(rule, packets, found)
         if isinstance(rule, OnWrap) and rule.name in COLUMNS:
             angles = np.asarray(getattr(found.cloud, rule.name), np.float64)
-            return self._wraps(angles, 2 * np.pi, rule.at).tolist()  # type: ignore[no-any-return]
+            return self._points(*self._wraps(angles, 2 * np.pi, rule.at))
         column = _field(found, rule.name)
         values, starts = _rows(column, found)
         if isinstance(rule, OnWrap):
             unit = packets.table.schema.fields[column.source].unit
-            rows = self._wraps(values, 360.0 if unit == "deg" else 2 * np.pi, rule.at)
-        else:
-            rows = self._changes(rule, values)
-        return starts[rows].tolist()  # type: ignore[no-any-return]
+            rows, steps = self._wraps(values, 360.0 if unit == "deg" else 2 * np.pi, rule.at)
+            return self._points(starts[rows], steps)
+        return starts[self._changes(rule, values)].tolist()  # type: ignore[no-any-return]
+
+    def _points(self, cuts: NDArray[np.intp], steps: NDArray[np.float64]) -> list[int]:
+        """The cuts, of which `leaps` keeps those where the angle goes on by an odd part of a turn; `steps`: by how much at each."""
+        for cut, step in zip(cuts.tolist(), steps.tolist(), strict=True):
+            if self._leap and step > max(AWAY, 2 * self._leap):
+                self.leaps.add(cut)
+            self._leap = step
+        return cuts.tolist()  # type: ignore[no-any-return]
 
     def _changes(self, rule: OnFlag | OnChange | OnRewind, values: NDArray[np.float64]) -> NDArray[np.intp]:
         if isinstance(rule, OnFlag):
@@ -109,13 +123,13 @@ class Cutter:
         self._before = float(values[-1])
         return np.flatnonzero(values < before if isinstance(rule, OnRewind) else values != before)
 
-    def _wraps(self, angles: NDArray[np.float64], full: float, at: float) -> NDArray[np.intp]:
-        """Places where the angle has gone on past `at`, in whichever direction the sensor turns."""
+    def _wraps(self, angles: NDArray[np.float64], full: float, at: float) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
+        """Places where the angle has gone on past `at`, in whichever direction the sensor turns; and by how much of a turn at each."""
         finite = np.isfinite(angles)
         known = None if finite.all() else np.flatnonzero(finite)
         values = angles if known is None else angles[known]
         if not len(values):
-            return np.empty(0, np.intp)
+            return np.empty(0, np.intp), np.empty(0)
         before = _before(values, self._before)
         self._before = float(values[-1])
         direction = self._turning.push((_folded(values - before + full / 2, full) - full / 2) / full)
@@ -125,8 +139,8 @@ class Cutter:
         else:
             turned, earlier = (_folded(direction * (some - at), full) for some in (values, before))
         passed = np.flatnonzero(earlier - turned > full / 2)
-        found = self._armed_at(passed, turned, full)
-        return np.array(found, np.intp) if known is None else known[np.array(found, np.intp)]
+        found = np.array(self._armed_at(passed, turned, full), np.intp)
+        return found if known is None else known[found], 1 - (earlier[found] - turned[found]) / full
 
     def _armed_at(self, passed: NDArray[np.intp], turned: NDArray[np.float64], full: float) -> list[int]:
         """The places, of those where an angle passes, that come after it was far away."""

@@ -2,30 +2,34 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+import dataclasses
+import math
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.columns.columns import Carry
 from lidarspec.errors import UsageError
+from lidarspec.packets.continuity import Reorder
 from lidarspec.packets.packets import Packets, joined as joined_packets
-from lidarspec.packets.sequences import Reorder
 from lidarspec.points.cloud import ColumnSource, LazyCloud, Mount, PointCloud, Stretch, Stretches, source_of
 from lidarspec.points.evaluate import guarded
 from lidarspec.points.plain import Evaluated
 from lidarspec.scans.cutter import Cutter, first_points
 from lidarspec.spec.description import Spec
 from lidarspec.spec.links import Serial
-from lidarspec.spec.timing import Every, OnFlag, OnWrap, Split
-from lidarspec.wire.arrays import alike
+from lidarspec.spec.timing import Every, OnFlag, OnRewind, OnWrap, Split
+from lidarspec.wire.arrays import alike, counted, repeated
 
 #: seconds that a turn takes at the slowest where no sensor says so; of a scan at least where packets bear the host's time, which may pause.
 SLOWEST, UNTIMED = 1.0, 1.0
 #: bytes of a scan at the most where neither points nor a line say so, and packets looked at together.
 LARGEST, TOGETHER = 1 << 26, 1024
+#: how much longer a scan with a gap may become than the whole one before it.
+LONGER = 1.125
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,16 +62,18 @@ class Scan:
 
     Attributes:
         points: in stream order.
-        rate_hz: one over the time to the next scan; nan where that is not known.
-        complete: whether both ends were seen, and no more is missing between them than is there; the first and the last piece of a stream
-            are not complete.
+        rate_hz: one over the time to the next scan; nan where that is not known, or the scan is not whole.
+        complete: whether both ends were seen, and nothing is missing between them; the first and the last piece of a stream are not
+            complete.
         sensor: whose.
+        whole: whether both ends were seen, and no more is missing between them than is there.
     """
 
     points: PointCloud
     rate_hz: float
     complete: bool
     sensor: Spec
+    whole: bool = False
 
     @property
     def stamp_ns(self) -> int:
@@ -82,7 +88,8 @@ class Scan:
         span = f"{ranges.min():.2f}..{ranges.max():.2f} m" if len(ranges) else "no returns"
         rate = f"{self.rate_hz:.1f} Hz, " if np.isfinite(self.rate_hz) else ""
         nominal = ", nominal calibration" if self.points.nominal else ""
-        return f"Scan({len(self)} points, {rate}{span}, {'complete' if self.complete else 'partial'}{nominal})"
+        state = "complete" if self.complete else "with gaps" if self.whole else "partial"
+        return f"Scan({len(self)} points, {rate}{span}, {state}{nominal})"
 
     def to_bins(self, n: int) -> NDArray[np.float32]:
         """The nearest return in each of n equal sectors from -pi on: (n,) float32 metres, inf where there is none.
@@ -129,110 +136,186 @@ def _sectors(number: Any, place: str) -> int:
     return int(number)
 
 
-class Losses:
-    """What is missing of each scan: bytes of a stream that are in no frame, datagrams that are missing by their numbers."""
+class Cut(NamedTuple):
+    """Where one scan ends and the next begins: before which point, and what the one is that ends there (see `Scan`)."""
 
-    def __init__(self, sensor: Spec) -> None:
-        self._by_number, self._starts_are_seen = sensor.datagrams, isinstance(sensor.scan, OnFlag)
-        self._last: tuple[int, int] | None = None  # where the last packet ends in the input, and its number
-        self._there = self._missing = 0.0  # bytes of the scan under way
-
-    def judged(self, packets: Packets, points: Evaluated, cuts: Sequence[int]) -> list[bool]:
-        """Whether at least half of each scan is there that ends in these packets: one for each of the `cuts`, which are between points."""
-        sizes = packets.table.sizes[: points.ready]
-        missing = self._missing_before(packets, sizes)
-        first = first_points(points) if len(cuts) else sizes
-        judged, start = list[bool](), 0
-        for cut in cuts:
-            edge = int(np.searchsorted(first, cut, side="right")) - 1  # the packet that the cut is in
-            begins = bool(first[edge] == cut)
-            edge += not begins
-            self._there += float(sizes[start:edge].sum())
-            self._missing += float(missing[start : edge + begins].sum())
-            judged.append(self._missing <= self._there)
-            # of what is missing at the cut nobody knows to which scan it belongs, unless the packet there says that it is the first
-            self._there, self._missing = 0.0, float(missing[edge]) if begins and not self._starts_are_seen else 0.0
-            missing[edge : edge + begins] = 0
-            start = edge
-        self._there += float(sizes[start:].sum())
-        self._missing += float(missing[start:].sum())
-        return judged
-
-    def _missing_before(self, packets: Packets, sizes: NDArray[np.intp]) -> NDArray[np.float64]:
-        """The bytes that are missing before each of the packets, (k,)."""
-        number, missing, last = len(sizes), np.zeros(len(sizes)), self._last
-        if not number:
-            return missing
-        self._last = int(packets.offset[number - 1] + sizes[-1]), int(packets.index[number - 1])
-        spots = np.flatnonzero(packets.breaks[:number])
-        if len(spots) and self._by_number:
-            before = np.append(packets.index[0] - 1 if last is None else last[1], packets.index[: number - 1])
-            missing[spots] = ((packets.index[:number] - before - 1) * sizes)[spots]
-        elif len(spots):
-            ends = packets.offset[:number] + sizes
-            missing[spots] = (packets.offset[:number] - np.append(ends[0] - sizes[0] if last is None else last[0], ends[:-1]))[spots]
-        return np.maximum(missing, 0, out=missing)
+    point: int
+    whole: bool
+    complete: bool
 
 
-class Limits:
-    """How long and how large a scan may become whose end does not come: the rotor may be blocked, or the start of a scan be missing.
+@dataclass
+class Underway:
+    """What there is of the scan under way.
 
-    Twice the slowest turn, by the packets' time; and twice the points of a scan where their number is constant, else the bytes that a
-    serial line carries in that time, else `LARGEST`.
+    Attributes:
+        begun: whether its start was seen.
+        since: the time of its first packet, ns.
+        packets, size: how many packets, and how many bytes, or points.
+        lost, broken: how many packets are missing, and whether there is any break.
+    """
+
+    begun: bool = False
+    since: int = 0
+    packets: int = 0
+    size: float = 0
+    lost: int = 0
+    broken: bool = False
+
+
+class Progress:
+    """How far the scan under way has come: when it ends, whether it is complete then, and when its end is waited for no longer.
+
+    A scan becomes no longer than twice the slowest turn, by the packets' time; and no larger than twice the points of a scan where their
+    number is constant, else the bytes that a serial line carries in that time, else `LARGEST`. Where packets are missing, and with them
+    maybe the end, it becomes little longer than the scan before. What is missing follows from the index of the packets, and their breaks.
     """
 
     def __init__(self, sensor: Spec) -> None:
-        rule, link = sensor.scan, sensor.links.get("data")
+        rule, link, counter = sensor.scan, sensor.links.get("data"), sensor.sequence
         turn = rule.seconds if isinstance(rule, Every) else 1 / sensor.turn[0] if sensor.turn else SLOWEST
         self.seconds = 2 * turn if sensor.clock is not None else max(2 * turn, UNTIMED)
         self._longest, self._by_points = int(self.seconds * 1e9), sensor.beams is not None
         self._most = 2 * sensor.beams if sensor.beams else self.seconds * link.baud / 10 if isinstance(link, Serial) else LARGEST
-        self._reason, self._has_ended = _without_end(rule), False
-        self._since = self._last = 0  # times of the first and the last packet of the scan under way, ns
-        self._held: float = 0  # what there is of it
+        self._reason, self._starts_are_seen = _without_end(rule), isinstance(rule, OnFlag)
+        self._may_pass = isinstance(rule, OnWrap | OnFlag)  # whether an end that is missing leaves no trace
+        self._counter = counter if counter is not None and isinstance(rule, OnRewind) and rule.name == counter.field else None
+        self._scan, self._has_ended = Underway(), False
+        self._last: tuple[int, int] | None = None  # time and index of the last packet
+        self._turn = math.inf  # packets of the last whole scan, at first of the first piece
 
-    def overdue(self, packets: Packets, points: Evaluated, cuts: Sequence[int]) -> list[int]:
-        """Before which points to cut because no end came in time, beside those where one did."""
-        times, sizes = packets.time_ns[: points.ready], packets.table.sizes[: points.ready]
-        first = first_points(points) if len(cuts) or self._by_points else sizes
-        if self._by_points:
-            sizes = np.diff(first, append=source_of(points.cloud).size)
-        found, start = list[int](), 0
-        for cut in cuts:
-            edge = int(np.searchsorted(first, cut, side="right")) - 1
-            found += self._without_end(packets, times, sizes, start, edge)
-            self._held, start = 0, edge
-        if len(cuts) and not self._has_ended:  # a rotor that spins up
-            packets.stats.unended, self._has_ended = "", True
-        found += self._without_end(packets, times, sizes, start, len(times))
-        return first_points(points)[found].tolist() if found else []
+    def cuts(self, packets: Packets, points: Evaluated, ends: Sequence[int], leaps: Collection[int]) -> list[Cut]:
+        """The cuts of a batch in order: at the ends, which are between points, and where none came in time.
 
-    def _without_end(self, packets: Packets, times: NDArray[np.int64], sizes: NDArray[np.intp], start: int, stop: int) -> list[int]:
-        """Before which packets of a part of one scan it has become too long, or too large."""
-        found = list[int]()
-        if start < stop:
-            self._since = self._since if self._held else times.item(start)
-            farthest = max(int(times[start:stop].max()) - self._since, self._since - int(times[start:stop].min()))
-            held = self._held + (int(sizes[start:stop].sum()) if (size := alike(sizes)) is None else size * (stop - start))
-            if farthest <= self._longest and held <= self._most:
-                self._held, start = held, stop
-        while start < stop:
-            part = slice(start, min(start + TOGETHER, stop))
-            self._since = self._since if self._held else times.item(start)
-            sums = self._held + np.cumsum(sizes[part])
-            over = (np.abs(times[part] - self._since) > self._longest) | (sums > self._most)
-            over[0] &= bool(self._held)
-            spot = int(over.argmax())
-            if not over[spot]:
-                start, self._held = part.stop, float(sums[-1])
-                continue
-            start, self._held = start + spot, 0
-            found.append(start)
-            step = times.item(start) - (times.item(start - 1) if start else self._last)
-            if abs(step) < self._longest / 2:  # else nothing came for so long
-                packets.stats.unended = f"{self._reason} within {self.seconds:.3g} s"
-        self._last = times.item(stop - 1) if stop else self._last
+        Args:
+            leaps: the ends at which the angle leaps as it does at no other, so that they may be none.
+        """
+        number, found, start = points.ready, list[Cut](), 0
+        if not number:
+            return found
+        first = first_points(points) if len(ends) or self._by_points else np.empty(0, np.intp)
+        sizes = np.diff(first, append=source_of(points.cloud).size) if self._by_points else packets.table.sizes[:number]
+        batch = Batch(packets.time_ns[:number], sizes, *self._missing(packets, number))
+        for end in ends:
+            edge = int(np.searchsorted(first, end, side="right")) - 1  # the packet that the end is in
+            begins = bool(first[edge] == end)
+            found += self._without_end(packets, batch, start, edge + (not begins), points)
+            is_shared = begins and not self._shows_start(packets, edge)
+            found.append(self._ended(batch, edge, end, begins=begins, is_shared=is_shared, is_seen=end not in leaps))
+            if not self._has_ended:  # a rotor that spun up
+                packets.stats.unended, self._has_ended = "", True
+            start = edge
+        found += self._without_end(packets, batch, start, number, points)
+        self._last = int(batch.times[-1]), int(packets.index[number - 1])
         return found
+
+    def _missing(self, packets: Packets, number: int) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+        """How many packets are missing before each, (n,), and whether there is a break, (n,)."""
+        index, broken = packets.index[:number], packets.breaks[:number]
+        before = int(index[0]) - 1 if self._last is None else self._last[1]
+        if int(index[-1]) - before == number:
+            return repeated(0, number), broken.copy() if broken.any() else broken
+        missing = np.maximum(np.diff(index, prepend=before) - 1, 0)
+        return missing, broken | (missing > 0)
+
+    def _shows_start(self, packets: Packets, edge: int) -> bool:
+        """Whether a packet says that it is the first of a scan."""
+        return self._starts_are_seen or (
+            self._counter is not None and int(packets.table.raw(self._counter.field)[edge]) == self._counter.first
+        )
+
+    def _ended(self, batch: Batch, edge: int, end: int, *, begins: bool, is_shared: bool, is_seen: bool) -> Cut:
+        """A scan ends at a point of a packet, and the next one begins.
+
+        Args:
+            begins: whether it is the first point of the packet.
+            is_shared: whether nobody knows to which of the two belongs what is missing before that packet.
+        """
+        if begins:
+            self._add(batch, slice(edge, edge + 1), gap_only=True)
+        scan, missing, is_broken = self._scan, batch.missing.item(edge), bool(batch.broken[edge])
+        whole = scan.begun and is_seen and scan.lost <= scan.packets
+        if whole or (self._turn == math.inf and scan.packets and self._may_pass):
+            self._turn = scan.packets + scan.lost
+        self._scan = Underway(is_seen and (scan.begun or scan.packets > 0), lost=missing * is_shared, broken=is_broken and is_shared)
+        batch.forget(edge)
+        return Cut(end, whole, whole and not scan.lost and not scan.broken)
+
+    def _without_end(self, packets: Packets, batch: Batch, start: int, stop: int, points: Evaluated) -> list[Cut]:
+        """The cuts in a part of one scan where it has become too long, or too large."""
+        found = list[int]()
+        if start < stop and not self._within(batch, slice(start, stop)):
+            while start < stop:
+                part = slice(start, min(start + TOGETHER, stop))
+                spot, is_endless = self._over(batch, part)
+                if spot is None:
+                    self._add(batch, part)
+                    start = part.stop
+                    continue
+                self._add(batch, slice(start, start + spot))
+                start += spot
+                found.append(start)
+                step = batch.times.item(start) - (batch.times.item(start - 1) if start or self._last is None else self._last[0])
+                if is_endless and abs(step) < self._longest / 2:  # else nothing came for so long
+                    packets.stats.unended = f"{self._reason} within {self.seconds:.3g} s"
+                self._scan, self._turn = Underway(), self._turn * (1 if is_endless else 2)  # lest it be wrong for ever
+                batch.forget(start)
+        return [Cut(point, whole=False, complete=False) for point in first_points(points)[found].tolist()] if found else []
+
+    def _within(self, batch: Batch, part: slice) -> bool:
+        """Whether the scan may go on over all of these packets, which are then counted."""
+        times, before = batch.times[part], dataclasses.replace(self._scan)
+        self._add(batch, part)
+        scan = self._scan
+        farthest = max(int(times.max()) - scan.since, scan.since - int(times.min()))
+        too_many = scan.lost > 0 and scan.packets - 1 + scan.lost > LONGER * self._turn
+        if farthest <= self._longest and scan.size <= self._most and not too_many:
+            return True
+        self._scan = before
+        return False
+
+    def _over(self, batch: Batch, part: slice) -> tuple[int | None, bool]:
+        """Before which of some packets the scan is over, None where it is not; and whether for want of an end, else for a gap."""
+        scan, times = self._scan, batch.times[part]
+        since = scan.since if scan.packets else times.item(0)
+        endless = (np.abs(times - since) > self._longest) | (scan.size + np.cumsum(batch.sizes[part]) > self._most)
+        lost = scan.lost + np.cumsum(batch.missing[part])
+        over = endless | ((lost > 0) & (scan.packets + counted(len(times)) + lost > LONGER * self._turn))
+        over[0] &= bool(scan.packets)
+        spot = int(over.argmax())
+        return (spot, bool(endless[spot])) if over[spot] else (None, False)
+
+    def _add(self, batch: Batch, part: slice, *, gap_only: bool = False) -> None:
+        """Count packets as parts of the scan, or only what is missing before them."""
+        number, scan = part.stop - part.start, self._scan
+        if not number:
+            return
+        if not gap_only:
+            scan.since = scan.since if scan.packets else batch.times.item(part.start)
+            scan.packets, scan.size = scan.packets + number, scan.size + _sum(batch.sizes[part])
+        scan.lost, scan.broken = scan.lost + _sum(batch.missing[part]), scan.broken or bool(batch.broken[part].any())
+
+
+@dataclass(frozen=True, eq=False)
+class Batch:
+    """What `Progress` looks at of some packets, (n,) each: their times, ns, sizes, how many are missing before each, and breaks."""
+
+    times: NDArray[np.int64]
+    sizes: NDArray[np.intp]
+    missing: NDArray[np.int64]
+    broken: NDArray[np.bool_]
+
+    def forget(self, place: int) -> None:
+        """What is missing before a packet has been counted."""
+        if self.broken[place]:
+            self.broken[place] = False
+        if self.missing[place]:
+            self.missing[place] = 0
+
+
+def _sum(values: NDArray[np.int64]) -> int:
+    each = alike(values)
+    return int(values.sum()) if each is None else each * len(values)
 
 
 def _without_end(rule: Split) -> str:
@@ -252,16 +335,14 @@ class ScanStream:
 
     def __init__(self, sensor: Spec, mount: Mount | None = None) -> None:
         self._sensor, self._mount = sensor, mount
-        self._reorder = Reorder(enabled=sensor.sequence is not None)
+        self._reorder = Reorder(enabled=sensor.sequence is not None or (sensor.clock is not None and sensor.datagrams))
         self._cutter = Cutter(sensor.scan)
         self._waiting: Packets | None = None
         self._carry: Carry = {}
         self._parts: list[Stretch] = []
-        self._started = False
         self._epoch: int | None = None
-        self._losses = Losses(sensor)
+        self._progress = Progress(sensor)
         self._begins: int | None = None  # time of the first point of the scan under way, ns, where it is known
-        self._limits = Limits(sensor)
 
     def add(self, packets: Packets) -> list[Scan]:
         """The scans that these packets complete."""
@@ -273,7 +354,7 @@ class ScanStream:
         if self._waiting is not None and len(self._waiting):
             waiting, self._waiting = self._waiting, None
             scans += self._push(waiting, final=True)
-        left = self._close(None, complete=False)
+        left = self._close(None)
         return scans + ([left] if left else [])
 
     def _push(self, packets: Packets, *, final: bool) -> list[Scan]:
@@ -291,27 +372,23 @@ class ScanStream:
         return list(self._cut(packets, points))
 
     def _cut(self, packets: Packets, points: Evaluated) -> Iterator[Scan]:
-        start, source, seen = 0, source_of(points.cloud), self._cutter.cuts(packets, points)
-        overdue = set(self._limits.overdue(packets, points, seen)).difference(seen)
-        cuts = sorted([*seen, *overdue]) if overdue else seen
-        first, *times = _times_ns(source, [0, *cuts])
+        start, source = 0, source_of(points.cloud)
+        cuts = self._progress.cuts(packets, points, self._cutter.cuts(packets, points), self._cutter.leaps)
+        first, *times = _times_ns(source, [0, *(cut.point for cut in cuts)])
         self._begins = first if self._begins is None else self._begins
-        mostly_there = self._losses.judged(packets, points, cuts)
-        for cut, ends, is_there in zip(cuts, times, mostly_there, strict=True):
-            self._take(source, start, cut)
-            scan = self._close(ends, complete=self._started and is_there and cut not in overdue)
-            self._begins = ends
+        for cut, ends in zip(cuts, times, strict=True):
+            self._take(source, start, cut.point)
+            scan = self._close(ends, whole=cut.whole, complete=cut.complete)
+            self._begins, start = ends, cut.point
             if scan is not None:
-                self._started = cut not in overdue
                 yield scan
-            start = cut
         self._take(source, start, source.size)
 
     def _take(self, source: ColumnSource, start: int, stop: int) -> None:
         if start < stop:
             self._parts.append(Stretch(source, start, stop))
 
-    def _close(self, ends: int | None, *, complete: bool) -> Scan | None:
+    def _close(self, ends: int | None, *, whole: bool = False, complete: bool = False) -> Scan | None:
         """The scan of the points so far; `ends`: the time of the first point after it, ns."""
         parts, self._parts = self._parts, []
         if not parts:
@@ -322,7 +399,7 @@ class ScanStream:
         rate = 1 / period if period > 0 else np.nan
         cloud: PointCloud = LazyCloud.of(Stretches(parts, from_first=True), begins)
         mounted = cloud if self._mount is None else self._mount.applied(cloud)
-        return Scan(mounted, float(rate) if complete else np.nan, complete, self._sensor)
+        return Scan(mounted, float(rate) if whole else np.nan, complete, self._sensor, whole)
 
 
 def _times_ns(source: ColumnSource, indices: Sequence[int]) -> list[int | None]:

@@ -63,8 +63,9 @@ class Clock:
         source: the field, the fields that add up (seconds and microseconds), or a function of `Fields` that returns
             a column, or several that add up, in seconds. Terms are summed as integer nanoseconds.
         wraps_at: seconds after which it starts again at 0; None if it does not.
-        pace: a function of `Fields`: by how many seconds it advances from a packet to the next; left out, by as much as in a simulation.
-            It tells relatives apart, and is needed where it depends on a mode that the packets name.
+        pace: a function of `Fields`: by how many seconds it advances from a packet to the next. It says what is missing where there is no
+            counter, and is learned from the stream where it is left out. It tells relatives apart, left out by the pace of a simulation,
+            and is needed where it depends on a mode that the packets name.
     """
 
     source: Source
@@ -74,7 +75,7 @@ class Clock:
 
 @dataclass(frozen=True)
 class Sequence:
-    """A counter of packets; a jump is a loss.
+    """A counter of packets; a jump is a loss, unless the clock denies it.
 
     Args:
         field: path of the counter.

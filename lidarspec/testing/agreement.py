@@ -252,7 +252,7 @@ def scans_do_not_depend_on_batches(subject: Subject) -> None:
     require(whole, "LS404", "there is no scan")
     for size in (1, 2, 5):
         parts = scans(size)
-        alike = [(len(scan), scan.complete) for scan in parts] == [(len(scan), scan.complete) for scan in whole]
+        alike = [(len(scan), scan.whole, scan.complete) for scan in parts] == [(len(scan), scan.whole, scan.complete) for scan in whole]
         require(alike, "LS404", f"{size} packets at a time give other scans than all at once")
         for part, other in zip(parts, whole, strict=True):
             assert_well_formed(part.points)

@@ -41,7 +41,7 @@ class Reading:
         points, valid: points per scan, and those with a return among them.
         error_rate: frames whose checksum, length or values were wrong, of all, from 0 to 1.
         skipped_rate: bytes that are in no frame and no declared filler, of all.
-        loss_rate: packets that are missing by the sensor's sequence, of all; None where it has none.
+        loss_rate: packets that are missing by the sensor's counter or clock, of all; None where it has neither.
         jitter_s: standard deviation of the time between packets' arrivals.
         longest_gap_s: the longest time between two arrivals.
         bytes_per_s: of input.
@@ -103,7 +103,7 @@ class Tally:
         Args:
             counters: now.
             seconds: how long it was by the caller's clock; taken from the arrivals where it is left out.
-            sequenced: whether the sensor numbers its packets.
+            sequenced: whether the sensor numbers its packets, or says when they were sent.
         """
         spanned = self._spanned or None
         lasted = seconds or spanned
@@ -146,7 +146,7 @@ class Meter:
 
     def scan(self, scan: Scan) -> None:
         """Count a whole scan; a piece of one says nothing of speed and points."""
-        if scan.complete:
+        if scan.whole:
             valid = int(scan.points.valid.sum())
             for tally in (self._recent, self._all):
                 tally.turned(len(scan), valid, scan.rate_hz)
@@ -207,7 +207,7 @@ class Feed:
         self.scan: Scan | None = None
         self.packets: Packets | None = None
         self.scans: list[Scan] = []
-        self.meter = Meter(device.stats, sequenced=device.sensor.sequence is not None)
+        self.meter = Meter(device.stats, sequenced=device.sensor.sequence is not None or device.sensor.clock is not None)
         self._played = played and not device.is_live
         self._batches, self._stream = device.packets(wait=LOOK), ScanStream(device.sensor, device.mount)
         self._waiting: deque[Scan] = deque()
@@ -264,7 +264,7 @@ class Feed:
     def _show(self, scan: Scan) -> None:
         self.meter.scan(scan)
         self.scans.append(scan)
-        if scan.complete or self.scan is None or not self.scan.complete:
+        if scan.whole or self.scan is None or not self.scan.whole:
             self.scan = scan
             self.number += 1
 

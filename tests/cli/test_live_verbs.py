@@ -73,7 +73,7 @@ def test_stats_of_a_simulated_sensor() -> None:
     assert summary["points"] == pytest.approx(2160, rel=0.1)
     assert summary["packets"] == summary["stats"]["frames"]["data"] > 0
     assert 0.005 < summary["error_rate"] < 0.15  # of 47 bytes one in a thousand is wrong
-    assert summary["loss_rate"] is None
+    assert summary["loss_rate"] == pytest.approx(summary["error_rate"], rel=0.5)  # by its clock
     assert summary["jitter_s"] > 0
     assert sum(line["packets"] for line in intervals) <= summary["packets"]
 
@@ -168,6 +168,6 @@ def test_plot_writes_a_picture(capture: Path, tmp_path: Path) -> None:
     root = ET.fromstring((tmp_path / "scan.svg").read_text(encoding="utf-8"))
     dots = [place for path in root.findall(".//{*}path") if path.get("stroke-linecap") for place in path.get("d", "").split("M")[1:]]
     assert 500 < len(dots) <= 2160
-    assert "complete" in "".join(text.text or "" for text in root.findall(".//{*}text"))
+    assert "10.0 Hz, " in "".join(text.text or "" for text in root.findall(".//{*}text"))
     assert ran("plot", capture, *SENSOR, "-o", "-").stdout.startswith("<svg")
     assert "pictures are written as .svg" in ran("plot", capture, *SENSOR, "-o", tmp_path / "scan.png", code=2).stderr

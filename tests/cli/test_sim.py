@@ -88,7 +88,7 @@ def test_a_file_is_written_at_once_and_can_be_read(tmp_path: Path) -> None:
     assert result.stdout == f"{path}\n"
     assert "36000 data frames sent" in result.stderr or "36001 data frames sent" in result.stderr
     with ls.open(path) as device:
-        assert len([scan for scan in device.scans() if scan.complete]) in (198, 199, 200)
+        assert len([scan for scan in device.scans() if scan.whole]) in (198, 199, 200)
         assert device.stats.bad_checksum > 0
     assert "exists" in ran("sim", STL, "--to", path, code=2).stderr
     ran("sim", STL, "--to", path, "-t", "1s", "--force")

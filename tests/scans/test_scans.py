@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import random
 import tracemalloc
+from collections.abc import Collection
 
 import numpy as np
 import pytest
@@ -99,3 +101,86 @@ def test_scans_of_data_without_an_end_are_warned_of() -> None:
     frames = simulation(sensor, "data", blocked=True).block(0, 1000, Room()).frames
     with pytest.warns(UserWarning, match=r"ldrobot-ld06: the angle does not pass 0 \(azimuth\): is the rotor blocked\?"):
         assert len(list(sensor.scans(b"".join(frames)))) == 7
+
+
+def scans_without(name: str, lost: Collection[int], number: int = 4000) -> list[Scan]:
+    """The scans of simulated frames some of which are missing."""
+    sensor = ls.sensor(name)
+    frames = [frame for place, frame in enumerate(simulate(sensor, number)) if place not in lost]
+    return list(sensor.scans(frames if sensor.datagrams else b"".join([opening(sensor), *frames])))
+
+
+@pytest.mark.parametrize(
+    "name", ["velodyne-vlp16", "velodyne-hdl32e", "hesai-pandar40p", "ldrobot-ld06", "robosense-m1", "robosense-helios16p"]
+)
+def test_a_scan_is_complete_where_nothing_is_missing_and_only_there(name: str) -> None:
+    sound = scans_without(name, ())
+    assert [scan.complete for scan in sound] == [False, *[True] * (len(sound) - 2), False]
+    sizes, per_packet = np.cumsum([len(scan) for scan in sound]), sum(map(len, sound)) / 4000
+    middle = round((sizes[1] + sizes[2]) / 2 / per_packet)
+    turn = round(len(sound[2]) / per_packet)
+    for lost in (1, turn // 3, turn // 2 - 5):
+        scans = scans_without(name, range(middle, middle + lost) if lost < turn // 3 + 1 else range(middle - lost // 2, middle + lost // 2))
+        assert len(scans) == len(sound)
+        assert [scan.complete for scan in scans] == [False, True, False, *[True] * (len(sound) - 4), False], lost
+        assert scans[2].whole
+        assert np.isfinite(scans[2].rate_hz)
+
+
+@pytest.mark.parametrize("name", ["ldrobot-ld06", "velodyne-vlp16", "robosense-m1"])
+@pytest.mark.parametrize("turns", [0.6, 0.9, 1.0, 1.1, 1.7, 2.0, 3.4])
+@pytest.mark.parametrize("after", [0.0, 0.3, 0.9])
+def test_no_two_turns_are_one_scan_whatever_is_missing(name: str, turns: float, after: float) -> None:
+    sound = scans_without(name, ())
+    turn = round(len(sound[2]) * 4000 / sum(map(len, sound)))
+    first = round((len(sound[0]) + len(sound[1])) * 4000 / sum(map(len, sound))) + round(after * turn)
+    scans = scans_without(name, range(first, first + round(turns * turn)))
+    for scan in scans:
+        assert len(scan) <= len(sound[2]) * 1.02
+        assert np.ptp(scan.points.time) <= 1.2 * np.ptp(sound[2].points.time)
+        assert not scan.complete or len(scan) >= len(sound[2]) * 0.98
+    assert sum(scan.complete for scan in scans) >= len(sound) - 2 - turns - 3
+
+
+def test_a_frame_whose_first_packet_is_there_is_complete_though_the_end_of_the_one_before_is_missing() -> None:
+    scans = scans_without("robosense-m1", range(1250, 1260))
+    assert [(len(scan) // 125, scan.complete) for scan in scans] == [(630, False), (620, False), *[(630, True)] * 4, (220, False)]
+
+
+@pytest.mark.parametrize("kind", ["node", "express", "hq"])
+def test_false_and_missing_nodes_make_a_scan_incomplete(kind: str) -> None:
+    sensor = ls.sensor("slamtec-rplidar-a1").configure(answer=kind)
+    sound, draw = opening(sensor) + b"".join(simulate(sensor, 3000 if kind == "node" else 300)), random.Random(5)
+    whole = {len(scan) for scan in sensor.scans(sound) if scan.complete}
+    for _ in range(20):
+        data, place = bytearray(sound), draw.randrange(len(sound) // 3, len(sound) // 2)
+        if draw.random() < 0.5:
+            del data[place]
+        else:
+            data.insert(place, draw.randrange(256))
+        scans = list(sensor.scans(bytes(data)))
+        assert all(len(scan) in whole for scan in scans if scan.complete)
+        assert len([scan for scan in scans[1:-1] if not scan.complete]) in (1, 2, 3)
+
+
+def test_a_datagram_of_others_takes_nothing_from_a_scan() -> None:
+    sensor = ls.sensor("velodyne-vlp16")
+    frames = simulate(sensor, 400)
+    assert [scan.complete for scan in sensor.scans([*frames[:150], b"noise", *frames[150:]])] == [
+        scan.complete for scan in sensor.scans(frames)
+    ]
+
+
+@pytest.mark.parametrize("name", ["ldrobot-ld06", "velodyne-vlp16", "cspc-m1c1-mini", "robosense-m1"])
+def test_pieces_do_not_matter_where_packets_are_missing(name: str) -> None:
+    sensor, draw = ls.sensor(name), random.Random(2)
+    frames = simulate(sensor, 2500)
+    for place in (300, 900, 1200):
+        del frames[place : place + draw.randrange(150)]
+    found = []
+    for size in (len(frames), 400, 37):
+        reading = Reading(name)
+        found.append(
+            [(len(scan), scan.whole, scan.complete) for at in range(0, len(frames), size) for scan in reading.scans(frames[at : at + size])]
+        )
+    assert found[0] == found[1] == found[2]

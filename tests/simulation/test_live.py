@@ -37,11 +37,11 @@ STL, VLP, A1 = ls.sensor("ldrobot-stl27l"), ls.sensor("velodyne-vlp16"), "slamte
 
 
 def scans(device: ls.Device, number: int) -> list[ls.Scan]:
-    """So many whole scans; fails where they do not come."""
+    """So many scans of which both ends were seen; fails where they do not come."""
     found: list[ls.Scan] = []
     deadline = time.monotonic() + SLACK * 3
     for scan in device.scans(wait=0.05):
-        found += [scan] if scan is not None and scan.complete else []
+        found += [scan] if scan is not None and scan.whole else []
         if len(found) >= number:
             return found
         assert time.monotonic() < deadline, f"{device} {device.warnings}"

@@ -1,0 +1,456 @@
+"""Whether packets follow one another: what was lost, came twice or late, where there is a break, and where each packet stands.
+
+`Continuity` is the one judge of that. It asks the sensor's counter and its clock, and where it has neither the bytes that were skipped; the
+counters, the breaks and the completeness of scans all follow from the index that it gives: it runs on, and leaves out as many numbers as
+packets are missing. What the counter cannot tell, the clock does: how often the counter has wrapped in a gap, and whether a number that
+jumps is damaged. How long a packet takes by the clock is declared (`Clock.pace`), or learned (`Pace`).
+
+By this index packets are put in order, doubles left out (`Reorder`), so that a late packet gives the same scan as a punctual one: what
+stands behind a gap is kept back for a while.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarspec.columns.columns import Batch
+from lidarspec.columns.graph import header_function
+from lidarspec.errors import SpecError
+from lidarspec.framing.results import Counters, Numbers
+from lidarspec.packets.clocks import Times
+from lidarspec.packets.packets import Packets, joined
+from lidarspec.spec.description import Spec
+from lidarspec.spec.timing import Clock, Sequence
+from lidarspec.wire.arrays import alike
+
+#: how far back a packet may come and still be a late one; further back the sensor has started again.
+LATE = 64
+#: the same where the packet would stand before the first one of all, which is more likely a turn that was missed.
+EARLY = 10
+#: counters with at least so many values start again at 0 only when the sensor does.
+LONG = 1 << 16
+#: counters with more values fill 64 bits: differences wrap by themselves.
+WIDE = 1 << 63
+#: a first index, and a step of a counter, are no larger: an index fits 64 bits whatever the counter says.
+FARTHEST = 1 << 32
+#: a clock that goes on by more nanoseconds from one packet to the next was set.
+SET = 3600 * 10**9
+#: packets that the pace is learned from: the first ones, some more, and then again and again.
+BLOCKS = (8, 32, 64)
+
+
+class Pace:
+    """How long a packet takes by the sensor's clock, as the spec declares it or most of the packets before show it.
+
+    It is learned from blocks of packets, each for the packets behind it, so that batches do not change it. A clock that does not advance
+    evenly tells nothing.
+
+    Attributes:
+        grain: the step of the clock, ns; 0 where a function computes it.
+    """
+
+    def __init__(self, clock: Clock, grain: float) -> None:
+        self._declared, self.grain = clock.pace, grain
+        self._times = np.empty(0, np.int64)
+        self._blocks, self._pace, self._is_even = 0, math.nan, False
+
+    def of(self, batch: Batch, times: Times, steps: Times) -> float | NDArray[np.float64]:
+        """Nanoseconds that each packet takes, (n,), or all of them; nan where nobody knows.
+
+        Args:
+            steps: of the clock to each packet from the one before.
+        """
+        if self._declared is not None:
+            (seconds,) = header_function(self._declared, batch.table.schema, _seconds)(batch)
+            return seconds.item(0) * 1e9 if (seconds == seconds[0]).all() else np.asarray(seconds * 1e9)
+        first, self._times = -len(self._times), np.concatenate([self._times, times])
+        if self._is_even and self._goes_on(steps):
+            return self._pace
+        paces, is_new = np.full(len(times), self._pace), True
+        self._is_even = False
+        while len(self._times) > (size := BLOCKS[min(self._blocks, len(BLOCKS) - 1)]):
+            self._pace, self._times = self._usual(self._times[: size + 1]), self._times[size:]
+            self._blocks, first = self._blocks + 1, first + size
+            paces[max(first + 1, 0) :] = self._pace
+            if is_new and first >= 0 and self._blocks >= len(BLOCKS):
+                is_new, self._is_even = False, self._goes_on(steps[first + 1 :])
+        return paces
+
+    def forget(self) -> None:
+        """Time has passed that no packet shows."""
+        self._times, self._is_even = self._times[:0], False
+
+    def _goes_on(self, steps: Times) -> bool:
+        """Whether these packets, the last ones, keep the pace all of them, so that nothing is to be learned but the newest pace."""
+        if not len(steps):
+            return True
+        pace, size, least, most = self._pace, BLOCKS[-1], int(steps.min()), int(steps.max())
+        if not 0.85 * pace - self.grain <= least <= most <= 1.05 * pace + self.grain:
+            return False
+        if most > 0.9 * pace + max(self.grain, 0.45 * pace):
+            return False
+        edges = self._times[::size]
+        means = np.diff(edges) / size
+        if not (np.abs(means - pace) <= pace / 10).all():
+            return False
+        if len(means):
+            self._pace, self._times = float(means[-1]), self._times[size * len(means) :]
+        return True
+
+    def _usual(self, times: Times) -> float:
+        """What most packets of a block take, in whichever order they came; nan where they differ."""
+        steps = np.diff(np.sort(times)).astype(np.float64)
+        near = steps[steps <= 1.5 * float(np.median(steps)) + self.grain]
+        pace = float(near.mean())
+        even = np.count_nonzero(np.abs(near - pace) <= pace / 4 + self.grain)
+        return pace if pace > 0 and even > 0.55 * len(steps) else math.nan
+
+
+@dataclass(frozen=True, eq=False)
+class Clues:
+    """What there is to judge the packets of a batch by.
+
+    Attributes:
+        numbers, periods: the counter, (n,), None where there is none; and after how many packets it starts again, one for all or (n,).
+        there: which packets have the counter, (n,); None where all have.
+        times, paces: of the sensor's clock, (n,) ns, None where there is none; and how long a packet takes by it, one for all or (n,).
+        skipped: how many packets the bytes before each would be that are in no frame, (n,).
+        steady: whether each follows the one that arrived before it, (n,).
+    """
+
+    batch: Batch
+    numbers: NDArray[Any] | None
+    periods: int | NDArray[np.int64]
+    there: NDArray[np.bool_] | None
+    times: Times | None
+    paces: float | NDArray[np.float64]
+    skipped: NDArray[np.int64]
+    steady: NDArray[np.bool_]
+
+    def number(self, spot: int) -> int | None:
+        """The counter of a packet."""
+        return None if self.numbers is None or (self.there is not None and not self.there[spot]) else self.numbers.item(spot)
+
+    def time(self, spot: int) -> int | None:
+        """The time of a packet, ns."""
+        return None if self.times is None else self.times.item(spot)
+
+
+class Continuity:
+    """Whether the packets of one stream follow one another; counts into `stats`.
+
+    Args:
+        counted, timed: whether these packets have the sensor's counter, and its clock.
+        grain: the step of that clock, ns; 0 where it is fine.
+    """
+
+    def __init__(self, sensor: Spec, stats: Counters, *, counted: bool, timed: bool, grain: float = 0) -> None:
+        self._sensor, self._stats = sensor, stats
+        self._rule: Sequence | None = sensor.sequence if counted else None
+        self._clock: Clock | None = sensor.clock if timed else None
+        self._pace = None if self._clock is None else Pace(self._clock, grain)
+        self._number: int | None = None  # of the newest packet, its time, ns, and where only the clock tells packets apart its bytes
+        self._time: int | None = None
+        self._newest, self._largest = b"", 1  # and bytes of the largest packet
+        self._arrived: int | None = None  # the time of the packet that came last, ns
+        self._suspect: tuple[int, int] | None = None  # number and time of a packet whose counter jumped while the clock went on
+        self._jump: tuple[int, int] | None = None  # the time before the clock jumped, ns, and how many packets that lost
+        self._period, self._index, self._first = 0, -1, 0
+        self._missing: set[int] = set()
+
+    def push(self, batch: Batch, times: Times | None, skipped: NDArray[np.int64]) -> tuple[Numbers, NDArray[np.bool_]]:
+        """The index of each packet, (n,), and True where there is a break before it, (n,).
+
+        Args:
+            times: by the sensor's clock, (n,) ns; None where it has none.
+            skipped: bytes that are in no frame before each packet, (n,).
+
+        Raises:
+            SpecError: where the counter is no field of the header.
+        """
+        clues, number, breaks = self._clues(batch, times, skipped), len(batch), skipped > 0
+        found: Numbers = np.empty(number, np.int64)
+        odd, spot, turn = [*np.flatnonzero(~clues.steady).tolist(), number], 0, 0
+        while spot < number:
+            while odd[turn] <= spot:
+                turn += 1
+            ahead, counted = self._ahead(clues, spot)
+            follows = ahead == 1 and counted == clues.number(spot)
+            end = odd[turn] if follows else spot + 1
+            if follows:
+                first, self._index = self._index + 1, self._index + end - spot
+                self._number, self._time = clues.number(end - 1), clues.time(end - 1)
+                found = self._placed(found, first, spot, end)
+            else:
+                index, is_break = self._step(clues, spot, ahead, counted)
+                found = self._placed(found, index, spot, end)
+                breaks[spot] |= is_break
+            spot = end
+        if number and self._rule is None and self._clock is not None and self._sensor.datagrams:
+            self._newest = batch.table.frame(number - 1)
+        return found, breaks
+
+    def forget(self) -> None:
+        """Time has passed, and packets may have, that nothing tells of: the clock is not asked about the next one."""
+        self._time = self._arrived = None
+        if self._pace is not None:
+            self._pace.forget()
+
+    @staticmethod
+    def _placed(found: Numbers, first: int, start: int, stop: int) -> Numbers:
+        """Indices with those of some packets put in, which run on from `first`; a range where these are all."""
+        if stop - start == len(found):
+            return range(first, first + stop - start)
+        assert not isinstance(found, range)
+        found[start:stop] = np.arange(first, first + stop - start)
+        return found
+
+    def _clues(self, batch: Batch, times: Times | None, skipped: NDArray[np.int64]) -> Clues:
+        """What these packets say, and which of them are steady by it."""
+        numbers, periods, there = self._numbers(batch)
+        steady = np.ones(len(batch), np.bool_)
+        if there is not None and not there.all():
+            steady[:] = False
+        elif numbers is not None:
+            each: Any = periods if isinstance(periods, int) else np.maximum(periods, 1)
+            steps = numbers[1:] - numbers[:-1]
+            steady[1:] = steps == 1
+            if not (isinstance(each, int) and each > WIDE) and not steady.all():
+                steady[1:] |= (steps - 1) % (each if isinstance(each, int) else each[1:]) == 0
+            if not isinstance(each, int):
+                steady[1:] &= each[1:] == each[:-1]
+        paces: float | NDArray[np.float64] = math.nan
+        if times is not None and self._pace is not None and len(batch):
+            passed = np.diff(times, prepend=times[0] if self._arrived is None else self._arrived)
+            paces = self._pace.of(batch, times, passed)
+            self._arrived = int(times[-1])
+            if numbers is None:
+                steady &= (passed >= int(self._sensor.datagrams)) & (passed <= SET)
+                steady &= ~(passed - np.maximum(self._pace.grain, paces / 2) > paces)
+            else:  # so much that the counter may have wrapped
+                steady &= ~(np.abs(passed) > paces * (periods / 2 if isinstance(periods, int) else np.maximum(periods, 1) / 2))
+        packets = skipped
+        if alike(skipped) != 0:
+            packets = np.rint(skipped / np.maximum(np.maximum.accumulate(batch.table.sizes), self._largest)).astype(np.int64)
+            steady &= (packets == 0) | (numbers is not None)
+        self._largest = max(self._largest, int(batch.table.sizes.max()))
+        return Clues(batch, numbers, periods, there, times, paces, packets, steady)
+
+    def _numbers(self, batch: Batch) -> tuple[NDArray[Any] | None, int | NDArray[np.int64], NDArray[np.bool_] | None]:
+        """The counter of each packet, after how many it starts again, and which packets have it."""
+        if self._rule is None:
+            return None, 1, None
+        info = batch.table.schema.fields.get(self._rule.field)
+        if info is None or info.axes:
+            raise SpecError("a sequence is a field of the header", path=self._rule.field)
+        numbers = batch.table.raw(self._rule.field)
+        periods = self._last(batch, (1 << info.bits) - 1) - self._rule.first + 1
+        if not isinstance(periods, int) or periods <= WIDE:
+            numbers = numbers.astype(np.int64)
+        return numbers, periods, batch.table.present(self._rule.field)
+
+    def _last(self, batch: Batch, widest: int) -> int | NDArray[np.int64]:
+        """The highest number of the counter, for each packet or for all."""
+        assert self._rule is not None
+        last = self._rule.last
+        if callable(last):
+            (values,) = header_function(last, batch.table.schema, _whole)(batch)
+            return values.item(0) if (values == values[0]).all() else values
+        return widest if last is None else int(last)
+
+    def _ahead(self, clues: Clues, spot: int) -> tuple[int | None, int | None]:
+        """How many places a packet stands ahead of the newest one, None where the sensor has started again; and its number, if right."""
+        time, number = clues.time(spot), clues.number(spot)
+        passed = None if time is None or self._time is None or abs(time - self._time) > SET else time - self._time
+        pace = clues.paces if isinstance(clues.paces, float) else clues.paces.item(spot)
+        if self._rule is None:
+            return self._by_clock(clues, spot, passed, pace) if time is not None else 1 + clues.skipped.item(spot), None
+        if number is None:
+            return 1, self._number
+        period = max(clues.periods if isinstance(clues.periods, int) else clues.periods.item(spot), 1)
+        if self._number is None or period != self._period:
+            self._period = period
+            return None, number
+        ahead = (number - self._number) % period
+        if passed is None or not pace > 0:
+            return self._by_counter(ahead, period), number
+        by_clock = passed / pace
+        near = ahead + period * round((by_clock - ahead) / period)
+        if ahead == 1 and not _agree(near, by_clock):
+            near = 1  # the clock was set, or is uneven
+        elif not _agree(near, by_clock):
+            return self._damaged(number, time or 0, pace, by_clock) if by_clock > 0.5 else (None, number)
+        self._suspect = None
+        return near, number
+
+    def _by_counter(self, ahead: int, period: int) -> int | None:
+        behind = period - ahead
+        reach = LATE if self._index - behind >= self._first else EARLY
+        if ahead == 0 or behind <= min(reach, period // 2):
+            return -behind if ahead else 0
+        return None if period >= LONG and ahead > min(period // 2, FARTHEST) else ahead
+
+    def _damaged(self, number: int, time: int, pace: float, by_clock: float) -> tuple[int, int]:
+        """What the clock says of a packet whose number does not fit, unless the numbers go on from there: then they have started again."""
+        ahead, suspect = max(round(by_clock), 1), self._suspect
+        self._suspect = number, time
+        if suspect is not None and _agree((number - suspect[0]) % self._period, (time - suspect[1]) / pace):
+            return ahead, number
+        assert self._number is not None
+        return ahead, self._number + ahead
+
+    def _by_clock(self, clues: Clues, spot: int, passed: int | None, pace: float) -> int | None:
+        """How many places a packet without a number is ahead: by the clock, and as far as that is too coarse by the bytes skipped."""
+        assert self._pace is not None
+        time, skipped = clues.time(spot) or 0, 1 + clues.skipped.item(spot)
+        if passed is None:
+            return 1 if self._index < 0 else skipped if self._time is None else None
+        if passed == 0 and self._sensor.datagrams and self._is_doubled(clues, spot):
+            return 0
+        if not pace > 0:
+            return 1 if self._sensor.datagrams else skipped if passed >= 0 else None
+        if abs(passed) > LATE * pace and self._jump is not None and 0 < time - self._jump[0] <= LATE * pace:
+            self._stats.lost -= self._jump[1]  # one reading was damaged
+            return None
+        if passed >= 0:
+            ahead = max(math.ceil((passed - max(self._pace.grain, pace / 2)) / pace), 1)
+            return ahead if self._pace.grain <= pace / 2 else max(ahead, skipped)
+        back = round(passed / pace)
+        return None if not self._sensor.datagrams or back < -LATE else back or 1
+
+    def _is_doubled(self, clues: Clues, spot: int) -> bool:
+        """Whether a packet has the bytes of the one before it."""
+        table = clues.batch.table
+        return table.frame(spot) == (table.frame(spot - 1) if spot else self._newest)
+
+    def _step(self, clues: Clues, spot: int, ahead: int | None, number: int | None) -> tuple[int, bool]:
+        """The index of a packet that does not follow the newest one, and whether there is a break before it."""
+        if ahead is not None and ahead <= 0:
+            return self._back(-ahead), False
+        before, lost = self._index, 0 if ahead is None else ahead - 1
+        if ahead is None:
+            self._begin(number)
+        else:
+            if self._rule is not None or self._clock is not None:
+                self._stats.lost += lost
+                self._missing = {index for index in self._missing if index > self._index + ahead - LATE}
+                self._missing.update(range(self._index + 1, self._index + ahead)[-LATE:])
+            self._index += ahead
+        self._jump = (self._time, lost) if self._time is not None and (ahead is None or lost > LATE) else None
+        self._number, self._time = number, clues.time(spot)
+        return self._index, before >= 0 and (ahead is None or lost > 0)
+
+    def _begin(self, number: int | None) -> None:
+        """A first packet, or the sensor started again: nothing is known to be lost, and the index leaves out one number."""
+        if self._index < 0 and self._rule is not None and number is not None:
+            self._index = (number - self._rule.first) % self._period % FARTHEST
+        else:
+            self._index += 2
+        self._first, self._missing, self._suspect = self._index, set(), None
+
+    def _back(self, behind: int) -> int:
+        index = self._index - behind
+        if index in self._missing:
+            self._missing.discard(index)
+            self._stats.lost -= 1
+            self._stats.late += 1
+        elif behind and index < self._first:
+            self._stats.late += 1
+        else:
+            self._stats.duplicates += 1
+        return index
+
+
+def _agree(ahead: int, by_clock: float) -> bool:
+    """Whether a counter and a clock say the same."""
+    return abs(ahead - by_clock) <= 1 + abs(by_clock) / 8 and (ahead > 0) == (by_clock > 0.5)
+
+
+def _whole(values: Any, number: int) -> NDArray[np.int64]:
+    found = np.asarray(values, np.float64).reshape(-1).astype(np.int64)
+    return found if len(found) == 1 else np.broadcast_to(found, (number,))
+
+
+def _seconds(values: Any, number: int) -> NDArray[np.float64]:
+    return np.broadcast_to(np.asarray(values, np.float64).reshape(-1), (number,))
+
+
+#: how many packets are kept back while one before them is missing, or may be, as at the beginning.
+WINDOW = 10
+
+
+class Reorder:
+    """Orders the packets of one stream; without a sequence everything passes as it comes."""
+
+    def __init__(self, *, enabled: bool) -> None:
+        self._enabled = enabled
+        self._next: int | None = None
+        self._held: Packets | None = None
+
+    def push(self, packets: Packets) -> list[Packets]:
+        """The packets that are now in order; at most one batch."""
+        if not self._enabled or not len(packets):
+            return [packets] if len(packets) else []
+        if self._held is None and (self._next is None or int(packets.index[0]) >= self._next):
+            steps = packets.index[1:] - packets.index[:-1]
+            if not len(steps) or int(steps.min()) > 0:
+                return self._ascending(packets, None if not len(steps) or int(steps.max()) == 1 else steps)
+        return self._ordered(packets)
+
+    def finish(self) -> list[Packets]:
+        """The packets that are still kept back."""
+        held, self._held = self._held, None
+        if held is None:
+            return []
+        return [self._marked(held.take(np.argsort(held.index, kind="stable")), self._next)]
+
+    def _ascending(self, packets: Packets, steps: NDArray[np.int64] | None) -> list[Packets]:
+        """Packets none of which is late, in order: those behind the first gap that is still open are kept back.
+
+        Args:
+            steps: of the index from each packet to the next; None where all are 1.
+        """
+        number, before = len(packets), self._next
+        gaps = [] if before == int(packets.index[0]) else [0]
+        if steps is not None:
+            gaps += (np.flatnonzero(steps > 1) + 1).tolist()
+        end = next((gap for gap in gaps if gap >= number - WINDOW), number)
+        if end < number:
+            self._held = packets.take(slice(end, None))
+            packets = packets.take(slice(0, end))
+        if not end:
+            return []
+        self._next = int(packets.index[-1]) + 1
+        return [self._marked(packets, before) if len(gaps) > (before is None) or packets.breaks.any() else packets]
+
+    def _ordered(self, packets: Packets) -> list[Packets]:
+        known = 0 if self._held is None else len(self._held)
+        everything = packets if self._held is None else joined([self._held, packets])
+        waiting = {int(index): spot for spot, index in enumerate(everything.index[:known].tolist())}
+        released: list[int] = []
+        before = self._next
+        for spot, index in enumerate(everything.index.tolist()[known:], start=known):
+            if index in waiting or (self._next is not None and index < self._next):
+                continue
+            waiting[index] = spot
+            if len(waiting) > WINDOW:
+                self._next = min(waiting)
+            while self._next in waiting:
+                released.append(waiting.pop(self._next))
+                self._next += 1
+        self._held = everything.take(np.array([waiting[index] for index in sorted(waiting)], np.intp)) if waiting else None
+        return [self._marked(everything.take(np.array(released, np.intp)), before)] if released else []
+
+    @staticmethod
+    def _marked(packets: Packets, before: int | None = None) -> Packets:
+        """These packets with a break wherever the index jumps, and nowhere else."""
+        start = int(packets.index[0]) if before is None else before
+        marked = copy.copy(packets)
+        marked.breaks = np.diff(packets.index, prepend=start - 1) != 1
+        return marked

@@ -1,0 +1,197 @@
+"""What was lost, came twice or late: by the counter, the clock and the bytes together."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import random
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import pytest
+
+import lidarspec as ls
+from lidarspec import Counters, Packets, Sensor
+from lidarspec.packets.stream import PacketStream
+from lidarspec.simulation.simulator import simulate
+from lidarspec.spec import Clock
+
+#: sensors without a counter, and what tells their packets apart.
+UNCOUNTED = ["velodyne-vlp16", "velodyne-hdl32e", "hesai-pandar40p"]
+
+
+def counted(packets: Packets) -> tuple[int, int, int]:
+    stats = packets.stats
+    assert stats.plugin_errors == 0
+    return stats.lost, stats.late, stats.duplicates
+
+
+def decoded(sensor: Sensor, frames: Sequence[bytes]) -> Packets:
+    return sensor.decode(list(frames) if sensor.datagrams else b"".join(frames))
+
+
+def in_pieces(sensor: Sensor, frames: Sequence[bytes], size: int) -> tuple[np.ndarray, Counters]:
+    """The index of each packet of datagrams that come some at a time."""
+    decoder = sensor.decoder()
+    stream = PacketStream(sensor, "data", decoder.stats)
+    parts = [frames[start : start + size] for start in range(0, len(frames), size)]
+    return np.concatenate([stream.add([decoder.datagrams(part, [None] * len(part))]).index for part in parts]), decoder.stats
+
+
+def test_sensors_without_a_counter_are_known() -> None:
+    assert all(ls.sensor(name).data_frame == "data" for name in UNCOUNTED)
+    for name in UNCOUNTED:
+        sequence = ls.sensor(name).sequence
+        assert sequence is None or sequence.field not in str(ls.sensor(name).frames["data"])
+
+
+@pytest.mark.parametrize("name", [*UNCOUNTED, "ldrobot-ld06", "hesai-xt32", "robosense-m1"])
+@pytest.mark.parametrize("lost", [1, 2, 50])
+def test_a_gap_of_the_clock_is_a_loss_where_nothing_is_counted(name: str, lost: int) -> None:
+    sensor = ls.sensor(name)
+    frames = simulate(sensor, 600)
+    packets = decoded(sensor, frames[:250] + frames[250 + lost :])
+    assert counted(packets) == (lost, 0, 0)
+    assert np.flatnonzero(packets.breaks).tolist() == [250]
+    assert packets.index.tolist() == [int(packets.index[0]) + place for place in range(600) if not 250 <= place < 250 + lost]
+    assert counted(decoded(sensor, frames)) == (0, 0, 0)
+
+
+def test_a_declared_pace_finds_that_every_second_packet_is_missing() -> None:
+    sensor = ls.sensor("velodyne-vlp16")
+    assert counted(sensor.decode(simulate(sensor, 600)[::2])) == (299, 0, 0)
+
+
+def test_a_clock_too_coarse_for_single_packets_claims_no_more_than_is_sure() -> None:
+    """A millisecond is two packets of an STL-27L."""
+    sensor = ls.sensor("ldrobot-stl27l")
+    frames = simulate(sensor, 3000)
+    assert counted(decoded(sensor, frames)) == (0, 0, 0)
+    for lost in (1, 3, 20, 400):
+        found = counted(decoded(sensor, frames[:2000] + frames[2000 + lost :]))[0]
+        assert lost - 4 - lost // 25 <= found <= lost + lost // 25
+
+
+def swapped(frames: list[bytes]) -> list[bytes]:
+    changed = list(frames)
+    for spot in range(50, len(frames) - 10, 37):
+        changed[spot], changed[spot + 3] = changed[spot + 3], changed[spot]
+    return changed
+
+
+def doubled(frames: list[bytes]) -> list[bytes]:
+    return [frame for place, frame in enumerate(frames) for _ in range(1 + (place % 10 == 3))]
+
+
+def doubled_late(frames: list[bytes]) -> list[bytes]:
+    return [other for place, frame in enumerate(frames) for other in ([frame, frames[place - 5]] if place % 50 == 30 else [frame])]
+
+
+@pytest.mark.parametrize("name", UNCOUNTED)
+@pytest.mark.parametrize("disturbed", [swapped, doubled, doubled_late])
+def test_order_and_identity_are_those_of_the_clock_where_nothing_is_counted(
+    name: str, disturbed: Callable[[list[bytes]], list[bytes]]
+) -> None:
+    sensor = ls.sensor(name)
+    frames = simulate(sensor, 600)
+    changed = disturbed(frames)
+    assert changed != frames
+    packets = sensor.decode(changed)
+    lost, late, duplicates = counted(packets)
+    assert (lost, duplicates) == (0, len(changed) - len(frames))
+    assert (late > 0) == (disturbed is swapped)
+    for scan, same in itertools.zip_longest(sensor.scans(changed), sensor.scans(frames)):
+        assert (len(scan), scan.complete, scan.stamp_ns) == (len(same), same.complete, same.stamp_ns)
+        for column in scan.points.columns:
+            np.testing.assert_array_equal(getattr(scan.points, column), getattr(same.points, column))
+
+
+def test_packets_of_one_time_that_differ_are_not_doubles() -> None:
+    sensor = ls.sensor("velodyne-vlp16")
+    frames = simulate(sensor, 100)
+    other = frames[51][:1200] + frames[50][1200:]
+    assert counted(sensor.decode([*frames[:51], other, *frames[52:]]))[2] == 0
+
+
+@pytest.mark.parametrize("lost", [300, 629, 630, 631, 6300, 118_976])
+def test_what_the_counter_wraps_over_is_counted_by_the_clock(lost: int) -> None:
+    sensor = ls.sensor("robosense-m1")
+    packets = sensor.decode(simulate(sensor, 700) + simulate(sensor, 700, start=700 + lost))
+    assert counted(packets) == (lost, 0, 0)
+    assert int(packets.breaks.sum()) == 1
+
+
+def helios(number: int, counter: int | None = None) -> bytes:
+    sensor = ls.sensor("robosense-helios16p")
+    (frame,) = simulate(sensor, 1, start=number)
+    return frame if counter is None else sensor.build("data", {**sensor.parse(frame), "bottom_packet_count": counter})
+
+
+@pytest.mark.parametrize("counter", [294_968_297, 0, 103, 95, 99, 2**32 - 1])
+def test_a_counter_that_jumps_without_the_clock_is_damage_and_no_loss(counter: int) -> None:
+    sensor = ls.sensor("robosense-helios16p")
+    frames = simulate(sensor, 300)
+    packets = sensor.decode([*frames[:100], helios(100, counter), *frames[101:]])
+    assert counted(packets) == (0, 0, 0)
+    assert np.diff(packets.index).tolist() == [1] * 299
+    assert not packets.breaks.any()
+
+
+def test_a_counter_that_starts_again_while_the_clock_goes_on_is_followed() -> None:
+    sensor = ls.sensor("robosense-helios16p")
+    frames = simulate(sensor, 200) + [helios(number, number - 200) for number in range(200, 300) if number not in (250, 251)]
+    assert counted(sensor.decode(frames)) == (2, 0, 0)
+
+
+def test_one_damaged_reading_of_the_clock_loses_nothing() -> None:
+    sensor = ls.sensor("velodyne-vlp16")
+    frames = simulate(sensor, 600)
+    for reading in (1_000_000_000, 3_000_000_000):
+        damaged = frames[300][:1200] + reading.to_bytes(4, "little") + frames[300][1204:]
+        packets = sensor.decode([*frames[:300], damaged, *frames[301:]])
+        assert counted(packets) == (0, 0, 0)
+        assert np.flatnonzero(packets.breaks).tolist() == [300, 301]
+
+
+def test_a_clock_that_is_set_and_a_sensor_that_starts_again_lose_nothing() -> None:
+    for name in ("robosense-m1", "hesai-pandar40p"):
+        sensor = ls.sensor(name)
+        frames = simulate(sensor, 2000)
+        for again in (frames[:300] + frames[:300], frames[1000:1300] + frames[:300]):
+            assert counted(sensor.decode(again))[0] <= 630
+
+
+def test_a_pace_that_nobody_declares_is_learned_and_learned_anew() -> None:
+    vlp16 = ls.sensor("velodyne-vlp16")
+    assert vlp16.clock is not None
+    sensor = dataclasses.replace(vlp16, clock=dataclasses.replace(vlp16.clock, pace=None))
+    frames = simulate(vlp16, 2000)
+    assert counted(sensor.decode(frames[:500] + frames[510:])) == (10, 0, 0)
+    halved = sensor.decode(frames[:500] + frames[500:1800:2] + frames[1800:])
+    assert counted(halved)[0] < 110, "taken for losses until the new pace is learned"
+
+
+def test_a_clock_that_does_not_advance_evenly_says_nothing() -> None:
+    vlp16 = ls.sensor("velodyne-vlp16")
+    sensor = dataclasses.replace(vlp16, clock=Clock("timestamp", wraps_at=3600.0))
+    draw, time, frames = random.Random(1), 0, list[bytes]()
+    for frame in simulate(vlp16, 400):
+        time += draw.choice([100, 500, 3000, 9000])
+        frames.append(frame[:1200] + time.to_bytes(4, "little") + frame[1204:])
+    assert counted(sensor.decode(frames)) == (0, 0, 0)
+
+
+@pytest.mark.parametrize("name", [*UNCOUNTED, "robosense-m1", "robosense-helios16p"])
+@pytest.mark.parametrize("seed", range(3))
+def test_pieces_do_not_matter(name: str, seed: int) -> None:
+    sensor, draw = ls.sensor(name), random.Random(seed)
+    frames = [frame for frame in simulate(sensor, 700) if draw.random() > 0.02 * seed]
+    for _ in range(20):
+        spot = draw.randrange(20, len(frames) - 20)
+        frames.insert(spot + draw.randint(0, 5), frames.pop(spot))
+        frames.insert(draw.randrange(len(frames)), frames[spot])
+    index, stats = in_pieces(sensor, frames, len(frames))
+    for size in (1, 7, 64, 333):
+        other, others = in_pieces(sensor, frames, size)
+        assert np.array_equal(other, index)
+        assert others == stats
