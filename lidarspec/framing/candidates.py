@@ -6,6 +6,7 @@ piece are judged in bulk, those of each type once, when it is looked for first: 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -29,10 +30,12 @@ class Mode:
     """What is remembered between pieces: the last frame named by any `after`, a run of weak frames under way, the last frame's size.
 
     Attributes:
+        changed: where in the stream what is looked for changed last.
         steady: frames of that size seem to follow one another without a byte between.
     """
 
     after: str | None = None
+    changed: float = -math.inf
     run: str | None = None
     run_end: int = -1
     size: int = 0
@@ -87,6 +90,7 @@ class Framing:
         lengths = [codec.frame.max_length for codec in self.codecs]
         #: no candidate waits for more bytes than these.
         self.reach = max(lengths) + max(codec.frame.max_length * codec.frame.confirm for codec in self.codecs)
+        self._weak = {kind for kind, codec in enumerate(self.codecs) if codec.frame.confirm > 1}
         self._active: dict[str | None, list[int]] = {}
 
     def active(self, mode: Mode) -> list[int]:
@@ -98,7 +102,11 @@ class Framing:
 
     def weak(self, kind: int) -> bool:
         """Whether frames of a type are believed in runs alone."""
-        return self.codecs[kind].frame.confirm > 1
+        return kind in self._weak
+
+    def any_weak(self, mode: Mode) -> bool:
+        """Whether any type that is looked for now is weak."""
+        return bool(self._weak) and not self._weak.isdisjoint(self.active(mode))
 
     def switches(self, kind: int, mode: Mode) -> bool:
         """Whether a frame of this type changes what is looked for."""
@@ -157,13 +165,14 @@ class Candidates:
     Attributes:
         buffer: the bytes; fewer of them where there are too many candidates.
         is_whole: whether these are all.
-        judged: the candidates of each type that was looked for, by its index.
+        judged: the candidates of each type that was looked for and has some, by its index.
     """
 
     def __init__(self, framing: Framing, buffer: Bytes1D, mode: Mode, *, final: bool) -> None:
         self._framing, self.buffer = framing, buffer
         self._begun: dict[Marks, Offsets] = {}
         self.judged: dict[int, Frames] = {}
+        self._known: set[int] = set()
         spots = self._spots(mode)
         limit = min((int(offsets[MOST]) for offsets in spots.values() if len(offsets) > MOST), default=len(buffer))
         if limit < len(buffer):
@@ -187,7 +196,7 @@ class Candidates:
         """Where the constants of types stand that have not been looked for before."""
         spots: dict[int, Offsets] = {}
         for kind in self._framing.active(mode):
-            if kind not in self.judged and not self._framing.weak(kind):
+            if kind not in self._known and not self._framing.weak(kind):
                 begin, rest = self._framing.marks[kind][:2], self._framing.marks[kind][2:]  # many types begin alike
                 if begin not in self._begun:
                     self._begun[begin] = matches(self.buffer, begin)
@@ -195,8 +204,11 @@ class Candidates:
         return spots
 
     def _judge(self, spots: Mapping[int, Offsets]) -> None:
+        self._known |= spots.keys()
         for kind, offsets in spots.items():
-            own = self._framing.survey(kind, self.buffer, offsets) if len(offsets) else Frames.none(self.buffer)
+            if not len(offsets):
+                continue
+            own = self._framing.survey(kind, self.buffer, offsets)
             self.judged[kind] = own if own.is_sound or (right := own.status != CONSTANT).all() else own.only(right)
 
 

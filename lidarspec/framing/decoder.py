@@ -196,8 +196,7 @@ class Decoder:
     def _piece(self, buffer: Bytes1D, *, final: bool) -> Piece:
         """A piece of a stream cut into frames: as rows while nothing disturbs and no weak type is looked for; else by search."""
         framing, mode = self._framing, self._mode
-        is_plain = not final and not any(map(framing.weak, framing.active(mode)))
-        piece = steady_stream(framing, buffer, mode) if is_plain else None
+        piece = None if final or framing.any_weak(mode) else steady_stream(framing, buffer, mode)
         return leftmost(framing, buffer, mode, self._base, final=final) if piece is None else piece
 
     def _entered(self, buffer: NDArray[np.uint8], piece: Piece, at: int | None) -> Frames:

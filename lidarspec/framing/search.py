@@ -21,6 +21,9 @@ from lidarspec.framing.candidates import Bytes1D, Candidates, Framing, Mode, Off
 from lidarspec.framing.results import SHORT, VALID, Frames
 from lidarspec.framing.weak_frames import Runs
 
+#: bytes from one change of what is looked for to the next, at which a piece ends there, and the next one is judged for what follows alone.
+SELDOM = 1 << 12
+
 
 def leftmost(framing: Framing, buffer: Bytes1D, mode: Mode, base: int, *, final: bool) -> Piece:
     """Cut one piece.
@@ -45,13 +48,18 @@ def leftmost(framing: Framing, buffer: Bytes1D, mode: Mode, base: int, *, final:
         after, position = mode.after, walks[mode.after].advance(position, piece)
         if mode.after == after:
             break
+        before, mode.changed = mode.changed, base + position
+        if mode.changed - before >= SELDOM:
+            piece.end = position
+            break
         stays.append((position, mode.after))
     frames = [frames for walk in walks.values() if len(frames := walk.frames())]
     if frames:
         piece.frames = joined = Frames.joined(frames)
         if len(frames) > 1:
             piece.frames = joined.only(np.argsort(joined.starts))
-        _remember_size(mode, piece.frames, stays[-1][0])
+        if not framing.weak(piece.frames.kinds.item(-1)):
+            _remember_size(mode, piece.frames, stays[-1][0])
     count_rejected(framing, piece, candidates, stays)
     return piece
 
@@ -71,7 +79,7 @@ class Walk(Protocol):
 
 
 def _walk(framing: Framing, candidates: Candidates, live: Frames, mode: Mode, base: int) -> Walk:
-    if any(map(framing.weak, framing.active(mode))):
+    if framing.any_weak(mode):
         return Runs(framing, candidates, live, mode, base)
     return _Chain(framing, candidates, live, mode)
 
@@ -151,7 +159,7 @@ def count_rejected(framing: Framing, piece: Piece, candidates: Candidates, stays
     Args:
         stays: from which offset on which types were looked for.
     """
-    frames, begins, names = piece.frames, np.array([begin for begin, _ in stays]), [name for _, name in stays]
+    frames, begins, names = piece.frames, [begin for begin, _ in stays], [name for _, name in stays]
     for kind, own in candidates.judged.items():
         refused = np.flatnonzero(own.status > (VALID if candidates.final else SHORT)) if not own.is_sound else ()
         if not len(refused):
@@ -160,7 +168,7 @@ def count_rejected(framing: Framing, piece: Piece, candidates: Candidates, stays
         counted = spots < piece.end
         if len(stays) > 1 and (after := framing.codecs[kind].frame.after) is not None:
             looked_for = np.array([name == after for name in names])
-            counted &= looked_for[begins.searchsorted(spots, side="right") - 1]
+            counted &= looked_for[np.searchsorted(begins, spots, side="right") - 1]
         if len(frames):
             before = np.searchsorted(frames.starts, spots, side="right") - 1
             held = np.maximum(before, 0)

@@ -368,9 +368,11 @@ class _Told:
     A header may claim any of some billion lengths, or have any key, and garbage does: those that mean the same are one branch.
 
     Attributes:
+        limits: of the field itself.
         rises: the value from which on a frame never gets shorter, so that what is too long stays so; None where there is none.
     """
 
+    limits: tuple[int, int]
     low: int
     high: int
     keys: frozenset[int] = frozenset()
@@ -383,19 +385,19 @@ class _Told:
         (low, high), known = info.limits, list(tree.nodes(root))
         asking = [(node, formula) for node in known for formula in tree.formulas(node) if _asks(formula, info)]
         if any(own.rebuilt is not None and _asks(own.rebuilt, info) for node in known for own in tree.infos(node)):
-            return cls(low, high)
+            return cls(info.limits, low, high)
         if all(isinstance(node, tree.Select) and isinstance(formula, tree.Ref) for node, formula in asking):
             keys = frozenset(key for node, _ in asking if isinstance(node, tree.Select) for key, _ in node.cases if low <= key <= high)
             other = next((value for value in range(low, high + 1) if value not in keys), None)
-            return cls(low, high) if other is None else cls(low, high, keys, other)
+            return cls(info.limits, low, high) if other is None else cls(info.limits, low, high, keys, other)
         if high - low < 1 << 62 and all(isinstance(node, tree.Repeat | tree.Blob) and _rises(formula) for node, formula in asking):
             values, spans = range(low, high + 1), []
             for _, formula in asking:
                 count = functools.partial(_with_value, formula)
                 spans.append((bisect.bisect_left(values, 0, key=count) - 1, bisect.bisect_right(values, limit, key=count)))
             firsts, lasts = zip(*spans, strict=True)
-            return cls(max(min(firsts) + low, low), min(max(lasts) + low, high), rises=max(firsts) + low + 1)
-        return cls(low, high)
+            return cls(info.limits, max(min(firsts) + low, low), min(max(lasts) + low, high), rises=max(firsts) + low + 1)
+        return cls(info.limits, low, high)
 
     def refused(self, value: int) -> _Told:
         """The same, where the frame of a value is known to be too long."""
@@ -409,6 +411,8 @@ class _Told:
 
     def all(self, values: NDArray[Any]) -> NDArray[Any]:
         """Those that stand for many, of their shape and type."""
+        if (self.low, self.high) == self.limits and not self.keys:
+            return values
         if self.keys:
             return np.where(np.isin(values, np.array(list(self.keys), values.dtype)), values, values.dtype.type(self.other))
         return np.asarray(np.clip(values, self.low, self.high))
