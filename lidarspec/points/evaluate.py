@@ -13,12 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.columns.columns import Batch, Carry, Column, Fields
+from lidarspec.columns.graph import Node
 from lidarspec.errors import PluginError, SpecError
 from lidarspec.points.cloud import LazyCloud, PointCloud
 from lidarspec.points.conventions import rows_of
 from lidarspec.points.lazy_columns import BatchColumns, Plain, Share
 from lidarspec.points.plain import Evaluated, PacketBatch, evaluate, stamp_of
-from lidarspec.points.plan import REMEMBERING, Plan, plan_for
+from lidarspec.points.plan import MODERATE, REMEMBERING, Plan, plan_for
 from lidarspec.wire.frame_table import Group, Rows, ascends
 
 
@@ -76,11 +77,19 @@ def _share(plan: Plan, batch: Batch, group: Group, whole: Plain, remembered: Map
 
 
 def _holds(share: Share) -> bool:
-    """Whether a plan holds for its packets: it was not made for other counts, and no factor is anything but positive."""
+    """Whether a plan holds for its packets: made for their counts, and for what factors and floating-point fields have in them."""
     if any(len(share.known.column(node).steps()) != number for node, number in share.plan.tape.steps):
         return False
     lows = (share.known.array(node) for node in share.plan.positive)
-    return all(bool(((low > 0) & np.isfinite(low)).all()) for low in lows)
+    return all(bool(((low > 0) & np.isfinite(low)).all()) for low in lows) and all(_moderate(share, node) for node in share.plan.floats)
+
+
+def _moderate(share: Share, node: Node) -> bool:
+    """Whether all numbers of a floating-point field are finite, and neither so small nor so large that float32 would lose them."""
+    leaf = share.plan.layout.leaves.get(node.path)
+    sizes = np.abs(share.known.array(node) if leaf is None else leaf.load(share.group.rows))
+    least, most = MODERATE
+    return bool(sizes.max(initial=0) <= most and ((sizes >= least) | (sizes == 0)).all())
 
 
 def _cloud_of(packets: PacketBatch, shares: list[Share], batch: Batch, ready: int, stamp_ns: int) -> LazyCloud:
