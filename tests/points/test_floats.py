@@ -15,6 +15,7 @@ from lidarspec import PointCloud, Sensor
 from lidarspec.points.cloud import LazyCloud
 from lidarspec.points.evaluate import evaluated
 from lidarspec.points.plain import evaluate
+from lidarspec.simulation.simulator import simulate
 from lidarspec.spec import Cartesian
 from lidarspec.testing.agreement import assert_same_points, assert_well_formed
 from tests.shapes import SHAPES
@@ -158,3 +159,12 @@ def test_floats_at_random(backend: str) -> None:
         found = evaluated(packets).cloud
         assert isinstance(found, LazyCloud) is not odd
         assert_same_points(found, evaluate(packets).cloud, ulps=6)
+
+
+def test_scans_of_coordinates_are_those_of_all_points() -> None:
+    sensor = SHAPES["shape-millimetres"]
+    frames = simulate(sensor, 60)
+    whole, scans = sensor.decode(frames).points(), list(sensor.scans(frames))
+    assert len(scans) > 4
+    for name in ("x", "range", "azimuth", "elevation"):
+        np.testing.assert_array_equal(np.concatenate([scan.points.columns[name] for scan in scans]), whole.columns[name])

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 from construct import Array, Const, Float32b, Int8ul, Int16sl, Int16ul, Int32sl, Struct, this
 
 from lidarspec import Sensor
-from lidarspec.spec import Cartesian, Checksummed, Clock, Crc, Every, Fields, Frame, Scaled, Sequence, Udp
+from lidarspec.spec import Cartesian, Checksummed, Clock, Crc, Every, Fields, Frame, Scaled, Sequence, Simulation, Udp
 
-POINTS = 12
+POINTS, RATE = 12, 100
 
 
 def _sensor(name: str, coordinate: Any, count: Any, longest: int) -> Sensor:
@@ -37,6 +38,7 @@ def _sensor(name: str, coordinate: Any, count: Any, longest: int) -> Sensor:
         links={"data": Udp(56_300)},
         clock=Clock("time", wraps_at=655.36),
         sequence=Sequence("number"),
+        simulation=Simulation(lambda i: dict(number=i % 65_536, time=i / RATE % 655.36, count=POINTS), directions=directions),
         range_limits=(0.1, 100.0),
         status="manual",
         source="invented for the tests: points by coordinates",
@@ -46,6 +48,12 @@ def _sensor(name: str, coordinate: Any, count: Any, longest: int) -> Sensor:
 def points(f: Fields) -> Cartesian:
     """A point with a tag of 200 or more is noise."""
     return Cartesian(f.points.x, f.points.y, f.points.z, intensity=f.points.reflectivity, invalid=f.points.tag >= 200)
+
+
+def directions(i: int) -> tuple[Any, Any]:
+    """A flower ahead, another part of it in each packet."""
+    turns = (np.arange(POINTS) + i * POINTS) * 0.0377
+    return 0.6 * np.sin(turns * 2.6) * np.cos(turns), 0.4 * np.sin(turns * 2.6) * np.sin(turns)
 
 
 SENSORS = (

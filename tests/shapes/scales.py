@@ -6,7 +6,7 @@ import numpy as np
 from construct import Array, Const, Float32b, Float64b, Int16ub, Struct
 
 from lidarspec import Sensor
-from lidarspec.spec import Checksummed, Crc, Fields, Frame, OnWrap, Polar, Scaled, Serial
+from lidarspec.spec import Checksummed, Crc, Fields, Frame, OnWrap, Polar, Scaled, Serial, Simulation
 
 SAMPLES, STEP = 6, 1.5
 
@@ -30,6 +30,11 @@ def points(f: Fields) -> Polar:
     return Polar(f.distances * f.scale, angles, f.tilt, intensity=f.strengths.on("distances") * 0.5)
 
 
+def sweep(i: int) -> dict[str, float]:
+    """Forty packets a turn."""
+    return dict(scale=2.0, start=i * SAMPLES * STEP % 360, tilt=0.1)
+
+
 SENSOR = Sensor(
     "shape-scales",
     vendor="Shapes",
@@ -38,6 +43,7 @@ SENSOR = Sensor(
     points=points,
     scan=OnWrap("azimuth"),
     links={"data": Serial(921_600)},
+    simulation=Simulation(sweep),
     range_limits=(0.1, 100.0),
     status="manual",
     source="invented for the tests: a floating-point scale",
