@@ -6,6 +6,7 @@ columns of its cloud cost is paid when they are read. The values of a packet do 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -21,6 +22,9 @@ from lidarspec.points.lazy_columns import BatchColumns, Plain, Share
 from lidarspec.points.plain import Evaluated, PacketBatch, evaluate, stamp_of
 from lidarspec.points.plan import MODERATE, REMEMBERING, Plan, plan_for
 from lidarspec.wire.frame_table import Group, Rows, ascends
+
+#: numbers that are looked at together, so that they stay in the cache.
+_AT_ONCE = 1 << 15
 
 
 def evaluated(packets: PacketBatch, carry: Carry | None = None, *, final: bool = True, epoch: int | None = None) -> Evaluated:
@@ -87,9 +91,19 @@ def _holds(share: Share) -> bool:
 def _moderate(share: Share, node: Node) -> bool:
     """Whether all numbers of a floating-point field are finite, and neither so small nor so large that float32 would lose them."""
     leaf = share.plan.layout.leaves.get(node.path)
-    sizes = np.abs(share.known.array(node) if leaf is None else leaf.load(share.group.rows))
-    least, most = MODERATE
-    return bool(sizes.max(initial=0) <= most and ((sizes >= least) | (sizes == 0)).all())
+    if leaf is None:
+        return False
+    rows, step = share.group.rows, max(_AT_ONCE // max(math.prod(leaf.shape), 1), 1)
+    return all(_all_moderate(leaf.load(rows[start : start + step])) for start in range(0, len(rows), step))
+
+
+def _all_moderate(values: NDArray[Any]) -> bool:
+    """Whether floating-point numbers are all 0 or of moderate size: their bits without the sign are integers in the same order."""
+    kind = np.dtype(f"u{values.dtype.itemsize}")
+    least, most = np.clip(MODERATE, 0, np.finfo(values.dtype).max).astype(values.dtype).view(kind)
+    sizes = values.view(kind) & np.array(np.iinfo(kind).max >> 1, kind)
+    odd = sizes - least > most - least
+    return not (odd.any() and sizes[odd].any())
 
 
 def _cloud_of(packets: PacketBatch, shares: list[Share], batch: Batch, ready: int, stamp_ns: int) -> LazyCloud:
