@@ -25,6 +25,9 @@ TYPES: Mapping[str, Any] = {
 #: largest float32 below pi: azimuths stay in [-pi, pi) in either precision.
 _PI = np.nextafter(np.float32(np.pi), np.float32(0))
 
+#: metres up to which float32 holds a place.
+FARTHEST = float(np.finfo(np.float32).max)
+
 #: radians from which on taking off whole turns loses precision.
 _FAR = 1e6
 
@@ -56,6 +59,25 @@ def coordinates(distance: Any, azimuth: Any, elevation: Any, origin: Sequence[An
     places = _product(level, np.cos(azimuth)), _product(level, np.sin(azimuth)), distance * np.sin(elevation)
     x, y, z = (place if is_zero(start) else place + start for place, start in zip(places, origin, strict=True))
     return x, y, z
+
+
+def placed(coordinates: Sequence[Any], invalid: Any) -> list[Any]:
+    """The coordinates of points that are given by them, metres: nan where nothing came back, one is no number, or the sensor says so.
+
+    Args:
+        coordinates: x, y and z as `Cartesian` has them.
+        invalid: where the sensor marks a point as wrong.
+    """
+    away = sum(abs(place) for place in coordinates if not is_zero(place))
+    lost = np.logical_not((away > 0) & (away <= FARTHEST))
+    lost = lost | invalid if isinstance(invalid, Traced) or np.any(invalid) else lost
+    return [np.where(lost, np.nan, place) for place in coordinates]
+
+
+def direction_of(x: Any, y: Any, z: Any) -> tuple[Any, Any, Any]:
+    """Range, azimuth and elevation of points that are given by coordinates: metres and radians."""
+    level = np.hypot(x, y)
+    return np.hypot(level, z), np.arctan2(y, x), np.arctan2(z, level)
 
 
 def _product(first: Any, second: Any) -> Any:

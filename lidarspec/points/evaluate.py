@@ -6,6 +6,7 @@ columns of its cloud cost is paid when they are read. The values of a packet do 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -13,13 +14,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.columns.columns import Batch, Carry, Column, Fields
+from lidarspec.columns.graph import Node
 from lidarspec.errors import PluginError, SpecError
 from lidarspec.points.cloud import LazyCloud, PointCloud
 from lidarspec.points.conventions import rows_of
 from lidarspec.points.lazy_columns import BatchColumns, Plain, Share
 from lidarspec.points.plain import Evaluated, PacketBatch, evaluate, stamp_of
-from lidarspec.points.plan import REMEMBERING, Plan, plan_for
+from lidarspec.points.plan import MODERATE, REMEMBERING, Plan, plan_for
 from lidarspec.wire.frame_table import Group, Rows, ascends
+
+#: numbers that are looked at together, so that they stay in the cache.
+_AT_ONCE = 1 << 15
 
 
 def evaluated(packets: PacketBatch, carry: Carry | None = None, *, final: bool = True, epoch: int | None = None) -> Evaluated:
@@ -76,11 +81,29 @@ def _share(plan: Plan, batch: Batch, group: Group, whole: Plain, remembered: Map
 
 
 def _holds(share: Share) -> bool:
-    """Whether a plan holds for its packets: it was not made for other counts, and no factor is anything but positive."""
+    """Whether a plan holds for its packets: made for their counts, and for what factors and floating-point fields have in them."""
     if any(len(share.known.column(node).steps()) != number for node, number in share.plan.tape.steps):
         return False
     lows = (share.known.array(node) for node in share.plan.positive)
-    return all(bool(((low > 0) & np.isfinite(low)).all()) for low in lows)
+    return all(bool(((low > 0) & np.isfinite(low)).all()) for low in lows) and all(_moderate(share, node) for node in share.plan.floats)
+
+
+def _moderate(share: Share, node: Node) -> bool:
+    """Whether all numbers of a floating-point field are finite, and neither so small nor so large that float32 would lose them."""
+    leaf = share.plan.layout.leaves.get(node.path)
+    if leaf is None:
+        return False
+    rows, step = share.group.rows, max(_AT_ONCE // max(math.prod(leaf.shape), 1), 1)
+    return all(_all_moderate(leaf.load(rows[start : start + step])) for start in range(0, len(rows), step))
+
+
+def _all_moderate(values: NDArray[Any]) -> bool:
+    """Whether floating-point numbers are all 0 or of moderate size: their bits without the sign are integers in the same order."""
+    kind = np.dtype(f"u{values.dtype.itemsize}")
+    least, most = np.clip(MODERATE, 0, np.finfo(values.dtype).max).astype(values.dtype).view(kind)
+    sizes = values.view(kind) & np.array(np.iinfo(kind).max >> 1, kind)
+    odd = sizes - least > most - least
+    return not (odd.any() and sizes[odd].any())
 
 
 def _cloud_of(packets: PacketBatch, shares: list[Share], batch: Batch, ready: int, stamp_ns: int) -> LazyCloud:

@@ -162,8 +162,8 @@ class Computed(ColumnSource):
             return self._main(name)
         if name == "valid":
             return {name: ~np.isnan(self._x())}
-        if name in ("range", "azimuth"):
-            columns = self._compiled(("range", "azimuth") if self._packets.backend == "jit" else (name,))
+        if name in self._shares[0].plan.expressions:
+            columns = self._compiled(("range", "azimuth") if name != "elevation" and self._packets.backend == "jit" else (name,))
             return columns | {"azimuth": self._azimuth(columns["azimuth"])} if "azimuth" in columns else columns
         if name == "time":
             times = [batch.times_of(share, *packets) + later(batch, self.base) for batch, share, packets in self._pieces()]

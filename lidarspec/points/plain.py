@@ -3,7 +3,7 @@
 This is the reference. It serves where `points` cannot be traced, and the tests as the second engine; plans (`points.plan`) take the
 parts of a result and the meaning of columns from here and from `points.conventions`.
 
-Columns that a sensor adds under names of its own (M5) join `parts_of`; points by coordinates (M2) have a plan when `Cartesian` has one.
+Columns that a sensor adds under names of its own (M5) join `parts_of`.
 """
 
 from __future__ import annotations
@@ -150,12 +150,9 @@ def make_cloud(flat: dict[str, NDArray[Any]], turn: NDArray[np.float64] | None =
         extra: `stamp_ns`, `shape` and `nominal` of the cloud.
     """
     with np.errstate(all="ignore"):
-        polar = flat if "range" in flat else _polar(flat)
-        measured, azimuth, elevation = (polar[name].astype(np.float64) for name in ("range", "azimuth", "elevation"))
-        distance = conventions.shown_range(measured, flat["invalid"].astype(np.bool_))
-        valid = np.isfinite(distance) & np.isfinite(azimuth) & np.isfinite(elevation)
-        xyz = _xyz(flat, distance, azimuth, elevation)
-        valid &= np.isfinite(xyz).all(axis=0)
+        distance, azimuth, elevation, xyz = (_by_coordinates if "x" in flat else _by_direction)(flat, flat["invalid"].astype(np.bool_))
+        known = np.isfinite(azimuth) & np.isfinite(elevation) & np.isfinite(xyz).all(axis=0)
+        valid = known & (np.abs(distance) <= conventions.FARTHEST)
         if turn is not None:
             xyz, azimuth = turn @ np.where(valid, xyz, 0), conventions.turned_azimuth(azimuth, turn)
         angles = {"azimuth": conventions.narrowed(azimuth), "elevation": elevation.astype(np.float32)}
@@ -164,15 +161,18 @@ def make_cloud(flat: dict[str, NDArray[Any]], turn: NDArray[np.float64] | None =
         return PointCloud(**columns, range=distance.astype(np.float32), time=np.array(flat["time"], np.float64), valid=valid, **extra)
 
 
-def _xyz(flat: dict[str, NDArray[Any]], distance: NDArray[Any], azimuth: NDArray[Any], elevation: NDArray[Any]) -> NDArray[np.float64]:
-    if "x" in flat:
-        return np.stack([flat[name].astype(np.float64) for name in "xyz"])
+#: range, azimuth and elevation of points, and their coordinates, (3, N).
+_Places = tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[np.float64]]
+
+
+def _by_direction(flat: dict[str, NDArray[Any]], invalid: NDArray[np.bool_]) -> _Places:
+    measured, azimuth, elevation = (flat[name].astype(np.float64) for name in ("range", "azimuth", "elevation"))
+    distance = conventions.shown_range(measured, invalid)
     places = conventions.coordinates(distance, azimuth, elevation, [flat[name] for name in ("ox", "oy", "oz")])
-    return np.stack(places) + 0.0  # no -0.0
+    return distance, azimuth, elevation, np.stack(places) + 0.0  # no -0.0
 
 
-def _polar(flat: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
-    """Range and direction of cartesian points."""
-    x, y, z = (flat[name].astype(np.float64) for name in "xyz")
-    level = np.hypot(x, y)
-    return {"range": np.hypot(level, z), "azimuth": np.arctan2(y, x), "elevation": np.arctan2(z, level)}
+def _by_coordinates(flat: dict[str, NDArray[Any]], invalid: NDArray[np.bool_]) -> _Places:
+    places = [flat[name].astype(np.float64) for name in "xyz"]
+    measured, azimuth, elevation = conventions.direction_of(*places)
+    return conventions.shown_range(measured, invalid), azimuth, elevation, np.stack(conventions.placed(places, invalid))

@@ -4,8 +4,10 @@
 a batch before they are computed. It computes nothing: a `Maker` does, which a back end compiles from it (`points.numpy_plan`,
 `points.numba_kernels`). Plans are kept with the layout that they are for, so a stream of packets traces nothing again.
 
-Points by coordinates (M2) are three expressions and a mask here, range and angles when they are asked for; floating-point fields, an
-expression that is planned where the columns of a batch are finite. Columns under names of a sensor's own (M5) are further expressions.
+Points by coordinates are three expressions and a mask (`conventions.placed`), their range and angles further ones. They are exact:
+computed in float64 as they are written, whatever floating-point fields hold. Points by direction are computed in another order and partly
+in float32: their plan holds where what a batch has in floating-point fields is of moderate size (`MODERATE`). Columns under names of a
+sensor's own (M5) are further expressions.
 """
 
 from __future__ import annotations
@@ -22,10 +24,10 @@ from numpy.typing import NDArray
 from lidarspec.columns import graph
 from lidarspec.columns.columns import Batch, of_points
 from lidarspec.columns.graph import Node, Traced, Untraceable, is_full, only_field
-from lidarspec.points.conventions import coordinates, is_zero, marked, returned_range, shown_range
+from lidarspec.points.conventions import coordinates, direction_of, is_zero, marked, placed, returned_range, shown_range
 from lidarspec.points.plain import columns_of, parts_of
-from lidarspec.points.windows import possible
-from lidarspec.spec.results import Polar
+from lidarspec.points.windows import is_number
+from lidarspec.spec.results import Cartesian, Polar
 from lidarspec.wire.frame_table import Group
 from lidarspec.wire.layout import Bytes2D, Layout
 
@@ -36,6 +38,9 @@ Values = Callable[[Node], NDArray[Any]]
 
 #: steps that remember something between packets or batches, or that other frames decide.
 REMEMBERING = ("shift", "latest", "state")
+
+#: the least and the most that a floating-point field may hold, if it is not 0, where float32 and another order of sums have to do no harm.
+MODERATE = 2.0**-60, 2.0**60
 
 
 class Maker(Protocol):
@@ -64,6 +69,7 @@ class Plan:
         parts: what it returned, by name, as nodes or as what no data decides.
         shape: of the points of a packet, one length for each axis in `axes`.
         expressions: the columns that back ends make, by name, as nodes or as what no data decides.
+        exact: whether all columns are computed in float64 as they are written.
         positive: nodes whose values have to be positive numbers, or the plan does not hold.
         nominal: whether a default calibration stands in for the sensor's own.
         varying: the arrays whose lengths differ from frame to frame.
@@ -76,12 +82,9 @@ class Plan:
 
     def __init__(self, function: PointsFunction, sample: Batch, layout: Layout) -> None:
         result, self.tape = graph.trace(function, sample)
-        schema = sample.table.schema
-        for node in self.tape.nodes:
-            if node.kind == "field" and schema.fields[node.path].kind == "float":
-                raise Untraceable(f"{node.path} is a floating-point field, which may hold any number")
-        if not isinstance(result, Polar):
-            raise Untraceable(f"{type(result).__name__} points are evaluated plainly")
+        self._schema = schema = sample.table.schema
+        if not isinstance(result, Polar | Cartesian):
+            raise Untraceable(f"points that are {type(result).__name__}")
         self.function, self.layout, self.nominal = function, layout, result.nominal
         self.parts = {name: graph.node_of(value) for name, value in parts_of(result).items()}
         columns = columns_of({name: part.sample if isinstance(part, Node) else part for name, part in self.parts.items()}, sample)
@@ -93,10 +96,14 @@ class Plan:
         self.kernels: dict[tuple[str, ...], Maker] = {}
         if 0 in self.shape:
             raise Untraceable("packets without points")
-        if not isinstance(result.range, Traced) or not is_full(result.range.node, self.width):
-            raise Untraceable("not every point has a range of its own")
+        self.exact = isinstance(result, Cartesian)
+        if not any(is_full(self.parts[name], self.width) for name in ("xyz" if self.exact else ["range"])):
+            raise Untraceable(f"not every point has {'coordinates' if self.exact else 'a range'} of its own")
         self.positive = list[Node]()
-        self.expressions = self._expressions(result, result.range)
+        expressions = self._by_coordinates(result) if isinstance(result, Cartesian) else self._by_direction(result)
+        if result.intensity is not None:
+            expressions["intensity"] = np.nan_to_num(result.intensity) if self._may_be_nan(result.intensity) else result.intensity
+        self.expressions = {name: graph.node_of(value) for name, value in expressions.items()}
 
     @cached_property
     def width(self) -> int:
@@ -106,7 +113,20 @@ class Plan:
     @cached_property
     def level(self) -> bool:
         """Whether all points lie in the horizontal plane through the sensor."""
-        return all(not isinstance(self.parts[name], Node) and is_zero(self.parts[name]) for name in ("elevation", "oz"))
+        upright = [self.parts[name] for name in (["z"] if self.exact else ["elevation", "oz"])]
+        return all(not isinstance(part, Node) and is_zero(part) for part in upright)
+
+    @cached_property
+    def floats(self) -> list[Node]:
+        """The floating-point fields whose values have to be of moderate size, or the plan does not hold."""
+        return [] if self.exact else self._floats_of(*(part for name, part in self.parts.items() if name != "intensity"))
+
+    def _floats_of(self, *values: Any) -> list[Node]:
+        """The floating-point fields that values are made of."""
+        return [node for node in graph.traverse(*values) if node.kind == "field" and self._schema.fields[node.path].kind == "float"]
+
+    def _may_be_nan(self, value: Any) -> bool:
+        return isinstance(value, Traced) and (bool(self._floats_of(value)) or not is_number(value.node, self.layout.leaves))
 
     @cached_property
     def eager(self) -> list[Node]:
@@ -115,14 +135,18 @@ class Plan:
         wanted += [node for node, _ in self.tape.steps] + self.positive
         return sorted(graph.traverse(*wanted), key=lambda node: node.number)
 
-    def _expressions(self, result: Polar, measured: Traced) -> dict[str, Any]:
+    def _by_direction(self, result: Polar) -> dict[str, Any]:
         """The columns that back ends make."""
-        distance = marked(self._distance(measured), result.invalid)
+        distance = marked(self._distance(result.range), result.invalid)
         places = coordinates(distance, result.azimuth, result.elevation, result.origin)
-        columns = dict(zip("xyz", places, strict=True)) | {"range": shown_range(measured, result.invalid), "azimuth": result.azimuth}
-        if result.intensity is not None:
-            columns["intensity"] = result.intensity
-        return {name: graph.node_of(value) for name, value in columns.items()}
+        return dict(zip("xyz", places, strict=True)) | {"range": shown_range(result.range, result.invalid), "azimuth": result.azimuth}
+
+    def _by_coordinates(self, result: Cartesian) -> dict[str, Any]:
+        """The columns that back ends make."""
+        given = result.x, result.y, result.z
+        measured, azimuth, elevation = direction_of(*given)
+        columns = {"range": shown_range(measured, result.invalid), "azimuth": azimuth, "elevation": elevation}
+        return dict(zip("xyz", placed(given, result.invalid), strict=True)) | columns
 
     def _distance(self, measured: Traced) -> Any:
         """The distance of a return, nan where there is none; where a low value only scales it, that value has to be positive."""
@@ -154,16 +178,15 @@ class Plan:
         return [part for part in self._directions_given if isinstance(part, Node)]
 
     @property
-    def _directions_given(self) -> tuple[Any, Any]:
-        return self.parts["azimuth"], self.parts["elevation"]
+    def _directions_given(self) -> tuple[Any, ...]:
+        return () if self.exact else (self.parts["azimuth"], self.parts["elevation"])
 
     def _finite(self, node: Node) -> bool:
         """Whether an expression is a number for every value that its field can have."""
         options = graph.chosen(node, self.width)
         if options is not None:
             return all(self._finite(option) if isinstance(option, Node) else bool(np.isfinite(option)) for option in options[1:])
-        values = possible(node, self.layout.leaves)
-        return values is not None and bool(np.isfinite(values).all())
+        return is_number(node, self.layout.leaves)
 
 
 #: tables by what they are of, shared by the plans of a `points` function.

@@ -19,10 +19,16 @@ from numpy.typing import NDArray
 from lidarspec.columns.graph import Expression, Node, only_field
 from lidarspec.wire.layout import Leaf
 
+#: what costs hardly more than looking its result up; with these, whatever is made of numbers stays a number.
+CHEAP: set[Any] = {np.add, np.subtract, np.multiply, np.negative, np.positive, np.absolute, np.deg2rad, np.radians, np.minimum, np.maximum}
+CHEAP |= {np.less, np.less_equal, np.greater, np.greater_equal, np.equal, np.not_equal, np.where}
+#: dividing by one of these numbers, or the rest of it, is a number too.
+_DIVISIONS = {np.true_divide, np.mod}
+
 
 @dataclass(frozen=True)
 class Window:
-    """The bytes of a field in its element: from `offset` of the frame, `size` (1 or 2) bytes, little-endian."""
+    """The bytes of a field in its element: from `offset` of the frame, `size` bytes, little-endian; 1 or 2 to look up by."""
 
     offset: int
     size: int
@@ -30,7 +36,7 @@ class Window:
     @property
     def dtype(self) -> np.dtype[Any]:
         """The type it is loaded as."""
-        return np.dtype("u1") if self.size == 1 else np.dtype("<u2")
+        return np.dtype(f"<u{self.size}")
 
 
 def window(leaf: Leaf) -> Window | None:
@@ -77,3 +83,20 @@ def possible(node: Node, leaves: Mapping[str, Leaf]) -> NDArray[Any] | None:
     source = only_field(node)
     leaf = leaves.get(source.path) if source is not None else None
     return every_value(node, leaf) if leaf is not None else None
+
+
+def is_number(value: Any, leaves: Any) -> bool:
+    """Whether an expression is finite wherever its fields are: made of some that the layout has, by safe operations."""
+    if not isinstance(value, Node):
+        return bool(np.isfinite(value).all())
+    if value.kind == "field":
+        return value.path in leaves
+    if value.kind != "call":
+        return False
+    found = possible(value, leaves)
+    if found is not None:
+        return bool(np.isfinite(found).all())
+    if value.function in _DIVISIONS:
+        divisor = value.args[1]
+        return not isinstance(divisor, Node) and bool(np.all(divisor)) and is_number(value.args[0], leaves)
+    return (value.function in CHEAP or value.function in (np.sin, np.cos)) and all(is_number(arg, leaves) for arg in value.args)

@@ -9,14 +9,15 @@ its own is given the measured points and returns the values of its fields.
 When each packet is sent follows from what the spec says of time, in this order: the rate that is declared; the sensor's clock, which
 its `sweep` sets; the times of the points, which say how long one takes; the speed of its serial line, which no sensor outruns.
 
-Points by coordinates (M2) are linear in the range: with the directions declared in the spec, `Measurement` writes each coordinate back.
+Where points are given by coordinates, nothing says where a beam would go: the spec declares the directions, and the raw values that the
+coordinates are linear in are solved for the place that is met (`Placement`).
 """
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Container, Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Container, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -27,14 +28,16 @@ from lidarspec.errors import SpecError, UsageError, plugin_errors
 from lidarspec.framing.examples import example
 from lidarspec.framing.frame_engine import codec
 from lidarspec.packets.clocks import clock_ns
+from lidarspec.points.conventions import coordinates, direction_of
+from lidarspec.points.plain import parts_of
 from lidarspec.simulation.frame_maker import FrameMaker, sealed
 from lidarspec.simulation.scenes import Room, Scene
 from lidarspec.spec.description import Spec
 from lidarspec.spec.fields import factor
 from lidarspec.spec.links import Serial
-from lidarspec.spec.results import Polar
+from lidarspec.spec.results import Cartesian, Points, Polar
 from lidarspec.spec.timing import Every
-from lidarspec.spec.tree import exact
+from lidarspec.spec.tree import FieldInfo, exact
 from lidarspec.wire.frame_table import Rows
 
 Times = NDArray[np.int64]
@@ -49,6 +52,8 @@ PROBED = 256
 Floats = NDArray[np.float64]
 #: how often ranges are measured again while directions still move.
 ROUNDS = 8
+#: the parts of points that beams are made of.
+_MEASURED = ("range", "azimuth", "elevation", "ox", "oy", "oz", "x", "y", "z", "time")
 #: raw value that a range field is given to see which points answer to it.
 PROBE = 100
 
@@ -77,6 +82,7 @@ class Beams:
         range, azimuth, elevation, time, origin: as in `Polar`, directions that nobody knows nan.
         counts: (n,) points of each packet.
         intensity: path of the field that it comes from, "" where it is none.
+        places: x, y and z of points that are given by coordinates, (3, n, ...).
     """
 
     range: Floats
@@ -86,6 +92,11 @@ class Beams:
     origin: tuple[Floats, Floats, Floats]
     counts: NDArray[np.intp]
     intensity: str
+    places: Floats | None = None
+
+    def unit(self) -> Floats:
+        """x, y and z of where the beams go, one metre on: (3, n, ...)."""
+        return np.stack(np.broadcast_arrays(*coordinates(np.ones(()), self.azimuth, self.elevation, (0, 0, 0))))
 
 
 class Measurement:
@@ -102,15 +113,21 @@ class Measurement:
         self._sensor, self._frame = sensor, frame
         self._points = sensor.points_of(frame)
         self._encode: Callable[[Polar], Mapping[str, Any]] | None = sensor.simulation_of(frame).encode
-        self._targets = () if self._encode else self._traced(table)
         intensity = self.beams(table).intensity
-        self._intensity = "" if intensity in given else intensity
+        self._given, self._intensity = given, "" if intensity in given else intensity
+        self._targets = () if self._encode else self._traced(table)
         self._coupled = self._encode is not None or self._turning(table)
 
-    def fill(self, table: Rows, scene: Scene, times: Floats) -> None:
+    @classmethod
+    def of(cls, sensor: Spec, frame: str, table: Rows, given: Container[str]) -> Measurement:
+        """The measurement of a sensor's points, as they are given by direction or by coordinates."""
+        return (Placement if _result(sensor, frame, table)[0].__class__ is Cartesian else Measurement)(sensor, frame, table, given)
+
+    def fill(self, table: Rows, numbers: range, scene: Scene, times: Floats) -> None:
         """Measure a table's ranges in the scene, and write them.
 
         Args:
+            numbers: of the packets.
             times: (n,) seconds since the scene began, of each packet.
         """
         steps = [self._step(table, target) for target in self._targets]
@@ -131,25 +148,30 @@ class Measurement:
             if not self._coupled or attempt >= ROUNDS - 2:
                 break
         if self._intensity and not self._encode:
-            first = known[self._targets[0].path]
-            store(table, self._intensity, np.where(first > 0, 40 + first % 160, 0))
+            self._shine(table, known[self._targets[0].path])
+
+    def _shine(self, table: Rows, ranges: NDArray[Any]) -> None:
+        """Write intensities, some number for each range."""
+        store(table, self._intensity, np.where(ranges > 0, 40 + np.rint(ranges) % 160, 0))
 
     def beams(self, table: Rows) -> Beams:
         """Where the beams of a table go as it stands."""
-        number = len(table)
-        state = {name: (None, np.full(number, -1, np.intp)) for name in self._sensor.state}
-        batch = Batch(table, np.zeros(number, np.bool_), state, self._sensor.state)
+        result, batch = _result(self._sensor, self._frame, table)
         with np.errstate(all="ignore"), plugin_errors(f"points of {self._frame}", self._sensor.id, self._points):
-            polar = self._points(Fields(batch))
-            if not isinstance(polar, Polar) or not isinstance(polar.range, Column):
-                raise SpecError("only polar points can be simulated", path="points", sensor=self._sensor.id)
-            parts = {name: getattr(polar, name) for name in ("range", "azimuth", "elevation", "time")}
-            parts |= dict(zip(("ox", "oy", "oz"), polar.origin, strict=True))
-            arrays = [np.asarray(array, np.float64) for array in of_points(parts, batch)[0]]
-        depth = max(array.ndim for array in arrays)
-        full = [array.reshape(*(1,) * (depth - array.ndim), *array.shape) for array in arrays]
-        intensity = polar.intensity.source if isinstance(polar.intensity, Column) else ""
-        return Beams(full[0], full[1], full[2], np.nan_to_num(full[3]), (full[4], full[5], full[6]), _counts(polar.range, batch), intensity)
+            parts = {name: part for name, part in parts_of(result).items() if name in _MEASURED}
+            arrays, axes, _, shape = of_points(parts, batch)
+        depth = len(shape)
+        full = {name: _as_deep(np.asarray(array, np.float64), depth) for name, array in zip(parts, arrays, strict=True)}
+        places = None
+        if isinstance(result, Cartesian):
+            places = np.stack([np.broadcast_to(full[name], shape) for name in "xyz"])
+            full |= dict(zip(("range", "azimuth", "elevation"), direction_of(*places), strict=True))
+        origin = [full.get(name, np.zeros((1,) * depth)) for name in ("ox", "oy", "oz")]
+        intensity = result.intensity.source if isinstance(result.intensity, Column) else ""
+        own = {name: full[name] for name in ("range", "azimuth", "elevation")} | {"time": np.nan_to_num(full["time"])}
+        return Beams(
+            **own, origin=(origin[0], origin[1], origin[2]), counts=_counts(shape, axes, batch), intensity=intensity, places=places
+        )
 
     def _measured(self, beams: Beams, scene: Scene, times: Floats) -> Floats:
         """Metres along each beam; 0 where the sensor does not reach, or nobody knows where the beam goes."""
@@ -171,9 +193,8 @@ class Measurement:
             info = table.schema.fields[target.path]
             part = _part(ranges, target.inner)
             with np.errstate(all="ignore"):
-                raw = np.rint((part - zero) / step)
-            top = float((1 << info.bits) - 1) if info.kind == "int" else np.inf
-            found[target.path] = np.where((part > 0) & (raw > 0) & (raw <= top), raw, 0)
+                raw = whole(info, (part - zero) / step)
+            found[target.path] = np.where((part > 0) & (raw > 0) & (raw <= info.limits[1]), raw, 0)
         return found
 
     def _traced(self, table: Rows) -> tuple[Target, ...]:
@@ -238,6 +259,114 @@ class Measurement:
         return not all(same)
 
 
+class Placement(Measurement):
+    """How one frame type of a sensor carries coordinates: its fields are solved for the place that a beam in a declared direction meets.
+
+    Raises:
+        SpecError: where no directions are declared, or no field makes a coordinate of a point.
+    """
+
+    def fill(self, table: Rows, numbers: range, scene: Scene, times: Floats) -> None:
+        beams = self.beams(table)
+        azimuth, elevation = self._directions(numbers, beams.range.shape[1:])
+        beams = replace(beams, azimuth=azimuth, elevation=elevation)
+        ranges = self._measured(beams, scene, times)
+        for path, raw in self._values(table, beams, ranges, []).items():
+            store(table, path, raw)
+        if self._intensity and not self._encode:
+            self._shine(table, _part(ranges, self._targets[0].inner) * 1000)
+
+    def _directions(self, numbers: range, shape: tuple[int, ...]) -> tuple[Floats, Floats]:
+        """The declared azimuths and elevations of packets, (n, *shape) each; nan beyond those of a packet that has fewer points."""
+        declared = self._sensor.simulation_of(self._frame).directions
+        if declared is None:
+            reason = "points by coordinates are simulated along Simulation(directions=...), and none are declared"
+            raise SpecError(reason, path="simulation", sensor=self._sensor.id)
+        found = np.full((2, len(numbers), *shape), np.nan)
+        with plugin_errors(f"directions of {self._frame}", self._sensor.id, declared):
+            for index, number in enumerate(numbers):
+                azimuth, elevation = np.broadcast_arrays(*declared(number))
+                given = np.stack([azimuth, elevation]).reshape(2, *(1,) * (len(shape) - azimuth.ndim), *azimuth.shape)
+                if any(own > length for own, length in zip(given.shape[1:], shape, strict=False)) or given.ndim > 1 + len(shape):
+                    raise SpecError(f"azimuth and elevation {azimuth.shape} do not broadcast to the points of frame {number}, {shape}")
+                corner: Any = tuple(slice(0, length if length > 1 else None) for length in given.shape[1:])
+                found[:, index][(slice(None), *corner)] = given
+        return found[0], found[1]
+
+    def _values(self, table: Rows, beams: Beams, ranges: Floats, steps: list[Any]) -> dict[str, NDArray[Any]]:
+        if self._encode is not None:
+            return super()._values(table, beams, ranges, steps)
+        found: dict[str, NDArray[Any]] = {}
+        aims = ranges * beams.unit()
+        for inner in dict.fromkeys(target.inner for target in self._targets):
+            paths = [target.path for target in self._targets if target.inner == inner]
+            infos = [table.schema.fields[path] for path in paths]
+            zero, *ones = (_part(places, inner) for places in self._moved(table, paths))
+            slopes = np.stack([(one - zero) / PROBE for one in ones])
+            raw = [whole(info, column) for info, column in zip(infos, _solved(slopes, _part(aims, inner) - zero), strict=True)]
+            kept = _part(ranges, inner) > 0
+            for info, column in zip(infos, raw, strict=True):
+                kept = kept & ((column >= info.limits[0]) & (column <= info.limits[1]) if info.kind == "int" else np.isfinite(column))
+            found |= {path: np.where(kept, column, 0) for path, column in zip(paths, raw, strict=True)}
+        return found
+
+    def _moved(self, table: Rows, paths: Sequence[str]) -> list[Floats]:
+        """The coordinates while all of these fields are 0, and with each of them at its probing value; (3, n, ...) each."""
+        before = {path: table.raw(path) for path in paths}
+        for path in paths:
+            store(table, path, np.array(0))
+        beams = [self.beams(table), *(self._probed(table, [path], PROBE)[0] for path in paths)]
+        for path, raw in before.items():
+            store(table, path, raw)
+        return [each.places for each in beams if each.places is not None]
+
+    def _traced(self, table: Rows) -> tuple[Target, ...]:
+        """The fields of points, in metres or without a unit, that coordinates are linear in."""
+        found = []
+        for path, info in table.schema.fields.items():
+            metres = not info.unit or factor(info.unit, "m") is not None
+            if not metres or info.kind not in ("int", "float") or path in self._given or len(info.axes) < table.schema.depth():
+                continue
+            places = [beams.places for beams in self._probed(table, [path], PROBE, 2 * PROBE, 3 * PROBE) if beams.places is not None]
+            for spot in self._inner(table, places[0][0]):
+                once, twice, thrice = (_part(place, spot) for place in places)
+                if (twice != once).any() and np.allclose(thrice - twice, twice - once):
+                    found.append(Target(path, spot, None))
+        if not found:
+            reason = "no field of a point makes its coordinates: the sensor has to give `encode`"
+            raise SpecError(reason, path="points", sensor=self._sensor.id)
+        return tuple(found)
+
+    def _turning(self, table: Rows) -> bool:
+        return False
+
+
+def _solved(slopes: Floats, aims: Floats) -> Floats:
+    """What fields have to be, (k, n, ...), that move points by `slopes`, (k, 3, n, ...), for these to be at `aims`, (3, n, ...)."""
+    matrices, wanted = np.moveaxis(slopes, (0, 1), (-1, -2)), np.moveaxis(aims, 0, -1)
+    first = matrices[(0,) * (matrices.ndim - 2)]
+    inverse = np.linalg.pinv(first if (matrices == first).all() else matrices)
+    return np.moveaxis((inverse @ wanted[..., None])[..., 0], -1, 0)
+
+
+def _result(sensor: Spec, frame: str, table: Rows) -> tuple[Points, Batch]:
+    """What the sensor's `points` says of a table of its frames, which nothing goes before."""
+    state = {name: (None, np.full(len(table), -1, np.intp)) for name in sensor.state}
+    batch = Batch(table, np.zeros(len(table), np.bool_), state, sensor.state)
+    points = sensor.points_of(frame)
+    with np.errstate(all="ignore"), plugin_errors(f"points of {frame}", sensor.id, points):
+        result = points(Fields(batch))
+    measured = [getattr(result, name, None) for name in ("range", "x", "y", "z")]
+    if not any(isinstance(part, Column) for part in measured):
+        raise SpecError("no field makes the range of a point: it cannot be simulated", path="points", sensor=sensor.id)
+    return result, batch
+
+
+def whole(info: FieldInfo, raw: Floats) -> Floats:
+    """Raw values as a field can hold them."""
+    return np.rint(raw) if info.kind == "int" else raw
+
+
 def store(table: Rows, path: str, values: NDArray[Any]) -> None:
     """Write raw values, (n, ...) or one for all, into every frame that has the field."""
     for group in table.groups:
@@ -255,10 +384,14 @@ def _part(array: Floats, inner: tuple[int, ...]) -> Floats:
     return np.asarray(array[corner])
 
 
-def _counts(column: Column, batch: Batch) -> NDArray[np.intp]:
+def _as_deep(array: Floats, depth: int) -> Floats:
+    return array.reshape(*(1,) * (depth - array.ndim), *array.shape)
+
+
+def _counts(shape: tuple[int, ...], axes: tuple[str | None, ...], batch: Batch) -> NDArray[np.intp]:
     """How many points each packet has."""
     counts = np.ones(len(batch), np.intp)
-    for length, name in zip(column.shape[1:], column.axes, strict=True):
+    for length, name in zip(shape[1:], axes, strict=True):
         counts = counts * (length if name is None or name.startswith("<") else batch.table.counts(name))
     return counts
 
@@ -348,7 +481,7 @@ class Simulation:
         self._stuck = self._turning(sweep(1)) if blocked else {}
         swept = self._swept(range(PROBED))
         table = self._maker.table(swept)
-        self._measurement = Measurement(sensor, frame, table, {path for values in swept for path in values})
+        self._measurement = Measurement.of(sensor, frame, table, {path for values in swept for path in values})
         self._pace = Pace(sensor, frame, table, self._measurement.beams(table))
         self.interval = self._pace.interval
 
@@ -358,9 +491,10 @@ class Simulation:
         Args:
             since: seconds since the scene began at the first of them.
         """
-        table = self._maker.table(self._swept(range(start, start + count + AHEAD)))
+        numbers = range(start, start + count + AHEAD)
+        table = self._maker.table(self._swept(numbers))
         times = self._pace.times(table, functools.partial(self._measurement.beams, table))
-        self._measurement.fill(table, scene, since + times / 1e9)
+        self._measurement.fill(table, numbers, scene, since + times / 1e9)
         return Block(sealed(table)[:count], times[: count + 1])
 
     def _swept(self, numbers: range) -> list[Mapping[str, Any]]:

@@ -48,12 +48,15 @@ class Simulation:
         answers: command -> all that the sensor sends for it before any data, in order: frames by name, or (name, values) with physical
             values by path, bytes as they are, and seconds of a pause, in which it sends its fillers; or a function from the raw fields
             of the request to these. A command that is left out is answered by its reply. Of a sensor only.
+        directions: the azimuths and elevations, radians, of the points of frame number i where these are `Cartesian`: two arrays that
+            broadcast to the points of a frame.
     """
 
     sweep: Callable[[int], Mapping[str, Any]] | None = None
     encode: Callable[..., Mapping[str, Any]] | None = None
     rate: float = 0.0
     answers: Mapping[str, Answers] = field(default_factory=dict)
+    directions: Callable[[int], tuple[Any, Any]] | None = None
 
     def __post_init__(self) -> None:
         _freeze(self, "answers")
@@ -267,7 +270,8 @@ class Spec:
     def simulation_of(self, frame: str) -> Simulation:
         """What a simulation of one frame type needs: the frame's own, and for data the sensor's where the frame has none."""
         own, shared = self.frames[frame].simulation, self.simulation if self.frames[frame].data else Simulation()
-        return Simulation(own.sweep or shared.sweep, own.encode or shared.encode, own.rate or shared.rate)
+        fields = ("sweep", "encode", "rate", "directions")
+        return Simulation(**{name: getattr(own, name) or getattr(shared, name) for name in fields})
 
     @property
     def datagrams(self) -> bool:

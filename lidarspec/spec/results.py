@@ -48,7 +48,7 @@ class Cartesian:
     """Points given by coordinates.
 
     Args:
-        x, y, z: metres, x forward, y left, z up; all three 0 is no return.
+        x, y, z: metres, x forward, y left, z up; all three 0 is no return, one that is nan or infinite makes the point invalid.
         intensity: the wire's number; None where the sensor has none.
         time: seconds after the packet's clock.
         ring: number of the laser or channel, None where there is none.

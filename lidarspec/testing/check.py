@@ -291,8 +291,9 @@ def _function(frame: str, name: str, sensor: Sensor | None) -> Spot | None:
     """Where a function of a frame type is written."""
     if sensor is None or frame not in sensor.frames:
         return None
-    own, sweep = sensor.frames[frame], sensor.simulation_of(frame).sweep
-    function = {"points": own.points or sensor.points, "plausible": own.plausible, "sweep": sweep}.get(name)
+    own, simulated = sensor.frames[frame], sensor.simulation_of(frame)
+    functions = {"points": own.points or sensor.points, "plausible": own.plausible, "sweep": simulated.sweep}
+    function = {**functions, "directions": simulated.directions}.get(name)
     while isinstance(function, functools.partial):
         function = function.func
     return (function.__code__.co_filename, function.__code__.co_firstlineno) if inspect.isfunction(function) else None

@@ -13,7 +13,7 @@ from lidarspec.columns.graph import Traced, Untraceable
 from lidarspec.errors import LidarSpecError, SpecError, did_you_mean
 from lidarspec.framing.frame_engine import CompiledCodec, codec
 from lidarspec.points.conventions import TYPES
-from lidarspec.spec import Clock, Frame, OnWrap, Polar, Sensor
+from lidarspec.spec import Clock, Frame, OnWrap, Sensor
 from lidarspec.spec.construct_layer import is_expression
 from lidarspec.spec.fields import factor, is_unit
 from lidarspec.spec.tree import Sealed, Struct, infos, nodes
@@ -32,6 +32,8 @@ WEAK, WEAK_DATAGRAM = 24, 8
 FAR = 8
 #: seconds after which nobody cares any more that a clock starts again.
 LONG = 7 * 86_400
+#: what points are made of, and the units of the fields that go into it.
+UNITS = {"range": ("m",), "azimuth": ("deg", "rad"), **dict.fromkeys("xyz", ("m",))}
 PLACEHOLDER = re.compile(r"\s*(\?*|-*|todo.*|tbd.*|n/?a|none|unknown)\s*", re.IGNORECASE)
 
 Findings = Iterator[tuple[str, str, str]]
@@ -229,10 +231,9 @@ def _points(subject: Subject, name: str) -> Findings:
         return
     except Exception:  # a property of its own says what fails at work
         return
-    if not isinstance(result, Polar):
-        return
-    for column, units in (("range", ("m",)), ("azimuth", ("deg", "rad"))):
-        yield from _column(subject, name, getattr(result, column), column, units)
+    for column, units in UNITS.items():
+        if hasattr(result, column):
+            yield from _column(subject, name, getattr(result, column), column, units)
 
 
 def _reach(subject: Subject) -> Findings:

@@ -106,17 +106,29 @@ def field_of(subject: Subject, name: str, node: Node) -> FieldInfo | None:
 
 
 def directions(subject: Subject, name: str, packets: Packets) -> list[NDArray[np.float64]] | None:
-    """Azimuths and elevations of points as `points` gives them, before they are folded, padding left out; None where it is not polar."""
+    """Azimuths and elevations of points as `points` gives them, before they are folded, padding left out.
+
+    Those of points by coordinates are the ones that are declared for their simulation; None where there are none.
+    """
     batch = packets.batch()
     with np.errstate(all="ignore"):
         polar = subject.sensor.points_of(name)(Fields(batch))
         if not isinstance(polar, Polar):
-            return None
+            return _declared(subject, name)
         arrays, axes, _ = aligned((polar.azimuth, polar.elevation, polar.range), batch)
     shape = np.broadcast_shapes((len(packets), *(1,) * len(axes)), *(array.shape for array in arrays))
     mask = unpadded(axes, shape, batch)
     whole = [np.broadcast_to(np.asarray(array, np.float64), shape).reshape(shape[0], math.prod(shape[1:])) for array in arrays[:2]]
     return whole if mask is None else [angles[mask] for angles in whole]
+
+
+def _declared(subject: Subject, name: str) -> list[NDArray[np.float64]] | None:
+    """The directions of the first frames that are declared for a simulation; None where there are none."""
+    declared = subject.sensor.simulation_of(name).directions
+    if declared is None:
+        return None
+    pairs = [declared(number) for number in range(64)]
+    return [np.concatenate([np.ravel(pair[which]) for pair in pairs]).astype(np.float64) for which in (0, 1)]
 
 
 def clouds_keep_the_conventions(subject: Subject, name: str) -> None:
@@ -136,16 +148,17 @@ def clouds_keep_the_conventions(subject: Subject, name: str) -> None:
 
 def directions_are_radians(subject: Subject, name: str) -> None:
     """No direction is so large that it can only be degrees."""
-    if any(info.kind == "float" for info in subject.fields(name).values()):
-        return  # which may hold any number
     along = swept(subject, name, 64)
+    if not along and any(info.kind == "float" for info in subject.fields(name).values()):
+        return  # which may hold any number
     frames = along or [subject.example(name, seed=seed) for seed in range(16)]
     angles = directions(subject, name, read(subject, name, frames))
     if angles is None:
         return
     azimuth, elevation = (float(np.nanmax(np.abs(part), initial=0)) for part in angles)
-    require(azimuth <= (TURNS if along else DRAWN), "LS502", f"an azimuth of {azimuth:.4g} rad", f"{name}.points")
-    require(not along or elevation <= np.pi / 2 + 1e-6, "LS502", f"an elevation of {elevation:.4g} rad", f"{name}.points")
+    where = f"{name}.{'directions' if subject.sensor.simulation_of(name).directions else 'points'}"
+    require(azimuth <= (TURNS if along else DRAWN), "LS502", f"an azimuth of {azimuth:.4g} rad", where)
+    require(not along or elevation <= np.pi / 2 + 1e-6, "LS502", f"an elevation of {elevation:.4g} rad", where)
 
 
 def a_single_point_has_a_direction(subject: Subject, name: str) -> None:
@@ -353,7 +366,8 @@ def a_simulated_scene_comes_back(subject: Subject, name: str) -> None:
     require(share > 0.5, "LS507", f"{share:.0%} of the beams in a closed room return", f"{name}.points")
     apart = off(room, cloud.xyz[:known][valid].astype(np.float64))
     worst = float(apart.max(initial=0))
-    near_enough = worst < half_step(subject, name) + EXACT
+    each = np.sqrt(3) if subject.sensor.simulation_of(name).directions else 1  # coordinates are rounded one by one
+    near_enough = worst < half_step(subject, name) * each + EXACT
     require(near_enough, "LS507", f"a point lies {worst:.4f} m from every surface of the scene", f"{name}.points")
     near, far = subject.sensor.range_limits
     ranges = cloud.range[:known][valid]

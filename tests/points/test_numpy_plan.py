@@ -28,9 +28,6 @@ SENSORS = {**lidarspec.sensors(), **SHAPED}
 #: sensors that go through what is proved on the shapes: one of each kind of link.
 TRIED = ("ldrobot-stl27l", "velodyne-vlp16")
 
-#: what is evaluated plainly, and a word of the reason.
-PLAIN = {"shape-numbers": "floating-point", "shape-text": "compiled"}
-
 
 def plan(packets: Packets) -> Any:
     assert isinstance(packets.table, Rows)

@@ -9,6 +9,7 @@ from tests.shapes import (
     calibration,
     clock,
     commands,
+    coordinates,
     count,
     datagrams,
     echoes,
@@ -23,6 +24,7 @@ from tests.shapes import (
     options,
     outer,
     remarks,
+    scales,
     sized,
     state,
     text,
@@ -55,6 +57,7 @@ _MODULES = (
     remarks,
     sized,
     outer,
+    scales,
 )
 
-SHAPES: dict[str, Sensor] = {module.SENSOR.id: module.SENSOR for module in _MODULES}
+SHAPES: dict[str, Sensor] = {sensor.id: sensor for sensor in (*(module.SENSOR for module in _MODULES), *coordinates.SENSORS)}

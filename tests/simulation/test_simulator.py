@@ -8,18 +8,19 @@ from typing import Any
 
 import numpy as np
 import pytest
-from construct import Array, Int8ub, Struct
+from construct import Array, Int8ub, Int16sl, Struct, this
 from numpy.typing import NDArray
 
 import lidarspec as ls
 from lidarspec import Sensor, SourceError, SpecError, UsageError
+from lidarspec.errors import PluginError
 from lidarspec.simulation.device import SECOND, SimulatedDevice
 from lidarspec.simulation.scenes import Box, Mover, Room, furnished, read_scene, scene_of
 from lidarspec.simulation.simulator import simulate, simulation
-from lidarspec.spec import Cartesian, Frame, Polar, Scaled, Serial, Simulation, Udp
+from lidarspec.spec import Cartesian, Frame, Polar, Scaled, Serial, Simulation, Udp, stack
 from lidarspec.testing.geometry import off
 from tests.engine import against_construct
-from tests.shapes import count, sized
+from tests.shapes import coordinates, count, sized
 
 #: metres by which a point may be off its surface: half a step of the range, and float32.
 EXACT = 2e-6
@@ -168,7 +169,9 @@ def test_what_cannot_be_simulated_says_why() -> None:
         simulate(replace(sensor, simulation=Simulation(None)), 1)
     with pytest.raises(SpecError, match="has to give `encode`"):
         simulate(replace(sensor, points=lambda f: Polar(f.samples.distance * 0 + 1, 0)), 1)
-    with pytest.raises(SpecError, match="only polar points"):
+    with pytest.raises(SpecError, match="no field makes the range"):
+        simulate(replace(sensor, points=lambda f: Polar(1, np.deg2rad(f.first))), 1)
+    with pytest.raises(SpecError, match=r"along Simulation\(directions=\.\.\.\), and none are declared"):
         simulate(replace(sensor, points=lambda f: Cartesian(f.samples.distance, 0, 0)), 1)
     with pytest.raises(SpecError, match="sweep has to give 'size', which the length"):
         simulate(replace(sized.SENSOR, simulation=Simulation(lambda i: {"angle": 0})), 1)
@@ -191,6 +194,75 @@ def test_corrected_ranges_go_back_through_the_correction(stretch: float, shift: 
     assert off(room, cloud.xyz.astype(np.float64)).max() < 0.0005 * stretch + EXACT
     raw = SHAPE.decode(b"".join(frames)).points()
     np.testing.assert_allclose(cloud.range, raw.range * stretch + shift, atol=1e-5)
+
+
+@pytest.mark.parametrize("sensor", coordinates.SENSORS, ids=lambda sensor: sensor.id)
+def test_coordinates_give_the_scene_back_along_the_directions_that_are_declared(sensor: Sensor) -> None:
+    room = furnished(3)
+    room = Room(room.walls, room.boxes)
+    out, device = streamed(sensor, 1.3, room)
+    packets = sensor.decode(out)
+    cloud = packets.points()
+    assert (packets.stats.frames, packets.stats.lost) == (dict(device.sent), 0)
+    assert cloud.valid.all()
+    step = {"shape-millimetres": 0.001, "shape-centimetres": 0.01, "shape-floats": 0}[sensor.id]
+    assert off(room, cloud.xyz.astype(np.float64)).max() < step / 2 * np.sqrt(3) + EXACT
+    declared = np.concatenate([np.ravel(coordinates.directions(i)[0]) for i in range(len(packets))])
+    np.testing.assert_allclose(cloud.azimuth, declared, atol=step + 1e-6)
+
+
+def turned(f: Any) -> Cartesian:
+    """Two returns of each beam, in steps of the header, turned and shifted."""
+    first, second = f.beams.first, f.beams.second
+    x, y, z = (stack(getattr(first, axis), getattr(second, axis)) * f.step for axis in "xyz")
+    return Cartesian(0.8 * x - 0.6 * y + 0.1, 0.6 * x + 0.8 * y, 0.05 - z, intensity=f.beams.light)
+
+
+def turned_sensor(directions: Any) -> Sensor:
+    """As many beams as the header says."""
+    point = Struct(*(axis / Int16sl for axis in "xyz"))
+    beam = Struct("first" / point, "second" / point, "light" / Int8ub)
+    sensor = against_construct.sensor(Struct("n" / Int8ub, "step" / Scaled(Int8ub, 0.001, "m"), "beams" / Array(this.n, beam)))
+    simulated = Simulation(lambda i: dict(n=2 + i % 5, step=0.001 * (1 + i % 3)), directions=directions, rate=100)
+    return replace(sensor, points=turned, simulation=simulated)
+
+
+def test_coordinates_are_solved_for_whatever_points_makes_of_the_fields() -> None:
+    def directions(i: int) -> tuple[Any, Any]:
+        return np.linspace(-1, 1, 2 + i % 5)[:, None] + i * 0.1, np.array([0.0, 0.3])
+
+    sensor, room = turned_sensor(directions), Room()
+    frames = simulate(sensor, 50, scene=room)
+    cloud = sensor.decode(frames).points()
+    assert len(cloud) == sum(2 * (2 + i % 5) for i in range(50))
+    assert cloud.valid.all()
+    assert off(room, cloud.xyz.astype(np.float64)).max() < 0.003 / 2 * np.sqrt(3) + EXACT
+    assert np.unique(np.round(cloud.elevation, 1)).tolist() == pytest.approx([0, 0.3])
+
+
+def test_directions_that_do_not_fit_and_fields_that_are_not_there_are_named() -> None:
+    with pytest.raises(PluginError, match=r"azimuth and elevation \(9,\) do not broadcast to the points of frame 0, "):
+        simulate(turned_sensor(lambda i: (np.zeros(9), 0)), 1)
+    with pytest.raises(SpecError, match="no field of a point makes its coordinates: the sensor has to give `encode`"):
+        simulate(replace(turned_sensor(None), points=lambda f: Cartesian(f.beams.light * 0 + 1, 2, 3)), 1)
+
+
+def test_a_beam_that_meets_nothing_in_reach_has_no_coordinates() -> None:
+    sensor = replace(coordinates.SENSORS[0], range_limits=(0.1, 3.0))
+    cloud = sensor.decode(simulate(sensor, 40)).points()
+    assert 0 < cloud.valid.sum() < len(cloud)
+    assert np.isinf(cloud.range[~cloud.valid]).all()
+
+
+def test_coordinates_may_be_encoded_too() -> None:
+    def encode(polar: Polar) -> dict[str, NDArray[np.float64]]:
+        return {"points.x": np.rint(np.asarray(polar.range) * 1000 * np.cos(polar.azimuth))}
+
+    shape = coordinates.SENSORS[0]
+    sensor = replace(shape, simulation=replace(shape.simulation, encode=encode))
+    plain, encoded = (each.decode(simulate(each, 9)) for each in (shape, sensor))
+    assert encoded["points.x"].min() >= plain["points.x"].min() - 0.001
+    assert not encoded["points.y"].any()
 
 
 def test_a_frame_may_encode_its_ranges_itself() -> None:

@@ -95,6 +95,7 @@ DECLARED = {
     "dear_headers": {"LS416"},
     "with_memory": {"LS415"},
     "degrees": {"LS502"},
+    "bare_coordinates": {"LS201", "LS502"},
     "against_its_axes": {"LS511"},
     "sweep_of_nothing": {"LS508"},
     "unknown_field": {"LS601"},

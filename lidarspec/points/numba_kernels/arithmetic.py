@@ -72,6 +72,32 @@ def word_at(context, array, index):
     return types.int64(array, types.int64), make
 
 
+def _float_at(bits, kind):
+    """What loads a float of so many bits from an index of bytes on, as a float64; one is kept for each order of the bytes."""
+
+    def maker(is_swapped):
+        @intrinsic
+        def loaded(context, array, index):
+            def make(target, builder, signature, args):
+                held = target.make_array(signature.args[0])(target, builder, args[0])
+                place = cgutils.gep_inbounds(builder, held.data, args[1])
+                word = builder.load(builder.bitcast(place, ir.IntType(bits).as_pointer()), align=1)
+                if is_swapped:
+                    word = builder.call(builder.module.declare_intrinsic("llvm.bswap", [ir.IntType(bits)]), [word])
+                number = builder.bitcast(word, kind)
+                return number if bits == 64 else builder.fpext(number, ir.DoubleType())
+
+            return types.float64(array, types.int64), make
+
+        return loaded
+
+    return maker(_IS_BIG), maker(not _IS_BIG)
+
+
+float4_little, float4_big = _float_at(32, ir.FloatType())
+float8_little, float8_big = _float_at(64, ir.DoubleType())
+
+
 @intrinsic
 def at(context, array, index):
     """An element of an array; whether there is one is not checked."""

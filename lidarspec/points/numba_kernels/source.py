@@ -16,9 +16,9 @@ from typing import Any
 import numpy as np
 
 from lidarspec.columns.graph import FACTORS, Node, is_full, only_field, traverse
-from lidarspec.points.numba_kernels.writer import TEMPLATES, Value, Wanted, Writer, is_cheap, is_number, line
+from lidarspec.points.numba_kernels.writer import TEMPLATES, Value, Wanted, Writer, is_cheap, line
 from lidarspec.points.plan import Plan
-from lidarspec.points.windows import every_value, possible, window
+from lidarspec.points.windows import every_value, is_number, possible, window
 from lidarspec.spec.vocabulary import LookUp, side_by_side
 
 #: points of which the scratch arrays stay in the fastest cache.
@@ -223,7 +223,8 @@ import numpy as np
 
 from lidarspec.points.numba_kernels.arithmetic import (
     BYTES, DOUBLES, INTEGER, MADE_PLACES, MADE_SINGLES, PLACES, SINGLES, WORDS,
-    at, byte_at, compiled, cos_sin, larger, looked_up, modulo, narrowed, number, put, smaller, word_at,
+    at, byte_at, compiled, cos_sin, float4_big, float4_little, float8_big, float8_little, larger, looked_up, modulo, narrowed, number, put,
+    smaller, word_at,
 )
 
 nan, inf = np.nan, np.inf
@@ -308,8 +309,8 @@ def written(plan: Plan, names: tuple[str, ...], varying: Set[str]) -> Text:
     writer = Expressions(plan.layout, plan.shape, plan.tables, varying)
     assembly = Assembly(writer)
     writer.both = _both(expressions.values())
-    made = {name: _made(writer, name, value) for name, value in expressions.items()}
-    directed = [*plan.directed, *(plan.parts[name] for name in ("ox", "oy", "oz"))]
+    made = {name: _made(writer, name, value, exact=plan.exact) for name, value in expressions.items()}
+    directed = [] if plan.exact else [*plan.directed, *(plan.parts[name] for name in ("ox", "oy", "oz"))]
     places = {}
     if not all(is_number(value, plan.layout.leaves) for value in directed):  # where one coordinate is nan, all are
         places = {name: value for name, value in made.items() if name in "xyz"}
@@ -329,10 +330,10 @@ def _both(expressions: Iterable[Any]) -> set[Node]:
     return {node for node in cosines & sines if isinstance(node, Node)}
 
 
-def _made(writer: Expressions, name: str, value: Any) -> Any:
-    if name == "azimuth":
-        angle = writer.double(value, len(writer.shape))
-        return writer.let(angle.level, f"narrowed({angle.text})")
+def _made(writer: Expressions, name: str, value: Any, *, exact: bool) -> Any:
+    if name == "azimuth" or (exact and name != "intensity"):
+        made = writer.double(value, len(writer.shape))
+        return writer.let(made.level, f"{'narrowed' if name == 'azimuth' else 'np.float32'}({made.text})")
     return writer.single(value, exact=name == "intensity", root=True)
 
 

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.columns.graph import FACTORS, Node, key, last_axis, traverse
-from lidarspec.points.windows import every_value, possible, raw_values, window
+from lidarspec.points.windows import CHEAP, every_value, raw_values, window
 from lidarspec.spec.bits import whole_bytes
 from lidarspec.wire.layout import Layout, Leaf
 
@@ -31,40 +31,19 @@ TEMPLATES: dict[Any, str] = {
     **{function: f"({{}} * {FACTORS[function]!r})" for function in (np.deg2rad, np.radians, np.rad2deg, np.degrees)},
     **{function: f"np.{function.__name__}({{}})" for function in (np.floor, np.ceil, np.trunc, np.rint, np.sqrt, np.exp2)},
     **{function: f"math.{function.__name__}({{}})" for function in (np.sin, np.cos, np.tan, np.exp, np.isfinite, np.isnan)},
-    **{np.arctan: "math.atan({})", np.arctan2: "math.atan2({}, {})", np.mod: "modulo({}, {})", np.nan_to_num: "number({})"},
-    **{np.minimum: "smaller({}, {})", np.maximum: "larger({}, {})"},
+    **{np.arctan: "math.atan({})", np.arctan2: "math.atan2({}, {})", np.hypot: "math.hypot({}, {})"},
+    **{np.mod: "modulo({}, {})", np.nan_to_num: "number({})", np.minimum: "smaller({}, {})", np.maximum: "larger({}, {})"},
     **{np.negative: "(-{})", np.positive: "{}", np.absolute: "abs({})"},
 }
 
-#: what costs hardly more than looking its result up; with these, whatever is made of numbers stays a number.
-CHEAP: set[Any] = {np.add, np.subtract, np.multiply, np.negative, np.positive, np.absolute, np.deg2rad, np.radians, np.minimum, np.maximum}
-CHEAP |= {np.less, np.less_equal, np.greater, np.greater_equal, np.equal, np.not_equal, np.where}
+#: operations of an expression that is computed rather than looked up, at most.
 FEW = 8
-#: dividing by one of these numbers, or the rest of it, is a number too.
-_DIVISIONS = {np.true_divide, np.mod}
 
 
 def is_cheap(node: Node) -> bool:
     """Whether an expression of one field is a few simple operations."""
     nodes = list(islice(traverse(node), FEW + 1))
     return len(nodes) <= FEW and all(this.kind != "call" or this.function in CHEAP for this in nodes)
-
-
-def is_number(value: Any, leaves: Any) -> bool:
-    """Whether an expression is finite whatever the bytes are: made of integer fields that the layout has, by safe operations."""
-    if not isinstance(value, Node):
-        return bool(np.isfinite(value).all())
-    if value.kind == "field":
-        return value.path in leaves and leaves[value.path].info.kind != "float"
-    if value.kind != "call":
-        return False
-    found = possible(value, leaves)
-    if found is not None:
-        return bool(np.isfinite(found).all())
-    if value.function in _DIVISIONS:
-        divisor = value.args[1]
-        return not isinstance(divisor, Node) and bool(np.all(divisor)) and is_number(value.args[0], leaves)
-    return (value.function in CHEAP or value.function in (np.sin, np.cos)) and all(is_number(arg, leaves) for arg in value.args)
 
 
 def integer(leaf: Leaf, byte: Any) -> str | None:
@@ -247,19 +226,32 @@ class Writer:
         return self.once(("given flag", node), lambda: self.let(found.level, f"{found.text} != 0"))  # type: ignore[no-any-return]
 
     def raw(self, leaf: Leaf) -> Value | None:
-        """The integer of a field."""
+        """The raw number of a field; None where only NumPy reads it."""
         if leaf.info.path not in self._known:
-            text = integer(leaf, lambda offset: self.byte(leaf, offset).text)
-            self._known[leaf.info.path] = None if text is None else self.let(1 + last_axis(leaf.shape), text)
+            self._known[leaf.info.path] = self._float(leaf) or self._integer(leaf)
         return self._known[leaf.info.path]  # type: ignore[no-any-return]
+
+    def _integer(self, leaf: Leaf) -> Value | None:
+        text = integer(leaf, lambda offset: self.byte(leaf, offset).text)
+        return None if text is None else self.let(1 + last_axis(leaf.shape), text)
+
+    def _float(self, leaf: Leaf) -> Value | None:
+        if leaf.wire is None or leaf.wire.kind != "f" or leaf.wire.itemsize < 4:
+            return None
+        order = "big" if leaf.wire.byteorder == ">" else "little"
+        return self._read(leaf, leaf.offset, f"float{leaf.wire.itemsize}_{order}")
 
     def byte(self, leaf: Leaf, offset: int) -> Value:
         """A byte of the element of an array, or of the frame."""
+        return self._read(leaf, offset, "byte_at")
+
+    def _read(self, leaf: Leaf, offset: int, reader: str) -> Value:
+        """What a function of `arithmetic` reads of the element of an array, or of the frame, from an offset on."""
         shape, level = leaf.shape[: len(leaf.strides)], 1 + last_axis(leaf.shape[: len(leaf.strides)])
         steps = self.once(("element", shape, leaf.strides), lambda: self.let(level, f"base + {self.strided(shape, self._strides(leaf))}"))
         place = str(offset) if self._stays(leaf) else self.number(offset)
         return self.once(  # type: ignore[no-any-return]
-            ("byte", shape, leaf.strides, offset), lambda: self.let(level, f"byte_at(rows, {steps.text} + {place})")
+            (reader, shape, leaf.strides, offset), lambda: self.let(level, f"{reader}(rows, {steps.text} + {place})")
         )
 
     def _strides(self, leaf: Leaf) -> tuple[str, ...]:

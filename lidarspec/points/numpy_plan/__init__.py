@@ -22,20 +22,23 @@ from lidarspec.points.plan import Maker, Plan
 def compile(plan: Plan, names: tuple[str, ...]) -> Maker:
     """What makes these columns of the plan's points; kept with the plan."""
     if names not in plan.programs:
-        compiler = Compiler(plan, plan.tables)
-        for name in names:
-            compiler.want(name, plan.expressions[name], "double" if name == "azimuth" else "single")
-        plan.programs[names] = compiler.program
+        plan.programs[names] = _compiled(plan, names, plan.tables).program
     return plan.programs[names]
+
+
+def _compiled(plan: Plan, names: tuple[str, ...], tables: dict[Any, NDArray[Any]]) -> Compiler:
+    compiler = Compiler(plan, tables)
+    for name in names:
+        kind = "double" if name == "azimuth" else "single"
+        compiler.want(name, plan.expressions[name], kind, exact=plan.exact or name == "intensity")
+    return compiler
 
 
 def describe(plan: Plan) -> list[str]:
     """A plan in lines: the shape, what is computed for each packet, and the calls for each chunk."""
     names = tuple(name for name in ("x", "y", "z", "intensity") if name in plan.expressions and not (name == "z" and plan.level))
     tables: dict[Any, NDArray[Any]] = {}
-    compiler = Compiler(plan, tables)
-    for name in names:
-        compiler.want(name, plan.expressions[name], "single")
+    compiler = _compiled(plan, names, tables)
     program = compiler.program
     axes = " x ".join(f"{axis} {length}" for axis, length in zip(plan.axes, plan.shape, strict=True))
     lines = [f"{plan.width} points a packet{': ' if axes else ''}{axes}"]

@@ -21,10 +21,13 @@ from lidarspec.points.numpy_plan.blocks import Blocks
 from lidarspec.points.numpy_plan.program import Program, Read, Run
 from lidarspec.points.numpy_plan.registers import TYPES
 from lidarspec.points.plan import Plan
-from lidarspec.points.windows import Window, every_value, shift_of, window
+from lidarspec.points.windows import CHEAP, Window, every_value, shift_of, window
 from lidarspec.wire.layout import Leaf
 
 _Made = TypeVar("_Made")
+
+#: what is computed faster than looked up in a table of 65,536 float64 numbers.
+_QUICK = {function for function in CHEAP if isinstance(function, np.ufunc)}
 
 
 class Compiler:
@@ -39,9 +42,16 @@ class Compiler:
         self.program, self.low = Program(plan.width, plan.safe), list[Node]()
         self._layout, self._shape, self._width, self._tables = plan.layout, plan.shape, plan.width, tables
         self._known: dict[Any, Any] = {}
+        self._exact = False
 
-    def want(self, name: str, value: Any, kind: str) -> None:
-        """Make a column of this name; `kind` is "single" or "double"."""
+    def want(self, name: str, value: Any, kind: str, *, exact: bool = False) -> None:
+        """Make a column of this name.
+
+        Args:
+            kind: "single" or "double".
+            exact: computed in float64, each operation as it is written; else products may be float32, and sums in another order.
+        """
+        self._exact = exact
         self.program.outputs[name] = self._single(value) if kind == "single" else self._double(value)
 
     def _once(self, name: Any, make: Callable[[], _Made]) -> _Made:
@@ -54,41 +64,73 @@ class Compiler:
         """An expression in float32; only products and tables are computed in that precision."""
         if not is_full(value, self._width):
             return self._spread(value, "single")
-        return self._once(("single", value), lambda: self._full_single(value))
+        return self._once(("single", self._exact, value), lambda: self._full_single(value))
 
     def _full_single(self, node: Node) -> int:
         register = self._of_field(node, "single")
+        if register is None:
+            register = self._marked(node, "single") if self._exact else self._product(node)
         if register is not None:
             return register
+        read = Read(self._double(node))
+        return self.program.step("as float32", "single", lambda run, out: np.copyto(out, read(run), casting="same_kind"), read)
+
+    def _product(self, node: Node) -> int | None:
+        """A product or a direction in float32; None where it is none."""
         if node.kind == "call" and node.function in (np.cos, np.sin):
             return self._direction(node)
         is_offset = node.function is np.add and any(not isinstance(arg, Node) for arg in node.args)
         if node.kind == "call" and (node.function is np.multiply or is_offset):
             first, second = (self._factor(arg) for arg in node.args)
             return self.program.call(node.function.__name__, "single", node.function, first, second)
-        read = Read(self._double(node))
-        return self.program.step("as float32", "single", lambda run, out: np.copyto(out, read(run), casting="same_kind"), read)
+        return None
 
     def _double(self, value: Any) -> int:
         """An expression in float64, or a condition."""
         if not is_full(value, self._width):
             return self._spread(value, "double")
-        return self._once(("double", value), lambda: self._full_double(value))
+        return self._once(("double", self._exact, value), lambda: self._full_double(value))
 
     def _full_double(self, node: Node) -> int:
         kind = "flag" if node.sample.array.dtype.kind == "b" else "double"
         register = self._of_field(node, kind)
         if register is None and node.kind == "call":
-            product = self._sum(node)
-            register = self._plain(node, kind) if product is None else product
+            register = self._marked(node, kind) if self._exact else self._sum(node)
+            register = self._plain(node, kind) if register is None else register
         return register if register is not None else self._spread(node, kind)
+
+    def _marked(self, node: Node, kind: str) -> int | None:
+        """A value, or nan where each point's own condition says so, without a branch; None where it is none."""
+        if node.kind != "call" or node.function is not np.where or len(node.args) != 3 or not is_full(node.args[0], self._width):
+            return None
+        first = node.args[1]
+        if node.args[0].sample.array.dtype.kind != "b" or isinstance(first, Node) or np.size(first) > 1 or not np.isnan(first).all():
+            return None
+
+        def marked(execution: Run, out: NDArray[Any]) -> None:
+            np.logical_not(condition(execution), out=out)
+            np.divide(out, out, out=out)
+            np.absolute(out, out=out)  # a nan without a sign, as np.nan is
+
+        condition = Read(self._double(node.args[0]))
+        mark = Read(self._once(("mark", kind, condition), lambda: self.program.step("1, or nan", kind, marked, condition)))
+        read = Read(self._single(node.args[2]) if kind == "single" else self._double(node.args[2]))
+        return self.program.call("marked", kind, np.multiply, mark, read)
 
     def _of_field(self, node: Node, kind: str, factor: float = 1.0) -> int | None:
         """An expression of one field, times a number: loaded as it is, or looked up by its window; None where it is neither."""
         source = only_field(node)
         leaf = self._layout.leaves.get(source.path) if source is not None and is_full(source, self._width) else None
         seen = window(leaf) if leaf is not None else None
-        if leaf is None or source is None or seen is None:
+        if (
+            leaf is not None
+            and node is source
+            and factor == 1
+            and leaf.wire is not None
+            and (seen is None or (self._exact and seen.size > 1))
+        ):
+            return self._whole(leaf, leaf.wire, kind)
+        if leaf is None or source is None or seen is None or (self._exact and seen.size > 1 and node.function in _QUICK):
             return None
         shift = self._shift(leaf, seen)
         if node is source and factor == 1 and not leaf.info.scaled:
@@ -104,6 +146,12 @@ class Compiler:
         text = f"{node.path or source.path}: table of {len(table)} by {(len(table) - 1).bit_length()} bits"
         read = Read(index)
         return self.program.step(text, kind, lambda run, out: table.take(read(run), out=out, mode="wrap"), read)
+
+    def _whole(self, leaf: Leaf, wire: np.dtype[Any], kind: str) -> int | None:
+        """A field of whole bytes, loaded; None where it has to be float64 first."""
+        if kind == "single" and (leaf.info.scaled or wire.itemsize > 4):
+            return None
+        return self._load(leaf, Window(leaf.offset, wire.itemsize), wire, kind)
 
     def _shift(self, leaf: Leaf, seen: Window) -> tuple[int, int] | None:
         """How a field that shares its window with others is cut out of it: shift and mask, or None where that takes a table."""
@@ -122,12 +170,16 @@ class Compiler:
         return self._tables[name]
 
     def _load(self, leaf: Leaf, seen: Window, dtype: np.dtype[Any], kind: str) -> int:
-        """A window of every element as it stands."""
-        blocks, width = self._blocks(leaf, seen), self._width
+        """A window of every element as it stands, in its unit where that is float64."""
+        blocks, width, info = self._blocks(leaf, seen), self._width, leaf.info
+        is_scaled = kind == "double" and info.scaled
 
         def run(execution: Run, out: NDArray[Any]) -> None:
             column = execution.prepared[blocks].column(seen, execution.start, execution.stop, width)
             np.copyto(out, column if column.dtype == dtype else column.view(dtype), casting="unsafe")
+            if is_scaled:
+                np.multiply(out, info.scale, out=out)
+                np.add(out, info.offset, out=out)
 
         return self.program.step(f"{leaf.info.path}: {dtype} at byte {seen.offset}", kind, run)
 
@@ -167,8 +219,13 @@ class Compiler:
         function, shape = node.function, node.shape
 
         def run(execution: Run, out: NDArray[Any]) -> None:
-            out.reshape(-1, *shape)[...] = function(*(read(execution) for read in reads))
+            target = out.reshape(-1, *shape)
+            if is_direct:
+                function(*(read(execution) for read in reads), out=target)
+            else:
+                target[...] = function(*(read(execution) for read in reads))
 
+        is_direct = isinstance(function, np.ufunc)
         return self.program.step(f"{getattr(function, '__name__', 'function')} as it stands", kind, run, *used)
 
     def _argument(self, value: Any, depth: int) -> Callable[[Run], Any]:
