@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.columns.columns import Column
+from lidarspec.columns.columns import AROUND, Column
 from lidarspec.errors import SpecError, UnknownField
 from lidarspec.packets.packets import Packets
 from lidarspec.points.cloud import COLUMNS
@@ -91,10 +91,13 @@ class Cutter:
         if isinstance(rule, OnWrap) and rule.name in COLUMNS:
             angles = np.asarray(getattr(found.cloud, rule.name), np.float64)
             return self._wraps(angles, 2 * np.pi, rule.at).tolist()  # type: ignore[no-any-return]
-        column = _field(found, rule.name)
+        path = _own_path(packets, rule.name)
+        column = _field(found, path)
         values, starts = _rows(column, found)
         if isinstance(rule, OnWrap):
-            unit = packets.table.schema.fields[column.source].unit
+            table = packets.state[AROUND][0] if path.startswith("frame.") and AROUND in packets.state else packets.table
+            assert table is not None
+            unit = table.schema.fields[column.source].unit
             rows = self._wraps(values, 360.0 if unit == "deg" else 2 * np.pi, rule.at)
         else:
             rows = self._changes(rule, values)
@@ -149,6 +152,12 @@ class Cutter:
         self._before = float(period[-1])
         starts = first_points(found)
         return starts[np.flatnonzero(period > before)].tolist()  # type: ignore[no-any-return]
+
+
+def _own_path(packets: Packets, path: str) -> str:
+    """The path of a field of the frame as packets that are parts of it have it."""
+    _, _, parts = packets.frame.partition(".")
+    return path if not parts else path.removeprefix(f"{parts}.") if path.startswith(f"{parts}.") else f"frame.{path}"
 
 
 def _field(found: Evaluated, path: str) -> Column:

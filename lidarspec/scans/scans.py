@@ -132,8 +132,9 @@ class Losses:
 
     def judged(self, packets: Packets, points: Evaluated, cuts: Sequence[int]) -> list[bool]:
         """Whether at least half of each scan is there that ends in these packets: one for each of the `cuts`, which are between points."""
-        sizes = packets.table.sizes[: points.ready]
+        sizes, firsts = packets.whole_sizes[: points.ready], packets.first_parts
         missing = self._missing_before(packets, sizes)
+        sizes = sizes if firsts is None else sizes * firsts[: points.ready]  # the bytes of a frame count once
         first = first_points(points) if len(cuts) else sizes
         judged, start = list[bool](), 0
         for cut in cuts:
@@ -201,9 +202,12 @@ class ScanStream:
         return scans + ([left] if left else [])
 
     def _push(self, packets: Packets, *, final: bool) -> list[Scan]:
+        packets = packets.with_points
         if self._waiting is not None and len(self._waiting):
             packets = joined_packets([self._waiting, packets])
         self._waiting = None
+        if not len(packets):
+            return []
         if self._epoch is None:
             self._epoch = int(packets.time_ns[0])  # one for the whole stream, so that batches do not change a bit of any time
         points = guarded(packets, self._carry, final=final, epoch=self._epoch)

@@ -16,13 +16,13 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Container, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.columns.columns import Batch, Column, Fields, of_points
+from lidarspec.columns.columns import AROUND, Batch, Column, Fields, of_points
 from lidarspec.errors import SpecError, UsageError, plugin_errors
 from lidarspec.framing.examples import example
 from lidarspec.packets.clocks import clock_ns
@@ -33,7 +33,7 @@ from lidarspec.spec.fields import factor
 from lidarspec.spec.links import Serial
 from lidarspec.spec.results import Polar
 from lidarspec.spec.tree import exact
-from lidarspec.wire.frame_table import Rows
+from lidarspec.wire.frame_table import Group, Rows, Table
 
 Times = NDArray[np.int64]
 #: bits on a serial line for each byte: start, eight, stop.
@@ -98,7 +98,8 @@ class Measurement:
 
     def __init__(self, sensor: Spec, frame: str, table: Rows, given: Container[str] = ()) -> None:
         self._sensor, self._frame = sensor, frame
-        self._points = sensor.points_of(frame)
+        parts = sensor.parts_with_points(frame)
+        self._points = sensor.points_of(f"{frame}.{parts}" if parts else frame)
         self._encode: Callable[[Polar], Mapping[str, Any]] | None = sensor.simulation_of(frame).encode
         self._targets = () if self._encode else self._traced(table)
         intensity = self.beams(table).intensity
@@ -135,7 +136,10 @@ class Measurement:
     def beams(self, table: Rows) -> Beams:
         """Where the beams of a table go as it stands."""
         number = len(table)
+        state: dict[str, tuple[Table | None, NDArray[np.intp]]]
         state = {name: (None, np.full(number, -1, np.intp)) for name in self._sensor.state}
+        if isinstance(table, PartRows):
+            state[AROUND] = (table.frames, table.which)
         batch = Batch(table, np.zeros(number, np.bool_), state, self._sensor.state)
         with np.errstate(all="ignore"), plugin_errors(f"points of {self._frame}", self._sensor.id, self._points):
             polar = self._points(Fields(batch))
@@ -234,6 +238,41 @@ class Measurement:
         first, second = self._probed(table, [target.path for target in self._targets], PROBE, 2 * PROBE)
         same = (np.array_equal(getattr(first, name), getattr(second, name), equal_nan=True) for name in ("azimuth", "elevation"))
         return not all(same)
+
+
+class PartRows(Rows):
+    """The parts that have the points of frames, with these frames, and the one that each is in.
+
+    Args:
+        frames: which are written to by `put_back`.
+        path: of the parts.
+    """
+
+    def __init__(self, frames: Rows, path: str) -> None:
+        place = frames.schema.within(path)
+        if place is None or place[2]:
+            raise SpecError("the frame has no such parts", path=path)
+        self.place, self.frames = place[:2], frames
+        own, self.which = frames.parts(*self.place)
+        super().__init__(own.schema, [Group(group.layout, group.where, group.rows.copy()) for group in own.groups])
+
+    def put_back(self) -> None:
+        """Write the parts into their frames, sealed."""
+        left = iter(sealed(self))
+        axis, kind = self.place
+        spots = list[tuple[int, int, NDArray[np.uint8]]]()
+        for group in self.frames.groups:
+            if (region := group.layout.regions.get(axis)) is not None:
+                buffer, walked = region.in_rows(group.rows)
+                pieces = [piece for pieces in walked.rounds for piece in pieces if region.kinds[piece.kind].node.name == kind]
+                spots += [
+                    (int(group.where[owner]), int(spot), buffer)
+                    for piece in pieces
+                    for owner, spot in zip(piece.owners, piece.spots, strict=True)
+                ]
+        for _, spot, buffer in sorted(spots, key=lambda found: found[:2]):
+            part = next(left)
+            buffer[spot : spot + len(part)] = np.frombuffer(part, np.uint8)
 
 
 def store(table: Rows, path: str, values: NDArray[Any]) -> None:
@@ -342,8 +381,10 @@ class Simulation:
         self._maker = FrameMaker(sensor, frame)
         swept = self._swept(range(PROBED))
         table = self._maker.table(swept)
-        self._measurement = Measurement(sensor, frame, table, {path for values in swept for path in values})
-        self._pace = Pace(sensor, frame, table, self._measurement.beams(table))
+        self._parts = sensor.parts_with_points(frame)
+        given = [part for values in swept for part in values[self._parts.partition(".")[0]]] if self._parts else swept
+        self._measurement = Measurement(sensor, frame, self._with_points(table), {path for values in given for path in values})
+        self._pace = Pace(sensor, frame, table, self._beams(table))
         self.interval = self._pace.interval
 
     def block(self, start: int, count: int, scene: Scene, since: float = 0.0) -> Block:
@@ -353,9 +394,27 @@ class Simulation:
             since: seconds since the scene began at the first of them.
         """
         table = self._maker.table(self._swept(range(start, start + count + AHEAD)))
-        times = self._pace.times(table, functools.partial(self._measurement.beams, table))
-        self._measurement.fill(table, scene, since + times / 1e9)
+        times = self._pace.times(table, functools.partial(self._beams, table))
+        measured = self._with_points(table)
+        if isinstance(measured, PartRows):
+            self._measurement.fill(measured, scene, since + times[measured.which] / 1e9)
+            measured.put_back()
+        else:
+            self._measurement.fill(table, scene, since + times / 1e9)
         return Block(sealed(table)[:count], times[: count + 1])
+
+    def _with_points(self, table: Rows) -> Rows:
+        """What points are made of: frames, or the parts in them."""
+        return PartRows(table, self._parts) if self._parts else table
+
+    def _beams(self, table: Rows) -> Beams:
+        """The beams of frames, those of their parts together."""
+        measured = self._with_points(table)
+        beams = self._measurement.beams(measured)
+        if not isinstance(measured, PartRows):
+            return beams
+        counts = np.bincount(measured.which, beams.counts, len(table))
+        return replace(beams, counts=counts.astype(np.intp))
 
     def _swept(self, numbers: range) -> list[Mapping[str, Any]]:
         """The values of the packets of these numbers, before anything is measured."""

@@ -7,6 +7,7 @@ from tests.shapes import (
     ahead,
     bits,
     calibration,
+    channels,
     clock,
     commands,
     count,
@@ -23,8 +24,10 @@ from tests.shapes import (
     options,
     outer,
     remarks,
+    segments,
     sized,
     state,
+    tags,
     text,
     twins,
     weak,
@@ -55,6 +58,9 @@ _MODULES = (
     remarks,
     sized,
     outer,
+    segments,
+    tags,
+    channels,
 )
 
 SHAPES: dict[str, Sensor] = {module.SENSOR.id: module.SENSOR for module in _MODULES}
