@@ -311,7 +311,7 @@ class _Types:
             raise Refused(f"{node.axis}: parts that are told apart by their constants, which Kaitai cannot do")
         (kind,), name = node.kinds, identifier(node.name)
         if node.within is not None:
-            inner = _Type([{"id": "parts", "type": "part", "repeat": "eos"}], types={"part": self._type(kind.element, (*scope, None))})
+            inner = _Type([{"id": "value", "type": "part", "repeat": "eos"}], types={"part": self._type(kind.element, (*scope, None))})
             kaitai.types[name] = inner.done(node.axis)
             kaitai.seq.append({"id": name, "type": name, "size": _size(node.within, scope), **more})
             return
