@@ -433,7 +433,7 @@ class HeaderTree:
         layout = self.layout(first)
         if not isinstance(layout, Layout):
             return None
-        same = (np.count_nonzero(leaf.load(rows) == leaf.scalar(first)) == len(rows) for leaf in self.asked(first))
+        same = (np.count_nonzero(leaf.load(rows) == value) == len(rows) for leaf, value in self._asked(first))
         return layout if all(same) else None
 
     def layout(self, frame: bytes) -> Layout | Refused | None:
@@ -446,13 +446,12 @@ class HeaderTree:
         groups = self.classify(np.frombuffer(frame, np.uint8), np.zeros(1, np.intp))
         return groups[0][0] if groups else None
 
-    def asked(self, frame: bytes) -> list[Leaf | Measure]:
-        """The fields that decided the layout of this frame, in the order in which they were asked for."""
-        found, node = list[Leaf | Measure](), self._root
-        while node.leaf is not None:
-            found.append(node.leaf)
-            node = node.children[node.leaf.scalar(frame)]
-        return found
+    def _asked(self, frame: bytes) -> Iterator[tuple[Leaf | Measure, int]]:
+        """The fields that decided the layout of this frame, and their values, in the order in which they were asked for."""
+        node = self._root
+        while node.leaf is not None and (value := node.leaf.of(frame)) is not None:
+            yield node.leaf, value
+            node = node.children[value]
 
     def choose(self, source: random.Random, drawn: Mapping[str, Draw] | None = None) -> tuple[Layout, dict[str, int]]:
         """A layout of a header chosen at random, with the values of the fields it depends on, by path.
@@ -523,7 +522,7 @@ class HeaderTree:
             return None, Refused(PluginError.of(error, "struct"))
 
 
-@functools.lru_cache(maxsize=2048)
+@functools.lru_cache(maxsize=256)
 def kinds_of(node: tree.Parts, given: tuple[tuple[str, int], ...], limit: int) -> tuple[Kind, ...]:
     """What the parts of frames can be in which fields around them have these values."""
     values = dict(given)

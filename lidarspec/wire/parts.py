@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Protocol
 
 import numpy as np
@@ -32,9 +33,6 @@ class Layouts(Protocol):
     def classify(self, buffer: NDArray[np.uint8], offsets: Offsets) -> list[tuple[Layout | Refused, Offsets]]:
         """The candidates at these offsets by layout, without those whose header is cut off."""
 
-    def layout(self, frame: bytes) -> Layout | Refused | None:
-        """The layout of one; None where its header is not all there."""
-
 
 @dataclass(frozen=True, eq=False)
 class Kind:
@@ -43,6 +41,16 @@ class Kind:
     node: tree.Kind
     layouts: Layouts
     prefix: Mapping[int, tuple[int, int]]
+
+    @cached_property
+    def start(self) -> tuple[Word, ...]:
+        """The constants that it begins with."""
+        return words(marks(self.prefix))
+
+    @cached_property
+    def is_sealed(self) -> bool:
+        """Whether it has a checksum of its own, or parts with one."""
+        return any(isinstance(node, tree.Sealed) for node in tree.nodes(self.node.root))
 
     def further(self, layout: Layout) -> tuple[Word, ...]:
         """The constants of a layout behind those that all begin with."""
@@ -112,7 +120,7 @@ class Region:
     @property
     def has_seals(self) -> bool:
         """Whether any part has a checksum of its own."""
-        return any(isinstance(node, tree.Sealed) for kind in self.kinds for node in tree.nodes(kind.node.root))
+        return any(kind.is_sealed for kind in self.kinds)
 
     def walked(self, buffer: NDArray[np.uint8], offsets: Offsets) -> Walked:
         """The parts of the frames at these offsets."""
@@ -170,7 +178,7 @@ class _Walk:
             if not len(active):
                 break
             spots = self._ends[active]
-            held = right_at(self._buffer, spots, words(marks(kind.prefix)))
+            held = right_at(self._buffer, spots, kind.start)
             own, others = (active, [active[:0]]) if held is None else (active[held], [active[~held]])
             seen = np.zeros(len(own), np.bool_)
             for layout, which in kind.layouts.classify(self._buffer, self._ends[own]):
@@ -284,10 +292,6 @@ class Measure:
         """As `Leaf.of`."""
         values = self.read(np.frombuffer(frame, np.uint8), np.zeros(1, np.intp))[1]
         return int(values[0]) if len(values) else None
-
-    def scalar(self, frame: bytes) -> int:
-        """As `Leaf.scalar`, of a whole frame."""
-        return self.of(frame) or 0
 
     def load(self, rows: Bytes2D) -> NDArray[Any]:
         """As `Leaf.load`; -1 where parts are cut off."""
