@@ -192,10 +192,8 @@ def ruled(node: tree.Parts) -> str:
     if node.within is not None:
         return f"as many parts as fill {phrase(node.within)} bytes"
     assert node.size is not None
-    following = dict.fromkeys(phrase(kind.following) for kind in node.kinds if kind.following is not None)
-    return (
-        f"parts, the first of {phrase(node.size)} bytes, each next one of as many as {', '.join(following)} of the one before says; 0 ends"
-    )
+    following = ", ".join(dict.fromkeys(phrase(kind.following) for kind in node.kinds if kind.following is not None))
+    return f"a chain: {phrase(node.size)} bytes, then as many as {following} of the part before says; 0 ends it"
 
 
 def phrase(formula: tree.Formula) -> str:
