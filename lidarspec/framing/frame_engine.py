@@ -104,7 +104,7 @@ class CompiledCodec(Codec):
         layouts, short = list[Layout](), list[tuple[NDArray[np.intp], NDArray[np.intp]]]()
         for layout, which in groups:
             if isinstance(layout, Refused):
-                status[which] = PLUGIN if layout.error else LENGTH
+                status[which] = PLUGIN if layout.error else CONSTANT if layout.by_constant else LENGTH
                 errors += [layout.error] * len(which) if layout.error else []
                 continue
             status[which], own, _ = self._judged(buffer, offsets[which], layout, errors, gathered=gathered, sums=sums)

@@ -132,6 +132,12 @@ def test_a_wrong_part_is_told_with_its_place() -> None:
         against_construct.sensor(COUNTED).parse(bytes.fromhex("01 09 00 09"))
 
 
+def test_a_part_of_no_kind_is_counted_alike_by_both_engines() -> None:
+    sensor, data = against_construct.sensor(COUNTED), bytes.fromhex("01 09 00 09")
+    assert_backends_agree(sensor, [data, bytes.fromhex("01 04 00 09")])
+    assert (sensor.decode([data]).stats.bad_constant, sensor.decode([data]).stats.bad_length) == (1, 0)
+
+
 def test_garbage_between_long_chains_is_walked_in_linear_time() -> None:
     """A chain that claims a thousand parts at every byte costs the frames behind it nothing."""
     link = Struct("next" / Int8ub, "x" / Bytes(3))
