@@ -441,6 +441,8 @@ class Registry:
             return replace(sensor, frames=frames, hooked=self.hooked)
 
         def asked(function: Any) -> Any:
+            if isinstance(function, Mapping):
+                return {path: asked(own) for path, own in function.items()}
             return function if function is None or isinstance(function, HookedPoints) else HookedPoints(sensor, function, points)
 
         frames = {name: replace(frame, points=asked(frame.points)) for name, frame in frames.items()}

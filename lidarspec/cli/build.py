@@ -84,9 +84,9 @@ def _assignment(table: Schema, text: str, place: str) -> tuple[Steps, Any]:
         raise UsageError(f"{place}: {text!r} is not field=value")
     steps: Steps = [int(step) if step.isdigit() else step for step in re.findall(r"\w+|\*", path)]
     plain = ".".join(str(step) for step in steps if not _is_index(step))
-    info = table.fields.get(plain)
+    info = table.all_fields.get(plain)
     if info is None:
-        raise UnknownField(path, table.fields, place=place)
+        raise UnknownField(path, table.all_fields, place=place)
     arrays = len(info.axes) - (info.kind == "bytes")
     given = sum(map(_is_index, steps))
     if given != arrays:
@@ -162,7 +162,7 @@ def _put(target: Any, steps: Steps, value: Any, length: Callable[[str], int], pa
 
 def _length(table: Schema, given: Mapping[str, Any], path: str, place: str) -> int:
     """The length of an array: declared, or from the count fields given; 0 where it follows from single elements given."""
-    declared = table.arrays[path]
+    declared = table.arrays.get(path)
     if isinstance(declared, int):
         return declared
     try:

@@ -115,7 +115,7 @@ def _assignments(ctx: click.Context, incomplete: str) -> Iterable[str]:
     """Fields of a frame, or arguments of a command."""
     sensor, frame, command = _sensor(ctx), ctx.params.get("frame") or "", ctx.params.get("command") or ""
     if sensor and frame in sensor.frames:
-        fields = schema(sensor.frames[frame].tree).fields
+        fields = schema(sensor.frames[frame].tree).all_fields
         return [f"{_assigned(path, info)}=" for path, info in fields.items() if info.const is None]
     return [f"{argument}=" for argument in sensor.commands[command].args] if sensor and command in sensor.commands else ()
 

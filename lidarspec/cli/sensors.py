@@ -6,27 +6,28 @@ from collections.abc import Mapping
 from typing import Any
 
 import click
-import numpy as np
 
 from lidarspec._version import __version__
 from lidarspec.cli.failures import FINDINGS
 from lidarspec.cli.options import output_options
 from lidarspec.cli.output import emit, emit_json, table
 from lidarspec.cli.terminal import note, say
-from lidarspec.columns.columns import Batch
 from lidarspec.device.settings import devices
 from lidarspec.errors import NO_SENSORS, SpecError
 from lidarspec.explaining.wording import limits
 from lidarspec.exports.json import facts, link_data
+from lidarspec.framing.results import Counters, Found, packed
+from lidarspec.packets.stream import PacketStream
 from lidarspec.plugins import Plugin, registry, sensor as named_sensor, tried
 from lidarspec.points.numpy_plan import describe
 from lidarspec.points.plan import Plan, plan_for
-from lidarspec.simulation.frame_maker import FrameMaker
+from lidarspec.simulation.frame_maker import FrameMaker, sealed
 from lidarspec.spec.description import Frame
 from lidarspec.spec.links import Link, Serial, Udp
 from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.ports import serial_ports
 from lidarspec.trust import FILE, TRUSTED, trust as trusted, user_folder
+from lidarspec.wire.frame_table import Rows
 from lidarspec.wire.wire_table import frame_size, wire_table
 
 #: packets that a plan is shown for: as many as a turn may take, since some of them are shorter.
@@ -115,10 +116,13 @@ def _plan(sensor: Sensor, frame: str) -> list[str]:
         made, sweep = FrameMaker(sensor, frame), sensor.simulation_of(frame).sweep
     except SpecError as error:
         return [f"plain evaluation: {error}"]
-    table = made.table([sweep(index) for index in range(PACKETS)]) if sweep else made.engine.table([sensor.example(frame)])
-    state = {name: (None, np.full(len(table), -1, np.intp)) for name in sensor.state}
-    largest = max(table.groups, key=lambda group: group.layout.size)
-    found = plan_for(sensor.points_of(frame), Batch(table, np.zeros(len(table), np.bool_), state, sensor.state), largest)
+    frames = sealed(made.table([sweep(index) for index in range(PACKETS)])) if sweep else [sensor.example(frame)]
+    sent = packed([Found(frame, 0, data) for data in frames])
+    packets = PacketStream(sensor, frame, Counters()).add([sent]).with_points
+    if not isinstance(packets.table, Rows) or not packets.table.groups:
+        return ["plain evaluation: an example has no points"]
+    largest = max(packets.table.groups, key=lambda group: group.layout.size)
+    found = plan_for(sensor.points_of(packets.frame), packets.batch(), largest)
     return describe(found) if isinstance(found, Plan) else [f"plain evaluation: {found}"]
 
 

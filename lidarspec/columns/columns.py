@@ -39,6 +39,9 @@ NO_BITS = "& | ~ take conditions, and fields are float64: each comparison in par
 
 Carry = dict[int, NDArray[np.float64]]
 
+#: where `Batch.state` has the frames that parts are in.
+AROUND = "^"
+
 
 @dataclass(eq=False)
 class Batch:
@@ -396,7 +399,8 @@ def physical(info: FieldInfo, table: Table) -> NDArray[np.float64]:
 
 
 class Fields:
-    """The fields of a batch of packets by attribute, as columns: ``f.points.distance``, ``f.state.difop.vertical``.
+    """The fields of a batch of packets by attribute, as columns: ``f.points.distance``, ``f.state.difop.vertical``; of parts also those
+    of the frame that each is in, ``f.frame.counter``.
 
     Args:
         prefix: the names so far, each with a dot behind it.
@@ -411,12 +415,19 @@ class Fields:
             raise AttributeError(name)
         if name == "state" and not self._prefix and not self._frame:
             return _States(self._batch)
+        if name == "frame" and not self._prefix and not self._frame and AROUND in self._batch.state:
+            return Fields(self._batch, frame=AROUND)
         path, known = f"{self._prefix}{name}", _paths(self._batch, self._frame)
         if path in known:
             return _column(self._batch, self._frame, path)
         if any(other.startswith(f"{path}.") for other in known):
             return Fields(self._batch, f"{path}.", self._frame)
-        raise UnknownField(path, known, place=f"state.{self._frame}" if self._frame else "")
+        raise UnknownField(path, known, place="frame" if self._frame == AROUND else f"state.{self._frame}" if self._frame else "")
+
+    @property
+    def _is_around(self) -> bool:
+        """Whether they are of other frames than the packets."""
+        return bool(self._frame)
 
 
 def _paths(batch: Batch, frame: str) -> Iterable[str]:

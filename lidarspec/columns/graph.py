@@ -214,7 +214,7 @@ class TracedFields:
         if not isinstance(value, Column):
             return TracedFields(value, self._tape, names)
         path = ".".join(names)
-        return self._tape.add("state" if names[0] == "state" else "field", attrgetter(path), (), value, path)
+        return self._tape.add("state" if self._real._is_around else "field", attrgetter(path), (), value, path)
 
 
 def node_of(value: Any) -> Any:

@@ -29,8 +29,8 @@ from lidarspec.packets.stream import PacketStream
 from lidarspec.points.plain import evaluate
 from lidarspec.spec import Checksummed, Frame, Sensor
 from lidarspec.spec.bits import BitField
-from lidarspec.spec.construct_layer import UNNAMED, Seen, field_path, leaves
-from lidarspec.spec.tree import Block, FieldInfo, Node, Opaque, Repeat, Struct, children, exact
+from lidarspec.spec.construct_layer import UNNAMED, Seen, field_path, leaves, member
+from lidarspec.spec.tree import Block, FieldInfo, Node, Opaque, Parts, Repeat, Struct, children, exact
 from lidarspec.wire.parse import parse_typed
 from lidarspec.wire.schema import schema
 from lidarspec.wire.wire_table import bit_text, hexed
@@ -150,7 +150,7 @@ class _Trail:
 
     def __init__(self, frame: Frame, data: bytes) -> None:
         self._data, self._schema = data, schema(frame.tree)
-        fields = self._schema.fields.values()
+        fields = self._schema.all_fields.values()
         self._arrays = [axis for info in fields for axis in (info.axes[:-1] if info.kind == "bytes" else info.axes)]
         self._blocks = dict(_blocks(frame.tree, ""))
         trail: list[Seen] = []
@@ -217,7 +217,7 @@ class _Trail:
     def _value(self, part: str, seen: Seen, keys: Keys, raw: Any) -> tuple[Value, FieldInfo]:
         path = part + "".join(f"[{key}]" if isinstance(key, int) else f".{key}" for key in keys)
         unknown = FieldInfo(plain(path), docs="constant" if path.endswith(UNNAMED) else "")
-        info = self._schema.fields.get(plain(path), unknown)
+        info = self._schema.all_fields.get(plain(path), unknown)
         bits = self._blocks.get(kind(part), {}).get(keys)
         physical = float(info.physical(raw)) if isinstance(raw, int | float) else None
         label = info.labels.get(raw, "") if isinstance(raw, int) else ""
@@ -256,7 +256,7 @@ def _blocks(node: Node, path: str) -> Iterator[tuple[str, Mapping[Keys, BitField
                 yield from _blocks(member, ".".join(filter(None, (path, member.name))))
         case _:
             for child in children(node):
-                yield from _blocks(child, f"{path}[]" if isinstance(node, Repeat) else path)
+                yield from _blocks(child, f"{path}[]" if isinstance(node, Repeat | Parts) else path)
 
 
 def _verdicts(data: bytes, seen: Seen) -> Iterator[tuple[str, tuple[str, bool]]]:
@@ -284,23 +284,43 @@ def _points(sensor: Sensor, name: str, data: bytes, rows: Sequence[Row]) -> tupl
     if not (frame.data or frame.points):
         return none, tuple(notes)
     try:
-        packets = PacketStream(sensor, name, Counters()).add([packed([Found(name, 0, data)])])
+        packets = PacketStream(sensor, name, Counters()).add([packed([Found(name, 0, data)])]).with_points
+        if not len(packets):
+            return none, tuple(notes)
         evaluated = evaluate(packets)
     except LidarSpecError as error:
         return none, (*notes, f"no points: {error}")
     notes += ["defaults stand in for what a frame of another type would say"] * bool(evaluated.cloud.nominal)
     points = [Point.of(evaluated.cloud, index) for index in range(len(evaluated.cloud))]
-    chain = packets.table.schema.chain
-    if not chain:
+    chain, parts = packets.table.schema.chain, _parts(sensor, name, data)
+    if not chain and not parts:
         return none, (*notes, *(f"point {point}" for point in points[:TOLD]))
-    inside = evaluated.counts[0].astype(np.bool_)
+    inside = evaluated.counts.astype(np.bool_)
     numbers = np.where(inside, np.cumsum(inside).reshape(inside.shape) - 1, -1)
-    return [tuple(points[number] for number in _numbers(row.path, chain, evaluated.axes, numbers)) for row in rows], tuple(notes)
+    given: list[tuple[Point, ...]] = []
+    for row in rows:
+        spot = next((spot for spot, part in enumerate(parts) if f"{row.path}.".startswith(f"{part}.")), None if parts else 0)
+        path = row.path if not parts or spot is None else row.path[len(parts[spot]) + 1 :]
+        own = () if spot is None else _numbers(path, chain, evaluated.axes, numbers[spot])
+        given.append(tuple(points[number] for number in own))
+    return given, tuple(notes)
+
+
+def _parts(sensor: Sensor, name: str, data: bytes) -> list[str]:
+    """The parts of a frame that have its points, as "segments[0]"; none where the frame itself has them."""
+    frame, path = sensor.frames[name], sensor.parts_with_points(name)
+    place = schema(frame.tree).within(path) if path else None
+    if place is None:
+        return []
+    pieces = member(frame.prepared.parse(data, _verify=False), place[0])
+    return [f"{place[0]}[{index}]" for index, (kind, _, _) in enumerate(pieces.spans) if kind == place[1]]
 
 
 def _numbers(path: str, chain: tuple[str, ...], axes: tuple[str | None, ...], numbers: Any) -> list[int]:
     """The numbers of the points that an element of the innermost array gives; none for any other row."""
     indices = [int(part.partition("]")[0]) for part in path.split("[")[1:]]
+    if not chain:
+        return [int(numbers)] if not path and numbers >= 0 else []
     if len(indices) != len(chain) or not chain[-1].startswith(plain(path)) or plain(path) not in chain[-1].removesuffix("[]"):
         return []
     own = dict(zip(chain, indices, strict=True))

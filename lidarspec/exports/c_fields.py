@@ -244,6 +244,8 @@ class CLayout:
                 if len({str(size) for _, size in sizes}) == 1:
                     return sizes[0][1]
                 return Extent(0, (f"(int64_t){self.extent_name(entry)}({given(entry.node, entry.depth)})",))
+            case tree.Parts():
+                raise Refused(f"{entry.path}: parts of sizes of their own, of which none has a place without reading those before it")
             case tree.Empty():
                 return Extent()
         return sum((self.extent(below) for below in self._below(entry)), Extent())

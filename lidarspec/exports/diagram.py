@@ -13,7 +13,7 @@ from xml.sax.saxutils import escape, quoteattr
 
 from lidarspec.exports import Message, messages
 from lidarspec.spec import Sensor, tree
-from lidarspec.wire.wire_table import INDICES, Extent, bit_text, branches, extent, frame_size, meaning, phrase, unit_text
+from lidarspec.wire.wire_table import INDICES, Extent, bit_text, branches, extent, frame_size, meaning, phrase, ruled, unit_text
 
 #: how the names of fields begin that are there for nothing yet, in manuals.
 SPARE = ("reserved", "unused", "spare", "zeros", "padding")
@@ -82,6 +82,10 @@ class _Cells:
                 return tuple(self._block(node, start))
             case tree.Repeat():
                 return (self._repeat(node, start, depth),)
+            case tree.Parts():
+                kinds = [(kind.name, self.visit(kind.element, Extent(0, ("i",)), depth + 1)) for kind in node.kinds]
+                items = kinds[0][1] if len(kinds) == 1 else tuple(Group(name, items, optional=True) for name, items in kinds)
+                return (Group(f"{node.name}: {ruled(node)}", items),)
             case tree.When() | tree.Select():
                 parts = ((label, self.visit(branch, start, depth)) for label, branch in branches(node))
                 return tuple(Group(label, items, optional=True) for label, items in parts if items)

@@ -126,6 +126,8 @@ def node_data(node: tree.Node) -> dict[str, Any]:
             return {"kind": "block", "name": node.name, "bytes": node.size, "parts": [_part(part) for part in node.parts]}
         case tree.Repeat():
             return {"kind": "array", "name": node.name, "count": formula_data(node.count), "element": node_data(node.element)}
+        case tree.Parts():
+            return _parts(node)
         case tree.When():
             branches = {"then": node_data(node.then), "else": node_data(node.otherwise)}
             return {"kind": "if", "name": node.name, "condition": formula_data(node.condition)} | branches
@@ -136,7 +138,15 @@ def node_data(node: tree.Node) -> dict[str, Any]:
             return {"kind": "nothing", "name": node.name}
 
 
-def formula_data(formula: tree.Formula) -> Any:
+def _parts(node: tree.Parts) -> dict[str, Any]:
+    """Parts: what says where the last one is, and what each kind is; `following` is the bytes of the next part."""
+    rules = {"count": node.count, "size": node.size, "within": node.within}
+    data = {name: None if rule is None else formula_data(rule) for name, rule in rules.items()}
+    kinds = [{"name": kind.name, "part": node_data(kind.element), "following": formula_data(node.following(kind))} for kind in node.kinds]
+    return {"kind": "parts", "name": node.name, **data, "kinds": kinds}
+
+
+def formula_data(formula: tree.Formula | None) -> Any:
     """A number as it is, a field as {"field": path}, an operation as {"op": symbol, "args": [...]}."""
     match formula:
         case tree.Ref():

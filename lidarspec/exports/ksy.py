@@ -293,6 +293,8 @@ class _Types:
                 self._switch(kaitai, node.name, number(node.key, scope), cases, scope, **more)
             case tree.Repeat():
                 self._repeat(kaitai, node, scope, **more)
+            case tree.Parts():
+                self._parts(kaitai, node, scope, **more)
             case tree.Block() if (plain := inline(node, more)) is not None:
                 kaitai.seq.append(plain[0] | self._doc(node.info))
                 kaitai.instances |= plain[1]
@@ -302,6 +304,24 @@ class _Types:
                 self._physical(kaitai, node.info, more)
             case _:
                 self._typed(kaitai, node.name, node, scope, **more)
+
+    def _parts(self, kaitai: _Type, node: tree.Parts, scope: Scope, **more: Any) -> None:
+        """Add parts; those of one kind, since Kaitai chooses a type before it reads it."""
+        if len(node.kinds) > 1:
+            raise Refused(f"{node.axis}: parts that are told apart by their constants, which Kaitai cannot do")
+        (kind,), name = node.kinds, identifier(node.name)
+        if node.within is not None:
+            inner = _Type([{"id": "value", "type": "part", "repeat": "eos"}], types={"part": self._type(kind.element, (*scope, None))})
+            kaitai.types[name] = inner.done(node.axis)
+            kaitai.seq.append({"id": name, "type": name, "size": _size(node.within, scope), **more})
+            return
+        if node.count is not None:
+            more |= {"repeat": "expr", "repeat-expr": _size(node.count, scope)}
+        elif node.size is not None and kind.following is not None:
+            ends = tree.written(kind.following, lambda ref: f"_.{ref.path}", _OPERATIONS)
+            condition = f"({more['if']}) and {number(node.size, scope)} != 0" if "if" in more else f"{number(node.size, scope)} != 0"
+            more |= {"repeat": "until", "repeat-until": f"{ends} == 0", "if": condition}
+        self._typed(kaitai, node.name, kind.element, scope, **more)
 
     def _typed(self, kaitai: _Type, name: str, node: tree.Node, scope: Scope, **more: Any) -> None:
         """Add an attribute whose type is one of its own."""

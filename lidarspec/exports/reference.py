@@ -163,7 +163,7 @@ def _cloud(sensor: Sensor, name: str) -> PointCloud | None:
     """The points of an example frame; None where it has none of its own."""
     try:
         frames = packed([Found(name, 0, sensor.example(name))])
-        return evaluate(PacketStream(sensor, name, Counters()).add([frames])).cloud
+        return evaluate(PacketStream(sensor, name, Counters()).add([frames]).with_points).cloud
     except LidarSpecError:
         return None
 

@@ -17,7 +17,7 @@ from dataclasses import dataclass, field
 
 from lidarspec.exports import Message, Refused, messages
 from lidarspec.spec import Command, Sensor
-from lidarspec.spec.tree import Blob, Block, Empty, FieldInfo, Node, Number, Opaque, Repeat, Sealed, Select, Struct, When, children
+from lidarspec.spec.tree import Blob, Block, Empty, FieldInfo, Node, Number, Opaque, Parts, Repeat, Sealed, Select, Struct, When, children
 from lidarspec.wire.schema import schema
 from lidarspec.wire.wire_table import meaning, unit_text
 
@@ -102,6 +102,8 @@ class _Classes:
                 return self.add(node, owner + camel(name), f"`{name}` of `{owner}`.")
             case Repeat():
                 return f"list[{self._type(owner, name, node.element)}]"
+            case Parts():
+                return f"list[{' | '.join(self._type(owner, name + camel(kind.name), kind.element) for kind in node.kinds)}]"
             case When() | Select():
                 return " | ".join(dict.fromkeys(self._type(owner, name, branch) for branch in children(node)))
             case Empty() | Opaque():
@@ -119,7 +121,7 @@ def _sensor(sensor: Sensor, frames: tuple[Message, ...], names: dict[str, str]) 
     rest = "    @overload\n    def command(self, name: str, **arguments: Any) -> bytes: ..." if len(sensor.commands) > 0 else ""
     literals = ", ".join(f'"{name}"' for name in names)
     data = next((message.frame for message in frames if message.frame.data), frames[0].frame)
-    fields = ", ".join(f'"{path}"' for path in schema(data.tree).fields)
+    fields = ", ".join(f'"{path}"' for path in schema(data.tree).all_fields)
     return f'''FrameName = Literal[{literals}]
 FieldPath = Literal[{fields}]
 

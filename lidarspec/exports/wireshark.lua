@@ -280,6 +280,36 @@ step["repeat"] = function(self, node, tree, label)
   if below then below:set_len(self.at - from) end
 end
 
+-- The first kind whose constants are right.
+function Walk:kind(kinds)
+  for _, kind in ipairs(kinds) do
+    local is_right = true
+    for _, mark in ipairs(kind.magic) do
+      if self.at + mark[1] >= self.stop then self:fail("short") end
+      is_right = is_right and int.band(self.tvb(self.at + mark[1], 1):uint(), mark[2]) == mark[3]
+    end
+    if is_right then return kind end
+  end
+  self:fail("constant")
+end
+
+function step.parts(self, node, tree, label)
+  local from, index = self.at, 0
+  local count, next = node.count and self:amount(node.count), node.size and self:amount(node.size)
+  local stop = node.within and from + self:amount(node.within)
+  local below = tree and tree:add(proto, self.tvb(from, 0), label)
+  while (count and index < count) or (next and next > 0) or (stop and self.at < stop) do
+    local begun, kind = self.at, self:kind(node.kinds)
+    self:visit(kind.element, below, tree and string.format("%s[%d]", label, index))
+    local size = self.at - begun
+    if size == 0 or (next and next ~= size) or (stop and self.at > stop) then self:fail("length") end
+    next = next and self:amount(kind.following)
+    index = index + 1
+  end
+  if node.total then self.values[node.total] = self.at - from end
+  if below then below:set_len(self.at - from) end
+end
+
 function step.when(self, node, tree, label)
   return self:visit(node.condition(self.values) ~= 0 and node.yes or node.no, tree, label)
 end

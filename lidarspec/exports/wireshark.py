@@ -18,6 +18,7 @@ from lidarspec.exports import Message, Refused, asked, messages
 from lidarspec.framing.frame_engine import codec
 from lidarspec.spec import Checksum, Crc, Fold15, Sensor, Sum, Tcp, Udp, WordXor, Xor, ZeroPadded, tree
 from lidarspec.spec.bits import BitField
+from lidarspec.wire.layout_tree import prefix_of
 
 WIDTH = 140
 
@@ -109,6 +110,8 @@ class _Writer:
                 return {"kind": "sealed", "name": node.name or None, "body": self.node(node.body), "seal": self._seal(node)}
             case tree.Repeat():
                 return self._repeat(node, path)
+            case tree.Parts():
+                return self._parts(node)
             case tree.When():
                 then, otherwise = self.node(node.then, path), self.node(node.otherwise, path)
                 return {"kind": "when", "name": node.name, "condition": _function(node.condition), "yes": then, "no": otherwise}
@@ -184,6 +187,16 @@ class _Writer:
         few = isinstance(node.element, tree.Block) or (isinstance(node.element, tree.Struct) and len(_leaves(node.element)) <= SUMMED)
         summed = (few and bool(_leaves(node.element))) or None
         return {"kind": "repeat", "name": node.name, "count": formula(node.count), "summed": summed, "skip": whole, "element": element}
+
+    def _parts(self, node: tree.Parts) -> Table:
+        kinds = []
+        for kind in node.kinds:
+            magic = [[offset, mask, value] for offset, (mask, value) in sorted(prefix_of(kind.root, self.message.frame.max_length).items())]
+            after = node.following(kind)
+            kinds.append({"magic": magic, "element": self.node(kind.element), "following": None if after is None else formula(after)})
+        rules = {"count": node.count, "size": node.size, "within": node.within}
+        said = {name: None if rule is None else formula(rule) for name, rule in rules.items()}
+        return {"kind": "parts", "name": node.name, "total": self._keep(node.total.path), **said, "kinds": kinds}
 
     def _described(self, info: tree.FieldInfo, kind: str, mask: int | None = None) -> Table:
         """What a number says of itself, and its fields in Wireshark."""

@@ -15,14 +15,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.errors import PluginError, SpecError, UnknownFrame, UsageError
-from lidarspec.framing.frame_engine import CompiledCodec, InterpretedCodec, codec
+from lidarspec.framing.frame_engine import Codec, CompiledCodec, codec
 from lidarspec.framing.plausibility import plausibility
 from lidarspec.framing.results import VALID
-from lidarspec.spec.construct_layer import Fault, random_value
+from lidarspec.spec.construct_layer import Fault, member, random_value
 from lidarspec.spec.description import Spec
+from lidarspec.spec.tree import Node, refs
 from lidarspec.wire.build import build
 from lidarspec.wire.frame_table import Group, Rows
 from lidarspec.wire.layout import Layout
+from lidarspec.wire.schema import schema
 
 #: random frames made at once, and how often, before a sensor's own `sweep` has to help.
 BATCH, TRIES = 64, 40
@@ -49,7 +51,7 @@ def examples(sensor: Spec, frame: str, source: random.Random, drawn: Drawn = NOT
         drawn: field path -> what draws its raw value, for what random values never make.
     """
     engine = codec(sensor.frames[frame])
-    if not isinstance(engine, CompiledCodec):
+    if not isinstance(engine, CompiledCodec) or engine.schema.parts:
         return [_interpreted(sensor, frame, engine, source, drawn)]
     for _ in range(TRIES):
         layout, chosen = engine.tree.choose(source, drawn)
@@ -65,16 +67,37 @@ def examples(sensor: Spec, frame: str, source: random.Random, drawn: Drawn = NOT
     return [_swept(sensor, frame, engine, source)]
 
 
-def _interpreted(sensor: Spec, frame: str, engine: InterpretedCodec, source: random.Random, drawn: Drawn) -> bytes:
-    """A frame that construct alone can read."""
+def _interpreted(sensor: Spec, frame: str, engine: Codec, source: random.Random, drawn: Drawn) -> bytes:
+    """A frame that construct alone can read, or one of parts."""
     for _ in range(BATCH * TRIES):
         try:
-            data = build(sensor, frame, random_value(engine.frame.prepared, source, drawn), {})
+            data = build(sensor, frame, _left_open(random_value(engine.frame.prepared, source, drawn), engine.frame.tree), {})
         except (UsageError, Fault):  # what was drawn goes not together; something else may
             continue
         if engine.survey(np.frombuffer(data, np.uint8), np.zeros(1, np.intp)).status[0] == VALID:
             return data
     raise SpecError("no random frame is valid", path=frame, sensor=sensor.id)
+
+
+def _left_open(values: Any, root: Node) -> Any:
+    """The values of a frame without those that say how many parts there are and how long, which `build` fills in."""
+    for node in schema(root).parts.values():
+        rules = (node.count, node.size, node.within)
+        asked = [ref.path for rule in rules if rule is not None for ref in refs(rule)[:1]]
+        for kind, part in ((kind, part) for part in member(values, node.axis, []) for kind in node.kinds):
+            own = () if kind.following is None else refs(kind.following)[:1]
+            for path in (ref.path for ref in own):
+                _blank(part, path)
+            _left_open(part, kind.root)
+        for path in asked:
+            _blank(values, path)
+    return values
+
+
+def _blank(values: Any, path: str) -> None:
+    """Take a field out of nested mappings, where it is."""
+    *parents, name = path.split(".")
+    member(values, ".".join(parents), {}).pop(name, None) if parents else values.pop(name, None)
 
 
 def _headed(rows: NDArray[np.uint8], layout: Layout, chosen: dict[str, int]) -> NDArray[np.uint8]:

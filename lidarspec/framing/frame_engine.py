@@ -25,8 +25,8 @@ from lidarspec.spec.construct_layer import Mismatch, fixed_size
 from lidarspec.spec.description import Frame
 from lidarspec.wire.arrays import alike, counted, repeated
 from lidarspec.wire.frame_table import Group, Records, Rows, Table
-from lidarspec.wire.layout import Layout, Sums, marks
-from lidarspec.wire.layout_tree import NotCompilable, Refused, frame_layouts, prefix_of, rows_at
+from lidarspec.wire.layout import Layout, Refused, Sums, marks, rows_at
+from lidarspec.wire.layout_tree import NotCompilable, frame_layouts, prefix_of
 from lidarspec.wire.schema import schema
 
 #: bytes of candidates looked at in one go, so that memory stays small on hostile streams.
@@ -104,7 +104,7 @@ class CompiledCodec(Codec):
         layouts, short = list[Layout](), list[tuple[NDArray[np.intp], NDArray[np.intp]]]()
         for layout, which in groups:
             if isinstance(layout, Refused):
-                status[which] = PLUGIN if layout.error else LENGTH
+                status[which] = PLUGIN if layout.error else CONSTANT if layout.by_constant else LENGTH
                 errors += [layout.error] if layout.error else []
                 continue
             status[which], own, _ = self._judged(buffer, offsets[which], layout, errors, gathered=gathered, sums=sums)

@@ -22,15 +22,19 @@ from numpy.typing import NDArray
 from lidarspec.columns.columns import Batch, Column, Fields, unpadded
 from lidarspec.columns.graph import Expression, Traced, conjuncts, sample_of, trace
 from lidarspec.errors import PluginError
-from lidarspec.framing.results import CHECKSUM, CONSTANT, IMPLAUSIBLE, PLUGIN, VALID
+from lidarspec.framing.results import CHECKSUM, CONSTANT, IMPLAUSIBLE, LENGTH, PLUGIN, VALID
 from lidarspec.spec.description import Frame
 from lidarspec.wire.arrays import taken
 from lidarspec.wire.frame_table import Group, Rows, Table
-from lidarspec.wire.layout import Bytes2D, Layout, Leaf, Seal, Sums, elements, marks, right, words
+from lidarspec.wire.layout import Bytes2D, Layout, Leaf, Seal, Sums, elements, marks, right, rows_at, words
+from lidarspec.wire.parts import Region
 from lidarspec.wire.schema import Schema
 
 #: values of a few bits that are compared one by one.
 ALLOWED = 2
+
+#: by what became of the parts of a frame: `parts.FOUND`, `CUT_OFF`, `LENGTH`, `CONSTANT`, `FAILED`.
+OF_PARTS = np.array([VALID, LENGTH, LENGTH, CONSTANT, PLUGIN], np.uint8)
 
 Check = Callable[[Bytes2D], NDArray[np.bool_]]
 
@@ -60,6 +64,7 @@ class Judge:
         held = right(self._constants, rows) if len(rows) else None
         if held is not None:
             status[~held] = CONSTANT
+        _parts_among(self._layout, status, rows, errors, sums)
         for seal in self._layout.seals:
             _among(status, rows, functools.partial(intactness, seal, errors, sums))
         if self._checks is not None:
@@ -86,6 +91,29 @@ def _among(status: NDArray[np.uint8], rows: Bytes2D, judge: Callable[[Bytes2D], 
     left = np.flatnonzero(status == VALID)
     if len(left):
         status[left] = judge(taken(rows, left))
+
+
+def _parts_among(layout: Layout, status: NDArray[np.uint8], rows: Bytes2D, errors: list[PluginError], sums: Sums | None) -> None:
+    """Judge by their parts those that are valid so far: whether these fill their room, and by the checksums in them."""
+    for region in layout.regions.values():
+        if not region.is_measured or region.has_seals:
+            _among(status, rows, functools.partial(_by_parts, region, errors, sums))
+
+
+def _by_parts(region: Region, errors: list[PluginError], sums: Sums | None, rows: Bytes2D) -> NDArray[np.uint8]:
+    """The status of each frame, (n,), by its parts."""
+    buffer, walked = region.in_rows(rows)
+    status = OF_PARTS[walked.status]
+    errors += walked.errors
+    for piece in (piece for pieces in walked.rounds for piece in pieces):
+        parts = rows_at(buffer, piece.spots, piece.layout.size)
+        verdicts = np.zeros(len(parts), np.uint8)
+        _parts_among(piece.layout, verdicts, parts, errors, sums)
+        for seal in piece.layout.seals:
+            _among(verdicts, parts, functools.partial(intactness, seal, errors, sums))
+        bad = (verdicts != VALID) & (status[piece.owners] == VALID)
+        status[piece.owners[bad]] = verdicts[bad]
+    return status
 
 
 def intactness(seal: Seal, errors: list[PluginError], sums: Sums | None, rows: Bytes2D) -> NDArray[np.uint8]:

@@ -16,6 +16,7 @@ from lidarspec.spec.fields import factor
 from lidarspec.spec.timing import Clock
 from lidarspec.spec.tree import exact
 from lidarspec.wire.arrays import alike
+from lidarspec.wire.frame_table import Table
 from lidarspec.wire.schema import Schema
 
 Times = NDArray[np.int64]
@@ -62,24 +63,85 @@ class Unwrapper:
 
 
 def clock_ns(sensor: Spec, batch: Batch) -> Times:
-    """The sensor's own clock in each packet, (n,) int64 nanoseconds, as it stands on the wire."""
+    """The sensor's own clock in each packet, (n,) int64 nanoseconds, as it stands on the wire.
+
+    Where it stands in the parts of a frame, it is that of the first one; in a frame without any that of the frame before.
+    """
+    which, readings = clocked(sensor, batch)
+    return readings if which is None else held(which, readings, np.zeros(len(batch), np.int64))
+
+
+def clocked(sensor: Spec, batch: Batch) -> tuple[NDArray[np.intp] | None, Times]:
+    """The packets that have the clock, None for all, and what it reads there: in the first of the parts in which it stands."""
     assert sensor.clock is not None
-    source = sensor.clock.source
+    place, source = clock_parts(sensor, batch.table.schema), sensor.clock.source
+    if place is not None:
+        table, which = batch.table.parts(*place)
+        frames, first = np.unique(which, return_index=True)
+        return frames, _in_parts(sensor, place, table.take(first))
     if callable(source):
         terms = header_function(source, batch.table.schema, _nanoseconds)(batch)
-        return sum(terms, np.zeros(len(batch), np.int64))
+        return None, sum(terms, np.zeros(len(batch), np.int64))
+    return None, _summed(paths(sensor.clock), batch.table, sensor.id)
+
+
+def held(which: NDArray[np.intp], times: Times, before: Times) -> Times:
+    """The times of some packets, each held until the next of them, (n,); before the first of them those given, (n,)."""
+    spots = np.searchsorted(which, np.arange(len(before)), side="right") - 1
+    return np.where(spots < 0, before, times[np.maximum(spots, 0)]) if len(times) else before
+
+
+def _summed(fields: tuple[str, ...], table: Table, sensor: str) -> Times:
+    """The nanoseconds that some fields add up to, (n,)."""
     total: Times | None = None
-    for path, step, zero, furthest in clock_terms(paths(sensor.clock), batch.table.schema, sensor.id):
-        raw = batch.table.raw(path)
+    for path, step, zero, furthest in clock_terms(fields, table.schema, sensor):
+        raw = table.raw(path)
         if furthest and raw.dtype.kind in "ui":
             part = _within(raw, furthest)
             part *= step
             if zero:
                 part += zero
         else:
-            part = _nanoseconds(raw.astype(np.float64) * float(step / 10**9) + float(zero / 10**9), len(batch))
+            part = _nanoseconds(raw.astype(np.float64) * float(step / 10**9) + float(zero / 10**9), len(table))
         total = part if total is None else np.add(total, part, out=total)
-    return np.zeros(len(batch), np.int64) if total is None else total
+    return np.zeros(len(table), np.int64) if total is None else total
+
+
+def clock_parts(sensor: Spec, schema: Schema) -> tuple[str, str] | None:
+    """The parts, and their kind, in which the clock stands; None where it stands in the frame."""
+    places = {schema.within(path) for path in (paths(sensor.clock) if sensor.clock is not None else ()) if path not in schema.fields}
+    found = {place[:2] for place in places if place is not None}
+    return found.pop() if len(found) == 1 else None
+
+
+def part_times(sensor: Spec, place: tuple[str, str], table: Table, which: NDArray[np.intp], times: Times) -> Times:
+    """The times of parts, (k,), where they have a clock of their own.
+
+    Args:
+        place: where they stand.
+        which: the frame of each.
+        times: of these frames, for each part: that of their first part, where the clock stands in it.
+    """
+    if not len(which) or sensor.clock is None or not _stands_in(sensor.clock, place):
+        return times
+    readings, first = _in_parts(sensor, place, table), np.searchsorted(which, which)
+    steps, turn = readings - readings[first], _turn(sensor.clock.wraps_at) if sensor.clock.wraps_at else 0
+    return times + ((steps + turn // 2) % turn - turn // 2 if turn else steps)
+
+
+def _stands_in(clock: Clock, place: tuple[str, str]) -> bool:
+    return any(path.startswith(f"{_prefix(place)}.") for path in paths(clock))
+
+
+def _prefix(place: tuple[str, str]) -> str:
+    return ".".join(filter(None, place))
+
+
+def _in_parts(sensor: Spec, place: tuple[str, str], table: Table) -> Times:
+    """The clock that stands in parts, in each of them."""
+    assert sensor.clock is not None
+    own = tuple(path.removeprefix(f"{_prefix(place)}.") for path in paths(sensor.clock))
+    return _summed(own, table, sensor.id)
 
 
 @lru_cache(maxsize=256)

@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.columns.columns import Batch, physical
+from lidarspec.columns.columns import AROUND, Batch, physical
 from lidarspec.errors import SpecError, UnknownField
 from lidarspec.framing.results import Counters, Numbers, array_of
+from lidarspec.packets.clocks import part_times
 from lidarspec.points.cloud import PointCloud
 from lidarspec.points.evaluate import cloud_of
 from lidarspec.spec.description import Spec
@@ -106,8 +107,11 @@ class Packets:
         Raises:
             UnknownField: for an array that the frame does not have.
         """
+        if array in self.table.schema.parts:
+            found = (self.table.parts(array, kind.name)[1] for kind in self.table.schema.parts[array].kinds)
+            return sum((np.bincount(which, minlength=len(self)) for which in found), np.zeros(len(self), np.intp))
         if array not in self.table.schema.arrays:
-            raise UnknownField(array, self.table.schema.arrays, place=f"{self.sensor.id} {self.frame}")
+            raise UnknownField(array, {*self.table.schema.arrays, *self.table.schema.parts}, place=f"{self.sensor.id} {self.frame}")
         return self.table.counts(array)
 
     def points(self) -> PointCloud:
@@ -116,7 +120,7 @@ class Packets:
         Raises:
             SpecError: where the sensor's `points` function fails, or returns columns that do not fit.
         """
-        return cloud_of(self)
+        return cloud_of(self.with_points)
 
     def take(self, which: Any) -> Packets:
         """The packets that indices, a mask or a slice pick, with their times, offsets and state."""
@@ -125,6 +129,42 @@ class Packets:
         state = {name: (table, chosen[indices]) for name, (table, chosen) in self.state.items()}
         table = self.table.take(indices)
         return Packets(self.sensor, self.frame, table, **columns, state=state, stats=self.stats, backend=self.backend)
+
+    def parts(self, path: str) -> Packets:
+        """The parts of all packets, in stream order, as packets: with the times, numbers and state of the frames that they are in.
+
+        Args:
+            path: of the parts; "tlvs.points" for one of several kinds.
+
+        Raises:
+            UnknownField: for parts that the frame does not have, and for several kinds of which none is named.
+        """
+        place = self.table.schema.within(path)
+        if place is None:
+            raise UnknownField(path, self.table.schema.parts, place=f"{self.sensor.id} {self.frame}")
+        axis, kind, below = place
+        table, which = self.table.parts(axis, kind)
+        columns: dict[str, Any] = {name: getattr(self, name)[which] for name in _COLUMNS}
+        columns["breaks"] = np.diff(np.cumsum(self.breaks)[which], prepend=0) > 0  # also of a frame without parts before
+        columns["time_ns"] = part_times(self.sensor, (axis, kind), table, which, columns["time_ns"])
+        state = {name: (frames, chosen[which]) for name, (frames, chosen) in self.state.items() if name != AROUND}
+        name = ".".join(filter(None, (self.frame, axis, kind)))
+        parts = Packets(
+            self.sensor, name, table, **columns, state={**state, AROUND: (self.table, which)}, stats=self.stats, backend=self.backend
+        )
+        return parts.parts(below) if below else parts
+
+    @property
+    def with_points(self) -> Packets:
+        """The packets that points are made of: these, or the parts in them."""
+        path = self.sensor.parts_with_points(self.frame)
+        return self.parts(path) if path else self
+
+    @property
+    def frames(self) -> tuple[Table, NDArray[np.intp] | slice]:
+        """The frames that they are, or that they are parts of, and the row of each there, (n,)."""
+        table, which = self.state.get(AROUND, (None, slice(None)))
+        return (self.table, slice(None)) if table is None else (table, which)
 
     def batch(self, carry: dict[int, NDArray[np.float64]] | None = None) -> Batch:
         """The packets as a plugin's functions are given them, through `Fields`; `carry`: what the batch before left."""

@@ -19,7 +19,7 @@ from lidarspec.columns.columns import Batch
 from lidarspec.errors import PluginError, UnknownFrame
 from lidarspec.framing.frame_engine import Codec, codec
 from lidarspec.framing.results import Counters, Frames, Numbers
-from lidarspec.packets.clocks import Unwrapper, clock_ns, clock_terms, paths
+from lidarspec.packets.clocks import Unwrapper, clock_parts, clock_terms, clocked, held, paths
 from lidarspec.packets.continuity import Continuity
 from lidarspec.packets.packets import Packets, StateOf, joined_tables
 from lidarspec.spec.description import Spec
@@ -56,10 +56,13 @@ class PacketStream:
         counted = sensor.sequence is not None and data and _has(sensor, frame, sensor.sequence.field)
         timed = sensor.clock is not None and data and all(_has(sensor, frame, path) for path in paths(sensor.clock))
         self._clock = Unwrapper(sensor.clock.wraps_at) if sensor.clock and timed else None
-        terms = clock_terms(paths(sensor.clock), self._codec.schema, sensor.id) if sensor.clock and timed else []
+        in_parts = sensor.clock is not None and timed and clock_parts(sensor, self._codec.schema) is not None
+        terms = clock_terms(paths(sensor.clock), self._codec.schema, sensor.id) if sensor.clock and timed and not in_parts else []
         grain = float(min((step for _, step, _, _ in terms), default=0))
-        self._continuity = Continuity(sensor, stats, counted=counted, timed=timed, grain=grain)
+        # a frame without the parts that have the clock says nothing of time, so that only a counter tells what was lost beside it
+        self._continuity = Continuity(sensor, stats, counted=counted, timed=timed and (counted or not in_parts), grain=grain)
         self._skipped = 0  # bytes since the last packet
+        self._time: int | None = None  # of the last packet with parts that have the clock
         self._tables: dict[str, tuple[bytes, Table]] = {}
 
     def add(self, found: Sequence[Frames], *, whole: bool = False) -> Packets:
@@ -98,7 +101,13 @@ class PacketStream:
 
     def _times(self, batch: Batch, host: NDArray[np.int64]) -> NDArray[np.int64]:
         assert self._clock is not None
-        return self._clock.push(clock_ns(self.sensor, batch), host)
+        which, readings = clocked(self.sensor, batch)
+        if which is None:
+            return self._clock.push(readings, host)
+        times = self._clock.push(readings, host[which])
+        before = host if self._time is None else repeated(self._time, len(host))
+        self._time = int(times[-1]) if len(times) else self._time
+        return held(which, times, before)
 
     def _bytes_skipped(self, part: _Part) -> NDArray[np.int64]:
         """The bytes in no frame before each of our frames, since ours before it, (n,)."""
@@ -214,7 +223,8 @@ def data_frame(sensor: Spec, found: Sequence[Frames]) -> str | None:
 
 def _has(sensor: Spec, frame: str, path: str) -> bool:
     """Whether packets of this type are to have a field, such as the counter: not, if only other data frames have it."""
-    having = [name for name in sensor.data_frames if path in codec(sensor.frames[name]).schema.fields]
+    schemas = {name: codec(sensor.frames[name]).schema for name in sensor.data_frames}
+    having = [name for name, schema in schemas.items() if path in schema.fields or schema.within(path) is not None]
     return frame in having or not having
 
 

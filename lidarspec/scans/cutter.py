@@ -98,10 +98,12 @@ class Cutter:
         if isinstance(rule, OnWrap) and rule.name in COLUMNS:
             angles = np.asarray(getattr(found.cloud, rule.name), np.float64)
             return self._points(*self._wraps(angles, 2 * np.pi, rule.at))
-        column = _field(found, rule.name)
+        path = _own_path(packets, rule.name)
+        column = _field(found, path)
         values, starts = _rows(column, found)
         if isinstance(rule, OnWrap):
-            unit = packets.table.schema.fields[column.source].unit
+            table = packets.frames[0] if path.startswith("frame.") else packets.table
+            unit = table.schema.fields[column.source].unit
             rows, steps = self._wraps(values, 360.0 if unit == "deg" else 2 * np.pi, rule.at)
             return self._points(starts[rows], steps)
         return starts[self._changes(rule, values)].tolist()  # type: ignore[no-any-return]
@@ -163,6 +165,12 @@ class Cutter:
         self._before = float(period[-1])
         starts = first_points(found)
         return starts[np.flatnonzero(period > before)].tolist()  # type: ignore[no-any-return]
+
+
+def _own_path(packets: Packets, path: str) -> str:
+    """The path of a field of the frame as packets that are parts of it have it."""
+    _, _, parts = packets.frame.partition(".")
+    return path if not parts else path.removeprefix(f"{parts}.") if path.startswith(f"{parts}.") else f"frame.{path}"
 
 
 def _field(found: Evaluated, path: str) -> Column:

@@ -22,7 +22,7 @@ from lidarspec.scans.cutter import Cutter, first_points
 from lidarspec.spec.description import Spec
 from lidarspec.spec.links import Serial
 from lidarspec.spec.timing import Every, OnFlag, OnRewind, OnWrap, Split
-from lidarspec.wire.arrays import alike, counted, repeated
+from lidarspec.wire.arrays import alike, repeated
 
 #: seconds that a turn takes at the slowest where no sensor says so; of a scan at least where packets bear the host's time, which may pause.
 SLOWEST, UNTIMED = 1.0, 1.0
@@ -194,8 +194,7 @@ class Progress:
         if not number:
             return found
         first = first_points(points) if len(ends) or self._by_points else np.empty(0, np.intp)
-        sizes = np.diff(first, append=source_of(points.cloud).size) if self._by_points else packets.table.sizes[:number]
-        batch = Batch(packets.time_ns[:number], sizes, *self._missing(packets, number))
+        batch = self._batch(packets, number, np.diff(first, append=source_of(points.cloud).size) if self._by_points else None)
         for end in ends:
             edge = int(np.searchsorted(first, end, side="right")) - 1  # the packet that the end is in
             begins = bool(first[edge] == end)
@@ -209,19 +208,22 @@ class Progress:
         self._last = int(batch.times[-1]), int(packets.index[number - 1])
         return found
 
-    def _missing(self, packets: Packets, number: int) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-        """How many packets are missing before each, (n,), and whether there is a break, (n,)."""
-        index, broken = packets.index[:number], packets.breaks[:number]
-        before = int(index[0]) - 1 if self._last is None else self._last[1]
-        if int(index[-1]) - before == number:
-            return repeated(0, number), broken.copy() if broken.any() else broken
-        missing = np.maximum(np.diff(index, prepend=before) - 1, 0)
-        return missing, broken | (missing > 0)
+    def _batch(self, packets: Packets, number: int, points: NDArray[np.intp] | None) -> Batch:
+        """What is looked at of the first packets, by the number of points of each, (n,), or their bytes; a frame of parts counts once."""
+        times, index, broken = packets.time_ns[:number], packets.index[:number], packets.breaks[:number]
+        before, (frames, which) = int(index[0]) - 1 if self._last is None else self._last[1], packets.frames
+        if frames is packets.table and int(index[-1]) - before == number:
+            sizes = frames.sizes[:number] if points is None else points
+            return Batch(times, repeated(1, number), sizes, repeated(0, number), broken.copy() if broken.any() else broken)
+        steps = np.diff(index, prepend=before)
+        counts, missing = (steps != 0).astype(np.int64) if frames is not packets.table else repeated(1, number), np.maximum(steps - 1, 0)
+        return Batch(times, counts, counts * frames.sizes[which][:number] if points is None else points, missing, broken | (missing > 0))
 
     def _shows_start(self, packets: Packets, edge: int) -> bool:
         """Whether a packet says that it is the first of a scan."""
+        frames, which = packets.frames
         return self._starts_are_seen or (
-            self._counter is not None and int(packets.table.raw(self._counter.field)[edge]) == self._counter.first
+            self._counter is not None and int(frames.raw(self._counter.field)[which][edge]) == self._counter.first
         )
 
     def _ended(self, batch: Batch, edge: int, end: int, *, begins: bool, is_shared: bool, is_seen: bool) -> Cut:
@@ -280,7 +282,7 @@ class Progress:
         since = scan.since if scan.packets else times.item(0)
         endless = (np.abs(times - since) > self._longest) | (scan.size + np.cumsum(batch.sizes[part]) > self._most)
         lost = scan.lost + np.cumsum(batch.missing[part])
-        over = endless | ((lost > 0) & (scan.packets + counted(len(times)) + lost > LONGER * self._turn))
+        over = endless | ((lost > 0) & (scan.packets + np.cumsum(batch.counts[part]) - 1 + lost > LONGER * self._turn))
         over[0] &= bool(scan.packets)
         spot = int(over.argmax())
         return (spot, bool(endless[spot])) if over[spot] else (None, False)
@@ -292,21 +294,25 @@ class Progress:
             return
         if not gap_only:
             scan.since = scan.since if scan.packets else batch.times.item(part.start)
-            scan.packets, scan.size = scan.packets + number, scan.size + _sum(batch.sizes[part])
+            scan.packets, scan.size = scan.packets + _sum(batch.counts[part]), scan.size + _sum(batch.sizes[part])
         scan.lost, scan.broken = scan.lost + _sum(batch.missing[part]), scan.broken or bool(batch.broken[part].any())
 
 
 @dataclass(frozen=True, eq=False)
 class Batch:
-    """What `Progress` looks at of some packets, (n,) each: their times, ns, sizes, how many are missing before each, and breaks."""
+    """What `Progress` looks at of some packets, (n,) each: their times, ns, how many each counts for (a frame of parts with the first of
+    them), their sizes, how many are missing before each, and breaks."""
 
     times: NDArray[np.int64]
+    counts: NDArray[np.int64]
     sizes: NDArray[np.intp]
     missing: NDArray[np.int64]
     broken: NDArray[np.bool_]
 
     def forget(self, place: int) -> None:
-        """What is missing before a packet has been counted."""
+        """What is missing before a packet has been counted; itself, or the frame that it is part of, is in the scan behind it as well."""
+        if not self.counts[place]:
+            self.counts[place] = 1
         if self.broken[place]:
             self.broken[place] = False
         if self.missing[place]:
@@ -342,6 +348,7 @@ class ScanStream:
         self._parts: list[Stretch] = []
         self._epoch: int | None = None
         self._progress = Progress(sensor)
+        self._empty, self._broken = 0, False  # frames without the parts that have the points, and whether there is a break before the last
         self._begins: int | None = None  # time of the first point of the scan under way, ns, where it is known
 
     def add(self, packets: Packets) -> list[Scan]:
@@ -358,9 +365,12 @@ class ScanStream:
         return scans + ([left] if left else [])
 
     def _push(self, packets: Packets, *, final: bool) -> list[Scan]:
+        packets = self._with_points(packets)
         if self._waiting is not None and len(self._waiting):
             packets = joined_packets([self._waiting, packets])
         self._waiting = None
+        if not len(packets):
+            return []
         if self._epoch is None:
             self._epoch = int(packets.time_ns[0])  # one for the whole stream, so that batches do not change a bit of any time
         points = guarded(packets, self._carry, final=final, epoch=self._epoch)
@@ -370,6 +380,18 @@ class ScanStream:
         if points.ready < len(packets):
             self._waiting = packets.take(slice(points.ready, None))
         return list(self._cut(packets, points))
+
+    def _with_points(self, packets: Packets) -> Packets:
+        """The packets that points are made of: these, or the parts in them; a frame without any leaves no gap."""
+        parts = packets.with_points
+        if parts is not packets:
+            spots = np.searchsorted(packets.index, parts.index)
+            empty = self._empty + np.cumsum(~np.isin(np.arange(len(packets)), spots))
+            parts.index, self._empty = parts.index - empty[spots], int(empty[-1])
+            parts.breaks[:1] |= self._broken
+            left = packets.breaks[spots[-1] + 1 if len(spots) else 0 :]
+            self._broken = bool(left.any()) or (self._broken and not len(spots))
+        return parts
 
     def _cut(self, packets: Packets, points: Evaluated) -> Iterator[Scan]:
         start, source = 0, source_of(points.cloud)

@@ -14,10 +14,14 @@ from numpy.typing import NDArray
 
 from lidarspec.errors import SpecError
 from lidarspec.framing.frame_engine import CompiledCodec, codec
+from lidarspec.spec.construct_layer import member
 from lidarspec.spec.description import Spec
+from lidarspec.spec.tree import Formula, Kind, Node, refs
+from lidarspec.wire.build import fill_in, kind_of
 from lidarspec.wire.frame_table import Group, Rows
 from lidarspec.wire.layout import Layout, Leaf
 from lidarspec.wire.layout_tree import TooLong, Unknown, layout_of
+from lidarspec.wire.schema import schema
 
 Values = Mapping[str, Any]
 
@@ -33,40 +37,86 @@ class FrameMaker:
         engine = codec(sensor.frames[frame])
         if not isinstance(engine, CompiledCodec):
             raise SpecError(f"cannot be simulated, since it is not compiled: {engine.reason}", path=frame, sensor=sensor.id)
-        self.sensor, self.engine = sensor, engine
+        others = sensor.data_frames if sensor.frames[frame].data else ()
+        elsewhere = {path for other in others for path in codec(sensor.frames[other]).schema.fields}
+        self.engine = engine
+        self._makes(sensor.id, engine.frame.tree, engine.frame.max_length, {}, elsewhere)
+
+    @classmethod
+    def _of_parts(cls, sensor: str, root: Node, limit: int, given: Mapping[str, int]) -> FrameMaker:
+        """Makes parts of one kind, in frames whose fields have the values that they ask for."""
+        maker = cls.__new__(cls)
+        maker._makes(sensor, root, limit, given, set())
+        return maker
+
+    def _makes(self, sensor: str, root: Node, limit: int, given: Mapping[str, int], elsewhere: set[str]) -> None:
+        self._sensor, self._root, self._limit, self._given, self._elsewhere = sensor, root, limit, given, elsewhere
+        self.schema = schema(root)
         self._layouts: dict[tuple[int, ...], Layout] = {}
         self._asked: list[str] = []
-        others = sensor.data_frames if sensor.frames[frame].data else ()
-        self._elsewhere = {path for other in others for path in codec(sensor.frames[other]).schema.fields}
+        self._makers: dict[tuple[Any, ...], FrameMaker] = {}
 
     def table(self, frames: Sequence[Values]) -> Rows:
-        """One frame for each mapping of field paths to physical values; arrays may be given as bytes, too.
+        """One frame for each mapping of field paths to physical values; arrays may be given as bytes, too, and parts as such mappings.
 
         Raises:
             SpecError: where a value is given to a field that the frame does not have.
         """
         members: dict[int, tuple[Layout, list[int]]] = {}
-        for index, values in enumerate(frames):
+        filled = [self._with_parts(values) for values in frames] if self.schema.parts else [(values, {}) for values in frames]
+        for index, (values, _) in enumerate(filled):
             layout = self._layout(values)
             members.setdefault(id(layout), (layout, []))[1].append(index)
         groups = [
-            Group(layout, np.array(which, np.intp), self._rows(layout, [frames[i] for i in which])) for layout, which in members.values()
+            Group(layout, np.array(which, np.intp), self._rows(layout, [filled[i] for i in which])) for layout, which in members.values()
         ]
-        return Rows(self.engine.schema, groups)
+        return Rows(self.schema, groups)
 
     def frame(self, values: Values) -> bytes:
         """One frame, sealed."""
         return sealed(self.table([values]))[0]
 
+    def _with_parts(self, values: Values) -> tuple[Values, dict[str, bytes]]:
+        """The values of a frame with what follows from its parts, and the bytes of these, by their axis."""
+        given, made = dict(values), dict[str, bytes]()
+        for axis, node in self.schema.parts.items():
+            parts = [dict(part) for part in given.pop(axis, ())]
+            kinds = [kind_of(node, part) for part in parts]
+            around = {ref.path: self._raw(given, ref.path) for ref in node.outer}
+            makers = [self._maker(kind, around) for kind in kinds]
+            sizes = [maker._layout(maker._with_parts(part)[0]).size for maker, part in zip(makers, parts, strict=True)]
+            for kind, maker, part, after in zip(kinds, makers, parts, [*sizes[1:], 0], strict=False):
+                maker._fill_in(kind.following, part, after, axis)
+            for formula, number in ((node.count, len(parts)), (node.size, sizes[0] if sizes else 0), (node.within, sum(sizes))):
+                self._fill_in(formula, given, number, axis)
+            made[axis] = b"".join(maker.frame(part) for maker, part in zip(makers, parts, strict=True))
+            given[node.total.path] = len(made[axis])
+        return given, made
+
+    def _maker(self, kind: Kind, around: Mapping[str, int]) -> FrameMaker:
+        key = (kind, *around.items())
+        if key not in self._makers:
+            self._makers[key] = FrameMaker._of_parts(self._sensor, kind.root, self._limit, around)
+        return self._makers[key]
+
+    def _fill_in(self, formula: Formula | None, values: dict[str, Any], number: int, axis: str) -> None:
+        """Set the field that a formula depends on, where it is not given, so that the formula gives a number."""
+        asked = [] if formula is None else [ref.path for ref in refs(formula) if ref.path in self.schema.fields]
+        if asked and asked[0] not in values:
+            raw: dict[str, Any] = {}
+            for path in asked[1:]:
+                nested(raw, path, self._raw(values, path))
+            fill_in(formula, raw, number, self.schema.fields, axis)
+            values[asked[0]] = self.schema.fields[asked[0]].physical(member(raw, asked[0]))
+
     def _layout(self, values: Values) -> Layout:
         """The layout that these values of header fields ask for."""
-        frame = self.engine.frame
         while True:
             header = {path: self._raw(values, path) for path in self._asked}
             key = tuple(header.values())
             try:
                 if key not in self._layouts:
-                    self._layouts[key] = layout_of(frame.tree, header, frame.max_length)
+                    self._layouts[key] = layout_of(self._root, header, self._limit, self._given)
                 return self._layouts[key]
             except Unknown as unknown:
                 self._asked.append(unknown.leaf.info.path)
@@ -75,31 +125,45 @@ class FrameMaker:
                 raise self._too_long(values, str(error)) from None
 
     def _too_long(self, values: Values, path: str) -> SpecError:
-        fields, most = self.engine.schema.fields, self.engine.frame.max_length
+        fields = self.schema.fields
         left_out = [path for path in self._asked if path not in values and fields[path].const is None]
         given = ", ".join(f"{path} = {values[path]}" for path in self._asked if path in values)
-        reason = f"with {given} there is no frame of at most {most} bytes (max_length)"
+        reason = f"with {given} there is no frame of at most {self._limit} bytes (max_length)"
         if left_out:
             reason = f"sweep has to give {left_out[0]!r}, which the length of the frame depends on"
-        return SpecError(reason, path=path, sensor=self.sensor.id)
+        return SpecError(reason, path=path, sensor=self._sensor)
 
-    def _rows(self, layout: Layout, frames: Sequence[Values]) -> NDArray[np.uint8]:
+    def _rows(self, layout: Layout, frames: Sequence[tuple[Values, Mapping[str, bytes]]]) -> NDArray[np.uint8]:
         rows = np.zeros((len(frames), layout.size), np.uint8)
-        for path in dict.fromkeys(path for values in frames for path in values):
+        totals = {node.total.path for node in self.schema.parts.values()}
+        for path in dict.fromkeys(path for values, _ in frames for path in values if path not in totals):
             leaf = layout.leaves.get(path)
             if leaf is None and path in self._elsewhere:
                 continue
             if leaf is None:
-                raise SpecError("sweep gives a value to a field that the frame does not have", path=path, sensor=self.sensor.id)
-            leaf.store(rows, _steps(leaf, [values.get(path, 0) for values in frames]))
+                raise SpecError("sweep gives a value to a field that the frame does not have", path=path, sensor=self._sensor)
+            leaf.store(rows, _steps(leaf, [values.get(path, 0) for values, _ in frames]))
+        for axis, region in layout.regions.items():
+            parts = b"".join(made[axis] for _, made in frames)
+            rows[:, region.start : region.start + region.size] = np.frombuffer(parts, np.uint8).reshape(len(frames), region.size)
         layout.seal(rows)
         return rows
 
     def _raw(self, values: Values, path: str) -> int:
-        info = self.engine.schema.fields[path]
+        info = self.schema.fields.get(path)
+        if info is None:
+            return int(values[path])  # the bytes of parts
         if path in values:
             return int(info.raw(float(values[path])))
         return int(info.const) if isinstance(info.const, int) else 0
+
+
+def nested(values: dict[str, Any], path: str, value: Any) -> None:
+    """Put a value into nested mappings."""
+    *parents, name = path.split(".")
+    for parent in parents:
+        values = values.setdefault(parent, {})
+    values[name] = value
 
 
 def sealed(table: Rows) -> list[bytes]:

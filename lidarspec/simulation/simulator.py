@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.columns.columns import Batch, Column, Fields, of_points
+from lidarspec.columns.columns import AROUND, Batch, Column, Fields, of_points
 from lidarspec.errors import SpecError, UsageError, plugin_errors
 from lidarspec.framing.examples import example
 from lidarspec.framing.frame_engine import codec
@@ -38,7 +38,7 @@ from lidarspec.spec.links import Serial
 from lidarspec.spec.results import Cartesian, Points, Polar
 from lidarspec.spec.timing import Every
 from lidarspec.spec.tree import FieldInfo, exact
-from lidarspec.wire.frame_table import Rows
+from lidarspec.wire.frame_table import Group, Rows, Table
 
 Times = NDArray[np.int64]
 #: bits on a serial line for each byte: start, eight, stop.
@@ -111,7 +111,7 @@ class Measurement:
 
     def __init__(self, sensor: Spec, frame: str, table: Rows, given: Container[str] = ()) -> None:
         self._sensor, self._frame = sensor, frame
-        self._points = sensor.points_of(frame)
+        self._points = sensor.points_of(_name(frame, table))
         self._encode: Callable[[Polar], Mapping[str, Any]] | None = sensor.simulation_of(frame).encode
         intensity = self.beams(table).intensity
         self._given, self._intensity = given, "" if intensity in given else intensity
@@ -123,11 +123,11 @@ class Measurement:
         """The measurement of a sensor's points, as they are given by direction or by coordinates."""
         return (Placement if _result(sensor, frame, table)[0].__class__ is Cartesian else Measurement)(sensor, frame, table, given)
 
-    def fill(self, table: Rows, numbers: range, scene: Scene, times: Floats) -> None:
+    def fill(self, table: Rows, numbers: Sequence[int], scene: Scene, times: Floats) -> None:
         """Measure a table's ranges in the scene, and write them.
 
         Args:
-            numbers: of the packets.
+            numbers: of the packets; of parts, those of the packets that they are in.
             times: (n,) seconds since the scene began, of each packet.
         """
         steps = [self._step(table, target) for target in self._targets]
@@ -266,7 +266,7 @@ class Placement(Measurement):
         SpecError: where no directions are declared, or no field makes a coordinate of a point.
     """
 
-    def fill(self, table: Rows, numbers: range, scene: Scene, times: Floats) -> None:
+    def fill(self, table: Rows, numbers: Sequence[int], scene: Scene, times: Floats) -> None:
         beams = self.beams(table)
         azimuth, elevation = self._directions(numbers, beams.range.shape[1:])
         beams = replace(beams, azimuth=azimuth, elevation=elevation)
@@ -276,7 +276,7 @@ class Placement(Measurement):
         if self._intensity and not self._encode:
             self._shine(table, _part(ranges, self._targets[0].inner) * 1000)
 
-    def _directions(self, numbers: range, shape: tuple[int, ...]) -> tuple[Floats, Floats]:
+    def _directions(self, numbers: Sequence[int], shape: tuple[int, ...]) -> tuple[Floats, Floats]:
         """The declared azimuths and elevations of packets, (n, *shape) each; nan beyond those of a packet that has fewer points."""
         declared = self._sensor.simulation_of(self._frame).directions
         if declared is None:
@@ -349,11 +349,19 @@ def _solved(slopes: Floats, aims: Floats) -> Floats:
     return np.moveaxis((inverse @ wanted[..., None])[..., 0], -1, 0)
 
 
+def _name(frame: str, table: Rows) -> str:
+    """What a table is of: a frame type, or parts of it."""
+    return ".".join(filter(None, (frame, *table.place))) if isinstance(table, PartRows) else frame
+
+
 def _result(sensor: Spec, frame: str, table: Rows) -> tuple[Points, Batch]:
     """What the sensor's `points` says of a table of its frames, which nothing goes before."""
+    state: dict[str, tuple[Table | None, NDArray[np.intp]]]
     state = {name: (None, np.full(len(table), -1, np.intp)) for name in sensor.state}
+    if isinstance(table, PartRows):
+        state[AROUND] = (table.frames, table.which)
     batch = Batch(table, np.zeros(len(table), np.bool_), state, sensor.state)
-    points = sensor.points_of(frame)
+    points = sensor.points_of(_name(frame, table))
     with np.errstate(all="ignore"), plugin_errors(f"points of {frame}", sensor.id, points):
         result = points(Fields(batch))
     measured = [getattr(result, name, None) for name in ("range", "x", "y", "z")]
@@ -365,6 +373,41 @@ def _result(sensor: Spec, frame: str, table: Rows) -> tuple[Points, Batch]:
 def whole(info: FieldInfo, raw: Floats) -> Floats:
     """Raw values as a field can hold them."""
     return np.rint(raw) if info.kind == "int" else raw
+
+
+class PartRows(Rows):
+    """The parts that have the points of frames, with these frames, and the one that each is in.
+
+    Args:
+        frames: which are written to by `put_back`.
+        path: of the parts.
+    """
+
+    def __init__(self, frames: Rows, path: str) -> None:
+        place = frames.schema.within(path)
+        if place is None or place[2]:
+            raise SpecError("the frame has no such parts", path=path)
+        self.place, self.frames = place[:2], frames
+        own, self.which = frames.parts(*self.place)
+        super().__init__(own.schema, [Group(group.layout, group.where, group.rows.copy()) for group in own.groups])
+
+    def put_back(self) -> None:
+        """Write the parts into their frames, sealed."""
+        left = iter(sealed(self))
+        axis, kind = self.place
+        spots = list[tuple[int, int, NDArray[np.uint8]]]()
+        for group in self.frames.groups:
+            if (region := group.layout.regions.get(axis)) is not None:
+                buffer, walked = region.in_rows(group.rows)
+                pieces = [piece for pieces in walked.rounds for piece in pieces if region.kinds[piece.kind].node.name == kind]
+                spots += [
+                    (int(group.where[owner]), int(spot), buffer)
+                    for piece in pieces
+                    for owner, spot in zip(piece.owners, piece.spots, strict=True)
+                ]
+        for _, spot, buffer in sorted(spots, key=lambda found: found[:2]):
+            part = next(left)
+            buffer[spot : spot + len(part)] = np.frombuffer(part, np.uint8)
 
 
 def store(table: Rows, path: str, values: NDArray[Any]) -> None:
@@ -481,8 +524,10 @@ class Simulation:
         self._stuck = self._turning(sweep(1)) if blocked else {}
         swept = self._swept(range(PROBED))
         table = self._maker.table(swept)
-        self._measurement = Measurement.of(sensor, frame, table, {path for values in swept for path in values})
-        self._pace = Pace(sensor, frame, table, self._measurement.beams(table))
+        self._parts = sensor.parts_with_points(frame)
+        given = [part for values in swept for part in values[self._parts.partition(".")[0]]] if self._parts else swept
+        self._measurement = Measurement.of(sensor, frame, self._with_points(table), {path for values in given for path in values})
+        self._pace = Pace(sensor, frame, table, self._beams(table))
         self.interval = self._pace.interval
 
     def block(self, start: int, count: int, scene: Scene, since: float = 0.0) -> Block:
@@ -493,9 +538,27 @@ class Simulation:
         """
         numbers = range(start, start + count + AHEAD)
         table = self._maker.table(self._swept(numbers))
-        times = self._pace.times(table, functools.partial(self._measurement.beams, table))
-        self._measurement.fill(table, numbers, scene, since + times / 1e9)
+        times = self._pace.times(table, functools.partial(self._beams, table))
+        seconds, measured = since + times / 1e9, self._with_points(table)
+        if isinstance(measured, PartRows):
+            self._measurement.fill(measured, [numbers[frame] for frame in measured.which], scene, seconds[measured.which])
+            measured.put_back()
+        else:
+            self._measurement.fill(table, numbers, scene, seconds)
         return Block(sealed(table)[:count], times[: count + 1])
+
+    def _with_points(self, table: Rows) -> Rows:
+        """What points are made of: frames, or the parts in them."""
+        return PartRows(table, self._parts) if self._parts else table
+
+    def _beams(self, table: Rows) -> Beams:
+        """The beams of frames, those of their parts together."""
+        measured = self._with_points(table)
+        beams = self._measurement.beams(measured)
+        if not isinstance(measured, PartRows):
+            return beams
+        counts = np.bincount(measured.which, beams.counts, len(table))
+        return replace(beams, counts=counts.astype(np.intp))
 
     def _swept(self, numbers: range) -> list[Mapping[str, Any]]:
         """The values of the packets of these numbers, before anything is measured."""

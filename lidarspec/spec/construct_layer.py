@@ -129,7 +129,7 @@ class IndexedArray(Array):  # type: ignore[misc]
     in_bits: bool
 
     def _parse(self, stream: Any, context: Any, path: str) -> Any:
-        count = _bounded(construct.evaluate(self.count, context), self.limit, "count", path)
+        count = bounded(construct.evaluate(self.count, context), self.limit, "count", path)
         found = construct.ListContainer()
         for index in range(count):
             context._index = index
@@ -137,7 +137,7 @@ class IndexedArray(Array):  # type: ignore[misc]
             found.append(self.subcon._parsereport(stream, context, f"{path}[{index}]"))
             note(context, f"{path}[{index}]", start, stream.tell(), found[-1])
             if stream.tell() == start and not self.in_bits:
-                context._params["_empty"] = _bounded(context._params.get("_empty", 0) + 1, self.limit, "count", path)
+                context._params["_empty"] = bounded(context._params.get("_empty", 0) + 1, self.limit, "count", path)
         return found
 
     def _build(self, obj: Any, stream: Any, context: Any, path: str) -> Any:
@@ -178,7 +178,7 @@ class FullRange(construct.GreedyRange):  # type: ignore[misc]
         return _built(self, obj, stream, context, path)
 
 
-def _bounded(number: int, limit: int, what: str, path: str) -> int:
+def bounded(number: int, limit: int, what: str, path: str) -> int:
     """A count or a length that a frame can have; RangeError for another one."""
     if not 0 <= number <= limit:
         raise construct.RangeError(f"invalid {what} {number}", path=path)
@@ -202,7 +202,7 @@ class CountedBytes(Bytes):  # type: ignore[misc]
     limit: int
 
     def _parse(self, stream: Any, context: Any, path: str) -> Any:
-        length = _bounded(operator.index(construct.evaluate(self.length, context)), self.limit, "length", path)
+        length = bounded(operator.index(construct.evaluate(self.length, context)), self.limit, "length", path)
         return construct.stream_read(stream, length, path)
 
     def _build(self, obj: Any, stream: Any, context: Any, path: str) -> Any:
@@ -259,6 +259,40 @@ class Sealing(Subconstruct):  # type: ignore[misc]
     absent: frozenset[int]
 
 
+class Pieces(construct.ListContainer):  # type: ignore[misc]
+    """Parts that were parsed or built: kind, first byte and the one after the last of each as `spans`; `size`: the bytes of all."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.spans: list[tuple[str, int, int]] = []
+
+    @property
+    def size(self) -> int:
+        """The bytes of all parts."""
+        return sum(end - start for _, start, end in self.spans)
+
+    def __getitem__(self, key: Any) -> Any:
+        return self.size if key == "size" else super().__getitem__(key)
+
+
+class Partition(Construct):  # type: ignore[misc]
+    """Structs one after another, each of a size of its own.
+
+    Attributes:
+        cases: what a part can be, by the name of its kind.
+        count, size, within: how many there are, the bytes of the first of a chain, or those of all.
+        following: of a part's own fields, the bytes of the next one.
+        limit: the longest frame, in bytes.
+    """
+
+    cases: dict[str, Construct]
+    count: Any
+    size: Any
+    within: Any
+    following: Any
+    limit: int = sys.maxsize
+
+
 def verifying(context: Any, *, checksums: bool = False) -> bool:
     """Whether constants, or checksums too, are checked in this parse (``_verify``: True, "constants" or False)."""
     wanted = context._params.get("_verify", True)
@@ -294,17 +328,19 @@ def prepare(con: Construct, limit: int = sys.maxsize, *, in_bits: bool = False) 
         while isinstance(inner, construct.Renamed):  # ("name" / con) * "docs" wraps twice, and the path would name it twice
             inner = inner.subcon
         return construct.Renamed(prepare(inner, limit, in_bits=in_bits), newname=con.name, newdocs=con.docs)
-    if not isinstance(con, Subconstruct | construct.IfThenElse | construct.Switch):
+    if not isinstance(con, Subconstruct | construct.IfThenElse | construct.Switch | Partition):
         return con
     same = copy.copy(con)
     same.__class__ = next((own for kind, own in _OWN.items() if isinstance(con, kind)), type(con))
     is_block = isinstance(con, construct.Transformed | construct.Restreamed)
     for name in vars(con).keys() & _INNER:
         setattr(same, name, prepare(getattr(con, name), 8 * limit if is_block else limit, in_bits=in_bits or is_block))
-    if isinstance(con, construct.Switch):
+    if isinstance(con, construct.Switch | Partition):
         same.cases = {key: prepare(case, limit, in_bits=in_bits) for key, case in con.cases.items()}
     if isinstance(same, IndexedArray):
         same.limit, same.in_bits = limit, in_bits
+    if isinstance(same, Partition):
+        same.limit = limit
     return same
 
 
@@ -315,6 +351,11 @@ def unwrap(con: Construct, *, bits: bool = True) -> Construct:
             return con
         con = con.subcon
     return con
+
+
+def is_struct(con: Construct) -> bool:
+    """Whether it is a Struct, sealed or not."""
+    return isinstance(unwrap(con, bits=False), Struct)
 
 
 def bit_width(con: Construct) -> int:
@@ -403,6 +444,8 @@ def check_struct(con: Construct) -> None:
             raise SpecError("Flag keeps one bit of its byte only: use a BitStruct, or Int8ul", path=path, rule="LS107")
         if isinstance(part, Struct):
             _check_names(part, path, in_bits=in_bits)
+        if isinstance(part, Partition) and any(child.name == "frame" for case in part.cases.values() for child in unwrap(case).subcons):
+            raise SpecError("no field of a part may be called 'frame', which is the frame around it", path=f"{path}.frame", rule="LS102")
     _check_measures(con, "", (1, 0, ""), {})
 
 
@@ -524,8 +567,10 @@ def random_value(con: Construct, source: random.Random, drawn: Drawn, scope: Any
         return values
     if isinstance(con, construct.GreedyRange):
         return [random_value(con.subcon, source, drawn, scope, path) for _ in range(source.randint(0, 4))]
+    if isinstance(con, Partition):
+        return _random_parts(con, source, drawn, scope, path)
     if isinstance(con, Array):
-        count = _bounded(construct.evaluate(con.count, scope), con.limit, "count", path)
+        count = bounded(construct.evaluate(con.count, scope), con.limit, "count", path)
         return [random_value(con.subcon, source, drawn, scope, path) for _ in range(count)]
     if isinstance(con, construct.IfThenElse):
         return random_value(con.thensubcon if construct.evaluate(con.condfunc, scope) else con.elsesubcon, source, drawn, scope, path)
@@ -541,6 +586,18 @@ def random_value(con: Construct, source: random.Random, drawn: Drawn, scope: Any
     return random_value(con.subcon, source, drawn, scope, path)
 
 
+def _random_parts(con: Partition, source: random.Random, drawn: Drawn, scope: Any, path: str) -> Pieces:
+    """Some parts, with how long each is, which what stands behind them may ask for."""
+    found = Pieces()
+    around = Container({**scope, "_params": Container(), "_parsing": False, "_building": True, "_sizing": False})
+    for _ in range(source.randint(0, 4)):
+        name, stream = source.choice(list(con.cases)), io.BytesIO()
+        found.append(random_value(con.cases[name], source, drawn, scope, path))
+        con.cases[name]._build(found[-1], stream, around, path)
+        found.spans.append((name, 0, stream.tell()))
+    return found
+
+
 def _random_leaf(con: Construct, source: random.Random, scope: Any) -> Any:
     if con is construct.Pass or isinstance(con, construct.Check):
         return None  # whether a Check holds is seen when the frame is built
@@ -551,7 +608,7 @@ def _random_leaf(con: Construct, source: random.Random, scope: Any) -> Any:
     if con is construct.GreedyBytes:
         return source.randbytes(source.randint(0, 4))
     if isinstance(con, Bytes):
-        return source.randbytes(_bounded(construct.evaluate(con.length, scope), con.limit, "length", ""))
+        return source.randbytes(bounded(construct.evaluate(con.length, scope), con.limit, "length", ""))
     if isinstance(con, FormatField | BytesInteger | BitsInteger) and source.random() < 0.5:  # it may be a count
         return con.parse(con.build(source.randint(0, min(MANY, (1 << (bit_width(con) - 1)) - 1))))
     if isinstance(con, BitsInteger):
@@ -667,6 +724,8 @@ class _Builder:
             axis = axis_path(info)
             count = self._formula(inner.count, place)
             return tree.Repeat(name, axis, count, self.node(inner.subcon, place.inside(axes=(*info.axes, axis))))
+        if isinstance(inner, Partition):
+            return self._parts(inner, place)
         if isinstance(inner, construct.IfThenElse):
             condition = self._formula(inner.condfunc, place)
             branches = (self.node(branch, place.inside(optional=True)) for branch in (inner.thensubcon, inner.elsesubcon))
@@ -762,6 +821,35 @@ class _Builder:
             members.append(self.node(child, _Place(said, scope, child.name or "", place.in_bits)))
         self.scopes[info.path] = scope
         return tree.Struct(place.name, info.path, tuple(members), info.docs)
+
+    def _parts(self, con: Partition, place: _Place) -> tree.Parts:
+        info, scope, axis = place.info, place.scope, axis_path(place.info)
+        assert scope is not None  # since parts are a member of a struct
+        elements = [self.node(case, place.inside(axes=(*info.axes, axis))) for case in con.cases.values()]
+        kinds, outer = list[tree.Kind](), dict[tree.Ref, None]()
+        for (name, case), element in zip(con.cases.items(), elements, strict=True):
+            root, following = self._alone(case, con.following, place)
+            kinds.append(tree.Kind(name, element, root, following))
+            asked = [ref for node in tree.nodes(root) for formula in tree.formulas(node) for ref in tree.refs(formula)]
+            asked += [] if following is None else tree.refs(following)
+            outer |= dict.fromkeys(tree.Ref(ref.path[2:], ref.info) for ref in asked if ref.path.startswith("_."))
+        count, size, within = (None if rule is None else self._formula(rule, place) for rule in (con.count, con.size, con.within))
+        total = tree.FieldInfo(f"{info.path}.size", info.axes, np.dtype(np.int64), "int", bits=64, docs="bytes of all parts")
+        known = scope.names[place.name] = tree.Scope(scope, info.path, self._asked)
+        known.add("size", tree.Ref(total.path, total))
+        return tree.Parts(place.name, axis, tuple(kinds), count, size, within, tuple(outer), total)
+
+    def _alone(self, case: Construct, following: Any, place: _Place) -> tuple[tree.Node, tree.Formula | None]:
+        """A part as a frame in itself, and the size of the one behind it."""
+        builder = _Builder({})
+        for _ in range(2):  # the second time values that follow from later fields know these
+            around = _Place(tree.FieldInfo(""), tree.Outside(place.scope, builder._asked))  # type: ignore[arg-type]
+            root = builder.node(case, around)
+            if not builder.rebuilding:
+                break
+            builder = _Builder(builder.scopes)
+        rule = None if following is None else builder._formula(following, replace(around, scope=builder.scopes[""]))
+        return root, rule
 
     def _sealed(self, con: Sealing, place: _Place) -> tree.Node:
         body = self.node(con.subcon, place)

@@ -70,7 +70,8 @@ class Frame:
         struct: its construct, most often a `Checksummed` Struct.
         direction: "in" from the sensor to us, "out" from us to it.
         data: whether it carries the points.
-        points: a `points` function of its own, for sensors that can answer in several data frames.
+        points: a `points` function of its own, for sensors that can answer in several data frames; for points that stand in parts of the
+            frame (`Parts`), their path and a function of these, {"modules": points}, {"tlvs.points": points}.
         max_length: the longest it can be, in bytes; longer candidates are not frames. Left out, it is the size of the struct, where that
             is fixed.
         plausible: a function of `Fields`: False where no sensor would send such values, reduced with `all` per packet.
@@ -87,7 +88,7 @@ class Frame:
     struct: Construct
     direction: Literal["in", "out"] = field(default="in", kw_only=True)
     data: bool = field(default=False, kw_only=True)
-    points: Callable[[Any], Points] | None = field(default=None, kw_only=True)
+    points: Callable[[Any], Points] | Mapping[str, Callable[[Any], Points]] | None = field(default=None, kw_only=True)
     max_length: int = field(default=0, kw_only=True)
     plausible: Callable[[Any], Any] | None = field(default=None, kw_only=True)
     after: str | None = field(default=None, kw_only=True)
@@ -102,6 +103,8 @@ class Frame:
         if self.max_length < 0 or self.confirm < 1:
             raise SpecError("max_length and confirm are at least 1")
         _freeze(self, "acknowledged")
+        if isinstance(self.points, Mapping) and len(self.points) != 1:
+            raise SpecError(f"points stand in parts of one kind, not in {', '.join(self.points) or 'none'}", path="points")
         longest = self.max_length or fixed_size(self.struct)
         object.__setattr__(self, "prepared", prepare(self.struct, longest or sys.maxsize))
         check_struct(self.prepared)
@@ -262,10 +265,17 @@ class Spec:
         Raises:
             SpecError: where the frame type has no points.
         """
-        function = self.frames[frame].points or (self.points if self.frames[frame].data else None)
+        name, _, parts = frame.partition(".")
+        own = self.frames[name].points
+        function = own.get(parts) if isinstance(own, Mapping) else own or (self.points if self.frames[name].data and not parts else None)
         if function is None:
             raise SpecError("this frame type has no points", path=frame, sensor=self.id)
         return function
+
+    def parts_with_points(self, frame: str) -> str:
+        """The path of the parts of a frame type that have the points; "" where the frame itself has them."""
+        points = self.frames[frame].points if frame in self.frames else None
+        return next(iter(points)) if isinstance(points, Mapping) else ""
 
     def simulation_of(self, frame: str) -> Simulation:
         """What a simulation of one frame type needs: the frame's own, and for data the sensor's where the frame has none."""

@@ -1,6 +1,6 @@
-"""What a struct needs beyond construct: a unit on a field, and a checksum that seals a struct.
+"""What a struct needs beyond construct: a unit on a field, a checksum that seals a struct, and parts that each have a size of their own.
 
-Both are ordinary parts of a struct, so that they nest in anything; neither changes the raw integers of the wire. Units go by name, and
+All are ordinary parts of a struct, so that they nest in anything; none changes the raw integers of the wire. Units go by name, and
 those few that someone may type are converted exactly.
 """
 
@@ -10,12 +10,12 @@ import io
 import math
 import numbers
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from fractions import Fraction
 from typing import Any
 
-from construct import Construct, Container
+from construct import ConstError, Construct, ConstructError, Container, RangeError, SizeofError, evaluate
 
 from lidarspec.errors import SpecError, UsageError
 from lidarspec.spec import construct_layer as layer
@@ -240,6 +240,135 @@ class Checksummed(layer.Sealing):
                 inside = layer.bytes_of(con, parts[depth + 1 :])
                 return start + min(inside), start + max(inside) + 1
         return start, end
+
+
+class Parts(layer.Partition):
+    """Structs one after another, each of a size of its own: the modules of a telegram, or its tags with a type and a length.
+
+    In the struct they are a list. In `points` each is a packet of its own (``Frame(points={"modules": points})``), whose fields are
+    ``f.distance``, and those of the frame around it ``f.frame.counter``; expressions of a part see these as ``this._.counter``.
+    Behind them, ``this.modules.size`` is how many bytes all of them take.
+
+    Args:
+        kinds: a Struct; or several by name, for parts that are told apart by their constants: the first one is taken whose constants
+            are right, so that a struct without any, as the last, takes what nobody knows.
+        count: how many there are.
+        size: the bytes of the first part of a chain, 0 for none; with `following`.
+        following: an expression of a part's own fields, the bytes of the next part, 0 behind the last.
+        within: the bytes of all parts, which fill them.
+
+    Raises:
+        SpecError: where what is said is not just one of `count`, `size` with `following`, and `within`, or a part is no struct.
+    """
+
+    def __init__(
+        self,
+        kinds: Construct | Mapping[str, Construct],
+        count: Any = None,
+        *,
+        size: Any = None,
+        following: Any = None,
+        within: Any = None,
+    ) -> None:
+        super().__init__()
+        if sum(rule is not None for rule in (count, size, within)) != 1 or (size is None) != (following is None):
+            raise SpecError("Parts takes one of count=, within=, and size= with following=: what says where the last part is")
+        self.cases = dict(kinds) if isinstance(kinds, Mapping) else {"": kinds}
+        if not self.cases or not all(map(layer.is_struct, self.cases.values())):
+            raise SpecError("a part is a Struct, or one of several Structs by name")
+        self.count, self.size, self.following, self.within = count, size, following, within
+
+    def _parse(self, stream: Any, context: Any, path: str) -> Any:
+        start, found = stream.tell(), layer.Pieces()
+        goes_on = self._rule(context, path)
+        while (announced := goes_on(found)) != 0:
+            place, spot = f"{path}[{len(found)}]", stream.tell()
+            kind = self._kind(stream, context, place)
+            part = self.cases[kind]._parsereport(stream, context, place)
+            self._take(found, kind, part, (spot, stream.tell()), announced, place)
+            layer.note(context, place, spot, stream.tell(), part)
+            if stream.tell() - start > self.limit:
+                raise RangeError("parts longer than the frame can be", path=place)
+        return found
+
+    def _build(self, obj: Any, stream: Any, context: Any, path: str) -> Any:
+        if not isinstance(obj, list | tuple):
+            raise layer.Mismatch(path, 0, "a list of its parts", repr(obj), "value")
+        built, goes_on = layer.Pieces(), self._rule(context, path)
+        for index, part in enumerate(obj):
+            announced, place = goes_on(built), f"{path}[{index}]"
+            kind, value, data = self._built(part, context, place)
+            self._take(built, kind, value, (stream.tell(), stream.tell() + len(data)), announced, place)
+            stream.write(data)
+        if goes_on(built) != 0:
+            raise RangeError(f"more parts are announced than the {len(built)} that are given", path=path)
+        return built
+
+    def _sizeof(self, context: Any, path: str) -> int:
+        raise SizeofError("the size of parts is theirs", path=path)
+
+    def _rule(self, context: Any, path: str) -> Callable[[layer.Pieces], int]:
+        """From the parts so far to the bytes of the next one, 0 where there is none, -1 where its own struct says it."""
+        rules = ((self.count, "count"), (self.size, "length"), (self.within, "length"))
+        known = (None if rule is None else layer.bounded(evaluate(rule, context), self.limit, what, path) for rule, what in rules)
+        count, size, within = known
+
+        def goes_on(found: layer.Pieces) -> int:
+            if count is not None:
+                return -1 if len(found) < count else 0
+            if within is not None:
+                return -1 if found.size < within else layer.bounded(found.size, within, "length of parts", path) - within
+            assert size is not None
+            if not found:
+                return size
+            return layer.bounded(evaluate(self.following, Container({**found[-1], "_": context})), self.limit, "length", path)
+
+        return goes_on
+
+    @staticmethod
+    def _take(found: layer.Pieces, kind: str, part: Any, span: tuple[int, int], announced: int, place: str) -> None:
+        size = span[1] - span[0]
+        if announced == 0 or size == 0 or announced not in (-1, size):
+            wanted = {0: "no further part", -1: "a part of at least one byte"}.get(announced, f"{announced} bytes")
+            raise RangeError(f"expected {wanted}, found {size} bytes", path=place)
+        found.append(part)
+        found.spans.append((kind, *span))
+
+    def _kind(self, stream: Any, context: Any, path: str) -> str:
+        """The first kind whose constants are right, as far as the bytes go.
+
+        Raises:
+            Mismatch: where those of no kind are.
+        """
+        spot, names = stream.tell(), list(self.cases)
+        trial = Container({**context, "_params": Container({**context._params, "_verify": "constants", "_trail": None})})
+        for name in names if len(names) > 1 else ():
+            try:
+                self.cases[name]._parsereport(stream, trial, path)
+            except (layer.Mismatch, ConstError) as fault:
+                if getattr(fault, "reason", "constant") == "constant":
+                    continue
+            except Exception:  # it is of this kind, and fails again when it is parsed
+                pass
+            finally:
+                stream.seek(spot)
+            return name
+        if len(names) > 1 and layer.verifying(context):
+            raise layer.Mismatch(path, spot, f"one of {', '.join(names)}", "none of these", "constant")
+        return names[-1]
+
+    def _built(self, part: Any, context: Any, path: str) -> tuple[str, Any, bytes]:
+        """A part as the first kind that takes its values: its kind, value and bytes."""
+        faults = list[ConstructError]()
+        for name, case in self.cases.items():
+            stream = io.BytesIO()
+            try:
+                value = case._build(part, stream, context, path)
+            except ConstructError as fault:
+                faults.append(fault)
+            else:
+                return name, value, stream.getvalue()
+        raise faults[0]
 
 
 def _replaced(obj: Any, name: str, value: object) -> Any:

@@ -10,6 +10,7 @@ and exports walk it (`children`, `nodes`) and know nothing of construct. Everyth
     Blob            plain bytes; a constant without name is one with name ""
     Block           so many bytes whose bits make up one or more integers (`Part`)
     Repeat          one element so many times
+    Parts           frames within the frame, one after another, each of a size of its own
     When            a part that a condition decides on
     Select          a part that a key decides on
     Empty           nothing
@@ -18,8 +19,10 @@ and exports walk it (`children`, `nodes`) and know nothing of construct. Everyth
 Counts, lengths, conditions and keys are formulas: numbers, references to fields (`Ref`) and operations on both (`Op`). What only Python
 can calculate is `Code`, which can be evaluated, but not be written down in another language.
 
-Room for what is to come. Parts that are frames in themselves, chains and tags with a length of their own (M1), are a node beside
-`Repeat`, with formulas for count and size. The length of a part in bytes (M7) is a formula beside `Ref`, of the path of that part;
+Parts stand in the tree twice: as they are described, with paths from the top of the frame (`Kind.element`), and as frames in themselves,
+with paths from their own start (`Kind.root`), which layouts and tables are made of.
+
+Room for what is to come. The length of a part in bytes (M7) is a formula beside `Ref`, of the path of that part;
 `wire.build` fills it in, and `wire.layout_tree` holds arriving frames to it. An axis (M3) has its name in `Repeat.axis` and
 `FieldInfo.axes`. One element of an array (M8) is an index in `Ref`. A wire form (M4), which recodes the bytes before they have places, is
 a value of the `Frame`, beside its tree.
@@ -30,7 +33,7 @@ from __future__ import annotations
 import operator
 import struct
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from typing import Any, Literal
 
@@ -247,6 +250,16 @@ def refs(formula: Formula) -> tuple[Ref, ...]:
     return ()
 
 
+def moved(formula: Formula, axis: str) -> Formula:
+    """A formula of a part as one of the frame around it, in which the part is at a path."""
+    match formula:
+        case Ref(path):
+            return replace(formula, path=path[2:] if path.startswith("_.") else f"{axis}.{path}")
+        case Op(symbol, args):
+            return Op(symbol, tuple(moved(arg, axis) for arg in args))
+    return formula
+
+
 @dataclass(frozen=True, eq=False)
 class Number:
     """An integer or float of whole bytes.
@@ -369,6 +382,48 @@ class Repeat:
 
 
 @dataclass(frozen=True, eq=False)
+class Kind:
+    """What a part can be.
+
+    Attributes:
+        name: by which it is asked for; "" where all parts are of one kind.
+        element: it as it stands in the frame.
+        root: it as a frame in itself; a field of the frame around it is "_." and its path there.
+        following: of fields of `root`: the bytes of the part behind it, 0 behind the last; None where parts are no chain.
+    """
+
+    name: str
+    element: Node
+    root: Node
+    following: Formula | None
+
+
+@dataclass(frozen=True, eq=False)
+class Parts:
+    """Frames within the frame: `count` of them, a chain whose first is `size` bytes long, or as many as fill `within` bytes.
+
+    Attributes:
+        axis: its path, the name of the array that parts are elements of.
+        kinds: those that a part is compared with, in this order.
+        outer: fields of the frame that formulas of the parts ask for.
+        total: the bytes of all parts, as formulas behind them ask for it.
+    """
+
+    name: str
+    axis: str
+    kinds: tuple[Kind, ...]
+    count: Formula | None
+    size: Formula | None
+    within: Formula | None
+    outer: tuple[Ref, ...]
+    total: FieldInfo
+
+    def following(self, kind: Kind) -> Formula | None:
+        """The bytes of the part behind one of a kind, by the paths that its fields have in the frame."""
+        return None if kind.following is None else moved(kind.following, self.axis)
+
+
+@dataclass(frozen=True, eq=False)
 class When:
     """`then` where the condition is not 0, else `otherwise`."""
 
@@ -419,7 +474,7 @@ class Opaque:
     in_bits: bool = False
 
 
-Node = Number | Blob | Block | Struct | Sealed | Repeat | When | Select | Empty | Opaque
+Node = Number | Blob | Block | Struct | Sealed | Repeat | Parts | When | Select | Empty | Opaque
 
 
 def children(node: Node) -> tuple[Node, ...]:
@@ -431,6 +486,8 @@ def children(node: Node) -> tuple[Node, ...]:
             return (node.body,)
         case Repeat():
             return (node.element,)
+        case Parts():
+            return tuple(kind.element for kind in node.kinds)
         case When():
             return (node.then, node.otherwise)
         case Select():
@@ -455,6 +512,9 @@ def formulas(node: Node) -> tuple[Formula, ...]:
             return (node.size,)
         case Repeat():
             return (node.count,)
+        case Parts():
+            found = (node.count, node.size, node.within, *map(node.following, node.kinds))
+            return tuple(formula for formula in found if formula is not None)
         case When():
             return (node.condition,)
         case Select():
@@ -512,6 +572,23 @@ class Scope:
 
     def __len__(self) -> int:
         raise Blind("an expression asks for the length of an array")
+
+
+class Outside(Scope):
+    """What a part sees of the frame around it: the same symbols, with "_." before their paths."""
+
+    def __init__(self, scope: Scope, asked: list[Ref]) -> None:
+        super().__init__(None, f"_.{scope.path}".rstrip("."), asked)
+        self._scope = scope
+
+    def __getitem__(self, name: str) -> Any:
+        found = self._scope[name]
+        if isinstance(found, Scope):
+            return Outside(found, self.asked)
+        if isinstance(found, Symbol) and isinstance(found.formula, Ref):
+            self.asked.append(Ref(f"_.{found.formula.path}", found.formula.info))
+            return Symbol(self.asked[-1])
+        return found
 
 
 class Untraceable(Exception):

@@ -51,6 +51,11 @@ def assert_same_packets(one: Packets, other: Packets) -> None:
     for name in ("offset", "time_ns", "host_ns", "index", "breaks"):
         assert same(getattr(one, name), getattr(other, name)), f"{name} differs"
     assert one.stats == other.stats
+    for axis, node in one.table.schema.parts.items():
+        assert same(one.count(axis), other.count(axis)), f"the numbers of {axis} differ"
+        for kind in node.kinds:
+            parts = f"{axis}.{kind.name}".rstrip(".")
+            assert_same_packets(one.parts(parts), other.parts(parts))
 
 
 def _lengths(packets: Packets, array: str) -> NDArray[np.intp]:

@@ -72,7 +72,7 @@ def _sensor(sensor: Sensor) -> Findings:
 
 def _asked(sensor: Sensor) -> Findings:
     """The fields that scans, clock and counter come from have to be there."""
-    known = {path for name in sensor.data_frames for path in codec(sensor.frames[name]).schema.fields}
+    known = {path for name in sensor.data_frames for path in codec(sensor.frames[name]).schema.named}
     cut_by = known | set(TYPES) if isinstance(sensor.scan, OnWrap) else known
     clock = sensor.clock.source if sensor.clock is not None else ()
     asked = {"scan": getattr(sensor.scan, "name", ""), "sequence": sensor.sequence.field if sensor.sequence is not None else ""}
@@ -88,7 +88,7 @@ def _clock(sensor: Sensor) -> Findings:
     clock = sensor.clock
     if not isinstance(clock, Clock) or callable(clock.source) or clock.wraps_at is not None or not sensor.frames:
         return
-    fields = codec(sensor.frames[sensor.data_frame]).schema.fields
+    fields = codec(sensor.frames[sensor.data_frame]).schema.named
     paths = (clock.source,) if isinstance(clock.source, str) else clock.source
     infos = [fields.get(path) for path in paths]
     spans = [info.limits[1] * info.scale * float(factor(info.unit, "s") or 0) if info and info.kind == "int" else np.inf for info in infos]
@@ -135,7 +135,7 @@ def _longest(subject: Subject, name: str, frame: Frame) -> Findings:
 def _names(subject: Subject, name: str, frame: Frame) -> Findings:
     """Fields whose names stand for a measure, without a unit; `Scaled(..., "")` says that it is a pure number."""
     pure = _measured(frame) | (_multiplied(subject, name) if frame.data else set())
-    for path, info in codec(frame).schema.fields.items():
+    for path, info in codec(frame).schema.all_fields.items():
         if info.name in MEASURES and info.kind in ("int", "float") and not info.unit and not info.labels and path not in pure:
             yield "LS201", f"{info.name!r} is a measure, and no Scaled says its unit", f"{name}.{path}"
 

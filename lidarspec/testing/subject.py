@@ -84,7 +84,7 @@ def integers(parsed: Any, path: str = "", kinds: tuple[type, ...] = (int,)) -> I
 
 def physical(sensor: Sensor, name: str, data: bytes) -> Any:
     """A parsed frame with its scaled numbers in units; None where one is too wide for a float to hold exactly."""
-    fields = codec(sensor.frames[name]).schema.fields
+    fields = codec(sensor.frames[name]).schema.all_fields
     parsed = sensor.parse(data, frame=name)
     for holder, key, path in list(integers(parsed, kinds=(int, float))):
         info = fields.get(path)
@@ -100,8 +100,9 @@ def physical(sensor: Sensor, name: str, data: bytes) -> Any:
 
 def seals(sensor: Sensor, name: str, data: bytes) -> set[str]:
     """The fields of a frame that hold a checksum, and so are not the caller's."""
-    layout = getattr(codec(sensor.frames[name]), "tree", None)
-    if layout is None:
+    engine = codec(sensor.frames[name])
+    layout = getattr(engine, "tree", None)
+    if layout is None or engine.schema.parts:
         return {path for node in nodes(sensor.frames[name].tree) if isinstance(node, Sealed) for path in node.fields}
     found = layout.layout(data)
     return {leaf.info.path for seal in getattr(found, "seals", ()) for leaf in seal.leaves}
@@ -141,7 +142,7 @@ class Subject:
 
     def fields(self, frame: str) -> Mapping[str, FieldInfo]:
         """The fields of a frame type, by path."""
-        return codec(self.sensor.frames[frame]).schema.fields
+        return codec(self.sensor.frames[frame]).schema.all_fields
 
     def source(self, purpose: str = "") -> random.Random:
         """Random numbers of this sensor's own for one purpose, the same in every run."""

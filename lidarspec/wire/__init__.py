@@ -5,6 +5,7 @@ Modules in reading order:
 
 * `schema`: the fields of a frame type as a table, without bytes.
 * `layout`: where each field of one kind of header is, as data; loading by it.
+* `parts`: frames within a frame, found from part to part, in many frames at once.
 * `layout_tree`: the layouts of a frame type, by the fields of the header that decide.
 * `row_checksums`: the checksums of many frames at once.
 * `frame_table`: many frames as columns of raw values.

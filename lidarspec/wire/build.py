@@ -13,7 +13,8 @@ from construct import Container
 from lidarspec.errors import LidarSpecError, MissingField, OutOfRange, SpecError, UnknownCommand, UnknownField, UnknownFrame, UsageError
 from lidarspec.spec.construct_layer import Mismatch, WireNaN, field_path, member, seen
 from lidarspec.spec.description import Spec
-from lidarspec.spec.tree import Blob, FieldInfo, Formula, Node, Number, Read, Sealed, Struct, evaluated, nodes, refs
+from lidarspec.spec.tree import Blob, FieldInfo, Formula, Kind, Node, Number, Parts, Read, Sealed, Struct, evaluated, nodes, refs
+from lidarspec.wire.layout_tree import TooLong, Unknown, layout_of
 from lidarspec.wire.schema import Schema, schema
 
 
@@ -35,8 +36,7 @@ def build(sensor: Spec, frame: str, value: Any, values: Mapping[str, Any], *, un
     table, known = _fields(tree)
     given = _Values(table, known, place, units=units).checked({**(value or {}), **values}, "")
     try:
-        _fill_counts(given, table)
-        _open(tree, given, given)
+        _fill(tree, given, sensor.frames[frame].max_length)
         return bytes(sensor.frames[frame].prepared.build(given))
     except Mismatch as fault:
         raise _usage(fault, place) from None
@@ -63,7 +63,7 @@ def _fields(tree: Node) -> tuple[Schema, frozenset[str]]:
     """The fields of a frame type, and the paths of these and of all that holds them."""
     table = schema(tree)
     named = {f"{node.path}.{member.name}".strip(".") for node in nodes(tree) if isinstance(node, Struct) for member in node.members}
-    parts = [path.split(".") for path in {*table.fields, *table.arrays, *named}]
+    parts = [path.split(".") for path in {*table.all_fields, *table.arrays, *named}]
     return table, frozenset(".".join(names[:depth]) for names in parts for depth in range(len(names) + 1))
 
 
@@ -74,7 +74,7 @@ class _Values:
         self._table, self._known, self._place, self._units = table, known, place, units
 
     def checked(self, value: Any, path: str, shown: str = "") -> Any:
-        info = self._table.fields.get(path)
+        info = self._table.all_fields.get(path)
         if info is not None and info.kind == "other" and not (self._units and info.scaled):
             return value  # construct alone knows what it takes
         if isinstance(value, Mapping):
@@ -128,6 +128,81 @@ class _Values:
         return int(raw)
 
 
+def _fill(root: Node, given: Container, limit: int) -> dict[str, int]:
+    """Add what follows from the values of a frame, or of a part: counts, constants, the sizes of parts; the bytes of these, by path."""
+    table = schema(root)
+    _fill_counts(given, table)
+    _open(root, given, given)
+    totals = dict[str, int]()
+    for node in table.parts.values():
+        sizes = _fill_parts(node, given, table, limit)
+        if sizes is not None:
+            totals[node.total.path] = sum(sizes)
+    return totals
+
+
+def _fill_parts(node: Parts, given: Container, table: Schema, limit: int) -> list[int] | None:
+    """Fill in parts, and what says how many there are and how long; their sizes, None where they are not given as they have to be."""
+    parts, sizes = member(given, node.axis, None), list[int]()
+    if not isinstance(parts, list) or not all(isinstance(part, dict) for part in parts):
+        return None  # construct says what is wrong
+    kinds = [kind_of(node, part) for part in parts]
+    around = {ref.path: value[1] for ref in node.outer if isinstance(value := given_value(given, table.fields, ref.path), tuple)}
+    for kind, part in zip(kinds, parts, strict=True):
+        totals = _fill(kind.root, part, limit)
+        sizes.append(_size_of(kind.root, part, limit, totals, around))
+    for kind, part, after in zip(kinds, parts, [*sizes[1:], 0], strict=False):
+        fill_in(kind.following, part, after, schema(kind.root).fields, node.axis)
+    for formula, number in ((node.count, len(parts)), (node.size, (sizes or [0])[0]), (node.within, sum(sizes))):
+        fill_in(formula, given, number, table.fields, node.axis)
+    return sizes
+
+
+def kind_of(node: Parts, part: Mapping[str, Any]) -> Kind:
+    """The kind of a part that is given by its values: the first that has all fields of these, and no other constant; else the first."""
+
+    def fits(kind: Kind) -> bool:
+        fields, names = _fields(kind.root)
+        given = ((info, part.get(path)) for path, info in fields.fields.items() if info.const is not None)
+        return part.keys() <= {*names, *fields.parts} and all(
+            value in (None, info.const, info.labels.get(info.const)) for info, value in given
+        )
+
+    return next(filter(fits, node.kinds), node.kinds[0])
+
+
+def _size_of(root: Node, part: Container, limit: int, totals: Mapping[str, int], around: Mapping[str, int]) -> int:
+    """The bytes of a part with these values, by its layout.
+
+    Raises:
+        MissingField: for a field that decides how long it is.
+        UsageError: where it is longer than the frame may be.
+    """
+    values, fields = dict(totals), schema(root).fields
+    while True:
+        try:
+            return layout_of(root, values, limit, around).size
+        except Unknown as unknown:
+            path = unknown.leaf.info.path
+            found = given_value(part, fields, path) if member(part, path, None) is not None else None
+            if not isinstance(found, tuple):
+                raise MissingField(path) from None
+            values[path] = int(found[1])
+        except TooLong:
+            raise UsageError(f"a part is longer than the {limit} bytes that a frame has at most") from None
+
+
+def fill_in(formula: Formula | None, given: Container, value: int, fields: Mapping[str, FieldInfo], axis: str) -> None:
+    """Set the field that a formula depends on, where it is left out, so that the formula gives a value."""
+    asked = () if formula is None else tuple(ref for ref in refs(formula) if ref.path in fields)
+    if formula is None or not asked:
+        return
+    holder, name = _place(given, asked[0].path)
+    if holder.get(name) is None:
+        read = functools.partial(given_value, given, fields)
+        holder[name] = _solved(formula, read, holder, name, value, fields[asked[0].path], f"{axis}: bytes or parts")
+
+
 def _open(node: Node, given: Any, values: Container) -> None:
     """Add to the values of a part (`given`, of all `values`) the constants, and a place for each checksum, which is filled in later."""
     match node:
@@ -150,7 +225,7 @@ def _fill_counts(given: Container, table: Schema) -> None:
         if count is None or "[]" in axis:
             continue
         array, asked = member(given, axis, None), refs(count)
-        if not isinstance(array, list | bytes) or not asked:
+        if not isinstance(array, list | bytes) or not asked or asked[0].path not in table.fields:
             continue
         holder, field = _place(given, asked[0].path)
         if isinstance(holder, dict) and holder.get(field) is None:
@@ -251,4 +326,4 @@ def _solved(count: Formula, read: Read, holder: Container, field: str, length: i
     for value in (length, *range(int(min(top, 65535)) + 1)):
         if value <= top and gives(value):
             return int(value)
-    raise UsageError(f"{axis}: no value of {field} gives {length} elements")
+    raise UsageError(f"{axis}: no value of {field} gives {length}")

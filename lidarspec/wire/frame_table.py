@@ -3,7 +3,7 @@
 Two kinds with one behaviour: `Rows` loads fields from bytes by their layout, `Records` collects them from what
 construct parsed. Arrays of variable length are padded to the longest with zeros; `counts` has the lengths.
 
-Parts that are frames in themselves (M1) become a table of their own, without padding, with the row of their frame for each.
+Parts, which are frames within a frame, are a table of their own, without padding, with the row of their frame for each.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.errors import SpecError
-from lidarspec.spec.construct_layer import leaves
+from lidarspec.spec.construct_layer import leaves, member
 from lidarspec.wire.arrays import counted, is_counted, repeated
-from lidarspec.wire.layout import Bytes2D, Layout
-from lidarspec.wire.schema import Schema
+from lidarspec.wire.layout import Bytes2D, Layout, rows_at
+from lidarspec.wire.schema import Schema, schema
 
 
 class Table(Protocol):
@@ -46,6 +46,9 @@ class Table(Protocol):
 
     def take(self, which: NDArray[np.intp]) -> Table:
         """A table of the frames that indices pick, in their order."""
+
+    def parts(self, axis: str, kind: str = "") -> tuple[Table, NDArray[np.intp]]:
+        """The parts of one kind, in stream order, and the frame that each is in, (k,)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,6 +141,22 @@ class Rows:
             groups.append(Group(group.layout, there[kept], group.rows[kept]))
         return Rows(self.schema, groups)
 
+    def parts(self, axis: str, kind: str = "") -> tuple[Rows, NDArray[np.intp]]:
+        node = self.schema.parts[axis]
+        wanted = next(number for number, one in enumerate(node.kinds) if one.name == kind)
+        found = list[_Piece]()
+        for group in self.groups:
+            region = group.layout.regions.get(axis)
+            if region is not None:
+                buffer, walked = region.in_rows(group.rows)
+                rounds = ((number, piece) for number, pieces in enumerate(walked.rounds) for piece in pieces if piece.kind == wanted)
+                found += [_Piece(buffer, piece.layout, piece.spots, group.where[piece.owners], number) for number, piece in rounds]
+        frames = np.concatenate([np.empty(0, np.intp), *(piece.frames for piece in found)])
+        order = np.lexsort((np.repeat([piece.number for piece in found], [len(piece.frames) for piece in found]), frames))
+        ranks = np.empty(len(order), np.intp)
+        ranks[order] = np.arange(len(order))
+        return Rows(schema(node.kinds[wanted].root), _by_layout(found, ranks)), frames[order]
+
     @staticmethod
     def joined(tables: Sequence[Rows]) -> Rows:
         """Several tables of one frame type, one after another."""
@@ -152,6 +171,35 @@ class Rows:
                 found.setdefault(id(group.layout), []).append(Group(group.layout, group.where + start, group.rows))
             start += len(table)
         return Rows(tables[0].schema, [_merged(groups) for groups in found.values()])
+
+
+@dataclass(frozen=True, eq=False)
+class _Piece:
+    """Parts of one layout that are the n-th of their frames: the bytes around them, where in these they begin, and their frames, (k,)."""
+
+    buffer: NDArray[np.uint8]
+    layout: Layout
+    spots: NDArray[np.intp]
+    frames: NDArray[np.intp]
+    number: int
+
+
+def _by_layout(pieces: Sequence[_Piece], ranks: NDArray[np.intp]) -> list[Group]:
+    """Parts as groups, their rows in stream order; `ranks`: the place of each in that, piece after piece."""
+    members: dict[int, dict[int, list[tuple[_Piece, NDArray[np.intp]]]]] = {}
+    start = 0
+    for piece in pieces:
+        own = ranks[start : start + len(piece.spots)]
+        members.setdefault(id(piece.layout), {}).setdefault(id(piece.buffer), []).append((piece, own))
+        start += len(piece.spots)
+    return [_merged([_gathered(parts) for parts in buffers.values()]) for buffers in members.values()]
+
+
+def _gathered(parts: Sequence[tuple[_Piece, NDArray[np.intp]]]) -> Group:
+    """Parts of one layout in one buffer as a group."""
+    where, spots = (np.concatenate(arrays) for arrays in zip(*((own, piece.spots) for piece, own in parts), strict=True))
+    order, (first, _) = np.argsort(where), parts[0]
+    return Group(first.layout, where[order], rows_at(first.buffer, spots[order], first.layout.size, gathered=False))
 
 
 def _merged(groups: list[Group]) -> Group:
@@ -244,6 +292,17 @@ class Records:
 
     def take(self, which: NDArray[np.intp]) -> Records:
         return Records(self.schema, [self._parsed[i] for i in which], [self._frames[i] for i in which])
+
+    def parts(self, axis: str, kind: str = "") -> tuple[Records, NDArray[np.intp]]:
+        node, found = self.schema.parts[axis], list[tuple[int, Any, bytes]]()
+        for index, (parsed, frame) in enumerate(zip(self._parsed, self._frames, strict=True)):
+            pieces = member(parsed, axis, None)
+            if pieces is not None:
+                spans = zip(pieces, pieces.spans, strict=True)
+                found += [(index, part, frame[start:end]) for part, (name, start, end) in spans if name == kind]
+        own = next(one for one in node.kinds if one.name == kind)
+        frames = np.array([index for index, _, _ in found], np.intp)
+        return Records(schema(own.root), [part for _, part, _ in found], [data for _, _, data in found]), frames
 
     @staticmethod
     def joined(tables: Sequence[Records]) -> Records:

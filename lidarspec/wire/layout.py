@@ -10,11 +10,12 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
-from typing import Any, Literal
+from typing import Any, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lidarspec.errors import PluginError
 from lidarspec.spec.bits import BitField
 from lidarspec.spec.checksums import Checksum, Single, single
 from lidarspec.spec.tree import FieldInfo, Node
@@ -38,6 +39,29 @@ def span(rows: Bytes2D) -> NDArray[np.uint8]:
     if rows.flags.c_contiguous:
         return rows.reshape(-1)
     return np.lib.stride_tricks.as_strided(rows, ((len(rows) - 1) * rows.strides[0] + rows.shape[1],), (1,))
+
+
+def rows_at(buffer: NDArray[np.uint8], offsets: NDArray[np.intp], size: int, *, gathered: bool = True) -> NDArray[np.uint8]:
+    """`size` bytes from each of these offsets on, one a row, (n, size); no copy where they stand back to back.
+
+    Args:
+        gathered: C-contiguous; else no copy either where they stand at one distance, and each row is contiguous by itself.
+    """
+    count = len(offsets)
+    if not count or not size:
+        return np.zeros((count, size), np.uint8)
+    if size == 1:
+        return buffer.take(offsets).reshape(count, 1)
+    first, step = offsets.item(0), offsets.item(1) - offsets.item(0) if count > 1 else size
+    even = offsets.item(-1) - first == (count - 1) * step
+    if even and count > 2:
+        even = np.count_nonzero(offsets[1:] - offsets[:-1] == step) == count - 1
+    if even and step == size:
+        return buffer[first : first + count * size].reshape(count, size)
+    if even and step > size and not gathered:
+        return np.ndarray((count, size), np.uint8, buffer.data, first, (step, 1))
+    windows: NDArray[Any] = np.ndarray((len(buffer) - size + 1,), f"V{size}", buffer.data, 0, (1,))
+    return windows[offsets].view(np.uint8).reshape(count, size)
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,6 +102,17 @@ class Leaf:
         assert self.wire is not None
         order: Literal["big", "little"] = "big" if self.wire.byteorder == ">" else "little"
         return int.from_bytes(frame[self.offset : self.offset + self.size], order, signed=self.wire.kind == "i")
+
+    def read(self, buffer: NDArray[np.uint8], offsets: NDArray[np.intp]) -> tuple[NDArray[np.intp] | None, NDArray[Any]]:
+        """An integer outside arrays in the candidates at these offsets: the indices of those that have it, None for all; its values."""
+        there = offsets + (self.offset + self.size) <= len(buffer)
+        which = None if there.all() else np.flatnonzero(there)
+        spots = (offsets if which is None else offsets[which]) + self.offset
+        return which, self.at(self.offset).load(rows_at(buffer, spots, self.size))
+
+    def of(self, frame: bytes) -> int | None:
+        """Its value in the first bytes of a frame; None where they end before it does."""
+        return self.scalar(frame) if self.offset + self.size <= len(frame) else None
 
     def store(self, rows: Bytes2D, values: Any) -> None:
         """Write raw values, broadcast to (n, *shape), into frames given as rows of bytes."""
@@ -223,6 +258,21 @@ class Seal:
         return right | np.isin(stored, np.array(self.absent, np.uint64)) if self.absent else right
 
 
+class PartsRegion(Protocol):
+    """The bytes of the parts of a frame, as `lidarspec.wire.parts.Region` has them."""
+
+    def sound(self, frame: bytes) -> bool:
+        """Whether the parts of one frame are sound, and as long as they have to be."""
+
+
+@dataclass(frozen=True, eq=False)
+class Refused:
+    """A header that leads to no frame: too long, a constant of its parts is wrong, or an expression of the plugin failed (`error`)."""
+
+    error: PluginError | None = None
+    by_constant: bool = False
+
+
 @dataclass(frozen=True, eq=False)
 class Layout:
     """A frame of one kind of header.
@@ -236,6 +286,7 @@ class Layout:
         branches: what each `When` and `Select` chose.
         following: fields whose values follow from this header in a frame that is made, and those; they are not asked of one that comes.
         lengths: of each array, by its axis; 0 in an array without elements.
+        regions: where parts are that are frames in themselves, by their axis.
         notes: what is worked out from the layout and kept with it.
     """
 
@@ -247,6 +298,7 @@ class Layout:
     branches: Mapping[Node, Node] = field(default_factory=dict)
     following: tuple[tuple[Leaf, int], ...] = ()
     lengths: Mapping[str, int] = field(default_factory=dict)
+    regions: Mapping[str, Any] = field(default_factory=dict)
     notes: dict[Any, Any] = field(default_factory=dict, repr=False)
 
     @cached_property
@@ -263,7 +315,7 @@ class Layout:
         return (
             len(frame) == self.size
             and int.from_bytes(frame, "little") & self._mask == self._value
-            and all(seal.sound(frame) for seal in self.seals)
+            and all(part.sound(frame) for part in (*self.seals, *self.regions.values()))
         )
 
     def seal(self, rows: Bytes2D) -> None:

@@ -29,7 +29,8 @@ from lidarspec.spec import tree
 from lidarspec.spec.bits import BitField, whole_bytes
 from lidarspec.spec.description import Frame
 from lidarspec.wire.arrays import by_value
-from lidarspec.wire.layout import Layout, Leaf, Seal
+from lidarspec.wire.layout import Layout, Leaf, Refused, Seal
+from lidarspec.wire.parts import CONSTANT, FAILED, Kind, Measure, Region, Rule
 from lidarspec.wire.schema import schema
 
 
@@ -42,9 +43,9 @@ class NotCompilable(Exception):
 
 
 class Unknown(Exception):
-    """The layout depends on a field whose value is not given; attribute `leaf`: where it stands."""
+    """The layout depends on a field whose value is not given, or on the size of parts; attribute `leaf`: where it stands."""
 
-    def __init__(self, leaf: Leaf) -> None:
+    def __init__(self, leaf: Leaf | Measure) -> None:
         self.leaf = leaf
         super().__init__(leaf.info.path)
 
@@ -53,20 +54,26 @@ class TooLong(Exception):
     """The header claims more than the longest length that the frame declares, or no byte at all."""
 
 
-def layout_of(root: tree.Node, values: Mapping[str, int], limit: int) -> Layout:
+class Unlike(Exception):
+    """A part has the constants of no kind."""
+
+
+def layout_of(root: tree.Node, values: Mapping[str, int], limit: int, given: Mapping[str, int] | None = None) -> Layout:
     """The layout of the frames whose header fields have these values.
 
     Args:
         values: raw, by path, of the fields that the layout depends on.
         limit: the longest frame, in bytes.
+        given: of parts, raw values of fields of the frame around them, by their path there.
 
     Raises:
         Unknown: where the value of a further field decides.
         TooLong: where the frame would be longer than `limit`, or without a byte.
+        Unlike: where a part has the constants of no kind.
         NotCompilable: where construct alone can tell what comes next.
         Exception: whatever a formula raises on these values.
     """
-    walk = _Walk(values, limit)
+    walk = _Walk(values, limit, given or {})
     walk.visit(root, "")
     if not walk.cursor:
         raise TooLong("")
@@ -94,6 +101,8 @@ def _check(node: tree.Node, path: str, *, in_array: bool) -> None:
             if in_array:
                 raise NotCompilable(path, "a checksum inside an array")
             _ = node.algorithm
+        case tree.Parts() if in_array:
+            raise NotCompilable(path, "parts inside an array")
         case tree.Block():
             for part in node.parts:
                 if len(part.indices) > 1:
@@ -103,9 +112,32 @@ def _check(node: tree.Node, path: str, *, in_array: bool) -> None:
             raise NotCompilable(path, formula.reason.partition(": ")[2])
         for ref in tree.refs(formula):
             check_control(ref.info)
+    if isinstance(node, tree.Parts):
+        for kind in node.kinds:
+            _check_part(kind, path)
+        return
     for child in tree.children(node):
         below = f"{path}.{child.name}".strip(".") if isinstance(node, tree.Struct) else path
         _check(child, below, in_array=in_array or isinstance(node, tree.Repeat))
+
+
+def _check_part(kind: tree.Kind, path: str) -> None:
+    """Hold a part, as a frame in itself, to what holds for frames."""
+    try:
+        _check(kind.root, "", in_array=False)
+        for ref in () if kind.following is None else tree.refs(kind.following):
+            check_control(ref.info)
+        check_columns(kind.root)
+    except NotCompilable as reason:
+        raise NotCompilable(f"{path}.{reason.path}".rstrip("."), reason.reason) from None
+
+
+def check_columns(root: tree.Node) -> None:
+    """Raise `NotCompilable` if a field of a tree has values that no column holds."""
+    for info in schema(root).fields.values():
+        if info.dtype is None:
+            wide = f"its {info.bits} bits are more than a column holds"
+            raise NotCompilable(info.path, wide if info.bits > 64 else "its values are not all plain numbers of one kind")
 
 
 def check_control(info: tree.FieldInfo) -> None:
@@ -122,6 +154,7 @@ class _Walk:
 
     values: Mapping[str, int]
     limit: int
+    given: Mapping[str, int] = field(default_factory=dict)
     cursor: int = 0
     leaves: dict[str, Leaf] = field(default_factory=dict)
     constants: dict[int, tuple[int, int]] = field(default_factory=dict)
@@ -129,15 +162,16 @@ class _Walk:
     places: dict[str, tuple[int, int]] = field(default_factory=dict)
     branches: dict[tree.Node, tree.Node] = field(default_factory=dict)
     lengths: dict[str, int] = field(default_factory=dict)
+    regions: dict[str, Region] = field(default_factory=dict)
     #: elements without a byte, of all arrays.
     empty: int = 0
     #: what expressions can ask for by now: a field, the path of a struct, None for what the header leaves out.
-    parts: dict[str, Leaf | str | None] = field(default_factory=dict)
+    parts: dict[str, Leaf | Measure | str | None] = field(default_factory=dict)
 
     def layout(self) -> Layout:
         """What was found, as a value."""
         seals, following = tuple(self.seals), tuple(self._following())
-        return Layout(self.cursor, self.leaves, self.constants, seals, self.places, self.branches, following, self.lengths)
+        return Layout(self.cursor, self.leaves, self.constants, seals, self.places, self.branches, following, self.lengths, self.regions)
 
     def read(self, path: str) -> tuple[tree.FieldInfo, int] | str | None:
         """What a formula reads by a path: a field and its raw value, the path of a struct, or None for what the header leaves out.
@@ -146,12 +180,16 @@ class _Walk:
             NotCompilable: for what is no field before the formula, or not one integer.
             Unknown: for a field whose value is not given.
         """
+        if path.startswith("_."):
+            return tree.FieldInfo(path), self.given[path[2:]]
         if path not in self.parts:
             scope, _, name = path.rpartition(".")
             raise NotCompilable(scope, f"an expression asks for {name!r}, which is not a field before it")
         part = self.parts[path]
-        if not isinstance(part, Leaf):
+        if not isinstance(part, Leaf | Measure):
             return part
+        if isinstance(part, Measure) and part.region.size is not None:
+            return part.info, part.region.size
         if path not in self.values:
             check_control(part.info)
             raise Unknown(part)
@@ -170,6 +208,8 @@ class _Walk:
                 self._field(node, path, shape, strides)
             case tree.Repeat():
                 self._array(node, path, shape, strides)
+            case tree.Parts():
+                self._parts(node, path)
             case tree.When():
                 self.branches[node] = node.then if self._value(node.condition) else node.otherwise
                 self.visit(self.branches[node], path, shape, strides)
@@ -210,6 +250,21 @@ class _Walk:
             byte = self.constants.pop(offset)
             self.constants.update({offset + size * index: byte for index in range(count)})
         self.cursor = start + size * count
+
+    def _parts(self, node: tree.Parts, path: str) -> None:
+        """Go over parts: how many bytes they take is told by the header, or asked for as a field of it would be."""
+        given = {ref.path: int(self._value(ref) or 0) for ref in node.outer}
+        rule = Rule(*(None if formula is None else self._count(formula, path) for formula in (node.count, node.size, node.within)))
+        region = Region(node, kinds_of(node, tuple(given.items()), self.limit), self.cursor, rule, self.limit, given, rule.within)
+        self.parts[node.total.path] = Measure(node.total, region)
+        size = rule.within if rule.within is not None else int(self._value(tree.Ref(node.total.path, node.total)))
+        if size == -FAILED:
+            raise ValueError(f"an expression in {path} fails")
+        if size < 0:
+            raise Unlike(path) if size == -CONSTANT else TooLong(path)
+        self.regions[node.axis] = region = replace(region, size=size)
+        self.parts[node.total.path] = Measure(node.total, region)
+        self.cursor += size
 
     def _no_element(self, node: tree.Node, path: str, shape: tuple[int, ...], strides: tuple[int, ...]) -> None:
         """Go through an element that the array has none of, for its fields alone: nothing is asked of it."""
@@ -338,23 +393,15 @@ REMEMBERED = 4096
 FEW = 4
 
 
-@dataclass(frozen=True, eq=False)
-class Refused:
-    """A header that leads to no frame: too long, or an expression of the plugin failed (`error`)."""
-
-    error: PluginError | None = None
-
-
 @dataclass(eq=False)
 class _Node:
-    leaf: Leaf | None = None
+    leaf: Leaf | Measure | None = None
     told: _Told | None = None
     children: dict[int, _Node] = field(default_factory=dict)
     result: Layout | Refused | None = None
 
-    def value(self, leaf: Leaf, frame: bytes) -> int:
-        """The value of its field in a frame, or the one that stands for it."""
-        value = leaf.scalar(frame)
+    def meant(self, value: int) -> int:
+        """The value of its field that stands for one that means the same."""
         return value if self.told is None else self.told.one(value)
 
 
@@ -444,34 +491,11 @@ def _with_value(formula: tree.Formula, value: int) -> int:
     return int(tree.evaluated(formula, lambda _: (ref.info, value)))
 
 
-def rows_at(buffer: NDArray[np.uint8], offsets: NDArray[np.intp], size: int, *, gathered: bool = True) -> NDArray[np.uint8]:
-    """`size` bytes from each of these offsets on, one a row, (n, size); no copy where they stand back to back.
-
-    Args:
-        gathered: C-contiguous; else no copy either where they stand at one distance, and each row is contiguous by itself.
-    """
-    count = len(offsets)
-    if not count or not size:
-        return np.zeros((count, size), np.uint8)
-    if size == 1:
-        return buffer.take(offsets).reshape(count, 1)
-    first, step = offsets.item(0), offsets.item(1) - offsets.item(0) if count > 1 else size
-    even = offsets.item(-1) - first == (count - 1) * step
-    if even and count > 2:
-        even = np.count_nonzero(offsets[1:] - offsets[:-1] == step) == count - 1
-    if even and step == size:
-        return buffer[first : first + count * size].reshape(count, size)
-    if even and step > size and not gathered:
-        return np.ndarray((count, size), np.uint8, buffer.data, first, (step, 1))
-    windows: NDArray[Any] = np.ndarray((len(buffer) - size + 1,), f"V{size}", buffer.data, 0, (1,))
-    return windows[offsets].view(np.uint8).reshape(count, size)
-
-
 class HeaderTree:
-    """All layouts of one frame type."""
+    """All layouts of one frame type, or of a kind of parts, with the values of fields around them."""
 
-    def __init__(self, frame: tree.Node, limit: int) -> None:
-        self._frame, self._limit = frame, limit
+    def __init__(self, frame: tree.Node, limit: int, given: Mapping[str, int] | None = None) -> None:
+        self._frame, self._limit, self._given = frame, limit, given or {}
         self._root, self._size = _Node(), 0
         self._told: dict[str, _Told] = {}
 
@@ -499,26 +523,25 @@ class HeaderTree:
         layout = self.layout(first)
         if not isinstance(layout, Layout):
             return None
-        same = (np.count_nonzero(leaf.load(rows) == leaf.scalar(first)) == len(rows) for leaf in self.asked(first))
+        same = (np.count_nonzero(leaf.load(rows) == value) == len(rows) for leaf, value in self._asked(first))
         return layout if all(same) else None
 
     def layout(self, frame: bytes) -> Layout | Refused | None:
         """The layout of one frame, or None where its header is not all there."""
         node: _Node | None = self._root
-        while node is not None and node.leaf is not None and node.leaf.offset + node.leaf.size <= len(frame):
-            node = node.children.get(node.value(node.leaf, frame))
+        while node is not None and node.leaf is not None and (value := node.leaf.of(frame)) is not None:
+            node = node.children.get(node.meant(value))
         if node is not None and node.result is not None:
             return node.result
         groups = self.classify(np.frombuffer(frame, np.uint8), np.zeros(1, np.intp))
         return groups[0][0] if groups else None
 
-    def asked(self, frame: bytes) -> list[Leaf]:
-        """The fields that decided the layout of this frame, in the order in which they were asked for."""
-        found, node = [], self._root
-        while node.leaf is not None:
-            found.append(node.leaf)
-            node = node.children[node.value(node.leaf, frame)]
-        return found
+    def _asked(self, frame: bytes) -> Iterator[tuple[Leaf | Measure, int]]:
+        """The fields that decided the layout of this frame, and their values, in the order in which they were asked for."""
+        node = self._root
+        while node.leaf is not None and (value := node.leaf.of(frame)) is not None:
+            yield node.leaf, value
+            node = node.children[node.meant(value)]
 
     def choose(self, source: random.Random, drawn: Mapping[str, Draw] | None = None) -> tuple[Layout, dict[str, int]]:
         """A layout of a header chosen at random, with the values of the fields it depends on, by path.
@@ -541,18 +564,19 @@ class HeaderTree:
             try:
                 return layout_of(self._frame, values, self._limit), values
             except Unknown as unknown:
+                if isinstance(unknown.leaf, Measure):
+                    raise SpecError("a header alone does not make a frame of parts", path=unknown.leaf.info.path) from None
                 own = drawn.get(unknown.leaf.info.path)
                 values[unknown.leaf.info.path] = own(source) if own else _some_value(source, unknown.leaf, keys)
 
     def _branched(
-        self, node: _Node, leaf: Leaf, buffer: NDArray[np.uint8], offsets: NDArray[np.intp], which: NDArray[np.intp]
+        self, node: _Node, leaf: Leaf | Measure, buffer: NDArray[np.uint8], offsets: NDArray[np.intp], which: NDArray[np.intp]
     ) -> list[tuple[_Node, NDArray[np.intp]]]:
         """The branches below a node, each with those of the candidates that have its value."""
-        there = offsets[which] + leaf.offset + leaf.size <= len(buffer)
-        which = which if there.all() else which[there]
+        there, values = leaf.read(buffer, offsets[which])
+        which = which if there is None else which[there]
         if not len(which):
             return []
-        values = leaf.at(leaf.offset).load(rows_at(buffer, offsets[which] + leaf.offset, leaf.size))
         values = values if node.told is None else node.told.all(values)
         if np.count_nonzero(values == values[0]) == len(values):
             return [(node.children.setdefault(values.item(0), _Node()), which)]
@@ -566,33 +590,44 @@ class HeaderTree:
             leaf = node.leaf
             if leaf is None:
                 node.leaf, node.result = self._next(values)
-                node.told = None if node.leaf is None else self._telling(node.leaf.info)
+                node.told = self._telling(node.leaf)
                 self._size += 1
                 if values and isinstance(node.result, Refused) and not node.result.error and above.told is not None:
                     above.told = above.told.refused(value)
-            elif leaf.offset + leaf.size > len(frame):
+            elif (found := leaf.of(frame)) is None:
                 break
             else:
-                values[leaf.info.path] = value = node.value(leaf, frame)
+                values[leaf.info.path] = value = node.meant(found)
                 node, above = node.children.setdefault(value, _Node()), node
 
-    def _telling(self, info: tree.FieldInfo) -> _Told:
-        if info.path not in self._told:
-            self._told[info.path] = _Told.of(info, self._frame, self._limit)
-        return self._told[info.path]
+    def _telling(self, leaf: Leaf | Measure | None) -> _Told | None:
+        if not isinstance(leaf, Leaf):
+            return None  # nothing is known of parts before they are walked
+        if leaf.info.path not in self._told:
+            self._told[leaf.info.path] = _Told.of(leaf.info, self._frame, self._limit)
+        return self._told[leaf.info.path]
 
-    def _next(self, values: Mapping[str, int]) -> tuple[Leaf | None, Layout | Refused | None]:
+    def _next(self, values: Mapping[str, int]) -> tuple[Leaf | Measure | None, Layout | Refused | None]:
         """The field that decides next, or what these values lead to."""
         try:
-            return None, layout_of(self._frame, values, self._limit)
+            return None, layout_of(self._frame, values, self._limit, self._given)
         except Unknown as unknown:
             return unknown.leaf, None
         except TooLong:
             return None, Refused()
+        except Unlike:
+            return None, Refused(by_constant=True)
         except SpecError:
             raise
         except Exception as error:
             return None, Refused(PluginError.of(error, "struct"))
+
+
+@functools.lru_cache(maxsize=256)
+def kinds_of(node: tree.Parts, given: tuple[tuple[str, int], ...], limit: int) -> tuple[Kind, ...]:
+    """What the parts of frames can be in which fields around them have these values."""
+    values = dict(given)
+    return tuple(Kind(kind, HeaderTree(kind.root, limit, values), prefix_of(kind.root, limit)) for kind in node.kinds)
 
 
 @functools.lru_cache(maxsize=2048)
@@ -600,10 +635,7 @@ def frame_layouts(frame: Frame) -> HeaderTree | NotCompilable:
     """The layouts of a frame type, or why they cannot be computed."""
     try:
         check_compilable(frame.tree)
-        for info in schema(frame.tree).fields.values():
-            if info.dtype is None:
-                wide = f"its {info.bits} bits are more than a column holds"
-                raise NotCompilable(info.path, wide if info.bits > 64 else "its values are not all plain numbers of one kind")
+        check_columns(frame.tree)
         return HeaderTree(frame.tree, frame.max_length)
     except NotCompilable as reason:
         return reason

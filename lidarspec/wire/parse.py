@@ -20,9 +20,10 @@ from lidarspec.errors import SpecError, UnknownFrame, WireError, refuse_text
 from lidarspec.spec.bits import BitField
 from lidarspec.spec.construct_layer import Mismatch, WireNaN, clean, field_path, seen, unnamed
 from lidarspec.spec.description import Spec
-from lidarspec.spec.tree import Blob, Block, FieldInfo, Node, Number, Repeat, Sealed, Select, Struct, When
-from lidarspec.wire.layout import Layout, Leaf
-from lidarspec.wire.layout_tree import NotCompilable, Refused, frame_layouts, prefix_of
+from lidarspec.spec.tree import Blob, Block, FieldInfo, Node, Number, Parts, Repeat, Sealed, Select, Struct, When
+from lidarspec.wire.layout import Layout, Leaf, Refused
+from lidarspec.wire.layout_tree import NotCompilable, frame_layouts, prefix_of
+from lidarspec.wire.parts import Region
 from lidarspec.wire.schema import schema
 
 
@@ -46,7 +47,7 @@ def parse(sensor: Spec, data: bytes, *, frame: str | None = None, verify: bool =
         name, values = parse_typed(sensor, data, frame=frame, verify=verify)
         found = name, clean(values)
     name, values = found
-    return _physical(schema(sensor.frames[name].tree).fields, values, "") if units else values
+    return _physical(schema(sensor.frames[name].tree).all_fields, values, "") if units else values
 
 
 def _compiled(sensor: Spec, data: bytes, frame: str | None) -> tuple[str, Any] | None:
@@ -103,6 +104,8 @@ def _reader(node: Node, path: str, layout: Layout, count: int) -> Reader:
         case Repeat():
             length = layout.lengths[node.axis] if not isinstance(node.count, int) else node.count
             return functools.partial(_lists, _reader(node.element, path, layout, count * length), count, length)
+        case Parts():
+            return functools.partial(_parts_of, layout.regions[node.axis])
         case When() | Select():
             return _reader(layout.branches[node], path, layout, count)
         case Number() | Blob():
@@ -139,6 +142,10 @@ def _lists(elements: Reader, count: int, length: int, frame: bytes) -> Sequence[
         if length
         else [ListContainer() for _ in range(count)]
     )
+
+
+def _parts_of(region: Region, frame: bytes) -> Sequence[ListContainer]:
+    return [ListContainer(unpacked(kind.node.root, layout, part) for kind, layout, part in region.listed(frame))]
 
 
 def _offsets(leaf: Leaf, shape: Sequence[int]) -> list[int]:

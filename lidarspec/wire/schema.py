@@ -7,12 +7,29 @@ header. Both engines (compiled and interpreted) make their columns by this table
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import dataclass, field, replace
+from functools import cached_property, lru_cache
 
 import numpy as np
 
-from lidarspec.spec.tree import Blob, Block, FieldInfo, Formula, Node, Number, Op, Opaque, Repeat, Select, Struct, When, children, nodes
+from lidarspec.errors import UnknownField
+from lidarspec.spec.tree import (
+    Blob,
+    Block,
+    FieldInfo,
+    Formula,
+    Node,
+    Number,
+    Op,
+    Opaque,
+    Parts,
+    Repeat,
+    Select,
+    Struct,
+    When,
+    children,
+    nodes,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -20,28 +37,72 @@ class Schema:
     """All fields of a frame type, in the order of the wire, and the arrays they are in.
 
     `arrays`: path -> declared count; a number where every frame has so many elements, else a formula of header fields, or None.
+    `parts`: frames within the frame, by path, which are tables of their own; `inside`: their fields, by path from the top.
     """
 
     fields: Mapping[str, FieldInfo]
     arrays: Mapping[str, Formula | None]
+    parts: Mapping[str, Parts] = field(default_factory=dict)
+    inside: Mapping[str, FieldInfo] = field(default_factory=dict)
+
+    @cached_property
+    def all_fields(self) -> Mapping[str, FieldInfo]:
+        """The fields of the frame and of the parts in it."""
+        return {**self.fields, **self.inside} if self.inside else self.fields
 
     @cached_property
     def chain(self) -> tuple[str, ...]:
         """The axes of the deepest nesting of arrays; the first one of equally deep ones."""
         return max((info.axes for info in self.fields.values() if info.kind != "bytes"), key=len, default=())
 
+    @cached_property
+    def named(self) -> Mapping[str, FieldInfo]:
+        """The fields of the frame and of its parts, as scans and clocks name them: those of a kind behind its name, "tags.points.angle"."""
+        found = dict(self.fields)
+        for axis, node in self.parts.items():
+            for kind in node.kinds:
+                before = f"{axis}.{kind.name}".rstrip(".")
+                found |= {f"{before}.{path}": info for path, info in schema(kind.root).named.items()}
+        return found
+
+    def within(self, path: str) -> tuple[str, str, str] | None:
+        """The parts that a path leads into: their axis, their kind, and the path in these; None where it leads into none.
+
+        Raises:
+            UnknownField: for parts of several kinds without one of them.
+        """
+        for axis, node in self.parts.items():
+            if path == axis or path.startswith(f"{axis}."):
+                names, rest = [kind.name for kind in node.kinds], path[len(axis) + 1 :]
+                if names == [""]:
+                    return axis, "", rest
+                kind, _, below = rest.partition(".")
+                if kind not in names:
+                    raise UnknownField(path, [f"{axis}.{name}" for name in names])
+                return axis, kind, below
+        return None
+
     def depth(self) -> int:
         """How many arrays are nested at most."""
         return len(self.chain)
 
 
+@lru_cache(maxsize=4096)
 def schema(root: Node) -> Schema:
     """The table of fields of a frame's tree."""
     fields: dict[str, FieldInfo] = {}
     arrays: dict[str, Formula | None] = {}
     _walk(root, fields, arrays, optional=False)
     structs = {node.path: node.docs for node in nodes(root) if isinstance(node, Struct) and node.docs}
-    return Schema({path: replace(info, docs=info.docs or _docs_around(path, structs)) for path, info in fields.items()}, arrays)
+    parts = {node.axis: node for node in nodes(root) if isinstance(node, Parts)}
+    inside: dict[str, FieldInfo] = {}
+    for node in parts.values():
+        for kind in node.kinds:
+            _walk(kind.element, inside, {}, optional=False)
+    own, theirs = (
+        {path: replace(info, docs=info.docs or _docs_around(path, structs)) for path, info in found.items()} for found in (fields, inside)
+    )
+    return Schema(own, arrays, {axis: node for axis, node in parts.items() if not node.total.axes}, theirs)
 
 
 def _docs_around(path: str, structs: Mapping[str, str]) -> str:
@@ -68,6 +129,8 @@ def _walk(node: Node, fields: dict[str, FieldInfo], arrays: dict[str, Formula | 
             _add(fields, node.info)
         case Block():
             _block(node, fields, arrays, optional=optional)
+        case Parts():
+            return
     for child in children(node):
         _walk(child, fields, arrays, optional=optional or isinstance(node, When | Select))
 

@@ -87,6 +87,8 @@ def extent(node: tree.Node, shown: str = "") -> Extent:
             return extent(node.body, shown)
         case tree.Repeat():
             return extent(node.element, _element(shown)[0]).times(_count(node))
+        case tree.Parts():
+            return _length(node.within, shown)
         case tree.When() | tree.Select():
             sizes = {extent(branch, shown) for branch in tree.children(node)}
             return sizes.pop() if len(sizes) == 1 else _length(None, shown)
@@ -129,6 +131,12 @@ def _rows(node: tree.Node, shown: str, start: Extent, condition: str, seals: Map
             says = "; ".join(filter(None, (condition, f"{_count(node)} elements of {size}")))
             yield WireRow(str(start), str(size.times(_count(node))), "array", shown, "", says)
             yield from _rows(node.element, element, start + size.times(index), condition, seals)
+        case tree.Parts():
+            element, _ = _element(shown)
+            yield WireRow(str(start), str(extent(node, shown)), "parts", shown, "", "; ".join(filter(None, (condition, ruled(node)))))
+            for kind in node.kinds:
+                said = f"{kind.name} in it" if kind.name else ""
+                yield from _rows(kind.element, element, Extent(0, (f"at({element})",)), said, seals)
         case tree.When() | tree.Select():
             for asked, branch in branches(node):
                 yield from _rows(branch, shown, start, asked, seals)
@@ -175,6 +183,17 @@ def branches(node: tree.When | tree.Select) -> list[tuple[str, tree.Node]]:
     key, labels = phrase(node.key), node.key.info.labels if isinstance(node.key, tree.Ref) else {}
     cases = [(f"if {key} == {labels.get(value, value)!r}", case) for value, case in node.cases]
     return [*cases, (f"for other values of {key}", node.default)]
+
+
+def ruled(node: tree.Parts) -> str:
+    """What says where the last one of some parts is, in words."""
+    if node.count is not None:
+        return f"{phrase(node.count)} parts of sizes of their own"
+    if node.within is not None:
+        return f"as many parts as fill {phrase(node.within)} bytes"
+    assert node.size is not None
+    following = ", ".join(dict.fromkeys(phrase(kind.following) for kind in node.kinds if kind.following is not None))
+    return f"a chain: {phrase(node.size)} bytes, then as many as {following} of the part before says; 0 ends it"
 
 
 def phrase(formula: tree.Formula) -> str:

@@ -254,3 +254,18 @@ def test_an_input_is_held_in_pieces(words: tuple[str, ...], code: int, tmp_path:
             Path(name).write_bytes(given)
         most = peak(lambda given=text if "-" in words else b"": ran(*words, code=code, given=given))
     assert most - len(text) * ("-" in words) < 16 * MEGABYTE, f"{most} bytes"
+
+
+def test_parts_are_built_shown_and_explained(tmp_path: Path) -> None:
+    file, fields = tmp_path / "tags.py", ["tags[0].type=1", "tags[0].points[0].distance=1m", "tags[0].points[0].angle=90deg"]
+    file.write_text(
+        "from lidarspec.spec import hookimpl\nfrom tests.shapes.tags import SENSOR\n\n\n"
+        "@hookimpl\ndef lidarspec_sensors():\n    return [SENSOR]\n",
+        encoding="utf-8",
+    )
+    data = ran("build", file, "data", "number=3", *fields, "padding=000000").stdout.strip()
+    assert data == "02 01 04 03 03 01 01 04 64 00 28 23 00 00 00 c2"
+    explained = ran("explain", data, "-s", file).stdout
+    assert "points[0]  1.00 m, 90.00 deg, at 90.00 deg -> x 0.000 y 1.000" in explained
+    assert "tags[i].points[j].angle" in ran("show", file).stdout
+    assert "unknown field 'tags[0].tipe'" in ran("build", file, "data", "tags[0].tipe=1", code=2).stderr

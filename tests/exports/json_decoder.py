@@ -87,6 +87,30 @@ class Decoder:
     def read_array(self, part: dict[str, Any]) -> Any:
         return [self.read(part["element"]) for _ in range(self.value(part["count"]))]
 
+    def read_parts(self, part: dict[str, Any]) -> Any:
+        found, start = list[Any](), self.at
+        count, following, within = (None if part[rule] is None else self.value(part[rule]) for rule in ("count", "size", "within"))
+        while len(found) < count if count is not None else following if within is None else self.at - start < within:
+            begun = self.at
+            value, kind = self.read_one(part["kinds"])
+            found.append(value)
+            if following is not None:
+                assert self.at - begun == following
+                following = self.value(kind["following"])
+        self.known[f"{part['name']}.size"] = self.at - start
+        return found
+
+    def read_one(self, kinds: list[dict[str, Any]]) -> tuple[Any, dict[str, Any]]:
+        """A part as the first kind whose constants are right."""
+        start = self.at
+        for kind in kinds:
+            self.at = start
+            value = self.read(kind["part"])
+            constants = {member["name"]: member.get("const") for member in kind["part"]["members"] if member.get("const") is not None}
+            if all(value[name] == const for name, const in constants.items()):
+                return value, kind
+        raise AssertionError("a part of no kind")
+
     def read_if(self, part: dict[str, Any]) -> Any:
         return self.read(part["then"] if self.value(part["condition"]) else part["else"])
 

@@ -74,11 +74,13 @@ def differences(parsed: Any, read: Any, path: str = "") -> list[str]:
     if isinstance(parsed, Mapping):
         return [place for name, value in parsed.items() for place in differences(value, _member(read, name), f"{path}.{name}")]
     if isinstance(parsed, list):
-        read = getattr(read, "value", read)
+        read = [] if read is None else getattr(read, "value", read)  # a chain without any part is not there
         if len(parsed) != len(read):
             return [f"{path}: {len(parsed)} elements, and {len(read)} in Kaitai"]
         return [place for index, value in enumerate(parsed) for place in differences(value, read[index], f"{path}[{index}]")]
-    value = getattr(read, "value", read)
+    value = read
+    while hasattr(value, "value"):  # of an array, and then of one of its alternatives
+        value = value.value
     same = parsed == value or (parsed != parsed and value != value)
     return [] if same else [f"{path}: {parsed!r}, and {value!r} in Kaitai"]
 

@@ -29,7 +29,13 @@ SANITIZED = ("-fsanitize=address,undefined", "-fno-sanitize-recover=all")
 #: fields of these names get an underscore, since functions of the whole frame have them.
 OWN = ("frame_length", "is_frame")
 #: what C cannot say, with the reason.
-REFUSED = {"shape-text": "Decimal is Python code"}
+_PARTS = "parts of sizes of their own"
+REFUSED = {
+    "shape-text": "Decimal is Python code",
+    "shape-segments": f"segments: {_PARTS}",
+    "shape-tags": f"tags: {_PARTS}",
+    "shape-channels": f"channels: {_PARTS}",
+}
 SENSORS = {name: sensor for name, sensor in DISTINCT.items() if name not in REFUSED}
 
 _MAIN = """\

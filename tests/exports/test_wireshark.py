@@ -23,7 +23,7 @@ from tests.exports.trees import DISTINCT, EVERY, values
 #: what Wireshark cannot be told, with the reason.
 REFUSED = {"shape-text": "Decimal is Python code"}
 #: what every run tries; the other shapes, and sensors that share the frames of one of these, are for the long one.
-FEW = {*lidarspec.sensors(), "shape-oddities", "shape-options"} & set(DISTINCT)
+FEW = {*lidarspec.sensors(), "shape-oddities", "shape-options", "shape-segments", "shape-tags", "shape-channels"} & set(DISTINCT)
 SENSORS = [
     pytest.param(sensor, id=name, marks=() if name in FEW else pytest.mark.soak) for name, sensor in EVERY.items() if name not in REFUSED
 ]

@@ -16,6 +16,7 @@ from lidarspec.packets.stream import PacketStream
 from lidarspec.scans.scans import ScanStream
 from lidarspec.simulation.scenes import Room
 from lidarspec.simulation.simulator import opening, simulate, simulation
+from tests.shapes import SHAPES
 
 #: a rotor that is blocked, or the start of a scan that does not come: seconds of the longest scan, twice the slowest turn.
 BLOCKED = {"ldrobot-ld06": 0.4, "velodyne-vlp16": 0.4, "slamtec-rplidar-a1": 2.0, "cspc-m1c1-mini": 1.0}
@@ -145,6 +146,37 @@ def test_no_two_turns_are_one_scan_whatever_is_missing(name: str, turns: float, 
 def test_a_frame_whose_first_packet_is_there_is_complete_though_the_end_of_the_one_before_is_missing() -> None:
     scans = scans_without("robosense-m1", range(1250, 1260))
     assert [(len(scan) // 125, scan.complete) for scan in scans] == [(630, False), (620, False), *[(630, True)] * 4, (220, False)]
+
+
+@pytest.mark.parametrize(("lost", "whole", "complete"), [(0, True, True), (3, True, False), (10, True, False), (11, False, False)])
+def test_a_frame_of_parts_counts_once(lost: int, whole: bool, complete: bool) -> None:
+    """A turn is 20 frames, with 30 parts: it is whole where at least as many frames are there as are missing."""
+    sensor = SHAPES["shape-segments"]
+    frames = [frame for place, frame in enumerate(simulate(sensor, 100)) if not 24 <= place < 24 + lost]
+    decoder = sensor.decoder()
+    packets = PacketStream(sensor, "data", decoder.stats).add([decoder.datagrams(frames, [1] * len(frames))])
+    for size in (len(packets), 7):
+        stream = ScanStream(sensor)
+        pieces = [packets.take(slice(start, start + size)) for start in range(0, len(packets), size)]
+        scans = [scan for piece in pieces for scan in stream.add(piece)] + stream.finish()
+        assert decoder.stats.lost == lost
+        assert [(scan.whole, scan.complete) for scan in scans] == [
+            (False, False),
+            (whole, complete),
+            (True, True),
+            (True, True),
+            (False, False),
+        ]
+
+
+def test_a_frame_without_parts_that_have_points_leaves_no_gap() -> None:
+    sensor = SHAPES["shape-tags"]
+    empty = sensor.build("data", number=0, tags=[dict(type=2, temperature=30)], padding=bytes(5))
+    frames = [frame for pair in zip(simulate(sensor, 16), [empty] * 16, strict=True) for frame in pair]
+    scans = list(sensor.scans(b"".join(frames)))
+    assert [scan.complete for scan in scans] == [False, True, True, False]
+    missing = list(sensor.scans(b"".join([*frames[:11], frames[10][:9], *frames[11:]])))
+    assert [scan.complete for scan in missing] == [False, False, True, False]
 
 
 @pytest.mark.parametrize("kind", ["node", "express", "hq"])

@@ -7,6 +7,7 @@ from tests.shapes import (
     ahead,
     bits,
     calibration,
+    channels,
     clock,
     commands,
     coordinates,
@@ -25,8 +26,10 @@ from tests.shapes import (
     outer,
     remarks,
     scales,
+    segments,
     sized,
     state,
+    tags,
     text,
     twins,
     weak,
@@ -58,6 +61,9 @@ _MODULES = (
     sized,
     outer,
     scales,
+    segments,
+    tags,
+    channels,
 )
 
 SHAPES: dict[str, Sensor] = {sensor.id: sensor for sensor in (*(module.SENSOR for module in _MODULES), *coordinates.SENSORS)}

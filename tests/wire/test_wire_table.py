@@ -49,8 +49,8 @@ def test_offsets_are_those_of_the_layout(sensor: str, frame: str) -> None:
 
 @pytest.mark.parametrize(("sensor", "frame"), FRAMES)
 def test_every_field_has_a_row(sensor: str, frame: str) -> None:
-    fields = set(codec(SENSORS[sensor].frames[frame]).schema.fields)
-    rows = {re.sub(r"\[\w\]", "", row.field) for row in wire_table(SENSORS[sensor].frames[frame]) if row.type != "array"}
+    fields = set(codec(SENSORS[sensor].frames[frame]).schema.all_fields)
+    rows = {re.sub(r"\[\w\]", "", row.field) for row in wire_table(SENSORS[sensor].frames[frame]) if row.type not in ("array", "parts")}
     assert rows - {"(constant)"} == fields
 
 
@@ -64,6 +64,14 @@ def test_rows_tell_type_unit_and_meaning() -> None:
     rows = {row.field: row for row in wire_table(ls.sensor("cspc-m1c1-mini").frames["data"])}
     assert rows["samples[i].distance"].type == "byte 2 bits 7-0, byte 1 bits 7-2"
     assert rows["samples"].size == "3*lsn"
+
+
+def test_a_part_begins_where_the_one_before_it_ends() -> None:
+    rows = {row.field: row for row in wire_table(SHAPES["shape-segments"].frames["data"])}
+    chain = "a chain: first_size bytes, then as many as next_size of the part before says; 0 ends it"
+    assert rows["segments"] == WireRow("9", "size(segments)", "parts", "segments", "", chain)
+    assert rows["segments[i].time"].offset == "4 + at(segments[i])"
+    assert rows["crc"].offset == "9 + size(segments)"
 
 
 def test_what_some_headers_leave_out_is_marked() -> None:
