@@ -348,7 +348,7 @@ class ScanStream:
         self._parts: list[Stretch] = []
         self._epoch: int | None = None
         self._progress = Progress(sensor)
-        self._empty, self._broken = 0, False  # frames without the parts that have the points, and whether there is a break before the last
+        self._empty, self._broken = 0, False  # frames without parts that have points, and whether there is a break before those at the end
         self._begins: int | None = None  # time of the first point of the scan under way, ns, where it is known
 
     def add(self, packets: Packets) -> list[Scan]:

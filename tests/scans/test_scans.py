@@ -148,35 +148,41 @@ def test_a_frame_whose_first_packet_is_there_is_complete_though_the_end_of_the_o
     assert [(len(scan) // 125, scan.complete) for scan in scans] == [(630, False), (620, False), *[(630, True)] * 4, (220, False)]
 
 
+def scans_of_pieces(name: str, frames: list[bytes], size: int) -> list[Scan]:
+    """The scans of the frames of a shape, whose packets come in batches of a size."""
+    sensor = SHAPES[name]
+    packets, stream = sensor.decode(frames if sensor.datagrams else b"".join(frames)), ScanStream(sensor)
+    pieces = [packets.take(slice(start, start + size)) for start in range(0, len(packets), size)]
+    return [scan for piece in pieces for scan in stream.add(piece)] + stream.finish()
+
+
+@pytest.mark.parametrize("size", [1, 7, 100])
 @pytest.mark.parametrize(("lost", "whole", "complete"), [(0, True, True), (3, True, False), (10, True, False), (11, False, False)])
-def test_a_frame_of_parts_counts_once(lost: int, whole: bool, complete: bool) -> None:
+def test_a_frame_of_parts_counts_once(lost: int, whole: bool, complete: bool, size: int) -> None:
     """A turn is 20 frames, with 30 parts: it is whole where at least as many frames are there as are missing."""
-    sensor = SHAPES["shape-segments"]
-    frames = [frame for place, frame in enumerate(simulate(sensor, 100)) if not 24 <= place < 24 + lost]
-    decoder = sensor.decoder()
-    packets = PacketStream(sensor, "data", decoder.stats).add([decoder.datagrams(frames, [1] * len(frames))])
-    for size in (len(packets), 7):
-        stream = ScanStream(sensor)
-        pieces = [packets.take(slice(start, start + size)) for start in range(0, len(packets), size)]
-        scans = [scan for piece in pieces for scan in stream.add(piece)] + stream.finish()
-        assert decoder.stats.lost == lost
-        assert [(scan.whole, scan.complete) for scan in scans] == [
-            (False, False),
-            (whole, complete),
-            (True, True),
-            (True, True),
-            (False, False),
-        ]
+    frames = [frame for place, frame in enumerate(simulate(SHAPES["shape-segments"], 100)) if not 24 <= place < 24 + lost]
+    assert SHAPES["shape-segments"].decode(frames).stats.lost == lost
+    scans = scans_of_pieces("shape-segments", frames, size)
+    ends = (False, False)
+    assert [(scan.whole, scan.complete) for scan in scans] == [ends, (whole, complete), (True, True), (True, True), ends]
 
 
-def test_a_frame_without_parts_that_have_points_leaves_no_gap() -> None:
+def test_a_frame_that_two_scans_share_counts_in_both() -> None:
+    sensor, segment = SHAPES["shape-segments"], dict(channels=1, beams=1, start=0, elevations=[4], data=[[dict(distance=1, strength=2)]])
+    turns = [[{**segment, "turn": turn, "time": turn * 1000} for turn in (number, number + 1)] for number in range(6)]
+    frames = [sensor.build("data", counter=number, step=15, segments=parts) for number, parts in enumerate(turns) if number != 3]
+    scans = scans_of_pieces("shape-segments", frames, 100)
+    assert [(scan.whole, scan.complete) for scan in scans[1:4]] == [(True, True), (True, True), (True, False)]
+
+
+@pytest.mark.parametrize("size", [1, 100])
+def test_a_frame_without_parts_that_have_points_leaves_no_gap(size: int) -> None:
     sensor = SHAPES["shape-tags"]
     empty = sensor.build("data", number=0, tags=[dict(type=2, temperature=30)], padding=bytes(5))
     frames = [frame for pair in zip(simulate(sensor, 16), [empty] * 16, strict=True) for frame in pair]
-    scans = list(sensor.scans(b"".join(frames)))
-    assert [scan.complete for scan in scans] == [False, True, True, False]
-    missing = list(sensor.scans(b"".join([*frames[:11], frames[10][:9], *frames[11:]])))
-    assert [scan.complete for scan in missing] == [False, False, True, False]
+    assert [scan.complete for scan in scans_of_pieces("shape-tags", frames, size)] == [False, True, True, False]
+    cut_off = [*frames[:11], frames[10][:9], *frames[11:]]
+    assert [scan.complete for scan in scans_of_pieces("shape-tags", cut_off, size)] == [False, False, True, False]
 
 
 @pytest.mark.parametrize("kind", ["node", "express", "hq"])
