@@ -287,7 +287,7 @@ class Continuity:
         elif not _agree(near, by_clock):
             return self._damaged(number, time or 0, pace, by_clock) if by_clock > 0.5 else (None, number)
         self._suspect = None
-        return near, number
+        return None if near <= -LATE else near, number
 
     def _by_counter(self, ahead: int, period: int) -> int | None:
         behind = period - ahead
