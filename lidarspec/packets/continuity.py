@@ -351,9 +351,10 @@ class Continuity:
             return self._by_counter(ahead, period), number
         by_clock = passed / pace
         near = ahead + period * round((by_clock - ahead) / period)
-        if ahead == 1 and not _agree(near, by_clock):
-            near = 1  # the clock was set, or is uneven
-        elif not _agree(near, by_clock):
+        is_right = _agree(near, by_clock) and near >= -LATE
+        if ahead == 1 and not is_right:
+            near = 1  # the clock was set, or is uneven, or a recording begins anew
+        elif not is_right:
             return self._damaged(number, time or 0, pace, by_clock) if by_clock > 0.5 else (None, number)
         self._suspect = None
         return None if near <= -LATE else near, number

@@ -195,3 +195,12 @@ def test_pieces_do_not_matter(name: str, seed: int) -> None:
         other, others = in_pieces(sensor, frames, size)
         assert np.array_equal(other, index)
         assert others == stats
+
+
+@pytest.mark.parametrize("name", ["robosense-m1", "hesai-xt32", "velodyne-vlp16"])
+def test_a_recording_that_is_played_in_a_loop_goes_on(name: str) -> None:
+    sensor = ls.sensor(name)
+    packets = sensor.decode(simulate(sensor, 630) * 4)
+    assert counted(packets) == (0, 0, 0)
+    assert packets.breaks.sum() == (0 if name == "robosense-m1" else 3)
+    assert sum(len(scan) for scan in sensor.scans(simulate(sensor, 630) * 4)) == len(packets.points())
