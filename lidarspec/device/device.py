@@ -122,7 +122,7 @@ class Device(Closing):
         self._streams: dict[str | None, PacketReader] = {}
         self._latest, self._unseen = ScanStream(sensor, mount), deque[Scan]()
         self._ahead: Arrival | None = None
-        self._first, self._another = list[Found](), "" if not sensor.relatives else None
+        self._first, self._another = list[Found](), None if sensor.relatives or "model" in sensor.info else ""
         self._own_recorder: Log | None = None
         self._input = self._opened(backend, record, overflow, period)
         self._finalizer = weakref.finalize(self, _close, self._input, self._own_recorder)
@@ -351,12 +351,12 @@ class Device(Closing):
         return arrival
 
     def _doubts(self) -> list[str]:
-        """That the first frames are another sensor's: found out once, when there are enough of them."""
+        """That the first frames are another sensor's, or name another model: found out once, when there are enough of them."""
         if self._another is None and (len(self._first) >= EXAMINED or self._input.ended):
             self._another = contradiction(self.sensor, self._first)
         if not self._another:
             return []
-        text = f"{self._source}: read as {self.sensor.id}, and the frames are those of {self._another}"
+        text = f"{self._source}: read as {self.sensor.id}, and {self._another}"
         return [f"{text}; next: lidarspec detect {quote(str(self._source))}"]
 
 

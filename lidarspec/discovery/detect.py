@@ -91,10 +91,14 @@ def told_apart(candidates: Sequence[Sensor], found: Sequence[Found]) -> Told:
 
 
 def contradiction(sensor: Sensor, found: Sequence[Found]) -> str:
-    """The relatives whose frames these are and not the sensor's, each with what says so; "" where nothing does."""
+    """That these frames are those of relatives and not the sensor's, with what says so, or name another model; "" where nothing does."""
     known = sensors()
     told = told_apart([sensor, *(known[name] for name in sensor.relatives if name in known)], found)
-    return "" if sensor.id in told.alike else " or ".join(f"{name} ({why})" for name, why in (told.alike or told.others).items())
+    if sensor.id not in told.alike:
+        return "the frames are those of " + " or ".join(f"{name} ({why})" for name, why in (told.alike or told.others).items())
+    names = _models(sensor, found)
+    fits = any(_plain(part) in _plain(sensor.model) for name in names for part in re.split(r",| and ", name))
+    return "" if fits or not names else f"{sensor.info['model']} says {names[0]}"
 
 
 def _shown(sensor: Sensor, found: Sequence[Found]) -> dict[str, str]:
@@ -156,13 +160,17 @@ def _declared_pace(pace: Callable[[Any], Any], packets: Packets) -> float:
 
 def _by_name(sensor: Sensor, found: Sequence[Found]) -> str:
     """Why the frames name this sensor as their model, "" where they do not."""
+    return next((f"{sensor.info['model']} says {text}" for text in _models(sensor, found) if _plain(text) == _plain(sensor.model)), "")
+
+
+def _models(sensor: Sensor, found: Sequence[Found]) -> list[str]:
+    """The models that the first frames name, as far as they name any."""
     frame, _, field = sensor.info.get("model", "").partition(".")
+    names = []
     for item in itertools.islice((item for item in found if item.frame == frame), READ):
         value = functools.reduce(lambda parsed, name: parsed[name], field.split("."), sensor.parse(item.data, frame))
-        text = _text(value, schema(sensor.frames[frame].tree).fields[field])
-        if _plain(text) == _plain(sensor.model):
-            return f"{frame}.{field} says {text}"
-    return ""
+        names.append(_text(value, schema(sensor.frames[frame].tree).fields[field]))
+    return [name for name in names if name]
 
 
 def _text(value: Any, info: FieldInfo) -> str:

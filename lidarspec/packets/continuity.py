@@ -13,7 +13,10 @@ from __future__ import annotations
 
 import copy
 import math
+from bisect import bisect
 from dataclasses import dataclass
+from functools import partial
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -24,10 +27,10 @@ from lidarspec.columns.graph import header_function
 from lidarspec.errors import SpecError
 from lidarspec.framing.results import Counters, Numbers
 from lidarspec.packets.clocks import Times
-from lidarspec.packets.packets import Packets, joined
+from lidarspec.packets.packets import Index, Packets, joined
 from lidarspec.spec.description import Spec
 from lidarspec.spec.timing import Clock, Sequence
-from lidarspec.wire.arrays import alike
+from lidarspec.wire.arrays import alike, counted
 
 #: how far back a packet may come and still be a late one; further back the sensor has started again.
 LATE = 64
@@ -41,14 +44,17 @@ WIDE = 1 << 63
 FARTHEST = 1 << 32
 #: a clock that goes on by more nanoseconds from one packet to the next was set.
 SET = 3600 * 10**9
-#: packets that the pace is learned from: the first ones, some more, and then again and again.
-BLOCKS = (8, 32, 64)
+#: packets from which the pace is learned: from one to another, the first ones, and then the first ones of each so many.
+LEARNED, EVERY = ((0, 8), (8, 72)), 512
+
+#: from which packet of a batch on each takes so many ns, nan where nobody knows; the first one from its beginning.
+Paces = list[tuple[int, float]]
 
 
 class Pace:
     """How long a packet takes by the sensor's clock, as the spec declares it or most of the packets before show it.
 
-    It is learned from blocks of packets, each for the packets behind it, so that batches do not change it. A clock that does not advance
+    It is learned from some packets now and then, for those behind them, so that batches do not change it. A clock that does not advance
     evenly tells nothing.
 
     Attributes:
@@ -57,58 +63,57 @@ class Pace:
 
     def __init__(self, clock: Clock, grain: float) -> None:
         self._declared, self.grain = clock.pace, grain
-        self._times = np.empty(0, np.int64)
-        self._blocks, self._pace, self._is_even = 0, math.nan, False
+        self._pace, self._seen, self._lessons = math.nan, 0, 0
+        self._times = list[int]()
 
-    def of(self, batch: Batch, times: Times, steps: Times) -> float | NDArray[np.float64]:
-        """Nanoseconds that each packet takes, (n,), or all of them; nan where nobody knows.
-
-        Args:
-            steps: of the clock to each packet from the one before.
-        """
+    def of(self, batch: Batch, times: Times) -> Paces:
+        """Nanoseconds that each packet takes; nan where nobody knows."""
         if self._declared is not None:
             (seconds,) = header_function(self._declared, batch.table.schema, _seconds)(batch)
-            return seconds.item(0) * 1e9 if (seconds == seconds[0]).all() else np.asarray(seconds * 1e9)
-        first, self._times = -len(self._times), np.concatenate([self._times, times])
-        if self._is_even and self._goes_on(steps):
-            return self._pace
-        paces, is_new = np.full(len(times), self._pace), True
-        self._is_even = False
-        while len(self._times) > (size := BLOCKS[min(self._blocks, len(BLOCKS) - 1)]):
-            self._pace, self._times = self._usual(self._times[: size + 1]), self._times[size:]
-            self._blocks, first = self._blocks + 1, first + size
-            paces[max(first + 1, 0) :] = self._pace
-            if is_new and first >= 0 and self._blocks >= len(BLOCKS):
-                is_new, self._is_even = False, self._goes_on(steps[first + 1 :])
+            if (seconds == seconds[0]).all():
+                return [(0, seconds.item(0) * 1e9)]
+            return [(spot, second * 1e9) for spot, second in enumerate(seconds.tolist())]
+        paces = [(0, self._pace)]
+        first, end = self._lesson()
+        while first < len(times):
+            if first >= 0 and self._lessons >= len(LEARNED):
+                starts = np.arange(first, len(times) + first - end + 1, EVERY)
+                keep = self._keep(times[starts + end - first - 1] - times[starts], end - first - 1)
+                self._lessons += len(keep) if keep.all() else int(keep.argmin())
+                first, end = self._lesson()
+            self._times += times[max(first, 0) : end].tolist()
+            if end > len(times):
+                break
+            if self._lessons < len(LEARNED) or not self._keep(self._times[-1] - self._times[0], end - first - 1):
+                self._pace = self._usual(self._times)
+                paces.append((end, self._pace))
+            self._times, self._lessons = [], self._lessons + 1
+            first, end = self._lesson()
+        self._seen += len(times)
         return paces
 
     def forget(self) -> None:
-        """Time has passed that no packet shows."""
-        self._times, self._is_even = self._times[:0], False
+        """Time has passed that no packet shows: what is being learned is begun anew."""
+        self._seen, self._times = self._seen + self._lesson()[0], []
 
-    def _goes_on(self, steps: Times) -> bool:
-        """Whether these packets, the last ones, keep the pace all of them, so that nothing is to be learned but the newest pace."""
-        if not len(steps):
-            return True
-        pace, size, least, most = self._pace, BLOCKS[-1], int(steps.min()), int(steps.max())
-        if not 0.85 * pace - self.grain <= least <= most <= 1.05 * pace + self.grain:
-            return False
-        if most > 0.9 * pace + max(self.grain, 0.45 * pace):
-            return False
-        edges = self._times[::size]
-        means = np.diff(edges) / size
-        if not (np.abs(means - pace) <= pace / 10).all():
-            return False
-        if len(means):
-            self._pace, self._times = float(means[-1]), self._times[size * len(means) :]
-        return True
+    def _lesson(self) -> tuple[int, int]:
+        """From which to before which packet, counted from the next one on, there is to be learned next."""
+        further = (self._lessons - len(LEARNED) + 1) * EVERY
+        first, last = LEARNED[self._lessons] if further <= 0 else (further, further + LEARNED[-1][1] - LEARNED[-1][0])
+        return first - self._seen, last + 1 - self._seen
 
-    def _usual(self, times: Times) -> float:
-        """What most packets of a block take, in whichever order they came; nan where they differ."""
-        steps = np.diff(np.sort(times)).astype(np.float64)
-        near = steps[steps <= 1.5 * float(np.median(steps)) + self.grain]
-        pace = float(near.mean())
-        even = np.count_nonzero(np.abs(near - pace) <= pace / 4 + self.grain)
+    def _keep(self, passed: Any, packets: int) -> Any:
+        """Whether so many packets have taken as long as is known."""
+        return abs(passed - packets * self._pace) <= packets * self._pace / 10
+
+    def _usual(self, times: list[int]) -> float:
+        """What most of these packets take, in whichever order they came; nan where they differ."""
+        times = sorted(times)
+        steps = sorted([after - before for before, after in pairwise(times)])
+        limit = 1.5 * steps[len(steps) // 2] + self.grain
+        near = steps[: bisect(steps, limit)]
+        pace = sum(near) / len(near)
+        even = bisect(near, 1.25 * pace + self.grain) - bisect(near, 0.75 * pace - self.grain)
         return pace if pace > 0 and even > 0.55 * len(steps) else math.nan
 
 
@@ -119,9 +124,9 @@ class Clues:
     Attributes:
         numbers, periods: the counter, (n,), None where there is none; and after how many packets it starts again, one for all or (n,).
         there: which packets have the counter, (n,); None where all have.
-        times, paces: of the sensor's clock, (n,) ns, None where there is none; and how long a packet takes by it, one for all or (n,).
-        skipped: how many packets the bytes before each would be that are in no frame, (n,).
-        steady: whether each follows the one that arrived before it, (n,).
+        times, paces: of the sensor's clock, (n,) ns, None where there is none; and how long packets take by it.
+        passed: from the time of the packet that arrived before to each, (n,) ns.
+        skipped: before which packets there are bytes in no frame, (k,), and how many packets these would be, (k,).
     """
 
     batch: Batch
@@ -129,9 +134,9 @@ class Clues:
     periods: int | NDArray[np.int64]
     there: NDArray[np.bool_] | None
     times: Times | None
-    paces: float | NDArray[np.float64]
-    skipped: NDArray[np.int64]
-    steady: NDArray[np.bool_]
+    passed: Times | None
+    paces: Paces
+    skipped: tuple[NDArray[np.intp], NDArray[np.int64]]
 
     def number(self, spot: int) -> int | None:
         """The counter of a packet."""
@@ -140,6 +145,19 @@ class Clues:
     def time(self, spot: int) -> int | None:
         """The time of a packet, ns."""
         return None if self.times is None else self.times.item(spot)
+
+    def period(self, spot: int) -> int:
+        """After how many packets the counter of a packet starts again."""
+        return max(self.periods if isinstance(self.periods, int) else self.periods.item(spot), 1)
+
+    def pace(self, spot: int) -> float:
+        """How long a packet takes, ns; nan where nobody knows."""
+        return self.paces[bisect(self.paces, spot, key=_first) - 1][1]
+
+    def paces_at(self, spots: NDArray[np.intp]) -> NDArray[np.float64]:
+        """How long some packets take, (k,) ns; nan where nobody knows."""
+        firsts, paces = zip(*self.paces, strict=True)
+        return np.array(paces)[np.searchsorted(firsts, spots, side="right") - 1]
 
 
 class Continuity:
@@ -155,6 +173,7 @@ class Continuity:
         self._rule: Sequence | None = sensor.sequence if counted else None
         self._clock: Clock | None = sensor.clock if timed else None
         self._pace = None if self._clock is None else Pace(self._clock, grain)
+        self._by_clock_alone = timed and not counted and sensor.datagrams
         self._number: int | None = None  # of the newest packet, its time, ns, and where only the clock tells packets apart its bytes
         self._time: int | None = None
         self._newest, self._largest = b"", 1  # and bytes of the largest packet
@@ -164,35 +183,42 @@ class Continuity:
         self._period, self._index, self._first = 0, -1, 0
         self._missing: set[int] = set()
 
-    def push(self, batch: Batch, times: Times | None, skipped: NDArray[np.int64]) -> tuple[Numbers, NDArray[np.bool_]]:
+    def push(self, batch: Batch, times: Times | None, skipped: NDArray[np.int64]) -> tuple[Index, NDArray[np.bool_]]:
         """The index of each packet, (n,), and True where there is a break before it, (n,).
 
         Args:
+            batch: the packets; `breaks` are those at skipped bytes, and further ones are marked.
             times: by the sensor's clock, (n,) ns; None where it has none.
             skipped: bytes that are in no frame before each packet, (n,).
 
         Raises:
             SpecError: where the counter is no field of the header.
         """
-        clues, number, breaks = self._clues(batch, times, skipped), len(batch), skipped > 0
+        number, breaks = len(batch), batch.breaks
+        if self._rule is None and self._clock is None and alike(skipped) == 0 and alike(batch.table.sizes) is not None:
+            self._index, self._largest = self._index + number, max(self._largest, batch.table.sizes.item(0))
+            return range(self._index + 1 - number, self._index + 1), breaks
+        clues = self._clues(batch, times, skipped)
+        if self._rule is None and not self._by_clock_alone:
+            return self._in_order(clues, breaks), breaks
         found: Numbers = np.empty(number, np.int64)
-        odd, spot, turn = [*np.flatnonzero(~clues.steady).tolist(), number], 0, 0
+        odd, spot, turn = [*self._odd(clues), number], 0, 0
         while spot < number:
             while odd[turn] <= spot:
                 turn += 1
-            ahead, counted = self._ahead(clues, spot)
-            follows = ahead == 1 and counted == clues.number(spot)
+            ahead, counts = self._ahead(clues, spot)
+            follows = ahead == 1 and counts == clues.number(spot)
             end = odd[turn] if follows else spot + 1
             if follows:
                 first, self._index = self._index + 1, self._index + end - spot
                 self._number, self._time = clues.number(end - 1), clues.time(end - 1)
                 found = self._placed(found, first, spot, end)
             else:
-                index, is_break = self._step(clues, spot, ahead, counted)
+                index, is_break = self._step(clues, spot, ahead, counts)
                 found = self._placed(found, index, spot, end)
                 breaks[spot] |= is_break
             spot = end
-        if number and self._rule is None and self._clock is not None and self._sensor.datagrams:
+        if number and self._by_clock_alone:
             self._newest = batch.table.frame(number - 1)
         return found, breaks
 
@@ -212,35 +238,79 @@ class Continuity:
         return found
 
     def _clues(self, batch: Batch, times: Times | None, skipped: NDArray[np.int64]) -> Clues:
-        """What these packets say, and which of them are steady by it."""
-        numbers, periods, there = self._numbers(batch)
-        steady = np.ones(len(batch), np.bool_)
-        if there is not None and not there.all():
-            steady[:] = False
-        elif numbers is not None:
-            each: Any = periods if isinstance(periods, int) else np.maximum(periods, 1)
-            steps = numbers[1:] - numbers[:-1]
-            steady[1:] = steps == 1
-            if not (isinstance(each, int) and each > WIDE) and not steady.all():
-                steady[1:] |= (steps - 1) % (each if isinstance(each, int) else each[1:]) == 0
-            if not isinstance(each, int):
-                steady[1:] &= each[1:] == each[:-1]
-        paces: float | NDArray[np.float64] = math.nan
-        if times is not None and self._pace is not None and len(batch):
-            passed = np.diff(times, prepend=times[0] if self._arrived is None else self._arrived)
-            paces = self._pace.of(batch, times, passed)
-            self._arrived = int(times[-1])
-            if numbers is None:
-                steady &= (passed >= int(self._sensor.datagrams)) & (passed <= SET)
-                steady &= ~(passed - np.maximum(self._pace.grain, paces / 2) > paces)
-            else:  # so much that the counter may have wrapped
-                steady &= ~(np.abs(passed) > paces * (periods / 2 if isinstance(periods, int) else np.maximum(periods, 1) / 2))
-        packets = skipped
+        """What these packets say."""
+        passed, paces = None, [(0, math.nan)]
+        if times is not None and self._pace is not None:
+            passed, paces = np.empty(len(times), np.int64), self._pace.of(batch, times)
+            passed[0] = 1 if self._arrived is None else times.item(0) - self._arrived
+            np.subtract(times[1:], times[:-1], out=passed[1:])
+            self._arrived = times.item(-1)
+        sizes = batch.table.sizes
+        spots, packets = np.empty(0, np.intp), np.empty(0, np.int64)
         if alike(skipped) != 0:
-            packets = np.rint(skipped / np.maximum(np.maximum.accumulate(batch.table.sizes), self._largest)).astype(np.int64)
-            steady &= (packets == 0) | (numbers is not None)
-        self._largest = max(self._largest, int(batch.table.sizes.max()))
-        return Clues(batch, numbers, periods, there, times, paces, packets, steady)
+            spots = np.flatnonzero(skipped > 0)
+            largest = sizes[spots] if alike(sizes) is not None else np.maximum.accumulate(sizes)[spots]
+            packets = np.rint(skipped[spots] / np.maximum(largest, self._largest)).astype(np.int64)
+        self._largest = max(self._largest, int(sizes.max()) if (size := alike(sizes)) is None else size)
+        return Clues(batch, *self._numbers(batch), times, passed, paces, (spots, packets))
+
+    def _odd(self, clues: Clues) -> list[int]:
+        """The packets that do not follow the one that arrived before them: all others, but the first, go on from there."""
+        numbers, passed = clues.numbers, clues.passed
+        if clues.there is not None and not clues.there.all():
+            return list(range(len(clues.batch)))
+        slowest = self._slowest(clues)
+        if numbers is None:
+            assert passed is not None
+            if passed.min() > 0 and passed.max() <= min(1.5 * slowest, SET):
+                return []
+            return np.flatnonzero((passed <= 0) | (passed > SET) | (passed > 1.5 * clues.paces_at(counted(len(passed))))).tolist()
+        each: Any = clues.periods if isinstance(clues.periods, int) else np.maximum(clues.periods, 1)
+        steps = numbers[1:] - numbers[:-1]
+        odd = steps != 1
+        if not (isinstance(each, int) and each > WIDE) and odd.any():
+            odd &= (steps - 1) % (each if isinstance(each, int) else each[1:]) != 0
+        if not isinstance(each, int):
+            odd |= each[1:] != each[:-1]
+        least = each if isinstance(each, int) else int(each.min())
+        if passed is not None and least < LONG and max(int(passed.max()), -int(passed.min())) > slowest * least / 2:  # it may have wrapped
+            odd |= (np.abs(passed) > clues.paces_at(counted(len(passed))) * each / 2)[1:]
+        return (np.flatnonzero(odd) + 1).tolist()
+
+    @staticmethod
+    def _slowest(clues: Clues) -> float:
+        """The least time that a packet takes, as far as that is known; inf where it is not."""
+        return min((pace for _, pace in clues.paces if pace > 0), default=math.inf)
+
+    def _in_order(self, clues: Clues, breaks: NDArray[np.bool_]) -> Index:
+        """The index of packets that come in order, and are not counted; `breaks` are marked."""
+        passed, first, number = clues.passed, self._index + 1, len(clues.batch)
+        grain = 0.0 if self._pace is None else self._pace.grain
+        slowest = self._slowest(clues)
+        limit = min(slowest + max(grain, slowest / 2), SET)
+        is_steady = passed is None or (int(passed.min()) >= 0 and int(passed.max()) <= limit)
+        spots, packets = clues.skipped
+        if is_steady and not packets.any():
+            self._index += number
+            return range(first, first + number)
+        ahead, restarts = 1 + packets, np.zeros(len(spots), np.bool_)
+        if passed is not None:
+            is_odd = (passed < 0) | (passed > limit)
+            is_odd[spots] = True
+            spots = np.flatnonzero(is_odd)
+            ahead = np.ones(len(spots), np.int64)
+            ahead[np.searchsorted(spots, clues.skipped[0])] += packets
+            paces, steps = clues.paces_at(spots), passed[spots]
+            by_clock = np.fmax(np.ceil((steps - np.maximum(grain, paces / 2)) / paces), 1).astype(np.int64)
+            ahead = np.where(grain <= paces / 2, by_clock, np.maximum(by_clock, ahead))
+            restarts = (steps < 0) | (steps > SET)
+            ahead[restarts] = 2
+            self._stats.lost += int(ahead[~restarts].sum()) - int(np.count_nonzero(~restarts))
+        if first == 0 and len(spots) and spots[0] == 0:
+            ahead[0] = 1
+        breaks[spots] |= ahead > 1
+        self._index += number + int(ahead.sum()) - len(ahead)
+        return partial(_with_gaps, first, number, spots, ahead - 1)
 
     def _numbers(self, batch: Batch) -> tuple[NDArray[Any] | None, int | NDArray[np.int64], NDArray[np.bool_] | None]:
         """The counter of each packet, after how many it starts again, and which packets have it."""
@@ -266,14 +336,13 @@ class Continuity:
 
     def _ahead(self, clues: Clues, spot: int) -> tuple[int | None, int | None]:
         """How many places a packet stands ahead of the newest one, None where the sensor has started again; and its number, if right."""
-        time, number = clues.time(spot), clues.number(spot)
+        time, number, pace = clues.time(spot), clues.number(spot), clues.pace(spot)
         passed = None if time is None or self._time is None or abs(time - self._time) > SET else time - self._time
-        pace = clues.paces if isinstance(clues.paces, float) else clues.paces.item(spot)
         if self._rule is None:
-            return self._by_clock(clues, spot, passed, pace) if time is not None else 1 + clues.skipped.item(spot), None
+            return self._by_clock(clues, spot, passed, pace), None
         if number is None:
             return 1, self._number
-        period = max(clues.periods if isinstance(clues.periods, int) else clues.periods.item(spot), 1)
+        period = clues.period(spot)
         if self._number is None or period != self._period:
             self._period = period
             return None, number
@@ -282,12 +351,13 @@ class Continuity:
             return self._by_counter(ahead, period), number
         by_clock = passed / pace
         near = ahead + period * round((by_clock - ahead) / period)
-        if ahead == 1 and not _agree(near, by_clock):
-            near = 1  # the clock was set, or is uneven
-        elif not _agree(near, by_clock):
+        is_right = _agree(near, by_clock) and near >= -LATE
+        if ahead == 1 and not is_right:
+            near = 1  # the clock was set, or is uneven, or a recording begins anew
+        elif not is_right:
             return self._damaged(number, time or 0, pace, by_clock) if by_clock > 0.5 else (None, number)
         self._suspect = None
-        return near, number
+        return None if near <= -LATE else near, number
 
     def _by_counter(self, ahead: int, period: int) -> int | None:
         behind = period - ahead
@@ -306,23 +376,19 @@ class Continuity:
         return ahead, self._number + ahead
 
     def _by_clock(self, clues: Clues, spot: int, passed: int | None, pace: float) -> int | None:
-        """How many places a packet without a number is ahead: by the clock, and as far as that is too coarse by the bytes skipped."""
-        assert self._pace is not None
-        time, skipped = clues.time(spot) or 0, 1 + clues.skipped.item(spot)
+        """How many places a datagram without a number is ahead, None where the clock was set or has started again."""
+        time = clues.time(spot) or 0
         if passed is None:
-            return 1 if self._index < 0 else skipped if self._time is None else None
-        if passed == 0 and self._sensor.datagrams and self._is_doubled(clues, spot):
+            return 1 if self._index < 0 or self._time is None else None
+        if passed == 0 and self._is_doubled(clues, spot):
             return 0
         if not pace > 0:
-            return 1 if self._sensor.datagrams else skipped if passed >= 0 else None
+            return 1
         if abs(passed) > LATE * pace and self._jump is not None and 0 < time - self._jump[0] <= LATE * pace:
             self._stats.lost -= self._jump[1]  # one reading was damaged
             return None
-        if passed >= 0:
-            ahead = max(math.ceil((passed - max(self._pace.grain, pace / 2)) / pace), 1)
-            return ahead if self._pace.grain <= pace / 2 else max(ahead, skipped)
-        back = round(passed / pace)
-        return None if not self._sensor.datagrams or back < -LATE else back or 1
+        ahead = math.ceil(passed / pace - 0.5)
+        return max(ahead, 1) if passed >= 0 else None if ahead < -LATE else ahead or 1
 
     def _is_doubled(self, clues: Clues, spot: int) -> bool:
         """Whether a packet has the bytes of the one before it."""
@@ -337,10 +403,9 @@ class Continuity:
         if ahead is None:
             self._begin(number)
         else:
-            if self._rule is not None or self._clock is not None:
-                self._stats.lost += lost
-                self._missing = {index for index in self._missing if index > self._index + ahead - LATE}
-                self._missing.update(range(self._index + 1, self._index + ahead)[-LATE:])
+            self._stats.lost += lost
+            self._missing = {index for index in self._missing if index > self._index + ahead - LATE}
+            self._missing.update(range(self._index + 1, self._index + ahead)[-LATE:])
             self._index += ahead
         self._jump = (self._time, lost) if self._time is not None and (ahead is None or lost > LATE) else None
         self._number, self._time = number, clues.time(spot)
@@ -365,6 +430,18 @@ class Continuity:
         else:
             self._stats.duplicates += 1
         return index
+
+
+def _with_gaps(first: int, number: int, spots: NDArray[np.intp], gaps: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Consecutive numbers, (number,), that leave out so many before some places."""
+    index = np.ones(number, np.int64)
+    index[:1] = first
+    index[spots] += gaps
+    return np.cumsum(index, out=index)
+
+
+def _first(pace: tuple[int, float]) -> int:
+    return pace[0]
 
 
 def _agree(ahead: int, by_clock: float) -> bool:

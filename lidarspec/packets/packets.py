@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from typing import Any
 
@@ -22,6 +22,8 @@ from lidarspec.wire.schema import Schema
 #: what is known of each packet besides its fields.
 _COLUMNS = ("offset", "time_ns", "host_ns", "index", "breaks")
 
+#: numbers, or what makes them when they are asked for.
+Index = Numbers | Callable[[], NDArray[np.int64]]
 StateOf = tuple[Table | None, NDArray[np.intp]]
 
 
@@ -48,7 +50,7 @@ class Packets:
         offset: Numbers,
         time_ns: NDArray[np.int64],
         host_ns: NDArray[np.int64],
-        index: Numbers,
+        index: Index,
         breaks: NDArray[np.bool_],
         state: Mapping[str, StateOf],
         stats: Counters,
@@ -66,7 +68,7 @@ class Packets:
     @cached_property
     def index(self) -> NDArray[np.int64]:
         """The number of each, (n,), which runs on over what is missing: the sensor's, unwrapped, where it counts its packets."""
-        return array_of(self._index)
+        return self._index() if callable(self._index) else array_of(self._index)
 
     def __len__(self) -> int:
         return len(self.table)

@@ -21,7 +21,7 @@ from lidarspec.framing.frame_engine import Codec, codec
 from lidarspec.framing.results import Counters, Frames, Numbers
 from lidarspec.packets.clocks import Unwrapper, clock_parts, clock_terms, clocked, held, paths
 from lidarspec.packets.continuity import Continuity
-from lidarspec.packets.packets import Packets, StateOf, joined_tables
+from lidarspec.packets.packets import Index, Packets, StateOf, joined_tables
 from lidarspec.spec.description import Spec
 from lidarspec.wire.arrays import alike, repeated, some
 from lidarspec.wire.frame_table import Table
@@ -72,14 +72,13 @@ class PacketStream:
             whole: the frames are a whole input: packets before the first frame of another type see that one as state.
         """
         parts = [_Part.of(frames, self.frame) for frames in found if len(frames)]
-        skipped = _joined([self._bytes_skipped(part) for part in parts], np.int64)
-        table = self._table(parts)
+        table, skipped = self._table(parts), _all_or_joined([self._bytes_skipped(part) for part in parts])
         state = self._states(parts, len(table), whole=whole)
         offset, host = _offsets(parts), _times([part.column(part.frames.at) for part in parts])
-        index: Numbers = range(0)
-        breaks, time = skipped > 0, None
+        index: Index = range(0)
+        breaks, time = np.zeros(len(table), np.bool_) if alike(skipped) == 0 else skipped > 0, None
         if len(table):
-            batch, otherwise = Batch(table, breaks, state, self.sensor.state), (np.arange(len(table)), breaks)
+            batch, otherwise = Batch(table, breaks, state, self.sensor.state), (range(len(table)), breaks)
             with np.errstate(all="ignore"):
                 time = self._guarded("clock", self._times, None, batch, host) if self._clock is not None else None
                 index, breaks = self._guarded("sequence", self._continuity.push, otherwise, batch, time, skipped)
@@ -111,11 +110,16 @@ class PacketStream:
 
     def _bytes_skipped(self, part: _Part) -> NDArray[np.int64]:
         """The bytes in no frame before each of our frames, since ours before it, (n,)."""
-        gaps = part.frames.gaps
+        gaps, own = part.frames.gaps, part.own
         if alike(gaps) == 0 and not self._skipped:
             return repeated(0, part.number)
+        if isinstance(own, slice) and part.number:
+            skipped = gaps[own].copy()
+            skipped[0] += self._skipped + int(gaps[: own.start].sum())
+            self._skipped = int(gaps[own.stop :].sum())
+            return skipped
         sums = self._skipped + np.cumsum(gaps)
-        marks = sums[part.own]
+        marks = sums[own]
         self._skipped = int(sums[-1]) - (int(marks[-1]) if part.number else 0)
         return np.diff(marks, prepend=0)
 
@@ -240,11 +244,19 @@ def _offsets(parts: Sequence[_Part]) -> Numbers:
 
 def _times(parts: Sequence[NDArray[np.int64]]) -> NDArray[np.int64]:
     """Arrival times, 0 where nobody knows them."""
+    found = _all_or_joined(parts)
+    only = alike(found)
+    if only is not None:
+        return repeated(max(only, 0), len(found))
+    return np.maximum(found, 0) if len(found) and int(found.min()) < 0 else found
+
+
+def _all_or_joined(parts: Sequence[NDArray[np.int64]]) -> NDArray[np.int64]:
+    """Arrays joined; `repeated`, where all are of one value."""
     known = {alike(part) for part in parts if len(part)}
     if len(known) == 1 and (only := known.pop()) is not None:
-        return repeated(max(only, 0), sum(map(len, parts)))
-    found = _joined(parts, np.int64)
-    return np.maximum(found, 0) if len(found) and int(found.min()) < 0 else found
+        return repeated(only, sum(map(len, parts)))
+    return _joined(parts, np.int64)
 
 
 def _joined(parts: Sequence[NDArray[Any]], dtype: Any) -> NDArray[Any]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ import pytest
 import lidarspec as ls
 from lidarspec.captures.pcap import CaptureReader
 from lidarspec.packets.stream import PacketStream
+from lidarspec.simulation.simulator import simulate
 from lidarspec.testing.agreement import assert_same_points
 from tests.sensors.evidence import assert_points, capture, clockwise, decoded, vector_bytes, vectors
 
@@ -270,3 +272,17 @@ def _nearest(scan: ls.PointCloud, published: Any) -> tuple[Any, Any]:
         distance[theirs] = np.sqrt(squares[np.arange(len(theirs)), best])
         degrees[theirs] = clockwise(ours)[best]
     return distance, degrees
+
+
+def test_a_packet_that_names_another_model_is_told_of(tmp_path: Path) -> None:
+    """Lidar type 6 is a Helios-5515, says the manual; and says the capture of a 16P, so that it is a doubt and no more."""
+    path, frames = tmp_path / "other.bin", simulate(SENSOR, 100)
+    path.write_bytes(b"".join(SENSOR.build("data", {**SENSOR.parse(frame), "lidar_type": 6}) for frame in frames))
+    with ls.open(path, SENSOR) as device:
+        assert list(device.scans())
+        told = "read as robosense-helios16p, and data.lidar_type says Helios-5515; next: lidarspec detect"
+        assert [told in warning for warning in device.warnings] == [True, False]
+    path.write_bytes(b"".join(frames))
+    with ls.open(path, SENSOR) as device:
+        assert list(device.scans())
+        assert not any("read as" in warning for warning in device.warnings)

@@ -31,6 +31,7 @@ class Promise:
 RULE, LIMITS, PROMISES = "tests/engine/test_framing_rule.py", "tests/engine/test_limits.py", "tests/engine/test_promises.py"
 RECORDINGS, DEVICE = "tests/recording/test_recordings.py", "tests/device/test_device.py"
 HOSTILE = "tests/captures/test_pcap_hostile.py"
+CONTINUITY, SCANS = "tests/packets/test_continuity.py", "tests/scans/test_scans.py"
 
 EVERY = (
     Promise("P1", "any split of a stream gives the same result", (RULE,), "", figures.splits),
@@ -87,14 +88,20 @@ EVERY = (
         (f"{PROMISES}::TestClocks", "tests/packets/test_clocks.py"),
         "100 turns of 30 s, an hour, and 16 bits, late packets among them: exact",
     ),
-    Promise("P17", "late, doubled and reordered packets give the same scan", (), "", figures.in_any_order),
+    Promise("P17", "late, doubled and reordered packets give the same scan", (CONTINUITY, SCANS), "", figures.in_any_order),
     Promise("P18", "decoders are independent", ("tests/framing/test_framing.py",), "in turn, and in 8 threads: as alone"),
-    Promise("P19", "a scan always ends", (), "", figures.blocked),
-    Promise("P20", "no stream is slower than its line: 10 times its rate, under 64 bytes kept for each", (), "", figures.slowest),
-    Promise("P21", "strangers do not disturb", (), "", figures.strangers),
-    Promise("P22", "other people's files run nothing", (), "", figures.nothing_runs),
-    Promise("P23", "complete means complete, lost is what was lost", (), "", figures.complete),
-    Promise("P24", "nothing is lost in silence", ("tests/cli/test_captures.py",), "", figures.not_in_silence),
+    Promise("P19", "a scan always ends", (SCANS,), "", figures.blocked),
+    Promise("P20", "no stream is slower than its line: 10 times its rate, under 64 bytes kept for each", (RULE,), "", figures.slowest),
+    Promise("P21", "strangers do not disturb", (DEVICE, "tests/device/test_source_recording.py"), "", figures.strangers),
+    Promise(
+        "P22",
+        "other people's files run nothing",
+        ("tests/device/test_settings.py", RECORDINGS, "tests/points/test_kernel_cache.py", "tests/plugins/test_installed.py"),
+        "",
+        figures.nothing_runs,
+    ),
+    Promise("P23", "complete means complete, lost is what was lost", (CONTINUITY, SCANS), "", figures.complete),
+    Promise("P24", "nothing is lost in silence", ("tests/cli/test_captures.py", "tests/cli/test_terminal.py"), "", figures.not_in_silence),
     Promise(
         "",
         "the other long tests: exports, engines and points agree on what is drawn at random",
