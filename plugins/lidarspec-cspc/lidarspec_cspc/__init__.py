@@ -29,6 +29,7 @@ from lidarspec.spec import (
     Frame,
     OnFlag,
     Polar,
+    Relative,
     Scaled,
     Sensor,
     Serial,
@@ -204,8 +205,17 @@ def started(firmware: int, model: bytes, revision: int, *noise: bytes) -> tuple[
     return ("ack", {"firmware": firmware}), SETTLING, *noise, ("info", {"model": model, "revision": revision}), "scan_start"
 
 
-# the point packet is the same; only what is sent before the first one differs (YDLIDAR SDK, communication protocol)
-OTHERS = {"ydlidar-t-mini": "info.model, which is sent when it is started"}
+def tells_state(f: Fields) -> Any:
+    """Whether a packet that begins no turn says what a CSPC says at most in the first one after a start (manual 2.2.3, M&T)."""
+    return (f.mt.start == 0) & (f.mt.frequency > 0)
+
+
+# the packet is the same, and the bits of a sample mean something else (YDLIDAR SDK, communication protocol)
+TMINI = Relative("bits are set beside the lowest of the third byte in packets that begin no turn", tells_state)
+OTHERS: dict[str, str | Relative] = {
+    **dict.fromkeys(("ydlidar-g2", "ydlidar-g4b", "ydlidar-s4b"), "the answers to its requests"),
+    **dict.fromkeys(("ydlidar-tmini", "ydlidar-tmini-pro", "ydlidar-tmini-plus"), TMINI),
+}
 
 VERSION = (("ack", {"firmware": 3}),)
 
