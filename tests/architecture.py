@@ -221,9 +221,11 @@ def attributes(module: Module) -> Iterator[tuple[int, str]]:
 
 
 def word(name: str) -> re.Pattern[str]:
-    """Matches a vendor, model or id as a word, however it is joined; one of one or two characters only in its own case."""
+    """Matches a vendor, model or id as a word, however it is joined; one of one or two characters only in its own case, and not as the end
+    of another name."""
     parts = [re.escape(part) for part in re.split(r"[\W_]+", name) if part]
-    return re.compile(r"(?<![^\W_])" + r"[\W_]?".join(parts) + r"(?![^\W_])", re.IGNORECASE if len(name) > 2 else 0)
+    before, flags = (r"(?<![^\W_])", re.IGNORECASE) if len(name) > 2 else (r"(?<![^\W_]|-)", re.NOFLAG)
+    return re.compile(before + r"[\W_]?".join(parts) + r"(?![^\W_])", flags)
 
 
 def named_sensors(modules: Mapping[str, Module], names: Collection[str]) -> list[str]:

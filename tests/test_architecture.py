@@ -206,6 +206,6 @@ def test_a_named_sensor_is_found(text: str) -> None:
     assert named_sensors(tree({"lidarspec.demo": f"\n{text}"}), ["acme-x9", "Acme", "R1"])
 
 
-@pytest.mark.parametrize("text", ["acmes", "x9", "r1 = 1", "FR1", "macme-x90"])
+@pytest.mark.parametrize("text", ["acmes", "x9", "r1 = 1", "FR1", "DVB-R1", "macme-x90"])
 def test_other_words_are_not_sensors(text: str) -> None:
     assert not named_sensors(tree({"lidarspec.demo": text}), ["acme-x9", "Acme", "R1"])

@@ -93,7 +93,6 @@ X1 = Sensor(
     configure=configure,
     range_limits=(0.08, 8.0),
     turn=(4.5, 6.0),
-    aliases=("x1",),
     status="vectors",
     source="three captured packets; kaiaai/LDS, LDS_CAMSENSE_X1; the housing's zero from the vendor's SDK. Limits of range are assumed",
 )
