@@ -269,7 +269,7 @@ def test_a_relative_file_needs_no_more_than_its_name(tmp_path: Path, monkeypatch
         ("ld60", "'ldrobot-ld06'"),
         ("xt", "'hesai-xt16' or 'hesai-xt32'"),
         ("helios", "'robosense-helios16p'"),
-        ("VLP", "'velodyne-vlp16'"),
+        ("VLP", "'velodyne-vlp16' or 'velodyne-vlp32c'"),
     ],
 )
 def test_an_unknown_sensor_suggests_those_with_this_part_or_the_closest(name: str, meant: str) -> None:
