@@ -1,4 +1,4 @@
-"""RoboSense RS-LiDAR-32 and RS-Bpearl: the packets of rs_driver's tests, points worked out by hand, the date, dual return, what tells them apart."""
+"""RoboSense RS-LiDAR-32 and RS-Bpearl: a vector, points worked out by hand, the date, dual return, the type byte."""
 
 from __future__ import annotations
 

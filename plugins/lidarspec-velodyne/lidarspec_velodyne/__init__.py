@@ -92,7 +92,7 @@ VLP32C_FIRINGS = Firings(
     # 32 lasers, two at a time, 2.304 us apart
     elevation=np.array(VLP32C_ELEVATION),
     offset=np.array(VLP32C_OFFSET),
-    delay=SLOT // 2 * 2.304e-6,
+    delay=(SLOT // 2).astype(np.float64) * 2.304e-6,
     period=55.296e-6,
     focal_distance=0.0424,
     product=VLP32C_PRODUCT,

@@ -31,11 +31,15 @@ def packet(flag: Construct, unit: float, mode: Construct, product: Construct, *,
         "distance" / Scaled(Int16ul, unit, "m") * "0: no return",
         "intensity" / Int8ul * "calibrated reflectivity: to 100 diffuse, above retroreflecting",
     )
-    azimuth = Scaled(Int16ul, 0.01, "deg") * "clockwise from the forward axis, at the first firing of the block"
-    block = Struct("flag" / flag, "azimuth" / azimuth, "channels" / Array(SLOTS, channel))
+    block = Struct(
+        "flag" / flag,
+        "azimuth" / Scaled(Int16ul, 0.01, "deg") * "clockwise from the forward axis, at the first firing of the block",
+        "channels" / Array(SLOTS, channel),
+    )
+    empty: list[Construct] = ["empty" / Bytes((BLOCKS - blocks) * 100)] if blocks < BLOCKS else []
     return Struct(
         "blocks" / Array(blocks, block),
-        *(["empty" / Bytes((BLOCKS - blocks) * 100)] if blocks < BLOCKS else []),
+        *empty,
         "timestamp" / Scaled(Int32ul, 1e-6, "s") * "of the first firing, since the top of the hour",
         "return_mode" / mode,
         "product" / product,
