@@ -118,7 +118,7 @@ def _cloud_of(packets: PacketBatch, shares: list[Share], batch: Batch, ready: in
         size = int(widths[:ready].sum())
         for share in shares:
             share.first = np.where(share.group.where < ready, starts[share.group.where], -1)
-    rows = rows_of(plan.shape) if all(share.plan.shape == plan.shape for share in shares) else 0
+    rows = rows_of(plan.shape) if all(rows_of(share.plan.shape) == rows_of(plan.shape) for share in shares) else 0
     return LazyCloud.of(BatchColumns(packets, shares, size, stamp_ns, rows=rows, nominal=batch.nominal or plan.nominal), stamp_ns)
 
 

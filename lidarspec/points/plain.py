@@ -125,12 +125,13 @@ def _flattened(packets: PacketBatch, result: Points, batch: Batch, stamp_ns: int
     offsets = conventions.seconds_since(packets.time_ns, stamp_ns).reshape(-1, *(1,) * len(axes))
     flat["time"] = flat["time"] + _flat(offsets, shape, mask, ready)
     inside = np.ones(shape, np.bool_) if mask is None else mask.reshape(shape)
-    rows = conventions.rows_of(shape[1:]) if mask is None else 0
+    in_columns = mask is None or bool((inside.any(axis=-1) == inside.all(axis=-1)).all())
+    rows = conventions.rows_of(shape[1:]) if in_columns else 0
     cloud = make_cloud(
         flat,
         conventions.vendor_turn(packets.sensor),
         stamp_ns=stamp_ns,
-        shape=(ready * int(np.prod(shape[1:-1])), rows) if rows else None,
+        shape=(len(flat["time"]) // rows, rows) if rows else None,
         nominal=np.bool_(batch.nominal or result.nominal),
     )
     return Evaluated(cloud, ready, batch.carried(ready), inside[:ready].astype(np.intp), Fields(batch), axes)

@@ -32,8 +32,8 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     [
         ("re", {"read", "record", "replay"}),
         ("help pl", {"plot", "plugins"}),
-        ("show velodyne-", {"velodyne-vlp16", "velodyne-hdl32e"}),
-        ("read x.bin -s pu", {"puck"}),
+        ("show velodyne-vlp", {"velodyne-vlp16", "velodyne-vlp32c"}),
+        ("read x.bin -s pu", {"puck", "puck-lite", "puck-hi-res"}),
         ("check lidarspec-ld", {"lidarspec-ldrobot"}),
         ("build ldrobot-ld06 ", {"data"}),
         ("build ldrobot-ld06 data s", {"speed=", "start_angle="}),

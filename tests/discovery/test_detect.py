@@ -123,12 +123,13 @@ def test_a_name_that_is_not_to_be_trusted_tells_nothing() -> None:
 def test_relatives_that_are_not_installed_are_recognised(tmp_path: Path) -> None:
     xt32 = ls.sensor("hesai-xt32")
     xt32m = [xt32.build("data", xt32.parse(packet), block_count=6, blocks=xt32.parse(packet).blocks[:6]) for packet in simulate(xt32, 5)]
-    for data, name in ((xt32m, "hesai-xt32m"), (old_firmware(60, period=6 * 110.592e-6, product=0x28), "velodyne-vlp32c")):
-        found = verdict(Heard("", tuple(data), datagrams=True))
-        assert (found.alike, [*found.others]) == ((), [name])
-        (tmp_path / "one.bin").write_bytes(data[0])
-        with pytest.raises(WireError, match=f"these are frames of {name} .*, which no installed plugin reads"):
-            detected(tmp_path / "one.bin")
+    assert verdict(Heard("", tuple(xt32m), datagrams=True)).sensor is ls.sensor("hesai-xt32m")
+    data, name = old_firmware(60, period=6 * 110.592e-6, product=0x23), "velodyne-vlp32a"
+    found = verdict(Heard("", tuple(data), datagrams=True))
+    assert (found.alike, [*found.others]) == ((), [name])
+    (tmp_path / "one.bin").write_bytes(data[0])
+    with pytest.raises(WireError, match=f"these are frames of {name} .*, which no installed plugin reads"):
+        detected(tmp_path / "one.bin")
 
 
 def test_a_relative_that_only_its_start_would_tell_leaves_a_doubt() -> None:

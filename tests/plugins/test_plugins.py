@@ -267,9 +267,9 @@ def test_a_relative_file_needs_no_more_than_its_name(tmp_path: Path, monkeypatch
         ("ldrobot-stl27", "'ldrobot-stl27l'"),
         ("LDROBOT-LD60", "'ldrobot-ld06'"),
         ("ld60", "'ldrobot-ld06'"),
-        ("xt", "'hesai-xt16' or 'hesai-xt32'"),
+        ("xt", "'hesai-xt16', 'hesai-xt32' or 'hesai-xt32m'"),
         ("helios", "'robosense-helios16p'"),
-        ("VLP", "'velodyne-vlp16'"),
+        ("VLP", "'velodyne-vlp16', 'velodyne-vlp32c' or 'velodyne-puck-hi-res'"),
     ],
 )
 def test_an_unknown_sensor_suggests_those_with_this_part_or_the_closest(name: str, meant: str) -> None:

@@ -1,4 +1,4 @@
-"""Hesai Pandar40P, PandarXT-32, XT-16 and PandarQT64: vectors, points and times worked out by hand, the clock, correction files."""
+"""Hesai: vectors, points and times worked out by hand, the clock, correction files."""
 
 from __future__ import annotations
 
@@ -19,8 +19,10 @@ from tests.sensors.evidence import PROTOCOLS, assert_points, decoded, vector_byt
 FILE = "vectors_udp3d.json"
 SENSORS = {name: ls.sensor(f"hesai-{name}") for name in ("pandar40p", "xt32", "xt16", "qt64")}
 P40, XT32, XT16, QT64 = SENSORS.values()
+P64, XT32M, QT128 = (ls.sensor(f"hesai-{name}") for name in ("pandar64", "xt32m", "qt128"))
 FORM = {"pandar40p": (10, 40), "xt32": (8, 32), "xt16": (8, 16), "qt64": (4, 64)}  # blocks, channels
 VECTORS = {"hesai_40p_real": P40, "hesai_xt32_real": XT32, "hesai_xt16_real": XT16, "hesai_qt64_real": QT64}
+VECTORS |= {"hesai_64_real": P64, "hesai_xt32m_real": XT32M, "hesai_qt128_real": QT128}
 NAMES = {"motor": "motor_speed", "ret": "return_mode", "factory": "factory", "seq": "sequence", "shutdown": "shutdown"}
 UTC = ("year", "month", "day", "hour", "minute", "second")
 HEADER = {
@@ -94,8 +96,9 @@ def test_a_captured_packet_has_the_fields_and_points_of_its_vector(name: str, tm
     sensor = VECTORS[name].configure(calibration=file, frame="vendor")
     parsed, packets = sensor.parse(data), decoded(sensor, [data])
     assert len(data) == expected["length"]
-    assert sensor.build("data", parsed) == data
-    assert packets.raw["blocks"]["azimuth"][0].tolist() == expected["azimuths"]
+    assert sensor.build(packets.frame, parsed) == data
+    body = packets.raw["body"] if sensor.id == "hesai-qt128" else packets.raw
+    assert body["blocks"]["azimuth"][0].tolist() == expected["azimuths"]
     assert all(parsed[HEADER[key]] == value for key, value in expected.items() if key in HEADER)
     assert int(packets.points().valid.sum()) == expected["n_nonzero"]
     tail = expected["tail"]
@@ -284,3 +287,39 @@ def test_the_nominal_tables_are_those_of_the_vendor() -> None:
         np.testing.assert_allclose(np.rad2deg(cloud.elevation[:channels]), table["elevation_deg"], atol=1e-5)
         np.testing.assert_allclose(np.rad2deg(-cloud.azimuth[:channels]), table["azimuth_offset_deg"], atol=1e-5)
         np.testing.assert_allclose(np.diff(cloud.time[:channels]) * 1e6, np.diff(table["firetime_us"]), atol=1e-6)
+
+
+def test_points_and_times_of_a_pandar64_by_hand() -> None:
+    parsed = P64.parse(simulate(P64, 1)[0], "data")
+    for block in range(6):
+        parsed.blocks[block].azimuth = 8896 if block == 4 else 0
+        for channel in range(64):
+            parsed.blocks[block].channels[channel].distance = 2500 if (block, channel) == (4, 6) else 0
+    single, dual = (decoded(P64, [P64.build("data", parsed, return_mode=mode)]).points() for mode in (0x37, 0x39))
+    # channel 6: E 1.686 (cos .999567, sin .029422), 1.042 to the right: A = 88.96 + 1.042 = 90.002; 10 m
+    assert_points(single, [(4 * 64 + 6, (-0.000349, -9.995671, 0.294223))])
+    # -42.58 - 55.56 - 11.444; of a pair with the last block, the last shot
+    assert [cloud.time[4 * 64 + 6] * 1e6 for cloud in (single, dual)] == [pytest.approx(-109.584), pytest.approx(-54.024)]
+
+
+def test_the_echoes_of_an_xt32m_are_as_many_as_its_return_mode_says() -> None:
+    parsed = XT32M.parse(simulate(XT32M, 1)[0])
+    echoes = {mode: decoded(XT32M, [XT32M.build("data", parsed, return_mode=mode, return_count=3)]).points() for mode in (0x37, 0x3C, 0x3D)}
+    found = {mode: cloud.return_index.reshape(6, 32)[:, 0].tolist() for mode, cloud in echoes.items() if cloud.return_index is not None}
+    assert found == {0x37: [0] * 6, 0x3C: [0, 1] * 3, 0x3D: [0, 1, 2] * 2}
+
+
+@pytest.mark.parametrize("place", [20, 1050, 1062])
+def test_each_crc_of_a_qt128_is_held(place: int) -> None:
+    data = bytearray(vector_bytes(FILE, "hesai_qt128_real"))
+    assert len(QT128.decode([bytes(data)])) == 1
+    data[place] ^= 1
+    assert len(decoded(QT128, [bytes(data)], "data")) == 0
+
+
+def test_the_loops_of_a_qt128_take_turns() -> None:
+    parsed = QT128.parse(simulate(QT128, 1)[0])
+    single, odd = (decoded(QT128, [QT128.build("data", parsed, **more)]).points() for more in ({}, {"return_count": 2, "mode_flag": 1}))
+    # channel 65 fires 1.456 us after the shot in the first loop, and 0.6 in the second; shots are 111.11 us apart, the first at 9
+    assert [single.time[block * 128 + 64] * 1e6 for block in (0, 1)] == [pytest.approx(10.456), pytest.approx(120.71)]
+    assert [odd.time[block * 128 + 64] * 1e6 for block in (0, 1)] == [pytest.approx(9.6), pytest.approx(9.6)]

@@ -6,11 +6,13 @@ from collections.abc import Iterable
 
 from lidarspec.spec import Sensor, hookimpl
 from lidarspec_hesai.pandar40p import PANDAR40P
+from lidarspec_hesai.pandar64 import PANDAR64
 from lidarspec_hesai.qt64 import QT64
-from lidarspec_hesai.xt import XT16, XT32
+from lidarspec_hesai.qt128 import QT128
+from lidarspec_hesai.xt import XT16, XT32, XT32M
 
 
 @hookimpl
 def lidarspec_sensors() -> Iterable[Sensor]:
     """The Hesai sensors."""
-    return [PANDAR40P, XT32, XT16, QT64]
+    return [PANDAR40P, PANDAR64, XT32, XT16, XT32M, QT64, QT128]

@@ -44,8 +44,8 @@ def longest(lasers: int, blocks: int) -> int:
 
 
 def plausible(f: Fields) -> Any:
-    """One to three returns, a unit, and azimuths below 360 degrees."""
-    return (f.dis_unit >= 1) & (f.return_count >= 1) & (f.return_count <= 3) & (f.blocks.azimuth < 360)
+    """A block, one to three returns, a unit, and azimuths below 360 degrees."""
+    return (f.block_count >= 1) & (f.dis_unit >= 1) & (f.return_count >= 1) & (f.return_count <= 3) & (f.blocks.azimuth < 360)
 
 
 def distance(f: Fields) -> Any:

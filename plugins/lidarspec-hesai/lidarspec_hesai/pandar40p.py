@@ -14,11 +14,11 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from construct import Array, Bytes, Const, Int8ul, Int16ul, Int32ul, Struct
+from construct import Array, Const, Int8ul, Int16ul, Int32ul, Struct
 
 from lidarspec.spec import Clock, Fields, Frame, OnWrap, Polar, Scaled, Sensor, Sequence, Simulation, Udp
 from lidarspec_hesai.calibration import Calibration, configure, nominal
-from lidarspec_hesai.parts import FACTORY, RETURN_MODES, TURN, UNPUBLISHED, UTC, beams, clock, turning
+from lidarspec_hesai.parts import TAIL_40P, TURN, UNPUBLISHED, beams, clock, returns_of, turning
 
 BLOCKS, CHANNELS = 10, 40
 PER_TURN = 1800  # blocks in a turn at 10 Hz and single return: 0.2 degrees
@@ -52,14 +52,7 @@ PLAIN = Struct(
             "channels" / Array(CHANNELS, Struct("distance" / Scaled(Int16ul, 0.004, "m") * "0: no return", "reflectivity" / Int8ul)),
         ),
     ),
-    "reserved" / Bytes(5),
-    "shutdown" / Int8ul * "1: too hot, about to shut down",
-    "tail_reserved" / Bytes(2),
-    "motor_speed" / Scaled(Int16ul, 1, "rpm"),
-    "timestamp" / Scaled(Int32ul, 1e-6, "s") * "within the second of utc",
-    "return_mode" / Int8ul * RETURN_MODES,
-    "factory" / Int8ul * FACTORY,
-    "utc" / UTC,
+    *TAIL_40P,
 )
 COUNTED = Struct(*PLAIN.subcons, "sequence" / Int32ul)
 
@@ -71,11 +64,9 @@ def plausible(f: Fields) -> Any:
 
 def points(f: Fields, channels: Calibration) -> Polar:
     """Shots before the packet's time (HesaiLidar_SDK_2.0); with dual return, pairs of blocks are one shot."""
-    block = np.arange(BLOCKS)[:, None]
-    mode = f.return_mode
-    returns = np.where((mode == 0x39) | (mode == 0x3B) | (mode == 0x3C), 2, 1)
+    block, returns = np.arange(BLOCKS)[:, None], returns_of(f.return_mode)
     fired = LAST_SHOT - SHOT * ((BLOCKS - 1 - block) // returns)
-    return beams(f, channels, distance=f.blocks.channels.distance, block=block, returns=returns, fired=fired)
+    return beams(f.blocks, channels, distance=f.blocks.channels.distance, block=block, returns=returns, fired=fired)
 
 
 def sweep(i: int) -> dict[str, Any]:

@@ -9,9 +9,9 @@ import datetime
 from typing import Any
 
 import numpy as np
-from construct import Int8ul, Struct
+from construct import Bytes, Int8ul, Int16ul, Int32ul, Struct
 
-from lidarspec.spec import Fields, Polar
+from lidarspec.spec import Fields, Polar, Scaled
 from lidarspec_hesai.calibration import Calibration
 
 RETURN_MODES = "33 first, 34 second, 37 strongest, 38 last, 39 last and strongest, 3b first and last, 3c first and strongest, 3d three"
@@ -32,6 +32,25 @@ UTC = Struct(
 )
 
 
+#: the tail of a Pandar40P and a Pandar64.
+TAIL_40P = (
+    "reserved" / Bytes(5),
+    "shutdown" / Int8ul * "1: too hot, about to shut down",
+    "tail_reserved" / Bytes(2),
+    "motor_speed" / Scaled(Int16ul, 1, "rpm"),
+    "timestamp" / Scaled(Int32ul, 1e-6, "s") * "within the second of utc",
+    "return_mode" / Int8ul * RETURN_MODES,
+    "factory" / Int8ul * FACTORY,
+    "utc" / UTC,
+)
+
+
+def returns_of(mode: Any) -> Any:
+    """How many blocks in a row are echoes of one shot, in this return mode."""
+    dual = (mode == 0x39) | (mode == 0x3B) | (mode == 0x3C)
+    return np.where(mode == 0x3D, 3, np.where(dual, 2, 1))
+
+
 def clock(f: Fields) -> tuple[Any, Any]:
     """Whole seconds since 1970, and the microseconds within the second: two terms, each exact."""
     utc = f.utc
@@ -49,10 +68,11 @@ def _days(year: Any, month: Any, day: Any) -> Any:
     return 365 * years + leap_days + np.floor((153 * months + 2) / 5) + day - 719_469
 
 
-def beams(f: Fields, channels: Calibration, *, distance: Any, block: Any, returns: Any, fired: Any) -> Polar:
+def beams(blocks: Fields, channels: Calibration, *, distance: Any, block: Any, returns: Any, fired: Any) -> Polar:
     """The points of a packet.
 
     Args:
+        blocks: the blocks of the frame.
         channels: what each channel adds to its block.
         distance: metres, (n, blocks, channels).
         block: the number of each block, (blocks, 1) or (n, blocks, 1).
@@ -61,9 +81,9 @@ def beams(f: Fields, channels: Calibration, *, distance: Any, block: Any, return
     """
     return Polar(
         range=distance,
-        azimuth=-np.deg2rad(f.blocks.azimuth + channels.azimuth),
+        azimuth=-np.deg2rad(blocks.azimuth + channels.azimuth),
         elevation=np.deg2rad(channels.elevation),
-        intensity=f.blocks.channels.reflectivity,
+        intensity=blocks.channels.reflectivity,
         time=fired + channels.firing,
         ring=np.arange(len(channels)),
         return_index=block % returns,

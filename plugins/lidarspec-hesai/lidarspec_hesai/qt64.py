@@ -55,7 +55,7 @@ def points(f: Fields, channels: Calibration) -> Polar:
     """Four shots, or two with dual return, after the packet's time (HesaiLidar_SDK_2.0)."""
     block, returns = block_numbers(f), f.return_count
     fired = FIRST_SHOT + take(SHOTS, block // returns)
-    return beams(f, channels, distance=distance(f), block=block, returns=returns, fired=fired)
+    return beams(f.blocks, channels, distance=distance(f), block=block, returns=returns, fired=fired)
 
 
 def sweep(i: int) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Hesai PandarXT-32 and PandarXT-16: protocol 6.1, a header, up to 8 blocks, 1080 and 568 bytes.
+"""Hesai PandarXT-32, PandarXT-16 and XT32M2X: protocol 6.1, a header, up to 8 blocks, 1080 and 568 bytes; 6 blocks, 820, of the last.
 
 Source: HesaiLidar_SDK_2.0 (udp_protocol_v6_1.h; correction files of the models, which give whole degrees and no offsets).
 """
@@ -15,7 +15,7 @@ from construct import Bytes, Int8ul, Int16ul, Int32ul
 from lidarspec.spec import Clock, Fields, Frame, OnWrap, Polar, Relative, Scaled, Sensor, Sequence, Simulation, Udp
 from lidarspec_hesai.calibration import Calibration, configure, nominal
 from lidarspec_hesai.headed import block_numbers, distance, header, longest, packet, plausible
-from lidarspec_hesai.parts import FACTORY, RETURN_MODES, TURN, UNPUBLISHED, UTC, beams, clock, turning
+from lidarspec_hesai.parts import FACTORY, RETURN_MODES, TURN, UNPUBLISHED, UTC, beams, clock, returns_of, turning
 
 BLOCKS = 8
 PER_TURN = 2000  # blocks in a turn at 10 Hz and single return: 0.18 degrees
@@ -33,18 +33,42 @@ TAIL = (
 
 def points(f: Fields, channels: Calibration) -> Polar:
     """Shots up to the packet's time (HesaiLidar_SDK_2.0)."""
-    block, returns = block_numbers(f), f.return_count
+    return _points(f, channels, f.return_count)
+
+
+def points_by_mode(f: Fields, channels: Calibration) -> Polar:
+    """Likewise, of a model whose header says how many returns there can be, not how many there are."""
+    return _points(f, channels, returns_of(f.return_mode))
+
+
+def _points(f: Fields, channels: Calibration, returns: Any) -> Polar:
+    block = block_numbers(f)
     fired = -SHOT * ((f.block_count - 1 - block) // returns)
-    return beams(f, channels, distance=distance(f), block=block, returns=returns, fired=fired)
+    return beams(f.blocks, channels, distance=distance(f), block=block, returns=returns, fired=fired)
 
 
-def sweep(i: int) -> dict[str, Any]:
+def sweep(i: int, blocks: int = BLOCKS) -> dict[str, Any]:
     """Packet i at 10 Hz with single return."""
-    return {**header(BLOCKS), **turning(i, BLOCKS, PER_TURN)}
+    return {**header(blocks), **turning(i, blocks, PER_TURN)}
+
+
+# fmt: off
+ELEVATION_XT32M = (
+    19.433708, 18.129961, 16.821214, 15.527467, 14.22747, 12.924973, 11.663726, 10.363728, 9.062481, 7.759984, 6.461237, 5.162489,
+    3.864992, 2.566245, 1.273747, -0.0325, -1.339997, -2.637495, -3.937492, -5.233739, -6.529987, -7.827484, -9.126231, -10.426228,
+    -11.719976, -12.984973, -14.27497, -15.567467, -16.859964, -18.157461, -19.451208, -20.747455,
+)
+AZIMUTH_XT32M = (
+    0.175281, 0.175729, 0.173645, 0.171487, 0.169308, 0.167102, 0.166029, 0.161264, 0.160229, 0.161676, 0.159349, 0.158259, 0.155905,
+    0.154796, 0.153668, 0.153816, 0.153966, 0.151599, 0.151743, 0.149387, 0.152042, 0.153463, 0.147404, 0.140117, 0.137839, 0.134276,
+    0.150794, 0.1511, 0.147691, 0.146833, 0.144759, 0.143988,
+)
+# fmt: on
 
 
 TABLE_32 = nominal(15.0 - np.arange(32), np.zeros(32), 6.0 + 1.512 * np.arange(32))
 TABLE_16 = nominal(15.0 - 2.0 * np.arange(16), np.zeros(16), 6.0 + 3.024 * np.arange(16))
+TABLE_XT32M = nominal(ELEVATION_XT32M, AZIMUTH_XT32M, 6.0 + 2.888 * (np.arange(32) % 16))
 
 XT32 = Sensor(
     "hesai-xt32",
@@ -79,4 +103,18 @@ XT16 = dataclasses.replace(
     relatives={},
     status="vectors",
     source="HesaiLidar_SDK_2.0 (udp_protocol_v6_1.h, PandarXT-16 correction files); one captured packet of tier4/nebula",
+)
+
+XT32M = dataclasses.replace(
+    XT32,
+    id="hesai-xt32m",
+    model="XT32M2X",
+    points=partial(points_by_mode, channels=TABLE_XT32M),
+    simulation=Simulation(partial(sweep, blocks=6)),
+    configure=partial(configure, points_by_mode, TABLE_XT32M),
+    aliases=("xt32m", "xt32m2x"),
+    range_limits=(0.5, 300.0),
+    relatives={"hesai-xt32": Relative("8 blocks in a packet, an XT32M sends 6", lambda f: f.block_count == 8)},
+    status="vectors",
+    source="HesaiLidar_SDK_2.0 (udp_protocol_v6_1.h, PandarXT-32M2X correction files); one captured packet of tier4/nebula",
 )

@@ -36,6 +36,15 @@ TURNS = 10  # per second, the factory's setting
 #: degrees; assumed: the topmost laser first, 2 degrees apart over the model's 30 degrees. Units differ by degrees.
 VERTICAL = 15.0 - 2 * np.arange(LASERS)
 
+#: of most models: the low byte first, its sign in a bit of its own.
+TEMPERATURE = ByteSwapped(
+    BitStruct(
+        "negative" / BitsInteger(1),
+        "magnitude" / Scaled(BitsInteger(12), 0.0625, "degC"),
+        "reserved" / BitsInteger(3),
+    )
+)
+
 DATA = Struct(
     "header" / Const(b"\x55\xaa\x05\x5a"),
     "protocol_version" / Int16ub * "0 old, 1 latest",
@@ -49,14 +58,7 @@ DATA = Struct(
     "microseconds" / Scaled(Int32ub, 1e-6, "s"),
     "lidar_type" / Int8ub * "6 Helios-5515, 7 Helios-1615 and Helios-16P",
     "reserved_31" / Bytes(7),
-    "temperature"
-    / ByteSwapped(
-        BitStruct(
-            "negative" / BitsInteger(1),
-            "magnitude" / Scaled(BitsInteger(12), 0.0625, "degC"),
-            "reserved" / BitsInteger(3),
-        )
-    ),
+    "temperature" / TEMPERATURE,
     "reserved_40" / Bytes(2),
     "blocks"
     / Array(

@@ -1,9 +1,12 @@
-"""Velodyne VLP-16 and HDL-32E: spinning lidars of 16 and 32 lasers over UDP.
+"""Velodyne VLP-16 (Puck, Puck LITE), Puck Hi-Res, HDL-32E, VLP-32C and VLS-128: spinning lidars of 16 to 128 lasers over UDP.
 
 Source: velodyne_decoder (calibration files, calib_db.cpp, packet_decoder.cpp) and ros-drivers/velodyne (rawdata), which
 cite the vendor's user manuals: laser angles, firing times, focal distances. The vertical offsets that follow from the
 focal distance are documented for the VLP-16 (11.2 mm at -15 degrees); ros-drivers and nebula leave them out, so their z
-differs by up to 11 mm (VLP-16) and 17 mm (HDL-32E).
+differs by up to 11 mm (VLP-16), 17 mm (HDL-32E), 20 mm (VLP-32C) and 27 mm (VLS-128).
+
+The times of a VLS-128's lasers differ by sources: ros-drivers has one idle slot after eight groups and 8.7 us before the packet's
+time, velodyne_decoder two and 7 us, which is what stands here; directions differ by 0.01 degrees.
 """
 
 from __future__ import annotations
@@ -11,12 +14,29 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterable
 from functools import partial
+from typing import Any
 
 import numpy as np
+from construct import Const, Int8ul
 
-from lidarspec.spec import Clock, OnWrap, Relative, Sensor, Simulation, Udp, hookimpl
+from lidarspec.spec import Clock, Frame, OnWrap, Relative, Sensor, Simulation, Udp, hookimpl
 from lidarspec_velodyne.firings import Firings, configure, pace, points, sweep
-from lidarspec_velodyne.frames import FRAMES, HOUR, SLOTS, TURN
+from lidarspec_velodyne.frames import (
+    BANK,
+    BANKS,
+    DUAL,
+    HOUR,
+    POSITION_FRAME,
+    PUCK_FRAMES,
+    SLOTS,
+    TURN,
+    VLP32C_FRAMES,
+    VLP32C_PRODUCT,
+    VLS128_PRODUCT,
+    packet,
+    plausible_dual,
+    plausible_single,
+)
 
 SLOT = np.arange(SLOTS)
 
@@ -41,52 +61,185 @@ HDL32E_FIRINGS = Firings(
     product=0x21,
 )
 
-# the same packets by other products (velodyne_decoder, types.h); 0x21 tells nothing: a VLP-16 with old firmware sends it too
-OTHERS = {
-    "velodyne-puck-hi-res": Relative("product 0x24", lambda f: f.product == 0x24),
-    "velodyne-vlp32c": Relative("product 0x28", lambda f: f.product == 0x28),
+# fmt: off
+VLP32C_ELEVATION = (
+    -25, -1, -1.667, -15.639, -11.31, 0, -0.667, -8.843, -7.254, 0.333, -0.333, -6.148, -5.333, 1.333, 0.667, -4, -4.667, 1.667, 1,
+    -3.667, -3.333, 3.333, 2.333, -2.667, -3, 7, 4.667, -2.333, -2, 15, 10.333, -1.333,
+)
+VLP32C_OFFSET = (
+    -1.4, 4.2, -1.4, 1.4, -1.4, 1.4, -4.2, 1.4, -1.4, 4.2, -1.4, 1.4, -4.2, 1.4, -4.2, 1.4, -1.4, 4.2, -1.4, 4.2, -4.2, 1.4, -1.4, 1.4,
+    -1.4, 1.4, -1.4, 4.2, -4.2, 1.4, -1.4, 1.4,
+)
+VLS128_ELEVATION = (
+    -11.742, -1.99, 3.4, -5.29, -0.78, 4.61, -4.08, 1.31, -6.5, -1.11, 4.28, -4.41, 0.1, 6.48, -3.2, 2.19, -3.86, 1.53, -9.244, -1.77,
+    2.74, -5.95, -0.56, 4.83, -2.98, 2.41, -6.28, -0.89, 3.62, -5.07, 0.32, 7.58, -0.34, 5.18, -3.64, 1.75, -25, -2.43, 2.96, -5.73,
+    0.54, 9.7, -2.76, 2.63, -7.65, -1.55, 3.84, -4.85, 3.18, -5.51, -0.12, 5.73, -4.3, 1.09, -16.042, -2.21, 4.06, -4.63, 0.76, 15,
+    -3.42, 1.97, -6.85, -1.33, -5.62, -0.23, 5.43, -3.53, 0.98, -19.582, -2.32, 3.07, -4.74, 0.65, 11.75, -2.65, 1.86, -7.15, -1.44,
+    3.95, -2.1, 3.29, -5.4, -0.01, 4.5, -4.19, 1.2, -13.565, -1.22, 4.17, -4.52, 0.87, 6.08, -3.31, 2.08, -6.65, 1.42, -10.346, -1.88,
+    3.51, -6.06, -0.67, 4.72, -3.97, 2.3, -6.39, -1, 4.39, -5.18, 0.21, 6.98, -3.09, 4.98, -3.75, 1.64, -8.352, -2.54, 2.85, -5.84,
+    -0.45, 8.43, -2.87, 2.52, -6.17, -1.66, 3.73, -4.96, 0.43,
+)
+VLS128_OFFSET = (-6.354, -4.548, -2.732, -0.911, 0.911, 2.732, 4.548, 6.354)  # of each eight lasers, which fire together
+# fmt: on
+
+HI_RES_FIRINGS = dataclasses.replace(
+    VLP16_FIRINGS,
+    elevation=np.tile([-10.0, 0.667, -8.667, 2, -7.333, 3.333, -6, 4.667, -4.667, 6, -3.333, 7.333, -2, 8.667, -0.667, 10], 2),
+    product=0x24,
+)
+
+VLP32C_FIRINGS = Firings(
+    # 32 lasers, two at a time, 2.304 us apart
+    elevation=np.array(VLP32C_ELEVATION),
+    offset=np.array(VLP32C_OFFSET),
+    delay=(SLOT // 2).astype(np.float64) * 2.304e-6,
+    period=55.296e-6,
+    focal_distance=0.0424,
+    product=VLP32C_PRODUCT,
+)
+
+GROUP = 8 / 3 * 1e-6  # seconds from eight lasers of a VLS-128 to the next eight; 2.89 us from firmware 5.2.3 on
+VLS128_LASERS = np.arange(4 * SLOTS).reshape(4, SLOTS)
+
+
+def vls128_firings(returns: int) -> Firings:
+    """128 lasers in four blocks, or in four pairs with dual return; eight fire at once, and after eight of these there is a pause."""
+
+    def blocks(values: Any) -> Any:
+        table = np.reshape(values, (4, SLOTS))
+        return np.repeat(table, 2, axis=0) if returns == 2 else np.tile(table, (3, 1))
+
+    return Firings(
+        elevation=blocks(VLS128_ELEVATION),
+        offset=blocks(np.tile(VLS128_OFFSET, 16)),
+        delay=blocks((VLS128_LASERS // 8 + 2 * (VLS128_LASERS // 64)) * GROUP),
+        period=20 * GROUP,
+        focal_distance=0.05863,
+        product=VLS128_PRODUCT,
+        sharing=4,
+        returns=returns,
+        start=-7e-6,  # the packet's time is that of the fourth group, about
+    )
+
+
+VLS128_SINGLE, VLS128_DUAL = vls128_firings(1), vls128_firings(2)
+VLS128_FRAMES = {
+    "data": Frame(
+        packet(BANK, 0.004, Int8ul * "0x37 strongest, 0x38 last", Const(VLS128_PRODUCT, Int8ul) * "0xA1 VLS-128"),
+        data=True,
+        plausible=plausible_single,
+        points=partial(points, model=VLS128_SINGLE),
+        simulation=Simulation(partial(sweep, model=VLS128_SINGLE, flags=np.tile(BANKS, (3, 1)))),
+    ),
+    "data_dual": Frame(
+        packet(BANK, 0.004, Const(DUAL, Int8ul), Const(VLS128_PRODUCT, Int8ul) * "0xA1 VLS-128", blocks=8),
+        data=True,
+        plausible=plausible_dual,
+        points=partial(points, model=VLS128_DUAL),
+        simulation=Simulation(partial(sweep, model=VLS128_DUAL, flags=np.repeat(BANKS, 2, axis=0))),
+    ),
+    "position": POSITION_FRAME,
 }
+
+# the same packets by other products (velodyne_decoder, types.h); 0x21 tells nothing: a VLP-16 with old firmware sends it too
+OTHERS = {"velodyne-vlp32a": Relative("product 0x23, VLP-32A or VLP-32B", lambda f: f.product == 0x23)}
+HI_RES = {"velodyne-puck-hi-res": Relative("product 0x24", lambda f: f.product == 0x24)}
 
 
 VLP16 = Sensor(
     "velodyne-vlp16",
     vendor="Velodyne",
     model="VLP-16",
-    frames=FRAMES,
+    frames=PUCK_FRAMES,
     points=partial(points, model=VLP16_FIRINGS),
     scan=OnWrap("blocks.azimuth"),
     links={"data": Udp(2368, 8308)},
     clock=Clock("timestamp", wraps_at=HOUR, pace=partial(pace, model=VLP16_FIRINGS)),
     simulation=Simulation(partial(sweep, model=VLP16_FIRINGS)),
-    configure=partial(configure, VLP16_FIRINGS),
+    configure=configure,
     range_limits=(0.4, 130.0),  # the default of ros-drivers/velodyne for this model
     vendor_axes=("right", "forward", "up"),
     turn=TURN,
     # 12 blocks, or 6 shots: periods of 110.592 and 46.080 us
-    relatives={"velodyne-hdl32e": "timestamp: a packet each 1327 us, with dual return 664 us; an HDL-32E's 553 and 276 us", **OTHERS},
+    relatives={
+        "velodyne-hdl32e": "timestamp: a packet each 1327 us, with dual return 664 us; an HDL-32E's 553 and 276 us",
+        **HI_RES,
+        **OTHERS,
+    },
     info={"temperature": "position.top_board_temperature"},  # the product byte is not to be trusted
-    aliases=("vlp16", "puck"),
+    aliases=("vlp16", "puck", "puck-lite", "velodyne-puck-lite"),
     status="capture",
     acknowledged={"LS710": "the captures are others', and too large: the project's tests read them where they are"},
     source="velodyne_decoder and ros-drivers/velodyne, citing the VLP-16 user manual; three captures",
 )
 
-HDL32E = dataclasses.replace(
-    VLP16,
-    id="velodyne-hdl32e",
-    model="HDL-32E",
+
+def relative(id: str, model: str, firings: Firings, **facts: Any) -> Sensor:
+    """Another model of the family: a VLP-16 but for these facts."""
+    return dataclasses.replace(
+        VLP16,
+        id=id,
+        model=model,
+        points=partial(points, model=firings),
+        clock=Clock("timestamp", wraps_at=HOUR, pace=partial(pace, model=firings)),
+        simulation=Simulation(partial(sweep, model=firings)),
+        **facts,
+    )
+
+
+HDL32E = relative(
+    "velodyne-hdl32e",
+    "HDL-32E",
+    HDL32E_FIRINGS,
     aliases=("hdl32e",),
-    points=partial(points, model=HDL32E_FIRINGS),
-    clock=Clock("timestamp", wraps_at=HOUR, pace=partial(pace, model=HDL32E_FIRINGS)),
-    simulation=Simulation(partial(sweep, model=HDL32E_FIRINGS)),
-    configure=partial(configure, HDL32E_FIRINGS),
     range_limits=(0.9, 130.0),  # likewise
-    relatives={"velodyne-vlp16": Relative("product 0x22; or a packet each 1327 us", lambda f: f.product == 0x22), **OTHERS},
+    relatives={"velodyne-vlp16": Relative("product 0x22; or a packet each 1327 us", lambda f: f.product == 0x22), **HI_RES, **OTHERS},
     source="velodyne_decoder and ros-drivers/velodyne, citing the HDL-32E user manual; one capture",
+)
+
+PUCK_HI_RES = relative(
+    "velodyne-puck-hi-res",
+    "Puck Hi-Res",
+    HI_RES_FIRINGS,
+    aliases=("puck-hi-res", "vlp16-hi-res"),
+    relatives={
+        "velodyne-vlp16": Relative("product 0x22, or 0x21 of old firmware", lambda f: (f.product == 0x22) | (f.product == 0x21)),
+        "velodyne-hdl32e": Relative("product 0x21", lambda f: f.product == 0x21),
+        **OTHERS,
+    },
+    status="manual",
+    acknowledged={},
+    source="velodyne_decoder (Puck Hi-Res.yml, packet_decoder.cpp), citing the VLP-16 user manual; no packet of this model was seen",
+)
+
+VLP32C = relative(
+    "velodyne-vlp32c",
+    "VLP-32C",
+    VLP32C_FIRINGS,
+    frames=VLP32C_FRAMES,
+    aliases=("vlp32c", "ultra-puck"),
+    range_limits=(0.4, 200.0),  # data sheet
+    relatives={},
+    info={"model": "data.product", **VLP16.info},
+    status="vectors",
+    source="velodyne_decoder (VLP-32C.yml, packet_decoder.cpp), citing the VLP-32C user manual; one captured packet of tier4/nebula",
+)
+
+VLS128 = relative(
+    "velodyne-vls128",
+    "VLS-128",
+    VLS128_SINGLE,
+    frames=VLS128_FRAMES,
+    aliases=("vls128", "alpha-prime", "velodyne-alpha-prime"),
+    range_limits=(0.4, 245.0),  # data sheet of the Alpha Prime
+    relatives={},
+    info={"model": "data.product", **VLP16.info},
+    status="vectors",
+    source="velodyne_decoder (Alpha Prime.yml, packet_decoder.cpp, which cites VeloView); one captured packet of tier4/nebula",
 )
 
 
 @hookimpl
 def lidarspec_sensors() -> Iterable[Sensor]:
     """The Velodyne sensors."""
-    return [VLP16, HDL32E]
+    return [VLP16, HDL32E, PUCK_HI_RES, VLP32C, VLS128]

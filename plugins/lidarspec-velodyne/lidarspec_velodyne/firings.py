@@ -33,19 +33,21 @@ LAST_BLOCK = ("previous", "invalid")
 FASTEST = TURN[1] * 360  # degrees per second
 JITTER = 1.25  # azimuths are encoder readings; steps of the captures vary by 5 %
 
-BLOCK = np.arange(BLOCKS)[:, None]
-
 
 @dataclass(frozen=True, eq=False)
 class Firings:
     """The firing pattern of a model.
 
     Attributes:
-        elevation: (32,) degrees, of the laser of each slot of a block.
-        delay: (32,) seconds from the beginning of the block to the firing of each slot.
-        period: seconds from one block to the next.
+        elevation: (32,) degrees, of the laser of each slot of a block; (blocks, 32) where these hold different lasers.
+        delay: likewise, seconds from the beginning of the firings that share an azimuth to the firing of each slot.
+        period: seconds from one azimuth to the next.
         focal_distance: metres; lasers leave the lens at different heights and cross at this distance.
         product: the product byte that the model should send.
+        offset: as `elevation`, degrees by which the laser of each slot looks to the left of the azimuth.
+        sharing: how many blocks of single return share an azimuth: banks of lasers.
+        returns: of each firing, in packets that always have so many; 0 where these say it.
+        start: seconds from the time of the packet to its first firing.
     """
 
     elevation: NDArray[np.float64]
@@ -53,42 +55,52 @@ class Firings:
     period: float
     focal_distance: float
     product: int
+    offset: NDArray[np.float64] | float = 0.0
+    sharing: int = 1
+    returns: int = 0
+    start: float = 0.0
+
+    @property
+    def blocks(self) -> int:
+        """How many blocks of a packet hold points."""
+        return BLOCKS if self.elevation.ndim == 1 else len(self.elevation)
 
     @property
     def ring(self) -> NDArray[np.intp]:
-        """(32,) the laser of each slot, counted from the lowest one."""
+        """The laser of each slot, counted from the lowest one, the shape of `elevation`."""
         return np.searchsorted(np.unique(self.elevation), self.elevation)
 
     @property
     def height(self) -> NDArray[np.float64]:
-        """(32,) metres above the origin at which the beam of each slot leaves."""
+        """Metres above the origin at which the beam of each slot leaves, the shape of `elevation`."""
         return -self.focal_distance * np.tan(np.deg2rad(self.elevation))
 
 
 def points(f: Fields, model: Firings, last_block: str = "previous") -> Polar:
     """The sensor turns clockwise from its forward axis; heights are along the axis of rotation."""
-    dual = f.return_mode == DUAL
-    clockwise = f.blocks.azimuth + _step(f, dual, model.period, last_block) * (model.delay / model.period)
+    dual = model.returns == 2 if model.returns else f.return_mode == DUAL
+    block = np.arange(model.blocks)[:, None]
+    clockwise = f.blocks.azimuth + _step(f, dual, model, last_block) * (model.delay / model.period) - model.offset
     return Polar(
         range=f.blocks.channels.distance,
         azimuth=-np.deg2rad(clockwise),
         elevation=np.deg2rad(model.elevation),
         intensity=f.blocks.channels.intensity,
-        time=np.where(dual, BLOCK // 2, BLOCK) * model.period + model.delay,
+        time=np.where(dual, block // (2 * model.sharing), block // model.sharing) * model.period + (model.delay + model.start),
         ring=model.ring,
-        return_index=np.where(dual, BLOCK % 2, 0),
+        return_index=np.where(dual, block % 2, 0),
         origin=(0, 0, model.height),
     )
 
 
-def _step(f: Fields, dual: Any, period: float, last_block: str) -> Any:
-    """Degrees that the sensor turns during each block, (n, 12, 1)."""
-    azimuth = f.blocks.azimuth
-    ahead = _difference(azimuth, np.where(dual, following(azimuth, 2), following(azimuth)))
+def _step(f: Fields, dual: Any, model: Firings, last_block: str) -> Any:
+    """Degrees that the sensor turns from the azimuth of each block to the next one, (n, blocks, 1)."""
+    azimuth, one, two = f.blocks.azimuth, model.sharing, 2 * model.sharing
+    ahead = _difference(azimuth, np.where(dual, following(azimuth, two), following(azimuth, one)))
     unknown = np.nan
     if last_block == "previous":
-        unknown = _difference(np.where(dual, previous(azimuth, 2), previous(azimuth)), azimuth)
-    return np.where(np.abs(ahead) < FASTEST * period * JITTER, ahead, unknown)
+        unknown = _difference(np.where(dual, previous(azimuth, two), previous(azimuth, one)), azimuth)
+    return np.where(np.abs(ahead) < FASTEST * model.period * JITTER, ahead, unknown)
 
 
 def _difference(start: Any, end: Any) -> Any:
@@ -96,7 +108,7 @@ def _difference(start: Any, end: Any) -> Any:
     return wrap(end - start + 180, 360) - 180
 
 
-def configure(model: Firings, sensor: Sensor, /, *, last_block: str) -> Sensor:
+def configure(sensor: Sensor, /, *, last_block: str) -> Sensor:
     """The sensor with another rule for the last block, "previous" or "invalid" (see the module's text).
 
     Raises:
@@ -104,17 +116,27 @@ def configure(model: Firings, sensor: Sensor, /, *, last_block: str) -> Sensor:
     """
     if last_block not in LAST_BLOCK:
         raise UsageError(f"{sensor.id}: last_block is one of {', '.join(LAST_BLOCK)}, not {last_block!r}")
-    return dataclasses.replace(sensor, points=partial(points, model=model, last_block=last_block))
+
+    def ruled(function: Any) -> Any:
+        return function and partial(function, last_block=last_block)
+
+    frames = {
+        name: dataclasses.replace(frame, points=ruled(frame.points)) if frame.points else frame for name, frame in sensor.frames.items()
+    }
+    return dataclasses.replace(sensor, points=ruled(sensor.points), frames=frames)
 
 
 def pace(f: Fields, model: Firings) -> Any:
     """Seconds from a packet to the next: 12 blocks, or the 6 shots of dual return."""
-    return np.where(f.return_mode == DUAL, BLOCKS // 2, BLOCKS) * model.period
+    shots = BLOCKS // model.sharing
+    return np.where(f.return_mode == DUAL, shots // 2, shots) * model.period
 
 
-def sweep(i: int, model: Firings) -> dict[str, Any]:
-    """Packet i with single return, at 10 turns a second."""
-    block = i * BLOCKS + np.arange(BLOCKS)
-    azimuth = np.round(block * model.period * 10 * 360, 2) % 360
-    timestamp = i * BLOCKS * model.period % HOUR
-    return {"blocks.azimuth": azimuth, "timestamp": timestamp, "return_mode": STRONGEST, "product": model.product}
+def sweep(i: int, model: Firings, flags: Any = None) -> dict[str, Any]:
+    """Packet i of packets with so many returns, one where these say it themselves, at 10 turns a second; with the flags of its blocks."""
+    dual = model.returns == 2
+    sharing = model.sharing * (2 if dual else 1)
+    shots = model.blocks // sharing
+    azimuth = np.round((i * shots + np.arange(model.blocks) // sharing) * model.period * 10 * 360, 2) % 360
+    values = {"blocks.azimuth": azimuth, "timestamp": i * shots * model.period % HOUR, "return_mode": DUAL if dual else STRONGEST}
+    return {**values, "product": model.product, **({} if flags is None else {"blocks.flag": flags.ravel()})}

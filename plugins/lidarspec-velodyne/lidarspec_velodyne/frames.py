@@ -1,4 +1,4 @@
-"""The packets that the VLP-16 and the HDL-32E have in common: data on UDP port 2368, position on port 8308.
+"""The packets of the family: data on UDP port 2368, in three forms, and position on port 8308, the same from all models.
 
 Source: velodyne_decoder (types.h, telemetry_packet.h) and ros-drivers/velodyne, which cite the vendor's user manuals;
 the leading zeros and inertial readings of position packets: VeloView's position reader.
@@ -9,38 +9,46 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from construct import Array, Bytes, Const, Int8ul, Int16sl, Int16ul, Int32ul, Struct
+from construct import Array, Bytes, Const, Construct, Int8ul, Int16sl, Int16ub, Int16ul, Int32ul, Struct
 
 from lidarspec.spec import Fields, Frame, Scaled, Simulation
 
 BLOCKS, SLOTS = 12, 32
 STRONGEST, DUAL = 0x37, 0x39
+VLP32C_PRODUCT, VLS128_PRODUCT = 0x28, 0xA1  # product bytes
 HOUR = 3600.0  # seconds after which the clock starts again
 TURN = (5.0, 20.0)  # turns a second, slowest and fastest (data sheets)
 POSITIONS = 144  # position packets a second, about
 NMEA = 128  # bytes that a sentence may have (velodyne_decoder)
 
-DATA = Struct(
-    "blocks"
-    / Array(
-        BLOCKS,
-        Struct(
-            "flag" / Const(b"\xff\xee"),
-            "azimuth" / Scaled(Int16ul, 0.01, "deg") * "clockwise from the forward axis, at the first firing of the block",
-            "channels"
-            / Array(
-                SLOTS,
-                Struct(
-                    "distance" / Scaled(Int16ul, 0.002, "m") * "0: no return",
-                    "intensity" / Int8ul * "calibrated reflectivity: to 100 diffuse, above retroreflecting",
-                ),
-            ),
-        ),
-    ),
-    "timestamp" / Scaled(Int32ul, 1e-6, "s") * "of the first firing, since the top of the hour",
-    "return_mode" / Int8ul * "0x37 strongest, 0x38 last, 0x39 dual; not set by HDL-32E firmware before 2.2.20",
-    "product" / Int8ul * "0x21 HDL-32E, 0x22 VLP-16; not to be trusted: VLP-16 with old firmware sends 0x21",
-)
+#: flags of the blocks of a VLS-128, by the bank of 32 lasers (velodyne_decoder, LaserBankId).
+BANKS = np.array([0xFFEE, 0xFFDD, 0xFFCC, 0xFFBB])[:, None]
+
+
+def packet(flag: Construct, unit: float, mode: Construct, product: Construct, *, blocks: int = BLOCKS) -> Struct:
+    """A data packet of so many blocks that hold points, with distances in steps of `unit` metres."""
+    channel = Struct(
+        "distance" / Scaled(Int16ul, unit, "m") * "0: no return",
+        "intensity" / Int8ul * "calibrated reflectivity: to 100 diffuse, above retroreflecting",
+    )
+    block = Struct(
+        "flag" / flag,
+        "azimuth" / Scaled(Int16ul, 0.01, "deg") * "clockwise from the forward axis, at the first firing of the block",
+        "channels" / Array(SLOTS, channel),
+    )
+    empty: list[Construct] = ["empty" / Bytes((BLOCKS - blocks) * 100)] if blocks < BLOCKS else []
+    return Struct(
+        "blocks" / Array(blocks, block),
+        *empty,
+        "timestamp" / Scaled(Int32ul, 1e-6, "s") * "of the first firing, since the top of the hour",
+        "return_mode" / mode,
+        "product" / product,
+    )
+
+
+MODE = Int8ul * "0x37 strongest, 0x38 last, 0x39 dual; not set by HDL-32E firmware before 2.2.20"
+BANK = Int16ub * "0xFFEE lasers 1 to 32, 0xFFDD 33 to 64, 0xFFCC 65 to 96, 0xFFBB 97 to 128"
+PRODUCT = Int8ul * "0x21 HDL-32E, 0x22 VLP-16, 0x24 Puck Hi-Res; not to be trusted: VLP-16 with old firmware sends 0x21"
 
 POSITION = Struct(
     "zeros" / Const(bytes(14)),
@@ -73,8 +81,23 @@ POSITION = Struct(
 
 
 def plausible(f: Fields) -> Any:
-    """Azimuths of at most a whole turn: documented to 359.99 degrees, and a VLP-16 with old firmware sends 360.00."""
+    """Azimuths of at most a whole turn (documented to 359.99 degrees; old firmware sends 360.00), and none of a VLP-32C's packets."""
+    return (f.blocks.azimuth <= 360) & (f.product != VLP32C_PRODUCT)
+
+
+def plausible_turn(f: Fields) -> Any:
+    """Azimuths of at most a whole turn."""
     return f.blocks.azimuth <= 360
+
+
+def plausible_single(f: Fields) -> Any:
+    """Four banks in a row, three times, and no dual return."""
+    return (f.blocks.azimuth <= 360) & (f.blocks.flag == np.tile(BANKS, (3, 1))) & (f.return_mode != DUAL)
+
+
+def plausible_dual(f: Fields) -> Any:
+    """Each of the four banks twice."""
+    return (f.blocks.azimuth <= 360) & (f.blocks.flag == np.repeat(BANKS, 2, axis=0))
 
 
 def plausible_position(f: Fields) -> Any:
@@ -87,12 +110,18 @@ def sweep_position(i: int) -> dict[str, Any]:
     return {"timestamp": i / POSITIONS % HOUR, "pps": 0, "nmea": np.zeros(NMEA)}
 
 
-FRAMES = {
-    "data": Frame(DATA, data=True, plausible=plausible),
-    "position": Frame(
-        POSITION,
-        plausible=plausible_position,
-        simulation=Simulation(sweep_position, rate=POSITIONS),
-        acknowledged={"LS201 inertial.temperature": "signed in the low 12 bits from an HDL-32E, and no number at all from a VLP-16"},
-    ),
+POSITION_FRAME = Frame(
+    POSITION,
+    plausible=plausible_position,
+    simulation=Simulation(sweep_position, rate=POSITIONS),
+    acknowledged={"LS201 inertial.temperature": "signed in the low 12 bits from an HDL-32E, and no number at all from a VLP-16"},
+)
+FLAG = Const(b"\xff\xee")
+PUCK_FRAMES = {
+    "data": Frame(packet(FLAG, 0.002, MODE, PRODUCT), data=True, plausible=plausible),
+    "position": POSITION_FRAME,
+}
+VLP32C_FRAMES = {
+    "data": Frame(packet(FLAG, 0.004, MODE, Const(VLP32C_PRODUCT, Int8ul) * "0x28 VLP-32C"), data=True, plausible=plausible_turn),
+    "position": POSITION_FRAME,
 }
