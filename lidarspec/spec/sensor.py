@@ -16,7 +16,7 @@ from os import PathLike
 from reprlib import repr as shown
 from typing import TYPE_CHECKING, Any
 
-from lidarspec.errors import UnknownOption, UsageError
+from lidarspec.errors import LidarSpecError, PluginError, UnknownOption, UsageError
 from lidarspec.spec.description import Spec
 from lidarspec.trust import beside
 
@@ -222,6 +222,7 @@ class Configure:
         Raises:
             UnknownOption: for an option that neither every sensor nor this one has.
             UsageError: for a value that an option cannot have.
+            PluginError: where the sensor's own function fails at something else.
         """
         sensor = self.sensor
         own = {name: value for name, value in options.items() if name not in OPTIONS}
@@ -272,7 +273,12 @@ class Configure:
             if not self.takes(name, value):
                 kinds = " or ".join(_TOLD[kind] for kind in sorted(self._kinds[name]) if kind in _TOLD)
                 raise UsageError(f"{self.sensor.id}: {name} is {kinds}, not {shown(value)}")
-        configured = self.function(self.sensor, **options)
+        try:
+            configured = self.function(self.sensor, **options)
+        except (LidarSpecError, OSError):
+            raise
+        except Exception as error:
+            raise PluginError.of(error, "configure", sensor=self.sensor.id, function=self.function) from error
         hooked: Sensor = self.sensor.hooked(configured) if self.sensor.hooked else configured
         return hooked
 

@@ -93,6 +93,15 @@ def test_crc32_is_that_of_zlib(length: int) -> None:
     assert CRC32(data) == zlib.crc32(data)
 
 
+@pytest.mark.parametrize("length", [128, 129, 781])
+@pytest.mark.parametrize("refout", [False, True])
+def test_rows_of_the_polynomial_of_zlib_agree_with_the_bitwise_oracle(length: int, refout: bool) -> None:
+    crc = Crc(32, 0x04C11DB7, 0x12345678, True, refout, 0x9ABCDEF0)
+    wide = random_rows(200, length + 9)
+    for rows in (wide[:, 4:-5], np.asfortranarray(wide[:, 4:-5])):
+        assert batch(crc, rows).tolist() == [bitwise_crc(crc, row.tobytes()) for row in rows]
+
+
 @pytest.mark.parametrize("width", range(1, 65))
 def test_every_width_agrees_with_the_bitwise_oracle(width: int) -> None:
     rng, top = random.Random(width), 2**width - 1
