@@ -160,6 +160,8 @@ def formula_data(formula: tree.Formula | None) -> Any:
 def _info(info: tree.FieldInfo) -> dict[str, Any]:
     const = info.const.hex() if isinstance(info.const, bytes | bytearray) else info.const
     facts = {"path": info.path, "unit": info.unit, "scale": info.scale, "offset": info.offset, "const": const, "docs": info.docs}
+    if info.held and info.rebuilt is not None:
+        facts["equals"] = formula_data(info.rebuilt)
     return {**facts, "labels": {str(value): name for value, name in info.labels.items()}}
 
 

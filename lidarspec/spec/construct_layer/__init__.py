@@ -20,6 +20,7 @@ from lidarspec.spec.construct_layer.classes import (
     Pieces as Pieces,
     Sealing as Sealing,
     Seen as Seen,
+    Sizing as Sizing,
     WireNaN as WireNaN,
     bit_width as bit_width,
     bounded as bounded,

@@ -21,6 +21,7 @@ import construct
 from construct import Array, BitsInteger, Bytes, BytesInteger, Const, Construct, Container, FormatField, Struct, Subconstruct
 from construct.expr import ExprMixin
 
+from lidarspec.errors import SpecError
 from lidarspec.spec import tree
 from lidarspec.spec.checksums import Checksum
 
@@ -86,19 +87,19 @@ class MarkedStruct(Struct):  # type: ignore[misc]
     """A Struct whose parsed container holds, under ``_marks``, the (start, end) of each member in the stream."""
 
     def _parse(self, stream: Any, context: Any, path: str) -> Any:
-        marks: dict[str, tuple[int, int]] = {}
-        obj = Container()
-        inner = Container(_=context, _params=context._params, _root=None, _parsing=True, _building=False, _sizing=False)
-        inner._subcons, inner._io, inner._index = self._subcons, stream, context.get("_index", None)
-        inner._root = context.get("_root", None) or inner
+        obj, inner = Container(), self._inner(stream, context, is_parsing=True)
         for con in self.subcons:
             start = stream.tell()
             value = con._parsereport(stream, inner, path)
             note(context, f"{path} -> {con.name or UNNAMED}", start, stream.tell(), value)
             if con.name:
                 obj[con.name] = inner[con.name] = value
-                marks[con.name] = (start, stream.tell())
-        obj["_marks"] = marks
+                inner._marks[con.name] = (start, stream.tell())
+        obj["_marks"] = inner._marks
+        for sizing, place, spot, value in inner._sizings if verifying(context, "lengths") else ():
+            expected = sizing.value(obj)
+            if value != expected:
+                raise Mismatch(place, spot, expected, value, "length")
         return obj
 
     def _build(self, obj: Any, stream: Any, context: Any, path: str) -> Any:
@@ -108,7 +109,25 @@ class MarkedStruct(Struct):  # type: ignore[misc]
         for con in self.subcons:
             if not con.flagbuildnone and con.name not in obj:
                 raise Mismatch(f"{path} -> {con.name}", 0, "a value", "none", "missing")
-        return super()._build(obj, stream, context, path)
+        inner = self._inner(stream, context, is_parsing=False)
+        inner.update({name: value for name, value in obj.items() if name != "_marks"})
+        for con in self.subcons:
+            start = stream.tell()
+            value = con._build(obj.get(con.name), stream, inner, path)
+            if con.name:
+                inner[con.name] = value
+                inner._marks[con.name] = (start, stream.tell())
+        for sizing, place, _, _ in inner._sizings:
+            context._params["_sizes"][place] = sizing.value(inner)
+        return inner
+
+    def _inner(self, stream: Any, context: Any, *, is_parsing: bool) -> Container:
+        """What its members' expressions see; `_marks`: where members stand; `_sizings`: what has to say how long any of them are."""
+        inner = Container(_=context, _params=context._params, _root=None, _parsing=is_parsing, _building=not is_parsing, _sizing=False)
+        inner._subcons, inner._io, inner._index = self._subcons, stream, context.get("_index", None)
+        inner._root = context.get("_root", None) or inner
+        inner._marks, inner._sizings = dict[str, tuple[int, int]](), list[tuple[Sizing, str, int, Any]]()
+        return inner
 
 
 class IndexedArray(Array):  # type: ignore[misc]
@@ -251,6 +270,103 @@ class Sealing(Subconstruct):  # type: ignore[misc]
     absent: frozenset[int]
 
 
+class Sizing(Subconstruct):  # type: ignore[misc]
+    """A number that says how many bytes a part has: made of it, and held to it.
+
+    Attributes:
+        of: the names that lead to the part from the struct that it stands in, which is itself what no names lead to; "_" leads one
+            struct out.
+        plus: what is added.
+        since: a member before the part, from which on is measured; "" for the part alone.
+    """
+
+    def __init__(self, subcon: Construct, of: tuple[str, ...], plus: int = 0, since: str = "") -> None:
+        super().__init__(subcon)
+        self.of, self.plus, self.since, self.flagbuildnone = of, plus, since, True
+
+    @property
+    def out(self) -> int:
+        """How many structs further out the one is that has the part."""
+        return self.of.count("_")
+
+    def value(self, obj: Any) -> int:
+        """What it has to say, of the struct that has the part, parsed or built."""
+        *parents, name = self.of[self.out :] or ("",)
+        try:
+            marks = (member(obj, ".".join(parents)) if parents else obj)["_marks"]
+            start, end = marks[name] if name else (min(marks.values())[0], max(end for _, end in marks.values()))
+            start = marks[self.since][0] if self.since else start
+        except (KeyError, TypeError):
+            raise SpecError(f"SizeOf measures {'.'.join(self.of)!r}, and there is no such part") from None
+        return int(end - start + self.plus)
+
+    def _parse(self, stream: Any, context: Any, path: str) -> Any:
+        start = stream.tell()
+        value = self.subcon._parsereport(stream, context, path)
+        self._enter(context, (path, start, value))
+        return value
+
+    def _build(self, obj: Any, stream: Any, context: Any, path: str) -> Any:
+        sizes = context._params.setdefault("_sizes", {})
+        self._enter(context, (path, 0, obj))
+        return self.subcon._build(sizes.get(path, obj or 0), stream, context, path)
+
+    def _enter(self, context: Any, said: tuple[str, int, Any]) -> None:
+        """Tell the struct that has the part; a bit block that is probed for itself stands in none."""
+        for _ in range(self.out):
+            context = context.get("_", {})
+        context.get("_sizings", []).append((self, *said))
+
+
+class Counting(Subconstruct):  # type: ignore[misc]
+    """The number of elements of an array behind it, `of` which it is made whatever value is given."""
+
+    def __init__(self, subcon: Construct, of: str) -> None:
+        super().__init__(subcon)
+        self.of, self.flagbuildnone = of, True
+
+    def _build(self, obj: Any, stream: Any, context: Any, path: str) -> Any:
+        array = context.get(self.of)
+        return self.subcon._build(len(array) if isinstance(array, list | tuple | bytes) else obj, stream, context, path)
+
+
+class Bounded(Subconstruct):  # type: ignore[misc]
+    """A part that ends after `length` bytes of a frame that comes, and is as long as its values are in one that is made."""
+
+    def __init__(self, length: Any, subcon: Construct) -> None:
+        super().__init__(subcon)
+        self.length = length
+
+    def _parse(self, stream: Any, context: Any, path: str) -> Any:
+        start, length = stream.tell(), bounded(construct.evaluate(self.length, context), sys.maxsize, "length", path)
+        stream.seek(0)
+        within = io.BytesIO(construct.stream_read(stream, start + length, path))
+        within.seek(start)
+        value = self.subcon._parsereport(within, context, path)
+        stream.seek(within.tell())
+        return value
+
+
+class Filler(CountedBytes):
+    """The bytes behind members (from one to another, `of`), up to a length (`to`) or to a multiple of one (`modulus`).
+
+    They are those of a pattern unless given.
+    """
+
+    def __init__(self, of: tuple[str, str], to: Any = None, modulus: Any = None, pattern: bytes = b"\0") -> None:
+        super().__init__(self._missing)
+        self.of, self.to, self.modulus, self.pattern, self.flagbuildnone = of, to, modulus, pattern, True
+
+    def _missing(self, context: Any) -> int:
+        start, end = context._marks[self.of[0]][0], context._marks[self.of[1]][1]
+        number = construct.evaluate(self.modulus if self.to is None else self.to, context)
+        return int((start - end) % number if self.to is None else number - (end - start))
+
+    def _build(self, obj: Any, stream: Any, context: Any, path: str) -> Any:
+        length = bounded(self._missing(context), self.limit, "length", path)
+        return super()._build(self.pattern * length if obj is None else obj, stream, context, path)
+
+
 class Pieces(construct.ListContainer):  # type: ignore[misc]
     """Parts that were parsed or built: kind, first byte and the one after the last of each as `spans`; `size`: the bytes of all."""
 
@@ -285,10 +401,14 @@ class Partition(Construct):  # type: ignore[misc]
     limit: int = sys.maxsize
 
 
-def verifying(context: Any, *, checksums: bool = False) -> bool:
-    """Whether constants, or checksums too, are checked in this parse (``_verify``: True, "constants" or False)."""
+#: how much of a frame is checked, where it is not all of it (``_verify``: True) or nothing (False).
+LEVELS = ("constants", "lengths", "checksums")
+
+
+def verifying(context: Any, what: str = "constants") -> bool:
+    """Whether constants, lengths of parts or checksums are checked in this parse; who checks one checks those before it."""
     wanted = context._params.get("_verify", True)
-    return wanted is True if checksums else bool(wanted)
+    return LEVELS.index(what) <= LEVELS.index(wanted) if isinstance(wanted, str) else bool(wanted)
 
 
 #: construct's classes -> those that stand in for them.
@@ -309,12 +429,16 @@ def prepare(con: Construct, limit: int = sys.maxsize, *, in_bits: bool = False) 
     """
     if isinstance(con, FormatField):
         return ExactFloat(con.fmtstr[0], con.fmtstr[-1]) if con.fmtstr[-1] in "efd" else con
+    if isinstance(con, Filler):
+        con.limit = limit
+        return con
     if isinstance(con, Bytes):
         counted = CountedBytes(con.length)
         counted.limit = limit
         return counted
     if isinstance(con, Struct):
-        return MarkedStruct(*(prepare(child, limit, in_bits=in_bits) for child in con.subcons))
+        members = con.subcons if in_bits else [member for child in con.subcons for member in _spelled_out(child)]
+        return MarkedStruct(*(prepare(child, limit, in_bits=in_bits) for child in members))
     if isinstance(con, construct.Renamed):
         inner = con.subcon
         while isinstance(inner, construct.Renamed):  # ("name" / con) * "docs" wraps twice, and the path would name it twice
@@ -334,6 +458,47 @@ def prepare(con: Construct, limit: int = sys.maxsize, *, in_bits: bool = False) 
     if isinstance(same, Partition):
         same.limit = limit
     return same
+
+
+def _spelled_out(con: Construct) -> list[Construct]:
+    """A member of a struct; of those that construct prefixes, pads or aligns, what it does not show: the length or count, the padding."""
+    name, inner, docs = con.name, con, con.docs
+    while isinstance(inner, construct.Renamed):
+        inner = inner.subcon
+
+    def named(ending: str, part: Construct, what: str) -> Construct:
+        return construct.Renamed(part, newname=name + ending, newdocs=f"{what} {name}")
+
+    if name and isinstance(inner, construct.Prefixed):
+        plus, length = inner.lengthfield.sizeof() if inner.includelength else 0, construct.this[f"{name}_size"]
+        content = Bounded(length - plus if plus else length, inner.subcon) if is_greedy(inner.subcon) else inner.subcon
+        members = _spelled_out(construct.Renamed(content, newname=name, newdocs=docs))
+        return [named("_size", Sizing(inner.lengthfield, (members[-1].name,), plus, members[0].name), "bytes of"), *members]
+    if name and isinstance(inner, construct.FocusedSeq) and [part.name for part in inner.subcons] == ["count", "items"]:  # PrefixedArray
+        count, items = (part.subcon for part in inner.subcons)
+        array = Array(construct.this[f"{name}_count"], items.subcon)
+        return [named("_count", Counting(count.subcon, name), "number of"), construct.Renamed(array, newname=name, newdocs=docs)]
+    if name and (isinstance(inner, construct.Aligned) or (isinstance(inner, construct.FixedSized) and not is_greedy(inner.subcon))):
+        members = _spelled_out(construct.Renamed(inner.subcon, newname=name, newdocs=docs))
+        span = (members[0].name, members[-1].name)
+        if isinstance(inner, construct.Aligned):
+            return [*members, named("_padding", Filler(span, modulus=inner.modulus, pattern=inner.pattern), "padding of")]
+        is_full = isinstance(inner.length, int) and inner.length == fixed_size(inner.subcon)
+        return members if is_full else [*members, named("_padding", Filler(span, to=inner.length), "padding of")]
+    return [con]
+
+
+#: what takes all bytes that there are.
+GREEDY = (construct.GreedyRange, type(construct.GreedyBytes))
+
+
+def is_greedy(con: Construct, kinds: tuple[type, ...] = (*GREEDY, construct.NullStripped)) -> bool:
+    """Whether a part takes all bytes that it is given, by ending in one of some kinds that do."""
+    if isinstance(con, kinds):
+        return True
+    if isinstance(con, Array | construct.NullTerminated | construct.NullStripped | construct.FixedSized | construct.Prefixed | Bounded):
+        return False
+    return any(is_greedy(child, kinds) for child in (children(con)[-1:] if isinstance(con, Struct) else children(con)))
 
 
 def unwrap(con: Construct, *, bits: bool = True) -> Construct:
@@ -501,6 +666,8 @@ def _random_leaf(con: Construct, source: random.Random, scope: Any) -> Any:
         return source.randbytes(bounded(construct.evaluate(con.length, scope), con.limit, "length", ""))
     if isinstance(con, FormatField | BytesInteger | BitsInteger) and source.random() < 0.5:  # it may be a count
         return con.parse(con.build(source.randint(0, min(MANY, (1 << (bit_width(con) - 1)) - 1))))
+    if con in (construct.VarInt, construct.ZigZag):
+        return source.randint(0, MANY)
     if isinstance(con, BitsInteger):
         value = source.getrandbits(con.length)
         return value - (1 << con.length) if con.signed and value >> (con.length - 1) else value

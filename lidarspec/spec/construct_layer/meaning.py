@@ -11,7 +11,7 @@ import functools
 import operator
 import re
 import sys
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -23,7 +23,18 @@ from construct.expr import BinExpr, ExprMixin, UniExpr
 from lidarspec.errors import SpecError
 from lidarspec.spec import tree
 from lidarspec.spec.bits import BitField, probe
-from lidarspec.spec.construct_layer.classes import Describing, Partition, Sealing, leaves
+from lidarspec.spec.construct_layer.classes import (
+    Bounded,
+    Counting,
+    Describing,
+    Filler,
+    Partition,
+    Sealing,
+    Sizing,
+    is_greedy,
+    leaves,
+    unwrap,
+)
 
 
 def frame_tree(con: Construct) -> tree.Node:
@@ -32,9 +43,17 @@ def frame_tree(con: Construct) -> tree.Node:
     Raises:
         SpecError: for a constant that its Enum has no value for.
     """
-    first = _Builder({})
-    root = first.node(con, _Place(tree.FieldInfo(""), None))
-    return _Builder(first.scopes).node(con, _Place(tree.FieldInfo(""), None)) if first.rebuilding else root
+    return _twice(lambda builder: builder.node(con, _Place(tree.FieldInfo(""), None)))[0]
+
+
+def _twice(made: Callable[[_Builder], tree.Node]) -> tuple[tree.Node, _Builder]:
+    """What a builder makes, and the builder; where values follow from later fields, one that knows these."""
+    builder = _Builder()
+    root = made(builder)
+    if builder.rebuilding:
+        builder = _Builder(builder)
+        root = made(builder)
+    return root, builder
 
 
 def _traced(expression: Any, scope: tree.Scope) -> Any:
@@ -103,6 +122,8 @@ class _Place:
     scope: tree.Scope | None
     name: str = ""
     in_bits: bool = False
+    #: bytes that are left where something else says how many there are.
+    room: tree.Formula | None = None
 
     def inside(self, **changes: Any) -> _Place:
         """The place with some facts of the field changed."""
@@ -110,11 +131,26 @@ class _Place:
 
 
 class _Builder:
-    """Makes the nodes of a struct; `scopes`: what was known at the end of each struct, for values that follow from later ones."""
+    """Makes the nodes of a struct.
 
-    def __init__(self, known: Mapping[str, tree.Scope]) -> None:
-        self._known, self.scopes, self.rebuilding = known, dict[str, tree.Scope](), False
+    Args:
+        before: that has made them once, where values follow from what stands behind them: it knows this.
+
+    Attributes:
+        scopes: what was known at the end of each struct.
+        sizes: the sizes that fields of the struct have to say, in the order of these fields.
+        rebuilding: whether values follow from others.
+    """
+
+    def __init__(self, before: _Builder | None = None) -> None:
+        self._known: dict[str, tree.Scope] = {} if before is None else before.scopes
+        self._sizes: list[tree.Formula | None] = [] if before is None else before.sizes
+        self.scopes: dict[str, tree.Scope] = {}
+        self.sizes: list[tree.Formula | None] = []
+        self.rebuilding = False
         self._asked: list[tree.Ref] = []
+        #: of each struct that is being made, those that measure a part of it: which they are, and what they measure.
+        self._measured: dict[tree.Scope, list[tuple[int, Sizing]]] = {}
 
     def node(self, con: Construct, place: _Place) -> tree.Node:
         """The node of a construct, whatever it is."""
@@ -141,6 +177,13 @@ class _Builder:
             return tree.When(name, condition, *branches)
         if isinstance(inner, construct.Switch):
             return self._select(inner, place)
+        if isinstance(inner, Bounded) or (
+            isinstance(inner, construct.FixedSized) and is_greedy(inner.subcon, (type(construct.GreedyBytes),))
+        ):
+            room = self._formula(inner.length, place)
+            return self.node(inner.subcon, replace(place, room=room))
+        if isinstance(inner, construct.GreedyRange) and place.room is not None:
+            return self._filling(inner, place)
         return tree.Empty(name) if inner is construct.Pass else self._leaf(inner, place)
 
     def _peeled(self, con: Construct, place: _Place) -> tuple[Construct, _Place]:
@@ -154,6 +197,10 @@ class _Builder:
                 place = place.inside(labels={int(value): str(name) for value, name in con.ksymapping.items()})
             elif isinstance(con, Const):
                 place = place.inside(const=_constant(con))
+            elif isinstance(con, Counting):
+                place = place.inside(held=True)
+            elif isinstance(con, Sizing):
+                place = place.inside(rebuilt=self._measuring(con, place), held=True)
             elif isinstance(con, construct.Rebuild):
                 self.rebuilding = True
                 known = None if place.scope is None else self._known.get(place.scope.path)
@@ -223,13 +270,55 @@ class _Builder:
         scope = tree.Scope(place.scope, info.path, self._asked)
         if place.name and place.scope is not None:
             place.scope.add(place.name, scope)
-        members = []
+        members = list[tree.Node]()
+        self._measured[scope] = []
         for child in con.subcons:
             path = ".".join(part for part in (info.path, child.name) if part)
             said = tree.FieldInfo(path, info.axes, docs=info.docs if place.in_bits else "", optional=info.optional)
-            members.append(self.node(child, _Place(said, scope, child.name or "", place.in_bits)))
+            inside = _Place(said, scope, child.name or "", place.in_bits)
+            if isinstance(filler := unwrap(child), Filler):
+                inside = replace(inside, room=self._padding(filler, inside, _from(members, filler.of[0])))
+            elif place.room is not None and child is con.subcons[-1]:
+                inside = replace(inside, room=tree.joined("-", place.room, tree.total(map(tree.size, members))))
+            members.append(self.node(child, inside))
         self.scopes[info.path] = scope
-        return tree.Struct(place.name, info.path, tuple(members), info.docs)
+        made = tree.Struct(place.name, info.path, tuple(members), info.docs)
+        for index, sizing in self._measured.pop(scope):
+            part = _below(made, sizing.of[sizing.out :])
+            self.sizes[index] = tree.total((_from(members, sizing.since, part.name) if sizing.since else tree.size(part), sizing.plus))
+        return made
+
+    def _padding(self, con: Filler, place: _Place, size: tree.Formula | None) -> tree.Formula | None:
+        """The bytes behind a part of this size."""
+        number = self._formula(con.modulus if con.to is None else con.to, place)
+        if con.to is not None:
+            return tree.joined("-", number, size)
+        return size if size is None else tree.calculated("%", tree.calculated("-", size), number)
+
+    def _measuring(self, con: Sizing, place: _Place) -> tree.Formula | None:
+        """What a part will add up to, once it is known."""
+        scope, self.rebuilding = place.scope, True
+        for _ in range(con.out):
+            scope = None if scope is None else scope.parent
+        if scope not in self._measured:
+            raise SpecError(
+                f"SizeOf measures {'.'.join(con.of)!r}, which is beyond the frame, or the part, that it stands in", path=place.info.path
+            )
+        index = len(self.sizes)
+        self._measured[scope].append((index, con))
+        self.sizes.append(None)
+        size = self._sizes[index] if self._sizes else None
+        return None if isinstance(size, tree.Ref) and size.path == place.info.path else size  # what it says itself holds
+
+    def _filling(self, con: construct.GreedyRange, place: _Place) -> tree.Node:
+        """As many elements as fill a part, where all are of one size."""
+        axis = axis_path(place.info)
+        element = self.node(con.subcon, replace(place.inside(axes=(*place.info.axes, axis)), room=None))
+        size = tree.size(element)
+        if not isinstance(size, int) or not size:
+            reason = "elements of sizes of their own, which fill a length: say Parts(element, within=...) for them"
+            return tree.Opaque(place.name, place.info, "GreedyRange", reason, (element,))
+        return tree.Repeat(place.name, axis, tree.calculated("//", place.room, size), element)  # type: ignore[arg-type]
 
     def _parts(self, con: Partition, place: _Place) -> tree.Parts:
         info, scope, axis = place.info, place.scope, axis_path(place.info)
@@ -250,14 +339,12 @@ class _Builder:
 
     def _alone(self, case: Construct, following: Any, place: _Place) -> tuple[tree.Node, tree.Formula | None]:
         """A part as a frame in itself, and the size of the one behind it."""
-        builder = _Builder({})
-        for _ in range(2):  # the second time values that follow from later fields know these
-            around = _Place(tree.FieldInfo(""), tree.Outside(place.scope, builder._asked))  # type: ignore[arg-type]
-            root = builder.node(case, around)
-            if not builder.rebuilding:
-                break
-            builder = _Builder(builder.scopes)
-        rule = None if following is None else builder._formula(following, replace(around, scope=builder.scopes[""]))
+
+        def around(builder: _Builder) -> _Place:
+            return _Place(tree.FieldInfo(""), tree.Outside(place.scope, builder._asked))  # type: ignore[arg-type]
+
+        root, builder = _twice(lambda builder: builder.node(case, around(builder)))
+        rule = None if following is None else builder._formula(following, replace(around(builder), scope=builder.scopes[""]))
         return root, rule
 
     def _sealed(self, con: Sealing, place: _Place) -> tree.Node:
@@ -277,7 +364,9 @@ class _Builder:
             node: tree.Node = tree.Number(info, con.length, _KINDS[info.dtype.kind], "big" if big else "little")  # type: ignore[union-attr]
         elif isinstance(con, BytesInteger) and not _is_odd(con):
             node = tree.Number(info, con.length, _KINDS[info.dtype.kind], "little" if con.swapped else "big")  # type: ignore[union-attr]
-        elif isinstance(con, Bytes):
+        elif place.room is not None and (isinstance(con, Filler) or con is construct.GreedyBytes):
+            node = tree.Blob(name, info, place.room, info.const)
+        elif isinstance(con, Bytes) and not isinstance(con, Filler):
             node = tree.Blob(name, info, self._formula(con.length, place), info.const)
         else:
             kind = type(con).__name__
@@ -306,6 +395,30 @@ class _Builder:
             parts.append(tree.Part(info, bits, names, tuple(key for key in bits.keys if isinstance(key, int))))
         return tree.Block(place.name, place.info, size, tuple(parts))
 
+
+def _from(members: Sequence[tree.Node], first: str, last: str = "") -> tree.Formula | None:
+    """The bytes of some members of a struct, from one name to another, or to the end."""
+    names = [member.name for member in members]
+    return tree.total(map(tree.size, members[names.index(first) : names.index(last) + 1 if last else None]))
+
+
+def _below(node: tree.Node, names: Iterable[str]) -> tree.Node:
+    """The part that names lead to in a struct.
+
+    Raises:
+        SpecError: where there is none.
+    """
+    for name in names:
+        body = node.body if isinstance(node, tree.Sealed) else node
+        found = [member for member in body.members if member.name == name] if isinstance(body, tree.Struct) else []
+        if not found:
+            raise SpecError(f"SizeOf measures {'.'.join(names)!r}, and there is no part {name!r}", path=getattr(body, "path", ""))
+        node = found[0]
+    return node
+
+
+#: what takes all bytes as they are.
+_BYTES = (type(construct.GreedyBytes),)
 
 #: of numbers, by those of their types.
 _KINDS: dict[str, Literal["uint", "int", "float"]] = {"u": "uint", "i": "int", "f": "float"}

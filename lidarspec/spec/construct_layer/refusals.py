@@ -9,7 +9,7 @@ from construct import Array, Const, Construct, Container, Struct
 
 from lidarspec.errors import SpecError
 from lidarspec.spec import tree
-from lidarspec.spec.construct_layer.classes import Describing, Partition, children, fixed_size, unwrap
+from lidarspec.spec.construct_layer.classes import GREEDY, Bounded, Describing, Partition, children, fixed_size, unwrap
 
 #: names that `points` and the engine need for themselves.
 RESERVED = frozenset({"state", "on"})
@@ -24,7 +24,7 @@ _REFUSED: dict[type, tuple[str, str]] = {
     construct.Padded: ("LS106", "padding loses its bytes on a round trip: declare it as a field, such as 'reserved' / Bytes(n)"),
     construct.Aligned: (
         "LS106",
-        "Aligned loses its padding on a round trip: declare it as a field, such as 'reserved' / Bytes(-this.size % 4)",
+        "Aligned loses its padding on a round trip, unless it is a named member of a Struct: Struct('part' / Aligned(4, ...))",
     ),
     construct.Pointer: ("LS112", "Pointer reads outside the frame"),
     construct.Seek: ("LS112", "Seek reads outside the frame"),
@@ -32,8 +32,7 @@ _REFUSED: dict[type, tuple[str, str]] = {
 }
 
 #: what gives a greedy part its end, and what has none of its own.
-_BOUNDED = (construct.NullTerminated, construct.FixedSized, construct.Prefixed)
-_GREEDY = (construct.GreedyRange, type(construct.GreedyBytes))
+_BOUNDED = (construct.NullTerminated, construct.FixedSized, construct.Prefixed, Bounded)
 
 
 def check_struct(con: Construct) -> None:
@@ -59,7 +58,7 @@ def check_struct(con: Construct) -> None:
 def _check_ends(con: Construct, path: str, *, bounded: bool) -> None:
     """Refuse what has no end on a stream: greedy parts, unless they are the last in one that has an end; and what such a one would drop."""
     path = f"{path}.{con.name}".strip(".") if isinstance(con, construct.Renamed) else path
-    if isinstance(con, _GREEDY) and not bounded:
+    if isinstance(con, GREEDY) and not bounded:
         name, what = (type(con), "length") if con is construct.GreedyBytes else (construct.GreedyRange, "count")
         reason = f"{name.__name__} has no end of its own on a stream: give a {what}, or a terminator, or bound it by Prefixed or FixedSized"
         raise SpecError(reason, path=path, rule="LS111")
@@ -70,7 +69,9 @@ def _check_ends(con: Construct, path: str, *, bounded: bool) -> None:
     is_sized = isinstance(con, construct.FixedSized)
     fits = is_sized and isinstance(con.length, int) and fixed_size(con.subcon) == con.length
     if isinstance(con, _BOUNDED) and not fits and not _fills(con.subcon, padded=is_sized):
-        reason = f"{type(con).__name__} loses what its content leaves of it: let the content end with a field for it, 'rest' / GreedyBytes"
+        name = "Prefixed" if isinstance(con, Bounded) else type(con).__name__
+        named = "" if isinstance(con, Bounded | construct.NullTerminated) else ", unless it is a named member of a Struct"
+        reason = f"{name} loses what its content leaves of it{named}: let the content end with a field for it, 'rest' / GreedyBytes"
         raise SpecError(reason, path=path, rule="LS106")
 
 
