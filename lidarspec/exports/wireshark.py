@@ -342,7 +342,9 @@ def dissector(sensor: Sensor) -> str:
     Raises:
         Refused: where only Python code can decide what a frame is made of.
     """
-    name, title = sensor.id.replace("-", "_"), f"{sensor.vendor} {sensor.model}"
+    name, title, link = sensor.id.replace("-", "_"), f"{sensor.vendor} {sensor.model}", sensor.links.get("data")
+    if isinstance(link, Udp) and link.assembled is not None:
+        raise Refused(f"{sensor.id}: messages in several datagrams, which the dissector does not join")
     by_direction = sorted(messages(sensor), key=lambda message: message.frame.direction)  # "in" first: what both could be came in
     about = {
         "title": title,

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     )
     from lidarspec.spec.description import Command as Command, Frame as Frame, Relative as Relative, Simulation as Simulation
     from lidarspec.spec.fields import Checksummed as Checksummed, Parts as Parts, Scaled as Scaled, SizeOf as SizeOf
-    from lidarspec.spec.links import Serial as Serial, Tcp as Tcp, Udp as Udp
+    from lidarspec.spec.links import Assembled as Assembled, Serial as Serial, Tcp as Tcp, Udp as Udp
     from lidarspec.spec.results import Cartesian as Cartesian, Points as Points, Polar as Polar
     from lidarspec.spec.sensor import Sensor as Sensor
     from lidarspec.spec.timing import (
@@ -70,7 +70,7 @@ _NAMES = {
     "spec.description": ("Frame", "Command", "Relative", "Simulation"),
     "spec.fields": ("Scaled", "Checksummed", "Parts", "SizeOf"),
     "spec.checksums": ("Checksum", "Crc", "Xor", "Sum", "WordXor", "Fold15", "ZeroPadded"),
-    "spec.links": ("Serial", "Udp", "Tcp"),
+    "spec.links": ("Assembled", "Serial", "Udp", "Tcp"),
     "spec.timing": ("Clock", "Sequence", "OnWrap", "OnFlag", "OnChange", "OnRewind", "Every"),
     "columns.columns": ("Fields", "Column"),
     "spec.results": ("Points", "Polar", "Cartesian"),

@@ -14,6 +14,7 @@ from tests.shapes import (
     count,
     datagrams,
     echoes,
+    fragments,
     grid,
     headed,
     lengths,
@@ -66,6 +67,7 @@ _MODULES = (
     segments,
     tags,
     channels,
+    fragments,
 )
 
 SHAPES: dict[str, Sensor] = {sensor.id: sensor for sensor in (*(module.SENSOR for module in _MODULES), *coordinates.SENSORS)}

@@ -515,6 +515,16 @@ def is_struct(con: Construct) -> bool:
     return isinstance(unwrap(con, bits=False), Struct)
 
 
+def has_member(con: Construct, dotted: str) -> bool:
+    """Whether a struct has a member under a dotted name."""
+    inner: Any = unwrap(con)
+    for part in dotted.split("."):
+        if not isinstance(inner, Struct) or part not in inner._subcons:
+            return False
+        inner = unwrap(inner._subcons[part])
+    return True
+
+
 def bit_width(con: Construct) -> int:
     """The number of bits of a field of fixed size."""
     inner = unwrap(con)
