@@ -429,6 +429,8 @@ def prepare(con: Construct, limit: int = sys.maxsize, *, in_bits: bool = False) 
     """
     if isinstance(con, FormatField):
         return ExactFloat(con.fmtstr[0], con.fmtstr[-1]) if con.fmtstr[-1] in "efd" else con
+    if isinstance(con, construct.Hex | construct.HexDump):  # how a value is printed; it is the value below it
+        return prepare(con.subcon, limit, in_bits=in_bits)
     if isinstance(con, Filler):
         con.limit = limit
         return con

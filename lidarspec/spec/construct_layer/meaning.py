@@ -371,7 +371,7 @@ class _Builder:
         else:
             kind = type(con).__name__
             size = self._formula(con.length, place) if isinstance(con, construct.FixedSized) else None
-            node = tree.Opaque(name, info, kind, f"{kind} has no fixed place", size=size, form=_form(con))
+            node = tree.Opaque(name, info, kind, _INSTEAD.get(kind, f"{kind} has no fixed place"), size=size, form=_form(con))
         if not name and info.const is not None and not isinstance(node, tree.Opaque):
             return tree.Blob("", info, con.length, con.build(info.const))
         return node
@@ -416,6 +416,15 @@ def _below(node: tree.Node, names: Iterable[str]) -> tree.Node:
         node = found[0]
     return node
 
+
+#: of what construct alone can read, what to write in its place.
+_INSTEAD = {
+    "FocusedSeq": "PrefixedArray is compiled as a named member of a Struct alone: Struct('points' / PrefixedArray(...))",
+    "Prefixed": "Prefixed is compiled as a named member of a Struct alone: Struct('part' / Prefixed(...))",
+    "Sequence": "the parts of a Sequence have no names: say Struct('a' / ..., 'b' / ...)",
+    "LazyStruct": "LazyStruct has no fixed place: say Struct, which is read in bulk",
+    "RepeatUntil": "RepeatUntil has no fixed place: say Array with a count, or Parts with one of its rules",
+}
 
 #: what takes all bytes as they are.
 _BYTES = (type(construct.GreedyBytes),)

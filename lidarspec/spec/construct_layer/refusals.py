@@ -35,6 +35,16 @@ _REFUSED: dict[type, tuple[str, str]] = {
 _BOUNDED = (construct.NullTerminated, construct.FixedSized, construct.Prefixed, Bounded)
 
 
+#: of what stands in a struct without a name, what to write in its place.
+_INSTEAD: dict[type, str] = {
+    construct.Check: "a Check has no name to be told by: 'valid' / Check(...), or plausible=lambda f: ..., which is judged in bulk",
+    type(construct.Terminated): "Terminated asks for the end of a stream, which a frame does not have: the last field ends it",
+    construct.Probe: "Probe prints while it parses: lidarspec explain shows every byte of a frame",
+    construct.StopIf: "StopIf leaves out what follows in a struct: 'rest' / If(this.more, Struct(...))",
+    construct.Seek: "Seek reads outside the frame: name the bytes between, 'reserved' / Bytes(n)",
+}
+
+
 def check_struct(con: Construct) -> None:
     """Raise `SpecError` with path and reason if a frame cannot be described by this construct.
 
@@ -93,7 +103,9 @@ def _check_names(struct: Struct, path: str, *, in_bits: bool) -> None:
             continue  # refused on its own, and with a better reason
         if name is None:
             if in_bits or not isinstance(unwrap(child), Const):
-                raise SpecError(f"an unnamed {type(unwrap(child)).__name__} would lose its value: give it a name", path=path, rule="LS105")
+                kind = type(unwrap(child))
+                reason = _INSTEAD.get(kind, f"an unnamed {kind.__name__} would lose its value: give it a name")
+                raise SpecError(reason, path=path, rule="LS105")
             continue
         if name in seen:
             raise SpecError("two fields of this name: the last one would win silently", path=place, rule="LS104")
