@@ -121,7 +121,7 @@ def explain(data: bytes, sensor: Sensor, frame: str | None = None) -> Explanatio
         fault, name = error, error.frame or frame or ""
         if not name:
             raise
-    trail = _Trail(sensor.frames[name], data)
+    trail = _Trail(sensor.frames[name], data, fault)
     rows = (*trail.rows(), *trail.rest(fault))
     if fault is not None and not fits(sensor, data[: trail.end], name):
         guessed = told(sensor.frames[name], data, lambda sent: values(sent, sensor, name))
@@ -148,8 +148,8 @@ def fits(sensor: Sensor, data: bytes, name: str) -> bool:
 class _Trail:
     """One frame as construct read it: its parts, how far it came, and the verdicts of its checksums."""
 
-    def __init__(self, frame: Frame, data: bytes) -> None:
-        self._data, self._schema = data, schema(frame.tree)
+    def __init__(self, frame: Frame, data: bytes, fault: WireError | None = None) -> None:
+        self._data, self._schema, self._fault = data, schema(frame.tree), fault
         fields = self._schema.all_fields.values()
         self._arrays = [axis for info in fields for axis in (info.axes[:-1] if info.kind == "bytes" else info.axes)]
         self._blocks = dict(_blocks(frame.tree, ""))
@@ -207,6 +207,9 @@ class _Trail:
                 values.append(value)
                 if info.const is not None and value.raw != info.const:
                     remarks.append(f"wrong: {hexed(value.raw, info.bits)}, expected {hexed(info.const, info.bits)}")
+                    right = False
+                if info.held and self._fault is not None and self._fault.path == value.path:
+                    remarks.append(f"wrong: {value.raw}, expected {self._fault.expected}")
                     right = False
                 if value.path in self._verdicts:
                     text, good = self._verdicts[value.path]

@@ -104,8 +104,13 @@ def messages(sensor: Sensor) -> tuple[Message, ...]:
 
 
 def asked(node: tree.Node) -> list[tree.Ref]:
-    """The fields that the formulas of a node and of what is in it ask for."""
-    return [ref for below in tree.nodes(node) for value in tree.formulas(below) for ref in tree.refs(value)]
+    """The fields that the formulas of a node and of what is in it ask for, and those that lengths are held to."""
+    return [ref for below in tree.nodes(node) for value in (*tree.formulas(below), *held(below).values()) for ref in tree.refs(value)]
+
+
+def held(node: tree.Node) -> dict[str, tree.Formula]:
+    """What the fields that a node is have to say of other parts, by their paths."""
+    return {info.path: info.rebuilt for info in tree.infos(node) if info.held and info.rebuilt is not None}
 
 
 def _message(sensor: Sensor, name: str, frame: Frame) -> Message:

@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from lidarspec.exports import Message, messages
-from lidarspec.spec import Command, Sensor, tree
+from lidarspec.spec import Command, Frame, Sensor, tree
 from lidarspec.spec.links import Link, Serial, Tcp, Udp
 from lidarspec.wire.wire_table import frame_size
 
@@ -67,7 +67,11 @@ def _plain(fact: Any) -> Any:
 
 def link_data(link: Link) -> dict[str, Any]:
     """A link as data: its kind, then what its class declares."""
-    return {"kind": {Serial: "serial", Udp: "udp", Tcp: "tcp"}[type(link)], **facts(link, *vars(link))}
+    said = {"kind": {Serial: "serial", Udp: "udp", Tcp: "tcp"}[type(link)], **facts(link, *vars(link))}
+    if isinstance(link, Udp) and (rule := link.assembled) is not None:
+        fragment = node_data(Frame(rule.struct, max_length=65_535).tree)
+        said["assembled"] = {**facts(rule, "keys", "index", "count", "payload", "first", "in_bytes"), "fragment": fragment}
+    return said
 
 
 def _clock(sensor: Sensor) -> dict[str, Any] | None:
@@ -160,6 +164,8 @@ def formula_data(formula: tree.Formula | None) -> Any:
 def _info(info: tree.FieldInfo) -> dict[str, Any]:
     const = info.const.hex() if isinstance(info.const, bytes | bytearray) else info.const
     facts = {"path": info.path, "unit": info.unit, "scale": info.scale, "offset": info.offset, "const": const, "docs": info.docs}
+    if info.held and info.rebuilt is not None:
+        facts["equals"] = formula_data(info.rebuilt)
     return {**facts, "labels": {str(value): name for value, name in info.labels.items()}}
 
 

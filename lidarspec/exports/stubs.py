@@ -146,7 +146,7 @@ def _build(message: Message) -> str:
         for member in body.members
         if member.name not in ("", "self", "units")
         and not keyword.iskeyword(member.name)
-        and not (isinstance(member, Number | Blob) and member.info.const is not None)
+        and not (isinstance(member, Number | Blob) and (member.info.const is not None or member.info.held))
     )
     more = f", units: bool = False{fields}, **values: Any"
     return f'    @overload\n    def build(self, _frame: Literal["{message.name}"], _value: Any = None, /, *{more}) -> bytes: ...'

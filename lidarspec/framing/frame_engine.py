@@ -208,6 +208,7 @@ class InterpretedCodec(Codec):
     def __init__(self, frame: Frame, reason: str = "") -> None:
         super().__init__(frame)
         self.reason = reason
+        self._levels = ("constants", "lengths", True) if any(info.held for info in self.schema.all_fields.values()) else ("constants", True)
 
     def survey(
         self, buffer: NDArray[np.uint8], offsets: NDArray[np.intp], *, kind: int = 0, gathered: bool = True, sums: Sums | None = None
@@ -227,13 +228,13 @@ class InterpretedCodec(Codec):
     def _judge(self, data: bytes, errors: list[PluginError]) -> tuple[int, int]:
         stream = io.BytesIO(data)
         try:
-            self.frame.prepared.parse_stream(stream, _verify="constants")
+            self.frame.prepared.parse_stream(stream, _verify=self._levels[0])
             size = stream.tell()
             if not size:
                 return LENGTH, 0
-            parsed = self.frame.prepared.parse(data[:size])
+            parsed = [self.frame.prepared.parse(data[:size], _verify=level) for level in self._levels[1:]][-1]
         except Mismatch as mismatch:
-            return (CHECKSUM if mismatch.reason == "checksum" else CONSTANT), 0
+            return {"checksum": CHECKSUM, "length": LENGTH}.get(mismatch.reason, CONSTANT), 0
         except construct.StreamError:
             return (LENGTH if len(data) >= self.frame.max_length else SHORT), 0
         except SpecError:
@@ -249,14 +250,15 @@ class InterpretedCodec(Codec):
 
 
 def _partial(buffer: NDArray[np.uint8], offsets: NDArray[np.intp], layout: Layout) -> tuple[NDArray[np.uint8], NDArray[np.intp]]:
-    """Candidates whose end is not there yet: still possible, or already refuted by a constant; and how many bytes tell more."""
+    """Candidates whose end is not there yet: still possible, or already refuted by a constant or a length; and how many bytes tell more."""
     status = np.full(len(offsets), SHORT, np.uint8)
     sizes = np.full(len(offsets), layout.size, np.intp)
-    for spot in sorted(layout.constants, reverse=True):
-        mask, value = layout.constants[spot]
-        there = offsets + spot < len(buffer)
-        status[there] = np.where(buffer[offsets[there] + spot] & mask == value, status[there], CONSTANT)
-        sizes[~there] = spot + 1
+    for verdict, known in ((LENGTH, layout.held), (CONSTANT, layout.constants)):
+        for spot in sorted(known, reverse=True):
+            mask, value = known[spot]
+            there = offsets + spot < len(buffer)
+            status[there] = np.where(buffer[offsets[there] + spot] & mask == value, status[there], verdict)
+            sizes[~there] = np.minimum(sizes[~there], spot + 1)
     return status, sizes
 
 

@@ -49,6 +49,8 @@ class Counters:
         bad_checksum, bad_length, implausible: rejected candidates.
         bad_constant: datagrams without the constants of any frame; in a stream such bytes are skipped, and are no candidate.
         lost, duplicates, late: packets, by the sensor's counter and clock.
+        fragments_lost, fragments_late: datagrams of messages that were given up without them; those that came when their message was
+            joined or given up already, or for the second time.
         kernel_drops, queue_dropped, foreign, disconnects: counted by the transports.
         unread: bytes of a damaged file that could not be read.
         plugin_errors: packets, or candidates, at which a function of the plugin raised; `failures` keeps the first ones.
@@ -68,6 +70,8 @@ class Counters:
     lost: int = 0
     duplicates: int = 0
     late: int = 0
+    fragments_lost: int = 0
+    fragments_late: int = 0
     kernel_drops: int = 0
     queue_dropped: int = 0
     foreign: int = 0

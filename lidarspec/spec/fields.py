@@ -118,6 +118,26 @@ class Scaled(layer.Describing):
         return replace(info, scale=self.scale, offset=self.offset, unit=self.unit, measured=True)
 
 
+class SizeOf(layer.Sizing):
+    """A number that says how many bytes a part of the frame has: filled in by `build`, whatever value is given, and wrong on a frame that
+    comes where the part is longer or shorter.
+
+    Args:
+        subcon: a field that parses to an integer, Int16ub.
+        part: the part, a member of the struct that the field stands in, or in one of it, "body", "body.tags"; "" for that struct itself;
+            of the struct around it with "_.", "_.body", and "_" for that itself.
+        plus: what the number has beyond these bytes; less than 0 where it does not count them all.
+
+    Raises:
+        SpecError: for arguments in another order.
+    """
+
+    def __init__(self, subcon: Construct, part: str = "", plus: int = 0) -> None:
+        if not hasattr(subcon, "parse") or not isinstance(part, str) or not isinstance(plus, int):
+            raise SpecError(f'SizeOf takes a field, the name of a part and a number, SizeOf(Int16ub, "body", 2), not {part!r} and {plus!r}')
+        super().__init__(subcon, tuple(filter(None, part.split("."))), plus)
+
+
 class Checksummed(layer.Sealing):
     """A struct sealed by one of its own fields, wherever in it that field stands. May nest.
 
@@ -149,7 +169,7 @@ class Checksummed(layer.Sealing):
         obj = self._marked._parsereport(stream, context, path)
         end = stream.tell()
         layer.note(context, path, start, end, obj, self)
-        if not layer.verifying(context, checksums=True):
+        if not layer.verifying(context, "checksums"):
             return obj
         stream.seek(start)
         data = stream.read(end - start)

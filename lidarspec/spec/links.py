@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Any
 
 from lidarspec.errors import SpecError
+from lidarspec.spec.construct_layer import has_member
 
 
 @dataclass(frozen=True, init=False)
@@ -33,22 +35,67 @@ class Serial:
         return self.bauds[0]
 
 
+@dataclass(frozen=True, eq=False)
+class Assembled:
+    """What a datagram says that is a fragment of a message: of which one, and which part of it.
+
+    Args:
+        struct: the construct Struct of a fragment, or of its header alone.
+        key: the field, or fields, that tell messages apart, such as a counter; no two of 16 messages in a row have the same.
+        index: the field with the number of the fragment in its message.
+        count: the field with the number of fragments of the message.
+        payload: the field of bytes that is a part of the message; "" where that is all that stands behind the struct.
+        first: the index of the first fragment.
+        in_bytes: `index` is the place of the fragment in the message in bytes, and `count` the bytes of the message.
+
+    Raises:
+        SpecError: for a field that the struct does not have.
+    """
+
+    struct: Any
+    key: str | tuple[str, ...] = field(kw_only=True)
+    index: str = field(kw_only=True)
+    count: str = field(kw_only=True)
+    payload: str = field(default="", kw_only=True)
+    first: int = field(default=0, kw_only=True)
+    in_bytes: bool = field(default=False, kw_only=True)
+
+    def __post_init__(self) -> None:
+        for path in (*self.keys, self.index, self.count, *filter(None, (self.payload,))):
+            if not has_member(self.struct, path):
+                raise self.wrong(f"the fragment has no field {path!r}")
+
+    @property
+    def keys(self) -> tuple[str, ...]:
+        """The fields that tell messages apart."""
+        return (self.key,) if isinstance(self.key, str) else tuple(self.key)
+
+    def wrong(self, reason: str) -> SpecError:
+        """An error that says where it is."""
+        return SpecError(reason, path="links.data.assembled")
+
+
 @dataclass(frozen=True, init=False)
 class Udp:
     """UDP datagrams, one frame each, or with `stream` a byte stream cut into datagrams (telegrams that span several).
 
     Args:
         ports: the default destination ports; hints only, since magic and length decide.
+        assembled: what says how datagrams are joined to a message, where one does not fit into one; others pass as they are.
     """
 
     ports: tuple[int, ...]
     stream: bool = False
+    assembled: Assembled | None = None
 
-    def __init__(self, *ports: int, stream: bool = False) -> None:
+    def __init__(self, *ports: int, stream: bool = False, assembled: Assembled | None = None) -> None:
         if any(not 0 < port < 65536 for port in ports):
             raise SpecError("a UDP port is a number from 1 to 65535")
         object.__setattr__(self, "ports", tuple(ports))
+        if stream and assembled is not None:
+            raise SpecError("datagrams are fragments of messages, or pieces of a stream, not both")
         object.__setattr__(self, "stream", stream)
+        object.__setattr__(self, "assembled", assembled)
 
 
 @dataclass(frozen=True)

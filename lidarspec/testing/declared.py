@@ -216,7 +216,7 @@ def _strength(subject: Subject, name: str, frame: Frame, layouts: list[Layout]) 
     if frame.plausible is not None or frame.confirm > 1 or not layouts:
         return
     checked = [sum(leaf.info.bits for seal in layout.seals for leaf in seal.leaves) for layout in layouts]
-    constant = [sum(mask.bit_count() for mask, _ in layout.constants.values()) for layout in layouts]
+    constant = [sum(mask.bit_count() for mask, _ in layout.known.values()) for layout in layouts]
     weakest = min(map(sum, zip(checked, constant, strict=True)))
     if weakest <= (WEAK_DATAGRAM if subject.sensor.datagrams else WEAK):
         yield "LS206", f"its constants and checksums have {weakest} bits, and it declares neither plausible nor confirm", name

@@ -17,6 +17,9 @@ from lidarspec.spec.tree import Blob, FieldInfo, Formula, Kind, Node, Number, Pa
 from lidarspec.wire.layout_tree import TooLong, Unknown, layout_of
 from lidarspec.wire.schema import Schema, schema
 
+#: how often a frame is built until its lengths agree: once more where it has any, and again where these themselves have no fixed length.
+RETRIES = 4
+
 
 def build(sensor: Spec, frame: str, value: Any, values: Mapping[str, Any], *, units: bool = False) -> bytes:
     """The bytes of one frame; constants, counts and the checksum are filled in.
@@ -37,7 +40,7 @@ def build(sensor: Spec, frame: str, value: Any, values: Mapping[str, Any], *, un
     given = _Values(table, known, place, units=units).checked({**(value or {}), **values}, "")
     try:
         _fill(tree, given, sensor.frames[frame].max_length)
-        return bytes(sensor.frames[frame].prepared.build(given))
+        return _built(sensor.frames[frame].prepared, given)
     except Mismatch as fault:
         raise _usage(fault, place) from None
     except construct.ConstructError as fault:
@@ -47,6 +50,17 @@ def build(sensor: Spec, frame: str, value: Any, values: Mapping[str, Any], *, un
         raise
     except Exception as fault:
         raise SpecError(f"an expression of the struct failed: {type(fault).__name__}: {fault}", path=frame, sensor=sensor.id) from fault
+
+
+def _built(con: Any, given: Container) -> bytes:
+    """The bytes of a frame, built once more where fields say how long parts are, which is seen when these are built."""
+    sizes, data = dict[str, int](), b""
+    for _ in range(RETRIES):
+        known = dict(sizes)
+        data = con.build(given, _sizes=sizes)
+        if sizes == known:
+            break
+    return bytes(data)
 
 
 def _usage(fault: Mismatch, place: str) -> UsageError:

@@ -287,6 +287,7 @@ class Layout:
         following: fields whose values follow from this header in a frame that is made, and those; they are not asked of one that comes.
         lengths: of each array, by its axis; 0 in an array without elements.
         regions: where parts are that are frames in themselves, by their axis.
+        held: as constants, what fields have to be that say how long parts are.
         notes: what is worked out from the layout and kept with it.
     """
 
@@ -299,16 +300,26 @@ class Layout:
     following: tuple[tuple[Leaf, int], ...] = ()
     lengths: Mapping[str, int] = field(default_factory=dict)
     regions: Mapping[str, Any] = field(default_factory=dict)
+    held: Mapping[int, tuple[int, int]] = field(default_factory=dict)
     notes: dict[Any, Any] = field(default_factory=dict, repr=False)
 
     @cached_property
+    def known(self) -> Mapping[int, tuple[int, int]]:
+        """The bits of a frame that its header leaves no choice of, constants and lengths: offset -> (mask, value)."""
+        both = dict(self.constants)
+        for spot, (mask, value) in self.held.items():
+            other = both.get(spot, (0, 0))
+            both[spot] = (mask | other[0], value | other[1])
+        return both
+
+    @cached_property
     def _mask(self) -> int:
-        """The bits of a frame that are constant, as one number."""
-        return sum(mask << 8 * spot for spot, (mask, _) in self.constants.items())
+        """These bits, as one number."""
+        return sum(mask << 8 * spot for spot, (mask, _) in self.known.items())
 
     @cached_property
     def _value(self) -> int:
-        return sum(value << 8 * spot for spot, (_, value) in self.constants.items())
+        return sum(value << 8 * spot for spot, (_, value) in self.known.items())
 
     def sound(self, frame: bytes) -> bool:
         """Whether one frame has this size, all constants and the right checksums."""
@@ -322,8 +333,8 @@ class Layout:
         """Write what follows from the header, the constants and the checksums into frames given as rows of bytes."""
         for leaf, value in self.following:
             leaf.store(rows, value)
-        if self.constants:
-            spots, facts = list(self.constants), np.array(list(self.constants.values()), np.uint8)
+        if self.known:
+            spots, facts = list(self.known), np.array(list(self.known.values()), np.uint8)
             rows[:, spots] = rows[:, spots] & ~facts[:, 0] | facts[:, 1]
         for seal in self.seals:
             seal.fill(rows)

@@ -171,7 +171,8 @@ class _Walk:
     def layout(self) -> Layout:
         """What was found, as a value."""
         seals, following = tuple(self.seals), tuple(self._following())
-        return Layout(self.cursor, self.leaves, self.constants, seals, self.places, self.branches, following, self.lengths, self.regions)
+        found = (self.cursor, self.leaves, self.constants, seals, self.places, self.branches, following, self.lengths, self.regions)
+        return Layout(*found, self._held())
 
     def read(self, path: str) -> tuple[tree.FieldInfo, int] | str | None:
         """What a formula reads by a path: a field and its raw value, the path of a struct, or None for what the header leaves out.
@@ -341,10 +342,23 @@ class _Walk:
             spans = [(a, b) for a, b in zip(edges[::2], edges[1::2], strict=True) if b > a]
         self.seals.append(Seal(leaves, tuple(spans), node.algorithm, node.absent))
 
+    def _held(self) -> dict[int, tuple[int, int]]:
+        """What fields have to be that say how long parts are, as constants, which they are in one layout."""
+        rows, found = np.zeros((2, self.cursor), np.uint8), [leaf for leaf in self.leaves.values() if leaf.info.held]
+        for leaf in found:
+            (low, high), rebuilt = leaf.info.limits, leaf.info.rebuilt
+            if rebuilt is not None:
+                value = operator.index(tree.evaluated(rebuilt, self._read_known))
+                if not low <= value <= high:
+                    raise TooLong(leaf.info.path)
+                leaf.store(rows, np.array([value, -1 if low else high], leaf.info.dtype).reshape(2, *(1 for _ in leaf.shape)))
+        spots = np.flatnonzero(rows[1]).tolist() if found else []
+        return {spot: (int(rows[1, spot]), int(rows[0, spot])) for spot in spots}
+
     def _following(self) -> Iterator[tuple[Leaf, int]]:
         """The values of rebuilt fields that follow from constants and from those that the layout depends on, and from no other."""
         for leaf in self.leaves.values():
-            if leaf.info.rebuilt is not None and not leaf.shape:
+            if leaf.info.rebuilt is not None and not leaf.info.held and not leaf.shape:
                 with contextlib.suppress(Exception):  # of the others: construct evaluates them when a frame is built
                     yield leaf, operator.index(tree.evaluated(leaf.info.rebuilt, self._read_known))
 
@@ -431,7 +445,7 @@ class _Told:
         """What the formulas of a frame tell apart of a field; all its values, where that is not seen from their form."""
         (low, high), known = info.limits, list(tree.nodes(root))
         asking = [(node, formula) for node in known for formula in tree.formulas(node) if _asks(formula, info)]
-        if any(own.rebuilt is not None and _asks(own.rebuilt, info) for node in known for own in tree.infos(node)):
+        if any(own.rebuilt is not None and not own.held and _asks(own.rebuilt, info) for node in known for own in tree.infos(node)):
             return cls(info.limits, low, high)
         if all(isinstance(node, tree.Select) and isinstance(formula, tree.Ref) for node, formula in asking):
             keys = frozenset(key for node, _ in asking if isinstance(node, tree.Select) for key, _ in node.cases if low <= key <= high)

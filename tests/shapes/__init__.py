@@ -14,9 +14,11 @@ from tests.shapes import (
     count,
     datagrams,
     echoes,
+    fragments,
     grid,
     headed,
     lengths,
+    measured,
     middle,
     modes,
     nested,
@@ -59,11 +61,13 @@ _MODULES = (
     headed,
     remarks,
     sized,
+    measured,
     outer,
     scales,
     segments,
     tags,
     channels,
+    fragments,
 )
 
 SHAPES: dict[str, Sensor] = {sensor.id: sensor for sensor in (*(module.SENSOR for module in _MODULES), *coordinates.SENSORS)}
