@@ -11,9 +11,10 @@ values that a field can have, tests of plausibility and clocks differ only in wh
 value is made of, conditions and sums taken apart. For them a value is *full* where each point has its own, else *low*: then it is
 computed once for its packet or block, plainly.
 
-Room is left for what is to come. Axes by name (M3): a node's axes are those of its sample, so constants that name an axis are operands
-like columns. Elements of an array and tables over two indices (M8): kinds of nodes beside "on". More columns of a point (M5): further
-values that are traced. Points by coordinates (M2): their expressions are nodes like any others.
+A node's axes are those of its sample. What is no column (`vocabulary.Along`, plain arrays) is lined up with these as it is noted down, so
+that whoever computes with the graph broadcasts arrays.
+
+Room is left for what is to come. More columns of a point (M5): further values that are traced.
 """
 
 from __future__ import annotations
@@ -28,9 +29,10 @@ import numpy as np
 from numpy.lib.mixins import NDArrayOperatorsMixin
 from numpy.typing import NDArray
 
-from lidarspec.columns.columns import ELEMENTWISE, NO_TRUTH, Batch, Column, Fields, called
+from lidarspec.columns.columns import NO_TRUTH, Batch, Column, Fields, aligned, called
 from lidarspec.errors import SpecError
 from lidarspec.spec.tree import FieldInfo
+from lidarspec.spec.vocabulary import ELEMENTWISE, Along
 from lidarspec.wire.frame_table import Group, Rows, Table
 from lidarspec.wire.schema import Schema
 
@@ -162,13 +164,20 @@ class Traced(NDArrayOperatorsMixin):
     def applied(self, function: Callable[..., Any], *values: Any) -> Traced:
         """What a function of arrays makes of the values, noted down."""
         samples = [value.node.sample if isinstance(value, Traced) else value for value in values]
-        return self._tape.add("call", function, values, self.node.sample.applied(function, *samples))
+        arrays, _, _ = aligned(tuple(samples), self.node.sample.batch)  # what is no column is noted down in its place
+        args = tuple(value if isinstance(value, Traced | int | float) else array for value, array in zip(values, arrays, strict=True))
+        return self._tape.add("call", function, args, self.node.sample.applied(function, *samples))
+
+    @property
+    def index(self) -> Along:
+        """0, 1, 2 ... along the innermost array that the values are in."""
+        return self.node.sample.index
 
     def on(self, *axes: str) -> Traced:
         """The value on other axes, by the names of arrays, noted down."""
         return self._tape.add("on", lambda column: column.on(*axes), (self,), self.node.sample.on(*axes))
 
-    def steps(self) -> NDArray[np.intp]:
+    def steps(self) -> Along | NDArray[np.intp]:
         """0, 1, 2 ... up to the largest value in the sample; the tape remembers how many these were."""
         found = self.node.sample.steps()
         self._tape.steps.append((self.node, len(found)))
@@ -211,6 +220,8 @@ class TracedFields:
         if name.startswith("__"):
             raise AttributeError(name)
         value, names = getattr(self._real, name), (*self._names, name)
+        if isinstance(value, Along):
+            return value
         if not isinstance(value, Column):
             return TracedFields(value, self._tape, names)
         path = ".".join(names)

@@ -37,6 +37,9 @@ class Table(Protocol):
     def counts(self, axis: str) -> NDArray[np.intp]:
         """The length of an array in each frame, (n,)."""
 
+    def length(self, axis: str) -> int:
+        """The longest length of an array."""
+
     @property
     def sizes(self) -> NDArray[np.intp]:
         """The bytes of each frame, (n,)."""

@@ -12,7 +12,7 @@ from functools import cached_property, lru_cache
 
 import numpy as np
 
-from lidarspec.errors import UnknownField
+from lidarspec.errors import SpecError, UnknownField
 from lidarspec.spec.tree import (
     Blob,
     Block,
@@ -81,6 +81,23 @@ class Schema:
                     raise UnknownField(path, [f"{axis}.{name}" for name in names])
                 return axis, kind, below
         return None
+
+    @cached_property
+    def places(self) -> Mapping[str, int]:
+        """How many arrays each array stands in, by its path."""
+        return {axis: index for info in self.fields.values() for index, axis in enumerate(info.axes)}
+
+    def axis(self, name: str) -> str:
+        """The path of an array, by it or by its last part.
+
+        Raises:
+            SpecError: where there is none of that name, or several.
+        """
+        found = [axis for axis in self.places if axis == name] or [axis for axis in self.places if axis.rpartition(".")[2] == name]
+        if len(found) != 1:
+            reason = f"several arrays are called {name!r}" if found else f"there is no array {name!r} in the frame"
+            raise SpecError(f"{reason}; there are {', '.join(found or self.places) or 'none'}", rule="LS214")
+        return found[0]
 
     def depth(self) -> int:
         """How many arrays are nested at most."""
