@@ -27,8 +27,10 @@ from numpy.typing import NDArray
 
 from lidarspec.errors import SpecError, UnknownField
 from lidarspec.spec.tree import FieldInfo, Ref
-from lidarspec.spec.vocabulary import ELEMENTWISE, Along
+from lidarspec.spec.vocabulary import ELEMENTWISE, Along, row_numbers
+from lidarspec.wire.arrays import deep
 from lidarspec.wire.frame_table import Group, Rows, Table
+from lidarspec.wire.schema import without_indices
 
 BITWISE = {np.bitwise_and, np.bitwise_or, np.bitwise_xor, np.invert}
 
@@ -85,12 +87,23 @@ class Column(NDArrayOperatorsMixin):
             name that `along` gave it, before the one that a plain array is guessed to be along.
         ready: packets from the start whose values depend on nothing that is still to come.
         source: the field's path, while the column is an unchanged field.
+        frame: the other frame type that this is a field of; "" for the packets themselves.
     """
 
+    #: a column is no sequence of its elements
+    __iter__ = None
+
     def __init__(
-        self, array: NDArray[Any], axes: tuple[str | None, ...], batch: Batch, *, ready: int | None = None, source: str = ""
+        self,
+        array: NDArray[Any],
+        axes: tuple[str | None, ...],
+        batch: Batch,
+        *,
+        ready: int | None = None,
+        source: str = "",
+        frame: str = "",
     ) -> None:
-        self.array, self.axes, self.batch, self.source = array, axes, batch, source
+        self.array, self.axes, self.batch, self.source, self.frame = array, axes, batch, source, frame
         self.ready = len(batch) if ready is None else ready
 
     @property
@@ -108,6 +121,12 @@ class Column(NDArrayOperatorsMixin):
 
     def __bool__(self) -> bool:
         raise SpecError(NO_TRUTH, rule="LS213")
+
+    def __getitem__(self, index: int) -> Column:
+        """An element of a field that is an array, of each packet; nan where a packet has fewer."""
+        if not self.source or not isinstance(index, int):
+            raise SpecError("only fields have elements, each by one index: f.columns[0].timestamp, f.distances[-1]")
+        return _column(self.batch, self.frame, f"{self.source}[{index}]")
 
     def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: Any, **kwargs: Any) -> Any:
         if kwargs.get("out") is not None:
@@ -168,9 +187,24 @@ class Column(NDArrayOperatorsMixin):
     def steps(self) -> Along | NDArray[np.intp]:
         """0, 1, 2 ... up to the largest value, (m,): the indices of the array of which this column is the count."""
         schema, numbers = self.batch.table.schema, np.arange(int(np.nanmax(self.array, initial=0)))
-        counted = [axis for axis, count in schema.arrays.items() if isinstance(count, Ref) and count.path == self.source]
+        counted = [axis for axis, count in schema.arrays.items() if isinstance(count, Ref) and count.path == self.source and not self.frame]
         axis = counted[0] if len(counted) == 1 else schema.chain[-1] if schema.chain else None
         return numbers if axis is None else Along((axis,), numbers)
+
+    def gathered(self, table: NDArray[np.float64]) -> Column:
+        """The rows of a table, (m + 1, k), the last one nan, at these indices, along the array of k elements that stands in theirs."""
+        own = [place for place, name in enumerate(self.axes) if name is not None]
+        depth = max(len(self.axes), self.batch.table.schema.depth())
+        place = _spot(table.shape[1:], [None] * depth, [1] * depth, self.batch.table, without=own)
+        found = table.take(row_numbers(deep(self.array, depth).squeeze(1 + place), len(table)), axis=0)
+        axes = [*self.axes, *(None,) * (depth - len(self.axes))]
+        axes[place] = f"?{self.batch.table.schema.chain[place]}"
+        return Column(np.moveaxis(found, -1, 1 + place), tuple(axes), self.batch, ready=self.ready)
+
+    def running(self) -> Column:
+        """The sum of the values so far along the innermost array that they are in."""
+        place = max([place for place, name in enumerate(self.axes) if name is not None], default=0)
+        return Column(np.cumsum(self.array, axis=1 + place, dtype=np.float64), self.axes, self.batch, ready=self.ready)
 
     def shifted(self, step: int) -> Column:
         """The values `step` places later (earlier if negative) in stream order, on the same axes; nan across a loss and at the end."""
@@ -329,12 +363,16 @@ def _placed(array: NDArray[Any], axes: list[str | None], lengths: Sequence[int],
     return array
 
 
-def _spot(shape: tuple[int, ...], axes: Sequence[str | None], lengths: Sequence[int], table: Table) -> int:
-    """The axis that the first one of a plain array goes with, as its lengths say: among those that are there, else among the frame's."""
+def _spot(shape: tuple[int, ...], axes: Sequence[str | None], lengths: Sequence[int], table: Table, without: Sequence[int] = ()) -> int:
+    """The axis that the first one of a plain array goes with, as its lengths say: among those that are there, else among the frame's.
+
+    Args:
+        without: axes that it does not go with.
+    """
     wanted = [(place, length) for place, length in enumerate(shape) if length != 1]
     there = {(place, length): (axes[place] or "").strip("?") for place, length in enumerate(lengths)}
     texts = {info.path for info in table.schema.fields.values() if info.kind == "bytes"}
-    whole = {(place, table.length(axis)): axis for axis, place in table.schema.places.items() if axis not in texts}
+    whole = {(place, table.length(axis)): axis for axis, place in table.schema.places.items() if axis not in texts and place not in without}
     for known in (there, whole):
         spots = [[(first + place, length) for place, length in wanted] for first in range(len(lengths) - len(shape) + 1)]
         found = {first: [known[spot] for spot in some] for first, some in enumerate(spots) if all(spot in known for spot in some)}
@@ -427,23 +465,25 @@ def _tail(values: NDArray[np.float64], edges: NDArray[np.intp], end: int, size: 
     return values[max(end - size, int(lost[-1]) if len(lost) else 0, 0) : end].copy()
 
 
-def field_column(info: FieldInfo, table: Table, depth: int, batch: Batch, which: NDArray[np.intp] | None = None) -> Column:
-    """A field in its unit as a column of `depth` array axes; `which`: the frame of the table for each packet."""
+def field_column(info: FieldInfo, table: Table, depth: int, batch: Batch, which: NDArray[np.intp] | None = None, frame: str = "") -> Column:
+    """A field in its unit as a column of `depth` array axes; `which`: the frame of the table, of type `frame`, for each packet."""
     array = field_array(info, table, depth)
     if which is not None:
         array = array[which]
-    axes = [_axis(name, length, table, known=which is None) for name, length in zip(info.axes, array.shape[1:], strict=False)]
-    return Column(array, (*axes, *(None,) * (array.ndim - 1 - len(axes))), batch, source=info.path)
+    axes = list[str | None]([None] * (array.ndim - 1))
+    for name in info.axes:
+        place = table.schema.places[name]
+        axes[place] = _axis(name, array.shape[1 + place], table, known=which is None)
+    return Column(array, tuple(axes), batch, source=info.path, frame=frame)
 
 
 def field_array(info: FieldInfo, table: Table, depth: int) -> NDArray[np.float64]:
-    """A field in its unit, (n, ...), with `depth` axes behind the first at least, of length 1 where the field has none."""
-    return deep(physical(info, table), depth)
-
-
-def deep(array: NDArray[Any], depth: int) -> NDArray[Any]:
-    """Values of packets, (n, ...), with axes of length 1 behind them, up to `depth` behind the first."""
-    return array.reshape(*array.shape, *(1,) * (depth + 1 - array.ndim))
+    """A field in its unit, (n, ...), each array's axis in its place, with `depth` axes at least behind the first, some of length 1."""
+    array, places = physical(info, table), [table.schema.places[axis] for axis in info.axes]
+    if places and places[-1] >= len(places):  # an element of an array in which others stand
+        lengths = dict(zip(places, array.shape[1:], strict=True))
+        array = array.reshape(len(array), *(lengths.get(place, 1) for place in range(places[-1] + 1)))
+    return deep(array, depth)
 
 
 def _axis(name: str, length: int, table: Table, *, known: bool) -> str | None:
@@ -486,14 +526,21 @@ class Fields:
         if name == "frame" and not self._prefix and not self._frame and AROUND in self._batch.state:
             return Fields(self._batch, frame=AROUND)
         path, known = f"{self._prefix}{name}", _paths(self._batch, self._frame)
-        if path in known:
+        base = without_indices(path)[0]
+        if base in known:
             return _column(self._batch, self._frame, path)
-        if any(other.startswith(f"{path}.") for other in known):
+        if any(other.startswith(f"{base}.") for other in known):
             return Fields(self._batch, f"{path}.", self._frame)
-        axis = self._prefix.removesuffix(".")
+        axis = base.rpartition(".")[0]
         if name == "index" and not self._frame and axis in self._batch.table.schema.arrays:
             return Along((axis,), np.arange(self._batch.table.length(axis)))
         raise UnknownField(path, known, place="frame" if self._frame == AROUND else f"state.{self._frame}" if self._frame else "")
+
+    def __getitem__(self, index: int) -> Fields:
+        """An element of an array of structs, counted from the last one of each packet where the index is negative."""
+        if not self._prefix or not isinstance(index, int):
+            raise SpecError("only arrays have elements, each by one index: f.columns[0].timestamp, f.distances[-1]")
+        return Fields(self._batch, f"{self._prefix.removesuffix('.')}[{index}].", self._frame)
 
     @property
     def _is_around(self) -> bool:
@@ -526,22 +573,25 @@ class _States:
 def _column(batch: Batch, frame: str, path: str) -> Column:
     """A field of a batch; of another frame type that of the frame that was last before each packet, or its declared default."""
     depth = batch.table.schema.depth()
+    table, which = batch.state[frame] if frame else (batch.table, np.zeros(0, np.intp))
+    if table is not None and path not in table.schema.fields and without_indices(path)[0] in table.schema.fields:
+        raise SpecError("there is no such element", path=path)
     if not frame:
         return field_column(batch.table.schema.fields[path], batch.table, depth, batch)
-    table, which = batch.state[frame]
     defaults = batch.defaults.get(frame, {})
     missing = which < 0
     if not missing.any() and table is not None:
         same = len(which) == 0 or int(which.min()) == int(which.max())
-        return field_column(table.schema.fields[path], table, depth, batch, which[:1] if same else which)
-    if path not in defaults:
+        return field_column(table.schema.fields[path], table, depth, batch, which[:1] if same else which, frame)
+    base, indices = without_indices(path)
+    if base not in defaults:
         raise SpecError(f"no {frame} frame has arrived yet, and no default is declared", path=f"state.{frame}.{path}")
     batch.nominal = True
-    default = np.asarray(defaults[path], np.float64)
+    default = np.asarray(defaults[base], np.float64)[tuple(indices.values())]
     names = tuple(path if length != 1 else None for length in default.shape)
     spare = (1,) * max(depth - default.ndim, 0)
     array = default.reshape(1, *default.shape, *spare)
     if table is not None and not missing.all():
         known = field_column(table.schema.fields[path], table, depth, batch, np.maximum(which, 0)).array
         array = np.where(missing.reshape(-1, *(1,) * (known.ndim - 1)), array, known)
-    return Column(array, (*names, *(None,) * len(spare)), batch)
+    return Column(array, (*names, *(None,) * len(spare)), batch, source=path, frame=frame)

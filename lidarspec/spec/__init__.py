@@ -52,6 +52,7 @@ if TYPE_CHECKING:
         following as following,
         last as last,
         previous as previous,
+        running as running,
         spread as spread,
         stack as stack,
         steps as steps,
@@ -75,7 +76,7 @@ _NAMES = {
     "spec.timing": ("Clock", "Sequence", "OnWrap", "OnFlag", "OnChange", "OnRewind", "Every"),
     "columns.columns": ("Fields", "Column"),
     "spec.results": ("Points", "Polar", "Cartesian"),
-    "spec.vocabulary": ("along", "spread", "wrap", "following", "previous", "last", "stack", "steps", "take"),
+    "spec.vocabulary": ("along", "spread", "wrap", "following", "previous", "last", "running", "stack", "steps", "take"),
     "plugins": ("hookimpl",),
     "transports.protocol": ("Format", "Transport", "LiveTransport", "Chunk", "Disconnected"),
 }

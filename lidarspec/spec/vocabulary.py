@@ -180,9 +180,30 @@ def side_by_side(*arrays: Any) -> Any:
     return np.stack(np.broadcast_arrays(*arrays), axis=-1)
 
 
+def running(a: Array) -> Array:
+    """The sum of the values so far along the innermost array that they are in, for differences on the wire: float64, the shape of `a`."""
+    return a.running() if hasattr(a, "running") else np.cumsum(np.asarray(a, np.float64), axis=-1)
+
+
 def take(table: Array, index: Array) -> Array:
-    """The entries of a table, shape (m,), at `index`: float64, the shape of `index`; nan where the index is not in the table."""
-    return _applied(LookUp(np.asarray(table, np.float64)), index)
+    """The entries of a table at `index`; nan where the index is not in the table.
+
+    Args:
+        table: (m,), a number for each index; or (m, k), a row for each, along the array of k elements that stands in those of `index`.
+
+    Returns:
+        float64, the shape of `index`; of rows with k in place of that array's length: of columns numbered (n, 16, 1), (n, 16, k).
+    """
+    entries = np.asarray(table, np.float64)
+    if entries.ndim == 1:
+        return _applied(LookUp(entries), index)
+    rows = np.concatenate([entries, np.full((1, entries.shape[1]), np.nan)])
+    return index.gathered(rows) if hasattr(index, "gathered") else rows[row_numbers(np.asarray(index), len(rows))]
+
+
+def row_numbers(index: NDArray[Any], rows: int) -> NDArray[np.intp]:
+    """The rows of a table for indices, of their shape; the last one, which is nan, for those that it does not have."""
+    return np.where((index >= 0) & (index < rows - 1), index, rows - 1).astype(np.intp)
 
 
 class LookUp:

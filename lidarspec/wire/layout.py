@@ -20,6 +20,7 @@ from lidarspec.spec.bits import BitField
 from lidarspec.spec.checksums import Checksum, Single, single
 from lidarspec.spec.tree import FieldInfo, Node
 from lidarspec.wire.row_checksums import over
+from lidarspec.wire.schema import element_of
 
 Bytes2D = NDArray[np.uint8]
 
@@ -179,6 +180,27 @@ class Leaf:
             return self.offset, self.offset + self.size
         spots = [self.offset + part.byte for element in self.elements for part in element.segments]
         return min(spots), max(spots) + 1
+
+    def element(self, path: str, indices: Mapping[str, int]) -> Leaf | None:
+        """Some element of its arrays, counted from the last one where an index is negative; None where there is none.
+
+        An array that others stand in remains, with that one element, so that each array keeps its place.
+        """
+        info = element_of(self.info, path, indices)
+        if info is None:
+            return None
+        offset, shape, elements, kept = self.offset, list(self.shape), self.elements, 0
+        for place, (axis, length) in enumerate(zip(self.info.axes, self.shape, strict=True)):
+            index = indices.get(axis, 0)
+            if not -length <= index < length:
+                return None
+            if axis not in indices:
+                kept = place + 1
+            elif place < len(self.strides):
+                offset, shape[place] = offset + index % length * self.strides[place], 1
+            else:
+                elements = (elements[index],)
+        return replace(self, info=info, offset=offset, shape=tuple(shape[:kept]), strides=self.strides[:kept], elements=elements)
 
     def at(self, offset: int) -> Leaf:
         """The field with its place counted from `offset`."""
