@@ -267,7 +267,7 @@ class Seal:
                 stored |= (leaf.scalar(frame) & ((1 << leaf.info.bits) - 1)) << shift
             shift += leaf.info.bits
         parts = [frame[a:b] for a, b in self.spans]
-        return stored == self._single(parts[0] if len(parts) == 1 else b"".join(parts)) or stored in self.absent
+        return stored in self.absent or stored == self._single(parts[0] if len(parts) == 1 else b"".join(parts))
 
     @cached_property
     def _single(self) -> Single:
@@ -276,8 +276,12 @@ class Seal:
     def intact(self, rows: Bytes2D, sums: Sums | None = None) -> NDArray[np.bool_]:
         """Which frames carry the right value, or one that means "not filled", (n,); `sums` computes it, by default the algorithm."""
         stored = self.stored(rows)
-        right = np.asarray(stored == self.computed(rows, sums))
-        return right | np.isin(stored, np.array(self.absent, np.uint64)) if self.absent else right
+        filled = ~np.isin(stored, np.array(self.absent, np.uint64)) if self.absent else None
+        if filled is None or filled.all():
+            return np.asarray(stored == self.computed(rows, sums))
+        right = np.ones(len(rows), np.bool_)
+        right[filled] = stored[filled] == self.computed(rows[filled], sums) if filled.any() else True
+        return right
 
 
 class PartsRegion(Protocol):
