@@ -18,12 +18,12 @@ from lidarspec.columns.columns import Batch, Carry, Fields, of_points, unpadded
 from lidarspec.errors import plugin_errors
 from lidarspec.framing.results import Counters
 from lidarspec.points import conventions
-from lidarspec.points.cloud import PointCloud
+from lidarspec.points.cloud import PointCloud, organised
 from lidarspec.spec.description import Spec
 from lidarspec.spec.results import Cartesian, Points, Polar
 from lidarspec.wire.frame_table import Table
 
-_OPTIONAL = ("intensity", "ring", "return_index")
+_OPTIONAL = ("intensity", "ring", "return_index", "column")
 
 
 class PacketBatch(Protocol):
@@ -113,12 +113,12 @@ def _flattened(packets: PacketBatch, result: Points, batch: Batch, stamp_ns: int
     offsets = conventions.seconds_since(packets.time_ns, stamp_ns).reshape(-1, *(1,) * len(axes))
     flat["time"] = flat["time"] + _flat(offsets, shape, mask, ready)
     inside = np.ones(shape, np.bool_) if mask is None else mask.reshape(shape)
-    rows = conventions.rows_of(shape[1:]) if mask is None else 0
+    grid = conventions.grid_of(shape[1:], axes) if mask is None else conventions.Grid()
     cloud = make_cloud(
         flat,
         conventions.vendor_turn(packets.sensor),
         stamp_ns=stamp_ns,
-        shape=(ready * int(np.prod(shape[1:-1])), rows) if rows else None,
+        shape=organised(ready * int(np.prod(shape[1:])), grid),
         nominal=np.bool_(batch.nominal or result.nominal),
     )
     return Evaluated(cloud, ready, batch.carried(ready), inside[:ready].astype(np.intp), Fields(batch), axes)

@@ -42,6 +42,7 @@ def points(f: Fields) -> Polar:
         intensity=columns.pixels.signal * f.gains.on("columns"),
         time=columns.timestamp - columns[0].timestamp,
         ring=columns.pixels.index,
+        column=columns.measurement,
         invalid=columns.status != 1,
     )
 
