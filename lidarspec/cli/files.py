@@ -60,7 +60,7 @@ def convert(
 ) -> None:
     """Write the points of a capture or raw file to a file, in the format of its suffix.
 
-    .csv and .npz hold x y z range azimuth elevation intensity time ring return_index, those that the sensor has, and the
+    .csv and .npz hold x y z range azimuth elevation intensity time ring return_index column, those that the sensor has, and the
     number of the scan; metres, radians, and seconds since the scan's stamp.
     """
     format_of(target)

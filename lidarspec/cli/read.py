@@ -36,6 +36,7 @@ POINTS = {
     "time": ("s", 10, 6),
     "ring": ("", 5, 0),
     "return_index": ("", 12, 0),
+    "column": ("", 6, 0),
 }
 #: digits of a packet's field, and the width of its column at least.
 DIGITS, NARROWEST = 10, 8

@@ -18,13 +18,14 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.columns.columns import Batch, Column, Fields, deep, field_array
+from lidarspec.columns.columns import Batch, Column, Fields, field_array
 from lidarspec.columns.graph import Node, evaluate
 from lidarspec.points import numpy_plan
 from lidarspec.points.cloud import ColumnSource, Stretch, later
-from lidarspec.points.conventions import TYPES, narrowed, numbers_of, seconds_since, turned_azimuth, vendor_turn
+from lidarspec.points.conventions import TYPES, Grid, narrowed, numbers_of, seconds_since, turned_azimuth, vendor_turn
 from lidarspec.points.plain import PacketBatch
 from lidarspec.points.plan import REMEMBERING, Maker, Plan
+from lidarspec.wire.arrays import deep
 from lidarspec.wire.frame_table import Group
 
 _MAIN = ("x", "y", "z", "intensity")
@@ -277,12 +278,12 @@ class BatchColumns(ColumnSource):
         shares: these, by their layouts.
         size: the number of points, those of packets that wait left out.
         base: the time that times count from, ns.
-        rows, nominal: as of all sources.
+        grid, nominal: as of all sources.
     """
 
-    def __init__(self, packets: PacketBatch, shares: Sequence[Share], size: int, base: int, *, rows: int, nominal: bool) -> None:
+    def __init__(self, packets: PacketBatch, shares: Sequence[Share], size: int, base: int, *, grid: Grid, nominal: bool) -> None:
         self.packets, self.shares = packets, shares
-        self.size, self.base, self.rows, self.nominal = size, base, rows, nominal
+        self.size, self.base, self.grid, self.nominal = size, base, grid, nominal
         self._made: dict[str, NDArray[Any]] = {}
         self._blocks: list[Block] = []
 

@@ -14,16 +14,16 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.columns.columns import Batch, Carry, Column, Fields, aligned, of_points, unpadded
+from lidarspec.columns.columns import Batch, Carry, Fields, of_points, unpadded
 from lidarspec.errors import plugin_errors
 from lidarspec.framing.results import Counters
 from lidarspec.points import conventions
-from lidarspec.points.cloud import PointCloud
+from lidarspec.points.cloud import PointCloud, organised
 from lidarspec.spec.description import Spec
 from lidarspec.spec.results import Cartesian, Points, Polar
 from lidarspec.wire.frame_table import Table
 
-_OPTIONAL = ("intensity", "ring", "return_index")
+_OPTIONAL = ("intensity", "ring", "return_index", "column")
 
 
 class PacketBatch(Protocol):
@@ -104,33 +104,21 @@ def parts_of(result: Points) -> dict[str, Any]:
     return {name: value for name, value in parts.items() if value is not None}
 
 
-def columns_of(parts: dict[str, Any], batch: Batch) -> dict[str, Column]:
-    """The parts of a result as columns; numbers and arrays get the batch's axes."""
-    depth = max([batch.table.schema.depth(), *(len(value.axes) for value in parts.values() if isinstance(value, Column))])
-    anchor = Column(np.zeros((1,) * (1 + depth)), (None,) * depth, batch)
-    return {name: value if isinstance(value, Column) else _anchored(value, anchor) for name, value in parts.items()}
-
-
-def _anchored(value: Any, anchor: Column) -> Column:
-    (array, _), axes, ready = aligned((value, anchor), anchor.batch)
-    return Column(array.reshape((1,) * (1 + len(axes) - array.ndim) + array.shape), axes, anchor.batch, ready=ready)
-
-
 def _flattened(packets: PacketBatch, result: Points, batch: Batch, stamp_ns: int, *, final: bool) -> Evaluated:
-    columns = columns_of(parts_of(result), batch)
-    arrays, axes, ready, shape = of_points(columns, batch)
+    parts = parts_of(result)
+    arrays, axes, ready, shape = of_points(parts, batch)
     ready = len(packets) if final else ready
     mask = unpadded(axes, shape, batch)
-    flat = {name: _flat(array, shape, mask, ready) for name, array in zip(columns, arrays, strict=True)}
+    flat = {name: _flat(array, shape, mask, ready) for name, array in zip(parts, arrays, strict=True)}
     offsets = conventions.seconds_since(packets.time_ns, stamp_ns).reshape(-1, *(1,) * len(axes))
     flat["time"] = flat["time"] + _flat(offsets, shape, mask, ready)
     inside = np.ones(shape, np.bool_) if mask is None else mask.reshape(shape)
-    rows = conventions.rows_of(shape[1:]) if mask is None else 0
+    grid = conventions.grid_of(shape[1:], axes) if mask is None else conventions.Grid()
     cloud = make_cloud(
         flat,
         conventions.vendor_turn(packets.sensor),
         stamp_ns=stamp_ns,
-        shape=(ready * int(np.prod(shape[1:-1])), rows) if rows else None,
+        shape=organised(ready * int(np.prod(shape[1:])), grid),
         nominal=np.bool_(batch.nominal or result.nominal),
     )
     return Evaluated(cloud, ready, batch.carried(ready), inside[:ready].astype(np.intp), Fields(batch), axes)

@@ -48,9 +48,11 @@ if TYPE_CHECKING:
         Sequence as Sequence,
     )
     from lidarspec.spec.vocabulary import (
+        along as along,
         following as following,
         last as last,
         previous as previous,
+        running as running,
         spread as spread,
         stack as stack,
         steps as steps,
@@ -74,7 +76,7 @@ _NAMES = {
     "spec.timing": ("Clock", "Sequence", "OnWrap", "OnFlag", "OnChange", "OnRewind", "Every"),
     "columns.columns": ("Fields", "Column"),
     "spec.results": ("Points", "Polar", "Cartesian"),
-    "spec.vocabulary": ("spread", "wrap", "following", "previous", "last", "stack", "steps", "take"),
+    "spec.vocabulary": ("along", "spread", "wrap", "following", "previous", "last", "running", "stack", "steps", "take"),
     "plugins": ("hookimpl",),
     "transports.protocol": ("Format", "Transport", "LiveTransport", "Chunk", "Disconnected"),
 }

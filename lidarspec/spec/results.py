@@ -29,6 +29,7 @@ class Polar:
         invalid: True where the sensor marks a point as wrong (becomes nan).
         origin: (x, y, z) in metres of where the beam starts, columns allowed, in REP-103 axes.
         nominal: True where a default calibration stands in for the sensor's own, which the cloud then says.
+        column: number of the column in its turn, from 0, where points are columns of rows; `PointCloud.organised` places it by that.
     """
 
     range: Array
@@ -41,6 +42,7 @@ class Polar:
     invalid: Array = False
     origin: tuple[Array, Array, Array] = (0, 0, 0)
     nominal: bool = False
+    column: Array | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,6 +57,7 @@ class Cartesian:
         return_index: 0 for the first or only return, 1 for the second ...; None where there is one.
         invalid: True where the sensor marks a point as wrong (becomes nan).
         nominal: True where a default calibration stands in for the sensor's own, which the cloud then says.
+        column: number of the column in its turn, from 0, where points are columns of rows; `PointCloud.organised` places it by that.
     """
 
     x: Array
@@ -66,6 +69,7 @@ class Cartesian:
     return_index: Array | None = None
     invalid: Array = False
     nominal: bool = False
+    column: Array | None = None
 
 
 Points = Polar | Cartesian

@@ -21,6 +21,7 @@ from lidarspec.testing.findings import Finding
 from lidarspec.testing.geometry import field_of, traced, used
 from lidarspec.testing.subject import Subject
 from lidarspec.wire.layout import Layout
+from lidarspec.wire.schema import without_indices
 
 #: field names that stand for a measure.
 MEASURES = frozenset(["distance", "range", "radius", "angle", "azimuth", "elevation", "temperature", "voltage", "timestamp"])
@@ -79,7 +80,7 @@ def _asked(sensor: Sensor) -> Findings:
     given = [*asked.items(), *(("clock", path) for path in ((clock,) if isinstance(clock, str) else () if callable(clock) else clock))]
     for place, path in given:
         there = cut_by if place == "scan" else known
-        if path and path not in there:
+        if path and without_indices(path)[0] not in there:
             yield "LS216", f"there is no field {path!r}{did_you_mean(path, there)}", place
 
 
@@ -90,7 +91,7 @@ def _clock(sensor: Sensor) -> Findings:
         return
     fields = codec(sensor.frames[sensor.data_frame]).schema.named
     paths = (clock.source,) if isinstance(clock.source, str) else clock.source
-    infos = [fields.get(path) for path in paths]
+    infos = [fields.get(without_indices(path)[0]) for path in paths]
     spans = [info.limits[1] * info.scale * float(factor(info.unit, "s") or 0) if info and info.kind == "int" else np.inf for info in infos]
     if 0 < sum(spans) < LONG:
         what = f"it can count {sum(spans):g} s, then it starts again, and wraps_at is not given"

@@ -20,6 +20,7 @@ from lidarspec.spec.bits import BitField
 from lidarspec.spec.checksums import Checksum, Single, single
 from lidarspec.spec.tree import FieldInfo, Node
 from lidarspec.wire.row_checksums import over
+from lidarspec.wire.schema import element_of
 
 Bytes2D = NDArray[np.uint8]
 
@@ -180,6 +181,27 @@ class Leaf:
         spots = [self.offset + part.byte for element in self.elements for part in element.segments]
         return min(spots), max(spots) + 1
 
+    def element(self, path: str, indices: Mapping[str, int]) -> Leaf | None:
+        """Some element of its arrays, counted from the last one where an index is negative; None where there is none.
+
+        An array that others stand in remains, with that one element, so that each array keeps its place.
+        """
+        info = element_of(self.info, path, indices)
+        if info is None:
+            return None
+        offset, shape, elements, kept = self.offset, list(self.shape), self.elements, 0
+        for place, (axis, length) in enumerate(zip(self.info.axes, self.shape, strict=True)):
+            index = indices.get(axis, 0)
+            if not -length <= index < length:
+                return None
+            if axis not in indices:
+                kept = place + 1
+            elif place < len(self.strides):
+                offset, shape[place] = offset + index % length * self.strides[place], 1
+            else:
+                elements = (elements[index],)
+        return replace(self, info=info, offset=offset, shape=tuple(shape[:kept]), strides=self.strides[:kept], elements=elements)
+
     def at(self, offset: int) -> Leaf:
         """The field with its place counted from `offset`."""
         return replace(self, offset=self.offset - offset)
@@ -245,7 +267,7 @@ class Seal:
                 stored |= (leaf.scalar(frame) & ((1 << leaf.info.bits) - 1)) << shift
             shift += leaf.info.bits
         parts = [frame[a:b] for a, b in self.spans]
-        return stored == self._single(parts[0] if len(parts) == 1 else b"".join(parts)) or stored in self.absent
+        return stored in self.absent or stored == self._single(parts[0] if len(parts) == 1 else b"".join(parts))
 
     @cached_property
     def _single(self) -> Single:
@@ -254,8 +276,12 @@ class Seal:
     def intact(self, rows: Bytes2D, sums: Sums | None = None) -> NDArray[np.bool_]:
         """Which frames carry the right value, or one that means "not filled", (n,); `sums` computes it, by default the algorithm."""
         stored = self.stored(rows)
-        right = np.asarray(stored == self.computed(rows, sums))
-        return right | np.isin(stored, np.array(self.absent, np.uint64)) if self.absent else right
+        filled = ~np.isin(stored, np.array(self.absent, np.uint64)) if self.absent else None
+        if filled is None or filled.all():
+            return np.asarray(stored == self.computed(rows, sums))
+        right = np.ones(len(rows), np.bool_)
+        right[filled] = stored[filled] == self.computed(rows[filled], sums) if filled.any() else True
+        return right
 
 
 class PartsRegion(Protocol):

@@ -31,7 +31,7 @@ from lidarspec.spec.description import Frame
 from lidarspec.wire.arrays import by_value
 from lidarspec.wire.layout import Layout, Leaf, Refused, Seal
 from lidarspec.wire.parts import CONSTANT, FAILED, Kind, Measure, Region, Rule
-from lidarspec.wire.schema import schema
+from lidarspec.wire.schema import ByPath, schema
 
 
 class NotCompilable(Exception):
@@ -171,7 +171,8 @@ class _Walk:
     def layout(self) -> Layout:
         """What was found, as a value."""
         seals, following = tuple(self.seals), tuple(self._following())
-        found = (self.cursor, self.leaves, self.constants, seals, self.places, self.branches, following, self.lengths, self.regions)
+        leaves = ByPath(self.leaves, Leaf.element)
+        found = (self.cursor, leaves, self.constants, seals, self.places, self.branches, following, self.lengths, self.regions)
         return Layout(*found, self._held())
 
     def read(self, path: str) -> tuple[tree.FieldInfo, int] | str | None:
