@@ -14,9 +14,11 @@ from tests.shapes import (
     count,
     datagrams,
     echoes,
+    escaped,
     grid,
     headed,
     lengths,
+    lines,
     middle,
     modes,
     nested,
@@ -31,6 +33,7 @@ from tests.shapes import (
     state,
     tags,
     text,
+    tokens,
     twins,
     weak,
 )
@@ -64,6 +67,9 @@ _MODULES = (
     segments,
     tags,
     channels,
+    tokens,
+    lines,
+    escaped,
 )
 
 SHAPES: dict[str, Sensor] = {sensor.id: sensor for sensor in (*(module.SENSOR for module in _MODULES), *coordinates.SENSORS)}
