@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.errors import PluginError, SpecError, UnknownFrame, UsageError
-from lidarspec.framing.frame_engine import Codec, CompiledCodec, RecodedCodec, codec
+from lidarspec.framing.frame_engine import Codec, CompiledCodec, codec
 from lidarspec.framing.plausibility import plausibility
 from lidarspec.framing.results import VALID
 from lidarspec.spec.construct_layer import Fault, member, random_value
@@ -51,9 +51,9 @@ def examples(sensor: Spec, frame: str, source: random.Random, drawn: Drawn = NOT
     Args:
         drawn: field path -> what draws its raw value, for what random values never make.
     """
-    known = codec(sensor.frames[frame])
-    engine, recoding = (known.engine, known.recoder) if isinstance(known, RecodedCodec) else (known, None)
-    if not isinstance(engine, CompiledCodec) or engine.schema.parts:
+    known, recoding = codec(sensor.frames[frame]), recoder(sensor.frames[frame])
+    engine = known.compiled
+    if engine is None or engine.schema.parts:
         return [_interpreted(sensor, frame, known, source, drawn)]
     for _ in range(TRIES):
         layout, chosen = engine.tree.choose(source, drawn)

@@ -47,6 +47,11 @@ class Codec:
 
     layout: Layout | None = None
 
+    @property
+    def compiled(self) -> CompiledCodec | None:
+        """What knows the layouts of its frames, or of their rows; None where construct alone reads them."""
+        return None
+
     def __init__(self, frame: Frame) -> None:
         self.frame, self.schema = frame, schema(frame.tree)
         self.prefix, self.size = prefix_of(frame.tree, frame.room), fixed_size(frame.prepared) or None
@@ -93,6 +98,10 @@ class CompiledCodec(Codec):
         self.tree, layout = layouts, layouts.layout(b"")
         self.layout = layout if isinstance(layout, Layout) else None
         self._conditions: Conditions | None = None
+
+    @property
+    def compiled(self) -> CompiledCodec:
+        return self
 
     def survey(
         self, buffer: NDArray[np.uint8], offsets: NDArray[np.intp], *, kind: int = 0, gathered: bool = True, sums: Sums | None = None
@@ -263,6 +272,10 @@ class RecodedCodec(Codec):
         self.recoder, self.engine, self.size = recoder, engine, None
         self.prefix = {spot: (0xFF, byte) for spot, byte in enumerate(recoder.begins)}
         self.marks = marks(self.prefix)
+
+    @property
+    def compiled(self) -> CompiledCodec | None:
+        return self.engine.compiled
 
     def survey(
         self, buffer: NDArray[np.uint8], offsets: NDArray[np.intp], *, kind: int = 0, gathered: bool = True, sums: Sums | None = None

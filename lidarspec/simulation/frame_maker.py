@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.errors import SpecError
-from lidarspec.framing.frame_engine import CompiledCodec, RecodedCodec, codec
+from lidarspec.framing.frame_engine import InterpretedCodec, codec
 from lidarspec.spec.construct_layer import member
 from lidarspec.spec.description import Spec
 from lidarspec.spec.tree import Formula, Kind, Node, refs
@@ -36,9 +36,10 @@ class FrameMaker:
 
     def __init__(self, sensor: Spec, frame: str) -> None:
         known = codec(sensor.frames[frame])
-        engine = known.engine if isinstance(known, RecodedCodec) else known
-        if not isinstance(engine, CompiledCodec):
-            raise SpecError(f"cannot be simulated, since it is not compiled: {engine.reason}", path=frame, sensor=sensor.id)
+        engine = known.compiled
+        if engine is None:
+            reason = known.reason if isinstance(known, InterpretedCodec) else ""
+            raise SpecError(f"cannot be simulated, since it is not compiled: {reason}", path=frame, sensor=sensor.id)
         others = sensor.data_frames if sensor.frames[frame].data else ()
         elsewhere = {path for other in others for path in codec(sensor.frames[other]).schema.fields}
         self.engine = engine

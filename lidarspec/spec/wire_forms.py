@@ -297,8 +297,8 @@ class _TokenReading:
         inside = (at >= 0) & (index + number <= len(self._stops))
         ends = self._stops[np.minimum(index[:, None] + np.arange(number), len(self._stops) - 1)]
         begins = np.empty_like(ends)
-        begins[:, 0] = np.maximum(at, 0)
-        np.add(ends[:, :-1], 1, out=begins[:, 1:])
+        begins[:, 0] = np.clip(at, 0, len(self._buffer) - 1)
+        np.minimum(ends[:, :-1] + 1, len(self._buffer) - 1, out=begins[:, 1:])
         values, right = self._values(begins, ends, fixed)
         right = inside & (ends[:, -1] < stops) & right
         at = np.where(right, ends[:, -1] + 1, NONE)
@@ -602,8 +602,8 @@ class Escaped:
         wrong = np.concatenate([[0], np.cumsum(escaped & (is_escape | is_flag))])
         sizes[(sizes > 0) & ((wrong[np.minimum(starts + np.maximum(sizes, 1), len(buffer))] > wrong[starts + 1]) | (sizes == 2))] = NONE
         places = np.flatnonzero(~(is_escape | is_flag))
-        values = buffer[places] ^ np.where(escaped[places], self.xor, 0).astype(np.uint8)
-        return Unescaped(sizes, places, values)
+        turned = escaped[places]
+        return Unescaped(sizes, places - turned, buffer[places] ^ np.where(turned, self.xor, 0).astype(np.uint8))
 
     def write(self, rows: Bytes2D, slots: Sequence[Slot]) -> list[bytes]:
         special = (rows == self.flag) | (rows == self.escape)

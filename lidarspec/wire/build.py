@@ -64,7 +64,9 @@ def _written(recoding: Recoder, row: bytes, spelling: bytes | None, place: str) 
     layout = recoding.tree.layout(row)
     data = recoding.written(np.frombuffer(row, np.uint8).reshape(1, -1), layout)[0] if isinstance(layout, Layout) else None
     if data is None:
-        raise UsageError(f"{place}: {recoding.form} cannot write these values: a number is too large for its digits, or a text has a mark in it")
+        raise UsageError(
+            f"{place}: {recoding.form} cannot write these values: a number is too large for its digits, or a text has a mark in it"
+        )
     return data
 
 

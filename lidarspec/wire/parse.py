@@ -358,7 +358,9 @@ def _unreadable(recoding: Recoder, data: bytes, fields: Sequence[Field], where: 
         return WireError("a check character of its lines is wrong", offset=start, **where)
     path, wanted = recoding.next_field(data, fields)
     got = data[start : start + SHOWN]
-    return WireError(f"{path or 'frame'} at byte {start}: {got!r} is not {wanted}", offset=start, path=path, expected=wanted, got=got, **where)
+    return WireError(
+        f"{path or 'frame'} at byte {start}: {got!r} is not {wanted}", offset=start, path=path, expected=wanted, got=got, **where
+    )
 
 
 def _parse_row(sensor: Spec, name: str, data: bytes, where: dict[str, Any], place: Callable[[int], int], *, verify: bool) -> Any:

@@ -185,6 +185,25 @@ class Recoder:
             row, start = row + part[0].tobytes(), ends
         return found, row
 
+    def places(self, data: bytes) -> tuple[bytes, list[int]]:
+        """The row of one frame as far as it can be read, and where in the frame each byte of it begins, and the last one ends.
+
+        What separates a slot from the next one belongs to it, the mark at the end to none.
+        """
+        fields, row = self.fields(data)
+        at = [field.start for field in fields for _ in range(field.first, field.end)]
+        if not data:
+            return row, [0]
+        reading = self.reading(np.frombuffer(data, np.uint8), np.zeros(1, np.intp))
+        size = reading.sizes.item(0)
+        if isinstance(reading, Unescaped):
+            inside = reading.places[(reading.places >= len(self.form.start)) & (reading.places < (size if size > 0 else len(data)))]
+            row = row if reading.numbers is not None else reading.values[reading.places.searchsorted(inside)].tobytes()
+            at = inside[: len(row)].tolist()
+            follows = inside[len(row)] if len(row) < len(inside) else size - 1 if size > 0 and self.form.start else at[-1] + 1 if at else 0
+            return row, [*at, int(follows)]
+        return row, [*at, fields[-1].stop - (fields[-1].stop == size) if fields else len(self.form.start)]
+
     def next_field(self, data: bytes, fields: Sequence[Field]) -> tuple[str, str]:
         """The path of the slot behind those that could be read, and what should stand there, in words."""
         buffer, starts = np.frombuffer(data, np.uint8), np.zeros(1, np.intp)
@@ -225,7 +244,9 @@ def _slot(leaf: Leaf) -> Slot:
     if leaf.wire is not None:
         return Slot(_KINDS[leaf.wire.kind], leaf.size, 1, leaf.wire.byteorder == "<")
     whole = leaf.elements[0].run
-    return Slot("int" if whole and leaf.info.kind == "int" and leaf.elements[0].signed else "uint", leaf.size, 1, bool(whole) and whole[0] == "<")
+    return Slot(
+        "int" if whole and leaf.info.kind == "int" and leaf.elements[0].signed else "uint", leaf.size, 1, bool(whole) and whole[0] == "<"
+    )
 
 
 _KINDS: dict[str, Literal["uint", "int", "float"]] = {"u": "uint", "i": "int", "f": "float"}

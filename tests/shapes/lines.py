@@ -18,29 +18,33 @@ DATA = Struct(
     "ones" / Int8ub,
     "status" / Const(b"99"),
     "time" / Scaled(Int32ub, 1, "ms"),
-    "sector" / Int8ub,
+    "sector" / Scaled(Int8ub, 40, "deg"),
     "ranges" / Array(this.tens * 10 + this.ones, Scaled(Int24ub, 0.001, "m")),
 )
 
 
 def plausible(f: Fields) -> Any:
-    return (f.tens < 10) & (f.ones < 10) & (f.sector < 9)
+    return (f.tens < 10) & (f.ones < 10) & (f.sector < 360)
 
 
 def points(f: Fields) -> Polar:
-    return Polar(range=f.ranges, azimuth=np.deg2rad(f.sector * float(BEAMS) + steps(f.tens * 10 + f.ones)))
+    return Polar(range=f.ranges, azimuth=np.deg2rad(f.sector + steps(f.tens * 10 + f.ones)))
 
 
 def sweep(i: int) -> dict[str, Any]:
     """Nine sectors a turn."""
-    return dict(tens=BEAMS // 10, ones=0, time=i * 10 % 2**24, sector=i % 9)
+    return dict(tens=BEAMS // 10, ones=0, time=i * 10 % 2**24, sector=i % 9 * 40)
 
 
 SENSOR = Sensor(
     "shape-lines",
     vendor="Shapes",
     model="Lines",
-    frames={"data": Frame(DATA, data=True, max_length=400, plausible=plausible, wire=Lines(64, head=(4, 2, 4), bare=1, check=Scip()) | SixBits())},
+    frames={
+        "data": Frame(
+            DATA, data=True, max_length=400, plausible=plausible, wire=Lines(64, head=(4, 2, 4), bare=1, check=Scip()) | SixBits()
+        )
+    },
     points=points,
     scan=OnWrap("azimuth"),
     links={"data": Tcp(10_940)},
