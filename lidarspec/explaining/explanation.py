@@ -170,12 +170,12 @@ class _Trail:
         self.after = len(data) if self._is_whole else self.end
 
     def rows(self) -> Iterator[Row]:
-        """A row for each part, and for the marks around a wire form; the parts of an element of an array in one, if it holds no further one."""
+        """A row for each part, and for the marks of a wire form; the parts of an element of an array in one, if it holds no further one."""
         if self._first:
-            yield Row(0, self._data[: self._first], "", (), ("start of the frame",), right=True)
+            yield Row(0, self._data[: self._first], "(start)", (), (), right=True)
         yield from self._fields()
         if self._is_whole and self.end < len(self._data):
-            yield Row(self.end, self._data[self.end :], "", (), ("end of the frame",), right=True)
+            yield Row(self.end, self._data[self.end :], "(end)", (), (), right=True)
 
     def _fields(self) -> Iterator[Row]:
         for element, group in itertools.groupby(self._leaves(), lambda leaf: self._element(leaf[0])):
@@ -190,6 +190,8 @@ class _Trail:
         left = self._data[self.after :]
         if self.failed and fault is not None:
             yield Row(self.after, left, fault.path, (), (fault.reason,), right=False)
+        elif fault is not None and self._recoder is not None and not left:
+            yield Row(self.after, left, "(end)", (), (fault.reason,), right=False)
         elif left:
             yield Row(self.after, left, "", (), ("after the frame's end",), right=False)
 

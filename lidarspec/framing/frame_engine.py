@@ -293,9 +293,9 @@ class RecodedCodec(Codec):
                 errors += [layout.error] if layout.error else []
                 continue
             own = whole[which] if is_read.all() else whole[which[is_read]]
-            rows = rows if len(own) == len(which) else rows[is_read]
-            status[own] = self._judged(layout, rows, errors, sums)
-            groups.append((layout, own, rows))
+            good = rows if len(own) == len(which) else rows[is_read]
+            status[own] = self._judged(layout, good, errors, sums)
+            groups.append((layout, own, good))
         recoded = (Recoded(kind, offsets, tuple(groups)),) if groups else ()
         kinds, sizes = repeated(kind, len(offsets)), np.maximum(reading.sizes, 0)
         return Frames(buffer, kinds, offsets, sizes, status=status, errors=tuple(errors), recoded=recoded)

@@ -136,7 +136,7 @@ class Found:
 
 @dataclass(frozen=True, eq=False)
 class Recoded:
-    """Rows of frames of one type that have a wire form: where they begin on the wire, ascending, and by layout the index and row of each."""
+    """Rows of frames of one type with a wire form: where they begin on the wire, ascending, and by layout the index and row of each."""
 
     kind: int
     starts: Indices

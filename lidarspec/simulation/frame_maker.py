@@ -22,7 +22,7 @@ from lidarspec.wire.frame_table import Group, Rows
 from lidarspec.wire.layout import Layout, Leaf
 from lidarspec.wire.layout_tree import TooLong, Unknown, layout_of
 from lidarspec.wire.schema import schema
-from lidarspec.wire.slots import Recoder, recoder
+from lidarspec.wire.slots import recoder
 
 Values = Mapping[str, Any]
 
@@ -43,8 +43,8 @@ class FrameMaker:
         others = sensor.data_frames if sensor.frames[frame].data else ()
         elsewhere = {path for other in others for path in codec(sensor.frames[other]).schema.fields}
         self.engine = engine
-        self._makes(sensor.id, engine.frame.tree, engine.frame.room, {}, elsewhere)
         self._recoder = recoder(engine.frame)
+        self._makes(sensor.id, engine.frame.tree, engine.frame.room, {}, elsewhere)
 
     @classmethod
     def _of_parts(cls, sensor: str, root: Node, limit: int, given: Mapping[str, int]) -> FrameMaker:
@@ -59,7 +59,6 @@ class FrameMaker:
         self._layouts: dict[tuple[int, ...], Layout] = {}
         self._asked: list[str] = []
         self._makers: dict[tuple[Any, ...], FrameMaker] = {}
-        self._recoder: Recoder | None = None
 
     def table(self, frames: Sequence[Values]) -> Rows:
         """One frame for each mapping of field paths to physical values; arrays may be given as bytes, too, and parts as such mappings.

@@ -24,8 +24,8 @@ with paths from their own start (`Kind.root`), which layouts and tables are made
 
 Room for what is to come. The length of a part in bytes (M7) is a formula beside `Ref`, of the path of that part;
 `wire.build` fills it in, and `wire.layout_tree` holds arriving frames to it. An axis (M3) has its name in `Repeat.axis` and
-`FieldInfo.axes`. One element of an array (M8) is an index in `Ref`. A wire form, which recodes the bytes before they have places, is a value
-of the `Frame`, beside its tree.
+`FieldInfo.axes`. One element of an array (M8) is an index in `Ref`. A wire form, which recodes the bytes before they have places,
+is a value of the `Frame`, beside its tree.
 """
 
 from __future__ import annotations

@@ -228,7 +228,7 @@ class Tokens:
 class _TokenReading:
     """Candidates of `Tokens` in one buffer."""
 
-    intact = None
+    intact: NDArray[np.bool_] | None = None
 
     def __init__(self, form: Tokens, buffer: Bytes1D, starts: Numbers, limit: int) -> None:
         self._form, self._buffer = form, buffer
@@ -273,9 +273,9 @@ class _TokenReading:
 
     def _read(self, at: Numbers, stops: Numbers, slots: Sequence[Slot]) -> tuple[Bytes2D, Numbers]:
         parts = [np.empty((len(at), 0), np.uint8)]
-        for kind, run in itertools.groupby(slots, lambda slot: slot if slot.count >= MANY else slot.kind == "text"):
-            is_text = kind is True or (isinstance(kind, Slot) and kind.kind == "text")
-            part, at = self._texts(at, stops, tuple(run)) if is_text else self._numbers(at, stops, tuple(run))
+        for (is_text, _), group in itertools.groupby(slots, lambda slot: (slot.kind == "text", slot if slot.count >= MANY else None)):
+            run = tuple(group)
+            part, at = self._texts(at, stops, run) if is_text else self._numbers(at, stops, run)
             parts.append(part)
         return np.concatenate(parts, axis=1), at
 
@@ -506,9 +506,12 @@ class Lines:
         sizes[whole[first < 0]] = NONE
         whole, first, last = whole[first >= 0], first[first >= 0], last[first >= 0]
         kept, intact = buffer != 0x0A, np.ones(len(starts), np.bool_)
+        kept[stops[-1] + 1 if len(stops) else 0 :] = False  # a line without an end: nobody knows what is its check
         if self.check is not None:
             checked = np.ones(len(stops), np.bool_)
-            checked[(first[:, None] + np.arange(self.bare)).reshape(-1)] = False
+            heads = np.concatenate([first, stops.searchsorted(starts[sizes == SHORT])])  # of one cut off, too, for who explains it
+            bare = (heads[:, None] + np.arange(self.bare)).reshape(-1)
+            checked[bare[bare < len(stops)]] = False
             checked &= stops > 0
             kept[stops[checked] - 1] = False
             intact[whole] = self._intact(buffer, starts[whole], stops, first, last)

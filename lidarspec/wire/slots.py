@@ -1,7 +1,7 @@
 """Frames of a wire form as rows of slots, and back: which slots a layout has, which layout a frame, and where each slot stands in it.
 
-A form (`lidarspec.spec.wire_forms`) reads slots in order, and nothing else; the layouts of the struct say which come next. So the fields that
-decide a layout are read first, and then the whole row, which has to end where the frame does.
+A form (`lidarspec.spec.wire_forms`) reads slots in order, and nothing else; the layouts of the struct say which come next. So the fields
+that decide a layout are read first, and then the rest of the row, which has to end where the frame does.
 """
 
 from __future__ import annotations
@@ -243,10 +243,8 @@ def _slot(leaf: Leaf) -> Slot:
         return Slot("text", leaf.size)
     if leaf.wire is not None:
         return Slot(_KINDS[leaf.wire.kind], leaf.size, 1, leaf.wire.byteorder == "<")
-    whole = leaf.elements[0].run
-    return Slot(
-        "int" if whole and leaf.info.kind == "int" and leaf.elements[0].signed else "uint", leaf.size, 1, bool(whole) and whole[0] == "<"
-    )
+    element, run = leaf.elements[0], leaf.elements[0].run
+    return Slot("int" if run and element.signed else "uint", leaf.size, 1, run is not None and run[0] == "<")
 
 
 _KINDS: dict[str, Literal["uint", "int", "float"]] = {"u": "uint", "i": "int", "f": "float"}

@@ -22,12 +22,13 @@ def _escaped(form: Escaped, data: bytes) -> tuple[bytes, int] | None:
         return None
     row, left = bytearray(), iter(data[1:end])
     for byte in left:
-        if byte == form.escape:
-            byte = next(left, form.escape)
-            if byte == form.escape:
-                return None
-            byte ^= form.xor
-        row.append(byte)
+        if byte != form.escape:
+            row.append(byte)
+            continue
+        turned = next(left, form.escape)
+        if turned == form.escape:
+            return None
+        row.append(turned ^ form.xor)
     return bytes(row), end + 1
 
 
@@ -37,9 +38,10 @@ def _lines(form: Lines, data: bytes) -> tuple[bytes, int] | None:
         return None
     row = b""
     lines = data[:end].split(b"\n")
-    for number, line in enumerate(lines):
+    for number, characters in enumerate(lines):
+        line = characters
         if form.check is not None and number >= form.bare:
-            line, check = line[:-1], line[-1:]
+            line, check = characters[:-1], characters[-1:]
             if check != bytes([(sum(line) & 63) + 48]):
                 return None
         wanted = form.head[number] if number < len(form.head) else form.width
@@ -128,9 +130,9 @@ class _Reader:
         bits = 8 * field.length
         value = int(digits, 10 if signed else self._form.base)
         is_signed, is_float = field.fmtstr[-1].islower(), field.fmtstr[-1] in "fd"
-        if signed and (is_float or not -(2 ** (bits - 1) if is_signed else 0) <= int(token) < 2 ** (bits - is_signed)):
-            if int(token):
-                raise ValueError(token)
+        limits = (-(2 ** (bits - 1)) if is_signed else 0, 2 ** (bits - is_signed))
+        if signed and int(token) and (is_float or not limits[0] <= int(token) < limits[1]):
+            raise ValueError(token)
         if not signed and value >= 2**bits:
             raise ValueError(token)
         value = int(token) if signed else value

@@ -34,9 +34,9 @@ def points(f: Fields) -> Polar:
 
 
 def sweep(i: int) -> dict[str, Any]:
-    """Two segments in each frame, fifteen of these a turn; the second is shorter."""
-    first, second = dict(count=BEAMS, start=i * 24.0 % 360), dict(count=BEAMS - i % 3, start=(i * 24.0 + 1) % 360)
-    return dict(number=i % 256, segments=[first, second])
+    """Two segments in each frame, fifteen of these a turn, of two lengths."""
+    segments = [dict(count=BEAMS - number % 2, start=number * 24.0 % 360) for number in (2 * i, 2 * i + 1)]
+    return dict(number=i % 256, segments=segments)
 
 
 SENSOR = Sensor(
