@@ -21,7 +21,7 @@ from lidarspec.packets.stream import PacketStream
 from lidarspec.plugins import Plugin, registry, sensor as named_sensor, tried
 from lidarspec.points.numpy_plan import describe
 from lidarspec.points.plan import Plan, plan_for
-from lidarspec.simulation.frame_maker import FrameMaker, sealed
+from lidarspec.simulation.frame_maker import FrameMaker
 from lidarspec.spec.description import Frame
 from lidarspec.spec.links import Link, Serial, Udp
 from lidarspec.spec.sensor import Sensor
@@ -116,7 +116,7 @@ def _plan(sensor: Sensor, frame: str) -> list[str]:
         made, sweep = FrameMaker(sensor, frame), sensor.simulation_of(frame).sweep
     except SpecError as error:
         return [f"plain evaluation: {error}"]
-    frames = sealed(made.table([sweep(index) for index in range(PACKETS)])) if sweep else [sensor.example(frame)]
+    frames = made.sealed(made.table([sweep(index) for index in range(PACKETS)])) if sweep else [sensor.example(frame)]
     sent = packed([Found(frame, 0, data) for data in frames])
     packets = PacketStream(sensor, frame, Counters()).add([sent]).with_points
     if not isinstance(packets.table, Rows) or not packets.table.groups:

@@ -92,14 +92,20 @@ class Message:
         return {path: node for node in tree.nodes(self.root) if isinstance(node, tree.Sealed) for path in node.fields}
 
 
-def messages(sensor: Sensor) -> tuple[Message, ...]:
+def messages(sensor: Sensor, *, on_wire: bool = True) -> tuple[Message, ...]:
     """All frame types of a sensor, in their order.
 
+    Args:
+        on_wire: their bytes as they are sent are asked for, and not the fields alone.
+
     Raises:
-        Refused: if it has none yet, or one holds a part that only Python code can decide.
+        Refused: if it has none yet, or one holds a part that only Python code can decide, or stands on the wire in a form of its own.
     """
     if not sensor.frames:
         raise Refused(f"{sensor.id}: has no frames yet: configure it first")
+    formed = [f"{name} in {frame.wire}" for name, frame in sensor.frames.items() if frame.wire is not None and on_wire]
+    if formed:
+        raise Refused(f"{sensor.id}: no other language recodes what stands on the wire: {', '.join(formed)}")
     return tuple(_message(sensor, name, frame) for name, frame in sensor.frames.items())
 
 

@@ -31,7 +31,7 @@ def pyi(sensor: Sensor) -> str:
     Raises:
         Refused: where a frame holds Python code, or two frame types have one class name.
     """
-    frames = messages(sensor)
+    frames = messages(sensor, on_wire=False)
     names = {message.name: camel(message.name) for message in frames}
     if len(set(names.values())) < len(names):
         raise Refused(f"{sensor.id}: two frame types have one class name")

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.errors import SpecError
-from lidarspec.framing.frame_engine import CompiledCodec, codec
+from lidarspec.framing.frame_engine import InterpretedCodec, codec
 from lidarspec.spec.construct_layer import member
 from lidarspec.spec.description import Spec
 from lidarspec.spec.tree import Formula, Kind, Node, refs
@@ -22,6 +22,7 @@ from lidarspec.wire.frame_table import Group, Rows
 from lidarspec.wire.layout import Layout, Leaf
 from lidarspec.wire.layout_tree import TooLong, Unknown, layout_of
 from lidarspec.wire.schema import schema
+from lidarspec.wire.slots import recoder
 
 Values = Mapping[str, Any]
 
@@ -34,13 +35,16 @@ class FrameMaker:
     """
 
     def __init__(self, sensor: Spec, frame: str) -> None:
-        engine = codec(sensor.frames[frame])
-        if not isinstance(engine, CompiledCodec):
-            raise SpecError(f"cannot be simulated, since it is not compiled: {engine.reason}", path=frame, sensor=sensor.id)
+        known = codec(sensor.frames[frame])
+        engine = known.compiled
+        if engine is None:
+            reason = known.reason if isinstance(known, InterpretedCodec) else ""
+            raise SpecError(f"cannot be simulated, since it is not compiled: {reason}", path=frame, sensor=sensor.id)
         others = sensor.data_frames if sensor.frames[frame].data else ()
         elsewhere = {path for other in others for path in codec(sensor.frames[other]).schema.fields}
         self.engine = engine
-        self._makes(sensor.id, engine.frame.tree, engine.frame.max_length, {}, elsewhere)
+        self._recoder = recoder(engine.frame)
+        self._makes(sensor.id, engine.frame.tree, engine.frame.room, {}, elsewhere)
 
     @classmethod
     def _of_parts(cls, sensor: str, root: Node, limit: int, given: Mapping[str, int]) -> FrameMaker:
@@ -74,7 +78,23 @@ class FrameMaker:
 
     def frame(self, values: Values) -> bytes:
         """One frame, sealed."""
-        return sealed(self.table([values]))[0]
+        return self.sealed(self.table([values]))[0]
+
+    def sealed(self, table: Rows) -> list[bytes]:
+        """The frames of a table as they are sent.
+
+        Raises:
+            SpecError: where its wire form cannot write a value.
+        """
+        frames = sealed(table)
+        if self._recoder is None:
+            return frames
+        for group in table.groups:
+            for place, data in zip(group.where.tolist(), self._recoder.written(group.rows, group.layout), strict=True):
+                if data is None:
+                    raise SpecError(f"{self._recoder.form} cannot write these values", path="simulation", sensor=self._sensor)
+                frames[place] = data
+        return frames
 
     def _with_parts(self, values: Values) -> tuple[Values, dict[str, bytes]]:
         """The values of a frame with what follows from its parts, and the bytes of these, by their axis."""

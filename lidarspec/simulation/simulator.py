@@ -545,7 +545,7 @@ class Simulation:
             measured.put_back()
         else:
             self._measurement.fill(table, numbers, scene, seconds)
-        return Block(sealed(table)[:count], times[: count + 1])
+        return Block(self._maker.sealed(table)[:count], times[: count + 1])
 
     def _with_points(self, table: Rows) -> Rows:
         """What points are made of: frames, or the parts in them."""

@@ -9,6 +9,7 @@ other package is a function. Nothing in this package reads bytes of a stream. Mo
 * `sensor`: a `Spec` with everything that can be done with it as methods; it stands above the stations that do it.
 * `fields`: units and seals, as parts of a struct.
 * `checksums`: algorithms as values; of one message.
+* `wire_forms`: what has to be recoded before its fields have places: tokens, lines, escapes.
 * `links`: how a sensor is connected.
 * `timing`: clocks, counters, where scans end.
 * `results`, `vocabulary`: what a `points` function returns, and what it is written with.
@@ -59,6 +60,17 @@ if TYPE_CHECKING:
         take as take,
         wrap as wrap,
     )
+    from lidarspec.spec.wire_forms import (
+        Escaped as Escaped,
+        Lines as Lines,
+        Reading as Reading,
+        Scip as Scip,
+        SixBits as SixBits,
+        Slot as Slot,
+        Tokens as Tokens,
+        Unescaped as Unescaped,
+        WireForm as WireForm,
+    )
     from lidarspec.transports.protocol import (
         Chunk as Chunk,
         Disconnected as Disconnected,
@@ -77,6 +89,7 @@ _NAMES = {
     "columns.columns": ("Fields", "Column"),
     "spec.results": ("Points", "Polar", "Cartesian"),
     "spec.vocabulary": ("along", "spread", "wrap", "following", "previous", "last", "running", "stack", "steps", "take"),
+    "spec.wire_forms": ("Tokens", "Lines", "SixBits", "Scip", "Escaped", "WireForm", "Reading", "Slot", "Unescaped"),
     "plugins": ("hookimpl",),
     "transports.protocol": ("Format", "Transport", "LiveTransport", "Chunk", "Disconnected"),
 }

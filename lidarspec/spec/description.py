@@ -22,6 +22,7 @@ from lidarspec.spec.links import Link, is_datagram
 from lidarspec.spec.results import Points
 from lidarspec.spec.timing import Clock, Sequence, Split
 from lidarspec.spec.tree import Node, Sealed, children
+from lidarspec.spec.wire_forms import WireForm
 
 #: version of the plugin interface; the engine reads this one and the one before.
 API = 1
@@ -80,6 +81,8 @@ class Frame:
         simulation: what a simulated sensor needs for this frame alone, where the sensor can answer in several data frames, or sends
             others that random values never make, or again and again by themselves.
         acknowledged: findings of `lidarspec check` that are true and meant, as "LS204" or "LS205 path.of.a.field" -> the reason.
+        wire: how the frame stands on the wire, where its fields have no fixed places there: `Tokens`, `Lines`, `Escaped`, or a form of a
+            plugin. The struct then describes what is read out of it, and `max_length`, in bytes on the wire, is always needed.
 
     Raises:
         SpecError: if the struct cannot describe a frame: a part without an end, with bytes that are lost, or names that clash.
@@ -95,6 +98,7 @@ class Frame:
     confirm: int = field(default=1, kw_only=True)
     simulation: Simulation = field(default_factory=Simulation, kw_only=True)
     acknowledged: Mapping[str, str] = field(default_factory=dict, kw_only=True)
+    wire: WireForm | None = field(default=None, kw_only=True)
     prepared: Construct = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -105,19 +109,24 @@ class Frame:
         _freeze(self, "acknowledged")
         if isinstance(self.points, Mapping) and len(self.points) != 1:
             raise SpecError(f"points stand in parts of one kind, not in {', '.join(self.points) or 'none'}", path="points")
-        longest = self.max_length or fixed_size(self.struct)
-        object.__setattr__(self, "prepared", prepare(self.struct, longest or sys.maxsize))
+        longest = self.max_length or (0 if self.wire is not None else fixed_size(self.struct))
+        object.__setattr__(self, "max_length", longest)
+        object.__setattr__(self, "prepared", prepare(self.struct, self.room or sys.maxsize))
         check_struct(self.prepared)
         if not longest:
-            raise SpecError("max_length may be left out only where the struct has a fixed size")
-        object.__setattr__(self, "max_length", longest)
+            raise SpecError("max_length may be left out only where the struct has a fixed size, and no wire form")
 
     def __repr__(self) -> str:
-        size = fixed_size(self.prepared)
+        size = 0 if self.wire is not None else fixed_size(self.prepared)
         kind = "data, " if self.data else "out, " if self.direction == "out" else ""
         root = self.tree.body if isinstance(self.tree, Sealed) else self.tree
         names = [member.name for member in children(root) if member.name]
         return f"Frame({kind}{size or f'up to {self.max_length}'} bytes{': ' * bool(names)}{', '.join(names)})"
+
+    @property
+    def room(self) -> int:
+        """The most bytes that the struct can have: those of the frame, of which any two may be a number of eight in a wire form."""
+        return self.max_length * (1 if self.wire is None else 4)
 
     @cached_property
     def tree(self) -> Node:

@@ -23,11 +23,8 @@ Parts stand in the tree twice: as they are described, with paths from the top of
 with paths from their own start (`Kind.root`), which layouts and tables are made of.
 
 A field that says how long a part is (`FieldInfo.held`) follows from what the nodes of that part add up to (`size`), and what pads a part is
-so many bytes: both are formulas like all others.
-
-Room for what is to come. An axis (M3) has its name in `Repeat.axis` and
-`FieldInfo.axes`. One element of an array (M8) is an index in `Ref`. A wire form (M4), which recodes the bytes before they have places, is
-a value of the `Frame`, beside its tree.
+so many bytes: both are formulas like all others. An axis has its name in `Repeat.axis` and `FieldInfo.axes`; one element of an array is an
+index in `Ref`. A wire form, which recodes the bytes before they have places, is a value of the `Frame`, beside its tree.
 """
 
 from __future__ import annotations

@@ -102,7 +102,7 @@ def _frame(subject: Subject, name: str, frame: Frame) -> Findings:
     engine = codec(frame)
     if not isinstance(frame.tree, Struct | Sealed):
         yield "LS114", f"it is a {type(frame.struct).__name__}", name
-    if not isinstance(engine, CompiledCodec):
+    if engine.compiled is None:
         yield "LS116", getattr(engine, "reason", "its layout cannot be computed"), name
     elif engine.size is not None and engine.size != frame.max_length:
         yield "LS203", f"every frame has {engine.size} bytes, and max_length is {frame.max_length}", name

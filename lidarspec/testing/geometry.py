@@ -27,7 +27,7 @@ from lidarspec.packets.packets import Packets
 from lidarspec.points.cloud import PointCloud
 from lidarspec.points.conventions import axis_matrix
 from lidarspec.points.plain import evaluate
-from lidarspec.simulation.frame_maker import FrameMaker, sealed
+from lidarspec.simulation.frame_maker import FrameMaker
 from lidarspec.simulation.scenes import Room, furnished
 from lidarspec.simulation.simulator import simulation
 from lidarspec.spec import OnWrap, Polar
@@ -66,7 +66,8 @@ def swept(subject: Subject, name: str, packets: int, start: int = 0) -> list[byt
     if sweep is None:
         return []
     try:
-        return sealed(FrameMaker(subject.sensor, name).table([sweep(start + index) for index in range(packets)]))
+        maker = FrameMaker(subject.sensor, name)
+        return maker.sealed(maker.table([sweep(start + index) for index in range(packets)]))
     except LidarSpecError:
         return []
 

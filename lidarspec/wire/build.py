@@ -14,8 +14,10 @@ from lidarspec.errors import LidarSpecError, MissingField, OutOfRange, SpecError
 from lidarspec.spec.construct_layer import Mismatch, WireNaN, field_path, member, seen
 from lidarspec.spec.description import Spec
 from lidarspec.spec.tree import Blob, FieldInfo, Formula, Kind, Node, Number, Parts, Read, Sealed, Struct, evaluated, nodes, refs
+from lidarspec.wire.layout import Layout
 from lidarspec.wire.layout_tree import TooLong, Unknown, layout_of
 from lidarspec.wire.schema import Schema, schema
+from lidarspec.wire.slots import SPELLING, Recoder, recoder
 
 #: how often a frame is built until its lengths agree: once more where it has any, and again where these themselves have no fixed length.
 RETRIES = 4
@@ -39,8 +41,10 @@ def build(sensor: Spec, frame: str, value: Any, values: Mapping[str, Any], *, un
     table, known = _fields(tree)
     given = _Values(table, known, place, units=units).checked({**(value or {}), **values}, "")
     try:
-        _fill(tree, given, sensor.frames[frame].max_length)
-        return _built(sensor.frames[frame].prepared, given)
+        _fill(tree, given, sensor.frames[frame].room)
+        data = _built(sensor.frames[frame].prepared, given)
+        recoding = recoder(sensor.frames[frame])
+        return data if recoding is None else _written(recoding, data, (value or {}).get(SPELLING), place)
     except Mismatch as fault:
         raise _usage(fault, place) from None
     except construct.ConstructError as fault:
@@ -61,6 +65,23 @@ def _built(con: Any, given: Container) -> bytes:
         if sizes == known:
             break
     return bytes(data)
+
+
+def _written(recoding: Recoder, row: bytes, spelling: bytes | None, place: str) -> bytes:
+    """A row on the wire, as it was spelled if it says the same.
+
+    Raises:
+        UsageError: for values that its form cannot write.
+    """
+    if spelling is not None and (known := recoding.row(spelling)) is not None and known[1] == row:
+        return spelling
+    layout = recoding.tree.layout(row)
+    data = recoding.written(np.frombuffer(row, np.uint8).reshape(1, -1), layout)[0] if isinstance(layout, Layout) else None
+    if data is None:
+        raise UsageError(
+            f"{place}: {recoding.form} cannot write these values: a number is too large for its digits, or a text has a mark in it"
+        )
+    return data
 
 
 def _usage(fault: Mismatch, place: str) -> UsageError:

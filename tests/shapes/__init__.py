@@ -15,10 +15,12 @@ from tests.shapes import (
     count,
     datagrams,
     echoes,
+    escaped,
     fragments,
     grid,
     headed,
     lengths,
+    lines,
     measured,
     middle,
     modes,
@@ -34,6 +36,7 @@ from tests.shapes import (
     state,
     tags,
     text,
+    tokens,
     twins,
     weak,
 )
@@ -70,6 +73,9 @@ _MODULES = (
     tags,
     channels,
     fragments,
+    tokens,
+    lines,
+    escaped,
 )
 
 SHAPES: dict[str, Sensor] = {sensor.id: sensor for sensor in (*(module.SENSOR for module in _MODULES), *coordinates.SENSORS)}
