@@ -99,7 +99,7 @@ class Input(Protocol):
         """Whether everything that had been produced at a mark has been decoded; of a file each scan is looked at in its turn."""
         return True
 
-    def send(self, name: str, *, timeout: float | None = None, **arguments: Any) -> Reply:
+    def send(self, name: str, /, *, timeout: float | None = None, **arguments: Any) -> Reply:
         """The reply to a command, which other threads may wait for at the same time.
 
         Raises:
@@ -191,7 +191,7 @@ class FileInput(Input):
     def begin(self) -> None:
         """A file has no sensor to be started."""
 
-    def send(self, name: str, *, timeout: float | None = None, **arguments: Any) -> Reply:
+    def send(self, name: str, /, *, timeout: float | None = None, **arguments: Any) -> Reply:
         raise CommandError(f"{self._sensor.id} {name}: {self._source} is a file, there is no device to send it to")
 
     def write(self, data: bytes, link: str = "data") -> None:

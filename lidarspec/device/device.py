@@ -265,7 +265,7 @@ class Device(Closing):
         error = SourceError(f"{self._source}: no scan in time; the source is {self.state}")
         return suggest(error, f"lidarspec doctor {quote(str(self._source))} -s {self.sensor.id}")
 
-    def send(self, name: str, *, timeout: float | None = None, **arguments: Any) -> Reply:
+    def send(self, name: str, /, *, timeout: float | None = None, **arguments: Any) -> Reply:
         """The reply to a command; at once with ``confirmed=False`` where none is documented.
 
         Args:

@@ -228,7 +228,7 @@ class LiveInput(Input):
     def caught_up(self, mark: int) -> bool:
         return not self._ready and self.queue.consumed + self.queue.dropped >= mark
 
-    def send(self, name: str, *, timeout: float | None = None, **arguments: Any) -> Reply:
+    def send(self, name: str, /, *, timeout: float | None = None, **arguments: Any) -> Reply:
         if name in self.sensor.commands:
             command = self.sensor.commands[name]
             self._await_sender(command.link, command.timeout * (1 + command.retries) if timeout is None else timeout)

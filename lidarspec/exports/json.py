@@ -13,6 +13,7 @@ from typing import Any
 
 from lidarspec.exports import Message, messages
 from lidarspec.spec import Command, Sensor, tree
+from lidarspec.spec.arguments import Address, Count
 from lidarspec.spec.links import Link, Serial, Tcp, Udp
 from lidarspec.wire.wire_table import frame_size
 
@@ -62,6 +63,8 @@ def _plain(fact: Any) -> Any:
         return {name: _plain(value) for name, value in fact.items()}
     if isinstance(fact, list | tuple):
         return [_plain(value) for value in fact]
+    if isinstance(fact, Count | Address):
+        return {"kind": type(fact).__name__.lower(), **vars(fact)}
     return fact.hex() if isinstance(fact, bytes | bytearray) else fact
 
 
@@ -92,7 +95,7 @@ def _frame(message: Message) -> dict[str, Any]:
 def _command(command: Command) -> dict[str, Any]:
     return {
         **facts(command, "frame", "values"),
-        "args": {name: {"field": path, "low": low, "high": high} for name, (path, low, high) in command.args.items()},
+        "args": {name: argument.to_dict() for name, argument in command.arguments.items()},
         **facts(
             command,
             "replies",

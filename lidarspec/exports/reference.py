@@ -12,7 +12,7 @@ from xml.sax.saxutils import escape
 import numpy as np
 
 from lidarspec.errors import LidarSpecError
-from lidarspec.explaining.wording import limits
+from lidarspec.explaining.wording import asked
 from lidarspec.framing.results import Counters, Found, packed
 from lidarspec.packets.stream import PacketStream
 from lidarspec.points.cloud import PointCloud
@@ -98,7 +98,7 @@ def _asked(sensor: Sensor, name: str) -> str:
     command = sensor.commands[name]
     said = _levels(command.lines)
     if command.frame and command.args:
-        args = " and ".join(f"`{arg}` {limits(low, high, ' to ')}" for arg, (_, low, high) in command.args.items())
+        args = " and ".join(f"`{name}` {asked(argument.kind, ' to ')}" for name, argument in command.arguments.items())
         said.insert(0, f"`{command.frame}` with {args}")
     elif command.frame:
         said.insert(0, f"`{sensor.command(name).hex(' ')}`")

@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from lidarspec.columns.columns import Column as Column, Fields as Fields
     from lidarspec.plugins import hookimpl as hookimpl
+    from lidarspec.spec.arguments import Address as Address, Count as Count, Text as Text
     from lidarspec.spec.checksums import (
         Checksum as Checksum,
         Crc as Crc,
@@ -68,6 +69,7 @@ if TYPE_CHECKING:
 _NAMES = {
     "spec.sensor": ("Sensor",),
     "spec.description": ("Frame", "Command", "Relative", "Simulation"),
+    "spec.arguments": ("Text", "Address", "Count"),
     "spec.fields": ("Scaled", "Checksummed", "Parts"),
     "spec.checksums": ("Checksum", "Crc", "Xor", "Sum", "WordXor", "Fold15", "ZeroPadded"),
     "spec.links": ("Serial", "Udp", "Tcp"),

@@ -116,7 +116,7 @@ class Sensor(Spec):
 
         return example(self, frame, seed=seed)
 
-    def command(self, name: str, **arguments: Any) -> bytes:
+    def command(self, name: str, /, **arguments: Any) -> bytes:
         """The bytes of a command; arguments by name, in units.
 
         Raises:
