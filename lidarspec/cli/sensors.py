@@ -23,7 +23,7 @@ from lidarspec.points.numpy_plan import describe
 from lidarspec.points.plan import Plan, plan_for
 from lidarspec.simulation.frame_maker import FrameMaker, sealed
 from lidarspec.spec.description import Frame
-from lidarspec.spec.links import Link, Serial, Udp
+from lidarspec.spec.links import Http, Link, Serial, Tcp, Udp
 from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.ports import serial_ports
 from lidarspec.trust import FILE, TRUSTED, trust as trusted, user_folder
@@ -204,4 +204,5 @@ def _links(sensor: Sensor) -> str:
 def _link_text(link: Link) -> str:
     if isinstance(link, Serial):
         return f"serial {'/'.join(str(baud) for baud in link.bauds)} baud"
-    return f"udp {'/'.join(str(port) for port in link.ports)}" if isinstance(link, Udp) else f"tcp {link.port}"
+    ports = link.ports or (link.broadcast,) if isinstance(link, Udp) else (link.port,) if isinstance(link, Tcp | Http) else ()
+    return f"{type(link).__name__.lower()} {'/'.join(map(str, ports))}".strip()

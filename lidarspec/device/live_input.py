@@ -25,8 +25,10 @@ from lidarspec.errors import CommandError, LidarSpecError, ReplyTimeout, SourceE
 from lidarspec.framing.decoder import Decoder, backend as backend_named
 from lidarspec.framing.results import Counters, Frames
 from lidarspec.recording.appending import Log
+from lidarspec.spec.arguments import Address
+from lidarspec.spec.links import Link, Udp
 from lidarspec.spec.sensor import Sensor
-from lidarspec.transports.base import HostClock, with_option
+from lidarspec.transports.base import HostClock, own_address, with_option
 from lidarspec.transports.open_url import control_link, has_control
 from lidarspec.transports.protocol import Chunk, LiveTransport, Sender, endpoint
 
@@ -157,6 +159,7 @@ class LiveInput(Input):
         self.decoder: Decoder = sensor.decoder(stream=not opened.datagrams, backend=self._backend)
         self._decoders, self._captures = {"data": self.decoder}, {}
         self._kept, self._ready = Kept(source, sensor, datagrams=opened.datagrams), deque[Arrival]()
+        self._answering: dict[str, Kept] = {}  # who answers what was broadcast, by link
         self._clock = HostClock()
         self._turn, self._talk = threading.RLock(), threading.RLock()
         self._due, self._stops, self._closed = 0.0, False, False
@@ -179,7 +182,7 @@ class LiveInput(Input):
     @property
     def warnings(self) -> list[str]:
         said = [warning for capture in self._captures.values() for warning in (*capture.transport.warnings, *capture.warnings)]
-        said += self._kept.warnings + self._said
+        said += [warning for kept in (self._kept, *self._answering.values()) for warning in kept.warnings] + self._said
         if self._recorder is not None and self._recorder.error is not None:
             said.append(f"the recording has stopped: {self._recorder.error}")
         return said if self._closed else said + self._watch.warnings
@@ -188,7 +191,8 @@ class LiveInput(Input):
     def stats(self) -> Counters:
         stats, captures = self.decoder.stats, list(self._captures.values())
         stats.kernel_drops = sum(capture.transport.kernel_drops for capture in captures)
-        stats.foreign = self._kept.foreign + sum(capture.transport.foreign for capture in captures)
+        others = sum(kept.foreign for kept in self._answering.values())
+        stats.foreign = self._kept.foreign + others + sum(capture.transport.foreign for capture in captures)
         stats.disconnects = sum(capture.disconnects for capture in captures)
         stats.queue_dropped = self.queue.dropped
         return stats
@@ -233,13 +237,25 @@ class LiveInput(Input):
             command = self.sensor.commands[name]
             self._await_sender(command.link, command.timeout * (1 + command.retries) if timeout is None else timeout)
         with self._talk:
+            self._find_own_address(name)
             pending = self._session.request(name, self._clock.now(), timeout=timeout, **arguments)
             self._speak()
         while not pending.done:
             if self._failure is not None:
                 raise self._failure
             self._help(pending)
-        return pending.result()
+        try:
+            return pending.result()
+        except ReplyTimeout as error:
+            why = self._captures[self.sensor.commands[name].link].transport.warnings
+            raise ReplyTimeout("; ".join([str(error), *why])) from None
+
+    def _find_own_address(self, name: str) -> None:
+        """Let the session know where we are, as the sensor sees it, where a command says that."""
+        command = self.sensor.commands.get(name)
+        if command is not None and any(isinstance(value, Address) for value in command.filled.values()):
+            peer = self._opened(command.link).peer()
+            self._session.host = own_address(peer) if peer else None
 
     def write(self, data: bytes, link: str = "data") -> None:
         refuse_text(data)
@@ -254,7 +270,8 @@ class LiveInput(Input):
     def _await_sender(self, link: str, seconds: float) -> None:
         """Wait for a first datagram where it alone says where the sensor is."""
         data = self._captures["data"].transport
-        if link not in self._captures and (data.peer() or has_control(self._source)):
+        is_known = link in self._captures or self._host() or has_control(self._source) or _is_broadcast(self.sensor.links.get(link))
+        if link != "data" and is_known:
             return
         limit = time.monotonic() + seconds
         while not data.addressed and self._failure is None and time.monotonic() < limit:
@@ -338,6 +355,8 @@ class LiveInput(Input):
             self._hand_on(link, decoder.rest(), interrupted=True)
         if link == "data":
             chunks = self._of_the_sensor(chunks)
+        elif link in self._answering:
+            chunks = self._of_who_answered(link, chunks)
         if not chunks:
             return
         found = fed(decoder, chunks)
@@ -355,6 +374,19 @@ class LiveInput(Input):
             self.decoder.rest()
             self._ready.append(Arrival(interrupted=True, replaced=True))
         return mine
+
+    def _of_who_answered(self, link: str, chunks: list[Chunk]) -> list[Chunk]:
+        """What the first one that answered a broadcast sent: it is the sensor, on every link."""
+        mine = self._answering[link].ours(chunks)
+        if (address := self._answering[link].address) is not None:
+            self._captures[link].transport.accept(address)
+            self._kept.choose(address)
+        return mine
+
+    def _host(self) -> str | None:
+        """The address of the sensor, as far as it is known."""
+        answered = [kept.address[0] for kept in self._answering.values() if kept.address is not None]
+        return self._captures["data"].transport.peer() or next(iter(answered), None)
 
     def _hand_on(self, link: str, found: list[Frames], *, interrupted: bool = False) -> None:
         with self._talk:
@@ -402,10 +434,16 @@ class LiveInput(Input):
         """The transport of a link; one apart from the data's is opened when it is first needed."""
         if link not in self._captures:
             data = self._captures["data"].transport
-            opened = data.link(link) or control_link(self._source, link, self.sensor.links[link], data.peer())
+            opened = data.link(link) or control_link(self._source, link, self.sensor.links[link], self._host())
+            if _is_broadcast(self.sensor.links[link]):
+                self._answering[link] = Kept(self._source, self.sensor, datagrams=True)
             self._decoders[link] = self.sensor.decoder(stream=not opened.datagrams, backend=self._backend)
             self._captures[link] = Capture(opened, self.queue, link=link)
         return self._captures[link].transport
+
+
+def _is_broadcast(link: Link | None) -> bool:
+    return isinstance(link, Udp) and bool(link.broadcast)
 
 
 def _runs(events: list[Event]) -> list[tuple[str, list[Chunk] | Mark | BaseException]]:

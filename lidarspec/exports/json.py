@@ -14,7 +14,7 @@ from typing import Any
 from lidarspec.exports import Message, messages
 from lidarspec.spec import Command, Sensor, tree
 from lidarspec.spec.arguments import Address, Count
-from lidarspec.spec.links import Link, Serial, Tcp, Udp
+from lidarspec.spec.links import Link
 from lidarspec.wire.wire_table import frame_size
 
 #: raised whenever a key changes its meaning or goes.
@@ -70,7 +70,7 @@ def _plain(fact: Any) -> Any:
 
 def link_data(link: Link) -> dict[str, Any]:
     """A link as data: its kind, then what its class declares."""
-    return {"kind": {Serial: "serial", Udp: "udp", Tcp: "tcp"}[type(link)], **facts(link, *vars(link))}
+    return {"kind": type(link).__name__.lower(), **facts(link, *vars(link))}
 
 
 def _clock(sensor: Sensor) -> dict[str, Any] | None:

@@ -35,8 +35,14 @@ if TYPE_CHECKING:
         ZeroPadded as ZeroPadded,
     )
     from lidarspec.spec.description import Command as Command, Frame as Frame, Relative as Relative, Simulation as Simulation
-    from lidarspec.spec.fields import Checksummed as Checksummed, Parts as Parts, Scaled as Scaled
-    from lidarspec.spec.links import Serial as Serial, Tcp as Tcp, Udp as Udp
+    from lidarspec.spec.fields import (
+        Checksummed as Checksummed,
+        HttpReply as HttpReply,
+        HttpRequest as HttpRequest,
+        Parts as Parts,
+        Scaled as Scaled,
+    )
+    from lidarspec.spec.links import Http as Http, Link as Link, Serial as Serial, Tcp as Tcp, Udp as Udp
     from lidarspec.spec.results import Cartesian as Cartesian, Points as Points, Polar as Polar
     from lidarspec.spec.sensor import Sensor as Sensor
     from lidarspec.spec.timing import (
@@ -70,9 +76,9 @@ _NAMES = {
     "spec.sensor": ("Sensor",),
     "spec.description": ("Frame", "Command", "Relative", "Simulation"),
     "spec.arguments": ("Text", "Address", "Count"),
-    "spec.fields": ("Scaled", "Checksummed", "Parts"),
+    "spec.fields": ("Scaled", "Checksummed", "Parts", "HttpRequest", "HttpReply"),
     "spec.checksums": ("Checksum", "Crc", "Xor", "Sum", "WordXor", "Fold15", "ZeroPadded"),
-    "spec.links": ("Serial", "Udp", "Tcp"),
+    "spec.links": ("Serial", "Udp", "Tcp", "Http", "Link"),
     "spec.timing": ("Clock", "Sequence", "OnWrap", "OnFlag", "OnChange", "OnRewind", "Every"),
     "columns.columns": ("Fields", "Column"),
     "spec.results": ("Points", "Polar", "Cartesian"),
