@@ -12,7 +12,7 @@ import contextlib
 import threading
 import time
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from shlex import quote
 from typing import Any
@@ -20,7 +20,7 @@ from typing import Any
 from lidarspec.device.arrivals import Arrival, Input, answers, fed
 from lidarspec.device.capture_thread import BoundedQueue, Capture, Event, Mark
 from lidarspec.device.senders import Kept, frame_senders
-from lidarspec.device.session import Outgoing, Pending, Reply, Session
+from lidarspec.device.session import Outgoing, Pending, Reply, Session, learned
 from lidarspec.errors import CommandError, LidarSpecError, ReplyTimeout, SourceError, UsageError, refuse_text, suggest
 from lidarspec.framing.decoder import Decoder, backend as backend_named
 from lidarspec.framing.results import Counters, Frames
@@ -135,7 +135,8 @@ class LiveInput(Input):
     Args:
         source, sensor, opened: the open transport of the data link, and whose.
         policy: of the queue, "drop_oldest" or "block".
-        recorder: gets everything that arrives and is sent, before the queue.
+        record: makes what gets everything that arrives and is sent, before the queue, of the sensor as it is read.
+        learns: whether `begin` is to be called, in which the sensor may say how it is read: nothing counts before that.
         period: seconds between two decodings.
     """
 
@@ -149,10 +150,14 @@ class LiveInput(Input):
         *,
         backend: str = "auto",
         policy: str = "drop_oldest",
-        recorder: Log | None = None,
+        record: Callable[[Sensor], Log | None] = lambda sensor: None,
+        learns: bool = False,
         period: float = PERIOD,
     ) -> None:
-        self._source, self.sensor, self._recorder, self._period = source, sensor, recorder, period
+        self._source, self.sensor, self._record, self._period = source, sensor, record, period
+        self._teachers = [name for name in sensor.on_open if sensor.commands[name].learns is not None] if learns else []
+        self._recorder = None if self._teachers else record(sensor)
+        self.learned: dict[str, Any] = {}
         chosen = backend_named(backend)
         self._backend = "numpy" if chosen == "auto" else chosen  # none by itself that stops to compile: nothing would be decoded meanwhile
         self.queue, self._session = BoundedQueue(policy), Session(sensor)
@@ -166,7 +171,8 @@ class LiveInput(Input):
         self._failure: SourceError | None = None
         self.stays_on = False
         self._said: list[str] = []
-        self._captures["data"] = Capture(opened, self.queue, log=recorder)
+        self._captures["data"] = Capture(opened, self.queue, log=self._recorder)
+        self._checked: list[Pending] = []
         self._watch = Watch(source, sensor, opened, self._captures["data"], self.decoder, self._kept)
 
     @property
@@ -205,11 +211,32 @@ class LiveInput(Input):
         self._stops = bool(self.sensor.on_open)
         for name in self.sensor.on_open:
             try:
-                self.send(name)
+                self.learned |= learned(self.sensor, self.send(name))
             except ReplyTimeout as error:
                 if not self._watch.streams:
                     raise suggest(error, self._watch.following()) from None
                 self._said.append(f"{error}; data come all the same")
+            if self._teachers and name == self._teachers[-1]:
+                self._adopt()
+
+    def _adopt(self) -> None:
+        """Go on as the sensor that was learned of; what came before counts for nothing."""
+        try:
+            self.sensor = self.sensor.configure(**self.learned)
+        except UsageError as error:
+            raise CommandError(f"{self.sensor.id}: what it says of itself cannot be: {error}") from error
+        with self._turn, self._talk:
+            data = self._captures["data"]
+            self._session.sensor = self.sensor
+            self._kept.configured(self.sensor)
+            self._decoders = {
+                link: self.sensor.decoder(stream=decoder.stream, backend=self._backend) for link, decoder in self._decoders.items()
+            }
+            self.decoder = self._decoders["data"]
+            self._recorder = self._record(self.sensor)
+            data.record(self._recorder)
+            self._ready.clear()
+            self._watch = Watch(self._source, self.sensor, data.transport, data, self.decoder, self._kept)
 
     def next(self, wait: float) -> Arrival | None:
         deadline = time.monotonic() + wait
@@ -333,6 +360,8 @@ class LiveInput(Input):
             self._due = time.monotonic() + self._period
         for link, run in _runs(events):
             self._take(link, run)
+        if self._checked:
+            self._compare()
 
     def _take(self, link: str, run: list[Chunk] | Mark | BaseException) -> None:
         """Decode consecutive chunks of a link, or note what happened on it."""
@@ -404,9 +433,18 @@ class LiveInput(Input):
     def _start_again(self) -> None:
         """The device is back: it has forgotten what it was told."""
         with self._talk:
-            for name in self.sensor.on_open if self._stops else ():
-                self._session.request(name, self._clock.now())
+            names = self.sensor.on_open if self._stops else ()
+            self._checked = [self._session.request(name, self._clock.now()) for name in names]
             self._speak()
+
+    def _compare(self) -> None:
+        """Say it where the sensor that came back says something else of itself: it may be another one."""
+        done, self._checked = [one for one in self._checked if one.done], [one for one in self._checked if not one.done]
+        for pending in done:
+            with contextlib.suppress(CommandError):
+                again = learned(self.sensor, pending.result())
+                others = [name for name, value in again.items() if self.learned.get(name, value) != value]
+                self._said += [f"{self._source}: the sensor that came back has another {name}: open it again" for name in others]
 
     def _speak(self) -> None:
         """Send what the session wants to be sent."""

@@ -25,7 +25,7 @@ from lidarspec.framing.frame_engine import codec
 from lidarspec.framing.results import Found
 from lidarspec.spec.arguments import Address, Filled
 from lidarspec.spec.description import Command
-from lidarspec.spec.sensor import Sensor
+from lidarspec.spec.sensor import Learned, Sensor
 from lidarspec.spec.tree import FieldInfo
 from lidarspec.wire.build import steps
 
@@ -401,6 +401,26 @@ class Session:
         line.quiet = since + _ns(request.command.settle)
         if request.expected is not None:
             line.owed += [_Owed(request.expected, sent + request.patience) for sent in request.sent[answers:]]
+
+
+def learned(sensor: Sensor, reply: Reply) -> dict[str, Any]:
+    """The options that a reply teaches, by name; none where the command learns nothing.
+
+    Raises:
+        CommandError: for a reply that cannot be learned from.
+    """
+    learns = sensor.commands[reply.command].learns
+    if learns is None or not reply.confirmed:
+        return {}
+    place = f"{sensor.id} {reply.command}"
+    try:
+        told = {name: value.encode() if isinstance(value, str) else value for name, value in learns(reply.values).items()}
+    except Exception as error:
+        raise CommandError(f"{place}: nothing can be learned from the reply: {type(error).__name__}: {error}") from error
+    for name, value in told.items():
+        if not isinstance(value, bytes | int | float):
+            raise CommandError(f"{place}: {name} is learned as a number, bytes or a text, not as {type(value).__name__}")
+    return {name: Learned(value) if isinstance(value, bytes) else value for name, value in told.items()}
 
 
 def _silence(sensor: Sensor, request: _Request) -> CommandError:

@@ -111,6 +111,7 @@ def _command(command: Command) -> dict[str, Any]:
             "only_stopped",
             "every",
         ),
+        "learns": command.learns is not None,
     }
 
 

@@ -7,6 +7,7 @@ other package is a function. Nothing in this package reads bytes of a stream. Mo
 
 * `description`: `Spec`, `Frame`, `Command`, `Simulation`: what must fit together.
 * `sensor`: a `Spec` with everything that can be done with it as methods; it stands above the stations that do it.
+* `arguments`: what a command is told, and what is found out when it is sent.
 * `fields`: units and seals, as parts of a struct.
 * `checksums`: algorithms as values; of one message.
 * `links`: how a sensor is connected.
@@ -44,7 +45,7 @@ if TYPE_CHECKING:
     )
     from lidarspec.spec.links import Http as Http, Link as Link, Serial as Serial, Tcp as Tcp, Udp as Udp
     from lidarspec.spec.results import Cartesian as Cartesian, Points as Points, Polar as Polar
-    from lidarspec.spec.sensor import Sensor as Sensor
+    from lidarspec.spec.sensor import Learned as Learned, Sensor as Sensor
     from lidarspec.spec.timing import (
         Clock as Clock,
         Every as Every,
@@ -73,7 +74,7 @@ if TYPE_CHECKING:
     )
 
 _NAMES = {
-    "spec.sensor": ("Sensor",),
+    "spec.sensor": ("Sensor", "Learned"),
     "spec.description": ("Frame", "Command", "Relative", "Simulation"),
     "spec.arguments": ("Text", "Address", "Count"),
     "spec.fields": ("Scaled", "Checksummed", "Parts", "HttpRequest", "HttpReply"),

@@ -150,6 +150,8 @@ class Command:
         lines: levels of control lines, {"dtr": False}, set with it.
         starts, stops: whether the sensor sends data after it, or no longer does.
         only_stopped: whether it is answered only while the sensor sends no data, and passed over otherwise.
+        learns: a function of the reply, as `Sensor.parse` gives it, that returns options for `configure`, by name: numbers, or bytes and
+            texts, which become `Learned`. They are applied where the command is among `on_open`.
         every: seconds after which it is sent once more, again and again from its first time on (a heartbeat); 0: never.
     """
 
@@ -167,6 +169,7 @@ class Command:
     starts: bool = False
     stops: bool = False
     only_stopped: bool = False
+    learns: Callable[[Any], Mapping[str, Any]] | None = None
     every: float = 0.0
     arguments: Mapping[str, Argument] = field(init=False, repr=False)
 
@@ -335,6 +338,8 @@ def _check_spec(sensor: Spec) -> None:
         _known(sensor, f"commands.{name}.link", [command.link], sensor.links)
         if command.only_stopped and not any(other.starts or other.stops for other in sensor.commands.values()):
             raise SpecError("it is answered only while the sensor is stopped, and no command starts or stops it", path=f"commands.{name}")
+        if command.learns is not None and not (command.replies and sensor.configure is not None):
+            raise SpecError("what it learns comes with a reply, and goes to `configure`: both are needed", path=f"commands.{name}.learns")
         if "timeout" in command.args:
             raise SpecError("'timeout' is how long its reply is waited for, and cannot be an argument", path=f"commands.{name}.args")
     if sensor.commands:

@@ -6,7 +6,7 @@ import math
 from ipaddress import ip_address
 from typing import Any
 
-from lidarspec.device.session import Reply, Session, found_at
+from lidarspec.device.session import Reply, Session, found_at, learned
 from lidarspec.errors import CommandError, LidarSpecError, UsageError
 from lidarspec.explaining.wording import asked
 from lidarspec.framing.results import Found
@@ -127,6 +127,8 @@ def the_simulated_sensor_answers(subject: Subject, name: str) -> None:
             refused = refused or str(error)
             continue
         require(reply.confirmed, "LS604", "the reply is not confirmed", f"commands.{name}")
+        if told := learned(subject.sensor, reply):
+            subject.sensor.configure(**told)
         return
     raise Violation("LS604", refused, f"commands.{name}")
 

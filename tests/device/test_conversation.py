@@ -10,14 +10,33 @@ import socket
 import sys
 import threading
 from collections.abc import Iterator
+from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 
 import lidarspec as ls
 from lidarspec.errors import CommandError, ReplyTimeout, SpecError, UsageError
 from lidarspec.plugins import Registry, standing_in
-from lidarspec.spec import Chunk, Command, Frame, Http, HttpReply, HttpRequest, Link, LiveTransport, Sensor, Tcp, Text, Udp, hookimpl
+from lidarspec.recording.format import Header
+from lidarspec.spec import (
+    Chunk,
+    Command,
+    Frame,
+    Http,
+    HttpReply,
+    HttpRequest,
+    Link,
+    LiveTransport,
+    Sensor,
+    Serial,
+    Tcp,
+    Text,
+    Udp,
+    hookimpl,
+)
 from lidarspec.testing.fixtures import virtual_port
 from tests.lines import SLACK, free_port, udp, until, working
 from tests.shapes.conversation import SENSOR
@@ -53,6 +72,97 @@ def test_a_simulated_sensor_answers_over_a_link_of_its_own(kind: type[Udp | Tcp]
         assert device.send("hello").values.head.number == 9
         assert port.device.heard == ["call", "send_to", "hello"]
         assert device.latest(SLACK).complete
+
+
+ANGLES = [0.5, 1.0, 1.5, 2.0]
+
+
+def teaching(**more: Any) -> Sensor:
+    """The shape, which is asked for its table on opening."""
+    return dataclasses.replace(linked(Udp(free_port())), on_open=("get_table",), **more)
+
+
+def angles(device: ls.Device) -> list[float]:
+    """The angles of the samples of a packet, degrees, from that of the first one of the model."""
+    packets = next(batch for batch in device.packets(wait=0.3) if len(batch))
+    found = np.rad2deg(packets.points().azimuth[:4]) - packets["angle"][0]
+    return [round(float(angle), 3) % 360 for angle in found]
+
+
+def test_what_a_sensor_says_of_itself_configures_it_and_its_recording(tmp_path: Path) -> None:
+    sensor, path = teaching(), tmp_path / "taught.lsr"
+    with virtual_port(sensor, to=f"udp://127.0.0.1:{sensor.links['data'].ports[0]}") as port:
+        with ls.open(port.path, sensor, record=path) as device:
+            assert device.learned == {"table": b"0.5 1 1.5 2"}
+            assert device.sensor.options == device.learned
+            assert angles(device) == ANGLES
+            live = device.latest(SLACK)
+        assert (live.points.nominal, device.warnings) == (False, [])
+        with ls.open(port.path, sensor, start=False) as device:  # which asks for nothing
+            assert (dict(device.learned), angles(device)) == ({}, [0.0, 1.0, 2.0, 3.0])
+    registry = Registry()
+    registry.add(SimpleNamespace(lidarspec_sensors=hookimpl(lambda: [sensor])), name="shapes")
+    with standing_in(registry):
+        with ls.open(path) as replay:
+            assert repr(replay.sensor.options["table"]) == "Learned(11 bytes)"
+            again = [scan.points.azimuth for scan in replay.scans() if scan.stamp_ns == live.stamp_ns]
+        assert np.array_equal(again[0], live.points.azimuth)
+        kept = Header(sensor.id, {"table": {"learned": "bm90aGluZw=="}})
+        with pytest.raises(UsageError, match="is nothing that a sensor said"):
+            kept.known_sensor(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("said", "learns", "error"),
+    [
+        (b"1 2 3", None, "what it says of itself cannot be: 3 angles, and there are 4 samples"),
+        (b"", lambda reply: {"table": reply.nothing}, "nothing can be learned from the reply: AttributeError"),
+        (b"", lambda reply: {"table": [1.0]}, "table is learned as a number, bytes or a text, not as list"),
+        (b"", lambda reply: {"tables": b""}, "unknown option 'tables'"),
+        (b"", lambda reply: {"frame": b"rep103"}, "frame is one of rep103, vendor"),
+    ],
+)
+def test_what_cannot_be_learned_is_the_sensors_fault(said: bytes, learns: Any, error: str) -> None:
+    asked = SENSOR.commands["get_table"]
+    commands = {"get_table": dataclasses.replace(asked, learns=learns or asked.learns)}
+    simulation = dataclasses.replace(SENSOR.simulation, answers={"get_table": [("table", {"angles": said})]})
+    sensor = teaching(commands=commands, simulation=simulation)
+    with virtual_port(sensor, to=f"udp://127.0.0.1:{sensor.links['data'].ports[0]}") as port, pytest.raises(CommandError, match=error):
+        ls.open(port.path, sensor)
+
+
+def test_what_is_learned_is_no_path() -> None:
+    def configure(sensor: Sensor, *, table: str | Path) -> Sensor:
+        raise AssertionError("a path that a stranger wrote is opened")
+
+    sensor = teaching(configure=configure)
+    refused = pytest.raises(CommandError, match="table is a path or a text, not")
+    with virtual_port(sensor, to=f"udp://127.0.0.1:{sensor.links['data'].ports[0]}") as port, refused:
+        ls.open(port.path, sensor)
+    with pytest.raises(SpecError, match="goes to `configure`"):
+        dataclasses.replace(SENSOR, configure=None)
+
+
+def test_a_sensor_that_comes_back_with_another_table_is_another_one() -> None:
+    said = [b"0.5 1 1.5 2", b"1 2 3 4"]
+    answers = {"get_table": lambda request: [("table", {"angles": said.pop(0)})]}
+    sensor = dataclasses.replace(
+        SENSOR,
+        links={"data": Serial(115_200), "control": Tcp(free_port())},
+        on_open=("get_table",),
+        simulation=dataclasses.replace(SENSOR.simulation, answers=answers),
+    )
+    with virtual_port(sensor) as port, ls.open(port.path, sensor) as device:
+        assert angles(device) == ANGLES
+        port.unplug()
+        port.plug()
+        told = "the sensor that came back has another table: open it again"
+
+        def is_told() -> bool:
+            device.newest(0.01)
+            return any(told in warning for warning in device.warnings)
+
+        until(is_told, 4 * SLACK)
 
 
 class Loop(Link):
