@@ -191,7 +191,8 @@ class LiveInput(Input):
         said += [warning for kept in (self._kept, *self._answering.values()) for warning in kept.warnings] + self._said
         if self._recorder is not None and self._recorder.error is not None:
             said.append(f"the recording has stopped: {self._recorder.error}")
-        return said if self._closed else said + self._watch.warnings
+        silent = [f"{self._source}: {error}; it is started again" for error in self._session.unanswered.values() if error is not None]
+        return said if self._closed else said + silent + self._watch.warnings
 
     @property
     def stats(self) -> Counters:
@@ -362,6 +363,8 @@ class LiveInput(Input):
             self._take(link, run)
         if self._checked:
             self._compare()
+        elif any(self._session.unanswered.values()):
+            self._start_again()  # what is not answered any more may have started anew, and have forgotten everything
 
     def _take(self, link: str, run: list[Chunk] | Mark | BaseException) -> None:
         """Decode consecutive chunks of a link, or note what happened on it."""
@@ -371,8 +374,8 @@ class LiveInput(Input):
             self._hand_on(link, self._decoders[link].rest(), interrupted=run is Mark.LOST)
             if run is Mark.LOST:
                 with self._talk:
-                    self._session.abandon("the connection was lost")
-            elif run is Mark.BACK and link == "data":
+                    self._session.abandon("the connection was lost", None if link == "data" else link)
+            elif run is Mark.BACK:
                 self._start_again()
         elif self._failure is None and not self._closed:
             self._failure = run if isinstance(run, SourceError) else SourceError(f"{self._source}: nothing is read any more: {run}")
@@ -434,7 +437,7 @@ class LiveInput(Input):
         """The device is back: it has forgotten what it was told."""
         with self._talk:
             names = self.sensor.on_open if self._stops else ()
-            self._checked = [self._session.request(name, self._clock.now()) for name in names]
+            self._checked += [self._session.request(name, self._clock.now()) for name in names]
             self._speak()
 
     def _compare(self) -> None:

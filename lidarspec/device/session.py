@@ -96,6 +96,11 @@ class Pending:
         """Whether there is a result."""
         return self._outcome is not None
 
+    @property
+    def failure(self) -> CommandError | None:
+        """Why there is no reply; None where there is one, or it is not known yet."""
+        return self._outcome if isinstance(self._outcome, CommandError) else None
+
     def result(self) -> Reply:
         """The reply.
 
@@ -237,12 +242,14 @@ class Session:
         sensor: the sensor.
         started: whether a command that starts the sensor was sent, and none since that stops it.
         late: answers that came after they had been given up.
+        unanswered: why the last heartbeat was not answered, None where it was, by command.
         host: the address of this computer as the sensor sees it, None where nobody knows it.
     """
 
     def __init__(self, sensor: Sensor) -> None:
         self.sensor, self.started, self.late = sensor, False, 0
         self.host: str | None = None
+        self.unanswered: dict[str, CommandError | None] = {}
         self._count = 0
         self._lines: dict[str, _Line] = {}
         self._beats: dict[str, _Beat] = {}
@@ -304,6 +311,7 @@ class Session:
             if now >= beat.due:
                 beat.due = now + _ns(self.sensor.commands[name].every)
                 if beat.pending.done:
+                    self.unanswered = {**self.unanswered, name: beat.pending.failure}
                     self.request(name, now, **beat.arguments)
         for link, line in self._lines.items():
             current = line.current
@@ -330,10 +338,12 @@ class Session:
         """Whether a request waits to be sent or answered; heartbeats to come do not count."""
         return any(line.current is not None or line.queue for line in self._lines.values())
 
-    def abandon(self, reason: str) -> None:
-        """Give up every request and heartbeat, since the link was lost or nobody waits any more; what was sent stays owed."""
-        self._beats.clear()
-        for line in self._lines.values():
+    def abandon(self, reason: str, link: str | None = None) -> None:
+        """Give up every request and heartbeat, or those on one link, since it was lost or nobody waits; what was sent stays owed."""
+        for name in [name for name in self._beats if link in (None, self.sensor.commands[name].link)]:
+            del self._beats[name]
+            self.unanswered.pop(name, None)
+        for line in [line for name, line in self._lines.items() if link in (None, name)]:
             waiting = list(line.queue)
             line.queue.clear()
             if line.current is not None:

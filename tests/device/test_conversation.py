@@ -145,7 +145,7 @@ def test_what_is_learned_is_no_path() -> None:
 
 def test_a_sensor_that_comes_back_with_another_table_is_another_one() -> None:
     said = [b"0.5 1 1.5 2", b"1 2 3 4"]
-    answers = {"get_table": lambda request: [("table", {"angles": said.pop(0)})]}
+    answers = {"get_table": lambda request: [("table", {"angles": said.pop(0) if len(said) > 1 else said[0]})]}
     sensor = dataclasses.replace(
         SENSOR,
         links={"data": Serial(115_200), "control": Tcp(free_port())},
@@ -163,6 +163,28 @@ def test_a_sensor_that_comes_back_with_another_table_is_another_one() -> None:
             return any(told in warning for warning in device.warnings)
 
         until(is_told, 4 * SLACK)
+
+
+def silent(device: ls.Device) -> bool:
+    """Whether it is said that the heartbeat is not answered."""
+    return any("beat: no ack frame came" in said and "started again" in said for said in device.warnings)
+
+
+def test_a_sensor_that_no_longer_answers_its_heartbeat_is_started_again() -> None:
+    order = SENSOR.commands["hello"]
+    beat = dataclasses.replace(order, values={**order.values, "head.code": 9}, every=0.1, timeout=0.3)
+    commands = {**SENSOR.commands, "hello": dataclasses.replace(order, starts=True, timeout=1.0), "beat": beat}
+    sensor = linked(Udp(free_port()), commands=commands, on_open=("hello", "beat"))
+    with virtual_port(sensor, to=f"udp://127.0.0.1:{sensor.links['data'].ports[0]}") as port, ls.open(port.path, sensor) as device:
+        device.latest(SLACK)
+        until(lambda: device.newest(0.01) and port.device.heard.count("beat") > 2)
+        assert not silent(device)
+        port.unplug()
+        until(lambda: device.newest(0.01) or silent(device))
+        heard = len(port.device.heard)
+        port.plug()
+        until(lambda: device.newest(0.01) and "hello" in port.device.heard[heard:], 2 * SLACK)
+        until(lambda: device.newest(0.01) and not silent(device), 2 * SLACK)
 
 
 class Loop(Link):

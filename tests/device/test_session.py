@@ -375,7 +375,7 @@ def conversed(session: Session) -> list[tuple[int, list[int]]]:
 def test_a_running_number_goes_on_and_tells_the_reply() -> None:
     hello = dataclasses.replace(CONVERSATION.commands["hello"], retries=1)
     counting = {**hello.values, "head.number": Count(3, 6)}
-    sensor = dataclasses.replace(CONVERSATION, commands={"hello": dataclasses.replace(hello, values=counting)})
+    sensor = dataclasses.replace(CONVERSATION, commands={**CONVERSATION.commands, "hello": dataclasses.replace(hello, values=counting)})
     session = Session(sensor)
     session.host = "10.0.0.7"
 
