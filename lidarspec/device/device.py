@@ -10,6 +10,7 @@ import time
 import weakref
 from collections import deque
 from collections.abc import Iterator, Mapping
+from functools import partial
 from pathlib import Path
 from shlex import quote
 from typing import Any, overload
@@ -318,14 +319,11 @@ class Device(Closing):
                 if record is not None:
                     raise UsageError(f"{self._source} is a file already: there is nothing to record")
                 return FileInput(self._source, self.sensor, opened, backend=backend)
-            live, policy, own = opened, opened.overflow if overflow is None else overflow, self._own_recorders
-
-            def recorder(sensor: Sensor) -> Log | None:
-                kept, is_own = (None, False) if record is None else recorder_for(record, sensor, self._source, live)
-                own.extend([kept] if kept is not None and is_own else [])
-                return kept
-
-            return LiveInput(self._source, self.sensor, live, backend=backend, policy=policy, record=recorder, learns=learns, period=period)
+            policy = opened.overflow if overflow is None else overflow
+            recorder = partial(_recorder, record, self._source, opened, self._own_recorders)  # which holds no device: it may be forgotten
+            return LiveInput(
+                self._source, self.sensor, opened, backend=backend, policy=policy, record=recorder, learns=learns, period=period
+            )
         except BaseException:
             _close(opened, self._own_recorders)
             raise
@@ -378,6 +376,15 @@ def _nominal(sensor: Sensor) -> str:
     if files := [name for name in sensor.configure.files if name not in sensor.options]:
         return f"{text}; its own: -O {files[0]}=FILE, in Python sensor.configure({files[0]}=FILE)"
     return text + (f", where no {' or '.join(sensor.state)} frame had come" if sensor.state else "")
+
+
+def _recorder(record: RecordTo | None, source: str | Path, opened: LiveTransport, own: list[Log], sensor: Sensor) -> Log | None:
+    """What is to record a sensor as it is read, None for nothing; added to `own` where it is to be closed with the device."""
+    if record is None:
+        return None
+    kept, is_own = recorder_for(record, sensor, source, opened)
+    own += [kept] * is_own
+    return kept
 
 
 def _close(source: Input | Transport, recorders: list[Log]) -> None:
