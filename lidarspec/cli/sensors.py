@@ -14,7 +14,7 @@ from lidarspec.cli.output import emit, emit_json, table
 from lidarspec.cli.terminal import note, say
 from lidarspec.device.settings import devices
 from lidarspec.errors import NO_SENSORS, SpecError
-from lidarspec.explaining.wording import limits
+from lidarspec.explaining.wording import asked
 from lidarspec.exports.json import facts, link_data
 from lidarspec.framing.results import Counters, Found, packed
 from lidarspec.packets.stream import PacketStream
@@ -23,7 +23,7 @@ from lidarspec.points.numpy_plan import describe
 from lidarspec.points.plan import Plan, plan_for
 from lidarspec.simulation.frame_maker import FrameMaker
 from lidarspec.spec.description import Frame
-from lidarspec.spec.links import Link, Serial, Udp
+from lidarspec.spec.links import Http, Link, Serial, Tcp, Udp
 from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.ports import serial_ports
 from lidarspec.trust import FILE, TRUSTED, trust as trusted, user_folder
@@ -101,7 +101,7 @@ def show(sensor_id: str, as_plan: bool, as_json: bool, output: str | None) -> No
         f"{sensor.id}: {sensor.vendor} {sensor.model}" + (f", also {', '.join(sensor.aliases)}" if sensor.aliases else ""),
         f"  link    {_links(sensor)}\n  range   {low:g} .. {high:g} m\n  status  {sensor.status}\n  source  {sensor.source}",
     ]
-    parts += [f"  command {name}{_command_text(_command(sensor, name))}" for name in sensor.commands]
+    parts += [f"  command {name}{_command_text(sensor, name)}" for name in sensor.commands]
     for name, frame in sensor.frames.items():
         rows = [[row.offset, row.size, row.type, row.field, row.unit, row.meaning] for row in wire_table(frame)]
         kind = " (to the sensor)" if frame.direction == "out" else " (points)" if frame.data else ""
@@ -179,7 +179,7 @@ def _frame(frame: Frame) -> dict[str, Any]:
 
 def _command(sensor: Sensor, name: str) -> Mapping[str, Any]:
     command = sensor.commands[name]
-    args = {name: {"field": path, "low": low, "high": high} for name, (path, low, high) in command.args.items()}
+    args = {name: argument.to_dict() for name, argument in command.arguments.items()}
     frame = "" if command.frame is None or args else sensor.command(name).hex(" ")
     return {
         "frame": command.frame,
@@ -190,8 +190,9 @@ def _command(sensor: Sensor, name: str) -> Mapping[str, Any]:
     }
 
 
-def _command_text(command: Mapping[str, Any]) -> str:
-    args = "".join(f" {name}={limits(arg['low'], arg['high'])}" for name, arg in command["arguments"].items())
+def _command_text(sensor: Sensor, name: str) -> str:
+    command = _command(sensor, name)
+    args = "".join(f" {name}={asked(argument.kind)}" for name, argument in sensor.commands[name].arguments.items())
     answer = f", answered by {command['reply']}{' while it is stopped' if command['only_stopped'] else ''}" if command["reply"] else ""
     return f"{args}{': ' if command['hex'] else ''}{command['hex']}{answer}"
 
@@ -203,4 +204,5 @@ def _links(sensor: Sensor) -> str:
 def _link_text(link: Link) -> str:
     if isinstance(link, Serial):
         return f"serial {'/'.join(str(baud) for baud in link.bauds)} baud"
-    return f"udp {'/'.join(str(port) for port in link.ports)}" if isinstance(link, Udp) else f"tcp {link.port}"
+    ports = link.ports or (link.broadcast,) if isinstance(link, Udp) else (link.port,) if isinstance(link, Tcp | Http) else ()
+    return f"{type(link).__name__.lower()} {'/'.join(map(str, ports))}".strip()

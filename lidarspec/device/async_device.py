@@ -113,7 +113,7 @@ class AsyncDevice:
             if newest is not None:
                 return newest
 
-    async def send(self, name: str, *, timeout: float | None = None, **arguments: Any) -> Reply:
+    async def send(self, name: str, /, *, timeout: float | None = None, **arguments: Any) -> Reply:
         """The reply to a command; at once with ``confirmed=False`` where none is documented.
 
         Args:

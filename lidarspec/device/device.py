@@ -10,6 +10,7 @@ import time
 import weakref
 from collections import deque
 from collections.abc import Iterator, Mapping
+from functools import partial
 from pathlib import Path
 from shlex import quote
 from typing import Any, overload
@@ -123,15 +124,18 @@ class Device(Closing):
         self._latest, self._unseen = ScanStream(sensor, mount), deque[Scan]()
         self._ahead: Arrival | None = None
         self._first, self._another = list[Found](), None if sensor.relatives or "model" in sensor.info else ""
-        self._own_recorder: Log | None = None
-        self._input = self._opened(backend, record, overflow, period)
-        self._finalizer = weakref.finalize(self, _close, self._input, self._own_recorder)
+        self._own_recorders = list[Log]()
+        self._input = self._opened(backend, record, overflow, period, learns=start)
+        self._finalizer = weakref.finalize(self, _close, self._input, self._own_recorders)
         if start:
             try:
                 self._input.begin()
             except BaseException:
                 self.close()
                 raise
+        if self.learned:
+            self.sensor = self._input.sensor
+            self._latest = ScanStream(self.sensor, mount)
 
     @property
     def stats(self) -> Counters:
@@ -146,6 +150,11 @@ class Device(Closing):
         nominal = [_nominal(self.sensor)] if self.stats.nominal else []
         unended = [f"{self._source}: {self.stats.unended}"] if self.stats.unended else []
         return [*self._input.warnings, *self._doubts(), *unended, *nominal, *([] if failure is None else [str(failure)])]
+
+    @property
+    def learned(self) -> Mapping[str, Any]:
+        """The options that the sensor has said of itself on opening; `sensor` is configured with them."""
+        return self._input.learned
 
     @property
     def state(self) -> str:
@@ -265,7 +274,7 @@ class Device(Closing):
         error = SourceError(f"{self._source}: no scan in time; the source is {self.state}")
         return suggest(error, f"lidarspec doctor {quote(str(self._source))} -s {self.sensor.id}")
 
-    def send(self, name: str, *, timeout: float | None = None, **arguments: Any) -> Reply:
+    def send(self, name: str, /, *, timeout: float | None = None, **arguments: Any) -> Reply:
         """The reply to a command; at once with ``confirmed=False`` where none is documented.
 
         Args:
@@ -303,19 +312,20 @@ class Device(Closing):
     def __repr__(self) -> str:
         return f"Device({self.sensor.id} on {self._source}, {self.state}: {self.stats})"
 
-    def _opened(self, backend: str, record: RecordTo | None, overflow: str | None, period: float) -> Input:
+    def _opened(self, backend: str, record: RecordTo | None, overflow: str | None, period: float, *, learns: bool) -> Input:
         opened = transport(self._source, self.sensor)
         try:
             if not isinstance(opened, LiveTransport):
                 if record is not None:
                     raise UsageError(f"{self._source} is a file already: there is nothing to record")
                 return FileInput(self._source, self.sensor, opened, backend=backend)
-            kept, is_own = (None, False) if record is None else recorder_for(record, self.sensor, self._source, opened)
-            self._own_recorder = kept if is_own else None
             policy = opened.overflow if overflow is None else overflow
-            return LiveInput(self._source, self.sensor, opened, backend=backend, policy=policy, recorder=kept, period=period)
+            recorder = partial(_recorder, record, self._source, opened, self._own_recorders)  # which holds no device: it may be forgotten
+            return LiveInput(
+                self._source, self.sensor, opened, backend=backend, policy=policy, record=recorder, learns=learns, period=period
+            )
         except BaseException:
-            _close(opened, self._own_recorder)
+            _close(opened, self._own_recorders)
             raise
 
     def _reader(self, frame: str | None) -> PacketReader:
@@ -368,12 +378,21 @@ def _nominal(sensor: Sensor) -> str:
     return text + (f", where no {' or '.join(sensor.state)} frame had come" if sensor.state else "")
 
 
-def _close(source: Input | Transport, recorder: Log | None) -> None:
+def _recorder(record: RecordTo | None, source: str | Path, opened: LiveTransport, own: list[Log], sensor: Sensor) -> Log | None:
+    """What is to record a sensor as it is read, None for nothing; added to `own` where it is to be closed with the device."""
+    if record is None:
+        return None
+    kept, is_own = recorder_for(record, sensor, source, opened)
+    own += [kept] * is_own
+    return kept
+
+
+def _close(source: Input | Transport, recorders: list[Log]) -> None:
     """Give everything back; the recording is closed even where the source fails."""
     try:
         source.close()
     finally:
-        if recorder is not None:
+        for recorder in recorders:
             recorder.close()
 
 

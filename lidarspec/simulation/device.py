@@ -114,8 +114,8 @@ class Answering:
         """The command that a frame is: of several that fit, the one that says most about it."""
         values = dict(_flat(parse(self._sensor, data, frame=frame)))
         sent = [one for one in self._sensor.commands.items() if (one[1].frame, one[1].link) == (frame, link)]
-        fitting = [one for one in sent if all(values.get(path) == value for path, value in one[1].values.items())]
-        return Request(*max(fitting, key=lambda one: len(one[1].values)), values) if fitting else None
+        fitting = [one for one in sent if all(values.get(path) == value for path, value in one[1].fixed.items())]
+        return Request(*max(fitting, key=lambda one: len(one[1].fixed)), values) if fitting else None
 
 
 def _listening(sensor: Spec, link: str) -> Decoder:

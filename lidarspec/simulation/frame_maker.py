@@ -56,6 +56,8 @@ class FrameMaker:
     def _makes(self, sensor: str, root: Node, limit: int, given: Mapping[str, int], elsewhere: set[str]) -> None:
         self._sensor, self._root, self._limit, self._given, self._elsewhere = sensor, root, limit, given, elsewhere
         self.schema = schema(root)
+        formulas = {axis: [ref.path for ref in refs(count)] for axis, count in self.schema.arrays.items() if count is not None}
+        self._counts = {axis: asked[0] for axis, asked in formulas.items() if asked and asked[0] in self.schema.fields}
         self._layouts: dict[tuple[int, ...], Layout] = {}
         self._asked: list[str] = []
         self._makers: dict[tuple[Any, ...], FrameMaker] = {}
@@ -67,7 +69,8 @@ class FrameMaker:
             SpecError: where a value is given to a field that the frame does not have.
         """
         members: dict[int, tuple[Layout, list[int]]] = {}
-        filled = [self._with_parts(values) for values in frames] if self.schema.parts else [(values, {}) for values in frames]
+        given = [self._with_counts(values) for values in frames] if self._counts else frames
+        filled = [self._with_parts(values) for values in given] if self.schema.parts else [(values, {}) for values in given]
         for index, (values, _) in enumerate(filled):
             layout = self._layout(values)
             members.setdefault(id(layout), (layout, []))[1].append(index)
@@ -95,6 +98,14 @@ class FrameMaker:
                     raise SpecError(f"{self._recoder.form} cannot write these values", path="simulation", sensor=self._sensor)
                 frames[place] = data
         return frames
+
+    def _with_counts(self, values: Values) -> Values:
+        """The values of a frame with the counts that follow from arrays and bytes, where these are left out."""
+        missing = [axis for axis, asked in self._counts.items() if axis in values and asked not in values]
+        given = dict(values) if missing else values
+        for axis in missing:
+            self._fill_in(self.schema.arrays[axis], given, len(values[axis]), axis)  # type: ignore[arg-type]  # a dict by now
+        return given
 
     def _with_parts(self, values: Values) -> tuple[Values, dict[str, bytes]]:
         """The values of a frame with what follows from its parts, and the bytes of these, by their axis."""

@@ -7,6 +7,7 @@ other package is a function. Nothing in this package reads bytes of a stream. Mo
 
 * `description`: `Spec`, `Frame`, `Command`, `Simulation`: what must fit together.
 * `sensor`: a `Spec` with everything that can be done with it as methods; it stands above the stations that do it.
+* `arguments`: what a command is told, and what is found out when it is sent.
 * `fields`: units and seals, as parts of a struct.
 * `checksums`: algorithms as values; of one message.
 * `wire_forms`: what has to be recoded before its fields have places: tokens, lines, escapes.
@@ -25,6 +26,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from lidarspec.columns.columns import Column as Column, Fields as Fields
     from lidarspec.plugins import hookimpl as hookimpl
+    from lidarspec.spec.arguments import Address as Address, Count as Count, Text as Text
     from lidarspec.spec.checksums import (
         Checksum as Checksum,
         Crc as Crc,
@@ -35,10 +37,17 @@ if TYPE_CHECKING:
         ZeroPadded as ZeroPadded,
     )
     from lidarspec.spec.description import Command as Command, Frame as Frame, Relative as Relative, Simulation as Simulation
-    from lidarspec.spec.fields import Checksummed as Checksummed, Parts as Parts, Scaled as Scaled, SizeOf as SizeOf
-    from lidarspec.spec.links import Assembled as Assembled, Serial as Serial, Tcp as Tcp, Udp as Udp
+    from lidarspec.spec.fields import (
+        Checksummed as Checksummed,
+        HttpReply as HttpReply,
+        HttpRequest as HttpRequest,
+        Parts as Parts,
+        Scaled as Scaled,
+        SizeOf as SizeOf,
+    )
+    from lidarspec.spec.links import Assembled as Assembled, Http as Http, Link as Link, Serial as Serial, Tcp as Tcp, Udp as Udp
     from lidarspec.spec.results import Cartesian as Cartesian, Points as Points, Polar as Polar
-    from lidarspec.spec.sensor import Sensor as Sensor
+    from lidarspec.spec.sensor import Learned as Learned, Sensor as Sensor
     from lidarspec.spec.timing import (
         Clock as Clock,
         Every as Every,
@@ -80,11 +89,12 @@ if TYPE_CHECKING:
     )
 
 _NAMES = {
-    "spec.sensor": ("Sensor",),
+    "spec.sensor": ("Sensor", "Learned"),
     "spec.description": ("Frame", "Command", "Relative", "Simulation"),
-    "spec.fields": ("Scaled", "Checksummed", "Parts", "SizeOf"),
+    "spec.arguments": ("Text", "Address", "Count"),
+    "spec.fields": ("Scaled", "Checksummed", "Parts", "SizeOf", "HttpRequest", "HttpReply"),
     "spec.checksums": ("Checksum", "Crc", "Xor", "Sum", "WordXor", "Fold15", "ZeroPadded"),
-    "spec.links": ("Assembled", "Serial", "Udp", "Tcp"),
+    "spec.links": ("Assembled", "Serial", "Udp", "Tcp", "Http", "Link"),
     "spec.timing": ("Clock", "Sequence", "OnWrap", "OnFlag", "OnChange", "OnRewind", "Every"),
     "columns.columns": ("Fields", "Column"),
     "spec.results": ("Points", "Polar", "Cartesian"),

@@ -17,6 +17,7 @@ from typing import Any, Literal, TypeVar
 from construct import Construct
 
 from lidarspec.errors import SpecError, UnknownFrame
+from lidarspec.spec.arguments import Address, Argument, Count, Filled, Text, argument
 from lidarspec.spec.construct_layer import check_struct, fixed_size, frame_tree, prepare
 from lidarspec.spec.links import Link, is_datagram
 from lidarspec.spec.results import Points
@@ -144,8 +145,9 @@ class Command:
 
     Args:
         frame: the outgoing frame that asks it; None for a command that only moves lines.
-        values: values of its fields, by path.
-        args: argument name -> (field path, lowest, highest), in the field's unit.
+        values: values of its fields, by path; `Count(16)` is a running number, `Address()` this computer's own address.
+        args: argument name -> (field path, lowest, highest), in the field's unit; (path, Text(16)), (path, Address()) or (path, bytes). A
+            path may lead to an element of an array, "ports[1]".
         reply: the frame that answers, or a tuple of those that may; None where no answer is documented.
         matches: values that fields of the reply must have for it to be the answer to this command; of several frames, each is
             asked for the fields that it has.
@@ -157,12 +159,14 @@ class Command:
         lines: levels of control lines, {"dtr": False}, set with it.
         starts, stops: whether the sensor sends data after it, or no longer does.
         only_stopped: whether it is answered only while the sensor sends no data, and passed over otherwise.
+        learns: a function of the reply, as `Sensor.parse` gives it, that returns options for `configure`, by name: numbers, or bytes and
+            texts, which become `Learned`. They are applied where the command is among `on_open`.
         every: seconds after which it is sent once more, again and again from its first time on (a heartbeat); 0: never.
     """
 
     frame: str | None = None
     values: Mapping[str, Any] = field(default_factory=dict)
-    args: Mapping[str, tuple[str, float, float]] = field(default_factory=dict)
+    args: Mapping[str, tuple[str, float, float] | tuple[str, Text | Address | type[bytes]]] = field(default_factory=dict)
     reply: str | tuple[str, ...] | None = None
     matches: Mapping[str, Any] = field(default_factory=dict)
     echoes: tuple[str, ...] = ()
@@ -174,11 +178,25 @@ class Command:
     starts: bool = False
     stops: bool = False
     only_stopped: bool = False
+    learns: Callable[[Any], Mapping[str, Any]] | None = None
     every: float = 0.0
+    arguments: Mapping[str, Argument] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         _freeze(self, "values", "args", "matches", "lines")
         object.__setattr__(self, "echoes", tuple(self.echoes))
+        object.__setattr__(self, "arguments", MappingProxyType({name: argument(given) for name, given in self.args.items()}))
+
+    @property
+    def filled(self) -> Mapping[str, Filled]:
+        """The values that are found out when it is sent, by path."""
+        return {path: value for path, value in self.values.items() if isinstance(value, Count | Address)}
+
+    @property
+    def fixed(self) -> Mapping[str, Any]:
+        """The values that every frame of it has, by path: none that is found out, or that an argument goes into."""
+        taken = {*self.filled, *(one.path.partition("[")[0] for one in self.arguments.values())}
+        return {path: value for path, value in self.values.items() if path not in taken}
 
     @property
     def replies(self) -> tuple[str, ...]:
@@ -329,6 +347,8 @@ def _check_spec(sensor: Spec) -> None:
         _known(sensor, f"commands.{name}.link", [command.link], sensor.links)
         if command.only_stopped and not any(other.starts or other.stops for other in sensor.commands.values()):
             raise SpecError("it is answered only while the sensor is stopped, and no command starts or stops it", path=f"commands.{name}")
+        if command.learns is not None and not (command.replies and sensor.configure is not None):
+            raise SpecError("what it learns comes with a reply, and goes to `configure`: both are needed", path=f"commands.{name}.learns")
         if "timeout" in command.args:
             raise SpecError("'timeout' is how long its reply is waited for, and cannot be an argument", path=f"commands.{name}.args")
     if sensor.commands:

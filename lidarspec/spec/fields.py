@@ -15,13 +15,39 @@ from dataclasses import replace
 from fractions import Fraction
 from typing import Any
 
-from construct import ConstError, Construct, ConstructError, Container, RangeError, SizeofError, evaluate
+from construct import (
+    Bytes,
+    Const,
+    ConstError,
+    Construct,
+    ConstructError,
+    Container,
+    Enum,
+    Int8ub,
+    Int16ub,
+    Int32ub,
+    RangeError,
+    SizeofError,
+    Struct,
+    evaluate,
+    this,
+)
 
 from lidarspec.errors import SpecError, UsageError
 from lidarspec.spec import construct_layer as layer
 from lidarspec.spec.checksums import Checksum
 from lidarspec.spec.tree import FieldInfo
 
+#: A request over a link `Http`, and the reply to it, as messages: what HTTP says besides is the link's business.
+HttpRequest = Struct(
+    "mark" / Const(b"HTTP"),
+    "method" / Enum(Int8ub, GET=1, PUT=2, POST=3, DELETE=4),
+    "path_size" / Int16ub,
+    "path" / Bytes(this.path_size),
+    "size" / Int32ub,
+    "body" / Bytes(this.size),
+)
+HttpReply = Struct("mark" / Const(b"HTTP"), "status" / Int16ub, "size" / Int32ub, "body" / Bytes(this.size))
 #: unit -> how many of the SI unit it is; only units that someone may type on the command line.
 _FACTORS: dict[str, dict[str, Fraction]] = {
     "m": {"m": Fraction(1), "cm": Fraction(1, 100), "mm": Fraction(1, 1000)},

@@ -9,8 +9,21 @@ from lidarspec.errors import SpecError
 from lidarspec.spec.construct_layer import has_member
 
 
+class Link:
+    """How bytes come and go: a kind of one's own derives from it, and the hook `lidarspec_link` opens it.
+
+    Attributes:
+        datagrams: whether frames come one to a datagram.
+    """
+
+    @property
+    def datagrams(self) -> bool:
+        """Whether frames come one to a datagram."""
+        return False
+
+
 @dataclass(frozen=True, init=False)
-class Serial:
+class Serial(Link):
     """A UART or USB serial port, 8N1.
 
     Args:
@@ -76,38 +89,64 @@ class Assembled:
 
 
 @dataclass(frozen=True, init=False)
-class Udp:
+class Udp(Link):
     """UDP datagrams, one frame each, or with `stream` a byte stream cut into datagrams (telegrams that span several).
 
     Args:
-        ports: the default destination ports; hints only, since magic and length decide.
+        ports: the default destination ports; of data hints only, since magic and length decide; of commands the sensor's.
         assembled: what says how datagrams are joined to a message, where one does not fit into one; others pass as they are.
+        broadcast: the port to which commands are broadcast while nobody knows the address of the sensor: whoever answers is it.
+        local: the port here that commands are sent from, where the sensor asks for one; any by default.
     """
 
     ports: tuple[int, ...]
     stream: bool = False
     assembled: Assembled | None = None
+    broadcast: int = 0
+    local: int = 0
 
-    def __init__(self, *ports: int, stream: bool = False, assembled: Assembled | None = None) -> None:
-        if any(not 0 < port < 65536 for port in ports):
+    def __init__(self, *ports: int, stream: bool = False, assembled: Assembled | None = None, broadcast: int = 0, local: int = 0) -> None:
+        if any(not 0 < port < 65536 for port in ports) or not (0 <= broadcast < 65536 and 0 <= local < 65536):
             raise SpecError("a UDP port is a number from 1 to 65535")
-        object.__setattr__(self, "ports", tuple(ports))
         if stream and assembled is not None:
             raise SpecError("datagrams are fragments of messages, or pieces of a stream, not both")
-        object.__setattr__(self, "stream", stream)
-        object.__setattr__(self, "assembled", assembled)
+        given = {"ports": tuple(ports), "stream": stream, "assembled": assembled, "broadcast": broadcast, "local": local}
+        for name, value in given.items():
+            object.__setattr__(self, name, value)
+
+    @property
+    def datagrams(self) -> bool:
+        """Whether each datagram is a frame."""
+        return not self.stream
 
 
 @dataclass(frozen=True)
-class Tcp:
+class Tcp(Link):
     """A TCP byte stream from `port` of the sensor."""
 
     port: int
 
 
-Link = Serial | Udp | Tcp
+@dataclass(frozen=True)
+class Http(Link):
+    """Requests to the web server of the sensor: the frames of its commands are `HttpRequest`, those of its replies `HttpReply`.
+
+    Args:
+        port: of the server.
+        timeout: seconds that a request may take in all.
+        largest: the longest body of a reply, in bytes; a longer one is refused.
+    """
+
+    port: int = 80
+    timeout: float = 5.0
+    largest: int = 1 << 20
+
+    @property
+    def datagrams(self) -> bool:
+        """Whether each message is a frame: it is."""
+        return True
 
 
 def is_datagram(link: Link | None) -> bool:
     """Whether frames arrive one to a datagram over this link."""
-    return isinstance(link, Udp) and not link.stream
+    return link is not None and link.datagrams

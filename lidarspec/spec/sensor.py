@@ -6,9 +6,11 @@ scans. They are imported when a method is called first: a sensor is found and lo
 
 from __future__ import annotations
 
+import base64
 import inspect
 import re
 import warnings
+import zlib
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from numbers import Integral, Real
@@ -28,11 +30,58 @@ if TYPE_CHECKING:
     from lidarspec.packets.packets import Packets
     from lidarspec.scans.scans import Scan
 
+#: bytes of something learned at most, where a file says it.
+LARGEST = 1 << 20
 #: options that every sensor has.
 OPTIONS = ("frame", "answer")
 FRAMES_OF_REFERENCE = ("rep103", "vendor")
 #: what a file may give as an option without naming a path.
 _WORD = re.compile(r"[A-Za-z0-9_+-]{1,40}")
+
+
+class Learned(bytes):
+    """What a sensor said of itself, as the value of an option: the content of what else is a file, never a path.
+
+    An option takes it where its parameter is annotated with it, ``calibration: str | Path | Learned``.
+    """
+
+    def __repr__(self) -> str:
+        return f"Learned({len(self)} bytes)"
+
+    def to_dict(self) -> dict[str, str]:
+        """As data, such as in the header of a recording."""
+        return {"learned": base64.b64encode(zlib.compress(self)).decode()}
+
+    @classmethod
+    def of_dict(cls, data: Mapping[str, Any]) -> Learned:
+        """What `to_dict` gave.
+
+        Raises:
+            UsageError: for what it never gives, or more than a megabyte.
+        """
+        reader = zlib.decompressobj()
+        try:
+            content = reader.decompress(base64.b64decode(data["learned"], validate=True), LARGEST)
+        except (KeyError, TypeError, ValueError, zlib.error):
+            content = b""
+        if not reader.eof or set(data) != {"learned"}:
+            raise UsageError(f"{shown(data)} is nothing that a sensor said")
+        return cls(content)
+
+    @classmethod
+    def content(cls, value: str | PathLike[str] | Learned) -> bytes:
+        """The bytes that an option stands for: learned ones themselves, those of a file for its path.
+
+        Raises:
+            UsageError: for a file that cannot be read.
+        """
+        if isinstance(value, cls):
+            return bytes(value)
+        try:
+            with open(value, "rb") as file:
+                return file.read()
+        except (OSError, ValueError) as error:
+            raise UsageError(f"{value!s}: {getattr(error, 'strerror', None) or error}") from None
 
 
 class Sensor(Spec):
@@ -116,7 +165,7 @@ class Sensor(Spec):
 
         return example(self, frame, seed=seed)
 
-    def command(self, name: str, **arguments: Any) -> bytes:
+    def command(self, name: str, /, **arguments: Any) -> bytes:
         """The bytes of a command; arguments by name, in units.
 
         Raises:
@@ -237,17 +286,20 @@ class Configure:
 
     def takes(self, name: str, value: object) -> bool:
         """Whether a value is of a type that the option is declared with, by the annotation of its parameter; of others nobody knows."""
-        return any(_TYPES.get(kind, _anything)(value) for kind in self._kinds.get(name, {""}))
+        kinds = self._kinds.get(name, {""})
+        return "Learned" in kinds if isinstance(value, Learned) else any(_TYPES.get(kind, _anything)(value) for kind in kinds)
 
     def options_of_file(self, options: Mapping[str, Any], folder: Path) -> dict[str, Any]:
-        """The options that stand in a file in `folder` that anybody may have written: numbers, words, and files beside it.
+        """The options that stand in a file in `folder` that anybody may have written: numbers, words, what was learned, files beside it.
 
         Raises:
             UsageError: for a path that leads anywhere else, and for other values.
         """
         given = dict(options)
         for name, value in options.items():
-            if name in self.files and value is not None:
+            if isinstance(value, Mapping):
+                given[name] = Learned.of_dict(value)
+            elif name in self.files and value is not None:
                 try:
                     given[name] = beside(folder, value)
                 except UsageError as error:
@@ -290,6 +342,7 @@ def _anything(value: object) -> bool:
 #: a type that an option is declared with -> whether a value is of it; what it is called, in the order of the alphabet.
 _TYPES: dict[str, Callable[[object], bool]] = {
     "Path": lambda value: isinstance(value, str | PathLike),
+    "Learned": lambda value: False,
     "bool": lambda value: isinstance(value, bool),
     "float": lambda value: isinstance(value, Real) and not isinstance(value, bool),
     "int": lambda value: isinstance(value, Integral) and not isinstance(value, bool),
