@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from shlex import quote
 
@@ -34,6 +34,7 @@ class Written:
     target: str
     scans: int = 0
     points: int = 0
+    units: Mapping[str, str] = field(default_factory=dict)
 
     def __str__(self) -> str:
         return f"{self.target}: {self.points} points of {self.scans} scan{'s' * (self.scans != 1)}"
@@ -42,6 +43,7 @@ class Written:
         """The scans, counted on their way."""
         for scan in scans:
             self.scans += 1
+            self.units = self.units or scan.points.units
             self.points += len(scan) if every_point else int(scan.points.valid.sum())
             progress(lambda: f"{self}, {size(self.device.stats.bytes_in)} read")
             yield scan
@@ -60,8 +62,8 @@ def convert(
 ) -> None:
     """Write the points of a capture or raw file to a file, in the format of its suffix.
 
-    .csv and .npz hold x y z range azimuth elevation intensity time ring return_index, those that the sensor has, and the
-    number of the scan; metres, radians, and seconds since the scan's stamp.
+    .csv and .npz hold x y z range azimuth elevation intensity time ring return_index, those that the sensor has, its further
+    columns, and the number of the scan; metres, radians, and seconds since the scan's stamp.
     """
     format_of(target)
     refuse_overwriting(target, source, sensor_id, force=force)
@@ -90,9 +92,21 @@ def _detected(source: str, target: str) -> Sensor:
 
 def _sum_up(device: Device, target: str, written: Written, *, as_json: bool) -> None:
     note(f"{written} of {device.sensor.id}; {device.stats}")
+    if written.units:
+        note(f"further columns: {', '.join(f'{name} [{unit}]' if unit else name for name, unit in written.units.items())}")
     if as_json:
         stats = device.stats.to_dict()
-        emit_json({"sensor": device.sensor.id, "output": target, "scans": written.scans, "points": written.points, "stats": stats}, None)
+        emit_json(
+            {
+                "sensor": device.sensor.id,
+                "output": target,
+                "scans": written.scans,
+                "points": written.points,
+                "units": dict(written.units),
+                "stats": stats,
+            },
+            None,
+        )
     conclude(device)
 
 

@@ -84,7 +84,7 @@ class Column(NDArrayOperatorsMixin):
         array: shape (n or 1, ...), one axis per array level of the struct, length 1 where the value is further out.
         axes: names of the axes after the first; None where the length is 1; with a "?" where plain arrays alone are as long by now.
         ready: packets from the start whose values depend on nothing that is still to come.
-        source: the field's path, while the column is an unchanged field.
+        source: the field's path, while the column is an unchanged field of the packets themselves.
     """
 
     def __init__(
@@ -365,7 +365,7 @@ def field_column(info: FieldInfo, table: Table, depth: int, batch: Batch, which:
     if which is not None:
         array = array[which]
     axes = [_axis(name, length, table, known=which is None) for name, length in zip(info.axes, array.shape[1:], strict=False)]
-    return Column(array, (*axes, *(None,) * (array.ndim - 1 - len(axes))), batch, source=info.path)
+    return Column(array, (*axes, *(None,) * (array.ndim - 1 - len(axes))), batch, source=info.path if which is None else "")
 
 
 def field_array(info: FieldInfo, table: Table, depth: int) -> NDArray[np.float64]:

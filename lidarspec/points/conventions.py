@@ -6,13 +6,15 @@ The formulas take arrays (the plain evaluation) and traced columns (plans) alike
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lidarspec.columns.columns import Column
 from lidarspec.columns.graph import Traced
 from lidarspec.spec.description import DIRECTIONS, Spec
+from lidarspec.spec.results import Extra
 
 Floats = NDArray[np.float32]
 
@@ -99,9 +101,28 @@ def rows_of(shape: Sequence[int]) -> int:
     return shape[-1] if len(shape) >= 2 and shape[-1] > 1 else 0
 
 
-def numbers_of(name: str, values: NDArray[Any]) -> NDArray[Any]:
-    """A column of numbers that sensors may leave out: intensity, ring or return, in its type and of the same shape; nan is 0."""
-    return np.asarray(np.nan_to_num(values), TYPES[name])
+class Kind(NamedTuple):
+    """What a further column of points holds: its type, and its unit, "" for a plain number."""
+
+    dtype: np.dtype[Any]
+    unit: str
+
+    @classmethod
+    def of(cls, extra: Extra, values: Column) -> Kind:
+        """What is declared, and else follows from the field that the values are."""
+        info = values.batch.table.schema.fields.get(values.source)
+        as_sent = info.dtype if info is not None and info.kind == "int" and not info.scaled else None
+        dtype = np.dtype(bool if values.array.dtype.kind == "b" else as_sent or np.float32) if extra.dtype is None else extra.dtype
+        return cls(dtype, (info.unit if info is not None else "") if extra.unit is None else extra.unit)
+
+    def column(self, values: NDArray[Any]) -> NDArray[Any]:
+        """Values in the type, of the same shape."""
+        return values.astype(self.dtype, copy=False) if self.dtype.kind == "f" else numbers_of(values, self.dtype)
+
+
+def numbers_of(values: NDArray[Any], dtype: Any) -> NDArray[Any]:
+    """A column of numbers in its type, of the same shape; nan is 0."""
+    return np.asarray(np.nan_to_num(values), dtype)
 
 
 def axis_matrix(axes: Sequence[str]) -> NDArray[np.float64]:

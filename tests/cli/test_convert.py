@@ -18,6 +18,7 @@ import lidarspec as ls
 from lidarspec.simulation.simulator import simulate
 from tests.cli.running import COIN_D4, EXAMPLE, LD06, printed, process, ran
 from tests.sensors.evidence import capture
+from tests.shapes import SHAPES
 
 COLUMNS = ["x", "y", "z", "range", "azimuth", "elevation", "intensity", "time", "scan"]
 
@@ -223,3 +224,17 @@ def test_a_terminal_shows_how_far_it_is(tmp_path: Path) -> None:
     assert re.search(r"\rout\.npz: \d+ points of 1 scan, [\d.]+ kB read", terminal.raw)
     assert " read" not in shown
     assert "out.npz: 10800 points of" in shown
+
+
+def test_further_columns_are_written_and_printed_with_their_units(tmp_path: Path) -> None:
+    plugin, bytes_, target = tmp_path / "extras.py", tmp_path / "in.bin", tmp_path / "out.csv"
+    hook = ["from lidarspec.spec import hookimpl", "from tests.shapes.extras import SENSOR", "@hookimpl", "def lidarspec_sensors():"]
+    plugin.write_text("\n".join([*hook, "    return [SENSOR]", ""]), encoding="ascii")
+    bytes_.write_bytes(b"".join(simulate(SHAPES["shape-extras"], 60)))
+    told = ran("convert", bytes_, target, "-s", plugin).stderr
+    assert "further columns: velocity [m/s], near_ir, signal [photons]" in told
+    assert set(read(target)["signal"]) == {2**24 + 1 + number for number in range(4)}
+    assert printed("convert", bytes_, target, "-s", plugin, "--force")["units"]["velocity"] == "m/s"
+    assert "velocity [m/s]" in ran("read", bytes_, "-s", plugin, "-n", 1).stdout
+    assert "colours: velocity 0 to 0.001 m/s" in ran("view", bytes_, "-s", plugin, "--once", "--colour", "velocity").stdout
+    assert "did you mean 'velocity'" in ran("view", bytes_, "-s", plugin, "--once", "--colour", "velocty", code=2).stderr
