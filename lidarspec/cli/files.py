@@ -17,7 +17,8 @@ from lidarspec.cli.terminal import note
 from lidarspec.device.device import Device, open as open_device
 from lidarspec.discovery.detect import detected
 from lidarspec.errors import UsageError, WireError, suggest, suggestion
-from lidarspec.formats import format_of, write
+from lidarspec.formats import format_of, write, write_imu
+from lidarspec.packets.imu import joined
 from lidarspec.plugins import sensor as named_sensor
 from lidarspec.scans.scans import Scan
 from lidarspec.spec.sensor import Sensor
@@ -55,10 +56,11 @@ class Written:
 @sensor_option
 @count_option("scans")
 @click.option("--all", "every_point", is_flag=True, help="Keep points without a valid return.")
+@click.option("--imu", "is_imu", is_flag=True, help="What the sensor's IMU felt, in place of the points.")
 @click.option("--force", is_flag=True, help="Overwrite OUT.")
 @click.option("--json", "as_json", is_flag=True, help="Print a summary as JSON.")
 def convert(
-    source: str, target: str, sensor_id: str | Sensor | None, count: int | None, every_point: bool, force: bool, as_json: bool
+    source: str, target: str, sensor_id: str | Sensor | None, count: int | None, every_point: bool, is_imu: bool, force: bool, as_json: bool
 ) -> None:
     """Write the points of a capture or raw file to a file, in the format of its suffix.
 
@@ -70,6 +72,16 @@ def convert(
     sensor = _detected(source, target) if sensor_id is None else named_sensor(sensor_id)
     with open_device(source, sensor) as device, Progress() as progress:
         written = Written(device, target)
+        if is_imu:
+            samples = joined(list(device.imu()))[:count]
+            if not len(samples):
+                raise _no_data(device, source, target)
+            write_imu(target, samples)
+            note(f"{target}: {len(samples)} samples of the IMU of {device.sensor.id}; {device.stats}")
+            if as_json:
+                emit_json({"sensor": device.sensor.id, "output": target, "samples": len(samples), "stats": device.stats.to_dict()}, None)
+            conclude(device)
+            return
         scans = itertools.islice(scans_of(device, source), count)
         first = next(scans, None)
         if first is None:

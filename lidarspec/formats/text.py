@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +36,14 @@ def write(path: Path, scans: Iterable[Scan], *, every_point: bool) -> None:
             template = ",".join([*written, f"{number}\n"])
             for start in range(0, len(cloud), ROWS):
                 file.write("".join(map(template.__mod__, zip(*(c[start : start + ROWS].tolist() for c in columns), strict=True))))
+
+
+def write_columns(path: Path, columns: Mapping[str, NDArray[Any]]) -> None:
+    """Write columns of one length, whole numbers and float64, with their names above."""
+    template = ",".join("%d" if column.dtype.kind == "i" else "%.15g" for column in columns.values()) + "\n"
+    with path.open("w", encoding="ascii", newline="") as file:
+        file.write(",".join(columns) + "\n")
+        file.writelines(template % row for row in zip(*(column.tolist() for column in columns.values()), strict=True))
 
 
 def _column(values: NDArray[Any] | None, length: int) -> NDArray[Any]:

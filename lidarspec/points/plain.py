@@ -127,13 +127,13 @@ def _flattened(packets: PacketBatch, result: Points, batch: Batch, stamp_ns: int
     arrays, axes, ready, shape = of_points(columns, batch)
     ready = len(packets) if final else ready
     mask = unpadded(axes, shape, batch)
-    flat = {name: _flat(array, shape, mask, ready) for name, array in zip(columns, arrays, strict=True)}
+    every = {name: flat(array, shape, mask, ready) for name, array in zip(columns, arrays, strict=True)}
     offsets = conventions.seconds_since(packets.time_ns, stamp_ns).reshape(-1, *(1,) * len(axes))
-    flat["time"] = flat["time"] + _flat(offsets, shape, mask, ready)
+    every["time"] = every["time"] + flat(offsets, shape, mask, ready)
     inside = np.ones(shape, np.bool_) if mask is None else mask.reshape(shape)
     rows = conventions.rows_of(shape[1:]) if mask is None else 0
     cloud = make_cloud(
-        flat,
+        every,
         conventions.vendor_turn(packets.sensor),
         kinds_of(result, columns),
         stamp_ns=stamp_ns,
@@ -143,7 +143,8 @@ def _flattened(packets: PacketBatch, result: Points, batch: Batch, stamp_ns: int
     return Evaluated(cloud, ready, batch.carried(ready), inside[:ready].astype(np.intp), Fields(batch), axes)
 
 
-def _flat(array: NDArray[Any], shape: tuple[int, ...], mask: NDArray[np.bool_] | None, ready: int) -> NDArray[Any]:
+def flat(array: NDArray[Any], shape: tuple[int, ...], mask: NDArray[np.bool_] | None, ready: int) -> NDArray[Any]:
+    """What an array that broadcasts to a shape, (n, ...), has for the first `ready` packets, without padding: (N,)."""
     full = np.broadcast_to(array, shape)[:ready]
     return full.reshape(-1) if mask is None else full.reshape(mask[:ready].shape)[mask[:ready]]
 

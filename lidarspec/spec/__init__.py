@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from lidarspec.spec.description import Command as Command, Frame as Frame, Relative as Relative, Simulation as Simulation
     from lidarspec.spec.fields import Checksummed as Checksummed, Parts as Parts, Scaled as Scaled
     from lidarspec.spec.links import Serial as Serial, Tcp as Tcp, Udp as Udp
-    from lidarspec.spec.results import Cartesian as Cartesian, Extra as Extra, Points as Points, Polar as Polar
+    from lidarspec.spec.results import Cartesian as Cartesian, Extra as Extra, Imu as Imu, Points as Points, Polar as Polar
     from lidarspec.spec.sensor import Sensor as Sensor
     from lidarspec.spec.timing import (
         Clock as Clock,
@@ -73,7 +73,7 @@ _NAMES = {
     "spec.links": ("Serial", "Udp", "Tcp"),
     "spec.timing": ("Clock", "Sequence", "OnWrap", "OnFlag", "OnChange", "OnRewind", "Every"),
     "columns.columns": ("Fields", "Column"),
-    "spec.results": ("Points", "Polar", "Cartesian", "Extra"),
+    "spec.results": ("Points", "Polar", "Cartesian", "Extra", "Imu"),
     "spec.vocabulary": ("spread", "wrap", "following", "previous", "last", "stack", "steps", "take"),
     "plugins": ("hookimpl",),
     "transports.protocol": ("Format", "Transport", "LiveTransport", "Chunk", "Disconnected"),

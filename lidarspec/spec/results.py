@@ -132,3 +132,27 @@ class Cartesian:
 
 
 Points = Polar | Cartesian
+
+
+@dataclass(frozen=True, eq=False)
+class Imu:
+    """What an inertial measurement unit in the sensor feels, in SI and in the axes of the points (REP-145): x forward, y left, z up.
+
+    Args:
+        angular_velocity: about x, y and z, rad/s, right-handed: positive about z turns to the left.
+        linear_acceleration: along x, y and z, m/s2, gravity in it: a level sensor at rest has +9.80665 along z.
+        time: seconds after the packet's clock.
+
+    Raises:
+        SpecError: where it is not three of each.
+    """
+
+    angular_velocity: tuple[Array, Array, Array]
+    linear_acceleration: tuple[Array, Array, Array]
+    time: Array = 0
+
+    def __post_init__(self) -> None:
+        for name in ("angular_velocity", "linear_acceleration"):
+            value = getattr(self, name)
+            if not isinstance(value, tuple | list) or len(value) != 3:
+                raise SpecError("(x, y, z), three columns", path=f"Imu.{name}")

@@ -238,3 +238,23 @@ def test_further_columns_are_written_and_printed_with_their_units(tmp_path: Path
     assert "velocity [m/s]" in ran("read", bytes_, "-s", plugin, "-n", 1).stdout
     assert "colours: velocity 0 to 0.001 m/s" in ran("view", bytes_, "-s", plugin, "--once", "--colour", "velocity").stdout
     assert "did you mean 'velocity'" in ran("view", bytes_, "-s", plugin, "--once", "--colour", "velocty", code=2).stderr
+
+
+def test_what_an_imu_felt_is_written_in_place_of_the_points(tmp_path: Path) -> None:
+    plugin, bytes_ = tmp_path / "inertia.py", tmp_path / "in.bin"
+    hook = ["from lidarspec.spec import hookimpl", "from tests.shapes.inertia import SENSOR", "@hookimpl", "def lidarspec_sensors():"]
+    plugin.write_text("\n".join([*hook, "    return [SENSOR]", ""]), encoding="ascii")
+    sensor = SHAPES["shape-inertia"]
+    bytes_.write_bytes(b"".join(simulate(sensor, 40)))
+    told = ran("convert", bytes_, tmp_path / "imu.csv", "-s", plugin, "--imu").stderr
+    assert "120 samples of the IMU of shape-inertia" in told
+    rows = read(tmp_path / "imu.csv")
+    assert next(iter(rows)) == "time_ns"
+    np.testing.assert_allclose(rows["linear_acceleration_z"], 9.80665)
+    assert printed("convert", bytes_, tmp_path / "imu.npz", "-s", plugin, "--imu", "-n", 10)["samples"] == 10
+    with np.load(tmp_path / "imu.npz") as arrays:
+        assert arrays["time_ns"].tolist() == rows["time_ns"][:10].tolist()
+    assert (
+        "no frame says what an IMU felt"
+        in ran("convert", capture(COIN_D4), tmp_path / "b.csv", "-s", "cspc-coin-d4", "--imu", code=2).stderr
+    )
