@@ -14,11 +14,13 @@ from pathlib import Path
 from shlex import quote
 from typing import Any, overload
 
+import numpy as np
+
 from lidarspec.device.arrivals import Arrival, FileInput, Input
 from lidarspec.device.live_input import PERIOD, LiveInput
 from lidarspec.device.session import Reply
 from lidarspec.device.settings import named
-from lidarspec.discovery.detect import contradiction, detected
+from lidarspec.discovery.detect import contradiction, detected, said
 from lidarspec.errors import SourceError, UsageError, suggest
 from lidarspec.framing.decoder import Decoder
 from lidarspec.framing.results import Counters, Found, Frames
@@ -148,6 +150,8 @@ class Device(Closing):
         self._ahead: Arrival | None = None
         self._first, self._another = list[Found](), None if sensor.relatives or "model" in sensor.info else ""
         self._own_recorder: Log | None = None
+        self._telling = {path.partition(".")[0] for path in sensor.info.values()}
+        self._told: dict[str, Found] = {}
         self._input = self._opened(backend, record, overflow, period)
         self._finalizer = weakref.finalize(self, _close, self._input, self._own_recorder)
         if start:
@@ -170,6 +174,11 @@ class Device(Closing):
         nominal = [_nominal(self.sensor)] if self.stats.nominal else []
         unended = [f"{self._source}: {self.stats.unended}"] if self.stats.unended else []
         return [*self._input.warnings, *self._doubts(), *unended, *nominal, *([] if failure is None else [str(failure)])]
+
+    @property
+    def info(self) -> dict[str, str]:
+        """What the sensor has said of itself so far: of "serial", "firmware", "model" and "temperature" those that its frames have."""
+        return said(self.sensor, self._told.values())
 
     @property
     def state(self) -> str:
@@ -399,6 +408,10 @@ class Device(Closing):
     def _next(self, wait: float) -> Arrival | None:
         """What arrives next; the first frames are kept until somebody asks whether they are another sensor's."""
         arrival = self._input.next(wait)
+        for frames in arrival.found if arrival is not None and self._telling else ():
+            for name in self._telling.intersection(frames.names):
+                where = np.flatnonzero(np.equal(frames.kinds, frames.names.index(name)))
+                self._told.update((item.frame, item) for item in frames.only(where[-1:]).found())
         if self._another is None and arrival is not None and len(self._first) < EXAMINED:
             for frames in arrival.found:
                 self._first += frames.only(slice(0, EXAMINED)).found()
