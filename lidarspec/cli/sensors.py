@@ -28,6 +28,7 @@ from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.ports import serial_ports
 from lidarspec.trust import FILE, TRUSTED, trust as trusted, user_folder
 from lidarspec.wire.frame_table import Rows
+from lidarspec.wire.schema import schema
 from lidarspec.wire.wire_table import frame_size, wire_table
 
 #: packets that a plan is shown for: as many as a turn may take, since some of them are shorter.
@@ -101,6 +102,8 @@ def show(sensor_id: str, as_plan: bool, as_json: bool, output: str | None) -> No
         f"{sensor.id}: {sensor.vendor} {sensor.model}" + (f", also {', '.join(sensor.aliases)}" if sensor.aliases else ""),
         f"  link    {_links(sensor)}\n  range   {low:g} .. {high:g} m\n  status  {sensor.status}\n  source  {sensor.source}",
     ]
+    units = {role: _unit(sensor, path) for role, path in sensor.info.items()}
+    parts += [f"  says    {', '.join(f'{role} ({path}{units[role]})' for role, path in sensor.info.items())}"] if sensor.info else []
     parts += [f"  command {name}{_command_text(sensor, name)}" for name in sensor.commands]
     for name, frame in sensor.frames.items():
         rows = [[row.offset, row.size, row.type, row.field, row.unit, row.meaning] for row in wire_table(frame)]
@@ -108,6 +111,13 @@ def show(sensor_id: str, as_plan: bool, as_json: bool, output: str | None) -> No
         headers = ["offset", "size", "type", "field", "unit", "meaning"]
         parts.append(f"\n{name}{kind}: {frame_size(frame)} bytes\n{table(headers, rows, output)}")
     emit("\n".join(parts), output)
+
+
+def _unit(sensor: Sensor, path: str) -> str:
+    """The unit of a field, as "frame.path", behind a comma."""
+    frame, _, field = path.partition(".")
+    unit = schema(sensor.frames[frame].tree).fields[field].unit if frame in sensor.frames else ""
+    return f", {unit}" if unit else ""
 
 
 def _plan(sensor: Sensor, frame: str) -> list[str]:
@@ -169,6 +179,7 @@ def _facts(sensor: Sensor) -> dict[str, Any]:
         "frames": list(sensor.frames),
         "commands": list(sensor.commands),
         **facts(sensor, "range_limits"),
+        "info": dict(sensor.info),
     }
 
 

@@ -50,6 +50,7 @@ WIDEST, HIGHEST, SUMMARY = 100, 42, 8
 @click.option("--loss", type=SHARE, default="0%", show_default=True, help="Share of the packets that get lost.")
 @click.option("--reorder", type=click.IntRange(0, 1000), default=0, show_default=True, help="How many places late a datagram may come.")
 @click.option("--unplug", type=DURATION, help="Pull the plug after so long, again and again.")
+@click.option("--shake", type=click.FloatRange(min=0), default=0.0, metavar="M/S2", help="Noise on what an IMU feels: m/s2, rad/s.")
 @click.option("--absent", type=DURATION, default="2s", show_default=True, help="How long it is out then.")
 @click.option("--rotor", type=click.Choice([BLOCKED]), help="It does not turn.")
 @click.option("--force", is_flag=True, help="Write over a file that exists.")
@@ -67,6 +68,7 @@ def sim(
     reorder: int,
     unplug: float | None,
     absent: float,
+    shake: float,
     rotor: str | None,
     force: bool,
     as_json: bool,
@@ -77,7 +79,7 @@ def sim(
     output, all else to standard error.
     """
     sensor = named_sensor(sensor_id)
-    faults = Faults(errors, loss, reorder, unplug or 0.0, absent, rotor or "")
+    faults = Faults(errors, loss, reorder, unplug or 0.0, absent, rotor or "", shake)
     seen = read_scene(scene) if scene is not None else None
     device = SimulatedDevice(sensor, scene=seen, seed=seed, rate=rate_of(rate), faults=faults)
     place = to or ("udp://" if sensor.datagrams else "pty")

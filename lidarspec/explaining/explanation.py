@@ -332,7 +332,7 @@ def _points(sensor: Sensor, name: str, data: bytes, rows: Sequence[Row]) -> tupl
 
 def _parts(sensor: Sensor, name: str, data: bytes) -> list[str]:
     """The parts of a frame that have its points, as "segments[0]"; none where the frame itself has them."""
-    frame, path = sensor.frames[name], sensor.parts_with_points(name)
+    frame, path = sensor.frames[name], sensor.parts_with("points", name)
     place = schema(frame.tree).within(path) if path else None
     if place is None:
         return []

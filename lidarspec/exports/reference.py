@@ -153,6 +153,9 @@ def _geometry(sensor: Sensor) -> Iterator[str]:
         if cloud is None:
             continue
         more = [column for column in ("intensity", "ring", "return_index", "column") if getattr(cloud, column) is not None]
+        more += [
+            f"`{column}` ({', '.join(filter(None, (cloud.units[column], values.dtype.name)))})" for column, values in cloud.extra.items()
+        ]
         many = "a point" if len(cloud) == 1 else f"{len(cloud)} points" if frame_size(frame).isdigit() else "points by its header"
         yield ""
         yield f"A `{name}` frame has {many}" + (f", with {', '.join(more[:-1])}{' and ' * (len(more) > 1)}{more[-1]}." if more else ".")

@@ -65,8 +65,8 @@ class Decoder:
         self._gap = 0
         self._fillers = bytes(sensor.fillers)
         link, longest = sensor.links.get("data"), max(frame.max_length for frame in sensor.incoming.values())
-        is_assembled = not stream and isinstance(link, Udp) and link.assembled is not None
-        self._assembly = Assembly(link.assembled, longest, self.stats) if is_assembled else None  # type: ignore[union-attr,arg-type]
+        rule = link.assembled if isinstance(link, Udp) and not stream else None
+        self._assembly = None if rule is None else Assembly(rule, longest, self.stats)
         self._least = max(LEAST, 2 * self._framing.reach)
         self._size = max(PIECE, self._least)
 

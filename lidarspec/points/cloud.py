@@ -5,13 +5,13 @@ sources, whatever the points are: those of a batch of packets (`lazy_columns.Bat
 (`CloudColumns`), and some of other sources one after another (`Stretches`), as slices and scans are. Scans are so cut out of batches
 without a column being made, and a source that can makes the columns of a scan for that scan alone.
 
-Further columns of points (M5) get a place beside the others here and in `conventions`, under their names.
+Columns under names of a sensor's own are in `extra`, each made when it is first read too; a source has them like all others, by name.
 """
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, NamedTuple
 
@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.errors import UsageError
-from lidarspec.points.conventions import TYPES, Floats, Grid, narrowed
+from lidarspec.points.conventions import TYPES, Floats, Grid, Kind, narrowed
 
 #: names of the columns that a cloud can have, in the order in which files list them.
 COLUMNS = tuple(TYPES)
@@ -33,6 +33,8 @@ STRUCTURED = np.dtype(
         "itemsize": 32,
     }
 )
+#: what the size of a structured point is a multiple of.
+_ALIGNED = 16
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -54,6 +56,8 @@ class PointCloud:
         shape: (columns, rows) where the points are organised so, else None; several returns of a place stand side by side:
             ``cloud.range.reshape(*cloud.shape, -1)`` is (columns, rows, returns).
         nominal: True where a default calibration stood in for the sensor's own.
+        extra: (N,) columns that the sensor gives besides, by name, such as "velocity"; each in its type.
+        units: of those in `extra`, by name; "" for a plain number.
     """
 
     x: Floats
@@ -71,6 +75,8 @@ class PointCloud:
     stamp_ns: int = 0
     shape: tuple[int, int] | None = None
     nominal: np.bool_ = field(default_factory=np.bool_)
+    extra: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+    units: Mapping[str, str] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.x)
@@ -82,8 +88,8 @@ class PointCloud:
 
     @property
     def columns(self) -> Mapping[str, NDArray[Any]]:
-        """The columns that this cloud has, by name."""
-        return {name: getattr(self, name) for name in COLUMNS if getattr(self, name) is not None}
+        """The columns that this cloud has, by name, those in `extra` last."""
+        return {name: getattr(self, name) for name in COLUMNS if getattr(self, name) is not None} | dict(self.extra)
 
     @property
     def xyz(self) -> Floats:
@@ -93,6 +99,7 @@ class PointCloud:
     def __getitem__(self, which: Any) -> PointCloud:
         """The points that a mask, indices or a slice pick; organised only if a slice holds whole columns."""
         picked = {f.name: _pick(getattr(self, f.name), which) for f in fields(self)}
+        picked["extra"] = {name: column[which] for name, column in self.extra.items()}
         shape = None
         if self.shape and isinstance(which, slice) and which.step in (None, 1):
             shape = organised(len(picked["x"]), _whole_columns(grid_of(self), which.indices(len(self))[0], len(picked["x"])))
@@ -150,13 +157,26 @@ class PointCloud:
         return picked
 
     def to_structured(self) -> NDArray[Any]:
-        """A structured array (N,) with PCL's layout: x y z intensity ring time, itemsize 32; what is missing is 0."""
-        structured = np.zeros(len(self), STRUCTURED)
-        for name in STRUCTURED.names or ():
-            column = getattr(self, name)
+        """A structured array (N,) with PCL's layout: x y z intensity ring time, itemsize 32; what is missing is 0.
+
+        The columns in `extra` follow from byte 32 on, each where its type allows, and the itemsize is a multiple of 16.
+        """
+        columns = {name: getattr(self, name) for name in STRUCTURED.names or ()} | dict(self.extra)
+        structured = np.zeros(len(self), _structured({name: column.dtype for name, column in self.extra.items()}))
+        for name, column in columns.items():
             if column is not None:
                 structured[name] = column
         return structured
+
+
+def _structured(extra: Mapping[str, np.dtype[Any]]) -> np.dtype[Any]:
+    """PCL's layout with further columns behind it."""
+    places, end = {name: place[:2] for name, place in (STRUCTURED.fields or {}).items()}, STRUCTURED.itemsize
+    for name, dtype in extra.items():
+        start = end + -end % dtype.itemsize
+        places[name], end = (dtype.newbyteorder("<"), start), start + dtype.itemsize
+    formats, offsets = zip(*places.values(), strict=True)
+    return np.dtype({"names": list(places), "formats": formats, "offsets": offsets, "itemsize": end + -end % _ALIGNED})
 
 
 def _pick(value: Any, which: Any) -> Any:
@@ -186,15 +206,17 @@ class ColumnSource:
         base: the time that their times count from, int64 ns.
         grid: how the points are organised.
         nominal: whether a default calibration stood in for the sensor's own.
+        extra: what the columns under names of the sensor's own hold, by name.
     """
 
     size: int
     base: int
     grid: Grid = Grid()
     nominal: bool = False
+    extra: Mapping[str, Kind] = {}
 
     def column(self, name: str) -> NDArray[Any] | None:
-        """A column of `PointCloud`, (size,), or "valid"; None where the sensor has none."""
+        """A column of `PointCloud`, (size,), "valid" or one of those in `extra`; None where the sensor has none."""
         raise NotImplementedError
 
     def holds(self, name: str) -> bool:
@@ -224,9 +246,11 @@ class CloudColumns(ColumnSource):
     def __init__(self, cloud: PointCloud) -> None:
         self._cloud, self.size, self.base = cloud, len(cloud), cloud.stamp_ns
         self.grid, self.nominal = grid_of(cloud), bool(cloud.nominal)
+        own = cloud.source.extra if isinstance(cloud, LazyCloud) else None
+        self.extra = {name: Kind(column.dtype, cloud.units.get(name, "")) for name, column in cloud.extra.items()} if own is None else own
 
     def column(self, name: str) -> NDArray[Any] | None:
-        column: NDArray[Any] | None = getattr(self._cloud, name)
+        column: NDArray[Any] | None = self._cloud.extra[name] if name in self.extra else getattr(self._cloud, name)
         return column
 
     def holds(self, name: str) -> bool:
@@ -264,6 +288,8 @@ class Stretches(ColumnSource):
         grids = {_whole_columns(part.source.grid, part.start, part.size) for part in parts}
         self.grid = grids.pop() if len(grids) == 1 else Grid()
         self.nominal = any(part.source.nominal for part in parts)
+        first = parts[0].source.extra
+        self.extra = {name: first[name] for name in first if all(name in part.source.extra for part in parts)} if first else first
         self._together = parts[0].source.together(parts)
 
     def column(self, name: str) -> NDArray[Any] | None:
@@ -309,6 +335,30 @@ def later(source: ColumnSource, base: int) -> float:
     return (source.base - base) * 1e-9
 
 
+class Extras(Mapping[str, NDArray[Any]]):
+    """The columns of a source under names of the sensor's own, each made when it is first read."""
+
+    def __init__(self, source: ColumnSource) -> None:
+        self._source, self._made = source, dict[str, Any]()
+
+    def __getitem__(self, name: str) -> NDArray[Any]:
+        if name not in self._made:
+            self._made[name] = self._source.column(name) if name in self._source.extra else None
+        if self._made[name] is None:
+            raise KeyError(f"{name}: there are {', '.join(self) or 'none'}")
+        column: NDArray[Any] = self._made[name]
+        return column
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._source.extra)
+
+    def __len__(self) -> int:
+        return len(self._source.extra)
+
+    def __repr__(self) -> str:
+        return f"Extras({', '.join(f'{name} [{kind.unit}]' if kind.unit else name for name, kind in self._source.extra.items())})"
+
+
 class _Unread:
     """A column that is made when it is first read."""
 
@@ -333,6 +383,7 @@ class LazyCloud(PointCloud):
         cloud = object.__new__(cls)
         shape = organised(source.size, source.grid)
         cloud.__dict__.update(source=source, stamp_ns=stamp_ns, shape=shape, nominal=np.bool_(source.nominal))
+        cloud.__dict__.update(extra=Extras(source), units={name: kind.unit for name, kind in source.extra.items()})
         return cloud
 
     def __len__(self) -> int:
@@ -345,7 +396,7 @@ class LazyCloud(PointCloud):
         return super().__getitem__(which)
 
     def __reduce__(self) -> Any:
-        return functools.partial(PointCloud, **{f.name: getattr(self, f.name) for f in fields(self)}), ()
+        return functools.partial(PointCloud, **{f.name: getattr(self, f.name) for f in fields(self)} | {"extra": dict(self.extra)}), ()
 
 
 for _name in (*COLUMNS, "valid"):

@@ -11,8 +11,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from lidarspec.columns.columns import Column
 from lidarspec.columns.graph import Traced
 from lidarspec.spec.description import DIRECTIONS, Spec
+from lidarspec.spec.results import Extra
 
 Floats = NDArray[np.float32]
 
@@ -115,9 +117,30 @@ def grid_of(shape: Sequence[int], axes: Sequence[str | None]) -> Grid:
     return Grid(lengths[-1], returns) if len(lengths) > 1 and lengths[-1] > 1 else Grid()
 
 
-def numbers_of(name: str, values: NDArray[Any]) -> NDArray[Any]:
-    """A column of numbers that sensors may leave out: intensity, ring, return or column, in its type and of the same shape; nan is 0."""
-    return np.asarray(np.nan_to_num(values), TYPES[name])
+class Kind(NamedTuple):
+    """What a further column of points holds: its type, and its unit, "" for a plain number."""
+
+    dtype: np.dtype[Any]
+    unit: str
+
+    @classmethod
+    def of(cls, extra: Extra, values: Any) -> Kind:
+        """What is declared, and else follows from the field that the values are."""
+        is_own = isinstance(values, Column) and not values.frame
+        info = values.batch.table.schema.fields.get(values.source) if is_own else None
+        as_sent = info.dtype if info is not None and info.kind == "int" and not info.scaled else None
+        array = values.array if isinstance(values, Column) else np.asarray(values)
+        dtype = np.dtype(bool if array.dtype.kind == "b" else as_sent or np.float32) if extra.dtype is None else extra.dtype
+        return cls(dtype, (info.unit if info is not None else "") if extra.unit is None else extra.unit)
+
+    def column(self, values: NDArray[Any]) -> NDArray[Any]:
+        """Values in the type, of the same shape."""
+        return values.astype(self.dtype, copy=False) if self.dtype.kind == "f" else numbers_of(values, self.dtype)
+
+
+def numbers_of(values: NDArray[Any], dtype: Any) -> NDArray[Any]:
+    """A column of numbers in its type, of the same shape; nan is 0."""
+    return np.asarray(np.nan_to_num(values), dtype)
 
 
 def axis_matrix(axes: Sequence[str]) -> NDArray[np.float64]:

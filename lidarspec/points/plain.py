@@ -2,12 +2,11 @@
 
 This is the reference. It serves where `points` cannot be traced, and the tests as the second engine; plans (`points.plan`) take the
 parts of a result and the meaning of columns from here and from `points.conventions`.
-
-Columns that a sensor adds under names of its own (M5) join `parts_of`.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any, Protocol
 
@@ -19,6 +18,7 @@ from lidarspec.errors import plugin_errors
 from lidarspec.framing.results import Counters
 from lidarspec.points import conventions
 from lidarspec.points.cloud import PointCloud, organised
+from lidarspec.points.conventions import Kind
 from lidarspec.spec.description import Spec
 from lidarspec.spec.results import Cartesian, Points, Polar
 from lidarspec.wire.frame_table import Table
@@ -98,10 +98,16 @@ def stamp_of(packets: PacketBatch, epoch: int | None) -> int:
 
 def parts_of(result: Points) -> dict[str, Any]:
     """What a `points` function returned, by the names of its parts, as far as the sensor has them; the origin as ox, oy and oz."""
-    parts = {f.name: getattr(result, f.name) for f in fields(result) if f.name != "nominal"}
+    parts = {f.name: getattr(result, f.name) for f in fields(result) if f.name not in ("nominal", "extra")}
     if isinstance(result, Polar):
         parts |= dict(zip(("ox", "oy", "oz"), parts.pop("origin"), strict=True))
+    parts |= {name: extra.values for name, extra in result.extra.items()}
     return {name: value for name, value in parts.items() if value is not None}
+
+
+def kinds_of(result: Points, parts: Mapping[str, Any]) -> dict[str, Kind]:
+    """What the further columns of points hold, by name; `parts`: those of the result."""
+    return {name: Kind.of(extra, parts[name]) for name, extra in result.extra.items()}
 
 
 def _flattened(packets: PacketBatch, result: Points, batch: Batch, stamp_ns: int, *, final: bool) -> Evaluated:
@@ -109,14 +115,15 @@ def _flattened(packets: PacketBatch, result: Points, batch: Batch, stamp_ns: int
     arrays, axes, ready, shape = of_points(parts, batch)
     ready = len(packets) if final else ready
     mask = unpadded(axes, shape, batch)
-    flat = {name: _flat(array, shape, mask, ready) for name, array in zip(parts, arrays, strict=True)}
+    every = {name: flat(array, shape, mask, ready) for name, array in zip(parts, arrays, strict=True)}
     offsets = conventions.seconds_since(packets.time_ns, stamp_ns).reshape(-1, *(1,) * len(axes))
-    flat["time"] = flat["time"] + _flat(offsets, shape, mask, ready)
+    every["time"] = every["time"] + flat(offsets, shape, mask, ready)
     inside = np.ones(shape, np.bool_) if mask is None else mask.reshape(shape)
     grid = conventions.grid_of(shape[1:], axes) if mask is None else conventions.Grid()
     cloud = make_cloud(
-        flat,
+        every,
         conventions.vendor_turn(packets.sensor),
+        kinds_of(result, parts),
         stamp_ns=stamp_ns,
         shape=organised(ready * int(np.prod(shape[1:])), grid),
         nominal=np.bool_(batch.nominal or result.nominal),
@@ -124,18 +131,20 @@ def _flattened(packets: PacketBatch, result: Points, batch: Batch, stamp_ns: int
     return Evaluated(cloud, ready, batch.carried(ready), inside[:ready].astype(np.intp), Fields(batch), axes)
 
 
-def _flat(array: NDArray[Any], shape: tuple[int, ...], mask: NDArray[np.bool_] | None, ready: int) -> NDArray[Any]:
+def flat(array: NDArray[Any], shape: tuple[int, ...], mask: NDArray[np.bool_] | None, ready: int) -> NDArray[Any]:
+    """What an array that broadcasts to a shape, (n, ...), has for the first `ready` packets, without padding: (N,)."""
     full = np.broadcast_to(array, shape)[:ready]
     return full.reshape(-1) if mask is None else full.reshape(mask[:ready].shape)[mask[:ready]]
 
 
-def make_cloud(flat: dict[str, NDArray[Any]], turn: NDArray[np.float64] | None = None, **extra: Any) -> PointCloud:
+def make_cloud(flat: dict[str, NDArray[Any]], turn: NDArray[np.float64] | None, kinds: Mapping[str, Kind], **facts: Any) -> PointCloud:
     """A cloud from flat columns.
 
     Args:
         flat: the parts of `Polar` (with ox, oy, oz) or `Cartesian`, (N,) each.
         turn: the matrix that turns REP-103 coordinates into the axes that are asked for.
-        extra: `stamp_ns`, `shape` and `nominal` of the cloud.
+        kinds: what its further columns hold.
+        facts: `stamp_ns`, `shape` and `nominal` of the cloud.
     """
     with np.errstate(all="ignore"):
         distance, azimuth, elevation, xyz = (_by_coordinates if "x" in flat else _by_direction)(flat, flat["invalid"].astype(np.bool_))
@@ -145,8 +154,11 @@ def make_cloud(flat: dict[str, NDArray[Any]], turn: NDArray[np.float64] | None =
             xyz, azimuth = turn @ np.where(valid, xyz, 0), conventions.turned_azimuth(azimuth, turn)
         angles = {"azimuth": conventions.narrowed(azimuth), "elevation": elevation.astype(np.float32)}
         columns = dict(zip("xyz", np.where(valid, xyz, np.nan).astype(np.float32), strict=True)) | angles
-        columns |= {name: conventions.numbers_of(name, flat[name]) for name in _OPTIONAL if name in flat}
-        return PointCloud(**columns, range=distance.astype(np.float32), time=np.array(flat["time"], np.float64), valid=valid, **extra)
+        columns |= {name: conventions.numbers_of(flat[name], conventions.TYPES[name]) for name in _OPTIONAL if name in flat}
+        extra = {name: kind.column(flat[name]) for name, kind in kinds.items()}
+        units = {name: kind.unit for name, kind in kinds.items()}
+        columns |= {"range": distance.astype(np.float32), "time": np.array(flat["time"], np.float64), "valid": valid}
+        return PointCloud(**columns, extra=extra, units=units, **facts)
 
 
 #: range, azimuth and elevation of points, and their coordinates, (3, N).

@@ -7,7 +7,7 @@ a batch before they are computed. It computes nothing: a `Maker` does, which a b
 Points by coordinates are three expressions and a mask (`conventions.placed`), their range and angles further ones. They are exact:
 computed in float64 as they are written, whatever floating-point fields hold. Points by direction are computed in another order and partly
 in float32: their plan holds where what a batch has in floating-point fields is of moderate size (`MODERATE`). Columns under names of a
-sensor's own (M5) are further expressions.
+sensor's own are further expressions where they are float32, exact too; others are what `points` says, in their type.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from lidarspec.columns import graph
 from lidarspec.columns.columns import Batch, of_points
 from lidarspec.columns.graph import Node, Traced, Untraceable, is_full, only_field
 from lidarspec.points.conventions import coordinates, direction_of, is_zero, marked, placed, returned_range, shown_range
-from lidarspec.points.plain import parts_of
+from lidarspec.points.plain import kinds_of, parts_of
 from lidarspec.points.windows import is_number
 from lidarspec.spec.results import Cartesian, Polar
 from lidarspec.wire.frame_table import Group
@@ -69,7 +69,8 @@ class Plan:
         parts: what it returned, by name, as nodes or as what no data decides.
         shape: of the points of a packet, one length for each axis in `axes`.
         expressions: the columns that back ends make, by name, as nodes or as what no data decides.
-        exact: whether all columns are computed in float64 as they are written.
+        extra: what the columns under names of the sensor's own hold, by name.
+        exact: whether coordinates and range are computed in float64 as they are written, as all other columns are.
         positive: nodes whose values have to be positive numbers, or the plan does not hold.
         nominal: whether a default calibration stands in for the sensor's own.
         varying: the arrays whose lengths differ from frame to frame.
@@ -89,6 +90,7 @@ class Plan:
         given = parts_of(result)
         samples = {name: part.node.sample if isinstance(part, Traced) else part for name, part in given.items()}
         arrays, self.axes, _, shape = of_points(samples, sample)
+        self.extra = kinds_of(result, samples)
         given = {name: part if isinstance(part, Traced) else array for (name, part), array in zip(given.items(), arrays, strict=True)}
         self.parts = {name: graph.node_of(part) for name, part in given.items()}
         self.shape = shape[1:]
@@ -106,6 +108,7 @@ class Plan:
         intensity = given.get("intensity")
         if intensity is not None:
             expressions["intensity"] = np.nan_to_num(intensity) if self._may_be_nan(intensity) else intensity
+        expressions |= {name: self.parts[name] for name, kind in self.extra.items() if kind.dtype == np.float32}
         self.expressions = {name: graph.node_of(value) for name, value in expressions.items()}
 
     @cached_property
@@ -122,7 +125,11 @@ class Plan:
     @cached_property
     def floats(self) -> list[Node]:
         """The floating-point fields whose values have to be of moderate size, or the plan does not hold."""
-        return [] if self.exact else self._floats_of(*(part for name, part in self.parts.items() if name != "intensity"))
+        return [] if self.exact else self._floats_of(*(part for name, part in self.parts.items() if not self.is_exact(name)))
+
+    def is_exact(self, name: str) -> bool:
+        """Whether a column is computed in float64 as it is written, and rounded then."""
+        return self.exact or name == "intensity" or name in self.extra
 
     def _floats_of(self, *values: Any) -> list[Node]:
         """The floating-point fields that values are made of."""

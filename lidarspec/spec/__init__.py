@@ -46,7 +46,7 @@ if TYPE_CHECKING:
         SizeOf as SizeOf,
     )
     from lidarspec.spec.links import Assembled as Assembled, Http as Http, Link as Link, Serial as Serial, Tcp as Tcp, Udp as Udp
-    from lidarspec.spec.results import Cartesian as Cartesian, Points as Points, Polar as Polar
+    from lidarspec.spec.results import Cartesian as Cartesian, Extra as Extra, Imu as Imu, Points as Points, Polar as Polar
     from lidarspec.spec.sensor import Learned as Learned, Sensor as Sensor
     from lidarspec.spec.timing import (
         Clock as Clock,
@@ -97,7 +97,7 @@ _NAMES = {
     "spec.links": ("Assembled", "Serial", "Udp", "Tcp", "Http", "Link"),
     "spec.timing": ("Clock", "Sequence", "OnWrap", "OnFlag", "OnChange", "OnRewind", "Every"),
     "columns.columns": ("Fields", "Column"),
-    "spec.results": ("Points", "Polar", "Cartesian"),
+    "spec.results": ("Points", "Polar", "Cartesian", "Extra", "Imu"),
     "spec.vocabulary": ("along", "spread", "wrap", "following", "previous", "last", "running", "stack", "steps", "take"),
     "spec.wire_forms": ("Tokens", "Lines", "SixBits", "Scip", "Escaped", "WireForm", "Reading", "Slot", "Unescaped"),
     "plugins": ("hookimpl",),

@@ -20,7 +20,7 @@ from lidarspec.errors import SpecError, UnknownFrame
 from lidarspec.spec.arguments import Address, Argument, Count, Filled, Text, argument
 from lidarspec.spec.construct_layer import check_struct, fixed_size, frame_tree, prepare
 from lidarspec.spec.links import Link, is_datagram
-from lidarspec.spec.results import Points
+from lidarspec.spec.results import Imu, Points
 from lidarspec.spec.timing import Clock, Sequence, Split
 from lidarspec.spec.tree import Node, Sealed, children
 from lidarspec.spec.wire_forms import WireForm
@@ -74,6 +74,9 @@ class Frame:
         data: whether it carries the points.
         points: a `points` function of its own, for sensors that can answer in several data frames; for points that stand in parts of the
             frame (`Parts`), their path and a function of these, {"modules": points}, {"tlvs.points": points}.
+        imu: a function of `Fields` that returns what the sensor's IMU felt, beside points or in a frame of its own; with its path where it
+            stands in parts, as for `points`.
+        clock: the time in a frame that is not data, where that of the sensor is not in it.
         max_length: the longest it can be, in bytes; longer candidates are not frames. Left out, it is the size of the struct, where that
             is fixed.
         plausible: a function of `Fields`: False where no sensor would send such values, reduced with `all` per packet.
@@ -93,6 +96,8 @@ class Frame:
     direction: Literal["in", "out"] = field(default="in", kw_only=True)
     data: bool = field(default=False, kw_only=True)
     points: Callable[[Any], Points] | Mapping[str, Callable[[Any], Points]] | None = field(default=None, kw_only=True)
+    imu: Callable[[Any], Imu] | Mapping[str, Callable[[Any], Imu]] | None = field(default=None, kw_only=True)
+    clock: Clock | None = field(default=None, kw_only=True)
     max_length: int = field(default=0, kw_only=True)
     plausible: Callable[[Any], Any] | None = field(default=None, kw_only=True)
     after: str | None = field(default=None, kw_only=True)
@@ -108,8 +113,11 @@ class Frame:
         if self.max_length < 0 or self.confirm < 1:
             raise SpecError("max_length and confirm are at least 1")
         _freeze(self, "acknowledged")
-        if isinstance(self.points, Mapping) and len(self.points) != 1:
-            raise SpecError(f"points stand in parts of one kind, not in {', '.join(self.points) or 'none'}", path="points")
+        for name in ("points", "imu"):
+            if isinstance(own := getattr(self, name), Mapping) and len(own) != 1:
+                raise SpecError(f"{name} stand in parts of one kind, not in {', '.join(own) or 'none'}", path=name)
+        if self.data and self.clock is not None:
+            raise SpecError("data have the clock of the sensor: give it there", path="clock")
         longest = self.max_length or (0 if self.wire is not None else fixed_size(self.struct))
         object.__setattr__(self, "max_length", longest)
         object.__setattr__(self, "prepared", prepare(self.struct, self.room or sys.maxsize))
@@ -299,10 +307,29 @@ class Spec:
             raise SpecError("this frame type has no points", path=frame, sensor=self.id)
         return function
 
-    def parts_with_points(self, frame: str) -> str:
-        """The path of the parts of a frame type that have the points; "" where the frame itself has them."""
-        points = self.frames[frame].points if frame in self.frames else None
-        return next(iter(points)) if isinstance(points, Mapping) else ""
+    def imu_of(self, frame: str) -> Callable[[Any], Imu]:
+        """The `imu` function of a frame type, or of its parts.
+
+        Raises:
+            SpecError: where the frame type has none; it names those that have.
+        """
+        name, _, parts = frame.partition(".")
+        own = self.frames[name].imu
+        function = own.get(parts) if isinstance(own, Mapping) else own
+        if function is None:
+            having = f"those of {', '.join(self.imu_frames)} have" if self.imu_frames else "no frame of the sensor has"
+            raise SpecError(f"this frame type has nothing of an IMU; {having}", path=frame, sensor=self.id)
+        return function
+
+    @cached_property
+    def imu_frames(self) -> tuple[str, ...]:
+        """The names of the incoming frame types that say what an IMU felt."""
+        return tuple(name for name, frame in self.incoming.items() if frame.imu is not None)
+
+    def parts_with(self, what: str, frame: str) -> str:
+        """The path of the parts of a frame type that have its "points" or its "imu"; "" where the frame itself has them."""
+        own = getattr(self.frames[frame], what) if frame in self.frames else None
+        return next(iter(own)) if isinstance(own, Mapping) else ""
 
     def simulation_of(self, frame: str) -> Simulation:
         """What a simulation of one frame type needs: the frame's own, and for data the sensor's where the frame has none."""

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 
     from lidarspec.framing.decoder import Decoder
     from lidarspec.framing.results import Found
+    from lidarspec.packets.imu import Waiting
     from lidarspec.packets.packets import Packets
     from lidarspec.scans.scans import Scan
 
@@ -222,13 +223,21 @@ class Sensor(Spec):
             UnknownFrame: for a frame type that the sensor does not have.
             UsageError: for a text or a path, an unknown back end, or a sensor that has no frames before it is configured.
         """
+        return self._decoded(data, frame, backend)[0]
+
+    def _decoded(self, data: Any, frame: str | None, backend: str) -> tuple[Packets, Waiting | None]:
+        """The packets of a frame type; and where none is named, what an IMU felt by their clock."""
         from lidarspec.framing.decoder import frames_of, is_stream
-        from lidarspec.packets.stream import PacketStream, data_frame
+        from lidarspec.packets.stream import ImuStream, PacketStream, data_frame
 
         decoder = self.decoder(stream=is_stream(data), backend=backend)
         frames = frames_of(decoder, data)
         name = frame or data_frame(self, frames) or self.data_frame
-        return PacketStream(self, name, decoder.stats, backend=decoder.backend).add(frames, whole=True)
+        stream = PacketStream(self, name, decoder.stats, backend=decoder.backend)
+        packets, imu = stream.add(frames, whole=True), ImuStream(self, decoder.stats, backend=decoder.backend) if frame is None else None
+        if imu is not None:
+            imu.add(frames, packets, whole=True)
+        return packets, None if imu is None else imu.waiting
 
     def scans(self, data: Any, *, backend: str = "auto") -> Iterator[Scan]:
         """Every scan of the data; the first and last piece are marked ``complete=False``.
@@ -244,10 +253,10 @@ class Sensor(Spec):
         """
         from lidarspec.scans.scans import scans_of
 
-        packets = self.decode(data, backend=backend)
+        packets, imu = self._decoded(data, None, backend)
         if packets.stats.bytes_in and not len(packets):
             warnings.warn(f"{self.id}: no {packets.frame} frame in the data ({packets.stats}): is it of another sensor?", stacklevel=2)
-        return self._followed(scans_of(self, [packets]), packets)
+        return self._followed(scans_of(self, [packets], imu), packets)
 
     def _followed(self, scans: Iterator[Scan], packets: Packets) -> Iterator[Scan]:
         """Scans, and behind them what the plugin failed at, and that they have no end."""

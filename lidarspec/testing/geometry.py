@@ -86,7 +86,7 @@ def traced(subject: Subject, name: str) -> Any:
     Raises:
         Untraceable: where it cannot be traced, with the reason.
     """
-    few = [subject.example(name, seed=seed) for seed in (range(8) if subject.sensor.parts_with_points(name) else (0,))]
+    few = [subject.example(name, seed=seed) for seed in (range(8) if subject.sensor.parts_with("points", name) else (0,))]
     packets = read(subject, name, few * subject.sensor.frames[name].confirm).with_points
     if not isinstance(packets.table, Rows) or not packets.table.groups:
         return None
@@ -106,7 +106,7 @@ def field_of(subject: Subject, name: str, node: Node) -> FieldInfo | None:
     if node.kind == "state":
         _, frame, path = node.path.split(".", 2)
         return subject.fields(frame).get(path)
-    parts = subject.sensor.parts_with_points(name)
+    parts = subject.sensor.parts_with("points", name)
     return codec(subject.sensor.frames[name]).schema.named.get(f"{parts}.{node.path}" if parts else node.path)
 
 

@@ -37,7 +37,6 @@ from lidarspec.spec.checksums import (
     Xor,
     ZeroPadded,
     byte_table,
-    zlib_crc,
 )
 
 LOOP_BYTES = 2048  # below this, a Python loop over bytes is done before NumPy's calls have started
@@ -45,7 +44,6 @@ NARROW_LOOP_BYTES = 256  # the same where the register is a byte
 ONE_BY_ONE = 4  # rows that are done one by one sooner than together
 BLOCK_BYTES = 1 << 20  # rows taken at a time: few enough for the caches, and many enough to hide NumPy's cost per call
 FEW, SHORT = 1 << 13, 1 << 7  # bytes of all rows, and of one, for which a table for each place pays
-LONG = 256  # bytes of a row from which on zlib, where it knows the CRC, is done sooner, called for each row
 MANY = 1024  # rows whose words are summed in less time than tables take
 
 #: width, polynomial and reflection of the one CRC that `zlib` has: on rows that are not short, one by one, it is several times as fast.
@@ -82,11 +80,6 @@ def _are_few(algorithm: Checksum, rows: NDArray[np.uint8], spans: Spans) -> bool
 
 
 def _crc(algorithm: Crc, rows: NDArray[np.uint8], spans: Spans) -> Values:
-    known = zlib_crc(algorithm) if sum(stop - start for start, stop in spans) >= LONG else None
-    if known is not None:
-        parts = np.ascontiguousarray(cut(rows, spans))
-        data, size = memoryview(parts).cast("B"), parts.shape[1]
-        return np.fromiter((known(data[first : first + size]) for first in range(0, parts.size, size)), np.uint64, len(rows))
     left = registers(rows, spans, algorithm.start, algorithm.width, algorithm.poly, algorithm.refin)
     if not algorithm.refin:
         left = left.byteswap() >> 8 * left.itemsize - algorithm.width

@@ -318,7 +318,7 @@ def written(plan: Plan, names: tuple[str, ...], varying: Set[str]) -> Text:
     writer = Expressions(plan.layout, plan.shape, plan.tables, varying)
     assembly = Assembly(writer)
     writer.both = _both(expressions.values())
-    made = {name: _made(writer, name, value, exact=plan.exact) for name, value in expressions.items()}
+    made = {name: _made(writer, name, value, exact=plan.is_exact(name)) for name, value in expressions.items()}
     directed = [] if plan.exact else [*plan.directed, *(plan.parts[name] for name in ("ox", "oy", "oz"))]
     places = {}
     if not all(is_number(value, plan.layout.leaves) for value in directed):  # where one coordinate is nan, all are
