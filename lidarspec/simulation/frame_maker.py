@@ -22,7 +22,7 @@ from lidarspec.wire.frame_table import Group, Rows
 from lidarspec.wire.layout import Layout, Leaf
 from lidarspec.wire.layout_tree import TooLong, Unknown, layout_of
 from lidarspec.wire.schema import schema
-from lidarspec.wire.slots import recoder
+from lidarspec.wire.slots import Recoder, recoder
 
 Values = Mapping[str, Any]
 
@@ -43,13 +43,14 @@ class FrameMaker:
         others = sensor.data_frames if sensor.frames[frame].data else ()
         elsewhere = {path for other in others for path in codec(sensor.frames[other]).schema.fields}
         self.engine = engine
-        self._recoder = recoder(engine.frame)
+        self._recoder: Recoder | None = recoder(engine.frame)
         self._makes(sensor.id, engine.frame.tree, engine.frame.room, {}, elsewhere)
 
     @classmethod
     def _of_parts(cls, sensor: str, root: Node, limit: int, given: Mapping[str, int]) -> FrameMaker:
         """Makes parts of one kind, in frames whose fields have the values that they ask for."""
         maker = cls.__new__(cls)
+        maker._recoder = None
         maker._makes(sensor, root, limit, given, set())
         return maker
 

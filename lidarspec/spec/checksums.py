@@ -318,7 +318,7 @@ def single(algorithm: Checksum) -> Single:
     return _single_crc(algorithm) if kind is Crc else _single_word_xor(algorithm) if kind is WordXor else algorithm
 
 
-def zlib_crc(algorithm: Crc) -> Single | None:
+def _zlib_crc(algorithm: Crc) -> Single | None:
     """A CRC by zlib, some gigabytes a second; None where its polynomial is another."""
     if (algorithm.width, algorithm.poly, algorithm.refin, algorithm.refout) != (32, 0x04C11DB7, True, True):
         return None
@@ -328,7 +328,7 @@ def zlib_crc(algorithm: Crc) -> Single | None:
 
 @lru_cache(maxsize=256)
 def _single_crc(algorithm: Crc) -> Single:
-    init, xorout, known = algorithm.init, algorithm.xorout, zlib_crc(algorithm)
+    init, xorout, known = algorithm.init, algorithm.xorout, _zlib_crc(algorithm)
     if known is not None:
         return known
     if (algorithm.width, algorithm.poly, algorithm.refin, algorithm.refout) == (16, 0x1021, False, False):
