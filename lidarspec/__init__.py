@@ -46,6 +46,7 @@ if TYPE_CHECKING:
     from lidarspec.exports import export as export
     from lidarspec.framing.decoder import Decoder as Decoder
     from lidarspec.framing.results import Counters as Counters, Found as Found
+    from lidarspec.packets.imu import ImuSamples as ImuSamples
     from lidarspec.packets.packets import Packets as Packets
     from lidarspec.plugins import sensor as sensor, sensors as sensors
     from lidarspec.points.cloud import PointCloud as PointCloud
@@ -62,6 +63,7 @@ _NAMES = {
     "device.session": ("Session", "Reply"),
     "framing.decoder": ("Decoder",),
     "framing.results": ("Found", "Counters"),
+    "packets.imu": ("ImuSamples",),
     "packets.packets": ("Packets",),
     "points.cloud": ("PointCloud",),
     "scans.scans": ("Scan", "LaserScan"),

@@ -40,6 +40,7 @@ from lidarspec.errors import NO_SENSORS, LidarSpecError, SourceError, SpecError,
 from lidarspec.spec.checksums import Checksum
 from lidarspec.spec.construct_layer import prepare, seals
 from lidarspec.spec.description import Frame
+from lidarspec.spec.links import Link
 from lidarspec.spec.results import Points
 from lidarspec.spec.sensor import Sensor
 from lidarspec.trust import document, own_settings
@@ -71,6 +72,11 @@ def lidarspec_points(sensor: Sensor, fields: Any) -> Points | None:
 @hookspec(firstresult=True)
 def lidarspec_source(url: str) -> Any:
     """A transport for a URL scheme that the package does not know, or None."""
+
+
+@hookspec(firstresult=True)
+def lidarspec_link(source: str, link: Link, host: str | None) -> Any:
+    """The open transport of a link of a kind that the package does not know, over which commands go, or None."""
 
 
 @hookspec

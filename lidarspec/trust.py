@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import re
+import stat
 from typing import TYPE_CHECKING, Any, Literal
 
 from lidarspec.errors import UsageError, system_errors
@@ -23,7 +24,7 @@ _ENDLESS_KEY = re.compile(rb"(?:\.[^.=,\]\n]{0,80}){32}")
 FILE = "lidarspec.toml"
 #: the file of the folders that are allowed, a line each, and the variable that names one for a single run.
 TRUSTED, VARIABLE = "trusted", "LIDARSPEC_TRUST"
-_WRITABLE_BY_ALL = 0o002
+_WRITABLE_BY_ALL = stat.S_IWOTH
 
 
 def user_folder() -> Path:
@@ -52,11 +53,22 @@ def foreign(path: Path) -> str:
     for place in (path, path.parent):
         with system_errors(place):
             status = place.stat()
-        if status.st_uid != os.getuid():
-            return f"{place} belongs to user {status.st_uid}"
-        if status.st_mode & _WRITABLE_BY_ALL:
-            return f"everybody may write to {place}"
+        if reason := shared(status, _WRITABLE_BY_ALL):
+            return f"{place} {reason}"
     return ""
+
+
+def shared(status: os.stat_result, others: int) -> str:
+    """Why something is not the user's own, such as "belongs to user 0"; "" where it is, and on Windows, where a user's folders are.
+
+    Args:
+        others: the bits of its mode that only its user may have.
+    """
+    if os.name == "nt":
+        return ""
+    if status.st_uid != os.geteuid():
+        return f"belongs to user {status.st_uid}"
+    return f"is open to others: its mode is {stat.S_IMODE(status.st_mode):o}" if status.st_mode & others else ""
 
 
 def is_trusted(folder: Path) -> bool:

@@ -58,7 +58,7 @@ CONFINED = {
     "hypothesis": {"testing"},
     "pytest": {"testing"},
 }
-#: the one module that asks which of construct's classes something is.
+#: the one package that asks which of construct's classes something is.
 CONSTRUCT_LAYER = "lidarspec.spec.construct_layer"
 
 TYPE_CHECKING = {"TYPE_CHECKING", "typing.TYPE_CHECKING"}
@@ -180,8 +180,9 @@ def construct_asked(modules: Mapping[str, Module]) -> list[str]:
     for module in modules.values():
         froms = [node for node in ast.walk(module.tree) if isinstance(node, ast.ImportFrom) and node.module == "construct"]
         names = {alias.asname or alias.name for node in froms for alias in node.names}
+        in_layer = f"{module.name}.".startswith(f"{CONSTRUCT_LAYER}.")
         for node in ast.walk(module.tree):
-            if module.name == CONSTRUCT_LAYER or not isinstance(node, ast.Call) or ast.unparse(node.func) != "isinstance":
+            if in_layer or not isinstance(node, ast.Call) or ast.unparse(node.func) != "isinstance":
                 continue
             asked = {ast.unparse(part) for part in ast.walk(node.args[1]) if isinstance(part, ast.Name | ast.Attribute)}
             if asked & names or any(name.startswith("construct.") for name in asked):

@@ -6,7 +6,7 @@ import functools
 import math
 import re
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from fractions import Fraction
 from shlex import quote
 from typing import Any, Literal
@@ -23,22 +23,20 @@ from lidarspec.errors import CommandError, LidarSpecError, OutOfRange, UnknownCo
 from lidarspec.explaining.explanation import explain
 from lidarspec.explaining.pieces import explained, pieces
 from lidarspec.plugins import sensor as named_sensor
+from lidarspec.spec.arguments import Octets, Range
 from lidarspec.spec.fields import factor, split_unit
 from lidarspec.spec.sensor import Sensor
 from lidarspec.spec.tree import FieldInfo, evaluated
 from lidarspec.transports.files import unhexed
 from lidarspec.transports.open_url import is_live
 from lidarspec.transports.protocol import Chunk
-from lidarspec.wire.build import argument_field, given_value
+from lidarspec.wire.build import Steps, argument_slot, given_value, is_index, put, steps
 from lidarspec.wire.schema import Schema, schema
 
 #: seconds to wait for what comes back on bytes sent by hand, and of silence behind it that end it.
 ANSWERED, QUIET = 1.0, 0.2
 _STEP = r"\w+(?:\[(?:\d+|\*)\])*"
 _PATH = re.compile(rf"{_STEP}(?:\.{_STEP})*")
-
-#: names of fields, and indices: a number, or "*" for every element.
-Steps = list[int | str]
 
 
 @click.command()
@@ -73,8 +71,8 @@ def values(table: Schema, assignments: Sequence[str], place: str) -> dict[str, A
     """
     parsed = [_assignment(table, text, place) for text in assignments]
     found: dict[str, Any] = {}
-    for steps, value in sorted(parsed, key=lambda item: any(_is_index(step) for step in item[0])):
-        _put(found, steps, value, lambda path: _length(table, found, path, place))
+    for names, value in sorted(parsed, key=lambda item: any(is_index(step) for step in item[0])):
+        put(found, names, value, lambda path: _length(table, found, path, place))
     return found
 
 
@@ -82,25 +80,22 @@ def _assignment(table: Schema, text: str, place: str) -> tuple[Steps, Any]:
     path, equals, value = text.partition("=")
     if not equals or not _PATH.fullmatch(path):
         raise UsageError(f"{place}: {text!r} is not field=value")
-    steps: Steps = [int(step) if step.isdigit() else step for step in re.findall(r"\w+|\*", path)]
-    plain = ".".join(str(step) for step in steps if not _is_index(step))
+    names = steps(path)
+    plain = ".".join(str(step) for step in names if not is_index(step))
     info = table.all_fields.get(plain)
     if info is None:
         raise UnknownField(path, table.all_fields, place=place)
     arrays = len(info.axes) - (info.kind == "bytes")
-    given = sum(map(_is_index, steps))
+    given = sum(map(is_index, names))
     if given != arrays:
         raise UsageError(f"{place}: {plain} is in {arrays} array{'s' * (arrays != 1)}, and {path!r} has {given} indices")
-    return steps, _raw(info, value.strip(), path, place)
+    return names, _raw(info, value.strip(), path, place)
 
 
 def _raw(info: FieldInfo, text: str, path: str, place: str) -> Any:
     """The raw value that a text stands for: hexadecimal for bytes, a label, a number, or a number with a unit."""
     if info.kind == "bytes":
-        try:
-            return unhexed(text)
-        except ValueError:
-            raise UsageError(f"{place}: {path} takes bytes in hexadecimal, not {text!r}") from None
+        return _octets(text, f"{place}: {path}")
     for raw, label in info.labels.items():
         if text == label:
             return raw
@@ -112,6 +107,13 @@ def _raw(info: FieldInfo, text: str, path: str, place: str) -> Any:
     if info.kind == "int":
         raise UsageError(f"{place}: {path} = {text} is not a raw integer{f'; give it a unit: {text}{info.unit}' if info.unit else ''}")
     return float(number)
+
+
+def _octets(text: str, place: str) -> bytes:
+    try:
+        return unhexed(text)
+    except ValueError:
+        raise UsageError(f"{place} takes bytes in hexadecimal, not {text!r}") from None
 
 
 def _number(text: str, unit: str, place: str, wanted: str) -> tuple[Fraction, str]:
@@ -137,27 +139,6 @@ def _nearest(info: FieldInfo, number: Fraction, path: str, place: str) -> int | 
         edges = [float(info.physical(Fraction(edge))) for edge in (low, high)]
         raise OutOfRange(path, float(number), *edges, unit=info.unit, place=place)
     return raw
-
-
-def _is_index(step: int | str) -> bool:
-    return step == "*" or isinstance(step, int)
-
-
-def _put(target: Any, steps: Steps, value: Any, length: Callable[[str], int], path: str = "") -> Any:
-    """A struct or array, or a new one for None, with a value set in it; "*" stands for every element of an array of known length."""
-    if not steps:
-        return value
-    step, *rest = steps
-    if isinstance(step, str) and step != "*":
-        target = {} if target is None else target
-        below = f"{path.removesuffix('[]')}.{step}".removeprefix(".")
-        target[step] = _put(target.get(step), rest, value, length, below)
-        return target
-    target = [] if target is None else target
-    for place in range(length(path) or len(target)) if step == "*" else [int(step)]:
-        target.extend([None] * (place + 1 - len(target)))
-        target[place] = _put(target[place], rest, value, length, f"{path}[]")
-    return target
 
 
 def _length(table: Schema, given: Mapping[str, Any], path: str, place: str) -> int:
@@ -289,26 +270,30 @@ def _refuse_file(device: Device, source: str) -> None:
         raise suggest(UsageError(f"{source} is a file: nothing can be sent to it"), "lidarspec ports")
 
 
-def arguments(sensor: Sensor, name: str, assignments: Sequence[str]) -> dict[str, float | int]:
-    """The arguments of a command, in the units of their fields.
+def arguments(sensor: Sensor, name: str, assignments: Sequence[str]) -> dict[str, Any]:
+    """The arguments of a command: numbers in the units of their fields, texts and addresses as they are, bytes from hexadecimal digits.
 
     Raises:
-        UsageError: for an unknown command or argument, or a text that is no number in a unit of its field.
+        UsageError: for an unknown command or argument, or a text that stands for no value of it.
     """
     if name not in sensor.commands:
         hint = "" if sensor.commands else "; it takes no commands"
         raise UnknownCommand(name, sensor.commands, place=sensor.id, hint=hint)
     command = sensor.commands[name]
-    found: dict[str, float | int] = {}
+    found: dict[str, Any] = {}
     for text in assignments:
         argument, equals, value = text.partition("=")
         if not equals:
             raise UsageError(f"{sensor.id} {name}: {text!r} is not argument=value")
         if argument not in command.args or command.frame is None:
             raise UnknownField(argument, command.args, place=f"{sensor.id} {name}")
-        unit = argument_field(sensor, name, argument).unit
-        number, _ = _number(value.strip(), unit, f"{sensor.id} {name}: {argument}", f"a number in {unit}" if unit else "a number")
-        found[argument] = int(number) if number.denominator == 1 else float(number)
+        slot, kind, place = argument_slot(sensor, name, argument), command.arguments[argument].kind, f"{sensor.id} {name}: {argument}"
+        if isinstance(kind, Range):
+            unit = slot.info.unit
+            number, _ = _number(value.strip(), unit, place, f"a number in {unit}" if unit else "a number")
+            found[argument] = int(number) if number.denominator == 1 else float(number)
+        else:
+            found[argument] = _octets(value, place) if isinstance(kind, Octets) else value
     return found
 
 

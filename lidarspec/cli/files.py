@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from shlex import quote
 
@@ -17,7 +17,8 @@ from lidarspec.cli.terminal import note
 from lidarspec.device.device import Device, open as open_device
 from lidarspec.discovery.detect import detected
 from lidarspec.errors import UsageError, WireError, suggest, suggestion
-from lidarspec.formats import format_of, write
+from lidarspec.formats import format_of, write, write_imu
+from lidarspec.packets.imu import joined
 from lidarspec.plugins import sensor as named_sensor
 from lidarspec.scans.scans import Scan
 from lidarspec.spec.sensor import Sensor
@@ -34,6 +35,7 @@ class Written:
     target: str
     scans: int = 0
     points: int = 0
+    units: Mapping[str, str] = field(default_factory=dict)
 
     def __str__(self) -> str:
         return f"{self.target}: {self.points} points of {self.scans} scan{'s' * (self.scans != 1)}"
@@ -42,6 +44,7 @@ class Written:
         """The scans, counted on their way."""
         for scan in scans:
             self.scans += 1
+            self.units = self.units or scan.points.units
             self.points += len(scan) if every_point else int(scan.points.valid.sum())
             progress(lambda: f"{self}, {size(self.device.stats.bytes_in)} read")
             yield scan
@@ -53,21 +56,32 @@ class Written:
 @sensor_option
 @count_option("scans")
 @click.option("--all", "every_point", is_flag=True, help="Keep points without a valid return.")
+@click.option("--imu", "is_imu", is_flag=True, help="What the sensor's IMU felt, in place of the points.")
 @click.option("--force", is_flag=True, help="Overwrite OUT.")
 @click.option("--json", "as_json", is_flag=True, help="Print a summary as JSON.")
 def convert(
-    source: str, target: str, sensor_id: str | Sensor | None, count: int | None, every_point: bool, force: bool, as_json: bool
+    source: str, target: str, sensor_id: str | Sensor | None, count: int | None, every_point: bool, is_imu: bool, force: bool, as_json: bool
 ) -> None:
     """Write the points of a capture or raw file to a file, in the format of its suffix.
 
-    .csv and .npz hold x y z range azimuth elevation intensity time ring return_index, those that the sensor has, and the
-    number of the scan; metres, radians, and seconds since the scan's stamp.
+    .csv and .npz hold x y z range azimuth elevation intensity time ring return_index column, those that the sensor has, its further
+    columns, and the number of the scan; metres, radians, and seconds since the scan's stamp.
     """
     format_of(target)
     refuse_overwriting(target, source, sensor_id, force=force)
     sensor = _detected(source, target) if sensor_id is None else named_sensor(sensor_id)
     with open_device(source, sensor) as device, Progress() as progress:
         written = Written(device, target)
+        if is_imu:
+            samples = joined(list(device.imu()))[:count]
+            if not len(samples):
+                raise _no_data(device, source, target)
+            write_imu(target, samples)
+            note(f"{target}: {len(samples)} samples of the IMU of {device.sensor.id}; {device.stats}")
+            if as_json:
+                emit_json({"sensor": device.sensor.id, "output": target, "samples": len(samples), "stats": device.stats.to_dict()}, None)
+            conclude(device)
+            return
         scans = itertools.islice(scans_of(device, source), count)
         first = next(scans, None)
         if first is None:
@@ -90,9 +104,21 @@ def _detected(source: str, target: str) -> Sensor:
 
 def _sum_up(device: Device, target: str, written: Written, *, as_json: bool) -> None:
     note(f"{written} of {device.sensor.id}; {device.stats}")
+    if written.units:
+        note(f"further columns: {', '.join(f'{name} [{unit}]' if unit else name for name, unit in written.units.items())}")
     if as_json:
         stats = device.stats.to_dict()
-        emit_json({"sensor": device.sensor.id, "output": target, "scans": written.scans, "points": written.points, "stats": stats}, None)
+        emit_json(
+            {
+                "sensor": device.sensor.id,
+                "output": target,
+                "scans": written.scans,
+                "points": written.points,
+                "units": dict(written.units),
+                "stats": stats,
+            },
+            None,
+        )
     conclude(device)
 
 

@@ -237,6 +237,8 @@ def conclude(device: Device) -> None:
         PluginError: where a function of the plugin raised at some of the packets.
     """
     failure = device.stats.failure(device.sensor.id)
+    for name, value in device.learned.items():
+        note(f"{device.sensor.id} has said its {name}: {f'{len(value)} bytes' if isinstance(value, bytes) else value}")
     for warning in device.warnings:
         if failure is None or warning != str(failure):
             note(warning)

@@ -60,8 +60,8 @@ def count_option(what: str, **more: Any) -> Callable[[Function], Function]:
 
 def colour_option(function: Function) -> Function:
     """``--colour`` of pictures, in both spellings."""
-    kinds = click.Choice(["range", "intensity"])
-    return click.option("--colour", "--color", "ramp", type=kinds, default="range", show_default=True, help="What colours show.")(function)
+    told = "What colours show: range, intensity, or a further column of the points."
+    return click.option("--colour", "--color", "ramp", metavar="COLUMN", default="range", show_default=True, help=told)(function)
 
 
 def output_options(function: Function) -> Function:

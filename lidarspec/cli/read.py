@@ -36,9 +36,10 @@ POINTS = {
     "time": ("s", 10, 6),
     "ring": ("", 5, 0),
     "return_index": ("", 12, 0),
+    "column": ("", 6, 0),
 }
-#: digits of a packet's field, and the width of its column at least.
-DIGITS, NARROWEST = 10, 8
+#: digits of a packet's field, of a further column of points in float32, and the width of a column at least.
+DIGITS, SINGLE, NARROWEST = 10, 7, 8
 #: digits of a float64 in JSON.
 KEPT = 14
 
@@ -110,7 +111,7 @@ def _points(device: Device, until: float, patience: Patience, *, every_point: bo
     units = {name: unit for name, (unit, _, _) in POINTS.items()}
     for number, scan in enumerate(_scans(device, until, patience)):
         cloud = scan.points if every_point else scan.points[scan.points.valid]
-        columns = dict(cloud.columns)
+        columns, units = dict(cloud.columns), units | dict(cloud.units)
         for values in zip(*columns.values(), strict=True):
             yield units, {"scan": number, **dict(zip(columns, values, strict=True))}
 
@@ -146,11 +147,12 @@ def _width(name: str) -> int:
 
 
 def _text(name: str, value: Any) -> str:
-    if isinstance(value, int):
-        return str(value)
+    if isinstance(value, int | np.bool_):
+        return str(int(value))
     if not math.isfinite(value):
         return "-" if math.isnan(value) else "inf"
-    return f"{value:.{POINTS[name][2]}f}" if name in POINTS else f"{value:.{DIGITS}g}"
+    digits = SINGLE if isinstance(value, np.float32) else DIGITS
+    return f"{value:.{POINTS[name][2]}f}" if name in POINTS else f"{value:.{digits}g}"
 
 
 def _row(cells: Sequence[str], widths: Sequence[int]) -> str:

@@ -14,20 +14,21 @@ from lidarspec.cli.output import emit, emit_json, table
 from lidarspec.cli.terminal import note, say
 from lidarspec.device.settings import devices
 from lidarspec.errors import NO_SENSORS, SpecError
-from lidarspec.explaining.wording import limits
+from lidarspec.explaining.wording import asked
 from lidarspec.exports.json import facts, link_data
 from lidarspec.framing.results import Counters, Found, packed
 from lidarspec.packets.stream import PacketStream
 from lidarspec.plugins import Plugin, registry, sensor as named_sensor, tried
 from lidarspec.points.numpy_plan import describe
 from lidarspec.points.plan import Plan, plan_for
-from lidarspec.simulation.frame_maker import FrameMaker, sealed
+from lidarspec.simulation.frame_maker import FrameMaker
 from lidarspec.spec.description import Frame
-from lidarspec.spec.links import Link, Serial, Udp
+from lidarspec.spec.links import Http, Link, Serial, Tcp, Udp
 from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.ports import serial_ports
 from lidarspec.trust import FILE, TRUSTED, trust as trusted, user_folder
 from lidarspec.wire.frame_table import Rows
+from lidarspec.wire.schema import schema
 from lidarspec.wire.wire_table import frame_size, wire_table
 
 #: packets that a plan is shown for: as many as a turn may take, since some of them are shorter.
@@ -101,7 +102,9 @@ def show(sensor_id: str, as_plan: bool, as_json: bool, output: str | None) -> No
         f"{sensor.id}: {sensor.vendor} {sensor.model}" + (f", also {', '.join(sensor.aliases)}" if sensor.aliases else ""),
         f"  link    {_links(sensor)}\n  range   {low:g} .. {high:g} m\n  status  {sensor.status}\n  source  {sensor.source}",
     ]
-    parts += [f"  command {name}{_command_text(_command(sensor, name))}" for name in sensor.commands]
+    units = {role: _unit(sensor, path) for role, path in sensor.info.items()}
+    parts += [f"  says    {', '.join(f'{role} ({path}{units[role]})' for role, path in sensor.info.items())}"] if sensor.info else []
+    parts += [f"  command {name}{_command_text(sensor, name)}" for name in sensor.commands]
     for name, frame in sensor.frames.items():
         rows = [[row.offset, row.size, row.type, row.field, row.unit, row.meaning] for row in wire_table(frame)]
         kind = " (to the sensor)" if frame.direction == "out" else " (points)" if frame.data else ""
@@ -110,13 +113,20 @@ def show(sensor_id: str, as_plan: bool, as_json: bool, output: str | None) -> No
     emit("\n".join(parts), output)
 
 
+def _unit(sensor: Sensor, path: str) -> str:
+    """The unit of a field, as "frame.path", behind a comma."""
+    frame, _, field = path.partition(".")
+    unit = schema(sensor.frames[frame].tree).fields[field].unit if frame in sensor.frames else ""
+    return f", {unit}" if unit else ""
+
+
 def _plan(sensor: Sensor, frame: str) -> list[str]:
     """The plan of a data frame in lines, or why there is none."""
     try:
         made, sweep = FrameMaker(sensor, frame), sensor.simulation_of(frame).sweep
     except SpecError as error:
         return [f"plain evaluation: {error}"]
-    frames = sealed(made.table([sweep(index) for index in range(PACKETS)])) if sweep else [sensor.example(frame)]
+    frames = made.sealed(made.table([sweep(index) for index in range(PACKETS)])) if sweep else [sensor.example(frame)]
     sent = packed([Found(frame, 0, data) for data in frames])
     packets = PacketStream(sensor, frame, Counters()).add([sent]).with_points
     if not isinstance(packets.table, Rows) or not packets.table.groups:
@@ -169,6 +179,7 @@ def _facts(sensor: Sensor) -> dict[str, Any]:
         "frames": list(sensor.frames),
         "commands": list(sensor.commands),
         **facts(sensor, "range_limits"),
+        "info": dict(sensor.info),
     }
 
 
@@ -179,7 +190,7 @@ def _frame(frame: Frame) -> dict[str, Any]:
 
 def _command(sensor: Sensor, name: str) -> Mapping[str, Any]:
     command = sensor.commands[name]
-    args = {name: {"field": path, "low": low, "high": high} for name, (path, low, high) in command.args.items()}
+    args = {name: argument.to_dict() for name, argument in command.arguments.items()}
     frame = "" if command.frame is None or args else sensor.command(name).hex(" ")
     return {
         "frame": command.frame,
@@ -190,8 +201,9 @@ def _command(sensor: Sensor, name: str) -> Mapping[str, Any]:
     }
 
 
-def _command_text(command: Mapping[str, Any]) -> str:
-    args = "".join(f" {name}={limits(arg['low'], arg['high'])}" for name, arg in command["arguments"].items())
+def _command_text(sensor: Sensor, name: str) -> str:
+    command = _command(sensor, name)
+    args = "".join(f" {name}={asked(argument.kind)}" for name, argument in sensor.commands[name].arguments.items())
     answer = f", answered by {command['reply']}{' while it is stopped' if command['only_stopped'] else ''}" if command["reply"] else ""
     return f"{args}{': ' if command['hex'] else ''}{command['hex']}{answer}"
 
@@ -203,4 +215,5 @@ def _links(sensor: Sensor) -> str:
 def _link_text(link: Link) -> str:
     if isinstance(link, Serial):
         return f"serial {'/'.join(str(baud) for baud in link.bauds)} baud"
-    return f"udp {'/'.join(str(port) for port in link.ports)}" if isinstance(link, Udp) else f"tcp {link.port}"
+    ports = link.ports or (link.broadcast,) if isinstance(link, Udp) else (link.port,) if isinstance(link, Tcp | Http) else ()
+    return f"{type(link).__name__.lower()} {'/'.join(map(str, ports))}".strip()

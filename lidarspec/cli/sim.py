@@ -7,7 +7,7 @@ import shlex
 import shutil
 import signal
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
 import click
@@ -50,6 +50,7 @@ WIDEST, HIGHEST, SUMMARY = 100, 42, 8
 @click.option("--loss", type=SHARE, default="0%", show_default=True, help="Share of the packets that get lost.")
 @click.option("--reorder", type=click.IntRange(0, 1000), default=0, show_default=True, help="How many places late a datagram may come.")
 @click.option("--unplug", type=DURATION, help="Pull the plug after so long, again and again.")
+@click.option("--shake", type=click.FloatRange(min=0), default=0.0, metavar="M/S2", help="Noise on what an IMU feels: m/s2, rad/s.")
 @click.option("--absent", type=DURATION, default="2s", show_default=True, help="How long it is out then.")
 @click.option("--rotor", type=click.Choice([BLOCKED]), help="It does not turn.")
 @click.option("--force", is_flag=True, help="Write over a file that exists.")
@@ -67,6 +68,7 @@ def sim(
     reorder: int,
     unplug: float | None,
     absent: float,
+    shake: float,
     rotor: str | None,
     force: bool,
     as_json: bool,
@@ -77,7 +79,7 @@ def sim(
     output, all else to standard error.
     """
     sensor = named_sensor(sensor_id)
-    faults = Faults(errors, loss, reorder, unplug or 0.0, absent, rotor or "")
+    faults = Faults(errors, loss, reorder, unplug or 0.0, absent, rotor or "", shake)
     seen = read_scene(scene) if scene is not None else None
     device = SimulatedDevice(sensor, scene=seen, seed=seed, rate=rate_of(rate), faults=faults)
     place = to or ("udp://" if sensor.datagrams else "pty")
@@ -87,7 +89,7 @@ def sim(
         if Path(place).suffix.lower() not in SUFFIXES:
             raise UsageError(f"{place!r} is no place: pty, udp://HOST:PORT, tcp://HOST:PORT, or a file ({', '.join(SUFFIXES)})")
         written = write_file(device, place, duration or IN_A_FILE, overwrite=force)
-        _tell(sensor, place, place, as_json=as_json)
+        _tell(sensor, place, place, {}, as_json=as_json)
         note(f"{_sent(device)}, {size(written)}")
         return
     try:
@@ -95,7 +97,8 @@ def sim(
     except UsageError as error:
         raise suggest(error, f"lidarspec sim {shlex.quote(str(sensor_id))} --to {'udp://' + HERE if sensor.datagrams else 'pty'}") from None
     try:
-        _tell(sensor, opened.place, opened.source, as_json=as_json)
+        controls = {name: control.place for name, control in opened.controls.items()}
+        _tell(sensor, opened.place, opened.source, controls, as_json=as_json)
         with _ended_by_terminate(), Progress() as progress:
             serve(device, opened, seconds=duration, turn=_watching(device, opened, progress))
     finally:
@@ -104,14 +107,17 @@ def sim(
         note(f"{_sent(device)}{lost}")
 
 
-def _tell(sensor: Sensor, where: str, source: str, *, as_json: bool) -> None:
-    """Where the sensor is, and what to type next."""
+def _tell(sensor: Sensor, where: str, source: str, controls: Mapping[str, str], *, as_json: bool) -> None:
+    """Where the sensor is, with its other links, and what to type next."""
     following = f"lidarspec view {shlex.quote(source)} -s {sensor.id}"
     if as_json:
-        emit_json({"sensor": sensor.id, "place": where, "source": source, "next": following}, None)
+        emit_json(
+            {"sensor": sensor.id, "place": where, "source": source, **({"controls": controls} if controls else {}), "next": following}, None
+        )
         return
     say(where)
-    note(f"{sensor.id}, simulated\n  next: {following}")
+    asked = "".join(f"\n  asked over {name}: {place}" for name, place in controls.items())
+    note(f"{sensor.id}, simulated{asked}\n  next: {following}")
 
 
 def _watching(device: SimulatedDevice, opened: Outlet, progress: Progress) -> Callable[[], None]:

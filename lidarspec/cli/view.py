@@ -83,5 +83,5 @@ def _printed(device: Device, source: str, ramp: str, patience: float) -> str:
     cells: Cells = picture(feed.scan.points, width=columns, height=max(lines - 2, 4), look=chosen)
     if not encodable(sys.stdout):
         cells = cells.ascii()
-    colours = f"{chosen.ramp} 0 to {chosen.full:g}{' m' if chosen.ramp == 'range' else ''}"
+    colours = f"{chosen.ramp} {' to '.join(chosen.ends)}"
     return f"{drawn(cells.text())}\n{device.sensor.id}: {feed.scan}; colours: {colours}"

@@ -10,8 +10,8 @@ knows its batch, and so where packets were lost and how long variable arrays are
 where a value depends on what follows. `RowOfValues` is a column as one run of values in stream order, without padding, which is what
 `previous`, `following` and `last` mean by "before" and "after".
 
-Axes that are kept by name whatever the depth (M3), elements of an array by index and tables over two indices (M8) belong here: in
-`Column.on`, in `aligned`, and in a ``__getitem__`` of `Fields`.
+Arrays that are no columns line up with them, too (`aligned`): what `along` made by the name of its array, a plain array where its length
+is that of one array alone; only one that has as many axes as the arrays that are nested lines up by place, as in NumPy.
 """
 
 from __future__ import annotations
@@ -26,12 +26,13 @@ from numpy.lib.mixins import NDArrayOperatorsMixin
 from numpy.typing import NDArray
 
 from lidarspec.errors import SpecError, UnknownField
-from lidarspec.spec.tree import FieldInfo
+from lidarspec.spec.tree import FieldInfo, Ref
+from lidarspec.spec.vocabulary import ELEMENTWISE, Along, row_numbers
+from lidarspec.wire.arrays import deep
 from lidarspec.wire.frame_table import Group, Rows, Table
+from lidarspec.wire.schema import without_indices
 
-#: NumPy functions that work element by element, and so keep axes; others see plain arrays.
 BITWISE = {np.bitwise_and, np.bitwise_or, np.bitwise_xor, np.invert}
-ELEMENTWISE = {np.where, np.clip, np.nan_to_num, np.round, np.isclose, np.real_if_close}
 
 #: what is said where Python, or a bitwise operator, asks one answer of a column.
 NO_TRUTH = "a column has an answer for each packet: & | ~ in place of `and`, `or`, `not` and a < f.x < b, np.where in place of `if`"
@@ -82,15 +83,27 @@ class Column(NDArrayOperatorsMixin):
 
     Attributes:
         array: shape (n or 1, ...), one axis per array level of the struct, length 1 where the value is further out.
-        axes: names of the axes after the first; None where the length is 1; with a "?" where plain arrays alone are as long by now.
+        axes: names of the axes after the first; None where the length is 1; with a "?" where no field is along it by now: behind the
+            name that `along` gave it, before the one that a plain array is guessed to be along.
         ready: packets from the start whose values depend on nothing that is still to come.
         source: the field's path, while the column is an unchanged field.
+        frame: the other frame type that this is a field of; "" for the packets themselves.
     """
 
+    #: a column is no sequence of its elements
+    __iter__ = None
+
     def __init__(
-        self, array: NDArray[Any], axes: tuple[str | None, ...], batch: Batch, *, ready: int | None = None, source: str = ""
+        self,
+        array: NDArray[Any],
+        axes: tuple[str | None, ...],
+        batch: Batch,
+        *,
+        ready: int | None = None,
+        source: str = "",
+        frame: str = "",
     ) -> None:
-        self.array, self.axes, self.batch, self.source = array, axes, batch, source
+        self.array, self.axes, self.batch, self.source, self.frame = array, axes, batch, source, frame
         self.ready = len(batch) if ready is None else ready
 
     @property
@@ -108,6 +121,12 @@ class Column(NDArrayOperatorsMixin):
 
     def __bool__(self) -> bool:
         raise SpecError(NO_TRUTH, rule="LS213")
+
+    def __getitem__(self, index: int) -> Column:
+        """An element of a field that is an array, of each packet; nan where a packet has fewer."""
+        if not self.source or not isinstance(index, int):
+            raise SpecError("only fields have elements, each by one index: f.columns[0].timestamp, f.distances[-1]")
+        return _column(self.batch, self.frame, f"{self.source}[{index}]")
 
     def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: Any, **kwargs: Any) -> Any:
         if kwargs.get("out") is not None:
@@ -138,24 +157,54 @@ class Column(NDArrayOperatorsMixin):
         return Column(array, names, self.batch, ready=ready)
 
     def on(self, *axes: str) -> Column:
-        """The column's values on other axes, by the names of arrays; its own axes go to the last of those named.
+        """The column's values on other axes, by the names of any arrays of the frame; its own axes go to the last of those named.
 
         Raises:
             SpecError: for fewer axes than the column has, or an array that the frame does not have.
         """
-        chain = self.batch.table.schema.chain
+        schema = self.batch.table.schema
         own = [index for index, name in enumerate(self.axes) if name is not None]
         if len(axes) < len(own):
             raise SpecError(f"a column with {len(own)} axes cannot be put on {axes}")
-        places = [_position(name, chain) for name in axes][len(axes) - len(own) :]
-        shape, names = [1] * max(len(chain), len(self.axes)), [None] * max(len(chain), len(self.axes))
-        for index, place in zip(own, places, strict=True):
-            shape[place], names[place] = self.array.shape[1 + index], chain[place]  # type: ignore[call-overload]
-        return Column(self.array.reshape(self.array.shape[0], *shape), tuple(names), self.batch, ready=self.ready)
+        names = {schema.places[axis]: axis for axis in map(schema.axis, axes)}
+        lengths = dict(zip(sorted(names)[len(axes) - len(own) :], (self.array.shape[1 + index] for index in own), strict=True))
+        depth = max(schema.depth(), len(self.axes), *(place + 1 for place in names))
+        array = self.array.reshape(self.array.shape[0], *(lengths.get(place, 1) for place in range(depth)))
+        return Column(array, tuple(names[place] if place in lengths else None for place in range(depth)), self.batch, ready=self.ready)
 
-    def steps(self) -> NDArray[np.intp]:
-        """0, 1, 2 ... up to the largest value, (m,): the indices of an array of which this column is the count."""
-        return np.arange(int(np.nanmax(self.array, initial=0)))
+    @property
+    def index(self) -> Along:
+        """0, 1, 2 ... along the innermost array that the values are in.
+
+        Raises:
+            SpecError: where they are in none.
+        """
+        places = [place for place, name in enumerate(self.axes) if name is not None]
+        if not places:
+            raise SpecError("there is an index of arrays only, and these values are in none")
+        return Along((str(self.axes[places[-1]]).strip("?"),), np.arange(self.array.shape[1 + places[-1]]))
+
+    def steps(self) -> Along | NDArray[np.intp]:
+        """0, 1, 2 ... up to the largest value, (m,): the indices of the array of which this column is the count."""
+        schema, numbers = self.batch.table.schema, np.arange(int(np.nanmax(self.array, initial=0)))
+        counted = [axis for axis, count in schema.arrays.items() if isinstance(count, Ref) and count.path == self.source and not self.frame]
+        axis = counted[0] if len(counted) == 1 else schema.chain[-1] if schema.chain else None
+        return numbers if axis is None else Along((axis,), numbers)
+
+    def gathered(self, table: NDArray[np.float64]) -> Column:
+        """The rows of a table, (m + 1, k), the last one nan, at these indices, along the array of k elements that stands in theirs."""
+        own = [place for place, name in enumerate(self.axes) if name is not None]
+        depth = max(len(self.axes), self.batch.table.schema.depth())
+        place = _spot(table.shape[1:], [None] * depth, [1] * depth, self.batch.table, without=own)
+        found = table.take(row_numbers(deep(self.array, depth).squeeze(1 + place), len(table)), axis=0)
+        axes = [*self.axes, *(None,) * (depth - len(self.axes))]
+        axes[place] = f"?{self.batch.table.schema.chain[place]}"
+        return Column(np.moveaxis(found, -1, 1 + place), tuple(axes), self.batch, ready=self.ready)
+
+    def running(self) -> Column:
+        """The sum of the values so far along the innermost array that they are in."""
+        place = max([place for place, name in enumerate(self.axes) if name is not None], default=0)
+        return Column(np.cumsum(self.array, axis=1 + place, dtype=np.float64), self.axes, self.batch, ready=self.ready)
 
     def shifted(self, step: int) -> Column:
         """The values `step` places later (earlier if negative) in stream order, on the same axes; nan across a loss and at the end."""
@@ -232,7 +281,7 @@ def unpadded(axes: tuple[str | None, ...], shape: tuple[int, ...], batch: Batch)
     """Which elements, (n, product of the other lengths), are not padding; None where none is."""
     mask: NDArray[np.bool_] | None = None
     for index, axis in enumerate(axes):
-        name = (axis or "<").rstrip("?")
+        name = (axis or "<").strip("?")
         if name.startswith("<") or isinstance(batch.table.schema.arrays.get(name), int):
             continue
         counts = batch.table.counts(name)
@@ -254,29 +303,90 @@ def aligned(values: tuple[Any, ...], batch: Batch) -> tuple[list[NDArray[Any]], 
     if columns and all(column.axes == columns[0].axes for column in columns) and _only_numbers_beside(values):
         arrays = [value.array if isinstance(value, Column) else np.asarray(value) for value in values]
         return arrays, columns[0].axes, min([column.ready for column in columns])
-    depth = max((len(column.axes) for column in columns), default=0)
-    names: list[str | None] = [None] * depth
+    schema = batch.table.schema
+    named = {at: {schema.places[axis]: axis for axis in map(schema.axis, v.axes)} for at, v in enumerate(values) if isinstance(v, Along)}
+    depth = max([len(column.axes) for column in columns] + [place + 1 for places in named.values() for place in places], default=0)
+    axes, lengths = list[str | None]([None] * depth), [1] * depth
     for column in columns:
-        for index, name in enumerate(column.axes):
-            known = names[index] or "?"
-            if known.endswith("?"):
-                names[index] = name or names[index]
-            elif name is not None and not name.endswith("?") and name != known:
-                raise SpecError(f"axis {known!r} meets axis {name!r}: put one on the other's place with .on(...)")
-    chain = batch.table.schema.chain
+        for place, name in enumerate(column.axes):
+            axes[place], lengths[place] = _met(axes[place], name), max(lengths[place], column.array.shape[1 + place])
+    for at, places in named.items():
+        for place, axis in places.items():
+            length = _length(values[at], axis)
+            axes[place], lengths[place] = _met(axes[place], f"{axis}?" if length != 1 else None), max(lengths[place], length)
     arrays = []
-    for value in values:
+    for at, value in enumerate(values):
         if isinstance(value, Column):
             arrays.append(deep(value.array, depth))
-            continue
-        array = np.asarray(value)
-        arrays.append(array)
-        for index in range(depth):
-            place = array.ndim - depth + index
-            if place >= 0 and array.shape[place] != 1 and names[index] is None:
-                own = "?" if array.ndim <= depth else ""  # with an axis for the packets it was made of columns
-                names[index] = f"{chain[index]}{own}" if index < len(chain) else f"<{index}>"
-    return arrays, tuple(names), min((column.ready for column in columns), default=len(batch))
+        elif at in named:
+            names = tuple(named[at].get(place, "").rpartition(".")[2] for place in range(min(named[at]), depth))
+            arrays.append(value.lined_up(names))
+        else:
+            arrays.append(_placed(np.asarray(value), axes, lengths, batch.table))
+    return arrays, tuple(axes), min((column.ready for column in columns), default=len(batch))
+
+
+def _met(known: str | None, name: str | None) -> str | None:
+    """The name of an axis that has two, of which one may be None.
+
+    Raises:
+        SpecError: for those of different arrays, unless one is a guess.
+    """
+    if known is None or name is None:
+        return known or name
+    if known.strip("?") != name.strip("?") and not known.startswith("?") and not name.startswith("?"):
+        raise SpecError(f"axis {known.strip('?')!r} meets axis {name.strip('?')!r}: put one on the other's place with .on(...)")
+    return min(known, name, key=lambda one: (one.startswith("?"), one.endswith("?")))
+
+
+def _length(value: Along, axis: str) -> int:
+    """How many numbers there are along an array."""
+    return int(value.array.shape[[name.rpartition(".")[2] for name in value.axes].index(axis.rpartition(".")[2])])
+
+
+def _placed(array: NDArray[Any], axes: list[str | None], lengths: Sequence[int], table: Table) -> NDArray[Any]:
+    """A plain array, lined up with axes of these lengths, which are given a name where they have none.
+
+    Raises:
+        SpecError: where its length is that of several of them, or of no array of the frame.
+    """
+    depth = len(lengths)
+    if array.size == 1:
+        return array
+    if array.ndim < depth:
+        array = array.reshape(*array.shape, *(1,) * (depth - array.ndim - _spot(array.shape, axes, lengths, table)))
+    for place in range(max(depth - array.ndim, 0), depth):
+        if array.shape[place - depth] != 1 and axes[place] is None:
+            chain = table.schema.chain
+            guess = "" if array.ndim > depth else "?"  # with an axis for the packets it was made of columns
+            axes[place] = f"{guess}{chain[place] if place < len(chain) else f'<{place}>'}"
+    return array
+
+
+def _spot(shape: tuple[int, ...], axes: Sequence[str | None], lengths: Sequence[int], table: Table, without: Sequence[int] = ()) -> int:
+    """The axis that the first one of a plain array goes with, as its lengths say: among those that are there, else among the frame's.
+
+    Args:
+        without: axes that it does not go with.
+    """
+    wanted = [(place, length) for place, length in enumerate(shape) if length != 1]
+    there = {(place, length): (axes[place] or "").strip("?") for place, length in enumerate(lengths)}
+    texts = {info.path for info in table.schema.fields.values() if info.kind == "bytes"}
+    whole = {(place, table.length(axis)): axis for axis, place in table.schema.places.items() if axis not in texts and place not in without}
+    for known in (there, whole):
+        spots = [[(first + place, length) for place, length in wanted] for first in range(len(lengths) - len(shape) + 1)]
+        found = {first: [known[spot] for spot in some] for first, some in enumerate(spots) if all(spot in known for spot in some)}
+        fixed = {first: names for first, names in found.items() if all(isinstance(table.schema.arrays.get(name, 0), int) for name in names)}
+        found = fixed or found  # which other arrays are as long by chance is not to change what a spec means
+        if len(found) == 1 or (len(shape) > 1 and len(lengths) - len(shape) in found):  # which says itself how far out it is
+            return max(found)
+        if found:
+            names = [" x ".join(names) for names in found.values()]
+            reason = f"goes with {' as well as with '.join(names)}: say which with along({found[max(found)][-1]!r}, ...)"
+            break
+    else:
+        reason = f"goes with no array of the frame: {', '.join(f'{axis} {length}' for (_, length), axis in whole.items()) or 'it has none'}"
+    raise SpecError(f"an array of {' x '.join(map(str, shape))} values {reason}", rule="LS214")
 
 
 def of_points(parts: Mapping[str, Any], batch: Batch) -> tuple[list[NDArray[Any]], tuple[str | None, ...], int, tuple[int, ...]]:
@@ -285,14 +395,17 @@ def of_points(parts: Mapping[str, Any], batch: Batch) -> tuple[list[NDArray[Any]
     Raises:
         SpecError: where axes of different arrays meet, lengths do not fit, or a plain array is along an axis that no field has.
     """
-    arrays, axes, ready = aligned(tuple(parts.values()), batch)
+    anchor = Column(np.zeros((1,) * (1 + batch.table.schema.depth())), (None,) * batch.table.schema.depth(), batch)
+    (_, *arrays), axes, ready = aligned((anchor, *parts.values()), batch)
     named = dict(zip(parts, arrays, strict=True))
     shape = together({"": np.empty((len(batch), *(1,) * len(axes)), np.bool_), **named}, axes)
-    stray = next((index for index, name in enumerate(axes) if name is not None and name.endswith("?")), None)
+    stray = next((name.strip("?") for name in axes if name is not None and "?" in name), None)
     if stray is not None or len(shape) > 1 + len(axes):
-        where = f"along {axes[stray]!r}".replace("?", "") if stray is not None else "along a further axis"
-        hint = "the last axis of a plain array goes with the innermost array of the frame: add [..., None] for one further out"
-        raise SpecError(f"points {where}, where no field of theirs is ({_lengths(named, axes)}); {hint}", rule="LS214")
+        where = f"along {stray!r}" if stray is not None else "along a further axis"
+        raise SpecError(
+            f"points {where}, where no field of theirs is ({_lengths(named, axes)}); numbers go along an array with along(...)",
+            rule="LS214",
+        )
     return arrays, axes, ready, shape
 
 
@@ -314,7 +427,7 @@ def together(arrays: Mapping[str, NDArray[Any]], axes: tuple[str | None, ...]) -
 
 def _lengths(arrays: Mapping[str, NDArray[Any]], axes: tuple[str | None, ...]) -> str:
     """How long arrays are along which axes: "range: samples 3, azimuth: samples 4"; those of one number are left out."""
-    names, told = ("packets", *((name or "").rstrip("?") for name in axes)), []
+    names, told = ("packets", *((name or "").strip("?") for name in axes)), []
     for what, array in arrays.items():
         own = [f"{name} {size}".strip() for name, size in zip(reversed(names), reversed(array.shape), strict=False) if size != 1]
         extra = [str(size) for size in array.shape[: max(array.ndim - len(names), 0)]]
@@ -344,13 +457,6 @@ def remainder(values: Any, full: Any) -> NDArray[Any]:
     return rest
 
 
-def _position(name: str, chain: tuple[str, ...]) -> int:
-    for index, axis in enumerate(chain):
-        if axis == name or axis.rpartition(".")[2] == name:
-            return index
-    raise SpecError(f"there is no array {name!r} around the points; there are {', '.join(chain) or 'none'}")
-
-
 def _tail(values: NDArray[np.float64], edges: NDArray[np.intp], end: int, size: int) -> NDArray[np.float64]:
     """The last values before `end` that nothing lost separates from it."""
     if end == 0 or size == 0:
@@ -359,23 +465,25 @@ def _tail(values: NDArray[np.float64], edges: NDArray[np.intp], end: int, size: 
     return values[max(end - size, int(lost[-1]) if len(lost) else 0, 0) : end].copy()
 
 
-def field_column(info: FieldInfo, table: Table, depth: int, batch: Batch, which: NDArray[np.intp] | None = None) -> Column:
-    """A field in its unit as a column of `depth` array axes; `which`: the frame of the table for each packet."""
+def field_column(info: FieldInfo, table: Table, depth: int, batch: Batch, which: NDArray[np.intp] | None = None, frame: str = "") -> Column:
+    """A field in its unit as a column of `depth` array axes; `which`: the frame of the table, of type `frame`, for each packet."""
     array = field_array(info, table, depth)
     if which is not None:
         array = array[which]
-    axes = [_axis(name, length, table, known=which is None) for name, length in zip(info.axes, array.shape[1:], strict=False)]
-    return Column(array, (*axes, *(None,) * (array.ndim - 1 - len(axes))), batch, source=info.path)
+    axes = list[str | None]([None] * (array.ndim - 1))
+    for name in info.axes:
+        place = table.schema.places[name]
+        axes[place] = _axis(name, array.shape[1 + place], table, known=which is None)
+    return Column(array, tuple(axes), batch, source=info.path, frame=frame)
 
 
 def field_array(info: FieldInfo, table: Table, depth: int) -> NDArray[np.float64]:
-    """A field in its unit, (n, ...), with `depth` axes behind the first at least, of length 1 where the field has none."""
-    return deep(physical(info, table), depth)
-
-
-def deep(array: NDArray[Any], depth: int) -> NDArray[Any]:
-    """Values of packets, (n, ...), with axes of length 1 behind them, up to `depth` behind the first."""
-    return array.reshape(*array.shape, *(1,) * (depth + 1 - array.ndim))
+    """A field in its unit, (n, ...), each array's axis in its place, with `depth` axes at least behind the first, some of length 1."""
+    array, places = physical(info, table), [table.schema.places[axis] for axis in info.axes]
+    if places and places[-1] >= len(places):  # an element of an array in which others stand
+        lengths = dict(zip(places, array.shape[1:], strict=True))
+        array = array.reshape(len(array), *(lengths.get(place, 1) for place in range(places[-1] + 1)))
+    return deep(array, depth)
 
 
 def _axis(name: str, length: int, table: Table, *, known: bool) -> str | None:
@@ -418,11 +526,21 @@ class Fields:
         if name == "frame" and not self._prefix and not self._frame and AROUND in self._batch.state:
             return Fields(self._batch, frame=AROUND)
         path, known = f"{self._prefix}{name}", _paths(self._batch, self._frame)
-        if path in known:
+        base = without_indices(path)[0]
+        if base in known:
             return _column(self._batch, self._frame, path)
-        if any(other.startswith(f"{path}.") for other in known):
+        if any(other.startswith(f"{base}.") for other in known):
             return Fields(self._batch, f"{path}.", self._frame)
+        axis = base.rpartition(".")[0]
+        if name == "index" and not self._frame and axis in self._batch.table.schema.arrays:
+            return Along((axis,), np.arange(self._batch.table.length(axis)))
         raise UnknownField(path, known, place="frame" if self._frame == AROUND else f"state.{self._frame}" if self._frame else "")
+
+    def __getitem__(self, index: int) -> Fields:
+        """An element of an array of structs, counted from the last one of each packet where the index is negative."""
+        if not self._prefix or not isinstance(index, int):
+            raise SpecError("only arrays have elements, each by one index: f.columns[0].timestamp, f.distances[-1]")
+        return Fields(self._batch, f"{self._prefix.removesuffix('.')}[{index}].", self._frame)
 
     @property
     def _is_around(self) -> bool:
@@ -455,22 +573,25 @@ class _States:
 def _column(batch: Batch, frame: str, path: str) -> Column:
     """A field of a batch; of another frame type that of the frame that was last before each packet, or its declared default."""
     depth = batch.table.schema.depth()
+    table, which = batch.state[frame] if frame else (batch.table, np.zeros(0, np.intp))
+    if table is not None and path not in table.schema.fields and without_indices(path)[0] in table.schema.fields:
+        raise SpecError("there is no such element", path=path)
     if not frame:
         return field_column(batch.table.schema.fields[path], batch.table, depth, batch)
-    table, which = batch.state[frame]
     defaults = batch.defaults.get(frame, {})
     missing = which < 0
     if not missing.any() and table is not None:
         same = len(which) == 0 or int(which.min()) == int(which.max())
-        return field_column(table.schema.fields[path], table, depth, batch, which[:1] if same else which)
-    if path not in defaults:
+        return field_column(table.schema.fields[path], table, depth, batch, which[:1] if same else which, frame)
+    base, indices = without_indices(path)
+    if base not in defaults:
         raise SpecError(f"no {frame} frame has arrived yet, and no default is declared", path=f"state.{frame}.{path}")
     batch.nominal = True
-    default = np.asarray(defaults[path], np.float64)
+    default = np.asarray(defaults[base], np.float64)[tuple(indices.values())]
     names = tuple(path if length != 1 else None for length in default.shape)
     spare = (1,) * max(depth - default.ndim, 0)
     array = default.reshape(1, *default.shape, *spare)
     if table is not None and not missing.all():
         known = field_column(table.schema.fields[path], table, depth, batch, np.maximum(which, 0)).array
         array = np.where(missing.reshape(-1, *(1,) * (known.ndim - 1)), array, known)
-    return Column(array, (*names, *(None,) * len(spare)), batch)
+    return Column(array, (*names, *(None,) * len(spare)), batch, source=path, frame=frame)

@@ -11,9 +11,10 @@ values that a field can have, tests of plausibility and clocks differ only in wh
 value is made of, conditions and sums taken apart. For them a value is *full* where each point has its own, else *low*: then it is
 computed once for its packet or block, plainly.
 
-Room is left for what is to come. Axes by name (M3): a node's axes are those of its sample, so constants that name an axis are operands
-like columns. Elements of an array and tables over two indices (M8): kinds of nodes beside "on". More columns of a point (M5): further
-values that are traced. Points by coordinates (M2): their expressions are nodes like any others.
+A node's axes are those of its sample. What is no column (`vocabulary.Along`, plain arrays) is lined up with these as it is noted down, so
+that whoever computes with the graph broadcasts arrays.
+
+Room is left for what is to come. More columns of a point (M5): further values that are traced.
 """
 
 from __future__ import annotations
@@ -21,16 +22,16 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
-from operator import attrgetter
 from typing import Any
 
 import numpy as np
 from numpy.lib.mixins import NDArrayOperatorsMixin
 from numpy.typing import NDArray
 
-from lidarspec.columns.columns import ELEMENTWISE, NO_TRUTH, Batch, Column, Fields, called
+from lidarspec.columns.columns import NO_TRUTH, Batch, Column, Fields, aligned, called
 from lidarspec.errors import SpecError
 from lidarspec.spec.tree import FieldInfo
+from lidarspec.spec.vocabulary import ELEMENTWISE, Along
 from lidarspec.wire.frame_table import Group, Rows, Table
 from lidarspec.wire.schema import Schema
 
@@ -44,7 +45,7 @@ class Node:
     """One step of the computation.
 
     Attributes:
-        kind: "field", "state", "shift", "latest", "on" or "call".
+        kind: "field", "state", "shift", "latest", "on", "running", "rows" (of a table, at indices) or "call".
         function: for "call" what is applied to arrays that broadcast; for "field" and "state" what makes its column of `Fields`; for the
             others what makes a column of columns.
         args: nodes, numbers and arrays.
@@ -162,13 +163,31 @@ class Traced(NDArrayOperatorsMixin):
     def applied(self, function: Callable[..., Any], *values: Any) -> Traced:
         """What a function of arrays makes of the values, noted down."""
         samples = [value.node.sample if isinstance(value, Traced) else value for value in values]
-        return self._tape.add("call", function, values, self.node.sample.applied(function, *samples))
+        arrays, _, _ = aligned(tuple(samples), self.node.sample.batch)  # what is no column is noted down in its place
+        table = _folded(function, values)
+        if table is not None:
+            return Traced(table[0], self._tape).gathered(table[1])
+        args = tuple(value if isinstance(value, Traced | int | float) else array for value, array in zip(values, arrays, strict=True))
+        return self._tape.add("call", function, args, self.node.sample.applied(function, *samples))
+
+    @property
+    def index(self) -> Along:
+        """0, 1, 2 ... along the innermost array that the values are in."""
+        return self.node.sample.index
 
     def on(self, *axes: str) -> Traced:
         """The value on other axes, by the names of arrays, noted down."""
         return self._tape.add("on", lambda column: column.on(*axes), (self,), self.node.sample.on(*axes))
 
-    def steps(self) -> NDArray[np.intp]:
+    def gathered(self, table: NDArray[np.float64]) -> Traced:
+        """The rows of a table at these indices, noted down."""
+        return self._tape.add("rows", lambda column, rows: column.gathered(rows), (self, table), self.node.sample.gathered(table))
+
+    def running(self) -> Traced:
+        """The sum so far along the innermost array, noted down."""
+        return self._tape.add("running", lambda column: column.running(), (self,), self.node.sample.running())
+
+    def steps(self) -> Along | NDArray[np.intp]:
         """0, 1, 2 ... up to the largest value in the sample; the tape remembers how many these were."""
         found = self.node.sample.steps()
         self._tape.steps.append((self.node, len(found)))
@@ -197,24 +216,46 @@ class Traced(NDArrayOperatorsMixin):
     def __len__(self) -> int:
         raise Untraceable("the length of a column")
 
-    def __getitem__(self, index: Any) -> Any:
-        raise Untraceable("a column is indexed")
+    def __getitem__(self, index: Any) -> Traced:
+        """An element of a field that is an array: a field by itself."""
+        node = self.node
+        return self._tape.add(node.kind, lambda fields: node.function(fields)[index], (), node.sample[index], f"{node.path}[{index}]")
 
 
 class TracedFields:
     """What `points` is given while it is traced: the fields of the sample, noted down."""
 
-    def __init__(self, real: Any, tape: Tape, names: tuple[str, ...] = ()) -> None:
-        self._real, self._tape, self._names = real, tape, names
+    def __init__(self, real: Any, tape: Tape, path: str = "", read: Callable[[Any], Any] = lambda fields: fields) -> None:
+        self._real, self._tape, self._path, self._read = real, tape, path, read
 
     def __getattr__(self, name: str) -> Any:
         if name.startswith("__"):
             raise AttributeError(name)
-        value, names = getattr(self._real, name), (*self._names, name)
+        path, before = f"{self._path}.{name}".lstrip("."), self._read
+        value, read = getattr(self._real, name), lambda fields: getattr(before(fields), name)
+        if isinstance(value, Along):
+            return value
         if not isinstance(value, Column):
-            return TracedFields(value, self._tape, names)
-        path = ".".join(names)
-        return self._tape.add("state" if self._real._is_around else "field", attrgetter(path), (), value, path)
+            return TracedFields(value, self._tape, path, read)
+        return self._tape.add("state" if self._real._is_around else "field", read, (), value, path)
+
+    def __getitem__(self, index: Any) -> TracedFields:
+        before = self._read
+        return TracedFields(self._real[index], self._tape, f"{self._path}[{index}]", lambda fields: before(fields)[index])
+
+
+def _folded(function: Callable[..., Any], values: Sequence[Any]) -> tuple[Node, NDArray[np.float64]] | None:
+    """A function of rows of tables at the same indices, and of numbers, as rows of one table: the indices and it; None where it is none.
+
+    So the sines and cosines of directions that are looked up are computed once, for the table.
+    """
+    nodes = [value.node for value in values if isinstance(value, Traced)]
+    if any(node.kind != "rows" or node.args[0] is not nodes[0].args[0] for node in nodes):
+        return None
+    if any(np.size(value) != 1 for value in values if not isinstance(value, Traced)):
+        return None
+    table = called(function, [value.node.args[1] if isinstance(value, Traced) else value for value in values])
+    return (nodes[0].args[0], table) if table.dtype == np.float64 and table.shape == nodes[0].args[1].shape else None
 
 
 def node_of(value: Any) -> Any:

@@ -6,11 +6,12 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import accumulate
 from pathlib import Path
 from shlex import quote
+from types import MappingProxyType
 from typing import Any, Protocol
 
 import numpy as np
@@ -49,11 +50,14 @@ class Input(Protocol):
         is_live: whether data come at their own pace, and not from a file.
         decoder: what finds the frames on the data link.
         stays_on: whether the sensor is left as it is at the end.
+        sensor: whose frames they are, configured with the options that it has `learned` of itself.
     """
 
     is_live: bool = False
+    sensor: Sensor
     decoder: Decoder
     stays_on: bool = True
+    learned: Mapping[str, Any] = MappingProxyType({})
 
     @property
     def state(self) -> str:
@@ -99,7 +103,7 @@ class Input(Protocol):
         """Whether everything that had been produced at a mark has been decoded; of a file each scan is looked at in its turn."""
         return True
 
-    def send(self, name: str, *, timeout: float | None = None, **arguments: Any) -> Reply:
+    def send(self, name: str, /, *, timeout: float | None = None, **arguments: Any) -> Reply:
         """The reply to a command, which other threads may wait for at the same time.
 
         Raises:
@@ -159,7 +163,7 @@ class FileInput(Input):
     state = "streaming"
 
     def __init__(self, source: str | Path, sensor: Sensor, opened: Transport, *, backend: str) -> None:
-        self._source, self._sensor, self._transport = source, sensor, opened
+        self._source, self.sensor, self._transport = source, sensor, opened
         self.decoder: Decoder = sensor.decoder(stream=not opened.datagrams, backend=backend)
         self._senders = Senders(source, sensor)
         self._arrivals = self._read()
@@ -171,8 +175,8 @@ class FileInput(Input):
     @property
     def warnings(self) -> list[str]:
         said, stats = list(self._transport.warnings), self.decoder.stats
-        if self.state == "ended" and stats.bytes_in and not any(name in stats.frames for name in self._sensor.data_frames):
-            text = f"{self._source}: {stats.bytes_in} bytes, and no data frame of {self._sensor.id} among them"
+        if self.state == "ended" and stats.bytes_in and not any(name in stats.frames for name in self.sensor.data_frames):
+            text = f"{self._source}: {stats.bytes_in} bytes, and no data frame of {self.sensor.id} among them"
             said.append(f"{text}; next: lidarspec detect {quote(str(self._source))}")
         return said
 
@@ -191,8 +195,8 @@ class FileInput(Input):
     def begin(self) -> None:
         """A file has no sensor to be started."""
 
-    def send(self, name: str, *, timeout: float | None = None, **arguments: Any) -> Reply:
-        raise CommandError(f"{self._sensor.id} {name}: {self._source} is a file, there is no device to send it to")
+    def send(self, name: str, /, *, timeout: float | None = None, **arguments: Any) -> Reply:
+        raise CommandError(f"{self.sensor.id} {name}: {self._source} is a file, there is no device to send it to")
 
     def write(self, data: bytes, link: str = "data") -> None:
         raise SourceError(f"{self._source} is a file, there is no device to send bytes to")
@@ -203,12 +207,12 @@ class FileInput(Input):
 
     def first_state(self) -> dict[str, bytes]:
         """The first frame of each type that `points` takes its state from: a file is read as if it stood at the start."""
-        wanted = set(self._sensor.state)
+        wanted = set(self.sensor.state)
         if not wanted or not Path(str(self._source).partition("?")[0]).is_file():
             return {}
         first: dict[str, bytes] = {}
         with contextlib.closing(transport(self._source)) as source:
-            decoder = self._sensor.decoder(stream=not source.datagrams)
+            decoder = self.sensor.decoder(stream=not source.datagrams)
             if isinstance(source, CaptureTransport):
                 return first_frames(decoder, source.batches(), wanted)
             for chunk in source.chunks():

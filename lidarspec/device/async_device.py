@@ -19,6 +19,7 @@ from lidarspec.device.device import Device, open as open_device
 from lidarspec.device.session import Reply
 from lidarspec.errors import UsageError
 from lidarspec.framing.results import Counters
+from lidarspec.packets.imu import ImuSamples
 from lidarspec.packets.packets import Packets
 from lidarspec.scans.scans import Scan
 from lidarspec.spec.sensor import Sensor
@@ -41,6 +42,7 @@ class AsyncDevice:
         self._reader = ThreadPoolExecutor(1, "reader of a device")
         self._sender = ThreadPoolExecutor(1, "sender of a device")
         self._scans: _Feed[Scan] | None = None
+        self._imu: _Feed[ImuSamples] | None = None
         self._packets: dict[str | None, _Feed[Packets]] = {}
         self._newest: Scan | None = None
 
@@ -96,6 +98,18 @@ class AsyncDevice:
         async for scan in self._drained(self._scans):
             yield scan
 
+    async def imu(self) -> AsyncIterator[ImuSamples]:
+        """What the sensor's IMU felt, in batches, until the input ends or the device is closed.
+
+        Raises:
+            UsageError: where no frame of the sensor says what an IMU felt.
+            SourceError: where a file has been read to its end before.
+        """
+        if self._imu is None:
+            self._imu = _Feed(self.device.imu(wait=STEP), lambda samples: not len(samples))
+        async for samples in self._drained(self._imu):
+            yield samples
+
     async def latest(self, timeout: float | None = None) -> Scan:
         """The newest whole scan, newer than the one that the last call gave; from a file the next.
 
@@ -113,7 +127,7 @@ class AsyncDevice:
             if newest is not None:
                 return newest
 
-    async def send(self, name: str, *, timeout: float | None = None, **arguments: Any) -> Reply:
+    async def send(self, name: str, /, *, timeout: float | None = None, **arguments: Any) -> Reply:
         """The reply to a command; at once with ``confirmed=False`` where none is documented.
 
         Args:

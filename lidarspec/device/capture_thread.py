@@ -166,7 +166,7 @@ class Capture:
         self.transport, self.connected, self.disconnects, self.last = transport, True, 0, time.monotonic()
         self._queue, self._link, self._log = queue, link, log
         self._clock, self.warnings = clock or HostClock(), list[str]()
-        self._stop = threading.Event()
+        self._stop, self._handing = threading.Event(), threading.Lock()
         self._thread = threading.Thread(target=self._run, name=f"capture of {link}", daemon=True)
         self._thread.start()
 
@@ -176,6 +176,15 @@ class Capture:
         if threading.current_thread() is not self._thread:
             self._thread.join(5.0)
         self.transport.close()
+
+    def record(self, log: Log | None) -> None:
+        """Record from now on, and forget what waits in the queue: what comes out of it is what is recorded."""
+        while not self._handing.acquire(timeout=POLL):
+            self._queue.take(0.0)  # which it may wait for
+        self._log = log
+        while self._queue.take(0.0):
+            pass
+        self._handing.release()
 
     def _run(self) -> None:
         try:
@@ -206,10 +215,11 @@ class Capture:
         if gap or quiet:
             chunks[0] = replace(chunks[0], gap=gap, quiet=quiet)
         self._look_at_the_clock(chunks[0])
-        if self._log is not None:
-            for chunk in chunks:
-                self._log.write(chunk)
-        self._queue.put(self._link, chunks)
+        with self._handing:
+            if self._log is not None:
+                for chunk in chunks:
+                    self._log.write(chunk)
+            self._queue.put(self._link, chunks)
 
     def _look_at_the_clock(self, chunk: Chunk) -> None:
         """Where the wall clock was set before a chunk came, arrival times go on as before; it is said once, and recorded each time."""

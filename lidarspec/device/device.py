@@ -10,20 +10,24 @@ import time
 import weakref
 from collections import deque
 from collections.abc import Iterator, Mapping
+from functools import partial
 from pathlib import Path
 from shlex import quote
 from typing import Any, overload
+
+import numpy as np
 
 from lidarspec.device.arrivals import Arrival, FileInput, Input
 from lidarspec.device.live_input import PERIOD, LiveInput
 from lidarspec.device.session import Reply
 from lidarspec.device.settings import named
-from lidarspec.discovery.detect import contradiction, detected
+from lidarspec.discovery.detect import contradiction, detected, said
 from lidarspec.errors import SourceError, UsageError, suggest
 from lidarspec.framing.decoder import Decoder
 from lidarspec.framing.results import Counters, Found, Frames
+from lidarspec.packets.imu import ImuSamples, joined
 from lidarspec.packets.packets import Packets
-from lidarspec.packets.stream import PacketStream, data_frame
+from lidarspec.packets.stream import ImuStream, PacketStream, data_frame
 from lidarspec.plugins import sensor as named_sensor
 from lidarspec.points.cloud import Mount
 from lidarspec.recording.appending import Log
@@ -37,6 +41,8 @@ from lidarspec.transports.protocol import Closing, LiveTransport, Transport
 UNDECIDED = 256
 #: frames that are asked whether they are another sensor's.
 EXAMINED = 64
+#: samples of an IMU kept at least while no scan ends.
+FELT = 1 << 16
 #: seconds that one wait for data takes where there is no end to waiting.
 LONG = 3600.0
 
@@ -51,6 +57,8 @@ class PacketReader:
 
     Attributes:
         last: the packets of the last arrival.
+        imu: what the sensor's IMU felt.
+        felt: the samples of the last arrival.
     """
 
     def __init__(self, sensor: Sensor, frame: str | None, decoder: Decoder, state: Mapping[str, bytes]) -> None:
@@ -58,6 +66,21 @@ class PacketReader:
         self._waiting: deque[Frames] = deque(maxlen=UNDECIDED)
         self._stream = self._made(frame) if frame is not None else None
         self.last: Packets | None = None
+        self.imu, self.felt = self._feeling(), joined([])
+
+    def feel(self, arrival: Arrival, data: Packets | None) -> None:
+        """Take the IMU's samples of an arrival, and of its packets."""
+        if arrival.replaced:
+            waiting, self.imu = self.imu.waiting, self._feeling()
+            self.imu.waiting = waiting
+        self.felt = self.imu.add(arrival.found, data)
+        if self.imu.waiting is not None:
+            self.imu.waiting.keep(FELT)
+        if arrival.interrupted:
+            self.imu.interrupt()
+
+    def _feeling(self) -> ImuStream:
+        return ImuStream(self._sensor, self._decoder.stats, backend=self._decoder.backend, state=self._state)
 
     def add(self, arrival: Arrival) -> Packets | None:
         """The packets among these frames; None while nobody knows of which type."""
@@ -87,7 +110,10 @@ class PacketReader:
         Args:
             read: it is the last one, of which packets were made before.
         """
-        packets = self.last if read else self.add(arrival)
+        packets = self.last
+        if not read:
+            packets = self.add(arrival)
+            self.feel(arrival, packets)
         if packets is not None and len(packets):
             yield from handed_out(stream.add(packets))
         if arrival.interrupted:
@@ -120,18 +146,24 @@ class Device(Closing):
     ) -> None:
         self.sensor, self._source, self.mount = sensor, source, mount
         self._streams: dict[str | None, PacketReader] = {}
-        self._latest, self._unseen = ScanStream(sensor, mount), deque[Scan]()
+        self._latest: ScanStream | None = None
+        self._unseen = deque[Scan]()
         self._ahead: Arrival | None = None
         self._first, self._another = list[Found](), None if sensor.relatives or "model" in sensor.info else ""
-        self._own_recorder: Log | None = None
-        self._input = self._opened(backend, record, overflow, period)
-        self._finalizer = weakref.finalize(self, _close, self._input, self._own_recorder)
+        self._own_recorders = list[Log]()
+        self._telling = {path.partition(".")[0] for path in sensor.info.values()}
+        self._told: dict[str, Found] = {}
+        self._input = self._opened(backend, record, overflow, period, learns=start)
+        self._finalizer = weakref.finalize(self, _close, self._input, self._own_recorders)
         if start:
             try:
                 self._input.begin()
             except BaseException:
                 self.close()
                 raise
+        if self.learned:
+            self.sensor = self._input.sensor
+            self._latest = ScanStream(self.sensor, mount)
 
     @property
     def stats(self) -> Counters:
@@ -146,6 +178,16 @@ class Device(Closing):
         nominal = [_nominal(self.sensor)] if self.stats.nominal else []
         unended = [f"{self._source}: {self.stats.unended}"] if self.stats.unended else []
         return [*self._input.warnings, *self._doubts(), *unended, *nominal, *([] if failure is None else [str(failure)])]
+
+    @property
+    def learned(self) -> Mapping[str, Any]:
+        """The options that the sensor has said of itself on opening; `sensor` is configured with them."""
+        return self._input.learned
+
+    @property
+    def info(self) -> dict[str, str]:
+        """What the sensor has said of itself so far: of "serial", "firmware", "model" and "temperature" those that its frames have."""
+        return said(self.sensor, self._told.values())
 
     @property
     def state(self) -> str:
@@ -207,7 +249,8 @@ class Device(Closing):
         Raises:
             SourceError: where a file has been read to its end before.
         """
-        stream, reader, ahead, turn = ScanStream(self.sensor, self.mount), self._reader(None), self._taken_back(), time.monotonic()
+        reader, ahead, turn = self._reader(None), self._taken_back(), time.monotonic()
+        stream = self._scan_stream()
         for arrival in self._arrivals(wait, ahead):
             for scan in () if arrival is None else reader.scans(stream, arrival, read=arrival is ahead):
                 yield scan
@@ -216,8 +259,33 @@ class Device(Closing):
             if wait is not None and (arrival is None or time.monotonic() - turn >= wait):
                 yield None
                 turn = time.monotonic()
-            stream = ScanStream(self.sensor, self.mount) if arrival is not None and arrival.interrupted else stream
+            stream = self._scan_stream() if arrival is not None and arrival.interrupted else stream
         yield from stream.finish()
+
+    def imu(self, *, wait: float | None = None) -> Iterator[ImuSamples]:
+        """What the sensor's IMU felt, in batches as it comes, in the carrier's axes where the sensor is mounted, until the input ends.
+
+        Scans have what was felt during them in `Scan.imu`. A file is read once, whoever reads it.
+
+        Args:
+            wait: yield no samples where none have come for so many seconds, so that the caller has a turn.
+
+        Raises:
+            UsageError: where no frame of the sensor says what an IMU felt.
+            SourceError: where a file has been read to its end before.
+        """
+        if not self.sensor.imu_frames:
+            raise UsageError(f"{self.sensor.id}: no frame says what an IMU felt")
+        reader, ahead, turn = self._reader(None), self._taken_back(), time.monotonic()
+        for arrival in self._arrivals(wait, ahead):
+            if arrival is not None and arrival is not ahead:
+                reader.feel(arrival, reader.add(arrival))
+            if reader.imu.waiting is not None:
+                reader.imu.waiting.until(None)  # no scan asks for them
+            felt = joined([]) if arrival is None else reader.felt
+            if len(felt) or arrival is None or (wait is not None and time.monotonic() - turn >= wait):
+                yield felt if self.mount is None else felt.turned(self.mount.rotation)
+                turn = time.monotonic()
 
     def latest(self, timeout: float | None = None) -> Scan:
         """The newest whole scan, newer than the one that the last call gave; waits for it. Older ones are passed over.
@@ -248,10 +316,11 @@ class Device(Closing):
                 raise SourceError(f"{self._source}: no further scan, since the input is {self._input.state}")
             arrival = self._next(max(deadline - time.monotonic(), 0.0))
             if arrival is not None:
+                self._latest = self._latest or self._scan_stream()
                 found = [scan for scan in reader.scans(self._latest, arrival) if scan.whole]
                 self._ahead = arrival if found and not self.is_live else None
                 self._unseen += found
-                self._latest = ScanStream(self.sensor, self.mount) if arrival.interrupted else self._latest
+                self._latest = None if arrival.interrupted else self._latest
             if not self._unseen and time.monotonic() >= deadline and (arrival is None or self._input.caught_up(mark)):
                 return None
         if not self.is_live:
@@ -265,7 +334,7 @@ class Device(Closing):
         error = SourceError(f"{self._source}: no scan in time; the source is {self.state}")
         return suggest(error, f"lidarspec doctor {quote(str(self._source))} -s {self.sensor.id}")
 
-    def send(self, name: str, *, timeout: float | None = None, **arguments: Any) -> Reply:
+    def send(self, name: str, /, *, timeout: float | None = None, **arguments: Any) -> Reply:
         """The reply to a command; at once with ``confirmed=False`` where none is documented.
 
         Args:
@@ -303,19 +372,20 @@ class Device(Closing):
     def __repr__(self) -> str:
         return f"Device({self.sensor.id} on {self._source}, {self.state}: {self.stats})"
 
-    def _opened(self, backend: str, record: RecordTo | None, overflow: str | None, period: float) -> Input:
+    def _opened(self, backend: str, record: RecordTo | None, overflow: str | None, period: float, *, learns: bool) -> Input:
         opened = transport(self._source, self.sensor)
         try:
             if not isinstance(opened, LiveTransport):
                 if record is not None:
                     raise UsageError(f"{self._source} is a file already: there is nothing to record")
                 return FileInput(self._source, self.sensor, opened, backend=backend)
-            kept, is_own = (None, False) if record is None else recorder_for(record, self.sensor, self._source, opened)
-            self._own_recorder = kept if is_own else None
             policy = opened.overflow if overflow is None else overflow
-            return LiveInput(self._source, self.sensor, opened, backend=backend, policy=policy, recorder=kept, period=period)
+            recorder = partial(_recorder, record, self._source, opened, self._own_recorders)  # which holds no device: it may be forgotten
+            return LiveInput(
+                self._source, self.sensor, opened, backend=backend, policy=policy, record=recorder, learns=learns, period=period
+            )
         except BaseException:
-            _close(opened, self._own_recorder)
+            _close(opened, self._own_recorders)
             raise
 
     def _reader(self, frame: str | None) -> PacketReader:
@@ -323,11 +393,14 @@ class Device(Closing):
             self._streams[frame] = PacketReader(self.sensor, frame, self._input.decoder, self._input.first_state())
         return self._streams[frame]
 
+    def _scan_stream(self) -> ScanStream:
+        return ScanStream(self.sensor, self.mount, self._reader(None).imu.waiting)
+
     def _taken_back(self) -> Arrival | None:
         """What of a file `latest` found its last scan in, for another to begin with; its further scans are then no longer waited for."""
         ahead, self._ahead = self._ahead, None
         if ahead is not None:
-            self._latest = ScanStream(self.sensor, self.mount)
+            self._latest = None
             self._unseen.clear()
         elif self._input.state == "ended":
             raise SourceError(f"{self._source} has been read to its end: open it again to read it once more")
@@ -345,6 +418,10 @@ class Device(Closing):
     def _next(self, wait: float) -> Arrival | None:
         """What arrives next; the first frames are kept until somebody asks whether they are another sensor's."""
         arrival = self._input.next(wait)
+        for frames in arrival.found if arrival is not None and self._telling else ():
+            for name in self._telling.intersection(frames.names):
+                where = np.flatnonzero(np.equal(frames.kinds, frames.names.index(name)))
+                self._told.update((item.frame, item) for item in frames.only(where[-1:]).found())
         if self._another is None and arrival is not None and len(self._first) < EXAMINED:
             for frames in arrival.found:
                 self._first += frames.only(slice(0, EXAMINED)).found()
@@ -368,12 +445,21 @@ def _nominal(sensor: Sensor) -> str:
     return text + (f", where no {' or '.join(sensor.state)} frame had come" if sensor.state else "")
 
 
-def _close(source: Input | Transport, recorder: Log | None) -> None:
+def _recorder(record: RecordTo | None, source: str | Path, opened: LiveTransport, own: list[Log], sensor: Sensor) -> Log | None:
+    """What is to record a sensor as it is read, None for nothing; added to `own` where it is to be closed with the device."""
+    if record is None:
+        return None
+    kept, is_own = recorder_for(record, sensor, source, opened)
+    own += [kept] * is_own
+    return kept
+
+
+def _close(source: Input | Transport, recorders: list[Log]) -> None:
     """Give everything back; the recording is closed even where the source fails."""
     try:
         source.close()
     finally:
-        if recorder is not None:
+        for recorder in recorders:
             recorder.close()
 
 

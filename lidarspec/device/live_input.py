@@ -12,7 +12,7 @@ import contextlib
 import threading
 import time
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from shlex import quote
 from typing import Any
@@ -20,13 +20,15 @@ from typing import Any
 from lidarspec.device.arrivals import Arrival, Input, answers, fed
 from lidarspec.device.capture_thread import BoundedQueue, Capture, Event, Mark
 from lidarspec.device.senders import Kept, frame_senders
-from lidarspec.device.session import Outgoing, Pending, Reply, Session
+from lidarspec.device.session import Outgoing, Pending, Reply, Session, learned
 from lidarspec.errors import CommandError, LidarSpecError, ReplyTimeout, SourceError, UsageError, refuse_text, suggest
 from lidarspec.framing.decoder import Decoder, backend as backend_named
 from lidarspec.framing.results import Counters, Frames
 from lidarspec.recording.appending import Log
+from lidarspec.spec.arguments import Address
+from lidarspec.spec.links import Link, Udp
 from lidarspec.spec.sensor import Sensor
-from lidarspec.transports.base import HostClock, with_option
+from lidarspec.transports.base import HostClock, own_address, with_option
 from lidarspec.transports.open_url import control_link, has_control
 from lidarspec.transports.protocol import Chunk, LiveTransport, Sender, endpoint
 
@@ -133,7 +135,8 @@ class LiveInput(Input):
     Args:
         source, sensor, opened: the open transport of the data link, and whose.
         policy: of the queue, "drop_oldest" or "block".
-        recorder: gets everything that arrives and is sent, before the queue.
+        record: makes what gets everything that arrives and is sent, before the queue, of the sensor as it is read.
+        learns: whether `begin` is to be called, in which the sensor may say how it is read: nothing counts before that.
         period: seconds between two decodings.
     """
 
@@ -147,23 +150,29 @@ class LiveInput(Input):
         *,
         backend: str = "auto",
         policy: str = "drop_oldest",
-        recorder: Log | None = None,
+        record: Callable[[Sensor], Log | None] = lambda sensor: None,
+        learns: bool = False,
         period: float = PERIOD,
     ) -> None:
-        self._source, self.sensor, self._recorder, self._period = source, sensor, recorder, period
+        self._source, self.sensor, self._record, self._period = source, sensor, record, period
+        self._teachers = [name for name in sensor.on_open if sensor.commands[name].learns is not None] if learns else []
+        self._recorder = None if self._teachers else record(sensor)
+        self.learned: dict[str, Any] = {}
         chosen = backend_named(backend)
         self._backend = "numpy" if chosen == "auto" else chosen  # none by itself that stops to compile: nothing would be decoded meanwhile
         self.queue, self._session = BoundedQueue(policy), Session(sensor)
         self.decoder: Decoder = sensor.decoder(stream=not opened.datagrams, backend=self._backend)
         self._decoders, self._captures = {"data": self.decoder}, {}
         self._kept, self._ready = Kept(source, sensor, datagrams=opened.datagrams), deque[Arrival]()
+        self._answering: dict[str, Kept] = {}  # who answers what was broadcast, by link
         self._clock = HostClock()
         self._turn, self._talk = threading.RLock(), threading.RLock()
         self._due, self._stops, self._closed = 0.0, False, False
         self._failure: SourceError | None = None
         self.stays_on = False
         self._said: list[str] = []
-        self._captures["data"] = Capture(opened, self.queue, log=recorder)
+        self._captures["data"] = Capture(opened, self.queue, log=self._recorder)
+        self._checked: list[Pending] = []
         self._watch = Watch(source, sensor, opened, self._captures["data"], self.decoder, self._kept)
 
     @property
@@ -179,16 +188,18 @@ class LiveInput(Input):
     @property
     def warnings(self) -> list[str]:
         said = [warning for capture in self._captures.values() for warning in (*capture.transport.warnings, *capture.warnings)]
-        said += self._kept.warnings + self._said
+        said += [warning for kept in (self._kept, *self._answering.values()) for warning in kept.warnings] + self._said
         if self._recorder is not None and self._recorder.error is not None:
             said.append(f"the recording has stopped: {self._recorder.error}")
-        return said if self._closed else said + self._watch.warnings
+        silent = [f"{self._source}: {error}; it is started again" for error in self._session.unanswered.values() if error is not None]
+        return said if self._closed else said + silent + self._watch.warnings
 
     @property
     def stats(self) -> Counters:
         stats, captures = self.decoder.stats, list(self._captures.values())
         stats.kernel_drops = sum(capture.transport.kernel_drops for capture in captures)
-        stats.foreign = self._kept.foreign + sum(capture.transport.foreign for capture in captures)
+        others = sum(kept.foreign for kept in self._answering.values())
+        stats.foreign = self._kept.foreign + others + sum(capture.transport.foreign for capture in captures)
         stats.disconnects = sum(capture.disconnects for capture in captures)
         stats.queue_dropped = self.queue.dropped
         return stats
@@ -201,11 +212,32 @@ class LiveInput(Input):
         self._stops = bool(self.sensor.on_open)
         for name in self.sensor.on_open:
             try:
-                self.send(name)
+                self.learned |= learned(self.sensor, self.send(name))
             except ReplyTimeout as error:
                 if not self._watch.streams:
                     raise suggest(error, self._watch.following()) from None
                 self._said.append(f"{error}; data come all the same")
+            if self._teachers and name == self._teachers[-1]:
+                self._adopt()
+
+    def _adopt(self) -> None:
+        """Go on as the sensor that was learned of; what came before counts for nothing."""
+        try:
+            self.sensor = self.sensor.configure(**self.learned)
+        except UsageError as error:
+            raise CommandError(f"{self.sensor.id}: what it says of itself cannot be: {error}") from error
+        with self._turn, self._talk:
+            data = self._captures["data"]
+            self._session.sensor = self.sensor
+            self._kept.configured(self.sensor)
+            self._decoders = {
+                link: self.sensor.decoder(stream=decoder.stream, backend=self._backend) for link, decoder in self._decoders.items()
+            }
+            self.decoder = self._decoders["data"]
+            self._recorder = self._record(self.sensor)
+            data.record(self._recorder)
+            self._ready.clear()
+            self._watch = Watch(self._source, self.sensor, data.transport, data, self.decoder, self._kept)
 
     def next(self, wait: float) -> Arrival | None:
         deadline = time.monotonic() + wait
@@ -228,18 +260,30 @@ class LiveInput(Input):
     def caught_up(self, mark: int) -> bool:
         return not self._ready and self.queue.consumed + self.queue.dropped >= mark
 
-    def send(self, name: str, *, timeout: float | None = None, **arguments: Any) -> Reply:
+    def send(self, name: str, /, *, timeout: float | None = None, **arguments: Any) -> Reply:
         if name in self.sensor.commands:
             command = self.sensor.commands[name]
             self._await_sender(command.link, command.timeout * (1 + command.retries) if timeout is None else timeout)
         with self._talk:
+            self._find_own_address(name)
             pending = self._session.request(name, self._clock.now(), timeout=timeout, **arguments)
             self._speak()
         while not pending.done:
             if self._failure is not None:
                 raise self._failure
             self._help(pending)
-        return pending.result()
+        try:
+            return pending.result()
+        except ReplyTimeout as error:
+            why = self._captures[self.sensor.commands[name].link].transport.warnings
+            raise ReplyTimeout("; ".join([str(error), *why])) from None
+
+    def _find_own_address(self, name: str) -> None:
+        """Let the session know where we are, as the sensor sees it, where a command says that."""
+        command = self.sensor.commands.get(name)
+        if command is not None and any(isinstance(value, Address) for value in command.filled.values()):
+            peer = self._opened(command.link).peer()
+            self._session.host = own_address(peer) if peer else None
 
     def write(self, data: bytes, link: str = "data") -> None:
         refuse_text(data)
@@ -254,7 +298,8 @@ class LiveInput(Input):
     def _await_sender(self, link: str, seconds: float) -> None:
         """Wait for a first datagram where it alone says where the sensor is."""
         data = self._captures["data"].transport
-        if link not in self._captures and (data.peer() or has_control(self._source)):
+        is_known = link in self._captures or self._host() or has_control(self._source) or _is_broadcast(self.sensor.links.get(link))
+        if link != "data" and is_known:
             return
         limit = time.monotonic() + seconds
         while not data.addressed and self._failure is None and time.monotonic() < limit:
@@ -316,6 +361,10 @@ class LiveInput(Input):
             self._due = time.monotonic() + self._period
         for link, run in _runs(events):
             self._take(link, run)
+        if self._checked:
+            self._compare()
+        elif any(self._session.unanswered.values()):
+            self._start_again()  # what is not answered any more may have started anew, and have forgotten everything
 
     def _take(self, link: str, run: list[Chunk] | Mark | BaseException) -> None:
         """Decode consecutive chunks of a link, or note what happened on it."""
@@ -325,8 +374,8 @@ class LiveInput(Input):
             self._hand_on(link, self._decoders[link].rest(), interrupted=run is Mark.LOST)
             if run is Mark.LOST:
                 with self._talk:
-                    self._session.abandon("the connection was lost")
-            elif run is Mark.BACK and link == "data":
+                    self._session.abandon("the connection was lost", None if link == "data" else link)
+            elif run is Mark.BACK:
                 self._start_again()
         elif self._failure is None and not self._closed:
             self._failure = run if isinstance(run, SourceError) else SourceError(f"{self._source}: nothing is read any more: {run}")
@@ -338,6 +387,8 @@ class LiveInput(Input):
             self._hand_on(link, decoder.rest(), interrupted=True)
         if link == "data":
             chunks = self._of_the_sensor(chunks)
+        elif link in self._answering:
+            chunks = self._of_who_answered(link, chunks)
         if not chunks:
             return
         found = fed(decoder, chunks)
@@ -356,6 +407,19 @@ class LiveInput(Input):
             self._ready.append(Arrival(interrupted=True, replaced=True))
         return mine
 
+    def _of_who_answered(self, link: str, chunks: list[Chunk]) -> list[Chunk]:
+        """What the first one that answered a broadcast sent: it is the sensor, on every link."""
+        mine = self._answering[link].ours(chunks)
+        if (address := self._answering[link].address) is not None:
+            self._captures[link].transport.accept(address)
+            self._kept.choose(address)
+        return mine
+
+    def _host(self) -> str | None:
+        """The address of the sensor, as far as it is known."""
+        answered = [kept.address[0] for kept in self._answering.values() if kept.address is not None]
+        return self._captures["data"].transport.peer() or next(iter(answered), None)
+
     def _hand_on(self, link: str, found: list[Frames], *, interrupted: bool = False) -> None:
         with self._talk:
             awaited = self._session.awaited(link)
@@ -372,9 +436,18 @@ class LiveInput(Input):
     def _start_again(self) -> None:
         """The device is back: it has forgotten what it was told."""
         with self._talk:
-            for name in self.sensor.on_open if self._stops else ():
-                self._session.request(name, self._clock.now())
+            names = self.sensor.on_open if self._stops else ()
+            self._checked += [self._session.request(name, self._clock.now()) for name in names]
             self._speak()
+
+    def _compare(self) -> None:
+        """Say it where the sensor that came back says something else of itself: it may be another one."""
+        done, self._checked = [one for one in self._checked if one.done], [one for one in self._checked if not one.done]
+        for pending in done:
+            with contextlib.suppress(CommandError):
+                again = learned(self.sensor, pending.result())
+                others = [name for name, value in again.items() if self.learned.get(name, value) != value]
+                self._said += [f"{self._source}: the sensor that came back has another {name}: open it again" for name in others]
 
     def _speak(self) -> None:
         """Send what the session wants to be sent."""
@@ -402,10 +475,16 @@ class LiveInput(Input):
         """The transport of a link; one apart from the data's is opened when it is first needed."""
         if link not in self._captures:
             data = self._captures["data"].transport
-            opened = data.link(link) or control_link(self._source, link, self.sensor.links[link], data.peer())
+            opened = data.link(link) or control_link(self._source, link, self.sensor.links[link], self._host())
+            if _is_broadcast(self.sensor.links[link]):
+                self._answering[link] = Kept(self._source, self.sensor, datagrams=True)
             self._decoders[link] = self.sensor.decoder(stream=not opened.datagrams, backend=self._backend)
             self._captures[link] = Capture(opened, self.queue, link=link)
         return self._captures[link].transport
+
+
+def _is_broadcast(link: Link | None) -> bool:
+    return isinstance(link, Udp) and bool(link.broadcast)
 
 
 def _runs(events: list[Event]) -> list[tuple[str, list[Chunk] | Mark | BaseException]]:

@@ -91,6 +91,15 @@ class Kept(Senders):
         """Where the sensor is, None while nobody has sent a frame."""
         return self._owner
 
+    def configured(self, sensor: Sensor) -> None:
+        """Go on with a sensor that is configured now."""
+        self._sensor = sensor
+        self._probes.clear()
+
+    def choose(self, sender: Sender) -> None:
+        """Take a sender for the sensor, since it has answered on another link."""
+        self._owner, self._is_sure = self._owner if self._is_sure else sender, True
+
     @property
     def warnings(self) -> list[str]:
         """Whom the device is made of, where others send as well."""

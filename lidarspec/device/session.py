@@ -9,8 +9,8 @@ in common, and no field in which the two have to differ), that request is held b
 in `late` and frees it. A frame that arrived before a request was sent is no answer to it. An answer that is later still can be
 told from the next one's only by what the command `matches` or `echoes`.
 
-A conversation that learns (M6) belongs here: counters in `Command.values` are filled in where a request is made, texts and addresses
-among its `args` by `wire.build.build_command`, and what a reply teaches is handed to the owner of the session, who configures the sensor.
+A running number (`Count`) is filled in where a request is made, so that what is sent once more has the number that it had; `echoes` then
+tells its answer from every other. What a reply teaches is for the owner of the session, who configures the sensor.
 """
 
 from __future__ import annotations
@@ -23,9 +23,11 @@ from typing import Any
 from lidarspec.errors import CommandError, ReplyTimeout, UnknownField, UsageError
 from lidarspec.framing.frame_engine import codec
 from lidarspec.framing.results import Found
+from lidarspec.spec.arguments import Address, Filled
 from lidarspec.spec.description import Command
-from lidarspec.spec.sensor import Sensor
+from lidarspec.spec.sensor import Learned, Sensor
 from lidarspec.spec.tree import FieldInfo
+from lidarspec.wire.build import steps
 
 #: fields that a reply's repr shows.
 SHOWN = 6
@@ -94,6 +96,11 @@ class Pending:
         """Whether there is a result."""
         return self._outcome is not None
 
+    @property
+    def failure(self) -> CommandError | None:
+        """Why there is no reply; None where there is one, or it is not known yet."""
+        return self._outcome if isinstance(self._outcome, CommandError) else None
+
     def result(self) -> Reply:
         """The reply.
 
@@ -143,9 +150,11 @@ class Expected:
 
 
 def found_at(values: Any, path: str) -> Any:
-    """The value at a dotted path of a parsed frame, a list of them below an array, or a mark that there is none."""
-    for name in path.split(".") if path else ():
-        if isinstance(values, list):
+    """The value at a path of a parsed frame, a list of them below an array without an index, or a mark that there is none."""
+    for name in steps(path):
+        if isinstance(name, int):
+            values = values[name] if isinstance(values, list) and name < len(values) else _MISSING
+        elif isinstance(values, list):
             values = [found_at(element, name) for element in values]
         elif isinstance(values, Mapping) and name in values:
             values = values[name]
@@ -233,10 +242,15 @@ class Session:
         sensor: the sensor.
         started: whether a command that starts the sensor was sent, and none since that stops it.
         late: answers that came after they had been given up.
+        unanswered: why the last heartbeat was not answered, None where it was, by command.
+        host: the address of this computer as the sensor sees it, None where nobody knows it.
     """
 
     def __init__(self, sensor: Sensor) -> None:
         self.sensor, self.started, self.late = sensor, False, 0
+        self.host: str | None = None
+        self.unanswered: dict[str, CommandError | None] = {}
+        self._count = 0
         self._lines: dict[str, _Line] = {}
         self._beats: dict[str, _Beat] = {}
         self._out: list[Outgoing] = []
@@ -253,7 +267,8 @@ class Session:
         Raises:
             UnknownCommand, UnknownField, MissingField, OutOfRange: for what the sensor does not take; nothing is sent.
         """
-        data = self.sensor.command(name, **arguments)
+        filled = {path: self._next(value) for path, value in self._filled(name).items() if path not in arguments}
+        data = self.sensor.command(name, **arguments, **filled)
         command = self.sensor.commands[name]
         tables = {reply: self._table(reply) for reply in command.replies}
         sent = self.sensor.parse(data, command.frame) if command.echoes else None
@@ -296,6 +311,7 @@ class Session:
             if now >= beat.due:
                 beat.due = now + _ns(self.sensor.commands[name].every)
                 if beat.pending.done:
+                    self.unanswered = {**self.unanswered, name: beat.pending.failure}
                     self.request(name, now, **beat.arguments)
         for link, line in self._lines.items():
             current = line.current
@@ -322,16 +338,28 @@ class Session:
         """Whether a request waits to be sent or answered; heartbeats to come do not count."""
         return any(line.current is not None or line.queue for line in self._lines.values())
 
-    def abandon(self, reason: str) -> None:
-        """Give up every request and heartbeat, since the link was lost or nobody waits any more; what was sent stays owed."""
-        self._beats.clear()
-        for line in self._lines.values():
+    def abandon(self, reason: str, link: str | None = None) -> None:
+        """Give up every request and heartbeat, or those on one link, since it was lost or nobody waits; what was sent stays owed."""
+        for name in [name for name in self._beats if link in (None, self.sensor.commands[name].link)]:
+            del self._beats[name]
+            self.unanswered.pop(name, None)
+        for line in [line for name, line in self._lines.items() if link in (None, name)]:
             waiting = list(line.queue)
             line.queue.clear()
             if line.current is not None:
                 self._give_up(line, line.current, CommandError(f"{self.sensor.id} {line.current.name}: {reason}"))
             for request in waiting:
                 request.pending.settle(CommandError(f"{self.sensor.id} {request.name}: {reason}"))
+
+    def _filled(self, name: str) -> Mapping[str, Filled]:
+        return self.sensor.commands[name].filled if name in self.sensor.commands else {}
+
+    def _next(self, value: Filled) -> Any:
+        """A value that is found out now: our own address, or the next number, which all commands of the session share."""
+        if isinstance(value, Address):
+            return self.host
+        self._count += 1
+        return value.at(self._count - 1)
 
     def _table(self, frame: str) -> Mapping[str, FieldInfo]:
         return codec(self.sensor.frames[frame]).schema.fields
@@ -383,6 +411,26 @@ class Session:
         line.quiet = since + _ns(request.command.settle)
         if request.expected is not None:
             line.owed += [_Owed(request.expected, sent + request.patience) for sent in request.sent[answers:]]
+
+
+def learned(sensor: Sensor, reply: Reply) -> dict[str, Any]:
+    """The options that a reply teaches, by name; none where the command learns nothing.
+
+    Raises:
+        CommandError: for a reply that cannot be learned from.
+    """
+    learns = sensor.commands[reply.command].learns
+    if learns is None or not reply.confirmed:
+        return {}
+    place = f"{sensor.id} {reply.command}"
+    try:
+        told = {name: value.encode() if isinstance(value, str) else value for name, value in learns(reply.values).items()}
+    except Exception as error:
+        raise CommandError(f"{place}: nothing can be learned from the reply: {type(error).__name__}: {error}") from error
+    for name, value in told.items():
+        if not isinstance(value, bytes | int | float):
+            raise CommandError(f"{place}: {name} is learned as a number, bytes or a text, not as {type(value).__name__}")
+    return {name: Learned(value) if isinstance(value, bytes) else value for name, value in told.items()}
 
 
 def _silence(sensor: Sensor, request: _Request) -> CommandError:

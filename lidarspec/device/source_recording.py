@@ -18,7 +18,8 @@ from lidarspec.device.device import Device
 from lidarspec.errors import SourceError, UsageError
 from lidarspec.recording.appending import Appender
 from lidarspec.recording.format import Header
-from lidarspec.recording.recorders import recorder
+from lidarspec.recording.recorders import MadeFor, recorder
+from lidarspec.spec.description import Spec
 from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.base import HostClock
 from lidarspec.transports.files import RecordingTransport
@@ -31,7 +32,7 @@ TURN = 0.1
 _FIGURES = re.compile(r"[\d.]+")
 
 
-def recorder_like(opened: Transport, source: str, target: str, sensor: Sensor | None, *, overwrite: bool) -> Appender:
+def recorder_like(opened: Transport, source: str, target: str, sensor: Spec | str | None, *, overwrite: bool) -> Appender:
     """The recorder of a new file in the place of an open source: of a recording its sensor, source and baud rate are taken over.
 
     Raises:
@@ -91,7 +92,7 @@ class SourceRecording:
     def _driven(self, sensor: Sensor) -> Generator[str, None, None]:
         """What a sensor sends is recorded by a thread; here it is decoded to be counted, whatever that fails at."""
         news, failures, known = list[str](), dict[str, None](), set[str]()
-        with Device(self._source, sensor, start=self._start, record=self._opened) as self.device:
+        with Device(self._source, sensor, start=self._start, record=MadeFor(self._opened)) as self.device:
             while self._goes_on():
                 try:
                     self.packets += len(next(self.device.packets(wait=TURN), ()))
@@ -107,7 +108,7 @@ class SourceRecording:
 
     def _received(self) -> Generator[str, None, None]:
         source = RecordingTransport(self._source, salvage=True) if self._salvage else transport(self._source, self._sensor)
-        with contextlib.closing(source), self._opened(source) as file:
+        with contextlib.closing(source), self._opened(source, self._sensor) as file:
             yield from self._captured(source, file) if isinstance(source, LiveTransport) else self._copied(source, file)
             yield from source.warnings
 
@@ -140,12 +141,12 @@ class SourceRecording:
             file.write(replace(chunk, at=at))
             self.packets += source.datagrams
 
-    def _opened(self, source: Transport) -> Appender:
-        """The recorder, now that the source is open."""
+    def _opened(self, source: Transport, sensor: Spec | str | None) -> Appender:
+        """The recorder, now that the source is open, and the sensor known as it is read."""
         counts = source.datagrams or (self._sensor is not None and isinstance(source, LiveTransport))
         if self._count is not None and not counts:
             raise UsageError(f"-n counts packets, and {self._source} is a byte stream: name the sensor with -s, or give a time with -t")
-        self.recorder = recorder_like(source, self._source, self._target, self._sensor, overwrite=self._overwrite)
+        self.recorder = recorder_like(source, self._source, self._target, sensor, overwrite=self._overwrite)
         self._began = time.monotonic()
         return self.recorder
 

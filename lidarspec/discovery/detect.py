@@ -13,7 +13,7 @@ from __future__ import annotations
 import functools
 import itertools
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from shlex import quote
@@ -168,9 +168,31 @@ def _models(sensor: Sensor, found: Sequence[Found]) -> list[str]:
     frame, _, field = sensor.info.get("model", "").partition(".")
     names = []
     for item in itertools.islice((item for item in found if item.frame == frame), READ):
-        value = functools.reduce(lambda parsed, name: parsed[name], field.split("."), sensor.parse(item.data, frame))
-        names.append(_text(value, schema(sensor.frames[frame].tree).fields[field]))
+        names.append(_text(*_field(sensor, item, field)))
     return [name for name in names if name]
+
+
+def said(sensor: Sensor, found: Iterable[Found]) -> dict[str, str]:
+    """What the last of these frames say of the device itself, as the sensor's `info` declares: role -> text, a number with its unit."""
+    last, told = {item.frame: item for item in found}, dict[str, str]()
+    for role, path in sensor.info.items():
+        frame, _, field = path.partition(".")
+        if frame in last:
+            value, info = _field(sensor, last[frame], field)
+            if isinstance(value, bytes):
+                text = value.rstrip(b"\0 ")
+                told[role] = text.decode("ascii") if text.isascii() and text.decode("ascii").isprintable() else value.hex()
+            else:
+                told[role] = _text(value, info) or (
+                    f"{info.physical(value):g} {info.unit}".rstrip() if isinstance(value, int | float) else f"{value}"
+                )
+    return {role: text for role, text in told.items() if text}
+
+
+def _field(sensor: Sensor, item: Found, path: str) -> tuple[Any, FieldInfo]:
+    """The raw value of a field of a frame, and what is known of the field."""
+    value = functools.reduce(lambda parsed, name: parsed[name], path.split("."), sensor.parse(item.data, item.frame))
+    return value, schema(sensor.frames[item.frame].tree).fields[path]
 
 
 def _text(value: Any, info: FieldInfo) -> str:

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from shlex import quote
 
-from lidarspec.discovery.detect import CLEAR, Verdict, verdict, verdicts
+from lidarspec.discovery.detect import CLEAR, Verdict, said, verdict, verdicts
 from lidarspec.discovery.listen import LISTEN, bauds, heard_as, started_first, udp_ports
-from lidarspec.errors import LidarSpecError, UsageError, suggestion
+from lidarspec.errors import LidarSpecError, UsageError, printable, suggestion
 from lidarspec.spec.links import Serial, Udp
 from lidarspec.spec.sensor import Sensor
 from lidarspec.transports import ports
@@ -237,7 +237,8 @@ def _verdict(source: str, found: Verdict, sensor: Sensor | None) -> Finding:
     cut_off = 2 * max(frame.max_length for frame in score.sensor.incoming.values()) / heard.size  # the first frame, and the last
     if score.share + (0 if heard.datagrams else cut_off) < CLEAR:
         return Finding(False, f"{name} sends{at}, and {1 - score.share:.0%} of the bytes are in no frame: cable, ground or baud rate")
-    return Finding(True, f"{name} sends{at}: {score.data_frames} data frames, {score.share:.0%} of the bytes in frames")
+    device = "".join(f", {role} {text}" for role, text in said(score.sensor, score.found).items())
+    return Finding(True, f"{name} sends{at}: {score.data_frames} data frames, {score.share:.0%} of the bytes in frames{printable(device)}")
 
 
 def _nothing(source: str, sensor: Sensor | None) -> Finding:

@@ -33,6 +33,7 @@ from lidarspec.spec.construct_layer import UNNAMED, Seen, field_path, leaves, me
 from lidarspec.spec.tree import Block, FieldInfo, Node, Opaque, Parts, Repeat, Struct, children, exact
 from lidarspec.wire.parse import parse_typed
 from lidarspec.wire.schema import schema
+from lidarspec.wire.slots import recoder
 from lidarspec.wire.wire_table import bit_text, hexed
 
 #: most points of a frame without arrays that are told.
@@ -121,12 +122,12 @@ def explain(data: bytes, sensor: Sensor, frame: str | None = None) -> Explanatio
         fault, name = error, error.frame or frame or ""
         if not name:
             raise
-    trail = _Trail(sensor.frames[name], data)
+    trail = _Trail(sensor.frames[name], data, fault)
     rows = (*trail.rows(), *trail.rest(fault))
-    if fault is not None and not fits(sensor, data[: trail.end], name):
+    if fault is not None and not fits(sensor, data[: trail.after], name):
         guessed = told(sensor.frames[name], data, lambda sent: values(sent, sensor, name))
         return Explanation(sensor.id, name, data, rows, fault, tuple(guessed))
-    points, notes = _points(sensor, name, data[: trail.end], rows)
+    points, notes = _points(sensor, name, data[: trail.after], rows)
     rows = tuple(replace(row, points=given) for row, given in zip(rows, points, strict=True))
     return Explanation(sensor.id, name, data, rows, fault, notes)
 
@@ -148,22 +149,35 @@ def fits(sensor: Sensor, data: bytes, name: str) -> bool:
 class _Trail:
     """One frame as construct read it: its parts, how far it came, and the verdicts of its checksums."""
 
-    def __init__(self, frame: Frame, data: bytes) -> None:
-        self._data, self._schema = data, schema(frame.tree)
+    def __init__(self, frame: Frame, data: bytes, fault: WireError | None = None) -> None:
+        self._data, self._schema, self._fault, self._recoder = data, schema(frame.tree), fault, recoder(frame)
+        row, places = (data, None) if self._recoder is None else self._recoder.places(data)
         fields = self._schema.all_fields.values()
         self._arrays = [axis for info in fields for axis in (info.axes[:-1] if info.kind == "bytes" else info.axes)]
         self._blocks = dict(_blocks(frame.tree, ""))
         trail: list[Seen] = []
         self.failed = True
         with contextlib.suppress(Exception):  # construct lets anything out of expressions; `parse_typed` has said what is wrong
-            frame.prepared.parse_stream(io.BytesIO(data), _verify=False, _trail=trail)
+            frame.prepared.parse_stream(io.BytesIO(row), _verify=False, _trail=trail)
             self.failed = False
         self._parts = [(field_path(seen.path), seen) for seen in trail if seen.seal is None]
-        self._verdicts = {path: verdict for seen in trail if seen.seal is not None for path, verdict in _verdicts(data, seen)}
-        self.end = max((seen.end for path, seen in self._parts if not self._in_block(path)), default=0)
+        self._verdicts = {path: verdict for seen in trail if seen.seal is not None for path, verdict in _verdicts(row, seen)}
+        if places is not None:
+            self._parts = [(path, seen if self._in_block(path) else _placed(seen, places)) for path, seen in self._parts]
+        self.end = self._first = 0 if places is None else places[0]
+        self.end = max((seen.end for path, seen in self._parts if not self._in_block(path)), default=self.end)
+        self._is_whole = self._recoder is not None and not self.failed and self._recoder.row(data) is not None
+        self.after = len(data) if self._is_whole else self.end
 
     def rows(self) -> Iterator[Row]:
-        """A row for each part; the parts of an element of an array in one, if it holds no further array."""
+        """A row for each part, and for the marks of a wire form; the parts of an element of an array in one, if it holds no further one."""
+        if self._first:
+            yield Row(0, self._data[: self._first], "(start)", (), (), right=True)
+        yield from self._fields()
+        if self._is_whole and self.end < len(self._data):
+            yield Row(self.end, self._data[self.end :], "(end)", (), (), right=True)
+
+    def _fields(self) -> Iterator[Row]:
         for element, group in itertools.groupby(self._leaves(), lambda leaf: self._element(leaf[0])):
             yield self._row(element, list(group))
 
@@ -173,11 +187,13 @@ class _Trail:
 
     def rest(self, fault: WireError | None) -> Iterator[Row]:
         """The bytes that no part took: those of the part that is cut off, or more than the frame has."""
-        left = self._data[self.end :]
+        left = self._data[self.after :]
         if self.failed and fault is not None:
-            yield Row(self.end, left, fault.path, (), (fault.reason,), right=False)
+            yield Row(self.after, left, fault.path, (), (fault.reason,), right=False)
+        elif fault is not None and self._recoder is not None and not left:
+            yield Row(self.after, left, "(end)", (), (fault.reason,), right=False)
         elif left:
-            yield Row(self.end, left, "", (), ("after the frame's end",), right=False)
+            yield Row(self.after, left, "", (), ("after the frame's end",), right=False)
 
     def _leaves(self) -> Iterator[tuple[str, Seen]]:
         for path, seen in self._parts:
@@ -208,6 +224,9 @@ class _Trail:
                 if info.const is not None and value.raw != info.const:
                     remarks.append(f"wrong: {hexed(value.raw, info.bits)}, expected {hexed(info.const, info.bits)}")
                     right = False
+                if info.held and self._fault is not None and self._fault.path == value.path:
+                    remarks.append(f"wrong: {value.raw}, expected {self._fault.expected}")
+                    right = False
                 if value.path in self._verdicts:
                     text, good = self._verdicts[value.path]
                     remarks.append(text)
@@ -218,12 +237,17 @@ class _Trail:
         path = part + "".join(f"[{key}]" if isinstance(key, int) else f".{key}" for key in keys)
         unknown = FieldInfo(plain(path), docs="constant" if path.endswith(UNNAMED) else "")
         info = self._schema.all_fields.get(plain(path), unknown)
-        bits = self._blocks.get(kind(part), {}).get(keys)
+        bits = self._blocks.get(kind(part), {}).get(keys) if self._recoder is None else None
         physical = float(info.physical(raw)) if isinstance(raw, int | float) else None
         label = info.labels.get(raw, "") if isinstance(raw, int) else ""
         digits = None if info.kind == "float" else _digits(info.scale, info.offset)
         masks = bits.masks(seen.end - seen.start) if bits else b"\xff" * (seen.end - seen.start)
         return Value(path, raw, physical, info.unit, digits, label, bit_text(bits) if bits else "", info.docs, seen.start, masks), info
+
+
+def _placed(seen: Seen, places: Sequence[int]) -> Seen:
+    """A part of a row where it stands on the wire."""
+    return seen._replace(start=places[seen.start], end=places[seen.end])
 
 
 def plain(path: str) -> str:
@@ -308,11 +332,13 @@ def _points(sensor: Sensor, name: str, data: bytes, rows: Sequence[Row]) -> tupl
 
 def _parts(sensor: Sensor, name: str, data: bytes) -> list[str]:
     """The parts of a frame that have its points, as "segments[0]"; none where the frame itself has them."""
-    frame, path = sensor.frames[name], sensor.parts_with_points(name)
+    frame, path = sensor.frames[name], sensor.parts_with("points", name)
     place = schema(frame.tree).within(path) if path else None
     if place is None:
         return []
-    pieces = member(frame.prepared.parse(data, _verify=False), place[0])
+    recoding = recoder(frame)
+    row = None if recoding is None else recoding.row(data)
+    pieces = member(frame.prepared.parse(data if row is None else row[1], _verify=False), place[0])
     return [f"{place[0]}[{index}]" for index, (kind, _, _) in enumerate(pieces.spans) if kind == place[1]]
 
 

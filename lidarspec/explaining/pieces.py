@@ -11,6 +11,8 @@ import re
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from lidarspec.errors import LidarSpecError, UnknownFrame, WireError
 from lidarspec.explaining.damage import changes
 from lidarspec.explaining.explanation import Explanation, explain
@@ -21,6 +23,7 @@ from lidarspec.spec.description import with_frames
 from lidarspec.transports.protocol import Chunk
 from lidarspec.wire.layout import Layout
 from lidarspec.wire.parse import layout_of, parse_typed
+from lidarspec.wire.slots import recoder
 
 #: constant bytes that look like the beginning of a frame in the midst of others.
 SYNC = 2
@@ -94,6 +97,9 @@ def _cut(sensor: Sensor, chunks: Iterable[Chunk], *, datagrams: bool) -> Iterato
         if chunk is not None:
             held += chunk.data
             found += decoder.feed(chunk.data)
+        if decoder.joins:  # a message stands in no one place of the input
+            yield from (Piece(item.offset, item.data, item.frame) for item in found)
+            continue
         end = start
         for item in found:
             if item.offset > end:
@@ -176,8 +182,11 @@ def _headless(sensor: Sensor, data: bytes) -> str:
 
 def _end(sensor: Sensor, data: bytes, start: int, name: str, ends: list[int]) -> int:
     """Where a damaged frame ends: by its length or next to that, where something else begins, or else where the first thing does."""
-    layout = layout_of(sensor, name, data[start : start + sensor.frames[name].max_length])
     following = [end for end in ends if end > start]
+    if (recoding := recoder(sensor.frames[name])) is not None:
+        size = recoding.reading(np.frombuffer(data[start:], np.uint8), np.zeros(1, np.intp)).sizes.item(0)
+        return start + size if size > 0 else following[0]
+    layout = layout_of(sensor, name, data[start : start + sensor.frames[name].max_length])
     if not isinstance(layout, Layout):
         return following[0]
     whole = start + layout.size

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 from lidarspec.errors import WireError
 from lidarspec.points.cloud import PointCloud
+from lidarspec.spec.arguments import Range, Taken
 
 #: bytes in a line of a hexdump, and lines before the marked one.
 DUMPED, BEFORE = 16, 2
@@ -236,6 +237,11 @@ def fixed(value: float, digits: int | None) -> str:
 def limits(low: float, high: float, between: str = "..") -> str:
     """A range of numbers, with every digit of whole ones: "0..4294967295"."""
     return between.join(f"{end:.0f}" if float(end).is_integer() else f"{end:g}" for end in (low, high))
+
+
+def asked(kind: Taken, between: str = "..") -> str:
+    """What an argument of a command takes: a range of numbers, or the name of another kind."""
+    return limits(kind.low, kind.high, between) if isinstance(kind, Range) else kind.words(None)
 
 
 def ascii_text(data: bytes | bytearray) -> str:

@@ -92,20 +92,31 @@ class Message:
         return {path: node for node in tree.nodes(self.root) if isinstance(node, tree.Sealed) for path in node.fields}
 
 
-def messages(sensor: Sensor) -> tuple[Message, ...]:
+def messages(sensor: Sensor, *, on_wire: bool = True) -> tuple[Message, ...]:
     """All frame types of a sensor, in their order.
 
+    Args:
+        on_wire: their bytes as they are sent are asked for, and not the fields alone.
+
     Raises:
-        Refused: if it has none yet, or one holds a part that only Python code can decide.
+        Refused: if it has none yet, or one holds a part that only Python code can decide, or stands on the wire in a form of its own.
     """
     if not sensor.frames:
         raise Refused(f"{sensor.id}: has no frames yet: configure it first")
+    formed = [f"{name} in {frame.wire}" for name, frame in sensor.frames.items() if frame.wire is not None and on_wire]
+    if formed:
+        raise Refused(f"{sensor.id}: no other language recodes what stands on the wire: {', '.join(formed)}")
     return tuple(_message(sensor, name, frame) for name, frame in sensor.frames.items())
 
 
 def asked(node: tree.Node) -> list[tree.Ref]:
-    """The fields that the formulas of a node and of what is in it ask for."""
-    return [ref for below in tree.nodes(node) for value in tree.formulas(below) for ref in tree.refs(value)]
+    """The fields that the formulas of a node and of what is in it ask for, and those that lengths are held to."""
+    return [ref for below in tree.nodes(node) for value in (*tree.formulas(below), *held(below).values()) for ref in tree.refs(value)]
+
+
+def held(node: tree.Node) -> dict[str, tree.Formula]:
+    """What the fields that a node is have to say of other parts, by their paths."""
+    return {info.path: info.rebuilt for info in tree.infos(node) if info.held and info.rebuilt is not None}
 
 
 def _message(sensor: Sensor, name: str, frame: Frame) -> Message:

@@ -261,6 +261,8 @@ def _constants(layout: CLayout) -> Iterator[str]:
             for access in entry.fields:
                 if access.info.const is not None:
                     yield _unless(entry, f"({access.expression}) != {_number(access.info.const)}")
+                elif access.info.held and access.info.rebuilt is not None:
+                    yield _unless(entry, f"(int64_t)({access.expression}) != {layout.formula(access.info.rebuilt)}")
 
 
 def _number(value: Any) -> str:

@@ -162,7 +162,7 @@ def svg(sensor: Sensor) -> str:
         Refused: where a frame holds a part that only Python code can decide.
     """
     sheet = _Sheet()
-    for message in messages(sensor):
+    for message in messages(sensor, on_wire=False):
         size = frame_size(message.frame)
         order = byte_order(message)
         detail = f"{size} byte{'s' * (size != '1')}" + (f", integers {order}-endian" if order else "")

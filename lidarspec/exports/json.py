@@ -12,8 +12,9 @@ from collections.abc import Mapping
 from typing import Any
 
 from lidarspec.exports import Message, messages
-from lidarspec.spec import Command, Sensor, tree
-from lidarspec.spec.links import Link, Serial, Tcp, Udp
+from lidarspec.spec import Command, Frame, Sensor, tree
+from lidarspec.spec.arguments import Address, Count
+from lidarspec.spec.links import Link, Udp
 from lidarspec.wire.wire_table import frame_size
 
 #: raised whenever a key changes its meaning or goes.
@@ -62,12 +63,18 @@ def _plain(fact: Any) -> Any:
         return {name: _plain(value) for name, value in fact.items()}
     if isinstance(fact, list | tuple):
         return [_plain(value) for value in fact]
+    if isinstance(fact, Count | Address):
+        return {"kind": type(fact).__name__.lower(), **vars(fact)}
     return fact.hex() if isinstance(fact, bytes | bytearray) else fact
 
 
 def link_data(link: Link) -> dict[str, Any]:
     """A link as data: its kind, then what its class declares."""
-    return {"kind": {Serial: "serial", Udp: "udp", Tcp: "tcp"}[type(link)], **facts(link, *vars(link))}
+    said = {"kind": type(link).__name__.lower(), **facts(link, *vars(link))}
+    if isinstance(link, Udp) and (rule := link.assembled) is not None:
+        fragment = node_data(Frame(rule.struct, max_length=65_535).tree)
+        said["assembled"] = {**facts(rule, "keys", "index", "count", "payload", "first", "in_bytes"), "fragment": fragment}
+    return said
 
 
 def _clock(sensor: Sensor) -> dict[str, Any] | None:
@@ -92,7 +99,7 @@ def _frame(message: Message) -> dict[str, Any]:
 def _command(command: Command) -> dict[str, Any]:
     return {
         **facts(command, "frame", "values"),
-        "args": {name: {"field": path, "low": low, "high": high} for name, (path, low, high) in command.args.items()},
+        "args": {name: argument.to_dict() for name, argument in command.arguments.items()},
         **facts(
             command,
             "replies",
@@ -108,6 +115,7 @@ def _command(command: Command) -> dict[str, Any]:
             "only_stopped",
             "every",
         ),
+        "learns": command.learns is not None,
     }
 
 
@@ -160,6 +168,8 @@ def formula_data(formula: tree.Formula | None) -> Any:
 def _info(info: tree.FieldInfo) -> dict[str, Any]:
     const = info.const.hex() if isinstance(info.const, bytes | bytearray) else info.const
     facts = {"path": info.path, "unit": info.unit, "scale": info.scale, "offset": info.offset, "const": const, "docs": info.docs}
+    if info.held and info.rebuilt is not None:
+        facts["equals"] = formula_data(info.rebuilt)
     return {**facts, "labels": {str(value): name for value, name in info.labels.items()}}
 
 

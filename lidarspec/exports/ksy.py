@@ -379,7 +379,8 @@ class _Types:
     def _doc(self, info: tree.FieldInfo) -> Attribute:
         seal = self.seals.get(info.path)
         sealed = "" if seal is None else f"{seal.algorithm.describe()} over {_span(seal)}; not checked here"
-        text = "; ".join(filter(None, (unit_text(info), meaning(info), sealed)))
+        unchecked = "a length, which is not checked here" if info.held else ""
+        text = "; ".join(filter(None, (unit_text(info), meaning(info), unchecked, sealed)))
         return {"doc": text} if text else {}
 
     def _physical(self, kaitai: _Type, info: tree.FieldInfo, more: Mapping[str, Any], *, name: str = "") -> None:

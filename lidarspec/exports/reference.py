@@ -12,13 +12,13 @@ from xml.sax.saxutils import escape
 import numpy as np
 
 from lidarspec.errors import LidarSpecError
-from lidarspec.explaining.wording import limits
+from lidarspec.explaining.wording import asked
 from lidarspec.framing.results import Counters, Found, packed
 from lidarspec.packets.stream import PacketStream
 from lidarspec.points.cloud import PointCloud
 from lidarspec.points.plain import evaluate
 from lidarspec.spec import Command, Frame, Sensor
-from lidarspec.spec.links import Link, Serial, Udp
+from lidarspec.spec.links import Http, Link, Serial, Tcp, Udp
 from lidarspec.spec.timing import Clock, Every, Split
 from lidarspec.wire.wire_table import frame_size, wire_table
 
@@ -70,8 +70,11 @@ def _link(link: Link) -> str:
         bauds = " or ".join(f"{baud:,}".replace(",", " ") for baud in link.bauds)
         return ", ".join([f"serial, {bauds} baud, 8N1", *_levels({"dtr": link.dtr, "rts": link.rts})])
     if isinstance(link, Udp):
-        return f"UDP, port {' and '.join(str(port) for port in link.ports)}" + (", a byte stream in datagrams" if link.stream else "")
-    return f"TCP, port {link.port}"
+        ports = [f"port {' and '.join(str(port) for port in link.ports)}"] * bool(link.ports)
+        asked = [f"broadcast to port {link.broadcast}"] * bool(link.broadcast) + [f"from port {link.local}"] * bool(link.local)
+        return ", ".join(["UDP", *ports, *asked, *["a byte stream in datagrams"] * link.stream])
+    kind = type(link).__name__
+    return f"{kind.upper()}, port {link.port}" if isinstance(link, Tcp | Http) else kind
 
 
 def _levels(lines: Mapping[str, bool | None]) -> list[str]:
@@ -98,7 +101,7 @@ def _asked(sensor: Sensor, name: str) -> str:
     command = sensor.commands[name]
     said = _levels(command.lines)
     if command.frame and command.args:
-        args = " and ".join(f"`{arg}` {limits(low, high, ' to ')}" for arg, (_, low, high) in command.args.items())
+        args = " and ".join(f"`{name}` {asked(argument.kind, ' to ')}" for name, argument in command.arguments.items())
         said.insert(0, f"`{command.frame}` with {args}")
     elif command.frame:
         said.insert(0, f"`{sensor.command(name).hex(' ')}`")
@@ -149,7 +152,10 @@ def _geometry(sensor: Sensor) -> Iterator[str]:
         cloud = _cloud(sensor, name) if frame.data else None
         if cloud is None:
             continue
-        more = [column for column in ("intensity", "ring", "return_index") if getattr(cloud, column) is not None]
+        more = [column for column in ("intensity", "ring", "return_index", "column") if getattr(cloud, column) is not None]
+        more += [
+            f"`{column}` ({', '.join(filter(None, (cloud.units[column], values.dtype.name)))})" for column, values in cloud.extra.items()
+        ]
         many = "a point" if len(cloud) == 1 else f"{len(cloud)} points" if frame_size(frame).isdigit() else "points by its header"
         yield ""
         yield f"A `{name}` frame has {many}" + (f", with {', '.join(more[:-1])}{' and ' * (len(more) > 1)}{more[-1]}." if more else ".")

@@ -17,10 +17,13 @@ from dataclasses import dataclass, field
 
 from lidarspec.exports import Message, Refused, messages
 from lidarspec.spec import Command, Sensor
+from lidarspec.spec.arguments import Address, Octets, Range, Text
 from lidarspec.spec.tree import Blob, Block, Empty, FieldInfo, Node, Number, Opaque, Parts, Repeat, Sealed, Select, Struct, When, children
 from lidarspec.wire.schema import schema
 from lidarspec.wire.wire_table import meaning, unit_text
 
+#: the types of arguments of commands.
+TYPES = {Range: "float", Text: "str", Address: "str", Octets: "bytes"}
 #: what `parse` takes besides the bytes and the frame.
 PARSING = "verify: bool = True, units: bool = False"
 
@@ -31,7 +34,7 @@ def pyi(sensor: Sensor) -> str:
     Raises:
         Refused: where a frame holds Python code, or two frame types have one class name.
     """
-    frames = messages(sensor)
+    frames = messages(sensor, on_wire=False)
     names = {message.name: camel(message.name) for message in frames}
     if len(set(names.values())) < len(names):
         raise Refused(f"{sensor.id}: two frame types have one class name")
@@ -118,7 +121,7 @@ def _sensor(sensor: Sensor, frames: tuple[Message, ...], names: dict[str, str]) 
     )
     builds = "\n".join(_build(message) for message in frames)
     commands = "\n".join(_command(name, command) for name, command in sensor.commands.items())
-    rest = "    @overload\n    def command(self, name: str, **arguments: Any) -> bytes: ..." if len(sensor.commands) > 0 else ""
+    rest = "    @overload\n    def command(self, _name: str, /, **arguments: Any) -> bytes: ..." if len(sensor.commands) > 0 else ""
     literals = ", ".join(f'"{name}"' for name in names)
     data = next((message.frame for message in frames if message.frame.data), frames[0].frame)
     fields = ", ".join(f'"{path}"' for path in schema(data.tree).all_fields)
@@ -146,15 +149,15 @@ def _build(message: Message) -> str:
         for member in body.members
         if member.name not in ("", "self", "units")
         and not keyword.iskeyword(member.name)
-        and not (isinstance(member, Number | Blob) and member.info.const is not None)
+        and not (isinstance(member, Number | Blob) and (member.info.const is not None or member.info.held))
     )
     more = f", units: bool = False{fields}, **values: Any"
     return f'    @overload\n    def build(self, _frame: Literal["{message.name}"], _value: Any = None, /, *{more}) -> bytes: ...'
 
 
 def _command(name: str, command: Command) -> str:
-    args = "".join(f", {arg}: float" for arg in command.args)
-    return f'    @overload\n    def command(self, name: Literal["{name}"]{", *" * bool(args)}{args}) -> bytes: ...'
+    args = "".join(f", {arg}: {TYPES[type(argument.kind)]}" for arg, argument in command.arguments.items())
+    return f'    @overload\n    def command(self, _name: Literal["{name}"], /{", *" * bool(args)}{args}) -> bytes: ...'
 
 
 def _quoted(said: str) -> str:

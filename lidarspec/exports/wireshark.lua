@@ -1,7 +1,7 @@
 local listed = {}
 for _, field in pairs(fields) do table.insert(listed, field) end
 proto.fields = listed
-proto.experts = {marks.checksum, marks.constant, marks.short, marks.skipped}
+proto.experts = {marks.checksum, marks.constant, marks.length, marks.short, marks.skipped}
 
 -- From here on nothing depends on the sensor: `sensor`, above, says what its frames are made of.
 
@@ -261,6 +261,13 @@ function step.struct(self, node, tree, label)
     local begun = self.at
     self:visit(member, below)
     if member.mark then self.places[member.mark] = {begun, self.at} end
+  end
+  for _, length in ipairs(node.lengths or {}) do
+    if self.values[length.path] ~= length.value(self.values) then
+      if not tree then self:fail("constant") end
+      self.wrong = self.wrong or "constant"
+      self.items[length.path]:add_proto_expert_info(marks.length)
+    end
   end
   if below ~= tree then below:set_len(self.at - from) end
   if tree and label then self:sum_up(below) end

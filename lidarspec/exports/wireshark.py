@@ -14,7 +14,7 @@ from importlib import resources
 from typing import Any
 
 from lidarspec._version import __version__
-from lidarspec.exports import Message, Refused, asked, messages
+from lidarspec.exports import Message, Refused, asked, held, messages
 from lidarspec.framing.frame_engine import codec
 from lidarspec.spec import Checksum, Crc, Fold15, Sensor, Sum, Tcp, Udp, WordXor, Xor, ZeroPadded, tree
 from lidarspec.spec.bits import BitField
@@ -41,8 +41,9 @@ def formula(value: tree.Formula) -> Code:
     return Code(str(value)) if isinstance(value, int) else _function(value)
 
 
-def _function(value: tree.Formula) -> Code:
-    return Code(f"function(v) return {tree.written(value, lambda ref: f'v[{quoted(ref.path)}]', _OPERATIONS)} end")
+def _function(value: tree.Formula, missing: str = "") -> Code:
+    """A formula as a function of the values of fields; `missing`: what is added to each, for one that may not be there."""
+    return Code(f"function(v) return {tree.written(value, lambda ref: f'(v[{quoted(ref.path)}]{missing})', _OPERATIONS)} end")
 
 
 def lua(value: Any, indent: str = "") -> str:
@@ -91,7 +92,8 @@ class _Writer:
 
     def __init__(self, message: Message, prefix: str) -> None:
         self.message, self.prefix = message, prefix
-        self.kept = {ref.path for ref in asked(message.root)} | message.seals.keys()
+        lengths = {path for node in tree.nodes(message.root) for path in held(node)}
+        self.kept = {ref.path for ref in asked(message.root)} | message.seals.keys() | lengths
         self.marked = {path for seal in message.seals.values() for path in seal.over or ()}
         self.types: dict[str, str] = {}
 
@@ -178,7 +180,13 @@ class _Writer:
             members.append(table | {"mark": path} if path in self.marked and member.name else table)
         sizes = [None if "mark" in member else member.get("skip") for member in members]
         total = None if None in sizes else sum(filter(None, sizes))
-        return {"kind": "struct", "name": node.name or None, "skip": total, "members": members}
+        inside = {path: value for below in tree.nodes(node) for path, value in held(below).items()}
+        lengths = [
+            {"path": path, "value": _function(value, " or 0")}
+            for path, value in inside.items()
+            if node.path == _around(path, *(ref.path for ref in tree.refs(value)))
+        ]
+        return {"kind": "struct", "name": node.name or None, "skip": total, "members": members, "lengths": lengths or None}
 
     def _repeat(self, node: tree.Repeat, path: str) -> Table:
         element = self.node(node.element, path)
@@ -267,6 +275,13 @@ def _leaves(node: tree.Node) -> list[tree.Node | tree.Part]:
     return [leaf for part in numbers for leaf in (part.parts if isinstance(part, tree.Block) else (part,))]
 
 
+def _around(*paths: str) -> str:
+    """The path of the innermost struct that has all of these fields."""
+    parents = [path.split(".")[:-1] for path in paths]
+    depth = next((depth for depth in range(min(map(len, parents))) if len({names[depth] for names in parents}) > 1), min(map(len, parents)))
+    return ".".join(parents[0][:depth])
+
+
 def _width(bits: int) -> int:
     return next(width for width in (8, 16, 24, 32, 64) if bits <= width)
 
@@ -314,6 +329,7 @@ local status = new({name} .. ".checksum.status", "checksum status", ftypes.UINT8
 local marks = {{
   checksum = ProtoExpert.new({name} .. ".checksum.bad", "checksum wrong", expert.group.CHECKSUM, expert.severity.ERROR),
   constant = ProtoExpert.new({name} .. ".constant.bad", "not the constant that stands here", expert.group.MALFORMED, expert.severity.ERROR),
+  length = ProtoExpert.new({name} .. ".length.bad", "not the length of its part", expert.group.MALFORMED, expert.severity.ERROR),
   short = ProtoExpert.new({name} .. ".cut_off", "the frame ends before its last field", expert.group.MALFORMED, expert.severity.ERROR),
   skipped = ProtoExpert.new({name} .. ".skipped", "bytes of no frame", expert.group.UNDECODED, expert.severity.WARN),
 }}
@@ -326,7 +342,9 @@ def dissector(sensor: Sensor) -> str:
     Raises:
         Refused: where only Python code can decide what a frame is made of.
     """
-    name, title = sensor.id.replace("-", "_"), f"{sensor.vendor} {sensor.model}"
+    name, title, link = sensor.id.replace("-", "_"), f"{sensor.vendor} {sensor.model}", sensor.links.get("data")
+    if isinstance(link, Udp) and link.assembled is not None:
+        raise Refused(f"{sensor.id}: messages in several datagrams, which the dissector does not join")
     by_direction = sorted(messages(sensor), key=lambda message: message.frame.direction)  # "in" first: what both could be came in
     about = {
         "title": title,

@@ -14,9 +14,12 @@ import os
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
+import numpy as np
+
 from lidarspec.errors import LidarSpecError, SpecError, UnknownFormat, system_errors
 from lidarspec.formats.arrays import NPZ
-from lidarspec.formats.text import CSV
+from lidarspec.formats.text import CSV, write_columns
+from lidarspec.packets.imu import ImuSamples
 from lidarspec.plugins import registry
 from lidarspec.scans.scans import Scan
 from lidarspec.transports.protocol import Format
@@ -70,6 +73,23 @@ def replacing(path: Path) -> Iterator[Path]:
     finally:
         with contextlib.suppress(OSError):
             part.unlink()
+
+
+def write_imu(path: str | Path, samples: ImuSamples) -> None:
+    """Write what an IMU felt to a .csv or .npz file: time_ns, and six columns in rad/s and m/s2.
+
+    Raises:
+        UnknownFormat: for another suffix.
+        SourceError: where the file cannot be written.
+    """
+    path = Path(path)
+    if path.suffix.lower() not in BUILT_IN:
+        raise UnknownFormat(path.suffix or str(path), BUILT_IN, place=str(path))
+    with replacing(path) as part:
+        if path.suffix.lower() == CSV.suffix:
+            write_columns(part, samples.columns)
+        else:
+            np.savez(part, **samples.columns)  # type: ignore[arg-type]  # no column is called allow_pickle
 
 
 def write(path: str | Path, scans: Iterable[Scan], *, every_point: bool = False) -> None:

@@ -17,7 +17,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from lidarspec.points.cloud import COLUMNS
 from lidarspec.scans.scans import Scan
 from lidarspec.transports.protocol import Format
 
@@ -48,26 +47,33 @@ class Column:
 
 
 def write(path: Path, scans: Iterable[Scan], *, every_point: bool) -> None:
-    """Write the columns that all scans have, `scan` for each point, and for each scan `stamp_ns`, `rate_hz` and `complete`."""
+    """Write the columns that all scans have, `scan` for each point, and for each scan `stamp_ns`, `rate_hz` and `complete`.
+
+    The unit of a sensor's further column stands in NAME.unit.
+    """
     with contextlib.ExitStack() as files:
 
         def column(dtype: DTypeLike) -> Column:
             return files.enter_context(contextlib.closing(Column(path.parent, dtype)))
 
         facts = {"stamp_ns": column(np.int64), "rate_hz": column(np.float64), "complete": column(np.bool_)}
-        numbers, columns = column(np.int32), dict[str, Column]()
+        numbers, columns, units = column(np.int32), dict[str, Column](), dict[str, str]()
         for number, scan in enumerate(scans):
             cloud = scan.points if every_point else scan.points[scan.points.valid]
             own = cloud.columns
-            columns = columns if number else {name: column(own[name].dtype) for name in COLUMNS if name in own}
+            columns = columns if number else {name: column(values.dtype) for name, values in own.items()}
+            units = units if number else {name: unit for name, unit in cloud.units.items() if unit}
             columns = {name: kept for name, kept in columns.items() if name in own}
             for name, kept in columns.items():
                 kept.add(own[name])
             numbers.add(np.full(len(cloud), number))
             for name, kept in facts.items():
                 kept.add(np.array([getattr(scan, name)]))
+        told = {f"{name}.unit": column(f"<U{len(unit)}") for name, unit in units.items()}
+        for unit, kept in zip(units.values(), told.values(), strict=True):
+            kept.add(np.array([unit]))
         with zipfile.ZipFile(path, "w") as archive:
-            for name, kept in {**columns, "scan": numbers, **facts}.items():
+            for name, kept in {**columns, "scan": numbers, **facts, **told}.items():
                 kept.put(archive, name)
 
 

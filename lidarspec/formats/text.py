@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.points.cloud import COLUMNS
 from lidarspec.scans.scans import Scan
 from lidarspec.transports.protocol import Format
 
 #: how a number of each type is written: seven figures are half a micrometre at a metre; times keep their nanoseconds.
-_WRITTEN = {"f4": "%.7g", "f8": "%.9f"}
+_WRITTEN = {"f2": "%.7g", "f4": "%.7g", "f8": "%.15g"}
+_TIME = "%.9f"
 #: rows turned into text at once.
 ROWS = 1 << 14
 
@@ -26,12 +26,24 @@ def write(path: Path, scans: Iterable[Scan], *, every_point: bool) -> None:
         for number, scan in enumerate(scans):
             cloud = scan.points if every_point else scan.points[scan.points.valid]
             if not names:
-                names = tuple(name for name in COLUMNS if name in cloud.columns)
+                names = tuple(cloud.columns)
                 file.write(",".join([*names, "scan"]) + "\n")
-            columns = [_column(cloud.columns.get(name), len(cloud)) for name in names]
-            template = ",".join([_WRITTEN.get(column.dtype.str[1:], "%d") for column in columns] + [f"{number}\n"])
+            own = cloud.columns
+            columns = [_column(own.get(name), len(cloud)) for name in names]
+            written = [
+                _TIME if name == "time" else _WRITTEN.get(column.dtype.str[1:], "%d") for name, column in zip(names, columns, strict=True)
+            ]
+            template = ",".join([*written, f"{number}\n"])
             for start in range(0, len(cloud), ROWS):
                 file.write("".join(map(template.__mod__, zip(*(c[start : start + ROWS].tolist() for c in columns), strict=True))))
+
+
+def write_columns(path: Path, columns: Mapping[str, NDArray[Any]]) -> None:
+    """Write columns of one length, whole numbers and float64, with their names above."""
+    template = ",".join("%d" if column.dtype.kind == "i" else "%.15g" for column in columns.values()) + "\n"
+    with path.open("w", encoding="ascii", newline="") as file:
+        file.write(",".join(columns) + "\n")
+        file.writelines(template % row for row in zip(*(column.tolist() for column in columns.values()), strict=True))
 
 
 def _column(values: NDArray[Any] | None, length: int) -> NDArray[Any]:

@@ -10,6 +10,7 @@ every other byte. No clock, port or thread in here, and no exception for any byt
 * `weak_frames`: types that are believed in runs alone.
 * `search`: the rule of a stream: the leftmost valid candidate, then on after its last byte.
 * `steady`: frames at one distance, which need no search: in streams, in datagrams, in arrays.
+* `assembly`: messages that come in several datagrams.
 * `datagrams`: datagrams of several types.
 * `decoder`: all of it, incrementally: what is undecided is looked at again with the next bytes.
 * `examples`: valid frames with random content.

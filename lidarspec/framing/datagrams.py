@@ -5,8 +5,7 @@ with `after` only counts while it is announced, and a frame has to be as long as
 are judged as rows (`lidarspec.framing.steady`); of others each type judges those that no type before it has taken. Only what
 makes a plugin fail is judged alone, so that one datagram does not cost the others.
 
-A message in several datagrams (M9) is joined before this: by a step of `Decoder.datagrams` that remembers parts by their key, and hands
-on whole messages as datagrams, each with the arrival time of its last part.
+A message in several datagrams is joined before this (`lidarspec.framing.assembly`).
 """
 
 from __future__ import annotations

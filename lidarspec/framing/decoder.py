@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.errors import PluginError, UsageError, refuse_text
+from lidarspec.framing.assembly import Assembly, Joined
 from lidarspec.framing.candidates import Bytes1D, Framing, Mode, Piece
 from lidarspec.framing.datagrams import sorted_datagrams
 from lidarspec.framing.frame_engine import codec
@@ -22,6 +23,7 @@ from lidarspec.framing.results import Counters, Found, Frames, Numbers, array_of
 from lidarspec.framing.search import leftmost
 from lidarspec.framing.steady import steady_stream
 from lidarspec.spec.description import Frame, Spec
+from lidarspec.spec.links import Udp
 from lidarspec.wire.arrays import alike, keep_freed_memory, repeated
 from lidarspec.wire.layout import Sums
 
@@ -62,11 +64,19 @@ class Decoder:
         self._pending, self._base, self._need = b"", 0, 0
         self._gap = 0
         self._fillers = bytes(sensor.fillers)
+        link, longest = sensor.links.get("data"), max(frame.max_length for frame in sensor.incoming.values())
+        rule = link.assembled if isinstance(link, Udp) and not stream else None
+        self._assembly = None if rule is None else Assembly(rule, longest, self.stats)
         self._least = max(LEAST, 2 * self._framing.reach)
         self._size = max(PIECE, self._least)
 
     def __repr__(self) -> str:
         return f"Decoder({self.sensor.id}, {'stream' if self.stream else 'datagrams'}, {self.backend}: {self.stats})"
+
+    @property
+    def joins(self) -> bool:
+        """Whether messages are joined from several datagrams (`lidarspec.spec.Assembled`)."""
+        return self._assembly is not None
 
     def feed(self, data: Data, at: int | None = None) -> list[Found]:
         """The frames that these bytes complete, in stream order. Raises on no bytes whatever.
@@ -114,6 +124,8 @@ class Decoder:
         """The frames among the bytes that wait for others, as arrays: these will not come."""
         found: list[Frames] = []
         self._need = 0
+        if self._assembly is not None:
+            self._drop(self._assembly.give_up())
         if self._pending:
             self._cut(np.frombuffer(self._pending, np.uint8), None, found, final=True)
         self._pending, self.stats.pending = b"", 0
@@ -143,29 +155,50 @@ class Decoder:
             starts, sizes: of each datagram, in the order of their arrival.
             at: their arrival times in ns, -1 where nobody knows.
         """
+        size = alike(sizes)
+        total, places, joined = int(sizes.sum()) if size is None else size * len(sizes), _places(sizes, self._base), None
+        if self._assembly is not None:
+            joined = self._assembly.join(buffer, starts, sizes, at, self._base)
+            buffer, starts, sizes, at, places = joined.buffer, joined.starts, joined.sizes, joined.at, joined.places
+            self.stats.bytes_skipped += joined.heads
+            self.stats.bytes_filler += joined.heads
+            self.stats.pending = self._assembly.pending
         piece = sorted_datagrams(self._framing, buffer, starts, sizes, self._mode)
-        frames, places, size = piece.frames, _places(sizes, self._base), alike(sizes)
-        total = int(sizes.sum()) if size is None else size * len(sizes)
+        frames = piece.frames
         self._base, self.stats.bytes_in = self._base + total, self.stats.bytes_in + total
         self._rejected(piece.rejected, piece.errors)
         gaps, kind = repeated(0, len(frames)), alike(frames.kinds)
         is_good = kind >= 0 if kind is not None else not np.count_nonzero(frames.kinds < 0)
-        if self._gap or not is_good:
+        if self._gap or not is_good or (joined is not None and joined.dropped.any()):
             good = frames.kinds >= 0
-            gaps = self._lost(buffer, frames.starts, sizes, good)
+            gaps = self._lost(buffer, frames.starts, sizes, good, joined)
             if not is_good:
                 frames, places, at = frames.only(good), array_of(places)[good], at[good]
         self._count(frames.kinds)
         return frames.located(self._framing.names, places, gaps, at)
 
     def _lost(
-        self, buffer: NDArray[np.uint8], starts: NDArray[np.intp], sizes: NDArray[np.intp], good: NDArray[np.bool_]
+        self,
+        buffer: NDArray[np.uint8],
+        starts: NDArray[np.intp],
+        sizes: NDArray[np.intp],
+        good: NDArray[np.bool_],
+        joined: Joined | None,
     ) -> NDArray[np.int64]:
         """The bytes in datagrams that are no frames before each one that is, fillers left out; counts them."""
         lost = self._skipped(buffer, np.where(good, 0, sizes), starts + sizes)
+        if joined is not None:
+            lost = lost + joined.dropped[:-1]
+            self.stats.bytes_skipped += int(joined.dropped[:-1].sum())
         before = np.concatenate([[-self._gap], np.cumsum(lost)[good]])
         self._gap = int(lost.sum() - before[-1])
+        if joined is not None:
+            self._drop(int(joined.dropped[-1]))
         return np.diff(before)
+
+    def _drop(self, size: int) -> None:
+        """Count bytes that are no frame, before the next one."""
+        self._gap, self.stats.bytes_skipped = self._gap + size, self.stats.bytes_skipped + size
 
     def _cut(self, buffer: NDArray[np.uint8], at: int | None, found: list[Frames], *, lasting: bool = True, final: bool = False) -> int:
         """Cut bytes into frames, piece by piece, and add those with frames to what is found.
@@ -287,7 +320,7 @@ def frames_of(decoder: Decoder, data: Any) -> list[Frames]:
     packets: Any = np.ascontiguousarray(data, np.uint8) if isinstance(data, np.ndarray) else list(data)
     most = ROWS if isinstance(data, np.ndarray) else TOGETHER
     step = max(1, min(most, ROW_BYTES // max(len(packets[0]), 1))) if len(packets) else 1
-    return [decoder.datagrams(packets[start : start + step]) for start in range(0, len(packets), step)]
+    return [decoder.datagrams(packets[start : start + step]) for start in range(0, len(packets), step)] + decoder.rest()
 
 
 def is_stream(data: Any) -> bool:

@@ -25,6 +25,7 @@ from lidarspec.wire.build import build
 from lidarspec.wire.frame_table import Group, Rows
 from lidarspec.wire.layout import Layout
 from lidarspec.wire.schema import schema
+from lidarspec.wire.slots import recoder
 
 #: random frames made at once, and how often, before a sensor's own `sweep` has to help.
 BATCH, TRIES = 64, 40
@@ -50,12 +51,15 @@ def examples(sensor: Spec, frame: str, source: random.Random, drawn: Drawn = NOT
     Args:
         drawn: field path -> what draws its raw value, for what random values never make.
     """
-    engine = codec(sensor.frames[frame])
-    if not isinstance(engine, CompiledCodec) or engine.schema.parts:
-        return [_interpreted(sensor, frame, engine, source, drawn)]
+    known, recoding = codec(sensor.frames[frame]), recoder(sensor.frames[frame])
+    engine = known.compiled
+    if engine is None or engine.schema.parts:
+        return [_interpreted(sensor, frame, known, source, drawn)]
     for _ in range(TRIES):
         layout, chosen = engine.tree.choose(source, drawn)
         rows = np.frombuffer(source.randbytes(BATCH * layout.size), np.uint8).reshape(BATCH, layout.size).copy()
+        if recoding is not None:
+            recoding.legal(rows, layout)
         for path, draw in drawn.items():
             if path in layout.leaves and path not in chosen:
                 leaf = layout.leaves[path]
@@ -111,12 +115,20 @@ def _headed(rows: NDArray[np.uint8], layout: Layout, chosen: dict[str, int]) -> 
 def _plausible(sensor: Spec, frame: str, layout: Layout, rows: NDArray[np.uint8]) -> list[bytes]:
     table = Rows(codec(sensor.frames[frame]).schema, [Group(layout, np.arange(len(rows)), rows)])
     if sensor.frames[frame].plausible is None:
-        return [row.tobytes() for row in rows]
+        return _sent(sensor, frame, layout, rows)
     errors: list[PluginError] = []
     good = np.flatnonzero(plausibility(sensor.frames[frame], table, errors) == 0)
     if errors:
         raise SpecError(errors[0].reason, path=f"{frame}.plausible", sensor=sensor.id, rule=errors[0].rule)
-    return [row.tobytes() for row in rows[good]]
+    return _sent(sensor, frame, layout, rows[good])
+
+
+def _sent(sensor: Spec, frame: str, layout: Layout, rows: NDArray[np.uint8]) -> list[bytes]:
+    """Frames as they stand on the wire, without those that are too long there or cannot be written."""
+    recoding = recoder(sensor.frames[frame])
+    if recoding is None:
+        return [row.tobytes() for row in rows]
+    return [data for data in recoding.written(rows, layout) if data is not None]
 
 
 def _swept(sensor: Spec, frame: str, engine: CompiledCodec, source: random.Random) -> bytes:

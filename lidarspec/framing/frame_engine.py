@@ -5,7 +5,8 @@ layouts on whole batches: the header of a candidate is looked at once, when it i
 columns. `InterpretedCodec` lets construct parse one candidate at a time, for structs that have no computable layout and as
 the reference.
 
-A wire form (M4), text or escaped bytes, is a third one: it finds candidates by marks of its own, and gives rows of slots that have layouts.
+`RecodedCodec` stands before either of them for frames with a wire form, text or escaped bytes: the form finds where candidates end, and
+gives rows, which the other one judges as if they had come so.
 """
 
 from __future__ import annotations
@@ -20,14 +21,15 @@ from numpy.typing import NDArray
 
 from lidarspec.errors import PluginError, SpecError
 from lidarspec.framing.plausibility import Check, Conditions, Judge, plausibility
-from lidarspec.framing.results import CHECKSUM, CONSTANT, LENGTH, PLUGIN, SHORT, VALID, Frames, Status
+from lidarspec.framing.results import CHECKSUM, CONSTANT, LENGTH, PLUGIN, SHORT, VALID, Frames, Recoded, Status
 from lidarspec.spec.construct_layer import Mismatch, fixed_size
 from lidarspec.spec.description import Frame
 from lidarspec.wire.arrays import alike, counted, repeated
 from lidarspec.wire.frame_table import Group, Records, Rows, Table
-from lidarspec.wire.layout import Layout, Refused, Sums, marks, rows_at
+from lidarspec.wire.layout import Layout, Refused, Sums, marks, right, rows_at, words
 from lidarspec.wire.layout_tree import NotCompilable, frame_layouts, prefix_of
 from lidarspec.wire.schema import schema
+from lidarspec.wire.slots import Recoder, recoder
 
 #: bytes of candidates looked at in one go, so that memory stays small on hostile streams.
 BLOCK = 1 << 19
@@ -45,9 +47,14 @@ class Codec:
 
     layout: Layout | None = None
 
+    @property
+    def compiled(self) -> CompiledCodec | None:
+        """What knows the layouts of its frames, or of their rows; None where construct alone reads them."""
+        return None
+
     def __init__(self, frame: Frame) -> None:
         self.frame, self.schema = frame, schema(frame.tree)
-        self.prefix, self.size = prefix_of(frame.tree, frame.max_length), fixed_size(frame.prepared) or None
+        self.prefix, self.size = prefix_of(frame.tree, frame.room), fixed_size(frame.prepared) or None
         self.marks = marks(self.prefix)
 
     def survey(
@@ -92,6 +99,10 @@ class CompiledCodec(Codec):
         self.layout = layout if isinstance(layout, Layout) else None
         self._conditions: Conditions | None = None
 
+    @property
+    def compiled(self) -> CompiledCodec:
+        return self
+
     def survey(
         self, buffer: NDArray[np.uint8], offsets: NDArray[np.intp], *, kind: int = 0, gathered: bool = True, sums: Sums | None = None
     ) -> Frames:
@@ -121,7 +132,7 @@ class CompiledCodec(Codec):
         if layout is None or layout.size != rows.shape[1]:
             return None
         errors: list[PluginError] = []
-        return layout, self._judge(layout)(rows, errors, sums), tuple(errors)
+        return layout, self.judge(layout)(rows, errors, sums), tuple(errors)
 
     def _judged(
         self,
@@ -162,7 +173,7 @@ class CompiledCodec(Codec):
         sums: Sums | None,
     ) -> tuple[NDArray[np.uint8], NDArray[np.uint8] | None]:
         """The status of whole candidates of one layout; their bytes, one a row, if they are wanted and not too many."""
-        judge = self._judge(layout)
+        judge = self.judge(layout)
         step = max(BLOCK // layout.size, 1)
         if len(offsets) <= step or not gathered:
             rows = rows_at(buffer, offsets, layout.size, gathered=gathered)
@@ -191,7 +202,8 @@ class CompiledCodec(Codec):
             groups.append(Group(layout, which, rows_at(frames.buffer, starts, layout.size, gathered=is_sparse)))
         return Rows(self.schema, groups)
 
-    def _judge(self, layout: Layout) -> Judge:
+    def judge(self, layout: Layout) -> Judge:
+        """What judges candidates of a layout that have the constants at the start."""
         judge = layout.notes.get(Judge)
         if judge is None:
             checks: list[Check] | None = []
@@ -208,6 +220,7 @@ class InterpretedCodec(Codec):
     def __init__(self, frame: Frame, reason: str = "") -> None:
         super().__init__(frame)
         self.reason = reason
+        self._levels = ("constants", "lengths", True) if any(info.held for info in self.schema.all_fields.values()) else ("constants", True)
 
     def survey(
         self, buffer: NDArray[np.uint8], offsets: NDArray[np.intp], *, kind: int = 0, gathered: bool = True, sums: Sums | None = None
@@ -216,7 +229,7 @@ class InterpretedCodec(Codec):
         sizes = np.zeros(len(offsets), np.intp)
         errors: list[PluginError] = []
         for index, offset in enumerate(offsets):
-            data = buffer[offset : offset + self.frame.max_length].tobytes()
+            data = buffer[offset : offset + self.frame.room].tobytes()
             status[index], sizes[index] = self._judge(data, errors)
         return Frames(buffer, repeated(kind, len(offsets)), offsets, sizes, status=status, errors=tuple(errors))
 
@@ -227,15 +240,15 @@ class InterpretedCodec(Codec):
     def _judge(self, data: bytes, errors: list[PluginError]) -> tuple[int, int]:
         stream = io.BytesIO(data)
         try:
-            self.frame.prepared.parse_stream(stream, _verify="constants")
+            self.frame.prepared.parse_stream(stream, _verify=self._levels[0])
             size = stream.tell()
             if not size:
                 return LENGTH, 0
-            parsed = self.frame.prepared.parse(data[:size])
+            parsed = [self.frame.prepared.parse(data[:size], _verify=level) for level in self._levels[1:]][-1]
         except Mismatch as mismatch:
-            return (CHECKSUM if mismatch.reason == "checksum" else CONSTANT), 0
+            return {"checksum": CHECKSUM, "length": LENGTH}.get(mismatch.reason, CONSTANT), 0
         except construct.StreamError:
-            return (LENGTH if len(data) >= self.frame.max_length else SHORT), 0
+            return (LENGTH if len(data) >= self.frame.room else SHORT), 0
         except SpecError:
             raise
         except construct.ConstructError:
@@ -248,21 +261,95 @@ class InterpretedCodec(Codec):
         return int(plausibility(self.frame, Records(self.schema, [parsed], [data[:size]]), errors)[0]), size
 
 
+class RecodedCodec(Codec):
+    """A frame type with a wire form: its rows are what `engine` knows as frames.
+
+    Raises:
+        SpecError: for a struct whose fields have no computable place.
+    """
+
+    def __init__(self, frame: Frame, recoder: Recoder, engine: CompiledCodec | InterpretedCodec) -> None:
+        super().__init__(frame)
+        self.recoder, self.engine, self.size = recoder, engine, None
+        self.prefix = {spot: (0xFF, byte) for spot, byte in enumerate(recoder.begins)}
+        self.marks = marks(self.prefix)
+
+    @property
+    def compiled(self) -> CompiledCodec | None:
+        return self.engine.compiled
+
+    def survey(
+        self, buffer: NDArray[np.uint8], offsets: NDArray[np.intp], *, kind: int = 0, gathered: bool = True, sums: Sums | None = None
+    ) -> Frames:
+        reading = self.recoder.reading(buffer, offsets)
+        status, errors = np.where(reading.sizes == 0, SHORT, LENGTH).astype(np.uint8), list[PluginError]()
+        whole = np.flatnonzero(reading.sizes > 0)
+        if reading.intact is not None:
+            status[whole[~reading.intact[whole]]] = CHECKSUM
+            whole = whole[reading.intact[whole]]
+        groups = list[tuple[Layout, NDArray[np.intp], NDArray[np.uint8]]]()
+        for layout, which, rows, is_read in self.recoder.rows(reading, offsets[whole], reading.sizes[whole]):
+            if isinstance(layout, Refused):
+                status[whole[which]] = PLUGIN if layout.error else LENGTH
+                errors += [layout.error] if layout.error else []
+                continue
+            own = whole[which] if is_read.all() else whole[which[is_read]]
+            good = rows if len(own) == len(which) else rows[is_read]
+            status[own] = self._judged(layout, good, errors, sums)
+            groups.append((layout, own, good))
+        recoded = (Recoded(kind, offsets, tuple(groups)),) if groups else ()
+        kinds, sizes = repeated(kind, len(offsets)), np.maximum(reading.sizes, 0)
+        return Frames(buffer, kinds, offsets, sizes, status=status, errors=tuple(errors), recoded=recoded)
+
+    def _judged(self, layout: Layout, rows: NDArray[np.uint8], errors: list[PluginError], sums: Sums | None) -> NDArray[np.uint8]:
+        """The status of rows of one layout."""
+        if isinstance(self.engine, CompiledCodec):
+            held = right(words(self.engine.marks), rows)
+            status = self.engine.judge(layout)(rows, errors, sums)
+            return status if held is None else np.where(held, status, np.uint8(CONSTANT))
+        surveys = [self.engine.survey(row, np.zeros(1, np.intp)) for row in rows]
+        errors += [error for survey in surveys for error in survey.errors]
+        judged = ((survey.status.item(0), survey.sizes.item(0)) for survey in surveys)
+        return np.array([LENGTH if status in (VALID, SHORT) and size != layout.size else status for status, size in judged], np.uint8)
+
+    def table(self, frames: Iterable[bytes]) -> Table:
+        frames = list(frames)
+        sizes = np.array([len(frame) for frame in frames], np.intp)
+        joined = np.frombuffer(b"".join(frames), np.uint8)
+        return self.gather(Frames(joined, repeated(0, len(frames)), np.cumsum(sizes) - sizes, sizes))
+
+    def gather(self, frames: Frames) -> Table:
+        known = next((one.only(frames.starts) for one in frames.recoded if one.kind == alike(frames.kinds)), None)
+        if known is None:
+            reading = self.recoder.reading(frames.buffer, frames.starts)
+            read = self.recoder.rows(reading, frames.starts, frames.sizes)
+            known = [(layout, which[right], rows[right]) for layout, which, rows, right in read if isinstance(layout, Layout)]
+        groups = [Group(*group) for group in known]
+        if isinstance(self.engine, CompiledCodec):
+            return Rows(self.schema, groups)
+        rows = {spot: row.tobytes() for group in groups for spot, row in zip(group.where.tolist(), group.rows, strict=True)}
+        return self.engine.table(rows[spot] for spot in sorted(rows))
+
+
 def _partial(buffer: NDArray[np.uint8], offsets: NDArray[np.intp], layout: Layout) -> tuple[NDArray[np.uint8], NDArray[np.intp]]:
-    """Candidates whose end is not there yet: still possible, or already refuted by a constant; and how many bytes tell more."""
+    """Candidates whose end is not there yet: still possible, or already refuted by a constant or a length; and how many bytes tell more."""
     status = np.full(len(offsets), SHORT, np.uint8)
     sizes = np.full(len(offsets), layout.size, np.intp)
-    for spot in sorted(layout.constants, reverse=True):
-        mask, value = layout.constants[spot]
-        there = offsets + spot < len(buffer)
-        status[there] = np.where(buffer[offsets[there] + spot] & mask == value, status[there], CONSTANT)
-        sizes[~there] = spot + 1
+    for verdict, known in ((LENGTH, layout.held), (CONSTANT, layout.constants)):
+        for spot in sorted(known, reverse=True):
+            mask, value = known[spot]
+            there = offsets + spot < len(buffer)
+            status[there] = np.where(buffer[offsets[there] + spot] & mask == value, status[there], verdict)
+            sizes[~there] = np.minimum(sizes[~there], spot + 1)
     return status, sizes
 
 
 @functools.lru_cache(maxsize=2048)
-def codec(frame: Frame, *, interpreted: bool = False) -> CompiledCodec | InterpretedCodec:
+def codec(frame: Frame, *, interpreted: bool = False) -> CompiledCodec | InterpretedCodec | RecodedCodec:
     """The engine of a frame type: compiled where that is possible and construct is not asked for."""
+    recoding = recoder(frame)
+    if recoding is not None:
+        return RecodedCodec(frame, recoding, InterpretedCodec(frame, "asked for") if interpreted else CompiledCodec(frame))
     if interpreted:
         return InterpretedCodec(frame, "asked for")
     try:

@@ -51,6 +51,7 @@ class Judge:
     ) -> None:
         self._frame, self._schema, self._layout, self._checks = frame, schema, layout, checks
         self._constants = words(marks({spot: known for spot, known in layout.constants.items() if prefix.get(spot) != known}))
+        self._held = words(marks(layout.held))
 
     def __call__(self, rows: Bytes2D, errors: list[PluginError], sums: Sums | None = None) -> NDArray[np.uint8]:
         """The status of each candidate, (n,).
@@ -64,6 +65,9 @@ class Judge:
         held = right(self._constants, rows) if len(rows) else None
         if held is not None:
             status[~held] = CONSTANT
+        held = right(self._held, rows) if len(rows) else None
+        if held is not None:
+            status[~held & (status == VALID)] = LENGTH
         _parts_among(self._layout, status, rows, errors, sums)
         for seal in self._layout.seals:
             _among(status, rows, functools.partial(intactness, seal, errors, sums))

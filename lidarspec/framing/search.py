@@ -39,13 +39,14 @@ def leftmost(framing: Framing, buffer: Bytes1D, mode: Mode, base: int, *, final:
     stays, walks = [(0, mode.after)], dict[str | None, Walk]()
     position = 0
     while position < piece.end:
-        if mode.after not in walks:
+        walk = walks.get(after := mode.after)
+        if walk is None:
             live = candidates.live(mode)
             if live is None:
                 piece.end = position
                 break
-            walks[mode.after] = _walk(framing, candidates, live, mode, base)
-        after, position = mode.after, walks[mode.after].advance(position, piece)
+            walk = walks[after] = _walk(framing, candidates, live, mode, base)
+        position = walk.advance(position, piece)
         if mode.after == after:
             break
         before, mode.changed = mode.changed, base + position
@@ -102,14 +103,13 @@ class _Chain:
             if bool((live.starts[1:] < ends[:-1]).any()):
                 self._after = live.starts.searchsorted(ends)
                 stops |= self._after != np.arange(1, len(live) + 1)
-        self._changes: dict[int, tuple[str, int]] = {}
+        self._changes, self._kinds, self._ends = b"", list[int](), list[int]()
         if framing.named:
-            changes = np.flatnonzero(framing.switching(mode)[live.kinds] & (live.status == VALID))
-            names = (framing.names[kind] for kind in live.kinds[changes].tolist())
-            self._changes = dict(zip(changes.tolist(), zip(names, ends[changes].tolist(), strict=True), strict=True))
-            stops[changes] = True
+            changes = framing.switching(mode)[live.kinds] & (live.status == VALID)
+            self._changes, self._kinds, self._ends = changes.tobytes(), live.kinds.tolist(), ends.tolist()
+            stops |= changes
         self._stops: list[int] = np.flatnonzero(stops).tolist()
-        self._starts: list[int] = live.starts.tolist() if self._changes else []
+        self._starts: list[int] = live.starts.tolist() if any(self._changes) else []
         self._runs: list[tuple[int, int]] = []
 
     def advance(self, position: int, piece: Piece) -> int:
@@ -118,10 +118,10 @@ class _Chain:
             first = bisect.bisect_left(self._starts, position) if self._starts else int(live.starts.searchsorted(position))
         while first < len(live):
             last = self._stops[bisect.bisect_left(self._stops, first)]
-            if last in self._changes:
+            if self._changes and self._changes[last]:
                 self._runs.append((first, last))
-                self._mode.after, end = self._changes[last]
-                return end
+                self._mode.after = self._framing.names[self._kinds[last]]
+                return self._ends[last]
             if live.status.item(last) == SHORT:
                 self._runs.append((first, last - 1))
                 piece.end, piece.waiting, piece.need = live.starts.item(last), self._is_whole, live.sizes.item(last)
@@ -159,7 +159,9 @@ def count_rejected(framing: Framing, piece: Piece, candidates: Candidates, stays
     Args:
         stays: from which offset on which types were looked for.
     """
-    frames, begins, names = piece.frames, [begin for begin, _ in stays], [name for _, name in stays]
+    frames, begins = piece.frames, np.array([begin for begin, _ in stays])
+    numbers = {name: number for number, name in enumerate({name for _, name in stays})}
+    modes = np.array([numbers[name] for _, name in stays])
     for kind, own in candidates.judged.items():
         refused = np.flatnonzero(own.status > (VALID if candidates.final else SHORT)) if not own.is_sound else ()
         if not len(refused):
@@ -167,8 +169,7 @@ def count_rejected(framing: Framing, piece: Piece, candidates: Candidates, stays
         spots = own.starts[refused]
         counted = spots < piece.end
         if len(stays) > 1 and (after := framing.codecs[kind].frame.after) is not None:
-            looked_for = np.array([name == after for name in names])
-            counted &= looked_for[np.searchsorted(begins, spots, side="right") - 1]
+            counted &= modes[begins.searchsorted(spots, side="right") - 1] == numbers.get(after, -1)
         if len(frames):
             before = np.searchsorted(frames.starts, spots, side="right") - 1
             held = np.maximum(before, 0)

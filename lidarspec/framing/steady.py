@@ -110,7 +110,7 @@ def _awaited(framing: Framing, mode: Mode, kind: int, layout: Layout, rest: byte
     if first != kind or framing.codecs[kind].size != layout.size:
         return 0
     need = layout.size
-    for spot, (mask, value) in layout.constants.items():
+    for spot, (mask, value) in layout.known.items():
         if spot >= len(rest):
             need = min(need, spot + 1)
         elif rest[spot] & mask != value:

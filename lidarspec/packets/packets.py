@@ -13,6 +13,7 @@ from lidarspec.columns.columns import AROUND, Batch, physical
 from lidarspec.errors import SpecError, UnknownField
 from lidarspec.framing.results import Counters, Numbers, array_of
 from lidarspec.packets.clocks import part_times
+from lidarspec.packets.imu import ImuSamples, samples
 from lidarspec.points.cloud import PointCloud
 from lidarspec.points.evaluate import cloud_of
 from lidarspec.spec.description import Spec
@@ -124,6 +125,16 @@ class Packets:
         """
         return cloud_of(self.with_points)
 
+    def imu(self) -> ImuSamples:
+        """What the sensor's IMU felt, in all packets in stream order: columns in SI, and the time of each sample.
+
+        Raises:
+            SpecError: where this frame type has nothing of an IMU, or its `imu` function fails or returns columns that do not fit.
+        """
+        path = self.sensor.parts_with("imu", self.frame)
+        own = self.parts(path) if path else self
+        return samples(self.sensor, own.frame, own.batch(), own.time_ns)
+
     def take(self, which: Any) -> Packets:
         """The packets that indices, a mask or a slice pick, with their times, offsets and state."""
         indices = np.arange(len(self))[which]
@@ -159,7 +170,7 @@ class Packets:
     @property
     def with_points(self) -> Packets:
         """The packets that points are made of: these, or the parts in them."""
-        path = self.sensor.parts_with_points(self.frame)
+        path = self.sensor.parts_with("points", self.frame)
         return self.parts(path) if path else self
 
     @property

@@ -7,7 +7,7 @@ the last frame of each other type, and whether bytes were skipped since the last
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
 from typing import Any
@@ -16,15 +16,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.columns.columns import Batch
-from lidarspec.errors import PluginError, UnknownFrame
+from lidarspec.errors import PluginError, SpecError, UnknownFrame
 from lidarspec.framing.frame_engine import Codec, codec
 from lidarspec.framing.results import Counters, Frames, Numbers
 from lidarspec.packets.clocks import Unwrapper, clock_parts, clock_terms, clocked, held, paths
 from lidarspec.packets.continuity import Continuity
+from lidarspec.packets.imu import ImuSamples, Waiting, joined
 from lidarspec.packets.packets import Index, Packets, StateOf, joined_tables
 from lidarspec.spec.description import Spec
+from lidarspec.spec.timing import Clock
 from lidarspec.wire.arrays import alike, repeated, some
 from lidarspec.wire.frame_table import Table
+from lidarspec.wire.schema import Schema
 
 
 class PacketStream:
@@ -54,9 +57,10 @@ class PacketStream:
         self._state: dict[str, bytes] = dict(state or {})
         data = sensor.frames[frame].data
         counted = sensor.sequence is not None and data and _has(sensor, frame, sensor.sequence.field)
-        timed = sensor.clock is not None and data and all(_has(sensor, frame, path) for path in paths(sensor.clock))
-        self._clock = Unwrapper(sensor.clock.wraps_at) if sensor.clock and timed else None
-        in_parts = sensor.clock is not None and timed and clock_parts(sensor, self._codec.schema) is not None
+        clock = _clock_of(sensor, frame, self._codec.schema)
+        self._timer, timed = replace(sensor, clock=clock) if clock else sensor, data and clock is not None
+        self._clock = Unwrapper(clock.wraps_at) if clock else None
+        in_parts = timed and clock_parts(sensor, self._codec.schema) is not None
         terms = clock_terms(paths(sensor.clock), self._codec.schema, sensor.id) if sensor.clock and timed and not in_parts else []
         grain = float(min((step for _, step, _, _ in terms), default=0))
         # a frame without the parts that have the clock says nothing of time, so that only a counter tells what was lost beside it
@@ -100,7 +104,7 @@ class PacketStream:
 
     def _times(self, batch: Batch, host: NDArray[np.int64]) -> NDArray[np.int64]:
         assert self._clock is not None
-        which, readings = clocked(self.sensor, batch)
+        which, readings = clocked(self._timer, batch)
         if which is None:
             return self._clock.push(readings, host)
         times = self._clock.push(readings, host[which])
@@ -176,6 +180,47 @@ class PacketStream:
         return joined_tables(tables), which
 
 
+class ImuStream:
+    """What a sensor's IMU felt, out of a decoder's frames: of every type that has it.
+
+    Args:
+        stats, backend, state: as of `PacketStream`.
+
+    Attributes:
+        waiting: for samples until the scan that they belong to ends; None where there is no IMU, or not by the clock of the points.
+    """
+
+    def __init__(self, sensor: Spec, stats: Counters, *, backend: str = "auto", state: Mapping[str, bytes] | None = None) -> None:
+        names = [name for name in sensor.imu_frames if not sensor.frames[name].data]
+        self._streams = [PacketStream(sensor, name, stats, backend=backend, state=state) for name in names]
+        kinds = {_clock_of(sensor, name, codec(sensor.frames[name]).schema) is None for name in (*names, *sensor.data_frames)}
+        self.waiting = Waiting() if sensor.imu_frames and len(kinds) == 1 else None
+
+    def add(self, found: Sequence[Frames], data: Packets | None, *, whole: bool = False) -> ImuSamples:
+        """The samples among these frames; those that wait have them too. A failing plugin is counted.
+
+        Args:
+            data: the packets of the data among them.
+            whole: the frames are a whole input.
+        """
+        own = [data] if data is not None and data.sensor.frames[data.frame].imu is not None else []
+        parts = list[ImuSamples]()
+        for packets in (*own, *(stream.add(found, whole=whole) for stream in self._streams)):
+            try:
+                parts += [packets.imu()] if len(packets) else []
+            except SpecError as error:
+                packets.stats.error(PluginError.of(error, f"imu of {packets.frame}"), len(packets))
+        samples = joined(parts)
+        if self.waiting is not None:
+            self.waiting.add(samples)
+        return samples
+
+    def interrupt(self) -> None:
+        """Input was lost here."""
+        for stream in self._streams:
+            stream.interrupt()
+
+
 @dataclass(frozen=True, eq=False)
 class _Part:
     """Our frames in a piece of input: indices, or None where all are ours."""
@@ -223,6 +268,17 @@ def data_frame(sensor: Spec, found: Sequence[Frames]) -> str | None:
         if len(own):
             return frames.names[own.item(0)]
     return None
+
+
+def _clock_of(sensor: Spec, frame: str, schema: Schema) -> Clock | None:
+    """The clock that is read in frames of a type: the sensor's in data, and where an IMU's frames have it; else their own, if any."""
+    declared, shared = sensor.frames[frame], sensor.clock
+    if declared.clock is not None or shared is None:
+        return declared.clock
+    if declared.data:
+        return shared if all(_has(sensor, frame, path) for path in paths(shared)) else None
+    known = declared.imu is not None and paths(shared)
+    return shared if known and all(path in schema.fields for path in known) else None
 
 
 def _has(sensor: Spec, frame: str, path: str) -> bool:

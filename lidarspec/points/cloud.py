@@ -5,20 +5,21 @@ sources, whatever the points are: those of a batch of packets (`lazy_columns.Bat
 (`CloudColumns`), and some of other sources one after another (`Stretches`), as slices and scans are. Scans are so cut out of batches
 without a column being made, and a source that can makes the columns of a scan for that scan alone.
 
-Further columns of points (M5) get a place beside the others here and in `conventions`, under their names.
+Columns under names of a sensor's own are in `extra`, each made when it is first read too; a source has them like all others, by name.
 """
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.points.conventions import TYPES, Floats, narrowed
+from lidarspec.errors import UsageError
+from lidarspec.points.conventions import TYPES, Floats, Grid, Kind, narrowed
 
 #: names of the columns that a cloud can have, in the order in which files list them.
 COLUMNS = tuple(TYPES)
@@ -32,6 +33,8 @@ STRUCTURED = np.dtype(
         "itemsize": 32,
     }
 )
+#: what the size of a structured point is a multiple of.
+_ALIGNED = 16
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -47,10 +50,14 @@ class PointCloud:
         intensity: (N,) float32, the wire's number; None where the sensor has none.
         ring: (N,) uint16, None where the sensor has none.
         return_index: (N,) uint8, None where the sensor has none.
+        column: (N,) uint16, which column of its turn a point is in, None where the sensor does not say.
         valid: (N,) bool, True for real returns.
         stamp_ns: int64 nanoseconds.
-        shape: (columns, rows) where the points are organised so, else None.
+        shape: (columns, rows) where the points are organised so, else None; several returns of a place stand side by side:
+            ``cloud.range.reshape(*cloud.shape, -1)`` is (columns, rows, returns).
         nominal: True where a default calibration stood in for the sensor's own.
+        extra: (N,) columns that the sensor gives besides, by name, such as "velocity"; each in its type.
+        units: of those in `extra`, by name; "" for a plain number.
     """
 
     x: Floats
@@ -64,9 +71,12 @@ class PointCloud:
     intensity: Floats | None = None
     ring: NDArray[np.uint16] | None = None
     return_index: NDArray[np.uint8] | None = None
+    column: NDArray[np.uint16] | None = None
     stamp_ns: int = 0
     shape: tuple[int, int] | None = None
     nominal: np.bool_ = field(default_factory=np.bool_)
+    extra: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+    units: Mapping[str, str] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.x)
@@ -78,8 +88,8 @@ class PointCloud:
 
     @property
     def columns(self) -> Mapping[str, NDArray[Any]]:
-        """The columns that this cloud has, by name."""
-        return {name: getattr(self, name) for name in COLUMNS if getattr(self, name) is not None}
+        """The columns that this cloud has, by name, those in `extra` last."""
+        return {name: getattr(self, name) for name in COLUMNS if getattr(self, name) is not None} | dict(self.extra)
 
     @property
     def xyz(self) -> Floats:
@@ -89,33 +99,103 @@ class PointCloud:
     def __getitem__(self, which: Any) -> PointCloud:
         """The points that a mask, indices or a slice pick; organised only if a slice holds whole columns."""
         picked = {f.name: _pick(getattr(self, f.name), which) for f in fields(self)}
+        picked["extra"] = {name: column[which] for name, column in self.extra.items()}
         shape = None
         if self.shape and isinstance(which, slice) and which.step in (None, 1):
-            shape = _organised(len(picked["x"]), _whole_rows(self.shape[1], which.indices(len(self))[0], len(picked["x"])))
+            shape = organised(len(picked["x"]), _whole_columns(grid_of(self), which.indices(len(self))[0], len(picked["x"])))
         return PointCloud(**{**picked, "shape": shape})
 
+    def organised(self, columns: int) -> PointCloud:
+        """The points as a picture of so many columns, each in the place of its number; one that was lost is a gap of invalid points.
+
+        Args:
+            columns: of a whole turn. The points are those of one turn at most.
+
+        Raises:
+            UsageError: where they have no `column` or are not organised, or a number comes twice or is too large.
+        """
+        if self.shape is None or self.column is None:
+            raise UsageError("a picture is made of organised points whose columns have numbers: Polar(..., column=...)")
+        each = grid_of(self).column
+        numbers, counts = np.unique(self.column[::each], return_counts=True)
+        wrong = numbers[(numbers >= columns) | (counts > 1)]
+        if len(wrong):
+            reason = f"comes {int(counts[numbers == wrong[0]][0])} times" if wrong[0] < columns else f"is not one of {columns}"
+            raise UsageError(f"column {wrong[0]} {reason}: give the points of one turn, and how many columns that has")
+        place = np.full(columns, -1)
+        place[self.column[::each]] = np.arange(self.shape[0])
+        indices = np.where(place[:, None] < 0, -1, place[:, None] * each + np.arange(each))
+        numbered = np.repeat(np.arange(columns), each).astype(TYPES["column"])
+        return replace(self._rearranged(indices), column=numbered, shape=(columns, self.shape[1]))
+
+    def destaggered(self, shifts: Sequence[int]) -> PointCloud:
+        """The points of a picture, each row moved on by so many columns, round the turn: what looks in one direction stands in one column.
+
+        Args:
+            shifts: columns for each row, (rows,), as the sensor's metadata has them.
+
+        Raises:
+            UsageError: where the points are not organised (see `organised`), or there is not one shift for each row.
+        """
+        if self.shape is None or np.shape(shifts) != (self.shape[1],):
+            what = f"{self.shape[1]} rows" if self.shape else "points that are not organised"
+            raise UsageError(f"{np.size(shifts)} shifts for {what}")
+        grid, (columns, rows) = grid_of(self), self.shape
+        source = (np.arange(columns)[:, None] - np.asarray(shifts)) % columns
+        places = source * rows + np.arange(rows)
+        return replace(self._rearranged(places[:, :, None] * grid.returns + np.arange(grid.returns)), shape=self.shape)
+
+    def _rearranged(self, indices: NDArray[np.intp]) -> PointCloud:
+        """The points at some indices, whole columns of them; -1 is an invalid one, in the row that it stands in."""
+        indices, each = indices.reshape(-1), grid_of(self).column
+        gaps = indices < 0
+        picked = self[np.where(gaps, np.arange(len(indices)) % each, indices)]
+        if gaps.any():
+            for column in (*picked.columns.values(), picked.valid):
+                if column.dtype.kind in "fb":
+                    column[gaps] = np.nan if column.dtype.kind == "f" else False
+        return picked
+
     def to_structured(self) -> NDArray[Any]:
-        """A structured array (N,) with PCL's layout: x y z intensity ring time, itemsize 32; what is missing is 0."""
-        structured = np.zeros(len(self), STRUCTURED)
-        for name in STRUCTURED.names or ():
-            column = getattr(self, name)
+        """A structured array (N,) with PCL's layout: x y z intensity ring time, itemsize 32; what is missing is 0.
+
+        The columns in `extra` follow from byte 32 on, each where its type allows, and the itemsize is a multiple of 16.
+        """
+        columns = {name: getattr(self, name) for name in STRUCTURED.names or ()} | dict(self.extra)
+        structured = np.zeros(len(self), _structured({name: column.dtype for name, column in self.extra.items()}))
+        for name, column in columns.items():
             if column is not None:
                 structured[name] = column
         return structured
+
+
+def _structured(extra: Mapping[str, np.dtype[Any]]) -> np.dtype[Any]:
+    """PCL's layout with further columns behind it."""
+    places, end = {name: place[:2] for name, place in (STRUCTURED.fields or {}).items()}, STRUCTURED.itemsize
+    for name, dtype in extra.items():
+        start = end + -end % dtype.itemsize
+        places[name], end = (dtype.newbyteorder("<"), start), start + dtype.itemsize
+    formats, offsets = zip(*places.values(), strict=True)
+    return np.dtype({"names": list(places), "formats": formats, "offsets": offsets, "itemsize": end + -end % _ALIGNED})
 
 
 def _pick(value: Any, which: Any) -> Any:
     return value[which] if isinstance(value, np.ndarray) and value.ndim else value
 
 
-def _whole_rows(rows: int, first: int, number: int) -> int:
-    """The rows of some points of an organised cloud, from the `first` on; 0 where they are not whole columns."""
-    return rows if rows and first % rows == 0 and number % rows == 0 else 0
+def grid_of(cloud: PointCloud) -> Grid:
+    """How the points of a cloud are organised."""
+    return Grid(cloud.shape[1], len(cloud) // max(cloud.shape[0] * cloud.shape[1], 1) or 1) if cloud.shape else Grid()
 
 
-def _organised(number: int, rows: int) -> tuple[int, int] | None:
-    """The shape of a cloud with so many rows."""
-    return (number // rows, rows) if rows else None
+def _whole_columns(grid: Grid, first: int, number: int) -> Grid:
+    """How some points of an organised cloud are, from the `first` on: not, where they are not whole columns."""
+    return grid if grid.rows and first % grid.column == 0 and number % grid.column == 0 else Grid()
+
+
+def organised(number: int, grid: Grid) -> tuple[int, int] | None:
+    """The shape of a cloud of so many points."""
+    return (number // grid.column, grid.rows) if grid.rows else None
 
 
 class ColumnSource:
@@ -124,17 +204,19 @@ class ColumnSource:
     Attributes:
         size: the number of points.
         base: the time that their times count from, int64 ns.
-        rows: of an organised cloud; 0 where the points are not organised.
+        grid: how the points are organised.
         nominal: whether a default calibration stood in for the sensor's own.
+        extra: what the columns under names of the sensor's own hold, by name.
     """
 
     size: int
     base: int
-    rows: int = 0
+    grid: Grid = Grid()
     nominal: bool = False
+    extra: Mapping[str, Kind] = {}
 
     def column(self, name: str) -> NDArray[Any] | None:
-        """A column of `PointCloud`, (size,), or "valid"; None where the sensor has none."""
+        """A column of `PointCloud`, (size,), "valid" or one of those in `extra`; None where the sensor has none."""
         raise NotImplementedError
 
     def holds(self, name: str) -> bool:
@@ -163,10 +245,12 @@ class CloudColumns(ColumnSource):
 
     def __init__(self, cloud: PointCloud) -> None:
         self._cloud, self.size, self.base = cloud, len(cloud), cloud.stamp_ns
-        self.rows, self.nominal = cloud.shape[1] if cloud.shape else 0, bool(cloud.nominal)
+        self.grid, self.nominal = grid_of(cloud), bool(cloud.nominal)
+        own = cloud.source.extra if isinstance(cloud, LazyCloud) else None
+        self.extra = {name: Kind(column.dtype, cloud.units.get(name, "")) for name, column in cloud.extra.items()} if own is None else own
 
     def column(self, name: str) -> NDArray[Any] | None:
-        column: NDArray[Any] | None = getattr(self._cloud, name)
+        column: NDArray[Any] | None = self._cloud.extra[name] if name in self.extra else getattr(self._cloud, name)
         return column
 
     def holds(self, name: str) -> bool:
@@ -201,9 +285,11 @@ class Stretches(ColumnSource):
     def __init__(self, parts: Sequence[Stretch], *, from_first: bool = False) -> None:
         self._parts, self._from_first = parts, from_first
         self.size, self.base = sum(part.size for part in parts), parts[0].source.base
-        rows = {_whole_rows(part.source.rows, part.start, part.size) for part in parts}
-        self.rows = rows.pop() if len(rows) == 1 else 0
+        grids = {_whole_columns(part.source.grid, part.start, part.size) for part in parts}
+        self.grid = grids.pop() if len(grids) == 1 else Grid()
         self.nominal = any(part.source.nominal for part in parts)
+        first = parts[0].source.extra
+        self.extra = {name: first[name] for name in first if all(name in part.source.extra for part in parts)} if first else first
         self._together = parts[0].source.together(parts)
 
     def column(self, name: str) -> NDArray[Any] | None:
@@ -249,6 +335,30 @@ def later(source: ColumnSource, base: int) -> float:
     return (source.base - base) * 1e-9
 
 
+class Extras(Mapping[str, NDArray[Any]]):
+    """The columns of a source under names of the sensor's own, each made when it is first read."""
+
+    def __init__(self, source: ColumnSource) -> None:
+        self._source, self._made = source, dict[str, Any]()
+
+    def __getitem__(self, name: str) -> NDArray[Any]:
+        if name not in self._made:
+            self._made[name] = self._source.column(name) if name in self._source.extra else None
+        if self._made[name] is None:
+            raise KeyError(f"{name}: there are {', '.join(self) or 'none'}")
+        column: NDArray[Any] = self._made[name]
+        return column
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._source.extra)
+
+    def __len__(self) -> int:
+        return len(self._source.extra)
+
+    def __repr__(self) -> str:
+        return f"Extras({', '.join(f'{name} [{kind.unit}]' if kind.unit else name for name, kind in self._source.extra.items())})"
+
+
 class _Unread:
     """A column that is made when it is first read."""
 
@@ -271,8 +381,9 @@ class LazyCloud(PointCloud):
     def of(cls, source: ColumnSource, stamp_ns: int) -> LazyCloud:
         """The cloud of these columns; `stamp_ns`: the time that theirs count from."""
         cloud = object.__new__(cls)
-        shape = _organised(source.size, source.rows)
+        shape = organised(source.size, source.grid)
         cloud.__dict__.update(source=source, stamp_ns=stamp_ns, shape=shape, nominal=np.bool_(source.nominal))
+        cloud.__dict__.update(extra=Extras(source), units={name: kind.unit for name, kind in source.extra.items()})
         return cloud
 
     def __len__(self) -> int:
@@ -285,7 +396,7 @@ class LazyCloud(PointCloud):
         return super().__getitem__(which)
 
     def __reduce__(self) -> Any:
-        return functools.partial(PointCloud, **{f.name: getattr(self, f.name) for f in fields(self)}), ()
+        return functools.partial(PointCloud, **{f.name: getattr(self, f.name) for f in fields(self)} | {"extra": dict(self.extra)}), ()
 
 
 for _name in (*COLUMNS, "valid"):

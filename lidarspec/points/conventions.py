@@ -6,20 +6,22 @@ The formulas take arrays (the plain evaluation) and traced columns (plans) alike
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lidarspec.columns.columns import Column
 from lidarspec.columns.graph import Traced
 from lidarspec.spec.description import DIRECTIONS, Spec
+from lidarspec.spec.results import Extra
 
 Floats = NDArray[np.float32]
 
 #: names of the columns that a cloud can have, in the order in which files list them, and their types.
 TYPES: Mapping[str, Any] = {
     **dict.fromkeys(("x", "y", "z", "range", "azimuth", "elevation", "intensity"), np.float32),
-    **{"time": np.float64, "ring": np.uint16, "return_index": np.uint8},
+    **{"time": np.float64, "ring": np.uint16, "return_index": np.uint8, "column": np.uint16},
 }
 
 #: largest float32 below pi: azimuths stay in [-pi, pi) in either precision.
@@ -94,14 +96,51 @@ def seconds_since(time_ns: NDArray[np.int64], base: int) -> NDArray[np.float64]:
     return np.multiply(time_ns - base, 1e-9, dtype=np.float64)
 
 
-def rows_of(shape: Sequence[int]) -> int:
-    """The rows of an organised cloud whose packets all have points of this shape; 0 where such points are not organised."""
-    return shape[-1] if len(shape) >= 2 and shape[-1] > 1 else 0
+class Grid(NamedTuple):
+    """How the points of a packet are organised: places of a column, none where they are not, and returns of each place, side by side."""
+
+    rows: int = 0
+    returns: int = 1
+
+    @property
+    def column(self) -> int:
+        """The points of a column."""
+        return self.rows * self.returns
 
 
-def numbers_of(name: str, values: NDArray[Any]) -> NDArray[Any]:
-    """A column of numbers that sensors may leave out: intensity, ring or return, in its type and of the same shape; nan is 0."""
-    return np.asarray(np.nan_to_num(values), TYPES[name])
+def grid_of(shape: Sequence[int], axes: Sequence[str | None]) -> Grid:
+    """How points are organised that have this shape in every packet, along axes of these names; `stack` makes returns."""
+    is_stacked = bool(axes) and (axes[-1] or "").startswith("<")
+    *lengths, returns = shape if is_stacked else (*shape, 1)
+    while len(lengths) > 2 and lengths[-1] == 1:
+        lengths.pop()
+    return Grid(lengths[-1], returns) if len(lengths) > 1 and lengths[-1] > 1 else Grid()
+
+
+class Kind(NamedTuple):
+    """What a further column of points holds: its type, and its unit, "" for a plain number."""
+
+    dtype: np.dtype[Any]
+    unit: str
+
+    @classmethod
+    def of(cls, extra: Extra, values: Any) -> Kind:
+        """What is declared, and else follows from the field that the values are."""
+        is_own = isinstance(values, Column) and not values.frame
+        info = values.batch.table.schema.fields.get(values.source) if is_own else None
+        as_sent = info.dtype if info is not None and info.kind == "int" and not info.scaled else None
+        array = values.array if isinstance(values, Column) else np.asarray(values)
+        dtype = np.dtype(bool if array.dtype.kind == "b" else as_sent or np.float32) if extra.dtype is None else extra.dtype
+        return cls(dtype, (info.unit if info is not None else "") if extra.unit is None else extra.unit)
+
+    def column(self, values: NDArray[Any]) -> NDArray[Any]:
+        """Values in the type, of the same shape."""
+        return values.astype(self.dtype, copy=False) if self.dtype.kind == "f" else numbers_of(values, self.dtype)
+
+
+def numbers_of(values: NDArray[Any], dtype: Any) -> NDArray[Any]:
+    """A column of numbers in its type, of the same shape; nan is 0."""
+    return np.asarray(np.nan_to_num(values), dtype)
 
 
 def axis_matrix(axes: Sequence[str]) -> NDArray[np.float64]:

@@ -17,7 +17,7 @@ from lidarspec.columns.columns import Batch, Carry, Column, Fields
 from lidarspec.columns.graph import Node
 from lidarspec.errors import PluginError, SpecError
 from lidarspec.points.cloud import LazyCloud, PointCloud
-from lidarspec.points.conventions import rows_of
+from lidarspec.points.conventions import Grid, grid_of
 from lidarspec.points.lazy_columns import BatchColumns, Plain, Share
 from lidarspec.points.plain import Evaluated, PacketBatch, evaluate, stamp_of
 from lidarspec.points.plan import MODERATE, REMEMBERING, Plan, plan_for
@@ -118,8 +118,9 @@ def _cloud_of(packets: PacketBatch, shares: list[Share], batch: Batch, ready: in
         size = int(widths[:ready].sum())
         for share in shares:
             share.first = np.where(share.group.where < ready, starts[share.group.where], -1)
-    rows = rows_of(plan.shape) if all(rows_of(share.plan.shape) == rows_of(plan.shape) for share in shares) else 0
-    return LazyCloud.of(BatchColumns(packets, shares, size, stamp_ns, rows=rows, nominal=batch.nominal or plan.nominal), stamp_ns)
+    grids = {grid_of(share.plan.shape, share.plan.axes) for share in shares}
+    grid = grids.pop() if len(grids) == 1 else Grid()
+    return LazyCloud.of(BatchColumns(packets, shares, size, stamp_ns, grid=grid, nominal=batch.nominal or plan.nominal), stamp_ns)
 
 
 def _counts(shares: list[Share], number: int) -> NDArray[Any]:

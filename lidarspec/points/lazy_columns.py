@@ -18,13 +18,14 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.columns.columns import Batch, Column, Fields, deep, field_array
+from lidarspec.columns.columns import Batch, Column, Fields, field_array
 from lidarspec.columns.graph import Node, evaluate
 from lidarspec.points import numpy_plan
 from lidarspec.points.cloud import ColumnSource, Stretch, later
-from lidarspec.points.conventions import TYPES, narrowed, numbers_of, seconds_since, turned_azimuth, vendor_turn
+from lidarspec.points.conventions import TYPES, Grid, narrowed, numbers_of, seconds_since, turned_azimuth, vendor_turn
 from lidarspec.points.plain import PacketBatch
 from lidarspec.points.plan import REMEMBERING, Maker, Plan
+from lidarspec.wire.arrays import deep
 from lidarspec.wire.frame_table import Group
 
 _MAIN = ("x", "y", "z", "intensity")
@@ -144,7 +145,7 @@ class Computed(ColumnSource):
     def __init__(self, parts: Sequence[tuple[BatchColumns, int, int]], made: dict[str, NDArray[Any]]) -> None:
         self._parts, self._made = parts, made
         self.size, self.base = sum(stop - start for _, start, stop in parts), parts[0][0].base
-        self._packets, self._shares = parts[0][0].packets, parts[0][0].shares
+        self._packets, self._shares, self.extra = parts[0][0].packets, parts[0][0].shares, parts[0][0].extra
         self._turn = vendor_turn(self._packets.sensor)
 
     def column(self, name: str) -> NDArray[Any] | None:
@@ -163,7 +164,7 @@ class Computed(ColumnSource):
         if name == "valid":
             return {name: ~np.isnan(self._x())}
         if name in self._shares[0].plan.expressions:
-            columns = self._compiled(("range", "azimuth") if name != "elevation" and self._packets.backend == "jit" else (name,))
+            columns = self._compiled(("range", "azimuth") if name in ("range", "azimuth") and self._packets.backend == "jit" else (name,))
             return columns | {"azimuth": self._azimuth(columns["azimuth"])} if "azimuth" in columns else columns
         if name == "time":
             times = [batch.times_of(share, *packets) + later(batch, self.base) for batch, share, packets in self._pieces()]
@@ -171,9 +172,11 @@ class Computed(ColumnSource):
         if name not in self._shares[0].plan.parts:
             return {}
         plain = [share.plain(name)[first:stop] for _, share, (first, stop) in self._pieces()]
+        column = self._joined(plain, np.result_type(*plain))
         if name == "elevation":
-            return {name: self._joined(plain, np.result_type(*plain)).astype(TYPES[name], copy=False)}
-        return {name: numbers_of(name, self._joined(plain, np.result_type(*plain)))}
+            return {name: column.astype(TYPES[name], copy=False)}
+        extra = self._shares[0].plan.extra.get(name)
+        return {name: numbers_of(column, TYPES[name]) if extra is None else extra.column(column)}
 
     def _main(self, name: str) -> dict[str, NDArray[Any]]:
         """The columns that are made together; where all points are level, the height only when it is asked for."""
@@ -277,12 +280,12 @@ class BatchColumns(ColumnSource):
         shares: these, by their layouts.
         size: the number of points, those of packets that wait left out.
         base: the time that times count from, ns.
-        rows, nominal: as of all sources.
+        grid, nominal: as of all sources.
     """
 
-    def __init__(self, packets: PacketBatch, shares: Sequence[Share], size: int, base: int, *, rows: int, nominal: bool) -> None:
-        self.packets, self.shares = packets, shares
-        self.size, self.base, self.rows, self.nominal = size, base, rows, nominal
+    def __init__(self, packets: PacketBatch, shares: Sequence[Share], size: int, base: int, *, grid: Grid, nominal: bool) -> None:
+        self.packets, self.shares, self.extra = packets, shares, shares[0].plan.extra
+        self.size, self.base, self.grid, self.nominal = size, base, grid, nominal
         self._made: dict[str, NDArray[Any]] = {}
         self._blocks: list[Block] = []
 

@@ -2,28 +2,28 @@
 
 This is the reference. It serves where `points` cannot be traced, and the tests as the second engine; plans (`points.plan`) take the
 parts of a result and the meaning of columns from here and from `points.conventions`.
-
-Columns that a sensor adds under names of its own (M5) join `parts_of`.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.columns.columns import Batch, Carry, Column, Fields, aligned, of_points, unpadded
+from lidarspec.columns.columns import Batch, Carry, Fields, of_points, unpadded
 from lidarspec.errors import plugin_errors
 from lidarspec.framing.results import Counters
 from lidarspec.points import conventions
-from lidarspec.points.cloud import PointCloud
+from lidarspec.points.cloud import PointCloud, organised
+from lidarspec.points.conventions import Kind
 from lidarspec.spec.description import Spec
 from lidarspec.spec.results import Cartesian, Points, Polar
 from lidarspec.wire.frame_table import Table
 
-_OPTIONAL = ("intensity", "ring", "return_index")
+_OPTIONAL = ("intensity", "ring", "return_index", "column")
 
 
 class PacketBatch(Protocol):
@@ -98,57 +98,56 @@ def stamp_of(packets: PacketBatch, epoch: int | None) -> int:
 
 def parts_of(result: Points) -> dict[str, Any]:
     """What a `points` function returned, by the names of its parts, as far as the sensor has them; the origin as ox, oy and oz."""
-    parts = {f.name: getattr(result, f.name) for f in fields(result) if f.name != "nominal"}
+    parts = {f.name: getattr(result, f.name) for f in fields(result) if f.name not in ("nominal", "extra")}
     if isinstance(result, Polar):
         parts |= dict(zip(("ox", "oy", "oz"), parts.pop("origin"), strict=True))
+    parts |= {name: extra.values for name, extra in result.extra.items()}
     return {name: value for name, value in parts.items() if value is not None}
 
 
-def columns_of(parts: dict[str, Any], batch: Batch) -> dict[str, Column]:
-    """The parts of a result as columns; numbers and arrays get the batch's axes."""
-    depth = max([batch.table.schema.depth(), *(len(value.axes) for value in parts.values() if isinstance(value, Column))])
-    anchor = Column(np.zeros((1,) * (1 + depth)), (None,) * depth, batch)
-    return {name: value if isinstance(value, Column) else _anchored(value, anchor) for name, value in parts.items()}
-
-
-def _anchored(value: Any, anchor: Column) -> Column:
-    (array, _), axes, ready = aligned((value, anchor), anchor.batch)
-    return Column(array.reshape((1,) * (1 + len(axes) - array.ndim) + array.shape), axes, anchor.batch, ready=ready)
+def kinds_of(result: Points, parts: Mapping[str, Any]) -> dict[str, Kind]:
+    """What the further columns of points hold, by name; `parts`: those of the result."""
+    return {name: Kind.of(extra, parts[name]) for name, extra in result.extra.items()}
 
 
 def _flattened(packets: PacketBatch, result: Points, batch: Batch, stamp_ns: int, *, final: bool) -> Evaluated:
-    columns = columns_of(parts_of(result), batch)
-    arrays, axes, ready, shape = of_points(columns, batch)
+    parts = parts_of(result)
+    arrays, axes, ready, shape = of_points(parts, batch)
     ready = len(packets) if final else ready
     mask = unpadded(axes, shape, batch)
-    flat = {name: _flat(array, shape, mask, ready) for name, array in zip(columns, arrays, strict=True)}
+    every = {name: flat(array, shape, mask, ready) for name, array in zip(parts, arrays, strict=True)}
     offsets = conventions.seconds_since(packets.time_ns, stamp_ns).reshape(-1, *(1,) * len(axes))
-    flat["time"] = flat["time"] + _flat(offsets, shape, mask, ready)
+    every["time"] = every["time"] + flat(offsets, shape, mask, ready)
     inside = np.ones(shape, np.bool_) if mask is None else mask.reshape(shape)
-    in_columns = mask is None or bool((inside.any(axis=-1) == inside.all(axis=-1)).all())
-    rows = conventions.rows_of(shape[1:]) if in_columns else 0
+    grid = conventions.grid_of(shape[1:], axes)
+    if mask is not None and grid.rows:
+        columns = inside.reshape(-1, grid.column)
+        grid = grid if (columns.any(axis=1) == columns.all(axis=1)).all() else conventions.Grid()
     cloud = make_cloud(
-        flat,
+        every,
         conventions.vendor_turn(packets.sensor),
+        kinds_of(result, parts),
         stamp_ns=stamp_ns,
-        shape=(len(flat["time"]) // rows, rows) if rows else None,
+        shape=organised(len(every["time"]), grid),
         nominal=np.bool_(batch.nominal or result.nominal),
     )
     return Evaluated(cloud, ready, batch.carried(ready), inside[:ready].astype(np.intp), Fields(batch), axes)
 
 
-def _flat(array: NDArray[Any], shape: tuple[int, ...], mask: NDArray[np.bool_] | None, ready: int) -> NDArray[Any]:
+def flat(array: NDArray[Any], shape: tuple[int, ...], mask: NDArray[np.bool_] | None, ready: int) -> NDArray[Any]:
+    """What an array that broadcasts to a shape, (n, ...), has for the first `ready` packets, without padding: (N,)."""
     full = np.broadcast_to(array, shape)[:ready]
     return full.reshape(-1) if mask is None else full.reshape(mask[:ready].shape)[mask[:ready]]
 
 
-def make_cloud(flat: dict[str, NDArray[Any]], turn: NDArray[np.float64] | None = None, **extra: Any) -> PointCloud:
+def make_cloud(flat: dict[str, NDArray[Any]], turn: NDArray[np.float64] | None, kinds: Mapping[str, Kind], **facts: Any) -> PointCloud:
     """A cloud from flat columns.
 
     Args:
         flat: the parts of `Polar` (with ox, oy, oz) or `Cartesian`, (N,) each.
         turn: the matrix that turns REP-103 coordinates into the axes that are asked for.
-        extra: `stamp_ns`, `shape` and `nominal` of the cloud.
+        kinds: what its further columns hold.
+        facts: `stamp_ns`, `shape` and `nominal` of the cloud.
     """
     with np.errstate(all="ignore"):
         distance, azimuth, elevation, xyz = (_by_coordinates if "x" in flat else _by_direction)(flat, flat["invalid"].astype(np.bool_))
@@ -158,8 +157,11 @@ def make_cloud(flat: dict[str, NDArray[Any]], turn: NDArray[np.float64] | None =
             xyz, azimuth = turn @ np.where(valid, xyz, 0), conventions.turned_azimuth(azimuth, turn)
         angles = {"azimuth": conventions.narrowed(azimuth), "elevation": elevation.astype(np.float32)}
         columns = dict(zip("xyz", np.where(valid, xyz, np.nan).astype(np.float32), strict=True)) | angles
-        columns |= {name: conventions.numbers_of(name, flat[name]) for name in _OPTIONAL if name in flat}
-        return PointCloud(**columns, range=distance.astype(np.float32), time=np.array(flat["time"], np.float64), valid=valid, **extra)
+        columns |= {name: conventions.numbers_of(flat[name], conventions.TYPES[name]) for name in _OPTIONAL if name in flat}
+        extra = {name: kind.column(flat[name]) for name, kind in kinds.items()}
+        units = {name: kind.unit for name, kind in kinds.items()}
+        columns |= {"range": distance.astype(np.float32), "time": np.array(flat["time"], np.float64), "valid": valid}
+        return PointCloud(**columns, extra=extra, units=units, **facts)
 
 
 #: range, azimuth and elevation of points, and their coordinates, (3, N).

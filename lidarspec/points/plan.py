@@ -7,7 +7,7 @@ a batch before they are computed. It computes nothing: a `Maker` does, which a b
 Points by coordinates are three expressions and a mask (`conventions.placed`), their range and angles further ones. They are exact:
 computed in float64 as they are written, whatever floating-point fields hold. Points by direction are computed in another order and partly
 in float32: their plan holds where what a batch has in floating-point fields is of moderate size (`MODERATE`). Columns under names of a
-sensor's own (M5) are further expressions.
+sensor's own are further expressions where they are float32, exact too; others are what `points` says, in their type.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from lidarspec.columns import graph
 from lidarspec.columns.columns import Batch, of_points
 from lidarspec.columns.graph import Node, Traced, Untraceable, is_full, only_field
 from lidarspec.points.conventions import coordinates, direction_of, is_zero, marked, placed, returned_range, shown_range
-from lidarspec.points.plain import columns_of, parts_of
+from lidarspec.points.plain import kinds_of, parts_of
 from lidarspec.points.windows import is_number
 from lidarspec.spec.results import Cartesian, Polar
 from lidarspec.wire.frame_table import Group
@@ -69,7 +69,8 @@ class Plan:
         parts: what it returned, by name, as nodes or as what no data decides.
         shape: of the points of a packet, one length for each axis in `axes`.
         expressions: the columns that back ends make, by name, as nodes or as what no data decides.
-        exact: whether all columns are computed in float64 as they are written.
+        extra: what the columns under names of the sensor's own hold, by name.
+        exact: whether coordinates and range are computed in float64 as they are written, as all other columns are.
         positive: nodes whose values have to be positive numbers, or the plan does not hold.
         nominal: whether a default calibration stands in for the sensor's own.
         varying: the arrays whose lengths differ from frame to frame.
@@ -86,9 +87,12 @@ class Plan:
         if not isinstance(result, Polar | Cartesian):
             raise Untraceable(f"points that are {type(result).__name__}")
         self.function, self.layout, self.nominal = function, layout, result.nominal
-        self.parts = {name: graph.node_of(value) for name, value in parts_of(result).items()}
-        columns = columns_of({name: part.sample if isinstance(part, Node) else part for name, part in self.parts.items()}, sample)
-        _, self.axes, _, shape = of_points(columns, sample)
+        given = parts_of(result)
+        samples = {name: part.node.sample if isinstance(part, Traced) else part for name, part in given.items()}
+        arrays, self.axes, _, shape = of_points(samples, sample)
+        self.extra = kinds_of(result, samples)
+        given = {name: part if isinstance(part, Traced) else array for (name, part), array in zip(given.items(), arrays, strict=True)}
+        self.parts = {name: graph.node_of(part) for name, part in given.items()}
         self.shape = shape[1:]
         self.varying = {name for name, count in schema.arrays.items() if not isinstance(count, int)}
         self.tables = _TABLES.setdefault(function, {})
@@ -100,9 +104,11 @@ class Plan:
         if not any(is_full(self.parts[name], self.width) for name in ("xyz" if self.exact else ["range"])):
             raise Untraceable(f"not every point has {'coordinates' if self.exact else 'a range'} of its own")
         self.positive = list[Node]()
-        expressions = self._by_coordinates(result) if isinstance(result, Cartesian) else self._by_direction(result)
-        if result.intensity is not None:
-            expressions["intensity"] = np.nan_to_num(result.intensity) if self._may_be_nan(result.intensity) else result.intensity
+        expressions = self._by_coordinates(given) if self.exact else self._by_direction(given)
+        intensity = given.get("intensity")
+        if intensity is not None:
+            expressions["intensity"] = np.nan_to_num(intensity) if self._may_be_nan(intensity) else intensity
+        expressions |= {name: self.parts[name] for name, kind in self.extra.items() if kind.dtype == np.float32}
         self.expressions = {name: graph.node_of(value) for name, value in expressions.items()}
 
     @cached_property
@@ -119,7 +125,11 @@ class Plan:
     @cached_property
     def floats(self) -> list[Node]:
         """The floating-point fields whose values have to be of moderate size, or the plan does not hold."""
-        return [] if self.exact else self._floats_of(*(part for name, part in self.parts.items() if name != "intensity"))
+        return [] if self.exact else self._floats_of(*(part for name, part in self.parts.items() if not self.is_exact(name)))
+
+    def is_exact(self, name: str) -> bool:
+        """Whether a column is computed in float64 as it is written, and rounded then."""
+        return self.exact or name == "intensity" or name in self.extra
 
     def _floats_of(self, *values: Any) -> list[Node]:
         """The floating-point fields that values are made of."""
@@ -135,18 +145,19 @@ class Plan:
         wanted += [node for node, _ in self.tape.steps] + self.positive
         return sorted(graph.traverse(*wanted), key=lambda node: node.number)
 
-    def _by_direction(self, result: Polar) -> dict[str, Any]:
-        """The columns that back ends make."""
-        distance = marked(self._distance(result.range), result.invalid)
-        places = coordinates(distance, result.azimuth, result.elevation, result.origin)
-        return dict(zip("xyz", places, strict=True)) | {"range": shown_range(result.range, result.invalid), "azimuth": result.azimuth}
+    def _by_direction(self, given: Mapping[str, Any]) -> dict[str, Any]:
+        """The columns that back ends make, of the parts of `Polar`."""
+        distance = marked(self._distance(given["range"]), given["invalid"])
+        places = coordinates(distance, given["azimuth"], given["elevation"], [given[name] for name in ("ox", "oy", "oz")])
+        columns = {"range": shown_range(given["range"], given["invalid"]), "azimuth": given["azimuth"]}
+        return dict(zip("xyz", places, strict=True)) | columns
 
-    def _by_coordinates(self, result: Cartesian) -> dict[str, Any]:
-        """The columns that back ends make."""
-        given = result.x, result.y, result.z
-        measured, azimuth, elevation = direction_of(*given)
-        columns = {"range": shown_range(measured, result.invalid), "azimuth": azimuth, "elevation": elevation}
-        return dict(zip("xyz", placed(given, result.invalid), strict=True)) | columns
+    def _by_coordinates(self, given: Mapping[str, Any]) -> dict[str, Any]:
+        """The columns that back ends make, of the parts of `Cartesian`."""
+        places = given["x"], given["y"], given["z"]
+        measured, azimuth, elevation = direction_of(*places)
+        columns = {"range": shown_range(measured, given["invalid"]), "azimuth": azimuth, "elevation": elevation}
+        return dict(zip("xyz", placed(places, given["invalid"]), strict=True)) | columns
 
     def _distance(self, measured: Traced) -> Any:
         """The distance of a return, nan where there is none; where a low value only scales it, that value has to be positive."""

@@ -39,7 +39,7 @@ from typing import Any, Literal
 
 from lidarspec.errors import SourceError, UsageError, WireError, suggest, system_errors
 from lidarspec.plugins import sensor as named_sensor
-from lidarspec.spec.sensor import Sensor
+from lidarspec.spec.sensor import Learned, Sensor
 from lidarspec.transports.protocol import Closing
 
 VERSION = 1
@@ -133,7 +133,7 @@ def read_header(data: bytes) -> Header:
 
 
 def _plain(value: Any) -> Any:
-    return dict(value) if isinstance(value, Mapping) else str(value)
+    return dict(value) if isinstance(value, Mapping) else value.to_dict() if isinstance(value, Learned) else str(value)
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 from typing import Any, Literal
@@ -30,8 +31,17 @@ from lidarspec.transports.protocol import Chunk, Transport
 SUFFIXES = (".lsr", ".pcap", ".bin")
 #: bytes between frames that make one packet at most.
 LARGEST_GAP = 1 << 16
+
+
+@dataclass(frozen=True)
+class MadeFor:
+    """What makes a recorder of the open transport and the sensor, as it is read: configured with what was learned of it."""
+
+    make: Callable[[Transport, Spec | str | None], Log]
+
+
 #: a file, a recorder, or what makes one when the source is open.
-RecordTo = str | Path | Appender | Callable[[Transport], Log]
+RecordTo = str | Path | Appender | Callable[[Transport], Log] | MadeFor
 
 
 class Recorder(Appender):
@@ -237,7 +247,9 @@ def recorder_for(target: RecordTo, sensor: Spec | str | None, source: str | Path
     """The recorder that a caller asks for, and whether it was made here, and has to be closed here."""
     if isinstance(target, str | Path):
         return recorder(target, sensor, source, datagrams=opened.datagrams, baud=opened.baud), True
-    return (target, False) if isinstance(target, Appender) else (target(opened), True)
+    if isinstance(target, Appender):
+        return target, False
+    return target.make(opened, sensor) if isinstance(target, MadeFor) else target(opened), True
 
 
 def _header(sensor: Spec | str | None, source: str, *, datagrams: bool | None, baud: int | None) -> Header:

@@ -103,7 +103,7 @@ class Cutter:
         values, starts = _rows(column, found)
         if isinstance(rule, OnWrap):
             table = packets.frames[0] if path.startswith("frame.") else packets.table
-            unit = table.schema.fields[column.source].unit
+            unit = table.schema.fields[path.removeprefix("frame.")].unit
             rows, steps = self._wraps(values, 360.0 if unit == "deg" else 2 * np.pi, rule.at)
             return self._points(starts[rows], steps)
         return starts[self._changes(rule, values)].tolist()  # type: ignore[no-any-return]

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from lidarspec.columns.columns import Carry
 from lidarspec.errors import UsageError
 from lidarspec.packets.continuity import Reorder
+from lidarspec.packets.imu import ImuSamples, Waiting
 from lidarspec.packets.packets import Packets, joined as joined_packets
 from lidarspec.points.cloud import ColumnSource, LazyCloud, Mount, PointCloud, Stretch, Stretches, source_of
 from lidarspec.points.evaluate import guarded
@@ -67,6 +68,7 @@ class Scan:
             complete.
         sensor: whose.
         whole: whether both ends were seen, and no more is missing between them than is there.
+        imu: what the IMU felt from the first point up to that of the next scan; None without an IMU, or where it has another clock.
     """
 
     points: PointCloud
@@ -74,6 +76,7 @@ class Scan:
     complete: bool
     sensor: Spec
     whole: bool = False
+    imu: ImuSamples | None = None
 
     @property
     def stamp_ns(self) -> int:
@@ -337,10 +340,11 @@ class ScanStream:
     Args:
         sensor: whose.
         mount: how it is mounted; the scans come in its carrier's axes.
+        imu: what its IMU felt, added to before the packets that came with it.
     """
 
-    def __init__(self, sensor: Spec, mount: Mount | None = None) -> None:
-        self._sensor, self._mount = sensor, mount
+    def __init__(self, sensor: Spec, mount: Mount | None = None, imu: Waiting | None = None) -> None:
+        self._sensor, self._mount, self._imu = sensor, mount, imu
         self._reorder = Reorder(enabled=sensor.sequence is not None or (sensor.clock is not None and sensor.datagrams))
         self._cutter = Cutter(sensor.scan)
         self._waiting: Packets | None = None
@@ -420,8 +424,10 @@ class ScanStream:
         period = (ends - begins) * 1e-9 if ends is not None else np.nan
         rate = 1 / period if period > 0 else np.nan
         cloud: PointCloud = LazyCloud.of(Stretches(parts, from_first=True), begins)
-        mounted = cloud if self._mount is None else self._mount.applied(cloud)
-        return Scan(mounted, float(rate) if whole else np.nan, complete, self._sensor, whole)
+        samples = None if self._imu is None else self._imu.until(ends)
+        if self._mount is not None:
+            cloud, samples = self._mount.applied(cloud), None if samples is None else samples.turned(self._mount.rotation)
+        return Scan(cloud, float(rate) if whole else np.nan, complete, self._sensor, whole, samples)
 
 
 def _times_ns(source: ColumnSource, indices: Sequence[int]) -> list[int | None]:
@@ -431,9 +437,9 @@ def _times_ns(source: ColumnSource, indices: Sequence[int]) -> list[int | None]:
     return [source.base + round(time * 1e9) for time in times] + [None] * (len(indices) - len(known))
 
 
-def scans_of(sensor: Spec, batches: Iterable[Packets]) -> Iterator[Scan]:
-    """Every scan of batches of one stream."""
-    stream = ScanStream(sensor)
+def scans_of(sensor: Spec, batches: Iterable[Packets], imu: Waiting | None = None) -> Iterator[Scan]:
+    """Every scan of batches of one stream; `imu`: the samples that go with them."""
+    stream = ScanStream(sensor, imu=imu)
     for batch in batches:
         yield from handed_out(stream.add(batch))
     yield from stream.finish()

@@ -22,9 +22,9 @@ from lidarspec.errors import SpecError
 from lidarspec.framing.decoder import Decoder
 from lidarspec.framing.frame_engine import codec
 from lidarspec.simulation.faults import Faults, Line
-from lidarspec.simulation.frame_maker import FrameMaker
+from lidarspec.simulation.frame_maker import FrameMaker, sealed
 from lidarspec.simulation.scenes import Scene, furnished
-from lidarspec.simulation.simulator import Simulation, simulation
+from lidarspec.simulation.simulator import Rest, Simulation, simulation
 from lidarspec.spec.description import Answer, Command, Spec, with_frames
 from lidarspec.spec.links import is_datagram
 from lidarspec.spec.tree import FieldInfo
@@ -61,10 +61,11 @@ class Answered(NamedTuple):
 
 
 class Answering:
-    """One sensor's side of the conversation."""
+    """One sensor's side of the conversation; `shake`: the noise on what an IMU feels, m/s2 and rad/s."""
 
-    def __init__(self, sensor: Spec) -> None:
-        self._sensor = sensor
+    def __init__(self, sensor: Spec, shake: float = 0.0) -> None:
+        self._sensor, self._shake = sensor, shake
+        self._rests: dict[str, Rest] = {}
         self._heard: dict[str, int] = {}
         links = {command.link for command in sensor.commands.values() if command.frame}
         self._decoders = {link: _listening(sensor, link) for link in links}
@@ -93,8 +94,13 @@ class Answering:
         """A frame of a type other than data: the defaults of the spec, its `sweep`, and these physical values."""
         if name not in self._makers:
             self._makers[name] = FrameMaker(self._sensor, name)
-        sweep = self._sensor.frames[name].simulation.sweep
-        return self._makers[name].frame({**self._sensor.state.get(name, {}), **(sweep(number) if sweep else {}), **(values or {})})
+        declared = self._sensor.frames[name]
+        sweep = declared.simulation.sweep
+        given = {**self._sensor.state.get(name, {}), **(sweep(number) if sweep else {}), **(values or {})}
+        table = self._makers[name].table([given])
+        if declared.imu is not None:
+            self._rests.setdefault(name, Rest(self._sensor, name, given)).fill(table, self._shake, [number])
+        return sealed(table)[0]
 
     def _answer(self, answer: Answer, request: Request) -> Answered:
         if isinstance(answer, bytes):
@@ -114,8 +120,8 @@ class Answering:
         """The command that a frame is: of several that fit, the one that says most about it."""
         values = dict(_flat(parse(self._sensor, data, frame=frame)))
         sent = [one for one in self._sensor.commands.items() if (one[1].frame, one[1].link) == (frame, link)]
-        fitting = [one for one in sent if all(values.get(path) == value for path, value in one[1].values.items())]
-        return Request(*max(fitting, key=lambda one: len(one[1].values)), values) if fitting else None
+        fitting = [one for one in sent if all(values.get(path) == value for path, value in one[1].fixed.items())]
+        return Request(*max(fitting, key=lambda one: len(one[1].fixed)), values) if fitting else None
 
 
 def _listening(sensor: Spec, link: str) -> Decoder:
@@ -158,8 +164,8 @@ class _Stream:
         due: when the next one is sent.
     """
 
-    def __init__(self, made: Simulation, frame: str, scene: Scene, began: float) -> None:
-        self._made, self._scene, self.frame = made, scene, frame
+    def __init__(self, made: Simulation, frame: str, scene: Scene, began: float, shake: float) -> None:
+        self._made, self._scene, self.frame, self._shake = made, scene, frame, shake
         self._next, self._end = 0, began
         self._frames: list[bytes] = []
         self._times: list[float] = []
@@ -180,7 +186,7 @@ class _Stream:
     def _more(self) -> None:
         """The next batch."""
         count = max(min(int(AHEAD / max(self._made.interval, 1)), MOST), 1)
-        block = self._made.block(self._next, count, self._scene, self._end / SECOND)
+        block = self._made.block(self._next, count, self._scene, self._end / SECOND, self._shake)
         times = (self._end + block.times).tolist()
         self._frames, self._times, self._spot = block.frames, times[:-1], 0
         self._next, self._end = self._next + count, times[-1]
@@ -212,7 +218,7 @@ class SimulatedDevice:
         self.lines = {name: Line(self.faults, seed=seed, stream=not is_datagram(link)) for name, link in sensor.links.items()}
         self._scene = scene or furnished(seed)
         self._source = random.Random(f"device {seed}")
-        self._answering = Answering(sensor)
+        self._answering = Answering(sensor, self.faults.shake)
         self._plan: list[_Due] = []
         self._planned = 0
         self._stream: _Stream | None = None
@@ -334,7 +340,7 @@ class SimulatedDevice:
         return at + seconds * SECOND
 
     def _begin(self, at: float, frame: str) -> None:
-        self._stream = _Stream(self._simulation(frame), frame, self._scene, at)
+        self._stream = _Stream(self._simulation(frame), frame, self._scene, at, self.faults.shake)
 
     def _simulation(self, frame: str) -> Simulation:
         made = simulation(self.sensor, frame, blocked=bool(self.faults.rotor))

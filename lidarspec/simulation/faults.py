@@ -33,6 +33,7 @@ class Faults:
         reorder: how many places late a datagram may come, one in ten does.
         unplug: seconds after which the sensor is unplugged, again and again; 0: never.
         absent: seconds that it is away then.
+        shake: standard deviation of the noise on what an IMU feels, m/s2 and rad/s; 0: it is at rest.
         rotor: "blocked": it does not turn, and the angles stay as they are; "" where it does.
 
     Raises:
@@ -46,9 +47,17 @@ class Faults:
     unplug: float = 0.0
     absent: float = 2.0
     rotor: str = ""
+    shake: float = 0.0
 
     def __post_init__(self) -> None:
-        for name, high in (("errors", 1.0), ("loss", 1.0), ("reorder", 1000), ("unplug", math.inf), ("absent", math.inf)):
+        for name, high in (
+            ("errors", 1.0),
+            ("loss", 1.0),
+            ("reorder", 1000),
+            ("unplug", math.inf),
+            ("absent", math.inf),
+            ("shake", math.inf),
+        ):
             value = getattr(self, name)
             if not 0 <= value <= high:
                 raise OutOfRange(name, value, 0, high, place="faults")
@@ -62,7 +71,15 @@ def faults_of(options: Mapping[str, str]) -> Faults:
     Raises:
         UsageError: for a value that is not of its kind.
     """
-    read: dict[str, Any] = {"errors": share, "loss": share, "reorder": int, "unplug": duration, "absent": duration, "rotor": str}
+    read: dict[str, Any] = {
+        "errors": share,
+        "loss": share,
+        "reorder": int,
+        "unplug": duration,
+        "absent": duration,
+        "shake": float,
+        "rotor": str,
+    }
     values = {}
     for name, text in options.items():
         try:

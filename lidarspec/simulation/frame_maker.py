@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.errors import SpecError
-from lidarspec.framing.frame_engine import CompiledCodec, codec
+from lidarspec.framing.frame_engine import InterpretedCodec, codec
 from lidarspec.spec.construct_layer import member
 from lidarspec.spec.description import Spec
 from lidarspec.spec.tree import Formula, Kind, Node, refs
@@ -22,6 +22,7 @@ from lidarspec.wire.frame_table import Group, Rows
 from lidarspec.wire.layout import Layout, Leaf
 from lidarspec.wire.layout_tree import TooLong, Unknown, layout_of
 from lidarspec.wire.schema import schema
+from lidarspec.wire.slots import Recoder, recoder
 
 Values = Mapping[str, Any]
 
@@ -34,24 +35,30 @@ class FrameMaker:
     """
 
     def __init__(self, sensor: Spec, frame: str) -> None:
-        engine = codec(sensor.frames[frame])
-        if not isinstance(engine, CompiledCodec):
-            raise SpecError(f"cannot be simulated, since it is not compiled: {engine.reason}", path=frame, sensor=sensor.id)
+        known = codec(sensor.frames[frame])
+        engine = known.compiled
+        if engine is None:
+            reason = known.reason if isinstance(known, InterpretedCodec) else ""
+            raise SpecError(f"cannot be simulated, since it is not compiled: {reason}", path=frame, sensor=sensor.id)
         others = sensor.data_frames if sensor.frames[frame].data else ()
         elsewhere = {path for other in others for path in codec(sensor.frames[other]).schema.fields}
         self.engine = engine
-        self._makes(sensor.id, engine.frame.tree, engine.frame.max_length, {}, elsewhere)
+        self._recoder: Recoder | None = recoder(engine.frame)
+        self._makes(sensor.id, engine.frame.tree, engine.frame.room, {}, elsewhere)
 
     @classmethod
     def _of_parts(cls, sensor: str, root: Node, limit: int, given: Mapping[str, int]) -> FrameMaker:
         """Makes parts of one kind, in frames whose fields have the values that they ask for."""
         maker = cls.__new__(cls)
+        maker._recoder = None
         maker._makes(sensor, root, limit, given, set())
         return maker
 
     def _makes(self, sensor: str, root: Node, limit: int, given: Mapping[str, int], elsewhere: set[str]) -> None:
         self._sensor, self._root, self._limit, self._given, self._elsewhere = sensor, root, limit, given, elsewhere
         self.schema = schema(root)
+        formulas = {axis: [ref.path for ref in refs(count)] for axis, count in self.schema.arrays.items() if count is not None}
+        self._counts = {axis: asked[0] for axis, asked in formulas.items() if asked and asked[0] in self.schema.fields}
         self._layouts: dict[tuple[int, ...], Layout] = {}
         self._asked: list[str] = []
         self._makers: dict[tuple[Any, ...], FrameMaker] = {}
@@ -63,7 +70,8 @@ class FrameMaker:
             SpecError: where a value is given to a field that the frame does not have.
         """
         members: dict[int, tuple[Layout, list[int]]] = {}
-        filled = [self._with_parts(values) for values in frames] if self.schema.parts else [(values, {}) for values in frames]
+        given = [self._with_counts(values) for values in frames] if self._counts else frames
+        filled = [self._with_parts(values) for values in given] if self.schema.parts else [(values, {}) for values in given]
         for index, (values, _) in enumerate(filled):
             layout = self._layout(values)
             members.setdefault(id(layout), (layout, []))[1].append(index)
@@ -74,7 +82,31 @@ class FrameMaker:
 
     def frame(self, values: Values) -> bytes:
         """One frame, sealed."""
-        return sealed(self.table([values]))[0]
+        return self.sealed(self.table([values]))[0]
+
+    def sealed(self, table: Rows) -> list[bytes]:
+        """The frames of a table as they are sent.
+
+        Raises:
+            SpecError: where its wire form cannot write a value.
+        """
+        frames = sealed(table)
+        if self._recoder is None:
+            return frames
+        for group in table.groups:
+            for place, data in zip(group.where.tolist(), self._recoder.written(group.rows, group.layout), strict=True):
+                if data is None:
+                    raise SpecError(f"{self._recoder.form} cannot write these values", path="simulation", sensor=self._sensor)
+                frames[place] = data
+        return frames
+
+    def _with_counts(self, values: Values) -> Values:
+        """The values of a frame with the counts that follow from arrays and bytes, where these are left out."""
+        missing = [axis for axis, asked in self._counts.items() if axis in values and asked not in values]
+        given = dict(values) if missing else values
+        for axis in missing:
+            self._fill_in(self.schema.arrays[axis], given, len(values[axis]), axis)  # type: ignore[arg-type]  # a dict by now
+        return given
 
     def _with_parts(self, values: Values) -> tuple[Values, dict[str, bytes]]:
         """The values of a frame with what follows from its parts, and the bytes of these, by their axis."""

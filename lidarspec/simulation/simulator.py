@@ -56,6 +56,8 @@ ROUNDS = 8
 _MEASURED = ("range", "azimuth", "elevation", "ox", "oy", "oz", "x", "y", "z", "time")
 #: raw value that a range field is given to see which points answer to it.
 PROBE = 100
+#: m/s2, standard gravity.
+GRAVITY = 9.80665
 
 
 @dataclass(frozen=True, eq=False)
@@ -342,7 +344,7 @@ class Placement(Measurement):
 
 
 def _solved(slopes: Floats, aims: Floats) -> Floats:
-    """What fields have to be, (k, n, ...), that move points by `slopes`, (k, 3, n, ...), for these to be at `aims`, (3, n, ...)."""
+    """What fields have to be, (k, n, ...), that move values by `slopes`, (k, m, n, ...), for these to be at `aims`, (m, n, ...)."""
     matrices, wanted = np.moveaxis(slopes, (0, 1), (-1, -2)), np.moveaxis(aims, 0, -1)
     first = matrices[(0,) * (matrices.ndim - 2)]
     inverse = np.linalg.pinv(first if (matrices == first).all() else matrices)
@@ -356,11 +358,7 @@ def _name(frame: str, table: Rows) -> str:
 
 def _result(sensor: Spec, frame: str, table: Rows) -> tuple[Points, Batch]:
     """What the sensor's `points` says of a table of its frames, which nothing goes before."""
-    state: dict[str, tuple[Table | None, NDArray[np.intp]]]
-    state = {name: (None, np.full(len(table), -1, np.intp)) for name in sensor.state}
-    if isinstance(table, PartRows):
-        state[AROUND] = (table.frames, table.which)
-    batch = Batch(table, np.zeros(len(table), np.bool_), state, sensor.state)
+    batch = _batch(sensor, table)
     points = sensor.points_of(_name(frame, table))
     with np.errstate(all="ignore"), plugin_errors(f"points of {frame}", sensor.id, points):
         result = points(Fields(batch))
@@ -368,6 +366,15 @@ def _result(sensor: Spec, frame: str, table: Rows) -> tuple[Points, Batch]:
     if not any(isinstance(part, Column) for part in measured):
         raise SpecError("no field makes the range of a point: it cannot be simulated", path="points", sensor=sensor.id)
     return result, batch
+
+
+def _batch(sensor: Spec, table: Rows) -> Batch:
+    """A table of frames, or of parts of them, which nothing goes before."""
+    state: dict[str, tuple[Table | None, NDArray[np.intp]]]
+    state = {name: (None, np.full(len(table), -1, np.intp)) for name in sensor.state}
+    if isinstance(table, PartRows):
+        state[AROUND] = (table.frames, table.which)
+    return Batch(table, np.zeros(len(table), np.bool_), state, sensor.state)
 
 
 def whole(info: FieldInfo, raw: Floats) -> Floats:
@@ -437,6 +444,83 @@ def _counts(shape: tuple[int, ...], axes: tuple[str | None, ...], batch: Batch) 
     for length, name in zip(shape[1:], axes, strict=True):
         counts = counts * (length if name is None or name.startswith("<") else batch.table.counts(name))
     return counts
+
+
+class Rest:
+    """What an IMU feels in a sensor that stands level and still, written into the fields that the `imu` of a frame type answers to.
+
+    Args:
+        given: paths of the fields that the frame's `sweep` gives.
+
+    Raises:
+        SpecError: where no field makes what the IMU feels.
+    """
+
+    def __init__(self, sensor: Spec, frame: str, given: Container[str]) -> None:
+        self._sensor, self._frame, self._given = sensor, frame, given
+        self._path = sensor.parts_with("imu", frame)
+        self._targets: list[str] | None = None
+
+    def fill(self, frames: Rows, shake: float, seed: Sequence[int]) -> None:
+        """Write it into frames.
+
+        Args:
+            shake: standard deviation of the noise on it, m/s2 and rad/s; 0 for none.
+            seed: of the noise.
+        """
+        table = PartRows(frames, self._path) if self._path else frames
+        if not len(table):
+            return
+        if self._targets is None:
+            self._targets = self._answering(table)
+        before = {path: table.raw(path) for path in self._targets}
+        for path in self._targets:
+            store(table, path, np.array(0))
+        zero = self._felt(table)
+        slopes = np.stack([self._probed(table, path) - zero for path in self._targets]) / PROBE
+        aims = np.random.default_rng(seed).normal(0.0, shake, zero.shape) if shake else np.zeros(zero.shape)
+        aims[5] += GRAVITY
+        for path, raw in zip(self._targets, _solved(slopes, aims - zero), strict=True):
+            info = table.schema.fields[path]
+            store(table, path, np.clip(whole(info, raw), *info.limits).reshape(before[path].shape) if info.kind == "int" else raw)
+        if isinstance(table, PartRows):
+            table.put_back()
+
+    def _answering(self, table: Rows) -> list[str]:
+        """The fields that what is felt is linear in."""
+        zero, found = self._felt(table), list[str]()
+        for path, info in table.schema.fields.items():
+            if info.kind not in ("int", "float") or info.const is not None or path in self._given:
+                continue
+            before = table.raw(path)
+            answers = []
+            for probe in (0, PROBE, 2 * PROBE):
+                store(table, path, np.array(probe))
+                answers.append(self._felt(table))
+            store(table, path, before)
+            none, once, twice = answers
+            if (once != none).any() and np.allclose(twice - once, once - none):
+                found.append(path)
+        if not found or zero.shape[0] != 6:
+            raise SpecError("no field makes what the IMU feels: it cannot be simulated", path=f"{self._frame}.imu", sensor=self._sensor.id)
+        return found
+
+    def _probed(self, table: Rows, path: str) -> Floats:
+        """What is felt while one of the fields has its probing value, and the others are 0."""
+        store(table, path, np.array(PROBE))
+        felt = self._felt(table)
+        store(table, path, np.array(0))
+        return felt
+
+    def _felt(self, table: Rows) -> Floats:
+        """Angular velocities, then accelerations: (6, n, ...)."""
+        batch = _batch(self._sensor, table)
+        function = self._sensor.imu_of(_name(self._frame, table))
+        with np.errstate(all="ignore"), plugin_errors(f"imu of {self._frame}", self._sensor.id, function):
+            result = function(Fields(batch))
+            parts = dict(enumerate((*result.angular_velocity, *result.linear_acceleration)))
+            arrays, _, _, shape = of_points({str(number): part for number, part in parts.items()}, batch)
+        return np.stack([np.broadcast_to(_as_deep(np.asarray(array, np.float64), len(shape)), shape) for array in arrays])
 
 
 class Pace:
@@ -524,17 +608,19 @@ class Simulation:
         self._stuck = self._turning(sweep(1)) if blocked else {}
         swept = self._swept(range(PROBED))
         table = self._maker.table(swept)
-        self._parts = sensor.parts_with_points(frame)
+        self._parts = sensor.parts_with("points", frame)
         given = [part for values in swept for part in values[self._parts.partition(".")[0]]] if self._parts else swept
         self._measurement = Measurement.of(sensor, frame, self._with_points(table), {path for values in given for path in values})
         self._pace = Pace(sensor, frame, table, self._beams(table))
+        self._rest = Rest(sensor, frame, {path for values in swept for path in values}) if sensor.frames[frame].imu else None
         self.interval = self._pace.interval
 
-    def block(self, start: int, count: int, scene: Scene, since: float = 0.0) -> Block:
+    def block(self, start: int, count: int, scene: Scene, since: float = 0.0, shake: float = 0.0) -> Block:
         """The packets from number `start` on.
 
         Args:
             since: seconds since the scene began at the first of them.
+            shake: standard deviation of the noise on what an IMU feels, m/s2 and rad/s.
         """
         numbers = range(start, start + count + AHEAD)
         table = self._maker.table(self._swept(numbers))
@@ -545,7 +631,9 @@ class Simulation:
             measured.put_back()
         else:
             self._measurement.fill(table, numbers, scene, seconds)
-        return Block(sealed(table)[:count], times[: count + 1])
+        if self._rest is not None:
+            self._rest.fill(table, shake, [start])
+        return Block(self._maker.sealed(table)[:count], times[: count + 1])
 
     def _with_points(self, table: Rows) -> Rows:
         """What points are made of: frames, or the parts in them."""

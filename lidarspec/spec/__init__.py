@@ -7,8 +7,10 @@ other package is a function. Nothing in this package reads bytes of a stream. Mo
 
 * `description`: `Spec`, `Frame`, `Command`, `Simulation`: what must fit together.
 * `sensor`: a `Spec` with everything that can be done with it as methods; it stands above the stations that do it.
+* `arguments`: what a command is told, and what is found out when it is sent.
 * `fields`: units and seals, as parts of a struct.
 * `checksums`: algorithms as values; of one message.
+* `wire_forms`: what has to be recoded before its fields have places: tokens, lines, escapes.
 * `links`: how a sensor is connected.
 * `timing`: clocks, counters, where scans end.
 * `results`, `vocabulary`: what a `points` function returns, and what it is written with.
@@ -24,6 +26,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from lidarspec.columns.columns import Column as Column, Fields as Fields
     from lidarspec.plugins import hookimpl as hookimpl
+    from lidarspec.spec.arguments import Address as Address, Count as Count, Text as Text
     from lidarspec.spec.checksums import (
         Checksum as Checksum,
         Crc as Crc,
@@ -34,10 +37,17 @@ if TYPE_CHECKING:
         ZeroPadded as ZeroPadded,
     )
     from lidarspec.spec.description import Command as Command, Frame as Frame, Relative as Relative, Simulation as Simulation
-    from lidarspec.spec.fields import Checksummed as Checksummed, Parts as Parts, Scaled as Scaled
-    from lidarspec.spec.links import Serial as Serial, Tcp as Tcp, Udp as Udp
-    from lidarspec.spec.results import Cartesian as Cartesian, Points as Points, Polar as Polar
-    from lidarspec.spec.sensor import Sensor as Sensor
+    from lidarspec.spec.fields import (
+        Checksummed as Checksummed,
+        HttpReply as HttpReply,
+        HttpRequest as HttpRequest,
+        Parts as Parts,
+        Scaled as Scaled,
+        SizeOf as SizeOf,
+    )
+    from lidarspec.spec.links import Assembled as Assembled, Http as Http, Link as Link, Serial as Serial, Tcp as Tcp, Udp as Udp
+    from lidarspec.spec.results import Cartesian as Cartesian, Extra as Extra, Imu as Imu, Points as Points, Polar as Polar
+    from lidarspec.spec.sensor import Learned as Learned, Sensor as Sensor
     from lidarspec.spec.timing import (
         Clock as Clock,
         Every as Every,
@@ -48,14 +58,27 @@ if TYPE_CHECKING:
         Sequence as Sequence,
     )
     from lidarspec.spec.vocabulary import (
+        along as along,
         following as following,
         last as last,
         previous as previous,
+        running as running,
         spread as spread,
         stack as stack,
         steps as steps,
         take as take,
         wrap as wrap,
+    )
+    from lidarspec.spec.wire_forms import (
+        Escaped as Escaped,
+        Lines as Lines,
+        Reading as Reading,
+        Scip as Scip,
+        SixBits as SixBits,
+        Slot as Slot,
+        Tokens as Tokens,
+        Unescaped as Unescaped,
+        WireForm as WireForm,
     )
     from lidarspec.transports.protocol import (
         Chunk as Chunk,
@@ -66,15 +89,17 @@ if TYPE_CHECKING:
     )
 
 _NAMES = {
-    "spec.sensor": ("Sensor",),
+    "spec.sensor": ("Sensor", "Learned"),
     "spec.description": ("Frame", "Command", "Relative", "Simulation"),
-    "spec.fields": ("Scaled", "Checksummed", "Parts"),
+    "spec.arguments": ("Text", "Address", "Count"),
+    "spec.fields": ("Scaled", "Checksummed", "Parts", "SizeOf", "HttpRequest", "HttpReply"),
     "spec.checksums": ("Checksum", "Crc", "Xor", "Sum", "WordXor", "Fold15", "ZeroPadded"),
-    "spec.links": ("Serial", "Udp", "Tcp"),
+    "spec.links": ("Assembled", "Serial", "Udp", "Tcp", "Http", "Link"),
     "spec.timing": ("Clock", "Sequence", "OnWrap", "OnFlag", "OnChange", "OnRewind", "Every"),
     "columns.columns": ("Fields", "Column"),
-    "spec.results": ("Points", "Polar", "Cartesian"),
-    "spec.vocabulary": ("spread", "wrap", "following", "previous", "last", "stack", "steps", "take"),
+    "spec.results": ("Points", "Polar", "Cartesian", "Extra", "Imu"),
+    "spec.vocabulary": ("along", "spread", "wrap", "following", "previous", "last", "running", "stack", "steps", "take"),
+    "spec.wire_forms": ("Tokens", "Lines", "SixBits", "Scip", "Escaped", "WireForm", "Reading", "Slot", "Unescaped"),
     "plugins": ("hookimpl",),
     "transports.protocol": ("Format", "Transport", "LiveTransport", "Chunk", "Disconnected"),
 }

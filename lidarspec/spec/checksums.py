@@ -318,14 +318,21 @@ def single(algorithm: Checksum) -> Single:
     return _single_crc(algorithm) if kind is Crc else _single_word_xor(algorithm) if kind is WordXor else algorithm
 
 
+def _zlib_crc(algorithm: Crc) -> Single | None:
+    """A CRC by zlib, some gigabytes a second; None where its polynomial is another."""
+    if (algorithm.width, algorithm.poly, algorithm.refin, algorithm.refout) != (32, 0x04C11DB7, True, True):
+        return None
+    start, end = reflected(algorithm.init, 32) ^ 0xFFFFFFFF, algorithm.xorout ^ 0xFFFFFFFF
+    return lambda data: zlib.crc32(data, start) ^ end
+
+
 @lru_cache(maxsize=256)
 def _single_crc(algorithm: Crc) -> Single:
-    init, xorout = algorithm.init, algorithm.xorout
+    init, xorout, known = algorithm.init, algorithm.xorout, _zlib_crc(algorithm)
+    if known is not None:
+        return known
     if (algorithm.width, algorithm.poly, algorithm.refin, algorithm.refout) == (16, 0x1021, False, False):
         return lambda data: binascii.crc_hqx(data, init) ^ xorout
-    if (algorithm.width, algorithm.poly, algorithm.refin, algorithm.refout) == (32, 0x04C11DB7, True, True):
-        start, end = int(f"{init:032b}"[::-1], 2) ^ 0xFFFFFFFF, xorout ^ 0xFFFFFFFF
-        return lambda data: zlib.crc32(data, start) ^ end
     table = byte_table(algorithm.width, algorithm.poly, algorithm.refin)
     if algorithm.width > 8:
         return functools.partial(_wide_crc, algorithm, table, algorithm.start)

@@ -17,11 +17,13 @@ from typing import Any, Literal, TypeVar
 from construct import Construct
 
 from lidarspec.errors import SpecError, UnknownFrame
+from lidarspec.spec.arguments import Address, Argument, Count, Filled, Text, argument
 from lidarspec.spec.construct_layer import check_struct, fixed_size, frame_tree, prepare
 from lidarspec.spec.links import Link, is_datagram
-from lidarspec.spec.results import Points
+from lidarspec.spec.results import Imu, Points
 from lidarspec.spec.timing import Clock, Sequence, Split
 from lidarspec.spec.tree import Node, Sealed, children
+from lidarspec.spec.wire_forms import WireForm
 
 #: version of the plugin interface; the engine reads this one and the one before.
 API = 1
@@ -72,6 +74,9 @@ class Frame:
         data: whether it carries the points.
         points: a `points` function of its own, for sensors that can answer in several data frames; for points that stand in parts of the
             frame (`Parts`), their path and a function of these, {"modules": points}, {"tlvs.points": points}.
+        imu: a function of `Fields` that returns what the sensor's IMU felt, beside points or in a frame of its own; with its path where it
+            stands in parts, as for `points`.
+        clock: the time in a frame that is not data, where that of the sensor is not in it.
         max_length: the longest it can be, in bytes; longer candidates are not frames. Left out, it is the size of the struct, where that
             is fixed.
         plausible: a function of `Fields`: False where no sensor would send such values, reduced with `all` per packet.
@@ -80,6 +85,8 @@ class Frame:
         simulation: what a simulated sensor needs for this frame alone, where the sensor can answer in several data frames, or sends
             others that random values never make, or again and again by themselves.
         acknowledged: findings of `lidarspec check` that are true and meant, as "LS204" or "LS205 path.of.a.field" -> the reason.
+        wire: how the frame stands on the wire, where its fields have no fixed places there: `Tokens`, `Lines`, `Escaped`, or a form of a
+            plugin. The struct then describes what is read out of it, and `max_length`, in bytes on the wire, is always needed.
 
     Raises:
         SpecError: if the struct cannot describe a frame: a part without an end, with bytes that are lost, or names that clash.
@@ -89,12 +96,15 @@ class Frame:
     direction: Literal["in", "out"] = field(default="in", kw_only=True)
     data: bool = field(default=False, kw_only=True)
     points: Callable[[Any], Points] | Mapping[str, Callable[[Any], Points]] | None = field(default=None, kw_only=True)
+    imu: Callable[[Any], Imu] | Mapping[str, Callable[[Any], Imu]] | None = field(default=None, kw_only=True)
+    clock: Clock | None = field(default=None, kw_only=True)
     max_length: int = field(default=0, kw_only=True)
     plausible: Callable[[Any], Any] | None = field(default=None, kw_only=True)
     after: str | None = field(default=None, kw_only=True)
     confirm: int = field(default=1, kw_only=True)
     simulation: Simulation = field(default_factory=Simulation, kw_only=True)
     acknowledged: Mapping[str, str] = field(default_factory=dict, kw_only=True)
+    wire: WireForm | None = field(default=None, kw_only=True)
     prepared: Construct = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -103,21 +113,29 @@ class Frame:
         if self.max_length < 0 or self.confirm < 1:
             raise SpecError("max_length and confirm are at least 1")
         _freeze(self, "acknowledged")
-        if isinstance(self.points, Mapping) and len(self.points) != 1:
-            raise SpecError(f"points stand in parts of one kind, not in {', '.join(self.points) or 'none'}", path="points")
-        longest = self.max_length or fixed_size(self.struct)
-        object.__setattr__(self, "prepared", prepare(self.struct, longest or sys.maxsize))
+        for name in ("points", "imu"):
+            if isinstance(own := getattr(self, name), Mapping) and len(own) != 1:
+                raise SpecError(f"{name} stand in parts of one kind, not in {', '.join(own) or 'none'}", path=name)
+        if self.data and self.clock is not None:
+            raise SpecError("data have the clock of the sensor: give it there", path="clock")
+        longest = self.max_length or (0 if self.wire is not None else fixed_size(self.struct))
+        object.__setattr__(self, "max_length", longest)
+        object.__setattr__(self, "prepared", prepare(self.struct, self.room or sys.maxsize))
         check_struct(self.prepared)
         if not longest:
-            raise SpecError("max_length may be left out only where the struct has a fixed size")
-        object.__setattr__(self, "max_length", longest)
+            raise SpecError("max_length may be left out only where the struct has a fixed size, and no wire form")
 
     def __repr__(self) -> str:
-        size = fixed_size(self.prepared)
+        size = 0 if self.wire is not None else fixed_size(self.prepared)
         kind = "data, " if self.data else "out, " if self.direction == "out" else ""
         root = self.tree.body if isinstance(self.tree, Sealed) else self.tree
         names = [member.name for member in children(root) if member.name]
         return f"Frame({kind}{size or f'up to {self.max_length}'} bytes{': ' * bool(names)}{', '.join(names)})"
+
+    @property
+    def room(self) -> int:
+        """The most bytes that the struct can have: those of the frame, of which any two may be a number of eight in a wire form."""
+        return self.max_length * (1 if self.wire is None else 4)
 
     @cached_property
     def tree(self) -> Node:
@@ -135,8 +153,9 @@ class Command:
 
     Args:
         frame: the outgoing frame that asks it; None for a command that only moves lines.
-        values: values of its fields, by path.
-        args: argument name -> (field path, lowest, highest), in the field's unit.
+        values: values of its fields, by path; `Count(16)` is a running number, `Address()` this computer's own address.
+        args: argument name -> (field path, lowest, highest), in the field's unit; (path, Text(16)), (path, Address()) or (path, bytes). A
+            path may lead to an element of an array, "ports[1]".
         reply: the frame that answers, or a tuple of those that may; None where no answer is documented.
         matches: values that fields of the reply must have for it to be the answer to this command; of several frames, each is
             asked for the fields that it has.
@@ -148,12 +167,14 @@ class Command:
         lines: levels of control lines, {"dtr": False}, set with it.
         starts, stops: whether the sensor sends data after it, or no longer does.
         only_stopped: whether it is answered only while the sensor sends no data, and passed over otherwise.
+        learns: a function of the reply, as `Sensor.parse` gives it, that returns options for `configure`, by name: numbers, or bytes and
+            texts, which become `Learned`. They are applied where the command is among `on_open`.
         every: seconds after which it is sent once more, again and again from its first time on (a heartbeat); 0: never.
     """
 
     frame: str | None = None
     values: Mapping[str, Any] = field(default_factory=dict)
-    args: Mapping[str, tuple[str, float, float]] = field(default_factory=dict)
+    args: Mapping[str, tuple[str, float, float] | tuple[str, Text | Address | type[bytes]]] = field(default_factory=dict)
     reply: str | tuple[str, ...] | None = None
     matches: Mapping[str, Any] = field(default_factory=dict)
     echoes: tuple[str, ...] = ()
@@ -165,11 +186,25 @@ class Command:
     starts: bool = False
     stops: bool = False
     only_stopped: bool = False
+    learns: Callable[[Any], Mapping[str, Any]] | None = None
     every: float = 0.0
+    arguments: Mapping[str, Argument] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         _freeze(self, "values", "args", "matches", "lines")
         object.__setattr__(self, "echoes", tuple(self.echoes))
+        object.__setattr__(self, "arguments", MappingProxyType({name: argument(given) for name, given in self.args.items()}))
+
+    @property
+    def filled(self) -> Mapping[str, Filled]:
+        """The values that are found out when it is sent, by path."""
+        return {path: value for path, value in self.values.items() if isinstance(value, Count | Address)}
+
+    @property
+    def fixed(self) -> Mapping[str, Any]:
+        """The values that every frame of it has, by path: none that is found out, or that an argument goes into."""
+        taken = {*self.filled, *(one.path.partition("[")[0] for one in self.arguments.values())}
+        return {path: value for path, value in self.values.items() if path not in taken}
 
     @property
     def replies(self) -> tuple[str, ...]:
@@ -272,10 +307,29 @@ class Spec:
             raise SpecError("this frame type has no points", path=frame, sensor=self.id)
         return function
 
-    def parts_with_points(self, frame: str) -> str:
-        """The path of the parts of a frame type that have the points; "" where the frame itself has them."""
-        points = self.frames[frame].points if frame in self.frames else None
-        return next(iter(points)) if isinstance(points, Mapping) else ""
+    def imu_of(self, frame: str) -> Callable[[Any], Imu]:
+        """The `imu` function of a frame type, or of its parts.
+
+        Raises:
+            SpecError: where the frame type has none; it names those that have.
+        """
+        name, _, parts = frame.partition(".")
+        own = self.frames[name].imu
+        function = own.get(parts) if isinstance(own, Mapping) else own
+        if function is None:
+            having = f"those of {', '.join(self.imu_frames)} have" if self.imu_frames else "no frame of the sensor has"
+            raise SpecError(f"this frame type has nothing of an IMU; {having}", path=frame, sensor=self.id)
+        return function
+
+    @cached_property
+    def imu_frames(self) -> tuple[str, ...]:
+        """The names of the incoming frame types that say what an IMU felt."""
+        return tuple(name for name, frame in self.incoming.items() if frame.imu is not None)
+
+    def parts_with(self, what: str, frame: str) -> str:
+        """The path of the parts of a frame type that have its "points" or its "imu"; "" where the frame itself has them."""
+        own = getattr(self.frames[frame], what) if frame in self.frames else None
+        return next(iter(own)) if isinstance(own, Mapping) else ""
 
     def simulation_of(self, frame: str) -> Simulation:
         """What a simulation of one frame type needs: the frame's own, and for data the sensor's where the frame has none."""
@@ -320,6 +374,8 @@ def _check_spec(sensor: Spec) -> None:
         _known(sensor, f"commands.{name}.link", [command.link], sensor.links)
         if command.only_stopped and not any(other.starts or other.stops for other in sensor.commands.values()):
             raise SpecError("it is answered only while the sensor is stopped, and no command starts or stops it", path=f"commands.{name}")
+        if command.learns is not None and not (command.replies and sensor.configure is not None):
+            raise SpecError("what it learns comes with a reply, and goes to `configure`: both are needed", path=f"commands.{name}.learns")
         if "timeout" in command.args:
             raise SpecError("'timeout' is how long its reply is waited for, and cannot be an argument", path=f"commands.{name}.args")
     if sensor.commands:

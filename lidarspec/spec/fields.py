@@ -15,13 +15,39 @@ from dataclasses import replace
 from fractions import Fraction
 from typing import Any
 
-from construct import ConstError, Construct, ConstructError, Container, RangeError, SizeofError, evaluate
+from construct import (
+    Bytes,
+    Const,
+    ConstError,
+    Construct,
+    ConstructError,
+    Container,
+    Enum,
+    Int8ub,
+    Int16ub,
+    Int32ub,
+    RangeError,
+    SizeofError,
+    Struct,
+    evaluate,
+    this,
+)
 
 from lidarspec.errors import SpecError, UsageError
 from lidarspec.spec import construct_layer as layer
 from lidarspec.spec.checksums import Checksum
 from lidarspec.spec.tree import FieldInfo
 
+#: A request over a link `Http`, and the reply to it, as messages: what HTTP says besides is the link's business.
+HttpRequest = Struct(
+    "mark" / Const(b"HTTP"),
+    "method" / Enum(Int8ub, GET=1, PUT=2, POST=3, DELETE=4),
+    "path_size" / Int16ub,
+    "path" / Bytes(this.path_size),
+    "size" / Int32ub,
+    "body" / Bytes(this.size),
+)
+HttpReply = Struct("mark" / Const(b"HTTP"), "status" / Int16ub, "size" / Int32ub, "body" / Bytes(this.size))
 #: unit -> how many of the SI unit it is; only units that someone may type on the command line.
 _FACTORS: dict[str, dict[str, Fraction]] = {
     "m": {"m": Fraction(1), "cm": Fraction(1, 100), "mm": Fraction(1, 1000)},
@@ -118,6 +144,26 @@ class Scaled(layer.Describing):
         return replace(info, scale=self.scale, offset=self.offset, unit=self.unit, measured=True)
 
 
+class SizeOf(layer.Sizing):
+    """A number that says how many bytes a part of the frame has: filled in by `build`, whatever value is given, and wrong on a frame that
+    comes where the part is longer or shorter.
+
+    Args:
+        subcon: a field that parses to an integer, Int16ub.
+        part: the part, a member of the struct that the field stands in, or in one of it, "body", "body.tags"; "" for that struct itself;
+            of the struct around it with "_.", "_.body", and "_" for that itself.
+        plus: what the number has beyond these bytes; less than 0 where it does not count them all.
+
+    Raises:
+        SpecError: for arguments in another order.
+    """
+
+    def __init__(self, subcon: Construct, part: str = "", plus: int = 0) -> None:
+        if not hasattr(subcon, "parse") or not isinstance(part, str) or not isinstance(plus, int):
+            raise SpecError(f'SizeOf takes a field, the name of a part and a number, SizeOf(Int16ub, "body", 2), not {part!r} and {plus!r}')
+        super().__init__(subcon, tuple(filter(None, part.split("."))), plus)
+
+
 class Checksummed(layer.Sealing):
     """A struct sealed by one of its own fields, wherever in it that field stands. May nest.
 
@@ -149,7 +195,7 @@ class Checksummed(layer.Sealing):
         obj = self._marked._parsereport(stream, context, path)
         end = stream.tell()
         layer.note(context, path, start, end, obj, self)
-        if not layer.verifying(context, checksums=True):
+        if not layer.verifying(context, "checksums"):
             return obj
         stream.seek(start)
         data = stream.read(end - start)

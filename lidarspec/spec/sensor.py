@@ -6,9 +6,11 @@ scans. They are imported when a method is called first: a sensor is found and lo
 
 from __future__ import annotations
 
+import base64
 import inspect
 import re
 import warnings
+import zlib
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from numbers import Integral, Real
@@ -16,7 +18,7 @@ from os import PathLike
 from reprlib import repr as shown
 from typing import TYPE_CHECKING, Any
 
-from lidarspec.errors import UnknownOption, UsageError
+from lidarspec.errors import LidarSpecError, PluginError, UnknownOption, UsageError
 from lidarspec.spec.description import Spec
 from lidarspec.trust import beside
 
@@ -25,14 +27,62 @@ if TYPE_CHECKING:
 
     from lidarspec.framing.decoder import Decoder
     from lidarspec.framing.results import Found
+    from lidarspec.packets.imu import Waiting
     from lidarspec.packets.packets import Packets
     from lidarspec.scans.scans import Scan
 
+#: bytes of something learned at most, where a file says it.
+LARGEST = 1 << 20
 #: options that every sensor has.
 OPTIONS = ("frame", "answer")
 FRAMES_OF_REFERENCE = ("rep103", "vendor")
 #: what a file may give as an option without naming a path.
 _WORD = re.compile(r"[A-Za-z0-9_+-]{1,40}")
+
+
+class Learned(bytes):
+    """What a sensor said of itself, as the value of an option: the content of what else is a file, never a path.
+
+    An option takes it where its parameter is annotated with it, ``calibration: str | Path | Learned``.
+    """
+
+    def __repr__(self) -> str:
+        return f"Learned({len(self)} bytes)"
+
+    def to_dict(self) -> dict[str, str]:
+        """As data, such as in the header of a recording."""
+        return {"learned": base64.b64encode(zlib.compress(self)).decode()}
+
+    @classmethod
+    def of_dict(cls, data: Mapping[str, Any]) -> Learned:
+        """What `to_dict` gave.
+
+        Raises:
+            UsageError: for what it never gives, or more than a megabyte.
+        """
+        reader = zlib.decompressobj()
+        try:
+            content = reader.decompress(base64.b64decode(data["learned"], validate=True), LARGEST)
+        except (KeyError, TypeError, ValueError, zlib.error):
+            content = b""
+        if not reader.eof or set(data) != {"learned"}:
+            raise UsageError(f"{shown(data)} is nothing that a sensor said")
+        return cls(content)
+
+    @classmethod
+    def content(cls, value: str | PathLike[str] | Learned) -> bytes:
+        """The bytes that an option stands for: learned ones themselves, those of a file for its path.
+
+        Raises:
+            UsageError: for a file that cannot be read.
+        """
+        if isinstance(value, cls):
+            return bytes(value)
+        try:
+            with open(value, "rb") as file:
+                return file.read()
+        except (OSError, ValueError) as error:
+            raise UsageError(f"{value!s}: {getattr(error, 'strerror', None) or error}") from None
 
 
 class Sensor(Spec):
@@ -116,7 +166,7 @@ class Sensor(Spec):
 
         return example(self, frame, seed=seed)
 
-    def command(self, name: str, **arguments: Any) -> bytes:
+    def command(self, name: str, /, **arguments: Any) -> bytes:
         """The bytes of a command; arguments by name, in units.
 
         Raises:
@@ -173,13 +223,21 @@ class Sensor(Spec):
             UnknownFrame: for a frame type that the sensor does not have.
             UsageError: for a text or a path, an unknown back end, or a sensor that has no frames before it is configured.
         """
+        return self._decoded(data, frame, backend)[0]
+
+    def _decoded(self, data: Any, frame: str | None, backend: str) -> tuple[Packets, Waiting | None]:
+        """The packets of a frame type; and where none is named, what an IMU felt by their clock."""
         from lidarspec.framing.decoder import frames_of, is_stream
-        from lidarspec.packets.stream import PacketStream, data_frame
+        from lidarspec.packets.stream import ImuStream, PacketStream, data_frame
 
         decoder = self.decoder(stream=is_stream(data), backend=backend)
         frames = frames_of(decoder, data)
         name = frame or data_frame(self, frames) or self.data_frame
-        return PacketStream(self, name, decoder.stats, backend=decoder.backend).add(frames, whole=True)
+        stream = PacketStream(self, name, decoder.stats, backend=decoder.backend)
+        packets, imu = stream.add(frames, whole=True), ImuStream(self, decoder.stats, backend=decoder.backend) if frame is None else None
+        if imu is not None:
+            imu.add(frames, packets, whole=True)
+        return packets, None if imu is None else imu.waiting
 
     def scans(self, data: Any, *, backend: str = "auto") -> Iterator[Scan]:
         """Every scan of the data; the first and last piece are marked ``complete=False``.
@@ -195,10 +253,10 @@ class Sensor(Spec):
         """
         from lidarspec.scans.scans import scans_of
 
-        packets = self.decode(data, backend=backend)
+        packets, imu = self._decoded(data, None, backend)
         if packets.stats.bytes_in and not len(packets):
             warnings.warn(f"{self.id}: no {packets.frame} frame in the data ({packets.stats}): is it of another sensor?", stacklevel=2)
-        return self._followed(scans_of(self, [packets]), packets)
+        return self._followed(scans_of(self, [packets], imu), packets)
 
     def _followed(self, scans: Iterator[Scan], packets: Packets) -> Iterator[Scan]:
         """Scans, and behind them what the plugin failed at, and that they have no end."""
@@ -222,6 +280,7 @@ class Configure:
         Raises:
             UnknownOption: for an option that neither every sensor nor this one has.
             UsageError: for a value that an option cannot have.
+            PluginError: where the sensor's own function fails at something else.
         """
         sensor = self.sensor
         own = {name: value for name, value in options.items() if name not in OPTIONS}
@@ -236,17 +295,20 @@ class Configure:
 
     def takes(self, name: str, value: object) -> bool:
         """Whether a value is of a type that the option is declared with, by the annotation of its parameter; of others nobody knows."""
-        return any(_TYPES.get(kind, _anything)(value) for kind in self._kinds.get(name, {""}))
+        kinds = self._kinds.get(name, {""})
+        return "Learned" in kinds if isinstance(value, Learned) else any(_TYPES.get(kind, _anything)(value) for kind in kinds)
 
     def options_of_file(self, options: Mapping[str, Any], folder: Path) -> dict[str, Any]:
-        """The options that stand in a file in `folder` that anybody may have written: numbers, words, and files beside it.
+        """The options that stand in a file in `folder` that anybody may have written: numbers, words, what was learned, files beside it.
 
         Raises:
             UsageError: for a path that leads anywhere else, and for other values.
         """
         given = dict(options)
         for name, value in options.items():
-            if name in self.files and value is not None:
+            if isinstance(value, Mapping):
+                given[name] = Learned.of_dict(value)
+            elif name in self.files and value is not None:
                 try:
                     given[name] = beside(folder, value)
                 except UsageError as error:
@@ -272,7 +334,12 @@ class Configure:
             if not self.takes(name, value):
                 kinds = " or ".join(_TOLD[kind] for kind in sorted(self._kinds[name]) if kind in _TOLD)
                 raise UsageError(f"{self.sensor.id}: {name} is {kinds}, not {shown(value)}")
-        configured = self.function(self.sensor, **options)
+        try:
+            configured = self.function(self.sensor, **options)
+        except (LidarSpecError, OSError):
+            raise
+        except Exception as error:
+            raise PluginError.of(error, "configure", sensor=self.sensor.id, function=self.function) from error
         hooked: Sensor = self.sensor.hooked(configured) if self.sensor.hooked else configured
         return hooked
 
@@ -284,6 +351,7 @@ def _anything(value: object) -> bool:
 #: a type that an option is declared with -> whether a value is of it; what it is called, in the order of the alphabet.
 _TYPES: dict[str, Callable[[object], bool]] = {
     "Path": lambda value: isinstance(value, str | PathLike),
+    "Learned": lambda value: False,
     "bool": lambda value: isinstance(value, bool),
     "float": lambda value: isinstance(value, Real) and not isinstance(value, bool),
     "int": lambda value: isinstance(value, Integral) and not isinstance(value, bool),

@@ -22,17 +22,17 @@ can calculate is `Code`, which can be evaluated, but not be written down in anot
 Parts stand in the tree twice: as they are described, with paths from the top of the frame (`Kind.element`), and as frames in themselves,
 with paths from their own start (`Kind.root`), which layouts and tables are made of.
 
-Room for what is to come. The length of a part in bytes (M7) is a formula beside `Ref`, of the path of that part;
-`wire.build` fills it in, and `wire.layout_tree` holds arriving frames to it. An axis (M3) has its name in `Repeat.axis` and
-`FieldInfo.axes`. One element of an array (M8) is an index in `Ref`. A wire form (M4), which recodes the bytes before they have places, is
-a value of the `Frame`, beside its tree.
+A field that says how long a part is (`FieldInfo.held`) follows from what the nodes of that part add up to (`size`), and what pads a part is
+so many bytes: both are formulas like all others. An axis has its name in `Repeat.axis` and `FieldInfo.axes`; one element of an array is an
+index in `Ref`. A wire form, which recodes the bytes before they have places, is a value of the `Frame`, beside its tree.
 """
 
 from __future__ import annotations
 
+import functools
 import operator
 import struct
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from typing import Any, Literal
@@ -62,6 +62,7 @@ class FieldInfo:
         bits: width in bits; 0 where not fixed.
         const: the value it must have, None where free.
         rebuilt: what its value in a frame that is made follows from, None where it is given (construct's Rebuild).
+        held: whether a frame that comes is held to that (`SizeOf`).
         labels: meanings of raw values (construct's Enum).
         optional: whether some headers leave it out.
         measured: whether the author says what it measures, with a unit or as a pure number.
@@ -78,6 +79,7 @@ class FieldInfo:
     bits: int = 0
     const: Any = None
     rebuilt: Formula | None = None
+    held: bool = False
     labels: Mapping[int, str] = field(default_factory=dict)
     optional: bool = False
     measured: bool = False
@@ -207,6 +209,8 @@ def evaluated(formula: Formula, read: Read) -> Any:
         case Ref():
             value = read(formula.path)
             return value[1] if isinstance(value, tuple) else value
+        case Op("*", (condition, _)) if _is_condition(condition) and not evaluated(condition, read):
+            return 0  # the size of an alternative that is not there, whose fields nobody can ask for
         case Op():
             return _OPERATIONS[formula.symbol](*(evaluated(arg, read) for arg in formula.args))
         case Code():
@@ -216,6 +220,10 @@ def evaluated(formula: Formula, read: Read) -> Any:
 
 #: operations that give 1 or 0.
 COMPARISONS = frozenset({"==", "!=", "<", "<=", ">", ">="})
+
+
+def _is_condition(formula: Formula) -> bool:
+    return isinstance(formula, Op) and (formula.symbol in COMPARISONS or (formula.symbol == "*" and all(map(_is_condition, formula.args))))
 
 
 def written(formula: Formula, named: Callable[[Ref], str], operations: Mapping[str, str]) -> str:
@@ -520,6 +528,58 @@ def formulas(node: Node) -> tuple[Formula, ...]:
         case Select():
             return (node.key,)
     return ()
+
+
+def size(node: Node) -> Formula | None:
+    """The bytes of a node as a formula of header fields; None where construct alone can tell."""
+    match node:
+        case Number() | Block() | Blob() | Opaque():
+            return node.size
+        case Repeat():
+            return joined("*", node.count, size(node.element))
+        case Parts():
+            return Ref(node.total.path, node.total)
+        case When():
+            return _chosen(
+                [(calculated("!=", node.condition, 0), size(node.then)), (calculated("==", node.condition, 0), size(node.otherwise))]
+            )
+        case Select():
+            cases = [(calculated("==", node.key, value), size(case)) for value, case in node.cases]
+            others = [calculated("!=", node.key, value) for value, _ in node.cases]
+            return _chosen([*cases, (functools.reduce(functools.partial(calculated, "*"), others), size(node.default))])
+    return total(size(below) for below in children(node))
+
+
+def total(sizes: Iterable[Formula | None]) -> Formula | None:
+    """The sum of sizes, None where one is not known."""
+    found: Formula | None = 0
+    for each in sizes:
+        found = joined("+", found, each)
+    return found
+
+
+def joined(symbol: str, one: Formula | None, other: Formula | None) -> Formula | None:
+    """A sum, difference or product, as short as it can be written; None where one of both is not known."""
+    if one is None or other is None:
+        return None
+    neutral = 1 if symbol == "*" else 0
+    if other == neutral or (one == neutral and symbol != "-"):
+        return one if other == neutral else other
+    if symbol == "*" and 0 in (one, other):
+        return 0
+    if symbol == "+" and isinstance(one, int):
+        one, other = other, one
+    match symbol, one, other:
+        case "+" | "-", Op("+" | "-" as inner, (first, int() as known)), int():
+            number = (known if inner == "+" else -known) + (other if symbol == "+" else -other)
+            return joined("+" if number >= 0 else "-", first, abs(number))
+    return calculated(symbol, one, other)
+
+
+def _chosen(cases: Sequence[tuple[Formula, Formula | None]]) -> Formula | None:
+    """The size of alternatives, each with the condition under which it is there."""
+    first = cases[0][1]
+    return first if all(each == first for _, each in cases) else total(joined("*", holds, each) for holds, each in cases)
 
 
 def infos(node: Node) -> tuple[FieldInfo, ...]:

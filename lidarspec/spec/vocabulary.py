@@ -10,10 +10,87 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from numpy.lib.mixins import NDArrayOperatorsMixin
+from numpy.typing import NDArray
 
 from lidarspec.errors import SpecError
 
 Array = Any
+
+#: NumPy functions that work element by element, and so keep axes; others see plain arrays.
+ELEMENTWISE = {np.where, np.clip, np.nan_to_num, np.round, np.isclose, np.real_if_close}
+
+
+class Along(NDArrayOperatorsMixin):
+    """Numbers that all packets share, along arrays of the frame; NumPy's ufuncs apply, among themselves and with columns.
+
+    Attributes:
+        axes: the arrays, by the last part of their paths or the whole of it.
+        array: the numbers, with an axis for each.
+    """
+
+    def __init__(self, axes: tuple[str, ...], array: NDArray[Any]) -> None:
+        self.axes, self.array = axes, array
+
+    def __len__(self) -> int:
+        return len(self.array)
+
+    def __getitem__(self, which: Any) -> Any:
+        """Of the plain array."""
+        return self.array[which]
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
+        return self.array if dtype is None else self.array.astype(dtype)
+
+    def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: Any, **kwargs: Any) -> Any:
+        if method != "__call__" or kwargs.get("out") is not None:
+            return getattr(ufunc, method)(*map(np.asarray, inputs), **kwargs)
+        return self.applied((lambda *arrays: ufunc(*arrays, **kwargs)) if kwargs else ufunc, *inputs)
+
+    def __array_function__(self, function: Callable[..., Any], types: Any, args: Any, kwargs: Any) -> Any:
+        if function in ELEMENTWISE:
+            return self.applied((lambda *arrays: function(*arrays, **kwargs)) if kwargs else function, *args)
+        return function(*(np.asarray(value) if isinstance(value, Along) else value for value in args), **kwargs)
+
+    def applied(self, function: Callable[..., Any], *values: Any) -> Any:
+        """`function` of arrays, lined up by the arrays that they are along; of columns too, if one is among the values."""
+        for value in values:
+            if hasattr(value, "applied") and not isinstance(value, Along):
+                return value.applied(function, *values)
+        axes: dict[str, str] = {}
+        for name in (name for value in values if isinstance(value, Along) for name in value.axes):
+            axes.setdefault(name.rpartition(".")[2], name)
+        arrays = [value.lined_up(tuple(axes)) if isinstance(value, Along) else np.asarray(value) for value in values]
+        array = np.asarray(function(*arrays))
+        if array.ndim != len(axes):
+            raise SpecError(f"an array of shape {array.shape} beside numbers along {', '.join(axes)}: say what it is along with along(...)")
+        return Along(tuple(axes.values()), array)
+
+    def lined_up(self, names: tuple[str, ...]) -> NDArray[Any]:
+        """The numbers with an axis for each of these names, last parts of paths, among which its own are."""
+        own = [name.rpartition(".")[2] for name in self.axes]
+        ordered = self.array.transpose([own.index(name) for name in names if name in own])
+        lengths = iter(ordered.shape)
+        return ordered.reshape([next(lengths) if name in own else 1 for name in names])
+
+
+def along(axis: str | tuple[str, ...], values: Array) -> Any:
+    """Numbers that all packets share, along an array of the frame: ``along("pixels", ELEVATIONS)``.
+
+    Args:
+        axis: the array, by its name; or several, outermost first.
+        values: as many numbers as the array has elements; with an axis for each of several arrays.
+
+    Returns:
+        What lines up with columns by the array's name, wherever it stands in the frame.
+
+    Raises:
+        SpecError: for values with more or fewer axes than are named.
+    """
+    axes, array = (axis,) if isinstance(axis, str) else tuple(axis), np.asarray(values)
+    if array.ndim != len(axes):
+        raise SpecError(f"along({axis!r}, ...) takes an array with an axis for each name, not one of shape {array.shape}")
+    return Along(axes, array)
 
 
 def spread(start: Array, end: Array, count: Array, *, full: float) -> Array:
@@ -103,9 +180,30 @@ def side_by_side(*arrays: Any) -> Any:
     return np.stack(np.broadcast_arrays(*arrays), axis=-1)
 
 
+def running(a: Array) -> Array:
+    """The sum of the values so far along the innermost array that they are in, for differences on the wire: float64, the shape of `a`."""
+    return a.running() if hasattr(a, "running") else np.cumsum(np.asarray(a, np.float64), axis=-1)
+
+
 def take(table: Array, index: Array) -> Array:
-    """The entries of a table, shape (m,), at `index`: float64, the shape of `index`; nan where the index is not in the table."""
-    return _applied(LookUp(np.asarray(table, np.float64)), index)
+    """The entries of a table at `index`; nan where the index is not in the table.
+
+    Args:
+        table: (m,), a number for each index; or (m, k), a row for each, along the array of k elements that stands in those of `index`.
+
+    Returns:
+        float64, the shape of `index`; of rows with k in place of that array's length: of columns numbered (n, 16, 1), (n, 16, k).
+    """
+    entries = np.asarray(table, np.float64)
+    if entries.ndim == 1:
+        return _applied(LookUp(entries), index)
+    rows = np.concatenate([entries, np.full((1, entries.shape[1]), np.nan)])
+    return index.gathered(rows) if hasattr(index, "gathered") else rows[row_numbers(np.asarray(index), len(rows))]
+
+
+def row_numbers(index: NDArray[Any], rows: int) -> NDArray[np.intp]:
+    """The rows of a table for indices, of their shape; the last one, which is nan, for those that it does not have."""
+    return np.where((index >= 0) & (index < rows - 1), index, rows - 1).astype(np.intp)
 
 
 class LookUp:

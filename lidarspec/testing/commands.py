@@ -3,27 +3,41 @@
 from __future__ import annotations
 
 import math
+from ipaddress import ip_address
 from typing import Any
 
-from lidarspec.device.session import Reply, Session
-from lidarspec.errors import CommandError, LidarSpecError, OutOfRange
-from lidarspec.framing.frame_engine import codec
+from lidarspec.device.session import Reply, Session, found_at, learned
+from lidarspec.errors import CommandError, LidarSpecError, UsageError
+from lidarspec.explaining.wording import asked
 from lidarspec.framing.results import Found
 from lidarspec.simulation.device import SimulatedDevice
-from lidarspec.spec.construct_layer import member
+from lidarspec.spec.arguments import Address, Range, Text
 from lidarspec.spec.links import is_datagram
 from lidarspec.spec.sensor import Sensor
 from lidarspec.testing.findings import Violation, require
 from lidarspec.testing.subject import Subject
+from lidarspec.wire.build import argument_slot, raw_argument
 from lidarspec.wire.parse import parse_typed
 
 #: ns of one step of a simulated conversation.
 STEP = 20_000_000
 
 
-def arguments(subject: Subject, name: str, share: float) -> dict[str, float]:
-    """An argument for each that a command takes, so far between its lowest and its highest value."""
-    return {key: low + share * (high - low) for key, (_, low, high) in subject.sensor.commands[name].args.items()}
+def arguments(subject: Subject, name: str, share: float) -> dict[str, Any]:
+    """An argument for each that a command takes, so far between its lowest and its highest value, or as long, of its longest."""
+    return {key: _value(subject.sensor, name, key, share) for key in subject.sensor.commands[name].arguments}
+
+
+def _value(sensor: Sensor, name: str, key: str, share: float) -> Any:
+    slot, kind = argument_slot(sensor, name, key), sensor.commands[name].arguments[key].kind
+    match kind:
+        case Range(low, high):
+            return low + share * (high - low)
+        case Text(size):
+            return "x" * round(share * min(size, slot.room or size))
+        case Address():
+            return str(ip_address(bytes([round(share * 255)] * (slot.room or 4))))
+    return bytes(range(slot.room or round(share * 16)))
 
 
 def a_command_parses_back(subject: Subject, name: str) -> None:
@@ -44,24 +58,29 @@ def _parses_back(sensor: Sensor, name: str, given: dict[str, float]) -> None:
         return
     parsed = sensor.parse(data, frame=command.frame)
     assert sensor.build(command.frame, parsed) == data, "it builds as other bytes"
-    for path, value in command.values.items():
-        assert member(parsed, path) == value, f"{path} is {member(parsed, path)}, and {value} is meant"
-    fields = codec(sensor.frames[command.frame]).schema.fields
+    for path, value in command.fixed.items():
+        assert found_at(parsed, path) == value, f"{path} is {found_at(parsed, path)}, and {value} is meant"
     for argument, value in given.items():
-        info = fields[command.args[argument][0]]
-        read = info.physical(member(parsed, info.path))
-        assert abs(read - value) <= abs(info.scale) * 0.5001, f"{argument} is {read:g}, and {value:g} is given"
+        slot, declared = argument_slot(sensor, name, argument), command.arguments[argument]
+        read, raw = found_at(parsed, declared.path), raw_argument(slot, declared.kind, value, argument, name)
+        if isinstance(declared.kind, Range):
+            read = slot.info.physical(read)
+            assert abs(read - value) <= abs(slot.info.scale) * 0.5001, f"{argument} is {read:g}, and {value:g} is given"
+        else:
+            assert read == raw, f"{argument} is {read!r}, and {value!r} is given"
 
 
 def arguments_are_held_to_their_ranges(subject: Subject, name: str) -> None:
     """An argument outside its range is refused."""
-    for key, (_, low, high) in subject.sensor.commands[name].args.items():
-        for outside in (low - 1, high + 1):
+    for key, declared in subject.sensor.commands[name].arguments.items():
+        kind = declared.kind
+        ends = (kind.low - 1, kind.high + 1) if isinstance(kind, Range) else ("x" * (kind.size + 1),) if isinstance(kind, Text) else ()
+        for outside in ends:
             try:
                 subject.sensor.command(name, **{**arguments(subject, name, 0.0), key: outside})
-            except OutOfRange:
+            except UsageError:
                 continue
-            raise Violation("LS602", f"{key} = {outside:g} is sent, and {low:g} .. {high:g} is declared", f"commands.{name}.args.{key}")
+            raise Violation("LS602", f"{key} = {outside} is sent, and {asked(kind)} is declared", f"commands.{name}.args.{key}")
 
 
 def an_exchange_holds(sensor: Sensor, name: str, given: dict[str, Any], data: bytes, answer: bytes | None, place: str) -> None:
@@ -108,6 +127,8 @@ def the_simulated_sensor_answers(subject: Subject, name: str) -> None:
             refused = refused or str(error)
             continue
         require(reply.confirmed, "LS604", "the reply is not confirmed", f"commands.{name}")
+        if told := learned(subject.sensor, reply):
+            subject.sensor.configure(**told)
         return
     raise Violation("LS604", refused, f"commands.{name}")
 

@@ -21,6 +21,7 @@ from lidarspec.testing.findings import Finding
 from lidarspec.testing.geometry import field_of, traced, used
 from lidarspec.testing.subject import Subject
 from lidarspec.wire.layout import Layout
+from lidarspec.wire.schema import without_indices
 
 #: field names that stand for a measure.
 MEASURES = frozenset(["distance", "range", "radius", "angle", "azimuth", "elevation", "temperature", "voltage", "timestamp"])
@@ -79,7 +80,7 @@ def _asked(sensor: Sensor) -> Findings:
     given = [*asked.items(), *(("clock", path) for path in ((clock,) if isinstance(clock, str) else () if callable(clock) else clock))]
     for place, path in given:
         there = cut_by if place == "scan" else known
-        if path and path not in there:
+        if path and without_indices(path)[0] not in there:
             yield "LS216", f"there is no field {path!r}{did_you_mean(path, there)}", place
 
 
@@ -90,7 +91,7 @@ def _clock(sensor: Sensor) -> Findings:
         return
     fields = codec(sensor.frames[sensor.data_frame]).schema.named
     paths = (clock.source,) if isinstance(clock.source, str) else clock.source
-    infos = [fields.get(path) for path in paths]
+    infos = [fields.get(without_indices(path)[0]) for path in paths]
     spans = [info.limits[1] * info.scale * float(factor(info.unit, "s") or 0) if info and info.kind == "int" else np.inf for info in infos]
     if 0 < sum(spans) < LONG:
         what = f"it can count {sum(spans):g} s, then it starts again, and wraps_at is not given"
@@ -101,7 +102,7 @@ def _frame(subject: Subject, name: str, frame: Frame) -> Findings:
     engine = codec(frame)
     if not isinstance(frame.tree, Struct | Sealed):
         yield "LS114", f"it is a {type(frame.struct).__name__}", name
-    if not isinstance(engine, CompiledCodec):
+    if engine.compiled is None:
         yield "LS116", getattr(engine, "reason", "its layout cannot be computed"), name
     elif engine.size is not None and engine.size != frame.max_length:
         yield "LS203", f"every frame has {engine.size} bytes, and max_length is {frame.max_length}", name
@@ -216,7 +217,7 @@ def _strength(subject: Subject, name: str, frame: Frame, layouts: list[Layout]) 
     if frame.plausible is not None or frame.confirm > 1 or not layouts:
         return
     checked = [sum(leaf.info.bits for seal in layout.seals for leaf in seal.leaves) for layout in layouts]
-    constant = [sum(mask.bit_count() for mask, _ in layout.constants.values()) for layout in layouts]
+    constant = [sum(mask.bit_count() for mask, _ in layout.known.values()) for layout in layouts]
     weakest = min(map(sum, zip(checked, constant, strict=True)))
     if weakest <= (WEAK_DATAGRAM if subject.sensor.datagrams else WEAK):
         yield "LS206", f"its constants and checksums have {weakest} bits, and it declares neither plausible nor confirm", name

@@ -67,7 +67,8 @@ LS212 a checksum that nobody checks | damaged frames are taken for good ones
       | Checksummed(Struct(...), field="crc", algorithm=...); `lidarspec crc` finds the algorithm
 LS213 Python asks whether a column is true | it takes one answer, and a column has one for each packet
       | (f.a < 1) & (f.b < 2), with | and ~, and np.where in place of `if`
-LS214 columns that do not fit together | a point needs one value of each | arrays as long as the frame's own, or one value for each packet
+LS214 columns that do not fit together | a point needs one value of each
+      | arrays as long as the frame's own, with along(...) the one that is meant; or one value for each packet
 LS215 `spread` folds everything onto one value | all samples of a packet get one angle, or one time
       | full= as the circle in the unit of the angles; steps(count) for the index of a sample
 LS216 a field that no data frame has | scans, clock or counter come from it, and never come | a path that `lidarspec show` prints

@@ -70,7 +70,7 @@ def every_raw_value_survives(subject: Subject, name: str) -> None:
     if isinstance(codec(sensor.frames[name]), CompiledCodec):
         return
     sealed = material.seals(sensor, name, b"")
-    follows = {info.path for info in codec(sensor.frames[name]).schema.fields.values() if info.rebuilt is not None}
+    follows = {info.path for info in codec(sensor.frames[name]).schema.fields.values() if info.rebuilt is not None or info.held}
     plain = [subject.example(name, seed=seed) for seed in range(3)]
     for example, spot in ((one, spot) for one in plain for spot in material.places(len(one), source) for _ in range(CHANGES)):
         data = bytearray(example)
@@ -241,7 +241,7 @@ def _values(info: FieldInfo, own: Any, st: Any) -> Any:
 
 
 def free(info: FieldInfo | None) -> bool:
-    return info is not None and info.kind == "int" and info.const is None and info.rebuilt is None
+    return info is not None and info.kind == "int" and info.const is None and info.rebuilt is None and not info.held
 
 
 def a_truncated_frame_is_a_wire_error(subject: Subject, name: str) -> None:

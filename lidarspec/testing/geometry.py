@@ -27,7 +27,7 @@ from lidarspec.packets.packets import Packets
 from lidarspec.points.cloud import PointCloud
 from lidarspec.points.conventions import axis_matrix
 from lidarspec.points.plain import evaluate
-from lidarspec.simulation.frame_maker import FrameMaker, sealed
+from lidarspec.simulation.frame_maker import FrameMaker
 from lidarspec.simulation.scenes import Room, furnished
 from lidarspec.simulation.simulator import simulation
 from lidarspec.spec import OnWrap, Polar
@@ -66,7 +66,8 @@ def swept(subject: Subject, name: str, packets: int, start: int = 0) -> list[byt
     if sweep is None:
         return []
     try:
-        return sealed(FrameMaker(subject.sensor, name).table([sweep(start + index) for index in range(packets)]))
+        maker = FrameMaker(subject.sensor, name)
+        return maker.sealed(maker.table([sweep(start + index) for index in range(packets)]))
     except LidarSpecError:
         return []
 
@@ -85,7 +86,7 @@ def traced(subject: Subject, name: str) -> Any:
     Raises:
         Untraceable: where it cannot be traced, with the reason.
     """
-    few = [subject.example(name, seed=seed) for seed in (range(8) if subject.sensor.parts_with_points(name) else (0,))]
+    few = [subject.example(name, seed=seed) for seed in (range(8) if subject.sensor.parts_with("points", name) else (0,))]
     packets = read(subject, name, few * subject.sensor.frames[name].confirm).with_points
     if not isinstance(packets.table, Rows) or not packets.table.groups:
         return None
@@ -105,7 +106,7 @@ def field_of(subject: Subject, name: str, node: Node) -> FieldInfo | None:
     if node.kind == "state":
         _, frame, path = node.path.split(".", 2)
         return subject.fields(frame).get(path)
-    parts = subject.sensor.parts_with_points(name)
+    parts = subject.sensor.parts_with("points", name)
     return codec(subject.sensor.frames[name]).schema.named.get(f"{parts}.{node.path}" if parts else node.path)
 
 

@@ -6,7 +6,8 @@
       "points": {"0": {"range": 0.224, "x": 0.18186, "y": 0.13078}}}]
 
 `values` are raw integers of the wire, `units` the same in the fields' units, `points` what becomes of single points (range, x, y, z,
-azimuth and elevation in radians, intensity, ring). All three may be left out: then the bytes have to be such a frame, and build again.
+azimuth and elevation in radians, intensity, ring, or a further column under its name). All three may be left out: then the bytes have to
+be such a frame, and build again.
 `sensor` is the id, or a list of ids, of the sensors that an entry is of; where one sensor alone has the file, it may be left out.
 An entry with `command` is what is sent for a command with `args`, by name in units; `reply` is what answers it.
 
@@ -50,7 +51,6 @@ PROVEN = 12
 IDLE = re.compile(r"reserved|unused|unknown|spare|padding|filler", re.IGNORECASE)
 #: more than any field of the wire holds.
 _HUGE = 1 << 65
-COLUMNS = ("range", "x", "y", "z", "azimuth", "elevation", "intensity", "ring", "return_index")
 
 
 def _is_number(value: object) -> bool:
@@ -293,13 +293,14 @@ def _reading(info: FieldInfo | None, raw: Any, wanted: Any) -> str:
 def _points(subject: Subject, name: str, data: bytes, wanted: Mapping[str, Mapping[str, float]], place: str) -> None:
     """Hold single points of a vector's frame to where they are said to be."""
     cloud = read(subject, name, [data] * subject.sensor.frames[name].confirm).points()
+    known = cloud.columns.keys() - {"time"}
     for index, columns in wanted.items():
         spot = int(index)
         require(-len(cloud) <= spot < len(cloud), "LS708", f"there is no point {spot} among {len(cloud)}", f"{place} {name}")
         got = {}
         for column in columns:
-            require(column in COLUMNS and getattr(cloud, column) is not None, "LS702", f"points have no {column!r}", f"{place} {name}")
-            got[column] = float(getattr(cloud, column)[spot])
+            require(column in known, "LS702", f"points have no {column!r}", f"{place} {name}")
+            got[column] = float(cloud.columns[column][spot])
         wrong = [column for column, value in columns.items() if not np.isclose(got[column], value, rtol=NEAR, atol=NEAR)]
         mirrored = all(column in ("y", "azimuth") and np.isclose(got[column], -columns[column], atol=NEAR) for column in wrong)
         said = ", ".join(f"{column} is {got[column]:.5g}, and {columns[column]:g} is printed" for column in wrong)

@@ -6,6 +6,7 @@ In: a SOURCE as text. Out: an open `Transport`, which gives `Chunk`s and takes b
 * `open_url`: from a SOURCE to the transport that opens it.
 * `base`: what they share: addresses, the clock, failures with the next command.
 * `serial`, `udp`, `tcp`: live sources.
+* `http`: the web server of a sensor, and that of a simulated one.
 * `simulated`: `sim:`, a sensor that is not there.
 * `files`: recordings, captures, raw bytes, standard input.
 * `ports`: which serial and UDP ports this computer has, and who holds them.

@@ -21,8 +21,8 @@ from lidarspec.spec.links import Link
 from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.protocol import Chunk, Disconnected, LiveTransport, Origin
 
-#: options that every live SOURCE takes: the address of the link that commands go over, where it is not that of the data.
-COMMON = frozenset({"control"})
+#: options that every live SOURCE takes: the address of the link that commands go over, where it is not that of the data, and of everybody.
+COMMON = frozenset({"control", "broadcast"})
 #: seconds between two reads, in which a fast line gathers some bytes: it would wake us for every one.
 PAUSE = 0.002
 #: ns by which a wall clock may go differently; more is a clock that was set.
@@ -185,6 +185,16 @@ class HostClock:
 def steady_ns() -> int:
     """A clock that nobody sets, in ns; where the system has one, one that goes on while it is suspended."""
     return time.monotonic_ns() if _BOOTTIME is None else time.clock_gettime_ns(_BOOTTIME)
+
+
+def own_address(host: str) -> str | None:
+    """The address of this computer on the way to a host; None where there is no way. Nothing is sent."""
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    with contextlib.suppress(OSError), socket.socket(family, socket.SOCK_DGRAM) as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
+        probe.connect((host, 9))
+        return str(probe.getsockname()[0])
+    return None
 
 
 def rest(until: float) -> None:

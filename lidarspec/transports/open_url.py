@@ -5,13 +5,14 @@ from __future__ import annotations
 import importlib
 import os
 import re
+from dataclasses import replace
 from pathlib import Path
 from urllib.parse import parse_qs
 
 from lidarspec.device.settings import named
 from lidarspec.errors import SpecError, UnknownOption, UsageError
 from lidarspec.plugins import registry
-from lidarspec.spec.links import Link, Tcp, Udp
+from lidarspec.spec.links import Http, Link, Tcp, Udp
 from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.base import Address, failure, numeric
 from lidarspec.transports.files import open_file
@@ -122,12 +123,24 @@ def control_link(source: str | Path, name: str, link: Link, host: str | None) ->
     known = found or host
     if isinstance(link, Tcp) and known:
         return live(f"tcp://{_bracketed(known)}:{port or link.port}")
-    if isinstance(link, Udp) and known and (port or link.ports):
+    if isinstance(link, Http) and known:
+        from lidarspec.transports.http import HttpTransport
+
+        return HttpTransport(known, replace(link, port=port or link.port))
+    if isinstance(link, Udp) and (known or link.broadcast):
         from lidarspec.transports.udp import UdpTransport
 
-        remote = (numeric(known, str(source)), port or link.ports[0])
-        own = "::" if ":" in remote[0] else ""
-        return UdpTransport(f"udp://{_bracketed(known)}:{remote[1]}", [0], host=own, sender=remote[0], remote=remote)
+        everybody = address.options.get("broadcast", "255.255.255.255") if address is not None else ""
+        remote = (numeric(known or everybody, str(source)), port or (link.ports[0] if known and link.ports else link.broadcast))
+        own, label = "::" if ":" in remote[0] else "", f"udp://{_bracketed(remote[0])}:{remote[1]}"
+        return UdpTransport(label, [link.local], host=own, sender=remote[0] if known else None, remote=remote, broadcast=not known)
+    opened = registry().call("lidarspec_link", source=str(source), link=link, host=known)
+    if isinstance(opened, LiveTransport):
+        return opened
+    if opened is not None:
+        raise SpecError(f"{name} link: what a plugin gives has to derive from LiveTransport, and is a {type(opened).__name__}")
+    if not isinstance(link, Tcp | Udp | Http):
+        raise UsageError(f"{source}: no plugin is installed that opens a {type(link).__name__} link, which {name} is")
     raise failure(f"{source}: nobody knows the address of the {name} link", f"the same with ?control=ADDRESS in {source}")
 
 

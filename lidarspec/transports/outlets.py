@@ -10,18 +10,20 @@ from __future__ import annotations
 import contextlib
 import errno
 import os
+import queue
 import select
 import socket
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from types import MappingProxyType
 
 from lidarspec.errors import SourceError, UsageError
 from lidarspec.recording.appending import Appender
-from lidarspec.spec.links import Tcp, Udp
+from lidarspec.spec.links import Http, Link, Tcp, Udp
 from lidarspec.spec.sensor import Sensor
-from lidarspec.transports.base import Address, failure, ready, reason
+from lidarspec.transports.base import Address, failure, ready, reason, with_option
 from lidarspec.transports.protocol import POLL, Chunk
 
 try:
@@ -33,7 +35,7 @@ except ImportError:  # no POSIX
 
 #: bytes of commands read at once, and bytes that wait for a slow reader at most: of a connection, and of a pseudo-terminal.
 BLOCK, BACKLOG, PTY_BACKLOG = 1 << 16, 1 << 20, 1 << 18
-HERE = "127.0.0.1"
+HERE, EVERYBODY_HERE, NOBODY = "127.0.0.1", "127.255.255.255", ("127.0.0.1", 9)
 #: seconds between two looks at whether somebody listens; what a listener takes to settle, since many drop what came while they opened.
 LOOK, SETTLE = 0.02, 0.25
 #: seconds between two looks at a pseudo-terminal that nobody has open.
@@ -49,16 +51,25 @@ class Outlet:
         place: what to open to listen, as a SOURCE.
         heard: whether somebody listens, as far as that can be known.
         unsent: bytes that nobody took in time.
+        port: where it listens, 0 where it does not.
+        controls: the outlets of the sensor's other links, by name, over which it is asked and answers.
     """
 
     place: str = ""
     heard: bool = True
     unsent: int = 0
+    port: int = 0
+    controls: Mapping[str, Outlet] = MappingProxyType({})
 
     @property
     def source(self) -> str:
         """The SOURCE by which a program elsewhere listens."""
-        return self.place
+        return self._controlled(self.place)
+
+    def _controlled(self, source: str) -> str:
+        """A SOURCE with the address that commands go to: with its port where there is one only."""
+        ports = {control.port for control in self.controls.values()}
+        return with_option(source, "control", f"{HERE}:{ports.pop()}" if len(ports) == 1 else HERE) if ports else source
 
     def send(self, chunks: Sequence[Chunk], *, patient: bool) -> None:
         """Send, in order, and where `patient`, wait until there is room.
@@ -89,6 +100,8 @@ class Outlet:
     def close(self) -> None:
         """Give everything back."""
         self.unplug()
+        for control in self.controls.values():
+            control.close()
 
 
 class UdpOutlet(Outlet):
@@ -123,7 +136,7 @@ class UdpOutlet(Outlet):
     @property
     def source(self) -> str:
         """The SOURCE by which a program on that computer listens: datagrams from elsewhere come in at every interface."""
-        return self.place if self.host == HERE else "udp://" + self.place.removeprefix(f"udp://{self.host}")
+        return self._controlled(self.place if self.host == HERE else "udp://" + self.place.removeprefix(f"udp://{self.host}"))
 
     def receive(self, wait: float) -> list[bytes]:
         if ready([self._socket], [], wait)[0]:
@@ -144,6 +157,7 @@ class UdpOutlet(Outlet):
                     break
 
     def close(self) -> None:
+        super().close()
         self._socket.close()
 
     def _sent(self, data: bytes, port: int) -> bool:
@@ -175,8 +189,9 @@ class TcpOutlet(Outlet):
     def __init__(self, host: str, port: int, *, sole: bool = False) -> None:
         self._sole, self._clients, self.heard = sole, dict[socket.socket, bytearray](), False
         self._listener = listener(host, port)
-        self._address = (host, int(self._listener.getsockname()[1]))
-        self.place = f"tcp://{host}:{self._address[1]}"
+        self.port = int(self._listener.getsockname()[1])
+        self._address = (host, self.port)
+        self.place = f"tcp://{host}:{self.port}"
 
     def receive(self, wait: float) -> list[bytes]:
         if self._listener.fileno() < 0:
@@ -267,6 +282,83 @@ class TcpOutlet(Outlet):
         self._clients.pop(client, None)
         self.heard = bool(self._clients)
         client.close()
+
+
+class AnsweringOutlet(Outlet):
+    """Datagrams that are answered: what is sent goes to whoever asked last.
+
+    Args:
+        host, port: where to listen; port 0 takes any that is free. What is broadcast within this computer is heard too.
+
+    Raises:
+        OSError: where the address cannot be had.
+    """
+
+    def __init__(self, host: str, port: int) -> None:
+        self._socket, self._asker = _bound(host, port), NOBODY
+        self.port = int(self._socket.getsockname()[1])
+        self.place, self._sockets = f"udp://{host}:{self.port}", [self._socket]
+        with contextlib.suppress(OSError):
+            self._sockets.append(_bound(EVERYBODY_HERE, self.port))
+
+    def receive(self, wait: float) -> list[bytes]:
+        found = []
+        for one in ready(self._sockets, [], wait)[0]:
+            with contextlib.suppress(OSError):
+                data, self._asker = one.recvfrom(BLOCK)
+                found.append(data)
+        return found
+
+    def send(self, chunks: Sequence[Chunk], *, patient: bool) -> None:
+        for chunk in chunks:
+            with contextlib.suppress(OSError):  # who asked has gone
+                self._socket.sendto(chunk.data, self._asker)
+
+    def close(self) -> None:
+        for one in self._sockets:
+            one.close()
+
+
+class HttpOutlet(Outlet):
+    """The web server of a simulated sensor.
+
+    Args:
+        host, port: where to listen; port 0 takes any that is free.
+
+    Raises:
+        OSError: where the address cannot be had.
+    """
+
+    def __init__(self, host: str, port: int) -> None:
+        from lidarspec.transports.http import Server
+
+        self._server = Server(host, port)
+        self.port = int(self._server.server_address[1])
+        self.place = f"http://{host}:{self.port}"
+
+    def receive(self, wait: float) -> list[bytes]:
+        with contextlib.suppress(queue.Empty):
+            return [self._server.asked.get(timeout=wait) if wait else self._server.asked.get_nowait()]
+        return []
+
+    def send(self, chunks: Sequence[Chunk], *, patient: bool) -> None:
+        for chunk in chunks:
+            with contextlib.suppress(IndexError):  # who asked has been told already that there is no answer
+                self._server.waiting.popleft().put(chunk.data)
+
+    def close(self) -> None:
+        self._server.server_close()
+
+
+def _bound(host: str, port: int) -> socket.socket:
+    found = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    try:
+        found.setblocking(False)
+        found.bind((host, port))
+    except BaseException:
+        found.close()
+        raise
+    return found
 
 
 class PtyOutlet(Outlet):
@@ -450,7 +542,44 @@ def has_terminals() -> bool:
     return termios is not None
 
 
+def _controls(sensor: Sensor) -> dict[str, Outlet]:
+    """Where a simulated sensor is asked over its other links: on this computer, at the declared ports, or free ones if these are taken."""
+    found: dict[str, Outlet] = {}
+    for name in {command.link for command in sensor.commands.values()} - {"data"}:
+        declared = sensor.links[name]
+        for port in (declared_port(declared), 0):
+            with contextlib.suppress(OSError, SourceError):
+                if isinstance(declared, Tcp):
+                    found[name] = TcpOutlet(HERE, port)
+                elif isinstance(declared, Udp):
+                    found[name] = AnsweringOutlet(HERE, port)
+                elif isinstance(declared, Http):
+                    found[name] = HttpOutlet(HERE, port)
+                break
+    return found
+
+
+def declared_port(link: Link) -> int:
+    """The port at which a sensor is asked over a link, 0 where it declares none."""
+    return link.port if isinstance(link, Tcp | Http) else (*link.ports, link.broadcast)[0] if isinstance(link, Udp) else 0
+
+
 def simulated_outlet(sensor: Sensor, place: str, link: str | Path | None = None) -> Outlet:
+    """The outlet of a simulated sensor, with those of its other links as `controls`.
+
+    Args:
+        place, link: as of the outlet of its data.
+
+    Raises:
+        UsageError: for what is no destination, and one that cannot carry what the sensor sends.
+        SourceError: where it cannot be had.
+    """
+    outlet = _data_outlet(sensor, place, link)
+    outlet.controls = _controls(sensor)
+    return outlet
+
+
+def _data_outlet(sensor: Sensor, place: str, link: str | Path | None) -> Outlet:
     """The outlet of a simulated sensor: "pty", "udp://HOST:PORT" or "tcp://HOST:PORT"; TCP port 0 takes one that is free.
 
     Without a UDP port, data goes to the first one that the sensor declares and the rest to its second.

@@ -27,6 +27,8 @@ from lidarspec.wire.build import build_command
 
 #: seconds at least between two sendings.
 PAUSE = 0.001
+#: seconds between two looks at whether somebody asks over a link of its own.
+ASKED = 0.01
 #: ns of data that are written to a file between two looks at its health.
 PIECE = SECOND // 100
 #: ns; a chunk of a replay that goes out later than this is worth a word.
@@ -94,7 +96,7 @@ def serve(
     Raises:
         SourceError: where nothing can be sent any more.
     """
-    stop, early = stop or threading.Event(), list[bytes]()
+    stop, early, outlets = stop or threading.Event(), list[bytes](), {"data": outlet, **outlet.controls}
     while patient and not outlet.heard and not stop.is_set():
         early = outlet.receive(POLL)
     began, present, endless = time.monotonic_ns(), True, math.isinf(device.rate)
@@ -110,16 +112,19 @@ def serve(
             break
         if outlet.heard or not endless:
             with TURNS.turn(stop) as is_ours:
-                chunks = _chunks(device, now) if is_ours else []
-            outlet.send(chunks, patient=endless)
+                chunks = _chunks(device, now) if is_ours else {}
+            for name, end_of_link in outlets.items():
+                end_of_link.send(chunks.get(name, []), patient=endless and name == "data")
         if device.present != present:
             present = device.present
-            outlet.plug() if present else outlet.unplug()
+            for end_of_link in outlets.values():
+                end_of_link.plug() if present else end_of_link.unplug()
         due = device.deadline
         pause = 0.0 if endless and outlet.heard else PAUSE
         wait = POLL if due is None else min(POLL, max((due - time.monotonic_ns()) / SECOND, pause))
-        for data in outlet.receive(wait):
-            device.receive(data, time.monotonic_ns())
+        for name, end_of_link in outlets.items():
+            for data in end_of_link.receive((min(wait, ASKED) if outlet.controls else wait) if name == "data" else 0.0):
+                device.receive(data, time.monotonic_ns(), name)
 
 
 class Served(Closing):
@@ -144,7 +149,7 @@ class Served(Closing):
     @property
     def path(self) -> str:
         """What to open."""
-        return self.outlet.place
+        return self.outlet.source
 
     def unplug(self) -> None:
         """Pull the plug: the port hangs up and is gone."""
@@ -215,29 +220,27 @@ def write_file(device: SimulatedDevice, path: str | Path, seconds: float, *, ove
                 out.write(Chunk(build_command(sensor, name, {}), began + now), "out")
                 device.receive(build_command(sensor, name, {}), now, sensor.commands[name].link)
             now += PIECE
-            for chunk in _chunks(device, now, began + now):
+            for chunk in _chunks(device, now, began + now).get("data", []):
                 out.write(chunk)
                 written += len(chunk.data)
             out.keep_up()
     return written
 
 
-def _chunks(device: SimulatedDevice, now: int, at: int | None = None) -> list[Chunk]:
-    """What a device sends by now; a datagram with the port that it goes to, which is the sensor's second one if it is no data frame.
+def _chunks(device: SimulatedDevice, now: int, at: int | None = None) -> dict[str, list[Chunk]]:
+    """What a device sends by now, by link; a datagram with the port that it goes to, the sensor's second one if it is no data frame.
 
     Args:
         at: the arrival time that is noted.
     """
     sensor, link = device.sensor, device.sensor.links.get("data")
-    if not sensor.datagrams:
-        return [Chunk(data, at) for _, _, data in device.sendings(now)]
+    found: dict[str, list[Chunk]] = {}
     ports = link.ports[:2] if isinstance(link, Udp) and link.ports else (0,)
     ends = {True: (HERE, ports[0]), False: (HERE, ports[-1])}
-    chunks = []
-    for _, frame, data in device.sendings(now):
-        end = ends[not frame or sensor.frames[frame].data]
-        chunks.append(Chunk(data, at, end, end))
-    return chunks
+    for name, frame, data in device.sendings(now):
+        end = ends[not frame or sensor.frames[frame].data] if sensor.datagrams and name == "data" else None
+        found.setdefault(name, []).append(Chunk(data, at, end, end))
+    return found
 
 
 class Deadlines:

@@ -171,6 +171,7 @@ class UdpTransport(LiveTransport):
         datagrams: whether each is a whole frame, not a piece of a stream.
         sensor: for the next command in messages.
         remote: where to send to; by default the sender that is asked for with its port, or accepted.
+        broadcast: whether that may be everybody.
 
     Attributes:
         ports: those that are open.
@@ -190,6 +191,7 @@ class UdpTransport(LiveTransport):
         datagrams: bool = True,
         sensor: Sensor | None = None,
         remote: tuple[str, int] | None = None,
+        broadcast: bool = False,
     ) -> None:
         self.clock = HostClock()
         self.label, self.datagrams = label, datagrams
@@ -206,6 +208,8 @@ class UdpTransport(LiveTransport):
             for port in ports:
                 self._sockets.append(_Socket(self._bound(host, port, group), slots))
                 self._selector.register(self._sockets[-1].socket, selectors.EVENT_READ, self._sockets[-1])
+                if broadcast:
+                    self._sockets[-1].socket.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
         except BaseException:
             self.close()
             raise

@@ -66,9 +66,14 @@ _FIXED = (
     Ink((96, 216, 110), 92, bold=True),
     Ink((255, 92, 87), 91, bold=True),
 )
-#: the first ink of each ramp, by what it shows.
+#: the first ink of each ramp, by what it shows: from near to far, or from weak to strong.
 RAMPS = {"range": len(_FIXED), "intensity": len(_FIXED) + STEPS}
 INKS: tuple[Ink, ...] = (*_FIXED, *_ramp(_RANGE, _RANGE_16), *_ramp(_INTENSITY, _INTENSITY_16))
+
+
+def first_ink(ramp: str) -> int:
+    """The first ink of the ramp for what colours show."""
+    return RAMPS["range" if ramp == "range" else "intensity"]
 
 
 @functools.cache
@@ -170,7 +175,7 @@ class Canvas:
 
     Attributes:
         width, height: in cells.
-        ramp: what the colours of points show, "range" or "intensity".
+        ramp: what the colours of points show, "range" or what is weak or strong.
         dots: (4 * height, 2 * width) bool, points.
         lines: the same for rings and axes, shown where a cell has no point.
         steps: (height, width) int16, the colour of a cell's points on the ramp; -1 without.
@@ -192,7 +197,7 @@ class Canvas:
         across, down, inside = self._places(column, row)
         self.dots[down, across] = True
         steps = np.clip(shade[inside] * STEPS, 0, STEPS - 1).astype(np.uint8)
-        order = np.argsort(steps if self.ramp == "intensity" else STEPS - steps, kind="stable")
+        order = np.argsort(STEPS - steps if self.ramp == "range" else steps, kind="stable")
         self.steps[down[order] // DOWN, across[order] // ACROSS] = steps[order]
 
     def line(self, column: NDArray[Any], row: NDArray[Any]) -> None:
@@ -218,7 +223,7 @@ class Canvas:
         """The picture."""
         points, lines = _braille(self.dots), _braille(self.lines)
         codes = np.where(points > 0, BLANK + points, np.where(lines > 0, BLANK + lines, _SPACE)).astype(np.int32)
-        inks = np.where(points > 0, RAMPS[self.ramp] + self.steps, np.where(lines > 0, FAINT, PLAIN)).astype(np.int16)
+        inks = np.where(points > 0, first_ink(self.ramp) + self.steps, np.where(lines > 0, FAINT, PLAIN)).astype(np.int16)
         for cell, (character, ink) in self.labels.items():
             codes[cell], inks[cell] = ord(character), ink
         return Cells(codes, inks)

@@ -21,9 +21,9 @@ from lidarspec.recording.appending import Appender, Log
 from lidarspec.recording.recorders import recorder
 from lidarspec.scans.scans import Scan
 from lidarspec.transports.protocol import Chunk, Transport
-from lidarspec.view.canvas import ALARM, FAINT, GOOD, LABEL, PLAIN, RAMPS, STEPS, STRONG, Cells
+from lidarspec.view.canvas import ALARM, FAINT, GOOD, LABEL, PLAIN, STEPS, STRONG, Cells, first_ink
 from lidarspec.view.feed import NOTHING, Feed, Reading, told
-from lidarspec.view.polar import Look, look, picture
+from lidarspec.view.polar import Look, look, picture, ramps
 from lidarspec.view.screen import Screen
 
 #: seconds from picture to picture at least, and between two readings of the figures.
@@ -39,7 +39,7 @@ BESIDE, NARROWEST = 25, 36
 ALARMING = 0.01
 KEYS = (
     ("space", "pause and go on"),
-    ("c", "colour by range or intensity"),
+    ("c", "what colours show"),
     ("+ -", "zoom in and out"),
     ("arrows", "move what is in the middle"),
     ("0", "all of it again"),
@@ -189,9 +189,9 @@ def _write_line(whole: Cells, figures: Sequence[Figure]) -> None:
 def _write_ramp(whole: Cells, row: int, column: int, look: Look) -> None:
     """What the colours mean: a bar of the ramp, and the values at its ends."""
     for step in range(STEPS):
-        whole.write(row, column + step, "━", RAMPS[look.ramp] + step)
-    end = f"{look.full:g} m" if look.ramp == "range" else f"{look.full:g}"
-    whole.write(row + 1, column, "0", LABEL)
+        whole.write(row, column + step, "━", first_ink(look.ramp) + step)
+    begin, end = look.ends
+    whole.write(row + 1, column, begin, LABEL)
     whole.write(row + 1, column + (STEPS - len(look.ramp)) // 2, look.ramp, LABEL)
     whole.write(row + 1, column + STEPS - len(end), end, LABEL)
 
@@ -218,14 +218,15 @@ class Choice:
     helped: bool = False
     done: bool = False
 
-    def after(self, key: str, reach: float) -> Choice:
-        """The choice after a key press; `reach` is what is shown now, in metres."""
+    def after(self, key: str, reach: float, ramps: Sequence[str] = ("range", "intensity")) -> Choice:
+        """The choice after a key press; `reach` is what is shown now, in metres, and `ramps` what colours can show."""
         if key in ("q", "Q"):
             return replace(self, done=True)
         if key == " ":
             return replace(self, paused=not self.paused)
         if key in ("c", "C"):
-            return replace(self, ramp="intensity" if self.ramp == "range" else "range")
+            following = ramps.index(self.ramp) + 1 if self.ramp in ramps else 0
+            return replace(self, ramp=ramps[following % len(ramps)])
         if key in ("+", "="):
             return replace(self, zoom=min(self.zoom * ZOOM, 1e3))
         if key in ("-", "_"):
@@ -311,7 +312,8 @@ class Window:
         return whole
 
     def _press(self, key: str) -> None:
-        self.choice = self.choice.after(key, self._current_look().reach)
+        known = ramps(self._scan.points) if self._scan is not None else ["range", "intensity"]
+        self.choice = self.choice.after(key, self._current_look().reach, known)
         if key in ("r", "R") and self._record is not None:
             self._record.toggle()
 
@@ -328,7 +330,7 @@ class Window:
         if before is not None and _fits(found.reach, before.reach):
             found = replace(found, reach=before.reach)
         if before is not None and before.ramp == found.ramp and _fits(found.full, before.full):
-            found = replace(found, full=before.full)
+            found = replace(found, full=before.full, low=min(before.low, found.low))
         self._look = found
 
     def _current_look(self) -> Look:

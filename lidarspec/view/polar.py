@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from lidarspec.errors import UnknownName
 from lidarspec.points.cloud import PointCloud
 from lidarspec.view.canvas import ACROSS, DOWN, FAINT, LABEL, STRONG, Canvas, Cells
 
@@ -33,11 +34,12 @@ class Look:
     """How a cloud is drawn.
 
     Attributes:
-        ramp: what colours show, "range" or "intensity".
+        ramp: what colours show: "range", "intensity", or a column in `PointCloud.extra`.
         reach: metres from the middle to the nearer edge.
-        full: the range in metres, or the intensity, at the end of the ramp.
+        full: the range in metres, the intensity, or the value at the end of the ramp.
         middle: what is in the middle, metres forward and left of the sensor.
         flat: from above only.
+        low, unit: the value at the beginning of the ramp, and what values are in, where they are no ranges.
     """
 
     ramp: str
@@ -45,16 +47,40 @@ class Look:
     full: float
     middle: tuple[float, float] = (0.0, 0.0)
     flat: bool = True
+    low: float = 0.0
+    unit: str = ""
+
+    @property
+    def ends(self) -> tuple[str, str]:
+        """The values at the beginning and end of the ramp, in words."""
+        unit = "m" if self.ramp == "range" else self.unit
+        return f"{self.low:g}", f"{self.full:g} {unit}".rstrip()
+
+
+def ramps(cloud: PointCloud) -> list[str]:
+    """What colours can show of a cloud."""
+    return ["range", *["intensity"] * (cloud.intensity is not None), *cloud.extra]
 
 
 def look(points: PointCloud, *, ramp: str = "range", reach: float | None = None) -> Look:
-    """How to draw a cloud so that all of it is seen; intensity is shown only where the cloud has some."""
+    """How to draw a cloud so that all of it is seen; intensity is shown only where the cloud has some.
+
+    Raises:
+        UnknownName: for a column that the cloud does not have.
+    """
     cloud = points[points.valid]
     found = reach or reach_of(cloud)
-    if ramp == "intensity" and cloud.intensity is not None:
-        strong = float(np.percentile(cloud.intensity, WITHIN)) if len(cloud) else 0.0
-        return Look("intensity", found, rounded_up(max(strong, 1e-3)), flat=is_flat(cloud))
-    return Look("range", found, found, flat=is_flat(cloud))
+    if ramp not in (known := ramps(cloud)):
+        if ramp != "intensity":
+            raise UnknownName(ramp, known, place="colours")
+        ramp = "range"
+    if ramp == "range":
+        return Look("range", found, found, flat=is_flat(cloud))
+    values = _shown(cloud, ramp)
+    values = values[np.isfinite(values)]
+    weak, strong = np.percentile(values, (100 - WITHIN, WITHIN)) if len(values) else (0.0, 0.0)
+    low = -rounded_up(-float(weak)) if weak < 0 else 0.0
+    return Look(ramp, found, rounded_up(max(float(strong), 1e-3)), flat=is_flat(cloud), low=low, unit=cloud.units.get(ramp, ""))
 
 
 def picture(points: PointCloud, *, width: int, height: int, look: Look) -> Cells:
@@ -105,9 +131,14 @@ def _scale(width: int, height: int, reach: float) -> float:
 
 def shade(cloud: PointCloud, look: Look) -> NDArray[np.float64]:
     """How far along the ramp of inks each point is, (n,), from 0."""
-    if look.ramp == "intensity" and cloud.intensity is not None:
-        return cloud.intensity.astype(np.float64) / look.full
-    return np.hypot(cloud.x, cloud.y).astype(np.float64) / look.full
+    if look.ramp == "range":
+        return np.hypot(cloud.x, cloud.y).astype(np.float64) / look.full
+    return np.nan_to_num((_shown(cloud, look.ramp) - look.low) / (look.full - look.low))
+
+
+def _shown(cloud: PointCloud, ramp: str) -> NDArray[np.float64]:
+    """The column that colours show, (n,)."""
+    return np.asarray(cloud.intensity if ramp == "intensity" else cloud.extra[ramp], np.float64)
 
 
 def _from_above(cloud: PointCloud, width: int, height: int, look: Look) -> Cells:

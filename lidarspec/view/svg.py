@@ -94,8 +94,8 @@ def _legend(look: Look) -> Iterator[str]:
     left, width = SIDE + MARGIN - STEPS * 8, 8
     for step in range(STEPS):
         yield f'<rect x="{left + step * width}" y="16" width="{width}" height="8" fill="{_colour(step)}"/>'
-    unit = " m" if look.ramp == "range" else ""
-    yield f'<text x="{left}" y="38">0</text><text x="{left + STEPS * width}" y="38" text-anchor="end">{look.full:g}{unit}</text>'
+    begin, end = (escape(text) for text in look.ends)
+    yield f'<text x="{left}" y="38">{begin}</text><text x="{left + STEPS * width}" y="38" text-anchor="end">{end}</text>'
     yield f'<text x="{left + STEPS * width / 2}" y="38" text-anchor="middle">{look.ramp}</text>'
 
 

@@ -7,6 +7,7 @@ Modules in reading order:
 * `layout`: where each field of one kind of header is, as data; loading by it.
 * `parts`: frames within a frame, found from part to part, in many frames at once.
 * `layout_tree`: the layouts of a frame type, by the fields of the header that decide.
+* `slots`: frames of a wire form as rows, and back.
 * `row_checksums`: the checksums of many frames at once.
 * `frame_table`: many frames as columns of raw values.
 * `parse`, `build`: one frame from bytes, and one from values.

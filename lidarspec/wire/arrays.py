@@ -88,3 +88,8 @@ def keep_freed_memory() -> None:
     Source: mallopt(3), M_MMAP_THRESHOLD: the threshold is adjusted dynamically, and M_TRIM_THRESHOLD to twice its value.
     """
     np.empty(KEPT, np.uint8)
+
+
+def deep(array: NDArray[Any], depth: int) -> NDArray[Any]:
+    """Values of packets, (n, ...), with axes of length 1 behind them, up to `depth` behind the first."""
+    return array.reshape(*array.shape, *(1,) * (depth + 1 - array.ndim))

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import copy
 import functools
-from collections.abc import Mapping
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import construct
@@ -11,11 +14,20 @@ import numpy as np
 from construct import Container
 
 from lidarspec.errors import LidarSpecError, MissingField, OutOfRange, SpecError, UnknownCommand, UnknownField, UnknownFrame, UsageError
+from lidarspec.spec.arguments import Address, Count, Filled, Range, Taken
 from lidarspec.spec.construct_layer import Mismatch, WireNaN, field_path, member, seen
 from lidarspec.spec.description import Spec
 from lidarspec.spec.tree import Blob, FieldInfo, Formula, Kind, Node, Number, Parts, Read, Sealed, Struct, evaluated, nodes, refs
+from lidarspec.wire.layout import Layout
 from lidarspec.wire.layout_tree import TooLong, Unknown, layout_of
 from lidarspec.wire.schema import Schema, schema
+from lidarspec.wire.slots import SPELLING, Recoder, recoder
+
+#: how often a frame is built until its lengths agree: once more where it has any, and again where these themselves have no fixed length.
+RETRIES = 4
+
+#: names of fields, and indices: a number, or "*" for every element.
+Steps = list[int | str]
 
 
 def build(sensor: Spec, frame: str, value: Any, values: Mapping[str, Any], *, units: bool = False) -> bytes:
@@ -36,8 +48,10 @@ def build(sensor: Spec, frame: str, value: Any, values: Mapping[str, Any], *, un
     table, known = _fields(tree)
     given = _Values(table, known, place, units=units).checked({**(value or {}), **values}, "")
     try:
-        _fill(tree, given, sensor.frames[frame].max_length)
-        return bytes(sensor.frames[frame].prepared.build(given))
+        _fill(tree, given, sensor.frames[frame].room)
+        data = _built(sensor.frames[frame].prepared, given)
+        recoding = recoder(sensor.frames[frame])
+        return data if recoding is None else _written(recoding, data, (value or {}).get(SPELLING), place)
     except Mismatch as fault:
         raise _usage(fault, place) from None
     except construct.ConstructError as fault:
@@ -47,6 +61,34 @@ def build(sensor: Spec, frame: str, value: Any, values: Mapping[str, Any], *, un
         raise
     except Exception as fault:
         raise SpecError(f"an expression of the struct failed: {type(fault).__name__}: {fault}", path=frame, sensor=sensor.id) from fault
+
+
+def _built(con: Any, given: Container) -> bytes:
+    """The bytes of a frame, built once more where fields say how long parts are, which is seen when these are built."""
+    sizes, data = dict[str, int](), b""
+    for _ in range(RETRIES):
+        known = dict(sizes)
+        data = con.build(given, _sizes=sizes)
+        if sizes == known:
+            break
+    return bytes(data)
+
+
+def _written(recoding: Recoder, row: bytes, spelling: bytes | None, place: str) -> bytes:
+    """A row on the wire, as it was spelled if it says the same.
+
+    Raises:
+        UsageError: for values that its form cannot write.
+    """
+    if spelling is not None and (known := recoding.row(spelling)) is not None and known[1] == row:
+        return spelling
+    layout = recoding.tree.layout(row)
+    data = recoding.written(np.frombuffer(row, np.uint8).reshape(1, -1), layout)[0] if isinstance(layout, Layout) else None
+    if data is None:
+        raise UsageError(
+            f"{place}: {recoding.form} cannot write these values: a number is too large for its digits, or a text has a mark in it"
+        )
+    return data
 
 
 def _usage(fault: Mismatch, place: str) -> UsageError:
@@ -253,7 +295,7 @@ def build_command(sensor: Spec, name: str, arguments: Mapping[str, Any]) -> byte
     """The bytes of a command, none for one that only moves lines.
 
     Args:
-        arguments: by name, in the units of their fields.
+        arguments: by name, in the units of their fields; a value that is found out when it is sent by its path.
 
     Raises:
         UnknownCommand: for a command that the sensor does not have.
@@ -263,45 +305,135 @@ def build_command(sensor: Spec, name: str, arguments: Mapping[str, Any]) -> byte
     if name not in sensor.commands:
         raise UnknownCommand(name, sensor.commands, place=sensor.id)
     command, place = sensor.commands[name], f"{sensor.id} {name}"
-    unknown = set(arguments) - set(command.args)
+    unknown = set(arguments) - set(command.args) - set(command.filled)
     if unknown:
         raise UnknownField(min(unknown), command.args, place=place)
     if command.frame is None:
         return b""
-    values = Container()
+    values: Any = {}
     for path, value in command.values.items():
-        holder, last = _place(values, path)
-        holder[last] = value
-    for argument, (path, low, high) in command.args.items():
-        info = argument_field(sensor, name, argument)
+        filled = _found_out(sensor, name, path, value, arguments.get(path)) if path in command.filled else copy.deepcopy(value)
+        values = put(values, steps(path), filled)
+    for argument, declared in command.arguments.items():
+        slot = argument_slot(sensor, name, argument)
         if argument not in arguments:
             raise MissingField(argument, place=place)
-        value = arguments[argument]
-        if not isinstance(value, int | float | np.number):
-            raise UsageError(f"{place}: {argument} is a number, not {value!r:.60}")
-        if not low <= value <= high:
-            raise OutOfRange(argument, value, low, high, unit=info.unit, place=place)
-        raw = info.raw(value)
-        bottom, top = info.limits if info.kind == "int" else (raw, raw)
-        holder, last = _place(values, path)
-        holder[last] = min(max(raw, bottom), top)
+        values = put(values, steps(declared.path), raw_argument(slot, declared.kind, arguments[argument], argument, place))
     return build(sensor, command.frame, None, values)
 
 
-def argument_field(sensor: Spec, name: str, argument: str) -> FieldInfo:
-    """The field that an argument of a command goes into.
+@dataclass(frozen=True)
+class Slot:
+    """Where an argument goes: its field; and how many bytes, or numbers of an array, there are for it, None where that varies."""
+
+    info: FieldInfo
+    room: int | None
+    is_array: bool = False
+
+
+def argument_slot(sensor: Spec, name: str, argument: str) -> Slot:
+    """Where an argument of a command goes.
 
     Raises:
-        SpecError: where it is not one number.
+        SpecError: where its kind of value cannot stand there.
     """
-    command = sensor.commands[name]
-    path = command.args[argument][0]
-    info = schema(sensor.frames[command.frame].tree).fields.get(path) if command.frame else None
-    if info is None or info.axes or info.kind not in ("int", "float"):
-        what = "in an array" if "[" in path or (info and info.kind != "bytes" and info.axes) else info.kind if info else "no field"
-        reason = f"an argument goes into a field of {command.frame} that is one number, and {path!r} is {what}: give the field in `values`"
-        raise SpecError(reason, path=f"commands.{name}.args.{argument}", sensor=sensor.id)
-    return info
+    declared, place = sensor.commands[name].arguments[argument], f"commands.{name}.args.{argument}"
+    slot = _slot(sensor, name, declared.path, place)
+    takes = {"int", "float"} if isinstance(declared.kind, Range) else {"bytes", "other"} | ({"int"} if slot.is_array else set())
+    takes |= {"int"} if isinstance(declared.kind, Address) else set()
+    if slot.info.kind not in takes or (slot.is_array and isinstance(declared.kind, Range)):
+        what = f"an array, of which an element is {declared.path}[0]" if slot.is_array else f"a field of kind {slot.info.kind!r}"
+        raise SpecError(f"{type(declared.kind).__name__} cannot stand in {declared.path!r}, which is {what}", path=place, sensor=sensor.id)
+    return slot
+
+
+def _slot(sensor: Spec, name: str, path: str, place: str) -> Slot:
+    frame, names = sensor.commands[name].frame or "", steps(path)
+    table = schema(sensor.frames[frame].tree) if frame else None
+    info = table.all_fields.get(".".join(step for step in names if isinstance(step, str))) if table is not None else None
+    if table is None or info is None:
+        raise SpecError(f"{frame or 'a command without a frame'} has no field {path!r}", path=place, sensor=sensor.id)
+    arrays = dict(table.arrays)
+    for axis, node in table.parts.items():
+        arrays |= {f"{axis}.{below}": count for kind in node.kinds for below, count in schema(kind.root).arrays.items()}
+    indices, counts = [step for step in names if isinstance(step, int)], [arrays.get(axis) for axis in info.axes]
+    left = counts[len(indices) :]
+    if len(left) > 1 or len(indices) > len(counts) - (info.kind == "bytes"):
+        reason = f"{path!r} names {len(indices)} elements of the {len(counts) - (info.kind == 'bytes')} arrays that its field is in"
+        raise SpecError(reason, path=place, sensor=sensor.id)
+    for index, count in zip(indices, counts, strict=False):
+        if isinstance(count, int) and index >= count:
+            raise SpecError(f"{path!r}: there are {count} elements, of which {index} is none", path=place, sensor=sensor.id)
+    room = left[0] if left else info.bits // 8 if info.kind == "int" else None
+    return Slot(info, room if isinstance(room, int) else None, bool(left) and info.kind != "bytes")
+
+
+def raw_argument(slot: Slot, kind: Taken, value: Any, argument: str, place: str) -> Any:
+    """The raw value of a field that an argument stands for.
+
+    Raises:
+        UsageError: for what it does not take.
+    """
+    info = slot.info
+    if isinstance(kind, Range):
+        if not isinstance(value, int | float | np.number):
+            raise UsageError(f"{place}: {argument} is a number, not {value!r:.60}")
+        if not kind.low <= value <= kind.high:
+            raise OutOfRange(argument, value, kind.low, kind.high, unit=info.unit, place=place)
+        raw = info.raw(value)
+        bottom, top = info.limits if info.kind == "int" else (raw, raw)
+        return min(max(raw, bottom), top)
+    try:
+        data = kind.packed(value, slot.room)
+    except ValueError:
+        raise UsageError(f"{place}: {argument} is {kind.words(slot.room)}, not {value!r:.60}") from None
+    if info.kind == "other":
+        return data if isinstance(value, bytes) else str(value)
+    return _placed(slot, data)
+
+
+def _placed(slot: Slot, data: bytes) -> Any:
+    """Bytes as the raw value of a field that is plain bytes, an array of numbers, or one number in network order."""
+    return data if slot.info.kind == "bytes" else list(data) if slot.is_array else int.from_bytes(data, "big")
+
+
+def _found_out(sensor: Spec, name: str, path: str, value: Filled, given: Any) -> Any:
+    """A value that is found out when a command is sent; where nobody says it, the first number, and no address."""
+    if isinstance(value, Count):
+        return value.first if given is None else given
+    slot = _slot(sensor, name, path, f"commands.{name}.values.{path}")
+    return _placed(slot, bytes(slot.room or 4)) if given is None else raw_argument(slot, value, given, path, f"{sensor.id} {name}")
+
+
+def is_index(step: int | str) -> bool:
+    """Whether a step of a path leads to elements of an array."""
+    return step == "*" or isinstance(step, int)
+
+
+def steps(path: str) -> Steps:
+    """The names and indices of a path: ["points", 3, "distance"] of "points[3].distance"."""
+    return [int(step) if step.isdigit() else step for step in re.findall(r"\w+|\*", path)]
+
+
+def put(target: Any, path: Steps, value: Any, length: Callable[[str], int] = lambda array: 0, place: str = "") -> Any:
+    """A struct or array, or a new one for None, with a value set in it.
+
+    Args:
+        length: how many elements the array of a path has, where that is known; "*" stands for each of them.
+    """
+    if not path:
+        return value
+    step, *rest = path
+    if not is_index(step):
+        target = {} if target is None else target
+        target[step] = put(target.get(step), rest, value, length, f"{place.removesuffix('[]')}.{step}".removeprefix("."))
+        return target
+    target = [] if target is None else list(target)
+    for index in range(length(place) or len(target)) if step == "*" else [int(step)]:
+        target.extend([None] * (index + 1 - len(target)))
+        element = target[index]
+        target[index] = put(dict(element) if isinstance(element, dict) else element, rest, value, length, f"{place}[]")
+    return target
 
 
 def _place(values: Any, path: str) -> tuple[Any, str]:

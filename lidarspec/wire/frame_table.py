@@ -8,7 +8,7 @@ Parts, which are frames within a frame, are a table of their own, without paddin
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 
 from lidarspec.errors import SpecError
 from lidarspec.spec.construct_layer import leaves, member
-from lidarspec.wire.arrays import counted, is_counted, repeated
-from lidarspec.wire.layout import Bytes2D, Layout, rows_at
-from lidarspec.wire.schema import Schema, schema
+from lidarspec.wire.arrays import counted, deep, is_counted, repeated
+from lidarspec.wire.layout import Bytes2D, Layout, Leaf, rows_at
+from lidarspec.wire.schema import Schema, schema, without_indices
 
 
 class Table(Protocol):
@@ -36,6 +36,9 @@ class Table(Protocol):
 
     def counts(self, axis: str) -> NDArray[np.intp]:
         """The length of an array in each frame, (n,)."""
+
+    def length(self, axis: str) -> int:
+        """The longest length of an array."""
 
     @property
     def sizes(self) -> NDArray[np.intp]:
@@ -74,8 +77,9 @@ class Rows:
     def raw(self, path: str) -> NDArray[Any]:
         info = self.schema.fields[path]
         assert info.dtype is not None
+        around = self.schema.fields[without_indices(path)[0]].axes if "[" in path else info.axes
         if len(self.groups) == 1 and (only := self.groups[0].layout.leaves.get(path)) is not None:
-            values = only.load(self.groups[0].rows)
+            values = _loaded(only, around, self.groups[0].rows)
             if self._order is None:
                 self._order = _order(self.groups[0].where)
             values = values if isinstance(self._order, slice) else values[self._order]
@@ -85,8 +89,9 @@ class Rows:
         for group in self.groups:
             leaf = group.layout.leaves.get(path)
             if leaf is not None and 0 not in leaf.shape:
-                corner: Any = (group.where, *(slice(0, length) for length in leaf.shape))
-                column[corner] = leaf.load(group.rows)
+                values = _loaded(leaf, around, group.rows)
+                corner: Any = (group.where, *(slice(0, length) for length in values.shape[1:]))
+                column[corner] = values
         return column
 
     def present(self, path: str) -> NDArray[np.bool_] | None:
@@ -173,6 +178,14 @@ class Rows:
         return Rows(tables[0].schema, [_merged(groups) for groups in found.values()])
 
 
+def _loaded(leaf: Leaf, around: Sequence[str], rows: Bytes2D) -> NDArray[Any]:
+    """Raw values without the axes of which only one element is asked for; `around`: the arrays that the field is in."""
+    values = leaf.load(rows)
+    if len(around) == len(leaf.info.axes):
+        return values
+    return values.reshape(len(rows), *(length for axis, length in zip(around, leaf.shape, strict=False) if axis in leaf.info.axes))
+
+
 @dataclass(frozen=True, eq=False)
 class _Piece:
     """Parts of one layout that are the n-th of their frames: the bytes around them, where in these they begin, and their frames, (k,)."""
@@ -243,7 +256,9 @@ class Records:
         return len(self._parsed)
 
     def raw(self, path: str) -> NDArray[Any]:
-        info = self.schema.fields[path]
+        info, (base, indices) = self.schema.fields[path], without_indices(path)
+        if indices:
+            return self._element(self.raw(base), base, indices)[0]
         found = [_values(parsed, path.split("."), len(info.axes)) for parsed in self._parsed]
         lengths = [self.length(axis) for axis in info.axes]
         dtype = info.dtype if info.dtype is not None else _common_type(found, path)
@@ -258,7 +273,11 @@ class Records:
     def present(self, path: str) -> NDArray[np.bool_] | None:
         if not self.schema.fields[path].optional:
             return None
-        axes = self.schema.fields[path].axes
+        axes, (base, indices) = self.schema.fields[path].axes, without_indices(path)
+        if indices:
+            known = self.present(base)
+            elements, inside = self._element(self.raw(base) if known is None or known.ndim == 1 else known, base, indices)
+            return inside if known is None else inside & known if known.ndim == 1 else deep(inside, elements.ndim - 1) & elements
         there = [_there(_values(parsed, path.split("."), len(axes))) for parsed in self._parsed]
         if not any(isinstance(one, list) for one in there):
             return np.array(there, np.bool_)
@@ -266,6 +285,19 @@ class Records:
         for index, one in enumerate(there):
             _put(column, index, one)
         return column
+
+    def _element(self, column: NDArray[Any], path: str, indices: Mapping[str, int]) -> tuple[NDArray[Any], NDArray[np.bool_]]:
+        """Some element of a field's arrays, and which frames have it, (n,)."""
+        inside, axes = np.ones(len(self), np.bool_), self.schema.fields[path].axes
+        for axis in sorted(indices, key=axes.index, reverse=True):
+            place, counts = 1 + axes.index(axis), self.counts(axis)
+            spots = indices[axis] + (counts if indices[axis] < 0 else 0)
+            inside &= (spots >= 0) & (spots < counts)
+            if not column.shape[place]:
+                return np.zeros((*column.shape[:place], *column.shape[place + 1 :]), column.dtype), inside
+            spots = np.broadcast_to(np.clip(spots, 0, column.shape[place] - 1), len(self))
+            column = np.take_along_axis(column, deep(spots, column.ndim - 1), place).squeeze(place)
+        return np.where(deep(inside, column.ndim - 1), column, 0).astype(column.dtype), inside
 
     def counts(self, axis: str) -> NDArray[np.intp]:
         lengths = self._lengths(axis)

@@ -20,6 +20,7 @@ from lidarspec.spec.bits import BitField
 from lidarspec.spec.checksums import Checksum, Single, single
 from lidarspec.spec.tree import FieldInfo, Node
 from lidarspec.wire.row_checksums import over
+from lidarspec.wire.schema import element_of
 
 Bytes2D = NDArray[np.uint8]
 
@@ -180,6 +181,27 @@ class Leaf:
         spots = [self.offset + part.byte for element in self.elements for part in element.segments]
         return min(spots), max(spots) + 1
 
+    def element(self, path: str, indices: Mapping[str, int]) -> Leaf | None:
+        """Some element of its arrays, counted from the last one where an index is negative; None where there is none.
+
+        An array that others stand in remains, with that one element, so that each array keeps its place.
+        """
+        info = element_of(self.info, path, indices)
+        if info is None:
+            return None
+        offset, shape, elements, kept = self.offset, list(self.shape), self.elements, 0
+        for place, (axis, length) in enumerate(zip(self.info.axes, self.shape, strict=True)):
+            index = indices.get(axis, 0)
+            if not -length <= index < length:
+                return None
+            if axis not in indices:
+                kept = place + 1
+            elif place < len(self.strides):
+                offset, shape[place] = offset + index % length * self.strides[place], 1
+            else:
+                elements = (elements[index],)
+        return replace(self, info=info, offset=offset, shape=tuple(shape[:kept]), strides=self.strides[:kept], elements=elements)
+
     def at(self, offset: int) -> Leaf:
         """The field with its place counted from `offset`."""
         return replace(self, offset=self.offset - offset)
@@ -245,7 +267,7 @@ class Seal:
                 stored |= (leaf.scalar(frame) & ((1 << leaf.info.bits) - 1)) << shift
             shift += leaf.info.bits
         parts = [frame[a:b] for a, b in self.spans]
-        return stored == self._single(parts[0] if len(parts) == 1 else b"".join(parts)) or stored in self.absent
+        return stored in self.absent or stored == self._single(parts[0] if len(parts) == 1 else b"".join(parts))
 
     @cached_property
     def _single(self) -> Single:
@@ -254,8 +276,12 @@ class Seal:
     def intact(self, rows: Bytes2D, sums: Sums | None = None) -> NDArray[np.bool_]:
         """Which frames carry the right value, or one that means "not filled", (n,); `sums` computes it, by default the algorithm."""
         stored = self.stored(rows)
-        right = np.asarray(stored == self.computed(rows, sums))
-        return right | np.isin(stored, np.array(self.absent, np.uint64)) if self.absent else right
+        filled = ~np.isin(stored, np.array(self.absent, np.uint64)) if self.absent else None
+        if filled is None or filled.all():
+            return np.asarray(stored == self.computed(rows, sums))
+        right = np.ones(len(rows), np.bool_)
+        right[filled] = stored[filled] == self.computed(rows[filled], sums) if filled.any() else True
+        return right
 
 
 class PartsRegion(Protocol):
@@ -287,6 +313,7 @@ class Layout:
         following: fields whose values follow from this header in a frame that is made, and those; they are not asked of one that comes.
         lengths: of each array, by its axis; 0 in an array without elements.
         regions: where parts are that are frames in themselves, by their axis.
+        held: as constants, what fields have to be that say how long parts are.
         notes: what is worked out from the layout and kept with it.
     """
 
@@ -299,16 +326,26 @@ class Layout:
     following: tuple[tuple[Leaf, int], ...] = ()
     lengths: Mapping[str, int] = field(default_factory=dict)
     regions: Mapping[str, Any] = field(default_factory=dict)
+    held: Mapping[int, tuple[int, int]] = field(default_factory=dict)
     notes: dict[Any, Any] = field(default_factory=dict, repr=False)
 
     @cached_property
+    def known(self) -> Mapping[int, tuple[int, int]]:
+        """The bits of a frame that its header leaves no choice of, constants and lengths: offset -> (mask, value)."""
+        both = dict(self.constants)
+        for spot, (mask, value) in self.held.items():
+            other = both.get(spot, (0, 0))
+            both[spot] = (mask | other[0], value | other[1])
+        return both
+
+    @cached_property
     def _mask(self) -> int:
-        """The bits of a frame that are constant, as one number."""
-        return sum(mask << 8 * spot for spot, (mask, _) in self.constants.items())
+        """These bits, as one number."""
+        return sum(mask << 8 * spot for spot, (mask, _) in self.known.items())
 
     @cached_property
     def _value(self) -> int:
-        return sum(value << 8 * spot for spot, (_, value) in self.constants.items())
+        return sum(value << 8 * spot for spot, (_, value) in self.known.items())
 
     def sound(self, frame: bytes) -> bool:
         """Whether one frame has this size, all constants and the right checksums."""
@@ -322,8 +359,8 @@ class Layout:
         """Write what follows from the header, the constants and the checksums into frames given as rows of bytes."""
         for leaf, value in self.following:
             leaf.store(rows, value)
-        if self.constants:
-            spots, facts = list(self.constants), np.array(list(self.constants.values()), np.uint8)
+        if self.known:
+            spots, facts = list(self.known), np.array(list(self.known.values()), np.uint8)
             rows[:, spots] = rows[:, spots] & ~facts[:, 0] | facts[:, 1]
         for seal in self.seals:
             seal.fill(rows)

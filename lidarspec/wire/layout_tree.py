@@ -31,7 +31,7 @@ from lidarspec.spec.description import Frame
 from lidarspec.wire.arrays import by_value
 from lidarspec.wire.layout import Layout, Leaf, Refused, Seal
 from lidarspec.wire.parts import CONSTANT, FAILED, Kind, Measure, Region, Rule
-from lidarspec.wire.schema import schema
+from lidarspec.wire.schema import ByPath, schema
 
 
 class NotCompilable(Exception):
@@ -43,10 +43,15 @@ class NotCompilable(Exception):
 
 
 class Unknown(Exception):
-    """The layout depends on a field whose value is not given, or on the size of parts; attribute `leaf`: where it stands."""
+    """The layout depends on a field whose value is not given, or on the size of parts.
 
-    def __init__(self, leaf: Leaf | Measure) -> None:
-        self.leaf = leaf
+    Attributes:
+        leaf: where it stands.
+        before: all fields up to there.
+    """
+
+    def __init__(self, leaf: Leaf | Measure, before: Mapping[str, Leaf]) -> None:
+        self.leaf, self.before = leaf, before
         super().__init__(leaf.info.path)
 
 
@@ -171,7 +176,9 @@ class _Walk:
     def layout(self) -> Layout:
         """What was found, as a value."""
         seals, following = tuple(self.seals), tuple(self._following())
-        return Layout(self.cursor, self.leaves, self.constants, seals, self.places, self.branches, following, self.lengths, self.regions)
+        leaves = ByPath(self.leaves, Leaf.element)
+        found = (self.cursor, leaves, self.constants, seals, self.places, self.branches, following, self.lengths, self.regions)
+        return Layout(*found, self._held())
 
     def read(self, path: str) -> tuple[tree.FieldInfo, int] | str | None:
         """What a formula reads by a path: a field and its raw value, the path of a struct, or None for what the header leaves out.
@@ -192,7 +199,7 @@ class _Walk:
             return part.info, part.region.size
         if path not in self.values:
             check_control(part.info)
-            raise Unknown(part)
+            raise Unknown(part, self.leaves)
         return part.info, self.values[path]
 
     def visit(self, node: tree.Node, path: str, shape: tuple[int, ...] = (), strides: tuple[int, ...] = ()) -> None:
@@ -341,10 +348,23 @@ class _Walk:
             spans = [(a, b) for a, b in zip(edges[::2], edges[1::2], strict=True) if b > a]
         self.seals.append(Seal(leaves, tuple(spans), node.algorithm, node.absent))
 
+    def _held(self) -> dict[int, tuple[int, int]]:
+        """What fields have to be that say how long parts are, as constants, which they are in one layout."""
+        rows, found = np.zeros((2, self.cursor), np.uint8), [leaf for leaf in self.leaves.values() if leaf.info.held]
+        for leaf in found:
+            (low, high), rebuilt = leaf.info.limits, leaf.info.rebuilt
+            if rebuilt is not None:
+                value = operator.index(tree.evaluated(rebuilt, self._read_known))
+                if not low <= value <= high:
+                    raise TooLong(leaf.info.path)
+                leaf.store(rows, np.array([value, -1 if low else high], leaf.info.dtype).reshape(2, *(1 for _ in leaf.shape)))
+        spots = np.flatnonzero(rows[1]).tolist() if found else []
+        return {spot: (int(rows[1, spot]), int(rows[0, spot])) for spot in spots}
+
     def _following(self) -> Iterator[tuple[Leaf, int]]:
         """The values of rebuilt fields that follow from constants and from those that the layout depends on, and from no other."""
         for leaf in self.leaves.values():
-            if leaf.info.rebuilt is not None and not leaf.shape:
+            if leaf.info.rebuilt is not None and not leaf.info.held and not leaf.shape:
                 with contextlib.suppress(Exception):  # of the others: construct evaluates them when a frame is built
                     yield leaf, operator.index(tree.evaluated(leaf.info.rebuilt, self._read_known))
 
@@ -394,17 +414,39 @@ FEW = 4
 
 
 @dataclass(eq=False)
-class _Node:
+class HeaderNode:
+    """A field that decides the layout, or what the values of those before it lead to.
+
+    Attributes:
+        values: those, raw, by path.
+        above: the node that they lead from; None for the first.
+        leaf, before: the field, and all fields up to it.
+        told: which of its values are told apart.
+        result: what the values lead to, where no further field decides.
+    """
+
+    values: Mapping[str, int] = field(default_factory=dict)
+    above: HeaderNode | None = None
     leaf: Leaf | Measure | None = None
+    before: Mapping[str, Leaf] = field(default_factory=dict)
     told: _Told | None = None
-    children: dict[int, _Node] = field(default_factory=dict)
+    children: dict[int, HeaderNode] = field(default_factory=dict)
     result: Layout | Refused | None = None
 
     def meant(self, value: int) -> int:
         """The value of its field that stands for one that means the same."""
         return value if self.told is None else self.told.one(value)
 
+    def child(self, value: int) -> HeaderNode:
+        """The branch of a value."""
+        if value not in self.children:
+            assert self.leaf is not None
+            self.children[value] = HeaderNode({**self.values, self.leaf.info.path: value}, self)
+        return self.children[value]
 
+
+#: what reads the field of a node in some of the candidates: the indices of those that have it, None for all; and its values.
+Reader = Callable[[HeaderNode, NDArray[np.intp]], tuple[NDArray[np.intp] | None, NDArray[Any]]]
 Group = tuple[Layout | Refused, NDArray[np.intp]]
 
 
@@ -431,7 +473,7 @@ class _Told:
         """What the formulas of a frame tell apart of a field; all its values, where that is not seen from their form."""
         (low, high), known = info.limits, list(tree.nodes(root))
         asking = [(node, formula) for node in known for formula in tree.formulas(node) if _asks(formula, info)]
-        if any(own.rebuilt is not None and _asks(own.rebuilt, info) for node in known for own in tree.infos(node)):
+        if any(own.rebuilt is not None and not own.held and _asks(own.rebuilt, info) for node in known for own in tree.infos(node)):
             return cls(info.limits, low, high)
         if all(isinstance(node, tree.Select) and isinstance(formula, tree.Ref) for node, formula in asking):
             keys = frozenset(key for node, _ in asking if isinstance(node, tree.Select) for key, _ in node.cases if low <= key <= high)
@@ -496,26 +538,46 @@ class HeaderTree:
 
     def __init__(self, frame: tree.Node, limit: int, given: Mapping[str, int] | None = None) -> None:
         self._frame, self._limit, self._given = frame, limit, given or {}
-        self._root, self._size = _Node(), 0
+        self._root, self._size = HeaderNode(), 0
         self._told: dict[str, _Told] = {}
 
     def classify(self, buffer: NDArray[np.uint8], offsets: NDArray[np.intp]) -> list[Group]:
         """The candidates at `offsets`, sorted by layout: (layout or refusal, indices) for each, without those whose header is cut off."""
+
+        def read(node: HeaderNode, which: NDArray[np.intp]) -> tuple[NDArray[np.intp] | None, NDArray[Any]]:
+            assert node.leaf is not None
+            return node.leaf.read(buffer, offsets[which])
+
+        return self.sorted(len(offsets), read)
+
+    def sorted(self, number: int, read: Reader) -> list[Group]:
+        """So many candidates by layout, as `classify` has them, whose header fields `read` reads."""
         if self._size > REMEMBERED:
-            self._root, self._size = _Node(), 0
-        if isinstance(self._root.result, Layout) and len(offsets):
-            return [(self._root.result, np.arange(len(offsets)))]
+            self._root, self._size = HeaderNode(), 0
         groups: list[Group] = []
-        stack = [(self._root, np.arange(len(offsets)))] if len(offsets) else []
+        stack = [(self._root, np.arange(number))] if number else []
         while stack:
             node, which = stack.pop()
-            if node.result is None and node.leaf is None:
-                self._explore(buffer[offsets[which[0]] : offsets[which[0]] + self._limit])
+            self._explore(node)
             if node.result is not None:
                 groups.append((node.result, which))
-            elif node.leaf is not None:
-                stack += self._branched(node, node.leaf, buffer, offsets, which)
+                continue
+            there, values = read(node, which)
+            which = which if there is None else which[there]
+            values = values if node.told is None else node.told.all(values)
+            if not len(which):
+                continue
+            if np.count_nonzero(values == values[0]) == len(values):
+                stack.append((node.child(values.item(0)), which))
+            else:
+                stack += [(node.child(value), which[places]) for value, places in by_value(values, FEW)]
         return groups
+
+    def first(self) -> tuple[tuple[Leaf, ...], dict[int, tuple[int, int]]]:
+        """The fields and the constants whose place depends on no header field."""
+        self._explore(self._root)
+        known = self._root.result.leaves if isinstance(self._root.result, Layout) else self._root.before
+        return tuple(known.values()), prefix_of(self._frame, self._limit)
 
     def common(self, rows: NDArray[np.uint8]) -> Layout | None:
         """The layout of candidates, one a row, if they have one and the fields that decide it are the same in all; else None."""
@@ -528,7 +590,7 @@ class HeaderTree:
 
     def layout(self, frame: bytes) -> Layout | Refused | None:
         """The layout of one frame, or None where its header is not all there."""
-        node: _Node | None = self._root
+        node: HeaderNode | None = self._root
         while node is not None and node.leaf is not None and (value := node.leaf.of(frame)) is not None:
             node = node.children.get(node.meant(value))
         if node is not None and node.result is not None:
@@ -569,58 +631,34 @@ class HeaderTree:
                 own = drawn.get(unknown.leaf.info.path)
                 values[unknown.leaf.info.path] = own(source) if own else _some_value(source, unknown.leaf, keys)
 
-    def _branched(
-        self, node: _Node, leaf: Leaf | Measure, buffer: NDArray[np.uint8], offsets: NDArray[np.intp], which: NDArray[np.intp]
-    ) -> list[tuple[_Node, NDArray[np.intp]]]:
-        """The branches below a node, each with those of the candidates that have its value."""
-        there, values = leaf.read(buffer, offsets[which])
-        which = which if there is None else which[there]
-        if not len(which):
-            return []
-        values = values if node.told is None else node.told.all(values)
-        if np.count_nonzero(values == values[0]) == len(values):
-            return [(node.children.setdefault(values.item(0), _Node()), which)]
-        return [(node.children.setdefault(value, _Node()), which[places]) for value, places in by_value(values, FEW)]
+    def _explore(self, node: HeaderNode) -> None:
+        """Find out which field decides next, or what the values so far lead to, where nobody has yet."""
+        if node.leaf is not None or node.result is not None:
+            return
+        self._size += 1
+        try:
+            node.result = layout_of(self._frame, node.values, self._limit, self._given)
+        except Unknown as unknown:
+            node.leaf, node.before = unknown.leaf, unknown.before
+            node.told = self._telling(node.leaf)
+        except TooLong:
+            node.result = Refused()
+        except Unlike:
+            node.result = Refused(by_constant=True)
+        except SpecError:
+            raise
+        except Exception as error:
+            node.result = Refused(PluginError.of(error, "struct"))
+        above = node.above
+        if above is not None and above.told is not None and isinstance(node.result, Refused) and not node.result.error:
+            above.told = above.told.refused([*node.values.values()][-1])
 
-    def _explore(self, sample: NDArray[np.uint8]) -> None:
-        """Find the layout of one sample, and add the fields that decide it to the tree; as far as the sample goes."""
-        frame, node, above, value = sample.tobytes(), self._root, self._root, 0
-        values: dict[str, int] = {}
-        while node.result is None:
-            leaf = node.leaf
-            if leaf is None:
-                node.leaf, node.result = self._next(values)
-                node.told = self._telling(node.leaf)
-                self._size += 1
-                if values and isinstance(node.result, Refused) and not node.result.error and above.told is not None:
-                    above.told = above.told.refused(value)
-            elif (found := leaf.of(frame)) is None:
-                break
-            else:
-                values[leaf.info.path] = value = node.meant(found)
-                node, above = node.children.setdefault(value, _Node()), node
-
-    def _telling(self, leaf: Leaf | Measure | None) -> _Told | None:
+    def _telling(self, leaf: Leaf | Measure) -> _Told | None:
         if not isinstance(leaf, Leaf):
             return None  # nothing is known of parts before they are walked
         if leaf.info.path not in self._told:
             self._told[leaf.info.path] = _Told.of(leaf.info, self._frame, self._limit)
         return self._told[leaf.info.path]
-
-    def _next(self, values: Mapping[str, int]) -> tuple[Leaf | Measure | None, Layout | Refused | None]:
-        """The field that decides next, or what these values lead to."""
-        try:
-            return None, layout_of(self._frame, values, self._limit, self._given)
-        except Unknown as unknown:
-            return unknown.leaf, None
-        except TooLong:
-            return None, Refused()
-        except Unlike:
-            return None, Refused(by_constant=True)
-        except SpecError:
-            raise
-        except Exception as error:
-            return None, Refused(PluginError.of(error, "struct"))
 
 
 @functools.lru_cache(maxsize=256)
@@ -636,6 +674,6 @@ def frame_layouts(frame: Frame) -> HeaderTree | NotCompilable:
     try:
         check_compilable(frame.tree)
         check_columns(frame.tree)
-        return HeaderTree(frame.tree, frame.max_length)
+        return HeaderTree(frame.tree, frame.room)
     except NotCompilable as reason:
         return reason

@@ -14,6 +14,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal
 
 import construct
+import numpy as np
 from construct import Container, ListContainer
 
 from lidarspec.errors import SpecError, UnknownFrame, WireError, refuse_text
@@ -25,6 +26,7 @@ from lidarspec.wire.layout import Layout, Leaf, Refused
 from lidarspec.wire.layout_tree import NotCompilable, frame_layouts, prefix_of
 from lidarspec.wire.parts import Region
 from lidarspec.wire.schema import schema
+from lidarspec.wire.slots import SPELLING, Field, Recoder, recoder
 
 
 def parse(sensor: Spec, data: bytes, *, frame: str | None = None, verify: bool = True, units: bool = False) -> Any:
@@ -54,6 +56,11 @@ def _compiled(sensor: Spec, data: bytes, frame: str | None) -> tuple[str, Any] |
     """The type and values of a frame that is sound, by its layout; None where construct has to read it."""
     try:
         for name in sensor.frames if frame is None or frame not in sensor.frames else (frame,):
+            recoding = recoder(sensor.frames[name])
+            if recoding is not None:
+                if (found := recoding.row(data)) is not None and found[0].sound(found[1]):
+                    return name, spelled(unpacked(sensor.frames[name].tree, *found), recoding, *found, data)
+                continue
             layouts = frame_layouts(sensor.frames[name])
             if isinstance(layouts, NotCompilable):
                 break  # it may be of this type, which comes first
@@ -65,6 +72,13 @@ def _compiled(sensor: Spec, data: bytes, frame: str | None) -> tuple[str, Any] |
     except Exception:  # out of a plugin: construct meets it again, and it is told with its place
         pass
     return None
+
+
+def spelled(values: Any, recoding: Recoder, layout: Layout, row: bytes, data: bytes) -> Any:
+    """Values of a frame with a wire form, with the frame itself as `SPELLING` where `build` would write them otherwise."""
+    if recoding.written(np.frombuffer(row, np.uint8).reshape(1, -1), layout) != [data]:
+        values[SPELLING] = data
+    return values
 
 
 def _physical(fields: Mapping[str, FieldInfo], value: Any, path: str) -> Any:
@@ -84,6 +98,9 @@ def unpacked(root: Node, layout: Layout, frame: bytes) -> Any:
 
 #: the byte orders in which a bit block is a number.
 ENDS: tuple[Literal["little"], Literal["big"]] = ("little", "big")
+
+#: bytes that are shown of what cannot be read.
+SHOWN = 12
 
 #: from the bytes of a frame (below a bit block: from the numbers in its place) to the values of a part of it, one for each element
 #: of the arrays that it is in, row by row.
@@ -310,14 +327,50 @@ def parse_typed(sensor: Spec, data: bytes, *, frame: str | None = None, verify: 
 
 
 def _parse_as(sensor: Spec, name: str, data: bytes, *, verify: bool) -> Any:
-    frame = sensor.frames[name]
-    stream = io.BytesIO(data)
-    where: dict[str, Any] = {"sensor": sensor.id, "frame": name, "data": data}
+    recoding, where = recoder(sensor.frames[name]), {"sensor": sensor.id, "frame": name, "data": data}
+    if recoding is None:
+        return _parse_row(sensor, name, data, where, int, verify=verify)
+    fields, row = recoding.fields(data)
+    found = recoding.row(data)
+    if verify and (found is None or len(row) < len(found[1])):
+        raise _unreadable(recoding, data, fields, where)
+
+    def place(offset: int) -> int:
+        return next((field.start for field in fields if offset < field.end), len(data))
+
+    parsed = _parse_row(sensor, name, row, where, place, verify=verify)
+    return parsed if found is None else spelled(parsed, recoding, *found, data)
+
+
+def _unreadable(recoding: Recoder, data: bytes, fields: Sequence[Field], where: Mapping[str, Any]) -> WireError:
+    """Why bytes are no frame of a wire form, with the place of the first slot that cannot be read."""
+    begins = recoding.begins
+    if not data or not data.startswith(begins):
+        reason = f"begins with {data[: len(begins)].hex(' ') or 'nothing'}, expected {begins.hex(' ')}"
+        return WireError(reason, offset=0, expected=begins, got=data[: len(begins)], **where)
+    reading = recoding.reading(np.frombuffer(data, np.uint8), np.zeros(1, np.intp))
+    size, start = reading.sizes.item(0), fields[-1].stop if fields else len(recoding.form.start)
+    if 0 < size < len(data):
+        return WireError(f"{len(data) - size} more bytes after the frame's {size}", offset=size, expected=size, got=len(data), **where)
+    if size <= 0:
+        return WireError(f"frame has no end in its {len(data)} bytes", offset=len(data), got=len(data), **where)
+    if reading.intact is not None and not reading.intact[0]:
+        return WireError("a check character of its lines is wrong", offset=start, **where)
+    path, wanted = recoding.next_field(data, fields)
+    got = data[start : start + SHOWN]
+    return WireError(
+        f"{path or 'frame'} at byte {start}: {got!r} is not {wanted}", offset=start, path=path, expected=wanted, got=got, **where
+    )
+
+
+def _parse_row(sensor: Spec, name: str, data: bytes, where: dict[str, Any], place: Callable[[int], int], *, verify: bool) -> Any:
+    """The frame as construct parses it; `place`: from where a field is in it to where it is on the wire."""
+    frame, stream = sensor.frames[name], io.BytesIO(data)
     try:
         parsed = frame.prepared.parse_stream(stream, _verify=verify)
     except Mismatch as fault:
         path = field_path(fault.path)
-        offset = _first_byte(sensor, name, data, path, fault.offset)
+        offset = place(_first_byte(sensor, name, data, path, fault.offset))
         raise WireError(
             f"{path} at byte {offset}: {fault.reason} {fault.got}, expected {fault.expected}",
             offset=offset,
@@ -331,7 +384,7 @@ def _parse_as(sensor: Spec, name: str, data: bytes, *, verify: bool) -> Any:
     except construct.ConstructError as fault:
         path = field_path(fault.path)
         reason = str(fault).partition("\n")[2].strip() or type(fault).__name__
-        raise WireError(f"{path}: {reason}", offset=stream.tell(), path=path, **where) from None
+        raise WireError(f"{path}: {reason}", offset=place(stream.tell()), path=path, **where) from None
     except SpecError:
         raise
     except Exception as fault:
@@ -339,8 +392,8 @@ def _parse_as(sensor: Spec, name: str, data: bytes, *, verify: bool) -> Any:
     size = stream.tell()
     if verify and size != len(data):
         raise WireError(f"{len(data) - size} more bytes after the frame's {size}", offset=size, expected=size, got=len(data), **where)
-    if size > frame.max_length:
-        raise WireError(f"{size} bytes, and the longest is {frame.max_length}", expected=frame.max_length, got=size, **where)
+    if size > frame.room:
+        raise WireError(f"{size} bytes, and the longest is {frame.room}", expected=frame.room, got=size, **where)
     return parsed
 
 
@@ -391,6 +444,8 @@ def layout_of(sensor: Spec, name: str, data: bytes) -> Layout | Refused | None:
 
 def _progress(sensor: Spec, fault: WireError) -> tuple[int, int]:
     """How far a type was right before it failed: a frame of this very size, or one in front, comes before all others."""
+    if sensor.frames[fault.frame].wire is not None:
+        return 0, fault.offset
     layout = layout_of(sensor, fault.frame, fault.data)
     fits = isinstance(layout, Layout) and layout.size == len(fault.data)
     whole = fault.reason.find("after the frame") >= 0 or (fits and fault.reason.find("checksum") >= 0)
@@ -403,9 +458,9 @@ def _likeliest(sensor: Spec, data: bytes, faults: list[WireError]) -> WireError:
         return best
     starts = []
     for name, frame in sensor.frames.items():
-        prefix = prefix_of(frame.tree, frame.max_length)
-        run = [prefix[spot][1] for spot in range(len(prefix)) if prefix.get(spot, (0, 0))[0] == 0xFF]
-        starts.append(f"{name} {bytes(run).hex(' ')}".strip())
+        prefix, recoding = prefix_of(frame.tree, frame.room), recoder(frame)
+        run = bytes(prefix[spot][1] for spot in range(len(prefix)) if prefix.get(spot, (0, 0))[0] == 0xFF)
+        starts.append(f"{name} {(run if recoding is None else recoding.begins).hex(' ')}".strip())
     begins = f"begins with {data[:4].hex(' ')}" if data else "is empty"
     return WireError(
         f"no frame type fits: the data {begins}, expected {', '.join(starts)}", sensor=sensor.id, expected=starts, got=data[:4], data=data

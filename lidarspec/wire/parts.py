@@ -191,7 +191,7 @@ class _Walk:
                 if held is not None:
                     others.append(theirs[~held])
                     theirs = theirs[held]
-                theirs = self._whole(layout, theirs)
+                theirs = self._whole(layout, self._measured(layout, theirs))
                 if len(theirs):
                     pieces.append(Piece(number, layout, theirs, self._ends[theirs]))
                     self._taken(kind, layout, theirs)
@@ -203,6 +203,14 @@ class _Walk:
     def _refused(self, refused: Refused, which: Offsets) -> None:
         self._status[which] = FAILED if refused.error else CONSTANT if refused.by_constant else LENGTH
         self._errors += [refused.error] if refused.error else []
+
+    def _measured(self, layout: Layout, which: Offsets) -> Offsets:
+        """Those whose lengths are right, as far as the bytes go; the status of the others."""
+        held = right_at(self._buffer, self._ends[which], words(marks(layout.held))) if layout.held else None
+        if held is None:
+            return which
+        self._status[which[~held]] = LENGTH
+        return which[held]
 
     def _whole(self, layout: Layout, which: Offsets) -> Offsets:
         """Those that have their part whole, and as long as was said; the status of the others."""

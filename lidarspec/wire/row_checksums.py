@@ -10,11 +10,14 @@ become one word before, without tables: eight bytes on, a byte counts as the sum
 what the polynomial says (its eighth power has the same terms, eight times as far apart). So each word is XORed onto sums for
 0 to 7 bytes on, and these are moved and added up. Where rows are few and short, each byte is looked up by its place. A wider
 register runs along all rows at once, two bytes a step, by a table of 65,536; long rows are cut into segments that run side by
-side and are joined in pairs. Tables depend on the polynomial and the distance alone. Registers are in wire order, see `Crc`.
+side and are joined in pairs. Rows of the usual CRC-32 that are not short are left to `zlib`. Tables depend on the polynomial
+and the distance alone. Registers are in wire order, see `Crc`.
 """
 
 from __future__ import annotations
 
+import itertools
+import zlib
 from collections.abc import Callable, Sequence
 from functools import lru_cache
 from typing import Any
@@ -22,7 +25,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.spec.checksums import MIRROR, REGISTER_BYTES, Checksum, Crc, Fold15, Sum, Values, WordXor, Xor, ZeroPadded, byte_table
+from lidarspec.spec.checksums import (
+    MIRROR,
+    REGISTER_BYTES,
+    Checksum,
+    Crc,
+    Fold15,
+    Sum,
+    Values,
+    WordXor,
+    Xor,
+    ZeroPadded,
+    byte_table,
+)
 
 LOOP_BYTES = 2048  # below this, a Python loop over bytes is done before NumPy's calls have started
 NARROW_LOOP_BYTES = 256  # the same where the register is a byte
@@ -30,6 +45,9 @@ ONE_BY_ONE = 4  # rows that are done one by one sooner than together
 BLOCK_BYTES = 1 << 20  # rows taken at a time: few enough for the caches, and many enough to hide NumPy's cost per call
 FEW, SHORT = 1 << 13, 1 << 7  # bytes of all rows, and of one, for which a table for each place pays
 MANY = 1024  # rows whose words are summed in less time than tables take
+
+#: width, polynomial and reflection of the one CRC that `zlib` has: on rows that are not short, one by one, it is several times as fast.
+ZLIB = (32, 0x04C11DB7, True)
 
 #: which bytes of a row: from one to another, one span after another.
 Spans = tuple[tuple[int, int], ...]
@@ -213,6 +231,8 @@ def registers(rows: NDArray[np.uint8], spans: Spans, start: int, width: int, pol
     length = sum(stop - first for first, stop in spans)
     if 0 < length <= SHORT and len(rows) * length <= FEW:
         return _by_place(rows, spans, length, start, width, poly, refin)
+    if length > SHORT and (width, poly, refin) == ZLIB:
+        return _by_zlib(cut(rows, spans), start)
     return (_narrow if width <= 8 else _wide)(rows, spans, start, width, poly, refin)
 
 
@@ -220,6 +240,12 @@ def cut(rows: NDArray[np.uint8], spans: Spans) -> NDArray[np.uint8]:
     """The bytes of each row that some spans cover, one span after another, (n, bytes)."""
     parts = [rows[:, start:stop] for start, stop in spans]
     return parts[0] if len(parts) == 1 else np.concatenate(parts, axis=1)
+
+
+def _by_zlib(rows: NDArray[np.uint8], start: int) -> NDArray[Any]:
+    """`registers` of CRC-32 by `zlib`, row by row, which starts from the register and ends with it inverted."""
+    rows = rows if rows.strides[1] == 1 else np.ascontiguousarray(rows)
+    return np.fromiter(map(zlib.crc32, rows, itertools.repeat(start ^ 0xFFFFFFFF)), np.uint32, len(rows)) ^ np.uint32(0xFFFFFFFF)
 
 
 def _by_place(rows: NDArray[np.uint8], spans: Spans, length: int, start: int, width: int, poly: int, refin: bool) -> NDArray[Any]:

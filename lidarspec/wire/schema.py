@@ -6,13 +6,16 @@ header. Both engines (compiled and interpreted) make their columns by this table
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import functools
+import re
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
+from typing import Any, TypeVar
 
 import numpy as np
 
-from lidarspec.errors import UnknownField
+from lidarspec.errors import SpecError, UnknownField
 from lidarspec.spec.tree import (
     Blob,
     Block,
@@ -30,6 +33,60 @@ from lidarspec.spec.tree import (
     children,
     nodes,
 )
+
+#: of a path, the index of an element of an array: "columns[0].timestamp".
+_INDEX = re.compile(r"\[(-?\d+)\]")
+
+_Field = TypeVar("_Field")
+
+
+def without_indices(path: str) -> tuple[str, dict[str, int]]:
+    """A path without the indices in it, and these, by the paths of their arrays: "a.b", {"a": 0} for "a[0].b"."""
+    names, indices = "", dict[str, int]()
+    for name, *numbers in (_INDEX.split(part)[:1] + _INDEX.findall(part) for part in path.split(".")):
+        names = f"{names}.{name}".lstrip(".")
+        indices |= {names + "[]" * depth: int(number) for depth, number in enumerate(numbers)}
+    return names, indices
+
+
+class ByPath(dict[str, _Field]):
+    """What fields have, by their paths; elements of arrays too, which are fields by themselves: "columns[0].timestamp".
+
+    Args:
+        known: by the paths of the fields.
+        element: of what a field has, its new path and the indices of some of its arrays, what that element has; None where there is none.
+    """
+
+    def __init__(self, known: Mapping[str, _Field], element: Callable[[_Field, str, Mapping[str, int]], _Field | None]) -> None:
+        super().__init__(known)
+        self._element, self._elements = element, dict[str, _Field | None]()
+
+    def __missing__(self, path: str) -> _Field:
+        found: _Field | None = self.get(path)
+        if found is None:
+            raise KeyError(path)
+        return found
+
+    def __contains__(self, path: object) -> bool:
+        return super().__contains__(path) or (isinstance(path, str) and self.get(path) is not None)
+
+    def get(self, path: str, default: Any = None) -> Any:
+        if "[" not in path:
+            return super().get(path, default)
+        if path not in self._elements:
+            base, indices = without_indices(path)
+            known = super().get(base)
+            self._elements[path] = None if known is None else self._element(known, path, indices)
+        found = self._elements[path]
+        return default if found is None else found
+
+
+def element_of(info: FieldInfo, path: str, indices: Mapping[str, int]) -> FieldInfo | None:
+    """A field by its place in some of its arrays, as a field of its own; None where it is not in these."""
+    if not indices.keys() <= set(info.axes):
+        return None
+    kind = "int" if info.kind == "bytes" and info.path in indices else info.kind
+    return replace(info, path=path, axes=tuple(axis for axis in info.axes if axis not in indices), kind=kind)
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,6 +139,23 @@ class Schema:
                 return axis, kind, below
         return None
 
+    @cached_property
+    def places(self) -> Mapping[str, int]:
+        """How many arrays each array stands in, by its path."""
+        return {axis: index for info in self.fields.values() for index, axis in enumerate(info.axes)}
+
+    def axis(self, name: str) -> str:
+        """The path of an array, by it or by its last part.
+
+        Raises:
+            SpecError: where there is none of that name, or several.
+        """
+        found = [axis for axis in self.places if axis == name] or [axis for axis in self.places if axis.rpartition(".")[2] == name]
+        if len(found) != 1:
+            reason = f"several arrays are called {name!r}" if found else f"there is no array {name!r} in the frame"
+            raise SpecError(f"{reason}; there are {', '.join(found or self.places) or 'none'}", rule="LS214")
+        return found[0]
+
     def depth(self) -> int:
         """How many arrays are nested at most."""
         return len(self.chain)
@@ -102,7 +176,20 @@ def schema(root: Node) -> Schema:
     own, theirs = (
         {path: replace(info, docs=info.docs or _docs_around(path, structs)) for path, info in found.items()} for found in (fields, inside)
     )
-    return Schema(own, arrays, {axis: node for axis, node in parts.items() if not node.total.axes}, theirs)
+    return Schema(
+        ByPath(own, functools.partial(_element, arrays)),
+        arrays,
+        {axis: node for axis, node in parts.items() if not node.total.axes},
+        theirs,
+    )
+
+
+def _element(arrays: Mapping[str, Formula | None], info: FieldInfo, path: str, indices: Mapping[str, int]) -> FieldInfo | None:
+    """An element of a field, which is left out by some headers where these decide how many there are; None where there never is one."""
+    found, counts = element_of(info, path, indices), [(arrays.get(axis), index) for axis, index in indices.items()]
+    if found is None or any(isinstance(count, int) and not -count <= index < count for count, index in counts):
+        return None
+    return found if all(isinstance(count, int) for count, _ in counts) else replace(found, optional=True)
 
 
 def _docs_around(path: str, structs: Mapping[str, str]) -> str:

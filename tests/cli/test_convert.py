@@ -18,6 +18,7 @@ import lidarspec as ls
 from lidarspec.simulation.simulator import simulate
 from tests.cli.running import COIN_D4, EXAMPLE, LD06, printed, process, ran
 from tests.sensors.evidence import capture
+from tests.shapes import SHAPES
 
 COLUMNS = ["x", "y", "z", "range", "azimuth", "elevation", "intensity", "time", "scan"]
 
@@ -223,3 +224,37 @@ def test_a_terminal_shows_how_far_it_is(tmp_path: Path) -> None:
     assert re.search(r"\rout\.npz: \d+ points of 1 scan, [\d.]+ kB read", terminal.raw)
     assert " read" not in shown
     assert "out.npz: 10800 points of" in shown
+
+
+def test_further_columns_are_written_and_printed_with_their_units(tmp_path: Path) -> None:
+    plugin, bytes_, target = tmp_path / "extras.py", tmp_path / "in.bin", tmp_path / "out.csv"
+    hook = ["from lidarspec.spec import hookimpl", "from tests.shapes.extras import SENSOR", "@hookimpl", "def lidarspec_sensors():"]
+    plugin.write_text("\n".join([*hook, "    return [SENSOR]", ""]), encoding="ascii")
+    bytes_.write_bytes(b"".join(simulate(SHAPES["shape-extras"], 60)))
+    told = ran("convert", bytes_, target, "-s", plugin).stderr
+    assert "further columns: velocity [m/s], near_ir, signal [photons]" in told
+    assert set(read(target)["signal"]) == {2**24 + 1 + number for number in range(4)}
+    assert printed("convert", bytes_, target, "-s", plugin, "--force")["units"]["velocity"] == "m/s"
+    assert "velocity [m/s]" in ran("read", bytes_, "-s", plugin, "-n", 1).stdout
+    assert "colours: velocity 0 to 0.001 m/s" in ran("view", bytes_, "-s", plugin, "--once", "--colour", "velocity").stdout
+    assert "did you mean 'velocity'" in ran("view", bytes_, "-s", plugin, "--once", "--colour", "velocty", code=2).stderr
+
+
+def test_what_an_imu_felt_is_written_in_place_of_the_points(tmp_path: Path) -> None:
+    plugin, bytes_ = tmp_path / "inertia.py", tmp_path / "in.bin"
+    hook = ["from lidarspec.spec import hookimpl", "from tests.shapes.inertia import SENSOR", "@hookimpl", "def lidarspec_sensors():"]
+    plugin.write_text("\n".join([*hook, "    return [SENSOR]", ""]), encoding="ascii")
+    sensor = SHAPES["shape-inertia"]
+    bytes_.write_bytes(b"".join(simulate(sensor, 40)))
+    told = ran("convert", bytes_, tmp_path / "imu.csv", "-s", plugin, "--imu").stderr
+    assert "120 samples of the IMU of shape-inertia" in told
+    rows = read(tmp_path / "imu.csv")
+    assert next(iter(rows)) == "time_ns"
+    np.testing.assert_allclose(rows["linear_acceleration_z"], 9.80665)
+    assert printed("convert", bytes_, tmp_path / "imu.npz", "-s", plugin, "--imu", "-n", 10)["samples"] == 10
+    with np.load(tmp_path / "imu.npz") as arrays:
+        assert arrays["time_ns"].tolist() == rows["time_ns"][:10].tolist()
+    assert (
+        "no frame says what an IMU felt"
+        in ran("convert", capture(COIN_D4), tmp_path / "b.csv", "-s", "cspc-coin-d4", "--imu", code=2).stderr
+    )

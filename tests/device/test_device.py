@@ -410,7 +410,7 @@ def test_everything_is_recorded_before_the_queue(line: Port, tmp_path: Path) -> 
         for frame in frames:
             line.send(frame)
             time.sleep(0.005)
-        until(lambda: device._own_recorder and device._own_recorder.bytes == sum(map(len, frames)))
+        until(lambda: device._own_recorders and device._own_recorders[0].bytes == sum(map(len, frames)))
         assert device.stats.queue_dropped > 0 or device._input.queue.produced == 1  # type: ignore[union-attr]
     with Recording(path) as recording:
         assert b"".join(record.data for record in recording if record.direction == "in") == b"".join(frames)

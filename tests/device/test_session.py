@@ -12,8 +12,9 @@ import pytest
 import lidarspec as ls
 from lidarspec import CommandError, Found, Sensor, Session, UsageError
 from lidarspec.errors import OutOfRange, ReplyTimeout, UnknownCommand, UnknownField
-from lidarspec.spec import Command, Udp
+from lidarspec.spec import Command, Count, Udp
 from tests.shapes.commands import SENSOR
+from tests.shapes.conversation import SENSOR as CONVERSATION
 
 SECOND = 1_000_000_000
 
@@ -363,3 +364,44 @@ def test_a_command_that_is_answered_only_while_the_sensor_is_stopped_says_so() -
         pending.result()
     with pytest.raises(ls.SpecError, match="no command starts or stops it"):
         dataclasses.replace(SENSOR, commands={"ask": asking}, on_open=(), on_close=())
+
+
+def conversed(session: Session) -> list[tuple[int, list[int]]]:
+    """The running number and the address in what is sent now."""
+    sent = [CONVERSATION.parse(one.data, "order") for one in session.outgoing()]
+    return [(one.head.number, list(one.host)) for one in sent]
+
+
+def test_a_running_number_goes_on_and_tells_the_reply() -> None:
+    hello = dataclasses.replace(CONVERSATION.commands["hello"], retries=1)
+    counting = {**hello.values, "head.number": Count(3, 6)}
+    sensor = dataclasses.replace(CONVERSATION, commands={**CONVERSATION.commands, "hello": dataclasses.replace(hello, values=counting)})
+    session = Session(sensor)
+    session.host = "10.0.0.7"
+
+    def answered(number: int, now: int) -> None:
+        session.receive([Found("ack", 0, sensor.build("ack", head={"number": number, "code": 1}, result=0))], now, link="control")
+
+    first = session.request("hello", 0)
+    assert conversed(session) == [(6, [10, 0, 0, 7])]
+    session.tick(SECOND)
+    assert conversed(session) == [(6, [10, 0, 0, 7])], "sent once more, it is the same request"
+    session.tick(2 * SECOND)
+    with pytest.raises(ReplyTimeout):
+        first.result()
+    second = session.request("hello", 2 * SECOND)
+    assert conversed(session) == [(7, [10, 0, 0, 7])]
+    answered(6, 2 * SECOND + 1)  # which is late
+    assert (second.done, session.late) == (False, 1)
+    answered(7, 2 * SECOND + 2)
+    assert second.result().values.head.number == 7
+    session.request("hello", 3 * SECOND)
+    assert [number for number, _ in conversed(session)] == [0], "it has three bits"
+
+
+def test_what_is_found_out_can_be_given() -> None:
+    assert CONVERSATION.parse(CONVERSATION.command("hello"), "order").head.number == 7
+    given = CONVERSATION.parse(CONVERSATION.command("hello", **{"head.number": 9, "host": "1.2.3.4"}), "order")
+    assert (given.head.number, list(given.host)) == (9, [1, 2, 3, 4])
+    with pytest.raises(UsageError, match="host is an IPv4 address, not '::1'"):
+        CONVERSATION.command("hello", host="::1")

@@ -14,8 +14,9 @@ from construct import ConstructError
 
 from lidarspec import Sensor
 from lidarspec.columns.columns import Batch
-from lidarspec.framing.frame_engine import InterpretedCodec
+from lidarspec.framing.frame_engine import codec
 from lidarspec.spec import Fields, Frame
+from tests.engine.plain_forms import plain_row
 
 #: (name, offset, bytes) of a frame.
 Cut = tuple[str, int, bytes]
@@ -26,7 +27,7 @@ class Oracle:
 
     def __init__(self, sensor: Sensor, data: bytes) -> None:
         self._frames = {name: frame for name, frame in sensor.frames.items() if frame.direction == "in"}
-        self._codecs = {name: InterpretedCodec(frame) for name, frame in self._frames.items()}
+        self._codecs = {name: codec(frame, interpreted=True) for name, frame in self._frames.items()}
         self._named = {frame.after for frame in self._frames.values()} - {None}
         answer = sensor.options.get("answer")
         self._mode = self._frames[answer].after if answer else None
@@ -70,12 +71,16 @@ class Oracle:
         return self._known[name, spot]
 
     def _size(self, name: str, frame: Frame, spot: int) -> int:
-        stream = io.BytesIO(self._data[spot : spot + frame.max_length])
+        data = self._data[spot : spot + frame.max_length]
+        row, size = (data, 0) if frame.wire is None else plain_row(frame.wire, frame.struct, data) or (b"", 0)
+        stream = io.BytesIO(row)
         try:
             frame.prepared.parse_stream(stream)
         except ConstructError:
             return 0
-        size = stream.tell()
+        if frame.wire is not None and stream.tell() != len(row):
+            return 0
+        size = size or stream.tell()
         return size if frame.plausible is None or self._sensible(name, frame.plausible, self._data[spot : spot + size]) else 0
 
     def _sensible(self, name: str, plausible: Any, data: bytes) -> bool:

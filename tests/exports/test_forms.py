@@ -25,7 +25,7 @@ from tests.exports.json_decoder import Decoder
 from tests.shapes import SHAPES
 
 SENSORS = {**ls.sensors(), **{name: sensor for name, sensor in SHAPES.items() if sensor.frames}}
-SPOKEN = [name for name in SENSORS if name != "shape-text"]
+SPOKEN = [name for name in SENSORS if name not in ("shape-text", "shape-tokens", "shape-lines", "shape-escaped")]
 PAGE = Path(__file__).parents[2] / "docs" / "reference" / "spec-json.md"
 #: keys below which names stand that each spec chooses.
 NAMED = {"links", "frames", "commands", "values", "args", "matches", "lines", "labels"}

@@ -21,7 +21,10 @@ from tests.exports.sharks import captured, columns, dissector, needs_tshark, tsh
 from tests.exports.trees import DISTINCT, EVERY, values
 
 #: what Wireshark cannot be told, with the reason.
-REFUSED = {"shape-text": "Decimal is Python code"}
+REFUSED = {
+    "shape-text": "Decimal is Python code",
+    **dict.fromkeys(("shape-tokens", "shape-lines", "shape-escaped"), "no other language recodes"),
+}
 #: what every run tries; the other shapes, and sensors that share the frames of one of these, are for the long one.
 FEW = {*lidarspec.sensors(), "shape-oddities", "shape-options", "shape-segments", "shape-tags", "shape-channels"} & set(DISTINCT)
 SENSORS = [

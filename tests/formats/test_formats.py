@@ -16,6 +16,8 @@ import lidarspec as ls
 from lidarspec import PointCloud, Scan, SourceError
 from lidarspec.errors import UnknownFormat
 from lidarspec.formats import format_of, formats, write
+from lidarspec.simulation.simulator import simulate
+from tests.shapes import SHAPES
 
 COLUMNS = ["x", "y", "z", "range", "azimuth", "elevation", "intensity", "time"]
 
@@ -157,6 +159,8 @@ def test_a_plugin_adds_a_format_and_takes_none_away(tmp_path: Path) -> None:
 from pathlib import Path
 import lidarspec as ls
 from lidarspec.formats import format_of, formats, write
+from lidarspec.simulation.simulator import simulate
+from tests.shapes import SHAPES
 from lidarspec.spec import hookimpl
 from lidarspec.plugins import registry
 from lidarspec.errors import UnknownFormat
@@ -206,3 +210,25 @@ else:
     raise SystemExit("no error")
 """
     subprocess.run([sys.executable, "-c", script], check=True, timeout=60)
+
+
+@pytest.mark.parametrize("name", ["a.csv", "a.npz"])
+def test_further_columns_are_written_under_their_names_in_their_types(tmp_path: Path, name: str) -> None:
+    sensor = SHAPES["shape-extras"]
+    scans = list(sensor.scans(simulate(sensor, 60)))
+    write(tmp_path / name, scans, every_point=True)
+    if name == "a.csv":
+        header, values = rows(tmp_path / name)
+        assert header[-7:] == ["velocity", "near_ir", "signal", "tag", "confidence", "strong", "scan"]
+        found = dict(zip(header, values.T, strict=True))
+    else:
+        with np.load(tmp_path / name) as arrays:
+            found = dict(arrays)
+        assert {key: value.tolist() for key, value in found.items() if key.endswith(".unit")} == {
+            "velocity.unit": ["m/s"],
+            "signal.unit": ["photons"],
+            "confidence.unit": ["1"],
+        }
+        assert found["signal"].dtype == np.uint32
+    for key in scans[0].points.extra:
+        np.testing.assert_allclose(found[key], np.concatenate([one.points.extra[key] for one in scans]), rtol=5.1e-7)

@@ -17,7 +17,7 @@ from typing import Any
 
 from tests.fuzz import slug
 from tests.fuzz.targets import LONGEST, Target
-from tests.fuzz.trial import Finding, judged, limits
+from tests.fuzz.trial import Finding, bound_memory, judged, limits
 
 #: one input in so many is traced for the lines that it reaches, which makes it ten times as slow.
 TRACED = 20
@@ -68,6 +68,7 @@ class Job:
             keep(self.folder, found)
         if time.monotonic() - self._began - self.seconds > TOLD:
             self.tell()
+            bound_memory()
 
     def tell(self) -> None:
         """Write how far it is."""

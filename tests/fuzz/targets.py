@@ -93,8 +93,8 @@ class Target:
 
 #: group -> its share of all inputs, from what an input costs and how much there is to get wrong.
 SHARES = {
-    "frame": 0.5,
-    "stream": 0.09,
+    "frame": 0.57,
+    "stream": 0.02,
     "capture": 0.15,
     "file": 0.02,
     "recording": 0.05,

@@ -46,9 +46,8 @@ class Finding:
 @contextlib.contextmanager
 def limits() -> Iterator[None]:
     """A process in which no input takes more memory than it may, and in which `judged` can count its time."""
-    pages = int(Path("/proc/self/statm").read_text().split()[0])
     before = resource.getrlimit(resource.RLIMIT_AS)
-    resource.setrlimit(resource.RLIMIT_AS, (pages * resource.getpagesize() + MEMORY, before[1]))
+    bound_memory()
     handlers = {kind: signal.signal(kind, _late) for kind in (signal.SIGPROF, signal.SIGALRM)}
     try:
         yield
@@ -56,6 +55,13 @@ def limits() -> Iterator[None]:
         for kind, handler in handlers.items():
             signal.signal(kind, handler)
         resource.setrlimit(resource.RLIMIT_AS, before)
+
+
+def bound_memory() -> None:
+    """From now on the process may take so much more memory; asked for now and then, since what chooses inputs keeps some of them."""
+    pages = int(Path("/proc/self/statm").read_text().split()[0])
+    hard = resource.getrlimit(resource.RLIMIT_AS)[1]
+    resource.setrlimit(resource.RLIMIT_AS, (pages * resource.getpagesize() + MEMORY, hard))
 
 
 def _late(number: int, frame: FrameType | None) -> NoReturn:

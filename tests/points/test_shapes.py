@@ -13,7 +13,7 @@ from construct import Array, Const, ConstructError, Int8ub, Int16ub, Int16ul, Re
 from lidarspec import PointCloud, Sensor, SpecError, UsageError
 from lidarspec.errors import OutOfRange, PluginError
 from lidarspec.simulation.simulator import simulate
-from lidarspec.spec import Checksummed, Frame, Polar, Scaled, Simulation, Sum, Xor, spread, steps, wrap
+from lidarspec.spec import Checksummed, Frame, Polar, Scaled, Simulation, Sum, Xor, along, spread, steps, wrap
 from tests.engine import against_construct
 from tests.shapes import SHAPES, calibration
 
@@ -343,46 +343,73 @@ def test_a_sequence_counts_what_is_lost_doubled_and_late(backend: str) -> None:
 
 
 #: three ranges beside a deeper array, which says nothing of them.
-BESIDE = Struct("near" / Array(3, Int8ub), "other" / Array(4, Array(3, Int8ub)))
+ANGLES = np.array([0.1, 0.2, 0.3])
+BESIDE = Struct("first" / Int8ub, "near" / Array(3, Int8ub), "other" / Array(4, Array(3, Int8ub)))
 
 
 @both
-def test_a_plain_array_along_an_axis_of_no_field_is_refused_by_its_axes_and_lengths(backend: str) -> None:
-    angles = np.array([0.1, 0.2, 0.3])
-    sensor = against_construct.sensor(BESIDE)
-    for points in (
-        lambda f: Polar(range=f.near, azimuth=angles),
-        lambda f: Polar(range=f.near * angles, azimuth=0),
-        lambda f: Polar(range=np.asarray(f.near)[:, :, 0], azimuth=0),  # (n, k) in a frame that is one level deeper
-    ):
-        packets = replace(sensor, points=points).decode([bytes(range(1, 16))] * 2, backend=backend)
-        with pytest.raises(SpecError, match=r"along 'other(\[\])?', where no field of theirs is \(.*other\[\] 3.*add \[..., None\]"):
-            packets.points()
-    for points in (
-        lambda f: Polar(range=f.near, azimuth=angles[:, None]),
-        lambda f: Polar(range=f.near, azimuth=f.near * 0 + angles[:, None]),
-        lambda f: Polar(range=np.asarray(f.near), azimuth=angles[:, None]),
-    ):
-        cloud = replace(sensor, points=points).decode([bytes(range(1, 16))] * 2, backend=backend).points()
-        np.testing.assert_allclose(cloud.azimuth, [*angles] * 2, rtol=1e-6)
-        assert cloud.range.tolist() == [1, 2, 3] * 2
+@pytest.mark.parametrize(
+    "points",
+    [
+        lambda f: Polar(range=f.near, azimuth=ANGLES),
+        lambda f: Polar(range=f.near, azimuth=f.near * 0 + ANGLES),
+        lambda f: Polar(range=f.near, azimuth=ANGLES[:, None]),
+        lambda f: Polar(range=f.near, azimuth=along("near", ANGLES)),
+        lambda f: Polar(range=f.near, azimuth=f.first * 0 + along("near", ANGLES)),
+        lambda f: Polar(range=f.near, azimuth=(f.near.index + 1) * 0.1),
+        lambda f: Polar(range=np.asarray(f.near), azimuth=ANGLES[:, None]),
+    ],
+)
+def test_numbers_go_along_the_one_array_that_is_as_long_or_that_is_named(points: Any, backend: str) -> None:
+    sensor = replace(against_construct.sensor(BESIDE), points=points)
+    cloud = sensor.decode([bytes(range(16))] * 2, backend=backend).points()
+    assert cloud.range.tolist() == [1, 2, 3] * 2
+    np.testing.assert_allclose(cloud.azimuth, [*ANGLES] * 2, rtol=1e-6)
+
+
+@both
+@pytest.mark.parametrize(
+    ("points", "said"),
+    [
+        (
+            lambda f: Polar(range=f.near, azimuth=f.first * ANGLES),
+            r"3 values goes with near as well as with other\[\]: .*along\('other\[\]', ",
+        ),
+        (lambda f: Polar(range=f.near, azimuth=np.zeros(7)), r"7 values goes with no array of the frame: near 3, other 4, other\[\] 3"),
+        (
+            lambda f: Polar(range=f.near, azimuth=along("other[]", ANGLES)),
+            r"along 'other\[\]', where no field of theirs is \(.*other\[\] 3",
+        ),
+        (lambda f: Polar(range=f.near, azimuth=along("other", np.zeros(4))), r"axis 'near' meets axis 'other'"),
+        (
+            lambda f: Polar(range=f.near, azimuth=along("further", ANGLES)),
+            r"no array 'further' in the frame; there are near, other, other\[\]",
+        ),
+        (lambda f: Polar(range=np.asarray(f.near)[:, :, 0], azimuth=0), r"along 'other(\[\])?', where no field of theirs is"),
+        (lambda f: Polar(range=f.first, azimuth=f.first.index), r"an index of arrays only"),
+    ],
+)
+def test_numbers_that_go_along_several_arrays_or_none_are_refused_by_their_names(points: Any, said: str, backend: str) -> None:
+    packets = replace(against_construct.sensor(BESIDE), points=points).decode([bytes(range(16))] * 2, backend=backend)
+    with pytest.raises(SpecError, match=said):
+        packets.points()
 
 
 @both
 def test_lengths_that_do_not_fit_are_named_with_their_axes(backend: str) -> None:
     sensor = against_construct.sensor(BESIDE)
-    parts = replace(sensor, points=lambda f: Polar(range=f.other, azimuth=np.zeros(2))).decode([bytes(15)], backend=backend)
-    with pytest.raises(SpecError, match=r"lengths that do not go together: range: other 4 x other\[\] 3, azimuth: other\[\] 2"):
-        parts.points()
-    terms = replace(sensor, points=lambda f: Polar(range=f.other * np.ones((3, 1)), azimuth=0)).decode([bytes(15)], backend=backend)
+    terms = replace(sensor, points=lambda f: Polar(range=f.other * np.ones((3, 1)), azimuth=0)).decode([bytes(16)], backend=backend)
     with pytest.raises(SpecError, match=r"lengths that do not go together: 1: other 4 x other\[\] 3, 2: other 3"):
         terms.points()
+    parts = replace(sensor, points=lambda f: Polar(range=f.other, azimuth=along("other", np.zeros(2)))).decode([bytes(16)], backend=backend)
+    with pytest.raises(SpecError, match=r"lengths that do not go together: range: other 4 x other\[\] 3, azimuth: other 2"):
+        parts.points()
 
 
 def test_what_a_sensor_in_a_scene_measures_is_refused_for_the_same_axes() -> None:
     sensor = replace(
         against_construct.sensor(Struct("near" / Array(3, Scaled(Int8ub, 0.1, "m")), "other" / Array(4, Array(3, Int8ub)))),
-        points=lambda f: Polar(range=f.near * np.ones(3), azimuth=0),
+        points=lambda f: Polar(range=f.near * along("other[]", np.ones(3)), azimuth=0),
         simulation=Simulation(lambda i: {}, rate=10),
     )
     with pytest.raises(SpecError, match=r"along 'other\[\]'"):

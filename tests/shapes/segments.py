@@ -8,7 +8,7 @@ import numpy as np
 from construct import Array, Const, Int8ul, Int16ul, Int32ul, Struct, this
 
 from lidarspec import Sensor
-from lidarspec.spec import Checksummed, Clock, Crc, Fields, Frame, OnChange, Parts, Polar, Scaled, Sequence, Simulation, Udp, steps
+from lidarspec.spec import Checksummed, Clock, Crc, Extra, Fields, Frame, OnChange, Parts, Polar, Scaled, Sequence, Simulation, Udp, steps
 
 SEGMENT = Struct(
     "turn" / Int16ul,
@@ -44,6 +44,7 @@ def points(f: Fields) -> Polar:
         elevation=np.deg2rad(f.elevations.on("data[]")),
         intensity=f.data.strength,
         ring=steps(f.channels),
+        extra={"signal": f.data.strength, "step": Extra(f.frame.step, unit="deg"), "share": f.data.strength / 255},
     )
 
 

@@ -16,10 +16,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from construct import Const, Int8ub, Struct
 from numpy.typing import NDArray
 
+from lidarspec.spec import Checksummed
 from lidarspec.spec.checksums import Checksum, Crc, Fold15, Sum, WordXor, Xor, ZeroPadded
 from lidarspec.wire.row_checksums import batch, over
+from tests.engine import against_construct
 
 VECTORS = Path(__file__).parents[3] / "shared" / "protocols" / "vectors_serial2d.json"
 
@@ -91,6 +94,15 @@ def test_catalogue_check_values(crc: Crc, check: int) -> None:
 def test_crc32_is_that_of_zlib(length: int) -> None:
     data = random_rows(1, length).tobytes()
     assert CRC32(data) == zlib.crc32(data)
+
+
+@pytest.mark.parametrize("length", [128, 129, 781])
+@pytest.mark.parametrize("refout", [False, True])
+def test_rows_of_the_polynomial_of_zlib_agree_with_the_bitwise_oracle(length: int, refout: bool) -> None:
+    crc = Crc(32, 0x04C11DB7, 0x12345678, True, refout, 0x9ABCDEF0)
+    wide = random_rows(200, length + 9)
+    for rows in (wide[:, 4:-5], np.asfortranarray(wide[:, 4:-5])):
+        assert batch(crc, rows).tolist() == [bitwise_crc(crc, row.tobytes()) for row in rows]
 
 
 @pytest.mark.parametrize("width", range(1, 65))
@@ -318,3 +330,41 @@ def test_an_algorithm_of_a_plugin_gets_its_batch_for_free() -> None:
 
     rows = np.frombuffer(b"00P99b0Ee", np.uint8).reshape(3, 3)[:, :2]
     assert bytes(Scip().batch(rows).tolist()) == b"Pbe"
+
+
+@pytest.mark.parametrize(("init", "xorout"), [(0xFFFFFFFF, 0xFFFFFFFF), (0x12345678, 0x9ABCDEF0)])
+def test_long_rows_of_zlibs_polynomial_have_its_values_wherever_they_stand(init: int, xorout: int) -> None:
+    crc = Crc(32, 0x04C11DB7, init, True, True, xorout)
+    rows = np.random.default_rng(5).integers(0, 256, (9, 3001), dtype=np.uint8)
+    parts = [row[2:1400].tobytes() + row[1404:].tobytes() for row in rows]
+    begin, end = int(f"{init:032b}"[::-1], 2) ^ 2**32 - 1, 2**32 - 1 ^ xorout
+    assert over(crc, rows, ((2, 1400), (1404, 3001))).tolist() == [zlib.crc32(part, begin) ^ end for part in parts]
+
+
+@dataclasses.dataclass(frozen=True)
+class Attentive(Checksum):
+    """The sum of all bytes, and what it was asked for."""
+
+    asked: list[bytes] = dataclasses.field(default_factory=list, compare=False)
+    width = 8
+
+    def __call__(self, data: Any) -> int:
+        self.asked.append(bytes(data))
+        return sum(data) & 0xFF
+
+    def describe(self) -> str:
+        return "a sum that remembers"
+
+
+def test_a_checksum_that_may_be_not_filled_is_computed_only_where_it_is() -> None:
+    attentive = Attentive()
+    sensor = against_construct.sensor(
+        Checksummed(Struct("header" / Const(b"\x55\x66"), "value" / Int8ub, "sum" / Int8ub), field="sum", algorithm=attentive, absent=[0])
+    )
+    frames = [bytes([0x55, 0x66, value, total]) for value, total in ((1, 0), (2, 0xBD), (3, 0), (4, 0xFF), (5, 0))]
+    packets = sensor.decode(b"".join(frames))
+    assert (packets["value"].tolist(), packets.stats.bad_checksum) == ([1, 2, 3, 5], 1)
+    assert {data[2] for data in attentive.asked} == {2, 4}
+    attentive.asked.clear()
+    assert sensor.parse(frames[0]).value == 1
+    assert not attentive.asked

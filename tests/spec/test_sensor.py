@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import lidarspec as ls
+from lidarspec.errors import PluginError
 from tests.cli.running import ran
 from tests.shapes import SHAPES
 
@@ -57,3 +58,9 @@ def test_on_the_command_line_a_digit_can_be_the_name_of_a_file(tmp_path: Path, m
     for name in ("1", "[" * 5000):  # which tomllib takes for a number, and for a list too deep
         said = ran("stats", "x.bin", "-s", "hesai-xt16", "-O", f"calibration={name}", code=2).stderr
         assert said.startswith(f"{name}: ")
+
+
+def test_what_a_sensors_own_function_does_not_foresee_is_the_plugins_fault(tmp_path: Path) -> None:
+    (tmp_path / "heads.json").write_text("{nonsense", encoding="utf-8")
+    with pytest.raises(PluginError, match="shape-headed: configure: JSONDecodeError"):
+        SHAPES["shape-headed"].configure(calibration=tmp_path / "heads.json")

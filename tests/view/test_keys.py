@@ -60,3 +60,9 @@ def test_screens_of_the_docs_hold_every_dot_and_word() -> None:
     root = ET.fromstring(screens.svg(canvas.cells()))
     assert sum(path.get("d", "").count("M") for path in root.findall(".//{*}path")) == 8
     assert [text.text for text in root.findall(".//{*}text")] == ["a", "<", "b"]
+
+
+def test_c_goes_through_all_that_colours_can_show() -> None:
+    shown, choice = ["range", "velocity", "snr"], Choice()
+    seen = [(choice := choice.after("c", 6, shown)).ramp for _ in range(3)]
+    assert seen == ["velocity", "snr", "range"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections import Counter
 from collections.abc import Iterable
 
@@ -9,8 +10,9 @@ import numpy as np
 import pytest
 
 from lidarspec import PointCloud
+from lidarspec.errors import UnknownName
 from lidarspec.view.canvas import BLANK, RAMPS, STEPS
-from lidarspec.view.polar import Look, look, picture, ring_step, rounded_up
+from lidarspec.view.polar import Look, look, picture, ramps, ring_step, rounded_up, shade
 
 DOTS = {0x01: (0, 0), 0x02: (1, 0), 0x04: (2, 0), 0x40: (3, 0), 0x08: (0, 1), 0x10: (1, 1), 0x20: (2, 1), 0x80: (3, 1)}
 FLAT = Look("range", 5, 5)
@@ -143,3 +145,14 @@ def test_small_heights_are_drawn_larger_and_that_is_said() -> None:
 def most(values: Iterable[int]) -> int:
     """The most frequent value."""
     return Counter(values).most_common(1)[0][0]
+
+
+def test_colours_show_a_further_column_from_its_lowest_value_on() -> None:
+    plain = cloud((1, 0, 0), (2, 0, 0), (3, 0, 0))
+    points = dataclasses.replace(plain, extra={"velocity": np.array([-3.0, np.nan, 5.0], np.float32)}, units={"velocity": "m/s"})
+    found = look(points, ramp="velocity")
+    assert (found.ramp, found.low, found.full, found.ends) == ("velocity", -3.0, 5.0, ("-3", "5 m/s"))
+    assert shade(points, found).tolist() == [0.0, 0.0, 1.0]
+    assert ramps(points) == ["range", "velocity"]
+    with pytest.raises(UnknownName, match="did you mean 'velocity'"):
+        look(points, ramp="velocty")

@@ -3,30 +3,83 @@
 from __future__ import annotations
 
 import re
+from typing import Any
 
 import pytest
-from construct import Array, Bytes, Int8ul, Struct
+from construct import Array, Bytes, Int8ul, Int32ub, Struct, this
 
-from lidarspec import SpecError, UsageError
-from lidarspec.spec import Command, Frame
+from lidarspec import Sensor, SpecError, UsageError
+from lidarspec.spec import Address, Command, Count, Frame, Parts, Text
 from tests.broken import sound
+
+FIELDS = {"key": Bytes(3), "v": Array(2, Int8ul), "s": Array(2, Struct("x" / Int8ul)), "t": Struct("u" / Int8ul, "w" / Int32ub)}
+ORDER = Frame(Struct(*(name / con for name, con in FIELDS.items())), direction="out")
+VALUES = {"key": b"abc", "v": [1, 2], "s": [{"x": 1}] * 2, "t.u": 1, "t.w": 0}
+
+
+def commanded(**args: Any) -> Sensor:
+    """A sensor with a command that has these arguments."""
+    return sound.sensor(frames={"data": sound.frame(), "order": ORDER}, commands={"start": Command("order", VALUES, args=args)})
 
 
 @pytest.mark.parametrize(
-    ("path", "what"),
-    [("s[1].x", "in an array"), ("s.x", "in an array"), ("v", "in an array"), ("key", "bytes"), ("nothing", "no field"), ("t", "no field")],
+    ("wrong", "reason"),
+    [
+        (("s.x", 0, 9), "Range cannot stand in 's.x', which is an array, of which an element is s.x[0]"),
+        (("v", 0, 9), "Range cannot stand in 'v', which is an array"),
+        (("key", 0, 9), "Range cannot stand in 'key', which is a field of kind 'bytes'"),
+        (("nothing", 0, 9), "order has no field 'nothing'"),
+        (("t", 0, 9), "order has no field 't'"),
+        (("v[2]", 0, 9), "there are 2 elements, of which 2 is none"),
+        (("t.u[0]", 0, 9), "names 1 elements of the 0 arrays"),
+        (("t.u", Text(3)), "Text cannot stand in 't.u', which is a field of kind 'int'"),
+    ],
 )
-def test_an_argument_that_goes_into_no_number_is_the_authors_fault(path: str, what: str) -> None:
-    fields = {"key": Bytes(3), "v": Array(2, Int8ul), "s": Array(2, Struct("x" / Int8ul)), "t": Struct("u" / Int8ul)}
-    order = Frame(Struct(*(name / con for name, con in fields.items())), direction="out")
-    frames = {"data": sound.frame(), "order": order}
-    values = {"key": b"abc", "v": [1, 2], "s": [{"x": 1}] * 2, "t.u": 1}
-    wrong = sound.sensor(frames=frames, commands={"start": Command("order", values, args={"rate": (path, 0, 9)})})
-    reason = rf"commands.start.args.rate: .*one number, and '{re.escape(path)}' is {what}"
-    with pytest.raises(SpecError, match=reason):
-        wrong.command("start", rate=3)
-    right = sound.sensor(frames=frames, commands={"start": Command("order", values, args={"rate": ("t.u", 0, 9)})})
-    assert right.command("start", rate=3) == b"abc\1\2\1\1\3"
-    for odd in ("3", b"3", [3], None):
-        with pytest.raises(UsageError, match="broken-one start: rate is a number, not"):
-            right.command("start", rate=odd)
+def test_an_argument_that_cannot_stand_in_its_field_is_the_authors_fault(wrong: Any, reason: str) -> None:
+    with pytest.raises(SpecError, match=rf"commands.start.args.rate: .*{re.escape(reason)}"):
+        commanded(rate=wrong).command("start", rate=3)
+
+
+def test_numbers_texts_addresses_and_bytes_go_to_their_places() -> None:
+    assert commanded(rate=("t.u", 0, 9)).command("start", rate=3) == b"abc\1\2\1\1\3\0\0\0\0"
+    assert commanded(a=("v[1]", 0, 9), b=("s[0].x", 0, 9)).command("start", a=7, b=8) == b"abc\1\7\x08\1\1\0\0\0\0"
+    assert commanded(name=("key", Text(3))).command("start", name="x")[:3] == b"x\0\0"
+    assert commanded(name=("key", Text(3, b" "))).command("start", name="x")[:3] == b"x  "
+    assert commanded(key=("key", bytes)).command("start", key=b"\1\2\3")[:3] == b"\1\2\3"
+    assert commanded(host=("t.w", Address())).command("start", host="192.168.1.10")[-4:] == bytes([192, 168, 1, 10])
+    assert VALUES["v"] == [1, 2]
+
+
+@pytest.mark.parametrize(
+    ("kind", "odd", "told"),
+    [
+        (("t.u", 0, 9), ["3", b"3", [3], None], "a number"),
+        (("key", Text(8)), ["four", b"abc", 3, "\u00e4"], "a text of up to 3 bytes in ASCII"),
+        (("t.w", Address()), ["somewhere", "1.2.3", "::1", 3], "an IPv4 address"),
+        (("key", bytes), ["abc", b"ab", 3], "3 bytes"),
+    ],
+)
+def test_a_value_that_an_argument_does_not_take_is_refused(kind: Any, odd: list[Any], told: str) -> None:
+    sensor = commanded(rate=kind)
+    for value in odd:
+        with pytest.raises(UsageError, match=f"broken-one start: rate is {told}, not"):
+            sensor.command("start", rate=value)
+
+
+def test_arguments_of_no_kind_are_refused_when_they_are_declared() -> None:
+    for wrong in [("v",), ("v", 1), ("v", str), (3, 0, 9), ("v", "0", "9")]:
+        with pytest.raises(SpecError, match=r"an argument is \(path, lowest, highest\), \(path, Text\(16\)\)"):
+            commanded(rate=wrong)
+    for bits, first in [(0, 0), (8, 256), (8, -1)]:
+        with pytest.raises(SpecError, match="begins with a number that its bits hold"):
+            Count(bits, first)
+
+
+def test_a_settings_list_of_parts_takes_arguments_too() -> None:
+    setting = Struct("key" / Int8ul, "size" / Int8ul, "value" / Bytes(this.size))
+    struct = Struct("number" / Int8ul, "settings" / Parts(setting, count=this.number))
+    frames = {"data": sound.frame(), "order": Frame(struct, direction="out", max_length=99)}
+    values = {"settings": [{"key": 4, "value": b"\1"}, {"key": 6}]}
+    command = Command("order", values, args={"host": ("settings[1].value", Address()), "name": ("settings[0].value", Text(9))})
+    sensor = sound.sensor(frames=frames, commands={"start": command})
+    assert sensor.command("start", host="10.0.0.1", name="on").hex(" ") == "02 04 02 6f 6e 06 04 0a 00 00 01"

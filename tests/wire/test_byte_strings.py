@@ -19,17 +19,28 @@ from construct import (
     FixedSized,
     GreedyBytes,
     GreedyRange,
+    Hex,
+    HexDump,
     If,
     Int8sb,
     Int8ub,
     Int16ub,
     Int32ub,
+    LazyStruct,
     NullStripped,
     NullTerminated,
     Prefixed,
+    PrefixedArray,
+    Probe,
+    RepeatUntil,
+    Seek,
+    Sequence,
+    StopIf,
     Struct,
     Switch,
+    Terminated,
     len_,
+    obj_,
     this,
 )
 
@@ -48,6 +59,7 @@ COMPILED: dict[str, Any] = {
     "fixed": Array(2, Bytes(2)),
     "nested": Array(2, Array(this.k, Bytes(2))),
     "of a length": Array(2, Bytes(this.k)),
+    "of a fixed size": FixedSized(3, GreedyBytes),
     "in a struct": Array(this.k, Struct("a" / Bytes(1), "b" / Array(2, Bytes(1)))),
     "empty elements": Array(this.k, Struct("x" / If(this._.k > 2, Int8ub))),
     "of what is not there": If(lambda found: found.y is None, Int8ub),
@@ -56,7 +68,6 @@ INTERPRETED: dict[str, Any] = {
     "terminated": TEXT,
     "terminated ones": Array(this.k, TEXT),
     "prefixed": Array(this.k, Prefixed(Int8ub, GreedyBytes)),
-    "of a fixed size": FixedSized(3, GreedyBytes),
     "elements of several lengths": Array(this.k, Struct("n" / Int8ub, "x" / Bytes(this.n % 3))),
     "arrays of several lengths": Array(this.k, Struct("n" / Int8ub, "x" / Array(this.n % 3, Int16ub))),
     "a part of some elements": Array(this.k, Struct("n" / Int8ub, "x" / If(this.n % 2, Int16ub))),
@@ -287,11 +298,9 @@ def test_of_a_greedy_array_no_byte_is_dropped() -> None:
         (GreedyRange(Int8ub), "GreedyRange has no end of its own"),
         (Prefixed(Int8ub, Struct("r" / GreedyBytes, "a" / Int8ub)), "r: GreedyBytes has no end of its own"),
         (Prefixed(Int8ub, GreedyRange(GreedyBytes)), "GreedyBytes has no end of its own"),
-        (Aligned(4, Int8ub), "Aligned loses its padding"),
-        (FixedSized(4, Int8ub), "FixedSized loses what its content leaves"),
-        (FixedSized(this.k, Struct("a" / Int8ub)), "FixedSized loses what its content leaves"),
-        (FixedSized(8, TEXT), "FixedSized loses what its content leaves"),
-        (Prefixed(Int8ub, Int16ub), "Prefixed loses what its content leaves"),
+        (Array(2, Aligned(4, Int8ub)), "Aligned loses its padding on a round trip, unless it is a named member of a Struct"),
+        (Array(2, FixedSized(4, Int8ub)), "FixedSized loses what its content leaves of it, unless it is a named member of a Struct"),
+        (Array(2, Prefixed(Int8ub, Int16ub)), "Prefixed loses what its content leaves of it, unless it is a named member of a Struct"),
         (Prefixed(Int8ub, NullStripped(GreedyBytes)), "Prefixed loses what its content leaves"),
     ],
 )
@@ -307,3 +316,42 @@ def test_examples_hold_what_is_checked_and_see_the_whole_frame() -> None:
     assert all(found.a < 200 and found.twice == 2 * found.a and len(found.v[1].x) == found.a % 3 for found in examples)
     with pytest.raises(WireError, match=r"v\[0\].ok: check failed"):
         ours.parse(b"\xc8\0\0\0\0")
+
+
+@pytest.mark.parametrize(
+    ("part", "instead"),
+    [
+        (Check(this.k < 3), "plausible=lambda f"),
+        (Terminated, "the last field ends it"),
+        (Probe(), "lidarspec explain shows"),
+        (StopIf(this.k == 0), "If(this.more, Struct"),
+        (Seek(4), "name the bytes between"),
+    ],
+)
+def test_what_has_no_name_is_refused_with_what_to_write(part: Any, instead: str) -> None:
+    with pytest.raises(SpecError) as caught:
+        sensor(Struct("k" / Int8ub, part))
+    assert instead in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("part", "instead"),
+    [
+        (Sequence(Int8ub, Int16ub), "say Struct('a'"),
+        (LazyStruct("a" / Int8ub), "say Struct, which is read in bulk"),
+        (RepeatUntil(obj_ == 0, Int8ub), "Array with a count"),
+        (If(this.k, PrefixedArray(Int8ub, Int8ub)), "a named member of a Struct alone"),
+    ],
+)
+def test_what_construct_alone_reads_says_what_to_write(part: Any, instead: str) -> None:
+    engine = codec(sensor(Struct("k" / Int8ub, "v" / part)).frames["data"])
+    assert isinstance(engine, InterpretedCodec)
+    assert instead in engine.reason
+
+
+def test_what_is_printed_in_hexadecimal_is_the_value_below() -> None:
+    ours = sensor(Struct("h" / Hex(Int16ub), "b" / HexDump(Bytes(2))))
+    assert isinstance(codec(ours.frames["data"]), CompiledCodec)
+    assert plain(ours.parse(b"\1\2ab")) == {"h": 258, "b": b"ab"}
+    assert ours.build("data", h=258, b=b"ab") == b"\1\2ab"
+    assert ours.decode([b"\1\2ab"])["h"].tolist() == [258]

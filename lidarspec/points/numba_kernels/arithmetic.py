@@ -186,6 +186,12 @@ def looked_up(table, index):
     return at(table, np.int64(index)) if 0 <= index < len(table) else np.nan
 
 
+@njit(forceinline=True)
+def row_at(index, rows):
+    """The row of a table for an index; the last one, which is nan, for one that it does not have."""
+    return np.int64(index) if 0 <= index < rows - 1 else rows - 1
+
+
 @njit(forceinline=True, error_model="numpy")
 def narrowed(angle):
     """Radians as float32 in [-pi, pi), as `clouds.narrowed`."""

@@ -21,6 +21,8 @@ import warnings
 from pathlib import Path
 from typing import Any
 
+from lidarspec.trust import shared
+
 # mypy: disable-error-code="no-untyped-call"
 
 CACHE = "LIDARSPEC_CACHE"
@@ -114,18 +116,9 @@ def _own(folder: Path) -> Path:
     Raises:
         OSError: where it is missing, or not its user's alone.
     """
-    if fault := _fault(folder.stat()):
-        raise PermissionError(f"{folder} {fault}")
+    if reason := shared(folder.stat(), _OTHERS):
+        raise PermissionError(f"{folder} {reason}")
     return folder
-
-
-def _fault(status: os.stat_result) -> str:
-    """Why something is not its user's alone, "" where it is; on Windows, folders of a user are."""
-    if sys.platform == "win32":
-        return ""
-    if status.st_uid != os.geteuid():
-        return f"belongs to another user (uid {status.st_uid})"
-    return "is open to other users: chmod 700 makes it yours alone" if status.st_mode & _OTHERS else ""
 
 
 def _key(folder: Path) -> bytes | None:
@@ -159,7 +152,7 @@ def _read(path: Path) -> bytes:
     """
     with open(path, "rb", opener=lambda name, flags: os.open(name, flags | _PLAINLY)) as file:
         status = os.fstat(file.fileno())
-        if _fault(status) or not stat.S_ISREG(status.st_mode):
+        if shared(status, _OTHERS) or not stat.S_ISREG(status.st_mode):
             raise PermissionError(f"{path} is not its user's alone")
         return file.read()
 

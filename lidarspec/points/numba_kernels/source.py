@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from lidarspec.columns.graph import FACTORS, Node, is_full, only_field, traverse
+from lidarspec.columns.graph import FACTORS, Node, is_full, last_axis, only_field, traverse
 from lidarspec.points.numba_kernels.writer import TEMPLATES, Value, Wanted, Writer, is_cheap, line
 from lidarspec.points.plan import Plan
 from lidarspec.points.windows import every_value, is_number, possible, window
@@ -62,7 +62,16 @@ class Expressions(Writer):
                 if found is not None:
                     return found
             return self._call(node)
+        if node.kind == "rows" and not self.shared(node.args[0]):
+            return self._row(node.args[0], node.args[1], node.shape)
         return self.given(node)
+
+    def _row(self, index: Node, table: Any, shape: tuple[int, ...]) -> Value:
+        """An element of the row of a table at an index."""
+        row, inner = self.double(index), self.number(table.shape[1])
+        start = self.let(row.level, f"row_at({row.text}, {self.number(len(table))}) * {inner}")
+        place = self.place(tuple(length if own == 1 else 1 for own, length in zip(index.shape, shape, strict=True)))
+        return self.let(1 + last_axis(shape), f"at({self.array(table)}, {start.text} + {place})")
 
     def shared(self, node: Node) -> bool:
         """Whether an expression is made of other frames' fields only: then NumPy computes it, mostly once for all packets."""
@@ -224,7 +233,7 @@ import numpy as np
 from lidarspec.points.numba_kernels.arithmetic import (
     BYTES, DOUBLES, INTEGER, MADE_PLACES, MADE_SINGLES, PLACES, SINGLES, WORDS,
     at, byte_at, compiled, cos_sin, float4_big, float4_little, float8_big, float8_little, larger, looked_up, modulo, narrowed, number, put,
-    smaller, word_at,
+    row_at, smaller, word_at,
 )
 
 nan, inf = np.nan, np.inf
@@ -309,7 +318,7 @@ def written(plan: Plan, names: tuple[str, ...], varying: Set[str]) -> Text:
     writer = Expressions(plan.layout, plan.shape, plan.tables, varying)
     assembly = Assembly(writer)
     writer.both = _both(expressions.values())
-    made = {name: _made(writer, name, value, exact=plan.exact) for name, value in expressions.items()}
+    made = {name: _made(writer, name, value, exact=plan.is_exact(name)) for name, value in expressions.items()}
     directed = [] if plan.exact else [*plan.directed, *(plan.parts[name] for name in ("ox", "oy", "oz"))]
     places = {}
     if not all(is_number(value, plan.layout.leaves) for value in directed):  # where one coordinate is nan, all are

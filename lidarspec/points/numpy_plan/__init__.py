@@ -30,7 +30,7 @@ def _compiled(plan: Plan, names: tuple[str, ...], tables: dict[Any, NDArray[Any]
     compiler = Compiler(plan, tables)
     for name in names:
         kind = "double" if name == "azimuth" else "single"
-        compiler.want(name, plan.expressions[name], kind, exact=plan.exact or name == "intensity")
+        compiler.want(name, plan.expressions[name], kind, exact=plan.is_exact(name))
     return compiler
 
 

@@ -14,7 +14,6 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.columns.columns import deep
 from lidarspec.columns.graph import Node, Term, chosen, is_full, key, last_axis, only_field
 from lidarspec.points.numpy_plan import products
 from lidarspec.points.numpy_plan.blocks import Blocks
@@ -22,6 +21,8 @@ from lidarspec.points.numpy_plan.program import Program, Read, Run
 from lidarspec.points.numpy_plan.registers import TYPES
 from lidarspec.points.plan import Plan
 from lidarspec.points.windows import CHEAP, Window, every_value, shift_of, window
+from lidarspec.spec.vocabulary import row_numbers
+from lidarspec.wire.arrays import deep
 from lidarspec.wire.layout import Leaf
 
 _Made = TypeVar("_Made")
@@ -67,7 +68,7 @@ class Compiler:
         return self._once(("single", self._exact, value), lambda: self._full_single(value))
 
     def _full_single(self, node: Node) -> int:
-        register = self._of_field(node, "single")
+        register = self._gathered(node, "single") if node.kind == "rows" else self._of_field(node, "single")
         if register is None:
             register = self._marked(node, "single") if self._exact else self._product(node)
         if register is not None:
@@ -93,7 +94,7 @@ class Compiler:
 
     def _full_double(self, node: Node) -> int:
         kind = "flag" if node.sample.array.dtype.kind == "b" else "double"
-        register = self._of_field(node, kind)
+        register = self._gathered(node, kind) if node.kind == "rows" else self._of_field(node, kind)
         if register is None and node.kind == "call":
             register = self._marked(node, kind) if self._exact else self._sum(node)
             register = self._plain(node, kind) if register is None else register
@@ -208,7 +209,7 @@ class Compiler:
             if blocks.shape == leaf.shape and blocks.holds(seen):
                 return blocks
         beside = [other for other in self._layout.leaves.values() if (other.info.axes, other.shape) == (leaf.info.axes, leaf.shape)]
-        self.program.blocks.append(Blocks(beside, self._layout.size))
+        self.program.blocks.append(Blocks(beside or [leaf], self._layout.size))
         return self.program.blocks[-1]
 
     def _plain(self, node: Node, kind: str) -> int:
@@ -258,6 +259,22 @@ class Compiler:
             out.reshape(-1, *shape)[...] = deep(execution.part(execution.values(value)), depth)
 
         return self.program.step("computed plainly before", kind, run)
+
+    def _gathered(self, node: Node, kind: str) -> int | None:
+        """Rows of a table, each as long as the innermost arrays; None where they are not."""
+        index, table = node.args
+        inner = table.shape[1]
+        if is_full(index, self._width) or inner != math.prod(self._shape[last_axis(index.shape) :]):
+            return None
+        self.low.append(index)
+        rows = self._once(("rows", id(table), kind), lambda: np.ascontiguousarray(table, TYPES[kind]))
+
+        def run(execution: Run, out: NDArray[Any]) -> None:
+            numbers = row_numbers(execution.part(execution.values(index)), len(rows))
+            numbers = np.broadcast_to(numbers, (execution.stop - execution.start, *index.shape))
+            rows.take(numbers.reshape(-1), axis=0, out=out.reshape(-1, inner), mode="clip")
+
+        return self.program.step(f"rows of a table of {len(rows) - 1} x {inner}", kind, run)
 
     def _direction(self, node: Node) -> int:
         """A cosine or sine; where all points of a packet or block have the same or nearly so, it is computed once for them."""

@@ -1,0 +1,140 @@
+"""Wire forms read by hand, one character after another, for the oracle: nothing is shared with `lidarspec.spec.wire_forms`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from construct import Array, Bytes, Const, Construct, Container, FormatField, IfThenElse, Pass, Renamed, Struct, evaluate
+
+from lidarspec.spec import Escaped, Lines, Tokens
+
+
+def plain_row(form: Any, struct: Construct, data: bytes) -> tuple[bytes, int] | None:
+    """The row of the frame that some bytes begin with, and its bytes on the wire; None where they begin with none."""
+    if isinstance(form, Tokens):
+        return _tokens(form, struct, data)
+    return _escaped(form, data) if isinstance(form, Escaped) else _lines(form, data)
+
+
+def _escaped(form: Escaped, data: bytes) -> tuple[bytes, int] | None:
+    end = data.find(form.flag, 1)
+    if not data or data[0] != form.flag or end < 2:
+        return None
+    row, left = bytearray(), iter(data[1:end])
+    for byte in left:
+        if byte != form.escape:
+            row.append(byte)
+            continue
+        turned = next(left, form.escape)
+        if turned == form.escape:
+            return None
+        row.append(turned ^ form.xor)
+    return bytes(row), end + 1
+
+
+def _lines(form: Lines, data: bytes) -> tuple[bytes, int] | None:
+    end = data.find(b"\n\n")
+    if end < 0:
+        return None
+    row = b""
+    lines = data[:end].split(b"\n")
+    for number, characters in enumerate(lines):
+        line = characters
+        if form.check is not None and number >= form.bare:
+            line, check = characters[:-1], characters[-1:]
+            if check != bytes([(sum(line) & 63) + 48]):
+                return None
+        wanted = form.head[number] if number < len(form.head) else form.width
+        if not line or len(line) > wanted or (len(line) < wanted and (number < len(form.head) or number < len(lines) - 1)):
+            return None
+        row += line
+    if len(lines) < len(form.head):
+        return None
+    return _six_bits(row), end + 2
+
+
+def _six_bits(row: bytes) -> bytes:
+    """Of the shape with lines: what is text, and what is a number of how many characters."""
+    if len(row) < 11 or any(not 48 <= character < 112 for character in row):
+        return b""
+    sizes = [1] * 2 + [0, 0] + [4, 1] + [3] * ((len(row) - 11) // 3)
+    found, left = bytearray(row[:2]), list(row[2:])
+    for size in sizes:
+        value, characters = 0, [left.pop(0) for _ in range(size or 1)]
+        for character in characters:
+            value = value * 64 + character - 48
+        found += value.to_bytes(size, "big") if size else bytes(characters)
+    return bytes(found) + bytes(left)
+
+
+def _tokens(form: Tokens, struct: Construct, data: bytes) -> tuple[bytes, int] | None:
+    end = data.find(form.end)
+    if not data.startswith(form.start) or end < 0 or form.start in data[1:end]:
+        return None
+    reader = _Reader(data[1 : end + 1], form)
+    try:
+        reader.read(struct, Container(), "")
+    except (ValueError, OverflowError):
+        return None
+    return (bytes(reader.row), end + 1) if not reader.left else None
+
+
+class _Reader:
+    """Goes through a struct and the characters of a frame side by side."""
+
+    def __init__(self, left: bytes, form: Tokens) -> None:
+        self.left, self.row, self._form = left, bytearray(), form
+
+    def read(self, part: Construct, context: Container, name: str) -> None:
+        if isinstance(part, Renamed):
+            self.read(part.subcon, context, part.name)
+        elif isinstance(part, Struct):
+            inner = Container(_=context)
+            for member in part.subcons:
+                self.read(member, inner, "")
+            context[name] = inner
+            context.update({key: value for key, value in inner.items() if key != "_"} if not name else {})
+        elif isinstance(part, Array):
+            for _ in range(evaluate(part.count, context)):
+                self.read(part.subcon, context, "")
+        elif isinstance(part, IfThenElse):
+            self.read(part.thensubcon if evaluate(part.condfunc, context) else part.elsesubcon, context, name)
+        elif isinstance(part, Const):
+            self._text(len(part.value))
+        elif isinstance(part, Bytes):
+            self._text(evaluate(part.length, context))
+        elif isinstance(part, FormatField):
+            context[name] = self._number(part)
+        elif hasattr(part, "subcon"):  # a unit, a name
+            self.read(part.subcon, context, name)
+        elif part is not Pass:
+            raise AssertionError(part)
+
+    def _text(self, size: int) -> None:
+        if not size:
+            return
+        text, mark, self.left = self.left[:size], self.left[size : size + 1], self.left[size + 1 :]
+        if mark not in (self._form.sep, self._form.end) or not mark:
+            raise ValueError("a token of another length")
+        self.row += text
+
+    def _number(self, field: FormatField) -> int:
+        stops = [self.left.find(mark) for mark in (self._form.sep, self._form.end) if mark in self.left]
+        if not stops:
+            raise ValueError("no token")
+        token, self.left = self.left[: min(stops)].decode("latin-1"), self.left[min(stops) + 1 :]
+        digits = token[1:] if token[:1] in ("+", "-") else token
+        if not digits or len(digits) > 16 or not set(digits) <= set("0123456789abcdefABCDEF"):
+            raise ValueError(token)
+        signed = digits != token
+        bits = 8 * field.length
+        value = int(digits, 10 if signed else self._form.base)
+        is_signed, is_float = field.fmtstr[-1].islower(), field.fmtstr[-1] in "fd"
+        limits = (-(2 ** (bits - 1)) if is_signed else 0, 2 ** (bits - is_signed))
+        if signed and int(token) and (is_float or not limits[0] <= int(token) < limits[1]):
+            raise ValueError(token)
+        if not signed and value >= 2**bits:
+            raise ValueError(token)
+        value = int(token) if signed else value
+        self.row += (value % 2**bits).to_bytes(field.length, "big")
+        return value

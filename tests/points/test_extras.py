@@ -1,0 +1,141 @@
+"""Further columns of points: the same on every way, in their types and units, carried wherever clouds go, free for who reads none."""
+
+from __future__ import annotations
+
+import dataclasses
+import pickle
+from importlib.util import find_spec
+
+import numpy as np
+import pytest
+
+from lidarspec import PointCloud, SpecError
+from lidarspec.packets.packets import Packets
+from lidarspec.points.cloud import LazyCloud, Mount
+from lidarspec.points.evaluate import evaluated
+from lidarspec.points.plain import evaluate
+from lidarspec.simulation.simulator import simulate
+from lidarspec.spec import Cartesian, Extra, Fields, Polar
+from lidarspec.testing.agreement import assert_same_points, assert_well_formed
+from tests.shapes import SHAPES
+
+SENSOR = SHAPES["shape-extras"]
+KINDS = {
+    "velocity": ("f4", "m/s"),
+    "near_ir": ("u2", ""),
+    "signal": ("u4", "photons"),
+    "tag": ("u1", ""),
+    "confidence": ("f4", "1"),
+    "strong": ("b1", ""),
+}
+COMPILED = pytest.mark.skipif(find_spec("numba") is None, reason="the fused back end needs Numba: pip install 'lidarspec[jit]'")
+
+
+def packets(number: int = 40, backend: str = "numpy") -> Packets:
+    """Packets with anything in them."""
+    return SENSOR.decode([SENSOR.example("data", seed=seed) for seed in range(number)], backend=backend)
+
+
+@pytest.mark.parametrize("backend", ["numpy", pytest.param("jit", marks=COMPILED), "construct"])
+def test_columns_have_the_values_types_and_units_of_the_plain_evaluation(backend: str) -> None:
+    read = packets(backend=backend)
+    found, plain = evaluated(read).cloud, evaluate(read).cloud
+    assert isinstance(found, LazyCloud) == (backend != "construct")
+    assert list(found.extra) == list(plain.extra) == list(KINDS)
+    for cloud in (found, plain):
+        assert {name: (cloud.extra[name].dtype.str[1:], cloud.units[name]) for name in cloud.extra} == KINDS
+    assert_same_points(found, plain)
+    channels = "blocks.channels."
+    np.testing.assert_array_equal(found.extra["velocity"], read[f"{channels}velocity"].reshape(-1).astype(np.float32))
+    np.testing.assert_array_equal(found.extra["signal"], np.repeat(read["blocks.signal"].reshape(-1), 3))  # more than float32 holds
+    assert found.extra["signal"].max() > 2**24
+    np.testing.assert_array_equal(np.isnan(found.extra["confidence"]), read[f"{channels}mark.noise"].reshape(-1) == 7)
+
+
+def test_a_column_that_nobody_reads_is_not_made() -> None:
+    cloud = packets().points()
+    assert isinstance(cloud, LazyCloud)
+    assert cloud.xyz.shape == (len(cloud), 3)
+    assert len(cloud.extra) == len(cloud.units) == 6
+    assert "velocity" in repr(cloud.extra)
+    assert not any(cloud.source.holds(name) for name in cloud.extra)
+    assert cloud.extra["velocity"] is cloud.extra["velocity"]
+    assert [name for name in cloud.extra if cloud.source.holds(name)] == ["velocity"]
+    with pytest.raises(KeyError, match="velocty: there are velocity, near_ir"):
+        cloud.extra["velocty"]
+
+
+def assert_carried(cloud: PointCloud, whole: PointCloud, which: object) -> None:
+    """Fail unless a cloud has some of the points of another one, with all of their columns."""
+    assert dict(cloud.units) == dict(whole.units)
+    assert list(cloud.extra) == list(whole.extra)
+    for name, column in whole.extra.items():
+        assert cloud.extra[name].dtype == column.dtype
+        np.testing.assert_array_equal(cloud.extra[name], column[which])  # type: ignore[call-overload]
+
+
+def test_masks_slices_scans_mounts_and_pickles_carry_them() -> None:
+    cloud, reader = packets().points(), packets().points()
+    mask = reader.extra["near_ir"] > 20_000
+    assert_carried(cloud[mask], reader, mask)
+    assert_carried(cloud[[3, 1, 99]], reader, [3, 1, 99])
+    assert_carried(cloud[7:200], reader, slice(7, 200))
+    assert_carried(cloud[7:200][3:9], reader, slice(10, 16))
+    assert_carried(cloud[::2][1:9], reader[::2], slice(1, 9))
+    assert_carried(pickle.loads(pickle.dumps(cloud)), reader, slice(None))
+    assert_carried(Mount(yaw_deg=90.0).applied(cloud), reader, slice(None))
+    data = simulate(SENSOR, 60)
+    scans, all_of_it = list(SENSOR.scans(data)), SENSOR.decode(data).points()
+    assert len(scans) > 3
+    ends = np.cumsum([0, *map(len, scans)])
+    for scan, start in zip(scans, ends, strict=False):
+        assert_carried(scan.points, all_of_it, slice(start, start + len(scan)))
+
+
+def test_structured_arrays_have_them_behind_the_layout_of_pcl() -> None:
+    cloud = packets().points()
+    made = cloud.to_structured()
+    assert made.dtype.itemsize == 64
+    assert {name: made.dtype.fields[name][1] for name in ("x", "ring", "time", "velocity", "near_ir", "signal")} == dict(  # type: ignore[index]
+        x=0, ring=20, time=24, velocity=32, near_ir=36, signal=40
+    )
+    for name, column in cloud.extra.items():
+        np.testing.assert_array_equal(made[name], column)
+
+
+@pytest.mark.parametrize("name", ["range", "valid", "x", "scan", "Near", "near ir", "2nd", ""])
+def test_a_name_that_means_something_else_is_refused(name: str) -> None:
+    with pytest.raises(SpecError, match=r"extra: .*name"):
+        Cartesian(0, 0, 0, extra={name: 1})
+
+
+def test_a_type_that_holds_no_numbers_is_refused() -> None:
+    with pytest.raises(SpecError, match="numbers"):
+        Extra(1, dtype="U4")
+
+
+def test_types_and_units_can_be_declared_and_low_values_are_spread() -> None:
+    def points(f: Fields) -> Polar:
+        extra = {
+            "velocity": Extra(f.blocks.channels.velocity, unit="", dtype=np.float64),
+            "noise": Extra(f.number % 7, dtype="u1"),
+            "one": 1,
+        }
+        return Polar(f.blocks.channels.distance, f.blocks.azimuth, extra=extra)
+
+    read = dataclasses.replace(SENSOR, points=points).decode([SENSOR.example("data", seed=seed) for seed in range(9)])
+    found, plain = read.points(), evaluate(read).cloud
+    assert [(column.dtype.str[1:], found.units[name]) for name, column in found.extra.items()] == [("f8", ""), ("u1", ""), ("f4", "")]
+    np.testing.assert_array_equal(found.extra["noise"], np.repeat(read["number"] % 7, 12))
+    assert_same_points(found, plain)
+    assert_well_formed(found)
+
+
+def test_points_in_parts_have_them_too() -> None:
+    sensor = SHAPES["shape-segments"]
+    read = sensor.decode(simulate(sensor, 30))
+    cloud = read.points()
+    assert cloud.extra["signal"].dtype == np.uint8
+    assert dict(cloud.units) == {"signal": "", "step": "deg", "share": ""}
+    np.testing.assert_array_equal(cloud.extra["signal"], cloud.extra["share"] * np.float32(255))
+    assert (cloud.extra["step"] == np.float32(1.5)).all()

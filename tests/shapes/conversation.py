@@ -1,0 +1,118 @@
+"""Commands with texts, addresses, bytes and elements of arrays, a running number that replies repeat, and a table that is learned."""
+
+from __future__ import annotations
+
+import dataclasses
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from construct import Array, Bytes, Const, Int8ul, Int16ub, Int16ul, Struct, this
+
+from lidarspec import Sensor, UsageError
+from lidarspec.spec import Address, Checksummed, Command, Count, Crc, Fields, Frame, Learned, OnWrap, Polar, Scaled, Simulation, Text, Udp
+
+SAMPLES = 4
+CRC = Crc(16, 0x1021, init=0xFFFF, order="big")
+
+ORDER = Checksummed(
+    Struct(
+        "header" / Const(b"\x2a\xc0"),
+        "head" / Struct("number" / Int16ub, "code" / Int8ul),
+        "host" / Array(4, Int8ul),
+        "ports" / Array(2, Int16ub),
+        "name" / Bytes(8),
+        "key" / Bytes(2),
+        "crc" / Int16ub,
+    ),
+    field="crc",
+    algorithm=CRC,
+)
+ACK = Checksummed(
+    Struct("header" / Const(b"\x2a\xc1"), "head" / Struct("number" / Int16ub, "code" / Int8ul), "result" / Int8ul, "crc" / Int16ub),
+    field="crc",
+    algorithm=CRC,
+)
+TABLE = Checksummed(
+    Struct(
+        "header" / Const(b"\x2a\xc3"),
+        "head" / Struct("number" / Int16ub, "code" / Int8ul),
+        "size" / Int8ul,
+        "angles" / Bytes(this.size),
+        "crc" / Int16ub,
+    ),
+    field="crc",
+    algorithm=CRC,
+)
+DATA = Checksummed(
+    Struct(
+        "header" / Const(b"\x2a\xc2"),
+        "angle" / Scaled(Int16ul, 0.01, "deg"),
+        "distances" / Array(SAMPLES, Scaled(Int16ul, 0.001, "m")),
+        "crc" / Int16ub,
+    ),
+    field="crc",
+    algorithm=CRC,
+)
+ECHOES = ("head.number", "head.code")
+
+
+def points(f: Fields, angles: tuple[float, ...] = (0.0, 1.0, 2.0, 3.0), *, nominal: bool = True) -> Polar:
+    return Polar(range=f.distances, azimuth=np.deg2rad(f.angle + np.array(angles)), nominal=nominal)
+
+
+def configure(sensor: Sensor, *, table: str | Path | Learned) -> Sensor:
+    """The sensor with the angles of a unit, degrees with spaces between them."""
+    try:
+        angles = tuple(map(float, Learned.content(table).split()))
+    except ValueError as error:
+        raise UsageError(f"{table}: no table of angles: {error}") from None
+    if len(angles) != SAMPLES:
+        raise UsageError(f"{len(angles)} angles, and there are {SAMPLES} samples")
+    return dataclasses.replace(sensor, points=partial(points, angles=angles, nominal=False))
+
+
+def sweep(i: int) -> dict[str, float]:
+    return {"angle": i * SAMPLES % 360}
+
+
+def order(code: int) -> dict[str, object]:
+    """The values of an order of its own code, in which nothing else is said."""
+    return {"head.number": Count(16, 7), "head.code": code, "host": [0] * 4, "ports": [7020, 0], "name": bytes(8), "key": bytes(2)}
+
+
+SENSOR = Sensor(
+    "shape-conversation",
+    vendor="Shapes",
+    model="Conversation",
+    frames={
+        "data": Frame(DATA, data=True, plausible=lambda f: f.angle < 360),
+        "ack": Frame(ACK),
+        "table": Frame(TABLE, max_length=64),
+        "order": Frame(ORDER, direction="out"),
+    },
+    points=points,
+    scan=OnWrap("azimuth"),
+    links={"data": Udp(7020), "control": Udp(7021)},
+    commands={
+        "get_table": Command(
+            "order", order(5), reply="table", echoes=ECHOES, link="control", learns=lambda reply: {"table": reply.angles}, timeout=5.0
+        ),
+        "hello": Command("order", {**order(1), "host": Address()}, reply="ack", echoes=ECHOES, link="control"),
+        "send_to": Command(
+            "order",
+            order(2),
+            args={"host": ("host", Address()), "port": ("ports[1]", 1024, 65535)},
+            reply="ack",
+            echoes=ECHOES,
+            link="control",
+        ),
+        "call": Command("order", order(3), args={"name": ("name", Text(8))}, reply="ack", echoes=ECHOES, link="control"),
+        "unlock": Command("order", order(4), args={"key": ("key", bytes)}, reply="ack", echoes=ECHOES, link="control"),
+    },
+    simulation=Simulation(sweep, rate=900, answers={"get_table": [("table", {"angles": b"0.5 1 1.5 2"})]}),
+    configure=configure,
+    range_limits=(0.05, 30.0),
+    status="manual",
+    source="invented for the tests: a conversation over a link of its own",
+)

@@ -1,0 +1,82 @@
+"""Points with further attributes: one in a unit, with a sign; one further out, as the wire has it; bits; and one calculated."""
+
+from __future__ import annotations
+
+import numpy as np
+from construct import Array, BitsInteger, BitStruct, Const, Int8ul, Int16sb, Int16ub, Int32ub, Struct
+
+from lidarspec import Sensor
+from lidarspec.spec import Checksummed, Clock, Every, Extra, Fields, Frame, Polar, Scaled, Sequence, Simulation, Udp, Xor
+
+BLOCKS, CHANNELS = 4, 3
+
+DATA = Checksummed(
+    Struct(
+        "head" / Const(b"\xe5\x7a"),
+        "number" / Int16ub,
+        "time" / Scaled(Int32ub, 1e-6, "s"),
+        "blocks"
+        / Array(
+            BLOCKS,
+            Struct(
+                "azimuth" / Scaled(Int16ub, 0.01, "deg"),
+                "signal" / Int32ub,
+                "channels"
+                / Array(
+                    CHANNELS,
+                    Struct(
+                        "distance" / Scaled(Int16ub, 0.004, "m"),
+                        "velocity" / Scaled(Int16sb, 0.01, "m/s"),
+                        "near_ir" / Int16ub,
+                        "mark" / BitStruct("noise" / BitsInteger(3), "tag" / BitsInteger(5)),
+                    ),
+                ),
+            ),
+        ),
+        "xor" / Int8ul,
+    ),
+    field="xor",
+    algorithm=Xor(),
+)
+
+
+def points(f: Fields) -> Polar:
+    """The signal is that of a block; the confidence falls with the noise, and there is none from noise 7 on."""
+    channels = f.blocks.channels
+    return Polar(
+        channels.distance,
+        np.deg2rad(f.blocks.azimuth),
+        np.deg2rad([-5.0, 0.0, 5.0]),
+        extra={
+            "velocity": channels.velocity,
+            "near_ir": channels.near_ir,
+            "signal": Extra(f.blocks.signal, unit="photons"),
+            "tag": channels.mark.tag,
+            "confidence": Extra(np.where(channels.mark.noise < 7, 1 - channels.mark.noise / 7, np.nan), unit="1"),
+            "strong": channels.near_ir > 1000 + 8 * channels.mark.tag,
+        },
+    )
+
+
+SENSOR = Sensor(
+    "shape-extras",
+    vendor="Shapes",
+    model="Extras",
+    frames={"data": Frame(DATA, data=True)},
+    points=points,
+    scan=Every(0.1),
+    links={"data": Udp(56_310)},
+    clock=Clock("time", wraps_at=4294.967296),
+    sequence=Sequence("number"),
+    simulation=Simulation(
+        lambda i: {
+            "number": i % 65_536,
+            "time": i * 0.01 % 4294.967296,
+            "blocks.azimuth": (np.arange(BLOCKS) + i * BLOCKS) * 9 % 360,
+            "blocks.signal": np.arange(BLOCKS) + 2**24 + 1,
+        }
+    ),
+    range_limits=(0.1, 200.0),
+    status="manual",
+    source="invented for the tests: further attributes of points",
+)

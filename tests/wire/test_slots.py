@@ -1,0 +1,107 @@
+"""Wire forms on single frames: what is read, what is written, how it was spelled, and what cannot be either."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from construct import Array, Const, Int8ub, Int16sb, Int16ub, Int24ub, Int32ub, Struct, this
+
+from lidarspec import Sensor, SpecError, UsageError, WireError
+from lidarspec.exports import Refused, export
+from lidarspec.spec import Escaped, Frame, Lines, Scip, SixBits, Tokens
+from tests.shapes import SHAPES
+
+TOKENS, LINES, ESCAPED = (SHAPES[f"shape-{name}"] for name in ("tokens", "lines", "escaped"))
+
+
+def sensor(struct: Struct, form: object, longest: int = 200) -> Sensor:
+    """A sensor with one frame in this form."""
+    frames = {"data": Frame(struct, data=True, max_length=longest, wire=form)}  # type: ignore[arg-type]
+    return Sensor(**{**vars(TOKENS), "frames": frames, "clock": None, "sequence": None})
+
+
+NUMBERS = sensor(Struct("a" / Int16ub, "b" / Int16sb, "c" / Int32ub), Tokens(start=b"\x02"))
+
+
+@pytest.mark.parametrize("text", [b"10F FFFE 2710", b"010f fffe 00002710", b"+271 -2 +10000", b"10F -2 0000000000002710"])
+def test_a_number_is_read_and_built_as_it_was_spelled(text: bytes) -> None:
+    data = b"\x02" + text + b"\x03"
+    values = NUMBERS.parse(data)
+    assert (values.a, values.b, values.c) == (271, -2, 10_000)
+    assert NUMBERS.build("data", values) == data
+    assert NUMBERS.build("data", {**values, "a": 272}) == b"\x02110 FFFE 2710\x03"
+
+
+@pytest.mark.parametrize("text", [b"10000 1 1", b"1 +32768 1", b"-1 1 1", b"+F 1 1", b"1 1", b"1  1", b"1 1 1 1", b"G 1 1", b"1 1 1 "])
+def test_what_is_no_number_of_its_slot_makes_no_frame(text: bytes) -> None:
+    data = b"\x02" + text + b"\x03"
+    with pytest.raises(WireError, match=r"is not a number of|is not the end of the frame|more bytes"):
+        NUMBERS.parse(data)
+    counters = NUMBERS.decode(data + b"\x021 1 1\x03").stats
+    assert (counters.frames, counters.bytes_skipped, counters.bad_length) == ({"data": 1}, len(data), 1)
+
+
+def test_decimal_tokens_have_signs_and_a_width() -> None:
+    decimal = sensor(Struct("a" / Int16ub, "b" / Int16sb), Tokens(start=b"$", sep=b",", end=b"\n", base=10, width=4))
+    assert decimal.build("data", a=65_535, b=-32_768) == b"$65535,-32768\n"
+    assert decimal.build("data", a=7, b=-1) == b"$0007,-0001\n"
+    assert decimal.parse(b"$7,-1\n") == decimal.parse(b"$0007,-0001\n")
+
+
+def test_characters_of_six_bits_are_those_of_the_specification() -> None:
+    """SCIP 2.0, C-42-03320B, 6: "CB" is 1234, "1Dh" 5432, "m2@0" 16000000."""
+    struct = Struct("kind" / Const(b"MD"), "two" / Int16ub, "three" / Int24ub, "four" / Int32ub)
+    made = sensor(struct, Lines(64, head=(2,), bare=1, check=Scip()) | SixBits())
+    data = made.build("data", two=1234, three=5432, four=16_000_000)
+    assert data.startswith(b"MD\nCB1Dhm2@0")
+    assert made.parse(data).three == 5432
+    with pytest.raises(UsageError, match="too large for its digits"):
+        made.build("data", two=4096, three=0, four=0)
+    with pytest.raises(WireError, match="check character"):
+        made.parse(data.replace(b"1Dh", b"1Di"))
+    assert made.decode(data.replace(b"1Dh", b"1Di")).stats.bad_checksum == 1
+
+
+def test_a_status_of_scip_has_the_sum_of_the_specification() -> None:
+    """SCIP 2.0: "00P", "99b", "0Ee"."""
+    assert Scip()(np.array([sum(b"00"), sum(b"99"), sum(b"0E")])).tobytes() == b"Pbe"
+
+
+def test_escapes_are_written_where_they_have_to_be_and_read_wherever_they_are() -> None:
+    made = sensor(Struct("count" / Int8ub, "bytes" / Array(this.count, Int8ub)), Escaped())
+    data = made.build("data", bytes=[0x7E, 0x11, 0x7D])
+    assert data == b"\x7e\x03\x7d\x5e\x11\x7d\x5d\x7e"
+    other = data.replace(b"\x11", b"\x7d\x31")
+    assert made.parse(other) == made.parse(data)
+    assert made.build("data", made.parse(other)) == other
+    assert made.decode(b"\x7e\x01\x7d\x7d\x5e\x7e" + data).stats.frames == {"data": 1}
+
+
+def test_a_fault_has_its_place_on_the_wire() -> None:
+    with pytest.raises(WireError) as fault:
+        NUMBERS.parse(b"\x0210F XY 1\x03")
+    assert (fault.value.path, fault.value.offset, fault.value.expected) == ("b", 5, "a number of 2 bytes")
+    with pytest.raises(WireError) as fault:
+        ESCAPED.parse(ESCAPED.example("data")[:-3] + b"\x00\x00\x7e")
+    assert fault.value.path == "fcs"
+
+
+@pytest.mark.parametrize("kind", ["c", "wireshark", "ksy", "json"])
+def test_an_export_that_cannot_recode_says_what(kind: str) -> None:
+    for each in (TOKENS, LINES, ESCAPED):
+        with pytest.raises(Refused, match=r"data in (Tokens|Lines|Escaped)\("):
+            export(each, kind)
+
+
+@pytest.mark.parametrize("kind", ["md", "svg", "pyi"])
+def test_pictures_stubs_and_pages_show_the_slots(kind: str) -> None:
+    assert "counter" in export(TOKENS, kind)
+
+
+def test_declarations_that_cannot_be_are_refused() -> None:
+    with pytest.raises(SpecError, match="one byte each, and differ"):
+        Tokens(start=b" ", sep=b" ")
+    with pytest.raises(SpecError, match="max_length may be left out only"):
+        Frame(Struct("a" / Int8ub), wire=Escaped())
+    with pytest.raises(SpecError, match="two bytes that differ"):
+        Escaped(0x7E, 0x5E)
