@@ -78,9 +78,9 @@ def _are_few(algorithm: Checksum, rows: NDArray[np.uint8], spans: Spans) -> bool
 def _crc(algorithm: Crc, rows: NDArray[np.uint8], spans: Spans) -> Values:
     known = zlib_crc(algorithm) if sum(stop - start for start, stop in spans) >= LONG else None
     if known is not None:
-        parts = np.ascontiguousarray(cut(rows, spans))
-        data, size = memoryview(parts).cast("B"), parts.shape[1]
-        return np.fromiter((known(data[first : first + size]) for first in range(0, parts.size, size)), np.uint64, len(rows))
+        parts = cut(rows, spans)
+        data, size = parts.tobytes(), parts.shape[1]
+        return np.fromiter((known(data[first : first + size]) for first in range(0, len(data), size)), np.uint64, len(rows))
     left = registers(rows, spans, algorithm.start, algorithm.width, algorithm.poly, algorithm.refin)
     if not algorithm.refin:
         left = left.byteswap() >> 8 * left.itemsize - algorithm.width
