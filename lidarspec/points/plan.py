@@ -28,6 +28,7 @@ from lidarspec.points.conventions import coordinates, direction_of, is_zero, mar
 from lidarspec.points.plain import kinds_of, parts_of
 from lidarspec.points.windows import is_number
 from lidarspec.spec.results import Cartesian, Polar
+from lidarspec.spec.vocabulary import row_numbers
 from lidarspec.wire.frame_table import Group
 from lidarspec.wire.layout import Bytes2D, Layout
 
@@ -171,7 +172,10 @@ class Plan:
 
     def safe(self, values: Callable[[Node], NDArray[Any]]) -> bool:
         """Whether all directions are numbers where everything that they are made of is: then a nan marks all coordinates alike."""
-        return self._may_be_safe and all(np.isfinite(values(term.low)).all() for term in self._directions if term.low is not None)
+        if not self._may_be_safe or not all(np.isfinite(values(term.low)).all() for term in self._directions if term.low is not None):
+            return False
+        rows = [term.full.args for term in self._directions if term.full is not None and term.full.kind == "rows"]
+        return all((row_numbers(values(index), len(table)) < len(table) - 1).all() for index, table in rows)
 
     @cached_property
     def _may_be_safe(self) -> bool:
@@ -194,6 +198,8 @@ class Plan:
 
     def _finite(self, node: Node) -> bool:
         """Whether an expression is a number for every value that its field can have."""
+        if node.kind == "rows":  # of a table of numbers, if the indices are in it
+            return bool(np.isfinite(node.args[1][:-1]).all())
         options = graph.chosen(node, self.width)
         if options is not None:
             return all(self._finite(option) if isinstance(option, Node) else bool(np.isfinite(option)) for option in options[1:])
