@@ -304,9 +304,9 @@ def _raw_text(raw: Any) -> str:
 
 
 def plain(parsed: Any) -> Any:
-    """A parsed frame as JSON takes it: bytes as hexadecimal text, null for nan and infinity."""
+    """A parsed frame as JSON takes it: its fields, bytes as hexadecimal text, null for nan and infinity."""
     if isinstance(parsed, dict):
-        return {name: plain(value) for name, value in parsed.items()}
+        return {name: plain(value) for name, value in parsed.items() if not name.startswith("_")}
     if isinstance(parsed, list):
         return [plain(value) for value in parsed]
     if isinstance(parsed, bytes | bytearray):

@@ -74,13 +74,13 @@ def _built(con: Any, given: Container) -> bytes:
     return bytes(data)
 
 
-def _written(recoding: Recoder, row: bytes, spelling: bytes | None, place: str) -> bytes:
+def _written(recoding: Recoder, row: bytes, spelling: object, place: str) -> bytes:
     """A row on the wire, as it was spelled if it says the same.
 
     Raises:
         UsageError: for values that its form cannot write.
     """
-    if spelling is not None and (known := recoding.row(spelling)) is not None and known[1] == row:
+    if isinstance(spelling, bytes) and (known := recoding.row(spelling)) is not None and known[1] == row:
         return spelling
     layout = recoding.tree.layout(row)
     data = recoding.written(np.frombuffer(row, np.uint8).reshape(1, -1), layout)[0] if isinstance(layout, Layout) else None

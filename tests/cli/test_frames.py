@@ -10,9 +10,11 @@ from pathlib import Path
 import pytest
 
 import lidarspec as ls
+from lidarspec.cli.frames import plain
 from tests.cli.running import COIN_D4, EXAMPLE, LD06, printed, process, ran
 from tests.engine.streams import MEGABYTE, peak
 from tests.sensors.evidence import capture
+from tests.shapes import SHAPES
 
 SENSOR = ("-s", "ldrobot-stl27l")
 FIELDS = ("speed=2152", "start_angle=324.27deg", "end_angle=334.7deg", "timestamp=6714ms")
@@ -269,3 +271,10 @@ def test_parts_are_built_shown_and_explained(tmp_path: Path) -> None:
     assert "points[0]  1.00 m, 90.00 deg, at 90.00 deg -> x 0.000 y 1.000" in explained
     assert "tags[i].points[j].angle" in ran("show", file).stdout
     assert "unknown field 'tags[0].tipe'" in ran("build", file, "data", "tags[0].tipe=1", code=2).stderr
+
+
+def test_json_has_the_fields_of_a_frame_and_not_how_they_were_spelled() -> None:
+    sensor = SHAPES["shape-tokens"]
+    spelled = sensor.parse(sensor.example("data").replace(b"scandata ", b"scandata 0"))
+    assert list(plain(spelled)) == [name for name in spelled if name != "_wire"]
+    assert len(spelled) == len(plain(spelled)) + 1
