@@ -15,7 +15,7 @@ RATE = 100  # IMU frames a second
 
 SAMPLE = Struct(
     *(f"gyro_{axis}" / Scaled(Int16sl, 0.01, "deg/s") for axis in "xyz"),
-    *(f"force_{axis}" / Int16sl * "in 1/2048 g" for axis in "xyz"),
+    *(f"force_{axis}" / Scaled(Int16sl, 9.80665 / 2048, "m/s2") for axis in "xyz"),
 )
 DATA = Checksummed(
     Struct(
@@ -50,10 +50,10 @@ def points(f: Fields) -> Polar:
 
 def beside(f: Fields) -> Imu:
     """The board of this one is turned over: its x is forward, its y to the right, its z down."""
-    s, radians, g = f.samples, np.pi / 180, 9.80665 / 2048
+    s, radians = f.samples, np.pi / 180
     return Imu(
         (s.gyro_x * radians, s.gyro_y * -radians, s.gyro_z * -radians),
-        (s.force_x * g, s.force_y * -g, s.force_z * -g),
+        (s.force_x, -s.force_y, -s.force_z),
         np.arange(SAMPLES) * (PERIOD / SAMPLES),
     )
 
