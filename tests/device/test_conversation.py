@@ -131,14 +131,23 @@ def test_what_cannot_be_learned_is_the_sensors_fault(said: bytes, learns: Any, e
         ls.open(port.path, sensor)
 
 
-def test_what_is_learned_is_no_path() -> None:
-    def configure(sensor: Sensor, *, table: str | Path) -> Sensor:
-        raise AssertionError("a path that a stranger wrote is opened")
+def path_alone(sensor: Sensor, *, table: str | Path) -> Sensor:
+    raise AssertionError("a path that a stranger wrote is opened")
 
+
+def of_no_type(sensor: Sensor, *, table) -> Sensor:  # type: ignore[no-untyped-def]  # as some authors write it
+    raise AssertionError("a path that a stranger wrote is opened")
+
+
+@pytest.mark.parametrize("configure", [path_alone, of_no_type])
+def test_what_is_learned_is_no_path(configure: Any) -> None:
     sensor = teaching(configure=configure)
-    refused = pytest.raises(CommandError, match="table is a path or a text, not")
+    refused = pytest.raises(CommandError, match=r"table is .*, not Learned\(11 bytes\)")
     with virtual_port(sensor, to=f"udp://127.0.0.1:{sensor.links['data'].ports[0]}") as port, refused:
         ls.open(port.path, sensor)
+
+
+def test_what_learns_has_a_reply_and_somewhere_to_go() -> None:
     with pytest.raises(SpecError, match="goes to `configure`"):
         dataclasses.replace(SENSOR, configure=None)
 
@@ -287,12 +296,19 @@ def test_of_several_that_answer_a_broadcast_the_first_is_the_sensor() -> None:
             orders.append(sensor.parse(data, "order"))
             first.sendto(sensor.build("ack", head=orders[1].head, result=0), sender)
 
-    with working(answer), ls.open(f"udp://127.0.0.1:{free_port()}?broadcast=127.255.255.255", sensor) as device:
+    data = sensor.links["data"].ports[0]
+    with working(answer), ls.open(f"udp://127.0.0.1:{data}?broadcast=127.255.255.255", sensor) as device:
         assert device.send("hello", timeout=SLACK).confirmed
         assert device.send("call", name="anna").confirmed
         until(lambda: device.newest(0.01) or device.stats.foreign)
         assert device.stats.foreign == 1
         assert any("127.0.0.2" in said and "127.0.0.3" in said and "left out" in said for said in device.warnings)
+        with udp("127.0.0.2") as own, udp("127.0.0.3") as other:
+            other.sendto(sensor.example("data"), ("127.0.0.1", data))
+            until(lambda: device.newest(0.01) or device.stats.foreign == 2)
+            own.sendto(sensor.example("data"), ("127.0.0.1", data))
+            until(lambda: device.newest(0.01) or device.stats.frames)
+        assert device.stats.frames == {"data": 1}, "the data are those of the sensor that answered"
     assert list(orders[0].host) == [127, 0, 0, 1]
 
 
