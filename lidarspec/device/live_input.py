@@ -172,7 +172,7 @@ class LiveInput(Input):
         self.stays_on = False
         self._said: list[str] = []
         self._captures["data"] = Capture(opened, self.queue, log=self._recorder)
-        self._checked: list[Pending] = []
+        self._checked, self._silent = list[Pending](), list[CommandError]()
         self._watch = Watch(source, sensor, opened, self._captures["data"], self.decoder, self._kept)
 
     @property
@@ -191,7 +191,7 @@ class LiveInput(Input):
         said += [warning for kept in (self._kept, *self._answering.values()) for warning in kept.warnings] + self._said
         if self._recorder is not None and self._recorder.error is not None:
             said.append(f"the recording has stopped: {self._recorder.error}")
-        silent = [f"{self._source}: {error}; it is started again" for error in self._session.unanswered.values() if error is not None]
+        silent = [f"{self._source}: {error}; it is started again" for error in list(self._session.unanswered.values())]
         return said if self._closed else said + silent + self._watch.warnings
 
     @property
@@ -363,8 +363,11 @@ class LiveInput(Input):
             self._take(link, run)
         if self._checked:
             self._compare()
-        elif any(self._session.unanswered.values()):
-            self._start_again()  # what is not answered any more may have started anew, and have forgotten everything
+        elif (silent := list(self._session.unanswered.values())) and silent != self._silent:
+            self._silent = (
+                silent  # for each beat that is not answered once: the sensor may have started anew, and have forgotten everything
+            )
+            self._start_again()
 
     def _take(self, link: str, run: list[Chunk] | Mark | BaseException) -> None:
         """Decode consecutive chunks of a link, or note what happened on it."""

@@ -242,14 +242,14 @@ class Session:
         sensor: the sensor.
         started: whether a command that starts the sensor was sent, and none since that stops it.
         late: answers that came after they had been given up.
-        unanswered: why the last heartbeat was not answered, None where it was, by command.
+        unanswered: why heartbeats are not answered any more, by command.
         host: the address of this computer as the sensor sees it, None where nobody knows it.
     """
 
     def __init__(self, sensor: Sensor) -> None:
         self.sensor, self.started, self.late = sensor, False, 0
         self.host: str | None = None
-        self.unanswered: dict[str, CommandError | None] = {}
+        self.unanswered: dict[str, CommandError] = {}
         self._count = 0
         self._lines: dict[str, _Line] = {}
         self._beats: dict[str, _Beat] = {}
@@ -311,7 +311,8 @@ class Session:
             if now >= beat.due:
                 beat.due = now + _ns(self.sensor.commands[name].every)
                 if beat.pending.done:
-                    self.unanswered = {**self.unanswered, name: beat.pending.failure}
+                    if beat.pending.failure is not None:
+                        self.unanswered[name] = beat.pending.failure
                     self.request(name, now, **beat.arguments)
         for link, line in self._lines.items():
             current = line.current
@@ -392,6 +393,7 @@ class Session:
             reply = Reply(current.name, item.frame, values, True, now, item.data, self._table(item.frame))
             self._close(line, current, answers=1, since=now)
             current.pending.settle(reply)
+            self.unanswered.pop(current.name, None)
             return
         for owed in line.owed:
             if not owed.expected.differs(item.frame, values):

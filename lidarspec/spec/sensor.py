@@ -332,7 +332,7 @@ class Configure:
             raise UnknownOption(min(options), OPTIONS, place=self.sensor.id, hint=f": {error}") from None
         for name, value in options.items():
             if not self.takes(name, value):
-                kinds = " or ".join(_TOLD[kind] for kind in sorted(self._kinds[name]) if kind in _TOLD)
+                kinds = " or ".join(_TOLD[kind] for kind in sorted(self._kinds[name]) if kind in _TOLD) or "no content"
                 raise UsageError(f"{self.sensor.id}: {name} is {kinds}, not {shown(value)}")
         try:
             configured = self.function(self.sensor, **options)
@@ -360,7 +360,14 @@ _TYPES: dict[str, Callable[[object], bool]] = {
     "Optional": lambda value: value is None,
     "Union": lambda value: False,
 }
-_TOLD = {"Path": "a path", "bool": "true or false", "float": "a number", "int": "a whole number", "str": "a text"}
+_TOLD = {
+    "Learned": "what a sensor said",
+    "Path": "a path",
+    "bool": "true or false",
+    "float": "a number",
+    "int": "a whole number",
+    "str": "a text",
+}
 
 
 def _type_names(annotation: object) -> set[str]:

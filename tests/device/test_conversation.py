@@ -9,7 +9,7 @@ import queue
 import socket
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -46,6 +46,16 @@ STATUS = Command(
     "ask", {"method": "GET", "path": b"/status", "body": b""}, reply="page", matches={"status": 200}, link="web", timeout=SLACK
 )
 SET = Command("ask", {"method": "PUT", "path": b"/mode"}, args={"mode": ("body", Text(40))}, reply="page", link="web", timeout=SLACK)
+
+
+def read_until(device: ls.Device, condition: Callable[[], object]) -> None:
+    """Read a device until something is so."""
+
+    def is_so() -> object:
+        device.newest(0.01)
+        return condition()
+
+    until(is_so, 4 * SLACK)
 
 
 def linked(control: Link, **more: Any) -> Sensor:
@@ -131,14 +141,23 @@ def test_what_cannot_be_learned_is_the_sensors_fault(said: bytes, learns: Any, e
         ls.open(port.path, sensor)
 
 
-def test_what_is_learned_is_no_path() -> None:
-    def configure(sensor: Sensor, *, table: str | Path) -> Sensor:
-        raise AssertionError("a path that a stranger wrote is opened")
+def path_alone(sensor: Sensor, *, table: str | Path) -> Sensor:
+    raise AssertionError("a path that a stranger wrote is opened")
 
+
+def of_no_type(sensor: Sensor, *, table) -> Sensor:  # type: ignore[no-untyped-def]  # as some authors write it
+    raise AssertionError("a path that a stranger wrote is opened")
+
+
+@pytest.mark.parametrize("configure", [path_alone, of_no_type])
+def test_what_is_learned_is_no_path(configure: Any) -> None:
     sensor = teaching(configure=configure)
-    refused = pytest.raises(CommandError, match="table is a path or a text, not")
+    refused = pytest.raises(CommandError, match=r"table is .*, not Learned\(11 bytes\)")
     with virtual_port(sensor, to=f"udp://127.0.0.1:{sensor.links['data'].ports[0]}") as port, refused:
         ls.open(port.path, sensor)
+
+
+def test_what_learns_has_a_reply_and_somewhere_to_go() -> None:
     with pytest.raises(SpecError, match="goes to `configure`"):
         dataclasses.replace(SENSOR, configure=None)
 
@@ -157,12 +176,7 @@ def test_a_sensor_that_comes_back_with_another_table_is_another_one() -> None:
         port.unplug()
         port.plug()
         told = "the sensor that came back has another table: open it again"
-
-        def is_told() -> bool:
-            device.newest(0.01)
-            return any(told in warning for warning in device.warnings)
-
-        until(is_told, 4 * SLACK)
+        read_until(device, lambda: any(told in warning for warning in device.warnings))
 
 
 def silent(device: ls.Device) -> bool:
@@ -172,19 +186,23 @@ def silent(device: ls.Device) -> bool:
 
 def test_a_sensor_that_no_longer_answers_its_heartbeat_is_started_again() -> None:
     order = SENSOR.commands["hello"]
-    beat = dataclasses.replace(order, values={**order.values, "head.code": 9}, every=0.1, timeout=0.3)
+    beat = dataclasses.replace(order, values={**order.values, "head.code": 9}, every=0.1, timeout=1.0)
     commands = {**SENSOR.commands, "hello": dataclasses.replace(order, starts=True, timeout=1.0), "beat": beat}
     sensor = linked(Udp(free_port()), commands=commands, on_open=("hello", "beat"))
     with virtual_port(sensor, to=f"udp://127.0.0.1:{sensor.links['data'].ports[0]}") as port, ls.open(port.path, sensor) as device:
         device.latest(SLACK)
-        until(lambda: device.newest(0.01) and port.device.heard.count("beat") > 2)
+        read_until(device, lambda: port.device.heard.count("beat") > 2)
         assert not silent(device)
         port.unplug()
-        until(lambda: device.newest(0.01) or silent(device))
+        read_until(device, lambda: silent(device))
         heard = len(port.device.heard)
         port.plug()
-        until(lambda: device.newest(0.01) and "hello" in port.device.heard[heard:], 2 * SLACK)
-        until(lambda: device.newest(0.01) and not silent(device), 2 * SLACK)
+        read_until(device, lambda: "hello" in port.device.heard[heard:] and not silent(device))
+        assert device.latest(SLACK).complete
+        begun = port.device.heard.count("hello")
+        beats = port.device.heard.count("beat")
+        read_until(device, lambda: port.device.heard.count("beat") > beats + 3)
+        assert port.device.heard.count("hello") == begun, "once is enough"
 
 
 class Loop(Link):
@@ -287,12 +305,18 @@ def test_of_several_that_answer_a_broadcast_the_first_is_the_sensor() -> None:
             orders.append(sensor.parse(data, "order"))
             first.sendto(sensor.build("ack", head=orders[1].head, result=0), sender)
 
-    with working(answer), ls.open(f"udp://127.0.0.1:{free_port()}?broadcast=127.255.255.255", sensor) as device:
+    data = sensor.links["data"].ports[0]
+    with working(answer), ls.open(f"udp://127.0.0.1:{data}?broadcast=127.255.255.255", sensor) as device:
         assert device.send("hello", timeout=SLACK).confirmed
         assert device.send("call", name="anna").confirmed
-        until(lambda: device.newest(0.01) or device.stats.foreign)
-        assert device.stats.foreign == 1
+        read_until(device, lambda: device.stats.foreign == 1)
         assert any("127.0.0.2" in said and "127.0.0.3" in said and "left out" in said for said in device.warnings)
+        with udp("127.0.0.2") as own, udp("127.0.0.3") as other:
+            other.sendto(sensor.example("data"), ("127.0.0.1", data))
+            read_until(device, lambda: device.stats.foreign == 2)
+            own.sendto(sensor.example("data"), ("127.0.0.1", data))
+            read_until(device, lambda: device.stats.frames)
+        assert device.stats.frames == {"data": 1}, "the data are those of the sensor that answered"
     assert list(orders[0].host) == [127, 0, 0, 1]
 
 
