@@ -69,14 +69,14 @@ class Told(NamedTuple):
     others: dict[str, str]
 
 
-def told_apart(candidates: Sequence[Sensor], found: Sequence[Found]) -> Told:
-    """What tells sensors with the same frames apart: single packets that only one sends, then the pace of the clock, then names.
+def told_apart(candidates: Sequence[Sensor], found: Mapping[str, Sequence[Found]]) -> Told:
+    """What tells sensors with the same data frames apart: single packets that only one sends, then the pace of the clock, then names.
 
     Args:
-        candidates: sensors whose frames these are alike.
-        found: frames in the order of their arrival.
+        candidates: sensors whose data frames these are alike.
+        found: frames as each of them reads the bytes, by id, in the order of their arrival.
     """
-    ids, shown = {sensor.id for sensor in candidates}, {sensor.id: _shown(sensor, found) for sensor in candidates}
+    ids, shown = {sensor.id for sensor in candidates}, {sensor.id: _shown(sensor, found[sensor.id]) for sensor in candidates}
     left = [sensor for sensor in candidates if not shown[sensor.id]]
     if not left:
         return Told({}, {name: why for seen in shown.values() for name, why in seen.items() if name not in ids})
@@ -93,7 +93,8 @@ def told_apart(candidates: Sequence[Sensor], found: Sequence[Found]) -> Told:
 def contradiction(sensor: Sensor, found: Sequence[Found]) -> str:
     """That these frames are those of relatives and not the sensor's, with what says so, or name another model; "" where nothing does."""
     known = sensors()
-    told = told_apart([sensor, *(known[name] for name in sensor.relatives if name in known)], found)
+    alike = [sensor, *(known[name] for name in sensor.relatives if name in known)]
+    told = told_apart(alike, {one.id: found for one in alike})
     if sensor.id not in told.alike:
         return "the frames are those of " + " or ".join(f"{name} ({why})" for name, why in (told.alike or told.others).items())
     names = _models(sensor, found)
@@ -111,11 +112,13 @@ def _shown(sensor: Sensor, found: Sequence[Found]) -> dict[str, str]:
     return {name: relative.told_by for name, relative in single.items() if np.mean(np.asarray(relative.sends(fields))) > 0.5}
 
 
-def _spoken_for(left: Sequence[Sensor], why: Callable[[Sensor, Sequence[Found]], str], found: Sequence[Found]) -> dict[str, str]:
+def _spoken_for(
+    left: Sequence[Sensor], why: Callable[[Sensor, Sequence[Found]], str], found: Mapping[str, Sequence[Found]]
+) -> dict[str, str]:
     """Those that the frames speak for in one way, by id, each with why; none where nothing does, or for all of several."""
     if len(left) == 1 and not left[0].relatives:
         return {}
-    reasons = {sensor.id: reason for sensor in left if (reason := why(sensor, found))}
+    reasons = {sensor.id: reason for sensor in left if (reason := why(sensor, found[sensor.id]))}
     return reasons if len(left) == 1 or len(reasons) < len(left) else {}
 
 
@@ -164,11 +167,14 @@ def _by_name(sensor: Sensor, found: Sequence[Found]) -> str:
 
 
 def _models(sensor: Sensor, found: Sequence[Found]) -> list[str]:
-    """The models that the first frames name, as far as they name any."""
+    """The models that the first frames name, as far as they name any; a relative may send another frame under the same name."""
     frame, _, field = sensor.info.get("model", "").partition(".")
     names = []
     for item in itertools.islice((item for item in found if item.frame == frame), READ):
-        names.append(_text(*_field(sensor, item, field)))
+        try:
+            names.append(_text(*_field(sensor, item, field)))
+        except WireError:
+            continue
     return [name for name in names if name]
 
 
@@ -319,7 +325,7 @@ def verdict(heard: Heard) -> Verdict:
     best = [score for score in fitting if score.share >= fitting[0].share - AS_GOOD]
     if not best:
         return Verdict(heard, fault=never_right(heard.chunks, datagrams=heard.datagrams))
-    told = told_apart([score.sensor for score in best], best[0].found)
+    told = told_apart([score.sensor for score in best], {score.sensor.id: score.found for score in best})
     alike = [replace(score, why=told.alike[score.sensor.id]) for score in best if score.sensor.id in told.alike]
     if len(alike) > 1 and heard.baud is not None:
         why = f"it runs at {heard.baud} baud"

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import lidarspec as ls
-from lidarspec.discovery.detect import verdict
+from lidarspec.discovery.detect import contradiction, verdict
 from lidarspec.discovery.listen import Heard
 from lidarspec.simulation.simulator import simulate
 from tests.sensors.evidence import capture, clockwise, decoded, vector_bytes, vectors
@@ -110,3 +110,13 @@ def test_a_tmini_is_told_from_other_makes_and_models_by_what_its_packets_say_of_
     others = verdict(Heard("", tuple(simulate(ls.sensor("ydlidar-g2"), 60))))
     assert {"cspc-coin-d4", "ydlidar-g2", "ydlidar-s4b"} <= {score.sensor.id for score in others.alike}
     assert verdict(Heard("", tuple(simulate(ls.sensor("ydlidar-tmini-plus-sh"), 60)))).sensor is ls.sensor("ydlidar-tmini-plus-sh")
+
+
+def test_a_relative_whose_other_frames_differ_contradicts_nothing() -> None:
+    coin = ls.sensor("cspc-coin-d4")
+    info = coin.build("info", model=b"COIN-D4".ljust(12, b"\0"), zero_angle=0, direction=0, correction=0, reserved=bytes(3), revision=1)
+    started = coin.split(info + b"".join(simulate(coin, 20)))
+    assert started[0].frame == "info"
+    assert contradiction(coin, started) == ""
+    said = contradiction(TMINI, TMINI.split(vector_bytes(FILE, "yd_devinfo_tmini_plus")))
+    assert said == "the frames are those of ydlidar-tmini-plus (info.model says T-mini Plus)"
