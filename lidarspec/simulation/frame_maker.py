@@ -22,7 +22,7 @@ from lidarspec.wire.frame_table import Group, Rows
 from lidarspec.wire.layout import Layout, Leaf
 from lidarspec.wire.layout_tree import TooLong, Unknown, layout_of
 from lidarspec.wire.schema import schema
-from lidarspec.wire.slots import recoder
+from lidarspec.wire.slots import Recoder, recoder
 
 Values = Mapping[str, Any]
 
@@ -33,6 +33,8 @@ class FrameMaker:
     Raises:
         SpecError: where the frame type is not compiled.
     """
+
+    _recoder: Recoder | None = None  # parts have none of their own
 
     def __init__(self, sensor: Spec, frame: str) -> None:
         known = codec(sensor.frames[frame])
