@@ -34,6 +34,8 @@ class FrameMaker:
         SpecError: where the frame type is not compiled.
     """
 
+    _recoder: Recoder | None = None  # parts have none of their own
+
     def __init__(self, sensor: Spec, frame: str) -> None:
         known = codec(sensor.frames[frame])
         engine = known.compiled
