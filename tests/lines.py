@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import socket
+import termios
 import threading
 import time
 import tty
@@ -38,6 +39,10 @@ class Port:
 
     def send(self, data: bytes) -> None:
         os.write(self._master, data)
+
+    def discard(self) -> None:
+        """Throw away what was sent and nobody read; a sender that waits for room has it."""
+        termios.tcflush(self._slave, termios.TCIFLUSH)
 
     def received(self, size: int) -> bytes:
         """The next bytes that the program on the other side wrote."""

@@ -20,7 +20,7 @@ from lidarspec.discovery.periods import structure
 from lidarspec.simulation.simulator import simulate
 from lidarspec.spec import Crc
 from lidarspec.testing.fixtures import virtual_port
-from tests.lines import Port, paced, port, working
+from tests.lines import Port, port, working
 from tests.sensors.evidence import capture
 
 CAPTURED = {
@@ -260,12 +260,16 @@ def test_udp_datagrams_of_two_senders_are_told_apart() -> None:
 
 def test_bytes_at_the_wrong_rate_fit_nobody(tmp_path: Path) -> None:
     source = random.Random(6)
-    with port(tmp_path) as made, working(lambda stop: _noise(made, source, stop)), pytest.raises(WireError, match="no installed sensor"):
-        detected(made.name)
+    with port(tmp_path) as made, working(lambda stop: _noise(made, source, stop)) as stop:
+        with pytest.raises(WireError, match="no installed sensor"):
+            detected(made.name)
+        stop.set()
+        made.discard()
 
 
 def _noise(made: Port, source: random.Random, stop: threading.Event) -> None:
-    paced(made.send, [source.randbytes(100) for _ in range(50)], 200, stop)
+    while not stop.wait(0.005):
+        made.send(source.randbytes(100))
 
 
 def test_what_cannot_be_opened_is_the_systems_fault(tmp_path: Path) -> None:
