@@ -698,8 +698,8 @@ def file_module(file: Path) -> ModuleType:
     if not file.is_file():
         raise SourceError(f"{file}: no such file")
     module_spec = importlib.util.spec_from_file_location(f"lidarspec_file_{file.stem}_{crc32(bytes(file.resolve())):08x}", file)
-    assert module_spec is not None
-    assert module_spec.loader is not None
+    if module_spec is None or module_spec.loader is None:
+        raise SourceError(f"{file} is no Python file: its name does not end in .py")
     module = importlib.util.module_from_spec(module_spec)
     sys.modules[module.__name__] = module
     try:

@@ -145,7 +145,9 @@ def _right(buffer: Bytes1D, spot: int, mask: int, value: int) -> NDArray[np.bool
 
 def fitting(buffer: Bytes1D, offsets: Offsets, constants: Marks) -> Offsets:
     """The offsets, in order, where the constants are right as far as the bytes go, (k,)."""
-    for spot, mask, value in constants if len(offsets) else ():
+    for spot, mask, value in constants:
+        if not len(offsets):
+            break
         inside = int(offsets.searchsorted(len(buffer) - spot))
         found = buffer.take(offsets[:inside] + spot)
         kept = np.flatnonzero((found if mask == 0xFF else found & np.uint8(mask)) == value)

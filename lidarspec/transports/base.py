@@ -139,11 +139,11 @@ def numeric(host: str, place: str) -> str:
         UsageError: where nobody knows it.
     """
     for family in (socket.AF_INET, socket.AF_INET6):
-        with contextlib.suppress(OSError):
+        with contextlib.suppress(OSError, ValueError):
             return socket.inet_ntop(family, socket.inet_pton(family, host.partition("%")[0]))
     if not re.fullmatch(r"[\d.]*", host):  # which are addresses that are not whole
         for family in (socket.AF_INET, socket.AF_INET6):
-            with contextlib.suppress(OSError, UnicodeError):
+            with contextlib.suppress(OSError, ValueError):
                 return str(socket.getaddrinfo(host, None, family, socket.SOCK_DGRAM)[0][4][0])
     error = UsageError(f"{place}: there is no host {host!r}; name one, or its address, such as 192.168.1.200")
     raise suggest(error, "lidarspec detect udp://")

@@ -125,6 +125,8 @@ def words(data: bytes) -> list[str]:
             found += [option.opts[-1]] if option.is_flag else [option.opts[-1], _value(option.name or "", next(rest, 0), next(rest, 0))]
     if verb == "sim":  # into a file, and not much of it
         found += ["--to", TARGETS[3 + data[-1] % 3], "-t", "10ms", "--rate", "max"]
+    if verb == "record":  # what is live has no end
+        found += ["-t", "10ms"]
     if verb in ("replay", "record"):
         found += ["--to" if verb == "replay" else "-o", TARGETS[3 + data[-1] % 3]]
     return found

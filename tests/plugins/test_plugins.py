@@ -228,6 +228,12 @@ def test_the_stranger_uses_state_look_ahead_and_its_calibration_file(tmp_path: P
     assert sensor.parse(sensor.command("spin", rate=10.0)).rate == 100
 
 
+def test_a_file_of_another_kind_is_no_sensor(tmp_path: Path) -> None:
+    (file := tmp_path / "readme.txt").write_text("hello", encoding="utf-8")
+    with pytest.raises(lidarspec.SourceError, match=r"readme\.txt is no Python file"):
+        lidarspec.sensor(str(file))
+
+
 def test_a_file_with_several_sensors_asks_which(tmp_path: Path) -> None:
     file = tmp_path / "two.py"
     text = STRANGER.read_text(encoding="utf-8").replace("return [X1]", "return [X1, dataclasses.replace(X1, id='acme-x2', aliases=())]")

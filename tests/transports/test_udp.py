@@ -93,9 +93,12 @@ def test_a_sender_is_asked_for_by_any_name_of_its_address(name: str) -> None:
     assert origin(name).host in ("127.0.0.1", "::1")
 
 
-@pytest.mark.parametrize("source", ["udp://:{port}?src=localhots.invalid", "udp://:{port}?src=192.168.1", "udp://10.0.0.256:{port}"])
+@pytest.mark.parametrize(
+    "source",
+    ["udp://:{port}?src=localhots.invalid", "udp://:{port}?src=192.168.1", "udp://10.0.0.256:{port}", "udp://:{port}?src=%00"],
+)
 def test_a_host_that_nobody_knows_is_refused(source: str) -> None:
-    with pytest.raises(UsageError, match=r"there is no host '(localhots.invalid|192.168.1|10.0.0.256)'"):
+    with pytest.raises(UsageError, match=r"there is no host '(localhots.invalid|192.168.1|10.0.0.256|\\x00)'"):
         opened(source.format(port=free_port()))
 
 
