@@ -68,7 +68,8 @@ def shared(status: os.stat_result, others: int) -> str:
         return ""
     if status.st_uid != os.geteuid():
         return f"belongs to user {status.st_uid}"
-    return f"is open to others: its mode is {stat.S_IMODE(status.st_mode):o}" if status.st_mode & others else ""
+    mode = stat.S_IMODE(status.st_mode)
+    return f"is open to others: chmod {mode & ~others:o} makes it yours" if mode & others else ""
 
 
 def is_trusted(folder: Path) -> bool:
@@ -93,7 +94,7 @@ def trust(folder: str | Path) -> Path:
     if not found.is_dir() or len(str(found).splitlines()) > 1:
         raise UsageError(f"{folder} is no folder")
     if reason := foreign(found / "."):
-        raise UsageError(f"{reason}: whoever writes there could run programs as you")
+        raise UsageError(f"{reason}; whoever writes there could run programs as you")
     file = user_folder() / TRUSTED
     if not is_trusted(found):
         with system_errors(file):

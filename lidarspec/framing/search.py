@@ -103,7 +103,7 @@ class _Chain:
             if bool((live.starts[1:] < ends[:-1]).any()):
                 self._after = live.starts.searchsorted(ends)
                 stops |= self._after != np.arange(1, len(live) + 1)
-        self._changes, self._kinds, self._ends = b"", list[int](), list[int]()
+        self._changes, self._kinds, self._ends = bytes(len(live)), list[int](), list[int]()
         if framing.named:
             changes = framing.switching(mode)[live.kinds] & (live.status == VALID)
             self._changes, self._kinds, self._ends = changes.tobytes(), live.kinds.tolist(), ends.tolist()
@@ -118,7 +118,7 @@ class _Chain:
             first = bisect.bisect_left(self._starts, position) if self._starts else int(live.starts.searchsorted(position))
         while first < len(live):
             last = self._stops[bisect.bisect_left(self._stops, first)]
-            if self._changes and self._changes[last]:
+            if self._changes[last]:
                 self._runs.append((first, last))
                 self._mode.after = self._framing.names[self._kinds[last]]
                 return self._ends[last]

@@ -139,7 +139,7 @@ def test_a_file_that_is_not_the_users_is_passed_over_and_said_once(folder: Path,
     else:
         place = file if whose == "everybody's" else file.parent
         place.chmod(0o777)
-        reason = f"{place} is open to others: its mode is 7"
+        reason = f"{place} is open to others: chmod 775 makes it yours"
     with pytest.warns(UserWarning, match=f"{file} is not read: {reason}"):
         device = settings.named("front")
     assert device is not None
@@ -197,7 +197,7 @@ def test_a_project_names_no_files_elsewhere_until_its_folder_is_allowed(folder: 
 def test_only_a_folder_of_ones_own_can_be_allowed(folder: Path) -> None:
     folder.chmod(0o777)
     said = ran("trust", folder, code=2).stderr
-    assert f"{folder} is open to others: its mode is 777: whoever writes there could run programs as you" in said
+    assert f"{folder} is open to others: chmod 775 makes it yours; whoever writes there could run programs as you" in said
     assert "is no folder" in ran("trust", folder / "front.bin", code=2).stderr
 
 

@@ -108,7 +108,7 @@ def test_a_file_of_another_user_is_not_read(folder: Path) -> None:
 def test_a_folder_that_is_open_to_others_is_not_used_and_that_is_said_once(folder: Path) -> None:
     _is_read()
     folder.chmod(0o777)
-    with pytest.warns(UserWarning, match="kernels is open to others: its mode is 7") as said:
+    with pytest.warns(UserWarning, match="kernels is open to others: chmod 700 makes it yours") as said:
         assert [_is_read(), _is_read()] == [False, False]
     assert len(said) == 1
     _forget()
