@@ -127,6 +127,11 @@ def _assigned(path: str, info: FieldInfo) -> str:
     return ".".join(steps) + ("[*]" if last in info.axes and info.kind != "bytes" else "")
 
 
+def _columns(ctx: click.Context, incomplete: str) -> Iterable[str]:
+    """What colours can show of each sensor; columns of its own are known once there are points."""
+    return ("range", "intensity")
+
+
 def _files(ctx: click.Context, incomplete: str) -> Iterable[str]:
     return ()
 
@@ -142,7 +147,7 @@ def _either(ctx: click.Context, incomplete: str) -> Iterable[str]:
 
 
 #: what is all that there can be; elsewhere files can stand as well.
-LISTED = (_frames, _commands, _assignments, _verbs)
+LISTED = (_frames, _commands, _assignments, _verbs, _columns)
 #: the name of a parameter -> what can stand there.
 BY_NAME: dict[str, Callable[[click.Context, str], Iterable[str]]] = {
     "sensor_id": _sensors,
@@ -152,6 +157,7 @@ BY_NAME: dict[str, Callable[[click.Context, str], Iterable[str]]] = {
     "assignments": _assignments,
     "name": _either,
     "verb": _verbs,
+    "ramp": _columns,
     **dict.fromkeys(
         ("file", "words", "target", "output", "scene", "vectors", "capture", "into", "diff", "link", "place", "to", "folder"), _files
     ),

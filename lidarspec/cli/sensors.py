@@ -41,11 +41,11 @@ def guide() -> str:
     ports = [port.path for port in serial_ports()]
     named = list(devices())
     source = (named or ports or ["sim:" + next(iter(known), "ID")])[0]
-    vendors = ", ".join(dict.fromkeys(sensor.vendor for sensor in known.values()))
+    vendors = {sensor.vendor for sensor in known.values()}
     return "\n".join(
         [
             f"lidarspec {__version__}",
-            f"{len(known)} sensors of {vendors}" if known else NO_SENSORS,
+            f"{len(known)} sensors of {len(vendors)} vendors" if vendors else NO_SENSORS,
             f"serial ports: {', '.join(ports) or 'none'}",
             *([f"devices of {FILE}: {', '.join(named)}"] if named else []),
             "",

@@ -6,5 +6,6 @@ sensor's clock and counter, and with what frames of other types said last. Modul
 * `packets`: the columns of n frames, raw and physical.
 * `clocks`: the sensor's own time as integer nanoseconds that run on.
 * `continuity`: what was lost, came twice or late; packets put back in order.
+* `imu`: what an IMU felt, beside the points.
 * `stream`: what is remembered from batch to batch.
 """

@@ -91,7 +91,7 @@ def test_bytes_of_live_sources_are_read_by_another_verb(verb: str, source: str) 
 
 def test_hexadecimal_digits_with_colons_are_no_address() -> None:
     assert "ldrobot-stl27l data, 47 bytes" in ran("parse", EXAMPLE.hex(":"), *STL).stdout
-    assert "lsn is cut off" in ran("parse", "aa:55:00", code=4).stderr
+    assert "lsn is cut off" in ran("parse", "aa:55:00", "-s", "cspc-m1c1-mini", code=4).stderr
 
 
 @pytest.mark.parametrize("words", [("replay", "kept.lsr"), ("sim", "ldrobot-stl27l", *BRIEF)])

@@ -64,7 +64,7 @@ SENSOR = Sensor(
     "shape-columns",
     vendor="Shapes",
     model="Columns",
-    frames={"data": Frame(DATA, data=True, max_length=2000, plausible=lambda f: f.columns.measurement < TURN)},
+    frames={"data": Frame(DATA, data=True, plausible=lambda f: f.columns.measurement < TURN)},
     points=points,
     scan=OnChange("frame"),
     clock=Clock("columns[0].timestamp", wraps_at=4294.967296),

@@ -22,7 +22,7 @@ DATA = Checksummed(
         "head" / Const(b"\x1d\xa7"),
         "number" / Int16ul,
         "time" / Scaled(Int64ul, 1, "ns"),
-        "block" / Int8ul,
+        "block" / Scaled(Int8ul, 18, "deg"),
         "distances" / Array(POINTS, Scaled(Int16ul, 0.002, "m")),
         "samples" / Array(SAMPLES, SAMPLE),
         "xor" / Int8ul,
@@ -45,7 +45,7 @@ IMU = Checksummed(
 
 
 def points(f: Fields) -> Polar:
-    return Polar(f.distances, np.deg2rad(f.block * 18 + np.arange(POINTS) * 2.25), time=np.arange(POINTS) * (PERIOD / POINTS))
+    return Polar(f.distances, np.deg2rad(f.block + np.arange(POINTS) * 2.25), time=np.arange(POINTS) * (PERIOD / POINTS))
 
 
 def beside(f: Fields) -> Imu:
@@ -63,7 +63,7 @@ def alone(f: Fields) -> Imu:
 
 
 def sweep(i: int) -> dict[str, Any]:
-    return dict(number=i % 65_536, time=i * 5_000_000, block=i % TURN)
+    return dict(number=i % 65_536, time=i * 5_000_000, block=i % TURN * 18)
 
 
 SENSOR = Sensor(
