@@ -50,7 +50,7 @@ WIDEST, HIGHEST, SUMMARY = 100, 42, 8
 @click.option("--loss", type=SHARE, default="0%", show_default=True, help="Share of the packets that get lost.")
 @click.option("--reorder", type=click.IntRange(0, 1000), default=0, show_default=True, help="How many places late a datagram may come.")
 @click.option("--unplug", type=DURATION, help="Pull the plug after so long, again and again.")
-@click.option("--shake", type=click.FloatRange(min=0), default=0.0, metavar="M/S2", help="Noise on what an IMU feels: m/s2, rad/s.")
+@click.option("--shake", type=click.FloatRange(min=0), default=0.0, metavar="NOISE", help="Deviation of what an IMU feels: m/s2 and rad/s.")
 @click.option("--absent", type=DURATION, default="2s", show_default=True, help="How long it is out then.")
 @click.option("--rotor", type=click.Choice([BLOCKED]), help="It does not turn.")
 @click.option("--force", is_flag=True, help="Write over a file that exists.")

@@ -55,6 +55,11 @@ def narrowed(sensor: Sensor, frame: str) -> Sensor:
     return with_frames(sensor, {frame: replace(sensor.frames[frame], after=None)})
 
 
+def beginning(sensor: Sensor) -> str:
+    """What names begin with where they have to begin with a letter."""
+    return sensor.id if sensor.id[0].isalpha() else f"lidar-{sensor.id}"
+
+
 def export(sensor: Sensor, kind: str) -> str:
     """The text of an export of a sensor.
 

@@ -16,7 +16,7 @@ from textwrap import indent
 from typing import Any
 
 from lidarspec._version import __version__
-from lidarspec.exports import Message, Refused, c_fields, messages
+from lidarspec.exports import Message, Refused, beginning, c_fields, messages
 from lidarspec.exports.c_fields import CLayout, Entry, accesses, arguments, comment, identifier, parameters, quoted, word
 from lidarspec.spec import Checksum, Crc, Fold15, Sensor, Sum, WordXor, Xor, ZeroPadded
 from lidarspec.spec.checksums import byte_table, mirrored_bytes, reflected
@@ -316,7 +316,7 @@ def header(sensor: Sensor) -> str:
     Raises:
         Refused: where only Python code can decide what a frame is made of, or its layout cannot be computed in C.
     """
-    prefix = identifier(sensor.id if sensor.id[0].isalpha() else f"lidar_{sensor.id}")
+    prefix = identifier(beginning(sensor))
     title, source = (text.replace("*/", "* /").replace("/*", "/ *") for text in (f"{sensor.vendor} {sensor.model}", sensor.source))
     found = messages(sensor)
     algorithms = dict.fromkeys(seal.algorithm for message in found for seal in message.seals.values())

@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from lidarspec.exports import Message, Refused, messages
+from lidarspec.exports import Message, Refused, beginning, messages
 from lidarspec.spec import Sensor, tree
 from lidarspec.spec.bits import BitField, Segment
 from lidarspec.spec.fields import slug
@@ -225,7 +225,7 @@ def ksy(sensor: Sensor) -> str:
     types = {identifier(message.name): _frame(sensor, message) for message in frames}
     if len(types) < len(frames):
         raise Refused(f"{sensor.id}: two frame types have one name in Kaitai, where names are in lower case")
-    name = identifier(sensor.id)
+    name = identifier(beginning(sensor))
     document = {
         "meta": {"id": name if name[0].isalpha() else f"lidar_{name}", "title": f"{sensor.vendor} {sensor.model}", "ks-version": "0.10"},
         "doc": f"{sensor.source}. Made by lidarspec export ksy {sensor.id}. Checksums are not checked.",

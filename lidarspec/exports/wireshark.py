@@ -345,7 +345,8 @@ def dissector(sensor: Sensor) -> str:
     name, title, link = sensor.id.replace("-", "_"), f"{sensor.vendor} {sensor.model}", sensor.links.get("data")
     if isinstance(link, Udp) and link.assembled is not None:
         raise Refused(f"{sensor.id}: messages in several datagrams, which the dissector does not join")
-    by_direction = sorted(messages(sensor), key=lambda message: message.frame.direction)  # "in" first: what both could be came in
+    # the first that fits is shown: what goes either way came in, and the one with more constants says more
+    by_direction = sorted(messages(sensor), key=lambda message: (message.frame.direction, -len(codec(message.frame).prefix)))
     about = {
         "title": title,
         "is_stream": any(isinstance(link, Udp) and link.stream for link in sensor.links.values()),

@@ -101,10 +101,9 @@ def test_points_are_those_of_the_cloud(sensor: str) -> None:
     data = examples(sensor, frame)[0]
     found = explain(data, value, frame)
     points = [point for row in found.rows for point in row.points]
-    if value.frames[frame].confirm > 1 or value.frames[frame].after or not points:
-        assert sensor in {"shape-weak", "shape-modes", "shape-text"} or not points or value.frames[frame].after
-        return
-    cloud = value.decode([data]).points()
+    if value.frames[frame].after or not points:
+        pytest.skip("what its points are follows from frames before it")
+    cloud = value.decode([data] * value.frames[frame].confirm).points()[: len(points)]
     told = np.array([[point.x, point.y, point.z] for point in points])
     told, found_there = np.nan_to_num(told), np.nan_to_num(cloud.xyz.astype(float))
     apart = np.abs(told[:, None] - found_there).max(axis=2)

@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 
 from lidarspec import Sensor, WireError
-from lidarspec.exports import Refused, export
+from lidarspec.exports import Refused, beginning, export
 from lidarspec.framing.frame_engine import codec
 from lidarspec.testing import subject as material
 from lidarspec.wire.schema import Schema
@@ -107,7 +107,7 @@ def reader(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFact
     source, program = folder / "reader.c", folder / "reader"
     dumps = [_dump(sensor, name) for sensor in SENSORS.values() for name in sensor.frames]
     calls = [
-        f'        if (!strcmp(name, "{sensor.id}:{name}")) dump_{_word(sensor.id)}_{name}(p, n);\n'
+        f'        if (!strcmp(name, "{sensor.id}:{name}")) dump_{_word(beginning(sensor))}_{name}(p, n);\n'
         for sensor in SENSORS.values()
         for name in sensor.frames
     ]
@@ -181,7 +181,7 @@ def _word(text: str) -> str:
 def _dump(sensor: Sensor, name: str) -> str:
     """A function that prints the fields of one frame type: which they are, and in which arrays, comes from the schema of lidarspec."""
     table = codec(sensor.frames[name]).schema
-    prefix = f"{_word(sensor.id)}_{name}"
+    prefix = f"{_word(beginning(sensor))}_{name}"
     text = export_of(sensor.id)
     lines = [
         f'    printf("%d %zu\\n", {prefix}_is_frame(p, n), {prefix}_frame_length(p, n));',

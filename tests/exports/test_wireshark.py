@@ -53,10 +53,23 @@ def test_what_only_python_can_decide_is_refused_with_the_reason() -> None:
 @pytest.mark.parametrize("sensor", SENSORS)
 def test_every_field_reads_as_lidarspec_reads_it(sensor: Sensor, tmp_path: Path) -> None:
     outgoing = [(name, sensor.example(name, seed=seed)) for seed in range(3) for name in sensor.frames if name not in sensor.incoming]
-    frames = [*Subject(sensor).conversation(), *outgoing]
+    frames = [(_answer(sensor, name, data), data) for name, data in [*Subject(sensor).conversation(), *outgoing]]
     capture = captured(sensor, [data for _, data in frames], tmp_path / "frames.pcap")
     script = written(sensor, tmp_path)
     assert_shown(sensor, capture, script, frames)
+
+
+def _answer(sensor: Sensor, name: str, data: bytes) -> str:
+    """The answer that has the very bytes of a command, which is what a dissector takes them for; else the frame's own name."""
+    return name if name in sensor.incoming else next((other for other in sensor.incoming if _reads(sensor, other, data)), name)
+
+
+def _reads(sensor: Sensor, name: str, data: bytes) -> bool:
+    try:
+        sensor.parse(data, frame=name)
+    except lidarspec.WireError:
+        return False
+    return True
 
 
 def assert_shown(sensor: Sensor, capture: Path, script: Path, frames: Sequence[tuple[str, bytes]], *arguments: str) -> None:

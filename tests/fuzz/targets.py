@@ -410,8 +410,8 @@ def _calibration(sensor: Sensor, option: str, folder: Path) -> Target:
 
     def examples() -> list[bytes]:
         heading = "Channel,Elevation,Azimuth" if option == "calibration" else "Channel,fire time(us)"
-        rows = [f"{channel},{20.5 - channel}{f',{channel % 5 * 3 - 6}' * heading.count('Azimuth')}" for channel in range(1, 65)]
-        return ["\n".join([heading, *rows[:number]]).encode() for number in (16, 32, 40, 64)]
+        rows = [f"{channel},{20.5 - channel / 2}{f',{channel % 5 * 3 - 6}' * heading.count('Azimuth')}" for channel in range(1, 129)]
+        return ["\n".join([heading, *rows[:number]]).encode() for number in (16, 32, 40, 64, 128)]
 
     words = [
         word.encode()

@@ -13,10 +13,20 @@ import lidarspec as ls
 
 #: what a sensor is made of, and how it is found.
 ALLOWED = {
-    *("_version", "columns", "columns.columns", "errors", "plugins", "spec", "spec.bits", "spec.checksums", "spec.construct_layer"),
-    *("spec.construct_layer.classes", "spec.construct_layer.meaning", "spec.construct_layer.refusals"),
+    *("_version", "columns", "columns.columns", "errors", "plugins", "spec", "spec.arguments", "spec.bits", "spec.checksums"),
+    *("spec.construct_layer", "spec.construct_layer.classes", "spec.construct_layer.meaning", "spec.construct_layer.refusals"),
     *("spec.description", "spec.fields", "spec.links", "spec.results", "spec.sensor", "spec.timing", "spec.tree"),
-    *("spec.vocabulary", "trust", "wire", "wire.arrays", "wire.frame_table", "wire.layout", "wire.row_checksums", "wire.schema"),
+    *(
+        "spec.vocabulary",
+        "spec.wire_forms",
+        "trust",
+        "wire",
+        "wire.arrays",
+        "wire.frame_table",
+        "wire.layout",
+        "wire.row_checksums",
+        "wire.schema",
+    ),
 }
 #: of the standard library, what takes long to import; NumPy and construct may bring it along, lidarspec does not.
 SLOW = {"difflib", "email", "importlib.metadata", "pathlib", "random", "socket", "zipfile"}

@@ -179,9 +179,9 @@ def _value(path: str | Path, line: int, cells: list[str], place: int, column: Co
 
 
 def _compare(path: str | Path, line: int, place: int, column: Column, table: Table, own: Table) -> None:
-    """Nothing, where the values spread like the model's own, to a factor of ten."""
+    """Nothing, where the values spread like the model's own, to a factor of ten, or those spread too little to tell by."""
     spread, usual = float(np.ptp(table)), float(np.ptp(own))
-    if usual and not usual / UNLIKE < spread < usual * UNLIKE:
+    if usual > 1 and not usual / UNLIKE < spread < usual * UNLIKE:
         told = f"spread over {spread:g}" if spread else f"are all {table[0]:g}"
         raise _fault(
             path, line, place, f"the {column.name}s {told}, those of this model over {usual:g} {column.units[0]}: is it another unit?"

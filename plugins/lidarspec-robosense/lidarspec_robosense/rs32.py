@@ -202,7 +202,7 @@ BPEARL_LASERS = Lasers(
     delay=(SLOT % 16 * 2.56 + SLOT // 16 * 1.28 + np.where(SLOT % 16 >= 8, 5.2, 0)) * 1e-6,
     lens=0.01473,
     height=0.09427,
-    vertical=89.5 - 2.8125 * SLOT.astype(np.float64),
+    vertical=np.round(89.5 - 2.8125 * SLOT, 2),  # in the steps of its DIFOP
     horizontal=np.zeros(LASERS),
 )
 
