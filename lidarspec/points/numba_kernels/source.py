@@ -60,7 +60,7 @@ class Expressions(Writer):
             if source is not None and is_full(source, self.width) and not is_cheap(node):
                 found = self.looked_up(node, source, np.float64, 1.0)
                 if found is not None:
-                    return found
+                    return self.let(found.level, f"{found.text} != 0") if node.sample.array.dtype.kind == "b" else found
             return self._call(node)
         if node.kind == "rows" and not self.shared(node.args[0]):
             return self._row(node.args[0], node.args[1], node.shape)
