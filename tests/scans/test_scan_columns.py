@@ -26,7 +26,7 @@ from lidarspec.points import lazy_columns
 from lidarspec.points.cloud import COLUMNS
 from lidarspec.scans.scans import ScanStream, scans_of
 from lidarspec.simulation.simulator import simulate
-from lidarspec.spec import OnChange, OnWrap
+from lidarspec.spec import OnChange, OnWrap, Udp
 from lidarspec.wire.frame_table import Rows
 from tests.broken import points_fail, sound
 from tests.shapes import SHAPES
@@ -202,7 +202,9 @@ def test_packets_that_stay_where_they_were_read_give_the_same_points(name: str, 
     together, separate = found
     assert len(together) == len(separate)
     if isinstance(separate.table, Rows) and len(separate):
-        if len(separate.table.groups[0].where) == len(rows) > 1:
+        link = sensor.links["data"]
+        joined = isinstance(link, Udp) and link.assembled is not None  # messages of several datagrams are copied when they are joined
+        if len(separate.table.groups[0].where) == len(rows) > 1 and not joined:
             assert separate.table.groups[0].rows.strides[0] == size + (size > 1)
         assert_cut_from([Scan(separate.points(), 0.0, True, sensor)], together.points())
 
