@@ -607,8 +607,8 @@ def is_expression(value: object) -> bool:
     return isinstance(value, ExprMixin | Construct)
 
 
-#: the highest of the low numbers that are drawn half of the time: as a count, a number of any size hardly ever fits.
-MANY = 40
+#: the highest of the low numbers that are drawn half of the time: as a count or a choice, a number of any size hardly ever fits.
+MANY = (1, 6, 40)
 
 
 def random_value(con: Construct, source: random.Random, drawn: Drawn, scope: Any = None, path: str = "") -> Any:
@@ -638,6 +638,7 @@ def random_value(con: Construct, source: random.Random, drawn: Drawn, scope: Any
         return _random_parts(con, source, drawn, scope, path)
     if isinstance(con, Array):
         count = bounded(construct.evaluate(con.count, scope), con.limit, "count", path)
+        bounded(count * _elements(con.subcon, scope), con.limit, "count", path)
         return [random_value(con.subcon, source, drawn, scope, path) for _ in range(count)]
     if isinstance(con, construct.IfThenElse):
         return random_value(con.thensubcon if construct.evaluate(con.condfunc, scope) else con.elsesubcon, source, drawn, scope, path)
@@ -651,6 +652,13 @@ def random_value(con: Construct, source: random.Random, drawn: Drawn, scope: Any
     if isinstance(con, construct.Adapter):
         return clean(con.parse(con.subcon.build(random_value(con.subcon, source, drawn, scope, path))))
     return random_value(con.subcon, source, drawn, scope, path)
+
+
+def _elements(con: Construct, scope: Any) -> int:
+    """How many an element of an array has itself, where it is an array too; as far as that is known before there is one."""
+    with contextlib.suppress(Exception):
+        return int(construct.evaluate(con.count, scope)) * _elements(con.subcon, scope) if isinstance(con, Array) else 1
+    return 1
 
 
 def _random_parts(con: Partition, source: random.Random, drawn: Drawn, scope: Any, path: str) -> Pieces:
@@ -677,9 +685,9 @@ def _random_leaf(con: Construct, source: random.Random, scope: Any) -> Any:
     if isinstance(con, Bytes):
         return source.randbytes(bounded(construct.evaluate(con.length, scope), con.limit, "length", ""))
     if isinstance(con, FormatField | BytesInteger | BitsInteger) and source.random() < 0.5:  # it may be a count
-        return con.parse(con.build(source.randint(0, min(MANY, (1 << (bit_width(con) - 1)) - 1))))
+        return con.parse(con.build(source.randint(0, min(source.choice(MANY), (1 << (bit_width(con) - 1)) - 1))))
     if con in (construct.VarInt, construct.ZigZag):
-        return source.randint(0, MANY)
+        return source.randint(0, source.choice(MANY))
     if isinstance(con, BitsInteger):
         value = source.getrandbits(con.length)
         return value - (1 << con.length) if con.signed and value >> (con.length - 1) else value
