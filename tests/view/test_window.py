@@ -47,7 +47,7 @@ def test_keys_do_what_the_help_says(tmp_path: Path) -> None:
     with Terminal(*LIVE, cwd=tmp_path) as terminal:
         terminal.wait_for("6 m")
         terminal.type("?")
-        assert "colour by range or intensity" in terminal.wait_for(" keys ")
+        assert "what colours show" in terminal.wait_for(" keys ")
         terminal.type("?c")
         terminal.wait_for("intensity")
         terminal.type("c+++++")
