@@ -282,7 +282,7 @@ step["repeat"] = function(self, node, tree, label)
     self.summary = tree and node.summed and {} or nil
     self:visit(node.element, below, tree and string.format("%s[%d]", label, index))
     self.summary = outer
-    if self.at == begun then self:fail("length") end
+    if self.at == begun then break end -- nothing is in this one, nor in the others
   end
   if below then below:set_len(self.at - from) end
 end
