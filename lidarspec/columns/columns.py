@@ -167,9 +167,13 @@ class Column(NDArrayOperatorsMixin):
         if len(axes) < len(own):
             raise SpecError(f"a column with {len(own)} axes cannot be put on {axes}")
         names = {schema.places[axis]: axis for axis in map(schema.axis, axes)}
-        lengths = dict(zip(sorted(names)[len(axes) - len(own) :], (self.array.shape[1 + index] for index in own), strict=True))
+        places = sorted(names)[len(axes) - len(own) :]
+        array = self.array
+        for index, place in zip(own, places, strict=True):
+            array = array.take(range(_reach(self.batch.table, names[place], array.shape[1 + index])), axis=1 + index)
+        lengths = dict(zip(places, (array.shape[1 + index] for index in own), strict=True))
         depth = max(schema.depth(), len(self.axes), *(place + 1 for place in names))
-        array = self.array.reshape(self.array.shape[0], *(lengths.get(place, 1) for place in range(depth)))
+        array = array.reshape(len(array), *(lengths.get(place, 1) for place in range(depth)))
         return Column(array, tuple(names[place] if place in lengths else None for place in range(depth)), self.batch, ready=self.ready)
 
     @property
@@ -186,10 +190,10 @@ class Column(NDArrayOperatorsMixin):
 
     def steps(self) -> Along | NDArray[np.intp]:
         """0, 1, 2 ... up to the largest value, (m,): the indices of the array of which this column is the count."""
-        schema, numbers = self.batch.table.schema, np.arange(int(np.nanmax(self.array, initial=0)))
+        schema, most = self.batch.table.schema, int(np.nanmax(self.array, initial=0))
         counted = [axis for axis, count in schema.arrays.items() if isinstance(count, Ref) and count.path == self.source and not self.frame]
         axis = counted[0] if len(counted) == 1 else schema.chain[-1] if schema.chain else None
-        return numbers if axis is None else Along((axis,), numbers)
+        return np.arange(most) if axis is None else Along((axis,), np.arange(_reach(self.batch.table, axis, most)))
 
     def gathered(self, table: NDArray[np.float64]) -> Column:
         """The rows of a table, (m + 1, k), the last one nan, at these indices, along the array of k elements that stands in theirs."""
@@ -407,6 +411,12 @@ def of_points(parts: Mapping[str, Any], batch: Batch) -> tuple[list[NDArray[Any]
             rule="LS214",
         )
     return arrays, axes, ready, shape
+
+
+def _reach(table: Table, axis: str, length: int) -> int:
+    """How far along an axis values are; no further than the array where frames say its length and have no array around it."""
+    around = [other for other in table.schema.arrays if axis.startswith(other) and axis != other]
+    return min(length, table.length(axis)) if any((table.counts(other) == 0).any() for other in around) else length
 
 
 def together(arrays: Mapping[str, NDArray[Any]], axes: tuple[str | None, ...]) -> tuple[int, ...]:
