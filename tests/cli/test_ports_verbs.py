@@ -78,7 +78,8 @@ class TestDetect:
         row = next(line.split() for line in found.stdout.splitlines() if "stl27l" in line)
         assert row[1:3] == ["ldrobot-stl27l", "yes"]
         assert told["sources"][0]["sensor"] == "ldrobot-stl27l"
-        assert {fit["sensor"] for fit in told["sources"][0]["fits"]} == {"ldrobot-stl27l", "ldrobot-ld06"}
+        alike = {f"ldrobot-{name}" for name in ("stl27l", "ld06", "ld14", "ld14p", "ld20", "stl06p")}
+        assert {fit["sensor"] for fit in told["sources"][0]["fits"]} == alike
 
     def test_a_silent_port_and_starting_it(self) -> None:
         with virtual_port("cspc-m1c1-mini") as made:
