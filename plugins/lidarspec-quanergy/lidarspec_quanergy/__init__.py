@@ -2,9 +2,9 @@
 
 Source: the vendor's quanergy_client (packet_header.h, m_series_data_packet.h, data_packet_parser_00.cpp, data_packet_parser_04.cpp,
 data_packet_parser_m_series.h). The client takes the time of a packet for that of its last firing; that firings are evenly apart, at the
-data sheet's rate of 420 000 points a second, is assumed, and so is the MQ8's range. Which way a unit turns its positions tell: they may fall as
-well as grow. The nanoseconds of packets before version 4 count tens of them, which is not corrected here. Packets of other kinds (1 and 6)
-and settings over HTTP are left out. No packet of a sensor was seen.
+data sheet's rate of 420 000 points a second, is assumed, and so is the MQ8's range. Which way a unit turns its positions tell: they may
+fall as well as grow. The nanoseconds of packets before version 4 count tens of them, which is not corrected here. Packets of other kinds
+(1 and 6) and settings over HTTP are left out. No packet of a sensor was seen.
 """
 
 from __future__ import annotations
