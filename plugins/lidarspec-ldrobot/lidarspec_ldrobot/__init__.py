@@ -226,7 +226,7 @@ LD14 = lidar(
     range_limits=(0.1, 8.0),
     aliases=("ld14",),
     status="vectors",
-    source="ldlidar_sdk (ldlidar_protocol.h, sl_transform.cpp, demo.cpp); the STL-27L manual's example, an LD14's by its pace",
+    source="ldlidar_sdk (ldlidar_protocol.h, sl_transform.cpp, demo.cpp); the STL-27L manual's example; its range is assumed",
 )
 LD14P = lidar(
     "LD14P",

@@ -1,10 +1,10 @@
 """Quanergy M8 and MQ8: rotating lidars of eight lasers over TCP, which send by themselves, high byte first.
 
 Source: the vendor's quanergy_client (packet_header.h, m_series_data_packet.h, data_packet_parser_00.cpp, data_packet_parser_04.cpp,
-data_packet_parser_m_series.h). The client takes the time of a packet for that of its last firing; that firings are evenly apart, at the
-data sheet's rate of 420 000 points a second, is assumed, and so is the MQ8's range. Which way a unit turns its positions tell: they may
-fall as well as grow. The nanoseconds of packets before version 4 count tens of them, which is not corrected here. Packets of other kinds
-(1 and 6) and settings over HTTP are left out. No packet of a sensor was seen.
+data_packet_parser_m_series.h). The client takes the time of a packet for that of its last firing. Assumed are what it does not say: that
+firings are evenly apart, at 420 000 points a second, the limits of range, and turns a second. Which way a unit turns its positions tell:
+they may fall as well as grow. The nanoseconds of packets before version 4 count tens of them, which is not corrected here. Packets of other
+kinds (1 and 6) and settings over HTTP are left out. No packet of a sensor was seen.
 """
 
 from __future__ import annotations
@@ -145,13 +145,13 @@ def lidar(model: str, elevation: NDArray[np.float64], other: str, **facts: Any) 
         relatives={f"quanergy-{other}": "nothing in the packets: the label, or the sensor's web page"},
         aliases=(model.lower(),),
         status="manual",
-        source="quanergy_client; M8 data sheet (rate, turns, range)",
+        source="quanergy_client; rate, turns and range are assumed",
         **facts,
     )
 
 
 M8 = lidar("M8", M8_ELEVATION, "mq8", range_limits=(1.0, 150.0))
-MQ8 = lidar("MQ8", MQ8_ELEVATION, "m8", range_limits=(1.0, 150.0))  # assumed: the M8's
+MQ8 = lidar("MQ8", MQ8_ELEVATION, "m8", range_limits=(1.0, 150.0))
 
 
 @hookimpl

@@ -1,7 +1,7 @@
 """Slamtec RPLIDAR A1 to A3, S1 to S3, T1 and C1: 360 degree lidars of one family, which answer in six kinds of data frames.
 
 Source: RPLIDAR interface protocol and the vendor's SDK (sl_lidar_cmd.h, handler_capsules.cpp, sl_lidar_driver.cpp); bauds and ports
-from the SDK (_getNativeBaudRate) and the launch files of sllidar_ros2, ranges from the models' data sheets.
+from the SDK (_getNativeBaudRate) and the launch files of sllidar_ros2, ranges from the models' data sheets where `source` names them.
 
 A response descriptor says which kind follows, and each kind is looked for after its descriptor alone. The kind that comes
 first in an input is its data. ``configure(answer="express")`` chooses another one, and starts as if its descriptor had been
@@ -16,8 +16,8 @@ No frame says when its points were taken: all points of one bear its time.
 
 How far it is proven: requests, descriptors, information and configuration answers against a live A1's exchange; nodes,
 express and ultra capsules against bytes built after the SDK; dense, ultra-dense and HQ capsules against the SDK's arithmetic
-by hand. Whether a C1 obeys the speed command is not known: the SDK's rule by model number would take PWM for it. An S2L has the
-numbers of an S2, as far as is public: nothing in the bytes tells these two apart. A T1 is asked over UDP, and sends its stream there.
+by hand. Whether a C1 obeys the speed command is not known: the SDK's rule by model number would take PWM for it. That an S2L
+has the numbers of an S2 is assumed: nothing in the bytes tells these two apart. A T1 is asked over UDP, and sends its stream there.
 """
 
 from __future__ import annotations
@@ -190,10 +190,10 @@ A2 = rplidar(
     link=Serial(115_200, 256_000),  # A2M8 and older; A2M7, A2M12
     motor=BY_PWM,
     unit=units.A2,
-    range_limits=(0.15, 16.0),  # A2M8: 0.15 to 12, A2M7: 0.2 to 16, A2M12: 0.2 to 12
+    range_limits=(0.15, 16.0),  # an A2M8 sees from 0.15 to 12 m; the rest is assumed for the A2M7
     turn=(5.0, 15.0),
     status="manual",
-    source="A2M8 data sheet rev. 2.5; data sheets of A2M7 and A2M12",
+    source="A2M8 data sheet rev. 2.5 (12 m, turns); the reach of an A2M7 is assumed",
     aliases=("rplidar-a2m8", "rplidar-a2m7", "rplidar-a2m12"),
 )
 A3 = rplidar(
@@ -214,7 +214,7 @@ S1 = rplidar(
     range_limits=(0.1, 40.0),
     turn=(8.0, 15.0),
     status="manual",
-    source="S1 data sheet",
+    source="ArduPilot's page of the S1 (40 m, turns); its nearest distance is assumed",
 )
 S2 = rplidar(
     "S2",
@@ -232,7 +232,7 @@ S2L = rplidar(
     unit=units.S2,
     range_limits=(0.05, 18.0),
     status="manual",
-    source="S2L data sheet",
+    source="its range is assumed",
 )
 S3 = rplidar(
     "S3",
@@ -240,9 +240,8 @@ S3 = rplidar(
     motor=BY_SPEED,
     unit=units.S3,
     range_limits=(0.05, 40.0),
-    turn=(10.0, 20.0),
     status="manual",
-    source="S3 data sheet",
+    source="its range is assumed",
 )
 T1 = rplidar(
     "T1",
@@ -259,7 +258,6 @@ C1 = rplidar(
     motor=BY_SPEED,
     unit=units.C1,
     range_limits=(0.05, 12.0),
-    turn=(8.0, 12.0),
     status="manual",
     source="C1 data sheet",
 )
