@@ -26,7 +26,9 @@ from lidarspec.scans.scans import Scan
 from lidarspec.simulation.device import SimulatedDevice
 from lidarspec.simulation.faults import BLOCKED, Faults
 from lidarspec.simulation.scenes import read_scene
+from lidarspec.spec.links import Serial
 from lidarspec.spec.sensor import Sensor
+from lidarspec.transports.base import data_link
 from lidarspec.transports.outlets import HERE, Outlet, has_terminals, simulated_outlet
 from lidarspec.transports.serving import serve, write_file
 from lidarspec.transports.simulated import rate_of
@@ -183,7 +185,8 @@ def _summary(result: Demonstration, whole: list[Scan], errors: float) -> list[st
     stats, name = result.stats, result.sensor.id
     frames = sum(stats.frames.values())
     harm = "of the datagrams lost" if result.sensor.datagrams else "of the bytes damaged"
-    where = result.place if result.sensor.datagrams or has_terminals() else f"{result.place}, since this system has no pseudo-terminals"
+    lacks_pty = data_link(result.sensor, Serial) and not has_terminals()
+    where = f"{result.place}, since this system has no pseudo-terminals" if lacks_pty else result.place
     passed = f"{errors:.1%} {harm}, {result.intact} came through unharmed"
     told = [
         f"{name}, simulated on {where}: {result.sent} frames sent, {passed}",

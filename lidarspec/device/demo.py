@@ -22,7 +22,9 @@ from lidarspec.framing.results import Counters
 from lidarspec.scans.scans import Scan
 from lidarspec.simulation.device import SimulatedDevice
 from lidarspec.simulation.faults import Faults
+from lidarspec.spec.links import Serial
 from lidarspec.spec.sensor import Sensor
+from lidarspec.transports.base import data_link
 from lidarspec.transports.outlets import HERE, has_terminals, simulated_outlet
 from lidarspec.transports.serving import Served
 
@@ -99,7 +101,7 @@ def _live(sensor: Sensor, simulated: SimulatedDevice, path: Path, turns: int) ->
         at = f"udp://{HERE}:{port}"
         with open_device(at, sensor, start=False, record=path) as device, Served(simulated, simulated_outlet(sensor, at)) as served:
             return at, *_read(device, served, turns)
-    to = "pty" if has_terminals() else f"tcp://{HERE}:0"
+    to = "pty" if has_terminals() and data_link(sensor, Serial) else f"tcp://{HERE}:0"
     with (
         Served(simulated, simulated_outlet(sensor, to), patient=True) as served,
         open_device(served.path, sensor, start=False, record=path) as device,

@@ -473,7 +473,7 @@ def _report(subject: Subject, places: Places, mistakes: list[Finding], watch: Ca
     watch(f"{sensor.id}: declaration")
     report.findings += declared(subject)
     for one in PROPERTIES:
-        known = sorted({finding.code for finding in report.findings} & set(one.unless))
+        known = sorted({finding.code for finding in left_over(report.findings, sensor, whole=False)} & set(one.unless))
         reason = one.lacks(subject) or (f"{', '.join(known)} is found already" if known else "")
         if reason:
             report.skipped[one.name] = reason

@@ -99,6 +99,12 @@ def test_demo_draws_and_sums_up() -> None:
     assert lines[-1] == "next: lidarspec view sim:cspc-m1c1-mini"
 
 
+def test_demo_reads_a_stream_without_a_serial_link_over_tcp() -> None:
+    found = printed("demo", "-s", "quanergy-m8", "-n", 1, "--errors", 0)
+    assert found["place"].startswith("tcp://127.0.0.1:")
+    assert found["stats"]["bytes_skipped"] == 0
+
+
 @pytest.mark.parametrize("sensor", ["ldrobot-stl27l", "velodyne-vlp16"])
 def test_demo_counts_what_the_line_did(sensor: str) -> None:
     found = printed("demo", "-s", sensor, "-n", 3, "--errors", 0.005)

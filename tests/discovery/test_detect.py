@@ -47,6 +47,7 @@ FOREIGN = (
     "sick/multiscan_compact_test01_udp_scandata.telegrams.bin",
 )
 ALIKE = ("ydlidar/packets_checksum_ok_concat.bin",)
+RPLIDARS = {f"slamtec-rplidar-{model}" for model in ("a1", "a2", "a3", "c1", "s1", "s2", "s2l", "s3", "t1")}
 TMINIS = {"ydlidar-tmini", "ydlidar-tmini-plus", "ydlidar-tmini-pro"}
 
 
@@ -75,7 +76,7 @@ def test_the_same_frames_without_a_difference_are_said_to_be_the_same() -> None:
         detected(capture(ALIKE[0]))
 
 
-@pytest.mark.parametrize("name", ["ldrobot-stl27l", "ldrobot-ld06", "velodyne-vlp16", "velodyne-hdl32e"])
+@pytest.mark.parametrize("name", ["ldrobot-stl27l", "ldrobot-ld06", "ldrobot-stl06p", "ldrobot-ld14", "velodyne-vlp16", "velodyne-hdl32e"])
 def test_clocks_tell_twins_apart(name: str) -> None:
     sensor = ls.sensor(name)
     data = simulate(sensor, 60, start=7)
@@ -137,7 +138,7 @@ def test_a_relative_that_only_its_start_would_tell_leaves_a_doubt() -> None:
     data = b"".join(simulate(sensor, 60))
     at_its_baud_rate = verdict(Heard("", (data,), baud=230_400))
     left = {score.sensor.id for score in at_its_baud_rate.alike}
-    assert left == {"cspc-coin-d4", "ydlidar-g2", *TMINIS}
+    assert left == {"cspc-coin-d4", "cspc-coin-d4a", "cspc-coin-d6", "ydlidar-g2", *TMINIS}
     named = sensor.build("info", model=b"COIN-D4".ljust(12, b"\0"), zero_angle=0, direction=0, correction=0, reserved=bytes(3), revision=1)
     assert verdict(Heard("", (named + data,))).sensor is sensor
 
@@ -145,9 +146,13 @@ def test_a_relative_that_only_its_start_would_tell_leaves_a_doubt() -> None:
 def test_a_baud_rate_decides_where_the_bytes_do_not() -> None:
     sensor = ls.sensor("slamtec-rplidar-s2")
     data = (sensor.build("scan_descriptor"), *simulate(sensor, 300))
-    assert len(verdict(Heard("", data)).alike) == 4
+    assert {score.sensor.id for score in verdict(Heard("", data)).alike} == RPLIDARS
     found = verdict(Heard("", data, baud=1_000_000))
-    assert (found.sensor and found.sensor.id, found.alike[0].why) == ("slamtec-rplidar-s2", "it runs at 1000000 baud")
+    assert {score.sensor.id for score in found.alike} == {f"slamtec-rplidar-{name}" for name in ("s2", "s2l", "s3")}
+    assert found.alike[0].why == "it runs at 1000000 baud"
+    named = sensor.build("info", model=0x81, firmware_minor=1, firmware_major=1, hardware=1, serial=bytes(16))
+    found = verdict(Heard("", (named, *data), baud=1_000_000))
+    assert (found.sensor and found.sensor.id, found.alike[0].why) == ("slamtec-rplidar-s3", "info.model says RPLIDAR S3")
 
 
 def test_a_scan_that_is_met_in_its_middle_is_known_all_the_same() -> None:
@@ -158,9 +163,7 @@ def test_a_scan_that_is_met_in_its_middle_is_known_all_the_same() -> None:
 def test_the_middle_of_a_scan_is_read_with_the_answer_that_began_it() -> None:
     data = b"".join(simulate(ls.sensor("slamtec-rplidar-a1"), 300))
     found = verdict(Heard("", (data,)))
-    assert {(score.sensor.id, score.sensor.options["answer"]) for score in found.alike} == {
-        (f"slamtec-rplidar-{model}", "node") for model in ("a1", "a3", "c1", "s2")
-    }
+    assert {(score.sensor.id, score.sensor.options["answer"]) for score in found.alike} == {(name, "node") for name in RPLIDARS}
     assert len(found.alike[0].sensor.decode(data)) == 300
 
 
@@ -181,7 +184,8 @@ def test_frames_whose_checksums_are_never_right_are_found_and_answered(tmp_path:
     data, path = b"".join(firmware_bug(60)), tmp_path / "bug.bin"
     found = verdict(Heard("", (data,)))
     assert (found.scores, found.sensor) == ((), None)
-    assert found.fault.startswith("60 data frames of ldrobot-ld06 or ldrobot-stl27l by their constants, lengths and rhythm")
+    alike = " or ".join(f"ldrobot-{name}" for name in ("ld06", "ld14", "ld14p", "ld20", "stl06p", "stl27l"))
+    assert found.fault.startswith(f"60 data frames of {alike} by their constants, lengths and rhythm")
     assert "CRC-8 poly 0x4d in the last byte is right in 60 of 60, over 45 of the 46 other bytes" in found.fault
     path.write_bytes(data)
     with pytest.raises(WireError, match="their checksums are never right") as error:

@@ -271,8 +271,8 @@ def test_a_relative_file_needs_no_more_than_its_name(tmp_path: Path, monkeypatch
     ("name", "meant"),
     [
         ("ldrobot-stl27", "'ldrobot-stl27l'"),
-        ("LDROBOT-LD60", "'ldrobot-ld06'"),
-        ("ld60", "'ldrobot-ld06'"),
+        ("LDROBOT-LD006", "'ldrobot-ld06'"),
+        ("ld006", "'ldrobot-ld06'"),
         ("xt", "'hesai-xt16', 'hesai-xt32' or 'hesai-xt32m'"),
         ("helios", "'robosense-helios16p'"),
         ("VLP", "'velodyne-vlp16', 'velodyne-vlp32c' or 'velodyne-puck-hi-res'"),

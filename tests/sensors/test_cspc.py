@@ -14,7 +14,7 @@ from lidarspec.testing.agreement import assert_same_points
 from tests.sensors.evidence import assert_points, clockwise, decoded, vector_bytes, vectors
 
 FILE = "vectors_serial2d.json"
-SENSOR, COIN = ls.sensor("cspc-m1c1-mini"), ls.sensor("cspc-coin-d4")
+SENSOR, COIN, COIN_D6 = ls.sensor("cspc-m1c1-mini"), ls.sensor("cspc-coin-d4"), ls.sensor("cspc-coin-d6")
 
 WHOLE = {
     "cspc_cmd_start": "command",
@@ -153,6 +153,15 @@ def test_points_by_hand_with_the_correction() -> None:
     assert cloud.intensity is not None
     assert cloud.intensity.tolist() == [100] * 4
     assert cloud.valid.all()
+
+
+def test_the_auxiliary_frame_of_a_coin_d6_is_no_noise() -> None:
+    data = bytes.fromhex("a55a0400fe 3a 06 39 000000")  # a5 ^ 5a ^ 04 ^ fe ^ 06 ^ 39 = 3a
+    parsed = COIN_D6.parse(data)
+    assert (parsed.value, COIN_D6.build("auxiliary", parsed)) == (0x39, data)
+    found = COIN_D6.decode(START + data + QUADRANTS)
+    assert (found.stats.frames, found.stats.bytes_skipped) == ({"data": 2, "auxiliary": 1}, 0)
+    assert COIN.decode(START + data + QUADRANTS).stats.bytes_skipped == len(data)
 
 
 def test_points_by_hand_without_the_correction() -> None:

@@ -1,4 +1,4 @@
-"""LDROBOT STL-27L and LD06: the manual's example, real frames, the clock, points worked out by hand."""
+"""LDROBOT STL-27L, LD06 and LD14P: the manual's example, real frames, the clock, points worked out by hand."""
 
 from __future__ import annotations
 
@@ -14,10 +14,11 @@ from construct import Array, Const, Int8ul, Int16ul, Struct
 import lidarspec as ls
 from lidarspec.packets.stream import PacketStream
 from lidarspec.spec import Checksummed, Clock, Crc, Fields, Frame, Polar, Scaled, Serial, spread
+from lidarspec_ldrobot import RATES, keeps_pace
 from tests.sensors.evidence import assert_points, capture, clockwise, decoded, vector_bytes, vectors
 
 FILE = "vectors_serial2d.json"
-SENSOR, LD06 = ls.sensor("ldrobot-stl27l"), ls.sensor("ldrobot-ld06")
+SENSOR, LD06, LD14P = (ls.sensor(f"ldrobot-{name}") for name in ("stl27l", "ld06", "ld14p"))
 
 WHOLE = [
     "ld_manual_example",
@@ -30,7 +31,7 @@ WHOLE = [
 ]
 STREAMS = {"ld06_stream_3_capture"}
 WRONG = {"ld_manual_table_variant"}
-OTHER_MODELS = {"ld14p_start", "ld14p_stop", "ld14p_speed_6hz", "ld14p_get_motor_fw", "ld_manufacture_synth"}
+OF_THE_LD14P = {"ld14p_start", "ld14p_stop", "ld14p_speed_6hz", "ld14p_get_motor_fw", "ld_manufacture_synth"}
 
 # 30 to 277.5 degrees in steps of 22.5; point k at 1 + k / 2 metres with intensity 10 + k; 3600 deg/s, 1 s.
 #   b8 0b: 0bb8 = 3000, 0.01 deg = 30.   66 6c: 6c66 = 27750.   d0 07 0c: 07d0 = 2000 mm, intensity 12.   CRC 1f.
@@ -45,7 +46,7 @@ def frame(start: float = 10.0, end: float = 12.0, seconds: float = 1.0, distance
 
 def test_every_vector_of_the_family_is_used() -> None:
     known = {name for name in vectors(FILE) if re.match(r"ld(_|\d\d(_|p_))", name)}
-    assert known == {*WHOLE} | STREAMS | WRONG | OTHER_MODELS
+    assert known == {*WHOLE} | STREAMS | WRONG | OF_THE_LD14P
 
 
 @pytest.mark.parametrize("name", WHOLE)
@@ -83,11 +84,39 @@ def test_the_decode_table_of_the_manual_is_wrong() -> None:
     assert (len(packets), packets.stats.bad_checksum, packets.stats.bytes_skipped) == (1, 1, 47)
 
 
-@pytest.mark.parametrize("name", sorted(OTHER_MODELS))
+@pytest.mark.parametrize("name", sorted(OF_THE_LD14P))
 def test_frames_of_the_ld14_are_not_ours(name: str) -> None:
     with pytest.raises(ls.WireError) as caught:
         SENSOR.parse(vector_bytes(FILE, name))
     assert caught.value.path == "header"
+
+
+@pytest.mark.parametrize("name", sorted(OF_THE_LD14P))
+def test_frames_of_the_ld14p_are_its_own(name: str) -> None:
+    data, expected = vector_bytes(FILE, name), vectors(FILE)[name]["expected"]
+    frame = "info" if name == "ld_manufacture_synth" else "command"
+    parsed = LD14P.parse(data, frame)
+    assert LD14P.build(frame, parsed) == data
+    named = {"cmd": "command", "value": "speed", "sn_high": "serial_high", "sn_low": "serial_low"}
+    known = {named.get(key, key): value for key, value in expected.items()}
+    assert {key: parsed[key] for key in parsed if key in known} == {key: value for key, value in known.items() if key in parsed}
+
+
+def test_an_ld14_looks_from_aside() -> None:
+    # 1 m at 30 degrees: atan((0.11923 * 1000 - 18.975571) / 1005.9) = 5.69167 degrees less: 24.30833.
+    # 3 m at 120 degrees: atan((357.69 - 18.975571) / 3005.9) = 6.42915 degrees less: 113.57085.
+    cloud = decoded(LD14P, QUADRANTS).points()
+    np.testing.assert_allclose(clockwise(cloud)[[0, 4]], [24.30833, 113.57085], atol=1e-4)
+    assert_points(cloud, [(0, (0.91134, -0.41165, 0))])
+
+
+@pytest.mark.parametrize(
+    ("name", "owner"),
+    [("ld06_capture_1", "LD06"), ("ld06_capture_fsharp", "LD06"), ("ld20_capture", "LD20"), ("ld_manual_example", "LD14")],
+)
+def test_one_frame_shows_the_pace_of_its_lidar(name: str, owner: str) -> None:
+    fields = Fields(SENSOR.decode(vector_bytes(FILE, name)).batch())
+    assert [rate for rate in sorted({*RATES.values()}) if np.all(np.asarray(keeps_pace(fields, rate)))] == [RATES[owner]]
 
 
 def test_the_crc_has_all_256_entries() -> None:

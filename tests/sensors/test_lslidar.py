@@ -1,4 +1,4 @@
-"""LSLIDAR N10, N10P and M10: the published packet, two returns, lengths that the packets say, and the clock."""
+"""LSLIDAR N10, N10P, M10 and C16: the published packet, two returns, lengths that the packets say, and the clock."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import lidarspec as ls
 from lidarspec.simulation.simulator import simulate
 from tests.sensors.evidence import clockwise, decoded, vector_bytes, vectors
 
-N10, N10P, M10P = (ls.sensor(f"lslidar-{name}") for name in ("n10", "n10p", "m10p"))
+N10, N10P, M10P, C16 = (ls.sensor(f"lslidar-{name}") for name in ("n10", "n10p", "m10p", "c16"))
 
 
 def test_the_published_packet_of_an_n10() -> None:
@@ -47,3 +47,36 @@ def test_no_return_is_no_point_and_a_strong_reflection_is_one() -> None:
     cloud = decoded(M10P, M10P.build("data", length=26, start_angle=0, period=4167, samples=samples, **time)).points()
     assert cloud.intensity is not None
     assert (cloud.valid.tolist(), cloud.intensity[1]) == ([False, True, False], 255)
+
+
+def test_a_captured_packet_of_a_c16() -> None:
+    data, expected = (
+        vector_bytes("vectors_udp3d.json", "lslidar_c16_like_vli16"),
+        vectors("vectors_udp3d.json")["lslidar_c16_like_vli16"]["expected"],
+    )
+    assert C16.build("data", C16.parse(data)) == data
+    packets = decoded(C16, [data])
+    assert packets.raw["blocks"]["azimuth"][0].tolist() == expected["azimuths"]
+    first = packets.raw["blocks"]["groups"]["channels"][0, 0].reshape(32)
+    assert [first["distance"][slot] for _, slot, _, _ in expected["first"]] == [distance for *_, distance, _ in expected["first"]]
+    assert [first["intensity"][slot] for _, slot, _, _ in expected["first"]] == [intensity for *_, intensity in expected["first"]]
+    cloud = packets.points()
+    assert cloud.valid.sum() == expected["n_nonzero"]
+    assert packets.time_ns[0] == 90_724_466_616  # 00:01:30 and b8 7b 2e 2b nanoseconds
+
+
+def test_a_c16_with_two_returns_and_with_steps_of_another_size() -> None:
+    data = vector_bytes("vectors_udp3d.json", "lslidar_c16_like_vli16")
+    parsed = C16.parse(data)
+    parsed.return_mode = 0x39
+    for first, second in zip(parsed.blocks[::2], parsed.blocks[1::2], strict=True):
+        second.azimuth = first.azimuth
+    dual = decoded(C16, [C16.build("data", parsed)]).points()
+    assert dual.return_index is not None
+    assert dual.return_index.reshape(12, 32)[:, 0].tolist() == [0, 1] * 6
+    np.testing.assert_array_equal(dual.azimuth[:32], dual.azimuth[32:64])
+    np.testing.assert_allclose([dual.time[0], dual.time[-1]], [-191 * 3.125e-6, 0], atol=1e-9)
+    single, fine = C16.decode([data]).points(), decoded(C16.configure(distance_unit=0.25), [data]).points()
+    np.testing.assert_allclose(fine.range[fine.valid], single.range[single.valid] * 0.625, rtol=1e-6)
+    with pytest.raises(ls.UsageError, match=r"0\.4 or 0\.25"):
+        C16.configure(distance_unit=1.0)

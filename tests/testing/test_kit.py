@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from construct import Array, Const, Float16b, Float32l, Float64l, Int8ul, Int16ub, Int16ul, Struct
+from construct import Array, Const, Float16b, Float32l, Float64l, Int8ul, Int16ub, Int16ul, Struct, this
 from hypothesis import strategies as st
 
 from lidarspec import Sensor
@@ -143,6 +143,14 @@ def test_what_is_meant_is_acknowledged_with_a_reason() -> None:
     assert left(replace(far, acknowledged={"LS210 data.samples.distance": "the next model reaches so far"})) == set()
     assert left(replace(far, acknowledged={"LS210": " "})) == {"LS209", "LS210"}
     assert left(replace(far, acknowledged={"LS210 data.tilt": "no"})) == {"LS209", "LS210"}
+
+
+def test_what_is_acknowledged_keeps_nothing_from_being_tried() -> None:
+    coded = sound.sealed(samples=Array(this.count, Struct("distance" / Int16ul, "quality" / Int8ul)))
+    bare = sound.sensor(sound.frame(coded), acknowledged={"LS201": "a code"})
+    (report,) = reports(Target([bare]), "bare", examples=1)
+    assert "LS201" not in {finding.code for finding in report.findings}
+    assert "the_simulated_sensor_answers" not in report.skipped
 
 
 def test_what_only_looks_up_a_table_needs_no_unit() -> None:

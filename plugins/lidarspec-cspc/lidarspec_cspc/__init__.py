@@ -1,4 +1,4 @@
-"""CSPC M1C1_Mini and its relative COIN-D4: 360 degree triangulation and time-of-flight lidars, started over a UART.
+"""CSPC M1C1_Mini and its relatives COIN-D4, COIN-D4A and COIN-D6: 360 degree triangulation and time-of-flight lidars, started over a UART.
 
 Source: CSPC M1C1_Mini development manual, sections 1 and 2. What it does not say comes from the vendor's SDK
 (ros_cspc_lidar_coin_d4a, sdk/lidar_information.h), the manual's edition v1.1 (2020-01-22), or captures of a COIN-D4
@@ -9,6 +9,10 @@ the corrections of the angle example, 10.9442 and 11.8653 degrees, are 10.9445 a
 71.1718 is 71.171875; the figure with the order of the checksum is lost (the grouping here fits every captured packet);
 no baud rate, no rule for packets that cross 360 degrees or have one sample (the formula divides by LSN - 1), no command
 for the announced switch between 5.5 and 7 Hz. Besides the fillers FE and FF, a COIN-D4 sends FA FA once, in no manual.
+
+Of a COIN-D4A only the vendor's driver is public, of a COIN-D6 what others saw of one: 10 turns a second, 400 points each, and every three
+seconds a frame that nobody explains. That both name themselves by their model is assumed. The M1C1_Mini of the manual's edition v1.1, with
+samples of two bytes and answers that begin with AA 55, is left out, and so is the M1CT_Coin_Plus, which sends Camsense's packets.
 """
 
 from __future__ import annotations
@@ -99,6 +103,19 @@ SCAN_START = Checksummed(
 )
 
 
+AUXILIARY = Checksummed(
+    Struct(
+        "header" / Const(b"\xa5\x5a\x04\x00\xfe"),
+        "checksum" / Int8ul,
+        "type" / Const(0x06, Int8ul),
+        "value" / Int8ul * "38 to 3F were seen; its meaning is not known",
+        "reserved" / Const(bytes(3)),
+    ),
+    field="checksum",
+    algorithm=Xor(),
+)
+
+
 def angle() -> Construct:
     """FSA and LSA: 1/64 degree above a check bit that is always 1 (manual 2.2.3)."""
     return ByteSwapped(BitStruct("angle" / Scaled(BitsInteger(15), 1 / 64, "deg"), "check" / Const(1, BitsInteger(1))))
@@ -180,17 +197,17 @@ def configure(sensor: Sensor, *, zero: str = "data") -> Sensor:
     return dataclasses.replace(sensor, points=partial(points, zero=zero))
 
 
-def sweep(i: int) -> dict[str, float]:
-    """Packet i of turns at 5.5 Hz, the slower speed: a start packet, then packets of 25 samples and a shorter one."""
-    packet = i % (1 + -(-(STEPS - 1) // SAMPLES))
+def sweep(i: int, steps: int = STEPS, hertz: float = LOW_SPEED) -> dict[str, float]:
+    """Packet i of turns of so many points, 5.5 Hz is the slower speed: a start packet, then packets of 25 samples and a shorter one."""
+    packet = i % (1 + -(-(steps - 1) // SAMPLES))
     first = 0 if packet == 0 else 1 + (packet - 1) * SAMPLES
-    samples = 1 if packet == 0 else min(SAMPLES, STEPS - first)
+    samples = 1 if packet == 0 else min(SAMPLES, steps - first)
     return {
-        "mt.frequency": LOW_SPEED if packet == 0 else 0.0,
+        "mt.frequency": hertz if packet == 0 else 0.0,
         "mt.start": int(packet == 0),
         "lsn": samples,
-        "fsa.angle": first * 360 / STEPS,
-        "lsa.angle": (first + samples - 1) * 360 / STEPS,
+        "fsa.angle": first * 360 / steps,
+        "lsa.angle": (first + samples - 1) * 360 / steps,
         "samples.exposure": LOW_EXPOSURE,
     }
 
@@ -217,6 +234,7 @@ OTHERS: dict[str, str | Relative] = {
     **dict.fromkeys(("ydlidar-tmini", "ydlidar-tmini-pro", "ydlidar-tmini-plus"), TMINI),
 }
 
+COINS = ("cspc-coin-d4", "cspc-coin-d4a", "cspc-coin-d6")
 VERSION = (("ack", {"firmware": 3}),)
 
 M1C1_MINI = Sensor(
@@ -250,30 +268,57 @@ M1C1_MINI = Sensor(
     range_limits=(0.001, 16.383),  # what the field can hold; the manual gives none
     vendor_axes=("forward", "right", "up"),
     turn=(LOW_SPEED, 7.0),  # manual 1c
-    relatives={"cspc-coin-d4": "info.model", **OTHERS},
+    relatives={**dict.fromkeys(COINS, "info.model"), **OTHERS},
     info={"model": "info.model", "firmware": "info.revision"},  # ack.firmware is 0 but in the answer to start (manual 2.1.3)
     aliases=("m1c1-mini", "m1c1"),
     status="vectors",
     source="CSPC M1C1_Mini development manual (3-byte samples), sections 1 and 2; baud rate and FC from the vendor's SDK",
 )
 
-COIN_D4 = dataclasses.replace(
-    M1C1_MINI,
-    id="cspc-coin-d4",
-    model="COIN-D4",
-    aliases=("coin-d4",),
-    links={"data": Serial(230_400, dtr=False)},
-    simulation=Simulation(sweep, answers={"start": started(1, b"COIN-D4", 1, b"\xfa\xfa"), "get_version": VERSION}),
-    state={"info": {"correction": 0, "zero_angle": 0}},  # the device information of a live unit
-    turn=None,  # the manual's two speeds are the M1C1_Mini's
-    relatives={"cspc-m1c1-mini": "info.model", **OTHERS},
+
+def coin(model: str, **facts: Any) -> Sensor:
+    """A time-of-flight lidar of the COIN series: an M1C1_Mini but for these facts, whose angles need no correction."""
+    name = f"cspc-{model.lower()}"
+    return dataclasses.replace(
+        M1C1_MINI,
+        id=name,
+        model=model,
+        aliases=(model.lower(),),
+        links={"data": Serial(230_400, dtr=False)},
+        state={"info": {"correction": 0, "zero_angle": 0}},  # the device information of a live COIN-D4
+        relatives={**dict.fromkeys({"cspc-m1c1-mini", *COINS} - {name}, "info.model"), **OTHERS},
+        **{"turn": None, "simulation": coin_simulation(model), **facts},  # the manual's two speeds are the M1C1_Mini's
+    )
+
+
+def coin_simulation(model: str, **turns: Any) -> Simulation:
+    """A simulated one, which says what it is when it is started."""
+    answers = {"start": started(1, model.encode(), 1, b"\xfa\xfa"), "get_version": VERSION}
+    return Simulation(partial(sweep, **turns), answers=answers)
+
+
+COIN_D4 = coin(
+    "COIN-D4",
     status="capture",
     acknowledged={"LS710": "the start-up is another's capture: the project's tests read it where it is"},
     source="the M1C1_Mini's manual; baud rate from the vendor's SDK; a captured start-up of a COIN-D4",
+)
+COIN_D4A = coin(
+    "COIN-D4A",
+    range_limits=(0.001, 12.0),
+    status="manual",
+    source="the vendor's driver, ros_cspc_lidar_coin_d4a: baud rate, 12 m",
+)
+COIN_D6 = coin(
+    "COIN-D6",
+    frames={**M1C1_MINI.frames, "auxiliary": Frame(AUXILIARY, simulation=Simulation(lambda i: {"value": 0x38 + i % 8}, rate=1 / 3))},
+    simulation=coin_simulation("COIN-D6", steps=400, hertz=10.0),
+    status="manual",
+    source="the vendor's SDK (baud rate); what others saw of a COIN-D6: turns, points, the auxiliary frame",
 )
 
 
 @hookimpl
 def lidarspec_sensors() -> Iterable[Sensor]:
     """The CSPC sensors."""
-    return [M1C1_MINI, COIN_D4]
+    return [M1C1_MINI, COIN_D4, COIN_D4A, COIN_D6]

@@ -1,25 +1,49 @@
-"""LDROBOT STL-27L and relatives: 360 degree time-of-flight lidars over a UART, which send by themselves.
+"""LDROBOT STL-27L and relatives: 360 degree time-of-flight and triangulating lidars over a UART, which send by themselves.
 
-Source: STL-27L development manual, section 3. Known errors of the manual: the CRC table lacks entries 175 to 186 (it
+Source: STL-27L development manual, section 3; rates, bauds and the frames beside the data from the vendor's SDKs (ldlidar_sdk,
+ldlidar_stl_ros2). LD06, LD19 and STL-19P are one sensor on the line: same frame, baud and rate. An LD14 triangulates, and its angles
+are turned into those seen from the axis as the SDK does (sl_transform.cpp). There is an older LD14P of 2300 points a second.
+
+What an LD14P answers to commands is nowhere said: they are sent without waiting. Bauds of LD20, STL-06P and STL-26 are assumed to be
+the LD19's; no frame of the last two was seen. An STL-50 is left out: nothing about its protocol is public.
+
+Known errors of the manual: the CRC table lacks entries 175 to 186 (it
 is generated here); the decode table of the example prints point 2 as 200 mm (0x00dc is 220) and point 12 as B0 00 EA
 (the dump, whose CRC is right, has C0 00 E5); no rule for frames that cross 360 degrees.
 """
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from functools import partial
 from typing import Any
 
 import numpy as np
-from construct import Array, Const, Int8ul, Int16ul, Struct
+from construct import Array, Const, Int8ul, Int16ul, Int32ul, Struct
 
-from lidarspec.spec import Checksummed, Clock, Crc, Fields, Frame, OnWrap, Polar, Scaled, Sensor, Serial, Simulation, hookimpl, spread
+from lidarspec.spec import (
+    Checksummed,
+    Clock,
+    Command,
+    Crc,
+    Fields,
+    Frame,
+    OnWrap,
+    Polar,
+    Relative,
+    Scaled,
+    Sensor,
+    Serial,
+    Simulation,
+    hookimpl,
+    spread,
+    wrap,
+)
 
 POINTS = 12
-RATE_STL27L = 21_600  # points per second (STL-27L manual, section 1)
-RATE_LD06 = 4_500  # points per second (LD06 data sheet; 450 points a turn at 10 Hz)
+#: points per second: STL-27L manual, section 1; LD06 data sheet (450 points a turn at 10 Hz); SDKs; LD20: from a captured frame.
+RATES = {"STL-27L": 21_600, "LD06": 4_500, "STL-06P": 5_000, "LD14": 2_300, "LD14P": 4_000, "LD20": 4_000}
+CRC8 = Crc(width=8, poly=0x4D)
 
 DATA = Checksummed(
     Struct(
@@ -39,7 +63,41 @@ DATA = Checksummed(
         "crc" / Int8ul,
     ),
     field="crc",
-    algorithm=Crc(width=8, poly=0x4D),
+    algorithm=CRC8,
+)
+HEALTH = Checksummed(
+    Struct(
+        "header" / Const(b"\x54\xe0"),
+        "error" / Int8ul * "1: motor blocked, 2: occluded, 3: both",
+        "crc" / Int8ul,
+    ),
+    field="crc",
+    algorithm=CRC8,
+)
+INFO = Checksummed(
+    Struct(
+        "header" / Const(b"\x54\x0f"),
+        "speed" / Scaled(Int16ul, 1, "deg/s"),
+        "product_version" / Int16ul,
+        "serial_high" / Int32ul,
+        "serial_low" / Int32ul,
+        "hardware_version" / Int32ul,
+        "firmware_version" / Int32ul,
+        "crc" / Int8ul,
+    ),
+    field="crc",
+    algorithm=CRC8,
+)
+COMMAND = Checksummed(
+    Struct(
+        "header" / Const(b"\x54"),
+        "command" / Int8ul * "A0 start, A1 stop, A2 speed, A8 firmware of the motor's board",
+        "length" / Const(4, Int8ul),
+        "speed" / Scaled(Int32ul, 1, "deg/s") * "0 in all but A2",
+        "crc" / Int8ul,
+    ),
+    field="crc",
+    algorithm=CRC8,
 )
 
 
@@ -48,9 +106,17 @@ def plausible(f: Fields) -> Any:
     return (f.start_angle < 360) & (f.end_angle < 360) & (f.timestamp <= 30)
 
 
-def points(f: Fields, rate: int) -> Polar:
+def seen_aside(distance: Any) -> Any:
+    """Degrees by which what an LD14 sees lies before the angle of its laser, by the distance in metres (SDK, sl_transform.cpp)."""
+    mm = distance * 1000
+    return np.where(mm > 0, np.rad2deg(np.arctan((0.11923 * mm - 18.975571) / (mm + 5.9))), 0)
+
+
+def points(f: Fields, rate: int, *, aside: bool = False) -> Polar:
     """Even steps from the start angle to the end angle (manual 3.2), at `rate` points per second."""
     clockwise = spread(f.start_angle, f.end_angle, POINTS, full=360.0)  # degrees, (n, 12)
+    if aside:
+        clockwise = clockwise - seen_aside(f.points.distance)
     return Polar(
         range=f.points.distance,
         azimuth=-np.deg2rad(clockwise),  # left-handed, clockwise (manual, section 4)
@@ -59,49 +125,131 @@ def points(f: Fields, rate: int) -> Polar:
     )
 
 
-def sweep(i: int, rate: int) -> dict[str, float]:
-    """Frame i at 10 turns and `rate` points per second."""
-    step = 360.0 * 10 / rate
+def sweep(i: int, rate: int, turns: int) -> dict[str, float]:
+    """Frame i at so many turns and points per second."""
+    step = 360.0 * turns / rate
     start = i * POINTS * step % 360
-    return dict(speed=3600, start_angle=start, end_angle=(start + (POINTS - 1) * step) % 360, timestamp=i * POINTS / rate % 30)
+    return dict(speed=360 * turns, start_angle=start, end_angle=(start + (POINTS - 1) * step) % 360, timestamp=i * POINTS / rate % 30)
 
 
-STL27L = Sensor(
-    "ldrobot-stl27l",
-    vendor="LDROBOT",
-    model="STL-27L",
-    frames={"data": Frame(DATA, data=True, plausible=plausible)},
-    points=partial(points, rate=RATE_STL27L),
-    scan=OnWrap("azimuth"),
+def slug(name: str) -> str:
+    """The id of a model."""
+    return "ldrobot-" + name.lower().replace("-", "")
+
+
+def keeps_pace(f: Fields, rate: int) -> Any:
+    """Whether the angles of a frame are as far apart as those of a lidar with so many points a second, more than with any other rate."""
+    found = (POINTS - 1) * np.maximum(f.speed, 1) / np.maximum(wrap(f.end_angle - f.start_angle, 360.0), 0.01)
+    off = [np.abs(np.log(found / known)) for known in (rate, *RATES.values())]
+    return np.min(off, axis=0) == off[0]
+
+
+def relatives(own: str) -> dict[str, str | Relative]:
+    """What tells the others apart: how far they turn from point to point at the speed that they tell."""
+    others = {slug(name): rate for name, rate in RATES.items() if name != own}
+    return {
+        name: "nothing in the data: it has as many points a second"
+        if rate == RATES[own]
+        else Relative(f"{rate} points a second, by its speed and angles", partial(keeps_pace, rate=rate))
+        for name, rate in others.items()
+    }
+
+
+DATA_FRAME = Frame(DATA, data=True, plausible=plausible)
+TOLD = {
+    "info": Frame(INFO, plausible=lambda f: f.speed <= 3600),
+    "health": Frame(HEALTH, plausible=lambda f: (f.error >= 1) & (f.error <= 3)),
+}
+
+
+def lidar(name: str, *, turns: int = 10, aside: bool = False, frames: Mapping[str, Frame] | None = None, **more: Any) -> Sensor:
+    """One model, simulated at so many turns a second, with the frames that it has beside the data."""
+    rate = RATES[name]
+    return Sensor(
+        slug(name),
+        vendor="LDROBOT",
+        model=more.pop("model", name),
+        frames={"data": DATA_FRAME, **(frames or {})},
+        points=partial(points, rate=rate, aside=True) if aside else partial(points, rate=rate),
+        scan=OnWrap("azimuth"),
+        clock=Clock("timestamp", wraps_at=30.0),
+        simulation=Simulation(partial(sweep, rate=rate, turns=turns)),
+        vendor_axes=("forward", "right", "up"),
+        relatives=relatives(name),
+        **more,
+    )
+
+
+STL27L = lidar(
+    "STL-27L",
     links={"data": Serial(921_600)},
-    clock=Clock("timestamp", wraps_at=30.0),
-    simulation=Simulation(partial(sweep, rate=RATE_STL27L)),
     range_limits=(0.03, 25.0),
-    vendor_axes=("forward", "right", "up"),
     turn=(9.9, 10.1),  # by its own control (manual, section 1); no limits are given for control by PWM
-    relatives={"ldrobot-ld06": "frames come 1800 to the second, an LD06's 375"},
     aliases=("stl27l",),
     status="vectors",
     source="STL-27L development manual, sections 1 to 4",
 )
-
-LD06 = dataclasses.replace(
-    STL27L,
-    id="ldrobot-ld06",
-    model="LD06",
-    aliases=("ld06", "ld19"),  # one manual, one frame, one baud rate
-    points=partial(points, rate=RATE_LD06),
-    simulation=Simulation(partial(sweep, rate=RATE_LD06)),
+LD06 = lidar(
+    "LD06",
+    model="LD06, LD19, STL-19P",
     links={"data": Serial(230_400)},
     range_limits=(0.02, 12.0),
     turn=(5.0, 13.0),  # inno-maker's page of the LD06; by PWM, as for the LD19
-    relatives={"ldrobot-stl27l": "frames come 375 to the second, an STL-27L's 1800"},
+    aliases=("ld06", "ld19", "ldrobot-ld19", "stl19p", "ldrobot-stl19p", "d500"),
     status="capture",
     source="LD06 and LD19 development manual v2.5 (the STL-27L's frame); three consecutive captured frames",
+)
+LD20 = lidar(
+    "LD20",
+    turns=6,
+    links={"data": Serial(230_400)},
+    range_limits=(0.02, 12.0),
+    aliases=("ld20",),
+    status="vectors",
+    source="one captured frame; baud and range are assumed to be the LD19's",
+)
+STL06P = lidar(
+    "STL-06P",
+    model="STL-06P, STL-26",
+    links={"data": Serial(230_400)},
+    range_limits=(0.02, 12.0),
+    aliases=("stl06p", "stl26", "ldrobot-stl26"),
+    status="manual",
+    source="ldlidar_stl_ros2, lipkg.cpp (the rate); baud and range are assumed to be the LD19's",
+)
+LD14 = lidar(
+    "LD14",
+    turns=6,
+    aside=True,
+    frames=TOLD,
+    links={"data": Serial(115_200)},
+    range_limits=(0.1, 8.0),
+    aliases=("ld14",),
+    status="vectors",
+    source="ldlidar_sdk (ldlidar_protocol.h, sl_transform.cpp, demo.cpp); the STL-27L manual's example; its range is assumed",
+)
+LD14P = lidar(
+    "LD14P",
+    turns=6,
+    aside=True,
+    frames={**TOLD, "command": Frame(COMMAND, direction="out")},
+    links={"data": Serial(230_400)},
+    commands={
+        "start": Command("command", {"command": 0xA0, "speed": 0}, starts=True),
+        "stop": Command("command", {"command": 0xA1, "speed": 0}, stops=True),
+        "set_speed": Command("command", {"command": 0xA2}, args={"speed": ("speed", 720, 2880)}),
+        "get_firmware": Command("command", {"command": 0xA8, "speed": 0}),
+    },
+    on_open=("start",),  # it turns by itself when it is plugged in, and not where it was stopped before
+    range_limits=(0.1, 8.0),
+    turn=(2.0, 8.0),
+    aliases=("ld14p", "d200"),
+    status="vectors",
+    source="ldlidar_sdk, as the LD14; commands as kaiaai/LDS sends them; Waveshare's page of the D200 kit (range, turns, baud)",
 )
 
 
 @hookimpl
 def lidarspec_sensors() -> Iterable[Sensor]:
     """The LDROBOT sensors."""
-    return [STL27L, LD06]
+    return [STL27L, LD06, LD20, STL06P, LD14, LD14P]

@@ -1,4 +1,4 @@
-"""LSLIDAR N10, N10P and the M10 family: 360 degree time-of-flight lidars over a UART, high byte first.
+"""LSLIDAR N10, N10P and the M10 family: 360 degree time-of-flight lidars over a UART, high byte first; the C16 is in `c16`.
 
 Source: the vendor's ROS drivers (lslidar_driver.cc of the edition for the N10P; lslidar_x10_driver.cpp of Lslidar_ROS2_driver V5). The N10
 and N10P are sealed by a sum; packets of the M10 family have no checksum, only marks at both ends. What the older driver calls the speed is
@@ -38,6 +38,7 @@ from lidarspec.spec import (
     stack,
     wrap,
 )
+from lidarspec_lslidar.c16 import C16
 
 N_SAMPLES, M_SAMPLES = 16, 42
 SPAN, PACKETS = 15.0, 24  # degrees of a packet, and packets a turn
@@ -278,4 +279,4 @@ N10, N10P, M10, M10_GPS, M10P = SENSORS = [lidar(name) for name in MODELS]
 @hookimpl
 def lidarspec_sensors() -> Iterable[Sensor]:
     """The LSLIDAR sensors."""
-    return SENSORS
+    return [*SENSORS, C16]

@@ -1,7 +1,7 @@
-"""Slamtec RPLIDAR A1, A3, S2 and C1: 360 degree serial lidars of one family, which answer in six kinds of data frames.
+"""Slamtec RPLIDAR A1 to A3, S1 to S3, T1 and C1: 360 degree lidars of one family, which answer in six kinds of data frames.
 
-Source: RPLIDAR interface protocol and the vendor's SDK (sl_lidar_cmd.h, handler_capsules.cpp, sl_lidar_driver.cpp); bauds and
-ranges from the models' data sheets.
+Source: RPLIDAR interface protocol and the vendor's SDK (sl_lidar_cmd.h, handler_capsules.cpp, sl_lidar_driver.cpp); bauds and ports
+from the SDK (_getNativeBaudRate) and the launch files of sllidar_ros2, ranges from the models' data sheets where `source` names them.
 
 A response descriptor says which kind follows, and each kind is looked for after its descriptor alone. The kind that comes
 first in an input is its data. ``configure(answer="express")`` chooses another one, and starts as if its descriptor had been
@@ -16,7 +16,8 @@ No frame says when its points were taken: all points of one bear its time.
 
 How far it is proven: requests, descriptors, information and configuration answers against a live A1's exchange; nodes,
 express and ultra capsules against bytes built after the SDK; dense, ultra-dense and HQ capsules against the SDK's arithmetic
-by hand. Whether a C1 obeys the speed command is not known: the SDK's rule by model number would take PWM for it.
+by hand. Whether a C1 obeys the speed command is not known: the SDK's rule by model number would take PWM for it. That an S2L
+has the numbers of an S2 is assumed: nothing in the bytes tells these two apart. A T1 is asked over UDP, and sends its stream there.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from collections.abc import Iterable, Mapping
 from functools import partial
 
 from lidarspec import UsageError
-from lidarspec.spec import Command, Frame, OnWrap, Sensor, Serial, Simulation, hookimpl
+from lidarspec.spec import Command, Frame, Link, OnWrap, Sensor, Serial, Simulation, Udp, hookimpl
 from lidarspec_slamtec import capsules, nodes, units
 from lidarspec_slamtec.answers import ANSWERS, DESCRIPTORS
 from lidarspec_slamtec.commands import BY_DTR, BY_PWM, BY_SPEED, COMMANDS, express
@@ -37,7 +38,8 @@ CODED = "a code word says itself how many millimetres one of its steps is (SDK, 
 #: why asking for any key is not always answered.
 KEYS = "a unit answers for the keys that it knows (answers.py)"
 DTHETA = ("unsigned", "signed")
-MODELS = ("A1", "A3", "S2", "C1")
+MODELS = ("A1", "A2", "A3", "S1", "S2", "S2L", "S3", "T1", "C1")
+TWINS = ("S2", "S2L")
 
 FRAMES = {
     **DESCRIPTORS,
@@ -129,7 +131,7 @@ def configure(sensor: Sensor, *, dtheta: str | None = None, mode: int | None = N
 def rplidar(
     name: str,
     *,
-    baud: int,
+    link: Link,
     motor: Mapping[str, Command],
     unit: units.Unit,
     range_limits: tuple[float, float],
@@ -147,7 +149,7 @@ def rplidar(
         frames=FRAMES,
         points=None,
         scan=OnWrap("azimuth"),
-        links={"data": Serial(baud)},
+        links={"data": link},
         commands=commands,
         simulation=Simulation(answers={name: answer for name, answer in unit.answers().items() if name in commands}),
         configure=configure,
@@ -160,7 +162,11 @@ def rplidar(
         range_limits=range_limits,
         vendor_axes=("forward", "right", "up"),
         turn=turn,
-        relatives={f"slamtec-rplidar-{model.lower()}": "info.model" for model in MODELS if model != name},
+        relatives={
+            f"slamtec-rplidar-{other.lower()}": "nothing public: the label" if {name, other} == {*TWINS} else "info.model"
+            for other in MODELS
+            if other != name
+        },
         info={"serial": "info.serial", "model": "info.model"},  # the firmware stands in two fields, major and minor
         status=status,
         source=f"RPLIDAR interface protocol and SDK; {source}",
@@ -170,7 +176,7 @@ def rplidar(
 
 A1 = rplidar(
     "A1",
-    baud=115_200,
+    link=Serial(115_200),
     motor=BY_DTR,
     unit=units.A1,
     range_limits=(0.15, 12.0),
@@ -179,27 +185,76 @@ A1 = rplidar(
     source="A1M8 data sheet; an A1's exchange",
     aliases=("rplidar",),  # the one that most people have
 )
+A2 = rplidar(
+    "A2",
+    link=Serial(115_200, 256_000),  # A2M8 and older; A2M7, A2M12
+    motor=BY_PWM,
+    unit=units.A2,
+    range_limits=(0.15, 16.0),  # an A2M8 sees from 0.15 to 12 m; the rest is assumed for the A2M7
+    turn=(5.0, 15.0),
+    status="manual",
+    source="A2M8 data sheet rev. 2.5 (12 m, turns); the reach of an A2M7 is assumed",
+    aliases=("rplidar-a2m8", "rplidar-a2m7", "rplidar-a2m12"),
+)
 A3 = rplidar(
     "A3",
-    baud=256_000,
+    link=Serial(256_000),
     motor=BY_PWM,
     unit=units.A3,
     range_limits=(0.2, 25.0),
+    turn=(5.0, 15.0),
     status="vectors",
     source="A3M1 data sheet; ultra capsules built after the SDK",
 )
+S1 = rplidar(
+    "S1",
+    link=Serial(256_000),
+    motor=BY_SPEED,
+    unit=units.S1,
+    range_limits=(0.1, 40.0),
+    turn=(8.0, 15.0),
+    status="manual",
+    source="ArduPilot's page of the S1 (40 m, turns); its nearest distance is assumed",
+)
 S2 = rplidar(
     "S2",
-    baud=1_000_000,
+    link=Serial(1_000_000),
     motor=BY_SPEED,
     unit=units.S2,
     range_limits=(0.05, 30.0),
     status="manual",
     source="S2 data sheet",
 )
+S2L = rplidar(
+    "S2L",
+    link=Serial(1_000_000),
+    motor=BY_SPEED,
+    unit=units.S2,
+    range_limits=(0.05, 18.0),
+    status="manual",
+    source="its range is assumed",
+)
+S3 = rplidar(
+    "S3",
+    link=Serial(1_000_000, 460_800),  # the second where the model is 82 (SDK)
+    motor=BY_SPEED,
+    unit=units.S3,
+    range_limits=(0.05, 40.0),
+    status="manual",
+    source="its range is assumed",
+)
+T1 = rplidar(
+    "T1",
+    link=Udp(8089, stream=True),  # asked at 192.168.11.2 (sllidar_ros2)
+    motor=BY_SPEED,
+    unit=units.T1,
+    range_limits=(0.05, 40.0),  # assumed: an S3's
+    status="manual",
+    source="port from sllidar_ros2; its range is assumed",
+)
 C1 = rplidar(
     "C1",
-    baud=460_800,
+    link=Serial(460_800),
     motor=BY_SPEED,
     unit=units.C1,
     range_limits=(0.05, 12.0),
@@ -211,4 +266,4 @@ C1 = rplidar(
 @hookimpl
 def lidarspec_sensors() -> Iterable[Sensor]:
     """The RPLIDAR models."""
-    return [A1, A3, S2, C1]
+    return [A1, A2, A3, S1, S2, S2L, S3, T1, C1]

@@ -20,6 +20,11 @@ from lidarspec.spec import Fields, Frame, Scaled, take
 SINGLE, STREAM = 0, 1  # the modes of a descriptor
 LONGEST_NAME = 64  # bytes of the name of a scan mode (SDK, LidarScanMode)
 
+#: series by the high nibble of the model (SDK, GetModelNameStringByModelID), and the models in them: an A2M8 is 28.
+SERIES = {0x1: ("A1", (8,)), 0x2: ("A2", (4, 6, 7, 8, 12)), 0x3: ("A3", (1,)), 0x4: ("C1", (1,))}
+SERIES |= {0x6: ("S1", (1,)), 0x7: ("S2", (1, 2)), 0x8: ("S3", (1, 2)), 0x9: ("T1", (1,))}
+MODEL_NUMBERS = ", ".join(f"0x{high:x}{low:x} RPLIDAR {name}" for high, (name, models) in SERIES.items() for low in models)
+
 #: keys of configuration values; the first two are of the sensor, the others of one of its scan modes.
 MODE_COUNT, TYPICAL_MODE, US_PER_SAMPLE, MAX_DISTANCE, ANSWER_TYPE, MODE_NAME = 0x70, 0x7C, 0x71, 0x74, 0x75, 0x7F
 
@@ -84,7 +89,7 @@ ANSWERS = {
     "info": single(
         0x04,
         20,
-        "model" / Int8ul * "high nibble: series, low nibble: model in it",
+        "model" / Int8ul * f"high nibble: series, low nibble: model in it; {MODEL_NUMBERS}",
         "firmware_minor" / Int8ul,
         "firmware_major" / Int8ul,
         "hardware" / Int8ul,

@@ -81,9 +81,21 @@ A1 = Unit(
         Mode("Sensitivity", 127, 12, ULTRA),
     ),
 )
+A2 = Unit(
+    0x28,
+    (
+        Mode("Standard", 500, 12, NODE),
+        Mode("Express", 250, 12, EXPRESS),
+        Mode("Boost", 125, 12, ULTRA),
+        Mode("Sensitivity", 125, 12, ULTRA),
+    ),
+)
 A3 = Unit(
     0x31,
     (Mode("Standard", 250, 16, NODE), Mode("Express", 125, 16, EXPRESS), Mode("Boost", 63, 25, ULTRA), Mode("Sensitivity", 63, 25, ULTRA)),
 )
+S1 = Unit(0x61, (Mode("Standard", 217, 40, NODE), Mode("Express", 109, 40, EXPRESS)))
 S2 = Unit(0x71, (Mode("Standard", 125, 30, NODE), Mode("DenseBoost", 31, 30, DENSE)))
+S3 = Unit(0x81, (Mode("Standard", 125, 40, NODE), Mode("DenseBoost", 31, 40, DENSE)))
+T1 = Unit(0x91, (Mode("Standard", 125, 40, NODE), Mode("Sensitivity", 31, 40, ULTRA)))
 C1 = Unit(0x41, (Mode("Standard", 200, 12, NODE), Mode("DenseBoost", 200, 12, DENSE)))

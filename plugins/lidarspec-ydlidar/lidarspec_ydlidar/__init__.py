@@ -42,7 +42,12 @@ from lidarspec_ydlidar.samples import Form
 FULL = 40  # samples of a full packet (protocol, LSN)
 SPEED = 6.0  # turns a second of simulated sensors, which all models can
 STATE = 0.8  # what a T-mini Pro has most often in the bits of the scan frequency while nothing is wrong (its packets)
-CSPC = ("cspc-m1c1-mini", "cspc-coin-d4")  # the same packet; the bits of a three-byte sample mean something else
+CSPC = (
+    "cspc-m1c1-mini",
+    "cspc-coin-d4",
+    "cspc-coin-d4a",
+    "cspc-coin-d6",
+)  # the same packet; the bits of a three-byte sample mean something else
 
 
 def angle() -> Construct:
