@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.columns.columns import Batch
+from lidarspec.columns.columns import Batch, Fields
 from lidarspec.columns.graph import header_function
 from lidarspec.errors import SpecError
 from lidarspec.spec.description import Spec
@@ -60,6 +60,39 @@ class Unwrapper:
         times = np.cumsum(steps)
         self._last = (int(ns[-1]), int(times[-1]), int(host[-1]))
         return times
+
+
+class Epoch:
+    """The turn of a clock, by what other frames tell, see `Clock.told`.
+
+    Attributes:
+        ns: nanoseconds that make the times of an `Unwrapper` complete; None before it was told.
+    """
+
+    def __init__(self, sensor: Spec, clock: Clock) -> None:
+        assert clock.told is not None
+        assert clock.wraps_at is not None
+        self._sensor, (self.frame, self._function), self._turn = sensor, clock.told, _turn(clock.wraps_at)
+        self.ns: int | None = None
+
+    def push(self, batch: Batch, readings: Times, times: Times) -> None:
+        """Ask the first and the last such frame among packets, given what their clock reads, (n,), and as times that run on, (n,)."""
+        table, which = batch.state[self.frame]
+        for row in dict.fromkeys((which.item(0), which.item(-1))) if table is not None and len(which) else ():
+            if row >= 0 and (told := self._told(frame := Batch(table.take(np.array([row])), np.zeros(1, np.bool_)))) is not None:
+                reading, at = clock_ns(self._sensor, frame).item(), int(np.searchsorted(which, row))
+                complete = reading + round((told - reading) / self._turn) * self._turn
+                self.ns = complete - times.item(at) - self._short(reading - readings.item(at))
+                return
+
+    def _told(self, frame: Batch) -> int | None:
+        """The nanoseconds since 1970 that a frame tells."""
+        seconds = float(np.asarray(self._function(Fields(frame)), np.float64).reshape(-1)[0])
+        return round(seconds * 1e9) if np.isfinite(seconds) else None
+
+    def _short(self, step: int) -> int:
+        """A step of the clock, the shorter way round."""
+        return (step + self._turn // 2) % self._turn - self._turn // 2
 
 
 def clock_ns(sensor: Spec, batch: Batch) -> Times:

@@ -381,6 +381,10 @@ def _check_spec(sensor: Spec) -> None:
     if sensor.commands:
         _known(sensor, "simulation.answers", sensor.simulation.answers, sensor.commands)
     _known(sensor, "state", sensor.state, sensor.frames)
+    if sensor.clock is not None and sensor.clock.told is not None:
+        _known(sensor, "clock.told", sensor.clock.told[:1], sensor.frames)
+        if sensor.clock.wraps_at is None or callable(sensor.clock.source):
+            raise SpecError("what is told completes a clock of fields that starts again at `wraps_at`", path="clock.told", sensor=sensor.id)
     _known(sensor, "info", [path.partition(".")[0] for path in sensor.info.values()], sensor.frames)
     if unknown := sorted(set(sensor.info) - set(ROLES)):
         raise SpecError(f"{unknown[0]!r} is not among {', '.join(ROLES)}", path="info", sensor=sensor.id)

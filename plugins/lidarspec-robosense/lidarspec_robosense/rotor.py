@@ -147,11 +147,11 @@ class Rotor:
         vertical, horizontal: (lasers,) degrees, nominal, until DIFOP says the unit's own.
     """
 
-    delay: NDArray[np.float64]
+    delay: NDArray[Any]
     period: float
     lens: float
-    vertical: NDArray[np.float64]
-    horizontal: NDArray[np.float64] | None = None
+    vertical: NDArray[Any]
+    horizontal: NDArray[Any] | None = None
     height: float = 0.0
 
     @property

@@ -36,6 +36,7 @@ from lidarspec_velodyne.frames import (
     packet,
     plausible_dual,
     plausible_single,
+    told,
 )
 
 SLOT = np.arange(SLOTS)
@@ -154,7 +155,7 @@ VLP16 = Sensor(
     points=partial(points, model=VLP16_FIRINGS),
     scan=OnWrap("blocks.azimuth"),
     links={"data": Udp(2368, 8308)},
-    clock=Clock("timestamp", wraps_at=HOUR, pace=partial(pace, model=VLP16_FIRINGS)),
+    clock=Clock("timestamp", wraps_at=HOUR, pace=partial(pace, model=VLP16_FIRINGS), told=("position", told)),
     simulation=Simulation(partial(sweep, model=VLP16_FIRINGS)),
     configure=configure,
     range_limits=(0.4, 130.0),  # the default of ros-drivers/velodyne for this model
@@ -181,7 +182,7 @@ def relative(id: str, model: str, firings: Firings, **facts: Any) -> Sensor:
         id=id,
         model=model,
         points=partial(points, model=firings),
-        clock=Clock("timestamp", wraps_at=HOUR, pace=partial(pace, model=firings)),
+        clock=Clock("timestamp", wraps_at=HOUR, pace=partial(pace, model=firings), told=("position", told)),
         simulation=Simulation(partial(sweep, model=firings)),
         **facts,
     )
