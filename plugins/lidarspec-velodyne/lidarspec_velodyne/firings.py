@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec import UsageError
-from lidarspec.spec import Fields, Polar, Sensor, following, previous, wrap
+from lidarspec.spec import Fields, Polar, Sensor, following, previous
 from lidarspec_velodyne.frames import BLOCKS, DUAL, HOUR, STRONGEST, TURN
 
 LAST_BLOCK = ("previous", "invalid")
@@ -105,7 +105,8 @@ def _step(f: Fields, dual: Any, model: Firings, last_block: str) -> Any:
 
 def _difference(start: Any, end: Any) -> Any:
     """The shorter way round from start to end, degrees: a reading that falls back by jitter is no turn."""
-    return wrap(end - start + 180, 360) - 180
+    step = end - start
+    return step - 360 * np.rint(step / 360)
 
 
 def configure(sensor: Sensor, /, *, last_block: str) -> Sensor:
