@@ -352,7 +352,10 @@ _AnySpec = TypeVar("_AnySpec", bound=Spec)
 
 def with_frames(sensor: _AnySpec, frames: Mapping[str, Frame]) -> _AnySpec:
     """A sensor with these frame types alone, and without what names others: commands, state, what frames say of the device."""
-    return replace(sensor, frames=frames, commands={}, state={}, info={}, on_open=(), on_close=())
+    clock = sensor.clock
+    if clock is not None and clock.told is not None and clock.told[0] not in frames:
+        clock = replace(clock, told=None)
+    return replace(sensor, frames=frames, clock=clock, commands={}, state={}, info={}, on_open=(), on_close=())
 
 
 def _freeze(value: object, *names: str) -> None:

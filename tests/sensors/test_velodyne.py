@@ -372,3 +372,25 @@ def test_the_hour_runs_on_over_its_end_and_between_batches() -> None:
         [midnight * 10**9 + 300_000_000, midnight * 10**9 + 700_000_000],
     ]
     assert not decoder.stats.undated
+
+
+def test_hdl64e_points_by_hand() -> None:
+    """Laser 1 of the example unit: E -8.769, 7.156 degrees to the left, 0.195 m up, 26 mm aside, 1.52 m farther."""
+    sensor = ls.sensor("velodyne-hdl64e-s2")
+    flags = [b"\xff\xee", b"\xff\xdd"] * 6
+    cloud = decoded(sensor, [packet(steps(9000, 20, each=2), {(0, 0): (4240, 9), (1, 0): (4240, 8)}, flags=flags)]).points()
+    # block 0, slot 0: 8.48 + 1.52 = 10 m, A = 90 + 7.156 = 97.156: cos -.124575, sin .992210; cosE .988311, sinE -.152450
+    #   out = 9.88311 + .195 * .152450 = 9.91284; x = -1.23489 + .026 * .992210 = -1.20909, y = -9.83562 + .026 * -.124575 = -9.83886
+    #   z = -1.52450 + .195 * .988311 = -1.33178
+    assert_points(cloud, [(0, (-1.20909, -9.83886, -1.33178))], atol=2e-3)
+    assert cloud.nominal
+    assert cloud.ring is not None
+    assert sorted(cloud.ring[:64].tolist()) == list(range(64))
+    np.testing.assert_allclose(cloud.time[[0, 32, 64, 65]], [0, 0, 48e-6, 49.26e-6], atol=1e-12)
+
+
+def test_dual_return_of_an_hdl64e_has_four_blocks_of_one_azimuth() -> None:
+    cloud = ls.sensor("velodyne-hdl64e-s3").decode([packet(steps(0, 20, each=4), {}, flags=[b"\xff\xee", b"\xff\xdd"] * 6)]).points()
+    assert cloud.return_index is not None
+    assert cloud.return_index[::32].tolist() == [0, 0, 1, 1] * 3
+    np.testing.assert_allclose(cloud.time[::128], np.arange(3) * 57.6e-6, atol=1e-12)

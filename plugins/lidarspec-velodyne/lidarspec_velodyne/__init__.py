@@ -38,6 +38,7 @@ from lidarspec_velodyne.frames import (
     plausible_single,
     told,
 )
+from lidarspec_velodyne.hdl64e import HDL64E_S2, HDL64E_S3
 
 SLOT = np.arange(SLOTS)
 
@@ -243,4 +244,4 @@ VLS128 = relative(
 @hookimpl
 def lidarspec_sensors() -> Iterable[Sensor]:
     """The Velodyne sensors."""
-    return [VLP16, HDL32E, PUCK_HI_RES, VLP32C, VLS128]
+    return [VLP16, HDL32E, PUCK_HI_RES, VLP32C, VLS128, HDL64E_S2, HDL64E_S3]

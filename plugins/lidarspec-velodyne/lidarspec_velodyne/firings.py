@@ -96,14 +96,14 @@ def points(f: Fields, model: Firings, last_block: str = "previous") -> Polar:
 def _step(f: Fields, dual: Any, model: Firings, last_block: str) -> Any:
     """Degrees that the sensor turns from the azimuth of each block to the next one, (n, blocks, 1)."""
     azimuth, one, two = f.blocks.azimuth, model.sharing, 2 * model.sharing
-    ahead = _difference(azimuth, np.where(dual, following(azimuth, two), following(azimuth, one)))
+    ahead = difference(azimuth, np.where(dual, following(azimuth, two), following(azimuth, one)))
     unknown = np.nan
     if last_block == "previous":
-        unknown = _difference(np.where(dual, previous(azimuth, two), previous(azimuth, one)), azimuth)
+        unknown = difference(np.where(dual, previous(azimuth, two), previous(azimuth, one)), azimuth)
     return np.where(np.abs(ahead) < FASTEST * model.period * JITTER, ahead, unknown)
 
 
-def _difference(start: Any, end: Any) -> Any:
+def difference(start: Any, end: Any) -> Any:
     """The shorter way round from start to end, degrees: a reading that falls back by jitter is no turn."""
     step = end - start
     return step - 360 * np.rint(step / 360)
