@@ -15,7 +15,7 @@ from lidarspec.spec.description import Spec
 from lidarspec.spec.fields import factor
 from lidarspec.spec.timing import Clock
 from lidarspec.spec.tree import exact
-from lidarspec.wire.arrays import alike
+from lidarspec.wire.arrays import alike, repeated
 from lidarspec.wire.frame_table import Table
 from lidarspec.wire.schema import Schema
 
@@ -75,20 +75,27 @@ class Epoch:
         self._sensor, (self.frame, self._function), self._turn = sensor, clock.told, _turn(clock.wraps_at)
         self.ns: int | None = None
 
-    def push(self, batch: Batch, readings: Times, times: Times) -> None:
-        """Ask the first and the last such frame among packets, given what their clock reads, (n,), and as times that run on, (n,)."""
-        table, which = batch.state[self.frame]
-        for row in dict.fromkeys((which.item(0), which.item(-1))) if table is not None and len(which) else ():
-            if row >= 0 and (told := self._told(frame := Batch(table.take(np.array([row])), np.zeros(1, np.bool_)))) is not None:
-                reading, at = clock_ns(self._sensor, frame).item(), int(np.searchsorted(which, row))
-                complete = reading + round((told - reading) / self._turn) * self._turn
-                self.ns = complete - times.item(at) - self._short(reading - readings.item(at))
-                return
+    def push(self, batch: Batch, readings: Times, times: Times) -> Times:
+        """What completes the times of packets, (n,): from the first one on before which such a frame told it; 0 before that.
 
-    def _told(self, frame: Batch) -> int | None:
-        """The nanoseconds since 1970 that a frame tells."""
-        seconds = float(np.asarray(self._function(Fields(frame)), np.float64).reshape(-1)[0])
-        return round(seconds * 1e9) if np.isfinite(seconds) else None
+        Args:
+            readings, times: (n,), what the clock reads in the packets, and as times that run on.
+        """
+        first = 0
+        if self.ns is None:
+            table, which = batch.state[self.frame]
+            rows = np.unique(which[which >= 0])
+            if table is None or not len(rows):
+                return repeated(0, len(times))
+            frames = Batch(table.take(rows), np.zeros(len(rows), np.bool_))
+            told = np.broadcast_to(np.asarray(self._function(Fields(frames)), np.float64).reshape(-1), (len(rows),))
+            if not np.isfinite(told).any():
+                return repeated(0, len(times))
+            row = int(np.isfinite(told).argmax())
+            reading, first = clock_ns(self._sensor, frames).item(row), int(np.searchsorted(which, rows[row]))
+            complete = reading + round((round(told.item(row) * 1e9) - reading) / self._turn) * self._turn
+            self.ns = complete - times.item(first) - self._short(reading - readings.item(first))
+        return np.where(np.arange(len(times)) < first, 0, self.ns) if first else repeated(self.ns, len(times))
 
     def _short(self, step: int) -> int:
         """A step of the clock, the shorter way round."""

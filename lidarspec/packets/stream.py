@@ -60,6 +60,7 @@ class PacketStream:
         clock = _clock_of(sensor, frame, self._codec.schema)
         self._timer, timed = replace(sensor, clock=clock) if clock else sensor, data and clock is not None
         self._clock = Unwrapper(clock.wraps_at) if clock else None
+        self._turn = repeated(0, 0)  # what completes the times of the packets at hand
         self._epoch = Epoch(self._timer, clock) if timed and clock is not None and clock.told is not None else None
         in_parts = timed and clock_parts(sensor, self._codec.schema) is not None
         terms = clock_terms(paths(sensor.clock), self._codec.schema, sensor.id) if sensor.clock and timed and not in_parts else []
@@ -109,7 +110,7 @@ class PacketStream:
         if which is None:
             times = self._clock.push(readings, host)
             if self._epoch is not None:
-                self._epoch.push(batch, readings, times)
+                self._turn = self._epoch.push(batch, readings, times)
             return times
         times = self._clock.push(readings, host[which])
         before = host if self._time is None else repeated(self._time, len(host))
@@ -124,7 +125,7 @@ class PacketStream:
             self.stats.undated = f"times count from where the sensor's clock began: no {self._epoch.frame} frame has told the date"
             return times
         self.stats.undated = ""
-        return times + self._epoch.ns
+        return times + self._turn
 
     def _bytes_skipped(self, part: _Part) -> NDArray[np.int64]:
         """The bytes in no frame before each of our frames, since ours before it, (n,)."""

@@ -67,8 +67,8 @@ class Clock:
             counter, and is learned from the stream where it is left out. It tells relatives apart, left out by the pace of a simulation,
             and is needed where it depends on a mode that the packets name.
         told: what completes a clock that starts again: another frame type that has the clock's field too, and a function of its `Fields`
-            to the seconds since 1970 that it tells, nan where it tells none. The turn of the clock is the one closest to what is told;
-            the first and the last such frame among the packets of a batch are asked.
+            to the seconds since 1970 that it tells, nan where it tells none. The turn of the clock is the one closest to what the first
+            frame that tells it says, for the packets from there on.
     """
 
     source: Source

@@ -112,16 +112,24 @@ _RMC = re.compile(rb"\$G[A-Z]RMC,(\d{6})(?:\.\d*)?,A,(?:[^,]*,){6}(\d{6})[,*]")
 LOCKED = 2  # state of the PPS
 
 
-def told(f: Fields) -> float:
-    """Seconds since 1970 of the NMEA sentence; nan of one that is not valid, or while no PPS holds the clock to it."""
-    sentence = _RMC.match(np.asarray(f.nmea).astype(np.uint8).tobytes())
-    if sentence is None or np.asarray(f.pps).item() != LOCKED:
-        return float("nan")
+def told(f: Fields) -> Any:
+    """Seconds since 1970 of each NMEA sentence; nan of one that is not valid, or while no PPS holds the clock to it."""
+    locked = np.asarray(f.pps).reshape(-1) == LOCKED
+    found, sentences = np.full(len(locked), np.nan), np.asarray(f.nmea).astype(np.uint8)
+    for row in np.flatnonzero(locked).tolist():
+        found[row] = _seconds(sentences[row].tobytes())
+        if found[row] > 0:
+            break  # the first one is enough
+    return found
+
+
+def _seconds(nmea: bytes) -> float:
+    sentence = _RMC.match(nmea)
     try:
-        moment = datetime.datetime.strptime((sentence[2] + sentence[1]).decode(), "%d%m%y%H%M%S")
+        moment = datetime.datetime.strptime((sentence[2] + sentence[1]).decode(), "%d%m%y%H%M%S") if sentence else None
     except ValueError:
-        return float("nan")
-    return moment.replace(tzinfo=datetime.UTC).timestamp()
+        moment = None
+    return moment.replace(tzinfo=datetime.UTC).timestamp() if moment else float("nan")
 
 
 def sweep_position(i: int) -> dict[str, Any]:
