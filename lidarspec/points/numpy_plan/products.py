@@ -249,7 +249,7 @@ class Rotation:
         """The left sides of the products, for a batch."""
         around, (middle, half) = self.angles.around, self.span
         numbered = [low for low in around.lows if low is not None]
-        terms = [*self.angles.start, *((low, middle) for low in numbered or [None])]
+        terms = [*self.angles.start, *((low, middle) for low in numbered)] if numbered else [*self.angles.start, (None, middle)]
         values = [(around.values(run, low), factor / TURN) for low, factor in terms if low is not None]
         return Turns(self, len(run.rows), values, sum(factor for low, factor in terms if low is None) / TURN, half)
 

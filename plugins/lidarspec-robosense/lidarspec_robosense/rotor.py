@@ -40,7 +40,7 @@ GAP = 1.0  # degrees; a longer step between blocks is the edge of the field of v
 TURNS = 10  # per second, the factory's setting
 CLOCKWISE = {"LS511": "the rotor turns clockwise, and the angle on the wire with it, in axes that are right-handed"}
 
-BLOCK = Const(b"\xff\xee")  # what a block begins with
+BLOCK: Construct = Const(b"\xff\xee")  # what a block begins with
 #: of most models: the low byte first, its sign in a bit of its own.
 TEMPERATURE = ByteSwapped(
     BitStruct(
@@ -69,7 +69,7 @@ def blocks(count: int, lasers: int, step: float, *, firings: int = 1, flag: Cons
     if firings > 1:
         groups = Struct(channels) * "single return: two firings; dual return: the two returns of one firing"
         channels = "groups" / Array(firings, groups)
-    azimuth = Scaled(Int16ub, 0.01, "deg") * "of the rotor, clockwise, at the block's first laser"
+    azimuth: Construct = Scaled(Int16ub, 0.01, "deg") * "of the rotor, clockwise, at the block's first laser"
     return Array(count, Struct("flag" / flag, "azimuth" / azimuth, channels))
 
 
