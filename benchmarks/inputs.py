@@ -22,6 +22,8 @@ SENSORS: dict[str, tuple[str, int, str | None]] = {
     "stl27l": ("ldrobot-stl27l", 40_000, None),
     "m1c1": ("cspc-m1c1-mini", 20_000, None),
     "vlp16": ("velodyne-vlp16", 2000, None),
+    "vlp32c": ("velodyne-vlp32c", 4000, None),
+    "vls128": ("velodyne-vls128", 12_000, None),
     "xt32": ("hesai-xt32", 3000, None),
     "rplidar": ("slamtec-rplidar-a1", 100_000, "node"),
     "m1-long": ("robosense-m1", 63_000, None),

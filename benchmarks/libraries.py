@@ -43,13 +43,17 @@ def versions() -> dict[str, str]:
     return found
 
 
-def velodyne_packets(frames: Sequence[bytes], points: int) -> Contender:
-    """velodyne-decoder on VLP-16 packets, 76 to a scan, its vectors of packets made beforehand."""
-    vd = library("velodyne_decoder")
-    config = vd.Config()
-    config.model = vd.Model.VLP16
-    packets = [vd.VelodynePacket(index / 754, frame) for index, frame in enumerate(frames)]
-    scans = [vd.PacketVector(packets[start : start + 76]) for start in range(0, len(packets), 76)]
+#: models of velodyne-decoder: its name of the model, packets a second.
+VELODYNE = {"vlp16": ("VLP16", 754), "vlp32c": ("VLP32C", 1507), "vls128": ("AlphaPrime", 6250)}
+
+
+def velodyne_packets(key: str, frames: Sequence[bytes], points: int) -> Contender:
+    """velodyne-decoder on packets, a tenth of a second to a scan, its vectors of packets made beforehand."""
+    vd, (model, rate) = library("velodyne_decoder"), VELODYNE[key]
+    config, turn = vd.Config(), -(-rate // 10)
+    config.model = getattr(vd.Model, model)
+    packets = [vd.VelodynePacket(index / rate, frame) for index, frame in enumerate(frames)]
+    scans = [vd.PacketVector(packets[start : start + turn]) for start in range(0, len(packets), turn)]
     decoder = vd.ScanDecoder(config)
     return Contender(lambda: [decoder.decode(scan) for scan in scans], points)
 

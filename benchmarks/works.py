@@ -150,11 +150,21 @@ BY_HAND: Mapping[str, Callable[[Any], Any]] = {
 
 
 def vlp16(inputs: Inputs) -> Work:
-    frames = inputs.frames("vlp16")
-    points = len(frames) * 384
-    return in_memory(
-        inputs, "vlp16", "VLP-16 packets, look-ahead", {"velodyne-decoder": lambda: libraries.velodyne_packets(frames, points)}
-    )
+    return in_memory(inputs, "vlp16", "VLP-16 packets, look-ahead", beside_velodyne_decoder(inputs, "vlp16"))
+
+
+def beside_velodyne_decoder(inputs: Inputs, key: str) -> Others:
+    """velodyne-decoder on all packets."""
+    frames = inputs.frames(key)
+    return {"velodyne-decoder": lambda: libraries.velodyne_packets(key, frames, len(frames) * 384)}
+
+
+def velodyne(inputs: Inputs, key: str, title: str) -> Work:
+    """Packets of a model that nobody has decoded by hand here."""
+    sensor, rows = inputs.sensor(key), inputs.array(key)
+    points = len(rows) * 384
+    others: Others = {"plain": lambda: Contender(plainly(sensor, rows), points), **beside_velodyne_decoder(inputs, key)}
+    return Work(title, "points", points, rows.size, lambda backend: points_of(sensor, rows, backend), others)
 
 
 def rplidar(inputs: Inputs) -> Work:
@@ -196,6 +206,8 @@ ON_BYTES: Mapping[str, Callable[[Inputs], Work]] = {
     "stl27l": lambda inputs: in_memory(inputs, "stl27l", "STL-27L frames"),
     "m1c1": lambda inputs: in_memory(inputs, "m1c1", "M1C1_Mini packets of 25 samples, corrected"),
     "vlp16": vlp16,
+    "vlp32c": lambda inputs: velodyne(inputs, "vlp32c", "VLP-32C packets, look-ahead"),
+    "vls128": lambda inputs: velodyne(inputs, "vls128", "VLS-128 packets, look-ahead"),
     "xt32": lambda inputs: in_memory(inputs, "xt32", "Pandar XT32 packets"),
     "rplidar": rplidar,
     "stl27l-stream": stl27l_stream,

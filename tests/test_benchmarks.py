@@ -83,4 +83,18 @@ def test_what_is_written_by_hand_gives_the_same_points(tmp_path: Path) -> None:
     """The decoders that the engine is measured beside do the same work: in a process of its own, where they can be imported."""
     done = subprocess.run([sys.executable, "-c", BY_HAND, str(RUN.parent), str(tmp_path)], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    assert done.stdout.split() == ["m1", "stl27l", "m1c1", "vlp16", "xt32", "rplidar", "stl27l", "m1c1", "rplidar", "payloads", "scans"]
+    assert done.stdout.split() == [
+        "m1",
+        "stl27l",
+        "m1c1",
+        "vlp16",
+        "vlp32c",
+        "vls128",
+        "xt32",
+        "rplidar",
+        "stl27l",
+        "m1c1",
+        "rplidar",
+        "payloads",
+        "scans",
+    ]

@@ -524,14 +524,11 @@ def _scaled(value: Node, parts: list[Term], factor: Any) -> list[Term]:
     return [part.times(factor) for part in parts]
 
 
-def split_level(parts: Sequence[Term], depth: int) -> int | None:
-    """The axis from which on only rows vary, and before which only low values do; None where they cross."""
+def split_level(parts: Sequence[Term], depth: int) -> tuple[int, bool]:
+    """The axis from which on only rows vary, and whether they vary before it too."""
     level = max((last_axis(part.low.shape) for part in parts if part.low is not None), default=0)
-    for part in parts:
-        lengths = (1,) * (depth - part.row.ndim) + part.row.shape
-        if any(length > 1 for length in lengths[:level]):
-            return None
-    return level
+    lengths = ((1,) * (depth - part.row.ndim) + part.row.shape for part in parts)
+    return level, any(length > 1 for row in lengths for length in row[:level])
 
 
 def last_axis(shape: tuple[int, ...]) -> int:

@@ -173,11 +173,11 @@ class Device(Closing):
     @property
     def warnings(self) -> list[str]:
         """What is to be said about the source now: a file that is cut off, silence, a likely wrong baud rate, a small buffer, frames
-        that are another sensor's, scans without an end, a nominal calibration; and what the plugin failed at."""
+        that are another sensor's, scans without an end, times without a date, a nominal calibration; and what the plugin failed at."""
         failure = self.stats.failure(self.sensor.id)
         nominal = [_nominal(self.sensor)] if self.stats.nominal else []
-        unended = [f"{self._source}: {self.stats.unended}"] if self.stats.unended else []
-        return [*self._input.warnings, *self._doubts(), *unended, *nominal, *([] if failure is None else [str(failure)])]
+        partial = [f"{self._source}: {text}" for text in (self.stats.unended, self.stats.undated) if text]
+        return [*self._input.warnings, *self._doubts(), *partial, *nominal, *([] if failure is None else [str(failure)])]
 
     @property
     def learned(self) -> Mapping[str, Any]:

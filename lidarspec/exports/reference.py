@@ -89,7 +89,8 @@ def _rule(scan: Split) -> str:
 def _clock(clock: Clock) -> str:
     names = [clock.source] if isinstance(clock.source, str) else clock.source
     fields = "calculated from the packet" if callable(names) else " + ".join(f"`{name}`" for name in names)
-    return fields + (f", starts again at {clock.wraps_at:g} s" if clock.wraps_at else "")
+    again = f", starts again at {clock.wraps_at:g} s" if clock.wraps_at else ""
+    return fields + again + (f", completed by {clock.told[0]} frames" if clock.told else "")
 
 
 def _commands(sensor: Sensor) -> Iterator[str]:

@@ -143,7 +143,9 @@ def _swept(sensor: Spec, frame: str, engine: CompiledCodec, source: random.Rando
         for path, value in values.items():
             leaf = layout.leaves.get(path)
             if leaf is not None and path not in chosen:
-                leaf.store(rows, leaf.info.raw(np.asarray(value, np.float64)))
+                leaf.store(
+                    rows, np.frombuffer(value, np.uint8) if isinstance(value, bytes) else leaf.info.raw(np.asarray(value, np.float64))
+                )
         found = _plausible(sensor, frame, layout, _headed(rows, layout, chosen))
         if found:
             return found[0]

@@ -56,6 +56,7 @@ class Counters:
         plugin_errors: packets, or candidates, at which a function of the plugin raised; `failures` keeps the first ones.
         nominal: whether a default calibration stood in for the sensor's own in any scan.
         unended: what to say of scans that were handed out without an end; "" where there were none.
+        undated: what to say of times that no frame has completed; "" where they are complete.
     """
 
     bytes_in: int = 0
@@ -81,6 +82,7 @@ class Counters:
     failures: list[PluginError] = field(default_factory=list, repr=False, compare=False)
     nominal: bool = field(default=False, repr=False, compare=False)
     unended: str = field(default="", repr=False, compare=False)
+    undated: str = field(default="", repr=False, compare=False)
 
     def to_dict(self) -> dict[str, Any]:
         """The counters by name."""

@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.columns.columns import Batch
+from lidarspec.columns.columns import Batch, Fields
 from lidarspec.columns.graph import header_function
 from lidarspec.errors import SpecError
 from lidarspec.spec.description import Spec
 from lidarspec.spec.fields import factor
 from lidarspec.spec.timing import Clock
 from lidarspec.spec.tree import exact
-from lidarspec.wire.arrays import alike
+from lidarspec.wire.arrays import alike, repeated
 from lidarspec.wire.frame_table import Table
 from lidarspec.wire.schema import Schema
 
@@ -60,6 +60,46 @@ class Unwrapper:
         times = np.cumsum(steps)
         self._last = (int(ns[-1]), int(times[-1]), int(host[-1]))
         return times
+
+
+class Epoch:
+    """The turn of a clock, by what other frames tell, see `Clock.told`.
+
+    Attributes:
+        ns: nanoseconds that make the times of an `Unwrapper` complete; None before it was told.
+    """
+
+    def __init__(self, sensor: Spec, clock: Clock) -> None:
+        assert clock.told is not None
+        assert clock.wraps_at is not None
+        self._sensor, (self.frame, self._function), self._turn = sensor, clock.told, _turn(clock.wraps_at)
+        self.ns: int | None = None
+
+    def push(self, batch: Batch, readings: Times, times: Times) -> Times:
+        """What completes the times of packets, (n,): from the first one on before which such a frame told it; 0 before that.
+
+        Args:
+            readings, times: (n,), what the clock reads in the packets, and as times that run on.
+        """
+        first = 0
+        if self.ns is None:
+            table, which = batch.state[self.frame]
+            rows = np.unique(which[which >= 0])
+            if table is None or not len(rows):
+                return repeated(0, len(times))
+            frames = Batch(table.take(rows), np.zeros(len(rows), np.bool_))
+            told = np.broadcast_to(np.asarray(self._function(Fields(frames)), np.float64).reshape(-1), (len(rows),))
+            if not np.isfinite(told).any():
+                return repeated(0, len(times))
+            row = int(np.isfinite(told).argmax())
+            reading, first = clock_ns(self._sensor, frames).item(row), int(np.searchsorted(which, rows[row]))
+            complete = reading + round((round(told.item(row) * 1e9) - reading) / self._turn) * self._turn
+            self.ns = complete - times.item(first) - self._short(reading - readings.item(first))
+        return np.where(np.arange(len(times)) < first, 0, self.ns) if first else repeated(self.ns, len(times))
+
+    def _short(self, step: int) -> int:
+        """A step of the clock, the shorter way round."""
+        return (step + self._turn // 2) % self._turn - self._turn // 2
 
 
 def clock_ns(sensor: Spec, batch: Batch) -> Times:

@@ -19,7 +19,7 @@ from lidarspec.columns.columns import Batch
 from lidarspec.errors import PluginError, SpecError, UnknownFrame
 from lidarspec.framing.frame_engine import Codec, codec
 from lidarspec.framing.results import Counters, Frames, Numbers
-from lidarspec.packets.clocks import Unwrapper, clock_parts, clock_terms, clocked, held, paths
+from lidarspec.packets.clocks import Epoch, Unwrapper, clock_parts, clock_terms, clocked, held, paths
 from lidarspec.packets.continuity import Continuity
 from lidarspec.packets.imu import ImuSamples, Waiting, joined
 from lidarspec.packets.packets import Index, Packets, StateOf, joined_tables
@@ -60,6 +60,8 @@ class PacketStream:
         clock = _clock_of(sensor, frame, self._codec.schema)
         self._timer, timed = replace(sensor, clock=clock) if clock else sensor, data and clock is not None
         self._clock = Unwrapper(clock.wraps_at) if clock else None
+        self._turn = repeated(0, 0)  # what completes the times of the packets at hand
+        self._epoch = Epoch(self._timer, clock) if timed and clock is not None and clock.told is not None else None
         in_parts = timed and clock_parts(sensor, self._codec.schema) is not None
         terms = clock_terms(paths(sensor.clock), self._codec.schema, sensor.id) if sensor.clock and timed and not in_parts else []
         grain = float(min((step for _, step, _, _ in terms), default=0))
@@ -86,7 +88,7 @@ class PacketStream:
             with np.errstate(all="ignore"):
                 time = self._guarded("clock", self._times, None, batch, host) if self._clock is not None else None
                 index, breaks = self._guarded("sequence", self._continuity.push, otherwise, batch, time, skipped)
-        time = host if time is None else time
+        time = host if time is None else self._complete(time)
         columns: dict[str, Any] = {"offset": offset, "time_ns": time, "host_ns": host, "index": index, "breaks": breaks}
         return Packets(self.sensor, self.frame, table, **columns, state=state, stats=self.stats, backend=self._backend)
 
@@ -106,11 +108,24 @@ class PacketStream:
         assert self._clock is not None
         which, readings = clocked(self._timer, batch)
         if which is None:
-            return self._clock.push(readings, host)
+            times = self._clock.push(readings, host)
+            if self._epoch is not None:
+                self._turn = self._epoch.push(batch, readings, times)
+            return times
         times = self._clock.push(readings, host[which])
         before = host if self._time is None else repeated(self._time, len(host))
         self._time = int(times[-1]) if len(times) else self._time
         return held(which, times, before)
+
+    def _complete(self, times: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Times with the turn of the clock that other frames have told, if they have."""
+        if self._epoch is None or not len(times):
+            return times
+        if self._epoch.ns is None:
+            self.stats.undated = f"times count from where the sensor's clock began: no {self._epoch.frame} frame has told the date"
+            return times
+        self.stats.undated = ""
+        return times + self._turn
 
     def _bytes_skipped(self, part: _Part) -> NDArray[np.int64]:
         """The bytes in no frame before each of our frames, since ours before it, (n,)."""

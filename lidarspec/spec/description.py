@@ -352,7 +352,10 @@ _AnySpec = TypeVar("_AnySpec", bound=Spec)
 
 def with_frames(sensor: _AnySpec, frames: Mapping[str, Frame]) -> _AnySpec:
     """A sensor with these frame types alone, and without what names others: commands, state, what frames say of the device."""
-    return replace(sensor, frames=frames, commands={}, state={}, info={}, on_open=(), on_close=())
+    clock = sensor.clock
+    if clock is not None and clock.told is not None and clock.told[0] not in frames:
+        clock = replace(clock, told=None)
+    return replace(sensor, frames=frames, clock=clock, commands={}, state={}, info={}, on_open=(), on_close=())
 
 
 def _freeze(value: object, *names: str) -> None:
@@ -381,6 +384,10 @@ def _check_spec(sensor: Spec) -> None:
     if sensor.commands:
         _known(sensor, "simulation.answers", sensor.simulation.answers, sensor.commands)
     _known(sensor, "state", sensor.state, sensor.frames)
+    if sensor.clock is not None and sensor.clock.told is not None:
+        _known(sensor, "clock.told", sensor.clock.told[:1], sensor.frames)
+        if sensor.clock.wraps_at is None or callable(sensor.clock.source):
+            raise SpecError("what is told completes a clock of fields that starts again at `wraps_at`", path="clock.told", sensor=sensor.id)
     _known(sensor, "info", [path.partition(".")[0] for path in sensor.info.values()], sensor.frames)
     if unknown := sorted(set(sensor.info) - set(ROLES)):
         raise SpecError(f"{unknown[0]!r} is not among {', '.join(ROLES)}", path="info", sensor=sensor.id)

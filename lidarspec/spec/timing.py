@@ -66,11 +66,15 @@ class Clock:
         pace: a function of `Fields`: by how many seconds it advances from a packet to the next. It says what is missing where there is no
             counter, and is learned from the stream where it is left out. It tells relatives apart, left out by the pace of a simulation,
             and is needed where it depends on a mode that the packets name.
+        told: what completes a clock that starts again: another frame type that has the clock's field too, and a function of its `Fields`
+            to the seconds since 1970 that it tells, nan where it tells none. The turn of the clock is the one closest to what the first
+            frame that tells it says, for the packets from there on.
     """
 
     source: Source
     wraps_at: float | None = None
     pace: Callable[[Any], Any] | None = None
+    told: tuple[str, Callable[[Any], Any]] | None = None
 
 
 @dataclass(frozen=True)

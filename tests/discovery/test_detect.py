@@ -30,7 +30,7 @@ CAPTURED = {
     "hesai/40p_20hz/lidar_20Hz.pcapng": "hesai-pandar40p",
     "hesai/xt32/packets.derived.pcap": "hesai-xt32",
     "hesai/qt64/packets.derived.pcap": "hesai-qt64",
-    "robosense/helios16p/packets.derived.pcap": "robosense-helios16p",
+    "robosense/helios16p/packets.derived.pcap": "robosense-helios5515",
     "velodyne/hdl32e/sample_velodyne_hdl32.pcap": "velodyne-hdl32e",
     "velodyne/vlp16_dual/packets.derived.pcap": "velodyne-vlp16",
     "velodyne/vlp16_old_firmware/vlp-16-test-90deg-1-50-frames.pcap": "velodyne-vlp16",

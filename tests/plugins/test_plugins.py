@@ -274,7 +274,7 @@ def test_a_relative_file_needs_no_more_than_its_name(tmp_path: Path, monkeypatch
         ("LDROBOT-LD006", "'ldrobot-ld06'"),
         ("ld006", "'ldrobot-ld06'"),
         ("xt", "'hesai-xt16', 'hesai-xt32' or 'hesai-xt32m'"),
-        ("helios", "'robosense-helios16p'"),
+        ("helios", "'robosense-helios16p', 'robosense-helios32' or 'robosense-helios5515'"),
         ("VLP", "'velodyne-vlp16', 'velodyne-vlp32c' or 'velodyne-puck-hi-res'"),
     ],
 )

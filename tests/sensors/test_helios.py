@@ -275,12 +275,12 @@ def _nearest(scan: ls.PointCloud, published: Any) -> tuple[Any, Any]:
 
 
 def test_a_packet_that_names_another_model_is_told_of(tmp_path: Path) -> None:
-    """Lidar type 6 is a Helios-5515, says the manual; and says the capture of a 16P, so that it is a doubt and no more."""
+    """Lidar type 6 is a Helios-5515: what is read as a 16P all the same is told of."""
     path, frames = tmp_path / "other.bin", simulate(SENSOR, 100)
     path.write_bytes(b"".join(SENSOR.build("data", {**SENSOR.parse(frame), "lidar_type": 6}) for frame in frames))
     with ls.open(path, SENSOR) as device:
         assert list(device.scans())
-        told = "read as robosense-helios16p, and data.lidar_type says Helios-5515; next: lidarspec detect"
+        told = "read as robosense-helios16p, and the frames are those of robosense-helios5515 (type 6, Helios-5515); next: lidarspec detect"
         assert [told in warning for warning in device.warnings] == [True, False]
     path.write_bytes(b"".join(frames))
     with ls.open(path, SENSOR) as device:

@@ -17,7 +17,7 @@ FILE = "vectors_udp3d.json"
 SENSOR = ls.sensor("robosense-m1")
 SIZE = 1210
 
-WHOLE = {"rsm1_msop_full_dual_1": "data", "rsm1_difop_rs_driver_fov": "difop"}
+WHOLE = {"rsm1_msop_full_dual_1": "data", "rsm1_difop_rs_driver_fov": "difop_fov"}
 EXCERPTS = {"rsm1_msop_header_manual", "rsm1_msop_blocks0_4_manual", "rsm1_point_manual_example", "rsm1_radius_example"}
 SPLITS = {"rsm1_split_unit_a", "rsm1_split_unit_b", "rsm1_split_loop"}
 OTHER_LAYOUTS = {"rs_time_utc_us"}  # a time with milliseconds and microseconds apart, of the mechanical models
@@ -43,9 +43,8 @@ def test_every_vector_of_the_model_is_used() -> None:
 def test_a_whole_packet_is_parsed_and_built_to_the_same_bytes(name: str) -> None:
     data, frame = vector_bytes(FILE, name), WHOLE[name]
     assert len(data) == vectors(FILE)[name]["length"]
-    parsed = SENSOR.parse(data)
+    parsed = SENSOR.parse(data, frame)
     assert SENSOR.build(frame, parsed) == data
-    assert SENSOR.parse(data, frame) == parsed
     assert [(found.frame, found.data) for found in SENSOR.split([data])] == [(frame, data)]
     assert len(decoded(SENSOR, [data], None if frame == "data" else frame)) == 1
 
@@ -152,7 +151,7 @@ def test_dual_return() -> None:
 
 def test_the_device_information() -> None:
     expected = vectors(FILE)["rsm1_difop_rs_driver_fov"]["expected"]
-    parsed = SENSOR.parse(vector_bytes(FILE, "rsm1_difop_rs_driver_fov"))
+    parsed = SENSOR.parse(vector_bytes(FILE, "rsm1_difop_rs_driver_fov"), "difop_fov")
     assert (parsed.frame_rate, parsed.msop_port, parsed.difop_port) == (
         expected["frame_rate"],
         expected["msop_port"],
@@ -160,7 +159,21 @@ def test_the_device_information() -> None:
     )
     assert ".".join(map(str, parsed.lidar_ip)) == expected["lidar_ip"]
     assert ".".join(map(str, parsed.host_ip)) == expected["host_ip"]
+    assert (parsed.return_mode, parsed.seconds, parsed.microseconds) == (4, expected["seconds"], expected["microseconds"])
     assert SENSOR.links["data"] == Udp(parsed.msop_port, parsed.difop_port)
+
+
+def test_each_layout_of_the_device_information_is_told_from_the_others() -> None:
+    """By what can stand where the modes and the time are; what fits none of them keeps its bytes."""
+    head = bytes.fromhex("a5ff005a11115555000a") + bytes(18)
+    modes = bytes([5, 2, 1]) + (1_700_000_000).to_bytes(6, "big") + (999_999).to_bytes(4, "big")
+    for frame, start in (("difop", 44), ("difop_fov", 52), ("difop_guide", 54), ("difop_other", 60)):
+        data = bytearray(head + bytes([9]) * (256 - len(head)))
+        data[start : start + len(modes)] = modes
+        (found,) = SENSOR.split([bytes(data)])
+        assert found.frame == frame
+        assert SENSOR.build(frame, SENSOR.parse(bytes(data), frame)) == data
+        assert frame == "difop_other" or SENSOR.parse(bytes(data), frame).seconds == 1_700_000_000
 
 
 @pytest.mark.parametrize("size", [0, 1, 255, 257, 1209, 1211, 62152])
@@ -216,6 +229,7 @@ def test_decoding_follows_a_struct_with_renamed_and_reordered_fields() -> None:
         clock=Clock("micros"),
         sequence=Sequence("turn"),
         scan=OnRewind("turn"),
+        info={},
     )
     groups = [{"delay": 0.00001 * g, "shots": [{"far": 1 + g, "bearing": 10 * k, "spare": b"xy"} for k in range(5)]} for g in range(3)]
     data = other.build("data", units=True, groups=groups, micros=0.5, turn=7)

@@ -1,4 +1,4 @@
-"""RoboSense RS-LiDAR-32 and RS-Bpearl: a vector, points worked out by hand, the date, dual return, the type byte."""
+"""RoboSense RS-LiDAR, RS-Bpearl, RS-Ruby, Airy: points worked out by hand, the date, dual return, what tells the models apart."""
 
 from __future__ import annotations
 
@@ -84,6 +84,65 @@ def test_the_date_is_taken_for_utc() -> None:
     assert packets.time_ns.tolist() == [int(moment.timestamp()) * 10**9 + 273_546_000]
 
 
-@pytest.mark.parametrize("sensor", [RS32, BPEARL])
-def test_the_type_byte_tells_them_apart(sensor: ls.Sensor) -> None:
+@pytest.mark.parametrize(
+    "sensor", [sensor for sensor in ls.sensors().values() if sensor.vendor == "RoboSense"], ids=lambda sensor: sensor.id
+)
+def test_every_model_is_told_from_the_others(sensor: ls.Sensor) -> None:
     assert verdict(Heard("", tuple(simulate(sensor, 20)), datagrams=True)).sensor is sensor
+
+
+def test_a_helios_of_16_lasers_and_one_of_32_are_told_apart_with_dual_return_too() -> None:
+    """They have one type byte, and 16 lasers with two returns are as quick as 32 with one: what is there twice tells."""
+    small, large = ls.sensor("robosense-helios16p"), ls.sensor("robosense-helios32")
+    twice, pairs = [], []
+    for frame in simulate(large, 20):
+        packet = large.parse(frame)
+        for block in packet.blocks:
+            block.channels[16:] = block.channels[:16]
+        twice.append(large.build("data", packet))
+        packet = large.parse(frame)
+        packet.blocks[1::2] = packet.blocks[::2]
+        pairs.append(large.build("data", packet))
+    assert verdict(Heard("", tuple(twice), datagrams=True)).sensor is small
+    assert verdict(Heard("", tuple(pairs), datagrams=True)).sensor is large
+
+
+def ruby(azimuths: Sequence[int], distances: Sequence[int], *, returns: int) -> bytes:
+    """A packet of three blocks by Table 5-2, with an echo of the first laser in each."""
+    head = bytes.fromhex("55aa055a010200") + bytes([returns]) + bytes(23) + bytes([5, 1]) + bytes(47)
+    cells = zip(azimuths, distances, strict=True)
+    return head + b"".join(b"\xfe\x01" + struct.pack(">HHB", azimuth, raw, 7) + bytes(381) for azimuth, raw in cells) + bytes(4)
+
+
+def test_three_blocks_of_dual_return_are_a_shot_and_a_half() -> None:
+    sensor = ls.sensor("robosense-ruby-plus-128")
+    cloud = decoded(sensor, [ruby([0, 0, 40], [200, 400, 600], returns=3), ruby([40, 80, 80], [800, 1000, 1200], returns=3)]).points()
+    assert cloud.return_index is not None
+    assert cloud.return_index[::128].tolist() == [0, 1, 0, 1, 0, 1]
+    np.testing.assert_allclose(cloud.time[::128], np.array([0, 0, 1, 0, 1, 1]) * 55.56e-6, atol=1e-12)
+    assert cloud.range[::128].tolist() == [1, 2, 3, 4, 5, 6]
+    single = decoded(sensor, [ruby([0, 40, 80], [200, 400, 600], returns=1)]).points()
+    assert single.return_index is not None
+    assert not single.return_index.any()
+    # the last laser fires 53.771 us of 55.56 after its block: 0.4 degrees on by the step to the next block, from the last one as before it
+    np.testing.assert_allclose(-np.rad2deg(single.azimuth[127::128]), np.array([0, 0.4, 0.8]) + 0.4 * 53.771 / 55.56, atol=1e-5)
+
+
+def test_pairs_of_blocks_of_an_airy_are_one_shot_and_its_imu_is_in_steps_of_its_ranges() -> None:
+    sensor = ls.sensor("robosense-airy")
+    packet = sensor.parse(simulate(sensor, 1)[0])
+    for number, block in enumerate(packet.blocks):
+        block.azimuth = 40 * (number // 4)
+    cloud = decoded(sensor, [sensor.build("data", {**packet, "returns": 3})]).points()
+    assert cloud.return_index is not None
+    assert cloud.ring is not None
+    assert cloud.return_index[::48].tolist() == [0, 0, 1, 1] * 2
+    assert cloud.ring[::48].tolist() == [0, 48] * 4
+    np.testing.assert_allclose(cloud.time[:: 4 * 48], [0, 111.08e-6], atol=1e-12)
+    axes = [f"{kind}_{axis}" for kind in ("acceleration", "rotation") for axis in "xyz"]
+    still = dict.fromkeys(axes, 0) | {"seconds": 5, "microseconds": 0, "temperature": 0, "data_rate": 3, "count": 1}
+    data = sensor.build("imu", **{**still, "acceleration_z": 8192, "rotation_x": -16384, "acceleration_range": 1, "rotation_range": 2})
+    felt = sensor.decode([data], "imu").imu()
+    np.testing.assert_allclose(felt.linear_acceleration, [[0, 0, 9.80665]])
+    np.testing.assert_allclose(felt.angular_velocity, [[np.deg2rad(-500), 0, 0]])
+    assert felt.time_ns.tolist() == [5_000_000_000]

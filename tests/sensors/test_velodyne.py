@@ -11,6 +11,7 @@ import pytest
 
 import lidarspec as ls
 from lidarspec.errors import UnknownOption
+from lidarspec.packets.stream import PacketStream
 from lidarspec.simulation.simulator import simulate
 from tests.sensors.evidence import assert_points, clockwise, decoded, vector_bytes, vectors
 
@@ -327,3 +328,69 @@ def test_the_simulated_sensor_turns_ten_times_a_second(sensor: ls.Sensor, lasers
     assert cloud.ring is not None
     assert set(cloud.ring.tolist()) == set(range(lasers))
     assert cloud.valid.mean() > 0.9
+
+
+def test_the_hour_is_that_of_the_position_packets() -> None:
+    """13:59:59 on 2023-07-05, told half a second into the next hour, and before the end of that one."""
+    sentence = b"$GPRMC,135959,A,4807.038,N,01131.000,E,022.4,084.4,050723,003.1,W*00\r\n"
+    ten = 1_688_558_400  # 12:00:00
+    for told, read, seconds in ((0.5, 0.25, 7200.25), (3599.5, 3599.9, 7199.9), (3599.5, 0.1, 7200.1)):
+        packets = decoded(VLP16, [packet(steps(0), {}, time_us=round(read * 1e6)), position(sentence, time_us=round(told * 1e6))])
+        assert packets.time_ns.tolist() == [ten * 10**9 + round(seconds * 1e9)]
+        assert not packets.stats.undated
+
+
+@pytest.mark.parametrize(
+    ("nmea", "pps"),
+    [
+        (b"", 2),
+        (b"$GPRMC,135959,V,,,,,,,050723,,,N*00", 2),
+        (b"$GPGGA,135959,4807.038,N,01131.000,E,1,08,0.9,545.4,M,46.9,M,,*47", 2),
+        (b"$GPRMC,135959,A,,,,,,,310223,,,A*00", 2),
+        (b"$GPRMC,135959,A,,,,,,,050723,,,A*00", 0),
+    ],
+    ids=["no sentence", "not valid", "without a date", "no day", "no pulse"],
+)
+def test_without_a_date_times_count_from_the_top_of_the_hour_and_that_is_said(nmea: bytes, pps: int) -> None:
+    packets = decoded(VLP16, [position(nmea, pps=pps), packet(steps(0), {}, time_us=2_000_000)])
+    assert packets.time_ns.tolist() == [2_000_000_000]
+    assert packets.stats.undated == "times count from where the sensor's clock began: no position frame has told the date"
+
+
+def test_the_hour_runs_on_over_its_end_and_between_batches() -> None:
+    clock = [3599.5, 3599.9, 0.3, 0.7]
+    data = [packet(steps(40 * number), {}, time_us=round(second * 1e6)) for number, second in enumerate(clock)]
+    stream = PacketStream(VLP16, "data", (decoder := VLP16.decoder()).stats)
+    told = position(b"$GPRMC,235959,A,,,,,,,311223,,,A*00", time_us=3_599_600_000)
+    parts = [
+        stream.add([frames for datagram in part for frames in decoder.frames(datagram)]) for part in (data[:1], [told, data[1]], data[2:])
+    ]
+    midnight = 1_704_067_200
+    assert [part.time_ns.tolist() for part in parts] == [
+        [3_599_500_000_000],
+        [midnight * 10**9 - 100_000_000],
+        [midnight * 10**9 + 300_000_000, midnight * 10**9 + 700_000_000],
+    ]
+    assert not decoder.stats.undated
+
+
+def test_hdl64e_points_by_hand() -> None:
+    """Laser 1 of the example unit: E -8.769, 7.156 degrees to the left, 0.195 m up, 26 mm aside, 1.52 m farther."""
+    sensor = ls.sensor("velodyne-hdl64e-s2")
+    flags = [b"\xff\xee", b"\xff\xdd"] * 6
+    cloud = decoded(sensor, [packet(steps(9000, 20, each=2), {(0, 0): (4240, 9), (1, 0): (4240, 8)}, flags=flags)]).points()
+    # block 0, slot 0: 8.48 + 1.52 = 10 m, A = 90 + 7.156 = 97.156: cos -.124575, sin .992210; cosE .988311, sinE -.152450
+    #   out = 9.88311 + .195 * .152450 = 9.91284; x = -1.23489 + .026 * .992210 = -1.20909, y = -9.83562 + .026 * -.124575 = -9.83886
+    #   z = -1.52450 + .195 * .988311 = -1.33178
+    assert_points(cloud, [(0, (-1.20909, -9.83886, -1.33178))], atol=2e-3)
+    assert cloud.nominal
+    assert cloud.ring is not None
+    assert sorted(cloud.ring[:64].tolist()) == list(range(64))
+    np.testing.assert_allclose(cloud.time[[0, 32, 64, 65]], [0, 0, 48e-6, 49.26e-6], atol=1e-12)
+
+
+def test_dual_return_of_an_hdl64e_has_four_blocks_of_one_azimuth() -> None:
+    cloud = ls.sensor("velodyne-hdl64e-s3").decode([packet(steps(0, 20, each=4), {}, flags=[b"\xff\xee", b"\xff\xdd"] * 6)]).points()
+    assert cloud.return_index is not None
+    assert cloud.return_index[::32].tolist() == [0, 0, 1, 1] * 3
+    np.testing.assert_allclose(cloud.time[::128], np.arange(3) * 57.6e-6, atol=1e-12)

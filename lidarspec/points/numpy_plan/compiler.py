@@ -314,7 +314,7 @@ class Compiler:
             turns: products.Turns = execution.prepared[rotation]
             rows = out.reshape(-1, rotation.inner)
             if not turns.all_wide:
-                products.multiplied(turns.left[which], rotation.rows[which], rows)
+                turns.multiply(which, rows)
             if turns.some_wide:
                 rows[turns.wide] = function(read(execution).reshape(-1, rotation.inner)[turns.wide])
 
@@ -373,7 +373,7 @@ class Compiler:
             left: makes the numbers, for the batch at its first chunk.
             place: where they are kept for the other chunks.
         """
-        inner = rows.shape[1]
+        inner = rows.shape[-1]
 
         def run(execution: Run, out: NDArray[Any]) -> None:
             if place not in execution.prepared:

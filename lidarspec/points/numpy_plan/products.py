@@ -32,6 +32,8 @@ Singles = NDArray[np.float32]
 TURN = 2 * np.pi
 #: radians from which on float32 is too coarse for an angle.
 NEAR = 4.0
+#: points that blocks with rows of their own have at least: each block takes a matrix product.
+WORTHWHILE = 16
 #: multiplications up to which OpenBLAS stays in one thread (`SMP_THRESHOLD_MIN` times `GEMM_MULTITHREAD_THRESHOLD`).
 _ALONE = 1 << 18
 
@@ -42,7 +44,7 @@ class Product:
 
     Attributes:
         lows: the numbers, None for 1.
-        rows: (k, inner), of each the row that it is multiplied by.
+        rows: (k, inner), of each the row that it is multiplied by; (k, groups, inner) where these differ by the block of a packet.
         outer: the axes after the packets' that the numbers have.
     """
 
@@ -52,18 +54,25 @@ class Product:
 
     @classmethod
     def of(cls, parts: Sequence[Term], shape: tuple[int, ...]) -> Product | None:
-        """The product of the parts of a sum that are low, for points of this shape; None where their axes cross, or there are none."""
-        level = split_level(parts, len(shape))
-        if level is None or not parts:
+        """The product of the parts of a sum that are low, for points of this shape; None where there are none, or it would be in crumbs."""
+        if not parts:
             return None
-        inner = math.prod(shape[level:])
-        rows = [np.broadcast_to(part.row, shape[level:] if part.row.ndim else (inner,)).reshape(inner) for part in parts]
-        return cls([part.low for part in parts], np.stack(rows), shape[:level])
+        level, crossing = split_level(parts, len(shape))
+        if crossing and math.prod(shape[level:]) < WORTHWHILE:
+            return None
+        whole, inner = (shape, math.prod(shape[level:])) if crossing else (shape[level:], math.prod(shape[level:]))
+        rows = np.stack([np.broadcast_to(part.row, whole).reshape(-1, inner) for part in parts])
+        return cls([part.low for part in parts], rows if crossing else rows[:, 0], shape[:level])
 
     @property
     def inner(self) -> int:
         """The length of a row."""
-        return int(self.rows.shape[1])
+        return int(self.rows.shape[-1])
+
+    @property
+    def groups(self) -> int:
+        """How many blocks of a packet have rows of their own."""
+        return 1 if self.rows.ndim == 2 else self.rows.shape[1]
 
     @property
     def nodes(self) -> list[Node]:
@@ -100,12 +109,12 @@ class Angles:
     @classmethod
     def of(cls, product: Product, more: tuple[float, float]) -> Angles | None:
         """The angles that a product makes; None where nothing is the same for all points of a packet or block."""
-        level = [bool((row == row[0]).all()) for row in product.rows]
-        start = [(low, float(row[0])) for low, row, is_level in zip(product.lows, product.rows, level, strict=True) if is_level]
+        level = [bool((row == row.flat[0]).all()) for row in product.rows]
+        start = [(low, float(row.flat[0])) for low, row, is_level in zip(product.lows, product.rows, level, strict=True) if is_level]
         if not any(low is not None for low, _ in start) or not np.isfinite((*product.rows.flat, *more)).all():
             return None
         others = [index for index, is_level in enumerate(level) if not is_level]
-        rows = np.vstack([np.ones(product.inner), product.rows[others]])
+        rows = np.concatenate([np.ones((1, *product.rows.shape[1:])), product.rows[others]])
         return cls(start, Product([None, *(product.lows[index] for index in others)], rows, product.outer), more)
 
     @property
@@ -120,7 +129,7 @@ class Angles:
 
     def left(self, run: Run) -> tuple[Floats, NDArray[np.bool_]]:
         """The numbers, (k, rows), the first of each within half a turn; and where angles may be that have to be reduced all the same."""
-        found, rows = self.around.left(run), self.around.rows
+        found, rows = self.around.left(run), self.around.rows.reshape(len(self.around.rows), -1)
         start = found[0].reshape(len(run.rows), *self.around.outer)
         start[...] = 0
         for low, factor in self.start:
@@ -147,8 +156,13 @@ def reduced(angles: Floats) -> Floats:
 def multiplied(left: NDArray[Any], right: NDArray[Any], out: NDArray[Any]) -> None:
     """A matrix product in pieces that a BLAS does in one thread; with two, a chunk would wait for the one that is busy elsewhere.
 
-    Rows come out the same in any company: for that a lone one needs another, as it would be summed in another order.
+    Rows come out the same in any company: for that a lone one needs another, as it would be summed in another order. Where the right side
+    differs by group, rows belong to the groups by turns.
     """
+    if right.ndim == 3:
+        for group in range(right.shape[1]):
+            multiplied(np.ascontiguousarray(left[group :: right.shape[1]]), right[:, group], out[group :: right.shape[1]])
+        return
     step = max(_ALONE // right.size, 2)
     for start in range(0, len(left), step):
         part, target = left[start : start + step], out[start : start + step]
@@ -180,9 +194,9 @@ class Rotation:
 
     @classmethod
     def of(cls, angles: Angles) -> Rotation | None:
-        """The rotation that makes these angles; None where that takes more than one row of numbers besides their middle."""
-        lows = angles.around.lows
-        return None if len(lows) > 2 or angles.more != (0.0, 0.0) else cls(angles, lows[-1] is not None)
+        """The rotation that makes these angles; None where several rows besides their middle have numbers of packets or blocks."""
+        numbered = [low for low in angles.around.lows if low is not None]
+        return None if len(numbered) > 1 or angles.more != (0.0, 0.0) else cls(angles, bool(numbered))
 
     @property
     def inner(self) -> int:
@@ -190,25 +204,52 @@ class Rotation:
         return self.angles.around.inner
 
     @cached_property
+    def row(self) -> Floats:
+        """By what the number of a packet or block is multiplied; where none has one, how far each point is turned."""
+        around = self.angles.around
+        return next((row for row, low in zip(around.rows, around.lows, strict=True) if low is not None), self.aside)
+
+    @cached_property
+    def aside(self) -> Floats:
+        """By how much each point is turned in all packets or blocks alike."""
+        around = self.angles.around
+        fixed = [row for row, low in zip(around.rows[1:], around.lows[1:], strict=True) if low is None]
+        return np.sum(fixed, axis=0) if fixed else np.zeros(around.rows.shape[1:])
+
+    @cached_property
+    def joint(self) -> bool:
+        """Whether points are turned both by numbers of their packet or block and alike in all."""
+        return self.moving and bool(self.aside.any())
+
+    @cached_property
     def span(self) -> tuple[float, float]:
         """What is in the middle of the row, and half of its width."""
-        row = self.angles.around.rows[-1]
-        return (float(row.max()) + float(row.min())) / 2, (float(row.max()) - float(row.min())) / 2
+        lowest, highest = float(self.row.min()), float(self.row.max())
+        return (highest + lowest) / 2, (highest - lowest) / 2
 
     @cached_property
     def rows(self) -> tuple[Singles, Singles]:
         """The right sides of the products, for cosines and for sines, (k, inner)."""
         middle, half = self.span
-        row = self.angles.around.rows[-1] - middle
+        row = self.row - middle
         if not self.moving:
             return _single([np.cos(row), -np.sin(row)]), _single([np.cos(row), np.sin(row)])
         series = [(row / half) ** term / math.factorial(term) for term in range(TERMS)]
-        return tuple(_single([s * t for s, t in zip(signs, series, strict=True)]) for signs in _SIGNS)  # type: ignore[return-value]
+        cos, sin = ([sign * part for sign, part in zip(signs, series, strict=True)] for signs in _SIGNS)
+        if not self.joint:
+            return _single(cos), _single(sin)
+        across, along = np.sin(self.aside), np.cos(self.aside)
+        pairs = list(zip(cos, sin, strict=True))
+        return (
+            _single([part for one, other in pairs for part in (one * along, -other * across)]),
+            _single([part for one, other in pairs for part in (one * across, other * along)]),
+        )
 
     def turns(self, run: Run) -> Turns:
         """The left sides of the products, for a batch."""
         around, (middle, half) = self.angles.around, self.span
-        terms = [*self.angles.start, (around.lows[-1], middle)]
+        numbered = [low for low in around.lows if low is not None]
+        terms = [*self.angles.start, *((low, middle) for low in numbered)] if numbered else [*self.angles.start, (None, middle)]
         values = [(around.values(run, low), factor / TURN) for low, factor in terms if low is not None]
         return Turns(self, len(run.rows), values, sum(factor for low, factor in terms if low is None) / TURN, half)
 
@@ -224,14 +265,14 @@ class Turns:
         half: the factor of those that makes the distance of the farthest points from the middle.
 
     Attributes:
-        left: for cosines and for sines, (rows of the chunk, k).
+        left: for cosines and for sines, (k, groups, rows of the chunk of each group).
         wide: which rows are not close enough together.
         some_wide, all_wide: whether there are such, and no others.
     """
 
     def __init__(self, rotation: Rotation, number: int, terms: list[tuple[Floats, float]], fixed: float, half: float) -> None:
         self._rotation, self._number, self._terms, self._fixed, self._half = rotation, number, terms, fixed, half
-        self._outer = math.prod(rotation.angles.around.outer)
+        self._outer, self._groups = math.prod(rotation.angles.around.outer), rotation.angles.around.groups
         self._first = self._last = 0
 
     def move(self, start: int, stop: int) -> None:
@@ -239,14 +280,30 @@ class Turns:
         if not self._first <= start < stop <= self._last:
             self._first, self._last = start, min(max(stop, start + _WINDOW // self._outer), self._number)
             self._expand()
-        rows = slice((start - self._first) * self._outer, (stop - self._first) * self._outer)
-        self.left = self._series[:, 0, rows].T, self._series[:, 1, rows].T
+        series = self._of_chunk(self._series, start, stop)
+        if self._rotation.joint:
+            both = series.reshape(2 * TERMS, *series.shape[2:])
+            self.left = both, both
+        else:
+            self.left = series[:, 0], series[:, 1]
         self.some_wide = self.all_wide = False
         if self._any_wide:
-            wide = self._wide[rows]
+            wide, middle, moved = (self._of_chunk(array, start, stop).T.reshape(-1) for array in (self._wide, self._middle, self._moved))
             self.some_wide, self.all_wide = bool(wide.any()), bool(wide.all())
             self.wide: slice | NDArray[np.intp] = slice(None) if self.all_wide else np.flatnonzero(wide)
-            self._chunk = self._middle[rows][self.wide], self._moved[rows][self.wide]
+            self._chunk = np.flatnonzero(wide) % self._groups, middle[self.wide], moved[self.wide]
+
+    def multiply(self, which: int, out: Singles) -> None:
+        """The products, of cosines for 0 and of sines for 1, (rows of the chunk, inner)."""
+        right = self._rotation.rows[which]
+        for group, left in enumerate(np.moveaxis(self.left[which], 1, 0)):
+            multiplied(left.T, right if right.ndim == 2 else right[:, group], out[group :: self._groups])
+
+    def _of_chunk(self, array: NDArray[Any], start: int, stop: int) -> NDArray[Any]:
+        """What an array, (..., rows of the window, group by group), holds for the packets of a chunk: (..., groups, rows)."""
+        each = self._outer // self._groups
+        whole = array.reshape(*array.shape[:-1], self._groups, -1)
+        return whole[..., (start - self._first) * each : (stop - self._first) * each]
 
     def _expand(self) -> None:
         """The coefficients of the packets that come next: of each, its cosine and sine times powers of how far its points go."""
@@ -260,7 +317,7 @@ class Turns:
         single = middle.astype(np.float32)
         rest = (middle - single).astype(np.float32)
         cos, sin = np.cos(single), np.sin(single)
-        series = self._series = np.empty((len(self._rotation.rows[0]), 2, len(middle)), np.float32)
+        series = self._series = np.empty((TERMS if self._rotation.moving else 2, 2, len(middle)), np.float32)
         np.subtract(cos, rest * sin, out=series[0, 0])
         np.add(sin, rest * cos, out=series[0, 1])
         self._any_wide = False
@@ -278,15 +335,18 @@ class Turns:
 
     def _rows(self, values: Floats) -> Floats:
         """Numbers of the packets that come next, one for each of their rows."""
-        if len(values) == 1:
-            return np.broadcast_to(values.reshape(-1), (self._last - self._first, self._outer)).reshape(-1)
-        return values[self._first : self._last].reshape(-1)
+        number = self._last - self._first
+        rows = np.broadcast_to(
+            values.reshape(-1, self._outer) if len(values) == 1 else values[self._first : self._last].reshape(number, -1),
+            (number, self._outer),
+        )
+        return rows.reshape(-1) if self._groups == 1 else rows.T.reshape(-1)
 
     def angles(self) -> Floats:
         """The angles of the rows that are wide, (rows, inner) radians."""
-        middle, moved = self._chunk
-        row, (at, _) = self._rotation.angles.around.rows[-1], self._rotation.span
-        return reduced(middle[:, None] + moved[:, None] * (row - at))
+        groups, middle, moved = self._chunk
+        row, aside = (row if row.ndim == 1 else row[groups] for row in (self._rotation.row, self._rotation.aside))
+        return reduced(middle[:, None] + moved[:, None] * (row - self._rotation.span[0]) + aside)
 
 
 def _single(rows: Sequence[Floats]) -> Singles:

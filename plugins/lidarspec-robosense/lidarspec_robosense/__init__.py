@@ -1,16 +1,20 @@
-"""RoboSense lidars, one module for each model."""
+"""RoboSense lidars, one module for each packet format."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 
 from lidarspec.spec import Sensor, hookimpl
-from lidarspec_robosense.helios import HELIOS_16P
+from lidarspec_robosense.airy import AIRY
+from lidarspec_robosense.helios import HELIOS_16P, HELIOS_32, HELIOS_5515
 from lidarspec_robosense.m1 import M1
-from lidarspec_robosense.rs32 import BPEARL, RS32
+from lidarspec_robosense.rs32 import BPEARL, BPEARL_V4, RS16, RS32
+from lidarspec_robosense.ruby import RS48, RS80, RS128, RUBY_PLUS_48, RUBY_PLUS_80, RUBY_PLUS_128
+from lidarspec_robosense.solid import E1, M2, MX
 
 
 @hookimpl
 def lidarspec_sensors() -> Iterable[Sensor]:
     """The RoboSense sensors."""
-    return [M1, HELIOS_16P, RS32, BPEARL]
+    rotating = [HELIOS_16P, HELIOS_32, HELIOS_5515, RS16, RS32, BPEARL, BPEARL_V4, AIRY]
+    return [M1, *rotating, RS128, RS80, RS48, RUBY_PLUS_128, RUBY_PLUS_80, RUBY_PLUS_48, M2, MX, E1]

@@ -1,134 +1,98 @@
-"""RoboSense RS-Helios-16P: rotating lidar of 16 lasers over UDP; its own angles come with the device information (DIFOP).
+"""RoboSense RS-Helios: rotating lidars of 16 and of 32 lasers over UDP; their own angles come with the device information (DIFOP).
 
 Source: RS-Helios-16P user manual: 5.4.2 (return modes), 6.2 and Table 9 (MSOP), 6.3 and Table 11 (DIFOP), appendix B.3
-to B.13 (registers). From the vendor's rs_driver (decoder_RSHELIOS_16P.hpp): coordinates, optical centre, temperature,
-where the horizontal angles stand. From nebula's former decoder of this model: the times of the lasers, by which the
-azimuths of the point clouds that it published come out to their last digit.
+to B.13 (registers). From the vendor's rs_driver (decoder_RSHELIOS.hpp, decoder_RSHELIOS_16P.hpp): coordinates, optical centre,
+temperature, where the horizontal angles stand, the times of 32 lasers. From nebula's former decoder of the 16P: the times of its
+lasers, by which the azimuths of the point clouds that it published come out to their last digit.
 
 Known errors and contradictions: the manual's worked distance, 320 steps of 0.25 cm, is printed as 8 m and is 0.8 m; its
 vertical angle 00 05 d6, printed as 14.95 degrees, is 14.94, and its horizontal one, 01 01 96, needs brackets (-4.06);
 appendix B.13 has nanoseconds in the second part of a time, Table 9 and the capture have microseconds; the manual of the
-Helios-1610 has the type at byte 31, rs_driver and the capture at 30. rs_driver gives the second firing 27.68 us after the
-first one; the manual's azimuth in between (half the step) and about 100 us from block to block ask for 55.56 us.
+Helios-1610 has the type at byte 31, rs_driver and the capture at 30. rs_driver gives the second firing of a 16P 27.68 us after the
+first one; the manual's azimuth in between (half the step) and about 100 us from block to block ask for 55.56 us. The times of 32
+lasers are rs_driver's, 1.73 us apart; nebula has the 16P's and other ones, up to 48 us.
 
-The published capture under this model's name says type 6, RS-Helios-5515, and holds 32 lasers: read as 16P, as it was
-published, the second half of each block gets directions that its lasers did not have, and the times of a packet run
-twice as long as it took. Not expressed: with a field of view set, blocks after the gap are later than a packet's times say.
+The published capture under the 16P's name says type 6, Helios-5515, and its DIFOP has 32 different angles, at single return: it is of
+a 5515. Read as 16P, as it was published, the second half of each block gets directions that its lasers did not have, and the times of
+a packet run twice as long as it took.
 """
 
 from __future__ import annotations
 
+import dataclasses
+from functools import partial
 from typing import Any
 
 import numpy as np
-from construct import Array, BitsInteger, BitStruct, Bytes, BytesInteger, ByteSwapped, Const, Construct, Int8ub, Int16ub, Int32ub, Struct
+from construct import Bytes, Const, Construct, Int8ub, Int16ub, Int32ub, Struct
 
-from lidarspec.spec import Clock, Fields, Frame, OnWrap, Polar, Scaled, Sensor, Sequence, Simulation, Udp, following, previous, wrap
+from lidarspec.spec import Fields, Frame, Polar, Relative, Scaled, Sensor, Sequence, Simulation
+from lidarspec_robosense.rotor import (
+    COMMON,
+    DIFOP_HEAD,
+    DIFOP_TAIL,
+    DIFOP_TIME,
+    DIFOP_UNIT,
+    DIFOP_VERSIONS,
+    TEMPERATURE,
+    TIME,
+    TURNS,
+    Rotor,
+    angles,
+    blocks,
+    directions,
+    halves,
+    pairs,
+    sweep,
+    sweep_difop,
+)
 
-BLOCKS, GROUPS, LASERS = 12, 2, 16
+BLOCKS, LASERS = 12, 32
 DUAL, STRONGEST = 0, 4  # return modes (manual 5.4.2)
-FIRING = 55.56e-6  # seconds from one firing of the 16 lasers to the next (rs_driver, nebula)
-#: seconds from the start of a firing to each laser (nebula's 16P decoder).
-LASER_TIMES = np.array([0, 3.15, 6.3, 9.45, 13.26, 17.08, 20.56, 23.71, 26.53, 27.77, 31.49, 32.73, 36.46, 38.94, 41.42, 43.91]) * 1e-6
-LENS = 0.03498  # metres from the axis to the optical centre, in the rotor's direction (rs_driver, RX)
-GAP = 1.0  # degrees; a longer step between blocks is the edge of the field of view that was set (rs_driver)
-TURNS = 10  # per second, the factory's setting
-#: degrees; assumed: the topmost laser first, 2 degrees apart over the model's 30 degrees. Units differ by degrees.
-VERTICAL = 15.0 - 2 * np.arange(LASERS)
-
-#: of most models: the low byte first, its sign in a bit of its own.
-TEMPERATURE = ByteSwapped(
-    BitStruct(
-        "negative" / BitsInteger(1),
-        "magnitude" / Scaled(BitsInteger(12), 0.0625, "degC"),
-        "reserved" / BitsInteger(3),
-    )
+PERIOD = 55.56e-6  # seconds from one firing of all lasers to the next (rs_driver, nebula)
+TYPE_5515, TYPE_1615 = 6, 7  # of the 16P too
+#: microseconds from the start of a firing to each laser of a 16P (nebula's decoder).
+TIMES_16P = (0, 3.15, 6.3, 9.45, 13.26, 17.08, 20.56, 23.71, 26.53, 27.77, 31.49, 32.73, 36.46, 38.94, 41.42, 43.91)
+#: degrees; those of a captured unit's DIFOP, in steps of a third of a degree.
+VERTICAL_5515 = (
+    *(15, 13, 11, 9, 7, 5.5, 4, 2.67, 1.33, 0, -1.33, -2.67, -4, -5.33, -6.67, -8),
+    *(-10, -16, -13, -19, -22, -28, -25, -31, -34, -37, -40, -43, -46, -49, -52, -55),
 )
 
-DATA = Struct(
-    "header" / Const(b"\x55\xaa\x05\x5a"),
-    "protocol_version" / Int16ub * "0 old, 1 latest",
-    "reserved_6" / Bytes(2),
-    "top_packet_count" / Bytes(4) * "four counts, each 3 above the one before",
-    "bottom_packet_count" / Int32ub * "of packets",
-    "reserved_16" / Bytes(1),
-    "range_resolution" / Int8ub * "1: 2.5 mm, 0: 5 mm",
-    "angle_pulse_interval" / Scaled(Int16ub, 1e-6, "s"),
-    "seconds" / Scaled(BytesInteger(6), 1, "s") * "since 1970, where synchronised",
-    "microseconds" / Scaled(Int32ub, 1e-6, "s"),
-    "lidar_type" / Int8ub * "6 Helios-5515, 7 Helios-1615 and Helios-16P",
-    "reserved_31" / Bytes(7),
-    "temperature" / TEMPERATURE,
-    "reserved_40" / Bytes(2),
-    "blocks"
-    / Array(
-        BLOCKS,
-        Struct(
-            "flag" / Const(b"\xff\xee"),
-            "azimuth" / Scaled(Int16ub, 0.01, "deg") * "of the rotor, clockwise, at the block's first laser",
-            "groups"
-            / Array(
-                GROUPS,
-                Struct(
-                    "channels"
-                    / Array(
-                        LASERS,
-                        Struct(
-                            "distance" / Scaled(Int16ub, 0.0025, "m") * "0: no return; twice as much at range_resolution 0",
-                            "intensity" / Int8ub,
-                        ),
-                    ),
-                )
-                * "single return: two firings; dual return: the two returns of one firing",
-            ),
-        ),
-    ),
-    "tail" / Bytes(6) * "reserved, and 00 FF",
+HELIOS_16P_ROTOR = Rotor(
+    delay=np.array(TIMES_16P) * 1e-6,
+    period=PERIOD,
+    lens=0.03498,
+    vertical=15.0 - 2 * np.arange(16),  # assumed: the topmost laser first, 2 degrees apart over the model's 30 degrees
 )
+HELIOS_5515_ROTOR = Rotor(delay=np.arange(LASERS) * 1.73e-6, period=PERIOD, lens=0.03498, vertical=np.array(VERTICAL_5515))
+# assumed: the topmost laser first, 1 degree apart over the model's 31 degrees
+HELIOS_32_ROTOR = dataclasses.replace(HELIOS_5515_ROTOR, vertical=15.0 - np.arange(LASERS))
 
 
-def angles() -> Construct:
-    """Sign and size of an angle for each laser (manual B.9, B.10)."""
-    return Array(
-        LASERS,
-        Struct(
-            "sign" / Int8ub * "0 positive, 1 negative, 255 not calibrated",
-            "value" / Scaled(Int16ub, 0.01, "deg"),
-        ),
+def packet(rows: Construct) -> Struct:
+    """A data packet with these blocks."""
+    return Struct(
+        "header" / Const(b"\x55\xaa\x05\x5a"),
+        "protocol_version" / Int16ub * "0 old, 1 latest",
+        "reserved_6" / Bytes(2),
+        "top_packet_count" / Bytes(4) * "four counts, each 3 above the one before",
+        "bottom_packet_count" / Int32ub * "of packets",
+        "reserved_16" / Bytes(1),
+        "range_resolution" / Int8ub * "1: 2.5 mm, 0: 5 mm",
+        "angle_pulse_interval" / Scaled(Int16ub, 1e-6, "s"),
+        *TIME,
+        "lidar_type" / Int8ub * "6 Helios-5515, 7 Helios-1615 and Helios-16P",
+        "reserved_31" / Bytes(7),
+        "temperature" / TEMPERATURE,
+        "reserved_40" / Bytes(2),
+        "blocks" / rows,
+        "tail" / Bytes(6) * "reserved, and 00 FF",
     )
 
 
-DIFOP = Struct(
-    "header" / Const(b"\xa5\xff\x00\x5a\x11\x11\x55\x55"),
-    "rpm" / Scaled(Int16ub, 1, "rpm") * "as set",
-    "lidar_ip" / Bytes(4),
-    "host_ip" / Bytes(4),
-    "mac" / Bytes(6),
-    "msop_local_port" / Int16ub,
-    "msop_port" / Int16ub,
-    "difop_local_port" / Int16ub,
-    "difop_port" / Int16ub,
-    "fov_start" / Scaled(Int16ub, 0.01, "deg"),
-    "fov_end" / Scaled(Int16ub, 0.01, "deg"),
-    "reserved_36" / Bytes(2),
-    "phase_lock" / Scaled(Int16ub, 1, "deg"),
-    "top_firmware" / Bytes(5),
-    "bottom_firmware" / Bytes(5),
-    "software" / Bytes(5),
-    "motor_firmware" / Bytes(5),
-    "hardware" / Bytes(3),
-    "web_version" / Bytes(4),
-    "backup_checksums" / Bytes(16) * "of top board, bottom board, software, web page",
-    "gateway" / Bytes(4),
-    "subnet_mask" / Bytes(4),
-    "reserved_91" / Bytes(201),
-    "serial_number" / Bytes(6),
-    "zero_angle_offset" / Int16ub,
-    "return_mode" / Int8ub * "0 dual, 4 strongest, 5 last, 6 first",
-    "time_sync_mode" / Int8ub,
-    "time_sync_status" / Int8ub,
-    "seconds" / Scaled(BytesInteger(6), 1, "s"),
-    "microseconds" / Scaled(Int32ub, 1e-6, "s"),
+#: Table 11: what stands from byte 313 on; the 16P has angles of 16 lasers and reserved bytes where others have those of 17 to 32.
+STATUS: tuple[Construct, ...] = (
     "operating_status" / Bytes(12) * "current, and voltages: in, 12 V, 5 V, 2.5 V, APD",
     "reserved_325" / Bytes(17),
     "board_temperatures" / Bytes(10),
@@ -138,13 +102,14 @@ DIFOP = Struct(
     "pps_trigger" / Int8ub,
     "reserved_362" / Bytes(20),
     "gprmc" / Bytes(86),
-    "vertical" / angles(),
-    "reserved_516" / Bytes(48) * "of lasers 17 to 32 in other models",
-    "horizontal" / angles(),
-    "reserved_612" / Bytes(48) * "of lasers 17 to 32 in other models",
-    "reserved_660" / Bytes(586),
-    "tail" / Const(b"\x0f\xf0"),
 )
+DIFOP_START = (*DIFOP_HEAD, *DIFOP_VERSIONS, *DIFOP_UNIT, *DIFOP_TIME, *STATUS)
+DIFOP_END = ("reserved_660" / Bytes(586), DIFOP_TAIL)
+OTHERS = Bytes(48) * "of lasers 17 to 32 in other models"
+DIFOP_16 = Struct(
+    *DIFOP_START, "vertical" / angles(16), "reserved_516" / OTHERS, "horizontal" / angles(16), "reserved_612" / OTHERS, *DIFOP_END
+)
+DIFOP_32 = Struct(*DIFOP_START, "vertical" / angles(LASERS), "horizontal" / angles(LASERS), *DIFOP_END)
 
 
 def plausible(f: Fields) -> Any:
@@ -152,96 +117,98 @@ def plausible(f: Fields) -> Any:
     return f.blocks.azimuth < 360
 
 
-def signed(entry: Any) -> Any:
-    """Degrees of each laser, on the lasers' axis; nan, so no point, where the sensor is not calibrated."""
-    sign, value = entry.sign.on("channels"), entry.value.on("channels")
-    return np.where(sign == 0, value, np.where(sign == 1, -value, np.nan))
+def points_16p(f: Fields) -> Polar:
+    """Two firings in a block; lasers are numbered as in it."""
+    polar = halves(f, f.state.difop.return_mode == DUAL, HELIOS_16P_ROTOR, directions(f))
+    return dataclasses.replace(polar, range=resolved(f, polar), ring=np.arange(16))
 
 
-def rotor_step(f: Fields, duration: Any) -> Any:
-    """Degrees from each block to the next; over a loss or a gap as before it, or as the rotor was set to turn."""
-    azimuth = f.blocks.azimuth
-    ahead, behind = wrap(following(azimuth) - azimuth, 360), wrap(azimuth - previous(azimuth), 360)
-    usual = np.where(behind <= GAP, behind, f.state.difop.rpm * 6 * duration)
-    return np.where(ahead <= GAP, ahead, usual)
+def points_32(f: Fields, model: Rotor) -> Polar:
+    """One firing in a block."""
+    polar = pairs(f, f.state.difop.return_mode == DUAL, model)
+    return dataclasses.replace(polar, range=resolved(f, polar))
 
 
-def points(f: Fields) -> Polar:
-    """Lasers beside the rotor's direction, from an optical centre that turns with it (rs_driver, internDecodeMsopPkt)."""
-    difop = f.state.difop
-    dual = difop.return_mode == DUAL
-    group = np.arange(GROUPS)[:, None]
-    duration = np.where(dual, 1, GROUPS) * FIRING
-    elapsed = np.where(dual, 0, group) * FIRING + LASER_TIMES
-    rotor = np.deg2rad(f.blocks.azimuth + rotor_step(f, duration) * elapsed / duration)
-    channels = f.blocks.groups.channels
-    return Polar(
-        range=channels.distance * np.where(f.range_resolution == 0, 2, 1),
-        azimuth=-(rotor + np.deg2rad(signed(difop.horizontal))),
-        elevation=np.deg2rad(signed(difop.vertical)),
-        intensity=channels.intensity,
-        time=np.arange(BLOCKS)[:, None, None] * duration + elapsed,
-        ring=np.arange(LASERS),
-        return_index=np.where(dual, group, 0),
-        origin=(LENS * np.cos(rotor), -LENS * np.sin(rotor), 0),
-    )
+def resolved(f: Fields, polar: Polar) -> Any:
+    """Metres, by the step that the header says."""
+    return polar.range * np.where(f.range_resolution == 0, 2, 1)
 
 
-def sweep(i: int) -> dict[str, Any]:
-    """Packet i of a sensor in single return mode."""
-    block = i * BLOCKS + np.arange(BLOCKS)
-    time = i * BLOCKS * GROUPS * FIRING
-    return {
-        "protocol_version": 1,
-        "bottom_packet_count": i % (1 << 32),
-        "range_resolution": 1,
-        "seconds": int(time),
-        "microseconds": time % 1,
-        "lidar_type": 7,
-        "blocks.azimuth": np.round(block * GROUPS * FIRING * TURNS * 360, 2) % 360,
-    }
+def sweep_data(i: int, shots: float, lidar_type: int) -> dict[str, Any]:
+    """Packet i, of blocks that take so many firings each."""
+    counts = {"protocol_version": 1, "bottom_packet_count": i % (1 << 32), "range_resolution": 1}
+    return sweep(i, BLOCKS, shots * PERIOD, lidar_type=lidar_type, **counts)
 
 
-def sweep_difop(i: int) -> dict[str, Any]:
-    """The device information of a sensor with the factory's settings; the angles are the default ones."""
-    addresses = {"lidar_ip": bytes([192, 168, 1, 200]), "host_ip": bytes([192, 168, 1, 102])}
-    return {"measured_rpm": TURNS * 60, "msop_port": 6699, "difop_port": 7788, "fov_end": 360.0, **addresses}
+def in_pairs(f: Fields) -> Any:
+    """Whether blocks have one azimuth: the two returns of 32 lasers."""
+    return f.blocks[0].azimuth == f.blocks[1].azimuth
 
+
+def two_returns(f: Fields) -> Any:
+    """Whether the halves of most blocks are the same: the two returns of 16 lasers, where most have one echo."""
+    distance = np.asarray(f.blocks.channels.distance)
+    one, other = distance[..., :16], distance[..., 16:]
+    return (one == other).sum(axis=(1, 2)) > ((one != other) | (one == 0)).sum(axis=(1, 2))
+
+
+DIFOP_SIMULATION = Simulation(partial(sweep_difop, speed="measured_rpm"), rate=1)
+PACKET_32 = Frame(packet(blocks(BLOCKS, LASERS, 0.0025)), data=True, plausible=plausible)
+INFORMATION_32 = Frame(DIFOP_32, simulation=DIFOP_SIMULATION)
+MODEL_5515 = Relative("type 6, Helios-5515", lambda f: f.lidar_type == TYPE_5515)
+NOT_5515 = Relative("another type than 6", lambda f: f.lidar_type != TYPE_5515)
 
 HELIOS_16P = Sensor(
     "robosense-helios16p",
-    vendor="RoboSense",
     model="RS-Helios-16P",
     frames={
-        "data": Frame(DATA, data=True, plausible=plausible),
-        "difop": Frame(DIFOP, simulation=Simulation(sweep_difop, rate=1)),  # the rate: assumed, the M1's
+        "data": Frame(packet(blocks(BLOCKS, 16, 0.0025, firings=2)), data=True, plausible=plausible),
+        "difop": Frame(DIFOP_16, simulation=DIFOP_SIMULATION),
     },
-    points=points,
-    scan=OnWrap("blocks.azimuth"),
-    links={"data": Udp(6699, 7788)},
-    clock=Clock(("seconds", "microseconds")),
+    points=points_16p,
     sequence=Sequence("bottom_packet_count"),
-    state={
-        "difop": {
-            "rpm": TURNS * 60,
-            "return_mode": STRONGEST,
-            "vertical.sign": VERTICAL < 0,
-            "vertical.value": np.abs(VERTICAL),
-            "horizontal.sign": np.zeros(LASERS),
-            "horizontal.value": np.zeros(LASERS),
-        }
-    },
-    simulation=Simulation(sweep),
+    state=HELIOS_16P_ROTOR.state(return_mode=STRONGEST),
+    simulation=Simulation(partial(sweep_data, shots=2, lidar_type=TYPE_1615)),
     range_limits=(0.1, 180.0),  # rs_driver's limits for this model
-    vendor_axes=("forward", "left", "up"),
-    turn=(TURNS, 20.0),  # 600 and 1200 rpm (manual B.1)
     # firmware: the first of three boards in Table 11; the temperature has its sign in a field of its own
     info={"serial": "difop.serial_number", "firmware": "difop.top_firmware", "model": "data.lidar_type"},
-    aliases=("helios16p", "rs-helios-16p"),
-    status="capture",
-    acknowledged={
-        "LS511": "the rotor turns clockwise, and the angle on the wire with it, in axes that are right-handed",
-        "LS710": "the capture is another's, and too large: the project's tests read it where it is",
+    relatives={
+        "robosense-helios5515": MODEL_5515,
+        "robosense-helios32": Relative(
+            "pairs of blocks with one azimuth; or a packet each 0.67 ms", lambda f: f.blocks[0].azimuth == f.blocks[1].azimuth
+        ),
     },
+    aliases=("helios16p", "rs-helios-16p"),
     source="RS-Helios-16P user manual, 5.4, 6.2, 6.3 and appendix B; rs_driver; nebula's capture and point clouds",
+    **{**COMMON, "turn": (TURNS, 20.0), "status": "capture"},  # 600 and 1200 rpm (manual B.1)
+)
+
+HELIOS_32 = dataclasses.replace(
+    HELIOS_16P,
+    id="robosense-helios32",
+    model="RS-Helios-1615",
+    frames={"data": PACKET_32, "difop": INFORMATION_32},
+    points=partial(points_32, model=HELIOS_32_ROTOR),
+    state=HELIOS_32_ROTOR.state(return_mode=STRONGEST),
+    simulation=Simulation(partial(sweep_data, shots=1, lidar_type=TYPE_1615)),
+    relatives={
+        "robosense-helios5515": MODEL_5515,
+        "robosense-helios16p": Relative("halves of blocks alike; or a packet each 1.33 ms", two_returns),
+    },
+    aliases=("helios32", "robosense-helios1615", "rs-helios-1615"),
+    status="manual",
+    source="rs_driver (decoder_RSHELIOS.hpp); RS-Helios-16P user manual; no packet of this model was seen",
+)
+
+HELIOS_5515 = dataclasses.replace(
+    HELIOS_32,
+    id="robosense-helios5515",
+    model="RS-Helios-5515",
+    points=partial(points_32, model=HELIOS_5515_ROTOR),
+    state=HELIOS_5515_ROTOR.state(return_mode=STRONGEST),
+    simulation=Simulation(partial(sweep_data, shots=1, lidar_type=TYPE_5515)),
+    relatives={"robosense-helios16p": NOT_5515, "robosense-helios32": NOT_5515},
+    aliases=("helios5515", "rs-helios-5515"),
+    status="capture",
+    source="rs_driver (decoder_RSHELIOS.hpp); RS-Helios-16P user manual; nebula's capture, which is of this model",
 )

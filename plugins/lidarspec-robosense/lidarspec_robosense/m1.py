@@ -1,4 +1,6 @@
-"""RoboSense RS-LiDAR-M1: solid-state lidar of five channels over UDP; every point carries its own angles.
+"""RoboSense RS-LiDAR-M1 and M1 Plus: solid-state lidars of five channels over UDP; every point carries its own angles.
+
+Both send the same packets, and nothing in them tells the two apart.
 
 Source: RS-LiDAR-M1 user guide, 2.1.2 and Table 5 (the data blocks); RS-LiDAR-M1P user guide, pages 9 to 14 (header,
 tail, formulas, worked example), with which the vendor's rs_driver agrees.
@@ -6,8 +8,11 @@ tail, formulas, worked example), with which the vendor's rs_driver agrees.
 Known errors and gaps of the guides: the time of a group of points is printed as "titime_offset", and is the packet's
 timestamp plus time_offset; the offset 32768 of the angles stands on the M1P's next page only; z of the worked example is
 printed as 2.17 and is 2.1647; the formula raw - 80 of mems_tmp gives -46 degC for the guide's own capture, so the raw
-byte is kept; 750 000 points per second do not agree with 630 packets in a frame (787 500); the layout of DIFOP differs
-between firmwares from byte 28 on, so only what is before has names.
+byte is kept; 750 000 points per second do not agree with 630 packets in a frame (787 500).
+
+DIFOP has three layouts from byte 28 on, and no number says which: that of rs_driver since December 2023 (`difop`), that of the driver
+before, with the field of view (`difop_fov`), and that of the M1P user guide (`difop_guide`). The one in which return mode, kind and state
+of the synchronisation and microseconds are what they can be is taken, in this order; where none is, what stands there is `difop_other`.
 """
 
 from __future__ import annotations
@@ -16,9 +21,10 @@ import functools
 from typing import Any
 
 import numpy as np
-from construct import Array, Bytes, BytesInteger, Const, Int8ub, Int16ub, Int32ub, Struct
+from construct import Array, Bytes, Const, Construct, Int8ub, Int16ub, Int24ub, Struct
 
 from lidarspec.spec import Clock, Fields, Frame, OnRewind, Polar, Scaled, Sensor, Sequence, Simulation, Udp
+from lidarspec_robosense.rotor import TIME
 
 BLOCKS, CHANNELS = 25, 5
 SINGLE, DUAL = 630, 1260  # packets of a frame (rs_driver; M1P user guide: the counter restarts with each frame)
@@ -27,17 +33,19 @@ FIRING = 10e-6 / 3  # seconds between blocks: 0, 3, 7, 10, 13, 17 us in the M1P 
 OFFSETS = np.round(np.arange(BLOCKS) * FIRING, 6)  # seconds, as the sensor rounds them
 LINE = 125  # firings of a line in `sweep`, which makes 126 lines 0.2 degrees apart
 
-DATA = Struct(
+HEADER: tuple[Construct, ...] = (
     "magic" / Const(b"\x55\xaa\x5a\xa5"),
-    "pkt_psn" / Int16ub * "1 to 630, with dual return to 1260, in each frame",
+    "pkt_psn" / Int16ub * "counts the packets of a frame; M1: 1 to 630, with dual return to 1260",
     "protocol_version" / Int16ub,
     "wave_mode" / Int8ub * "0 dual, 4 strongest, 5 last, 6 first",
     "time_sync_mode" / Int8ub * "0 internal, 1 PPS, 2 PTP, 3 gPTP",
-    "seconds" / Scaled(BytesInteger(6), 1, "s"),
-    "microseconds" / Scaled(Int32ub, 1e-6, "s"),
+    *TIME,
     "reserved" / Bytes(10),
     "lidar_type" / Int8ub * "0x10: M1",
     "mems_tmp" / Int8ub * "degC + 80, or signed degC, by firmware",
+)
+DATA = Struct(
+    *HEADER,
     "blocks"
     / Array(
         BLOCKS,
@@ -60,22 +68,52 @@ DATA = Struct(
     "tail" / Bytes(3) * "reserved",
 )
 
-DIFOP = Struct(
+#: the first 28 bytes of every DIFOP.
+DIFOP_HEAD: tuple[Construct, ...] = (
     "magic" / Const(b"\xa5\xff\x00\x5a\x11\x11\x55\x55"),
-    "reserved" / Bytes(1),
+    "reserved_8" / Bytes(1),
     "frame_rate" / Scaled(Int8ub, 1, "Hz"),
     "lidar_ip" / Bytes(4),
     "host_ip" / Bytes(4),
     "mac" / Bytes(6),
     "msop_port" / Int16ub,
     "difop_port" / Int16ub,
-    "rest" / Bytes(228) * "by firmware",
 )
+FIRMWARE = ("pl_firmware" / Bytes(5), "ps_firmware" / Bytes(5))
+MODES: tuple[Construct, ...] = (
+    "return_mode" / Int8ub * "0 dual, 4 strongest, 5 last, 6 first",
+    "time_sync_mode" / Int8ub * "0 internal, 1 PPS, 2 PTP, 3 gPTP",
+    "time_sync_status" / Int8ub * "0 none, 1 locked, 2 timeout",
+    *TIME,
+)
+VIEW = tuple(f"{way}_{end}" / Scaled(Int16ub, 0.01, "deg") for way in ("horizontal", "vertical") for end in ("start", "end"))
+POWER = ("currents" / Array(2, Int24ub), "voltages" / Array(2, Int16ub), "reserved_power" / Bytes(50))
+CALIBRATION = "calibration" / Array(20, Struct("sign" / Int8ub, "value" / Int16ub))
+RECENT = ("serial_number" / Bytes(6), *MODES, *POWER, CALIBRATION)
+DIFOP = Struct(*DIFOP_HEAD, *FIRMWARE, *RECENT, "reserved_end" / Bytes(79))
+DIFOP_FOV = Struct(*DIFOP_HEAD, *VIEW, *FIRMWARE, *RECENT, "reserved_end" / Bytes(71))
+DIFOP_GUIDE = Struct(
+    *DIFOP_HEAD,
+    *FIRMWARE,
+    "reserved_38" / Bytes(16),
+    *MODES,
+    "battery_voltage" / Int16ub,
+    "reserved_69" / Bytes(67),
+    "faults" / Int8ub,
+    "reserved_end" / Bytes(119),
+)
+DIFOP_OTHER = Struct(*DIFOP_HEAD, "rest" / Bytes(228))
 
 
 def plausible(f: Fields) -> Any:
     """The counter starts at 1 (M1P user guide, header)."""
     return f.pkt_psn >= 1
+
+
+def plausible_difop(f: Fields) -> Any:
+    """Modes that there are, and less than a second of microseconds, before the year 4000."""
+    known = (f.return_mode == 0) | ((f.return_mode >= 4) & (f.return_mode <= 6))
+    return known & (f.time_sync_mode <= 3) & (f.time_sync_status <= 2) & (f.microseconds < 1) & (f.seconds < 2**36)
 
 
 def packets_per_frame(f: Fields) -> Any:
@@ -133,16 +171,22 @@ def sweep(i: int) -> dict[str, Any]:
 def sweep_difop(i: int) -> dict[str, Any]:
     """The device information of a sensor with the factory's settings."""
     addresses = {"lidar_ip": bytes([192, 168, 1, 200]), "host_ip": bytes([192, 168, 1, 102])}
-    return {"frame_rate": FRAME_RATE, "msop_port": 6699, "difop_port": 7788, **addresses}
+    modes = {"return_mode": 4, "time_sync_mode": 0, "time_sync_status": 0, "seconds": i, "microseconds": 0}
+    return {"frame_rate": FRAME_RATE, "msop_port": 6699, "difop_port": 7788, **addresses, **modes}
 
 
 M1 = Sensor(
     "robosense-m1",
     vendor="RoboSense",
-    model="RS-LiDAR-M1",
+    model="RS-LiDAR-M1, M1 Plus",
     frames={
         "data": Frame(DATA, data=True, plausible=plausible),
-        "difop": Frame(DIFOP, simulation=Simulation(sweep_difop, rate=1)),  # M1 user guide; the M1P's: 10 a second
+        "difop": Frame(
+            DIFOP, plausible=plausible_difop, simulation=Simulation(sweep_difop, rate=1)
+        ),  # M1 user guide; the M1P's: 10 a second
+        "difop_fov": Frame(DIFOP_FOV, plausible=plausible_difop, simulation=Simulation(sweep_difop)),
+        "difop_guide": Frame(DIFOP_GUIDE, plausible=plausible_difop, simulation=Simulation(sweep_difop)),
+        "difop_other": Frame(DIFOP_OTHER),
     },
     points=points,
     scan=OnRewind("pkt_psn"),
@@ -153,9 +197,8 @@ M1 = Sensor(
     range_limits=(0.2, 200.0),  # rs_driver's limits for this model
     vendor_axes=("forward", "left", "up"),
     turn=(FRAME_RATE, FRAME_RATE),
-    info={"model": "data.lidar_type"},
-    aliases=("rs-m1", "rs-lidar-m1"),
+    info={"serial": "difop.serial_number", "firmware": "difop.pl_firmware"},
+    aliases=("rs-m1", "rs-lidar-m1", "robosense-m1plus", "rs-m1p"),
     status="vectors",
-    acknowledged={"LS710": "the guides print parts of packets: the project's tests put them in frames"},
     source="RS-LiDAR-M1 user guide 2.1.2 (Table 5); RS-LiDAR-M1P user guide, pages 9 to 14; rs_driver",
 )

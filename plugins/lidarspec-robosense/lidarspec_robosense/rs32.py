@@ -1,32 +1,48 @@
-"""RoboSense RS-LiDAR-32 and RS-Bpearl (before version 4): rotating lidars of 32 lasers over UDP, with DIFOP of the first layout.
+"""RoboSense RS-LiDAR-16, RS-LiDAR-32 and RS-Bpearl: rotating lidars of 16 and 32 lasers over UDP, with DIFOP of the first layout.
 
-Source: the vendor's rs_driver (decoder_RS32.hpp, decoder_RSBP.hpp: layouts, firing times, optical centre, return modes, time); angles of
-an example unit of each, ros_rslidar. The date of a packet is taken for UTC: rs_driver takes it for the computer's own zone.
+Source: the vendor's rs_driver (decoder_RS16.hpp, decoder_RS32.hpp, decoder_RSBP.hpp and their tests: layouts, firing times, optical centre,
+return modes, time); angles of an example unit of each, ros_rslidar. The date of a packet is taken for UTC: rs_driver takes it for the
+computer's own zone. A comment in the test of the RS-LiDAR-16 has its angles in steps of 0.001 degrees, its result in steps of 0.0001.
 
-Assumed: that the type byte 30 is 2 from an RS-LiDAR-32 alone and 1 from an RS-LiDAR-16 alone, as rs_driver has it, and that a DIFOP packet
-comes once a second. Not expressed: with a field of view set, blocks after the gap are later than a packet's times say.
+Assumed: that the type byte 30 is 2 from an RS-LiDAR-32 alone and 1 from an RS-LiDAR-16 alone, as rs_driver has it; and that the nominal
+angles of a Bpearl are those of version 4 too. What tells version 4, bytes 31 and 32, is rs_driver's.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
 import numpy as np
 from construct import Array, Bytes, Const, Construct, Int8ub, Int16ub, Int24ub, Struct
-from numpy.typing import NDArray
 
-from lidarspec.spec import Clock, Fields, Frame, OnWrap, Polar, Scaled, Sensor, Simulation, Udp, following, previous, wrap
-from lidarspec_robosense.helios import GAP, TEMPERATURE, TURNS, signed, sweep_difop
+from lidarspec.spec import Clock, Fields, Frame, Polar, Scaled, Sensor, Simulation
+from lidarspec_robosense.rotor import (
+    COMMON,
+    TEMPERATURE,
+    TIME,
+    TURNS,
+    Rotor,
+    angles,
+    blocks,
+    difop_first,
+    halves,
+    pairs,
+    sweep as turning,
+    sweep_difop,
+)
 
 BLOCKS, LASERS = 12, 32
 DUAL, STRONGEST = 0, 1  # return modes in DIFOP
-PERIOD = 55.52e-6  # seconds from one firing of all lasers to the next
 RS16_TYPE, RS32_TYPE = 1, 2
+V4 = (3, 4)  # bytes 31 and 32 of a Bpearl of version 4
+SLOT = np.arange(LASERS)
 
 # fmt: off
+RS16_VERTICAL = (
+    -14.9994, -12.9766, -10.9894, -8.975, -6.9734, -4.99, -2.9946, -0.9918, 14.986, 12.963, 10.9756, 8.996, 6.9945, 5.0113, 2.9803, 1.0133,
+)
 RS32_VERTICAL = (
     -10.2637, 0.2972, -6.4063, -0.0179, 2.2794, -0.333, 3.2973, -0.667, 4.6136, 1.6849, 7.0176, 1.2972, 10.2983, 1.0, 15.0167, 0.7028,
     -25.0, -2.2794, -14.638, -2.667, -7.91, -3.0179, -5.407, -3.2973, -3.6492, -1.0179, -4.0534, -1.333, -4.3864, -1.6312, -4.6492, -1.9821,
@@ -37,33 +53,33 @@ RS32_HORIZONTAL = (
 )
 # fmt: on
 
+RS16_ROTOR = Rotor(delay=np.arange(16) * 2.8e-6, period=55.5e-6, lens=0.03825, vertical=np.array(RS16_VERTICAL))
+RS32_ROTOR = Rotor(
+    # 2.88 us apart in two rows, the second 1.44 us after the first; the last of each later (rs_driver)
+    delay=(SLOT % 16 * 2.88 + SLOT // 16 * 1.44 + np.where(SLOT % 16 == 15, 1.44, 0)) * 1e-6,
+    period=55.52e-6,
+    lens=0.03997,
+    vertical=np.array(RS32_VERTICAL),
+    horizontal=np.array(RS32_HORIZONTAL),
+)
+BPEARL_ROTOR = Rotor(
+    # 2.56 us apart in two rows, the second 1.28 us after the first, each with a pause in its middle (rs_driver)
+    delay=(SLOT % 16 * 2.56 + SLOT // 16 * 1.28 + np.where(SLOT % 16 >= 8, 5.2, 0)) * 1e-6,
+    period=55.52e-6,
+    lens=0.01473,
+    height=0.09427,
+    vertical=np.round(89.5 - 2.8125 * SLOT, 2),  # in the steps of its DIFOP
+)
+BPEARL_V4_ROTOR = dataclasses.replace(
+    # in steps of 1.6680 us, rounded to hundredths (rs_driver)
+    BPEARL_ROTOR,
+    delay=np.round(SLOT * 1.668, 2) * 1e-6,
+    period=55.56e-6,
+    lens=0.01619,
+    height=0.09571,
+)
 
-@dataclass(frozen=True, eq=False)
-class Lasers:
-    """What tells the models apart.
-
-    Attributes:
-        delay: (32,) seconds from the block to the firing of each laser.
-        lens: metres from the axis to the optical centre, in the rotor's direction.
-        height: metres of it above the origin.
-        vertical, horizontal: (32,) degrees, of an example unit, until DIFOP says the unit's own.
-    """
-
-    delay: NDArray[np.float64]
-    lens: float
-    height: float
-    vertical: NDArray[np.float64]
-    horizontal: NDArray[np.float64]
-
-    @property
-    def ring(self) -> NDArray[np.intp]:
-        """(32,) the lasers, counted from the lowest one of the example unit."""
-        return np.argsort(np.argsort(self.vertical))
-
-
-DATA = Struct(
-    "header" / Const(b"\x55\xaa\x05\x0a\x5a\xa5\x50\xa0"),
-    "reserved_8" / Bytes(12),
+DATE: tuple[Construct, ...] = (
     "year" / Int8ub * "from 2000 on",
     "month" / Int8ub,
     "day" / Int8ub,
@@ -72,71 +88,48 @@ DATA = Struct(
     "second" / Int8ub,
     "milliseconds" / Scaled(Int16ub, 1e-3, "s"),
     "microseconds" / Scaled(Int16ub, 1e-6, "s"),
-    "lidar_type" / Int8ub * "1 RS-LiDAR-16, 2 RS-LiDAR-32",
-    "reserved_31" / Bytes(7),
-    "temperature" / TEMPERATURE,
-    "reserved_40" / Bytes(2),
-    "blocks"
-    / Array(
-        BLOCKS,
-        Struct(
-            "flag" / Const(b"\xff\xee"),
-            "azimuth" / Scaled(Int16ub, 0.01, "deg") * "of the rotor, clockwise, at the block's first laser",
-            "channels" / Array(LASERS, Struct("distance" / Scaled(Int16ub, 0.005, "m") * "0: no return", "intensity" / Int8ub)),
-        ),
-    ),
-    "index" / Bytes(4),
-    "tail" / Const(b"\x00\xff"),
 )
 
 
-def difop(step: float) -> Construct:
-    """Device information of the first layout; a step of the lasers' angles in degrees."""
-    angle = Struct("sign" / Int8ub * "0 positive, 1 negative, 255 not calibrated", "value" / Scaled(Int16ub, step, "deg"))
+def packet(time: tuple[Construct, ...], rows: Construct) -> Struct:
+    """A data packet with this time and these blocks."""
     return Struct(
-        "header" / Const(b"\xa5\xff\x00\x5a\x11\x11\x55\x55"),
-        "rpm" / Scaled(Int16ub, 1, "rpm") * "as set",
-        "lidar_ip" / Bytes(4),
-        "host_ip" / Bytes(4),
-        "mac" / Bytes(6),
-        "msop_local_port" / Int16ub,
-        "msop_port" / Int16ub,
-        "difop_local_port" / Int16ub,
-        "difop_port" / Int16ub,
-        "fov_start" / Scaled(Int16ub, 0.01, "deg"),
-        "fov_end" / Scaled(Int16ub, 0.01, "deg"),
-        "reserved_36" / Bytes(2),
-        "phase_lock" / Scaled(Int16ub, 1, "deg"),
-        "top_firmware" / Bytes(5),
-        "bottom_firmware" / Bytes(5),
-        "reserved_50" / Bytes(242),
-        "serial_number" / Bytes(6),
-        "zero_angle_offset" / Int16ub,
-        "return_mode" / Int8ub * "0 dual, 1 strongest, 2 last",
-        "software" / Int16ub,
-        "time" / Bytes(10),
-        "currents" / Array(2, Int24ub),
-        "voltages" / Array(9, Int16ub),
-        "reserved_337" / Bytes(5),
-        "diagnostics" / Bytes(31),
-        "measured_speed" / Scaled(Int16ub, 1 / 6, "rpm"),
-        "diagnostics_2" / Bytes(7),
-        "gprmc" / Bytes(86),
-        "vertical" / Array(LASERS, angle),
-        "horizontal" / Array(LASERS, angle),
-        "reserved_660" / Bytes(586),
-        "tail" / Const(b"\x0f\xf0"),
+        "header" / Const(b"\x55\xaa\x05\x0a\x5a\xa5\x50\xa0"),
+        "reserved_8" / Bytes(12),
+        *time,
+        "lidar_type" / Int8ub * "1 RS-LiDAR-16, 2 RS-LiDAR-32",
+        "series" / Int8ub * "3 RS-Bpearl of version 4",
+        "version" / Int8ub * "4 of version 4",
+        "reserved_33" / Bytes(5),
+        "temperature" / TEMPERATURE,
+        "reserved_40" / Bytes(2),
+        "blocks" / rows,
+        "index" / Bytes(4),
+        "tail" / Const(b"\x00\xff"),
     )
 
 
-def plausible_rs32(f: Fields) -> Any:
+def difop(step: float) -> Construct:
+    """Device information with the angles of 32 lasers, in steps of so many degrees."""
+    return difop_first("vertical" / angles(LASERS, step), "horizontal" / angles(LASERS, step), "reserved_660" / Bytes(586))
+
+
+DIFOP_16 = difop_first(
+    "reserved_468" / Bytes(697),
+    "pitch" / Array(16, Scaled(Int24ub, 0.0001, "deg")) * "size of the vertical angles, those of the first eight lasers below the horizon",
+    "reserved_1213" / Bytes(33),
+)
+
+
+def plausible(f: Fields, lidar_type: int) -> Any:
     """Azimuths below 360 degrees, and this model's type."""
-    return (f.blocks.azimuth < 360) & (f.lidar_type == RS32_TYPE)
+    return (f.blocks.azimuth < 360) & (f.lidar_type == lidar_type)
 
 
-def plausible_bpearl(f: Fields) -> Any:
+def plausible_bpearl(f: Fields, v4: bool) -> Any:
     """Azimuths below 360 degrees, and the type of no other model with such packets."""
-    return (f.blocks.azimuth < 360) & (f.lidar_type != RS16_TYPE) & (f.lidar_type != RS32_TYPE)
+    newer = (f.series == V4[0]) & (f.version == V4[1])
+    return (f.blocks.azimuth < 360) & (newer if v4 else (f.lidar_type != RS16_TYPE) & (f.lidar_type != RS32_TYPE) & ~newer)
 
 
 def clock(f: Fields) -> tuple[Any, Any, Any]:
@@ -147,94 +140,58 @@ def clock(f: Fields) -> tuple[Any, Any, Any]:
     return 86_400 * days + 3600 * f.hour + 60 * f.minute + f.second, f.milliseconds, f.microseconds
 
 
-def points(f: Fields, model: Lasers) -> Polar:
-    """Lasers beside the rotor's direction, from an optical centre that turns with it; with dual return, pairs of blocks are one firing."""
-    information, azimuth = f.state.difop, f.blocks.azimuth
-    dual = information.return_mode == DUAL
-    block = np.arange(BLOCKS)[:, None]
-    ahead = wrap(np.where(dual, following(azimuth, 2), following(azimuth)) - azimuth, 360)
-    behind = wrap(azimuth - np.where(dual, previous(azimuth, 2), previous(azimuth)), 360)
-    step = np.where(ahead <= GAP, ahead, np.where(behind <= GAP, behind, information.rpm * 6 * PERIOD))
-    rotor = np.deg2rad(azimuth + step * (model.delay / PERIOD))
-    return Polar(
-        range=f.blocks.channels.distance,
-        azimuth=-(rotor + np.deg2rad(signed(information.horizontal))),
-        elevation=np.deg2rad(signed(information.vertical)),
-        intensity=f.blocks.channels.intensity,
-        time=np.where(dual, block // 2, block) * PERIOD + model.delay,
-        ring=model.ring,
-        return_index=np.where(dual, block % 2, 0),
-        origin=(model.lens * np.cos(rotor), -model.lens * np.sin(rotor), model.height),
-    )
+def points_16(f: Fields) -> Polar:
+    """Two firings in a block; angles up and down alone, with their signs as they are in every unit."""
+    up = np.where(np.arange(16) < 8, -1, 1) * f.state.difop.pitch.on("channels")
+    return halves(f, f.state.difop.return_mode == DUAL, RS16_ROTOR, (up, 0.0))
 
 
-def sweep(i: int, lidar_type: int) -> dict[str, Any]:
-    """Packet i of a sensor in single return mode, from the beginning of 2024 on."""
-    time = i * BLOCKS * PERIOD
-    azimuth = np.round((i * BLOCKS + np.arange(BLOCKS)) * PERIOD * TURNS * 360, 2) % 360
-    date = {"year": 24, "month": 1, "day": 1, "hour": int(time / 3600), "minute": int(time / 60) % 60, "second": int(time) % 60}
-    micros = round(time * 1e6) % 1_000_000
-    fraction = {"milliseconds": micros // 1000 * 1e-3, "microseconds": micros % 1000 * 1e-6}
-    return {**date, "second": round(time * 1e6) // 1_000_000 % 60, **fraction, "lidar_type": lidar_type, "blocks.azimuth": azimuth}
+def points(f: Fields, model: Rotor) -> Polar:
+    """One firing in a block."""
+    return pairs(f, f.state.difop.return_mode == DUAL, model)
 
 
-def sweep_information(i: int) -> dict[str, Any]:
-    """The device information of a sensor with the factory's settings; the angles are the default ones."""
-    return {**{name: value for name, value in sweep_difop(i).items() if name != "measured_rpm"}, "measured_speed": TURNS * 60}
+def sweep(i: int, shots: float, lidar_type: int) -> dict[str, Any]:
+    """Packet i of a sensor in single return mode, from the beginning of 2024 on; blocks take so many microseconds."""
+    values = turning(i, BLOCKS, shots * 1e-6, lidar_type=lidar_type)
+    seconds, micros = divmod(round(i * BLOCKS * shots), 1_000_000)
+    date = {"year": 24, "month": 1, "day": 1, "hour": seconds // 3600 % 24, "minute": seconds // 60 % 60, "second": seconds % 60}
+    del values["seconds"]
+    return {**values, **date, "milliseconds": micros // 1000 * 1e-3, "microseconds": micros % 1000 * 1e-6}
 
 
-def angles(values: NDArray[np.float64], name: str) -> dict[str, Any]:
-    """Default angles as DIFOP has them."""
-    return {f"{name}.sign": values < 0, f"{name}.value": np.abs(values)}
-
-
-SLOT = np.arange(LASERS)
-RS32_LASERS = Lasers(
-    # 2.88 us apart in two rows, the second 1.44 us after the first; the last of each later (rs_driver)
-    delay=(SLOT % 16 * 2.88 + SLOT // 16 * 1.44 + np.where(SLOT % 16 == 15, 1.44, 0)) * 1e-6,
-    lens=0.03997,
-    height=0.0,
-    vertical=np.array(RS32_VERTICAL),
-    horizontal=np.array(RS32_HORIZONTAL),
-)
-BPEARL_LASERS = Lasers(
-    # 2.56 us apart in two rows, the second 1.28 us after the first, each with a pause in its middle (rs_driver)
-    delay=(SLOT % 16 * 2.56 + SLOT // 16 * 1.28 + np.where(SLOT % 16 >= 8, 5.2, 0)) * 1e-6,
-    lens=0.01473,
-    height=0.09427,
-    vertical=np.round(89.5 - 2.8125 * SLOT, 2),  # in the steps of its DIFOP
-    horizontal=np.zeros(LASERS),
-)
+INFORMATION = Simulation(sweep_difop, rate=1)
 
 RS32 = Sensor(
     "robosense-rs32",
-    vendor="RoboSense",
     model="RS-LiDAR-32",
     frames={
-        "data": Frame(DATA, data=True, plausible=plausible_rs32),
-        "difop": Frame(difop(0.001), simulation=Simulation(sweep_information, rate=1)),
+        "data": Frame(packet(DATE, blocks(BLOCKS, LASERS, 0.005)), data=True, plausible=partial(plausible, lidar_type=RS32_TYPE)),
+        "difop": Frame(difop(0.001), simulation=INFORMATION),
     },
-    points=partial(points, model=RS32_LASERS),
-    scan=OnWrap("blocks.azimuth"),
-    links={"data": Udp(6699, 7788)},
-    clock=Clock(clock),
-    state={
-        "difop": {
-            "rpm": TURNS * 60,
-            "return_mode": STRONGEST,
-            **angles(RS32_LASERS.vertical, "vertical"),
-            **angles(RS32_LASERS.horizontal, "horizontal"),
-        }
-    },
-    simulation=Simulation(partial(sweep, lidar_type=RS32_TYPE)),
+    points=partial(points, model=RS32_ROTOR),
+    state=RS32_ROTOR.state(return_mode=STRONGEST),
+    simulation=Simulation(partial(sweep, shots=55.52, lidar_type=RS32_TYPE)),
     range_limits=(0.4, 230.0),  # rs_driver's limits for this model
-    vendor_axes=("forward", "left", "up"),
-    turn=(5.0, 20.0),
     info={"serial": "difop.serial_number", "firmware": "difop.top_firmware", "model": "data.lidar_type"},
     aliases=("rs32", "rs-lidar-32"),
-    status="manual",
-    acknowledged={"LS511": "the rotor turns clockwise, and the angle on the wire with it, in axes that are right-handed"},
     source="rs_driver (decoder_RS32.hpp); angles of an example unit in ros_rslidar",
+    **{**COMMON, "clock": Clock(clock)},
+)
+
+RS16 = dataclasses.replace(
+    RS32,
+    id="robosense-rs16",
+    model="RS-LiDAR-16",
+    frames={
+        "data": Frame(packet(DATE, blocks(BLOCKS, 16, 0.005, firings=2)), data=True, plausible=partial(plausible, lidar_type=RS16_TYPE)),
+        "difop": Frame(DIFOP_16, simulation=INFORMATION),
+    },
+    points=points_16,
+    state={"difop": {"rpm": TURNS * 60, "return_mode": STRONGEST, "pitch": np.abs(RS16_ROTOR.vertical)}},
+    simulation=Simulation(partial(sweep, shots=111.0, lidar_type=RS16_TYPE)),
+    aliases=("rs16", "rs-lidar-16"),
+    source="rs_driver (decoder_RS16.hpp and its test); angles of an example unit in ros_rslidar",
 )
 
 BPEARL = dataclasses.replace(
@@ -242,20 +199,29 @@ BPEARL = dataclasses.replace(
     id="robosense-bpearl",
     model="RS-Bpearl",
     frames={
-        "data": Frame(DATA, data=True, plausible=plausible_bpearl),
-        "difop": Frame(difop(0.01), simulation=Simulation(sweep_information, rate=1)),
+        "data": Frame(packet(DATE, blocks(BLOCKS, LASERS, 0.005)), data=True, plausible=partial(plausible_bpearl, v4=False)),
+        "difop": Frame(difop(0.01), simulation=INFORMATION),
     },
-    points=partial(points, model=BPEARL_LASERS),
-    state={
-        "difop": {
-            **RS32.state["difop"],
-            **angles(BPEARL_LASERS.vertical, "vertical"),
-            **angles(BPEARL_LASERS.horizontal, "horizontal"),
-        }
-    },
-    simulation=Simulation(partial(sweep, lidar_type=0)),
+    points=partial(points, model=BPEARL_ROTOR),
+    state=BPEARL_ROTOR.state(return_mode=STRONGEST),
+    simulation=Simulation(partial(sweep, shots=55.52, lidar_type=0)),
     range_limits=(0.1, 150.0),  # likewise
     aliases=("bpearl", "rs-bpearl", "rsbp"),
     info={"serial": "difop.serial_number", "firmware": "difop.top_firmware"},
     source="rs_driver (decoder_RSBP.hpp and its tests); angles of an example unit in ros_rslidar",
+)
+
+BPEARL_V4 = dataclasses.replace(
+    BPEARL,
+    id="robosense-bpearl-v4",
+    model="RS-Bpearl, version 4",
+    frames={
+        "data": Frame(packet(TIME, blocks(BLOCKS, LASERS, 0.0025)), data=True, plausible=partial(plausible_bpearl, v4=True)),
+        "difop": BPEARL.frames["difop"],
+    },
+    points=partial(points, model=BPEARL_V4_ROTOR),
+    clock=Clock(("seconds", "microseconds")),
+    state=BPEARL_V4_ROTOR.state(return_mode=STRONGEST),
+    simulation=Simulation(lambda i: turning(i, BLOCKS, BPEARL_V4_ROTOR.period, series=V4[0], version=V4[1])),
+    aliases=("bpearl-v4", "rs-bpearl-v4"),
 )

@@ -36,7 +36,9 @@ from lidarspec_velodyne.frames import (
     packet,
     plausible_dual,
     plausible_single,
+    told,
 )
+from lidarspec_velodyne.hdl64e import HDL64E_S2, HDL64E_S3
 
 SLOT = np.arange(SLOTS)
 
@@ -154,7 +156,7 @@ VLP16 = Sensor(
     points=partial(points, model=VLP16_FIRINGS),
     scan=OnWrap("blocks.azimuth"),
     links={"data": Udp(2368, 8308)},
-    clock=Clock("timestamp", wraps_at=HOUR, pace=partial(pace, model=VLP16_FIRINGS)),
+    clock=Clock("timestamp", wraps_at=HOUR, pace=partial(pace, model=VLP16_FIRINGS), told=("position", told)),
     simulation=Simulation(partial(sweep, model=VLP16_FIRINGS)),
     configure=configure,
     range_limits=(0.4, 130.0),  # the default of ros-drivers/velodyne for this model
@@ -181,7 +183,7 @@ def relative(id: str, model: str, firings: Firings, **facts: Any) -> Sensor:
         id=id,
         model=model,
         points=partial(points, model=firings),
-        clock=Clock("timestamp", wraps_at=HOUR, pace=partial(pace, model=firings)),
+        clock=Clock("timestamp", wraps_at=HOUR, pace=partial(pace, model=firings), told=("position", told)),
         simulation=Simulation(partial(sweep, model=firings)),
         **facts,
     )
@@ -242,4 +244,4 @@ VLS128 = relative(
 @hookimpl
 def lidarspec_sensors() -> Iterable[Sensor]:
     """The Velodyne sensors."""
-    return [VLP16, HDL32E, PUCK_HI_RES, VLP32C, VLS128]
+    return [VLP16, HDL32E, PUCK_HI_RES, VLP32C, VLS128, HDL64E_S2, HDL64E_S3]

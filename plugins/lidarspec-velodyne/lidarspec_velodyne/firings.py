@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec import UsageError
-from lidarspec.spec import Fields, Polar, Sensor, following, previous, wrap
+from lidarspec.spec import Fields, Polar, Sensor, following, previous
 from lidarspec_velodyne.frames import BLOCKS, DUAL, HOUR, STRONGEST, TURN
 
 LAST_BLOCK = ("previous", "invalid")
@@ -96,16 +96,17 @@ def points(f: Fields, model: Firings, last_block: str = "previous") -> Polar:
 def _step(f: Fields, dual: Any, model: Firings, last_block: str) -> Any:
     """Degrees that the sensor turns from the azimuth of each block to the next one, (n, blocks, 1)."""
     azimuth, one, two = f.blocks.azimuth, model.sharing, 2 * model.sharing
-    ahead = _difference(azimuth, np.where(dual, following(azimuth, two), following(azimuth, one)))
+    ahead = difference(azimuth, np.where(dual, following(azimuth, two), following(azimuth, one)))
     unknown = np.nan
     if last_block == "previous":
-        unknown = _difference(np.where(dual, previous(azimuth, two), previous(azimuth, one)), azimuth)
+        unknown = difference(np.where(dual, previous(azimuth, two), previous(azimuth, one)), azimuth)
     return np.where(np.abs(ahead) < FASTEST * model.period * JITTER, ahead, unknown)
 
 
-def _difference(start: Any, end: Any) -> Any:
+def difference(start: Any, end: Any) -> Any:
     """The shorter way round from start to end, degrees: a reading that falls back by jitter is no turn."""
-    return wrap(end - start + 180, 360) - 180
+    step = end - start
+    return step - 360 * np.rint(step / 360)
 
 
 def configure(sensor: Sensor, /, *, last_block: str) -> Sensor:

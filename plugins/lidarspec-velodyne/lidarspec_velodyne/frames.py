@@ -6,6 +6,8 @@ the leading zeros and inertial readings of position packets: VeloView's position
 
 from __future__ import annotations
 
+import datetime
+import re
 from typing import Any
 
 import numpy as np
@@ -105,9 +107,37 @@ def plausible_position(f: Fields) -> Any:
     return (f.pps <= 3) & ((f.nmea == 0) | ((f.nmea >= 9) & (f.nmea < 127)))
 
 
+#: time, that it is valid, and date of a sentence; what stands in between is the position and the movement.
+_RMC = re.compile(rb"\$G[A-Z]RMC,(\d{6})(?:\.\d*)?,A,(?:[^,]*,){6}(\d{6})[,*]")
+LOCKED = 2  # state of the PPS
+
+
+def told(f: Fields) -> Any:
+    """Seconds since 1970 of each NMEA sentence; nan of one that is not valid, or while no PPS holds the clock to it."""
+    locked = np.asarray(f.pps).reshape(-1) == LOCKED
+    found, sentences = np.full(len(locked), np.nan), np.asarray(f.nmea).astype(np.uint8)
+    for row in np.flatnonzero(locked).tolist():
+        found[row] = _seconds(sentences[row].tobytes())
+        if found[row] > 0:
+            break  # the first one is enough
+    return found
+
+
+def _seconds(nmea: bytes) -> float:
+    sentence = _RMC.match(nmea)
+    try:
+        moment = datetime.datetime.strptime((sentence[2] + sentence[1]).decode(), "%d%m%y%H%M%S") if sentence else None
+    except ValueError:
+        moment = None
+    return moment.replace(tzinfo=datetime.UTC).timestamp() if moment else float("nan")
+
+
 def sweep_position(i: int) -> dict[str, Any]:
-    """Position packet i of a sensor without a GPS receiver."""
-    return {"timestamp": i / POSITIONS % HOUR, "pps": 0, "nmea": np.zeros(NMEA)}
+    """Position packet i of a sensor that was switched on at the beginning of 2024, with a GPS receiver that knows the time alone."""
+    moment = datetime.datetime(2024, 1, 1, tzinfo=datetime.UTC) + datetime.timedelta(seconds=i // POSITIONS)
+    text = moment.strftime("GPRMC,%H%M%S,A,,,,,,,%d%m%y,,,A").encode()
+    sentence = b"$%s*%02X\r\n" % (text, np.bitwise_xor.reduce(np.frombuffer(text, np.uint8)))
+    return {"timestamp": i / POSITIONS % HOUR, "pps": LOCKED, "nmea": np.frombuffer(sentence.ljust(NMEA, b"\0"), np.uint8)}
 
 
 POSITION_FRAME = Frame(

@@ -1,0 +1,218 @@
+"""RoboSense Airy: rotating lidar of 96 lasers from the horizon to the zenith over UDP, with an IMU.
+
+Two blocks of 48 lasers share an azimuth, the first with the lower half of the lasers; with dual return two such pairs.
+
+Source: Airy user manual 1.3: Tables 8 to 13 and 32 (packets, angles, emission times), appendix C (registers of DIFOP); from the vendor's
+rs_driver (decoder_RSAIRY.hpp): the optical centre, where it differs by how the sensor stands when its lasers fire, the bits of a distance,
+dual return, the time in a packet of the IMU.
+
+Contradictions: the manual's formula has x with the sine of the azimuth and the sensor turns towards y; rs_driver has x with its cosine
+and y with its sine turned round, as in all models, which is what stands here. Whether the integers of the IMU are big-endian nobody says:
+assumed, as all else is. Assumed too: the order of the blocks of dual return, which rs_driver reads by their places alone. Models of 48
+and 192 lasers (bytes 1 and 3) send other packets, and are refused.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from functools import partial
+from typing import Any
+
+import numpy as np
+from construct import Array, BitsInteger, BitStruct, Bytes, Const, Float32b, Int8ub, Int16ub, Int32sb, Int32ub, Struct
+
+from lidarspec.spec import Fields, Frame, Imu, Polar, Scaled, Sensor, Sequence, Simulation, Udp, following, previous, take
+from lidarspec_robosense.rotor import (
+    BLOCK,
+    COMMON,
+    DIFOP_HEAD,
+    DIFOP_TAIL,
+    DIFOP_TIME,
+    DIFOP_UNIT,
+    TEMPERATURE,
+    TIME,
+    TURNS,
+    Rotor,
+    angles,
+    beams,
+    signed,
+    signs,
+    sweep,
+    sweep_difop,
+)
+
+TYPE, MODEL_96, DUAL = 0x31, 2, 3
+BLOCKS, HALF = 8, 48
+IMU_RATE = 200  # a second, as delivered (manual 4.4.4)
+GRAVITY = 9.80665
+
+
+def emission(*times: float) -> Any:
+    """(blocks, lasers) seconds at which groups of eight lasers fire, after the azimuth of a pair of blocks."""
+    return np.tile(np.repeat(times, 8).reshape(2, HALF), (BLOCKS // 2, 1)) * 1e-6
+
+
+UPRIGHT = emission(0, 5.712, 12.376, 19.04, 25.704, 33.32, 41.888, 50.456, 59.024, 70.448, 81.872, 93.296)  # Table 32
+SIDEWAYS = emission(0, 11.424, 22.848, 34.272, 45.696, 54.264, 62.832, 71.4, 79.016, 85.68, 92.344, 99.008)  # rs_driver
+AIRY_M = emission(0, 7.616, 16.184, 24.752, 33.32, 42.84, 52.36, 61.88, 71.4, 79.968, 88.536, 97.104)  # rs_driver
+# fmt: off
+VERTICAL = np.array([  # Table 32
+    -0.07, 0.88, 1.81, 2.76, 3.69, 4.62, 5.54, 6.48, 7.41, 8.34, 9.27, 10.21, 11.15, 12.09, 13.03, 13.98, 14.92, 15.87, 16.82, 17.77, 18.72,
+    19.67, 20.62, 21.57, 22.51, 23.45, 24.4, 25.33, 26.28, 27.21, 28.15, 29.08, 30.02, 30.95, 31.88, 32.82, 33.74, 34.68, 35.62, 36.55,
+    37.5, 38.43, 39.37, 40.31, 41.25, 42.21, 43.16, 44.09, 45.05, 46.0, 46.95, 47.9, 48.85, 49.8, 50.73, 51.69, 52.62, 53.56, 54.5, 55.45,
+    56.37, 57.3, 58.24, 59.18, 60.12, 61.05, 61.99, 62.93, 63.86, 64.81, 65.76, 66.69, 67.65, 68.6, 69.56, 70.51, 71.46, 72.42, 73.37,
+    74.33, 75.29, 76.24, 77.19, 78.14, 79.07, 80.02, 80.96, 81.9, 82.84, 83.78, 84.7, 85.64, 86.57, 87.52, 88.46, 89.4,
+])
+# fmt: on
+ROTOR = Rotor(delay=UPRIGHT, period=111.08e-6, lens=float(np.hypot(0.0075, 0.00664)), height=0.04532, vertical=VERTICAL)
+
+ECHO = BitStruct("feature" / BitsInteger(2), "distance" / Scaled(BitsInteger(14), 0.005, "m") * "0: no return")
+DATA = Struct(
+    "header" / Const(b"\x55\xaa\x05\x5a"),
+    "reserved_4" / Bytes(4),
+    "top_packet_count" / Int32ub,
+    "packet_count" / Int32ub,
+    "data_type" / Const(0, Int8ub) * "0: points",
+    "returns" / Int8ub * "3: dual return",
+    "reserved_18" / Bytes(2),
+    *TIME,
+    "reserved_30" / Bytes(1),
+    "lidar_type" / Const(TYPE, Int8ub) * "0x31 Airy",
+    "lidar_model" / Const(MODEL_96, Int8ub) * "1 48 lasers, 2 96 lasers, 3 192 lasers",
+    "reserved_33" / Bytes(5),
+    "temperature" / TEMPERATURE,
+    "top_temperature" / TEMPERATURE,
+    "blocks"
+    / Array(
+        BLOCKS,
+        Struct(
+            "flag" / BLOCK,
+            "azimuth" / Scaled(Int16ub, 0.01, "deg") * "of the rotor, clockwise, at the first laser of a pair of blocks",
+            "channels" / Array(HALF, Struct("echo" / ECHO, "intensity" / Int8ub)),
+        ),
+    ),
+    "tail" / Bytes(6) * "reserved, and 00 FF",
+    "reserved_end" / Bytes(16),
+)
+DIFOP = Struct(
+    *DIFOP_HEAD,
+    "software" / Bytes(5),
+    "motor_firmware" / Bytes(5),
+    "reserved_60" / Bytes(229),
+    "install_mode" / Int8ub * "0 upright, 1 on its side, 2 Airy M",
+    "reserved_290" / Bytes(2),
+    *DIFOP_UNIT,
+    *DIFOP_TIME,
+    "reserved_313" / Bytes(60),
+    "measured_rpm" / Scaled(Int16ub, 1, "rpm"),
+    "reserved_375" / Bytes(93),
+    "vertical_low" / angles(HALF),
+    "vertical_high" / angles(HALF),
+    "horizontal_low" / angles(HALF),
+    "horizontal_high" / angles(HALF),
+    "board_voltage" / Scaled(Int16ub, 0.01, "V"),
+    "reserved_1046" / Bytes(20),
+    "voltage" / Scaled(Int16ub, 0.01, "V"),
+    "voltage_12v" / Scaled(Int16ub, 0.01, "V"),
+    "reserved_1070" / Bytes(10),
+    "emitter_temperature" / Scaled(Int16ub, 0.01, "degC"),
+    "reserved_1082" / Bytes(10),
+    "imu_rotation" / Array(4, Float32b) * "of the IMU in the lidar: quaternion x, y, z, w",
+    "imu_position" / Array(3, Scaled(Float32b, 1, "m")),
+    "reserved_1120" / Bytes(126),
+    DIFOP_TAIL,
+)
+IMU = Struct(
+    "header" / Const(b"\xaa\x55\x5a\x05"),
+    *TIME,
+    *(f"acceleration_{axis}" / Int32sb for axis in "xyz"),
+    *(f"rotation_{axis}" / Int32sb for axis in "xyz"),
+    "temperature" / Scaled(Int32sb, 0.01, "degC"),
+    "data_rate" / Int8ub * "0 25 Hz, 1 50 Hz, 2 100 Hz, 3 200 Hz, 4 1000 Hz",
+    "acceleration_range" / Int8ub * "0 2 g, 1 4 g, 2 8 g, 3 16 g",
+    "rotation_range" / Int8ub * "0 250 deg/s, 1 500 deg/s, 2 1000 deg/s, 3 2000 deg/s",
+    "count" / Int32ub,
+    "tail" / Const(b"\xf0\x0f"),
+)
+
+
+def plausible(f: Fields) -> Any:
+    """Azimuths below 360 degrees."""
+    return f.blocks.azimuth < 360
+
+
+def plausible_imu(f: Fields) -> Any:
+    """Known ranges."""
+    return (f.acceleration_range <= 3) & (f.rotation_range <= 3) & (f.data_rate <= 4)
+
+
+def points(f: Fields) -> Polar:
+    """96 lasers in pairs of blocks, the upper half in the second."""
+    azimuth, block, difop = f.blocks.azimuth, f.blocks.index, f.state.difop
+    dual, low = f.returns == DUAL, f.blocks.index % 2 == 0
+    ahead = np.where(dual, following(azimuth, 4), following(azimuth, 2)) - azimuth
+    behind = azimuth - np.where(dual, previous(azimuth, 4), previous(azimuth, 2))
+    vertical = np.where(low, signed(difop.vertical_low), signed(difop.vertical_high))
+    horizontal = np.where(low, signed(difop.horizontal_low), signed(difop.horizontal_high))
+    delay = np.where(difop.install_mode == 1, SIDEWAYS, np.where(difop.install_mode == 2, AIRY_M, UPRIGHT))
+    polar = beams(
+        f,
+        f.blocks.channels,
+        ROTOR,
+        (vertical, horizontal),
+        ahead,
+        behind,
+        elapsed=delay,
+        duration=ROTOR.period,
+        shot=np.where(dual, block // 4, block // 2),
+        echo=np.where(dual, block // 2 % 2, 0),
+        distance=f.blocks.channels.echo.distance,
+        ring=np.arange(2 * HALF).reshape(2, HALF)[np.arange(BLOCKS) % 2],
+    )
+    return dataclasses.replace(polar, extra={"feature": f.blocks.channels.echo.feature})
+
+
+def imu(f: Fields) -> Imu:
+    """Steps of a range that the packet names, 32768 of them (manual, Table 13)."""
+    force = take(GRAVITY * np.array([2, 4, 8, 16]) / 32768, f.acceleration_range)
+    rate = take(np.deg2rad(np.array([250, 500, 1000, 2000]) / 32768), f.rotation_range)
+    return Imu(
+        (f.rotation_x * rate, f.rotation_y * rate, f.rotation_z * rate),
+        (f.acceleration_x * force, f.acceleration_y * force, f.acceleration_z * force),
+    )
+
+
+def sweep_data(i: int) -> dict[str, Any]:
+    """Packet i: four azimuths, of two blocks each."""
+    values = sweep(i, BLOCKS // 2, ROTOR.period, packet_count=i % (1 << 32))
+    return {**values, "blocks.azimuth": np.repeat(values["blocks.azimuth"], 2)}
+
+
+def sweep_imu(i: int) -> dict[str, Any]:
+    """Sample i of an IMU with the ranges as delivered."""
+    codes = {"data_rate": 3, "acceleration_range": 1, "rotation_range": 1}
+    return {"seconds": i // IMU_RATE, "microseconds": i % IMU_RATE / IMU_RATE, "count": (i + 1) % (1 << 32), **codes}
+
+
+LOW, HIGH = np.split(VERTICAL, 2)
+NONE = np.zeros(HALF)
+STATE = {**signs("vertical_low", LOW), **signs("vertical_high", HIGH), **signs("horizontal_low", NONE), **signs("horizontal_high", NONE)}
+
+AIRY = Sensor(
+    "robosense-airy",
+    model="Airy",
+    frames={
+        "data": Frame(DATA, data=True, plausible=plausible),
+        "difop": Frame(DIFOP, simulation=Simulation(partial(sweep_difop, speed="measured_rpm"), rate=1)),
+        "imu": Frame(IMU, imu=imu, plausible=plausible_imu, simulation=Simulation(sweep_imu, rate=IMU_RATE)),
+    },
+    points=points,
+    sequence=Sequence("packet_count"),
+    state={"difop": {"rpm": TURNS * 60, "install_mode": 0, **STATE}},
+    simulation=Simulation(sweep_data),
+    range_limits=(0.1, 60.0),  # Table 1
+    info={"serial": "difop.serial_number", "firmware": "difop.top_firmware"},
+    aliases=("airy", "rs-airy"),
+    source="Airy user manual 1.3, chapter 4.4 and appendices C and D; rs_driver (decoder_RSAIRY.hpp); no packet was seen",
+    **{**COMMON, "links": {"data": Udp(6699, 7788, 6688)}, "turn": (TURNS, TURNS)},
+)

@@ -1,0 +1,244 @@
+"""RoboSense M2, MX and E1: solid-state lidars over UDP; every point carries its radius and a direction of length 1.
+
+Source: the vendor's rs_driver (decoder_RSM2.hpp, decoder_RSMX.hpp, decoder_RSE1.hpp: packets, their number in a frame,
+limits); E1 user manual, Tables 4 to 9 (packets, tail, DIFOP).
+
+Contradictions: the E1's manual counts packets from 0, and has dual return as modes 9 to 11, rs_driver as 0. Not checked: the CRCs at the
+end of packets, of which nobody says in public what they are over; that of the E1 is called AUTOSAR E2E profile 4. Assumed: that the other
+models count from 1, as the M1 does; frames with dual return of twice as many packets, but for the MX, whose points have two radii; and g
+and rad/s of the E1's IMU, since rs_driver hands its numbers on beside those of the Airy in these units, from bytes that the manual leaves
+reserved.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+from construct import Array, Bytes, Const, Construct, Float32b, Int8ub, Int16sb, Int16ub, Int32ub, Struct
+
+from lidarspec.spec import Fields, Frame, Imu, Polar, Scaled, Sequence, Simulation, stack
+from lidarspec_robosense.m1 import FRAME_RATE, HEADER, M1
+from lidarspec_robosense.rotor import TIME
+
+DUAL, STRONGEST = 0, 4  # return modes
+GRAVITY = 9.80665
+MAGIC = Const(b"\xa5\xff\x00\x5a\x11\x11\x55\x55")
+UNIT = tuple(axis / Scaled(Int16sb, 1 / 32768, "") for axis in "xyz")
+
+
+@dataclass(frozen=True)
+class Scanner:
+    """What tells the models apart.
+
+    Attributes:
+        blocks, channels: of a packet, and of a block.
+        packets: of a frame with single return.
+        first: the number of the first of them.
+        wide, high: degrees of the field of view, for simulation.
+    """
+
+    blocks: int
+    channels: int
+    packets: int
+    first: int
+    wide: float
+    high: float
+
+
+def packet(model: Scanner, offset: Construct, parts: tuple[Construct, ...], channel: tuple[Construct, ...], *tail: Construct) -> Struct:
+    """A packet whose blocks have an offset of time, these parts, and channels of these fields."""
+    time = "time_offset" / Scaled(offset, 1e-6, "s") * "after the packet's time"
+    return Struct(
+        *HEADER, "blocks" / Array(model.blocks, Struct(time, *parts, "channels" / Array(model.channels, Struct(*channel)))), *tail
+    )
+
+
+RADIUS = "radius" / Scaled(Int16ub, 0.005, "m") * "0: no return"
+ATTRIBUTE = "attribute" / Int8ub * "E1: 1 normal, 2 noise"
+ONE = (RADIUS, *UNIT, "intensity" / Int8ub, ATTRIBUTE)
+TWO = (
+    RADIUS,
+    "second_radius" / Scaled(Int16ub, 0.005, "m") * "of dual return",
+    *UNIT,
+    "intensity" / Int8ub,
+    "second_intensity" / Int8ub,
+    ATTRIBUTE,
+)
+RETURN = "return_seq" / Int8ub * "0 single return, 1 first, 2 second"
+#: what is true and meant of every data frame.
+UNCHECKED = {
+    "LS212 crc": "nobody says in public what it is over",
+    "LS201 blocks.channels.x": "a component of a direction of length 1, not an angle",
+}
+SEALED = ("crc" / Int32ub, "rolling_counter" / Int16ub)
+
+M2_SCANNER = Scanner(25, 5, 1260, 1, wide=120, high=25)
+MX_SCANNER = Scanner(50, 2, 630, 1, wide=120, high=25)
+E1_SCANNER = Scanner(96, 1, 288, 0, wide=120, high=90)
+
+M2_DATA = packet(M2_SCANNER, Int8ub, (RETURN,), ONE, "reserved_end" / Bytes(4), *SEALED)
+MX_DATA = packet(MX_SCANNER, Int8ub, (), TWO, "reserved_end" / Bytes(16), *SEALED)
+E1_TAIL = ("data_length" / Const(1200, Int16ub), "counter" / Int16ub, "data_id" / Const(0xE5C, Int32ub), "crc" / Int32ub)
+E1_DATA = packet(E1_SCANNER, Int16ub, (), ONE, "reserved_end" / Bytes(4), *E1_TAIL)
+E1_DIFOP = Struct(
+    "magic" / MAGIC,
+    "reserved_8" / Bytes(8),
+    "software" / Bytes(3),
+    "reserved_19" / Bytes(1),
+    "serial_number" / Bytes(6),
+    "reserved_26" / Bytes(18),
+    "lidar_ip" / Bytes(4),
+    "subnet_mask" / Bytes(4),
+    "mac" / Bytes(6),
+    "msop_host_ip" / Bytes(4),
+    "msop_local_port" / Int16ub,
+    "msop_port" / Int16ub,
+    "difop_host_ip" / Bytes(4),
+    "difop_local_port" / Int16ub,
+    "difop_port" / Int16ub,
+    "reserved_74" / Bytes(25),
+    "frame_rate" / Scaled(Int8ub, 1, "Hz"),
+    "return_mode" / Int8ub * "0 farthest, 4 strongest, 7 nearest, 8 second strongest, 9 to 11 two of these",
+    "time_sync_mode" / Int8ub * "0 internal, 2 E2E L2, 3 gPTP",
+    "time_sync_status" / Int8ub * "0 failed, 1 success, 2 timeout",
+    *TIME,
+    "phy_mode" / Int8ub * "0 negotiated, 1 master, 2 slave",
+    "reserved_114" / Bytes(94),
+    *(f"acceleration_{axis}" / Scaled(Float32b, GRAVITY, "m/s2") * "in g" for axis in "xyz"),
+    *(f"rotation_{axis}" / Scaled(Float32b, 1, "rad/s") for axis in "xyz"),
+    "reserved_end" / Bytes(24),
+)
+
+
+def plausible(f: Fields, model: Scanner) -> Any:
+    """Numbers of a frame with dual return at most."""
+    return (f.pkt_psn >= model.first) & (f.pkt_psn < model.first + 2 * model.packets)
+
+
+def packets(f: Fields, model: Scanner, dual: tuple[int, ...]) -> Any:
+    """The last number of a frame, by the return mode."""
+    twice = np.logical_or.reduce([f.wave_mode == mode for mode in dual]) if dual else False
+    return np.where(twice, 2 * model.packets, model.packets) + model.first - 1
+
+
+def direction(f: Fields) -> dict[str, Any]:
+    """Azimuth, elevation, and what points of every model have besides; REP-103 axes, as on the wire."""
+    channels = f.blocks.channels
+    across = np.hypot(channels.x, channels.y)
+    return {
+        "azimuth": np.arctan2(channels.y, channels.x),
+        "elevation": np.arctan2(channels.z, across),
+        "time": f.blocks.time_offset,
+        "ring": channels.index,
+    }
+
+
+def points(f: Fields, returns: bool = False) -> Polar:
+    """A point of each channel; the length of a direction, 1 but for its steps, is part of the range, as in rs_driver."""
+    channels = f.blocks.channels
+    length = np.sqrt(channels.x**2 + channels.y**2 + channels.z**2)
+    echo = np.maximum(f.blocks.return_seq - 1, 0) if returns else None
+    own = {"intensity": channels.intensity, "return_index": echo, "extra": {"attribute": channels.attribute}}
+    return Polar(range=channels.radius * length, **direction(f), **own)
+
+
+def points_mx(f: Fields) -> Polar:
+    """Two points of each channel with dual return."""
+    channels = f.blocks.channels
+    length = np.sqrt(channels.x**2 + channels.y**2 + channels.z**2)
+    second = np.where(f.wave_mode == DUAL, channels.second_radius, 0)
+    return Polar(
+        range=stack(channels.radius * length, second * length),
+        intensity=stack(channels.intensity, channels.second_intensity),
+        return_index=stack(second * 0, second * 0 + 1),
+        **direction(f),
+    )
+
+
+def imu(f: Fields) -> Imu:
+    """As rs_driver hands it on."""
+    return Imu((f.rotation_x, f.rotation_y, f.rotation_z), (f.acceleration_x, f.acceleration_y, f.acceleration_z))
+
+
+def sweep(i: int, model: Scanner) -> dict[str, Any]:
+    """Packet i of frames with single return: lines to and fro, downwards; each channel an equal part of a line."""
+    number, time = i % model.packets, i / (model.packets * FRAME_RATE)
+    spot = (number * model.blocks + np.arange(model.blocks))[:, None] / (model.packets * model.blocks)
+    lines = 100
+    line, along = np.divmod(spot * lines, 1)
+    along = np.where(line % 2, 1 - along, along)
+    azimuth = np.deg2rad((0.5 - (along + np.arange(model.channels)) / model.channels) * model.wide)
+    elevation = np.deg2rad(np.broadcast_to((0.5 - line / (lines - 1)) * model.high, azimuth.shape))
+    offsets = np.arange(model.blocks) / (model.packets * FRAME_RATE * model.blocks)
+    return {
+        "pkt_psn": number + model.first,
+        "wave_mode": STRONGEST,
+        "seconds": int(time),
+        "microseconds": time % 1,
+        "blocks.time_offset": np.round(offsets, 6),
+        "blocks.channels.x": np.cos(elevation) * np.cos(azimuth),
+        "blocks.channels.y": np.cos(elevation) * np.sin(azimuth),
+        "blocks.channels.z": np.sin(elevation),
+    }
+
+
+def sweep_e1(i: int) -> dict[str, Any]:
+    """The device information of a sensor at rest with the factory's settings."""
+    ports = {"msop_port": 6699, "difop_port": 7788, "lidar_ip": bytes([192, 168, 1, 200])}
+    return {"frame_rate": FRAME_RATE, "return_mode": STRONGEST, "seconds": i, "microseconds": 0, **ports}
+
+
+MX_DIFOP = Struct("magic" / MAGIC, "reserved_8" / Bytes(30), "serial_number" / Bytes(6), "reserved_44" / Bytes(212))
+
+M2 = dataclasses.replace(
+    M1,
+    id="robosense-m2",
+    model="M2",
+    frames={**M1.frames, "data": Frame(M2_DATA, data=True, plausible=partial(plausible, model=M2_SCANNER), acknowledged=UNCHECKED)},
+    points=partial(points, returns=True),
+    sequence=Sequence("pkt_psn", first=1, last=partial(packets, model=M2_SCANNER, dual=(DUAL,))),
+    simulation=Simulation(partial(sweep, model=M2_SCANNER)),
+    range_limits=(0.2, 250.0),  # rs_driver's limits for these models
+    aliases=("rs-m2", "rs-lidar-m2"),
+    status="manual",
+    acknowledged={},
+    source="rs_driver (decoder_RSM2.hpp); no packet of this model was seen",
+)
+
+MX = dataclasses.replace(
+    M2,
+    id="robosense-mx",
+    model="MX",
+    frames={
+        "data": Frame(MX_DATA, data=True, plausible=partial(plausible, model=MX_SCANNER), acknowledged=UNCHECKED),
+        "difop": Frame(MX_DIFOP, simulation=Simulation(lambda i: {}, rate=1)),
+    },
+    points=points_mx,
+    sequence=Sequence("pkt_psn", first=1, last=partial(packets, model=MX_SCANNER, dual=())),
+    simulation=Simulation(partial(sweep, model=MX_SCANNER)),
+    range_limits=(0.2, 200.0),
+    info={"serial": "difop.serial_number"},
+    aliases=("rs-mx",),
+    source="rs_driver (decoder_RSMX.hpp); no packet of this model was seen",
+)
+
+E1 = dataclasses.replace(
+    M2,
+    id="robosense-e1",
+    model="E1",
+    frames={
+        "data": Frame(E1_DATA, data=True, plausible=partial(plausible, model=E1_SCANNER), acknowledged=UNCHECKED),
+        "difop": Frame(E1_DIFOP, imu=imu, simulation=Simulation(sweep_e1, rate=1)),
+    },
+    points=points,
+    sequence=Sequence("pkt_psn", last=partial(packets, model=E1_SCANNER, dual=(9, 10, 11))),
+    simulation=Simulation(partial(sweep, model=E1_SCANNER)),
+    range_limits=(0.1, 200.0),  # E1 user manual, Table 1; rs_driver's
+    info={"serial": "difop.serial_number", "firmware": "difop.software"},
+    aliases=("rs-e1",),
+    source="E1 user manual, Tables 4 to 9; rs_driver (decoder_RSE1.hpp); no packet of this model was seen",
+)
