@@ -73,7 +73,7 @@ def test_captures_of_others_are_nobodys(name: str) -> None:
 
 @pytest.mark.parametrize("name", ALIKE)
 def test_the_same_frames_without_a_difference_are_said_to_be_the_same(name: str) -> None:
-    for found in verdicts(capture(name)):
+    for found in (one for one in verdicts(capture(name)) if one.scores):  # an IMU sends on a port of its own
         assert found.sensor is None
         assert {score.sensor.id for score in found.alike} == ALIKE[name]
     with pytest.raises(UsageError, match="send the same frames"):
