@@ -160,7 +160,7 @@ class Leaf:
 
     def _whole(self, rows: Bytes2D, element: BitField, wide: np.dtype[Any]) -> NDArray[Any] | None:
         """Values of bits in a row, cut out of the words that end with their bytes; None where there is not so much before, or in a word."""
-        if element.run is None:
+        if element.run is None or len(element.segments) == 1:
             return None
         order, first, count, lowest = element.run
         spare = wide.itemsize - count
