@@ -6,6 +6,7 @@ import functools
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,18 +17,19 @@ from lidarspec.captures.pcap import Datagram, datagram_record
 from lidarspec.captures.records import capture_head
 from lidarspec.simulation.simulator import opening, simulate
 
-#: sensor, frames of a full run, the answer it is configured for.
-SENSORS: dict[str, tuple[str, int, str | None]] = {
-    "m1": ("robosense-m1", 6300, None),
-    "stl27l": ("ldrobot-stl27l", 40_000, None),
-    "m1c1": ("cspc-m1c1-mini", 20_000, None),
-    "vlp16": ("velodyne-vlp16", 2000, None),
-    "vlp32c": ("velodyne-vlp32c", 4000, None),
-    "vls128": ("velodyne-vls128", 12_000, None),
-    "xt32": ("hesai-xt32", 3000, None),
-    "rplidar": ("slamtec-rplidar-a1", 100_000, "node"),
-    "m1-long": ("robosense-m1", 63_000, None),
-    "vlp16-long": ("velodyne-vlp16", 20_000, None),
+#: sensor, frames of a full run, what it is configured for.
+SENSORS: dict[str, tuple[str, int, dict[str, Any]]] = {
+    "m1": ("robosense-m1", 6300, {}),
+    "stl27l": ("ldrobot-stl27l", 40_000, {}),
+    "m1c1": ("cspc-m1c1-mini", 20_000, {}),
+    "vlp16": ("velodyne-vlp16", 2000, {}),
+    "vlp32c": ("velodyne-vlp32c", 4000, {}),
+    "vls128": ("velodyne-vls128", 12_000, {}),
+    "xt32": ("hesai-xt32", 3000, {}),
+    "rplidar": ("slamtec-rplidar-a1", 100_000, {"answer": "node"}),
+    "m1-long": ("robosense-m1", 63_000, {}),
+    "vlp16-long": ("velodyne-vlp16", 20_000, {}),
+    "ouster": ("ouster-os1", 640, {"rows": 128}),
 }
 QUICKER = 50  # times fewer frames in a quick run
 NOISE = 0.02  # share of the frames that is damaged, and share of noise among the bytes
@@ -64,8 +66,8 @@ class Inputs:
 
     def sensor(self, key: str) -> ls.Sensor:
         """The sensor of this name, configured."""
-        name, _, answer = SENSORS[key]
-        return ls.sensor(name).configure(answer=answer) if answer else ls.sensor(name)
+        name, _, options = SENSORS[key]
+        return ls.sensor(name).configure(**options) if options else ls.sensor(name)
 
     def array(self, key: str) -> Bytes:
         """The frames that have the full length, (n, size)."""

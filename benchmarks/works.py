@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -19,6 +20,7 @@ import lidarspec as ls
 from lidarspec.packets.packets import Packets
 from lidarspec.points.plain import evaluate
 from lidarspec.simulation.simulator import opening
+from lidarspec_ouster import nominal
 
 Others = dict[str, Callable[[], Contender]]
 Facts = dict[str, float]
@@ -167,6 +169,28 @@ def velodyne(inputs: Inputs, key: str, title: str) -> Work:
     return Work(title, "points", points, rows.size, lambda backend: points_of(sensor, rows, backend), others)
 
 
+def ouster(inputs: Inputs) -> Work:
+    """Every field and the coordinates, beside the vendor's own library; without CRCs, which that does not check."""
+    sensor, rows = inputs.sensor("ouster"), inputs.array("ouster").copy()
+    rows[:, -8:] = 0
+    frames = [row.tobytes() for row in rows]
+    points = len(sensor.decode(rows).points())
+    metadata = json.loads(nominal("OS1", 128, 1024, "RNG19_RFL8_SIG16_NIR16").told())
+
+    def ours(backend: str) -> Any:
+        cloud = sensor.decode(rows, backend=backend).points()
+        return columns(cloud), [cloud.extra[name] for name in cloud.extra]
+
+    return Work(
+        "Ouster RNG19 packets of 128 pixels, all fields",
+        "points",
+        points,
+        rows.size,
+        lambda backend: lambda: ours(backend),
+        {"ouster-sdk": lambda: libraries.ouster_scans(frames, metadata, points), "plain": lambda: Contender(plainly(sensor, rows), points)},
+    )
+
+
 def rplidar(inputs: Inputs) -> Work:
     some = inputs.frames("rplidar")[: 10 * FEW]
     return in_memory(inputs, "rplidar", "RPLIDAR nodes", {"rplidar": lambda: libraries.rplidar_nodes(some)})
@@ -209,6 +233,7 @@ ON_BYTES: Mapping[str, Callable[[Inputs], Work]] = {
     "vlp32c": lambda inputs: velodyne(inputs, "vlp32c", "VLP-32C packets, look-ahead"),
     "vls128": lambda inputs: velodyne(inputs, "vls128", "VLS-128 packets, look-ahead"),
     "xt32": lambda inputs: in_memory(inputs, "xt32", "Pandar XT32 packets"),
+    "ouster": ouster,
     "rplidar": rplidar,
     "stl27l-stream": stl27l_stream,
     "m1c1-stream": m1c1_stream,

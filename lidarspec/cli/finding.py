@@ -260,6 +260,8 @@ def _conclusions(source: str | None, found: Sequence[Verdict], unknown: Structur
             yield f"next: lidarspec {_verb(one)} {_again(one)} {chosen(one.sensor)}"
         elif one.alike:
             yield f"{_place(one.heard)}: {', '.join(names(one))} send the same frames, and nothing in these tells them apart: choose one"
+            if files := [name for name in one.alike[0].sensor.configure.files if one.alike[0].sensor.recognise is not None]:
+                yield f"which unit it is, and where its beams point, no packet says: -O {files[0]}=FILE does"
             yield f"next: lidarspec {_verb(one)} {_again(one)} {chosen(one.alike[0].sensor)}"
         elif one.others:
             yield f"{_place(one.heard)}: {others_named(one)}"

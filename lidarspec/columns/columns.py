@@ -487,9 +487,13 @@ def field_column(info: FieldInfo, table: Table, depth: int, batch: Batch, which:
     return Column(array, tuple(axes), batch, source=info.path, frame=frame)
 
 
-def field_array(info: FieldInfo, table: Table, depth: int) -> NDArray[np.float64]:
-    """A field in its unit, (n, ...), each array's axis in its place, with `depth` axes at least behind the first, some of length 1."""
-    array, places = physical(info, table), [table.schema.places[axis] for axis in info.axes]
+def field_array(info: FieldInfo, table: Table, depth: int, *, raw: bool = False) -> NDArray[Any]:
+    """A field in its unit, (n, ...), each array's axis in its place, with `depth` axes at least behind the first, some of length 1.
+
+    Args:
+        raw: as it was sent, of its own type.
+    """
+    array, places = table.raw(info.path) if raw else physical(info, table), [table.schema.places[axis] for axis in info.axes]
     if places and places[-1] >= len(places):  # an element of an array in which others stand
         lengths = dict(zip(places, array.shape[1:], strict=True))
         array = array.reshape(len(array), *(lengths.get(place, 1) for place in range(places[-1] + 1)))

@@ -306,6 +306,8 @@ def _each(known: Sequence[Sensor], scored: Callable[[Sensor], Score | None]) -> 
 
 
 def _score(sensor: Sensor, chunks: Sequence[bytes], *, datagrams: bool, sums: Sums | None = None) -> Score | None:
+    if sensor.recognise is not None and datagrams and (options := sensor.recognise(tuple(chunks))):
+        sensor = sensor.configure(**options)
     decoder = Decoder(sensor, stream=not datagrams, sums=sums)
     items = [item for chunk in chunks for item in decoder.feed(chunk)] + decoder.finish()
     number = sum(decoder.stats.frames.get(name, 0) for name in sensor.data_frames)
@@ -331,6 +333,9 @@ def verdict(heard: Heard) -> Verdict:
         why = f"it runs at {heard.baud} baud"
         links = [(score, data_link(score.sensor, Serial)) for score in alike]
         alike = [replace(score, why=why) for score, link in links if link and heard.baud in link.bauds] or alike
+    alike = [
+        replace(score, why=score.why or ", ".join(f"{name}={value}" for name, value in score.sensor.options.items())) for score in alike
+    ]
     ruled_out = [score for score in fitting if score.sensor.id not in {one.sensor.id for one in alike}]
     return Verdict(heard, (*alike, *ruled_out), tuple(alike), told.others)
 

@@ -140,7 +140,7 @@ class Kind(NamedTuple):
 
 def numbers_of(values: NDArray[Any], dtype: Any) -> NDArray[Any]:
     """A column of numbers in its type, of the same shape; nan is 0."""
-    return np.asarray(np.nan_to_num(values), dtype)
+    return np.asarray(np.nan_to_num(values) if values.dtype.kind == "f" else values, dtype)
 
 
 def axis_matrix(axes: Sequence[str]) -> NDArray[np.float64]:

@@ -32,6 +32,8 @@ _MAIN = ("x", "y", "z", "intensity")
 
 #: points of a scan from which on its columns are made for itself; smaller ones share those of so many points.
 LEAST, SHARED = 1 << 14, 1 << 16
+#: bytes of a whole number that float64 holds exactly.
+EXACT = 4
 
 
 class Plain:
@@ -55,6 +57,13 @@ class Plain:
             with np.errstate(all="ignore"):
                 evaluate(node, self._arrays, self._loaded)
         return self._arrays[node]  # type: ignore[no-any-return]
+
+    def sent(self, node: Node) -> NDArray[Any] | None:
+        """Whole numbers of a field as they were sent, (n, ...); None for what is no such field, or not in every packet."""
+        info = self._table.schema.fields.get(node.path) if node.kind == "field" else None
+        if info is None or info.scaled or info.dtype is None or info.dtype.kind not in "iu" or info.dtype.itemsize > EXACT:
+            return None
+        return field_array(info, self._table, self._table.schema.depth(), raw=True) if self._table.present(info.path) is None else None
 
     def know(self, node: Node, column: Column) -> None:
         """Take a result as given."""
@@ -97,9 +106,15 @@ class Share:
             maker.run(self.group.rows[first:stop], values, columns)
 
     def plain(self, name: str) -> NDArray[Any]:
-        """A part of what `points` returned, for every point of the group, evaluated plainly: (packets, *shape of the plan)."""
+        """A part of what `points` returned, for every point of the group, evaluated plainly: (packets, *shape of the plan).
+
+        A further column of whole numbers that is a field as it stands is of their type, all others of float64.
+        """
         part, shape = self.plan.parts[name], (len(self), *self.plan.shape)
-        return np.broadcast_to(deep(self.known.array(part), len(shape) - 1) if isinstance(part, Node) else np.asarray(part), shape)
+        array = self.known.sent(part) if isinstance(part, Node) and name in self.plan.extra else None
+        if array is None:
+            array = self.known.array(part) if isinstance(part, Node) else np.asarray(part)
+        return np.broadcast_to(deep(array, len(shape) - 1) if isinstance(part, Node) else array, shape)
 
     @classmethod
     def part(cls, plan: Plan, batch: Batch, group: Group, remembered: Mapping[int, Column]) -> Share:

@@ -45,14 +45,20 @@ class BitField:
     flag: bool = False
 
     @cached_property
-    def run(self) -> tuple[str, int, int] | None:
-        """The value as whole bytes in a row, if it is: "<" or ">", the first byte, and how many; else None."""
+    def run(self) -> tuple[str, int, int, int] | None:
+        """The value as bits in a row of a number of whole bytes, if it is: "<" or ">", the first byte, how many, and the lowest bit."""
         parts = sorted(self.segments, key=lambda part: part.byte)
-        first, count = parts[0].byte, len(parts)
-        places = [(part.byte - first, part.target) for part in parts]
-        orders = {"<": [(at, 8 * at) for at in range(count)], ">": [(at, 8 * (count - 1 - at)) for at in range(count)]}
-        order = next((name for name, expected in orders.items() if places == expected), None)
-        return None if order is None or any(part.mask != 0xFF or part.low for part in parts) else (order, first, count)
+        first, count = parts[0].byte, parts[-1].byte - parts[0].byte + 1
+        for order, places in (("<", range(count)), (">", range(count - 1, -1, -1))):
+            lowest = {8 * places[part.byte - first] + part.low - part.target for part in parts}
+            if len(lowest) == 1:
+                return order, first, count, lowest.pop()
+        return None
+
+    @cached_property
+    def is_whole(self) -> bool:
+        """Whether it is whole bytes in a row."""
+        return self.run is not None and (self.run[2] * 8, self.run[3]) == (self.width, 0)
 
     def value(self, block: bytes) -> int:
         """The value in one block of bytes."""

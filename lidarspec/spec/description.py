@@ -249,6 +249,7 @@ class Spec:
     state: Mapping[str, Mapping[str, Any]] = field(default_factory=dict, kw_only=True)
     simulation: Simulation = field(default_factory=Simulation, kw_only=True)
     configure: Any = field(default=None, kw_only=True)
+    recognise: Callable[[tuple[bytes, ...]], Mapping[str, Any]] | None = field(default=None, kw_only=True)
     on_open: tuple[str, ...] = field(default=(), kw_only=True)
     on_close: tuple[str, ...] = field(default=(), kw_only=True)
     range_limits: tuple[float, float] = field(kw_only=True)

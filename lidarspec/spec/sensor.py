@@ -102,6 +102,8 @@ class Sensor(Spec):
         state: defaults of other frames' fields for ``f.state``, by frame and path, in units.
         simulation: what a simulated sensor needs beyond all this.
         configure: a function of the sensor and its options, by name, that returns another sensor.
+        recognise: where data frames do not say how they are laid out: a function of datagrams that returns the options of `configure` with
+            which they are read, {} where they are of no such sensor.
         on_open, on_close: names of the commands that are sent when it is opened and closed.
         range_limits: the shortest and the longest range that it can measure, metres.
         vendor_axes: where the vendor's x, y and z point, of forward, back, left, right, up and down, for ``frame="vendor"``.

@@ -213,7 +213,7 @@ def _differing(parsed: Any, raw: Any, path: str = "") -> str | None:
         entries = [(f"{path}[{index}]", value, raw[index]) for index, value in enumerate(parsed)]
     else:
         number = isinstance(parsed, int | float) and np.ndim(raw) == 0
-        return path if number and parsed != raw and parsed == parsed else None
+        return path if number and parsed == parsed and parsed != raw else None
     return next((found for name, value, other in entries if (found := _differing(value, other, name)) is not None), None)
 
 

@@ -159,18 +159,19 @@ class Leaf:
         return total.astype(self.info.dtype, copy=False)
 
     def _whole(self, rows: Bytes2D, element: BitField, wide: np.dtype[Any]) -> NDArray[Any] | None:
-        """Values of whole bytes in a row, cut out of the words that end with them; None where there is not so much before."""
-        if element.run is None or wide.itemsize < 4:
+        """Values of bits in a row, cut out of the words that end with their bytes; None where there is not so much before, or in a word."""
+        if element.run is None or len(element.segments) == 1:
             return None
-        order, first, count = element.run
+        order, first, count, lowest = element.run
         spare = wide.itemsize - count
-        if self.offset + first < spare:
+        if spare < 0 or self.offset + first < spare:
             return None
         total = self._view(rows, np.dtype(f"{order}u{wide.itemsize}"), first - spare).astype(wide)
-        if spare and order == "<":
-            total >>= wide.type(8 * spare)
-        elif spare:
-            total &= wide.type((1 << 8 * count) - 1)
+        lowest += 8 * spare if order == "<" else 0
+        if lowest:
+            total >>= wide.type(lowest)
+        if lowest + element.width < 8 * wide.itemsize:
+            total &= wide.type((1 << element.width) - 1)
         return total
 
     @property

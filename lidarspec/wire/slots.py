@@ -243,8 +243,9 @@ def _slot(leaf: Leaf) -> Slot:
         return Slot("text", leaf.size)
     if leaf.wire is not None:
         return Slot(_KINDS[leaf.wire.kind], leaf.size, 1, leaf.wire.byteorder == "<")
-    element, run = leaf.elements[0], leaf.elements[0].run
-    return Slot("int" if run and element.signed else "uint", leaf.size, 1, run is not None and run[0] == "<")
+    element = leaf.elements[0]
+    order = element.run[0] if element.run is not None and element.is_whole else ""
+    return Slot("int" if order and element.signed else "uint", leaf.size, 1, order == "<")
 
 
 _KINDS: dict[str, Literal["uint", "int", "float"]] = {"u": "uint", "i": "int", "f": "float"}

@@ -160,8 +160,8 @@ def _part(shown: str, part: tree.Part) -> str:
 
 def _bits(part: tree.Part) -> tuple[str, str]:
     """Size and type of a part of a block: bits, or bytes for an integer that is wider than any number."""
-    if part.info.dtype is None and part.bits.run is not None:
-        order, _, size = part.bits.run
+    if part.info.dtype is None and part.bits.run is not None and part.bits.is_whole:
+        order, _, size, _ = part.bits.run
         return str(size), f"{'int' if part.bits.signed else 'uint'}{8 * size} {'be' if order == '>' else 'le'}"
     return f"{part.bits.width} bit{'s' * (part.bits.width > 1)}", bit_text(part.bits)
 

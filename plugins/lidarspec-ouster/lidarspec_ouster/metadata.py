@@ -1,0 +1,209 @@
+"""What a unit says of itself: the layout of its packets and where its beams point, from its metadata (JSON).
+
+Source: ouster-sdk (metadata.cpp, xyzlut.cpp). Files of firmware up to 2.4 are flat, later ones, and the sensor's own web server, have
+sections; both are read.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarspec import UsageError
+from lidarspec.spec import Learned
+from lidarspec_ouster.packets import COLUMNS, PROFILES
+
+Table = NDArray[np.float64]
+
+#: sections of newer metadata, and of older ones.
+SECTIONS = ("sensor_info", "lidar_data_format", "data_format", "beam_intrinsics", "lidar_intrinsics", "imu_intrinsics", "config_params")
+#: the most of each that a sensor has: pixels of a column, columns of a turn.
+ROWS, TURN = 256, 4096
+STILL = tuple(np.eye(4).ravel())
+
+
+@dataclass(frozen=True, eq=False)
+class Unit:
+    """One sensor as its metadata describe it.
+
+    Attributes:
+        profile: how its pixels are packed, of `PROFILES`.
+        turn: columns of a turn.
+        columns: of a packet.
+        window: the first and the last column that it sends.
+        rate: turns a second; 0 where nobody says it.
+        elevation, azimuth: (rows,) degrees, of each beam; azimuth counted clockwise.
+        shifts: (rows,) by how many columns each row lies behind, for a picture: `PointCloud.destaggered`.
+        beam, lidar, imu: (4, 4), millimetres: where the beams leave in the lidar, the lidar in the sensor, and the IMU in it.
+        samples: of an IMU packet; 0 for those of LEGACY.
+        product, serial: as the metadata have them, "" where they do not.
+        nominal: whether this is the model and not a unit.
+    """
+
+    profile: str
+    turn: int
+    columns: int
+    window: tuple[int, int]
+    rate: float
+    elevation: Table
+    azimuth: Table
+    shifts: NDArray[np.int64]
+    beam: Table
+    lidar: Table
+    imu: Table
+    samples: int = 0
+    product: str = ""
+    serial: str = ""
+    nominal: bool = False
+
+    @property
+    def rows(self) -> int:
+        """Pixels of a column."""
+        return len(self.elevation)
+
+    def beams(self) -> tuple[Table, Table]:
+        """Directions (turn, rows, 3), and where each beam would begin if it were straight from range 0 on, (turn, rows, 3) in metres."""
+        encoder = 2 * np.pi * (1 - np.arange(self.turn) / self.turn)[:, None]
+        azimuth, elevation = encoder - np.deg2rad(self.azimuth), np.deg2rad(self.elevation)
+        level = np.cos(elevation)
+        directions = np.stack([np.cos(azimuth) * level, np.sin(azimuth) * level, np.sin(elevation) + 0 * azimuth], axis=-1)
+        out, up = self.beam[0, 3], self.beam[2, 3]
+        lens = np.stack([out * np.cos(encoder), out * np.sin(encoder), up + 0 * encoder], axis=-1)
+        starts = lens - directions * np.hypot(out, up)
+        turned = self.lidar[:3, :3].T
+        return directions @ turned, (starts @ turned + self.lidar[:3, 3]) / 1000
+
+    def told(self) -> bytes:
+        """The metadata, as the web server of such a sensor would give them."""
+        first, last = self.window
+        return json.dumps(
+            {
+                "sensor_info": {"prod_line": self.product, "prod_sn": self.serial},
+                "lidar_data_format": {
+                    "columns_per_frame": self.turn,
+                    "columns_per_packet": self.columns,
+                    "pixels_per_column": self.rows,
+                    "column_window": [first, last],
+                    "pixel_shift_by_row": self.shifts.tolist(),
+                    "udp_profile_lidar": self.profile,
+                    "udp_profile_imu": "ACCEL32_GYRO32_NMEA" if self.samples else "LEGACY",
+                    **({"imu_measurements_per_packet": self.samples} if self.samples else {}),
+                },
+                "beam_intrinsics": {
+                    "beam_altitude_angles": self.elevation.tolist(),
+                    "beam_azimuth_angles": self.azimuth.tolist(),
+                    "beam_to_lidar_transform": self.beam.ravel().tolist(),
+                },
+                "lidar_intrinsics": {"lidar_to_sensor_transform": self.lidar.ravel().tolist()},
+                "imu_intrinsics": {"imu_to_sensor_transform": self.imu.ravel().tolist()},
+                "config_params": {"lidar_mode": f"{self.turn}x{self.rate:g}"},
+            }
+        ).encode()
+
+
+def read(metadata: str | Path | Learned) -> Unit:
+    """The unit that a file, or the sensor itself, describes.
+
+    Raises:
+        UsageError: for what cannot be read, or lacks what the points need; with the key.
+    """
+    name = "the sensor's metadata" if isinstance(metadata, Learned) else str(metadata)
+    try:
+        data = json.loads(Learned.content(metadata))
+    except (ValueError, RecursionError) as error:
+        raise UsageError(f"{name}: no metadata of an Ouster sensor: {error}") from error
+    if not isinstance(data, dict):
+        raise UsageError(f"{name}: no metadata of an Ouster sensor: a {type(data).__name__}, not an object")
+    flat: dict[str, Any] = dict(data)
+    for section in SECTIONS:
+        flat |= data[section] if isinstance(data.get(section), dict) else {}
+    return Facts(name, flat).unit()
+
+
+@dataclass(frozen=True)
+class Facts:
+    """Metadata without their sections, and where they come from."""
+
+    name: str
+    data: Mapping[str, Any]
+
+    def unit(self) -> Unit:
+        """The unit.
+
+        Raises:
+            UsageError: for a key that is missing, or has a value that cannot be.
+        """
+        elevation = self._numbers("beam_altitude_angles", None)
+        rows, mode = len(elevation), str(self.data.get("lidar_mode", ""))
+        turn, _, rate = mode.partition("x")
+        columns = self._whole("columns_per_packet", COLUMNS, COLUMNS)
+        width = self._whole("columns_per_frame", TURN, int(turn) if turn.isdecimal() else None)
+        if self._whole("pixels_per_column", ROWS, rows) != rows:
+            raise self._fault("beam_altitude_angles", f"{rows} angles for {self.data['pixels_per_column']} pixels of a column")
+        if width % columns:
+            raise self._fault("columns_per_frame", f"{width} is no multiple of {columns} columns in a packet")
+        first, last = map(int, self._numbers("column_window", 2, (0, width - 1)))
+        beam = self._transform("beam_to_lidar_transform", None)
+        if beam is None:
+            beam = np.eye(4)
+            beam[0, 3] = self._numbers("lidar_origin_to_beam_origin_mm", 1)[0]
+        measured = self.data.get("udp_profile_imu", "LEGACY") == "ACCEL32_GYRO32_NMEA"
+        return Unit(
+            profile=self._profile(),
+            turn=width,
+            columns=columns,
+            window=(first, last),
+            rate=float(rate) if rate.isdecimal() else 0.0,
+            elevation=elevation,
+            azimuth=self._numbers("beam_azimuth_angles", rows),
+            shifts=self._numbers("pixel_shift_by_row", rows, (0,) * rows).astype(np.int64),
+            beam=beam,
+            lidar=self._transform("lidar_to_sensor_transform", STILL),
+            imu=self._transform("imu_to_sensor_transform", STILL),
+            samples=self._whole("imu_measurements_per_packet", ROWS, None) if measured else 0,
+            product=str(self.data.get("prod_line", "")),
+            serial=str(self.data.get("prod_sn", "")),
+        )
+
+    def _profile(self) -> str:
+        profile = str(self.data.get("udp_profile_lidar", "LEGACY"))
+        if profile not in PROFILES:
+            raise self._fault("udp_profile_lidar", f"{profile[:60]} is none of {', '.join(PROFILES)}")
+        return profile
+
+    def _numbers(self, key: str, count: int | None, usual: tuple[float, ...] | None = None) -> Table:
+        """So many finite numbers; `usual` where the key is missing."""
+        given = self.data.get(key, usual)
+        try:
+            numbers = np.atleast_1d(np.array(given, np.float64))
+        except (TypeError, ValueError):
+            numbers = np.array([np.nan])
+        if given is None or numbers.ndim != 1 or not 1 <= len(numbers) <= ROWS or not np.isfinite(numbers).all():
+            raise self._fault(key, "is missing" if given is None else "is no list of numbers")
+        if count is not None and len(numbers) != count:
+            raise self._fault(key, f"has {len(numbers)} numbers, not {count}")
+        return numbers
+
+    def _whole(self, key: str, most: int, usual: int | None) -> int:
+        number = self.data.get(key, usual)
+        if not isinstance(number, int) or isinstance(number, bool) or not 1 <= number <= most:
+            raise self._fault(key, "is missing" if number is None else f"is not within 1 .. {most}")
+        return number
+
+    def _transform(self, key: str, usual: tuple[float, ...] | None) -> Any:
+        """(4, 4), of 16 numbers in a row or in four; None where the key is missing and `usual` is None."""
+        if usual is None and key not in self.data:
+            return None
+        given = self.data.get(key, usual)
+        if isinstance(given, list) and all(isinstance(row, list) for row in given):
+            given = [number for row in given for number in row]
+        return Facts(self.name, {key: given})._numbers(key, 16).reshape(4, 4)
+
+    def _fault(self, key: str, reason: str) -> UsageError:
+        return UsageError(f"{self.name}: no metadata of an Ouster sensor: {key} {reason}")
