@@ -7,8 +7,8 @@ leaves the CRC of point packets 0: these are taken as they are.
 Source: Livox Mid-360 protocol document 1.4.10 and Livox-SDK2 08f523c (livox_lidar_def.h), HAP protocol document 1.4.8 where they
 differ; rates, ranges and fields of view: the user manuals (HAP: table 1.2.1). livox_ros_driver2 divides `time_interval` by the number of
 points, the document by one less: the driver's rule is taken, which differs by 1 %. That a HAP takes the commands of a Mid-360 is
-assumed from the SDK, which sends it the same. Commands for logs and firmware are not here. Keys whose values are not known are passed on as
-bytes.
+assumed from the SDK, which sends it the same; where its state goes is not known, and not asked for. Commands for logs and firmware are
+not here. Keys whose values are not known are passed on as bytes.
 """
 
 from __future__ import annotations
@@ -56,6 +56,7 @@ from lidarspec_livox.points import (
     spherical,
 )
 
+DISCOVERY = 56_000  # the port that is asked by a broadcast
 REBOOT, FACTORY_SETTINGS, SET_GPS_TIME = 0x0200, 0x0201, 0x0202
 CRC32 = Crc(32, 0x04C11DB7, init=0xFFFFFFFF, refin=True, refout=True, xorout=0xFFFFFFFF)
 CRC16 = Crc(16, 0x1021, init=0xFFFF)
@@ -314,7 +315,6 @@ def work(mode: int, **more: Any) -> Command:
 
 FAR = 1000.0  # metres that it can be mounted away from where its points are counted from, and degrees that angles go
 COMMANDS: dict[str, Command] = {
-    "discover": asking("discover", "discovery", link="discovery"),
     "start": work(1, starts=True),
     "stop": work(2, stops=True),
     "set_point_type": one_of("point_type", 1, 3),
@@ -344,14 +344,16 @@ COMMANDS: dict[str, Command] = {
 }
 
 
-#: id -> model, device type, ports of the Lidar (commands, state, points, IMU), of the host, points a second, view, ranges, aliases.
-Model = tuple[str, int, tuple[int, ...], tuple[int, ...], int, View, tuple[float, float], tuple[str, ...]]
-MODELS: dict[str, Model] = {
+#: what is sent to the host -> the port of the Lidar, and that of the host.
+Ports = dict[str, tuple[int, int]]
+#: id -> model, device type, port of the Lidar for commands and of the host, ports of the rest, points a second, view, ranges, other ids.
+MODELS: dict[str, tuple[str, int, int, int, Ports, int, View, tuple[float, float], tuple[str, ...]]] = {
     "livox-mid360": (
         "Mid-360",
         9,
-        (56_100, 56_200, 56_300, 56_400),
-        (56_101, 56_201, 56_301, 56_401),
+        56_100,
+        56_101,
+        {"point": (56_300, 56_301), "imu": (56_400, 56_401), "state": (56_200, 56_201)},
         200_000,
         (-180, 180, -7, 52),
         (0.1, 70.0),
@@ -360,8 +362,9 @@ MODELS: dict[str, Model] = {
     "livox-hap": (
         "HAP",
         15,
-        (56_000, 56_000, 57_000, 58_000),
-        (56_000, 56_000, 57_000, 58_000),
+        DISCOVERY,
+        0,
+        {"point": (57_000, 57_000), "imu": (58_000, 58_000)},
         452_000,
         (-60, 60, -12.5, 12.5),
         (0.5, 150.0),
@@ -372,7 +375,8 @@ MODELS: dict[str, Model] = {
 
 def lidar(name: str) -> Sensor:
     """One row of the table as a sensor."""
-    model, device_type, (control, *sources), (local, *ports), rate, view, limits, aliases = MODELS[name]
+    model, device_type, control, local, ports, rate, view, limits, aliases = MODELS[name]
+    discovery = "control" if control == DISCOVERY else "discovery"
     found = {"result": 0, "device_type": device_type, "serial": b"SIMULATED", "address": bytes([127, 0, 0, 1]), "command_port": control}
     return Sensor(
         name,
@@ -382,21 +386,21 @@ def lidar(name: str) -> Sensor:
         points=None,
         scan=Every(0.1),
         links={
-            "data": Udp(*dict.fromkeys(ports[1:] + ports[:1])),
+            "data": Udp(*(port for _, port in ports.values())),
             "control": Udp(control, local=local),
-            "discovery": Udp(56_000, broadcast=56_000),
+            discovery: Udp(DISCOVERY, broadcast=DISCOVERY),
         },
         commands={
+            "discover": asking("discover", "discovery", link=discovery),
             **COMMANDS,
-            **{
-                f"set_{what}_host": host(f"{what}_host", port, source)
-                for what, port, source in zip(("state", "point", "imu"), ports, sources, strict=True)
-            },
+            **{f"set_{what}_host": host(f"{what}_host", port, source) for what, (source, port) in ports.items()},
         },
         clock=Clock("timestamp"),
         sequence=Sequence("udp_cnt"),
-        simulation=simulation(rate, view, answers={"discover": (("discovery", found),)}),
-        on_open=("discover", "set_point_host", "set_imu_host", "set_state_host", "start"),
+        simulation=simulation(
+            rate, view, answers={"discover": (("discovery", found),), "get_state": (("parameters", {"result": 0, **state(0)}),)}
+        ),
+        on_open=("discover", *(f"set_{what}_host" for what in ports), "start"),
         on_close=("stop",),
         range_limits=limits,
         vendor_axes=("forward", "left", "up"),
