@@ -57,7 +57,7 @@ CRC32 = Crc(32, 0x04C11DB7, init=0xAFE50D95, refin=True, refout=True, xorout=0xF
 FARTHEST = 1000.0  # metres; twice what the Tele-15 sees
 GPS = 3  # the type of timestamps that are a date
 IMU_RATE = 200  # samples a second
-MODEL_TYPES = "1 Mid-40, 2 Tele-15, 3 Horizon, 6 Mid-70, 7 Avia"
+MODEL_TYPES = "1 Mid-40, 2 Tele-15, 3 Horizon LiDAR, 6 Mid-70, 7 Avia"
 STATES = "0 starts, 1 normal, 2 saves power, 3 stands by, 4 error"
 LONG = {"LS711": "packets of points have up to 1362 bytes: those that were worked out are in the project's tests"}
 COMMAND_PORT, DATA_PORT, IMU_PORT = 55_501, 56_001, 56_002  # of this computer

@@ -373,6 +373,11 @@ MODELS: dict[str, tuple[str, int, int, int, Ports, int, View, tuple[float, float
 }
 
 
+def told(request: Mapping[str, Any]) -> tuple[Any, ...]:
+    """What a simulated one answers where it is asked for its state."""
+    return (("parameters", {"result": 0, **state(request["head.seq"])}),)
+
+
 def lidar(name: str) -> Sensor:
     """One row of the table as a sensor."""
     model, device_type, control, local, ports, rate, view, limits, aliases = MODELS[name]
@@ -397,9 +402,7 @@ def lidar(name: str) -> Sensor:
         },
         clock=Clock("timestamp"),
         sequence=Sequence("udp_cnt"),
-        simulation=simulation(
-            rate, view, answers={"discover": (("discovery", found),), "get_state": (("parameters", {"result": 0, **state(0)}),)}
-        ),
+        simulation=simulation(rate, view, answers={"discover": (("discovery", found),), "get_state": told}),
         on_open=("discover", *(f"set_{what}_host" for what in ports), "start"),
         on_close=("stop",),
         range_limits=limits,
