@@ -327,7 +327,7 @@ def lidar(name: str) -> Sensor:
         on_close=("stop", "disconnect"),
         range_limits=limits,
         vendor_axes=("forward", "left", "up"),
-        relatives={other: "the device type in what it broadcasts" for other in MODELS if other != name},
+        relatives={other: "the device type in what it broadcasts" for other in MODELS if other != name and MODELS[other][2] == rate},
         info={"serial": "broadcast.broadcast_code", "model": "broadcast.device_type", "firmware": "firmware.firmware"},
         aliases=aliases,
         status="vectors",
