@@ -80,7 +80,9 @@ def told_apart(candidates: Sequence[Sensor], found: Mapping[str, Sequence[Found]
     left = [sensor for sensor in candidates if not shown[sensor.id]]
     if not left:
         return Told({}, {name: why for seen in shown.values() for name, why in seen.items() if name not in ids})
-    spoken_for = _spoken_for(left, _by_clock, found) or _spoken_for(left, _by_name, found)
+    timed = _spoken_for(left, _by_clock, found)
+    named_among = [sensor for sensor in left if sensor.id in timed] or left
+    spoken_for = timed if len(timed) == 1 else _spoken_for(named_among, _by_name, found) or timed
     if spoken_for:
         return Told(spoken_for, {})
     reasons = {name: why for seen in shown.values() for name, why in seen.items()}

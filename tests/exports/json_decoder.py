@@ -105,7 +105,10 @@ class Decoder:
         start = self.at
         for kind in kinds:
             self.at = start
-            value = self.read(kind["part"])
+            try:
+                value = self.read(kind["part"])
+            except AssertionError:  # it would be longer than what is left
+                continue
             constants = {member["name"]: member.get("const") for member in kind["part"]["members"] if member.get("const") is not None}
             if all(value[name] == const for name, const in constants.items()):
                 return value, kind

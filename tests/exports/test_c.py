@@ -35,6 +35,8 @@ REFUSED = {
     "shape-segments": f"segments: {_PARTS}",
     "shape-tags": f"tags: {_PARTS}",
     "shape-channels": f"channels: {_PARTS}",
+    **dict.fromkeys(("livox-mid360", "livox-hap"), f"parameters: {_PARTS}"),
+    "ti-iwr6843": f"tlvs: {_PARTS}",
     **dict.fromkeys(("shape-tokens", "shape-lines", "shape-escaped"), "no other language recodes"),
 }
 SENSORS = {name: sensor for name, sensor in DISTINCT.items() if name not in REFUSED}

@@ -1,0 +1,70 @@
+"""What both generations have in common: what a point is, what an IMU feels, and where a simulated one looks.
+
+Source: Livox-SDK 9306596 (livox_def.h) and Livox-SDK2 08f523c (livox_lidar_def.h), which have the same points.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from construct import Array, Const, Float32l, Int8ul, Int16sl, Int16ul, Int32sl, Int32ul, Struct
+
+from lidarspec.spec import Cartesian, Fields, Imu, Polar, Scaled
+
+#: degrees to the right, to the left, below and above that a Lidar sees.
+View = tuple[float, float, float, float]
+SOF = "sof" / Const(b"\xaa")
+GRAVITY = 9.80665  # m/s2
+REFLECTIVITY = "reflectivity" / Int8ul * "up to 150 as of a diffuse target, 0 to 100 %; above as of a retroreflector"
+TAG = "tag" / Int8ul * "doubts about the point, and of the first generation its return; 0: none"
+MILLIMETRES = tuple(axis / Scaled(Int32sl, 0.001, "m") for axis in "xyz")
+CENTIMETRES = tuple(axis / Scaled(Int16sl, 0.01, "m") for axis in "xyz")
+DEPTH = ("depth" / Scaled(Int32ul, 0.001, "m"),)
+DIRECTION = ("zenith" / Scaled(Int16ul, 0.01, "deg") * "from the z axis", "azimuth" / Scaled(Int16ul, 0.01, "deg"))
+INERTIAL = (
+    *(f"gyro_{axis}" / Scaled(Float32l, 1, "rad/s") for axis in "xyz"),
+    *(f"acc_{axis}" / Scaled(Float32l, GRAVITY, "m/s2") * "in g" for axis in "xyz"),
+)
+
+
+def echoes(number: int, *members: Any) -> Any:
+    """The returns of one shot."""
+    return "returns" / Array(number, Struct(*members, REFLECTIVITY, TAG))
+
+
+def cartesian(f: Fields, time: Any, *, returns: int = 1, tagged: bool = True) -> Cartesian:
+    """Points as they stand on the wire, in REP-103 axes already; three zeros are no return."""
+    place = f.points if returns == 1 else f.points.returns
+    return Cartesian(place.x, place.y, place.z, **_common(place, time, returns, tagged))
+
+
+def spherical(f: Fields, time: Any, *, returns: int = 1, tagged: bool = True) -> Polar:
+    """Points by depth and direction, whose zenith angle is counted from the z axis."""
+    place = f.points if returns == 1 else f.points.returns
+    azimuth, elevation = np.deg2rad(f.points.azimuth), np.deg2rad(90 - f.points.zenith)
+    return Polar(place.depth, azimuth, elevation, **_common(place, time, returns, tagged))
+
+
+def _common(place: Fields, time: Any, returns: int, tagged: bool) -> dict[str, Any]:
+    return {
+        "intensity": place.reflectivity,
+        "time": time,
+        "return_index": np.arange(returns) if returns > 1 else None,
+        "extra": {"tag": place.tag} if tagged else {},
+    }
+
+
+def imu(f: Fields) -> Imu:
+    """Rates and forces, in the axes of the points."""
+    return Imu((f.gyro_x, f.gyro_y, f.gyro_z), (f.acc_x, f.acc_y, f.acc_z))
+
+
+def looking(shots: Any, rate: float, view: View) -> tuple[Any, Any]:
+    """Azimuth and elevation, degrees, of shots with these numbers, at so many a second.
+
+    The real pattern never repeats and is not published: here a wave goes up and down 610 times a second, and across 7.3 times.
+    """
+    right, left, low, high = view
+    across, up = np.sin(2 * np.pi * 7.3 * shots / rate), np.sin(2 * np.pi * 610 * shots / rate)
+    return (right + left + (left - right) * across) / 2, (low + high + (high - low) * up) / 2
