@@ -159,6 +159,8 @@ class Column(NDArrayOperatorsMixin):
     def on(self, *axes: str) -> Column:
         """The column's values on other axes, by the names of any arrays of the frame; its own axes go to the last of those named.
 
+        Where they are fewer than that array has elements, as in frames that lack theirs, the others are nan.
+
         Raises:
             SpecError: for fewer axes than the column has, or an array that the frame does not have.
         """
@@ -167,9 +169,16 @@ class Column(NDArrayOperatorsMixin):
         if len(axes) < len(own):
             raise SpecError(f"a column with {len(own)} axes cannot be put on {axes}")
         names = {schema.places[axis]: axis for axis in map(schema.axis, axes)}
-        lengths = dict(zip(sorted(names)[len(axes) - len(own) :], (self.array.shape[1 + index] for index in own), strict=True))
+        targets = sorted(names)[len(axes) - len(own) :]
+        short = [self.batch.table.length(names[place]) - self.array.shape[1 + index] for place, index in zip(targets, own, strict=True)]
+        array = self.array
+        if any(missing > 0 for missing in short):
+            more = dict(zip(own, short, strict=True))
+            gaps = [(0, 0), *((0, max(more.get(index, 0), 0)) for index in range(array.ndim - 1))]
+            array = np.pad(array.astype(np.float64), gaps, constant_values=np.nan)
+        lengths = {place: array.shape[1 + index] for place, index in zip(targets, own, strict=True)}
         depth = max(schema.depth(), len(self.axes), *(place + 1 for place in names))
-        array = self.array.reshape(self.array.shape[0], *(lengths.get(place, 1) for place in range(depth)))
+        array = array.reshape(array.shape[0], *(lengths.get(place, 1) for place in range(depth)))
         return Column(array, tuple(names[place] if place in lengths else None for place in range(depth)), self.batch, ready=self.ready)
 
     @property
@@ -179,10 +188,12 @@ class Column(NDArrayOperatorsMixin):
         Raises:
             SpecError: where they are in none.
         """
-        places = [place for place, name in enumerate(self.axes) if name is not None]
-        if not places:
+        schema, names = self.batch.table.schema, [str(name).strip("?") for name in self.axes if name is not None]
+        if not names and not self.frame and self.source in schema.fields:  # of one element in all packets
+            names = list(schema.fields[self.source].axes)
+        if not names:
             raise SpecError("there is an index of arrays only, and these values are in none")
-        return Along((str(self.axes[places[-1]]).strip("?"),), np.arange(self.array.shape[1 + places[-1]]))
+        return Along((names[-1],), np.arange(self.array.shape[1 + schema.places[names[-1]]]))
 
     def steps(self) -> Along | NDArray[np.intp]:
         """0, 1, 2 ... up to the largest value, (m,): the indices of the array of which this column is the count."""
