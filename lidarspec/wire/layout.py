@@ -293,7 +293,7 @@ class PartsRegion(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Refused:
-    """A header that leads to no frame: too long (with its `values`), a constant is wrong, or an expression of the plugin failed (`error`)."""
+    """A header that leads to no frame: too long (its `values`), a constant is wrong, or an expression of the plugin failed (`error`)."""
 
     error: PluginError | None = None
     by_constant: bool = False

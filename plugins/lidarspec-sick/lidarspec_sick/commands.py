@@ -122,7 +122,7 @@ def commands(scan: str) -> dict[str, Command]:
 
 
 #: what a simulated scanner answers, where that is more than the reply as it stands.
-ANSWERS = {
+ANSWERS: dict[str, Any] = {
     "get_state": (("state", {"readiness": 1}),),
     "get_firmware": (("firmware", {"text": b"V1.0"}),),
 }
