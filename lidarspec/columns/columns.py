@@ -159,6 +159,8 @@ class Column(NDArrayOperatorsMixin):
     def on(self, *axes: str) -> Column:
         """The column's values on other axes, by the names of any arrays of the frame; its own axes go to the last of those named.
 
+        Where they are fewer than that array has elements, as in frames that lack theirs, the others are nan.
+
         Raises:
             SpecError: for fewer axes than the column has, or an array that the frame does not have.
         """
@@ -167,10 +169,9 @@ class Column(NDArrayOperatorsMixin):
         if len(axes) < len(own):
             raise SpecError(f"a column with {len(own)} axes cannot be put on {axes}")
         names = {schema.places[axis]: axis for axis in map(schema.axis, axes)}
-        places = sorted(names)[len(axes) - len(own) :]
-        array = self.array
+        places, array = sorted(names)[len(axes) - len(own) :], self.array
         for index, place in zip(own, places, strict=True):
-            array = array.take(range(_reach(self.batch.table, names[place], array.shape[1 + index])), axis=1 + index)
+            array = _reaching(array, 1 + index, self.batch.table, names[place])
         lengths = dict(zip(places, (array.shape[1 + index] for index in own), strict=True))
         depth = max(schema.depth(), len(self.axes), *(place + 1 for place in names))
         array = array.reshape(len(array), *(lengths.get(place, 1) for place in range(depth)))
@@ -183,10 +184,12 @@ class Column(NDArrayOperatorsMixin):
         Raises:
             SpecError: where they are in none.
         """
-        places = [place for place, name in enumerate(self.axes) if name is not None]
-        if not places:
+        schema, names = self.batch.table.schema, [str(name).strip("?") for name in self.axes if name is not None]
+        if not names and not self.frame and self.source in schema.fields:  # of one element in all packets
+            names = list(schema.fields[self.source].axes)
+        if not names:
             raise SpecError("there is an index of arrays only, and these values are in none")
-        return Along((str(self.axes[places[-1]]).strip("?"),), np.arange(self.array.shape[1 + places[-1]]))
+        return Along((names[-1],), np.arange(self.array.shape[1 + schema.places[names[-1]]]))
 
     def steps(self) -> Along | NDArray[np.intp]:
         """0, 1, 2 ... up to the largest value, (m,): the indices of the array of which this column is the count."""
@@ -417,6 +420,15 @@ def _reach(table: Table, axis: str, length: int) -> int:
     """How far along an axis values are; no further than the array where frames say its length and have no array around it."""
     around = [other for other in table.schema.arrays if axis.startswith(other) and axis != other]
     return min(length, table.length(axis)) if any((table.counts(other) == 0).any() for other in around) else length
+
+
+def _reaching(array: NDArray[Any], place: int, table: Table, axis: str) -> NDArray[Any]:
+    """An array at a place of its shape as far along an axis as frames go; nan where they have nothing to put there."""
+    length = array.shape[place]
+    if not length:
+        return np.full((*array.shape[:place], table.length(axis), *array.shape[place + 1 :]), np.nan)
+    reach = _reach(table, axis, length)
+    return array if reach == length else array.take(range(reach), axis=place)
 
 
 def together(arrays: Mapping[str, NDArray[Any]], axes: tuple[str | None, ...]) -> tuple[int, ...]:

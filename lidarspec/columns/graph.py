@@ -175,9 +175,14 @@ class Traced(NDArrayOperatorsMixin):
         """0, 1, 2 ... along the innermost array that the values are in."""
         return self.node.sample.index
 
-    def on(self, *axes: str) -> Traced:
-        """The value on other axes, by the names of arrays, noted down."""
-        return self._tape.add("on", lambda column: column.on(*axes), (self,), self.node.sample.on(*axes))
+    def on(self, *axes: str) -> Any:
+        """The value on other axes, by the names of arrays, noted down; nan where frames of this layout lack the array that it is in."""
+        sample = self.node.sample.on(*axes)
+        if sample.array.size != self.node.sample.array.size:
+            if not self.node.sample.array.size:
+                return np.nan
+            raise Untraceable("an array shorter than the one that it is put on")
+        return self._tape.add("on", lambda column: column.on(*axes), (self,), sample)
 
     def gathered(self, table: NDArray[np.float64]) -> Traced:
         """The rows of a table at these indices, noted down."""

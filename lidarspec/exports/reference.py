@@ -19,7 +19,7 @@ from lidarspec.points.cloud import PointCloud
 from lidarspec.points.plain import evaluate
 from lidarspec.spec import Command, Frame, Sensor
 from lidarspec.spec.links import Http, Link, Serial, Tcp, Udp
-from lidarspec.spec.timing import Clock, Every, Split
+from lidarspec.spec.timing import Clock, Every, OnFlag, Split
 from lidarspec.wire.wire_table import frame_size, wire_table
 
 STATUSES = {
@@ -83,7 +83,11 @@ def _levels(lines: Mapping[str, bool | None]) -> list[str]:
 
 
 def _rule(scan: Split) -> str:
-    return f"every {scan.seconds:g} s" if isinstance(scan, Every) else RULES[type(scan).__name__].format(**vars(scan))
+    if isinstance(scan, Every):
+        return f"every {scan.seconds:g} s"
+    if isinstance(scan, OnFlag) and scan.value is not None:
+        return f"before every packet in which `{scan.name}` is {scan.value:g}"
+    return RULES[type(scan).__name__].format(**vars(scan))
 
 
 def _clock(clock: Clock) -> str:

@@ -294,6 +294,8 @@ class RecodedCodec(Codec):
                 errors += [layout.error] if layout.error else []
                 continue
             own = whole[which] if is_read.all() else whole[which[is_read]]
+            if not len(own):
+                continue
             good = rows if len(own) == len(which) else rows[is_read]
             status[own] = self._judged(layout, good, errors, sums)
             groups.append((layout, own, good))

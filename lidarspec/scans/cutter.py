@@ -118,7 +118,7 @@ class Cutter:
 
     def _changes(self, rule: OnFlag | OnChange | OnRewind, values: NDArray[np.float64]) -> NDArray[np.intp]:
         if isinstance(rule, OnFlag):
-            return np.flatnonzero(values != 0)
+            return np.flatnonzero(values != 0 if rule.value is None else values == rule.value)
         if not len(values):
             return np.empty(0, np.intp)
         before = _before(values, self._before)

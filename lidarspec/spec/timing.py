@@ -26,9 +26,10 @@ class OnWrap:
 
 @dataclass(frozen=True)
 class OnFlag:
-    """Cut before every packet (or row of an array) in which the field `name` is not 0."""
+    """Cut before every packet (or row of an array) in which the field `name` is not 0, or is `value` where that is given."""
 
     name: str
+    value: float | None = None
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,8 @@ from lidarspec.columns.graph import Traced, Untraceable
 from lidarspec.errors import LidarSpecError, SpecError, did_you_mean
 from lidarspec.framing.frame_engine import CompiledCodec, codec
 from lidarspec.points.conventions import TYPES
+from lidarspec.simulation.scenes import Room
+from lidarspec.simulation.simulator import simulation
 from lidarspec.spec import Clock, Frame, OnWrap, Sensor
 from lidarspec.spec.construct_layer import is_expression
 from lidarspec.spec.fields import factor, is_unit
@@ -127,6 +129,8 @@ def _longest(subject: Subject, name: str, frame: Frame) -> Findings:
     """A longest length that frames of random content do not come near to: damage is waited for that much longer."""
     try:
         sizes = [len(subject.example(name, seed=seed)) for seed in range(12)]
+        if name in subject.sensor.data_frames and subject.sensor.simulation_of(name).sweep is not None:
+            sizes.append(len(simulation(subject.sensor, name).block(0, 1, Room(), 0.0).frames[0]))
     except LidarSpecError:  # said elsewhere
         return
     if FAR * max(sizes) < frame.max_length:
@@ -183,7 +187,7 @@ def _covered(name: str, layouts: list[Layout]) -> Findings:
         under = {byte for seal in layout.seals for start, end in seal.spans for byte in range(start, end)}
         sealing = {leaf.info.path for seal in layout.seals for leaf in seal.leaves}
         for path, leaf in layout.leaves.items():
-            if path in sealing or leaf.info.const is not None or path in reported or 0 in leaf.shape:
+            if path in sealing or leaf.info.const is not None or leaf.info.held or path in reported or 0 in leaf.shape:
                 continue
             own = {leaf.offset} if leaf.wire is not None else {leaf.offset + part.byte for part in leaf.elements[0].segments}
             if not own <= under:

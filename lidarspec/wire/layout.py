@@ -294,10 +294,11 @@ class PartsRegion(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Refused:
-    """A header that leads to no frame: too long, a constant of its parts is wrong, or an expression of the plugin failed (`error`)."""
+    """A header that leads to no frame: too long (its `values`), a constant is wrong, or an expression of the plugin failed (`error`)."""
 
     error: PluginError | None = None
     by_constant: bool = False
+    values: Mapping[str, int] | None = None
 
 
 @dataclass(frozen=True, eq=False)

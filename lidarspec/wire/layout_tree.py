@@ -544,11 +544,35 @@ class HeaderTree:
     def classify(self, buffer: NDArray[np.uint8], offsets: NDArray[np.intp]) -> list[Group]:
         """The candidates at `offsets`, sorted by layout: (layout or refusal, indices) for each, without those whose header is cut off."""
 
+        refuted = list[NDArray[np.intp]]()
+
         def read(node: HeaderNode, which: NDArray[np.intp]) -> tuple[NDArray[np.intp] | None, NDArray[Any]]:
             assert node.leaf is not None
-            return node.leaf.read(buffer, offsets[which])
+            there, values = node.leaf.read(buffer, offsets[which])
+            if there is not None:
+                cut = np.delete(which, there)
+                refuted.append(cut[self._refuted(node.values, buffer, offsets[cut])])
+            return there, values
 
-        return self.sorted(len(offsets), read)
+        groups = list[Group]()
+        for result, which in self.sorted(len(offsets), read):
+            if not isinstance(result, Refused) or result.values is None:
+                groups.append((result, which))
+                continue
+            wrong = self._refuted(result.values, buffer, offsets[which])
+            refuted.append(which[wrong])
+            groups.append((result, which[~wrong]))
+        return groups + [(Refused(by_constant=True), which) for which in refuted if len(which)]
+
+    def _refuted(self, values: Mapping[str, int], buffer: NDArray[np.uint8], offsets: NDArray[np.intp]) -> NDArray[np.bool_]:
+        """Which candidates with these header fields have a wrong constant before the field that is cut off, or before they are too long."""
+        walk, wrong = _Walk(values, self._limit, self._given), np.zeros(len(offsets), np.bool_)
+        with contextlib.suppress(Exception):  # up to there
+            walk.visit(self._frame, "")
+        for spot, (mask, value) in walk.constants.items() if len(offsets) else ():
+            there = offsets + spot < len(buffer)
+            wrong[there] |= buffer[offsets[there] + spot] & mask != value
+        return wrong
 
     def sorted(self, number: int, read: Reader) -> list[Group]:
         """So many candidates by layout, as `classify` has them, whose header fields `read` reads."""
@@ -642,7 +666,7 @@ class HeaderTree:
             node.leaf, node.before = unknown.leaf, unknown.before
             node.told = self._telling(node.leaf)
         except TooLong:
-            node.result = Refused()
+            node.result = Refused(values=node.values)
         except Unlike:
             node.result = Refused(by_constant=True)
         except SpecError:

@@ -1,0 +1,18 @@
+"""SICK scanners: those that send LMDscandata, and multiScan and picoScan with compact telegrams."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from lidarspec.spec import Sensor, hookimpl
+from lidarspec_sick.compact import COMPACT
+from lidarspec_sick.scanners import SCANNERS
+
+TIM551, TIM561, TIM571, TIM781, TIM781S, TIM871S, LMS111, LMS151, LMS511, MRS1104 = SCANNERS
+MULTISCAN136, PICOSCAN150 = COMPACT
+
+
+@hookimpl
+def lidarspec_sensors() -> Iterable[Sensor]:
+    """The SICK scanners."""
+    return [*SCANNERS, *COMPACT]

@@ -1,0 +1,188 @@
+"""multiScan100 and picoScan100: telegrams in the compact format over UDP, of scans and of the IMU.
+
+Source: sick_scan_xd (compact_parser.cpp and its unit tests) for the layout, of versions 3 and 4; multiScan136 operating instructions
+8027119 for segments and layers. A telegram is a chain of modules under one CRC; each has its own layers, beams and echoes, and its
+azimuths on the wire, or evenly between those of its first and last beam. Elevation counts downwards. The property of a beam says by
+bit 0 that a reflector was seen.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Any
+
+import numpy as np
+from construct import Array, BitsInteger, BitStruct, Const, Construct, Float32l, If, Int8ul, Int16ul, Int32ul, Int64ul, Struct, this
+
+from lidarspec.spec import (
+    Checksummed,
+    Clock,
+    Crc,
+    Fields,
+    Frame,
+    Imu,
+    OnChange,
+    Parts,
+    Polar,
+    Scaled,
+    Sensor,
+    Sequence,
+    Simulation,
+    Udp,
+    steps,
+)
+
+CRC = Crc(32, 0x04C11DB7, init=0xFFFFFFFF, refin=True, refout=True, xorout=0xFFFFFFFF, order="little")
+MAGIC = "magic" / Const(b"\x02\x02\x02\x02")
+LONGEST = 16_384  # bytes: three echoes of the 900 beams of a segment of a multiScan136 take 14 160
+STEP, ZERO = 1 / 5215, 16_384  # radians for each step of an azimuth, and the step straight ahead
+TURNS = 20.0  # turns a second of a simulated one
+
+
+def module(version: int) -> Struct:
+    """A module of a telegram of version 3 or 4: beams of all its layers."""
+    azimuth = "azimuth" / If(this._.beam_content.has_azimuth == 1, Scaled(Int16ul, STEP, "rad", -ZERO * STEP))
+    properties = "property" / If(this._.beam_content.has_property == 1, Int8ul) * "bit 0: a reflector"
+    echo = Struct(
+        "distance" / If(this._._.echo_content.has_distance == 1, Scaled(Int16ul, 0.001, "m")),
+        "strength" / If(this._._.echo_content.has_strength == 1, Int16ul),
+    )
+    beam = Struct("echoes" / Array(this._.echo_count, echo), *((properties, azimuth) if version == 4 else (azimuth, properties)))
+    return Struct(
+        "segment" / Int64ul,
+        "turn" / Int64ul,
+        "sender" / Int32ul,
+        "layer_count" / Int32ul,
+        "beam_count" / Int32ul,
+        "echo_count" / Int32ul,
+        "start_time" / Array(this.layer_count, Scaled(Int64ul, 1, "us")),
+        "stop_time" / Array(this.layer_count, Scaled(Int64ul, 1, "us")),
+        "elevation" / Array(this.layer_count, Scaled(Float32l, 1, "rad")) * "downwards",
+        "first_azimuth" / Array(this.layer_count, Scaled(Float32l, 1, "rad")),
+        "last_azimuth" / Array(this.layer_count, Scaled(Float32l, 1, "rad")),
+        *(["scale" / Float32l] if version == 4 else []),
+        "next_size" / Int32ul * "bytes of the next module, 0 behind the last",
+        "available" / Int8ul,
+        "echo_content" / BitStruct("reserved" / BitsInteger(6), "has_strength" / BitsInteger(1), "has_distance" / BitsInteger(1)),
+        "beam_content" / BitStruct("reserved" / BitsInteger(6), "has_azimuth" / BitsInteger(1), "has_property" / BitsInteger(1)),
+        "reserved" / Int8ul,
+        "beams" / Array(this.beam_count, Array(this.layer_count, beam)),
+    )
+
+
+def telegram(version: int) -> Construct:
+    """A telegram of scans, of version 3 or 4."""
+    struct = Struct(
+        MAGIC,
+        "command" / Const(1, Int32ul),
+        "counter" / Int64ul,
+        "sent" / Scaled(Int64ul, 1, "us"),
+        "version" / Const(version, Int32ul),
+        "size" / Int32ul * "of the first module",
+        "modules" / Parts(module(version), size=this.size, following=this.next_size),
+        "crc" / Int32ul,
+    )
+    return Checksummed(struct, field="crc", algorithm=CRC)
+
+
+IMU = Checksummed(
+    Struct(
+        MAGIC,
+        "command" / Const(2, Int32ul),
+        "version" / Const(1, Int32ul),
+        *(f"acceleration_{axis}" / Scaled(Float32l, 1, "m/s2") for axis in "xyz"),
+        *(f"turning_{axis}" / Scaled(Float32l, 1, "rad/s") for axis in "xyz"),
+        *(f"orientation_{axis}" / Float32l for axis in "wxyz"),
+        "time" / Scaled(Int64ul, 1, "us"),
+        "crc" / Int32ul,
+    ),
+    field="crc",
+    algorithm=CRC,
+)
+
+
+def points(f: Fields, version: int) -> Polar:
+    """Points of one module: all echoes of a beam, the beams of all layers one after another."""
+    beam, beams = f.beams, f.beam_count
+    number = steps(beams)[:, None] / np.maximum(beams - 1, 1)
+    first, start = f.first_azimuth.on("beams[]"), f.start_time.on("beams[]")
+    even = first + (f.last_azimuth.on("beams[]") - first) * number
+    return Polar(
+        range=beam.echoes.distance * (f.scale if version == 4 else 1.0),
+        azimuth=np.where(f.beam_content.has_azimuth == 1, beam.azimuth, even),
+        elevation=-f.elevation.on("beams[]"),
+        intensity=beam.echoes.strength,
+        time=(start - f.start_time[0] + (f.stop_time.on("beams[]") - start) * number) * 1e-6,
+        extra={"reflector": beam.property % 2 == 1},
+    )
+
+
+def imu(f: Fields) -> Imu:
+    """What is felt, gravity included."""
+    return Imu((f.turning_x, f.turning_y, f.turning_z), (f.acceleration_x, f.acceleration_y, f.acceleration_z))
+
+
+def sweep(i: int, version: int, elevations: tuple[float, ...], beams: int, segments: int) -> dict[str, Any]:
+    """Telegram i: one segment of a turn, in one module, with one echo."""
+    layers, begin = len(elevations), i / segments / TURNS * 1e6
+    width = 360 / segments
+    azimuths = np.deg2rad(i % segments * width - 180 + np.arange(beams) * width / beams)
+    module = {
+        "segment": i % segments,
+        "turn": i // segments,
+        "layer_count": layers,
+        "beam_count": beams,
+        "echo_count": 1,
+        "start_time": np.full(layers, begin),
+        "stop_time": np.full(layers, begin + (beams - 1) / beams / segments / TURNS * 1e6),
+        "elevation": -np.deg2rad(elevations),
+        "first_azimuth": np.full(layers, azimuths[0]),
+        "last_azimuth": np.full(layers, azimuths[-1]),
+        **({"scale": 1.0} if version == 4 else {}),
+        "echo_content.has_distance": 1,
+        "echo_content.has_strength": 1,
+        "beam_content.has_azimuth": 1,
+        "beam_content.has_property": 1,
+        "beams.azimuth": np.repeat(azimuths[:, None], layers, axis=1),
+    }
+    return {"counter": i, "sent": begin, "modules": [module]}
+
+
+def scans(version: int, sweep: Callable[..., Mapping[str, Any]]) -> Frame:
+    """The telegram of scans of this version, and what is simulated in it."""
+    read = {"modules": partial(points, version=version)}
+    return Frame(telegram(version), data=True, max_length=LONGEST, points=read, simulation=Simulation(partial(sweep, version=version)))
+
+
+IMU_FRAME = Frame(IMU, imu=imu, clock=Clock("time"), simulation=Simulation(lambda i: {"time": i * 10_000}, rate=100))
+#: id -> model, elevations of the layers in degrees, beams of a segment, segments of a turn, limits of range, status.
+MODELS: dict[str, tuple[str, tuple[float, ...], int, int, tuple[float, float], str]] = {
+    "sick-multiscan136": ("multiScan136", tuple(np.linspace(22.5, -42.5, 16)), 30, 12, (0.05, 60), "capture"),
+    "sick-picoscan150": ("picoScan150", (0.0,), 240, 12, (0.05, 75), "vectors"),
+}
+
+
+def scanner(name: str) -> Sensor:
+    """One row of the table as a sensor."""
+    model, elevations, beams, segments, limits, status = MODELS[name]
+    shown = partial(sweep, elevations=elevations, beams=beams, segments=segments)
+    return Sensor(
+        name,
+        vendor="SICK",
+        model=model,
+        frames={"scan": scans(4, shown), "scan_v3": scans(3, shown), "imu": IMU_FRAME},
+        points=None,
+        scan=OnChange("modules.turn"),
+        clock=Clock("modules.start_time[0]"),
+        sequence=Sequence("counter"),
+        links={"data": Udp(2115), "imu": Udp(7503)},
+        range_limits=limits,
+        relatives={other: "how many layers its modules have" for other in MODELS if other != name},
+        aliases=(model.lower(),),
+        status=status,
+        source="sick_scan_xd, compact_parser.cpp; 8027119 for segments. The elevations of simulated layers are assumed to be even",
+    )
+
+
+COMPACT = [scanner(name) for name in MODELS]
