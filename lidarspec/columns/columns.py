@@ -425,10 +425,11 @@ def _reach(table: Table, axis: str, length: int) -> int:
 def _reaching(array: NDArray[Any], place: int, table: Table, axis: str) -> NDArray[Any]:
     """An array at a place of its shape as far along an axis as frames go; nan where they have nothing to put there."""
     length = array.shape[place]
-    if not length:
-        return np.full((*array.shape[:place], table.length(axis), *array.shape[place + 1 :]), np.nan)
-    reach = _reach(table, axis, length)
-    return array if reach == length else array.take(range(reach), axis=place)
+    missing = table.length(axis) - length
+    if missing > 0:
+        gaps = [(0, missing * (place == other)) for other in range(array.ndim)]
+        return np.pad(array.astype(np.float64), gaps, constant_values=np.nan)
+    return array.take(range(_reach(table, axis, length)), axis=place) if missing else array
 
 
 def together(arrays: Mapping[str, NDArray[Any]], axes: tuple[str | None, ...]) -> tuple[int, ...]:

@@ -178,7 +178,7 @@ class Traced(NDArrayOperatorsMixin):
     def on(self, *axes: str) -> Any:
         """The value on other axes, by the names of arrays, noted down; nan where frames of this layout lack the array that it is in."""
         sample = self.node.sample.on(*axes)
-        if sample.array.size != self.node.sample.array.size:
+        if sample.array.size > self.node.sample.array.size:
             if not self.node.sample.array.size:
                 return np.nan
             raise Untraceable("an array shorter than the one that it is put on")
