@@ -9,11 +9,14 @@ from pathlib import Path
 
 import pytest
 
+import lidarspec as ls
 from lidarspec.testing.findings import RULES
 from tests.cli.running import ran
 
 ROOT = Path(__file__).resolve().parents[2]
 STRANGER = ROOT / "tests" / "shapes" / "stranger" / "acme_lidars.py"
+
+LDROBOT = [name for name in ls.sensors() if name.startswith("ldrobot-")]
 
 
 def test_a_clean_file_says_so() -> None:
@@ -47,7 +50,7 @@ def test_json_has_the_same(tmp_path: Path) -> None:
 
 def test_a_distribution_is_checked_with_all_of_its_sensors() -> None:
     found = json.loads(ran("check", "lidarspec-ldrobot", "--max-examples", "3", "--json").stdout)
-    assert [report["name"] for report in found] == ["ldrobot-ld06", "ldrobot-stl27l"]
+    assert sorted(report["name"] for report in found) == LDROBOT
 
 
 def test_what_was_measured_stands_beside_what_it_is_held_against() -> None:
@@ -73,11 +76,11 @@ def test_a_file_with_the_id_of_an_installed_sensor_is_told_whose_it_is(tmp_path:
     shutil.copy(installed, tmp_path / "mine.py")
     shutil.copy(installed.with_name("vectors.json"), tmp_path)
     (loading, *others) = json.loads(ran("check", tmp_path / "mine.py", "--max-examples", "3", "--json", code=1).stdout)
-    assert [finding["sensor"] for finding in loading["findings"]] == ["ldrobot-stl27l", "ldrobot-ld06"]
+    assert sorted(finding["sensor"] for finding in loading["findings"]) == LDROBOT
     assert {finding["code"] for finding in loading["findings"]} == {"LS005"}
     said = "lidarspec-ldrobot is installed, and has it (lidarspec.sensors = lidarspec_ldrobot)"
     assert loading["findings"][0]["what"] == said
-    assert loading["findings"][0]["line"]
+    assert any(finding["line"] for finding in loading["findings"])
     assert not any(report["findings"] for report in others)
     ran("check", installed, "--max-examples", "3")
 
@@ -90,8 +93,8 @@ def test_vectors_of_a_distribution_with_several_sensors_are_looked_at() -> None:
 
 
 def test_a_distribution_is_checked_by_its_folder(tmp_path: Path) -> None:
-    report, _ = json.loads(ran("check", ROOT / "plugins" / "lidarspec-ldrobot", "--max-examples", "3", "--json").stdout)
-    assert report["name"] == "ldrobot-ld06"
+    found = json.loads(ran("check", ROOT / "plugins" / "lidarspec-ldrobot", "--max-examples", "3", "--json").stdout)
+    assert sorted(report["name"] for report in found) == LDROBOT
     (tmp_path / "pyproject.toml").write_text('[project]\nname = "lidarspec-nobody-has"\n', encoding="utf-8")
     assert f"lidarspec-nobody-has is not installed, or has no sensors: pip install -e {tmp_path}" in ran("check", tmp_path, code=3).stderr
 

@@ -44,7 +44,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         ("send sim : slamtec-rplidar-s2 motor_", {"motor_speed"}),
         ("send x.bin -s nobody-x fr", set()),
         ("view fr", {"front"}),
-        ("view sim : ldrobot-", {"ldrobot-ld06", "ldrobot-stl27l"}),
+        ("view sim : velodyne-v", {"velodyne-vlp16", "velodyne-vlp32c", "velodyne-vls128"}),
         ("view s", {"sim:", "scans/"}),
         ("view d", {"file d"}),
         ("convert drive.pcap o", {"file o"}),

@@ -106,9 +106,9 @@ def test_hexadecimal_text_and_standard_input_are_read(tmp_path: Path) -> None:
 
 def test_several_sensors_with_the_same_frames_have_to_be_chosen_from(tmp_path: Path) -> None:
     source = tmp_path / "in.bin"
-    source.write_bytes(EXAMPLE * 3)
+    source.write_bytes(b"".join(simulate(ls.sensor("ydlidar-tmini"), 30)))
     result = ran("convert", source, tmp_path / "out.csv", code=2)
-    assert "ldrobot-ld06, ldrobot-stl27l send the same frames" in result.stderr
+    assert "ydlidar-tmini, ydlidar-tmini-plus, ydlidar-tmini-pro send the same frames" in result.stderr
 
 
 def test_points_of_a_sensor_that_the_frames_contradict_come_with_a_word(tmp_path: Path) -> None:

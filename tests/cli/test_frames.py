@@ -72,7 +72,7 @@ def test_the_sensors_that_fit_are_found_and_listed() -> None:
     result = ran("parse", EXAMPLE.hex())
     assert "ldrobot-ld06" in result.stderr
     assert "ldrobot-stl27l" in result.stderr
-    assert printed("parse", EXAMPLE.hex())["fits"] == ["ldrobot-ld06", "ldrobot-stl27l"]
+    assert printed("parse", EXAMPLE.hex())["fits"] == [name for name in ls.sensors() if name.startswith("ldrobot-")]
     assert printed("parse", ls.sensor("robosense-m1").example("difop").hex())["sensor"] == "robosense-m1"
 
 

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+import lidarspec as ls
 import lidarspec.cli
 from tests.cli.running import EXAMPLE, process, ran
 
@@ -64,14 +65,15 @@ def test_what_plugins_call_their_sensors_is_spelled_out(folder: Path) -> None:
 
 def test_the_next_command_can_be_typed_whatever_a_file_is_called(folder: Path) -> None:
     name, cut = "it's; touch x.bin", EXAMPLE[:20]
+    twins = b"".join(ls.simulate(ls.sensor("ydlidar-tmini"), 30))
     for data, words in (
-        (EXAMPLE * 3, ("convert", name, "a b.csv")),
+        (twins, ("convert", name, "a b.csv")),
         (cut, ("convert", name, "a b.csv", "-s", SENSOR)),
         (cut, ("parse", name, "-s", SENSOR)),
         (EXAMPLE[:-1] + b"\0", ("plot", name, "-s", SENSOR, "-o", "x.svg")),
     ):
         (folder / name).write_bytes(data)
-        following = shlex.split(ran(*words, code=2 if data == EXAMPLE * 3 else 4).stderr.rpartition("next: ")[2])
+        following = shlex.split(ran(*words, code=2 if data == twins else 4).stderr.rpartition("next: ")[2])
         assert following[0] == "lidarspec"
         assert name in following
 

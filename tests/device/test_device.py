@@ -454,12 +454,12 @@ def test_a_sensor_that_the_frames_contradict_is_told_of(tmp_path: Path, number: 
     path.write_bytes(b"".join(simulate(ls.sensor("velodyne-vlp16"), number)))
     with ls.open(path, "velodyne-hdl32e") as device:
         assert list(device.scans())
-        (warning,) = device.warnings
+        (warning,) = (warning for warning in device.warnings if "read as" in warning)
         assert f"{path}: read as velodyne-hdl32e, and the frames are those of velodyne-vlp16 (" in warning
         assert f"next: lidarspec detect {path}" in warning
     with ls.open(path, "velodyne-vlp16") as device:
         assert list(device.scans())
-        assert device.warnings == []
+        assert not any("read as" in warning for warning in device.warnings)
 
 
 def test_a_live_sensor_that_the_frames_contradict_is_told_of() -> None:

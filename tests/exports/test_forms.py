@@ -167,7 +167,7 @@ def test_the_verb_says_what_is_wrong() -> None:
     result = ran("export", "json", Path(__file__).parents[1] / "shapes" / "stranger" / "acme_lidars.py", code=0)
     assert json.loads(result.stdout)["vendor"]
     assert "unknown frame 'dta'; did you mean 'data'?" in ran("export", "svg", "ldrobot-ld06", "--frame", "dta", code=2).stderr
-    assert "did you mean 'ldrobot-ld06'" in ran("export", "svg", "ldrobot-ld60", code=2).stderr
+    assert "did you mean 'ldrobot-ld06'" in ran("export", "svg", "ldrobot-ld006", code=2).stderr
 
 
 def test_bytes_in_a_command_are_hex_in_the_json() -> None:

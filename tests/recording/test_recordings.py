@@ -378,8 +378,7 @@ def test_a_disk_that_does_not_keep_up_holds_up_nobody(path: Path, monkeypatch: p
 
 
 def frames(number: int) -> list[bytes]:
-    sensor = ls.sensor(STREAM)
-    return [sensor.example("data", seed=seed) for seed in range(number)]
+    return ls.simulate(ls.sensor(STREAM), number)
 
 
 def test_a_recording_is_read_like_any_file(path: Path) -> None:
