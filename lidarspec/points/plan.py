@@ -28,7 +28,7 @@ from lidarspec.points.conventions import coordinates, direction_of, is_zero, mar
 from lidarspec.points.plain import kinds_of, parts_of
 from lidarspec.points.windows import is_number
 from lidarspec.spec.results import Cartesian, Polar
-from lidarspec.spec.vocabulary import row_numbers
+from lidarspec.spec.vocabulary import Along, row_numbers
 from lidarspec.wire.frame_table import Group
 from lidarspec.wire.layout import Bytes2D, Layout
 
@@ -105,7 +105,8 @@ class Plan:
         if not any(is_full(self.parts[name], self.width) for name in ("xyz" if self.exact else ["range"])):
             raise Untraceable(f"not every point has {'coordinates' if self.exact else 'a range'} of its own")
         self.positive = list[Node]()
-        expressions = self._by_coordinates(given) if self.exact else self._by_direction(given)
+        named = {name: part for name, part in parts_of(result).items() if isinstance(part, Along)}
+        expressions = self._by_coordinates(given) if self.exact else self._by_direction(given, named)
         intensity = given.get("intensity")
         if intensity is not None:
             expressions["intensity"] = np.nan_to_num(intensity) if self._may_be_nan(intensity) else intensity
@@ -146,10 +147,11 @@ class Plan:
         wanted += [node for node, _ in self.tape.steps] + self.positive
         return sorted(graph.traverse(*wanted), key=lambda node: node.number)
 
-    def _by_direction(self, given: Mapping[str, Any]) -> dict[str, Any]:
-        """The columns that back ends make, of the parts of `Polar`."""
+    def _by_direction(self, given: Mapping[str, Any], named: Mapping[str, Along]) -> dict[str, Any]:
+        """The columns that back ends make, of the parts of `Polar`; `named`: those that say along which arrays they are."""
         distance = marked(self._distance(given["range"]), given["invalid"])
-        places = coordinates(distance, given["azimuth"], given["elevation"], [given[name] for name in ("ox", "oy", "oz")])
+        azimuth, elevation, *origin = (named.get(name, given[name]) for name in ("azimuth", "elevation", "ox", "oy", "oz"))
+        places = coordinates(distance, azimuth, elevation, origin)
         columns = {"range": shown_range(given["range"], given["invalid"]), "azimuth": given["azimuth"]}
         return dict(zip("xyz", places, strict=True)) | columns
 

@@ -72,15 +72,15 @@ def test_what_was_measured_stands_beside_what_it_is_held_against() -> None:
 
 
 def test_a_file_with_the_id_of_an_installed_sensor_is_told_whose_it_is(tmp_path: Path) -> None:
-    installed = ROOT / "plugins" / "lidarspec-ldrobot" / "lidarspec_ldrobot" / "__init__.py"
+    installed = ROOT / "plugins" / "lidarspec-camsense" / "lidarspec_camsense" / "__init__.py"
     shutil.copy(installed, tmp_path / "mine.py")
     shutil.copy(installed.with_name("vectors.json"), tmp_path)
     (loading, *others) = json.loads(ran("check", tmp_path / "mine.py", "--max-examples", "3", "--json", code=1).stdout)
-    assert sorted(finding["sensor"] for finding in loading["findings"]) == LDROBOT
+    assert sorted(finding["sensor"] for finding in loading["findings"]) == ["camsense-lds08rr", "camsense-x1"]
     assert {finding["code"] for finding in loading["findings"]} == {"LS005"}
-    said = "lidarspec-ldrobot is installed, and has it (lidarspec.sensors = lidarspec_ldrobot)"
+    said = "lidarspec-camsense is installed, and has it (lidarspec.sensors = lidarspec_camsense)"
     assert loading["findings"][0]["what"] == said
-    assert any(finding["line"] for finding in loading["findings"])
+    assert all(finding["line"] for finding in loading["findings"])
     assert not any(report["findings"] for report in others)
     ran("check", installed, "--max-examples", "3")
 

@@ -73,7 +73,7 @@ def test_the_sensors_that_fit_are_found_and_listed() -> None:
     assert "ldrobot-ld06" in result.stderr
     assert "ldrobot-stl27l" in result.stderr
     assert printed("parse", EXAMPLE.hex())["fits"] == [name for name in ls.sensors() if name.startswith("ldrobot-")]
-    assert printed("parse", ls.sensor("robosense-m1").example("difop").hex())["sensor"] == "robosense-m1"
+    assert printed("parse", ls.sensor("robosense-m1").example("data").hex())["sensor"] == "robosense-m1"
 
 
 def test_a_stream_is_parsed_frame_by_frame_and_gaps_are_told() -> None:
