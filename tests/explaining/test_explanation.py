@@ -10,7 +10,7 @@ import re
 
 import numpy as np
 import pytest
-from construct import Array, BitsInteger, BitStruct, Const, Enum, EnumIntegerString, IfThenElse, Int8ul, Int16ub, Int16ul, Nibble, Struct, this
+from construct import Array, BitsInteger, BitStruct, Const, Enum, IfThenElse, Int8ul, Int16ub, Int16ul, Nibble, Struct, this
 
 import lidarspec as ls
 from lidarspec import Sensor, WireError
@@ -19,6 +19,7 @@ from lidarspec.explaining.explanation import Explanation, explain
 from lidarspec.explaining.wording import hexdump
 from lidarspec.spec import Checksummed, Frame, Polar, Scaled, Simulation, Sum, Xor
 from tests.all_sensors import EVERY as SENSORS, FRAMES
+from tests.exports.trees import number
 from tests.shapes import SHAPES
 
 EXAMPLE = bytes.fromhex("542c6808ab7ee000e4dc00e2d900e5d500e3d300e4d000e9cd00e4ca00e2c700e9c500e5c200e5c000e5be823a1a50")
@@ -72,7 +73,7 @@ def test_the_values_are_those_that_parse_gives(sensor: str, frame: str) -> None:
         found = parsed
         for name in re.findall(r"\w+", value.path):
             found = found[int(name)] if name.isdigit() else found[name]
-        found = int(found) if isinstance(found, EnumIntegerString) else found
+        found = number(found)
         assert value.raw == found or (value.raw != value.raw and found != found)
     assert len(values) == leaves(parsed)
 
