@@ -239,7 +239,8 @@ class _Walk:
 
     def _array(self, node: tree.Repeat, path: str, shape: tuple[int, ...], strides: tuple[int, ...]) -> None:
         count, start = self._count(node.count, path), self.cursor
-        self.lengths[node.axis] = 0 if 0 in shape else count
+        count = 0 if 0 in shape else count  # arrays in an empty one are nowhere, however long they would be
+        self.lengths[node.axis] = count
         if count > self.limit:
             raise TooLong(path)
         if count:

@@ -87,7 +87,7 @@ def _physical(fields: Mapping[str, FieldInfo], value: Any, path: str) -> Any:
         return Container((name, _physical(fields, part, f"{path}.{name}".strip("."))) for name, part in value.items())
     if isinstance(value, list):
         return ListContainer(_physical(fields, part, path) for part in value)
-    return fields[path].physical(value) if path in fields and fields[path].scaled else value
+    return fields[path].physical(value) if value is not None and path in fields and fields[path].scaled else value
 
 
 def unpacked(root: Node, layout: Layout, frame: bytes) -> Any:

@@ -18,6 +18,7 @@ import pytest
 from lidarspec import Sensor
 from lidarspec.exports import beginning, export
 from lidarspec.exports.ksy import identifier
+from tests.exports.trees import number
 
 HERE = Path(__file__).parent
 #: the compiler of Kaitai's own packages, by path or on PATH; without it the npm package is looked for, as node does (NODE_PATH).
@@ -81,6 +82,7 @@ def differences(parsed: Any, read: Any, path: str = "") -> list[str]:
     value = read
     while hasattr(value, "value"):  # of an array, and then of one of its alternatives
         value = value.value
+    parsed = number(parsed)
     same = parsed == value or (parsed != parsed and value != value)
     return [] if same else [f"{path}: {parsed!r}, and {value!r} in Kaitai"]
 

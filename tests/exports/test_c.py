@@ -20,7 +20,7 @@ from lidarspec.exports import Refused, beginning, export
 from lidarspec.framing.frame_engine import codec
 from lidarspec.testing import subject as material
 from lidarspec.wire.schema import Schema
-from tests.exports.trees import DISTINCT, EVERY, values
+from tests.exports.trees import DISTINCT, EVERY, in_forms, values
 
 GCC = shutil.which("gcc")
 needs_gcc = pytest.mark.skipif(GCC is None, reason="gcc is not installed")
@@ -37,7 +37,8 @@ REFUSED = {
     "shape-channels": f"channels: {_PARTS}",
     **dict.fromkeys(("livox-mid360", "livox-hap"), f"parameters: {_PARTS}"),
     "ti-iwr6843": f"tlvs: {_PARTS}",
-    **dict.fromkeys(("shape-tokens", "shape-lines", "shape-escaped"), "no other language recodes"),
+    **dict.fromkeys(("sick-multiscan136", "sick-picoscan150"), f"modules: {_PARTS}"),
+    **in_forms(EVERY),
 }
 SENSORS = {name: sensor for name, sensor in DISTINCT.items() if name not in REFUSED}
 

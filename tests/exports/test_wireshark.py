@@ -18,12 +18,12 @@ from lidarspec.testing import subject as material
 from lidarspec.testing.subject import Subject
 from tests import made_captures as made
 from tests.exports.sharks import captured, columns, dissector, needs_tshark, tshark, written
-from tests.exports.trees import DISTINCT, EVERY, values
+from tests.exports.trees import DISTINCT, EVERY, in_forms, values
 
 #: what Wireshark cannot be told, with the reason.
 REFUSED = {
     "shape-text": "Decimal is Python code",
-    **dict.fromkeys(("shape-tokens", "shape-lines", "shape-escaped"), "no other language recodes"),
+    **in_forms(EVERY),
 }
 #: what every run tries; the other shapes, and sensors that share the frames of one of these, are for the long one.
 FEW = {*lidarspec.sensors(), "shape-oddities", "shape-options", "shape-segments", "shape-tags", "shape-channels"} & set(DISTINCT)
