@@ -211,8 +211,9 @@ class Measurement:
             expected = info.physical(PROBE)
             for spot in self._inner(table, answer):
                 part = _part(answer, spot)
-                near = part[np.isclose(part, expected)]  # a direction whose length is 1 but for the steps of its own is a part of the range
-                found += [Target(path, spot, info.scale if np.allclose(near, expected, EXACT, 0) else None, info.offset)] if near.size else []
+                near = part[np.isclose(part, expected)]  # a direction whose length is 1 but for its own steps is part of the range
+                step = info.scale if np.allclose(near, expected, EXACT, 0) else None
+                found += [Target(path, spot, step, info.offset)] if near.size else []
         found = found or self._linear(table)
         if not found:
             reason = "no field in metres makes the range of a point: the sensor has to give `encode`"
