@@ -56,6 +56,8 @@ ROUNDS = 8
 _MEASURED = ("range", "azimuth", "elevation", "ox", "oy", "oz", "x", "y", "z", "time")
 #: raw value that a range field is given to see which points answer to it.
 PROBE = 100
+#: by how much of itself a range may be off the field that it is read from, for the arithmetic alone.
+EXACT = 1e-9
 #: m/s2, standard gravity.
 GRAVITY = 9.80665
 
@@ -207,8 +209,11 @@ class Measurement:
                 continue
             answer = self._probed(table, [path], PROBE)[0].range
             expected = info.physical(PROBE)
-            inner = [spot for spot in self._inner(table, answer) if np.isclose(_part(answer, spot), expected).any()]
-            found += [Target(path, spot, info.scale, info.offset) for spot in inner]
+            for spot in self._inner(table, answer):
+                part = _part(answer, spot)
+                near = part[np.isclose(part, expected)]  # a direction whose length is 1 but for its own steps is part of the range
+                step = info.scale if np.allclose(near, expected, EXACT, 0) else None
+                found += [Target(path, spot, step, info.offset)] if near.size else []
         found = found or self._linear(table)
         if not found:
             reason = "no field in metres makes the range of a point: the sensor has to give `encode`"

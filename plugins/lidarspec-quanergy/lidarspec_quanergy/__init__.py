@@ -113,9 +113,9 @@ def one_points(f: Fields, elevation: NDArray[np.float64]) -> Polar:
 
 def sweep(i: int, more: Mapping[str, Any]) -> dict[str, Any]:
     """Packet i of 10 turns a second."""
-    seconds = i * FIRINGS * PERIOD
+    seconds, nanoseconds = divmod(round(i * FIRINGS * PERIOD * 1e9), 1_000_000_000)
     position = (i * FIRINGS + np.arange(FIRINGS)) * PERIOD * 3600 % 360
-    return {"firings.position": position, "seconds": seconds // 1, "nanoseconds": seconds % 1, **more}
+    return {"firings.position": position, "seconds": seconds, "nanoseconds": nanoseconds * 1e-9, **more}
 
 
 def lidar(model: str, elevation: NDArray[np.float64], other: str, **facts: Any) -> Sensor:

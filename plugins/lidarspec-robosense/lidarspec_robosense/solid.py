@@ -164,8 +164,8 @@ def imu(f: Fields) -> Imu:
     return Imu((f.rotation_x, f.rotation_y, f.rotation_z), (f.acceleration_x, f.acceleration_y, f.acceleration_z))
 
 
-def sweep(i: int, model: Scanner) -> dict[str, Any]:
-    """Packet i of frames with single return: lines to and fro, downwards; each channel an equal part of a line."""
+def sweep(i: int, model: Scanner, mode: int = STRONGEST) -> dict[str, Any]:
+    """Packet i of frames of so many packets: lines to and fro, downwards; each channel an equal part of a line."""
     number, time = i % model.packets, i / (model.packets * FRAME_RATE)
     spot = (number * model.blocks + np.arange(model.blocks))[:, None] / (model.packets * model.blocks)
     lines = 100
@@ -176,7 +176,7 @@ def sweep(i: int, model: Scanner) -> dict[str, Any]:
     offsets = np.arange(model.blocks) / (model.packets * FRAME_RATE * model.blocks)
     return {
         "pkt_psn": number + model.first,
-        "wave_mode": STRONGEST,
+        "wave_mode": mode,
         "seconds": int(time),
         "microseconds": time % 1,
         "blocks.time_offset": np.round(offsets, 6),
@@ -219,7 +219,7 @@ MX = dataclasses.replace(
     },
     points=points_mx,
     sequence=Sequence("pkt_psn", first=1, last=partial(packets, model=MX_SCANNER, dual=())),
-    simulation=Simulation(partial(sweep, model=MX_SCANNER)),
+    simulation=Simulation(partial(sweep, model=MX_SCANNER, mode=DUAL)),  # whose packets have a second radius that is used
     range_limits=(0.2, 200.0),
     info={"serial": "difop.serial_number"},
     aliases=("rs-mx",),
