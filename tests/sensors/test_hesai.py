@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import datetime
 import json
 import pickle
@@ -13,7 +14,10 @@ import pytest
 
 import lidarspec as ls
 from lidarspec.simulation.simulator import simulate
+from lidarspec.spec import Tcp, Udp
 from lidarspec.testing.agreement import assert_same_points
+from lidarspec.testing.fixtures import virtual_port
+from tests.lines import SLACK, free_port
 from tests.sensors.evidence import PROTOCOLS, assert_points, decoded, vector_bytes, vectors
 
 FILE = "vectors_udp3d.json"
@@ -134,8 +138,9 @@ def test_points_by_hand(name: str) -> None:
 @pytest.mark.parametrize("name", SENSORS)
 def test_firing_times_and_echoes(name: str) -> None:
     channels = FORM[name][1]
-    dual: dict[str, Any] = {"return_mode": 0x39} if name == "pandar40p" else {"return_count": 2}
-    single, double = (decoded(SENSORS[name], [packet(name, **more)]).points() for more in ({}, dual))
+    dual: dict[str, Any] = {"return_mode": 0x39} if name == "pandar40p" else {"return_mode": 0x39, "return_count": 2}
+    alone: dict[str, Any] = {name: value for name, value in dual.items() if name == "return_count"}  # the most that there can be
+    single, double = (decoded(SENSORS[name], [packet(name, **more)]).points() for more in (alone, dual))
     for block, channel, one, two in TIMES[name]:
         place = block * channels + channel
         assert (single.time[place] * 1e6, double.time[place] * 1e6) == (pytest.approx(one, abs=1e-3), pytest.approx(two, abs=1e-3))
@@ -319,7 +324,53 @@ def test_each_crc_of_a_qt128_is_held(place: int) -> None:
 
 def test_the_loops_of_a_qt128_take_turns() -> None:
     parsed = QT128.parse(simulate(QT128, 1)[0])
-    single, odd = (decoded(QT128, [QT128.build("data", parsed, **more)]).points() for more in ({}, {"return_count": 2, "mode_flag": 1}))
+    single = decoded(QT128, [QT128.build("data", parsed, return_count=2)]).points()
+    odd = decoded(QT128, [QT128.build("data", parsed, return_mode=0x39, mode_flag=1)]).points()
     # channel 65 fires 1.456 us after the shot in the first loop, and 0.6 in the second; shots are 111.11 us apart, the first at 9
     assert [single.time[block * 128 + 64] * 1e6 for block in (0, 1)] == [pytest.approx(10.456), pytest.approx(120.71)]
     assert [odd.time[block * 128 + 64] * 1e6 for block in (0, 1)] == [pytest.approx(9.6), pytest.approx(9.6)]
+
+
+def test_commands_are_those_of_the_protocol() -> None:
+    for name, command, arguments in (
+        ("hesai_ptc_get_calibration", "get_calibration", {}),
+        ("hesai_ptc_get_status", "get_status", {}),
+        ("hesai_ptc_set_return_dual", "return_mode", {"mode": 2}),
+        ("hesai_ptc_standby", "standby", {"standby": 1}),
+    ):
+        assert XT32.command(command, **arguments) == vector_bytes(FILE, name)
+    assert XT32.command("send_to", host="192.168.1.100", port=2368, gps_port=10110).hex() == "4774200000000008c0a801640940277e"
+
+
+def on_free_ports(sensor: ls.Sensor, said: bytes) -> ls.Sensor:
+    """The sensor with a unit's own words for its angles."""
+    answers = {"get_calibration": [("answer", {"payload": said})]}
+    links = {"data": Udp(free_port()), "control": Tcp(free_port())}
+    return dataclasses.replace(sensor, links=links, simulation=dataclasses.replace(sensor.simulation, answers=answers))
+
+
+def test_a_unit_is_asked_for_its_angles_when_it_is_opened(tmp_path: Path) -> None:
+    said = "Laser id,Elevation,Azimuth\n" + "".join(f"{i},{16.5 - i},0.25\n" for i in range(1, 33))
+    unit, file = on_free_ports(XT32, said.encode()), angles(tmp_path / "own.csv", 32)
+    data = f"udp://127.0.0.1:{unit.links['data'].ports[0]}"
+    with virtual_port(unit, to=data) as port:
+        with ls.open(port.path, unit) as device:
+            cloud = device.latest(SLACK).points
+            assert device.send("speed", rate=600).values.code == 0x17
+        assert (cloud.nominal, device.warnings, port.device.heard) == (False, [], ["get_calibration", "speed"])
+        assert np.rad2deg(cloud.elevation[:2]) == pytest.approx([15.5, 14.5])
+        with ls.open(port.path, unit.configure(calibration=file)) as device:  # whose angles are known already
+            assert np.rad2deg(device.latest(SLACK).points.elevation[:2]) == pytest.approx([-4.5, -4.0])
+        assert port.device.heard == ["get_calibration", "speed"]
+        with ls.open(f"{data}?control=127.0.0.1:{free_port()}", unit) as device:  # where nobody answers
+            assert device.latest(SLACK).points.nominal
+            assert any("refuses connections" in said and "it is read as it stands" in said for said in device.warnings)
+
+
+def test_a_unit_that_does_not_say_its_angles_is_read_all_the_same() -> None:
+    unit = on_free_ports(XT16, b"")
+    refusing = {"get_calibration": [("answer", {"result": 5, "payload": b""})]}
+    unit = dataclasses.replace(unit, simulation=dataclasses.replace(unit.simulation, answers=refusing))
+    with virtual_port(unit, to=f"udp://127.0.0.1:{unit.links['data'].ports[0]}") as port, ls.open(port.path, unit) as device:
+        assert device.latest(SLACK).points.nominal
+        assert any("result 5 instead of 0" in said for said in device.warnings)

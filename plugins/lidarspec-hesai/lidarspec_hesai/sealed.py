@@ -68,7 +68,7 @@ def packet(major: int, minor: int, lasers: int, tail: Sequence[Construct], *, co
         "block_count" / Const(BLOCKS, Int8ul),
         "first_return" / Int8ul * "which return the first block of a shot holds",
         "dis_unit" / Scaled(Int8ul, 1, "mm") * "one step of a distance",
-        "return_count" / Int8ul * "blocks in a row of one shot",
+        "return_count" / Int8ul * "returns of a shot; of some models the most that there can be",
         "flags" / flags,
         "body" / Checksummed(Struct("blocks" / blocks, "crc" / Int32ul), "crc", CRC),
         "safety" / If(this.flags.safety == 1, SAFETY),
