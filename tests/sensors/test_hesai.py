@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 import lidarspec as ls
+from lidarspec.discovery.detect import Heard, verdict
 from lidarspec.simulation.simulator import simulate
 from lidarspec.spec import Tcp, Udp
 from lidarspec.testing.agreement import assert_same_points
@@ -346,7 +347,8 @@ def on_free_ports(sensor: ls.Sensor, said: bytes) -> ls.Sensor:
     """The sensor with a unit's own words for its angles."""
     answers = {"get_calibration": [("answer", {"payload": said})]}
     links = {"data": Udp(free_port()), "control": Tcp(free_port())}
-    return dataclasses.replace(sensor, links=links, simulation=dataclasses.replace(sensor.simulation, answers=answers))
+    patient = {name: dataclasses.replace(command, timeout=SLACK) for name, command in sensor.commands.items()}
+    return dataclasses.replace(sensor, links=links, commands=patient, simulation=dataclasses.replace(sensor.simulation, answers=answers))
 
 
 def test_a_unit_is_asked_for_its_angles_when_it_is_opened(tmp_path: Path) -> None:
@@ -374,3 +376,59 @@ def test_a_unit_that_does_not_say_its_angles_is_read_all_the_same() -> None:
     with virtual_port(unit, to=f"udp://127.0.0.1:{unit.links['data'].ports[0]}") as port, ls.open(port.path, unit) as device:
         assert device.latest(SLACK).points.nominal
         assert any("result 5 instead of 0" in said for said in device.warnings)
+
+
+# Of a packet of two blocks: (azimuth on the wire, block, channel, raw distance in 4 mm, x y z, microseconds from the packet's time).
+STATED = {
+    # E 14.436 (cos 0.968427, sin 0.249298), A = 86.74 + 3.257 = 89.997; 3.148 - 27.778 + 4.436
+    # E -25.01577 (0.906191, -0.422868), A = 183.45 - 3.448749 = 180.001251; 3.148 + 0.776 in state 1, in which channel 126 does not fire
+    "pandar128": [
+        (8674, 0, 0, 2500, (0.000507, -9.684267, 2.492984), -20.194),
+        (18345, 1, 125, 0, (0.0, 0.0, 0.0), 3.148),
+        (18345, 1, 127, 2500, (-9.061914, 0.000198, -4.228677), 3.924),
+    ],
+    # E -3.001 (0.998629, -0.052353), A = 88.68 + 1.324 = 90.004; in all states alike
+    "ot128": [
+        (8868, 0, 64, 2500, (-0.000697, -9.986286, -0.523534), -13.547),
+        (8868, 1, 64, 2500, (-0.000697, -9.986286, -0.523534), 14.231),
+    ],
+    # E -4.965 (0.996248, -0.086547), A = 100.04 + 169.963 = 270.003; -1888 - 111 + 95.18
+    "jt128": [(10004, 0, 0, 2500, (0.000522, 9.962478, -0.865472), -1903.82)],
+}
+
+
+@pytest.mark.parametrize("name", STATED)
+def test_points_and_times_by_hand_of_those_whose_status_tells_the_model(name: str) -> None:
+    sensor = ls.sensor(f"hesai-{name}")
+    sent = simulate(sensor, 20)
+    parsed = sensor.parse(sent[0], "data")
+    for block in parsed.body.blocks:
+        for channel in block.channels:
+            channel.distance = 0
+    for azimuth, block, channel, raw, _, _ in STATED[name]:
+        parsed.body.blocks[block].azimuth, parsed.body.blocks[block].channels[channel].distance = azimuth, raw
+    cloud = decoded(sensor, [sensor.build("data", parsed, operational_state=0)]).points()
+    for _, block, channel, raw, xyz, fired in STATED[name]:
+        place = block * 128 + channel
+        assert cloud.valid[place] == (raw > 0)
+        assert_points(cloud, [(place, xyz)] if raw else [], atol=3e-5)
+        assert cloud.time[place] * 1e6 == pytest.approx(fired, abs=1e-3)
+    dual = sensor.decode([sensor.build("data", parsed, return_mode=0x39, operational_state=1)]).points()
+    assert dual.return_index is not None
+    assert dual.return_index[::128].tolist() == [0, 1]
+    assert dual.time[0] == dual.time[128] or name == "pandar128"  # whose blocks have states of their own
+    assert verdict(Heard("", tuple(sent), datagrams=True)).sensor is sensor
+
+
+def test_channels_have_the_further_bytes_that_the_header_says() -> None:
+    sensor = ls.sensor("hesai-ot128")
+    parsed = sensor.parse(simulate(sensor, 1)[0], "data")
+    parsed.flags.confidence = parsed.flags.environment = 1
+    for block in parsed.body.blocks:
+        for channel in block.channels:
+            channel.confidence, channel.environment = 7, 9
+    data = sensor.build("data", parsed)
+    assert len(data) == 861 + 2 * 2 * 128
+    packets = decoded(sensor, [data, simulate(sensor, 1)[0]])
+    assert len(packets) == 2
+    np.testing.assert_array_equal(packets.points().range[:256], packets.points().range[256:])

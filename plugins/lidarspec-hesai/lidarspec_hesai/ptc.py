@@ -57,7 +57,7 @@ FRAMES = {
 
 def _command(code: int, **more: Any) -> Command:
     fixed = {"code": code, "result": 0, **({} if code in SETTINGS else {"payload": b""})}
-    return Command("request", fixed, reply="answer", matches={"result": 0}, echoes=("code",), timeout=2.0, link="control", **more)
+    return Command("request", fixed, reply="answer", matches={"result": 0}, echoes=("code",), timeout=3.0, link="control", **more)
 
 
 def commands(rates: tuple[int, int]) -> Mapping[str, Command]:

@@ -10,15 +10,14 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from construct import Bytes, Int8ul, Int16ul, Int32ul
+from construct import Bytes, Const, Int8ul, Int16ul, Int32ul, Struct
 
 from lidarspec.spec import Fields, Frame, Polar, Scaled
 from lidarspec_hesai.calibration import Calibration, nominal
 from lidarspec_hesai.family import spinning
 from lidarspec_hesai.parts import FACTORY, RETURN_MODES, UTC, beams, returns_of, turning
-from lidarspec_hesai.sealed import ACKNOWLEDGED, BLOCKS, distance, in_body, longest, packet, plausible
+from lidarspec_hesai.sealed import ACKNOWLEDGED, BLOCKS, LASERS, distance, in_body, longest, packet, plausible
 
-CHANNELS = 128
 PER_TURN = 900  # blocks in a turn at 10 Hz and single return: 0.4 degrees
 FIRST_SHOT, SHOT = 9e-6, 111.11e-6  # seconds from the packet's time to the first shot, and from shot to shot
 
@@ -74,6 +73,8 @@ LOOP_2_US = (
 )
 # fmt: on
 
+VERSION = ("major" / Const(3, Int8ul), "minor" / Const(2, Int8ul))
+CHANNEL = Struct("distance" / Int16ul * "steps of dis_unit; 0: no return", "reflectivity" / Int8ul, "confidence" / Int8ul)
 TAIL = (
     "tail_reserved" / Bytes(5),
     "mode_flag" / Int8ul * "bit 0: the loop of the packet, with dual return",
@@ -96,7 +97,7 @@ def points(f: Fields, channels: Calibration) -> Polar:
 
 def sweep(i: int) -> dict[str, Any]:
     """Packet i at 10 Hz with single return."""
-    return in_body(turning(i, BLOCKS, PER_TURN), confidence=True)
+    return in_body(turning(i, BLOCKS, PER_TURN), confidence=1)
 
 
 TABLE = nominal(ELEVATION, AZIMUTH, LOOP_1_US)
@@ -106,9 +107,9 @@ QT128 = spinning(
     "hesai-qt128",
     {
         "data": Frame(
-            packet(3, 2, CHANNELS, TAIL, confidence=True),
+            packet(VERSION, CHANNEL[LASERS], TAIL, held=True),
             data=True,
-            max_length=longest(CHANNELS, 4),
+            max_length=longest(BLOCKS, 2 + 4 * LASERS),
             plausible=plausible,
             acknowledged=ACKNOWLEDGED,
         )
