@@ -212,7 +212,7 @@ PANDAR128 = spinning(
     aliases=("pandar128", "pandar128e3x", "hesai-pandar128e3x"),
     relatives=relatives("hesai-pandar128"),
     status="manual",
-    acknowledged={},
+    acknowledged={"LS711": UNSEEN},
     source=f"HesaiLidar_SDK_2.0 (udp_protocol_v1_4.h, Pandar128E3X correction files), Pandar128E3X user manual; {UNSEEN}",
 )
 
@@ -228,6 +228,6 @@ OT128 = spinning(
     aliases=("ot128", "pandar128e4x", "hesai-pandar128e4x"),
     relatives=relatives("hesai-ot128"),
     status="manual",
-    acknowledged={},
+    acknowledged={"LS711": UNSEEN},
     source=f"HesaiLidar_SDK_2.0 (udp_protocol_v1_4.h, OT128 correction files); {UNSEEN}",
 )
