@@ -14,10 +14,13 @@ import pytest
 
 import lidarspec as ls
 from lidarspec.discovery.detect import Heard, verdict
+from lidarspec.simulation.faults import Faults
 from lidarspec.simulation.simulator import simulate
 from lidarspec.spec import Tcp, Udp
 from lidarspec.testing.agreement import assert_same_points
 from lidarspec.testing.fixtures import virtual_port
+from lidarspec_hesai.calibration import told
+from lidarspec_hesai.xt import TABLE_32
 from tests.lines import SLACK, free_port
 from tests.sensors.evidence import PROTOCOLS, assert_points, decoded, vector_bytes, vectors
 
@@ -432,3 +435,10 @@ def test_channels_have_the_further_bytes_that_the_header_says() -> None:
     packets = decoded(sensor, [data, simulate(sensor, 1)[0]])
     assert len(packets) == 2
     np.testing.assert_array_equal(packets.points().range[:256], packets.points().range[256:])
+
+
+def test_a_bad_network_does_not_damage_what_a_unit_says_of_its_angles() -> None:
+    unit = on_free_ports(XT32, told(TABLE_32))
+    data = f"udp://127.0.0.1:{unit.links['data'].ports[0]}"
+    with virtual_port(unit, to=data, faults=Faults(loss=0.5, reorder=3)) as port, ls.open(port.path, unit) as device:
+        assert device.learned == {"calibration": told(TABLE_32)}
