@@ -212,11 +212,16 @@ class LiveInput(Input):
         self._stops = bool(self.sensor.on_open)
         for name in self.sensor.on_open:
             try:
-                self.learned |= learned(self.sensor, self.send(name))
-            except ReplyTimeout as error:
-                if not self._watch.streams:
+                reply = self.send(name)
+            except CommandError as error:
+                if name in self._teachers and self.sensor.data_frames and not self.sensor.commands[name].starts:
+                    self._said.append(f"{error}; it is read as it stands, without what it would say of itself")
+                elif isinstance(error, ReplyTimeout) and self._watch.streams:
+                    self._said.append(f"{error}; data come all the same")
+                else:
                     raise suggest(error, self._watch.following()) from None
-                self._said.append(f"{error}; data come all the same")
+            else:
+                self.learned |= learned(self.sensor, reply)
             if self._teachers and name == self._teachers[-1]:
                 self._adopt()
 

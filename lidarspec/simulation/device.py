@@ -215,7 +215,7 @@ class SimulatedDevice:
     def __init__(self, sensor: Spec, *, scene: Scene | None = None, seed: int = 0, rate: float = 1.0, faults: Faults | None = None) -> None:
         self.sensor, self.rate, self.faults = sensor, rate, faults or Faults()
         self.present, self.heard, self.sent = True, list[str](), Counter[str]()
-        self.lines = {name: Line(self.faults, seed=seed, stream=not is_datagram(link)) for name, link in sensor.links.items()}
+        self.lines = {name: self._line(name, seed) for name in sensor.links}
         self._scene = scene or furnished(seed)
         self._source = random.Random(f"device {seed}")
         self._answering = Answering(sensor, self.faults.shake)
@@ -225,6 +225,11 @@ class SimulatedDevice:
         self._powered, self._time = 0, 0.0
         self._plug: int | None = None
         self._simulation(sensor.data_frame)
+
+    def _line(self, name: str, seed: int) -> Line:
+        """The way of a link; one beside the data over which bytes come in order is TCP or HTTP, which bring them all."""
+        stream = not is_datagram(self.sensor.links[name])
+        return Line(Faults() if stream and name != "data" else self.faults, seed=seed, stream=stream)
 
     def start(self, now: int) -> None:
         """Switch it on, or off and on again."""

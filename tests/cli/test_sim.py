@@ -66,19 +66,19 @@ def test_a_port_is_the_default_of_a_serial_sensor_and_datagrams_of_the_others() 
 
 
 def test_the_place_as_json() -> None:
-    made = json.loads(ran("sim", "hesai-xt32", "-t", "50ms", "--to", "udp://127.0.0.1:2999", "--json").stdout)
+    made = json.loads(ran("sim", "velodyne-vlp16", "-t", "50ms", "--to", "udp://127.0.0.1:2999", "--json").stdout)
     assert made == {
-        "sensor": "hesai-xt32",
+        "sensor": "velodyne-vlp16",
         "place": "udp://127.0.0.1:2999",
         "source": "udp://127.0.0.1:2999",
-        "next": "lidarspec view udp://127.0.0.1:2999 -s hesai-xt32",
+        "next": "lidarspec view udp://127.0.0.1:2999 -s velodyne-vlp16",
     }
 
 
 def test_datagrams_for_another_computer_are_read_there_at_every_interface() -> None:
-    result = ran("sim", "hesai-xt32", "-t", "20ms", "--to", "udp://127.0.0.2:2999")
+    result = ran("sim", "velodyne-vlp16", "-t", "20ms", "--to", "udp://127.0.0.2:2999")
     assert result.stdout == "udp://127.0.0.2:2999\n"
-    assert "lidarspec view udp://:2999 -s hesai-xt32" in result.stderr
+    assert "lidarspec view udp://:2999 -s velodyne-vlp16" in result.stderr
 
 
 def test_a_file_is_written_at_once_and_can_be_read(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import datetime
 import json
 import pickle
@@ -12,8 +13,15 @@ import numpy as np
 import pytest
 
 import lidarspec as ls
+from lidarspec.discovery.detect import Heard, verdict
+from lidarspec.simulation.faults import Faults
 from lidarspec.simulation.simulator import simulate
+from lidarspec.spec import Tcp, Udp
 from lidarspec.testing.agreement import assert_same_points
+from lidarspec.testing.fixtures import virtual_port
+from lidarspec_hesai.calibration import told
+from lidarspec_hesai.xt import TABLE_32
+from tests.lines import SLACK, free_port
 from tests.sensors.evidence import PROTOCOLS, assert_points, decoded, vector_bytes, vectors
 
 FILE = "vectors_udp3d.json"
@@ -134,8 +142,9 @@ def test_points_by_hand(name: str) -> None:
 @pytest.mark.parametrize("name", SENSORS)
 def test_firing_times_and_echoes(name: str) -> None:
     channels = FORM[name][1]
-    dual: dict[str, Any] = {"return_mode": 0x39} if name == "pandar40p" else {"return_count": 2}
-    single, double = (decoded(SENSORS[name], [packet(name, **more)]).points() for more in ({}, dual))
+    dual: dict[str, Any] = {"return_mode": 0x39} if name == "pandar40p" else {"return_mode": 0x39, "return_count": 2}
+    alone: dict[str, Any] = {name: value for name, value in dual.items() if name == "return_count"}  # the most that there can be
+    single, double = (decoded(SENSORS[name], [packet(name, **more)]).points() for more in (alone, dual))
     for block, channel, one, two in TIMES[name]:
         place = block * channels + channel
         assert (single.time[place] * 1e6, double.time[place] * 1e6) == (pytest.approx(one, abs=1e-3), pytest.approx(two, abs=1e-3))
@@ -319,7 +328,117 @@ def test_each_crc_of_a_qt128_is_held(place: int) -> None:
 
 def test_the_loops_of_a_qt128_take_turns() -> None:
     parsed = QT128.parse(simulate(QT128, 1)[0])
-    single, odd = (decoded(QT128, [QT128.build("data", parsed, **more)]).points() for more in ({}, {"return_count": 2, "mode_flag": 1}))
+    single = decoded(QT128, [QT128.build("data", parsed, return_count=2)]).points()
+    odd = decoded(QT128, [QT128.build("data", parsed, return_mode=0x39, mode_flag=1)]).points()
     # channel 65 fires 1.456 us after the shot in the first loop, and 0.6 in the second; shots are 111.11 us apart, the first at 9
     assert [single.time[block * 128 + 64] * 1e6 for block in (0, 1)] == [pytest.approx(10.456), pytest.approx(120.71)]
     assert [odd.time[block * 128 + 64] * 1e6 for block in (0, 1)] == [pytest.approx(9.6), pytest.approx(9.6)]
+
+
+def test_commands_are_those_of_the_protocol() -> None:
+    for name, command, arguments in (
+        ("hesai_ptc_get_calibration", "get_calibration", {}),
+        ("hesai_ptc_get_status", "get_status", {}),
+        ("hesai_ptc_set_return_dual", "return_mode", {"mode": 2}),
+        ("hesai_ptc_standby", "standby", {"standby": 1}),
+    ):
+        assert XT32.command(command, **arguments) == vector_bytes(FILE, name)
+    assert XT32.command("send_to", host="192.168.1.100", port=2368, gps_port=10110).hex() == "4774200000000008c0a801640940277e"
+
+
+def on_free_ports(sensor: ls.Sensor, said: bytes) -> ls.Sensor:
+    """The sensor with a unit's own words for its angles."""
+    answers = {"get_calibration": [("answer", {"payload": said})]}
+    links = {"data": Udp(free_port()), "control": Tcp(free_port())}
+    patient = {name: dataclasses.replace(command, timeout=SLACK) for name, command in sensor.commands.items()}
+    return dataclasses.replace(sensor, links=links, commands=patient, simulation=dataclasses.replace(sensor.simulation, answers=answers))
+
+
+def test_a_unit_is_asked_for_its_angles_when_it_is_opened(tmp_path: Path) -> None:
+    said = "Laser id,Elevation,Azimuth\n" + "".join(f"{i},{16.5 - i},0.25\n" for i in range(1, 33))
+    unit, file = on_free_ports(XT32, said.encode()), angles(tmp_path / "own.csv", 32)
+    data = f"udp://127.0.0.1:{unit.links['data'].ports[0]}"
+    with virtual_port(unit, to=data) as port:
+        with ls.open(port.path, unit) as device:
+            cloud = device.latest(SLACK).points
+            assert device.send("speed", rate=600).values.code == 0x17
+        assert (cloud.nominal, device.warnings, port.device.heard) == (False, [], ["get_calibration", "speed"])
+        assert np.rad2deg(cloud.elevation[:2]) == pytest.approx([15.5, 14.5])
+        with ls.open(port.path, unit.configure(calibration=file)) as device:  # whose angles are known already
+            assert np.rad2deg(device.latest(SLACK).points.elevation[:2]) == pytest.approx([-4.5, -4.0])
+        assert port.device.heard == ["get_calibration", "speed"]
+        with ls.open(f"{data}?control=127.0.0.1:{free_port()}", unit) as device:  # where nobody answers
+            assert device.latest(SLACK).points.nominal
+            assert any("refuses connections" in said and "it is read as it stands" in said for said in device.warnings)
+
+
+def test_a_unit_that_does_not_say_its_angles_is_read_all_the_same() -> None:
+    unit = on_free_ports(XT16, b"")
+    refusing = {"get_calibration": [("answer", {"result": 5, "payload": b""})]}
+    unit = dataclasses.replace(unit, simulation=dataclasses.replace(unit.simulation, answers=refusing))
+    with virtual_port(unit, to=f"udp://127.0.0.1:{unit.links['data'].ports[0]}") as port, ls.open(port.path, unit) as device:
+        assert device.latest(SLACK).points.nominal
+        assert any("result 5 instead of 0" in said for said in device.warnings)
+
+
+# Of a packet of two blocks: (azimuth on the wire, block, channel, raw distance in 4 mm, x y z, microseconds from the packet's time).
+STATED = {
+    # E 14.436 (cos 0.968427, sin 0.249298), A = 86.74 + 3.257 = 89.997; 3.148 - 27.778 + 4.436
+    # E -25.01577 (0.906191, -0.422868), A = 183.45 - 3.448749 = 180.001251; 3.148 + 0.776 in state 1, in which channel 126 does not fire
+    "pandar128": [
+        (8674, 0, 0, 2500, (0.000507, -9.684267, 2.492984), -20.194),
+        (18345, 1, 125, 0, (0.0, 0.0, 0.0), 3.148),
+        (18345, 1, 127, 2500, (-9.061914, 0.000198, -4.228677), 3.924),
+    ],
+    # E -3.001 (0.998629, -0.052353), A = 88.68 + 1.324 = 90.004; in all states alike
+    "ot128": [
+        (8868, 0, 64, 2500, (-0.000697, -9.986286, -0.523534), -13.547),
+        (8868, 1, 64, 2500, (-0.000697, -9.986286, -0.523534), 14.231),
+    ],
+    # E -4.965 (0.996248, -0.086547), A = 100.04 + 169.963 = 270.003; -1888 - 111 + 95.18
+    "jt128": [(10004, 0, 0, 2500, (0.000522, 9.962478, -0.865472), -1903.82)],
+}
+
+
+@pytest.mark.parametrize("name", STATED)
+def test_points_and_times_by_hand_of_those_whose_status_tells_the_model(name: str) -> None:
+    sensor = ls.sensor(f"hesai-{name}")
+    sent = simulate(sensor, 20)
+    parsed = sensor.parse(sent[0], "data")
+    for block in parsed.body.blocks:
+        for channel in block.channels:
+            channel.distance = 0
+    for azimuth, block, channel, raw, _, _ in STATED[name]:
+        parsed.body.blocks[block].azimuth, parsed.body.blocks[block].channels[channel].distance = azimuth, raw
+    cloud = decoded(sensor, [sensor.build("data", parsed, operational_state=0)]).points()
+    for _, block, channel, raw, xyz, fired in STATED[name]:
+        place = block * 128 + channel
+        assert cloud.valid[place] == (raw > 0)
+        assert_points(cloud, [(place, xyz)] if raw else [], atol=3e-5)
+        assert cloud.time[place] * 1e6 == pytest.approx(fired, abs=1e-3)
+    dual = sensor.decode([sensor.build("data", parsed, return_mode=0x39, operational_state=1)]).points()
+    assert dual.return_index is not None
+    assert dual.return_index[::128].tolist() == [0, 1]
+    assert dual.time[0] == dual.time[128] or name == "pandar128"  # whose blocks have states of their own
+    assert verdict(Heard("", tuple(sent), datagrams=True)).sensor is sensor
+
+
+def test_channels_have_the_further_bytes_that_the_header_says() -> None:
+    sensor = ls.sensor("hesai-ot128")
+    parsed = sensor.parse(simulate(sensor, 1)[0], "data")
+    parsed.flags.confidence = parsed.flags.environment = 1
+    for block in parsed.body.blocks:
+        for channel in block.channels:
+            channel.confidence, channel.environment = 7, 9
+    data = sensor.build("data", parsed)
+    assert len(data) == 861 + 2 * 2 * 128
+    packets = decoded(sensor, [data, simulate(sensor, 1)[0]])
+    assert len(packets) == 2
+    np.testing.assert_array_equal(packets.points().range[:256], packets.points().range[256:])
+
+
+def test_a_bad_network_does_not_damage_what_a_unit_says_of_its_angles() -> None:
+    unit = on_free_ports(XT32, told(TABLE_32))
+    data = f"udp://127.0.0.1:{unit.links['data'].ports[0]}"
+    with virtual_port(unit, to=data, faults=Faults(loss=0.5, reorder=3)) as port, ls.open(port.path, unit) as device:
+        assert device.learned == {"calibration": told(TABLE_32)}

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec import UsageError
-from lidarspec.spec import Points, Sensor
+from lidarspec.spec import Learned, Points, Sensor
 
 Table = NDArray[np.float64]
 
@@ -84,15 +84,17 @@ def configure(
     sensor: Sensor,
     /,
     *,
-    calibration: str | Path | None = None,
+    calibration: str | Path | Learned | None = None,
     firing_times: str | Path | None = None,
 ) -> Sensor:
     """The sensor with a unit's own tables in place of the model's; a file named in an earlier `configure` stays.
 
+    A unit whose angles stand in a file is not asked for them.
+
     Args:
         points: the model's function of `Fields` and the channels' `Calibration`.
         table: the model's channels.
-        calibration: CSV with the headings Channel (or Laser id), Elevation and Azimuth, in degrees; in any order.
+        calibration: CSV with the headings Channel (or Laser id), Elevation and Azimuth, in degrees; in any order; or what the unit said.
         firing_times: CSV with the headings Channel and Fire time, in microseconds.
 
     Raises:
@@ -104,10 +106,17 @@ def configure(
         table = dataclasses.replace(table, elevation=elevation, azimuth=azimuth, nominal=False)
     if times:
         table = dataclasses.replace(table, firing=columns(times, {FIRING: table.firing * 1e6})[0] * 1e-6)
-    return dataclasses.replace(sensor, points=partial(points, channels=table))
+    asked = () if angles and not isinstance(angles, Learned) else sensor.on_open
+    return dataclasses.replace(sensor, points=partial(points, channels=table), on_open=asked)
 
 
-def columns(path: str | Path, wanted: Mapping[Column, Table]) -> list[Table]:
+def told(table: Calibration) -> bytes:
+    """The angles as a unit says them: a file of corrections."""
+    rows = zip(table.elevation, table.azimuth, strict=True)
+    return "".join(["Laser id,Elevation,Azimuth\n", *(f"{i},{e:.6f},{a:.6f}\n" for i, (e, a) in enumerate(rows, start=1))]).encode()
+
+
+def columns(path: str | Path | Learned, wanted: Mapping[Column, Table]) -> list[Table]:
     """Columns of a correction file by their headings, each (channels,), in the order of the channels.
 
     The mark EEFF above the headings and the hash below the table are passed over, as the vendor's reader does.
@@ -131,7 +140,7 @@ def columns(path: str | Path, wanted: Mapping[Column, Table]) -> list[Table]:
         listed[int(channel)] = line, values
     if missing := [channel for channel in range(1, channels + 1) if channel not in listed]:
         raise UsageError(
-            f"{path}: lists {len(listed)} channels, and this model has channels 1 to {channels}; {missing[0]} is the first missing"
+            f"{path!s}: lists {len(listed)} channels, and this model has channels 1 to {channels}; {missing[0]} is the first missing"
         )
     tables = list(np.array([listed[channel][1] for channel in sorted(listed)]).T)
     for (column, own), table, place in zip(wanted.items(), tables, places[1:], strict=True):
@@ -139,24 +148,31 @@ def columns(path: str | Path, wanted: Mapping[Column, Table]) -> list[Table]:
     return tables
 
 
-def _rows(path: str | Path) -> list[tuple[int, list[str]]]:
+def _rows(path: str | Path | Learned) -> list[tuple[int, list[str]]]:
     """The headings and the table, each row with its line."""
     try:
-        with open(path, "rb") as file:
-            data = file.read(LARGEST + 1)
+        data = _content(path)
         if len(data) > LARGEST:
-            raise UsageError(f"{path}: not a correction file: it has more than {LARGEST // 1_000_000} MB")
+            raise UsageError(f"{path!s}: not a correction file: it has more than {LARGEST // 1_000_000} MB")
         reader = csv.reader(io.StringIO(data.decode("utf-8-sig", "replace"), newline=""))
         rows = [(reader.line_num, [cell.strip() for cell in cells]) for cells in reader if any(map(str.strip, cells))]
     except (OSError, csv.Error) as error:
-        raise UsageError(f"{path}: not a correction file: {error}") from error
+        raise UsageError(f"{path!s}: not a correction file: {error}") from error
     rows = rows[1:] if rows and rows[0][1][0] == MARK else rows
     if not rows:
-        raise UsageError(f"{path}: not a correction file: it is empty")
+        raise UsageError(f"{path!s}: not a correction file: it is empty")
     return rows[:-1] if len(rows) > 1 and HASH.fullmatch(",".join(rows[-1][1])) else rows
 
 
-def _place(path: str | Path, line: int, headings: list[str], column: Column) -> int:
+def _content(path: str | Path | Learned) -> bytes:
+    """What the unit said, or stands in a file, of that no more than can be."""
+    if isinstance(path, Learned):
+        return path
+    with open(path, "rb") as file:
+        return file.read(LARGEST + 1)
+
+
+def _place(path: str | Path | Learned, line: int, headings: list[str], column: Column) -> int:
     """Where a column stands, from 0."""
     for place, heading in enumerate(headings):
         name, _, unit = heading.lower().partition("(")
@@ -164,10 +180,10 @@ def _place(path: str | Path, line: int, headings: list[str], column: Column) -> 
             if unit.strip(" )") not in ("", *column.units):
                 raise _fault(path, line, place, f"{heading!r} is not in {column.units[0]}")
             return place
-    raise UsageError(f"{path}: line {line}: no column is headed {column.name!r}; the headings are {', '.join(headings)[:QUOTED]!r}")
+    raise UsageError(f"{path!s}: line {line}: no column is headed {column.name!r}; the headings are {', '.join(headings)[:QUOTED]!r}")
 
 
-def _value(path: str | Path, line: int, cells: list[str], place: int, column: Column) -> float:
+def _value(path: str | Path | Learned, line: int, cells: list[str], place: int, column: Column) -> float:
     text = cells[place] if place < len(cells) else ""
     try:
         value = float(text)
@@ -178,7 +194,7 @@ def _value(path: str | Path, line: int, cells: list[str], place: int, column: Co
     return value
 
 
-def _compare(path: str | Path, line: int, place: int, column: Column, table: Table, own: Table) -> None:
+def _compare(path: str | Path | Learned, line: int, place: int, column: Column, table: Table, own: Table) -> None:
     """Nothing, where the values spread like the model's own, to a factor of ten, or those spread too little to tell by."""
     spread, usual = float(np.ptp(table)), float(np.ptp(own))
     if usual > 1 and not usual / UNLIKE < spread < usual * UNLIKE:
@@ -188,5 +204,5 @@ def _compare(path: str | Path, line: int, place: int, column: Column, table: Tab
         )
 
 
-def _fault(path: str | Path, line: int, place: int, reason: str) -> UsageError:
-    return UsageError(f"{path}: line {line}, column {place + 1}: {reason}")
+def _fault(path: str | Path | Learned, line: int, place: int, reason: str) -> UsageError:
+    return UsageError(f"{path!s}: line {line}, column {place + 1}: {reason}")

@@ -29,7 +29,7 @@ def packet(major: int, minor: int, lasers: int, tail: Sequence[Construct]) -> St
         "block_count" / Int8ul,
         "first_return" / Int8ul * "which return the first block of a shot holds",
         "dis_unit" / Scaled(Int8ul, 1, "mm") * "one step of a distance",
-        "return_count" / Int8ul * "blocks in a row of one shot",
+        "return_count" / Int8ul * "returns of a shot; of some models the most that there can be",
         "flags" / BitStruct("reserved" / BitsInteger(7), "sequence" / BitsInteger(1)),
     ]
     channel = Struct("distance" / Int16ul * "steps of dis_unit; 0: no return", "reflectivity" / Int8ul, "reserved" / Int8ul)

@@ -10,15 +10,15 @@ Source: HesaiLidar_SDK_2.0 (udp_protocol_p40.h; angle and firing-time files of a
 
 from __future__ import annotations
 
-from functools import partial
 from typing import Any
 
 import numpy as np
 from construct import Array, Const, Int8ul, Int16ul, Int32ul, Struct
 
-from lidarspec.spec import Clock, Fields, Frame, OnWrap, Polar, Scaled, Sensor, Sequence, Simulation, Udp
-from lidarspec_hesai.calibration import Calibration, configure, nominal
-from lidarspec_hesai.parts import TAIL_40P, TURN, UNPUBLISHED, beams, clock, returns_of, turning
+from lidarspec.spec import Fields, Frame, Polar, Scaled
+from lidarspec_hesai.calibration import Calibration, nominal
+from lidarspec_hesai.family import spinning
+from lidarspec_hesai.parts import TAIL_40P, beams, returns_of, turning
 
 BLOCKS, CHANNELS = 10, 40
 PER_TURN = 1800  # blocks in a turn at 10 Hz and single return: 0.2 degrees
@@ -76,26 +76,15 @@ def sweep(i: int) -> dict[str, Any]:
 
 TABLE = nominal(ELEVATION, AZIMUTH, FIRING_US)
 
-PANDAR40P = Sensor(
+PANDAR40P = spinning(
     "hesai-pandar40p",
-    vendor="Hesai",
+    {"data": Frame(PLAIN, data=True, plausible=plausible), "data_sequence": Frame(COUNTED, data=True, plausible=plausible)},
+    points,
+    TABLE,
+    sweep,
     model="Pandar40P",
-    frames={
-        "data": Frame(PLAIN, data=True, plausible=plausible),
-        "data_sequence": Frame(COUNTED, data=True, plausible=plausible),
-    },
-    points=partial(points, channels=TABLE),
-    scan=OnWrap("blocks.azimuth"),
-    links={"data": Udp(2368)},
-    clock=Clock(clock),
-    sequence=Sequence("sequence"),
-    simulation=Simulation(sweep),
-    configure=partial(configure, points, TABLE),
     range_limits=(0.3, 200.0),
-    vendor_axes=("right", "forward", "up"),
-    turn=TURN,
     aliases=("pandar40p",),
     status="capture",
-    acknowledged=UNPUBLISHED,
     source="HesaiLidar_SDK_2.0 (udp_protocol_p40.h, Pandar40P correction files); captures of tier4/nebula and velocity.report",
 )

@@ -10,17 +10,16 @@ in which the year counts from 1900.
 
 from __future__ import annotations
 
-import dataclasses
-from functools import partial
 from typing import Any
 
 import numpy as np
 from construct import Array, Bytes, Const, Int8ul, Int16ul, Int32ul, Struct
 
-from lidarspec.spec import Fields, Frame, Polar, Scaled, Simulation
-from lidarspec_hesai.calibration import Calibration, configure, nominal
+from lidarspec.spec import Fields, Frame, Polar, Scaled
+from lidarspec_hesai.calibration import Calibration, nominal
+from lidarspec_hesai.family import spinning
 from lidarspec_hesai.headed import USUAL_UNIT, distance
-from lidarspec_hesai.pandar40p import PANDAR40P, SHOT
+from lidarspec_hesai.pandar40p import SHOT
 from lidarspec_hesai.parts import TAIL_40P, beams, returns_of, turning
 
 BLOCKS, CHANNELS = 6, 64
@@ -82,17 +81,14 @@ def sweep(i: int) -> dict[str, Any]:
 
 TABLE = nominal(ELEVATION, AZIMUTH, FIRING_US)
 
-PANDAR64 = dataclasses.replace(
-    PANDAR40P,
-    id="hesai-pandar64",
+PANDAR64 = spinning(
+    "hesai-pandar64",
+    {"data": Frame(PLAIN, data=True, plausible=plausible), "data_sequence": Frame(COUNTED, data=True, plausible=plausible)},
+    points,
+    TABLE,
+    sweep,
     model="Pandar64",
-    frames={
-        "data": Frame(PLAIN, data=True, plausible=plausible),
-        "data_sequence": Frame(COUNTED, data=True, plausible=plausible),
-    },
-    points=partial(points, channels=TABLE),
-    simulation=Simulation(sweep),
-    configure=partial(configure, points, TABLE),
+    range_limits=(0.3, 200.0),
     aliases=("pandar64",),
     status="vectors",
     source="HesaiLidar_SDK_2.0 (udp_protocol_p64.h, Pandar64 correction files); one captured packet of tier4/nebula",

@@ -19,8 +19,8 @@ FACTORY = "42 or 43"
 EPOCH = datetime.datetime(2024, 1, 1)  # of simulated packets
 TURN = (5.0, 20.0)  # turns a second, slowest and fastest: 300 to 1200 rpm (tier4/nebula, rotation_speed of all models)
 
-#: why there are no golden vectors beside these modules.
-UNPUBLISHED = {"LS710": "the captures are others', and too large: the project's tests read them where they are"}
+#: why no data frames are among the golden vectors.
+UNPUBLISHED = {"LS711": "the captures are others', and too large: the project's tests read them where they are"}
 
 UTC = Struct(
     "year" / Int8ul * "from 70 on since 1900, below since 2000; 0: the last five bytes are Unix seconds, big-endian",

@@ -7,18 +7,17 @@ the channels each.
 
 from __future__ import annotations
 
-from functools import partial
 from typing import Any
 
 import numpy as np
-from construct import Bytes, Int8ul, Int16ul, Int32ul
+from construct import Bytes, Const, Int8ul, Int16ul, Int32ul, Struct
 
-from lidarspec.spec import Clock, Fields, Frame, OnWrap, Polar, Scaled, Sensor, Sequence, Simulation, Udp
-from lidarspec_hesai.calibration import Calibration, configure, nominal
-from lidarspec_hesai.parts import FACTORY, RETURN_MODES, TURN, UNPUBLISHED, UTC, beams, clock, turning
-from lidarspec_hesai.sealed import ACKNOWLEDGED, BLOCKS, distance, in_body, longest, packet, plausible
+from lidarspec.spec import Fields, Frame, Polar, Scaled
+from lidarspec_hesai.calibration import Calibration, nominal
+from lidarspec_hesai.family import spinning
+from lidarspec_hesai.parts import FACTORY, RETURN_MODES, UTC, beams, returns_of, turning
+from lidarspec_hesai.sealed import ACKNOWLEDGED, BLOCKS, LASERS, distance, in_body, longest, packet, plausible
 
-CHANNELS = 128
 PER_TURN = 900  # blocks in a turn at 10 Hz and single return: 0.4 degrees
 FIRST_SHOT, SHOT = 9e-6, 111.11e-6  # seconds from the packet's time to the first shot, and from shot to shot
 
@@ -74,6 +73,8 @@ LOOP_2_US = (
 )
 # fmt: on
 
+VERSION = ("major" / Const(3, Int8ul), "minor" / Const(2, Int8ul))
+CHANNEL = Struct("distance" / Int16ul * "steps of dis_unit; 0: no return", "reflectivity" / Int8ul, "confidence" / Int8ul)
 TAIL = (
     "tail_reserved" / Bytes(5),
     "mode_flag" / Int8ul * "bit 0: the loop of the packet, with dual return",
@@ -88,7 +89,7 @@ TAIL = (
 
 def points(f: Fields, channels: Calibration) -> Polar:
     """Shots after the packet's time (HesaiLidar_SDK_2.0); channels by the loop, which changes with each shot."""
-    block, returns = np.arange(BLOCKS)[:, None], f.return_count
+    block, returns = np.arange(BLOCKS)[:, None], returns_of(f.return_mode)
     loop = np.where(returns > 1, np.mod(f.mode_flag, 2), block % 2)
     fired = FIRST_SHOT + SHOT * (block // returns) + np.where(loop == 0, 0, 1) * LATER
     return beams(f.body.blocks, channels, distance=distance(f), block=block, returns=returns, fired=fired)
@@ -96,37 +97,30 @@ def points(f: Fields, channels: Calibration) -> Polar:
 
 def sweep(i: int) -> dict[str, Any]:
     """Packet i at 10 Hz with single return."""
-    return in_body(turning(i, BLOCKS, PER_TURN), confidence=True)
+    return in_body(turning(i, BLOCKS, PER_TURN), confidence=1)
 
 
 TABLE = nominal(ELEVATION, AZIMUTH, LOOP_1_US)
 LATER = (np.array(LOOP_2_US) - np.array(LOOP_1_US)) * 1e-6  # seconds by which channels fire later in the second loop
 
-QT128 = Sensor(
+QT128 = spinning(
     "hesai-qt128",
-    vendor="Hesai",
-    model="QT128C2X",
-    frames={
+    {
         "data": Frame(
-            packet(3, 2, CHANNELS, TAIL, confidence=True),
+            packet(VERSION, CHANNEL[LASERS], TAIL, held=True),
             data=True,
-            max_length=longest(CHANNELS, 4),
+            max_length=longest(BLOCKS, 2 + 4 * LASERS),
             plausible=plausible,
             acknowledged=ACKNOWLEDGED,
         )
     },
-    points=partial(points, channels=TABLE),
-    scan=OnWrap("body.blocks.azimuth"),
-    links={"data": Udp(2368)},
-    clock=Clock(clock),
-    sequence=Sequence("sequence"),
-    simulation=Simulation(sweep),
-    configure=partial(configure, points, TABLE),
+    points,
+    TABLE,
+    sweep,
+    "body.blocks.azimuth",
+    model="QT128C2X",
     range_limits=(0.05, 50.0),
-    vendor_axes=("right", "forward", "up"),
-    turn=TURN,
     aliases=("qt128", "qt128c2x"),
     status="vectors",
-    acknowledged=UNPUBLISHED,
     source="HesaiLidar_SDK_2.0 (udp_protocol_v3_2.h, QT128C2X correction files); one captured packet of tier4/nebula",
 )

@@ -5,15 +5,15 @@ Source: HesaiLidar_SDK_2.0 (udp_protocol_v3_1.h; angle and firing-time files of 
 
 from __future__ import annotations
 
-from functools import partial
 from typing import Any
 
 from construct import Bytes, Int8ul, Int16ul, Int32ul
 
-from lidarspec.spec import Clock, Fields, Frame, OnWrap, Polar, Scaled, Sensor, Sequence, Simulation, Udp, take
-from lidarspec_hesai.calibration import Calibration, configure, nominal
+from lidarspec.spec import Fields, Frame, Polar, Scaled, take
+from lidarspec_hesai.calibration import Calibration, nominal
+from lidarspec_hesai.family import spinning
 from lidarspec_hesai.headed import block_numbers, distance, header, longest, packet, plausible
-from lidarspec_hesai.parts import FACTORY, RETURN_MODES, TURN, UNPUBLISHED, UTC, beams, clock, turning
+from lidarspec_hesai.parts import FACTORY, RETURN_MODES, UTC, beams, returns_of, turning
 
 BLOCKS, CHANNELS = 4, 64
 PER_TURN = 600  # blocks in a turn at 10 Hz and single return: 0.6 degrees
@@ -53,7 +53,7 @@ TAIL = (
 
 def points(f: Fields, channels: Calibration) -> Polar:
     """Four shots, or two with dual return, after the packet's time (HesaiLidar_SDK_2.0)."""
-    block, returns = block_numbers(f), f.return_count
+    block, returns = block_numbers(f), returns_of(f.return_mode)
     fired = FIRST_SHOT + take(SHOTS, block // returns)
     return beams(f.blocks, channels, distance=distance(f), block=block, returns=returns, fired=fired)
 
@@ -65,23 +65,15 @@ def sweep(i: int) -> dict[str, Any]:
 
 TABLE = nominal(ELEVATION, AZIMUTH, FIRING_US)
 
-QT64 = Sensor(
+QT64 = spinning(
     "hesai-qt64",
-    vendor="Hesai",
+    {"data": Frame(packet(3, 1, CHANNELS, TAIL), data=True, max_length=longest(CHANNELS, BLOCKS), plausible=plausible)},
+    points,
+    TABLE,
+    sweep,
     model="PandarQT64",
-    frames={"data": Frame(packet(3, 1, CHANNELS, TAIL), data=True, max_length=longest(CHANNELS, BLOCKS), plausible=plausible)},
-    points=partial(points, channels=TABLE),
-    scan=OnWrap("blocks.azimuth"),
-    links={"data": Udp(2368)},
-    clock=Clock(clock),
-    sequence=Sequence("sequence"),
-    simulation=Simulation(sweep),
-    configure=partial(configure, points, TABLE),
     range_limits=(0.1, 60.0),
-    vendor_axes=("right", "forward", "up"),
-    turn=TURN,
     aliases=("qt64", "pandarqt64"),
     status="capture",
-    acknowledged=UNPUBLISHED,
     source="HesaiLidar_SDK_2.0 (udp_protocol_v3_1.h, PandarQT correction files); capture of tier4/nebula",
 )

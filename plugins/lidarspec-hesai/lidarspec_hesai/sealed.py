@@ -4,7 +4,7 @@
     2 x [azimuth, channels], CRC [, functional safety] , tail [, sequence], [, IMU], CRC [, signature]
 
 Source: HesaiLidar_SDK_2.0 (udp_protocol_v3_2.h, udp_protocol_v1_4.h); what the CRCs cover was found in a capture of a QT128, and is assumed
-of the others.
+of the others, where they are not held.
 """
 
 from __future__ import annotations
@@ -17,61 +17,78 @@ from construct import Array, BitsInteger, BitStruct, Bytes, Const, Construct, If
 from lidarspec.spec import Checksummed, Crc, Fields, Scaled
 from lidarspec_hesai.headed import USUAL_UNIT
 
-BLOCKS = 2
+LASERS, BLOCKS = 128, 2
+TWO = Const(BLOCKS, Int8ul)
 CRC = Crc(32, poly=0x04C11DB7, init=0xFFFFFFFF)  # CRC-32/MPEG-2
 
-SAFETY = Checksummed(
-    Struct(
-        "version" / Int8ul,
-        "status" / Int8ul * "bits 7 to 5 state, 4 and 3 type of the fault, 2 to 0 a counter",
-        "fault_number" / Int8ul * "how many faults, in the high half, and which of them this is",
-        "fault_code" / Int16ul,
-        "reserved" / Bytes(8),
-        "crc" / Int32ul,
-    ),
-    "crc",
-    CRC,
-    over=("status", "fault_number", "fault_code", "reserved"),
+SAFETY = Struct(
+    "version" / Int8ul,
+    "status" / Int8ul * "bits 7 to 5 state, 4 and 3 type of the fault, 2 to 0 a counter",
+    "fault_number" / Int8ul * "how many faults, in the high half, and which of them this is",
+    "fault_code" / Int16ul,
+    "reserved" / Bytes(8),
+    "crc" / Int32ul,
+)
+SAFE = ("status", "fault_number", "fault_code", "reserved")  # what its CRC covers
+FLAGS = BitStruct(
+    "reserved" / BitsInteger(1),
+    "environment" / BitsInteger(1),
+    "weight" / BitsInteger(1),
+    "confidence" / BitsInteger(1),
+    "signature" / BitsInteger(1),
+    "safety" / BitsInteger(1),
+    "imu" / BitsInteger(1),
+    "sequence" / BitsInteger(1),
 )
 IMU = Struct(
-    "temperature" / Int16sl,
-    "acceleration_unit" / Int16ul,
-    "rate_unit" / Int16ul,
-    "time" / Int32ul,
-    "acceleration" / Array(3, Int16sl),
+    "temperature" / Scaled(Int16sl, 0.01, "degC"),
+    "acceleration_unit" / Int16ul * "one step of an acceleration, millionths of g",
+    "rate_unit" / Int16ul * "one step of a rate, hundredths of mdeg/s",
+    "time" / Int32ul * "steps of 25 ns",
+    "acceleration" / Array(3, Int16sl) * "x, y, z of the unit's IMU, whose axes are not documented",
     "rate" / Array(3, Int16sl),
 )
 
 
-def packet(major: int, minor: int, lasers: int, tail: Sequence[Construct], *, confidence: bool, imu: bool = False) -> Construct:
-    """The packet of a protocol version with so many lasers in each block, and a fourth byte of each where there is a confidence."""
-    flags = BitStruct(
-        "reserved" / BitsInteger(1),
-        "environment" / BitsInteger(1),
-        "weight" / BitsInteger(1),
-        "confidence" / BitsInteger(1),
-        "signature" / BitsInteger(1),
-        "safety" / BitsInteger(1),
-        "imu" / BitsInteger(1),
-        "sequence" / BitsInteger(1),
+def packet(
+    version: Sequence[Construct],
+    channels: Construct,
+    tail: Sequence[Construct],
+    *,
+    block: Construct | None = None,
+    blocks: Construct = TWO,
+    imu: bool = False,
+    held: bool = False,
+) -> Construct:
+    """The packet of a protocol version.
+
+    Args:
+        version: the fields major and minor.
+        channels: those of a block, an array.
+        tail: what stands between functional safety and sequence.
+        block: what stands between the azimuth of a block and its channels.
+        blocks: how many there are.
+        imu: whether there can be one.
+        held: whether CRCs are held; where nobody has seen what they cover, they are fields like others.
+    """
+    finer = [] if block is None else ["fine_azimuth" / block]
+    body = Struct(
+        "blocks" / Array(this._.block_count, Struct("azimuth" / Scaled(Int16ul, 0.01, "deg"), *finer, "channels" / channels)),
+        "crc" / Int32ul,
     )
-    more = ["confidence" / Int8ul] if confidence else []
-    channel = Struct("distance" / Int16ul * "steps of dis_unit; 0: no return", "reflectivity" / Int8ul, *more)
-    blocks = Array(BLOCKS, Struct("azimuth" / Scaled(Int16ul, 0.01, "deg"), "channels" / Array(lasers, channel)))
     frame = Struct(
         "sync" / Const(b"\xee\xff"),
-        "major" / Const(major, Int8ul),
-        "minor" / Const(minor, Int8ul),
-        "status_version" / Int8ul,
+        *version,
+        "status_version" / Int8ul * "of what the tail says of the unit; tells models of one version",
         "header_reserved" / Bytes(1),
-        "lasers" / Const(lasers, Int8ul),
-        "block_count" / Const(BLOCKS, Int8ul),
+        "lasers" / Const(LASERS, Int8ul),
+        "block_count" / blocks,
         "first_return" / Int8ul * "which return the first block of a shot holds",
         "dis_unit" / Scaled(Int8ul, 1, "mm") * "one step of a distance",
-        "return_count" / Int8ul * "blocks in a row of one shot",
-        "flags" / flags,
-        "body" / Checksummed(Struct("blocks" / blocks, "crc" / Int32ul), "crc", CRC),
-        "safety" / If(this.flags.safety == 1, SAFETY),
+        "return_count" / Int8ul * "returns of a shot; of some models the most that there can be",
+        "flags" / FLAGS,
+        "body" / (Checksummed(body, "crc", CRC) if held else body),
+        "safety" / If(this.flags.safety == 1, Checksummed(SAFETY, "crc", CRC, over=SAFE) if held else SAFETY),
         *tail,
         "sequence" / If(this.flags.sequence == 1, Int32ul),
         *(["imu" / If(this.flags.imu == 1, IMU)] if imu else []),
@@ -80,20 +97,22 @@ def packet(major: int, minor: int, lasers: int, tail: Sequence[Construct], *, co
     )
     names = [part.name for part in frame.subcons]
     covered = names[names.index("safety") + 1 : names.index("tail_crc")]
-    return Checksummed(frame, "tail_crc", CRC, over=covered)
+    return Checksummed(frame, "tail_crc", CRC, over=covered) if held else frame
 
 
-def longest(lasers: int, unit: int) -> int:
-    """The length of a packet with all that there can be, and so many bytes for each channel."""
-    return 12 + BLOCKS * (2 + unit * lasers) + 4 + 17 + 26 + 4 + 22 + 4 + 32
+def longest(blocks: int, block: int) -> int:
+    """The length of a packet with all that there can be, and so many blocks of so many bytes."""
+    return 12 + blocks * block + 4 + 17 + 32 + 4 + 22 + 4 + 32
 
 
 def plausible(f: Fields) -> Any:
-    """One to three returns, a unit, and azimuths below 360 degrees."""
-    return (f.dis_unit >= 1) & (f.return_count >= 1) & (f.return_count <= 3) & (f.body.blocks.azimuth < 360)
+    """Blocks, one to three returns, a unit, and azimuths below 360 degrees."""
+    counted = (f.block_count >= 1) & (f.dis_unit >= 1) & (f.return_count >= 1) & (f.return_count <= 3)
+    return counted & (f.body.blocks.azimuth < 360)
 
 
 #: findings of the kit that hold for these packets.
+UNSEEN = "no packet of this model was seen: what its CRCs cover is not known, and they are not held"
 ACKNOWLEDGED = {"LS205": "as found on a captured stream: header, version of the safety part and signature are under no CRC"}
 
 
@@ -102,8 +121,12 @@ def distance(f: Fields) -> Any:
     return f.body.blocks.channels.distance * (f.dis_unit * 0.001)
 
 
-def in_body(values: dict[str, Any], *, confidence: bool, status_version: int = 0) -> dict[str, Any]:
-    """The values of a simulated packet with single return and a sequence: of its header, and these, its azimuths in the body."""
-    flags = {"flags.sequence": 1, "flags.confidence": int(confidence)}
-    header = {"status_version": status_version, "first_return": 1, "dis_unit": USUAL_UNIT, "return_count": 1, **flags}
+def in_body(values: dict[str, Any], **more: int) -> dict[str, Any]:
+    """The values of a simulated packet with single return and a sequence: of its header, and these, its azimuths in the body.
+
+    Args:
+        more: flags, and fields of the header.
+    """
+    flags = {"flags.sequence": 1, **{f"flags.{name}": value for name, value in more.items() if name in ("confidence", "imu", "safety")}}
+    header = {"first_return": 1, "dis_unit": USUAL_UNIT, "return_count": 1, **flags}
     return {**header, **{name.replace("blocks.", "body.blocks."): value for name, value in values.items()}}

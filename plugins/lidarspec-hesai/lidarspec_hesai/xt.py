@@ -5,17 +5,17 @@ Source: HesaiLidar_SDK_2.0 (udp_protocol_v6_1.h; correction files of the models,
 
 from __future__ import annotations
 
-import dataclasses
 from functools import partial
 from typing import Any
 
 import numpy as np
 from construct import Bytes, Int8ul, Int16ul, Int32ul
 
-from lidarspec.spec import Clock, Fields, Frame, OnWrap, Polar, Relative, Scaled, Sensor, Sequence, Simulation, Udp
-from lidarspec_hesai.calibration import Calibration, configure, nominal
+from lidarspec.spec import Fields, Frame, Polar, Relative, Scaled
+from lidarspec_hesai.calibration import Calibration, nominal
+from lidarspec_hesai.family import spinning
 from lidarspec_hesai.headed import block_numbers, distance, header, longest, packet, plausible
-from lidarspec_hesai.parts import FACTORY, RETURN_MODES, TURN, UNPUBLISHED, UTC, beams, clock, returns_of, turning
+from lidarspec_hesai.parts import FACTORY, RETURN_MODES, UTC, beams, returns_of, turning
 
 BLOCKS = 8
 PER_TURN = 2000  # blocks in a turn at 10 Hz and single return: 0.18 degrees
@@ -32,17 +32,8 @@ TAIL = (
 
 
 def points(f: Fields, channels: Calibration) -> Polar:
-    """Shots up to the packet's time (HesaiLidar_SDK_2.0)."""
-    return _points(f, channels, f.return_count)
-
-
-def points_by_mode(f: Fields, channels: Calibration) -> Polar:
-    """Likewise, of a model whose header says how many returns there can be, not how many there are."""
-    return _points(f, channels, returns_of(f.return_mode))
-
-
-def _points(f: Fields, channels: Calibration, returns: Any) -> Polar:
-    block = block_numbers(f)
+    """Shots up to the packet's time (HesaiLidar_SDK_2.0); the header says how many returns there can be, not how many there are."""
+    block, returns = block_numbers(f), returns_of(f.return_mode)
     fired = -SHOT * ((f.block_count - 1 - block) // returns)
     return beams(f.blocks, channels, distance=distance(f), block=block, returns=returns, fired=fired)
 
@@ -70,50 +61,45 @@ TABLE_32 = nominal(15.0 - np.arange(32), np.zeros(32), 6.0 + 1.512 * np.arange(3
 TABLE_16 = nominal(15.0 - 2.0 * np.arange(16), np.zeros(16), 6.0 + 3.024 * np.arange(16))
 TABLE_XT32M = nominal(ELEVATION_XT32M, AZIMUTH_XT32M, 6.0 + 2.888 * (np.arange(32) % 16))
 
-XT32 = Sensor(
+FRAMES_32 = {"data": Frame(packet(6, 1, 32, TAIL), data=True, max_length=longest(32, BLOCKS), plausible=plausible)}
+FRAMES_16 = {"data": Frame(packet(6, 1, 16, TAIL), data=True, max_length=longest(16, BLOCKS), plausible=plausible)}
+
+XT32 = spinning(
     "hesai-xt32",
-    vendor="Hesai",
+    FRAMES_32,
+    points,
+    TABLE_32,
+    sweep,
     model="PandarXT-32",
-    frames={"data": Frame(packet(6, 1, 32, TAIL), data=True, max_length=longest(32, BLOCKS), plausible=plausible)},
-    points=partial(points, channels=TABLE_32),
-    scan=OnWrap("blocks.azimuth"),
-    links={"data": Udp(2368)},
-    clock=Clock(clock),
-    sequence=Sequence("sequence"),
-    simulation=Simulation(sweep),
-    configure=partial(configure, points, TABLE_32),
     range_limits=(0.05, 120.0),
-    vendor_axes=("right", "forward", "up"),
-    turn=TURN,
     aliases=("xt32", "pandarxt-32"),
     relatives={"hesai-xt32m": Relative("6 blocks in a packet, an XT32 sends 8", lambda f: f.block_count == 6)},
     status="capture",
-    acknowledged=UNPUBLISHED,
     source="HesaiLidar_SDK_2.0 (udp_protocol_v6_1.h, PandarXT correction files); capture of tier4/nebula",
 )
 
-XT16 = dataclasses.replace(
-    XT32,
-    id="hesai-xt16",
+XT16 = spinning(
+    "hesai-xt16",
+    FRAMES_16,
+    points,
+    TABLE_16,
+    sweep,
     model="PandarXT-16",
-    frames={"data": Frame(packet(6, 1, 16, TAIL), data=True, max_length=longest(16, BLOCKS), plausible=plausible)},
-    points=partial(points, channels=TABLE_16),
-    configure=partial(configure, points, TABLE_16),
+    range_limits=(0.05, 120.0),
     aliases=("xt16", "pandarxt-16"),
-    relatives={},
     status="vectors",
     source="HesaiLidar_SDK_2.0 (udp_protocol_v6_1.h, PandarXT-16 correction files); one captured packet of tier4/nebula",
 )
 
-XT32M = dataclasses.replace(
-    XT32,
-    id="hesai-xt32m",
+XT32M = spinning(
+    "hesai-xt32m",
+    FRAMES_32,
+    points,
+    TABLE_XT32M,
+    partial(sweep, blocks=6),
     model="XT32M2X",
-    points=partial(points_by_mode, channels=TABLE_XT32M),
-    simulation=Simulation(partial(sweep, blocks=6)),
-    configure=partial(configure, points_by_mode, TABLE_XT32M),
-    aliases=("xt32m", "xt32m2x"),
     range_limits=(0.5, 300.0),
+    aliases=("xt32m", "xt32m2x"),
     relatives={"hesai-xt32": Relative("8 blocks in a packet, an XT32M sends 6", lambda f: f.block_count == 8)},
     status="vectors",
     source="HesaiLidar_SDK_2.0 (udp_protocol_v6_1.h, PandarXT-32M2X correction files); one captured packet of tier4/nebula",

@@ -1,0 +1,50 @@
+"""A sensor of the family: the links, commands, clock and files that all of them have."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Any
+
+from lidarspec.spec import Clock, Frame, OnWrap, Points, Sensor, Sequence, Simulation, Udp
+from lidarspec_hesai import ptc
+from lidarspec_hesai.calibration import Calibration, configure, told
+from lidarspec_hesai.parts import TURN, UNPUBLISHED, clock
+
+
+def spinning(
+    id: str,
+    data: Mapping[str, Frame],
+    points: Callable[..., Points],
+    table: Calibration,
+    sweep: Callable[[int], Mapping[str, Any]],
+    azimuth: str = "blocks.azimuth",
+    **facts: Any,
+) -> Sensor:
+    """A sensor that turns, and is asked for its angles when it is opened.
+
+    Args:
+        data: its data frames.
+        points: a function of `Fields` and the channels' `Calibration`.
+        table: the model's channels.
+        sweep: the values of simulated packet i.
+        azimuth: the field that passes 0 where a scan ends.
+        facts: what else a `Sensor` has.
+    """
+    defaults: dict[str, Any] = {"turn": TURN, "acknowledged": UNPUBLISHED}
+    return Sensor(
+        id,
+        vendor="Hesai",
+        frames={**data, **ptc.FRAMES},
+        points=partial(points, channels=table),
+        scan=OnWrap(azimuth),
+        links={"data": Udp(2368), "control": ptc.CONTROL},
+        commands=ptc.commands((300, 1200)),
+        on_open=("get_calibration",),
+        clock=Clock(clock),
+        sequence=Sequence("sequence"),
+        simulation=Simulation(sweep, answers={"get_calibration": (("answer", {"payload": told(table)}),)}),
+        configure=partial(configure, points, table),
+        vendor_axes=("right", "forward", "up"),
+        **(defaults | facts),
+    )
