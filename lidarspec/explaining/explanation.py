@@ -197,7 +197,8 @@ class _Trail:
 
     def _leaves(self) -> Iterator[tuple[str, Seen]]:
         for path, seen in self._parts:
-            if not self._in_block(path) and (kind(path) in self._blocks or not isinstance(seen.value, dict | list | None)):
+            is_leaf = seen.value is not None and (kind(path) in self._blocks or not isinstance(seen.value, dict | list))
+            if is_leaf and not self._in_block(path):
                 yield path, seen
 
     def _in_block(self, path: str) -> bool:

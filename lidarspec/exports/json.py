@@ -125,7 +125,8 @@ def node_data(node: tree.Node) -> dict[str, Any]:
         case tree.Struct():
             return {"kind": "struct", "name": node.name, "members": [node_data(member) for member in node.members]}
         case tree.Sealed():
-            return node_data(node.body) | {"checksum": _seal(node)}
+            body = node_data(node.body)
+            return body | {"checksum": _seal(node) | {"inner": body.get("checksum")}}
         case tree.Number():
             return {"kind": node.kind, "name": node.name, "bytes": node.size, "order": node.order} | _info(node.info)
         case tree.Blob():

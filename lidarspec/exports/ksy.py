@@ -271,7 +271,7 @@ class _Types:
 
     def struct(self, node: tree.Struct | tree.Sealed, scope: Scope) -> Attribute:
         """The type of a struct; `scope` says which types it stands in."""
-        body = node.body if isinstance(node, tree.Sealed) else node
+        body = node.struct if isinstance(node, tree.Sealed) else node
         kaitai = _Type()
         for member in body.members:
             self._member(kaitai, member, (*scope, body.path))

@@ -76,7 +76,7 @@ class _Classes:
 
     def _members(self, node: Struct | Sealed | Block) -> Iterator[tuple[str, Node | list[FieldInfo]]]:
         if isinstance(node, Sealed):
-            node = node.body
+            node = node.struct
         if isinstance(node, Struct):
             yield from ((member.name, member) for member in node.members if member.name)
         else:
@@ -143,7 +143,7 @@ class {camel(sensor.id)}(Sensor):
 
 def _build(message: Message) -> str:
     """The signature that builds a frame: its fields by name, numbers raw or with `units` physical; constants and sums are filled in."""
-    body = message.root.body if isinstance(message.root, Sealed) else message.root
+    body = message.root.struct if isinstance(message.root, Sealed) else message.root
     fields = "".join(
         f", {member.name}: {'float' if isinstance(member, Number) else 'Any'} = ..."
         for member in body.members

@@ -349,14 +349,14 @@ class Sealed:
     """A struct with a checksum.
 
     Attributes:
-        body: the struct.
+        body: the struct, which may be sealed by other fields too.
         fields: paths of what holds the checksum, low bits first.
         over: paths of the first and last member that it covers; None: all bytes of the body that hold no bit of `fields`.
         declared: the algorithm, None where a hook has to supply it.
         absent: values that mean "not filled", and pass.
     """
 
-    body: Struct
+    body: Struct | Sealed
     fields: tuple[str, ...]
     over: tuple[str, str] | None
     declared: Checksum | None
@@ -372,6 +372,11 @@ class Sealed:
         if self.declared is None:
             raise SpecError("a checksum without algorithm, and no lidarspec_checksum hook supplies one", path=self.fields[0])
         return self.declared
+
+    @property
+    def struct(self) -> Struct:
+        """The struct itself, below all its seals."""
+        return self.body if isinstance(self.body, Struct) else self.body.struct
 
     @property
     def name(self) -> str:

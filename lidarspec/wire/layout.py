@@ -220,6 +220,10 @@ class Seal:
     algorithm: Checksum
     absent: tuple[int, ...]
 
+    def covers(self, other: Seal) -> bool:
+        """Whether a field that holds another checksum is among what this one covers."""
+        return any(start < leaf.held[1] and leaf.held[0] < end for start, end in self.spans for leaf in other.leaves)
+
     def stored(self, rows: Bytes2D) -> NDArray[np.uint64]:
         """The values that stand in the frames, (n,)."""
         if len(self.leaves) == 1 and self.leaves[0].info.kind != "bytes":

@@ -175,7 +175,7 @@ class _Walk:
 
     def layout(self) -> Layout:
         """What was found, as a value."""
-        seals, following = tuple(self.seals), tuple(self._following())
+        seals, following = tuple(_in_order(self.seals)), tuple(self._following())
         leaves = ByPath(self.leaves, Leaf.element)
         found = (self.cursor, leaves, self.constants, seals, self.places, self.branches, following, self.lengths, self.regions)
         return Layout(*found, self._held())
@@ -382,6 +382,15 @@ class _Walk:
         if count < 0:
             raise TooLong(path)
         return count
+
+
+def _in_order(seals: list[Seal]) -> Iterator[Seal]:
+    """Checksums, each before those that cover its field; inner ones first where neither does."""
+    left = list(seals)
+    while left:
+        free = (seal for seal in left if not any(seal.covers(other) for other in left if other is not seal))
+        left.remove(first := next(free, left[0]))
+        yield first
 
 
 Draw = Callable[[random.Random], int]

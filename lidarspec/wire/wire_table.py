@@ -246,5 +246,5 @@ def hexed(value: object, bits: int) -> str:
 def _sealed(node: tree.Sealed) -> str:
     """What is said of the fields that hold a checksum."""
     name = node.declared.describe() if node.declared else "a checksum that a hook supplies"
-    first, last = (path.removeprefix(f"{node.body.path}.") for path in node.over or ("", ""))
+    first, last = (path.removeprefix(f"{node.struct.path}.") for path in node.over or ("", ""))
     return f"{name} over " + (f"{first} to {last}" if first != last else first or "all other bytes")

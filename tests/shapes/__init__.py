@@ -40,6 +40,7 @@ from tests.shapes import (
     tags,
     text,
     tokens,
+    twice,
     twins,
     weak,
 )
@@ -50,6 +51,7 @@ _MODULES = (
     middle,
     nibbles,
     nested,
+    twice,
     weak,
     twins,
     ahead,

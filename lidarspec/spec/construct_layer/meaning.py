@@ -349,7 +349,7 @@ class _Builder:
 
     def _sealed(self, con: Sealing, place: _Place) -> tree.Node:
         body = self.node(con.subcon, place)
-        if not isinstance(body, tree.Struct):
+        if not isinstance(body, tree.Struct | tree.Sealed):
             return tree.Opaque(place.name, place.info, type(con).__name__, "a checksum around something that is no struct", (body,))
         prefix = f"{place.info.path}." if place.info.path else ""
         over = (prefix + con.over[0], prefix + con.over[-1]) if con.over is not None else None
@@ -409,7 +409,7 @@ def _below(node: tree.Node, names: Iterable[str]) -> tree.Node:
         SpecError: where there is none.
     """
     for name in names:
-        body = node.body if isinstance(node, tree.Sealed) else node
+        body = node.struct if isinstance(node, tree.Sealed) else node
         found = [member for member in body.members if member.name == name] if isinstance(body, tree.Struct) else []
         if not found:
             raise SpecError(f"SizeOf measures {'.'.join(names)!r}, and there is no part {name!r}", path=getattr(body, "path", ""))
