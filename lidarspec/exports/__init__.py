@@ -115,8 +115,10 @@ def messages(sensor: Sensor, *, on_wire: bool = True) -> tuple[Message, ...]:
 
 
 def asked(node: tree.Node) -> list[tree.Ref]:
-    """The fields that the formulas of a node and of what is in it ask for, and those that lengths are held to."""
-    return [ref for below in tree.nodes(node) for value in (*tree.formulas(below), *held(below).values()) for ref in tree.refs(value)]
+    """The fields that the formulas of a node and of what is in it ask for, and those that lengths and conditions are held to."""
+    found = [value for below in tree.nodes(node) for value in (*tree.formulas(below), *held(below).values())]
+    found += [below.condition for below in tree.nodes(node) if isinstance(below, tree.Check)]
+    return [ref for value in found for ref in tree.refs(value)]
 
 
 def held(node: tree.Node) -> dict[str, tree.Formula]:

@@ -20,7 +20,7 @@ from lidarspec.exports import Message, Refused, beginning, c_fields, messages
 from lidarspec.exports.c_fields import CLayout, Entry, accesses, arguments, comment, identifier, parameters, quoted, word
 from lidarspec.spec import Checksum, Crc, Fold15, Sensor, Sum, WordXor, Xor, ZeroPadded
 from lidarspec.spec.checksums import byte_table, mirrored_bytes, reflected
-from lidarspec.spec.tree import Blob, Block, Formula, Number, Op, Repeat, Sealed, formulas, refs
+from lidarspec.spec.tree import Blob, Block, Check, Formula, Never, Number, Op, Repeat, Sealed, formulas, refs, runs_of
 from lidarspec.wire.wire_table import Extent
 
 _FUNCTION = """\
@@ -261,12 +261,24 @@ def _constants(layout: CLayout) -> Iterator[str]:
         node = entry.node
         if isinstance(node, Blob) and node.const is not None:
             yield _unless(entry, f"memcmp(p + {entry.start}, {quoted(node.const)}, {len(node.const)}) != 0")
+        elif isinstance(node, Check):
+            yield _unless(entry, f"!{layout.formula(node.condition)}")
+        elif isinstance(node, Never):
+            yield _unless(entry, "1")
         elif isinstance(node, Number | Block):
             for access in entry.fields:
                 if access.info.const is not None:
                     yield _unless(entry, f"({access.expression}) != {_number(access.info.const)}")
+                elif access.info.allowed is not None:
+                    yield _unless(entry, f"!({_among(access.expression, access.info.allowed)})")
                 elif access.info.held and access.info.rebuilt is not None:
                     yield _unless(entry, f"(int64_t)({access.expression}) != {layout.formula(access.info.rebuilt)}")
+
+
+def _among(expression: str, allowed: tuple[int, ...]) -> str:
+    """Whether a number is one of some."""
+    ranges = (f"(lidarspec_int({expression}) >= {first} && lidarspec_int({expression}) <= {last})" for first, last in runs_of(allowed))
+    return " || ".join(ranges) or "0"
 
 
 def _number(value: Any) -> str:

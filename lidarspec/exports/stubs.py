@@ -18,7 +18,24 @@ from dataclasses import dataclass, field
 from lidarspec.exports import Message, Refused, messages
 from lidarspec.spec import Command, Sensor
 from lidarspec.spec.arguments import Address, Octets, Range, Text
-from lidarspec.spec.tree import Blob, Block, Empty, FieldInfo, Node, Number, Opaque, Parts, Repeat, Sealed, Select, Struct, When, children
+from lidarspec.spec.tree import (
+    Blob,
+    Block,
+    Check,
+    Empty,
+    FieldInfo,
+    Never,
+    Node,
+    Number,
+    Opaque,
+    Parts,
+    Repeat,
+    Sealed,
+    Select,
+    Struct,
+    When,
+    children,
+)
 from lidarspec.wire.schema import schema
 from lidarspec.wire.wire_table import meaning, unit_text
 
@@ -109,7 +126,7 @@ class _Classes:
                 return f"list[{' | '.join(self._type(owner, name + camel(kind.name), kind.element) for kind in node.kinds)}]"
             case When() | Select():
                 return " | ".join(dict.fromkeys(self._type(owner, name, branch) for branch in children(node)))
-            case Empty() | Opaque():
+            case Empty() | Check() | Never() | Opaque():
                 return "None"
 
 

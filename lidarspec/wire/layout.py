@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from lidarspec.errors import PluginError
 from lidarspec.spec.bits import BitField
 from lidarspec.spec.checksums import Checksum, Single, single
-from lidarspec.spec.tree import FieldInfo, Node
+from lidarspec.spec.tree import Check, FieldInfo, Formula, Node, arrays, refs
 from lidarspec.wire.row_checksums import over
 from lidarspec.wire.schema import element_of
 
@@ -288,6 +288,51 @@ class Seal:
         return right
 
 
+@dataclass(frozen=True, eq=False)
+class Condition:
+    """What frames have to meet: one field is one of some values, or a formula of fields side by side is not 0."""
+
+    fields: tuple[FieldInfo, ...]
+    formula: Formula | None
+
+    @classmethod
+    def of(cls, what: FieldInfo | Check) -> Condition:
+        """That a field has one of the values that it may have, or a check."""
+        if isinstance(what, FieldInfo):
+            return cls((what,), None)
+        return cls(tuple(ref.info for ref in refs(what.condition)), what.condition)
+
+    def values(self, raw: Mapping[str, NDArray[Any]]) -> NDArray[np.bool_]:
+        """Whether it holds, element by element, by the raw values of its fields; not where one is left out."""
+        if len(raw) < len(self.fields):
+            return np.zeros(1, np.bool_)
+        if self.formula is None:
+            (values,) = raw.values()
+            return np.isin(values, np.array(self.fields[0].allowed, values.dtype))
+        depth = max(array.ndim for array in raw.values())
+        columns = {path: array.astype(np.int64).reshape(*array.shape, *(1,) * (depth - array.ndim)) for path, array in raw.items()}
+        return np.asarray(arrays(self.formula, columns) != 0)
+
+
+class Test(Protocol):
+    """What frames have to pass, field by field."""
+
+    @property
+    def fields(self) -> tuple[FieldInfo, ...]:
+        """What it is made of."""
+
+    def values(self, raw: Mapping[str, NDArray[Any]]) -> NDArray[Any]:
+        """Whether it holds, element by element, by the raw values of those of its fields that a layout has."""
+
+
+def holding(test: Test, leaves: Mapping[str, Leaf], rows: Bytes2D) -> NDArray[np.bool_]:
+    """In which frames, given as rows of bytes, a test holds everywhere, (n,)."""
+    raw = {info.path: leaf.load(rows) for info in test.fields if (leaf := leaves.get(info.path)) is not None}
+    held = test.values(raw).astype(np.bool_, copy=False)
+    held = np.broadcast_to(held, (len(rows), *held.shape[1:]))
+    return np.asarray(held.all(axis=tuple(range(1, held.ndim))))
+
+
 class PartsRegion(Protocol):
     """The bytes of the parts of a frame, as `lidarspec.wire.parts.Region` has them."""
 
@@ -318,6 +363,7 @@ class Layout:
         lengths: of each array, by its axis; 0 in an array without elements.
         regions: where parts are that are frames in themselves, by their axis.
         held: as constants, what fields have to be that say how long parts are.
+        conditions: that the values of its fields have to meet.
         notes: what is worked out from the layout and kept with it.
     """
 
@@ -331,6 +377,7 @@ class Layout:
     lengths: Mapping[str, int] = field(default_factory=dict)
     regions: Mapping[str, Any] = field(default_factory=dict)
     held: Mapping[int, tuple[int, int]] = field(default_factory=dict)
+    conditions: tuple[Condition, ...] = ()
     notes: dict[Any, Any] = field(default_factory=dict, repr=False)
 
     @cached_property
@@ -352,12 +399,20 @@ class Layout:
         return sum(value << 8 * spot for spot, (_, value) in self.known.items())
 
     def sound(self, frame: bytes) -> bool:
-        """Whether one frame has this size, all constants and the right checksums."""
+        """Whether one frame has this size, all constants and the right checksums, and meets all conditions."""
         return (
             len(frame) == self.size
             and int.from_bytes(frame, "little") & self._mask == self._value
             and all(part.sound(frame) for part in (*self.seals, *self.regions.values()))
+            and (not self.conditions or self.meets(np.frombuffer(frame, np.uint8).reshape(1, -1)).item())
         )
+
+    def meets(self, rows: Bytes2D) -> NDArray[np.bool_]:
+        """Which frames, given as rows of bytes, meet all conditions, (n,)."""
+        met = np.ones(len(rows), np.bool_)
+        for condition in self.conditions:
+            met &= holding(condition, self.leaves, rows)
+        return met
 
     def seal(self, rows: Bytes2D) -> None:
         """Write what follows from the header, the constants and the checksums into frames given as rows of bytes."""

@@ -10,7 +10,21 @@ import re
 
 import numpy as np
 import pytest
-from construct import Array, BitsInteger, BitStruct, Const, Enum, IfThenElse, Int8ul, Int16ub, Int16ul, Nibble, Struct, this
+from construct import (
+    Array,
+    BitsInteger,
+    BitStruct,
+    Const,
+    Enum,
+    EnumIntegerString,
+    IfThenElse,
+    Int8ul,
+    Int16ub,
+    Int16ul,
+    Nibble,
+    Struct,
+    this,
+)
 
 import lidarspec as ls
 from lidarspec import Sensor, WireError
@@ -72,6 +86,7 @@ def test_the_values_are_those_that_parse_gives(sensor: str, frame: str) -> None:
         found = parsed
         for name in re.findall(r"\w+", value.path):
             found = found[int(name)] if name.isdigit() else found[name]
+        found = int(found) if isinstance(found, EnumIntegerString) else found
         assert value.raw == found or (value.raw != value.raw and found != found)
     assert len(values) == leaves(parsed)
 

@@ -14,6 +14,7 @@ from types import ModuleType
 from typing import Any
 
 import pytest
+from construct import EnumIntegerString
 
 from lidarspec import Sensor
 from lidarspec.exports import beginning, export
@@ -81,6 +82,8 @@ def differences(parsed: Any, read: Any, path: str = "") -> list[str]:
     value = read
     while hasattr(value, "value"):  # of an array, and then of one of its alternatives
         value = value.value
+    parsed = int(parsed) if isinstance(parsed, EnumIntegerString) else parsed
+    value = None if parsed is None and value == b"" else value  # a check
     same = parsed == value or (parsed != parsed and value != value)
     return [] if same else [f"{path}: {parsed!r}, and {value!r} in Kaitai"]
 

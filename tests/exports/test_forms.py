@@ -12,7 +12,7 @@ from typing import Any
 from xml.etree import ElementTree
 
 import pytest
-from construct import Bytes, Const, Struct
+from construct import Bytes, Const, EnumIntegerString, Struct
 
 import lidarspec as ls
 from lidarspec.exports import EXPORTS, Refused, UnknownExport, export, narrowed
@@ -47,6 +47,7 @@ def same(one: Any, other: Any) -> bool:
         return set(one) == set(other) and all(same(one[name], value) for name, value in other.items())
     if isinstance(other, list):
         return len(one) == len(other) and all(map(same, one, other))
+    other = int(other) if isinstance(other, EnumIntegerString) else other
     return one == other or (one != one and other != other)
 
 
