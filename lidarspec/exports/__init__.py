@@ -143,6 +143,8 @@ def _check(node: tree.Node) -> None:
     for formula in tree.formulas(node):
         if isinstance(formula, tree.Code):
             raise Refused(formula.reason)
+        if element := next((ref.path for ref in tree.refs(formula) if "[" in ref.path), None):
+            raise Refused(f"{element}: an element of an array decides on what follows, and this language keeps none")
     if isinstance(node, tree.Opaque):
         raise Refused(f"{node.info.path}: {node.reason if node.inside else f'{node.kind} is Python code, which no other language runs'}")
     if isinstance(node, tree.Sealed):

@@ -21,7 +21,7 @@ from lidarspec.wire.build import fill_in, kind_of
 from lidarspec.wire.frame_table import Group, Rows
 from lidarspec.wire.layout import Layout, Leaf
 from lidarspec.wire.layout_tree import TooLong, Unknown, layout_of
-from lidarspec.wire.schema import schema
+from lidarspec.wire.schema import schema, without_indices
 from lidarspec.wire.slots import Recoder, recoder
 
 Values = Mapping[str, Any]
@@ -190,8 +190,9 @@ class FrameMaker:
         info = self.schema.fields.get(path)
         if info is None:
             return int(values[path])  # the bytes of parts
-        if path in values:
-            return int(info.raw(float(values[path])))
+        base, indices = without_indices(path)
+        if base in values:
+            return int(info.raw(float(np.asarray(values[base])[tuple(indices.values())])))
         return int(info.const) if isinstance(info.const, int) else 0 if info.allowed is None or 0 in info.allowed else info.allowed[0]
 
 

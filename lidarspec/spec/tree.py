@@ -274,6 +274,15 @@ def written(formula: Formula, named: Callable[[Ref], str], operations: Mapping[s
     return f"({formula})" if formula < 0 else str(formula)
 
 
+def element_of(info: FieldInfo, path: str, indices: Mapping[str, int]) -> FieldInfo | None:
+    """A field by its place in some of its arrays, as a field of its own; None where it is not in these."""
+    if not indices.keys() <= set(info.axes):
+        return None
+    is_byte = info.kind == "bytes" and info.path in indices
+    kind, bits = ("int", 8) if is_byte else (info.kind, info.bits)
+    return replace(info, path=path, axes=tuple(axis for axis in info.axes if axis not in indices), kind=kind, bits=bits)
+
+
 def parts(formula: Formula) -> Iterator[Formula]:
     """A formula and all that it is made of."""
     yield formula
@@ -773,6 +782,11 @@ class Symbol:
         raise Untraceable(f"an expression asks for {name!r} of a number")
 
     def __getitem__(self, key: object) -> Any:
+        known = self.formula
+        if isinstance(known, Ref) and len(known.info.axes) == 1 and type(key) is int and key >= 0:
+            path = f"{known.path}[{key}]"
+            info = element_of(known.info, path, {known.info.axes[0]: key})
+            return Symbol(Ref(path, info or known.info))
         raise Untraceable("an expression takes an element of an array, or a byte")
 
 

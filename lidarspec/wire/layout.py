@@ -18,9 +18,8 @@ from numpy.typing import NDArray
 from lidarspec.errors import PluginError
 from lidarspec.spec.bits import BitField
 from lidarspec.spec.checksums import Checksum, Single, single
-from lidarspec.spec.tree import Check, FieldInfo, Formula, Node, arrays, refs
+from lidarspec.spec.tree import Check, FieldInfo, Formula, Node, arrays, element_of, refs
 from lidarspec.wire.row_checksums import over
-from lidarspec.wire.schema import element_of
 
 Bytes2D = NDArray[np.uint8]
 
@@ -200,7 +199,8 @@ class Leaf:
                 offset, shape[place] = offset + index % length * self.strides[place], 1
             else:
                 elements = (elements[index],)
-        return replace(self, info=info, offset=offset, shape=tuple(shape[:kept]), strides=self.strides[:kept], elements=elements)
+        size = 1 if self.info.kind == "bytes" and info.kind == "int" else self.size
+        return replace(self, info=info, offset=offset, shape=tuple(shape[:kept]), strides=self.strides[:kept], size=size, elements=elements)
 
     def at(self, offset: int) -> Leaf:
         """The field with its place counted from `offset`."""

@@ -31,7 +31,7 @@ from lidarspec.spec.description import Frame
 from lidarspec.wire.arrays import by_value
 from lidarspec.wire.layout import Condition, Layout, Leaf, Refused, Seal
 from lidarspec.wire.parts import CONSTANT, FAILED, Kind, Measure, Region, Rule
-from lidarspec.wire.schema import ByPath, schema
+from lidarspec.wire.schema import ByPath, schema, without_indices
 
 
 class NotCompilable(Exception):
@@ -191,6 +191,8 @@ class _Walk:
         """
         if path.startswith("_."):
             return tree.FieldInfo(path), self.given[path[2:]]
+        if path not in self.parts and "[" in path:
+            return self._element(path)
         if path not in self.parts:
             scope, _, name = path.rpartition(".")
             raise NotCompilable(scope, f"an expression asks for {name!r}, which is not a field before it")
@@ -203,6 +205,16 @@ class _Walk:
             check_control(part.info)
             raise Unknown(part, self.leaves)
         return part.info, self.values[path]
+
+    def _element(self, path: str) -> tuple[tree.FieldInfo, int]:
+        """An element of an array: the whole of it stands before the formula."""
+        base, indices = without_indices(path)
+        leaf = self.leaves[base].element(path, indices) if base in self.leaves else None
+        if leaf is None:
+            raise IndexError(f"{base} has no such element")
+        if path not in self.values:
+            raise Unknown(leaf, self.leaves)
+        return leaf.info, self.values[path]
 
     def visit(self, node: tree.Node, path: str, shape: tuple[int, ...] = (), strides: tuple[int, ...] = ()) -> None:
         """Go through a part; `shape` and `strides` of the arrays that it is in."""

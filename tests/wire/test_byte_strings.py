@@ -51,6 +51,7 @@ from construct import (
 )
 
 from lidarspec import SpecError, UsageError, WireError
+from lidarspec.exports import Refused, export
 from lidarspec.framing.frame_engine import CompiledCodec, InterpretedCodec, codec
 from lidarspec.testing.conformance import PROPERTIES
 from lidarspec.testing.subject import Subject
@@ -73,6 +74,8 @@ COMPILED: dict[str, Any] = {
     "of a fixed size": FixedSized(3, GreedyBytes),
     "in a struct": Array(this.k, Struct("a" / Bytes(1), "b" / Array(2, Bytes(1)))),
     "empty elements": Array(this.k, Struct("x" / If(this._.k > 2, Int8ub))),
+    "as many as an element says": Struct("a" / Array(2, Int8ub), "b" / Array(this.a[0] % 4, Int8ub), "c" / Bytes(this.a[1] % 3)),
+    "as many as a byte says": Struct("a" / Bytes(2), "b" / Array(this.a[1] % 3, Int16ub)),
     "of what is not there": If(lambda found: found.y is None, Int8ub),
 }
 INTERPRETED: dict[str, Any] = {
@@ -380,3 +383,16 @@ def test_what_is_printed_in_hexadecimal_is_the_value_below() -> None:
     assert plain(ours.parse(b"\1\2ab")) == {"h": 258, "b": b"ab"}
     assert ours.build("data", h=258, b=b"ab") == b"\1\2ab"
     assert ours.decode([b"\1\2ab"])["h"].tolist() == [258]
+
+
+def test_an_element_decides_on_what_follows() -> None:
+    ours = sensor(Struct("sizes" / Array(2, Int8ub), "v" / Array(this.sizes[1], Int8ub)))
+    frames = [ours.build("data", sizes=[9, len(v)], v=v) for v in ([], [5], [6, 7])]
+    assert frames == [b"\x09\0", b"\x09\1\5", b"\x09\2\6\7"]
+    assert ours.decode(frames)["v"].tolist() == [[0, 0], [5, 0], [6, 7]]
+    with pytest.raises(WireError, match="frame ends at byte 3 of 4"):
+        ours.parse(b"\x09\2\6")
+    with pytest.raises(Refused, match=r"sizes\[1\]: an element of an array decides on what follows"):
+        export(ours, "c")
+    outside = sensor(Struct("sizes" / Array(2, Int8ub), "v" / Array(this.sizes[2], Int8ub)))
+    assert outside.decode([b"\1\2\3"]).stats.plugin_errors == 1
