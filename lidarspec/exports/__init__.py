@@ -140,7 +140,7 @@ def _message(sensor: Sensor, name: str, frame: Frame) -> Message:
 
 def _check(node: tree.Node) -> None:
     """Refuse what no other language can say."""
-    for formula in tree.formulas(node):
+    for formula in (*tree.formulas(node), *([node.condition] if isinstance(node, tree.Check) else [])):
         if isinstance(formula, tree.Code):
             raise Refused(formula.reason)
         if element := next((ref.path for ref in tree.refs(formula) if "[" in ref.path), None):

@@ -234,20 +234,27 @@ def evaluated(formula: Formula, read: Read) -> Any:
     return formula
 
 
-def arrays(formula: Formula, columns: Mapping[str, Any]) -> Any:
-    """The values of a formula without `Code`, by int64 arrays of its fields: int64, of the shape that these broadcast to."""
+def arrays(formula: Formula, columns: Mapping[str, Any], dtype: Any) -> Any:
+    """The values of a formula without `Code`, by arrays of its fields of a type that holds all it comes to; truths stay truths."""
     match formula:
         case Ref():
             return columns[formula.path]
         case Op("not", (operand,)):
-            return (arrays(operand, columns) == 0).astype(np.int64)
+            return arrays(operand, columns, dtype) == 0
         case Op(symbol, args):
-            return np.asarray(_OPERATIONS[symbol](*(arrays(arg, columns) for arg in args))).astype(np.int64, copy=False)
-    return np.int64(formula)  # type: ignore[arg-type]
+            values = [arrays(arg, columns, dtype) for arg in args]
+            if symbol not in _OF_TRUTHS:
+                values = [np.asarray(value, dtype) if isinstance(value, np.ndarray) else value for value in values]
+            return _OPERATIONS[symbol](*values)
+    return formula
 
 
 #: operations that give 1 or 0.
 COMPARISONS = frozenset({"==", "!=", "<", "<=", ">", ">="})
+
+
+#: operations that take truths for 1 and 0 in arrays too.
+_OF_TRUTHS = COMPARISONS | {"&", "|", "^"}
 
 
 def _is_condition(formula: Formula) -> bool:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from lidarspec.errors import PluginError
 from lidarspec.spec.bits import BitField
 from lidarspec.spec.checksums import Checksum, Single, single
-from lidarspec.spec.tree import Check, FieldInfo, Formula, Node, arrays, element_of, refs
+from lidarspec.spec.tree import Check, FieldInfo, Formula, Node, arrays, element_of, parts, refs, width
 from lidarspec.wire.row_checksums import over
 
 Bytes2D = NDArray[np.uint8]
@@ -310,8 +310,15 @@ class Condition:
             (values,) = raw.values()
             return np.isin(values, np.array(self.fields[0].allowed, values.dtype))
         depth = max(array.ndim for array in raw.values())
-        columns = {path: array.astype(np.int64).reshape(*array.shape, *(1,) * (depth - array.ndim)) for path, array in raw.items()}
-        return np.asarray(arrays(self.formula, columns) != 0)
+        columns = {path: array.astype(self._dtype).reshape(*array.shape, *(1,) * (depth - array.ndim)) for path, array in raw.items()}
+        found = np.asarray(arrays(self.formula, columns, self._dtype))
+        return found if found.dtype == np.bool_ else found != 0
+
+    @cached_property
+    def _dtype(self) -> Any:
+        """The smallest type that holds whatever the formula comes to on the way."""
+        most = max(width(part) for part in parts(self.formula or 0))
+        return np.int16 if most < 15 else np.int32 if most < 31 else np.int64
 
 
 class Test(Protocol):
