@@ -22,7 +22,7 @@ from construct import (
 )
 
 from lidarspec import Sensor
-from lidarspec.spec import Checksummed, Fields, Frame, OnWrap, Polar, Scaled, Serial, Sum
+from lidarspec.spec import Checksummed, Fields, Frame, OnWrap, Polar, Scaled, Serial, Simulation, Sum
 
 SAMPLE = Struct(
     "distance" / Scaled(Int16ub, 0.001, "m"),
@@ -50,6 +50,11 @@ def points(f: Fields) -> Polar:
     return Polar(range=f.samples.distance, azimuth=np.deg2rad(f.angle + np.arange(2)), intensity=f.samples.flags.quality)
 
 
+def sweep(i: int) -> dict[str, float]:
+    """Eighteen packets a turn; what only some values may be is left out, and the first of them stands there."""
+    return {"angle": i * 20.0 % 360, "samples.flags.quality": 40}
+
+
 SENSOR = Sensor(
     "shape-choices",
     vendor="Shapes",
@@ -57,6 +62,7 @@ SENSOR = Sensor(
     frames={"data": Frame(DATA, data=True, max_length=18)},
     points=points,
     scan=OnWrap("angle"),
+    simulation=Simulation(sweep),
     links={"data": Serial(115_200)},
     range_limits=(0.05, 60.0),
     status="manual",
