@@ -14,6 +14,7 @@ import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from importlib.metadata import distribution
 from importlib.resources import files
 from pathlib import Path
 from string import Template
@@ -662,9 +663,10 @@ def _files(names: Names, link: Link, values: Mapping[str, str], vectors: str, te
     return {
         "pyproject.toml": filled("pyproject.toml", values, link),
         "README.md": readme,
-        "vectors.json": vectors,
+        "LICENSE": distribution("lidarspec").read_text("licenses/LICENSE") or "",
         f"{names.module}/__init__.py": module,
         f"{names.module}/py.typed": "",
+        f"{names.module}/vectors.json": vectors,
         f"tests/test_{names.id.replace('-', '_')}.py": tests,
     }
 
@@ -691,9 +693,10 @@ def joining(folder: Path, names: Names, texts: Mapping[str, str]) -> dict[str, s
         UsageError: where it is another distribution, or has such a sensor already.
         SourceError: where its files cannot be read.
     """
+    listed = f"{names.module}/vectors.json"
     with system_errors(folder):
         project, readme = ((folder / name).read_text(encoding="utf-8") for name in ("pyproject.toml", "README.md"))
-        vectors = (folder / "vectors.json").read_text(encoding="utf-8") if (folder / "vectors.json").exists() else "[]"
+        vectors = (folder / listed).read_text(encoding="utf-8") if (folder / listed).exists() else "[]"
     if f'name = "{names.distribution}"\n' not in project or _LISTED not in project:
         raise UsageError(f"{folder / 'pyproject.toml'} is not that of {names.distribution}, or lists no lidarspec.sensors")
     part = names.id.partition("-")[2].replace("-", "_")
@@ -704,11 +707,11 @@ def joining(folder: Path, names: Names, texts: Mapping[str, str]) -> dict[str, s
         if (folder / name).exists():
             raise UsageError(f"{folder / name} exists already: nothing was written")
     entry = f'{names.id} = "{names.module}.{part}:{names.constant}"\n'
-    own, before = texts["vectors.json"].strip().removeprefix("["), vectors.rstrip().removesuffix("]").rstrip()
+    own, before = texts[listed].strip().removeprefix("["), vectors.rstrip().removesuffix("]").rstrip()
     return {
         **new,
         "pyproject.toml": project.replace(_LISTED, _LISTED + entry),
-        "vectors.json": f"{before}{'' if before == '[' else ','}{own}\n",
+        listed: f"{before}{'' if before == '[' else ','}{own}\n",
         "README.md": f"{readme.rstrip()}\n\nThe {names.vendor} {names.model}, `{names.id}`, stands in `{names.module}/{part}.py`.\n",
     }
 

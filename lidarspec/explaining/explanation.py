@@ -30,7 +30,7 @@ from lidarspec.points.plain import evaluate
 from lidarspec.spec import Checksummed, Frame, Sensor
 from lidarspec.spec.bits import BitField
 from lidarspec.spec.construct_layer import UNNAMED, Seen, field_path, leaves, member
-from lidarspec.spec.tree import Block, FieldInfo, Node, Opaque, Parts, Repeat, Struct, children, exact
+from lidarspec.spec.tree import Block, FieldInfo, Node, Opaque, Parts, Repeat, Struct, children, exact, listed
 from lidarspec.wire.parse import parse_typed
 from lidarspec.wire.schema import schema
 from lidarspec.wire.slots import recoder
@@ -197,7 +197,8 @@ class _Trail:
 
     def _leaves(self) -> Iterator[tuple[str, Seen]]:
         for path, seen in self._parts:
-            if not self._in_block(path) and (kind(path) in self._blocks or not isinstance(seen.value, dict | list | None)):
+            is_leaf = seen.value is not None and (kind(path) in self._blocks or not isinstance(seen.value, dict | list))
+            if is_leaf and not self._in_block(path):
                 yield path, seen
 
     def _in_block(self, path: str) -> bool:
@@ -223,6 +224,9 @@ class _Trail:
                 values.append(value)
                 if info.const is not None and value.raw != info.const:
                     remarks.append(f"wrong: {hexed(value.raw, info.bits)}, expected {hexed(info.const, info.bits)}")
+                    right = False
+                if info.allowed is not None and value.raw not in info.allowed:
+                    remarks.append(f"wrong: {value.raw}, expected {listed(info.allowed)}")
                     right = False
                 if info.held and self._fault is not None and self._fault.path == value.path:
                     remarks.append(f"wrong: {value.raw}, expected {self._fault.expected}")

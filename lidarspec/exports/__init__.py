@@ -115,8 +115,10 @@ def messages(sensor: Sensor, *, on_wire: bool = True) -> tuple[Message, ...]:
 
 
 def asked(node: tree.Node) -> list[tree.Ref]:
-    """The fields that the formulas of a node and of what is in it ask for, and those that lengths are held to."""
-    return [ref for below in tree.nodes(node) for value in (*tree.formulas(below), *held(below).values()) for ref in tree.refs(value)]
+    """The fields that the formulas of a node and of what is in it ask for, and those that lengths and conditions are held to."""
+    found = [value for below in tree.nodes(node) for value in (*tree.formulas(below), *held(below).values())]
+    found += [below.condition for below in tree.nodes(node) if isinstance(below, tree.Check)]
+    return [ref for value in found for ref in tree.refs(value)]
 
 
 def held(node: tree.Node) -> dict[str, tree.Formula]:
@@ -138,9 +140,11 @@ def _message(sensor: Sensor, name: str, frame: Frame) -> Message:
 
 def _check(node: tree.Node) -> None:
     """Refuse what no other language can say."""
-    for formula in tree.formulas(node):
+    for formula in (*tree.formulas(node), *([node.condition] if isinstance(node, tree.Check) else [])):
         if isinstance(formula, tree.Code):
             raise Refused(formula.reason)
+        if element := next((ref.path for ref in tree.refs(formula) if "[" in ref.path), None):
+            raise Refused(f"{element}: an element of an array decides on what follows, and this language keeps none")
     if isinstance(node, tree.Opaque):
         raise Refused(f"{node.info.path}: {node.reason if node.inside else f'{node.kind} is Python code, which no other language runs'}")
     if isinstance(node, tree.Sealed):

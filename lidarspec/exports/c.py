@@ -20,7 +20,7 @@ from lidarspec.exports import Message, Refused, beginning, c_fields, messages
 from lidarspec.exports.c_fields import CLayout, Entry, accesses, arguments, comment, identifier, parameters, quoted, word
 from lidarspec.spec import Checksum, Crc, Fold15, Sensor, Sum, WordXor, Xor, ZeroPadded
 from lidarspec.spec.checksums import byte_table, mirrored_bytes, reflected
-from lidarspec.spec.tree import Blob, Block, Formula, Number, Op, Repeat, Sealed, formulas, refs
+from lidarspec.spec.tree import Blob, Block, Check, Formula, Never, Number, Op, Repeat, Sealed, formulas, refs, runs_of
 from lidarspec.wire.wire_table import Extent
 
 _FUNCTION = """\
@@ -166,10 +166,14 @@ def _frame(layout: CLayout, algorithms: Mapping[Checksum, str]) -> Iterator[str]
     checks = _lines(_needs(layout))
     unused = "" if checks else "    (void)p;\n    (void)n;\n"
     yield _LENGTH.format(name=length, unused=unused, checks=checks, size=layout.size, longest=longest)
-    seals = [(entry, entry.node) for entry in layout.entries if isinstance(entry.node, Sealed)]
-    for entry, seal in seals:
-        yield _checksum(layout, entry, seal, algorithms[seal.algorithm])
-    sealed = [_unless(entry, f"!{layout.name(entry.path, 'checksum_ok')}({arguments(entry.depth)})") for entry, _ in seals]
+    seals = dict[str, tuple[Entry, Sealed]]()
+    for entry in layout.entries:
+        if isinstance(entry.node, Sealed):  # of several around one struct, the inner ones are called after their fields
+            path = entry.path if layout.name(entry.path, "checksum_ok") not in seals else entry.node.fields[0]
+            seals[layout.name(path, "checksum_ok")] = entry, entry.node
+    for name, (entry, seal) in seals.items():
+        yield _checksum(layout, entry, seal, name, algorithms[seal.algorithm])
+    sealed = [_unless(entry, f"!{name}({arguments(entry.depth)})") for name, (entry, _) in seals.items()]
     yield _IS_FRAME.format(name=layout.name("", "is_frame"), length=length, checks=_lines([*_constants(layout), *sealed]))
 
 
@@ -202,13 +206,13 @@ def _divisors(value: Formula) -> Iterator[Formula]:
             yield value.args[1]
 
 
-def _checksum(layout: CLayout, entry: Entry, seal: Sealed, algorithm: str) -> str:
+def _checksum(layout: CLayout, entry: Entry, seal: Sealed, name: str, algorithm: str) -> str:
     held = [access for path in seal.fields for access in accesses(layout, path)]
     for path in seal.fields:
         if [access.depth for access in held if access.info.path == path] != [entry.depth]:
             raise Refused(f"{path}: a checksum that stands in several places")
     return _CHECKSUM.format(
-        name=layout.name(entry.path, "checksum_ok").removesuffix("_ok"),
+        name=name.removesuffix("_ok"),
         parameters=parameters(entry.depth),
         arguments=arguments(entry.depth),
         spans=", ".join(f"{{{start}, {end}}}" for start, end in _spans(layout, entry, seal, held)),
@@ -257,12 +261,24 @@ def _constants(layout: CLayout) -> Iterator[str]:
         node = entry.node
         if isinstance(node, Blob) and node.const is not None:
             yield _unless(entry, f"memcmp(p + {entry.start}, {quoted(node.const)}, {len(node.const)}) != 0")
+        elif isinstance(node, Check):
+            yield _unless(entry, f"!{layout.formula(node.condition)}")
+        elif isinstance(node, Never):
+            yield _unless(entry, "1")
         elif isinstance(node, Number | Block):
             for access in entry.fields:
                 if access.info.const is not None:
                     yield _unless(entry, f"({access.expression}) != {_number(access.info.const)}")
+                elif access.info.allowed is not None:
+                    yield _unless(entry, f"!({_among(access.expression, access.info.allowed)})")
                 elif access.info.held and access.info.rebuilt is not None:
                     yield _unless(entry, f"(int64_t)({access.expression}) != {layout.formula(access.info.rebuilt)}")
+
+
+def _among(expression: str, allowed: tuple[int, ...]) -> str:
+    """Whether a number is one of some."""
+    ranges = (f"(lidarspec_int({expression}) >= {first} && lidarspec_int({expression}) <= {last})" for first, last in runs_of(allowed))
+    return " || ".join(ranges) or "0"
 
 
 def _number(value: Any) -> str:

@@ -19,8 +19,6 @@ from lidarspec.exports import Message, Refused, asked
 from lidarspec.spec import tree
 from lidarspec.wire.wire_table import Extent, meaning, unit_text
 
-#: bits of a value that a formula in 64-bit integers may reach.
-MOST_BITS = 62
 #: comparisons go through a function: compilers warn of what a narrow number can never be.
 _OPERATIONS = {
     **{"//": "lidarspec_floor_div({}, {})", "%": "lidarspec_floor_mod({}, {})", "not": "(int64_t)!{}"},
@@ -47,34 +45,6 @@ def arguments(depth: int) -> str:
 def identifier(text: str) -> str:
     """A text as a part of a C name."""
     return re.sub(r"\W", "_", text.replace("[]", "_inner"), flags=re.ASCII)
-
-
-def bits(value: tree.Formula) -> int:
-    """How many bits, besides a sign, a formula takes at most.
-
-    Raises:
-        Refused: for one that is Python code.
-    """
-    if isinstance(value, tree.Ref):
-        return value.info.bits
-    if isinstance(value, int):
-        return value.bit_length()
-    if isinstance(value, tree.Code):
-        raise Refused(value.reason)
-    args = [bits(arg) for arg in value.args]
-    match value.symbol:
-        case "+" | "-":
-            return max(args) + 1
-        case "*":
-            return sum(args)
-        case "<<":
-            most = value.args[1] if isinstance(value.args[1], int) else (1 << args[1]) - 1 if args[1] < 8 else 99
-            return args[0] + most
-        case "//" | ">>":
-            return args[0] + 1
-        case "not":
-            return 1
-    return 1 if value.symbol in tree.COMPARISONS else max(args)
 
 
 def number_type(fields: Sequence[tree.FieldInfo]) -> str:
@@ -214,7 +184,7 @@ class CLayout:
         Raises:
             Refused: where 64-bit integers cannot hold what it may come to.
         """
-        if bits(value) > MOST_BITS:
+        if tree.width(value) > tree.MOST_BITS:
             raise Refused("a formula that may pass what a 64-bit integer holds")
         return tree.written(value, lambda ref: f"(int64_t){self.name(ref.path, '')}({arguments(len(ref.info.axes))})", _OPERATIONS)
 

@@ -125,7 +125,8 @@ def node_data(node: tree.Node) -> dict[str, Any]:
         case tree.Struct():
             return {"kind": "struct", "name": node.name, "members": [node_data(member) for member in node.members]}
         case tree.Sealed():
-            return node_data(node.body) | {"checksum": _seal(node)}
+            body = node_data(node.body)
+            return body | {"checksum": _seal(node) | {"inner": body.get("checksum")}}
         case tree.Number():
             return {"kind": node.kind, "name": node.name, "bytes": node.size, "order": node.order} | _info(node.info)
         case tree.Blob():
@@ -142,6 +143,10 @@ def node_data(node: tree.Node) -> dict[str, Any]:
         case tree.Select():
             cases = [{"value": value, "part": node_data(case)} for value, case in node.cases]
             return {"kind": "switch", "name": node.name, "key": formula_data(node.key), "cases": cases, "default": node_data(node.default)}
+        case tree.Check():
+            return {"kind": "check", "name": node.name, "condition": formula_data(node.condition)}
+        case tree.Never():
+            return {"kind": "never", "name": node.name}
         case tree.Empty() | tree.Opaque():
             return {"kind": "nothing", "name": node.name}
 
@@ -168,6 +173,8 @@ def formula_data(formula: tree.Formula | None) -> Any:
 def _info(info: tree.FieldInfo) -> dict[str, Any]:
     const = info.const.hex() if isinstance(info.const, bytes | bytearray) else info.const
     facts = {"path": info.path, "unit": info.unit, "scale": info.scale, "offset": info.offset, "const": const, "docs": info.docs}
+    if info.allowed is not None:
+        facts["allowed"] = list(info.allowed)
     if info.held and info.rebuilt is not None:
         facts["equals"] = formula_data(info.rebuilt)
     return {**facts, "labels": {str(value): name for value, name in info.labels.items()}}

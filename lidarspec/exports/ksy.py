@@ -24,6 +24,8 @@ from lidarspec.wire.wire_table import meaning, unit_text
 
 #: a string that means the same without quotes.
 _PLAIN = re.compile(r"[A-Za-z_][A-Za-z0-9_./()<>=+*-]*( [A-Za-z0-9_./()<>=+*;,-]+)*")
+#: values of a field that are listed.
+LISTED = 16
 _WORDS = {"true", "false", "yes", "no", "on", "off", "null", "y", "n"}
 
 
@@ -170,9 +172,14 @@ def _name(part: tree.Part) -> str:
     return identifier("_".join([*(part.names or ("value",)), *map(str, part.indices)]))
 
 
+def _any_of(info: tree.FieldInfo) -> Attribute:
+    """The values that a field may have, unless they are too many to be listed."""
+    return {"valid": {"any-of": list(info.allowed)}} if info.allowed and len(info.allowed) <= LISTED else {}
+
+
 def _valid(part: tree.Part) -> Attribute:
     if part.info.const is None:
-        return {}
+        return _any_of(part.info) if part.bits.width > 1 else {}
     return {"valid": bool(part.info.const) if part.bits.width == 1 else part.info.const}
 
 
@@ -271,7 +278,7 @@ class _Types:
 
     def struct(self, node: tree.Struct | tree.Sealed, scope: Scope) -> Attribute:
         """The type of a struct; `scope` says which types it stands in."""
-        body = node.body if isinstance(node, tree.Sealed) else node
+        body = node.struct if isinstance(node, tree.Sealed) else node
         kaitai = _Type()
         for member in body.members:
             self._member(kaitai, member, (*scope, body.path))
@@ -283,6 +290,10 @@ class _Types:
         match node:
             case tree.Empty():
                 return
+            case tree.Check():
+                kaitai.seq.append({"id": identifier(node.name), "size": 0, "valid": {"expr": truth(node.condition, scope)}, **more})
+            case tree.Never():
+                kaitai.seq.append({"id": identifier(node.name), "size": 0, "valid": {"expr": "false"}, **more})
             case tree.When(otherwise=tree.Empty()):
                 self._member(kaitai, node.then, scope, **more, **{"if": truth(node.condition, scope)})
             case tree.When():
@@ -373,7 +384,7 @@ class _Types:
         if node.kind == "float" and node.size not in FLOATS:
             raise Refused(f"{node.info.path}: a float of {node.size} bytes, and Kaitai knows those of 4 and 8")
         order = {"little": "le", "big": "be"}[node.order] if node.size > 1 else ""
-        const = {} if node.info.const is None else {"valid": node.info.const}
+        const = _any_of(node.info) if node.info.const is None else {"valid": node.info.const}
         return head | {"type": f"{letter}{node.size}{order}"} | const | self._doc(node.info)
 
     def _doc(self, info: tree.FieldInfo) -> Attribute:

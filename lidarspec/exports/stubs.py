@@ -18,7 +18,24 @@ from dataclasses import dataclass, field
 from lidarspec.exports import Message, Refused, messages
 from lidarspec.spec import Command, Sensor
 from lidarspec.spec.arguments import Address, Octets, Range, Text
-from lidarspec.spec.tree import Blob, Block, Empty, FieldInfo, Node, Number, Opaque, Parts, Repeat, Sealed, Select, Struct, When, children
+from lidarspec.spec.tree import (
+    Blob,
+    Block,
+    Check,
+    Empty,
+    FieldInfo,
+    Never,
+    Node,
+    Number,
+    Opaque,
+    Parts,
+    Repeat,
+    Sealed,
+    Select,
+    Struct,
+    When,
+    children,
+)
 from lidarspec.wire.schema import schema
 from lidarspec.wire.wire_table import meaning, unit_text
 
@@ -76,7 +93,7 @@ class _Classes:
 
     def _members(self, node: Struct | Sealed | Block) -> Iterator[tuple[str, Node | list[FieldInfo]]]:
         if isinstance(node, Sealed):
-            node = node.body
+            node = node.struct
         if isinstance(node, Struct):
             yield from ((member.name, member) for member in node.members if member.name)
         else:
@@ -109,7 +126,7 @@ class _Classes:
                 return f"list[{' | '.join(self._type(owner, name + camel(kind.name), kind.element) for kind in node.kinds)}]"
             case When() | Select():
                 return " | ".join(dict.fromkeys(self._type(owner, name, branch) for branch in children(node)))
-            case Empty() | Opaque():
+            case Empty() | Check() | Never() | Opaque():
                 return "None"
 
 
@@ -143,7 +160,7 @@ class {camel(sensor.id)}(Sensor):
 
 def _build(message: Message) -> str:
     """The signature that builds a frame: its fields by name, numbers raw or with `units` physical; constants and sums are filled in."""
-    body = message.root.body if isinstance(message.root, Sealed) else message.root
+    body = message.root.struct if isinstance(message.root, Sealed) else message.root
     fields = "".join(
         f", {member.name}: {'float' if isinstance(member, Number) else 'Any'} = ..."
         for member in body.members

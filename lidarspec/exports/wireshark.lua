@@ -183,12 +183,19 @@ function Walk:amount(formula)
   return count
 end
 
+local function among(runs, value)
+  for _, run in ipairs(runs) do
+    if run[1] <= value and value <= run[2] then return true end
+  end
+  return false
+end
+
 function Walk:keep(node, value, from, to, tree)
   if node.keep then
     self.values[node.keep] = type(value) == "string" and value or plain(value)
     self.exact[node.keep], self.places[node.keep] = value, {from, to}
   end
-  if node.const and tostring(value) ~= tostring(node.const) then
+  if (node.const and tostring(value) ~= tostring(node.const)) or (node.allowed and not among(node.allowed, plain(value))) then
     if not tree then self:fail("constant") end
     self.wrong = self.wrong or "constant"
     return false
@@ -326,6 +333,14 @@ function step.select(self, node, tree, label)
 end
 
 function step.empty() end
+
+function step.never(self) self:fail("length") end
+
+function step.check(self, node, tree)
+  if node.condition(self.values) ~= 0 then return end
+  if not tree then self:fail("constant") end
+  self.wrong = self.wrong or "constant"
+end
 
 -- What is stored, low bits first, and what should be.
 function Walk:stored(seal)

@@ -121,6 +121,10 @@ class _Writer:
                 cases = {value: self.node(case, path) for value, case in node.cases}
                 default = self.node(node.default, path)
                 return {"kind": "select", "name": node.name, "key": _function(node.key), "cases": cases, "default": default}
+            case tree.Check():
+                return {"kind": "check", "name": node.name, "condition": _function(node.condition)}
+            case tree.Never():
+                return {"kind": "never"}
             case tree.Empty() | tree.Opaque():
                 return {"kind": "empty", "skip": 0}
 
@@ -142,7 +146,7 @@ class _Writer:
     def _block(self, node: tree.Block) -> Table:
         order = _word_order(node)
         parts = [self._part(node, part, order) for part in node.parts]
-        looked_at = any(part["keep"] is not None or part["const"] is not None for part in parts)
+        looked_at = any(part[fact] is not None for fact in ("keep", "const", "allowed") for part in parts)
         return {
             "kind": "block",
             "name": node.name,
@@ -214,7 +218,9 @@ class _Writer:
         if info.scaled:
             table["physical"] = self._new("DOUBLE", f"{info.path}.physical", info.name, f"{info.docs} in {info.unit}".strip(), "NONE")
         table |= {"scale": info.scale if info.scaled else None, "offset": info.offset or None, "unit": info.unit or None}
-        return table | {"labels": dict(info.labels) or None, "const": info.const, "keep": self._keep(info.path)}
+        table |= {"labels": dict(info.labels) or None, "const": info.const}
+        table["allowed"] = None if info.allowed is None else [list(run) for run in tree.runs_of(info.allowed)]
+        return table | {"keep": self._keep(info.path)}
 
     def _new(self, kind: str, path: str, name: str, docs: str, base: str, labels: Any = None, mask: int | None = None) -> Code:
         """A field of Wireshark; one name stands for numbers of one family only."""
@@ -230,7 +236,7 @@ class _Writer:
         return path if path in self.kept else None
 
     def _skip(self, info: tree.FieldInfo, size: int) -> int | None:
-        return None if info.path in self.kept or info.const is not None else size
+        return None if info.path in self.kept or info.const is not None or info.allowed is not None else size
 
     def _seal(self, node: tree.Sealed) -> Table:
         widths = {info.path: info.bits for below in tree.nodes(node) for info in tree.infos(below)}

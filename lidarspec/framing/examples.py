@@ -7,6 +7,7 @@ plausible is drawn again, in the end around the values that the sensor's `sweep`
 from __future__ import annotations
 
 import functools
+import math
 import random
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -60,10 +61,13 @@ def examples(sensor: Spec, frame: str, source: random.Random, drawn: Drawn = NOT
         rows = np.frombuffer(source.randbytes(BATCH * layout.size), np.uint8).reshape(BATCH, layout.size).copy()
         if recoding is not None:
             recoding.legal(rows, layout)
+        for leaf in layout.leaves.values():
+            if leaf.info.allowed:
+                leaf.store(rows, np.array(source.choices(leaf.info.allowed, k=BATCH * math.prod(leaf.shape))).reshape(BATCH, *leaf.shape))
         for path, draw in drawn.items():
             if path in layout.leaves and path not in chosen:
                 leaf = layout.leaves[path]
-                count = BATCH * int(np.prod(leaf.shape, dtype=np.intp))
+                count = BATCH * math.prod(leaf.shape)
                 leaf.store(rows, np.array([draw(source) for _ in range(count)]).reshape(BATCH, *leaf.shape))
         found = _plausible(sensor, frame, layout, _headed(rows, layout, chosen))
         if found:
@@ -113,6 +117,8 @@ def _headed(rows: NDArray[np.uint8], layout: Layout, chosen: dict[str, int]) -> 
 
 
 def _plausible(sensor: Spec, frame: str, layout: Layout, rows: NDArray[np.uint8]) -> list[bytes]:
+    if layout.conditions:
+        rows = rows[layout.meets(rows)]
     table = Rows(codec(sensor.frames[frame]).schema, [Group(layout, np.arange(len(rows)), rows)])
     if sensor.frames[frame].plausible is None:
         return _sent(sensor, frame, layout, rows)

@@ -20,9 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.errors import PluginError, SpecError
-from lidarspec.framing.plausibility import Check, Conditions, Judge, plausibility
-from lidarspec.framing.results import CHECKSUM, CONSTANT, LENGTH, PLUGIN, SHORT, VALID, Frames, Recoded, Status
-from lidarspec.spec.construct_layer import Mismatch, fixed_size
+from lidarspec.framing.plausibility import Conditions, Judge, plausibility
+from lidarspec.framing.results import CHECKSUM, CONSTANT, IMPLAUSIBLE, LENGTH, PLUGIN, SHORT, VALID, Frames, Recoded, Status
+from lidarspec.spec.construct_layer import Mismatch, fixed_size, has_conditions
 from lidarspec.spec.description import Frame
 from lidarspec.wire.arrays import alike, counted, repeated
 from lidarspec.wire.frame_table import Group, Records, Rows, Table
@@ -206,11 +206,9 @@ class CompiledCodec(Codec):
         """What judges candidates of a layout that have the constants at the start."""
         judge = layout.notes.get(Judge)
         if judge is None:
-            checks: list[Check] | None = []
-            if self.frame.plausible is not None:
-                self._conditions = self._conditions or Conditions(self.frame.plausible, self.schema, layout)
-                checks = self._conditions.checks(layout)
-            judge = layout.notes[Judge] = Judge(self.frame, self.schema, layout, self.prefix, checks)
+            self._conditions = self._conditions or Conditions(self.frame.plausible, self.schema, layout)
+            tests = self._conditions.met(layout), self._conditions.checks(layout)
+            judge = layout.notes[Judge] = Judge(self.frame, self.schema, layout, self.prefix, *tests)
         return judge
 
 
@@ -220,7 +218,8 @@ class InterpretedCodec(Codec):
     def __init__(self, frame: Frame, reason: str = "") -> None:
         super().__init__(frame)
         self.reason = reason
-        self._levels = ("constants", "lengths", True) if any(info.held for info in self.schema.all_fields.values()) else ("constants", True)
+        lengths = ["lengths"] if any(info.held for info in self.schema.all_fields.values()) else []
+        self._levels = ["constants", *lengths, *(["checksums"] if has_conditions(frame.prepared) else []), True]
 
     def survey(
         self, buffer: NDArray[np.uint8], offsets: NDArray[np.intp], *, kind: int = 0, gathered: bool = True, sums: Sums | None = None
@@ -246,7 +245,9 @@ class InterpretedCodec(Codec):
                 return LENGTH, 0
             parsed = [self.frame.prepared.parse(data[:size], _verify=level) for level in self._levels[1:]][-1]
         except Mismatch as mismatch:
-            return {"checksum": CHECKSUM, "length": LENGTH}.get(mismatch.reason, CONSTANT), 0
+            return {"checksum": CHECKSUM, "length": LENGTH, "value": IMPLAUSIBLE}.get(mismatch.reason, CONSTANT), 0
+        except construct.CheckError:
+            return IMPLAUSIBLE, 0
         except construct.StreamError:
             return (LENGTH if len(data) >= self.frame.room else SHORT), 0
         except SpecError:

@@ -26,7 +26,7 @@ from lidarspec.framing.results import CHECKSUM, CONSTANT, IMPLAUSIBLE, LENGTH, P
 from lidarspec.spec.description import Frame
 from lidarspec.wire.arrays import taken
 from lidarspec.wire.frame_table import Group, Rows, Table
-from lidarspec.wire.layout import Bytes2D, Layout, Leaf, Seal, Sums, elements, marks, right, rows_at, words
+from lidarspec.wire.layout import Bytes2D, Layout, Leaf, Seal, Sums, Test, elements, holding, marks, right, rows_at, words
 from lidarspec.wire.parts import Region
 from lidarspec.wire.schema import Schema
 
@@ -43,13 +43,20 @@ class Judge:
     """Judges candidates of one layout, whose first constants (`prefix`) are known to be right.
 
     Args:
+        met: what the struct's own conditions ask of values.
         checks: the test of plausibility, taken apart; None where only the function itself can tell.
     """
 
     def __init__(
-        self, frame: Frame, schema: Schema, layout: Layout, prefix: Mapping[int, tuple[int, int]], checks: list[Check] | None
+        self,
+        frame: Frame,
+        schema: Schema,
+        layout: Layout,
+        prefix: Mapping[int, tuple[int, int]],
+        met: list[Check],
+        checks: list[Check] | None,
     ) -> None:
-        self._frame, self._schema, self._layout, self._checks = frame, schema, layout, checks
+        self._frame, self._schema, self._layout, self._met, self._checks = frame, schema, layout, met, checks
         self._constants = words(marks({spot: known for spot, known in layout.constants.items() if prefix.get(spot) != known}))
         self._held = words(marks(layout.held))
 
@@ -71,6 +78,7 @@ class Judge:
         _parts_among(self._layout, status, rows, errors, sums)
         for seal in self._layout.seals:
             _among(status, rows, functools.partial(intactness, seal, errors, sums))
+        self._check(status, rows, self._met)
         if self._checks is not None:
             self._check(status, rows, self._checks)
         elif self._frame.plausible is not None:
@@ -100,7 +108,7 @@ def _among(status: NDArray[np.uint8], rows: Bytes2D, judge: Callable[[Bytes2D], 
 def _parts_among(layout: Layout, status: NDArray[np.uint8], rows: Bytes2D, errors: list[PluginError], sums: Sums | None) -> None:
     """Judge by their parts those that are valid so far: whether these fill their room, and by the checksums in them."""
     for region in layout.regions.values():
-        if not region.is_measured or region.has_seals:
+        if not region.is_measured or region.has_checks:
             _among(status, rows, functools.partial(_by_parts, region, errors, sums))
 
 
@@ -115,6 +123,8 @@ def _by_parts(region: Region, errors: list[PluginError], sums: Sums | None, rows
         _parts_among(piece.layout, verdicts, parts, errors, sums)
         for seal in piece.layout.seals:
             _among(verdicts, parts, functools.partial(intactness, seal, errors, sums))
+        if piece.layout.conditions:
+            verdicts[(verdicts == VALID) & ~piece.layout.meets(parts)] = IMPLAUSIBLE
         bad = (verdicts != VALID) & (status[piece.owners] == VALID)
         status[piece.owners[bad]] = verdicts[bad]
     return status
@@ -152,7 +162,7 @@ def _all(array: NDArray[Any], answer: Any, batch: Batch) -> NDArray[np.bool_]:
 
 
 class Conditions:
-    """The test of one frame type.
+    """The tests of one frame type: its own, and those of its struct.
 
     Args:
         plausible: as in `Frame`.
@@ -160,9 +170,14 @@ class Conditions:
         layout: any of its layouts, to trace it on.
     """
 
-    def __init__(self, plausible: Callable[[Any], Any], schema: Schema, layout: Layout) -> None:
-        self._parts = _parts(plausible, schema, layout)
+    def __init__(self, plausible: Callable[[Any], Any] | None, schema: Schema, layout: Layout) -> None:
+        self._parts = [] if plausible is None else _parts(plausible, schema, layout)
         self._tables: dict[tuple[Any, ...], _Table] = {}
+
+    def met(self, layout: Layout) -> list[Check]:
+        """What the struct asks of the values of frames of a layout, as rows of bytes."""
+        every = ((one, {info.path: leaf for info in one.fields if (leaf := layout.leaves.get(info.path))}) for one in layout.conditions)
+        return [self._check(one, leaves) for one, leaves in every]
 
     def checks(self, layout: Layout) -> list[Check] | None:
         """What frames of a layout, as rows of bytes, have to pass; None where only the function itself can tell."""
@@ -175,24 +190,17 @@ class Conditions:
             return []  # a test on no elements holds, and what is combined with it is a test on none either
         return [self._check(part, own) for part, own in zip(self._parts, leaves, strict=True)]
 
-    def _check(self, part: Expression, leaves: Mapping[str, Leaf]) -> Check:
+    def _check(self, part: Test, leaves: Mapping[str, Leaf]) -> Check:
         places = {(leaf.shape, leaf.strides) for leaf in leaves.values()}
         first, last = _window(leaves.values())
         if last - first > 2 or len(places) > 1 or any(len(shape) != len(strides) for shape, strides in places):
-            return functools.partial(_computed, part, leaves)  # more bytes than a table is made for
-        key = (id(part), *((path, leaf.offset - first, leaf.wire, leaf.elements) for path, leaf in leaves.items()))
+            return functools.partial(holding, part, leaves)  # more bytes than a table is made for
+        key = (part, *((path, leaf.offset - first, leaf.wire, leaf.elements) for path, leaf in leaves.items()))
         if key not in self._tables:
             single = {path: replace(leaf.at(first), shape=(), strides=()) for path, leaf in leaves.items()}
             self._tables[key] = _table(part, single, last - first)
         shape, strides = places.pop() if places else ((), ())
         return functools.partial(_looked_up, self._tables[key], first, shape, strides)
-
-
-def _computed(part: Expression, leaves: Mapping[str, Leaf], rows: Bytes2D) -> NDArray[np.bool_]:
-    """Whether a condition holds everywhere in each frame; a field that the layout lacks is nan."""
-    held = part.values({path: leaf.load(rows) for path, leaf in leaves.items()}).astype(np.bool_)
-    held = np.broadcast_to(held, (len(rows), *held.shape[1:]))
-    return np.asarray(held.all(axis=tuple(range(1, held.ndim))))
 
 
 @dataclass(frozen=True, eq=False)
@@ -238,11 +246,11 @@ def _looked_up(table: _Table, spot: int, shape: tuple[int, ...], strides: tuple[
     return np.asarray(held.all(axis=tuple(range(1, held.ndim)))) if shape else held
 
 
-def _table(part: Expression, leaves: Mapping[str, Leaf], size: int) -> _Table:
+def _table(part: Test, leaves: Mapping[str, Leaf], size: int) -> _Table:
     """A condition on so many bytes, at most two."""
     for dtype in map(np.dtype, ("<u2", ">u2") if size == 2 else ("u1",)):
         blocks = np.split(np.arange(1 << 8 * dtype.itemsize, dtype=dtype), 16)  # so that it takes little memory at a time
-        listed = np.concatenate([_computed(part, leaves, codes.view(np.uint8).reshape(len(codes), -1)) for codes in blocks])
+        listed = np.concatenate([holding(part, leaves, codes.view(np.uint8).reshape(len(codes), -1)) for codes in blocks])
         true = np.flatnonzero(listed)
         if len(true) and true[-1] - true[0] == len(true) - 1:
             return _Table(dtype, (int(true[0]), int(true[-1])), listed)

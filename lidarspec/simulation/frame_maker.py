@@ -21,7 +21,7 @@ from lidarspec.wire.build import fill_in, kind_of
 from lidarspec.wire.frame_table import Group, Rows
 from lidarspec.wire.layout import Layout, Leaf
 from lidarspec.wire.layout_tree import TooLong, Unknown, layout_of
-from lidarspec.wire.schema import schema
+from lidarspec.wire.schema import schema, without_indices
 from lidarspec.wire.slots import Recoder, recoder
 
 Values = Mapping[str, Any]
@@ -180,6 +180,9 @@ class FrameMaker:
         for axis, region in layout.regions.items():
             parts = b"".join(made[axis] for _, made in frames)
             rows[:, region.start : region.start + region.size] = np.frombuffer(parts, np.uint8).reshape(len(frames), region.size)
+        for leaf in layout.leaves.values():
+            if leaf.info.allowed and 0 not in leaf.info.allowed and all(leaf.info.path not in values for values, _ in frames):
+                leaf.store(rows, leaf.info.allowed[0])
         layout.seal(rows)
         return rows
 
@@ -187,9 +190,10 @@ class FrameMaker:
         info = self.schema.fields.get(path)
         if info is None:
             return int(values[path])  # the bytes of parts
-        if path in values:
-            return int(info.raw(float(values[path])))
-        return int(info.const) if isinstance(info.const, int) else 0
+        base, indices = without_indices(path)
+        if base in values:
+            return int(info.raw(float(np.asarray(values[base])[tuple(indices.values())])))
+        return int(info.const) if isinstance(info.const, int) else 0 if info.allowed is None or 0 in info.allowed else info.allowed[0]
 
 
 def nested(values: dict[str, Any], path: str, value: Any) -> None:

@@ -128,7 +128,7 @@ class Frame:
     def __repr__(self) -> str:
         size = 0 if self.wire is not None else fixed_size(self.prepared)
         kind = "data, " if self.data else "out, " if self.direction == "out" else ""
-        root = self.tree.body if isinstance(self.tree, Sealed) else self.tree
+        root = self.tree.struct if isinstance(self.tree, Sealed) else self.tree
         names = [member.name for member in children(root) if member.name]
         return f"Frame({kind}{size or f'up to {self.max_length}'} bytes{': ' * bool(names)}{', '.join(names)})"
 

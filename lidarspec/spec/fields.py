@@ -165,7 +165,7 @@ class SizeOf(layer.Sizing):
 
 
 class Checksummed(layer.Sealing):
-    """A struct sealed by one of its own fields, wherever in it that field stands. May nest.
+    """A struct sealed by one of its own fields, wherever in it that field stands. May nest, around one struct too, each with its own field.
 
     Args:
         struct: a construct Struct.
@@ -189,6 +189,12 @@ class Checksummed(layer.Sealing):
         self.algorithm = algorithm
         self.over = (over,) if isinstance(over, str) else tuple(over) if over is not None else None
         self.absent = frozenset(absent)
+        inner = struct
+        while isinstance(inner, Checksummed):
+            if self.over is None and inner.over is None:
+                both = f"the checksums {inner.fields[0]!r} and {self.fields[0]!r} cover each other"
+                raise SpecError(f"{both}: say over= of the one that is made first")
+            inner = inner.subcon
 
     def _parse(self, stream: Any, context: Any, path: str) -> Any:
         start = stream.tell()
@@ -282,7 +288,7 @@ class Checksummed(layer.Sealing):
         for depth, part in enumerate(parts):
             start, end = obj["_marks"][part]
             con, obj = layer.unwrap(con, bits=False)._subcons[part], obj[part]
-            if layer.unwrap(con, bits=False) is not layer.unwrap(con):
+            if parts[depth + 1 :] and layer.unwrap(con, bits=False) is not layer.unwrap(con):
                 inside = layer.bytes_of(con, parts[depth + 1 :])
                 return start + min(inside), start + max(inside) + 1
         return start, end

@@ -14,6 +14,8 @@ and exports walk it (`children`, `nodes`) and know nothing of construct. Everyth
     When            a part that a condition decides on
     Select          a part that a key decides on
     Empty           nothing
+    Check           nothing, under a condition that the frame has to meet
+    Never           what no frame has
     Opaque          what construct alone can read
 
 Counts, lengths, conditions and keys are formulas: numbers, references to fields (`Ref`) and operations on both (`Op`). What only Python
@@ -61,6 +63,7 @@ class FieldInfo:
         scale, offset, unit: ``physical = raw * scale + offset``.
         bits: width in bits; 0 where not fixed.
         const: the value it must have, None where free.
+        allowed: the raw values that it may have (construct's OneOf, NoneOf and Mapping), in their order; None for any.
         rebuilt: what its value in a frame that is made follows from, None where it is given (construct's Rebuild).
         held: whether a frame that comes is held to that (`SizeOf`).
         labels: meanings of raw values (construct's Enum).
@@ -78,6 +81,7 @@ class FieldInfo:
     docs: str = ""
     bits: int = 0
     const: Any = None
+    allowed: tuple[int, ...] | None = None
     rebuilt: Formula | None = None
     held: bool = False
     labels: Mapping[int, str] = field(default_factory=dict)
@@ -131,6 +135,18 @@ class FieldInfo:
         """The lowest and highest raw value of an integer field."""
         signed = self.dtype is not None and self.dtype.kind == "i"
         return (-(1 << (self.bits - 1)), (1 << (self.bits - 1)) - 1) if signed else (0, (1 << self.bits) - 1)
+
+
+def runs_of(values: Sequence[int]) -> list[tuple[int, int]]:
+    """The first and last of each run of values that follow one another; they ascend."""
+    ends = [index for index, value in enumerate(values) if index + 1 == len(values) or values[index + 1] != value + 1]
+    return [(values[first], values[last]) for first, last in zip([0, *(end + 1 for end in ends)], ends, strict=False)]
+
+
+def listed(values: Sequence[int]) -> str:
+    """Some raw values in words: "1, 3, 5 to 7"."""
+    between = {0: "{0}", 1: "{0}, {1}"}
+    return ", ".join(between.get(last - first, "{0} to {1}").format(first, last) for first, last in runs_of(values))
 
 
 @dataclass(frozen=True)
@@ -218,8 +234,27 @@ def evaluated(formula: Formula, read: Read) -> Any:
     return formula
 
 
+def arrays(formula: Formula, columns: Mapping[str, Any], dtype: Any) -> Any:
+    """The values of a formula without `Code`, by arrays of its fields of a type that holds all it comes to; truths stay truths."""
+    match formula:
+        case Ref():
+            return columns[formula.path]
+        case Op("not", (operand,)):
+            return arrays(operand, columns, dtype) == 0
+        case Op(symbol, args):
+            values = [arrays(arg, columns, dtype) for arg in args]
+            if symbol not in _OF_TRUTHS:
+                values = [np.asarray(value, dtype) if isinstance(value, np.ndarray) else value for value in values]
+            return _OPERATIONS[symbol](*values)
+    return formula
+
+
 #: operations that give 1 or 0.
 COMPARISONS = frozenset({"==", "!=", "<", "<=", ">", ">="})
+
+
+#: operations that take truths for 1 and 0 in arrays too.
+_OF_TRUTHS = COMPARISONS | {"&", "|", "^"}
 
 
 def _is_condition(formula: Formula) -> bool:
@@ -246,6 +281,23 @@ def written(formula: Formula, named: Callable[[Ref], str], operations: Mapping[s
     return f"({formula})" if formula < 0 else str(formula)
 
 
+def element_of(info: FieldInfo, path: str, indices: Mapping[str, int]) -> FieldInfo | None:
+    """A field by its place in some of its arrays, as a field of its own; None where it is not in these."""
+    if not indices.keys() <= set(info.axes):
+        return None
+    is_byte = info.kind == "bytes" and info.path in indices
+    kind, bits = ("int", 8) if is_byte else (info.kind, info.bits)
+    return replace(info, path=path, axes=tuple(axis for axis in info.axes if axis not in indices), kind=kind, bits=bits)
+
+
+def parts(formula: Formula) -> Iterator[Formula]:
+    """A formula and all that it is made of."""
+    yield formula
+    if isinstance(formula, Op):
+        for arg in formula.args:
+            yield from parts(arg)
+
+
 def refs(formula: Formula) -> tuple[Ref, ...]:
     """The fields that a formula depends on, in the order in which it names them, each once."""
     match formula:
@@ -256,6 +308,34 @@ def refs(formula: Formula) -> tuple[Ref, ...]:
         case Code():
             return formula.refs
     return ()
+
+
+#: bits of a value that a formula in 64-bit integers may reach.
+MOST_BITS = 62
+
+
+def width(formula: Formula) -> int:
+    """How many bits, besides a sign, a formula without `Code` takes at most."""
+    if isinstance(formula, Ref):
+        return formula.info.bits
+    if isinstance(formula, int):
+        return formula.bit_length()
+    if isinstance(formula, Code):
+        raise ValueError(formula.reason)
+    args = [width(arg) for arg in formula.args]
+    match formula.symbol:
+        case "+" | "-":
+            return max(args) + 1
+        case "*":
+            return sum(args)
+        case "<<":
+            most = formula.args[1] if isinstance(formula.args[1], int) else (1 << args[1]) - 1 if args[1] < 8 else 99
+            return args[0] + most
+        case "//" | ">>":
+            return args[0] + 1
+        case "not":
+            return 1
+    return 1 if formula.symbol in COMPARISONS else max(args)
 
 
 def moved(formula: Formula, axis: str) -> Formula:
@@ -349,14 +429,14 @@ class Sealed:
     """A struct with a checksum.
 
     Attributes:
-        body: the struct.
+        body: the struct, which may be sealed by other fields too.
         fields: paths of what holds the checksum, low bits first.
         over: paths of the first and last member that it covers; None: all bytes of the body that hold no bit of `fields`.
         declared: the algorithm, None where a hook has to supply it.
         absent: values that mean "not filled", and pass.
     """
 
-    body: Struct
+    body: Struct | Sealed
     fields: tuple[str, ...]
     over: tuple[str, str] | None
     declared: Checksum | None
@@ -372,6 +452,11 @@ class Sealed:
         if self.declared is None:
             raise SpecError("a checksum without algorithm, and no lidarspec_checksum hook supplies one", path=self.fields[0])
         return self.declared
+
+    @property
+    def struct(self) -> Struct:
+        """The struct itself, below all its seals."""
+        return self.body if isinstance(self.body, Struct) else self.body.struct
 
     @property
     def name(self) -> str:
@@ -459,6 +544,23 @@ class Empty:
 
 
 @dataclass(frozen=True, eq=False)
+class Check:
+    """A condition that frames have to meet: not 0; `axes` of the arrays that it is in."""
+
+    name: str
+    path: str
+    axes: tuple[str, ...]
+    condition: Formula
+
+
+@dataclass(frozen=True, eq=False)
+class Never:
+    """What no frame has: an alternative that is an error."""
+
+    name: str
+
+
+@dataclass(frozen=True, eq=False)
 class Opaque:
     """What construct alone can read.
 
@@ -482,7 +584,7 @@ class Opaque:
     in_bits: bool = False
 
 
-Node = Number | Blob | Block | Struct | Sealed | Repeat | Parts | When | Select | Empty | Opaque
+Node = Number | Blob | Block | Struct | Sealed | Repeat | Parts | When | Select | Empty | Check | Never | Opaque
 
 
 def children(node: Node) -> tuple[Node, ...]:
@@ -544,8 +646,10 @@ def size(node: Node) -> Formula | None:
                 [(calculated("!=", node.condition, 0), size(node.then)), (calculated("==", node.condition, 0), size(node.otherwise))]
             )
         case Select():
-            cases = [(calculated("==", node.key, value), size(case)) for value, case in node.cases]
+            cases = [(calculated("==", node.key, value), size(case)) for value, case in node.cases if not isinstance(case, Never)]
             others = [calculated("!=", node.key, value) for value, _ in node.cases]
+            if isinstance(node.default, Never):
+                return _chosen(cases)
             return _chosen([*cases, (functools.reduce(functools.partial(calculated, "*"), others), size(node.default))])
     return total(size(below) for below in children(node))
 
@@ -578,7 +682,7 @@ def joined(symbol: str, one: Formula | None, other: Formula | None) -> Formula |
 
 def _chosen(cases: Sequence[tuple[Formula, Formula | None]]) -> Formula | None:
     """The size of alternatives, each with the condition under which it is there."""
-    first = cases[0][1]
+    first = cases[0][1] if cases else 0
     return first if all(each == first for _, each in cases) else total(joined("*", holds, each) for holds, each in cases)
 
 
@@ -685,6 +789,11 @@ class Symbol:
         raise Untraceable(f"an expression asks for {name!r} of a number")
 
     def __getitem__(self, key: object) -> Any:
+        known = self.formula
+        if isinstance(known, Ref) and len(known.info.axes) == 1 and type(key) is int and key >= 0:
+            path = f"{known.path}[{key}]"
+            info = element_of(known.info, path, {known.info.axes[0]: key})
+            return Symbol(Ref(path, info or known.info))
         raise Untraceable("an expression takes an element of an array, or a byte")
 
 

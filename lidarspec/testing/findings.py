@@ -44,7 +44,8 @@ LS105 a field without a name | its bytes are lost on a round trip | "reserved" /
 LS106 padding | its bits come back as zeros | "reserved" / Bytes(n), or "reserved" / BitsInteger(n) among bits
 LS107 Flag on a whole byte | seven bits of it are lost on a round trip | Int8ul, or BitStruct with all eight bits
 LS108 FlagsEnum | bits without a name are lost on a round trip | a BitStruct with a field for every bit
-LS109 RawCopy or construct's Checksum | edits are ignored when it is built again | Checksummed(Struct(...), field=...)
+LS109 RawCopy, Union or construct's Checksum | edits are ignored when it is built again
+      | Checksummed(Struct(...), field=...); one reading of the bytes
 LS110 Pickled | it runs code from the wire | the fields themselves
 LS111 a greedy field | on a stream it has no end, and of empty elements none ever | a count, a length, or a terminator
 LS112 Pointer or Seek | it reads bytes that are not the frame's | the fields in the order of the wire

@@ -236,7 +236,7 @@ def _size_of(root: Node, part: Container, limit: int, totals: Mapping[str, int],
 
 def fill_in(formula: Formula | None, given: Container, value: int, fields: Mapping[str, FieldInfo], axis: str) -> None:
     """Set the field that a formula depends on, where it is left out, so that the formula gives a value."""
-    asked = () if formula is None else tuple(ref for ref in refs(formula) if ref.path in fields)
+    asked = () if formula is None else tuple(ref for ref in refs(formula) if ref.path in fields and "[" not in ref.path)
     if formula is None or not asked:
         return
     holder, name = _place(given, asked[0].path)
@@ -267,7 +267,7 @@ def _fill_counts(given: Container, table: Schema) -> None:
         if count is None or "[]" in axis:
             continue
         array, asked = member(given, axis, None), refs(count)
-        if not isinstance(array, list | bytes) or not asked or asked[0].path not in table.fields:
+        if not isinstance(array, list | bytes) or not asked or asked[0].path not in table.fields or "[" in asked[0].path:
             continue
         holder, field = _place(given, asked[0].path)
         if isinstance(holder, dict) and holder.get(field) is None:
@@ -282,8 +282,8 @@ def given_value(given: Mapping[str, Any], fields: Mapping[str, FieldInfo], path:
         LookupError: where there is none.
     """
     value: Any = given
-    for name in path.split("."):
-        value = value[name]
+    for step in steps(path):
+        value = value[step]
     if isinstance(value, Mapping) or path not in fields:
         return path
     info = fields[path]

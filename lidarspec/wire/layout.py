@@ -18,9 +18,8 @@ from numpy.typing import NDArray
 from lidarspec.errors import PluginError
 from lidarspec.spec.bits import BitField
 from lidarspec.spec.checksums import Checksum, Single, single
-from lidarspec.spec.tree import FieldInfo, Node
+from lidarspec.spec.tree import Check, FieldInfo, Formula, Node, arrays, element_of, parts, refs, width
 from lidarspec.wire.row_checksums import over
-from lidarspec.wire.schema import element_of
 
 Bytes2D = NDArray[np.uint8]
 
@@ -201,7 +200,8 @@ class Leaf:
                 offset, shape[place] = offset + index % length * self.strides[place], 1
             else:
                 elements = (elements[index],)
-        return replace(self, info=info, offset=offset, shape=tuple(shape[:kept]), strides=self.strides[:kept], elements=elements)
+        size = 1 if self.info.kind == "bytes" and info.kind == "int" else self.size
+        return replace(self, info=info, offset=offset, shape=tuple(shape[:kept]), strides=self.strides[:kept], size=size, elements=elements)
 
     def at(self, offset: int) -> Leaf:
         """The field with its place counted from `offset`."""
@@ -220,6 +220,10 @@ class Seal:
     spans: tuple[tuple[int, int], ...]
     algorithm: Checksum
     absent: tuple[int, ...]
+
+    def covers(self, other: Seal) -> bool:
+        """Whether a field that holds another checksum is among what this one covers."""
+        return any(start < leaf.held[1] and leaf.held[0] < end for start, end in self.spans for leaf in other.leaves)
 
     def stored(self, rows: Bytes2D) -> NDArray[np.uint64]:
         """The values that stand in the frames, (n,)."""
@@ -285,6 +289,58 @@ class Seal:
         return right
 
 
+@dataclass(frozen=True, eq=False)
+class Condition:
+    """What frames have to meet: one field is one of some values, or a formula of fields side by side is not 0."""
+
+    fields: tuple[FieldInfo, ...]
+    formula: Formula | None
+
+    @classmethod
+    def of(cls, what: FieldInfo | Check) -> Condition:
+        """That a field has one of the values that it may have, or a check."""
+        if isinstance(what, FieldInfo):
+            return cls((what,), None)
+        return cls(tuple(ref.info for ref in refs(what.condition)), what.condition)
+
+    def values(self, raw: Mapping[str, NDArray[Any]]) -> NDArray[np.bool_]:
+        """Whether it holds, element by element, by the raw values of its fields; not where one is left out."""
+        if len(raw) < len(self.fields):
+            return np.zeros(1, np.bool_)
+        if self.formula is None:
+            (values,) = raw.values()
+            return np.isin(values, np.array(self.fields[0].allowed, values.dtype))
+        depth = max(array.ndim for array in raw.values())
+        columns = {path: array.astype(self._dtype).reshape(*array.shape, *(1,) * (depth - array.ndim)) for path, array in raw.items()}
+        found = np.asarray(arrays(self.formula, columns, self._dtype))
+        return found if found.dtype == np.bool_ else found != 0
+
+    @cached_property
+    def _dtype(self) -> Any:
+        """The smallest type that holds whatever the formula comes to on the way."""
+        most = max(width(part) for part in parts(self.formula or 0))
+        return np.int16 if most < 15 else np.int32 if most < 31 else np.int64
+
+
+class Test(Protocol):
+    """What frames have to pass, field by field."""
+
+    @property
+    def fields(self) -> tuple[FieldInfo, ...]:
+        """What it is made of."""
+
+    def values(self, raw: Mapping[str, NDArray[Any]]) -> NDArray[Any]:
+        """Whether it holds, element by element, by the raw values of those of its fields that a layout has."""
+
+
+def holding(test: Test, leaves: Mapping[str, Leaf], rows: Bytes2D) -> NDArray[np.bool_]:
+    """In which frames, given as rows of bytes, a test holds everywhere, (n,)."""
+    raw = {info.path: leaf.load(rows) for info in test.fields if (leaf := leaves.get(info.path)) is not None}
+    held = test.values(raw).astype(np.bool_, copy=False)
+    held = np.broadcast_to(held, (len(rows), *held.shape[1:]))
+    return np.asarray(held.all(axis=tuple(range(1, held.ndim))))
+
+
 class PartsRegion(Protocol):
     """The bytes of the parts of a frame, as `lidarspec.wire.parts.Region` has them."""
 
@@ -316,6 +372,7 @@ class Layout:
         lengths: of each array, by its axis; 0 in an array without elements.
         regions: where parts are that are frames in themselves, by their axis.
         held: as constants, what fields have to be that say how long parts are.
+        conditions: that the values of its fields have to meet.
         notes: what is worked out from the layout and kept with it.
     """
 
@@ -329,6 +386,7 @@ class Layout:
     lengths: Mapping[str, int] = field(default_factory=dict)
     regions: Mapping[str, Any] = field(default_factory=dict)
     held: Mapping[int, tuple[int, int]] = field(default_factory=dict)
+    conditions: tuple[Condition, ...] = ()
     notes: dict[Any, Any] = field(default_factory=dict, repr=False)
 
     @cached_property
@@ -350,12 +408,20 @@ class Layout:
         return sum(value << 8 * spot for spot, (_, value) in self.known.items())
 
     def sound(self, frame: bytes) -> bool:
-        """Whether one frame has this size, all constants and the right checksums."""
+        """Whether one frame has this size, all constants and the right checksums, and meets all conditions."""
         return (
             len(frame) == self.size
             and int.from_bytes(frame, "little") & self._mask == self._value
             and all(part.sound(frame) for part in (*self.seals, *self.regions.values()))
+            and (not self.conditions or self.meets(np.frombuffer(frame, np.uint8).reshape(1, -1)).item())
         )
+
+    def meets(self, rows: Bytes2D) -> NDArray[np.bool_]:
+        """Which frames, given as rows of bytes, meet all conditions, (n,)."""
+        met = np.ones(len(rows), np.bool_)
+        for condition in self.conditions:
+            met &= holding(condition, self.leaves, rows)
+        return met
 
     def seal(self, rows: Bytes2D) -> None:
         """Write what follows from the header, the constants and the checksums into frames given as rows of bytes."""

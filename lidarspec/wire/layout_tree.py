@@ -29,9 +29,9 @@ from lidarspec.spec import tree
 from lidarspec.spec.bits import BitField, whole_bytes
 from lidarspec.spec.description import Frame
 from lidarspec.wire.arrays import by_value
-from lidarspec.wire.layout import Layout, Leaf, Refused, Seal
+from lidarspec.wire.layout import Condition, Layout, Leaf, Refused, Seal
 from lidarspec.wire.parts import CONSTANT, FAILED, Kind, Measure, Region, Rule
-from lidarspec.wire.schema import ByPath, schema
+from lidarspec.wire.schema import ByPath, schema, without_indices
 
 
 class NotCompilable(Exception):
@@ -148,7 +148,7 @@ def check_columns(root: tree.Node) -> None:
 def check_control(info: tree.FieldInfo) -> None:
     """Raise `NotCompilable` if a layout cannot be made to depend on a field."""
     if info.kind == "int" and info.axes and info.axes[-1].strip("[]") != info.path:
-        raise NotCompilable(info.path, "elements of one array differ in layout")
+        raise NotCompilable(info.path, "elements of one array differ in layout: Parts(struct, count) reads such in bulk")
     if info.axes or info.kind != "int":
         raise NotCompilable(info.path, "the layout depends on a field that is not one integer")
 
@@ -168,6 +168,8 @@ class _Walk:
     branches: dict[tree.Node, tree.Node] = field(default_factory=dict)
     lengths: dict[str, int] = field(default_factory=dict)
     regions: dict[str, Region] = field(default_factory=dict)
+    #: what values have to meet; each once, as a key.
+    conditions: dict[tree.FieldInfo | tree.Check, Condition] = field(default_factory=dict)
     #: elements without a byte, of all arrays.
     empty: int = 0
     #: what expressions can ask for by now: a field, the path of a struct, None for what the header leaves out.
@@ -175,10 +177,10 @@ class _Walk:
 
     def layout(self) -> Layout:
         """What was found, as a value."""
-        seals, following = tuple(self.seals), tuple(self._following())
+        seals, following = tuple(_in_order(self.seals)), tuple(self._following())
         leaves = ByPath(self.leaves, Leaf.element)
         found = (self.cursor, leaves, self.constants, seals, self.places, self.branches, following, self.lengths, self.regions)
-        return Layout(*found, self._held())
+        return Layout(*found, self._held(), tuple(self.conditions.values()))
 
     def read(self, path: str) -> tuple[tree.FieldInfo, int] | str | None:
         """What a formula reads by a path: a field and its raw value, the path of a struct, or None for what the header leaves out.
@@ -189,6 +191,8 @@ class _Walk:
         """
         if path.startswith("_."):
             return tree.FieldInfo(path), self.given[path[2:]]
+        if path not in self.parts and "[" in path:
+            return self._element(path)
         if path not in self.parts:
             scope, _, name = path.rpartition(".")
             raise NotCompilable(scope, f"an expression asks for {name!r}, which is not a field before it")
@@ -201,6 +205,16 @@ class _Walk:
             check_control(part.info)
             raise Unknown(part, self.leaves)
         return part.info, self.values[path]
+
+    def _element(self, path: str) -> tuple[tree.FieldInfo, int]:
+        """An element of an array: the whole of it stands before the formula."""
+        base, indices = without_indices(path)
+        leaf = self.leaves[base].element(path, indices) if base in self.leaves else None
+        if leaf is None:
+            raise IndexError(f"{base} has no such element")
+        if path not in self.values:
+            raise Unknown(leaf, self.leaves)
+        return leaf.info, self.values[path]
 
     def visit(self, node: tree.Node, path: str, shape: tuple[int, ...] = (), strides: tuple[int, ...] = ()) -> None:
         """Go through a part; `shape` and `strides` of the arrays that it is in."""
@@ -223,6 +237,10 @@ class _Walk:
             case tree.Select():
                 self.branches[node] = dict(node.cases).get(self._value(node.key), node.default)
                 self.visit(self.branches[node], path, shape, strides)
+            case tree.Check() if 0 not in shape:
+                self.conditions[node] = condition_of(node)
+            case tree.Never():
+                raise TooLong(path)
             case tree.Opaque():
                 raise NotCompilable(node.info.path, node.reason)
         if self.cursor > self.limit:
@@ -335,6 +353,8 @@ class _Walk:
             self.constants[self.cursor + part.byte] = (mask | part.mask, byte)
 
     def _add(self, leaf: Leaf) -> None:
+        if leaf.info.allowed is not None:
+            self.conditions[leaf.info] = condition_of(leaf.info)
         self.leaves[leaf.info.path] = self.parts[leaf.info.path] = leaf
         if leaf.shape and len(leaf.shape) > len(leaf.strides) - (leaf.info.kind == "bytes"):  # bytes, or an array within a bit block
             self.lengths[leaf.info.axes[-1]] = 0 if 0 in leaf.shape[:-1] else leaf.shape[-1]
@@ -385,6 +405,15 @@ class _Walk:
         return count
 
 
+def _in_order(seals: list[Seal]) -> Iterator[Seal]:
+    """Checksums, each before those that cover its field; inner ones first where neither does."""
+    left = list(seals)
+    while left:
+        free = (seal for seal in left if not any(seal.covers(other) for other in left if other is not seal))
+        left.remove(first := next(free, left[0]))
+        yield first
+
+
 Draw = Callable[[random.Random], int]
 
 
@@ -397,8 +426,8 @@ def _switch_keys(root: tree.Node) -> Iterator[int]:
 
 
 def _some_value(source: random.Random, leaf: Leaf, keys: list[int]) -> int:
-    if leaf.info.const is not None:
-        return int(leaf.info.const)
+    if leaf.info.const is not None or leaf.info.allowed:
+        return int(leaf.info.const) if leaf.info.const is not None else source.choice(leaf.info.allowed or ())
     top = (1 << leaf.info.bits) - 1
     kinds = [source.randint(0, top), source.randint(0, min(top, 8)), source.randint(0, min(top, 40))]
     named = [key for key in (*leaf.info.labels, *keys) if key <= top]
@@ -684,6 +713,12 @@ class HeaderTree:
         if leaf.info.path not in self._told:
             self._told[leaf.info.path] = _Told.of(leaf.info, self._frame, self._limit)
         return self._told[leaf.info.path]
+
+
+@functools.lru_cache(maxsize=4096)
+def condition_of(what: tree.FieldInfo | tree.Check) -> Condition:
+    """The condition that a field or a check makes, the same in all layouts."""
+    return Condition.of(what)
 
 
 @functools.lru_cache(maxsize=256)

@@ -48,9 +48,10 @@ class Kind:
         return words(marks(self.prefix))
 
     @cached_property
-    def is_sealed(self) -> bool:
-        """Whether it has a checksum of its own, or parts with one."""
-        return any(isinstance(node, tree.Sealed) for node in tree.nodes(self.node.root))
+    def is_checked(self) -> bool:
+        """Whether it has a checksum of its own, or conditions, or parts with such."""
+        found = tree.nodes(self.node.root)
+        return any(isinstance(node, tree.Sealed | tree.Check) or any(info.allowed for info in tree.infos(node)) for node in found)
 
     def further(self, layout: Layout) -> tuple[Word, ...]:
         """The constants of a layout behind those that all begin with."""
@@ -114,13 +115,13 @@ class Region:
 
     @property
     def is_measured(self) -> bool:
-        """Whether frames of this layout are known to have these parts, but for their checksums."""
+        """Whether frames of this layout are known to have these parts, but for their checksums and conditions."""
         return self.rule.within is None
 
     @property
-    def has_seals(self) -> bool:
-        """Whether any part has a checksum of its own."""
-        return any(kind.is_sealed for kind in self.kinds)
+    def has_checks(self) -> bool:
+        """Whether any part has a checksum or conditions of its own."""
+        return any(kind.is_checked for kind in self.kinds)
 
     def walked(self, buffer: NDArray[np.uint8], offsets: Offsets) -> Walked:
         """The parts of the frames at these offsets."""

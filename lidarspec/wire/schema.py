@@ -31,6 +31,7 @@ from lidarspec.spec.tree import (
     Struct,
     When,
     children,
+    element_of,
     nodes,
 )
 
@@ -79,14 +80,6 @@ class ByPath(dict[str, _Field]):
             self._elements[path] = None if known is None else self._element(known, path, indices)
         found = self._elements[path]
         return default if found is None else found
-
-
-def element_of(info: FieldInfo, path: str, indices: Mapping[str, int]) -> FieldInfo | None:
-    """A field by its place in some of its arrays, as a field of its own; None where it is not in these."""
-    if not indices.keys() <= set(info.axes):
-        return None
-    kind = "int" if info.kind == "bytes" and info.path in indices else info.kind
-    return replace(info, path=path, axes=tuple(axis for axis in info.axes if axis not in indices), kind=kind)
 
 
 @dataclass(frozen=True, eq=False)

@@ -90,7 +90,7 @@ def extent(node: tree.Node, shown: str = "") -> Extent:
         case tree.Parts():
             return _length(node.within, shown)
         case tree.When() | tree.Select():
-            sizes = {extent(branch, shown) for branch in tree.children(node)}
+            sizes = {extent(branch, shown) for branch in tree.children(node) if not isinstance(branch, tree.Never)}
             return sizes.pop() if len(sizes) == 1 else _length(None, shown)
     return Extent()
 
@@ -140,6 +140,10 @@ def _rows(node: tree.Node, shown: str, start: Extent, condition: str, seals: Map
         case tree.When() | tree.Select():
             for asked, branch in branches(node):
                 yield from _rows(branch, shown, start, asked, seals)
+        case tree.Check():
+            yield WireRow(str(start), "0", "check", shown, "", "; ".join(filter(None, (condition, f"holds: {phrase(node.condition)}"))))
+        case tree.Never():
+            yield WireRow(str(start), "0", "no frame", shown, "", condition)
         case tree.Block():
             for part in node.parts:
                 yield _row(part.info, str(start), *_bits(part), _part(shown, part), condition, seals)
@@ -231,6 +235,7 @@ def unit_text(info: tree.FieldInfo) -> str:
 def meaning(info: tree.FieldInfo) -> str:
     """What is said of a field: its constant, what it follows from, its text, the names of its values."""
     const = f"always {hexed(info.const, info.bits)}" if info.const is not None else ""
+    const = const or (f"only {tree.listed(info.allowed)}" if info.allowed is not None and not info.labels else "")
     follows = phrase(info.rebuilt) if info.rebuilt is not None else "?"
     labels = ", ".join(f"{value} {name}" for value, name in info.labels.items())
     return "; ".join(filter(None, (const, "" if follows == "?" else f"= {follows}", info.docs, labels)))
@@ -246,5 +251,5 @@ def hexed(value: object, bits: int) -> str:
 def _sealed(node: tree.Sealed) -> str:
     """What is said of the fields that hold a checksum."""
     name = node.declared.describe() if node.declared else "a checksum that a hook supplies"
-    first, last = (path.removeprefix(f"{node.body.path}.") for path in node.over or ("", ""))
+    first, last = (path.removeprefix(f"{node.struct.path}.") for path in node.over or ("", ""))
     return f"{name} over " + (f"{first} to {last}" if first != last else first or "all other bytes")

@@ -50,7 +50,7 @@ def test_the_tests_of_a_draft_pass(tmp_path: Path) -> None:
     (tmp_path / "some.bin").write_bytes(b"".join(simulate(ls.sensor("ldrobot-ld06"), 200)))
     ran("new", "acme-x1", "--into", tmp_path, "--from-capture", tmp_path / "some.bin")
     folder = tmp_path / "lidarspec-acme-x1"
-    assert len(json.loads((folder / "vectors.json").read_text(encoding="utf-8"))) == 3
+    assert len(json.loads((folder / "lidarspec_acme_x1" / "vectors.json").read_text(encoding="utf-8"))) == 3
     assert " passed" in run(folder, "pytest", "-q", "-p", "no:cacheprovider")
     assert "angle_4" in run(folder, "lidarspec", "explain", tmp_path / "some.bin", "-s", "acme-x1")
 
@@ -118,7 +118,7 @@ def test_the_points_are_compiled(made: Path) -> None:
 
 def test_its_vectors_are_true(made: Path) -> None:
     sensor = ls.sensor(made / "lidarspec_acme_x1" / "__init__.py")
-    listed = json.loads((made / "vectors.json").read_text(encoding="utf-8"))
+    listed = json.loads((made / "lidarspec_acme_x1" / "vectors.json").read_text(encoding="utf-8"))
     assert {vector["frame"] for vector in listed} == set(sensor.frames)
     for vector in listed:
         parsed = sensor.parse(bytes.fromhex(vector["hex"]), vector["frame"])
@@ -141,6 +141,20 @@ def test_it_is_written_as_the_projects_own_sensors_are(made: Path) -> None:
         done = subprocess.run(ruff, cwd=ROOT, capture_output=True, text=True, check=False)  # where lidarspec is first party
         assert done.returncode == 0, done.stdout
     assert len(module.text.splitlines()) < 160
+
+
+def test_it_has_the_files_and_facts_that_the_projects_own_distributions_have(made: Path) -> None:
+    ours = ROOT / "plugins" / "lidarspec-camsense"
+    kept = {"README.md", "LICENSE", "pyproject.toml"}
+    assert {path.name for path in ours.iterdir() if path.is_file()} == kept == kept & {path.name for path in made.iterdir()}
+    inside = {"__init__.py", "py.typed", "vectors.json"}
+    assert {path.name for path in (ours / "lidarspec_camsense").iterdir() if path.is_file()} == inside
+    assert inside <= {path.name for path in (made / "lidarspec_acme_x1").iterdir()}
+    assert (made / "LICENSE").read_bytes() == (ours / "LICENSE").read_bytes()
+    about, model = (tomllib.loads((folder / "pyproject.toml").read_text(encoding="utf-8"))["project"] for folder in (made, ours))
+    for name in ("license", "license-files", "classifiers", "dependencies", "requires-python"):
+        assert about[name] == model[name]
+    assert not model.keys() - about.keys() - {"authors", "urls"}
 
 
 def test_what_is_there_is_not_overwritten(tmp_path: Path) -> None:
@@ -181,7 +195,8 @@ def test_a_second_model_joins_a_distribution(tmp_path: Path) -> None:
     assert all(file.read_bytes() == text for file, text in before.items())
     assert str(folder / "lidarspec_acme" / "model_2d_x.py") in told
     assert [ls.sensor(folder / "lidarspec_acme" / name).vendor for name in ("__init__.py", "model_2d_x.py")] == ["ACME Robotics"] * 2
-    assert {entry["sensor"] for entry in json.loads((folder / "vectors.json").read_text(encoding="utf-8"))} == {"acme-x1", "acme-2d-x"}
+    listed = json.loads((folder / "lidarspec_acme" / "vectors.json").read_text(encoding="utf-8"))
+    assert {entry["sensor"] for entry in listed} == {"acme-x1", "acme-2d-x"}
     assert "acme-2d-x" in (folder / "README.md").read_text(encoding="utf-8")
     assert " passed" in run(folder, "pytest", "-q", "-p", "no:cacheprovider", "-k", "vectors or by_hand or declaration")
     assert "ACME Robotics X1 Pro" in run(folder, "lidarspec", "show", "acme-x1")

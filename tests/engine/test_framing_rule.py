@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 import pytest
 
+import lidarspec
 from lidarspec import Sensor
 from lidarspec.testing.subject import Subject
 from tests.all_sensors import STREAMS, streams
@@ -40,7 +41,7 @@ def test_every_recoverable_frame_of_every_sensor_is_recovered(sensor: Sensor) ->
 
 
 def test_what_a_sensor_announces_may_change_with_every_frame() -> None:
-    rule.what_is_looked_for_may_change_with_every_frame(Subject(INSTALLED["slamtec-rplidar-s2"]), 4000)
+    rule.what_is_looked_for_may_change_with_every_frame(Subject(lidarspec.sensors()["slamtec-rplidar-s2"]), 4000)
 
 
 @pytest.mark.parametrize("holds", rule.RULES, ids=lambda holds: holds.__name__)

@@ -10,7 +10,20 @@ import re
 
 import numpy as np
 import pytest
-from construct import Array, BitsInteger, BitStruct, Const, Enum, IfThenElse, Int8ul, Int16ub, Int16ul, Nibble, Struct, this
+from construct import (
+    Array,
+    BitsInteger,
+    BitStruct,
+    Const,
+    Enum,
+    IfThenElse,
+    Int8ul,
+    Int16ub,
+    Int16ul,
+    Nibble,
+    Struct,
+    this,
+)
 
 import lidarspec as ls
 from lidarspec import Sensor, WireError

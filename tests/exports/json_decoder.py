@@ -121,5 +121,8 @@ class Decoder:
         key = self.value(part["key"])
         return self.read(next((case["part"] for case in part["cases"] if case["value"] == key), part["default"]))
 
+    def read_check(self, part: dict[str, Any]) -> None:
+        assert self.value(part["condition"])
+
     def read_nothing(self, part: dict[str, Any]) -> None:
         return None

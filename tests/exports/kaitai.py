@@ -83,6 +83,7 @@ def differences(parsed: Any, read: Any, path: str = "") -> list[str]:
     while hasattr(value, "value"):  # of an array, and then of one of its alternatives
         value = value.value
     parsed = number(parsed)
+    value = None if parsed is None and value == b"" else value  # a check
     same = parsed == value or (parsed != parsed and value != value)
     return [] if same else [f"{path}: {parsed!r}, and {value!r} in Kaitai"]
 

@@ -112,7 +112,7 @@ def test_physical_values_are_fields_too(tmp_path: Path) -> None:
     assert "start_angle: 32427 (324.27 deg)" in tshark(capture, "-V", scripts=[script])
 
 
-@pytest.mark.parametrize("name", ["ldrobot-stl27l", "shape-nested", "shape-nibbles", "shape-oddities"])
+@pytest.mark.parametrize("name", ["ldrobot-stl27l", "shape-nested", "shape-twice", "shape-nibbles", "shape-oddities"])
 def test_a_wrong_checksum_is_marked(name: str, tmp_path: Path) -> None:
     sensor = EVERY[name]
     sealed = [kind for kind in sensor.incoming if material.seals(sensor, kind, sensor.example(kind))]

@@ -50,7 +50,7 @@ def alike(f: Fields) -> Any:
 
 
 @pytest.mark.parametrize(
-    ("azimuth", "words"), [(turning, "cos by 5"), (fixed, "cos by 2"), (both, "reduce what is far"), (alike, "cos of each block")]
+    ("azimuth", "words"), [(turning, "cos by 5"), (fixed, "cos by 2"), (both, "cos by 10"), (alike, "cos of each block")]
 )
 @pytest.mark.parametrize("narrow", [True, False])
 def test_points_are_those_of_the_plain_evaluation(azimuth: Any, words: str, narrow: bool) -> None:

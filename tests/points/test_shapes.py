@@ -142,7 +142,7 @@ def test_checksums_stand_where_they_are_declared() -> None:
     assert frame[14:18] == other[14:18]
 
 
-@pytest.mark.parametrize("name", ["shape-middle", "shape-nibbles", "shape-nested", "shape-sized"])
+@pytest.mark.parametrize("name", ["shape-middle", "shape-nibbles", "shape-nested", "shape-twice", "shape-sized"])
 def test_a_sealed_struct_parses_and_builds_without_a_sensor(name: str) -> None:
     """As an author tries it first."""
     sensor = SHAPES[name]

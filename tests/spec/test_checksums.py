@@ -16,9 +16,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from construct import Const, Int8ub, Struct
+from construct import BitsInteger, BitStruct, Const, Int8ub, Struct
 from numpy.typing import NDArray
 
+from lidarspec import SpecError
 from lidarspec.spec import Checksummed
 from lidarspec.spec.checksums import Checksum, Crc, Fold15, Sum, WordXor, Xor, ZeroPadded
 from lidarspec.wire.row_checksums import batch, over
@@ -368,3 +369,25 @@ def test_a_checksum_that_may_be_not_filled_is_computed_only_where_it_is() -> Non
     attentive.asked.clear()
     assert sensor.parse(frames[0]).value == 1
     assert not attentive.asked
+
+
+def test_two_checksums_around_one_struct_are_made_in_the_order_in_which_they_need_each_other() -> None:
+    fields = Struct("header" / Const(b"\x55\x66"), "value" / Int8ub, "check" / Int8ub, "rest" / Int8ub, "sum" / Int8ub)
+    inside_first = Checksummed(Checksummed(fields, "check", Xor(), over=("header", "value")), "sum", Sum(8))
+    outside_first = Checksummed(Checksummed(fields, "sum", Sum(8)), "check", Xor(), over=("header", "value"))
+    for struct in (inside_first, outside_first):
+        sensor = against_construct.sensor(struct)
+        frame = sensor.build("data", value=7, rest=9)
+        assert frame == bytes([0x55, 0x66, 7, 0x55 ^ 0x66 ^ 7, 9, sum([0x55, 0x66, 7, 0x55 ^ 0x66 ^ 7, 9]) & 0xFF])
+        assert sensor.parse(sensor.example("data"))
+        damaged = [frame[:3] + b"\0" + frame[4:], frame[:-1] + b"\0"]
+        assert [sensor.decode(data).stats.bad_checksum for data in (frame, *damaged)] == [0, 1, 1]
+    with pytest.raises(SpecError, match="'check' and 'sum' cover each other"):
+        Checksummed(Checksummed(fields, "check", Xor()), "sum", Sum(8))
+
+
+def test_a_checksum_over_a_whole_bit_block_covers_its_bytes() -> None:
+    block = BitStruct("high" / BitsInteger(4), "low" / BitsInteger(4))
+    sensor = against_construct.sensor(Checksummed(Struct("k" / Int8ub, "bits" / block, "sum" / Int8ub), "sum", Xor(), over="bits"))
+    assert sensor.build("data", k=1, bits={"high": 5, "low": 6}) == b"\x01\x56\x56"
+    assert sensor.parse(b"\x01\x56\x56").sum == 0x56

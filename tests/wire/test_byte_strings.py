@@ -16,6 +16,7 @@ from construct import (
     Computed,
     Const,
     CString,
+    ExprAdapter,
     FixedSized,
     GreedyBytes,
     GreedyRange,
@@ -27,11 +28,14 @@ from construct import (
     Int16ub,
     Int32ub,
     LazyStruct,
+    Mapping,
     NullStripped,
     NullTerminated,
+    PaddedString,
     Prefixed,
     PrefixedArray,
     Probe,
+    ProcessXor,
     RepeatUntil,
     Seek,
     Sequence,
@@ -39,17 +43,25 @@ from construct import (
     Struct,
     Switch,
     Terminated,
+    Transformed,
+    Union,
     len_,
     obj_,
     this,
 )
 
 from lidarspec import SpecError, UsageError, WireError
+from lidarspec.exports import Refused, export
 from lidarspec.framing.frame_engine import CompiledCodec, InterpretedCodec, codec
 from lidarspec.testing.conformance import PROPERTIES
 from lidarspec.testing.subject import Subject
 from tests.engine.against_construct import BACKENDS, agree, plain, sensor
 from tests.engine.engines import clean_and_damaged_input_read_alike, values_at_the_edges_read_alike
+
+
+def inverted(data: bytes) -> bytes:
+    return bytes(byte ^ 0xFF for byte in data)
+
 
 TEXT = NullTerminated(GreedyBytes)
 COUNTED = [bytes([count, *range(1, 1 + size)]) for count in range(4) for size in range(15)]
@@ -62,6 +74,8 @@ COMPILED: dict[str, Any] = {
     "of a fixed size": FixedSized(3, GreedyBytes),
     "in a struct": Array(this.k, Struct("a" / Bytes(1), "b" / Array(2, Bytes(1)))),
     "empty elements": Array(this.k, Struct("x" / If(this._.k > 2, Int8ub))),
+    "as many as an element says": Struct("a" / Array(2, Int8ub), "b" / Array(this.a[0] % 4, Int8ub), "c" / Bytes(this.a[1] % 3)),
+    "as many as a byte says": Struct("a" / Bytes(2), "b" / Array(this.a[1] % 3, Int16ub)),
     "of what is not there": If(lambda found: found.y is None, Int8ub),
 }
 INTERPRETED: dict[str, Any] = {
@@ -202,7 +216,7 @@ def test_a_length_that_is_no_number_is_the_plugins_fault_and_a_negative_one_is_t
 @pytest.mark.parametrize(
     ("part", "reason"),
     [
-        (Computed(this.a + 1), "Computed has no fixed place"),
+        (Computed(this.a + 1), "Computed is no field of the wire"),
         (BitStruct("n" / BitsInteger(8), "x" / Switch(this.n, {77: BitsInteger(8)}, default=BitStruct("y" / BitsInteger(8)))), "b"),
         (BitStruct("wide" / BitsInteger(72)), "its 72 bits are more than a column holds"),
     ],
@@ -301,6 +315,7 @@ def test_of_a_greedy_array_no_byte_is_dropped() -> None:
         (Array(2, Aligned(4, Int8ub)), "Aligned loses its padding on a round trip, unless it is a named member of a Struct"),
         (Array(2, FixedSized(4, Int8ub)), "FixedSized loses what its content leaves of it, unless it is a named member of a Struct"),
         (Array(2, Prefixed(Int8ub, Int16ub)), "Prefixed loses what its content leaves of it, unless it is a named member of a Struct"),
+        (Union(0, "a" / Int16ub, "b" / Int8ub), "edits of all but one are ignored on rebuild: declare one of them"),
         (Prefixed(Int8ub, NullStripped(GreedyBytes)), "Prefixed loses what its content leaves"),
     ],
 )
@@ -340,7 +355,15 @@ def test_what_has_no_name_is_refused_with_what_to_write(part: Any, instead: str)
         (Sequence(Int8ub, Int16ub), "say Struct('a'"),
         (LazyStruct("a" / Int8ub), "say Struct, which is read in bulk"),
         (RepeatUntil(obj_ == 0, Int8ub), "Array with a count"),
-        (If(this.k, PrefixedArray(Int8ub, Int8ub)), "a named member of a Struct alone"),
+        (ProcessXor(0x55, Int16ub), "undo it in `points`"),
+        (Transformed(Int16ub, inverted, 2, inverted, 2), "undo it in `points`"),
+        (ExprAdapter(Int8ub, obj_ + 1, obj_ - 1), "say Scaled"),
+        (Mapping(Int8ub, {100: 1, 200: 2}), "say Enum"),
+        (PaddedString(8, "ascii"), "say Bytes(n)"),
+        (FixedSized(8, CString("ascii")), "say Bytes(n)"),
+        (Computed(this.k * 2), "calculate it in `points`"),
+        (Array(2, Struct("n" / Int8ub, "x" / Array(this.n, Int8ub))), "Parts(struct, count)"),
+        (Array(2, PrefixedArray(Int8ub, Int8ub)), "a named member of a Struct alone"),
     ],
 )
 def test_what_construct_alone_reads_says_what_to_write(part: Any, instead: str) -> None:
@@ -349,9 +372,27 @@ def test_what_construct_alone_reads_says_what_to_write(part: Any, instead: str) 
     assert instead in engine.reason
 
 
+def test_a_text_in_a_part_of_fixed_size_has_examples() -> None:
+    ours = sensor(Struct("k" / Int8ub, "v" / FixedSized(8, CString("ascii"))))
+    assert len(ours.example("data")) == 9
+
+
 def test_what_is_printed_in_hexadecimal_is_the_value_below() -> None:
     ours = sensor(Struct("h" / Hex(Int16ub), "b" / HexDump(Bytes(2))))
     assert isinstance(codec(ours.frames["data"]), CompiledCodec)
     assert plain(ours.parse(b"\1\2ab")) == {"h": 258, "b": b"ab"}
     assert ours.build("data", h=258, b=b"ab") == b"\1\2ab"
     assert ours.decode([b"\1\2ab"])["h"].tolist() == [258]
+
+
+def test_an_element_decides_on_what_follows() -> None:
+    ours = sensor(Struct("sizes" / Array(2, Int8ub), "v" / Array(this.sizes[1], Int8ub)))
+    frames = [ours.build("data", sizes=[9, len(v)], v=v) for v in ([], [5], [6, 7])]
+    assert frames == [b"\x09\0", b"\x09\1\5", b"\x09\2\6\7"]
+    assert ours.decode(frames)["v"].tolist() == [[0, 0], [5, 0], [6, 7]]
+    with pytest.raises(WireError, match="frame ends at byte 3 of 4"):
+        ours.parse(b"\x09\2\6")
+    with pytest.raises(Refused, match=r"sizes\[1\]: an element of an array decides on what follows"):
+        export(ours, "c")
+    outside = sensor(Struct("sizes" / Array(2, Int8ub), "v" / Array(this.sizes[2], Int8ub)))
+    assert outside.decode([b"\1\2\3"]).stats.plugin_errors == 1

@@ -207,6 +207,67 @@ class CheckedConst(Const):  # type: ignore[misc]
         return obj
 
 
+class Limited(Subconstruct):  # type: ignore[misc]
+    """A number that is one of some raw values, and no other: construct's OneOf, NoneOf and Mapping."""
+
+    def __init__(self, subcon: Construct, allowed: tuple[int, ...]) -> None:
+        super().__init__(subcon)
+        self.allowed = allowed
+
+    def _parse(self, stream: Any, context: Any, path: str) -> Any:
+        start = stream.tell()
+        obj = self.subcon._parsereport(stream, context, path)
+        return self._held(obj, start, path) if verifying(context, "values") else obj
+
+    def _build(self, obj: Any, stream: Any, context: Any, path: str) -> Any:
+        return self._held(self.subcon._build(obj, stream, context, path), 0, path)
+
+    def _held(self, obj: Any, start: int, path: str) -> Any:
+        if int(obj) not in self.allowed:
+            raise Mismatch(path, start, tree.listed(self.allowed), int(obj), "value")
+        return obj
+
+
+class HeldCheck(construct.Check):  # type: ignore[misc]
+    """A Check that can be read unchecked."""
+
+    def _parse(self, stream: Any, context: Any, path: str) -> Any:
+        return super()._parse(stream, context, path) if verifying(context, "values") else None
+
+
+class _Compared:
+    """What stands for a value that a validator is given, and remembers what it is compared with."""
+
+    __hash__ = None  # type: ignore[assignment]
+
+    def __init__(self) -> None:
+        self.values: list[Any] = []
+
+    def __eq__(self, other: object) -> bool:
+        self.values.append(other)
+        return False
+
+
+def _allowed(con: construct.Validator) -> tuple[int, ...] | None:
+    """The raw values that a validator lets pass: those that it compares with, or of 16 bits all that pass; None where neither is known."""
+    field, subcon = unwrap(con), con.subcon
+    while isinstance(subcon, Subconstruct) and not isinstance(subcon, construct.Enum):
+        subcon = subcon.subcon
+    if not isinstance(field, FormatField | BytesInteger | BitsInteger) or getattr(field, "fmtstr", "B")[-1] in "efd?":
+        return None
+    width, signed = bit_width(field), field.fmtstr[-1].islower() if isinstance(field, FormatField) else field.signed
+    low, high = (-(1 << (width - 1)), (1 << (width - 1)) - 1) if signed else (0, (1 << width) - 1)
+    with contextlib.suppress(Exception):
+        passes = con._validate(compared := _Compared(), None, "")
+        if compared.values and not passes and all(type(value) is int for value in compared.values):
+            return tuple(value for value in sorted({*compared.values}) if low <= value <= high and con._validate(value, None, ""))
+    with contextlib.suppress(Exception):
+        if width <= 16:
+            seen = (lambda raw: subcon._decode(raw, None, None)) if isinstance(subcon, construct.Enum) else int
+            return tuple(raw for raw in range(low, high + 1) if con._validate(seen(raw), None, ""))
+    return None
+
+
 class CountedBytes(Bytes):  # type: ignore[misc]
     """Bytes, of which a wrong length is told from an end of the stream, and what are none from an expression that fails."""
 
@@ -402,11 +463,11 @@ class Partition(Construct):  # type: ignore[misc]
 
 
 #: how much of a frame is checked, where it is not all of it (``_verify``: True) or nothing (False).
-LEVELS = ("constants", "lengths", "checksums")
+LEVELS = ("constants", "lengths", "checksums", "values")
 
 
 def verifying(context: Any, what: str = "constants") -> bool:
-    """Whether constants, lengths of parts or checksums are checked in this parse; who checks one checks those before it."""
+    """Whether constants, lengths, checksums or values are checked in this parse; who checks one of them checks those before it."""
     wanted = context._params.get("_verify", True)
     return LEVELS.index(what) <= LEVELS.index(wanted) if isinstance(wanted, str) else bool(wanted)
 
@@ -431,6 +492,12 @@ def prepare(con: Construct, limit: int = sys.maxsize, *, in_bits: bool = False) 
         return ExactFloat(con.fmtstr[0], con.fmtstr[-1]) if con.fmtstr[-1] in "efd" else con
     if isinstance(con, construct.Hex | construct.HexDump):  # how a value is printed; it is the value below it
         return prepare(con.subcon, limit, in_bits=in_bits)
+    if isinstance(con, construct.Check):
+        return HeldCheck(con.func)
+    if isinstance(con, construct.Mapping) and {*map(type, con.encmapping), *map(type, con.decmapping)} == {str, int}:
+        return Limited(NamedEnum(prepare(con.subcon, limit, in_bits=in_bits), **con.encmapping), tuple(sorted(con.decmapping)))
+    if isinstance(con, construct.ExprValidator) and (allowed := _allowed(con)) is not None:
+        return Limited(prepare(con.subcon, limit, in_bits=in_bits), allowed)
     if isinstance(con, Filler):
         con.limit = limit
         return con
@@ -471,6 +538,10 @@ def _spelled_out(con: Construct) -> list[Construct]:
     def named(ending: str, part: Construct, what: str) -> Construct:
         return construct.Renamed(part, newname=name + ending, newdocs=f"{what} {name}")
 
+    if name and isinstance(inner, construct.IfThenElse) and inner.elsesubcon is construct.Pass:
+        members = _spelled_out(construct.Renamed(inner.thensubcon, newname=name, newdocs=docs))
+        optional = (construct.Renamed(construct.If(inner.condfunc, one.subcon), newname=one.name, newdocs=one.docs) for one in members)
+        return [con] if len(members) == 1 else list(optional)
     if name and isinstance(inner, construct.Prefixed):
         plus, length = inner.lengthfield.sizeof() if inner.includelength else 0, construct.this[f"{name}_size"]
         content = Bounded(length - plus if plus else length, inner.subcon) if is_greedy(inner.subcon) else inner.subcon
@@ -581,6 +652,11 @@ def children(con: Construct) -> list[Construct]:
     return found + (list(con.cases.values()) if "cases" in vars(con) else [])
 
 
+def has_conditions(con: Construct) -> bool:
+    """Whether a struct asks something of values."""
+    return isinstance(con, Limited | HeldCheck) or any(map(has_conditions, children(con)))
+
+
 def seals(con: Construct) -> Iterator[Sealing]:
     """The sealed structs of a struct, outer ones first."""
     if isinstance(con, Sealing):
@@ -644,6 +720,9 @@ def random_value(con: Construct, source: random.Random, drawn: Drawn, scope: Any
         return random_value(con.thensubcon if construct.evaluate(con.condfunc, scope) else con.elsesubcon, source, drawn, scope, path)
     if isinstance(con, construct.Switch):
         return random_value(con.cases.get(construct.evaluate(con.keyfunc, scope), con.default), source, drawn, scope, path)
+    if isinstance(con, Limited):
+        raw = source.choice(con.allowed)
+        return con.subcon._decode(raw, None, None) if isinstance(con.subcon, construct.Enum) else raw
     if isinstance(con, construct.Enum):
         named = list(con.ksymapping) if not isinstance(unwrap(con), Const) and source.random() < 0.5 else []
         return con._decode(source.choice(named) if named else random_value(con.subcon, source, drawn, scope, path), None, None)
@@ -674,8 +753,8 @@ def _random_parts(con: Partition, source: random.Random, drawn: Drawn, scope: An
 
 
 def _random_leaf(con: Construct, source: random.Random, scope: Any) -> Any:
-    if con is construct.Pass or isinstance(con, construct.Check):
-        return None  # whether a Check holds is seen when the frame is built
+    if con is construct.Pass or isinstance(con, construct.Check | Filler):
+        return None  # whether a Check holds, and how much there is to fill, is seen when the frame is built
     if isinstance(con, construct.NullTerminated):
         return str(source.randrange(10 ** source.randint(1, 4))).encode()
     if isinstance(con, construct.Computed):

@@ -28,6 +28,7 @@ from lidarspec.spec.construct_layer.classes import (
     Counting,
     Describing,
     Filler,
+    Limited,
     Partition,
     Sealing,
     Sizing,
@@ -184,6 +185,10 @@ class _Builder:
             return self.node(inner.subcon, replace(place, room=room))
         if isinstance(inner, construct.GreedyRange) and place.room is not None:
             return self._filling(inner, place)
+        if isinstance(inner, construct.Check):
+            return self._check(inner, place)
+        if inner is construct.Error:
+            return tree.Never(name)
         return tree.Empty(name) if inner is construct.Pass else self._leaf(inner, place)
 
     def _peeled(self, con: Construct, place: _Place) -> tuple[Construct, _Place]:
@@ -197,6 +202,8 @@ class _Builder:
                 place = place.inside(labels={int(value): str(name) for value, name in con.ksymapping.items()})
             elif isinstance(con, Const):
                 place = place.inside(const=_constant(con))
+            elif isinstance(con, Limited):
+                place = place.inside(allowed=con.allowed)
             elif isinstance(con, Counting):
                 place = place.inside(held=True)
             elif isinstance(con, Sizing):
@@ -276,7 +283,8 @@ class _Builder:
             path = ".".join(part for part in (info.path, child.name) if part)
             said = tree.FieldInfo(path, info.axes, docs=info.docs if place.in_bits else "", optional=info.optional)
             inside = _Place(said, scope, child.name or "", place.in_bits)
-            if isinstance(filler := unwrap(child), Filler):
+            part = unwrap(child)
+            if isinstance(filler := unwrap(part.thensubcon) if isinstance(part, construct.IfThenElse) else part, Filler):
                 inside = replace(inside, room=self._padding(filler, inside, _from(members, filler.of[0])))
             elif place.room is not None and child is con.subcons[-1]:
                 inside = replace(inside, room=tree.joined("-", place.room, tree.total(map(tree.size, members))))
@@ -347,9 +355,23 @@ class _Builder:
         rule = None if following is None else builder._formula(following, replace(around(builder), scope=builder.scopes[""]))
         return root, rule
 
+    def _check(self, con: construct.Check, place: _Place) -> tree.Node:
+        """A condition on fields that stand side by side, as far as 64-bit integers hold what it comes to."""
+        condition, info = self._formula(con.func, place), place.info
+        if isinstance(condition, int):
+            return tree.Empty(place.name) if condition else tree.Never(place.name)
+        try:
+            asked = [ref for ref in tree.refs(condition) if ref.path.startswith("_.") or ref.info.axes != info.axes[: len(ref.info.axes)]]
+            if not asked and tree.width(condition) <= tree.MOST_BITS and all(map(_is_whole, tree.parts(condition))):
+                return tree.Check(place.name, info.path, info.axes, condition)
+            reason = f"{info.path}: it asks for {asked[0].path}, another array or frame" if asked else f"{info.path}: it may exceed 64 bits"
+        except ValueError as code:
+            reason = str(code)
+        return tree.Opaque(place.name, info, "Check", f"{reason.partition(': ')[2]}: plausible=lambda f: ... is judged in bulk")
+
     def _sealed(self, con: Sealing, place: _Place) -> tree.Node:
         body = self.node(con.subcon, place)
-        if not isinstance(body, tree.Struct):
+        if not isinstance(body, tree.Struct | tree.Sealed):
             return tree.Opaque(place.name, place.info, type(con).__name__, "a checksum around something that is no struct", (body,))
         prefix = f"{place.info.path}." if place.info.path else ""
         over = (prefix + con.over[0], prefix + con.over[-1]) if con.over is not None else None
@@ -385,7 +407,7 @@ class _Builder:
         except (construct.ConstructError, LookupError):
             fields = None
         if fields is None:
-            reason = "a bit block whose values are not plain bits of it"
+            reason = "a bit block whose values are not plain bits of it: declare the bits as they come, and undo it in `points`"
             return tree.Opaque(place.name, place.info, type(con).__name__, reason, (inside,), in_bits=True)
         infos = {node.info.path: node.info for node in tree.nodes(inside) if isinstance(node, tree.Number | tree.Blob | tree.Opaque)}
         parts = []
@@ -394,6 +416,13 @@ class _Builder:
             info = infos[".".join(part for part in (place.info.path, *names) if part)]
             parts.append(tree.Part(info, bits, names, tuple(key for key in bits.keys if isinstance(key, int))))
         return tree.Block(place.name, place.info, size, tuple(parts))
+
+
+def _is_whole(formula: tree.Formula) -> bool:
+    """Whether an operation gives an integer whatever its fields are: it neither divides by one nor shifts by one."""
+    return not (isinstance(formula, tree.Op) and formula.symbol in ("//", "%", "<<", ">>")) or (
+        isinstance(formula.args[1], int) and formula.args[1] > 0
+    )
 
 
 def _from(members: Sequence[tree.Node], first: str, last: str = "") -> tree.Formula | None:
@@ -409,7 +438,7 @@ def _below(node: tree.Node, names: Iterable[str]) -> tree.Node:
         SpecError: where there is none.
     """
     for name in names:
-        body = node.body if isinstance(node, tree.Sealed) else node
+        body = node.struct if isinstance(node, tree.Sealed) else node
         found = [member for member in body.members if member.name == name] if isinstance(body, tree.Struct) else []
         if not found:
             raise SpecError(f"SizeOf measures {'.'.join(names)!r}, and there is no part {name!r}", path=getattr(body, "path", ""))
@@ -417,8 +446,26 @@ def _below(node: tree.Node, names: Iterable[str]) -> tree.Node:
     return node
 
 
+_TURNED = "{} makes other bytes of those on the wire: declare them as they come and undo it in `points` (f.x ^ 0x55), or say a WireForm"
+
 #: of what construct alone can read, what to write in its place.
 _INSTEAD = {
+    **{name: _TURNED.format(name) for name in ("ProcessXor", "ProcessRotateLeft", "Compressed")},
+    **{
+        name: f"{name} has no numbers of its own: say the Array or Struct below it"
+        for name in ("Slicing", "Indexing", "NamedTuple", "LazyArray")
+    },
+    "StringEncoded": "a text has no numbers and no fixed place: say Bytes(n), and decode it where it is shown",
+    "Mapping": "Mapping to what is no name: say Enum, or Scaled(field, step, unit) for numbers",
+    "ExprAdapter": "ExprAdapter is Python code: say Scaled(field, step, unit, offset), or calculate it in `points`",
+    "ExprValidator": "a test of values that are not listed: say OneOf with those that there are, or plausible=lambda f: ...",
+    "Computed": "Computed is no field of the wire: calculate it in `points`, and repeat it where a count needs it",
+    "Peek": "Peek reads bytes twice: declare them as a field, and let If or Switch behind it choose",
+    "Tell": "Tell is no field of the wire: SizeOf says and holds the length of a part",
+    "Index": "Index is no field of the wire: in `points` the index of an element is f.x.index",
+    "LazyBound": "LazyBound has no fixed place: say the part itself, or Parts for one after another",
+    "VarInt": "VarInt has no fixed place: a WireForm makes numbers of as many bytes as they need",
+    "ZigZag": "ZigZag has no fixed place: a WireForm makes numbers of as many bytes as they need",
     "FocusedSeq": "PrefixedArray is compiled as a named member of a Struct alone: Struct('points' / PrefixedArray(...))",
     "Prefixed": "Prefixed is compiled as a named member of a Struct alone: Struct('part' / Prefixed(...))",
     "Sequence": "the parts of a Sequence have no names: say Struct('a' / ..., 'b' / ...)",

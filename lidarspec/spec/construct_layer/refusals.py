@@ -9,7 +9,7 @@ from construct import Array, Const, Construct, Container, Struct
 
 from lidarspec.errors import SpecError
 from lidarspec.spec import tree
-from lidarspec.spec.construct_layer.classes import GREEDY, Bounded, Describing, Partition, children, fixed_size, unwrap
+from lidarspec.spec.construct_layer.classes import GREEDY, Bounded, Describing, HeldCheck, Partition, children, fixed_size, unwrap
 
 #: names that `points` and the engine need for themselves.
 RESERVED = frozenset({"state", "on"})
@@ -21,6 +21,7 @@ _REFUSED: dict[type, tuple[str, str]] = {
     construct.FlagsEnum: ("LS108", "FlagsEnum loses undeclared bits: declare each bit as a field of a BitStruct"),
     construct.RawCopy: ("LS109", "RawCopy ignores edits on rebuild: use Checksummed"),
     construct.Checksum: ("LS109", "construct's Checksum needs RawCopy, which ignores edits on rebuild: use Checksummed"),
+    construct.Union: ("LS109", "Union reads bytes in several ways, and edits of all but one are ignored on rebuild: declare one of them"),
     construct.Padded: ("LS106", "padding loses its bytes on a round trip: declare it as a field, such as 'reserved' / Bytes(n)"),
     construct.Aligned: (
         "LS106",
@@ -37,7 +38,7 @@ _BOUNDED = (construct.NullTerminated, construct.FixedSized, construct.Prefixed, 
 
 #: of what stands in a struct without a name, what to write in its place.
 _INSTEAD: dict[type, str] = {
-    construct.Check: "a Check has no name to be told by: 'valid' / Check(...), or plausible=lambda f: ..., which is judged in bulk",
+    HeldCheck: "a Check has no name to be told by: 'valid' / Check(...), or plausible=lambda f: ..., which is judged in bulk",
     type(construct.Terminated): "Terminated asks for the end of a stream, which a frame does not have: the last field ends it",
     construct.Probe: "Probe prints while it parses: lidarspec explain shows every byte of a frame",
     construct.StopIf: "StopIf leaves out what follows in a struct: 'rest' / If(this.more, Struct(...))",

@@ -1,0 +1,108 @@
+"""What a struct asks of values: construct judges one frame after another, and every engine as it does."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from construct import (
+    Array,
+    BitsInteger,
+    BitStruct,
+    Check,
+    Enum,
+    Error,
+    ExprValidator,
+    Float32b,
+    If,
+    Int8sb,
+    Int8ub,
+    Int16ub,
+    Int32ub,
+    Mapping,
+    NoneOf,
+    OneOf,
+    Struct,
+    Switch,
+    this,
+)
+
+from lidarspec import UsageError, WireError
+from lidarspec.framing.frame_engine import CompiledCodec, InterpretedCodec, codec
+from lidarspec.spec import Parts
+from tests.engine.against_construct import BACKENDS, agree, sensor
+
+ANY = [bytes([first, second, third]) for first in range(0, 256, 5) for second in (0, 1, 2, 9, 128, 255) for third in (0, 3, 200)]
+CONDITIONS: dict[str, Any] = {
+    "one of": Struct("a" / OneOf(Int8ub, [5, 10, 255]), "b" / Int16ub),
+    "none of": Struct("a" / NoneOf(Int8sb, [5, -1]), "b" / NoneOf(Int16ub, range(0x200, 0x300))),
+    "a function": Struct("a" / ExprValidator(Int8ub, lambda value, _: value % 3 == 0), "b" / Int16ub),
+    "a named one": Struct("a" / OneOf(Enum(Int8ub, low=5, high=10), ["high", "low"]), "b" / Int16ub),
+    "bits": Struct("a" / BitStruct("x" / OneOf(BitsInteger(3), [0, 4]), "y" / BitsInteger(5)), "b" / Array(2, Int8ub)),
+    "elements": Struct("a" / Int8ub, "v" / Array(2, Struct("b" / Int8ub, "ok" / Check((this.b <= this._.a) & (this.b != 3))))),
+    "no elements": Struct("a" / Int8ub, "b" / Int16ub, "v" / Array(this.a * 0, Struct("ok" / Check(this._.a < 20)))),
+    "a branch": Struct("a" / Int8ub, "b" / Int16ub, "v" / If(this.a > 50, Struct("ok" / Check(this._.b < 512)))),
+    "an element": Struct("a" / Int8ub, "v" / Array(2, Int8ub), "ok" / Check(this.v[1] < this.a)),
+    "errors": Struct("a" / Int8ub, "v" / Switch(this.a, {5: Struct("d" / Int16ub), 10: Struct("b" / Int8ub, "c" / Int8ub)}, default=Error)),
+}
+
+
+@pytest.mark.parametrize("name", CONDITIONS)
+def test_frames_are_judged_as_construct_judges_them(name: str) -> None:
+    ours = sensor(CONDITIONS[name])
+    assert isinstance(codec(ours.frames["data"]), CompiledCodec)
+    assert 3 <= agree(CONDITIONS[name], ANY) < len(ANY) or name == "no elements"
+    assert all(ours.parse(ours.example("data", seed=seed)) for seed in range(5))
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_what_is_not_allowed_is_counted_shown_and_not_built(backend: str) -> None:
+    ours = sensor(Struct("a" / OneOf(Int8ub, [1, 2]), "b" / Int8ub, "ok" / Check(this.b < 9)))
+    packets = ours.decode(b"\1\2\3\4\2\x09\2\3", backend=backend)
+    assert packets["b"].tolist() == [2, 3]
+    assert (packets.stats.implausible, packets.stats.bytes_skipped) == (4, 4)
+    assert ours.parse(b"\3\x09", verify=False).a == 3
+    with pytest.raises(WireError, match="a at byte 0: value 3, expected 1, 2"):
+        ours.parse(b"\3\4")
+    with pytest.raises(WireError, match="ok: check failed"):
+        ours.parse(b"\1\x09")
+    for values in (dict(a=3, b=1), dict(a=1, b=9)):
+        with pytest.raises(UsageError, match=r"a: expected 1, 2, got 3|ok: check failed"):
+            ours.build("data", **values)
+
+
+def test_a_mapping_is_names_of_all_values_that_there_are() -> None:
+    ours = sensor(Struct("a" / Mapping(Int8ub, {"low": 5, "high": 255}), "b" / Array(this.a == "low", Int8ub)))
+    assert isinstance(codec(ours.frames["data"]), CompiledCodec)
+    assert [ours.parse(data).a for data in (b"\5\7", b"\xff")] == ["low", "high"]
+    assert [ours.build("data", a=name, b=[7] * (name == "low")) for name in ("low", "high")] == [b"\5\7", b"\xff"]
+    assert ours.decode([b"\5\7", b"\xff", b"\6"])["a"].tolist() == [5, 255]
+    with pytest.raises(WireError, match="a at byte 0: value 6, expected 5, 255"):
+        ours.parse(b"\6")
+
+
+def test_parts_meet_their_own_conditions() -> None:
+    part = Struct("kind" / OneOf(Int8ub, [1, 2]), "value" / Int8ub, "ok" / Check(this.value != 7))
+    ours = sensor(Struct("count" / OneOf(Int8ub, [1, 2]), "parts" / Parts(part, this.count)))
+    good, wrong = b"\2\1\5\2\6", [b"\2\3\5\2\6", b"\2\1\7\2\6"]
+    assert [len(ours.decode([data])) for data in (good, *wrong)] == [1, 0, 0]
+    assert ours.parse(good).parts[1].value == 6
+    for data in wrong:
+        with pytest.raises(WireError, match=r"parts\[0\]"):
+            ours.parse(data)
+
+
+@pytest.mark.parametrize(
+    "check",
+    [
+        Check(lambda found: found.a > 3 and found.b),
+        Check(this.f < 1.5),
+        Check(this.v == 3),
+        Check(this.a % this.b == 0),
+    ],
+)
+def test_what_is_no_condition_on_integers_side_by_side_says_what_to_write(check: Any) -> None:
+    struct = Struct("a" / Int32ub, "b" / Int8ub, "f" / Float32b, "v" / Array(2, Int8ub), "ok" / check)
+    engine = codec(sensor(struct).frames["data"])
+    assert isinstance(engine, InterpretedCodec)
+    assert "plausible=lambda f: ... is judged in bulk" in engine.reason
