@@ -88,8 +88,6 @@ def test_what_is_written_by_hand_gives_the_same_points(tmp_path: Path) -> None:
         "stl27l",
         "m1c1",
         "vlp16",
-        "vlp32c",
-        "vls128",
         "xt32",
         "rplidar",
         "stl27l",

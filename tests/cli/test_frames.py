@@ -255,7 +255,8 @@ def test_an_input_is_held_in_pieces(words: tuple[str, ...], code: int, tmp_path:
         for name, given in (("zeros.bin", data), ("zeros.hex", text), ("few.bin", data[: MEGABYTE // 2])):
             Path(name).write_bytes(given)
         most = peak(lambda given=text if "-" in words else b"": ran(*words, code=code, given=given))
-    assert most - len(text) * ("-" in words) < 16 * MEGABYTE, f"{most} bytes"
+    # the whole at once would be 300 MB: a piece is looked through for every kind of frame of a sensor, and some have a dozen
+    assert most - len(text) * ("-" in words) < 32 * MEGABYTE, f"{most} bytes"
 
 
 def test_parts_are_built_shown_and_explained(tmp_path: Path) -> None:
