@@ -5,9 +5,9 @@ long as it hears a `heartbeat` each second. Packets of points have no checksum a
 them; they do not say either how far apart their points are in time, which is the model's.
 
 Source: Livox-SDK communication protocol 1.3.0, Livox-SDK 9306596 (livox_def.h, device_discovery.h) and livox_ros_driver (lds.h: packet
-sizes, points a second; it prints 9 bytes for a point of type 3, which has 10); rates, ranges and fields of view: the user manuals. Which
-model sends which type of data is not said: all are read of each. That the version of a packet is 5 is assumed, since vectors have it and
-drivers do not look at it. Hubs are not here, nor are the parameters of commands 0B to 0D.
+sizes, points a second; it prints 9 bytes for a point of type 3, which has 10). Ranges and fields of view are as remembered from the user
+manuals: assumed. Which model sends which type of data is not said: all are read of each. That the version of a packet
+is 5 is assumed, since vectors have it and drivers do not look at it. Hubs are not here, nor are the parameters of commands 0B to 0D.
 """
 
 from __future__ import annotations
@@ -330,7 +330,7 @@ def lidar(name: str) -> Sensor:
         relatives={other: "the device type in what it broadcasts" for other in MODELS if other != name and MODELS[other][2] == rate},
         info={"serial": "broadcast.broadcast_code", "model": "broadcast.device_type", "firmware": "firmware.firmware"},
         aliases=aliases,
-        status="vectors",
+        status="manual",
         acknowledged={"LS507": "it sees nothing in a small room, which is nearer than its shortest range"} if limits[0] > 1 else {},
         source="Livox-SDK communication protocol 1.3.0; Livox-SDK 9306596; livox_ros_driver (lds.h); user manuals",
     )

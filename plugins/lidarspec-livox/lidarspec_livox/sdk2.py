@@ -5,7 +5,7 @@ Points, IMU and parameters come over UDP, each from and to a port of its own. A 
 leaves the CRC of point packets 0: these are taken as they are.
 
 Source: Livox Mid-360 protocol document 1.4.10 and Livox-SDK2 08f523c (livox_lidar_def.h), HAP protocol document 1.4.8 where they
-differ; rates, ranges and fields of view: the user manuals (HAP: table 1.2.1). livox_ros_driver2 divides `time_interval` by the number of
+differ; HAP user manual, table 1.2.1, for its rate, ranges and view; those of a Mid-360 are assumed. livox_ros_driver2 divides `time_interval` by the number of
 points, the document by one less: the driver's rule is taken, which differs by 1 %. That a HAP takes the commands of a Mid-360 is
 assumed from the SDK, which sends it the same; where its state goes is not known, and not asked for. Commands for logs and firmware are
 not here. Keys whose values are not known are passed on as bytes.
@@ -410,7 +410,7 @@ def lidar(name: str) -> Sensor:
         relatives={other: RELATIVES[other] for other in RELATIVES if other != name},
         info={"serial": "discovery.serial", "model": "discovery.device_type"},
         aliases=aliases,
-        status="vectors",
+        status="manual",
         source="Livox Mid-360 protocol document 1.4.10; HAP protocol document 1.4.8; Livox-SDK2 08f523c; user manuals",
     )
 

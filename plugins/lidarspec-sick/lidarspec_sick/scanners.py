@@ -1,8 +1,9 @@
 """TiM5xx, TiM7xx, TiM871S, LMS1xx, LMS5xx and MRS1000: scanners that send LMDscandata over TCP, in CoLa B or CoLa A.
 
-Source: the telegram listing 8014631; ranges, angles, steps and rates from the operating instructions and data sheets, and sick_scan_xd.
-What can be set stands in the telegrams, so that models are told apart by what others cannot be set to; what cannot be told, they
-answer to `get_identity`. The nearest range of an LMS511 is assumed.
+Source: the telegram listing 8014631; TiM55x, TiM56x and TiM57x operating instructions 8015883 (steps, rate and angles, 5.3), LMS5xx 8013796
+(steps, 3.5), MRS1000 8020494 (layers, 3.5.10). Assumed, since no sheet was at hand: the steps, rates and angles of TiM7xx and LMS1xx,
+the rates of an LMS5xx, and the ranges of all. What can be set stands in the telegrams, so that models are told apart by what others
+cannot be set to; what cannot be told, they answer to `get_identity`.
 """
 
 from __future__ import annotations
@@ -65,15 +66,15 @@ MRS1 = Kind((50,), (0.25,), -47.5, 1101, echoes=3, layers=(0, -2.5, 2.5, -5))  #
 #: id -> model, kind, limits of range, status.
 MODELS: dict[str, tuple[str, Kind, tuple[float, float], str]] = {
     "sick-tim551": ("TiM551", COARSE, (0.05, 10), "vectors"),
-    "sick-tim561": ("TiM561", TIM5, (0.05, 10), "vectors"),
-    "sick-tim571": ("TiM571", TIM5, (0.05, 25), "vectors"),
-    "sick-tim781": ("TiM781", TIM7, (0.05, 25), "vectors"),
-    "sick-tim781s": ("TiM781S", TIM7, (0.05, 25), "vectors"),
+    "sick-tim561": ("TiM561", TIM5, (0.05, 10), "manual"),
+    "sick-tim571": ("TiM571", TIM5, (0.05, 25), "manual"),
+    "sick-tim781": ("TiM781", TIM7, (0.05, 25), "manual"),
+    "sick-tim781s": ("TiM781S", TIM7, (0.05, 25), "manual"),
     "sick-tim871s": ("TiM871S", TIM7, (0.05, 25), "capture"),
-    "sick-lms111": ("LMS111", LMS1, (0.5, 20), "vectors"),
-    "sick-lms151": ("LMS151", LMS1, (0.5, 50), "vectors"),
-    "sick-lms511": ("LMS511", LMS5, (0.2, 80), "vectors"),
-    "sick-mrs1104": ("MRS1104", MRS1, (0.2, 64), "vectors"),
+    "sick-lms111": ("LMS111", LMS1, (0.5, 20), "manual"),
+    "sick-lms151": ("LMS151", LMS1, (0.5, 50), "manual"),
+    "sick-lms511": ("LMS511", LMS5, (0.2, 80), "manual"),
+    "sick-mrs1104": ("MRS1104", MRS1, (0.2, 64), "manual"),
 }
 
 

@@ -140,7 +140,7 @@ IWR6843 = Sensor(
     range_limits=(0.05, 100.0),
     vendor_axes=("right", "forward", "up"),
     aliases=("iwr6843", "ti-iwr6843isk", "ti-iwr6843aop"),
-    status="vectors",
+    status="manual",
     source="TI, Understanding the Out of Box Demo Data Output (industrial toolbox 4.10); mmWave SDK 3.5, mmw_output.h",
 )
 
