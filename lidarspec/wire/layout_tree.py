@@ -573,8 +573,7 @@ class HeaderTree:
 
     def classify(self, buffer: NDArray[np.uint8], offsets: NDArray[np.intp]) -> list[Group]:
         """The candidates at `offsets`, sorted by layout: (layout or refusal, indices) for each, without those whose header is cut off."""
-
-        refuted = list[NDArray[np.intp]]()
+        refuted: list[NDArray[np.intp]] = []
 
         def read(node: HeaderNode, which: NDArray[np.intp]) -> tuple[NDArray[np.intp] | None, NDArray[Any]]:
             assert node.leaf is not None
@@ -584,7 +583,7 @@ class HeaderTree:
                 refuted.append(cut[self._refuted(node.values, buffer, offsets[cut])])
             return there, values
 
-        groups = list[Group]()
+        groups: list[Group] = []
         for result, which in self.sorted(len(offsets), read):
             if not isinstance(result, Refused) or result.values is None:
                 groups.append((result, which))

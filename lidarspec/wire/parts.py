@@ -180,6 +180,8 @@ class _Walk:
                 break
             spots = self._ends[active]
             held = right_at(self._buffer, spots, kind.start)
+            if held is not None and not np.count_nonzero(held):
+                continue  # one of many kinds, that none of these parts is of
             own, others = (active, [active[:0]]) if held is None else (active[held], [active[~held]])
             seen = np.zeros(len(own), np.bool_)
             for layout, which in kind.layouts.classify(self._buffer, self._ends[own]):
