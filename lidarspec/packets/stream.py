@@ -164,8 +164,9 @@ class PacketStream:
                 others = np.flatnonzero(mask)
                 kinds, before = part.frames.kinds[others], number + others - np.arange(len(others))
                 for kind in np.unique(kinds).tolist():
-                    which = kinds == kind
-                    seen.setdefault(part.frames.names[kind], []).append((part.frames.only(others[which]), before[which]))
+                    which, name = kinds == kind, part.frames.names[kind]
+                    if name in self._others:
+                        seen.setdefault(name, []).append((part.frames.only(others[which]), before[which]))
             number += part.number
         return seen
 

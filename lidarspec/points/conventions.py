@@ -40,7 +40,9 @@ def shown_range(measured: Any, invalid: Any) -> Any:
 
 
 def returned_range(measured: Any) -> Any:
-    """The range of a return, metres; nan where nothing came back."""
+    """The range of a return, metres; nan where nothing came back. Of what is traced it is one step, which compilers know."""
+    if isinstance(measured, Traced):
+        return measured.applied(returned_range, measured)
     return np.where((measured > 0) & (measured < np.inf), measured, np.nan)
 
 

@@ -58,12 +58,18 @@ class Plain:
                 evaluate(node, self._arrays, self._loaded)
         return self._arrays[node]  # type: ignore[no-any-return]
 
-    def sent(self, node: Node) -> NDArray[Any] | None:
-        """Whole numbers of a field as they were sent, (n, ...); None for what is no such field, or not in every packet."""
+    def sent(self, node: Node, first: int, stop: int) -> NDArray[Any] | None:
+        """Whole numbers of a field as they were sent, in the packets from `first` to `stop`, (n, ...).
+
+        None for what is no such field, or not in every packet.
+        """
         info = self._table.schema.fields.get(node.path) if node.kind == "field" else None
         if info is None or info.scaled or info.dtype is None or info.dtype.kind not in "iu" or info.dtype.itemsize > EXACT:
             return None
-        return field_array(info, self._table, self._table.schema.depth(), raw=True) if self._table.present(info.path) is None else None
+        if self._table.present(info.path) is not None:
+            return None
+        some = self._table if stop - first == len(self._table) else self._table.take(np.arange(first, stop))
+        return field_array(info, some, self._table.schema.depth(), raw=True)
 
     def know(self, node: Node, column: Column) -> None:
         """Take a result as given."""
@@ -105,15 +111,19 @@ class Share:
         else:
             maker.run(self.group.rows[first:stop], values, columns)
 
-    def plain(self, name: str) -> NDArray[Any]:
-        """A part of what `points` returned, for every point of the group, evaluated plainly: (packets, *shape of the plan).
+    def plain(self, name: str, first: int = 0, stop: int | None = None) -> NDArray[Any]:
+        """A part of what `points` returned, for every point of the packets from `first` to `stop` (None: all), evaluated plainly.
+
+        Its shape is that of the plan, behind the packets.
 
         A further column of whole numbers that is a field as it stands is of their type, all others of float64.
         """
-        part, shape = self.plan.parts[name], (len(self), *self.plan.shape)
-        array = self.known.sent(part) if isinstance(part, Node) and name in self.plan.extra else None
+        stop = len(self) if stop is None else stop
+        part, shape = self.plan.parts[name], (stop - first, *self.plan.shape)
+        array = self.known.sent(part, first, stop) if isinstance(part, Node) and name in self.plan.extra else None
         if array is None:
             array = self.known.array(part) if isinstance(part, Node) else np.asarray(part)
+            array = array[first:stop] if isinstance(part, Node) and len(array) > 1 else array
         return np.broadcast_to(deep(array, len(shape) - 1) if isinstance(part, Node) else array, shape)
 
     @classmethod
@@ -186,7 +196,7 @@ class Computed(ColumnSource):
             return {name: self._joined(times, np.float64)}
         if name not in self._shares[0].plan.parts:
             return {}
-        plain = [share.plain(name)[first:stop] for _, share, (first, stop) in self._pieces()]
+        plain = [share.plain(name, *packets) for _, share, packets in self._pieces()]
         column = self._joined(plain, np.result_type(*plain))
         if name == "elevation":
             return {name: column.astype(TYPES[name], copy=False)}
@@ -368,4 +378,4 @@ class BatchColumns(ColumnSource):
     def times_of(self, share: Share, first: int, stop: int) -> NDArray[np.float64]:
         """The times of all points of some packets of a share, seconds since `base`: (packets, *shape of the plan)."""
         offsets = seconds_since(self.packets.time_ns[share.group.where[first:stop]], self.base)
-        return np.asarray(share.plain("time")[first:stop] + deep(offsets, len(share.plan.shape)))
+        return np.asarray(share.plain("time", first, stop) + deep(offsets, len(share.plan.shape)))

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.errors import PluginError
-from lidarspec.spec.bits import BitField
+from lidarspec.spec.bits import BitField, Segment
 from lidarspec.spec.checksums import Checksum, Single, single
 from lidarspec.spec.tree import Check, FieldInfo, Formula, Node, arrays, element_of, parts, refs, width
 from lidarspec.wire.row_checksums import over
@@ -146,7 +146,7 @@ class Leaf:
     def _bits(self, rows: Bytes2D, element: BitField) -> NDArray[Any]:
         assert self.info.dtype is not None
         wide = np.dtype(f"u{self.info.dtype.itemsize}")
-        total = self._whole(rows, element, wide)
+        total = self._within(rows, element.segments[0], wide) if len(element.segments) == 1 else self._whole(rows, element, wide)
         if total is None:
             total = np.zeros((len(rows), *self.shape[: len(self.strides)]), wide)
             for part in element.segments:
@@ -157,9 +157,17 @@ class Leaf:
             return np.asarray(((total ^ sign) - sign).view(self.info.dtype))
         return total.astype(self.info.dtype, copy=False)
 
+    def _within(self, rows: Bytes2D, part: Segment, wide: np.dtype[Any]) -> NDArray[Any]:
+        """Values of bits within one byte."""
+        total = self._view(rows, np.dtype("u1"), part.byte).astype(wide)
+        if part.mask != 0xFF:
+            total &= wide.type(part.mask)
+            total >>= wide.type(part.low)
+        return total
+
     def _whole(self, rows: Bytes2D, element: BitField, wide: np.dtype[Any]) -> NDArray[Any] | None:
         """Values of bits in a row, cut out of the words that end with their bytes; None where there is not so much before, or in a word."""
-        if element.run is None or len(element.segments) == 1:
+        if element.run is None:
             return None
         order, first, count, lowest = element.run
         spare = wide.itemsize - count

@@ -80,7 +80,11 @@ def _are_few(algorithm: Checksum, rows: NDArray[np.uint8], spans: Spans) -> bool
 
 
 def _crc(algorithm: Crc, rows: NDArray[np.uint8], spans: Spans) -> Values:
-    left = registers(rows, spans, algorithm.start, algorithm.width, algorithm.poly, algorithm.refin)
+    return finished(algorithm, registers(rows, spans, algorithm.start, algorithm.width, algorithm.poly, algorithm.refin))
+
+
+def finished(algorithm: Crc, left: NDArray[Any]) -> Values:
+    """The checksums, (n,), by the registers after all bytes, of their type."""
     if not algorithm.refin:
         left = left.byteswap() >> 8 * left.itemsize - algorithm.width
     values = left.astype(np.uint64)
@@ -250,13 +254,13 @@ def _by_zlib(rows: NDArray[np.uint8], start: int) -> NDArray[Any]:
 
 def _by_place(rows: NDArray[np.uint8], spans: Spans, length: int, start: int, width: int, poly: int, refin: bool) -> NDArray[Any]:
     """`registers` of a few short rows: what each byte comes to at the end is looked up, and the sum is taken."""
-    table, firsts, begun = _places(length, start, width, poly, refin)
+    table, firsts, begun = places(length, start, width, poly, refin)
     found: NDArray[Any] = np.bitwise_xor.reduce(table.take(cut(rows, spans) + firsts), axis=1)
     return np.bitwise_xor(found, begun, out=found) if begun else found
 
 
 @lru_cache(maxsize=64)
-def _places(length: int, start: int, width: int, poly: int, refin: bool) -> tuple[NDArray[Any], NDArray[np.intp], Any]:
+def places(length: int, start: int, width: int, poly: int, refin: bool) -> tuple[NDArray[Any], NDArray[np.intp], Any]:
     """The register after the bytes from each place of a row to its end, by the first of them, the others being 0.
 
     Returns:

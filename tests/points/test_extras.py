@@ -9,6 +9,7 @@ from importlib.util import find_spec
 import numpy as np
 import pytest
 
+import lidarspec
 from lidarspec import PointCloud, SpecError
 from lidarspec.packets.packets import Packets
 from lidarspec.points.cloud import LazyCloud, Mount
@@ -50,6 +51,17 @@ def test_columns_have_the_values_types_and_units_of_the_plain_evaluation(backend
     np.testing.assert_array_equal(found.extra["signal"], np.repeat(read["blocks.signal"].reshape(-1), 3))  # more than float32 holds
     assert found.extra["signal"].max() > 2**24
     np.testing.assert_array_equal(np.isnan(found.extra["confidence"]), read[f"{channels}mark.noise"].reshape(-1) == 7)
+
+
+def test_a_scan_has_columns_of_its_own_packets_made_and_no_others() -> None:
+    sensor = lidarspec.sensor("ouster-os1").configure(rows=32)
+    frames = simulate(sensor, 3 * 64)
+    scans, whole = list(sensor.scans(frames)), sensor.decode(frames).points()
+    assert len(scans) == 3
+    for name in ("signal", "flags"):
+        columns = [scan.points.extra[name] for scan in scans]
+        assert all(column.base is not None and column.base.nbytes == column.nbytes for column in columns)
+        np.testing.assert_array_equal(np.concatenate(columns), whole.extra[name])
 
 
 def test_a_column_that_nobody_reads_is_not_made() -> None:

@@ -9,8 +9,11 @@ import numpy as np
 import pytest
 
 from lidarspec import PointCloud, UsageError
+from lidarspec.points.evaluate import evaluated
+from lidarspec.points.plain import evaluate
 from lidarspec.simulation.simulator import simulate
 from lidarspec.spec import Fields, Polar, stack
+from lidarspec.testing.agreement import assert_same_points
 from tests.shapes import SHAPES
 from tests.shapes.columns import AZIMUTHS, COLUMNS, PIXELS, TURN
 
@@ -61,6 +64,14 @@ def test_the_shape_is_columns_and_rows_for_two_returns_too(engine: str) -> None:
     assert picture.shape == (TURN, PIXELS)
     assert picture.return_index.reshape(TURN, PIXELS, 2)[50, 9].tolist() == [0, 1]  # type: ignore[union-attr]
     assert picture.range.reshape(TURN, PIXELS, 2)[33, 4].tolist() == pytest.approx([1.04, 2.04])
+
+
+def test_rows_of_tables_are_looked_at_where_they_are_or_gathered() -> None:
+    in_order = [frame(first) for first in (*range(16, TURN, COLUMNS), 0, 16)]  # round the end of the table, too
+    beyond, mixed = [frame(TURN - 1)], [frame(0), frame(32)]
+    for frames in (in_order, beyond, mixed, in_order * 40 + beyond):
+        read = SENSOR.decode(frames, backend="numpy")
+        assert_same_points(evaluated(read).cloud, evaluate(read).cloud)
 
 
 @ENGINES

@@ -181,6 +181,12 @@ def number(a):
 
 
 @njit(forceinline=True)
+def returned(a):
+    """`conventions.returned_range`."""
+    return a if 0.0 < a < np.inf else np.nan
+
+
+@njit(forceinline=True)
 def looked_up(table, index):
     """The entry of a table; nan where there is none."""
     return at(table, np.int64(index)) if 0 <= index < len(table) else np.nan

@@ -63,15 +63,20 @@ class Expressions(Writer):
                     return self.let(found.level, f"{found.text} != 0") if node.sample.array.dtype.kind == "b" else found
             return self._call(node)
         if node.kind == "rows" and not self.shared(node.args[0]):
-            return self._row(node.args[0], node.args[1], node.shape)
+            return self._row(node, "float64")
         return self.given(node)
 
-    def _row(self, index: Node, table: Any, shape: tuple[int, ...]) -> Value:
+    def _row(self, node: Node, kind: str) -> Value:
         """An element of the row of a table at an index."""
-        row, inner = self.double(index), self.number(table.shape[1])
-        start = self.let(row.level, f"row_at({row.text}, {self.number(len(table))}) * {inner}")
-        place = self.place(tuple(length if own == 1 else 1 for own, length in zip(index.shape, shape, strict=True)))
-        return self.let(1 + last_axis(shape), f"at({self.array(table)}, {start.text} + {place})")
+        index, table = node.args
+        row = self.double(index)
+        start = self.once(
+            ("row", index, table.shape),
+            lambda: self.let(row.level, f"row_at({row.text}, {self.number(len(table))}) * {self.number(table.shape[1])}"),
+        )
+        place = self.place(tuple(length if own == 1 else 1 for own, length in zip(index.shape, node.shape, strict=True)))
+        name = self.array(self.once(("cast", id(table), kind), lambda: (table.astype(kind, copy=False), table))[0])
+        return self.let(1 + last_axis(node.shape), f"at({name}, {start.text} + {place})")
 
     def shared(self, node: Node) -> bool:
         """Whether an expression is made of other frames' fields only: then NumPy computes it, mostly once for all packets."""
@@ -147,6 +152,8 @@ class Expressions(Writer):
                 return self.combined(sign, *(self.single(arg) for arg in node.args))
             if node.function in (np.cos, np.sin) and is_full(node.args[0], self.width):
                 return Trig(node.function.__name__, self.angle_of(node.args[0]))
+        if node.kind == "rows" and not self.shared(node.args[0]) and not exact:
+            return self._row(node, "float32")
         made = self.double(node)
         return self.let(made.level, f"np.float32({made.text if not exact else f'number({made.text})'})")
 
@@ -233,7 +240,7 @@ import numpy as np
 from lidarspec.points.numba_kernels.arithmetic import (
     BYTES, DOUBLES, INTEGER, MADE_PLACES, MADE_SINGLES, PLACES, SINGLES, WORDS,
     at, byte_at, compiled, cos_sin, float4_big, float4_little, float8_big, float8_little, larger, looked_up, modulo, narrowed, number, put,
-    row_at, smaller, word_at,
+    returned, row_at, smaller, word_at,
 )
 
 nan, inf = np.nan, np.inf

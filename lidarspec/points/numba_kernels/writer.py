@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.columns.graph import FACTORS, Node, key, last_axis, traverse
+from lidarspec.points.conventions import returned_range
 from lidarspec.points.windows import CHEAP, every_value, raw_values, window
 from lidarspec.spec.bits import whole_bytes
 from lidarspec.wire.layout import Layout, Leaf
@@ -33,6 +34,7 @@ TEMPLATES: dict[Any, str] = {
     **{function: f"math.{function.__name__}({{}})" for function in (np.sin, np.cos, np.tan, np.exp, np.isfinite, np.isnan)},
     **{np.arctan: "math.atan({})", np.arctan2: "math.atan2({}, {})", np.hypot: "math.hypot({}, {})"},
     **{np.mod: "modulo({}, {})", np.nan_to_num: "number({})", np.minimum: "smaller({}, {})", np.maximum: "larger({}, {})"},
+    returned_range: "returned({})",
     **{np.negative: "(-{})", np.positive: "{}", np.absolute: "abs({})"},
 }
 

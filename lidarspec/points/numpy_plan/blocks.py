@@ -1,7 +1,8 @@
 """Frames compacted before anything is computed: the innermost arrays of a chunk of packets, without what stands between them.
 
 Each field is then one long array with one distance from element to element, which NumPy reads several times as fast as a view with a
-distance for each level. Where elements follow each other at one distance from frame to frame as they stand, nothing is copied.
+distance for each level. Where elements follow each other at one distance from frame to frame as they stand, nothing is copied; nor where
+so many of them do that their arrays are read as quickly where they are.
 """
 
 from __future__ import annotations
@@ -14,6 +15,9 @@ from numpy.typing import NDArray
 
 from lidarspec.points.windows import Window
 from lidarspec.wire.layout import Bytes2D, Leaf, elements
+
+#: elements of an array from which on it is not compacted.
+LONG = 64
 
 
 class Blocks:
@@ -34,11 +38,12 @@ class Blocks:
         self.stride = strides[-1] if strides else size
         count = self.shape[-1] if self.shape else 1
         self.is_flat = self._regular(size, strides)
+        self.is_long = count >= LONG and not self.is_flat
         self._length = count * self.stride
         last = sum((number - 1) * step for number, step in zip(self.shape, strides[:-1], strict=False))  # from the first block on
         self._base = 0 if self.is_flat else min(*(leaf.offset for leaf in leaves), size - last - self._length)
         self._strides, self._size = strides[:-1], size
-        self.room = 0 if self.is_flat else math.prod(self.shape[:-1]) * self._length
+        self.room = 0 if self.is_flat or self.is_long else math.prod(self.shape[:-1]) * self._length
 
     def _regular(self, size: int, strides: tuple[int, ...]) -> bool:
         """Whether elements follow each other at one distance from frame to frame too."""
@@ -47,8 +52,8 @@ class Blocks:
 
     def loading(self, rows: Bytes2D, room: NDArray[np.uint8]) -> Loading:
         """Their fields, compacted in this room."""
-        if self.is_flat:
-            return Loading(rows, None, 0, self._size, self.stride)
+        if self.is_flat or self.is_long:
+            return Loading(rows, None, 0, self._size, self.stride, (self.shape, (*self._strides, self.stride)) if self.is_long else None)
         block = np.dtype(f"V{self._length}")
         source = elements(rows, block, self._base, self.shape[:-1], self._strides)
         return Loading(source, room.view(block).reshape(-1, *self.shape[:-1]), self._base, 0, self.stride)
@@ -67,14 +72,26 @@ class Loading:
         base: where a block begins in its frame.
         size: bytes from packet to packet in the source, where that is looked at.
         stride: bytes from element to element.
+        arrays: lengths and distances of arrays that are looked at themselves; None where all elements have one distance.
     """
 
-    def __init__(self, source: NDArray[Any], compact: NDArray[Any] | None, base: int, size: int, stride: int) -> None:
+    def __init__(
+        self,
+        source: NDArray[Any],
+        compact: NDArray[Any] | None,
+        base: int,
+        size: int,
+        stride: int,
+        arrays: tuple[tuple[int, ...], tuple[int, ...]] | None = None,
+    ) -> None:
         self._source, self._compact, self._base, self._size, self._stride = source, compact, base, size, stride
+        self._arrays = arrays
         self._start = -1
 
     def column(self, seen: Window, start: int, stop: int, width: int) -> NDArray[Any]:
-        """A window of each of `width` elements of the packets from `start` to `stop`."""
+        """A window of each of `width` elements of the packets from `start` to `stop`; along their arrays where these are long."""
+        if self._arrays is not None:
+            return elements(self._source[start:stop], seen.dtype, seen.offset, *self._arrays)
         if self._compact is None:
             return np.ndarray(((stop - start) * width,), seen.dtype, self._source.data, start * self._size + seen.offset, (self._stride,))
         if self._start != start:

@@ -15,17 +15,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.columns.graph import Node, Term, chosen, is_full, key, last_axis, only_field
+from lidarspec.points.conventions import returned_range
 from lidarspec.points.numpy_plan import products
 from lidarspec.points.numpy_plan.blocks import Blocks
 from lidarspec.points.numpy_plan.program import Program, Read, Run
 from lidarspec.points.numpy_plan.registers import TYPES
 from lidarspec.points.plan import Plan
 from lidarspec.points.windows import CHEAP, Window, every_value, shift_of, window
+from lidarspec.spec.tree import FieldInfo
 from lidarspec.spec.vocabulary import row_numbers
 from lidarspec.wire.arrays import deep
 from lidarspec.wire.layout import Leaf
 
 _Made = TypeVar("_Made")
+
+#: how often a table is repeated at most, so that rows that follow one another round its end follow one another in it.
+TURNS = 8
 
 #: what is computed faster than looked up in a table of 65,536 float64 numbers.
 _QUICK = {function for function in CHEAP if isinstance(function, np.ufunc)}
@@ -70,7 +75,9 @@ class Compiler:
     def _full_single(self, node: Node) -> int:
         register = self._gathered(node, "single") if node.kind == "rows" else self._of_field(node, "single")
         if register is None:
-            register = self._marked(node, "single") if self._exact else self._product(node)
+            register = self._marked(node, "single")
+        if register is None and not self._exact:
+            register = self._product(node)
         if register is not None:
             return register
         read = Read(self._double(node))
@@ -96,27 +103,71 @@ class Compiler:
         kind = "flag" if node.sample.array.dtype.kind == "b" else "double"
         register = self._gathered(node, kind) if node.kind == "rows" else self._of_field(node, kind)
         if register is None and node.kind == "call":
-            register = self._marked(node, kind) if self._exact else self._sum(node)
+            register = self._marked(node, kind)
+            if register is None and not self._exact:
+                register = self._sum(node)
             register = self._plain(node, kind) if register is None else register
         return register if register is not None else self._spread(node, kind)
 
     def _marked(self, node: Node, kind: str) -> int | None:
-        """A value, or nan where each point's own condition says so, without a branch; None where it is none."""
-        if node.kind != "call" or node.function is not np.where or len(node.args) != 3 or not is_full(node.args[0], self._width):
+        """A value, or nan where a condition says so or nothing came back, without a branch; None where it is none."""
+        if node.kind != "call" or not is_full(value := node.args[-1], self._width):
             return None
-        first = node.args[1]
-        if node.args[0].sample.array.dtype.kind != "b" or isinstance(first, Node) or np.size(first) > 1 or not np.isnan(first).all():
+        if node.function is returned_range:
+            return self._returned(value, kind, None)
+        condition, first, *_ = (*node.args, None)
+        if node.function is not np.where or isinstance(first, Node) or np.size(first) > 1 or not np.isnan(first).all():
             return None
+        if not isinstance(condition, Node) or condition.sample.array.dtype.kind != "b":
+            return None
+        if value.function is returned_range and not is_full(condition, self._width):
+            return self._returned(value.args[0], kind, condition)
+        mark, read, is_each = self._mark(condition, kind), self._read(value, kind), is_full(condition, self._width)
+
+        def run(execution: Run, out: NDArray[Any]) -> None:
+            target = out.reshape(-1, *self._shape)
+            marks = mark(execution)
+            np.multiply(read(execution).reshape(target.shape), marks.reshape(target.shape) if is_each else marks, out=target)
+
+        return self.program.step("marked", kind, run, mark, read)
+
+    def _mark(self, condition: Node, kind: str) -> Callable[[Run], Any]:
+        """1, or nan where a condition holds: for each point, or what packets and blocks have."""
+        depth, marks = len(self._shape), np.array([1, np.nan], TYPES[kind])
+        if not is_full(condition, self._width):
+            self.low.append(condition)
+            return lambda run: marks[deep(run.part(run.values(condition)), depth).astype(np.intp)]
 
         def marked(execution: Run, out: NDArray[Any]) -> None:
-            np.logical_not(condition(execution), out=out)
+            np.logical_not(flags(execution), out=out)
             np.divide(out, out, out=out)
             np.absolute(out, out=out)  # a nan without a sign, as np.nan is
 
-        condition = Read(self._double(node.args[0]))
-        mark = Read(self._once(("mark", kind, condition), lambda: self.program.step("1, or nan", kind, marked, condition)))
-        read = Read(self._single(node.args[2]) if kind == "single" else self._double(node.args[2]))
-        return self.program.call("marked", kind, np.multiply, mark, read)
+        flags = Read(self._double(condition))
+        return Read(self._once(("mark", kind, condition), lambda: self.program.step("1, or nan", kind, marked, flags)))
+
+    def _returned(self, value: Node, kind: str, lost: Node | None) -> int:
+        """Ranges, nan where nothing came back, or where packets or blocks are `lost`: what divided by itself is 1, or no number."""
+        read, shape, depth = self._read(value, kind), self._shape, len(self._shape)
+        self.low += [] if lost is None else [lost]
+        leaf = self._layout.leaves.get(value.path)
+        is_positive = (
+            leaf is not None and leaf.info.dtype is not None and leaf.info.dtype.kind == "u" and min(leaf.info.scale, leaf.info.offset) >= 0
+        )
+
+        def run(execution: Run, out: NDArray[Any]) -> None:
+            measured = read(execution) if is_positive else np.maximum(read(execution), 0, out=out)
+            np.divide(measured, measured, out=out)
+            np.multiply(out, read(execution), out=out)
+            flags = execution.part(execution.values(lost)) if lost is not None else _NONE
+            if flags.any():
+                np.copyto(out.reshape(-1, *shape), np.nan, where=deep(flags, depth))
+
+        return self.program.step("what came back", kind, run, read)
+
+    def _read(self, value: Node, kind: str) -> Read:
+        """An expression as an argument, in float32 or float64."""
+        return Read(self._single(value) if kind == "single" else self._double(value))
 
     def _of_field(self, node: Node, kind: str, factor: float = 1.0) -> int | None:
         """An expression of one field, times a number: loaded as it is, or looked up by its window; None where it is neither."""
@@ -131,10 +182,14 @@ class Compiler:
             and (seen is None or (self._exact and seen.size > 1))
         ):
             return self._whole(leaf, leaf.wire, kind)
+        if leaf is not None and node is source and factor == 1 and seen is None:
+            return self._cut_out(leaf, kind)
         if leaf is None or source is None or seen is None or (self._exact and seen.size > 1 and node.function in _QUICK):
             return None
         shift = self._shift(leaf, seen)
         if node is source and factor == 1 and not leaf.info.scaled:
+            if shift == (0, (1 << 8 * seen.size) - 1):
+                return self._load(leaf, seen, seen.dtype, kind)
             if shift is not None:
                 return self._shifted(leaf, seen, *shift, kind)
             if leaf.wire is not None:
@@ -150,9 +205,29 @@ class Compiler:
 
     def _whole(self, leaf: Leaf, wire: np.dtype[Any], kind: str) -> int | None:
         """A field of whole bytes, loaded; None where it has to be float64 first."""
-        if kind == "single" and (leaf.info.scaled or wire.itemsize > 4):
+        if kind == "single" and (wire.itemsize > 4 or not self._is_short(leaf)):
             return None
         return self._load(leaf, Window(leaf.offset, wire.itemsize), wire, kind)
+
+    def _is_short(self, leaf: Leaf) -> bool:
+        """Whether the raw number of a field may be brought to its unit in float32."""
+        return not leaf.info.scaled or not (self._exact or leaf.info.offset)
+
+    def _cut_out(self, leaf: Leaf, kind: str) -> int | None:
+        """A field of bits that stand in a row in four bytes, cut out of these; None where they do not, or it has to be float64 first."""
+        run = None if len(leaf.elements) != 1 or leaf.elements[0].signed else leaf.elements[0].run
+        if run is None or len(leaf.shape) > len(leaf.strides) or run[2] > 4 or (kind == "single" and not self._is_short(leaf)):
+            return None
+        order, first, count, lowest = run
+        first += leaf.offset
+        last = self._layout.size - sum((length - 1) * stride for length, stride in zip(leaf.shape, leaf.strides, strict=True)) - 4
+        blocks = self._blocks(leaf, Window(first, count))
+        for start in (first, first + count - 4):
+            if 0 <= start <= last and blocks.holds(Window(start, 4)):
+                shift = lowest + 8 * (first - start if order == "<" else start + 4 - first - count)
+                mask = (1 << leaf.elements[0].width) - 1
+                return self._shifted(leaf, Window(start, 4), shift, mask, kind, np.dtype(f"{order}u4"))
+        return None
 
     def _shift(self, leaf: Leaf, seen: Window) -> tuple[int, int] | None:
         """How a field that shares its window with others is cut out of it: shift and mask, or None where that takes a table."""
@@ -173,23 +248,29 @@ class Compiler:
     def _load(self, leaf: Leaf, seen: Window, dtype: np.dtype[Any], kind: str) -> int:
         """A window of every element as it stands, in its unit where that is float64."""
         blocks, width, info = self._blocks(leaf, seen), self._width, leaf.info
-        is_scaled = kind == "double" and info.scaled
+        is_scaled = kind in ("single", "double") and info.scaled
 
         def run(execution: Run, out: NDArray[Any]) -> None:
             column = execution.prepared[blocks].column(seen, execution.start, execution.stop, width)
-            np.copyto(out, column if column.dtype == dtype else column.view(dtype), casting="unsafe")
+            np.copyto(out.reshape(column.shape), column if column.dtype == dtype else column.view(dtype), casting="unsafe")
             if is_scaled:
-                np.multiply(out, info.scale, out=out)
-                np.add(out, info.offset, out=out)
+                _scale(out, info)
 
         return self.program.step(f"{leaf.info.path}: {dtype} at byte {seen.offset}", kind, run)
 
-    def _shifted(self, leaf: Leaf, seen: Window, shift: int, mask: int, kind: str) -> int:
-        """Some bits of a window of every element."""
-        words = f"u{seen.size}"
-        word = Read(self._once((words, seen), lambda: self._load(leaf, seen, seen.dtype, words)))
+    def _shifted(self, leaf: Leaf, seen: Window, shift: int, mask: int, kind: str, dtype: np.dtype[Any] | None = None) -> int:
+        """Some bits of a window of every element, in its unit; `dtype`: of the window's word, where that is not little-endian."""
+        words, dtype = f"u{seen.size}", dtype or seen.dtype
+        word = Read(self._once((dtype, seen), lambda: self._load(leaf, seen, dtype, words)))
         read = Read(self._cut(leaf, seen, shift, mask, word))
-        return self.program.step(f"{leaf.info.path} as it stands", kind, lambda run, out: np.copyto(out, read(run), casting="unsafe"), read)
+        quick = np.dtype(f"i{seen.size}" if mask >> 8 * seen.size - 1 == 0 else words)  # signed ones become floats several at a time
+
+        def run(execution: Run, out: NDArray[Any]) -> None:
+            np.copyto(out, read(execution).view(quick), casting="unsafe")
+            if leaf.info.scaled:
+                _scale(out, leaf.info)
+
+        return self.program.step(f"{leaf.info.path} as it stands", kind, run, read)
 
     def _cut(self, leaf: Leaf, seen: Window, shift: int, mask: int, word: Read) -> int:
         """Some bits of words, as words."""
@@ -267,14 +348,26 @@ class Compiler:
         if is_full(index, self._width) or inner != math.prod(self._shape[last_axis(index.shape) :]):
             return None
         self.low.append(index)
-        rows = self._once(("rows", id(table), kind), lambda: np.ascontiguousarray(table, TYPES[kind]))
+        number = len(table) - 1
+        times = 1 + -(-self.program.most * index.width // number) if number else 1
+        times = times if times <= TURNS else 1
+        rows = self._once(
+            ("rows", id(table), kind), lambda: np.concatenate([np.tile(table[:-1], (times, 1)), table[-1:]]).astype(TYPES[kind])
+        )
+        register, place = len(self.program.kinds), ("rows", index, number)
 
         def run(execution: Run, out: NDArray[Any]) -> None:
-            numbers = row_numbers(execution.part(execution.values(index)), len(rows))
-            numbers = np.broadcast_to(numbers, (execution.stop - execution.start, *index.shape))
-            rows.take(numbers.reshape(-1), axis=0, out=out.reshape(-1, inner), mode="clip")
+            known = execution.prepared.get(place)
+            if known is None or known[0] != execution.start:
+                known = execution.prepared[place] = execution.start, *_in_a_row(_numbers(execution, index, number), number)
+            _, numbers, first = known
+            last = first + len(numbers)
+            if first >= 0 and last < len(rows):  # they are looked at where they are
+                execution.views[register] = rows[first:last].reshape(-1)
+            else:
+                rows[(times - 1) * number :].take(numbers, axis=0, out=out.reshape(-1, inner), mode="clip")
 
-        return self.program.step(f"rows of a table of {len(rows) - 1} x {inner}", kind, run)
+        return self.program.step(f"rows of a table of {number} x {inner}", kind, run)
 
     def _direction(self, node: Node) -> int:
         """A cosine or sine; where all points of a packet or block have the same or nearly so, it is computed once for them."""
@@ -419,6 +512,16 @@ class Compiler:
         return self.program.step(f"times {factor:.6g}", "double", lambda run, out: np.multiply(read(run), factor, out=out), read)
 
 
+_NONE = np.zeros(0, np.bool_)
+
+
+def _scale(out: NDArray[Any], info: FieldInfo) -> None:
+    """Bring raw numbers to their unit, in place."""
+    np.multiply(out, out.dtype.type(info.scale), out=out)
+    if info.offset:
+        np.add(out, out.dtype.type(info.offset), out=out)
+
+
 def _always(value: Any) -> Callable[[Run], Any]:
     return lambda run: value
 
@@ -427,6 +530,18 @@ def _rows(run: Run, numbers: NDArray[Any]) -> slice:
     """The columns of a left side that belong to the chunk: one for each packet, or several."""
     each = numbers.shape[1] // len(run.rows)
     return slice(run.start * each, run.stop * each)
+
+
+def _numbers(run: Run, index: Node, rows: int) -> NDArray[np.intp]:
+    """The rows of a table of so many, for the packets or blocks of the chunk, (k,)."""
+    numbers = row_numbers(run.part(run.values(index)), rows + 1)
+    return np.broadcast_to(numbers, (run.stop - run.start, *index.shape)).reshape(-1)
+
+
+def _in_a_row(numbers: NDArray[np.intp], turn: int) -> tuple[NDArray[np.intp], int]:
+    """Numbers, and the first of them if they follow one another, 0 after the last of a turn; -1 if they do not."""
+    first = int(numbers[0])
+    return numbers, first if (numbers == np.arange(first, first + len(numbers)) % turn).all() else -1
 
 
 def _shared_by(angles: products.Angles, run: Run) -> NDArray[np.float32]:
