@@ -409,8 +409,10 @@ def _calibration(sensor: Sensor, option: str, folder: Path) -> Target:
         sensor.configure(**{option: path})
 
     def examples() -> list[bytes]:
+        if option == "metadata":
+            return [_metadata(rows) for rows in (16, 32)]
         heading = "Channel,Elevation,Azimuth" if option == "calibration" else "Channel,fire time(us)"
-        rows = [f"{channel},{20.5 - channel / 2}{f',{channel % 5 * 3 - 6}' * heading.count('Azimuth')}" for channel in range(1, 129)]
+        rows = [f"{channel},{20.5 - channel / 2}{f',{channel % 5 * 15 - 30}' * heading.count('Azimuth')}" for channel in range(1, 129)]
         return ["\n".join([heading, *rows[:number]]).encode() for number in (16, 32, 40, 64, 128)]
 
     words = [
@@ -418,6 +420,23 @@ def _calibration(sensor: Sensor, option: str, folder: Path) -> Target:
         for word in ("nan", "inf", "-inf", "1e999", ",", "\n", '"', "\x00", "1_0", "\u0661", "EEFF", "414", "0", "-0", ",,,,", "9" * 5000)
     ]
     return Target(f"calibration {sensor.id} {option}", run, examples, (ls.UsageError, ls.SourceError), words, is_text=True)
+
+
+def _metadata(rows: int) -> bytes:
+    """What a unit of so many rows would say of itself, as its web server has it."""
+    numbers, still = [float(row) for row in range(rows)], [float(spot % 5 == 0) for spot in range(16)]
+    layout = {"columns_per_frame": 1024, "columns_per_packet": 16, "pixels_per_column": rows, "udp_profile_lidar": "RNG19_RFL8_SIG16_NIR16"}
+    beams = {"beam_altitude_angles": numbers, "beam_azimuth_angles": numbers, "beam_to_lidar_transform": still}
+    return json.dumps(
+        {
+            "sensor_info": {},
+            "lidar_data_format": {**layout, "column_window": [0, 1023], "pixel_shift_by_row": [0] * rows},
+            "beam_intrinsics": beams,
+            "lidar_intrinsics": {"lidar_to_sensor_transform": still},
+            "imu_intrinsics": {"imu_to_sensor_transform": still},
+            "config_params": {"lidar_mode": "1024x10"},
+        }
+    ).encode()
 
 
 def _named(data: bytes) -> None:
