@@ -20,6 +20,7 @@ from lidarspec.exports import Refused, beginning, export
 from lidarspec.framing.frame_engine import codec
 from lidarspec.testing import subject as material
 from lidarspec.wire.schema import Schema
+from tests.all_sensors import RECODED
 from tests.exports.trees import DISTINCT, EVERY, values
 
 GCC = shutil.which("gcc")
@@ -37,7 +38,7 @@ REFUSED = {
     "shape-channels": f"channels: {_PARTS}",
     **dict.fromkeys(("livox-mid360", "livox-hap"), f"parameters: {_PARTS}"),
     "ti-iwr6843": f"tlvs: {_PARTS}",
-    **dict.fromkeys(("shape-tokens", "shape-lines", "shape-escaped"), "no other language recodes"),
+    **dict.fromkeys(RECODED, "no other language recodes"),
 }
 SENSORS = {name: sensor for name, sensor in DISTINCT.items() if name not in REFUSED}
 

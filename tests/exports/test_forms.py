@@ -19,13 +19,14 @@ from lidarspec.exports import EXPORTS, Refused, UnknownExport, export, narrowed
 from lidarspec.exports.diagram import BIT, BITS, LEFT
 from lidarspec.spec import Command, Frame
 from lidarspec.wire.schema import schema
+from tests.all_sensors import RECODED
 from tests.broken import sound
 from tests.cli.running import ran
 from tests.exports.json_decoder import Decoder
 from tests.shapes import SHAPES
 
 SENSORS = {**ls.sensors(), **{name: sensor for name, sensor in SHAPES.items() if sensor.frames}}
-SPOKEN = [name for name in SENSORS if name not in ("shape-text", "shape-tokens", "shape-lines", "shape-escaped")]
+SPOKEN = [name for name in SENSORS if name not in ("shape-text", *RECODED)]
 PAGE = Path(__file__).parents[2] / "docs" / "reference" / "spec-json.md"
 #: keys below which names stand that each spec chooses.
 NAMED = {"links", "frames", "commands", "values", "args", "matches", "lines", "labels"}

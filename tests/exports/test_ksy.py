@@ -13,6 +13,7 @@ from lidarspec import Sensor
 from lidarspec.exports import Refused, export
 from lidarspec.exports.ksy import yaml
 from lidarspec.spec import Every, Frame, Polar, Serial
+from tests.all_sensors import RECODED
 from tests.exports import kaitai
 from tests.shapes import SHAPES
 
@@ -21,7 +22,7 @@ SENSORS = {**ls.sensors(), **SHAPES}
 REFUSED = (
     {"shape-text": "Decimal is Python code"}
     | dict.fromkeys(("shape-tags", "livox-mid360", "livox-hap", "ti-iwr6843"), "told apart by their constants")
-    | dict.fromkeys(("shape-tokens", "shape-lines", "shape-escaped"), "no other language recodes")
+    | dict.fromkeys(RECODED, "no other language recodes")
 )
 SPOKEN = [name for name, sensor in SENSORS.items() if name not in REFUSED and sensor.frames]
 

@@ -17,13 +17,14 @@ from lidarspec.framing.frame_engine import codec
 from lidarspec.testing import subject as material
 from lidarspec.testing.subject import Subject
 from tests import made_captures as made
+from tests.all_sensors import RECODED
 from tests.exports.sharks import captured, columns, dissector, needs_tshark, tshark, written
 from tests.exports.trees import DISTINCT, EVERY, values
 
 #: what Wireshark cannot be told, with the reason.
 REFUSED = {
     "shape-text": "Decimal is Python code",
-    **dict.fromkeys(("shape-tokens", "shape-lines", "shape-escaped"), "no other language recodes"),
+    **dict.fromkeys(RECODED, "no other language recodes"),
 }
 #: what every run tries; the other shapes, and sensors that share the frames of one of these, are for the long one.
 FEW = {*lidarspec.sensors(), "shape-oddities", "shape-options", "shape-segments", "shape-tags", "shape-channels"} & set(DISTINCT)
