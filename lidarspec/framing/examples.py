@@ -139,13 +139,15 @@ def _sent(sensor: Spec, frame: str, layout: Layout, rows: NDArray[np.uint8]) -> 
 
 def _swept(sensor: Spec, frame: str, engine: CompiledCodec, source: random.Random) -> bytes:
     """A frame around the values that the sensor's `sweep` declares, where random ones are never plausible."""
-    sweep = sensor.simulation_of(frame).sweep
+    sweep, recoding = sensor.simulation_of(frame).sweep, recoder(sensor.frames[frame])
     if sweep is None:
         raise SpecError("no random frame passes `plausible`, and there is no `sweep` to start from", path=frame, sensor=sensor.id)
     for _ in range(TRIES):
         values = sweep(source.randrange(10_000))
         layout, chosen = engine.tree.choose(source, _stated(engine, values))
         rows = np.frombuffer(source.randbytes(layout.size), np.uint8).reshape(1, layout.size).copy()
+        if recoding is not None:
+            recoding.legal(rows, layout)
         for path, value in values.items():
             leaf = layout.leaves.get(path)
             if leaf is not None and path not in chosen:

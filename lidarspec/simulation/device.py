@@ -22,7 +22,7 @@ from lidarspec.errors import SpecError
 from lidarspec.framing.decoder import Decoder
 from lidarspec.framing.frame_engine import codec
 from lidarspec.simulation.faults import Faults, Line
-from lidarspec.simulation.frame_maker import FrameMaker, sealed
+from lidarspec.simulation.frame_maker import FrameMaker
 from lidarspec.simulation.scenes import Scene, furnished
 from lidarspec.simulation.simulator import Rest, Simulation, simulation
 from lidarspec.spec.description import Answer, Command, Spec, with_frames
@@ -100,7 +100,7 @@ class Answering:
         table = self._makers[name].table([given])
         if declared.imu is not None:
             self._rests.setdefault(name, Rest(self._sensor, name, given)).fill(table, self._shake, [number])
-        return sealed(table)[0]
+        return self._makers[name].sealed(table)[0]
 
     def _answer(self, answer: Answer, request: Request) -> Answered:
         if isinstance(answer, bytes):

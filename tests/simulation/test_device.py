@@ -75,6 +75,12 @@ def test_commands_without_an_answer_get_none_and_noise_is_ignored() -> None:
     assert device.heard == ["low_exposure", "get_version"]
 
 
+def test_answers_stand_in_the_form_of_their_frames() -> None:
+    device = on(ls.sensor("hokuyo-ust10lx"))
+    assert asked(device, "stop", 0) == b"QT\n00P\n\n"
+    assert asked(device, "get_time", MS) == b"TM1\n00P\n00000\n\n"
+
+
 def test_half_a_command_is_forgotten_when_the_line_falls_silent() -> None:
     device = on(A1)
     device.receive(b"\xa5\xa5\xff", 0)  # the beginning of a request with a long payload

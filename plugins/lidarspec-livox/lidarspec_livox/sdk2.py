@@ -6,9 +6,9 @@ leaves the CRC of point packets 0: these are taken as they are.
 
 Source: Livox Mid-360 protocol document 1.4.10 and Livox-SDK2 08f523c (livox_lidar_def.h), HAP protocol document 1.4.8 where they
 differ; HAP user manual, table 1.2.1, for its rate, ranges and view; those of a Mid-360 are assumed. livox_ros_driver2 divides
-`time_interval` by the number of points, the document by one less: the driver's rule is taken, which differs by 1 %. That a HAP takes
-the commands of a Mid-360 is assumed from the SDK, which sends it the same; where its state goes is not known, and not asked for.
-Commands for logs and firmware are not here. Keys whose values are not known are passed on as bytes.
+`time_interval` by the number of points, the document by one less: the driver's rule is taken, which differs by 1 %. That a HAP takes the
+commands of a Mid-360 is assumed from the SDK, which sends it the same; where its state goes is not known, and not asked for. Commands for
+logs and firmware are not here. Keys whose values are not known are passed on as bytes.
 """
 
 from __future__ import annotations

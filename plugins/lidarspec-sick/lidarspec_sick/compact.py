@@ -181,7 +181,7 @@ def scanner(name: str) -> Sensor:
         relatives={other: "how many layers its modules have" for other in MODELS if other != name},
         aliases=(model.lower(),),
         status=status,
-        source="sick_scan_xd, compact_parser.cpp; 8027119 for segments. Assumed: ranges, 20 turns a second, elevations of simulated layers",
+        source="sick_scan_xd, compact_parser.cpp; 8027119 for segments. Assumed: ranges, turns, elevations of simulated layers",
     )
 
 

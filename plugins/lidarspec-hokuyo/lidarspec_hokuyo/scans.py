@@ -1,0 +1,150 @@
+"""The scans that a scanner sends: distances of two or three characters, or distances with intensities.
+
+Source: SCIP 2.0, C-42-03320B: characters (6), steps (5), MD and MS with the time and the errors (8.1), GD and GS (8.2). ME and GE send a
+distance and an intensity of three characters each (UTM-30LX-EW, C-42-03886). A cluster of steps comes as one distance, its shortest; that
+a last cluster of fewer steps comes too, and that a cluster is seen in its middle, is assumed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache, partial
+from typing import Any
+
+import numpy as np
+from construct import Array, Const, Int8ub, Int16ub, Int24ub, Int32ub, Struct, this
+
+from lidarspec.spec import Fields, Frame, Lines, Polar, Scaled, Scip, SixBits, steps
+
+WIDTH = 64  # characters of a line of data
+LONGEST = 7000  # characters: 1081 distances with intensities take 6727
+WRAP = 2**24 * 1e-3  # seconds after which the clock starts again
+LEAST = 0.02  # metres: what is below is the number of an error (tables 3 and 4)
+KINDS = {"D": "distances", "E": "intensities", "S": "short"}
+DIGITS = {2: ("tens", "ones"), 4: ("thousands", "hundreds", "tens", "ones")}
+FIELDS: dict[str, Any] = {
+    "S": Struct("distance" / Scaled(Int16ub, 0.001, "m")),
+    "D": Struct("distance" / Scaled(Int24ub, 0.001, "m")),
+    "E": Struct("distance" / Scaled(Int24ub, 0.001, "m"), "intensity" / Int24ub),
+}
+
+
+@dataclass(frozen=True)
+class Geometry:
+    """Where a scanner looks, and how.
+
+    Attributes:
+        division: steps of a whole turn.
+        first, last, ahead: the first and the last step that it measures, and the one straight ahead.
+        end: the highest step that can be asked for.
+        rate: turns a second.
+        kinds: of scans that it sends.
+    """
+
+    division: int
+    first: int
+    last: int
+    ahead: int
+    end: int
+    rate: float
+    kinds: str
+
+
+@dataclass(frozen=True)
+class Asked:
+    """Which steps are asked for, and how many of them come as one distance."""
+
+    first: int
+    last: int
+    cluster: int
+
+    @property
+    def text(self) -> bytes:
+        """The same as in a command."""
+        return f"{self.first:04}{self.last:04}{self.cluster:02}".encode()
+
+
+def decimal(name: str, places: int) -> Any:
+    """A number of so many decimal digits."""
+    return name / Struct(*(place / Scaled(Int8ub, 1, "") for place in DIGITS[places]))
+
+
+def number(digits: Any) -> Any:
+    """What digits of a `decimal` say."""
+    return digits.thousands * 1000 + digits.hundreds * 100 + two(digits)
+
+
+def two(digits: Any) -> Any:
+    """What two digits say."""
+    return digits.tens * 10 + digits.ones
+
+
+def digits(name: str, value: int, places: int) -> dict[str, int]:
+    """The digits of a number, by their paths."""
+    return {f"{name}.{place}": int(digit) for place, digit in zip(DIGITS[places], f"{value:0{places}}", strict=True)}
+
+
+def width(f: Any) -> Any:
+    """The steps of a cluster, of which 00 means one too."""
+    return two(f.cluster) + (two(f.cluster) == 0)
+
+
+def count(f: Any) -> Any:
+    """How many distances there are."""
+    return (number(f.last) - number(f.first)) // width(f) + 1
+
+
+def plausible(f: Fields, end: int) -> Any:
+    """All digits are digits, and the steps those of the scanner."""
+    held = (number(f.last) <= end) & (number(f.first) <= number(f.last))
+    for places, name in ((4, "first"), (4, "last"), (2, "cluster")):
+        for place in DIGITS[places]:
+            held = held & (getattr(getattr(f, name), place) <= 9)
+    return held
+
+
+def points(f: Fields, geometry: Geometry) -> Polar:
+    """Points from the first step on, counter-clockwise; a distance below the shortest is the number of an error."""
+    step = number(f.first) + steps(count(f)) * width(f) + (width(f) - 1) / 2
+    return Polar(
+        range=f.points.distance,
+        azimuth=(step - geometry.ahead) * (2 * np.pi / geometry.division),
+        intensity=getattr(f.points, "intensity", None),
+        time=step / (geometry.division * geometry.rate),
+        invalid=f.points.distance < LEAST,
+    )
+
+
+@cache
+def scan(command: str, geometry: Geometry) -> Frame:
+    """The answer to MD, MS, ME, GD, GS or GE."""
+    goes_on = command[0] == "M"
+    rest = ("skip" / Int8ub * "turns left out between scans", decimal("left", 2) * "scans to come; 0: on and on") if goes_on else ()
+    struct = Struct(
+        "command" / Const(command.encode()),
+        decimal("first", 4) * "step",
+        decimal("last", 4) * "step",
+        decimal("cluster", 2) * "steps that come as one distance",
+        *rest,
+        "status" / Const(b"99" if goes_on else b"00"),
+        "time" / Scaled(Int32ub, 0.001, "s") * "when the turn was at step 0; 24 bits",
+        "points" / Array(count(this), FIELDS[command[1]]),
+    )
+    acknowledged = {"LS508": "two characters end at 4.1 m: configure(content='short') looks no farther"} if command[1] == "S" else {}
+    if geometry.end < 1000:
+        acknowledged["LS711"] = "it has no step of four digits"
+    return Frame(
+        struct,
+        data=True,
+        max_length=LONGEST,
+        plausible=partial(plausible, end=geometry.end),
+        points=partial(points, geometry=geometry),
+        acknowledged=acknowledged,
+        wire=Lines(WIDTH, head=(15 if goes_on else 12, 2, 4), bare=1, check=Scip()) | SixBits(),
+    )
+
+
+def sweep(i: int, geometry: Geometry, asked: Asked) -> dict[str, Any]:
+    """Scan i of those that were asked for."""
+    steps = digits("first", asked.first, 4) | digits("last", asked.last, 4) | digits("cluster", asked.cluster, 2)
+    return {**steps, "skip": 0, **digits("left", 0, 2), "time": i / geometry.rate % WRAP}
