@@ -80,6 +80,7 @@ class Cutter:
     Attributes:
         leaps: those of the last batch's at which the angle leaps by more than `AWAY`, and twice as far as at the one before: something is
             missing there, or no angle.
+        edges: the packets that those of the last batch begin at, where it is packets that say so, of which some may be without points.
     """
 
     def __init__(self, rule: Split) -> None:
@@ -89,10 +90,11 @@ class Cutter:
         self._start: int | None = None
         self._leap = 0.0  # by how much of a turn the angle went on at the last cut
         self.leaps = set[int]()
+        self.edges: list[int] | None = None
 
     def cuts(self, packets: Packets, found: Evaluated) -> list[int]:
         """Indices of the points of this batch before which to cut, ascending."""
-        rule, self.leaps = self._rule, set()
+        rule, self.leaps, self.edges = self._rule, set(), None
         if isinstance(rule, Every):
             return self._periods(rule, packets, found)
         if isinstance(rule, OnWrap) and rule.name in COLUMNS:
@@ -101,12 +103,15 @@ class Cutter:
         path = _own_path(packets, rule.name)
         column = _field(found, path)
         values, starts = _rows(column, found)
+        is_of_packets = all(name is None for name in column.axes)
         if isinstance(rule, OnWrap):
             table = packets.frames[0] if path.startswith("frame.") else packets.table
             unit = table.schema.fields[path.removeprefix("frame.")].unit
             rows, steps = self._wraps(values, 360.0 if unit == "deg" else 2 * np.pi, rule.at)
-            return self._points(starts[rows], steps)
-        return starts[self._changes(rule, values)].tolist()  # type: ignore[no-any-return]
+        else:
+            rows, steps = self._changes(rule, values), np.empty(0)
+        self.edges = rows.tolist() if is_of_packets else None
+        return self._points(starts[rows], steps) if isinstance(rule, OnWrap) else starts[rows].tolist()
 
     def _points(self, cuts: NDArray[np.intp], steps: NDArray[np.float64]) -> list[int]:
         """The cuts, of which `leaps` keeps those where the angle goes on by an odd part of a turn; `steps`: by how much at each."""
@@ -163,8 +168,8 @@ class Cutter:
         period = (times - self._start) // int(rule.seconds * 1e9)
         before = _before(period.astype(np.float64), self._before)
         self._before = float(period[-1])
-        starts = first_points(found)
-        return starts[np.flatnonzero(period > before)].tolist()  # type: ignore[no-any-return]
+        self.edges = np.flatnonzero(period > before).tolist()
+        return first_points(found)[self.edges].tolist()  # type: ignore[no-any-return]
 
 
 def _own_path(packets: Packets, path: str) -> str:

@@ -187,19 +187,23 @@ class Progress:
         self._last: tuple[int, int] | None = None  # time and index of the last packet
         self._turn = math.inf  # packets of the last whole scan, at first of the first piece
 
-    def cuts(self, packets: Packets, points: Evaluated, ends: Sequence[int], leaps: Collection[int]) -> list[Cut]:
+    def cuts(
+        self, packets: Packets, points: Evaluated, ends: Sequence[int], leaps: Collection[int], edges: Sequence[int] | None = None
+    ) -> list[Cut]:
         """The cuts of a batch in order: at the ends, which are between points, and where none came in time.
 
         Args:
             leaps: the ends at which the angle leaps as it does at no other, so that they may be none.
+            edges: the packets that the ends are in; None where each is in the one that has its point.
         """
         number, found, start = points.ready, list[Cut](), 0
         if not number:
             return found
         first = first_points(points) if len(ends) or self._by_points else np.empty(0, np.intp)
         batch = self._batch(packets, number, np.diff(first, append=source_of(points.cloud).size) if self._by_points else None)
-        for end in ends:
-            edge = int(np.searchsorted(first, end, side="right")) - 1  # the packet that the end is in
+        if edges is None:
+            edges = (np.searchsorted(first, ends, side="right") - 1).tolist()
+        for edge, end in zip(edges, ends, strict=True):
             begins = bool(first[edge] == end)
             found += self._without_end(packets, batch, start, edge + (not begins), points)
             is_shared = begins and not self._shows_start(packets, edge)
@@ -399,13 +403,14 @@ class ScanStream:
 
     def _cut(self, packets: Packets, points: Evaluated) -> Iterator[Scan]:
         start, source = 0, source_of(points.cloud)
-        cuts = self._progress.cuts(packets, points, self._cutter.cuts(packets, points), self._cutter.leaps)
+        ends = self._cutter.cuts(packets, points)
+        cuts = self._progress.cuts(packets, points, ends, self._cutter.leaps, self._cutter.edges)
         first, *times = _times_ns(source, [0, *(cut.point for cut in cuts)])
         self._begins = first if self._begins is None else self._begins
-        for cut, ends in zip(cuts, times, strict=True):
+        for cut, time in zip(cuts, times, strict=True):
             self._take(source, start, cut.point)
-            scan = self._close(ends, whole=cut.whole, complete=cut.complete)
-            self._begins, start = ends, cut.point
+            scan = self._close(time, whole=cut.whole, complete=cut.complete)
+            self._begins, start = time, cut.point
             if scan is not None:
                 yield scan
         self._take(source, start, source.size)

@@ -686,6 +686,9 @@ def is_expression(value: object) -> bool:
 #: the highest of the low numbers that are drawn half of the time: as a count or a choice, a number of any size hardly ever fits.
 MANY = (1, 6, 40)
 
+#: how often a part is drawn that does not fit.
+DRAWS = 100
+
 
 def random_value(con: Construct, source: random.Random, drawn: Drawn, scope: Any = None, path: str = "") -> Any:
     """A random value that a construct can build; for parts that have no places and so cannot be filled with random bytes.
@@ -746,10 +749,18 @@ def _random_parts(con: Partition, source: random.Random, drawn: Drawn, scope: An
     around = Container({**scope, "_params": Container(), "_parsing": False, "_building": True, "_sizing": False})
     for _ in range(source.randint(0, 4)):
         name, stream = source.choice(list(con.cases)), io.BytesIO()
-        found.append(random_value(con.cases[name], source, drawn, scope, path))
+        found.append(_random_part(con.cases[name], source, drawn, scope, path))
         con.cases[name]._build(found[-1], stream, around, path)
         found.spans.append((name, 0, stream.tell()))
     return found
+
+
+def _random_part(con: Construct, source: random.Random, drawn: Drawn, scope: Any, path: str) -> Any:
+    """One part; drawn again by itself where it is too long, since frames of many counts would else have no part at all."""
+    for _ in range(DRAWS):
+        with contextlib.suppress(Fault):
+            return random_value(con, source, drawn, scope, path)
+    return random_value(con, source, drawn, scope, path)
 
 
 def _random_leaf(con: Construct, source: random.Random, scope: Any) -> Any:

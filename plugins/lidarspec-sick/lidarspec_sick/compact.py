@@ -159,7 +159,7 @@ IMU_FRAME = Frame(IMU, imu=imu, clock=Clock("time"), simulation=Simulation(lambd
 #: id -> model, elevations of the layers in degrees, beams of a segment, segments of a turn, limits of range, status.
 MODELS: dict[str, tuple[str, tuple[float, ...], int, int, tuple[float, float], str]] = {
     "sick-multiscan136": ("multiScan136", tuple(np.linspace(22.5, -42.5, 16)), 30, 12, (0.05, 60), "capture"),
-    "sick-picoscan150": ("picoScan150", (0.0,), 240, 12, (0.05, 75), "manual"),
+    "sick-picoscan150": ("picoScan150", (0.0,), 300, 12, (0.05, 75), "manual"),
 }
 
 
@@ -181,7 +181,8 @@ def scanner(name: str) -> Sensor:
         relatives={other: "how many layers its modules have" for other in MODELS if other != name},
         aliases=(model.lower(),),
         status=status,
-        source="sick_scan_xd, compact_parser.cpp; 8027119 for segments. Assumed: ranges, turns, elevations of simulated layers",
+        acknowledged={"LS404": "clouds of telegrams of different layouts have no grid, and which ones are together depends on the batch"},
+        source="sick_scan_xd, compact_parser.cpp; 8027119 for segments. Assumed: ranges, turns, beams, elevations of simulated layers",
     )
 
 
