@@ -323,6 +323,9 @@ def _points(sensor: Sensor, name: str, data: bytes, rows: Sequence[Row]) -> tupl
     chain, parts = packets.table.schema.chain, _parts(sensor, name, data)
     if not chain and not parts:
         return none, (*notes, *(f"point {point}" for point in points[:TOLD]))
+    arrays = {axis for info in packets.table.schema.fields.values() for axis in info.axes}
+    along = tuple(axis for axis in evaluated.axes if axis in arrays)
+    chain = along if len(along) == len(chain) else chain  # which of several arrays side by side points go with, they say
     inside = evaluated.counts.astype(np.bool_)
     numbers = np.where(inside, np.cumsum(inside).reshape(inside.shape) - 1, -1)
     given: list[tuple[Point, ...]] = []
