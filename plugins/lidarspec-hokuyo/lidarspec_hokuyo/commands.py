@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
-from typing import Any
+from typing import Any, Literal
 
 from construct import Bytes, Const, Construct, GreedyBytes, Int8ub, Int32ub, NullTerminated, Struct
 
@@ -55,9 +55,9 @@ class LineCheck(Checksum):
     """Six bits of the sum of a line's characters without the semicolon at its end, from "0" on."""
 
     width: int = 8
-    order: str = "little"
+    order: Literal["little", "big"] = "little"
 
-    def __call__(self, data: bytes) -> int:
+    def __call__(self, data: bytes | bytearray | memoryview) -> int:
         return (sum(data[:-1]) & 0x3F) + 0x30
 
     def describe(self) -> str:
