@@ -66,13 +66,14 @@ def demonstrate(sensor: Sensor, *, turns: int = 5, errors: float = 0.01, seed: i
 
     Args:
         turns: whole scans wanted.
-        errors: share of the bytes of a stream that are damaged, or of the datagrams that are lost.
+        errors: share of the bytes of a stream that are damaged, one in each of the longest frames at most, or of the datagrams that are lost.
 
     Raises:
         SourceError: where no line can be had, or the scans do not come.
         PluginError: where a function of the plugin raises.
     """
-    faults = Faults(loss=errors) if sensor.datagrams else Faults(errors=errors)
+    longest = sensor.frames[sensor.data_frame].max_length
+    faults = Faults(loss=errors) if sensor.datagrams else Faults(errors=min(errors, 1 / longest))
     simulated = SimulatedDevice(sensor, seed=seed, faults=faults)
     with tempfile.TemporaryDirectory(prefix="lidarspec-demo-") as folder:
         path = Path(folder) / "demo.lsr"
