@@ -66,7 +66,7 @@ def demonstrate(sensor: Sensor, *, turns: int = 5, errors: float = 0.01, seed: i
 
     Args:
         turns: whole scans wanted.
-        errors: share of the bytes of a stream that are damaged, one in each of the longest frames at most, or of the datagrams that are lost.
+        errors: share of the bytes of a stream that are damaged, at most one in each of the longest frames; of datagrams, those lost.
 
     Raises:
         SourceError: where no line can be had, or the scans do not come.

@@ -144,7 +144,8 @@ def _frame(name: str, frame: Frame, picture: str) -> Iterator[str]:
     if picture:
         yield f"![{name}: packet diagram]({picture})"
     rows = [(row.offset, row.size, row.type, f"`{row.field}`", row.unit, row.meaning) for row in wire_table(frame)]
-    yield "\n".join(_table(["offset", "size", "type", "field", "unit", "meaning"], rows))
+    told = [[cell if "`" in cell else cell.replace("[", r"\[") for cell in row] for row in rows]  # an index is no link
+    yield "\n".join(_table(["offset", "size", "type", "field", "unit", "meaning"], told))
 
 
 def _geometry(sensor: Sensor) -> Iterator[str]:
