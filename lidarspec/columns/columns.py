@@ -418,8 +418,7 @@ def of_points(parts: Mapping[str, Any], batch: Batch) -> tuple[list[NDArray[Any]
 
 def _reach(table: Table, axis: str, length: int) -> int:
     """How far along an axis values are; no further than the array where frames say its length and have no array around it."""
-    around = [other for other in table.schema.arrays if axis.startswith(other) and axis != other]
-    return min(length, table.length(axis)) if any((table.counts(other) == 0).any() for other in around) else length
+    return min(length, table.length(axis)) if any((table.counts(other) == 0).any() for other in table.schema.outer(axis)) else length
 
 
 def _reaching(array: NDArray[Any], place: int, table: Table, axis: str) -> NDArray[Any]:

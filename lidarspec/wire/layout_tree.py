@@ -257,8 +257,7 @@ class _Walk:
 
     def _array(self, node: tree.Repeat, path: str, shape: tuple[int, ...], strides: tuple[int, ...]) -> None:
         count, start = self._count(node.count, path), self.cursor
-        count = 0 if 0 in shape else count  # arrays in an empty one are nowhere, however long they would be
-        self.lengths[node.axis] = count
+        self.lengths[node.axis] = 0 if 0 in shape else count
         if count > self.limit:
             raise TooLong(path)
         if count:

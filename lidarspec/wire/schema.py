@@ -149,6 +149,10 @@ class Schema:
             raise SpecError(f"{reason}; there are {', '.join(found or self.places) or 'none'}", rule="LS214")
         return found[0]
 
+    def outer(self, axis: str) -> list[str]:
+        """The arrays that an array is in."""
+        return [other for other in self.arrays if axis.startswith((f"{other}.", f"{other}["))]
+
     def depth(self) -> int:
         """How many arrays are nested at most."""
         return len(self.chain)
