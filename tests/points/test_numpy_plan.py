@@ -31,7 +31,9 @@ TRIED = ("ldrobot-stl27l", "velodyne-vlp16")
 
 def plan(packets: Packets) -> Any:
     assert isinstance(packets.table, Rows)
-    return plan_for(packets.sensor.points_of(packets.frame), packets.batch(), packets.table.groups[0])
+    return plan_for(
+        packets.sensor.points_of(packets.frame), packets.batch(), max(packets.table.groups, key=lambda group: group.layout.size)
+    )
 
 
 def packets_of(sensor: Sensor, number: int) -> Packets:
