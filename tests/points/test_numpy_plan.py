@@ -69,7 +69,7 @@ def test_every_column_of_damaged_and_mixed_streams(name: str) -> None:
 @pytest.mark.parametrize("name", list(lidarspec.sensors()))
 def test_all_sensors_of_this_repository_have_a_plan(name: str) -> None:
     packets = packets_of(SENSORS[name], 3)
-    if len(packets):
+    if len(packets.points()):  # headers of random counts may leave none
         assert isinstance(plan(packets), Plan), str(plan(packets))
 
 
