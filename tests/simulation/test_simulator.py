@@ -30,7 +30,12 @@ STEPS = {"ultra": 0.004, "ultra_dense": 0.0015}
 REPEATING = {("quanergy-m8", "data"): 3, ("quanergy-mq8", "data"): 3}
 #: metres of one step where the header says the unit.
 BY_HEADER = 0.004
-EVERY = [(name, frame) for name, sensor in ls.sensors().items() for frame in sensor.frames if sensor.frames[frame].data]
+EVERY = [
+    (name, frame)
+    for name, sensor in ls.sensors().items()
+    for frame in sensor.frames
+    if sensor.frames[frame].data and "LS508" not in sensor.frames[frame].acknowledged  # those cannot say how far a room is
+]
 
 
 #: 40 samples a packet, and nothing that says when they are sent.
