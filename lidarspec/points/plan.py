@@ -208,7 +208,7 @@ class Plan:
         return is_number(node, self.layout.leaves)
 
 
-#: tables by what they are of, shared by the plans of a `points` function.
+#: tables by what they are of, shared by the plans of a `points` function, which several sensors may have: a field is told by its info.
 _TABLES: WeakKeyDictionary[PointsFunction, dict[Any, NDArray[Any]]] = WeakKeyDictionary()
 
 

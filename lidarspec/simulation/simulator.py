@@ -39,6 +39,7 @@ from lidarspec.spec.results import Cartesian, Points, Polar
 from lidarspec.spec.timing import Every
 from lidarspec.spec.tree import FieldInfo, exact
 from lidarspec.wire.frame_table import Group, Rows, Table
+from lidarspec.wire.slots import slot_of
 
 Times = NDArray[np.int64]
 #: bits on a serial line for each byte: start, eight, stop.
@@ -198,8 +199,14 @@ class Measurement:
             part = _part(ranges, target.inner)
             with np.errstate(all="ignore"):
                 raw = whole(info, (part - zero) / step)
-            found[target.path] = np.where((part > 0) & (raw > 0) & (raw <= info.limits[1]), raw, 0)
+            found[target.path] = np.where((part > 0) & (raw > 0) & (raw <= self._most(table, target.path)), raw, 0)
         return found
+
+    def _most(self, table: Rows, path: str) -> float:
+        """The largest raw value that a field holds, and that the frame's wire form can write."""
+        most, form = table.schema.fields[path].limits[1], self._sensor.frames[self._frame].wire
+        leaves = [group.layout.leaves[path] for group in table.groups if path in group.layout.leaves]
+        return most if form is None else min(most, *(form.largest(slot_of(leaf)) for leaf in leaves))
 
     def _traced(self, table: Rows) -> tuple[Target, ...]:
         """The fields in metres that the ranges of the points answer to."""

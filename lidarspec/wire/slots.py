@@ -237,7 +237,7 @@ def _between(leaves: tuple[Leaf, ...], first: int, end: int) -> tuple[Slot, ...]
     return tuple(Slot(slot.kind, slot.size, sum(1 for _ in group), slot.little) for slot, group in groups)
 
 
-def _slot(leaf: Leaf) -> Slot:
+def slot_of(leaf: Leaf) -> Slot:
     """What one element of a field is; a block of bits is a number."""
     if leaf.info.kind == "bytes":
         return Slot("text", leaf.size)
@@ -253,7 +253,7 @@ _KINDS: dict[str, Literal["uint", "int", "float"]] = {"u": "uint", "i": "int", "
 
 def _elements(leaves: Sequence[Leaf], first: int, end: int) -> Iterator[tuple[str, int, Slot]]:
     """The slots from one byte of the row to another, one by one: path, place and kind; constants without a name and parts are text."""
-    known = [_slot(leaf) for leaf in leaves]
+    known = [slot_of(leaf) for leaf in leaves]
     for offset, index in _spots(leaves).tolist():
         if first < min(offset, end):
             yield "", first, Slot("text", min(offset, end) - first)

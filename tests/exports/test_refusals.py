@@ -43,7 +43,7 @@ def with_frame(*fields: Any, algorithm: Checksum | None = None) -> Sensor:
         (with_frame("x" / Bytes(lambda c: 1 if c.a else 2)), "x: a Python function decides on the values"),
         (with_frame("x" / Bytes(lambda c: {0: 1}[c.a])), "x: a Python function"),
         (with_frame("x" / Bytes(this.a / 2)), "x: an expression with '/'"),
-        (with_frame("l" / Array(2, Int8ub), "x" / Bytes(this.l[1])), "x: an expression"),
+        (with_frame("l" / Array(2, Int8ub), "x" / Bytes(this.l[1])), "l[1]: an element of an array"),
         (with_frame("x" / Bytes(this.later)), "x: an expression asks for 'later'"),
         (with_frame("x" / Switch(this.a, {"word": Int8ub})), "a has no value named 'word'"),
         (with_frame(algorithm=Own()), "the checksum Own is Python code"),

@@ -9,17 +9,20 @@ from typing import Any
 
 import numpy as np
 import pytest
+from construct import Array, Int8ul, Int16ul, Struct, this
 
 import lidarspec
 from lidarspec import Packets, Sensor
 from lidarspec.points.evaluate import evaluated
 from lidarspec.points.plain import evaluate
 from lidarspec.points.plan import Plan, plan_for
-from lidarspec.spec import Fields, Polar
+from lidarspec.simulation.simulator import simulate
+from lidarspec.spec import Fields, Polar, Scaled
 from lidarspec.spec.links import is_datagram
 from lidarspec.testing.agreement import assert_same_points
 from lidarspec.testing.subject import Subject
 from lidarspec.wire.frame_table import Rows
+from tests.broken import sound
 from tests.engine.against_construct import clouds_agree, sensor
 from tests.engine.random_specs import made
 from tests.shapes import SHAPES
@@ -155,3 +158,15 @@ def test_threads_that_decode_with_one_sensor_do_not_meet() -> None:
 
     with ThreadPoolExecutor(2) as pool:
         assert all(pool.map(same, [0, 1]))
+
+
+@pytest.mark.parametrize("backend", ["numpy", "jit"])
+def test_sensors_that_share_a_points_function_keep_their_own_scales(backend: str) -> None:
+    """Tables are kept for a points function, and one of these sensors measures in other units than the first."""
+    for unit in (0.001, 0.002):
+        sample = Struct("distance" / Scaled(Int16ul, unit, "m"), "quality" / Int8ul)
+        made = sound.sensor(sound.frame(sound.sealed(samples=Array(this.count, sample))))
+        cloud = made.decode(b"".join(simulate(made, 40)), backend=backend).points()
+        plain = made.decode(b"".join(simulate(made, 40)), backend="construct").points()
+        assert cloud.valid.any()
+        assert_same_points(cloud, plain)

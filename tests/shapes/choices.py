@@ -31,7 +31,7 @@ SAMPLE = Struct(
 )
 DATA = Checksummed(
     Struct(
-        "magic" / Const(b"\xd1"),
+        "magic" / Const(b"\xd1\x5e\x2c"),
         "version" / OneOf(Int32ub, [0x01000002, 0x01000003]),
         "mode" / Mapping(Int8ub, {"slow": 1, "fast": 4}),
         "least" / NoneOf(Int8ub, [0, *range(32, 256)]),
@@ -59,7 +59,7 @@ SENSOR = Sensor(
     "shape-choices",
     vendor="Shapes",
     model="Choices",
-    frames={"data": Frame(DATA, data=True, max_length=18)},
+    frames={"data": Frame(DATA, data=True, max_length=20)},
     points=points,
     scan=OnWrap("angle"),
     simulation=Simulation(sweep),

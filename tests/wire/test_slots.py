@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 from construct import Array, Const, Int8ub, Int16sb, Int16ub, Int24ub, Int32ub, Struct, this
@@ -17,7 +19,7 @@ TOKENS, LINES, ESCAPED = (SHAPES[f"shape-{name}"] for name in ("tokens", "lines"
 def sensor(struct: Struct, form: object, longest: int = 200) -> Sensor:
     """A sensor with one frame in this form."""
     frames = {"data": Frame(struct, data=True, max_length=longest, wire=form)}  # type: ignore[arg-type]
-    return Sensor(**{**vars(TOKENS), "frames": frames, "clock": None, "sequence": None})
+    return dataclasses.replace(TOKENS, frames=frames, clock=None, sequence=None)
 
 
 NUMBERS = sensor(Struct("a" / Int16ub, "b" / Int16sb, "c" / Int32ub), Tokens(start=b"\x02"))

@@ -283,7 +283,7 @@ class Writer:
     def _table(self, node: Node, leaf: Leaf, kind: Any, factor: float) -> NDArray[Any]:
         seen = window(leaf)
         assert seen is not None
-        name = ("kernel", np.dtype(kind).name, factor, seen.offset - leaf.offset, seen.size, leaf.size, leaf.info.path, key(node))
+        name = ("kernel", np.dtype(kind).name, factor, seen.offset - leaf.offset, seen.size, leaf.size, leaf.info, key(node))
         if name not in self._tables:
             self._tables[name] = np.ascontiguousarray(np.asarray(every_value(node, leaf)) * factor, kind)
         return self._tables[name]
@@ -296,7 +296,7 @@ class Writer:
 
     def beside(self, node: Node, leaf: Leaf) -> Value:
         """A cosine or sine from a table that has both side by side, so that they are fetched together."""
-        name = ("kernel", "both", leaf.info.path, leaf.size, key(node.args[0]))
+        name = ("kernel", "both", leaf.info, leaf.size, key(node.args[0]))
         if name not in self._tables:
             angles = np.asarray(every_value(node.args[0], leaf))
             self._tables[name] = np.stack([np.cos(angles), np.sin(angles)], axis=1).astype(np.float32)

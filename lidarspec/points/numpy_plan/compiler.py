@@ -237,7 +237,7 @@ class Compiler:
 
     def _table(self, node: Node, leaf: Leaf, seen: Window, kind: str, factor: float) -> NDArray[Any]:
         shift = self._shift(leaf, seen)
-        name = (kind, seen.offset - leaf.offset, seen.size, leaf.size, shift, factor, key(node))
+        name = (kind, seen.offset - leaf.offset, seen.size, leaf.size, shift, factor, leaf.info, key(node))
         if name not in self._tables:
             values = np.asarray(every_value(node, leaf))
             if shift is not None and seen.size > 1:
