@@ -81,6 +81,9 @@ class Reading(Protocol):
             cannot be read.
         """
 
+    def starts(self, at: int, slots: Sequence[Slot]) -> Numbers:
+        """Where each of the slots begins that follow from a place in the buffer on and can be read, one for each of their `count`."""
+
 
 class WireForm(Protocol):
     """How frames stand on the wire.
@@ -271,6 +274,18 @@ class _TokenReading:
         rows, ends = zip(*parts, strict=True)
         return np.concatenate(rows), np.concatenate(ends)
 
+    def starts(self, at: int, slots: Sequence[Slot]) -> Numbers:
+        found = [np.zeros(0, np.intp)]
+        for slot in slots:
+            if slot.kind == "text":  # which may have a separator inside
+                begins = at + (slot.size + 1 if slot.size else 0) * np.arange(slot.count + 1)
+            else:
+                first = self._stops.searchsorted(at)
+                begins = np.append(at, self._stops[first : first + slot.count] + 1)
+            found.append(begins[:-1])
+            at = begins[-1]
+        return np.concatenate(found)
+
     def _read(self, at: Numbers, stops: Numbers, slots: Sequence[Slot]) -> tuple[Bytes2D, Numbers]:
         parts = [np.empty((len(at), 0), np.uint8)]
         for (is_text, _), group in itertools.groupby(slots, lambda slot: (slot.kind == "text", slot if slot.count >= MANY else None)):
@@ -404,6 +419,11 @@ class Unescaped:
             return rows, goes_on
         rows, right = self.numbers.read(rows, slots)
         return rows, np.where(right, goes_on, NONE)
+
+    def starts(self, at: int, slots: Sequence[Slot]) -> Numbers:
+        sizes = np.repeat([slot.size for slot in slots], [slot.count for slot in slots])
+        found: Numbers = self.places[self.places.searchsorted(at) + np.cumsum(sizes) - sizes]
+        return found
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,7 @@ from lidarspec.wire.layout import Layout, Leaf, Refused
 from lidarspec.wire.layout_tree import NotCompilable, frame_layouts, prefix_of
 from lidarspec.wire.parts import Region
 from lidarspec.wire.schema import schema
-from lidarspec.wire.slots import SPELLING, Field, Recoder, recoder
+from lidarspec.wire.slots import SPELLING, Recoder, recoder
 
 
 def parse(sensor: Spec, data: bytes, *, frame: str | None = None, verify: bool = True, units: bool = False) -> Any:
@@ -330,33 +330,29 @@ def _parse_as(sensor: Spec, name: str, data: bytes, *, verify: bool) -> Any:
     recoding, where = recoder(sensor.frames[name]), {"sensor": sensor.id, "frame": name, "data": data}
     if recoding is None:
         return _parse_row(sensor, name, data, where, int, verify=verify)
-    fields, row = recoding.fields(data)
     found = recoding.row(data)
-    if verify and (found is None or len(row) < len(found[1])):
-        raise _unreadable(recoding, data, fields, where)
-
-    def place(offset: int) -> int:
-        return next((field.start for field in fields if offset < field.end), len(data))
-
-    parsed = _parse_row(sensor, name, row, where, place, verify=verify)
+    if verify and found is None:
+        raise _unreadable(recoding, data, where)
+    row = recoding.legible(data).row if found is None else found[1]
+    parsed = _parse_row(sensor, name, row, where, functools.partial(recoding.place, data), verify=verify)
     return parsed if found is None else spelled(parsed, recoding, *found, data)
 
 
-def _unreadable(recoding: Recoder, data: bytes, fields: Sequence[Field], where: Mapping[str, Any]) -> WireError:
+def _unreadable(recoding: Recoder, data: bytes, where: Mapping[str, Any]) -> WireError:
     """Why bytes are no frame of a wire form, with the place of the first slot that cannot be read."""
     begins = recoding.begins
     if not data or not data.startswith(begins):
         reason = f"begins with {data[: len(begins)].hex(' ') or 'nothing'}, expected {begins.hex(' ')}"
         return WireError(reason, offset=0, expected=begins, got=data[: len(begins)], **where)
     reading = recoding.reading(np.frombuffer(data, np.uint8), np.zeros(1, np.intp))
-    size, start = reading.sizes.item(0), fields[-1].stop if fields else len(recoding.form.start)
+    size, legible = reading.sizes.item(0), recoding.legible(data)
+    start, path, wanted = legible.stop, legible.path, legible.wanted
     if 0 < size < len(data):
         return WireError(f"{len(data) - size} more bytes after the frame's {size}", offset=size, expected=size, got=len(data), **where)
     if size <= 0:
         return WireError(f"frame has no end in its {len(data)} bytes", offset=len(data), got=len(data), **where)
     if reading.intact is not None and not reading.intact[0]:
         return WireError("a check character of its lines is wrong", offset=start, **where)
-    path, wanted = recoding.next_field(data, fields)
     got = data[start : start + SHOWN]
     return WireError(
         f"{path or 'frame'} at byte {start}: {got!r} is not {wanted}", offset=start, path=path, expected=wanted, got=got, **where

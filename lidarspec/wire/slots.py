@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import functools
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -30,19 +30,21 @@ Read = tuple[Layout | Refused, Indices, Bytes2D, NDArray[np.bool_]]
 
 
 @dataclass(frozen=True)
-class Field:
-    """One slot of a frame: the path of its field, with the index of an element of arrays, and where it stands.
+class Legible:
+    """What can be read of one frame.
 
     Attributes:
-        first, end: of its row.
-        start, stop: of the frame on the wire; what separates it from the next one included.
+        slots: that can be read, one by one.
+        row: their bytes.
+        stop: where in the frame the first slot stands that cannot be read, or what follows the last one.
+        path, wanted: of that slot, and what should stand there, in words.
     """
 
-    path: str
-    first: int
-    end: int
-    start: int
+    slots: tuple[Slot, ...]
+    row: bytes
     stop: int
+    path: str
+    wanted: str
 
 
 class _Heads:
@@ -169,32 +171,16 @@ class Recoder:
                 each = wide[:, :, 8 - slot.size :]
                 part[...] = (each[:, :, ::-1] if slot.little else each).reshape(len(rows), -1)
 
-    def fields(self, data: bytes) -> tuple[list[Field], bytes]:
-        """The slots of one frame, as far as they can be read, and their row; its layout is that of the header, if that is whole."""
-        buffer, starts, start = np.frombuffer(data, np.uint8), np.zeros(1, np.intp), np.array([len(self.form.start)])
-        if not data:
-            return [], b""
-        reading = self.reading(buffer, starts)
-        stop = np.array([reading.sizes.item(0) if reading.sizes[0] > 0 else len(data)])
-        found, row = list[Field](), b""
-        for path, _, slot in _elements(*self._leaves(reading, starts, stop)):
-            part, ends = reading.rows(start, stop, (slot,))
-            if ends[0] == NONE:
-                break
-            found.append(Field(path, len(row), len(row) + slot.size, start.item(0), ends.item(0)))
-            row, start = row + part[0].tobytes(), ends
-        return found, row
-
     def places(self, data: bytes) -> tuple[bytes, list[int]]:
         """The row of one frame as far as it can be read, and where in the frame each byte of it begins, and the last one ends.
 
         What separates a slot from the next one belongs to it, the mark at the end to none.
         """
-        fields, row = self.fields(data)
-        at = [field.start for field in fields for _ in range(field.first, field.end)]
         if not data:
-            return row, [0]
-        reading = self.reading(np.frombuffer(data, np.uint8), np.zeros(1, np.intp))
+            return b"", [0]
+        legible = self.legible(data)
+        row = legible.row
+        reading, start, _ = self._alone(data)
         size = reading.sizes.item(0)
         if isinstance(reading, Unescaped):
             inside = reading.places[(reading.places >= len(self.form.start)) & (reading.places < (size if size > 0 else len(data)))]
@@ -202,16 +188,39 @@ class Recoder:
             at = inside[: len(row)].tolist()
             follows = inside[len(row)] if len(row) < len(inside) else size - 1 if size > 0 and self.form.start else at[-1] + 1 if at else 0
             return row, [*at, int(follows)]
-        return row, [*at, fields[-1].stop - (fields[-1].stop == size) if fields else len(self.form.start)]
+        starts = reading.starts(start.item(0), _joined(legible.slots))
+        at = np.repeat(starts, [slot.size for slot in legible.slots]).tolist()
+        return row, [*at, legible.stop - (legible.stop == size)]
 
-    def next_field(self, data: bytes, fields: Sequence[Field]) -> tuple[str, str]:
-        """The path of the slot behind those that could be read, and what should stand there, in words."""
-        buffer, starts = np.frombuffer(data, np.uint8), np.zeros(1, np.intp)
-        slots = _elements(*self._leaves(self.reading(buffer, starts), starts, np.array([len(data)])))
-        path, _, slot = next(itertools.islice(slots, len(fields), None), ("", 0, None))
-        if slot is None:
-            return path, "the end of the frame"
-        return path, f"{slot.size} characters of text" if slot.kind == "text" else f"a number of {slot.size} bytes"
+    def legible(self, data: bytes) -> Legible:
+        """One frame as far as its slots can be read; which ones it has tells its header, if that is whole."""
+        if not data:
+            return Legible((), b"", 0, "", "a frame")
+        reading, at, stop = self._alone(data)
+        elements, row, number = list(_elements(*self._leaves(reading, np.zeros(1, np.intp), stop))), b"", 0
+        step = len(elements)
+        while step:  # halved where one of so many cannot be read
+            part, ends = reading.rows(at, stop, _joined(slot for _, _, slot in elements[number : number + step]))
+            if number + step <= len(elements) and ends[0] != NONE:
+                row, at, number = row + part[0].tobytes(), ends, number + step
+            else:
+                step //= 2
+        path, _, slot = elements[number] if number < len(elements) else ("", 0, None)
+        seen = tuple(slot for _, _, slot in elements[:number])
+        return Legible(seen, row, at.item(0), path, "the end of the frame" if slot is None else _in_words(slot))
+
+    def place(self, data: bytes, offset: int) -> int:
+        """Where a byte of the row of one frame stands in it: where its slot begins; its end for one that cannot be read."""
+        reading, at, stop = self._alone(data)
+        before = [slot for _, first, slot in _elements(*self._leaves(reading, np.zeros(1, np.intp), stop)) if first + slot.size <= offset]
+        found = reading.rows(at, stop, _joined(before))[1].item(0)
+        return len(data) if found == NONE else found
+
+    def _alone(self, data: bytes) -> tuple[Reading, Indices, Indices]:
+        """One frame, where its slots begin, and where it ends."""
+        reading = self.reading(np.frombuffer(data, np.uint8), np.zeros(1, np.intp))
+        size = reading.sizes.item(0)
+        return reading, np.array([len(self.form.start)]), np.array([size if size > 0 else len(data)])
 
     def _leaves(self, reading: Reading, starts: Indices, stops: Indices) -> tuple[Sequence[Leaf], int, int]:
         """The fields of one frame, as far as its header tells, and the bytes of the row that these are in."""
@@ -233,8 +242,16 @@ def slots(layout: Layout) -> tuple[Slot, ...]:
 @functools.lru_cache(maxsize=1024)
 def _between(leaves: tuple[Leaf, ...], first: int, end: int) -> tuple[Slot, ...]:
     """The slots of fields from one byte of the row to another, those of one kind as one."""
-    groups = itertools.groupby(slot for _, _, slot in _elements(leaves, first, end))
-    return tuple(Slot(slot.kind, slot.size, sum(1 for _ in group), slot.little) for slot, group in groups)
+    return _joined(slot for _, _, slot in _elements(leaves, first, end))
+
+
+def _joined(slots: Iterable[Slot]) -> tuple[Slot, ...]:
+    """Slots one by one, those of one kind that follow one another as one."""
+    return tuple(Slot(slot.kind, slot.size, sum(1 for _ in group), slot.little) for slot, group in itertools.groupby(slots))
+
+
+def _in_words(slot: Slot) -> str:
+    return f"{slot.size} characters of text" if slot.kind == "text" else f"a number of {slot.size} bytes"
 
 
 def slot_of(leaf: Leaf) -> Slot:

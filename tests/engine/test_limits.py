@@ -65,11 +65,12 @@ def test_the_worst_stream_takes_little_memory(sensor: Sensor) -> None:
 
 @each_stream
 def test_a_frame_is_out_before_one_longest_frame_more_has_come(sensor: Sensor) -> None:
-    """The first frame found by an endless stream, byte by byte: how many bytes after its own last one."""
+    """The first frame found by an endless stream, in pieces of half a percent of it: how many bytes after its own last one."""
     frames = Subject(sensor).conversation(rounds=3)
     data = b"".join(part for _, part in frames)
     bound = max(frame.max_length * frame.confirm for frame in sensor.frames.values() if frame.direction == "in")
     decoder = sensor.decoder()
-    for spot in range(len(data)):
-        for found in decoder.feed(data[spot : spot + 1]):
+    step = max(bound // 200, 1)
+    for spot in range(0, len(data), step):
+        for found in decoder.feed(data[spot : spot + step]):
             assert spot + 1 - (found.offset + len(found.data)) < bound
