@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.errors import UsageError
-from lidarspec.points.conventions import TYPES, Floats, Grid, Kind, narrowed
+from lidarspec.points.conventions import TYPES, Floats, Grid, Grids, Kind, narrowed, whole_columns
 
 #: names of the columns that a cloud can have, in the order in which files list them.
 COLUMNS = tuple(TYPES)
@@ -102,7 +102,7 @@ class PointCloud:
         picked["extra"] = {name: column[which] for name, column in self.extra.items()}
         shape = None
         if self.shape and isinstance(which, slice) and which.step in (None, 1):
-            shape = organised(len(picked["x"]), _whole_columns(grid_of(self), which.indices(len(self))[0], len(picked["x"])))
+            shape = organised(len(picked["x"]), whole_columns(grid_of(self), which.indices(len(self))[0], len(picked["x"])))
         return PointCloud(**{**picked, "shape": shape})
 
     def organised(self, columns: int) -> PointCloud:
@@ -188,11 +188,6 @@ def grid_of(cloud: PointCloud) -> Grid:
     return Grid(cloud.shape[1], len(cloud) // max(cloud.shape[0] * cloud.shape[1], 1) or 1) if cloud.shape else Grid()
 
 
-def _whole_columns(grid: Grid, first: int, number: int) -> Grid:
-    """How some points of an organised cloud are, from the `first` on: not, where they are not whole columns."""
-    return grid if grid.rows and first % grid.column == 0 and number % grid.column == 0 else Grid()
-
-
 def organised(number: int, grid: Grid) -> tuple[int, int] | None:
     """The shape of a cloud of so many points."""
     return (number // grid.column, grid.rows) if grid.rows else None
@@ -204,7 +199,8 @@ class ColumnSource:
     Attributes:
         size: the number of points.
         base: the time that their times count from, int64 ns.
-        grid: how the points are organised.
+        grid: how the points are organised, all together.
+        grids: how those of each packet are, where they are of several shapes.
         nominal: whether a default calibration stood in for the sensor's own.
         extra: what the columns under names of the sensor's own hold, by name.
     """
@@ -212,6 +208,7 @@ class ColumnSource:
     size: int
     base: int
     grid: Grid = Grid()
+    grids: Grids | None = None
     nominal: bool = False
     extra: Mapping[str, Kind] = {}
 
@@ -228,6 +225,10 @@ class ColumnSource:
         column = self.column(name)
         return None if column is None else column[start:stop]
 
+    def grid_between(self, start: int, stop: int) -> Grid:
+        """How the points from `start` to `stop` are organised, whatever is around them."""
+        return self.grids.between(start, stop) if self.grids else whole_columns(self.grid, start, stop - start)
+
     def times_at(self, indices: NDArray[np.intp]) -> NDArray[np.float64]:
         """The column "time" at some indices, of their shape, seconds since `base`; the others need not be made for them."""
         times = self.column("time")
@@ -243,9 +244,10 @@ class ColumnSource:
 class CloudColumns(ColumnSource):
     """The columns of a cloud."""
 
-    def __init__(self, cloud: PointCloud) -> None:
+    def __init__(self, cloud: PointCloud, grids: Grids | None = None) -> None:
         self._cloud, self.size, self.base = cloud, len(cloud), cloud.stamp_ns
-        self.grid, self.nominal = grid_of(cloud), bool(cloud.nominal)
+        self.grids, self.nominal = grids, bool(cloud.nominal)
+        self.grid = grids.between(0, self.size) if grids else grid_of(cloud)
         own = cloud.source.extra if isinstance(cloud, LazyCloud) else None
         self.extra = {name: Kind(column.dtype, cloud.units.get(name, "")) for name, column in cloud.extra.items()} if own is None else own
 
@@ -285,7 +287,7 @@ class Stretches(ColumnSource):
     def __init__(self, parts: Sequence[Stretch], *, from_first: bool = False) -> None:
         self._parts, self._from_first = parts, from_first
         self.size, self.base = sum(part.size for part in parts), parts[0].source.base
-        grids = {_whole_columns(part.source.grid, part.start, part.size) for part in parts}
+        grids = {part.source.grid_between(part.start, part.stop) for part in parts}
         self.grid = grids.pop() if len(grids) == 1 else Grid()
         self.nominal = any(part.source.nominal for part in parts)
         first = parts[0].source.extra

@@ -119,6 +119,33 @@ def grid_of(shape: Sequence[int], axes: Sequence[str | None]) -> Grid:
     return Grid(lengths[-1], returns) if len(lengths) > 1 and lengths[-1] > 1 else Grid()
 
 
+class Grids(NamedTuple):
+    """How the points of packets of several shapes are organised, in stream order.
+
+    Attributes:
+        ends: (n,) the point after the last one of each packet.
+        which: (n,) the one of `grids` that a packet has; of one without points it says nothing.
+        grids: these.
+    """
+
+    ends: NDArray[np.intp]
+    which: NDArray[np.intp]
+    grids: Sequence[Grid]
+
+    def between(self, start: int, stop: int) -> Grid:
+        """How some points are organised: not, where their packets differ, or they are not whole columns."""
+        first, last = self.ends.searchsorted(start, side="right"), self.ends.searchsorted(stop)
+        begin, packets = int(self.ends[first - 1]) if first else 0, slice(first, last + 1)
+        has_points = np.diff(self.ends[packets], prepend=begin) > 0
+        found = {self.grids[which] for which in np.unique(self.which[packets][has_points]).tolist()}
+        return whole_columns(found.pop(), start - begin, stop - start) if len(found) == 1 else Grid()
+
+
+def whole_columns(grid: Grid, first: int, number: int) -> Grid:
+    """How some points of organised ones are, which begin so many points behind a column: not, where they are not whole columns."""
+    return grid if grid.rows and first % grid.column == 0 and number % grid.column == 0 else Grid()
+
+
 class Kind(NamedTuple):
     """What a further column of points holds: its type, and its unit, "" for a plain number."""
 

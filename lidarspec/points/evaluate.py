@@ -17,7 +17,7 @@ from lidarspec.columns.columns import Batch, Carry, Column, Fields
 from lidarspec.columns.graph import Node
 from lidarspec.errors import PluginError, SpecError
 from lidarspec.points.cloud import LazyCloud, PointCloud
-from lidarspec.points.conventions import Grid, grid_of
+from lidarspec.points.conventions import Grids, grid_of
 from lidarspec.points.lazy_columns import BatchColumns, Plain, Share
 from lidarspec.points.plain import Evaluated, PacketBatch, evaluate, stamp_of
 from lidarspec.points.plan import MODERATE, REMEMBERING, Plan, plan_for
@@ -108,19 +108,17 @@ def _all_moderate(values: NDArray[Any]) -> bool:
 
 def _cloud_of(packets: PacketBatch, shares: list[Share], batch: Batch, ready: int, stamp_ns: int) -> LazyCloud:
     """The cloud of the first `ready` packets."""
-    plan = shares[0].plan
+    plan, grids = shares[0].plan, None
     size = ready * plan.width
     if len(shares) > 1 or not ascends(shares[0].group.where):
-        widths = np.zeros(len(packets), np.intp)
-        for share in shares:
-            widths[share.group.where] = share.plan.width
-        starts = np.cumsum(widths) - widths
-        size = int(widths[:ready].sum())
+        widths, which = np.zeros((2, len(packets)), np.intp)
+        for number, share in enumerate(shares):
+            widths[share.group.where], which[share.group.where] = share.plan.width, number
+        grids = Grids(np.cumsum(widths), which, [grid_of(share.plan.shape, share.plan.axes) for share in shares])
+        starts, size = grids.ends - widths, int(widths[:ready].sum())
         for share in shares:
             share.first = np.where(share.group.where < ready, starts[share.group.where], -1)
-    grids = {grid_of(share.plan.shape, share.plan.axes) for share in shares}
-    grid = grids.pop() if len(grids) == 1 else Grid()
-    return LazyCloud.of(BatchColumns(packets, shares, size, stamp_ns, grid=grid, nominal=batch.nominal or plan.nominal), stamp_ns)
+    return LazyCloud.of(BatchColumns(packets, shares, size, stamp_ns, grids=grids, nominal=batch.nominal or plan.nominal), stamp_ns)
 
 
 def _counts(shares: list[Share], number: int) -> NDArray[Any]:

@@ -22,7 +22,7 @@ from lidarspec.columns.columns import Batch, Column, Fields, field_array
 from lidarspec.columns.graph import Node, evaluate
 from lidarspec.points import numpy_plan
 from lidarspec.points.cloud import ColumnSource, Stretch, later
-from lidarspec.points.conventions import TYPES, Grid, narrowed, numbers_of, seconds_since, turned_azimuth, vendor_turn
+from lidarspec.points.conventions import TYPES, Grids, grid_of, narrowed, numbers_of, seconds_since, turned_azimuth, vendor_turn
 from lidarspec.points.plain import PacketBatch
 from lidarspec.points.plan import REMEMBERING, Maker, Plan
 from lidarspec.wire.arrays import deep
@@ -305,12 +305,13 @@ class BatchColumns(ColumnSource):
         shares: these, by their layouts.
         size: the number of points, those of packets that wait left out.
         base: the time that times count from, ns.
-        grid, nominal: as of all sources.
+        grids, nominal: as of all sources.
     """
 
-    def __init__(self, packets: PacketBatch, shares: Sequence[Share], size: int, base: int, *, grid: Grid, nominal: bool) -> None:
+    def __init__(self, packets: PacketBatch, shares: Sequence[Share], size: int, base: int, *, grids: Grids | None, nominal: bool) -> None:
         self.packets, self.shares, self.extra = packets, shares, shares[0].plan.extra
-        self.size, self.base, self.grid, self.nominal = size, base, grid, nominal
+        self.size, self.base, self.grids, self.nominal = size, base, grids, nominal
+        self.grid = grids.between(0, size) if grids else grid_of(shares[0].plan.shape, shares[0].plan.axes)
         self._made: dict[str, NDArray[Any]] = {}
         self._blocks: list[Block] = []
 

@@ -17,7 +17,7 @@ from lidarspec.columns.columns import Batch, Carry, Fields, of_points, unpadded
 from lidarspec.errors import plugin_errors
 from lidarspec.framing.results import Counters
 from lidarspec.points import conventions
-from lidarspec.points.cloud import PointCloud, organised
+from lidarspec.points.cloud import CloudColumns, LazyCloud, PointCloud, organised
 from lidarspec.points.conventions import Kind
 from lidarspec.spec.description import Spec
 from lidarspec.spec.results import Cartesian, Points, Polar
@@ -119,19 +119,26 @@ def _flattened(packets: PacketBatch, result: Points, batch: Batch, stamp_ns: int
     offsets = conventions.seconds_since(packets.time_ns, stamp_ns).reshape(-1, *(1,) * len(axes))
     every["time"] = every["time"] + flat(offsets, shape, mask, ready)
     inside = np.ones(shape, np.bool_) if mask is None else mask.reshape(shape)
-    grid = conventions.grid_of(shape[1:], axes)
-    if mask is not None and grid.rows:
-        columns = inside.reshape(-1, grid.column)
-        grid = grid if (columns.any(axis=1) == columns.all(axis=1)).all() else conventions.Grid()
     cloud = make_cloud(
         every,
         conventions.vendor_turn(packets.sensor),
         kinds_of(result, parts),
         stamp_ns=stamp_ns,
-        shape=organised(len(every["time"]), grid),
+        shape=organised(len(every["time"]), conventions.grid_of(shape[1:], axes)),
         nominal=np.bool_(batch.nominal or result.nominal),
     )
+    if mask is not None:
+        cloud = LazyCloud.of(CloudColumns(cloud, _grids(inside, axes)), stamp_ns)
     return Evaluated(cloud, ready, batch.carried(ready), inside[:ready].astype(np.intp), Fields(batch), axes)
+
+
+def _grids(inside: NDArray[np.bool_], axes: tuple[str | None, ...]) -> conventions.Grids:
+    """How the points of packets are organised, by which elements of their arrays, (n, ...), are not padding."""
+    inner = range(1, inside.ndim)
+    lengths = np.stack([inside.any(axis=tuple(other for other in inner if other != axis)).sum(axis=1) for axis in inner], axis=1)
+    shapes, which = np.unique(lengths, axis=0, return_inverse=True)
+    grids = [conventions.grid_of(shape, axes) for shape in shapes.tolist()]
+    return conventions.Grids(np.cumsum(lengths.prod(axis=1)), which.reshape(-1), grids)
 
 
 def flat(array: NDArray[Any], shape: tuple[int, ...], mask: NDArray[np.bool_] | None, ready: int) -> NDArray[Any]:

@@ -78,7 +78,8 @@ class Rows:
         info = self.schema.fields[path]
         assert info.dtype is not None
         around = self.schema.fields[without_indices(path)[0]].axes if "[" in path else info.axes
-        if len(self.groups) == 1 and (only := self.groups[0].layout.leaves.get(path)) is not None:
+        only = self.groups[0].layout.leaves.get(path) if len(self.groups) == 1 else None
+        if only is not None and 0 not in only.shape:  # arrays in an empty one have no length, whatever their count says
             values = _loaded(only, around, self.groups[0].rows)
             if self._order is None:
                 self._order = _order(self.groups[0].where)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -38,8 +37,7 @@ def plan(packets: Packets) -> Any:
     assert isinstance(packets.table, Rows)
     made: Any = None
     for group in sorted(packets.table.groups, key=lambda group: -group.layout.size):
-        with contextlib.suppress(lidarspec.SpecError):  # arrays within empty ones, of lengths that nothing is told of
-            made = plan_for(packets.sensor.points_of(packets.frame), packets.batch(), group)
+        made = plan_for(packets.sensor.points_of(packets.frame), packets.batch(), group)
         if isinstance(made, Plan):
             break
     return made

@@ -14,6 +14,7 @@ from lidarspec import PointCloud, Sensor, SpecError, UsageError
 from lidarspec.errors import OutOfRange, PluginError
 from lidarspec.simulation.simulator import simulate
 from lidarspec.spec import Checksummed, Frame, Polar, Scaled, Simulation, Sum, Xor, along, spread, steps, wrap
+from lidarspec.testing.agreement import assert_same_points
 from tests.engine import against_construct
 from tests.shapes import SHAPES, calibration
 
@@ -414,3 +415,16 @@ def test_what_a_sensor_in_a_scene_measures_is_refused_for_the_same_axes() -> Non
     )
     with pytest.raises(SpecError, match=r"along 'other\[\]'"):
         simulate(sensor, 2)
+
+
+@pytest.mark.parametrize("sizes", [[(7, 0)], [(0, 3)], [(7, 0), (3, 2)], [(0, 3), (3, 2)], [(7, 0), (0, 3)]])
+def test_arrays_in_empty_ones_have_no_length(sizes: list[tuple[int, int]]) -> None:
+    sensor, each = SHAPES["shape-segments"], dict(turn=0, time=0, start=0)
+    segments = [
+        dict(each, channels=channels, beams=beams, elevations=[1] * channels, data=[[dict(distance=1, strength=1)] * channels] * beams)
+        for channels, beams in sizes
+    ]
+    frame = sensor.build("data", counter=1, step=1.5, segments=segments, units=True)
+    plain, parsed = cloud_of(sensor, frame, backend="numpy"), cloud_of(sensor, frame, backend="construct")
+    assert len(plain) == sum(channels * beams for channels, beams in sizes)
+    assert_same_points(plain, parsed)

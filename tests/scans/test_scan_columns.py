@@ -259,3 +259,19 @@ def test_scans_of_a_wrong_sensor_and_of_a_plugin_that_raises_are_warned_of() -> 
         assert not list(ls.sensor("ldrobot-stl27l").scans(other))
     with pytest.warns(UserWarning, match=r"distnace.*, at 12 packets"):
         list(sound.sensor(points=points_fail.points).scans(b"".join(simulate(sound.sensor(), 12))))
+
+
+@pytest.mark.parametrize("backend", ["construct", "numpy"])
+@pytest.mark.parametrize("size", [1, 2, 3, 100])
+def test_the_shape_of_a_scan_is_that_of_its_packets_whatever_they_came_with(backend: str, size: int) -> None:
+    sensor = SHAPES["shape-segments"]
+
+    def segment(turn: int, channels: int, beams: int) -> dict[str, Any]:
+        data = [[dict(distance=1, strength=1)] * channels] * beams
+        return dict(turn=turn, channels=channels, beams=beams, time=turn, start=0, elevations=[1] * channels, data=data)
+
+    turns = [[(3, 4), (3, 2), (3, 0), (3, 4)], [(2, 5), (0, 5), (2, 5)], [(3, 4), (2, 4)], [(2, 1)]]
+    segments = [segment(turn, *each) for turn, sizes in enumerate(turns) for each in sizes]
+    frames = [sensor.build("data", counter=i, step=15, segments=segments[2 * i : 2 * i + 2]) for i in range(len(segments) // 2)]
+    read = [sensor.decode(frames[start : start + size], backend=backend) for start in range(0, len(frames), size)]
+    assert [scan.points.shape for scan in scans_of(sensor, read)] == [(10, 3), (10, 2), None, (1, 2)]

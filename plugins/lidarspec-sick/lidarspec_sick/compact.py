@@ -30,7 +30,6 @@ from lidarspec.spec import (
     Sequence,
     Simulation,
     Udp,
-    steps,
 )
 
 CRC = Crc(32, 0x04C11DB7, init=0xFFFFFFFF, refin=True, refout=True, xorout=0xFFFFFFFF, order="little")
@@ -104,8 +103,8 @@ IMU = Checksummed(
 
 def points(f: Fields, version: int) -> Polar:
     """Points of one module: all echoes of a beam, the beams of all layers one after another."""
-    beam, beams = f.beams, f.beam_count
-    number = steps(beams)[:, None] / np.maximum(beams - 1, 1)
+    beam = f.beams
+    number = beam.index / np.maximum(f.beam_count - 1, 1)
     first, start = f.first_azimuth.on("beams[]"), f.start_time.on("beams[]")
     even = first + (f.last_azimuth.on("beams[]") - first) * number
     return Polar(
@@ -181,7 +180,6 @@ def scanner(name: str) -> Sensor:
         relatives={other: "how many layers its modules have" for other in MODELS if other != name},
         aliases=(model.lower(),),
         status=status,
-        acknowledged={"LS404": "clouds of telegrams of different layouts have no grid, and which ones are together depends on the batch"},
         source="sick_scan_xd, compact_parser.cpp; 8027119 for segments. Assumed: ranges, turns, beams, elevations of simulated layers",
     )
 
