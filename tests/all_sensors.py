@@ -21,6 +21,4 @@ EVERY: dict[str, Sensor] = {**lidarspec.sensors(), **SHAPES}
 DISTINCT = distinct(EVERY)
 #: (sensor, frame type), each frame once, whichever sensors have it.
 FRAMES = list({id(frame): (sensor.id, name) for sensor in EVERY.values() for name, frame in sensor.frames.items()}.values())
-#: those whose data no other language recodes.
-RECODED = ("shape-tokens", "shape-lines", "shape-escaped", *(name for name in EVERY if name.startswith("hokuyo-")))
 STREAMS = streams(EVERY)
