@@ -43,7 +43,6 @@ FLOOR_OF = {name: floor for floor, names in enumerate(FLOORS) for name in names.
 IO_FLOOR = FLOOR_OF["plugins"]
 #: packages with a face above their modules.
 PACKAGES = {name.removesuffix(".__init__") for name in FLOOR_OF if name.endswith(".__init__")}
-TOP = len(FLOORS) - 1
 
 IO = {"asyncio", "logging", "serial", "socket", "threading", "time"}
 #: who may import a library; whoever is not named here may not.

@@ -20,7 +20,7 @@ from lidarspec.exports import Message, Refused, beginning, c_fields, messages
 from lidarspec.exports.c_fields import CLayout, Entry, accesses, arguments, comment, identifier, parameters, quoted, word
 from lidarspec.spec import Checksum, Crc, Fold15, Sensor, Sum, WordXor, Xor, ZeroPadded
 from lidarspec.spec.checksums import byte_table, mirrored_bytes, reflected
-from lidarspec.spec.tree import Blob, Block, Check, Formula, Never, Number, Op, Repeat, Sealed, formulas, refs, runs_of
+from lidarspec.spec.tree import Blob, Block, Check, Never, Number, Op, Repeat, Sealed, formulas, parts, refs, runs_of
 from lidarspec.wire.wire_table import Extent
 
 _FUNCTION = """\
@@ -192,18 +192,11 @@ def _needs(layout: CLayout) -> Iterator[str]:
             for ref in refs(value):
                 ends = [other.start + other.size for other in layout.named(ref.path)]
                 yield from (f"if ({before}(int64_t)n < {end}) return 0;" for end in ends)
-            for divisor in _divisors(value):
-                yield f"if ({before}!lidarspec_int({layout.formula(divisor)})) return 0;"
+            for part in parts(value):
+                if isinstance(part, Op) and part.symbol in ("//", "%") and not isinstance(part.args[1], int):
+                    yield f"if ({before}!lidarspec_int({layout.formula(part.args[1])})) return 0;"
             if isinstance(entry.node, Repeat | Blob) and not isinstance(value, int):
                 yield f"if ({before}!lidarspec_within({layout.formula(value)}, {longest})) return 0;"
-
-
-def _divisors(value: Formula) -> Iterator[Formula]:
-    if isinstance(value, Op):
-        for arg in value.args:
-            yield from _divisors(arg)
-        if value.symbol in ("//", "%") and not isinstance(value.args[1], int):
-            yield value.args[1]
 
 
 def _checksum(layout: CLayout, entry: Entry, seal: Sealed, name: str, algorithm: str) -> str:

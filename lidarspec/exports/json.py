@@ -154,7 +154,7 @@ def node_data(node: tree.Node) -> dict[str, Any]:
 def _parts(node: tree.Parts) -> dict[str, Any]:
     """Parts: what says where the last one is, and what each kind is; `following` is the bytes of the next part."""
     rules = {"count": node.count, "size": node.size, "within": node.within}
-    data = {name: None if rule is None else formula_data(rule) for name, rule in rules.items()}
+    data = {name: formula_data(rule) for name, rule in rules.items()}
     kinds = [{"name": kind.name, "part": node_data(kind.element), "following": formula_data(node.following(kind))} for kind in node.kinds]
     return {"kind": "parts", "name": node.name, **data, "kinds": kinds}
 

@@ -234,7 +234,7 @@ def ksy(sensor: Sensor) -> str:
         raise Refused(f"{sensor.id}: two frame types have one name in Kaitai, where names are in lower case")
     name = identifier(beginning(sensor))
     document = {
-        "meta": {"id": name if name[0].isalpha() else f"lidar_{name}", "title": f"{sensor.vendor} {sensor.model}", "ks-version": "0.10"},
+        "meta": {"id": name, "title": f"{sensor.vendor} {sensor.model}", "ks-version": "0.10"},
         "doc": f"{sensor.source}. Made by lidarspec export ksy {sensor.id}. Checksums are not checked.",
         "seq": [{"id": "frames", "type": identifier(main.name), "repeat": "eos"}],
         "types": types,
@@ -278,11 +278,10 @@ class _Types:
 
     def struct(self, node: tree.Struct | tree.Sealed, scope: Scope) -> Attribute:
         """The type of a struct; `scope` says which types it stands in."""
-        body = node.struct if isinstance(node, tree.Sealed) else node
         kaitai = _Type()
-        for member in body.members:
-            self._member(kaitai, member, (*scope, body.path))
-        return kaitai.done(body.path)
+        for member in node.struct.members:
+            self._member(kaitai, member, (*scope, node.struct.path))
+        return kaitai.done(node.struct.path)
 
     def _member(self, kaitai: _Type, node: tree.Node, scope: Scope, **more: Any) -> None:
         """Add a part to a type, with what else is said of its attribute."""

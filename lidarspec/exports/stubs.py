@@ -92,10 +92,8 @@ class _Classes:
         return name
 
     def _members(self, node: Struct | Sealed | Block) -> Iterator[tuple[str, Node | list[FieldInfo]]]:
-        if isinstance(node, Sealed):
-            node = node.struct
-        if isinstance(node, Struct):
-            yield from ((member.name, member) for member in node.members if member.name)
+        if isinstance(node, Struct | Sealed):
+            yield from ((member.name, member) for member in node.struct.members if member.name)
         else:
             for name in dict.fromkeys(part.names[0] for part in node.parts):
                 yield name, [part.info for part in node.parts if part.names[0] == name]
@@ -160,10 +158,9 @@ class {camel(sensor.id)}(Sensor):
 
 def _build(message: Message) -> str:
     """The signature that builds a frame: its fields by name, numbers raw or with `units` physical; constants and sums are filled in."""
-    body = message.root.struct if isinstance(message.root, Sealed) else message.root
     fields = "".join(
         f", {member.name}: {'float' if isinstance(member, Number) else 'Any'} = ..."
-        for member in body.members
+        for member in message.root.struct.members
         if member.name not in ("", "self", "units")
         and not keyword.iskeyword(member.name)
         and not (isinstance(member, Number | Blob) and (member.info.const is not None or member.info.held))

@@ -52,18 +52,13 @@ def examples(sensor: Spec, frame: str, source: random.Random, drawn: Drawn = NOT
     Args:
         drawn: field path -> what draws its raw value, for what random values never make.
     """
-    known, recoding = codec(sensor.frames[frame]), recoder(sensor.frames[frame])
+    known = codec(sensor.frames[frame])
     engine = known.compiled
     if engine is None or engine.schema.parts:
         return [_interpreted(sensor, frame, known, source, drawn)]
     for _ in range(TRIES):
         layout, chosen = engine.tree.choose(source, drawn)
-        rows = np.frombuffer(source.randbytes(BATCH * layout.size), np.uint8).reshape(BATCH, layout.size).copy()
-        if recoding is not None:
-            recoding.legal(rows, layout)
-        for leaf in layout.leaves.values():
-            if leaf.info.allowed:
-                leaf.store(rows, np.array(source.choices(leaf.info.allowed, k=BATCH * math.prod(leaf.shape))).reshape(BATCH, *leaf.shape))
+        rows = _random(engine, layout, BATCH, source)
         for path, draw in drawn.items():
             if path in layout.leaves and path not in chosen:
                 leaf = layout.leaves[path]
@@ -73,6 +68,18 @@ def examples(sensor: Spec, frame: str, source: random.Random, drawn: Drawn = NOT
         if found:
             return found
     return [_swept(sensor, frame, engine, source)]
+
+
+def _random(engine: CompiledCodec, layout: Layout, number: int, source: random.Random) -> NDArray[np.uint8]:
+    """So many rows of random bytes, of which the wire form can write every value, with values that fields may have."""
+    rows = np.frombuffer(source.randbytes(number * layout.size), np.uint8).reshape(number, layout.size).copy()
+    recoding = recoder(engine.frame)
+    if recoding is not None:
+        recoding.legal(rows, layout)
+    for leaf in layout.leaves.values():
+        if leaf.info.allowed:
+            leaf.store(rows, np.array(source.choices(leaf.info.allowed, k=number * math.prod(leaf.shape))).reshape(number, *leaf.shape))
+    return rows
 
 
 def _interpreted(sensor: Spec, frame: str, engine: Codec, source: random.Random, drawn: Drawn) -> bytes:
@@ -139,21 +146,17 @@ def _sent(sensor: Spec, frame: str, layout: Layout, rows: NDArray[np.uint8]) -> 
 
 def _swept(sensor: Spec, frame: str, engine: CompiledCodec, source: random.Random) -> bytes:
     """A frame around the values that the sensor's `sweep` declares, where random ones are never plausible."""
-    sweep, recoding = sensor.simulation_of(frame).sweep, recoder(sensor.frames[frame])
+    sweep = sensor.simulation_of(frame).sweep
     if sweep is None:
         raise SpecError("no random frame passes `plausible`, and there is no `sweep` to start from", path=frame, sensor=sensor.id)
     for _ in range(TRIES):
         values = sweep(source.randrange(10_000))
         layout, chosen = engine.tree.choose(source, _stated(engine, values))
-        rows = np.frombuffer(source.randbytes(layout.size), np.uint8).reshape(1, layout.size).copy()
-        if recoding is not None:
-            recoding.legal(rows, layout)
+        rows = _random(engine, layout, 1, source)
         for path, value in values.items():
             leaf = layout.leaves.get(path)
             if leaf is not None and path not in chosen:
-                leaf.store(
-                    rows, np.frombuffer(value, np.uint8) if isinstance(value, bytes) else leaf.info.raw(np.asarray(value, np.float64))
-                )
+                leaf.store(rows, leaf.raw([value]))
         found = _plausible(sensor, frame, layout, _headed(rows, layout, chosen))
         if found:
             return found[0]

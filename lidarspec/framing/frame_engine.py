@@ -151,35 +151,22 @@ class CompiledCodec(Codec):
             these are wanted, are in front, and are not too many.
         """
         whole = offsets <= len(buffer) - layout.size
-        count, number = np.count_nonzero(whole), len(offsets)
+        count, number = int(np.count_nonzero(whole)), len(offsets)
+        own = offsets if count == number else offsets[whole]
+        gathered = gathered and (count == number or bool(whole[:count].all()))
+        judge, step, kept = self.judge(layout), max(BLOCK // layout.size, 1), None
+        if count <= step or not gathered:
+            rows = rows_at(buffer, own, layout.size, gathered=gathered)
+            judged, kept = judge(rows, errors, sums), rows if gathered else None
+        else:
+            blocks = (own[start : start + step] for start in range(0, count, step))
+            judged = np.concatenate([judge(rows_at(buffer, block, layout.size), errors, sums) for block in blocks])
         if count == number:
-            judged, rows = self._judged_whole(buffer, offsets, layout, errors, gathered=gathered, sums=sums)
-            return judged, repeated(layout.size, number), rows
-        are_in_front = bool(whole[:count].all())
-        judged, rows = self._judged_whole(buffer, offsets[whole], layout, errors, gathered=gathered and are_in_front, sums=sums)
+            return judged, repeated(layout.size, number), kept
         status, sizes = np.empty(number, np.uint8), np.full(number, layout.size)
         status[whole] = judged
         status[~whole], sizes[~whole] = _partial(buffer, offsets[~whole], layout)
-        return status, sizes, rows
-
-    def _judged_whole(
-        self,
-        buffer: NDArray[np.uint8],
-        offsets: NDArray[np.intp],
-        layout: Layout,
-        errors: list[PluginError],
-        *,
-        gathered: bool,
-        sums: Sums | None,
-    ) -> tuple[NDArray[np.uint8], NDArray[np.uint8] | None]:
-        """The status of whole candidates of one layout; their bytes, one a row, if they are wanted and not too many."""
-        judge = self.judge(layout)
-        step = max(BLOCK // layout.size, 1)
-        if len(offsets) <= step or not gathered:
-            rows = rows_at(buffer, offsets, layout.size, gathered=gathered)
-            return judge(rows, errors, sums), rows if gathered else None
-        parts = [judge(rows_at(buffer, offsets[start : start + step], layout.size), errors, sums) for start in range(0, len(offsets), step)]
-        return np.concatenate(parts), None
+        return status, sizes, kept
 
     def table(self, frames: Iterable[bytes]) -> Rows:
         frames = list(frames)

@@ -19,7 +19,7 @@ from lidarspec.spec.description import Spec
 from lidarspec.spec.tree import Formula, Kind, Node, refs
 from lidarspec.wire.build import fill_in, kind_of
 from lidarspec.wire.frame_table import Group, Rows
-from lidarspec.wire.layout import Layout, Leaf
+from lidarspec.wire.layout import Layout
 from lidarspec.wire.layout_tree import TooLong, Unknown, layout_of
 from lidarspec.wire.schema import schema, without_indices
 from lidarspec.wire.slots import Recoder, recoder
@@ -33,8 +33,6 @@ class FrameMaker:
     Raises:
         SpecError: where the frame type is not compiled.
     """
-
-    _recoder: Recoder | None = None  # parts have none of their own
 
     def __init__(self, sensor: Spec, frame: str) -> None:
         known = codec(sensor.frames[frame])
@@ -52,7 +50,7 @@ class FrameMaker:
     def _of_parts(cls, sensor: str, root: Node, limit: int, given: Mapping[str, int]) -> FrameMaker:
         """Makes parts of one kind, in frames whose fields have the values that they ask for."""
         maker = cls.__new__(cls)
-        maker._recoder = None
+        maker._recoder = None  # parts have none of their own
         maker._makes(sensor, root, limit, given, set())
         return maker
 
@@ -176,13 +174,13 @@ class FrameMaker:
                 continue
             if leaf is None:
                 raise SpecError("sweep gives a value to a field that the frame does not have", path=path, sensor=self._sensor)
-            leaf.store(rows, _steps(leaf, [values.get(path, 0) for values, _ in frames]))
+            leaf.store(rows, leaf.raw([values.get(path, 0) for values, _ in frames]))
         for axis, region in layout.regions.items():
             parts = b"".join(made[axis] for _, made in frames)
             rows[:, region.start : region.start + region.size] = np.frombuffer(parts, np.uint8).reshape(len(frames), region.size)
         for leaf in layout.leaves.values():
-            if leaf.info.allowed and 0 not in leaf.info.allowed and all(leaf.info.path not in values for values, _ in frames):
-                leaf.store(rows, leaf.info.allowed[0])
+            if leaf.info.initial and all(leaf.info.path not in values for values, _ in frames):
+                leaf.store(rows, leaf.info.initial)
         layout.seal(rows)
         return rows
 
@@ -193,7 +191,7 @@ class FrameMaker:
         base, indices = without_indices(path)
         if base in values:
             return int(info.raw(float(np.asarray(values[base])[tuple(indices.values())])))
-        return int(info.const) if isinstance(info.const, int) else 0 if info.allowed is None or 0 in info.allowed else info.allowed[0]
+        return int(info.const) if isinstance(info.const, int) else info.initial
 
 
 def nested(values: dict[str, Any], path: str, value: Any) -> None:
@@ -213,14 +211,3 @@ def sealed(table: Rows) -> list[bytes]:
         for spot, place in enumerate(group.where.tolist()):
             frames[place] = data[spot * size : (spot + 1) * size]
     return frames
-
-
-def _steps(leaf: Leaf, given: Sequence[Any]) -> NDArray[Any]:
-    """Physical values as raw ones, with room for the arrays that the field is in; bytes fill up with zeros."""
-    info = leaf.info
-    if info.kind == "bytes":
-        size = leaf.shape[-1]
-        given = [list(value[:size].ljust(size, b"\0")) if isinstance(value, bytes) else value for value in given]
-    values = np.array([np.asarray(value, np.float64) for value in given])
-    values = values.reshape(*values.shape, *(1,) * (1 + len(leaf.shape) - values.ndim))
-    return np.asarray(info.raw(values))

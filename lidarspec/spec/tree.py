@@ -32,6 +32,7 @@ index in `Ref`. A wire form, which recodes the bytes before they have places, is
 from __future__ import annotations
 
 import functools
+import itertools
 import operator
 import struct
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -135,6 +136,11 @@ class FieldInfo:
         """The lowest and highest raw value of an integer field."""
         signed = self.dtype is not None and self.dtype.kind == "i"
         return (-(1 << (self.bits - 1)), (1 << (self.bits - 1)) - 1) if signed else (0, (1 << self.bits) - 1)
+
+    @property
+    def initial(self) -> int:
+        """The raw value that stands where none is given: 0, or the first of those that it may have."""
+        return 0 if self.allowed is None or 0 in self.allowed else self.allowed[0]
 
 
 def runs_of(values: Sequence[int]) -> list[tuple[int, int]]:
@@ -252,7 +258,6 @@ def arrays(formula: Formula, columns: Mapping[str, Any], dtype: Any) -> Any:
 #: operations that give 1 or 0.
 COMPARISONS = frozenset({"==", "!=", "<", "<=", ">", ">="})
 
-
 #: operations that take truths for 1 and 0 in arrays too.
 _OF_TRUTHS = COMPARISONS | {"&", "|", "^"}
 
@@ -300,14 +305,8 @@ def parts(formula: Formula) -> Iterator[Formula]:
 
 def refs(formula: Formula) -> tuple[Ref, ...]:
     """The fields that a formula depends on, in the order in which it names them, each once."""
-    match formula:
-        case Op():
-            return tuple(dict.fromkeys(ref for arg in formula.args for ref in refs(arg)))
-        case Ref():
-            return (formula,)
-        case Code():
-            return formula.refs
-    return ()
+    found = ((part,) if isinstance(part, Ref) else part.refs for part in parts(formula) if isinstance(part, Ref | Code))
+    return tuple(dict.fromkeys(itertools.chain.from_iterable(found)))
 
 
 #: bits of a value that a formula in 64-bit integers may reach.
@@ -423,6 +422,11 @@ class Struct:
     members: tuple[Node, ...]
     docs: str = ""
 
+    @property
+    def struct(self) -> Struct:
+        """Itself, as `Sealed.struct`."""
+        return self
+
 
 @dataclass(frozen=True, eq=False)
 class Sealed:
@@ -456,7 +460,7 @@ class Sealed:
     @property
     def struct(self) -> Struct:
         """The struct itself, below all its seals."""
-        return self.body if isinstance(self.body, Struct) else self.body.struct
+        return self.body.struct
 
     @property
     def name(self) -> str:

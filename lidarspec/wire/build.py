@@ -240,9 +240,9 @@ def fill_in(formula: Formula | None, given: Container, value: int, fields: Mappi
     if formula is None or not asked:
         return
     holder, name = _place(given, asked[0].path)
-    if holder.get(name) is None:
+    if isinstance(holder, dict) and holder.get(name) is None:
         read = functools.partial(given_value, given, fields)
-        holder[name] = _solved(formula, read, holder, name, value, fields[asked[0].path], f"{axis}: bytes or parts")
+        holder[name] = _solved(formula, read, holder, name, value, fields[asked[0].path], axis)
 
 
 def _open(node: Node, given: Any, values: Container) -> None:
@@ -264,15 +264,9 @@ def _open(node: Node, given: Any, values: Container) -> None:
 def _fill_counts(given: Container, table: Schema) -> None:
     """Set the header fields that arrays take their length from, where the caller left them out."""
     for axis, count in table.arrays.items():
-        if count is None or "[]" in axis:
-            continue
-        array, asked = member(given, axis, None), refs(count)
-        if not isinstance(array, list | bytes) or not asked or asked[0].path not in table.fields or "[" in asked[0].path:
-            continue
-        holder, field = _place(given, asked[0].path)
-        if isinstance(holder, dict) and holder.get(field) is None:
-            read = functools.partial(given_value, given, table.fields)
-            holder[field] = _solved(count, read, holder, field, len(array), table.fields.get(asked[0].path), axis)
+        array = member(given, axis, None)
+        if isinstance(array, list | bytes):
+            fill_in(count, given, len(array), table.fields, axis)
 
 
 def given_value(given: Mapping[str, Any], fields: Mapping[str, FieldInfo], path: str) -> tuple[FieldInfo, Any] | str | None:
@@ -444,15 +438,15 @@ def _place(values: Any, path: str) -> tuple[Any, str]:
     return values, last
 
 
-def _solved(count: Formula, read: Read, holder: Container, field: str, length: int, info: FieldInfo | None, axis: str) -> int:
+def _solved(count: Formula, read: Read, holder: Container, field: str, length: int, info: FieldInfo, axis: str) -> int:
     """The value of the count field that gives this length."""
-    top = info.limits[1] if info is not None and info.kind == "int" else 65535
+    top = info.limits[1] if info.kind == "int" else 65535
 
     def gives(value: int) -> bool:
         holder[field] = value
         try:
             return bool(evaluated(count, read) == length)
-        except Exception:
+        except Exception:  # an expression of the struct, that may divide by what is tried
             return False
 
     for value in (length, *range(int(min(top, 65535)) + 1)):

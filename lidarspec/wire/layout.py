@@ -7,7 +7,7 @@ compared in words of up to eight bytes.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from typing import Any, Literal, Protocol
@@ -126,6 +126,14 @@ class Leaf:
                 view = self._view(rows, np.dtype("u1"), part.byte)
                 bits = (column >> part.target << part.low).astype(np.uint8) & np.uint8(part.mask)
                 view[...] = (view & np.uint8(~part.mask & 0xFF)) | bits
+
+    def raw(self, given: Sequence[Any]) -> NDArray[Any]:
+        """Physical values of n frames as raw ones, (n, ...), with room for the arrays that the field is in; bytes fill up with zeros."""
+        if self.info.kind == "bytes":
+            size = self.shape[-1]
+            given = [list(value[:size].ljust(size, b"\0")) if isinstance(value, bytes) else value for value in given]
+        values = np.array([np.asarray(value, np.float64) for value in given])
+        return np.asarray(self.info.raw(values.reshape(*values.shape, *(1,) * (1 + len(self.shape) - values.ndim))))
 
     @cached_property
     def _native(self) -> np.dtype[Any]:
@@ -347,13 +355,6 @@ def holding(test: Test, leaves: Mapping[str, Leaf], rows: Bytes2D) -> NDArray[np
     held = test.values(raw).astype(np.bool_, copy=False)
     held = np.broadcast_to(held, (len(rows), *held.shape[1:]))
     return np.asarray(held.all(axis=tuple(range(1, held.ndim))))
-
-
-class PartsRegion(Protocol):
-    """The bytes of the parts of a frame, as `lidarspec.wire.parts.Region` has them."""
-
-    def sound(self, frame: bytes) -> bool:
-        """Whether the parts of one frame are sound, and as long as they have to be."""
 
 
 @dataclass(frozen=True, eq=False)

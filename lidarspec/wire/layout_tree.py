@@ -88,7 +88,7 @@ def layout_of(root: tree.Node, values: Mapping[str, int], limit: int, given: Map
 def prefix_of(root: tree.Node, limit: int) -> dict[int, tuple[int, int]]:
     """The constants whose place depends on no header field: offset -> (mask, value)."""
     walk = _Walk({}, limit)
-    with contextlib.suppress(Exception):  # what comes before counts
+    with contextlib.suppress(Exception):  # whatever an expression of the struct raises: what comes before counts
         walk.visit(root, "")
     return walk.constants
 
@@ -299,7 +299,7 @@ class _Walk:
         except Unknown:
             raise
         except Exception:
-            pass  # what construct never looks at cannot fail
+            pass  # whatever an expression raises: what construct never looks at cannot fail
         finally:
             self.cursor, self.constants = start, constants
 
@@ -595,7 +595,7 @@ class HeaderTree:
     def _refuted(self, values: Mapping[str, int], buffer: NDArray[np.uint8], offsets: NDArray[np.intp]) -> NDArray[np.bool_]:
         """Which candidates with these header fields have a wrong constant before the field that is cut off, or before they are too long."""
         walk, wrong = _Walk(values, self._limit, self._given), np.zeros(len(offsets), np.bool_)
-        with contextlib.suppress(Exception):  # up to there
+        with contextlib.suppress(Exception):  # whatever an expression raises at such values: what comes before counts
             walk.visit(self._frame, "")
         for spot, (mask, value) in walk.constants.items() if len(offsets) else ():
             there = offsets + spot < len(buffer)

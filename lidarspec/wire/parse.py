@@ -69,7 +69,7 @@ def _compiled(sensor: Spec, data: bytes, frame: str | None) -> tuple[str, Any] |
                 return name, unpacked(sensor.frames[name].tree, layout, data)
     except SpecError:
         raise
-    except Exception:  # out of a plugin: construct meets it again, and it is told with its place
+    except Exception:  # a plugin's expression, checksum or wire form may raise anything: construct meets it again, and tells the place
         pass
     return None
 

@@ -21,6 +21,7 @@ from lidarspec.spec.links import is_datagram
 from lidarspec.testing.agreement import assert_same_points
 from lidarspec.testing.subject import Subject
 from lidarspec.wire.frame_table import Rows
+from tests.all_sensors import READERS
 from tests.broken import sound
 from tests.engine.against_construct import clouds_agree, sensor
 from tests.engine.random_specs import made
@@ -50,10 +51,12 @@ def packets_of(sensor: Sensor, number: int) -> Packets:
 
 
 @pytest.mark.parametrize(
-    ("name", "number"), [*((name, number) for name in SHAPED for number in (1, 2, 7, 40)), *((name, 5) for name in lidarspec.sensors())]
+    ("name", "number"), [*((name, number) for name in SHAPED for number in (1, 2, 7, 40)), *((name, 5) for name in READERS)]
 )
-def test_the_plan_gives_what_the_plain_evaluation_gives(name: str, number: int) -> None:
+def test_every_sensor_has_a_plan_that_gives_what_the_plain_evaluation_gives(name: str, number: int) -> None:
     packets = packets_of(SENSORS[name], number)
+    if name not in SHAPED and packets.points().valid.any():  # headers of random counts may leave none
+        assert isinstance(plan(packets), Plan), str(plan(packets))
     if len(packets):
         assert_same_points(evaluated(packets).cloud, evaluate(packets).cloud)
         one, other = evaluated(packets, final=False, epoch=5), evaluate(packets, final=False, epoch=5)
@@ -71,13 +74,6 @@ def test_every_column_of_damaged_and_mixed_streams(name: str) -> None:
     packets = sensor.decode(Subject(sensor).stream()).with_points
     if len(packets):
         assert_same_points(evaluated(packets).cloud, evaluate(packets).cloud)
-
-
-@pytest.mark.parametrize("name", list(lidarspec.sensors()))
-def test_all_sensors_of_this_repository_have_a_plan(name: str) -> None:
-    packets = packets_of(SENSORS[name], 3)
-    if packets.points().valid.any():  # headers of random counts may leave none
-        assert isinstance(plan(packets), Plan), str(plan(packets))
 
 
 @pytest.mark.parametrize("frame", ["rep103", "vendor"])

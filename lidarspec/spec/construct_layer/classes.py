@@ -257,11 +257,11 @@ def _allowed(con: construct.Validator) -> tuple[int, ...] | None:
         return None
     width, signed = bit_width(field), field.fmtstr[-1].islower() if isinstance(field, FormatField) else field.signed
     low, high = (-(1 << (width - 1)), (1 << (width - 1)) - 1) if signed else (0, (1 << width) - 1)
-    with contextlib.suppress(Exception):
+    with contextlib.suppress(Exception):  # the author's function may raise anything at what is no number
         passes = con._validate(compared := _Compared(), None, "")
         if compared.values and not passes and all(type(value) is int for value in compared.values):
             return tuple(value for value in sorted({*compared.values}) if low <= value <= high and con._validate(value, None, ""))
-    with contextlib.suppress(Exception):
+    with contextlib.suppress(Exception):  # or at numbers that it does not expect
         if width <= 16:
             seen = (lambda raw: subcon._decode(raw, None, None)) if isinstance(subcon, construct.Enum) else int
             return tuple(raw for raw in range(low, high + 1) if con._validate(seen(raw), None, ""))
@@ -738,7 +738,7 @@ def random_value(con: Construct, source: random.Random, drawn: Drawn, scope: Any
 
 def _elements(con: Construct, scope: Any) -> int:
     """How many an element of an array has itself, where it is an array too; as far as that is known before there is one."""
-    with contextlib.suppress(Exception):
+    with contextlib.suppress(Exception):  # whatever an expression raises that asks for what is not there yet
         return int(construct.evaluate(con.count, scope)) * _elements(con.subcon, scope) if isinstance(con, Array) else 1
     return 1
 

@@ -45,59 +45,45 @@ POINTS = 12
 RATES = {"STL-27L": 21_600, "LD06": 4_500, "STL-06P": 5_000, "LD14": 2_300, "LD14P": 4_000, "LD20": 4_000}
 CRC8 = Crc(width=8, poly=0x4D)
 
-DATA = Checksummed(
-    Struct(
-        "header" / Const(b"\x54\x2c") * "start byte 0x54; type 1 and 12 points",
-        "speed" / Scaled(Int16ul, 1, "deg/s"),
-        "start_angle" / Scaled(Int16ul, 0.01, "deg"),
-        "points"
-        / Array(
-            POINTS,
-            Struct(
-                "distance" / Scaled(Int16ul, 0.001, "m") * "0: no return",
-                "intensity" / Int8ul,
-            ),
+
+def sealed(*members: Any) -> Checksummed:
+    """A frame that ends with its CRC."""
+    return Checksummed(Struct(*members, "crc" / Int8ul), field="crc", algorithm=CRC8)
+
+
+DATA = sealed(
+    "header" / Const(b"\x54\x2c") * "start byte 0x54; type 1 and 12 points",
+    "speed" / Scaled(Int16ul, 1, "deg/s"),
+    "start_angle" / Scaled(Int16ul, 0.01, "deg"),
+    "points"
+    / Array(
+        POINTS,
+        Struct(
+            "distance" / Scaled(Int16ul, 0.001, "m") * "0: no return",
+            "intensity" / Int8ul,
         ),
-        "end_angle" / Scaled(Int16ul, 0.01, "deg"),
-        "timestamp" / Scaled(Int16ul, 0.001, "s") * "restarts at 30 s",
-        "crc" / Int8ul,
     ),
-    field="crc",
-    algorithm=CRC8,
+    "end_angle" / Scaled(Int16ul, 0.01, "deg"),
+    "timestamp" / Scaled(Int16ul, 0.001, "s") * "restarts at 30 s",
 )
-HEALTH = Checksummed(
-    Struct(
-        "header" / Const(b"\x54\xe0"),
-        "error" / Int8ul * "1: motor blocked, 2: occluded, 3: both",
-        "crc" / Int8ul,
-    ),
-    field="crc",
-    algorithm=CRC8,
+HEALTH = sealed(
+    "header" / Const(b"\x54\xe0"),
+    "error" / Int8ul * "1: motor blocked, 2: occluded, 3: both",
 )
-INFO = Checksummed(
-    Struct(
-        "header" / Const(b"\x54\x0f"),
-        "speed" / Scaled(Int16ul, 1, "deg/s"),
-        "product_version" / Int16ul,
-        "serial_high" / Int32ul,
-        "serial_low" / Int32ul,
-        "hardware_version" / Int32ul,
-        "firmware_version" / Int32ul,
-        "crc" / Int8ul,
-    ),
-    field="crc",
-    algorithm=CRC8,
+INFO = sealed(
+    "header" / Const(b"\x54\x0f"),
+    "speed" / Scaled(Int16ul, 1, "deg/s"),
+    "product_version" / Int16ul,
+    "serial_high" / Int32ul,
+    "serial_low" / Int32ul,
+    "hardware_version" / Int32ul,
+    "firmware_version" / Int32ul,
 )
-COMMAND = Checksummed(
-    Struct(
-        "header" / Const(b"\x54"),
-        "command" / Int8ul * "A0 start, A1 stop, A2 speed, A8 firmware of the motor's board",
-        "length" / Const(4, Int8ul),
-        "speed" / Scaled(Int32ul, 1, "deg/s") * "0 in all but A2",
-        "crc" / Int8ul,
-    ),
-    field="crc",
-    algorithm=CRC8,
+COMMAND = sealed(
+    "header" / Const(b"\x54"),
+    "command" / Int8ul * "A0 start, A1 stop, A2 speed, A8 firmware of the motor's board",
+    "length" / Const(4, Int8ul),
+    "speed" / Scaled(Int32ul, 1, "deg/s") * "0 in all but A2",
 )
 
 

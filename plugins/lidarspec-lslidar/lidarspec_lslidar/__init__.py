@@ -38,7 +38,7 @@ from lidarspec.spec import (
     stack,
     wrap,
 )
-from lidarspec_lslidar.c16 import C16
+from lidarspec_lslidar.c16 import C16, DATE
 
 N_SAMPLES, M_SAMPLES = 16, 42
 SPAN, PACKETS = 15.0, 24  # degrees of a packet, and packets a turn
@@ -53,12 +53,7 @@ SAMPLE = BitStruct(
     "distance" / Scaled(BitsInteger(15), 0.001, "m") * "0: no return, and with bright 7FFF",
 )
 TIME = (
-    "year" / Int8ub * "from 2000 on",
-    "month" / Int8ub,
-    "day" / Int8ub,
-    "hour" / Scaled(Int8ub, 3600, "s"),
-    "minute" / Scaled(Int8ub, 60, "s"),
-    "second" / Scaled(Int8ub, 1, "s"),
+    *DATE,
     "millisecond" / Scaled(Int16ub, 0.001, "s"),
     "microsecond" / Scaled(Int16ub, 1e-6, "s"),
 )

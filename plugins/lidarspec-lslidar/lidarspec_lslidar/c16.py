@@ -31,6 +31,15 @@ GAP = 2.0  # degrees; 20 turns a second are 0.72 from block to block
 UNITS = (0.4, 0.25)  # centimetres of a step of distance, by the unit
 ELEVATION = np.array([-16.0, 0, -14, 2, -12, 4, -10, 6, -8, 8, -6, 10, -4, 12, -2, 14])
 
+#: as the packets of this vendor have it.
+DATE = (
+    "year" / Int8ub * "from 2000 on",
+    "month" / Int8ub,
+    "day" / Int8ub,
+    "hour" / Scaled(Int8ub, 3600, "s"),
+    "minute" / Scaled(Int8ub, 60, "s"),
+    "second" / Scaled(Int8ub, 1, "s"),
+)
 DATA = Struct(
     "blocks"
     / Array(
@@ -46,12 +55,7 @@ DATA = Struct(
             * "two firings; with dual return the next block has the other returns of the same",
         ),
     ),
-    "year" / Int8ub * "from 2000 on",
-    "month" / Int8ub,
-    "day" / Int8ub,
-    "hour" / Scaled(Int8ub, 3600, "s"),
-    "minute" / Scaled(Int8ub, 60, "s"),
-    "second" / Scaled(Int8ub, 1, "s"),
+    *DATE,
     "nanosecond" / Scaled(Int32ul, 1e-9, "s"),
     "return_mode" / Int8ub * "0x37 single, 0x39 dual",
     "model" / Int8ub * "0x10 C16, 0x12 C16 domestic",

@@ -174,9 +174,7 @@ HELIOS_16P = Sensor(
     info={"serial": "difop.serial_number", "firmware": "difop.top_firmware", "model": "data.lidar_type"},
     relatives={
         "robosense-helios5515": MODEL_5515,
-        "robosense-helios32": Relative(
-            "pairs of blocks with one azimuth; or a packet each 0.67 ms", lambda f: f.blocks[0].azimuth == f.blocks[1].azimuth
-        ),
+        "robosense-helios32": Relative("pairs of blocks with one azimuth; or a packet each 0.67 ms", in_pairs),
     },
     aliases=("helios16p", "rs-helios-16p"),
     source="RS-Helios-16P user manual, 5.4, 6.2, 6.3 and appendix B; rs_driver; nebula's capture and point clouds",

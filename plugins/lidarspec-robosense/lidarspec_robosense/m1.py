@@ -181,9 +181,8 @@ M1 = Sensor(
     model="RS-LiDAR-M1, M1 Plus",
     frames={
         "data": Frame(DATA, data=True, plausible=plausible),
-        "difop": Frame(
-            DIFOP, plausible=plausible_difop, simulation=Simulation(sweep_difop, rate=1)
-        ),  # M1 user guide; the M1P's: 10 a second
+        # one a second (M1 user guide); an M1P sends 10
+        "difop": Frame(DIFOP, plausible=plausible_difop, simulation=Simulation(sweep_difop, rate=1)),
         "difop_fov": Frame(DIFOP_FOV, plausible=plausible_difop, simulation=Simulation(sweep_difop)),
         "difop_guide": Frame(DIFOP_GUIDE, plausible=plausible_difop, simulation=Simulation(sweep_difop)),
         "difop_other": Frame(DIFOP_OTHER),
