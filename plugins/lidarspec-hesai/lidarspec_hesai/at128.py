@@ -116,7 +116,7 @@ class Mirror(Calibration):
             "azimuth_adjust": none,
             "elevation_adjust": none,
         }
-        data = FILE.build(values | {"sha256": bytes(32)})[:-32]
+        data: bytes = FILE.build(values | {"sha256": bytes(32)})[:-32]
         return data + hashlib.sha256(data).digest()
 
     def adjusted(self, table: Table | None, azimuth: Any) -> Any:
