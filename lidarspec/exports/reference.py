@@ -33,6 +33,7 @@ RULES = {
     "OnWrap": "where `{name}` passes {at:g}",
     "OnFlag": "before every packet in which `{name}` is set",
     "OnChange": "before every packet in which `{name}` changes",
+    "OnJump": "before every packet in which `{name}` jumps by more than {by:g}",
     "OnRewind": "before every packet in which `{name}` falls back",
 }
 #: most channels that are listed.

@@ -12,10 +12,12 @@ from lidarspec.errors import SpecError, UnknownField
 from lidarspec.packets.packets import Packets
 from lidarspec.points.cloud import COLUMNS
 from lidarspec.points.plain import Evaluated
-from lidarspec.spec.timing import Every, OnChange, OnFlag, OnRewind, OnWrap, Split
+from lidarspec.spec.timing import Every, OnChange, OnFlag, OnJump, OnRewind, OnWrap, Split
 
 #: an angle has to have been this part of a turn away from the cut before it cuts again, so that jitter does not.
 AWAY = 1 / 8
+#: the whole turn in the units of angles.
+FULL = {"deg": 360.0, "rad": 2 * np.pi}
 
 
 class Turning:
@@ -105,11 +107,9 @@ class Cutter:
         values, starts = _rows(column, found)
         is_of_packets = all(name is None for name in column.axes)
         if isinstance(rule, OnWrap):
-            table = packets.frames[0] if path.startswith("frame.") else packets.table
-            unit = table.schema.fields[path.removeprefix("frame.")].unit
-            rows, steps = self._wraps(values, 360.0 if unit == "deg" else 2 * np.pi, rule.at)
+            rows, steps = self._wraps(values, _turn(packets, path) or 2 * np.pi, rule.at)
         else:
-            rows, steps = self._changes(rule, values), np.empty(0)
+            rows, steps = self._changes(rule, values, _turn(packets, path) if isinstance(rule, OnJump) else None), np.empty(0)
         self.edges = rows.tolist() if is_of_packets else None
         return self._points(starts[rows], steps) if isinstance(rule, OnWrap) else starts[rows].tolist()
 
@@ -121,13 +121,16 @@ class Cutter:
             self._leap = step
         return cuts.tolist()  # type: ignore[no-any-return]
 
-    def _changes(self, rule: OnFlag | OnChange | OnRewind, values: NDArray[np.float64]) -> NDArray[np.intp]:
+    def _changes(self, rule: OnFlag | OnChange | OnJump | OnRewind, values: NDArray[np.float64], full: float | None) -> NDArray[np.intp]:
         if isinstance(rule, OnFlag):
             return np.flatnonzero(values != 0 if rule.value is None else values == rule.value)
         if not len(values):
             return np.empty(0, np.intp)
         before = _before(values, self._before)
         self._before = float(values[-1])
+        if isinstance(rule, OnJump):
+            steps = values - before if full is None else _folded(values - before + full / 2, full) - full / 2
+            return np.flatnonzero(np.abs(steps) > rule.by)
         return np.flatnonzero(values < before if isinstance(rule, OnRewind) else values != before)
 
     def _wraps(self, angles: NDArray[np.float64], full: float, at: float) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
@@ -170,6 +173,12 @@ class Cutter:
         self._before = float(period[-1])
         self.edges = np.flatnonzero(period > before).tolist()
         return first_points(found)[self.edges].tolist()  # type: ignore[no-any-return]
+
+
+def _turn(packets: Packets, path: str) -> float | None:
+    """The whole turn in the unit of a field, None where it is no angle."""
+    table = packets.frames[0] if path.startswith("frame.") else packets.table
+    return FULL.get(table.schema.fields[path.removeprefix("frame.")].unit)
 
 
 def _own_path(packets: Packets, path: str) -> str:

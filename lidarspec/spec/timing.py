@@ -40,6 +40,19 @@ class OnChange:
 
 
 @dataclass(frozen=True)
+class OnJump:
+    """Cut before every packet (or row) in which the field `name` is farther than `by` from the one before, either way.
+
+    Args:
+        name: a field path; an angle goes the short way around the circle.
+        by: in the unit of the field, more than its largest step within a scan.
+    """
+
+    name: str
+    by: float
+
+
+@dataclass(frozen=True)
 class OnRewind:
     """Cut before every packet in which the field `name` is lower than in the one before."""
 
@@ -53,7 +66,7 @@ class Every:
     seconds: float
 
 
-Split = OnWrap | OnFlag | OnChange | OnRewind | Every
+Split = OnWrap | OnFlag | OnChange | OnJump | OnRewind | Every
 
 
 @dataclass(frozen=True)

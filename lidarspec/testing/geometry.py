@@ -27,6 +27,7 @@ from lidarspec.packets.packets import Packets
 from lidarspec.points.cloud import PointCloud
 from lidarspec.points.conventions import axis_matrix
 from lidarspec.points.plain import evaluate
+from lidarspec.scans.cutter import FULL
 from lidarspec.simulation.frame_maker import FrameMaker
 from lidarspec.simulation.scenes import Room, furnished
 from lidarspec.simulation.simulator import simulation
@@ -55,7 +56,6 @@ BASES = range(1, 9)
 SEEN = 1e-5
 #: share of a direction along one of two axes from which on it is that axis's.
 ALONG = 0.9
-FULL = {"deg": 360.0, "rad": 2 * np.pi}
 #: metres by which a point may be off its surface beyond half a step: float32, and steps that a header or a code word widens.
 EXACT, UNTOLD = 2e-6, 0.004
 

@@ -222,3 +222,13 @@ def test_pieces_do_not_matter_where_packets_are_missing(name: str) -> None:
             [(len(scan), scan.whole, scan.complete) for at in range(0, len(frames), size) for scan in reading.scans(frames[at : at + size])]
         )
     assert found[0] == found[1] == found[2]
+
+
+@pytest.mark.parametrize("size", [1, 7, 200])
+def test_scans_end_where_an_angle_jumps_and_not_where_it_passes_0(size: int) -> None:
+    """Each face of the shape's mirror is a scan of 20 rows, whichever packets they stand in; the second sweeps across 0."""
+    sensor = SHAPES["shape-mirror"]
+    scans = scans_of_pieces("shape-mirror", simulate(sensor, 200), size)
+    assert [len(scan) for scan in scans] == [40] * 30
+    assert {scan.complete for scan in scans[1:-1]} == {True}
+    assert np.ptp(np.rad2deg(scans[1].points.azimuth.astype(np.float64))) == pytest.approx(2 * 28.5 + 0.4, abs=1e-3)

@@ -10,11 +10,14 @@ import numpy as np
 import pytest
 
 import lidarspec as ls
+from lidarspec.discovery.detect import Heard, verdict
+from lidarspec.simulation.simulator import simulate
 from lidarspec.testing.agreement import assert_same_points
 from tests.sensors.evidence import assert_points, clockwise, decoded, vector_bytes, vectors
 
 FILE = "vectors_serial2d.json"
 SENSOR, COIN, COIN_D6 = ls.sensor("cspc-m1c1-mini"), ls.sensor("cspc-coin-d4"), ls.sensor("cspc-coin-d6")
+V11 = ls.sensor("cspc-m1c1-mini-v11")
 
 WHOLE = {
     "cspc_cmd_start": "command",
@@ -32,7 +35,7 @@ WHOLE = {
 STREAMS = {"cspc_stream_startup_synth", "coin_d4_startup_capture"}
 WRONG = {"cspc_info_as_printed"}
 EXCERPTS = {"cspc_angle_example"}
-OLDER = {"cspc_v11_ack_start", "cspc_v11_ack_stop", "cspc_v11_si2"}  # the generation with 2-byte samples, another protocol
+OLDER = {"cspc_v11_ack_start", "cspc_v11_ack_stop", "cspc_v11_si2"}  # of V11
 
 # A start packet at 0.5 degrees: 500 mm, intensity 200, scans at 5.5 Hz.
 START = bytes.fromhex("aa556f0141004100375321d307")
@@ -93,13 +96,38 @@ def test_the_printed_sum_of_the_device_information_is_wrong() -> None:
     assert decoded(SENSOR, data).stats.bad_checksum == 1
 
 
-@pytest.mark.parametrize("name", sorted(OLDER - {"cspc_v11_si2"}))
+@pytest.mark.parametrize("name", ["cspc_v11_ack_start", "cspc_v11_ack_stop"])
 def test_an_answer_of_the_older_generation_is_no_point_packet(name: str) -> None:
-    data = vector_bytes(FILE, name)
-    with pytest.raises(ls.WireError, match=r"fsa\.check") as caught:
-        SENSOR.parse(data, "data")
-    assert (caught.value.path, caught.value.offset) == ("fsa.check", 4)
+    data, expected = vector_bytes(FILE, name), vectors(FILE)[name]["expected"]
+    parsed = V11.parse(data)
+    assert (parsed.mode, parsed.length, parsed.checksum) == (expected["mode"], 7, expected["xor"])
+    assert V11.build("ack", parsed) == data
+    assert [(item.frame, item.data) for item in V11.split(data)] == [("ack", data)]
+    for sensor in (SENSOR, V11):
+        with pytest.raises(ls.WireError, match=r"fsa\.check") as caught:
+            sensor.parse(data, "data")
+        assert (caught.value.path, caught.value.offset) == ("fsa.check", 4)
     assert SENSOR.split(data + bytes(40)) == []
+
+
+def test_the_samples_of_the_older_generation_have_two_bytes() -> None:
+    """The answer, what it is, and a packet with the manual's sample: 30, 120, 210 and 300 degrees, 1, 2, 7.161 and 8 m."""
+    si = vector_bytes(FILE, "cspc_v11_si2")
+    data = bytes.fromhex("aa55 0004 010f 0196 aeca a00f 401f") + si + bytes.fromhex("007d")
+    packets = decoded(V11, vector_bytes(FILE, "cspc_v11_ack_start") + b"\xfe\xff" + INFO + bytes.fromhex("a55a0000800181") + data)
+    assert packets.stats.frames == {"ack": 1, "info": 1, "scan_start": 1, "data": 1}
+    assert packets["samples.distance"][0].tolist() == pytest.approx([1, 2, vectors(FILE)["cspc_v11_si2"]["expected"]["mm"] / 1000, 8])
+    # corrected as by the newer manual, at 7161 mm by 11.852045 degrees: 198.147955
+    assert_points(packets.points(), [(0, (0.94520, -0.32648, 0)), (2, (-6.80478, 2.23045, 0)), (3, (2.48973, 7.60271, 0))])
+    assert packets.points().intensity is None
+    assert np.rad2deg(-V11.configure(zero="housing").decode(data).points().azimuth[0]) == pytest.approx(19.055532 + 12, abs=1e-4)
+
+
+def test_an_older_one_is_told_from_a_ydlidar_by_its_name_or_by_start_packets_that_tell_a_speed() -> None:
+    """Its packets are those of a YDLIDAR with two bytes a sample; started, it says its name, and a YDLIDAR tells how fast it turns."""
+    own, other = (b"".join(simulate(ls.sensor(name), 60)) for name in (V11.id, "ydlidar-x4"))
+    assert verdict(Heard("", (INFO + own,))).sensor is V11
+    assert V11.id not in {alike.sensor.id for alike in verdict(Heard("", (other,))).alike}
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from lidarspec.columns.columns import Fields
 from lidarspec.simulation.simulator import simulate
 from lidarspec.spec import Frame
 from lidarspec.wire.schema import schema
+from tests.sensors.evidence import vectors
 
 SENSORS = ls.sensors()
 
@@ -74,3 +76,18 @@ def test_simulated_it_turns_no_slower_and_no_faster(name: str) -> None:
     slowest, fastest = sensor.turn or (0, 0)
     assert rates
     assert slowest - 0.01 <= min(rates) <= max(rates) <= fastest + 0.01
+
+
+#: vectors of the collection that no test can use, and why.
+LEFT_OUT = {
+    "rs_ucwp_bpearl": "settings are not sent: the layout is that of a tool of others, no manual has it",
+    "wt53r_read": "a request to a single-point sensor over Modbus, of which there is no plugin",
+}
+
+
+def test_no_vector_is_left_unused() -> None:
+    """Tests name a vector, or what its name has behind the family's."""
+    texts = "".join(path.read_text(encoding="utf-8") for path in Path(__file__).parent.glob("*.py") if path.name != Path(__file__).name)
+    names = [name for file in ("vectors_serial2d.json", "vectors_udp3d.json") for name in vectors(file)]
+    unused = {name for name in names if name not in texts and f'"{name.partition("_")[2]}"' not in texts}
+    assert unused == LEFT_OUT.keys()

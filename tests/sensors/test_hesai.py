@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import datetime
+import hashlib
 import json
 import pickle
 from pathlib import Path
@@ -16,10 +17,10 @@ import lidarspec as ls
 from lidarspec.discovery.detect import Heard, verdict
 from lidarspec.simulation.faults import Faults
 from lidarspec.simulation.simulator import simulate
-from lidarspec.spec import Tcp, Udp
+from lidarspec.spec import Learned, Tcp, Udp
 from lidarspec.testing.agreement import assert_same_points
 from lidarspec.testing.fixtures import virtual_port
-from lidarspec_hesai.calibration import told
+from lidarspec_hesai import at128
 from lidarspec_hesai.xt import TABLE_32
 from tests.lines import SLACK, free_port
 from tests.sensors.evidence import PROTOCOLS, assert_points, decoded, vector_bytes, vectors
@@ -438,7 +439,89 @@ def test_channels_have_the_further_bytes_that_the_header_says() -> None:
 
 
 def test_a_bad_network_does_not_damage_what_a_unit_says_of_its_angles() -> None:
-    unit = on_free_ports(XT32, told(TABLE_32))
+    unit = on_free_ports(XT32, TABLE_32.told())
     data = f"udp://127.0.0.1:{unit.links['data'].ports[0]}"
     with virtual_port(unit, to=data, faults=Faults(loss=0.5, reorder=3)) as port, ls.open(port.path, unit) as device:
-        assert device.learned == {"calibration": told(TABLE_32)}
+        assert device.learned == {"calibration": TABLE_32.told()}
+
+
+AT128 = ls.sensor("hesai-at128")
+
+
+def of_mirror(azimuth: float, raw: dict[tuple[int, int], int], **more: Any) -> bytes:
+    """A packet of an AT128 whose mirror stands at this azimuth, with distances by block and channel."""
+    parsed = AT128.parse(simulate(AT128, 1)[0], "data")
+    for number, block in enumerate(parsed.body.blocks):
+        block.azimuth, block.fine_azimuth = int(azimuth * 100), round(azimuth * 25600) % 256
+        for index, channel in enumerate(block.channels):
+            channel.distance = raw.get((number, index), 0)
+    return AT128.build("data", parsed, **more)
+
+
+def test_points_and_times_of_an_at128_by_hand() -> None:
+    # 10 m. The face behind begins at 143.44 degrees: 173.445 is 30.005 after it, the beam 60.01 + 2.4 = 62.41 clockwise from the left,
+    # with E 12.883 (cos 0.974827, sin 0.222964); sin 62.41 = 0.886285, cos 62.41 = 0.463141
+    first = of_mirror(173.445, {(0, 0): 2500, (1, 0): 2500})
+    # across 0: 20 is 116.867 after the face at 263.133, the beam 233.734 + 0.65 = 234.384
+    across = of_mirror(20.0, {(1, 17): 2500})
+    cloud = decoded(AT128, [first, across]).points()
+    assert_points(cloud, [(0, (8.639747, 4.514825, 2.229640)), (128, (8.639747, 4.514825, 2.229640))], atol=3e-4)
+    assert np.rad2deg(cloud.azimuth[256 + 128 + 17]) == pytest.approx(90 - 234.384, abs=1e-3)
+    assert cloud.nominal
+    # -9.249 - 2 * 41.666, and - 41.666; channel 2 fires 8.24 us later; of a pair both are of the last shot
+    assert (cloud.time[[0, 2, 128]] * 1e6).tolist() == pytest.approx([-92.581, -84.341, -50.915], abs=1e-3)
+    dual = decoded(AT128, [of_mirror(173.445, {}, return_mode=0x39)]).points()
+    assert (dual.time[[0, 128]] * 1e6).tolist() == pytest.approx([-50.915, -50.915], abs=1e-3)
+    assert dual.return_index is not None
+    assert dual.return_index[[0, 128]].tolist() == [0, 1]
+    assert len(first) == 1086
+
+
+def of_a_mirror(**values: Any) -> bytes:
+    """What a unit says of its mirror, with these values in the file and their hash."""
+    data = at128.FILE.build({**at128.FILE.parse(AT128_FILE), **values})[:-32]
+    return data + hashlib.sha256(data).digest()
+
+
+AT128_FILE = at128.TABLE.told()
+
+
+def test_an_at128_has_the_angles_of_its_file(tmp_path: Path) -> None:
+    """Two steps of the file are 0.04 degrees; corrections go evenly from the entry at 172 degrees to the one at 174."""
+    adjust = bytearray(128 * 180)
+    adjust[0 * 180 + 86], adjust[0 * 180 + 87] = 10, 0xFC  # 0.2 and -0.08 degrees of channel 0
+    start = [295_360, 1_836_032, 3_368_102]  # 23.075, 143.44 and 263.133 degrees
+    told = of_a_mirror(resolution=2, start=start, azimuth_adjust=bytes(adjust), elevation_adjust=bytes(adjust))
+    file = tmp_path / "unit.dat"
+    file.write_bytes(told)
+    data = [of_mirror(173.5, {(0, 0): 2500})]
+    for source in (file, Learned(told)):
+        cloud = decoded(AT128.configure(calibration=source), data).points()
+        # 30.06 degrees after the face, 60.12 + 4.8 of the channel; a quarter of 0.2 and three of -0.08 degrees: -0.01
+        assert np.rad2deg(cloud.azimuth[0]) == pytest.approx(90 - (60.12 + 4.8 - 0.01), abs=2e-4)
+        assert np.rad2deg(cloud.elevation[0]) == pytest.approx(2 * 12.883 - 0.01, abs=2e-4)
+        assert not cloud.nominal
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"Channel,Elevation,Azimuth\n", r"unit\.dat: not a correction file of an AT128, version 1\.5 \(\.dat\)"),
+        (AT128_FILE[:-40], "not a correction file of an AT128"),
+        (AT128_FILE[:100] + b"x" + AT128_FILE[101:], "is damaged: its SHA-256"),
+        (AT128_FILE + b"x", "is damaged"),
+    ],
+    ids=["text", "short", "changed", "longer"],
+)
+def test_a_file_that_is_none_of_an_at128_is_refused(content: bytes, message: str, tmp_path: Path) -> None:
+    file = tmp_path / "unit.dat"
+    file.write_bytes(content)
+    with pytest.raises(ls.UsageError, match=message):
+        AT128.configure(calibration=file)
+
+
+def test_a_scan_of_an_at128_is_what_one_face_of_the_mirror_sees() -> None:
+    scans = list(AT128.scans(simulate(AT128, 1300)))
+    assert [(len(scan), scan.complete) for scan in scans[:2]] == [(600 * 256, False), (600 * 256, True)]
+    assert np.rad2deg(scans[1].points.azimuth).min() == pytest.approx(-62.3, abs=0.1)
+    assert scans[1].points.x.min() > 0

@@ -12,7 +12,7 @@ from lidarspec.simulation.device import SimulatedDevice
 from tests.sensors.evidence import decoded, vector_bytes
 
 URG, UST, UTM = ls.sensor("hokuyo-urg04lx"), ls.sensor("hokuyo-ust10lx"), ls.sensor("hokuyo-utm30lxew")
-LINES = ("dmin", "dmax", "ares", "amin", "amax", "afrt", "scan")
+LINES = ("pp_dmin", "pp_dmax", "pp_ares", "pp_amin", "pp_amax", "pp_afrt", "pp_scan")
 LOOK_ALIKE = {"hokuyo-ust10lx", "hokuyo-ust20lx", "hokuyo-utm30lx", "hokuyo-utm30lxew"}
 
 
@@ -21,7 +21,7 @@ def hokuyo(name: str) -> bytes:
 
 
 def test_the_examples_of_the_manual_are_read() -> None:
-    lines = b"".join(hokuyo(f"pp_{line}") + b"\n" for line in LINES)
+    lines = b"".join(hokuyo(line) + b"\n" for line in LINES)
     parameters = URG.parse(b"PP\n" + hokuyo("status_00") + b"\nMODL:URG-04LX;9\n" + lines + b"\n", frame="parameters")
     assert [int(parameters[name].text) for name in ("shortest", "longest", "division", "first", "last", "ahead", "speed")] == [
         20,

@@ -16,7 +16,7 @@ from lidarspec.simulation.simulator import simulate
 from tests.sensors.evidence import assert_points, decoded, vector_bytes, vectors
 
 FILE = "vectors_udp3d.json"
-RS32, BPEARL = ls.sensor("robosense-rs32"), ls.sensor("robosense-bpearl")
+RS32, RS16, BPEARL = (ls.sensor(f"robosense-{model}") for model in ("rs32", "rs16", "bpearl"))
 
 
 def msop(azimuths: Sequence[int], channels: Mapping[tuple[int, int], tuple[int, int]], *, lidar_type: int = 2) -> bytes:
@@ -76,11 +76,25 @@ def test_the_packet_of_the_vectors() -> None:
     parsed = BPEARL.parse(start[:142] + blocks * 11 + bytes(4) + b"\x00\xff", "data", units=True)
     assert parsed.temperature.magnitude == expected["temp_c"]
     assert [parsed.blocks[0].channels[0].distance, parsed.blocks[0].channels[0].intensity] == expected["b0c0"]
+    colder = start[:38] + vector_bytes(FILE, "rs_temp_le_1801") + start[40:142] + blocks * 11 + bytes(4) + b"\x00\xff"
+    assert BPEARL.parse(colder, "data", units=True).temperature.magnitude == vectors(FILE)["rs_temp_le_1801"]["expected"]["celsius"]
+
+
+def test_the_steps_of_the_angles_of_an_rs16_and_the_end_of_an_e1_are_those_of_the_vectors() -> None:
+    parsed, pitch = RS16.parse(difop(), "difop"), vectors(FILE)["rs16_pitch"]["expected"]
+    parsed.pitch[0] = pitch["raw"]
+    data = RS16.build("difop", parsed)
+    assert vector_bytes(FILE, "rs16_pitch") in data
+    assert RS16.parse(data, "difop", units=True).pitch[0] == pytest.approx(pitch["deg"])
+    tail, expected = ls.sensor("robosense-e1").parse(vector_bytes(FILE, "rs_e1_e2e_tail")), vectors(FILE)["rs_e1_e2e_tail"]["expected"]
+    assert all(tail[name] == expected[name] for name in ("data_length", "counter", "data_id"))
 
 
 def test_the_date_is_taken_for_utc() -> None:
     moment = datetime.datetime(2021, 10, 1, 1, 2, 3, tzinfo=datetime.UTC)
-    packets = decoded(RS32, [msop([0] * 12, {})])
+    data = msop([0] * 12, {})
+    assert vector_bytes(FILE, "rs_time_ymd") in data
+    packets = decoded(RS32, [data])
     assert packets.time_ns.tolist() == [int(moment.timestamp()) * 10**9 + 273_546_000]
 
 

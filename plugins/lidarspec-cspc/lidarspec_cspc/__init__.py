@@ -1,4 +1,4 @@
-"""CSPC M1C1_Mini and its relatives COIN-D4, COIN-D4A and COIN-D6: 360 degree triangulation and time-of-flight lidars, started over a UART.
+"""CSPC M1C1_Mini, old and new, COIN-D4, COIN-D4A and COIN-D6: 360 degree triangulation and time-of-flight lidars, started over a UART.
 
 Source: CSPC M1C1_Mini development manual, sections 1 and 2. What it does not say comes from the vendor's SDK
 (ros_cspc_lidar_coin_d4a, sdk/lidar_information.h), the manual's edition v1.1 (2020-01-22), or captures of a COIN-D4
@@ -11,14 +11,15 @@ no baud rate, no rule for packets that cross 360 degrees or have one sample (the
 for the announced switch between 5.5 and 7 Hz. Besides the fillers FE and FF, a COIN-D4 sends FA FA once, in no manual.
 
 Of a COIN-D4A only the vendor's driver is public, of a COIN-D6 what others saw of one: 10 turns a second, 400 points each, and every three
-seconds a frame that nobody explains. That both name themselves by their model is assumed. The M1C1_Mini of the manual's edition v1.1, with
-samples of two bytes and answers that begin with AA 55, is left out, and so is the M1CT_Coin_Plus, which sends Camsense's packets.
+seconds a frame that nobody explains. That both name themselves by their model is assumed. The M1C1_Mini of the manual's edition v1.1 is a
+sensor of its own: samples of two bytes, answers that begin with AA 55, no exposure, and packets that do not tell how fast it turns. The
+M1CT_Coin_Plus, which sends Camsense's packets, is left out.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from functools import partial
 from typing import Any
 
@@ -61,18 +62,22 @@ COMMAND = Checksummed(
     algorithm=Xor(),
 )
 
-ACK = Checksummed(
-    Struct(
-        "header" / Const(b"\xa5\x5a"),
-        "mode" / Int8ul * "the command's mode ^ A0",
-        "length" / Const(7, Int8ul) * "of the data: firmware and reserved",
-        "firmware" / Int8ul * "to start: 3 is V3.0",
-        "reserved" / Bytes(6),
-        "checksum" / Int8ul,
-    ),
-    field="checksum",
-    algorithm=Xor(),
-)
+
+def ack(header: bytes) -> Checksummed:
+    """The acknowledgement of a command, behind this header."""
+    return Checksummed(
+        Struct(
+            "header" / Const(header),
+            "mode" / Int8ul * "the command's mode ^ A0",
+            "length" / Const(7, Int8ul) * "of the data: firmware and reserved",
+            "firmware" / Int8ul * "to start: 3 is V3.0",
+            "reserved" / Bytes(6),
+            "checksum" / Int8ul,
+        ),
+        field="checksum",
+        algorithm=Xor(),
+    )
+
 
 INFO = Checksummed(
     Struct(
@@ -121,33 +126,36 @@ def angle() -> Construct:
     return ByteSwapped(BitStruct("angle" / Scaled(BitsInteger(15), 1 / 64, "deg"), "check" / Const(1, BitsInteger(1))))
 
 
-DATA = Checksummed(
-    Struct(
-        "header" / Const(b"\xaa\x55"),
-        "mt"
-        / BitStruct(
-            "frequency" / Scaled(BitsInteger(7), 0.1, "Hz") * "of scans, in a start packet; firmware number in the next packet; else 0",
-            "start" / BitsInteger(1) * "1: start packet, a turn begins",
+def data(first: Construct, sample: Construct, groups: tuple[int, ...]) -> Checksummed:
+    """The point packet.
+
+    Args:
+        first: what stands above the bit that says that a turn begins, 7 bits.
+        sample: one of them.
+        groups: sizes of the words that the checksum takes of it.
+    """
+    return Checksummed(
+        Struct(
+            "header" / Const(b"\xaa\x55"),
+            "mt" / BitStruct(first, "start" / BitsInteger(1) * "1: start packet, a turn begins"),
+            "lsn" / Int8ul * "number of samples",
+            "fsa" / angle() * "angle of the first sample",
+            "lsa" / angle() * "angle of the last sample",
+            "cs" / Int16ul,
+            "samples" / Array(this.lsn, sample),
         ),
-        "lsn" / Int8ul * "number of samples",
-        "fsa" / angle() * "angle of the first sample",
-        "lsa" / angle() * "angle of the last sample",
-        "cs" / Int16ul,
-        "samples"
-        / Array(
-            this.lsn,
-            ByteSwapped(
-                BitStruct(
-                    "distance" / Scaled(BitsInteger(14), 0.001, "m") * "0: no return",
-                    "intensity" / BitsInteger(8),
-                    "exposure" / BitsInteger(2) * "1 high, 2 low",
-                )
-            ),
-        ),
-    ),
-    field="cs",
-    algorithm=WordXor(head=8, groups=(1, 2)),
+        field="cs",
+        algorithm=WordXor(head=8, groups=groups),
+    )
+
+
+DISTANCE = "distance" / Scaled(BitsInteger(14), 0.001, "m") * "0: no return"
+DATA = data(
+    "frequency" / Scaled(BitsInteger(7), 0.1, "Hz") * "of scans, in a start packet; firmware number in the next packet; else 0",
+    ByteSwapped(BitStruct(DISTANCE, "intensity" / BitsInteger(8), "exposure" / BitsInteger(2) * "1 high, 2 low")),
+    (1, 2),
 )
+OLDER_DATA = data("reserved" / BitsInteger(7), ByteSwapped(BitStruct(DISTANCE, "flags" / BitsInteger(2) * "not explained")), (2,))
 
 
 def ack_plausible(f: Fields) -> Any:
@@ -169,12 +177,16 @@ def correction(distance: Any) -> Any:
     return np.where(distance > 0, np.rad2deg(np.arctan(19.16 * (mm - 90.15) / (90.15 * mm))), 0)
 
 
-def points(f: Fields, zero: str = "data") -> Polar:
-    """Even steps from FSA to LSA, corrected (manual 2.2.3), from the zero of the data or from the one marked on the housing."""
+def directions(f: Fields, zero: str) -> tuple[Any, Any]:
+    """Even steps from FSA to LSA, and those corrected (manual 2.2.3), from the zero of the data or from the one marked on the housing."""
     raw = spread(f.fsa.angle, f.lsa.angle, f.lsn, full=360.0)  # degrees, (n, LSN)
     clockwise = raw - np.where(f.state.info.correction == 1, correction(f.samples.distance), 0)
-    if zero == "housing":
-        clockwise = clockwise + f.state.info.zero_angle
+    return raw, clockwise + f.state.info.zero_angle if zero == "housing" else clockwise
+
+
+def points(f: Fields, zero: str = "data") -> Polar:
+    """The points of a packet, and their times by the speed that the last start packet told."""
+    raw, clockwise = directions(f, zero)
     rate = last(f.mt.frequency, where=(f.mt.start == 1) & (f.mt.frequency > 0)) * 360  # degrees per second
     return Polar(
         range=f.samples.distance,
@@ -184,7 +196,12 @@ def points(f: Fields, zero: str = "data") -> Polar:
     )
 
 
-def configure(sensor: Sensor, *, zero: str = "data") -> Sensor:
+def older_points(f: Fields, zero: str = "data") -> Polar:
+    """The points of a packet of the older kind, which all have the time of their packet."""
+    return Polar(range=f.samples.distance, azimuth=-np.deg2rad(directions(f, zero)[1]))
+
+
+def configure(points: Callable[..., Polar], sensor: Sensor, /, *, zero: str = "data") -> Sensor:
     """The sensor with angles counted from the zero of the data (as on the wire), or from the housing's mark.
 
     Raises:
@@ -210,6 +227,11 @@ def sweep(i: int, steps: int = STEPS, hertz: float = LOW_SPEED) -> dict[str, flo
         "lsa.angle": (first + samples - 1) * 360 / steps,
         "samples.exposure": LOW_EXPOSURE,
     }
+
+
+def older_sweep(i: int) -> dict[str, float]:
+    """Packet i of the older kind, in turns like those of the newer one."""
+    return {name: value for name, value in sweep(i).items() if name not in ("mt.frequency", "samples.exposure")}
 
 
 def asking(mode: int, **more: Any) -> Command:
@@ -242,7 +264,7 @@ M1C1_MINI = Sensor(
     vendor="CSPC",
     model="M1C1_Mini",
     frames={
-        "ack": Frame(ACK, plausible=ack_plausible),
+        "ack": Frame(ack(b"\xa5\x5a"), plausible=ack_plausible),
         "info": Frame(INFO),
         "scan_start": Frame(SCAN_START),
         "data": Frame(DATA, data=True, max_length=10 + 3 * 255, plausible=plausible),
@@ -262,7 +284,7 @@ M1C1_MINI = Sensor(
     fillers=b"\xfe\xff",
     state={"info": {"correction": 1, "zero_angle": 12}},  # the device information printed in the manual, 2.2.2
     simulation=Simulation(sweep, answers={"start": started(3, b"M1C1_Mini", 4), "get_version": VERSION}),
-    configure=configure,
+    configure=partial(configure, points),
     on_open=("start",),
     on_close=("stop",),
     range_limits=(0.001, 16.383),  # what the field can hold; the manual gives none
@@ -273,6 +295,40 @@ M1C1_MINI = Sensor(
     aliases=("m1c1-mini", "m1c1"),
     status="vectors",
     source="CSPC M1C1_Mini development manual (3-byte samples), sections 1 and 2; baud rate and FC from the vendor's SDK",
+)
+
+
+# two bytes a sample, like these; an M1C1_Mini says what it is when it is started, and never how fast it turns
+MODELS_2 = "f4 g1 g2a g2c g4 g4-pro g4c g5 g6 g7 s2 s4 tg15 tg30 tg50 tx20 tx8 x2 x3 x4 x4-pro"
+TELLS_SPEED = Relative("start packets tell how fast it turns", lambda f: np.asarray((f.mt.start == 1) & (f.mt.reserved > 0)).any())
+M1C1_MINI_V11 = Sensor(
+    "cspc-m1c1-mini-v11",
+    vendor="CSPC",
+    model="M1C1_Mini",
+    frames={
+        "ack": Frame(ack(b"\xaa\x55"), plausible=ack_plausible),
+        "info": M1C1_MINI.frames["info"],
+        "scan_start": M1C1_MINI.frames["scan_start"],
+        "data": Frame(OLDER_DATA, data=True, max_length=10 + 2 * 255, plausible=plausible),
+        "command": M1C1_MINI.frames["command"],
+    },
+    points=older_points,
+    scan=OnFlag("mt.start"),
+    links={"data": Serial(115_200, dtr=False)},
+    commands={name: M1C1_MINI.commands[name] for name in ("start", "stop")},
+    fillers=M1C1_MINI.fillers,
+    state=M1C1_MINI.state,
+    simulation=Simulation(older_sweep, answers={"start": started(0, b"M1C1_Mini", 4)}),
+    configure=partial(configure, older_points),
+    on_open=("start",),
+    on_close=("stop",),
+    range_limits=M1C1_MINI.range_limits,
+    vendor_axes=M1C1_MINI.vendor_axes,
+    relatives={f"ydlidar-{name}": TELLS_SPEED for name in MODELS_2.split()},
+    info=M1C1_MINI.info,
+    aliases=("cspc-m1c1-mini-v1", "m1c1-mini-v11", "m1c1-mini-v1"),
+    status="vectors",
+    source="CSPC M1C1_Mini development manual v1.1 (2020-01-22), sections 1 and 2; baud rate and DTR from the vendor's SDK",
 )
 
 
@@ -321,4 +377,4 @@ COIN_D6 = coin(
 @hookimpl
 def lidarspec_sensors() -> Iterable[Sensor]:
     """The CSPC sensors."""
-    return [M1C1_MINI, COIN_D4, COIN_D4A, COIN_D6]
+    return [M1C1_MINI, M1C1_MINI_V11, COIN_D4, COIN_D4A, COIN_D6]

@@ -72,6 +72,20 @@ class Calibration:
     def __len__(self) -> int:
         return len(self.elevation)
 
+    def measured(self, path: str | Path | Learned) -> Calibration:
+        """With the angles of one unit, out of a correction file or out of what it said.
+
+        Raises:
+            UsageError: for a file that cannot be read, or is none of this model; with its place.
+        """
+        elevation, azimuth = columns(path, {ELEVATION: self.elevation, AZIMUTH: self.azimuth})
+        return dataclasses.replace(self, elevation=elevation, azimuth=azimuth, nominal=False)
+
+    def told(self) -> bytes:
+        """The angles as a unit says them: a file of corrections."""
+        rows = zip(self.elevation, self.azimuth, strict=True)
+        return "".join(["Laser id,Elevation,Azimuth\n", *(f"{i},{e:.6f},{a:.6f}\n" for i, (e, a) in enumerate(rows, start=1))]).encode()
+
 
 def nominal(elevation: Iterable[float], azimuth: Iterable[float], firing_us: Iterable[float]) -> Calibration:
     """The table of a model; firing times in microseconds."""
@@ -94,7 +108,8 @@ def configure(
     Args:
         points: the model's function of `Fields` and the channels' `Calibration`.
         table: the model's channels.
-        calibration: CSV with the headings Channel (or Laser id), Elevation and Azimuth, in degrees; in any order; or what the unit said.
+        calibration: CSV with the headings Channel (or Laser id), Elevation and Azimuth, in degrees, in any order, or the binary file of a
+            model that has one; or what the unit said.
         firing_times: CSV with the headings Channel and Fire time, in microseconds.
 
     Raises:
@@ -102,18 +117,11 @@ def configure(
     """
     angles, times = calibration or sensor.options.get("calibration"), firing_times or sensor.options.get("firing_times")
     if angles:
-        elevation, azimuth = columns(angles, {ELEVATION: table.elevation, AZIMUTH: table.azimuth})
-        table = dataclasses.replace(table, elevation=elevation, azimuth=azimuth, nominal=False)
+        table = table.measured(angles)
     if times:
         table = dataclasses.replace(table, firing=columns(times, {FIRING: table.firing * 1e6})[0] * 1e-6)
     asked = () if angles and not isinstance(angles, Learned) else sensor.on_open
     return dataclasses.replace(sensor, points=partial(points, channels=table), on_open=asked)
-
-
-def told(table: Calibration) -> bytes:
-    """The angles as a unit says them: a file of corrections."""
-    rows = zip(table.elevation, table.azimuth, strict=True)
-    return "".join(["Laser id,Elevation,Azimuth\n", *(f"{i},{e:.6f},{a:.6f}\n" for i, (e, a) in enumerate(rows, start=1))]).encode()
 
 
 def columns(path: str | Path | Learned, wanted: Mapping[Column, Table]) -> list[Table]:
@@ -151,12 +159,9 @@ def columns(path: str | Path | Learned, wanted: Mapping[Column, Table]) -> list[
 def _rows(path: str | Path | Learned) -> list[tuple[int, list[str]]]:
     """The headings and the table, each row with its line."""
     try:
-        data = _content(path)
-        if len(data) > LARGEST:
-            raise UsageError(f"{path!s}: not a correction file: it has more than {LARGEST // 1_000_000} MB")
-        reader = csv.reader(io.StringIO(data.decode("utf-8-sig", "replace"), newline=""))
+        reader = csv.reader(io.StringIO(content(path).decode("utf-8-sig", "replace"), newline=""))
         rows = [(reader.line_num, [cell.strip() for cell in cells]) for cells in reader if any(map(str.strip, cells))]
-    except (OSError, csv.Error) as error:
+    except csv.Error as error:
         raise UsageError(f"{path!s}: not a correction file: {error}") from error
     rows = rows[1:] if rows and rows[0][1][0] == MARK else rows
     if not rows:
@@ -164,12 +169,22 @@ def _rows(path: str | Path | Learned) -> list[tuple[int, list[str]]]:
     return rows[:-1] if len(rows) > 1 and HASH.fullmatch(",".join(rows[-1][1])) else rows
 
 
-def _content(path: str | Path | Learned) -> bytes:
-    """What the unit said, or stands in a file, of that no more than can be."""
+def content(path: str | Path | Learned) -> bytes:
+    """What the unit said, or stands in a file.
+
+    Raises:
+        UsageError: for a file that cannot be read, or is longer than one can be.
+    """
     if isinstance(path, Learned):
         return path
-    with open(path, "rb") as file:
-        return file.read(LARGEST + 1)
+    try:
+        with open(path, "rb") as file:
+            data = file.read(LARGEST + 1)
+    except OSError as error:
+        raise UsageError(f"{path!s}: not a correction file: {error}") from error
+    if len(data) > LARGEST:
+        raise UsageError(f"{path!s}: not a correction file: it has more than {LARGEST // 1_000_000} MB")
+    return data
 
 
 def _place(path: str | Path | Learned, line: int, headings: list[str], column: Column) -> int:

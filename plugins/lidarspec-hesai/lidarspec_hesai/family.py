@@ -8,7 +8,7 @@ from typing import Any
 
 from lidarspec.spec import Clock, Frame, OnWrap, Points, Sensor, Sequence, Simulation, Udp
 from lidarspec_hesai import ptc
-from lidarspec_hesai.calibration import Calibration, configure, told
+from lidarspec_hesai.calibration import Calibration, configure
 from lidarspec_hesai.parts import TURN, UNPUBLISHED, clock
 
 
@@ -31,20 +31,23 @@ def spinning(
         azimuth: the field that passes 0 where a scan ends.
         facts: what else a `Sensor` has.
     """
-    defaults: dict[str, Any] = {"turn": TURN, "acknowledged": UNPUBLISHED}
+    defaults: dict[str, Any] = {
+        "turn": TURN,
+        "acknowledged": UNPUBLISHED,
+        "scan": OnWrap(azimuth),
+        "vendor_axes": ("right", "forward", "up"),
+    }
     return Sensor(
         id,
         vendor="Hesai",
         frames={**data, **ptc.FRAMES},
         points=partial(points, channels=table),
-        scan=OnWrap(azimuth),
         links={"data": Udp(2368), "control": ptc.CONTROL},
         commands=ptc.commands((300, 1200)),
         on_open=("get_calibration",),
         clock=Clock(clock),
         sequence=Sequence("sequence"),
-        simulation=Simulation(sweep, answers={"get_calibration": (("answer", {"payload": told(table)}),)}),
+        simulation=Simulation(sweep, answers={"get_calibration": (("answer", {"payload": table.told()}),)}),
         configure=partial(configure, points, table),
-        vendor_axes=("right", "forward", "up"),
         **(defaults | facts),
     )

@@ -1,4 +1,4 @@
-"""Packets with CRCs of their own over blocks, functional safety and tail (QT128, Pandar128, OT128).
+"""Packets with CRCs of their own over blocks, functional safety and tail (QT128, Pandar128, OT128, JT128, AT128).
 
     EE FF  major minor  status reserved | lasers blocks first_return dis_unit return_num flags
     2 x [azimuth, channels], CRC [, functional safety] , tail [, sequence], [, IMU], CRC [, signature]
@@ -58,6 +58,7 @@ def packet(
     block: Construct | None = None,
     blocks: Construct = TWO,
     imu: bool = False,
+    safety: bool = True,
     held: bool = False,
 ) -> Construct:
     """The packet of a protocol version.
@@ -68,7 +69,7 @@ def packet(
         tail: what stands between functional safety and sequence.
         block: what stands between the azimuth of a block and its channels.
         blocks: how many there are.
-        imu: whether there can be one.
+        imu, safety: whether there can be one.
         held: whether CRCs are held; where nobody has seen what they cover, they are fields like others.
     """
     finer = [] if block is None else ["fine_azimuth" / block]
@@ -88,7 +89,7 @@ def packet(
         "return_count" / Int8ul * "returns of a shot; of some models the most that there can be",
         "flags" / FLAGS,
         "body" / (Checksummed(body, "crc", CRC) if held else body),
-        "safety" / If(this.flags.safety == 1, Checksummed(SAFETY, "crc", CRC, over=SAFE) if held else SAFETY),
+        *(["safety" / If(this.flags.safety == 1, Checksummed(SAFETY, "crc", CRC, over=SAFE) if held else SAFETY)] if safety else []),
         *tail,
         "sequence" / If(this.flags.sequence == 1, Int32ul),
         *(["imu" / If(this.flags.imu == 1, IMU)] if imu else []),
@@ -96,7 +97,7 @@ def packet(
         "signature" / If(this.flags.signature == 1, Bytes(32)),
     )
     names = [part.name for part in frame.subcons]
-    covered = names[names.index("safety") + 1 : names.index("tail_crc")]
+    covered = names[names.index("body") + 1 + safety : names.index("tail_crc")]
     return Checksummed(frame, "tail_crc", CRC, over=covered) if held else frame
 
 

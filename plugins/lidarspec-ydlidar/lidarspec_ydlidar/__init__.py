@@ -42,12 +42,8 @@ from lidarspec_ydlidar.samples import Form
 FULL = 40  # samples of a full packet (protocol, LSN)
 SPEED = 6.0  # turns a second of simulated sensors, which all models can
 STATE = 0.8  # what a T-mini Pro has most often in the bits of the scan frequency while nothing is wrong (its packets)
-CSPC = (
-    "cspc-m1c1-mini",
-    "cspc-coin-d4",
-    "cspc-coin-d4a",
-    "cspc-coin-d6",
-)  # the same packet; the bits of a three-byte sample mean something else
+#: the same packet, by the bytes of a sample, whose bits mean something else.
+CSPC = {2: ("cspc-m1c1-mini-v11",), 3: ("cspc-m1c1-mini", "cspc-coin-d4", "cspc-coin-d4a", "cspc-coin-d6")}
 
 
 def angle() -> Construct:
@@ -136,7 +132,7 @@ def relatives(name: str) -> dict[str, str | Relative]:
     """The models whose packets look like this one's; a CSPC sends the packet with three bytes a sample as well."""
     own = MODELS[name]
     found = {slug(other): relative(own, model) for other, model in MODELS.items() if other != name and model.form.size == own.form.size}
-    return found | (dict.fromkeys(CSPC, "info, which a CSPC sends when it is started") if own.form.size == 3 else {})
+    return found | dict.fromkeys(CSPC.get(own.form.size, ()), "info, which a CSPC sends when it is started")
 
 
 def lidar(name: str) -> Sensor:

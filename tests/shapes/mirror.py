@@ -1,0 +1,56 @@
+"""A mirror of two faces, each with a sector of its own, one of them across 0: a scan ends where the angle jumps from one to the other."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from construct import Array, Const, Int8ul, Int16ul, Struct
+
+from lidarspec import Sensor
+from lidarspec.spec import Fields, Frame, OnJump, Polar, Scaled, Sequence, Simulation, Udp
+
+ROWS, PER_FACE, STEP = 3, 20, 1.5  # rows of a packet and of a face, degrees between two of them
+FACES = (150.0, 345.0)  # where they begin; a sector has 28.5 degrees, and the second goes on past 0
+FRAME = Struct(
+    "magic" / Const(b"MR"),
+    "counter" / Int8ul,
+    "rows" / Array(ROWS, Struct("angle" / Scaled(Int16ul, 0.01, "deg"), "distances" / Array(2, Scaled(Int16ul, 0.01, "m")))),
+)
+
+
+def points(f: Fields) -> Polar:
+    """Two pixels side by side; the mirror turns the beam by twice its own angle."""
+    behind = np.minimum(*(np.mod(f.rows.angle - face, 360) for face in FACES))
+    return Polar(range=f.rows.distances, azimuth=np.deg2rad(2 * behind + np.array([-0.2, 0.2])))
+
+
+def sweep(i: int) -> dict[str, Any]:
+    """Packet i, of a face after the other; a packet may be of both."""
+    row = i * ROWS + np.arange(ROWS)
+    begins = np.array(FACES)[row // PER_FACE % len(FACES)]
+    return {"counter": i % 256, "rows.angle": np.round((begins + row % PER_FACE * STEP) % 360, 2)}
+
+
+SENSOR = Sensor(
+    "shape-mirror",
+    vendor="Shapes",
+    model="Mirror",
+    frames={
+        "data": Frame(
+            FRAME,
+            data=True,
+            max_length=3 + 6 * ROWS,
+            plausible=lambda f: f.rows.angle < 360,
+            acknowledged={"LS504": "a packet may be of two faces"},
+        )
+    },
+    points=points,
+    scan=OnJump("rows.angle", 10.0),
+    links={"data": Udp(7043)},
+    sequence=Sequence("counter"),
+    simulation=Simulation(sweep),
+    range_limits=(0.01, 60.0),
+    status="manual",
+    source="invented for the tests: sectors of a mirror",
+)
