@@ -3,27 +3,31 @@
 In: scans. Out: a file, which appears under its name only when it is whole. `write` is all that is asked for; `formats` knows the plugins'
 formats, too. Modules in reading order:
 
+* `writing`: what formats have in common.
 * `text`: .csv, a row a point.
 * `arrays`: .npz, an array a column.
 """
 
 from __future__ import annotations
 
-import contextlib
-import os
-from collections.abc import Iterable, Iterator
+import re
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
+from typing import NoReturn
 
 import numpy as np
 
 from lidarspec.errors import LidarSpecError, SpecError, UnknownFormat, system_errors
 from lidarspec.formats.arrays import NPZ
 from lidarspec.formats.text import CSV, write_columns
+from lidarspec.formats.writing import replacing
 from lidarspec.packets.imu import ImuSamples
 from lidarspec.plugins import registry
 from lidarspec.scans.scans import Scan
 from lidarspec.transports.protocol import Format
 
+#: the place of a number in the name of a file.
+NUMBERED = re.compile(r"%0?\d*d")
 BUILT_IN = {known.suffix: known for known in (CSV, NPZ)}
 
 
@@ -48,31 +52,17 @@ def format_of(path: str | Path) -> Format:
     Raises:
         UnknownFormat: with a suggestion.
     """
-    suffix = Path(path).suffix.lower()
-    if suffix in BUILT_IN:
-        return BUILT_IN[suffix]
-    known = formats()
-    if suffix not in known:
-        raise UnknownFormat(suffix or str(path), known, place=str(path))
-    return known[suffix]
+    return _longest(path, BUILT_IN) or _longest(path, known := formats()) or _unknown(path, known)
 
 
-@contextlib.contextmanager
-def replacing(path: Path) -> Iterator[Path]:
-    """A file beside another one to write to, which takes its place when the block ends, and is gone if that fails.
+def _longest(path: str | Path, known: Mapping[str, Format]) -> Format | None:
+    """The format with the longest of the suffixes that a name ends with, such as .csv.gz."""
+    name = Path(path).name.lower()
+    return max((found for suffix, found in known.items() if name.endswith(suffix)), key=lambda found: len(found.suffix), default=None)
 
-    Raises:
-        SourceError: where the file cannot be written.
-    """
-    part = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
-    try:
-        with system_errors(path):
-            part.unlink(missing_ok=True)
-            yield part
-            os.replace(part, path)
-    finally:
-        with contextlib.suppress(OSError):
-            part.unlink()
+
+def _unknown(path: str | Path, known: Mapping[str, Format]) -> NoReturn:
+    raise UnknownFormat(Path(path).suffix or str(path), known, place=str(path))
 
 
 def write_imu(path: str | Path, samples: ImuSamples) -> None:
@@ -93,10 +83,11 @@ def write_imu(path: str | Path, samples: ImuSamples) -> None:
 
 
 def write(path: str | Path, scans: Iterable[Scan], *, every_point: bool = False) -> None:
-    """Write scans to a file in the format of its suffix.
+    """Write scans to a file in the format of its suffix, or each to one of its own.
 
     Args:
-        path: the file; what it held is replaced once the new content is whole, and stays if that fails.
+        path: the file; what it held is replaced once the new content is whole, and stays if that fails. With the place of a number in
+            its name, such as "scans/%05d.pcd", each scan has a file of its own, from 0 on; the folder is made where there is none.
         every_point: also the points without a valid return.
 
     Raises:
@@ -105,5 +96,14 @@ def write(path: str | Path, scans: Iterable[Scan], *, every_point: bool = False)
     """
     path = Path(path)
     chosen = format_of(path)
-    with replacing(path) as part:
-        chosen(part, scans, every_point=every_point)
+    for target, held in _each(path, scans) if NUMBERED.search(path.name) else [(path, scans)]:
+        with replacing(target) as part:
+            chosen(part, held, every_point=every_point)
+
+
+def _each(path: Path, scans: Iterable[Scan]) -> Iterator[tuple[Path, list[Scan]]]:
+    """A file for each scan."""
+    with system_errors(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+    for number, scan in enumerate(scans):
+        yield path.with_name(path.name % number), [scan]

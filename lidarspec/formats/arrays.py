@@ -7,43 +7,24 @@ name, in the same folder.
 from __future__ import annotations
 
 import contextlib
-import shutil
-import tempfile
 import zipfile
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import DTypeLike, NDArray
+from numpy.typing import DTypeLike
 
+from lidarspec.formats.writing import Spool, written
 from lidarspec.scans.scans import Scan
 from lidarspec.transports.protocol import Format
 
 
-class Column:
-    """One column, as long as scans come."""
-
-    def __init__(self, folder: Path, dtype: DTypeLike) -> None:
-        self._file = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115  closed by `close`
-        self._dtype, self._length = np.dtype(dtype), 0
-
-    def add(self, values: NDArray[Any]) -> None:
-        """Append the values of a scan."""
-        self._file.write(np.ascontiguousarray(values, self._dtype).view(np.uint8).data)
-        self._length += len(values)
-
-    def put(self, archive: zipfile.ZipFile, name: str) -> None:
-        """Put all of it into an archive, as NumPy reads it."""
-        self._file.seek(0)
-        with archive.open(f"{name}.npy", "w", force_zip64=True) as target:
-            shape = {"descr": self._dtype.str, "fortran_order": False, "shape": (self._length,)}
-            np.lib.format.write_array_header_1_0(target, shape)
-            shutil.copyfileobj(self._file, target)
-
-    def close(self) -> None:
-        """Give its file back."""
-        self._file.close()
+def put(archive: zipfile.ZipFile, name: str, column: Spool) -> None:
+    """Put a column into an archive, as NumPy reads it."""
+    with archive.open(f"{name}.npy", "w", force_zip64=True) as target:
+        shape = {"descr": column.dtype.str, "fortran_order": False, "shape": (column.length,)}
+        np.lib.format.write_array_header_1_0(target, shape)
+        column.copy_to(target)
 
 
 def write(path: Path, scans: Iterable[Scan], *, every_point: bool) -> None:
@@ -53,13 +34,13 @@ def write(path: Path, scans: Iterable[Scan], *, every_point: bool) -> None:
     """
     with contextlib.ExitStack() as files:
 
-        def column(dtype: DTypeLike) -> Column:
-            return files.enter_context(contextlib.closing(Column(path.parent, dtype)))
+        def column(dtype: DTypeLike) -> Spool:
+            return files.enter_context(contextlib.closing(Spool(path.parent, dtype)))
 
         facts = {"stamp_ns": column(np.int64), "rate_hz": column(np.float64), "complete": column(np.bool_)}
-        numbers, columns, units = column(np.int32), dict[str, Column](), dict[str, str]()
+        numbers, columns, units = column(np.int32), dict[str, Spool](), dict[str, str]()
         for number, scan in enumerate(scans):
-            cloud = scan.points if every_point else scan.points[scan.points.valid]
+            cloud = written(scan, every_point=every_point)
             own = cloud.columns
             columns = columns if number else {name: column(values.dtype) for name, values in own.items()}
             units = units if number else {name: unit for name, unit in cloud.units.items() if unit}
@@ -74,7 +55,7 @@ def write(path: Path, scans: Iterable[Scan], *, every_point: bool) -> None:
             kept.add(np.array([unit]))
         with zipfile.ZipFile(path, "w") as archive:
             for name, kept in {**columns, "scan": numbers, **facts, **told}.items():
-                kept.put(archive, name)
+                put(archive, name, kept)
 
 
 NPZ = Format(".npz", "NumPy arrays, one a column", write)

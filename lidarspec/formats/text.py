@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lidarspec.formats.writing import written
 from lidarspec.scans.scans import Scan
 from lidarspec.transports.protocol import Format
 
@@ -24,16 +25,16 @@ def write(path: Path, scans: Iterable[Scan], *, every_point: bool) -> None:
     names: tuple[str, ...] = ()
     with path.open("w", encoding="ascii", newline="") as file:
         for number, scan in enumerate(scans):
-            cloud = scan.points if every_point else scan.points[scan.points.valid]
+            cloud = written(scan, every_point=every_point)
             if not names:
                 names = tuple(cloud.columns)
                 file.write(",".join([*names, "scan"]) + "\n")
             own = cloud.columns
             columns = [_column(own.get(name), len(cloud)) for name in names]
-            written = [
+            cells = [
                 _TIME if name == "time" else _WRITTEN.get(column.dtype.str[1:], "%d") for name, column in zip(names, columns, strict=True)
             ]
-            template = ",".join([*written, f"{number}\n"])
+            template = ",".join([*cells, f"{number}\n"])
             for start in range(0, len(cloud), ROWS):
                 file.write("".join(map(template.__mod__, zip(*(c[start : start + ROWS].tolist() for c in columns), strict=True))))
 

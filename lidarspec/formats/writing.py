@@ -1,0 +1,90 @@
+"""What formats have in common: the points of scans, columns that grow beside the file, and a file that appears when it is whole.
+
+A format is a function that writes scans to a path, one by one, so that memory stays small. Many begin with how much they hold, which is
+known at the end alone: they write it there and come back, or let their columns grow in files without a name.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+from numpy.typing import DTypeLike, NDArray
+
+from lidarspec.errors import UsageError, suggest, system_errors
+from lidarspec.points.cloud import PointCloud
+from lidarspec.scans.scans import Scan
+
+
+@contextlib.contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """A file or folder beside another one to write to, which takes its place when the block ends, and is gone if that fails.
+
+    Raises:
+        SourceError: where it cannot be written.
+    """
+    part = path.with_name(f".{os.getpid()}.{path.name}")
+    try:
+        with system_errors(path):
+            _remove(part)
+            yield part
+            if path.is_dir() and part.is_dir():
+                _remove(path)
+            os.replace(part, path)
+    finally:
+        with contextlib.suppress(OSError):
+            _remove(part)
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)
+
+
+def library(name: str, extra: str) -> Any:
+    """A module of an optional library.
+
+    Raises:
+        UsageError: where it is not installed, with what to type.
+    """
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:
+        reason = f"it takes {name.partition('.')[0]}, which is not installed ({error})"
+        raise suggest(UsageError(reason), f"pip install 'lidarspec[{extra}]'") from error
+
+
+def written(scan: Scan, *, every_point: bool) -> PointCloud:
+    """The points of a scan that are written: those with a valid return, or all."""
+    return scan.points if every_point else scan.points[scan.points.valid]
+
+
+class Spool:
+    """The values of one column, as long as scans come, in a file without a name in the folder of the target."""
+
+    def __init__(self, folder: Path, dtype: DTypeLike) -> None:
+        self._file = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115  closed by `close`
+        self.dtype, self.length = np.dtype(dtype), 0
+
+    def add(self, values: NDArray[Any]) -> None:
+        """Append the values of a scan."""
+        self._file.write(np.ascontiguousarray(values, self.dtype).view(np.uint8).data)
+        self.length += len(values)
+
+    def copy_to(self, target: IO[bytes]) -> None:
+        """Put all of them into a file."""
+        self._file.seek(0)
+        shutil.copyfileobj(self._file, target)
+
+    def close(self) -> None:
+        """Give the file back."""
+        self._file.close()
