@@ -397,9 +397,11 @@ class Parts(layer.Partition):
         for name in names if len(names) > 1 else ():
             try:
                 self.cases[name]._parsereport(stream, trial, path)
-            except Exception as fault:  # an expression may raise anything: it is of this kind, and fails again
-                if isinstance(fault, layer.Mismatch | ConstError) and getattr(fault, "reason", "constant") == "constant":
+            except (layer.Mismatch, ConstError) as fault:
+                if getattr(fault, "reason", "constant") == "constant":
                     continue
+            except Exception:  # an expression may raise anything: the part is of this kind, and fails again when it is parsed
+                pass
             finally:
                 stream.seek(spot)
             return name
