@@ -70,6 +70,15 @@ def test_every_telegram_of_a_multiscan_is_read() -> None:
     assert 9.5 < np.median(np.linalg.norm(MULTISCAN.decode(data, "imu").imu().linear_acceleration, axis=1)) < 10.1
 
 
+def test_what_the_imu_of_a_multiscan_felt_is_that_published() -> None:
+    expected = vectors("vectors_udp3d.json")["sick_imu"]["expected"]
+    packets = MULTISCAN.decode([vector_bytes("vectors_udp3d.json", "sick_imu")], "imu")
+    samples, orientation = packets.imu(), [packets[f"orientation_{axis}"][0] for axis in "wxyz"]
+    assert samples.linear_acceleration[0].tolist() == pytest.approx(expected["acc"])
+    assert samples.angular_velocity[0].tolist() == pytest.approx([0.01, 0.02, 0.03])
+    assert (orientation, packets.time_ns.tolist()) == (expected["quat_wxyz"], [expected["ts_us"] * 1000])
+
+
 @pytest.mark.parametrize("name", ["sick_compact_estmultiscan2layerscompactv4", "sick_compact_unittestcompactv4"])
 def test_modules_of_a_multiscan_are_those_published(name: str) -> None:
     data, expected = vector_bytes("vectors_udp3d.json", name), vectors("vectors_udp3d.json")[name]["expected"]
