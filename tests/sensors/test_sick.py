@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ import pytest
 import lidarspec as ls
 from lidarspec.discovery.detect import verdict
 from lidarspec.discovery.listen import Heard
+from lidarspec.errors import CommandError
 from tests.sensors.evidence import capture, decoded, vector_bytes, vectors
 
 TIM871S, TIM551 = ls.sensor("sick-tim871s"), ls.sensor("sick-tim551")
@@ -59,6 +61,19 @@ def test_a_telegram_without_strengths_beside_one_that_has_them() -> None:
     assert cloud.intensity is not None
     assert cloud.intensity[271:].tolist() == [0] * 271
     np.testing.assert_array_equal(cloud.range[271:], cloud.range[:271])
+
+
+@pytest.mark.parametrize("cola", ["A", "B"])
+def test_a_refusal_is_told_at_once_and_in_words(cola: str) -> None:
+    sensor = TIM551.configure(cola=cola)
+    if cola == "A":
+        assert sensor.parse(b"\x02sFA 3\x03", "refused").error == "variable_unknown"
+    refused = (("refused", {"error": 4}),)
+    sensor = replace(sensor, simulation=replace(sensor.simulation, answers={**sensor.simulation.answers, "set_range": refused}))
+    with ls.open("sim:", sensor) as device:
+        with pytest.raises(CommandError, match=r"set_range: the sensor refuses it: error value_not_allowed \(4\)$"):
+            device.send("set_range", timeout=60, step=0.5, start=0, stop=90)
+        assert device.send("get_state", timeout=60).confirmed
 
 
 def test_every_telegram_of_a_multiscan_is_read() -> None:
