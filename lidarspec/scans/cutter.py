@@ -116,14 +116,8 @@ class Cutter:
         if isinstance(rule, OnWrap):
             rows, steps = self._wraps(values, _turn(packets, path) or 2 * np.pi, rule.at)
         else:
-<<<<<<< HEAD
-            rows, steps = self._changes(rule, values, _turn(packets, path) if isinstance(rule, OnJump) else None), np.empty(0)
-        self.edges = rows.tolist() if is_of_packets else None
-        return self._points(starts[rows], steps) if isinstance(rule, OnWrap) else starts[rows].tolist()
-=======
-            rows = self._changes(rule, values)
+            rows = self._changes(rule, values, _turn(packets, path) if isinstance(rule, OnJump) else None)
         return self._ends(starts[rows], rows if all(name is None for name in column.axes) else None, steps)
->>>>>>> h-i4
 
     def _ends(
         self, points: NDArray[np.intp], packets: NDArray[np.intp] | None = None, steps: NDArray[np.float64] | None = None

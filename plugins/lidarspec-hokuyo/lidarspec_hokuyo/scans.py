@@ -129,16 +129,13 @@ def scan(command: str, geometry: Geometry) -> Frame:
         "time" / Scaled(Int32ub, 0.001, "s") * "when the turn was at step 0; 24 bits",
         "points" / Array(count(this), FIELDS[command[1]]),
     )
-    acknowledged = {"LS508": "two characters end at 4.1 m: configure(content='short') looks no farther"} if command[1] == "S" else {}
-    if geometry.end < 1000:
-        acknowledged["LS711"] = "it has no step of four digits"
     return Frame(
         struct,
         data=True,
         max_length=LONGEST,
         plausible=partial(plausible, end=geometry.end),
         points=partial(points, geometry=geometry),
-        acknowledged=acknowledged,
+        acknowledged={"LS711": "it has no step of four digits"} if geometry.end < 1000 else {},
         wire=Lines(WIDTH, head=(15 if goes_on else 12, 2, 4), bare=1, check=Scip()) | SixBits(),
     )
 
