@@ -45,8 +45,8 @@ class WholeWords(Checksum):
 
     width: int = 32
 
-    def __call__(self, data: bytes) -> int:
-        return CRC(data + bytes(-len(data) % 4))
+    def __call__(self, data: bytes | bytearray | memoryview) -> int:
+        return CRC(bytes(data) + bytes(-len(data) % 4))
 
     def describe(self) -> str:
         return f"{CRC.describe()}, over bytes filled up with zeros to a multiple of 4"
