@@ -179,7 +179,7 @@ def ouster(inputs: Inputs) -> Work:
 
     def ours(backend: str) -> Any:
         cloud = sensor.decode(rows, backend=backend).points()
-        return columns(cloud), [cloud.extra[name] for name in cloud.extra]
+        return cloud.read("x", "y", "z", "intensity", *cloud.extra)
 
     return Work(
         "Ouster RNG19 packets of 128 pixels, all fields",

@@ -116,7 +116,7 @@ def show(sensor_id: str, as_plan: bool, as_json: bool, output: str | None) -> No
 def _unit(sensor: Sensor, path: str) -> str:
     """The unit of a field, as "frame.path", behind a comma."""
     frame, _, field = path.partition(".")
-    unit = schema(sensor.frames[frame].tree).fields[field].unit if frame in sensor.frames else ""
+    unit = schema(sensor.frames[frame].tree).named[field].unit if frame in sensor.frames else ""
     return f", {unit}" if unit else ""
 
 

@@ -164,7 +164,7 @@ class Traced(NDArrayOperatorsMixin):
         """What a function of arrays makes of the values, noted down."""
         samples = [value.node.sample if isinstance(value, Traced) else value for value in values]
         arrays, _, _ = aligned(tuple(samples), self.node.sample.batch)  # what is no column is noted down in its place
-        table = _folded(function, values)
+        table = _folded(function, values, arrays)
         if table is not None:
             return Traced(table[0], self._tape).gathered(table[1])
         args = tuple(value if isinstance(value, Traced | int | float) else array for value, array in zip(values, arrays, strict=True))
@@ -249,18 +249,32 @@ class TracedFields:
         return TracedFields(self._real[index], self._tape, f"{self._path}[{index}]", lambda fields: before(fields)[index])
 
 
-def _folded(function: Callable[..., Any], values: Sequence[Any]) -> tuple[Node, NDArray[np.float64]] | None:
-    """A function of rows of tables at the same indices, and of numbers, as rows of one table: the indices and it; None where it is none.
+def _folded(function: Callable[..., Any], values: Sequence[Any], arrays: Sequence[Any]) -> tuple[Node, NDArray[np.float64]] | None:
+    """A function of rows of tables at the same indices, of numbers and of a row that all packets share, as rows of one table.
 
-    So the sines and cosines of directions that are looked up are computed once, for the table.
+    So the sines and cosines of directions that are looked up, and their products, are computed once, for the table.
+
+    Args:
+        arrays: the values, those that are no columns lined up with the others.
+
+    Returns:
+        The indices and the table; None where it is none.
     """
     nodes = [value.node for value in values if isinstance(value, Traced)]
     if any(node.kind != "rows" or node.args[0] is not nodes[0].args[0] for node in nodes):
         return None
-    if any(np.size(value) != 1 for value in values if not isinstance(value, Traced)):
-        return None
-    table = called(function, [value.node.args[1] if isinstance(value, Traced) else value for value in values])
-    return (nodes[0].args[0], table) if table.dtype == np.float64 and table.shape == nodes[0].args[1].shape else None
+    (index, first), shape = nodes[0].args, nodes[0].sample.array.shape
+    has_rows = shape[-1] == first.shape[1] and index.sample.array.shape[len(shape) - 1 :] in ((), (1,))
+    known: list[Any] = []
+    for value, array in zip(values, arrays, strict=True):
+        if isinstance(value, Traced):
+            known.append(value.node.args[1])
+        elif np.size(value) == 1 or (has_rows and array.shape[-1] == np.size(array) == first.shape[1]):
+            known.append(np.asarray(array).reshape(-1))
+        else:
+            return None
+    table = called(function, known)
+    return (index, table) if table.dtype == np.float64 and table.shape == first.shape else None
 
 
 def node_of(value: Any) -> Any:
@@ -492,6 +506,13 @@ def chosen(node: Node, width: int) -> tuple[Node, Any, Any] | None:
     if not isinstance(condition, Node) or is_full(condition, width) or not all(fits):
         return None
     return condition, *(o if isinstance(o, Node) else float(np.asarray(o).reshape(())) for o in options)  # type: ignore[return-value]
+
+
+def is_nan_where(node: Node) -> bool:
+    """Whether a node is nan where a condition holds, and else another value."""
+    if node.function is not np.where or len(node.args) != 3 or isinstance(node.args[1], Node) or np.size(node.args[1]) > 1:
+        return False
+    return isinstance(node.args[2], Node) and bool(np.isnan(node.args[1]).all())
 
 
 def key(node: Node) -> tuple[Any, ...]:

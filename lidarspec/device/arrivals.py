@@ -19,6 +19,7 @@ import numpy as np
 from lidarspec.captures.bulk import first_frames
 from lidarspec.device.senders import Senders, frame_senders
 from lidarspec.device.session import Reply
+from lidarspec.discovery.detect import said
 from lidarspec.errors import CommandError, SourceError
 from lidarspec.framing.decoder import Decoder
 from lidarspec.framing.results import Counters, Found, Frames
@@ -26,6 +27,7 @@ from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.files import CaptureTransport
 from lidarspec.transports.open_url import transport
 from lidarspec.transports.protocol import Chunk, Transport
+from lidarspec.wire.schema import schema
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,6 +53,7 @@ class Input(Protocol):
         decoder: what finds the frames on the data link.
         stays_on: whether the sensor is left as it is at the end.
         sensor: whose frames they are, configured with the options that it has `learned` of itself.
+        told: the last frame of each type that says what `Sensor.info` declares, on whichever link it came.
     """
 
     is_live: bool = False
@@ -58,6 +61,18 @@ class Input(Protocol):
     decoder: Decoder
     stays_on: bool = True
     learned: Mapping[str, Any] = MappingProxyType({})
+    told: Mapping[str, Found] = MappingProxyType({})
+
+    def note(self, found: Sequence[Frames]) -> None:
+        """Keep what frames say of the device itself; of those with parts one that leaves out what another one said is none."""
+        telling = {path.partition(".")[0] for path in self.sensor.info.values()}
+        for frames in found if telling else ():
+            for name in telling.intersection(frames.names):
+                where = np.flatnonzero(np.equal(frames.kinds, frames.names.index(name)))
+                for item in frames.only(where[-1:]).found():
+                    known = [self.told[name]] if name in self.told and schema(self.sensor.frames[name].tree).parts else []
+                    if said(self.sensor, known).keys() <= said(self.sensor, [item] if known else []).keys():
+                        self.told = {**self.told, name: item}
 
     @property
     def state(self) -> str:
@@ -190,6 +205,8 @@ class FileInput(Input):
         found = next(self._arrivals, None)
         if found is None:
             self.state = "ended"
+        else:
+            self.note(found.found)
         return found
 
     def begin(self) -> None:

@@ -15,8 +15,6 @@ from pathlib import Path
 from shlex import quote
 from typing import Any, overload
 
-import numpy as np
-
 from lidarspec.device.arrivals import Arrival, FileInput, Input
 from lidarspec.device.live_input import PERIOD, LiveInput
 from lidarspec.device.session import Reply
@@ -151,8 +149,6 @@ class Device(Closing):
         self._ahead: Arrival | None = None
         self._first, self._another = list[Found](), None if sensor.relatives or "model" in sensor.info else ""
         self._own_recorders = list[Log]()
-        self._telling = {path.partition(".")[0] for path in sensor.info.values()}
-        self._told: dict[str, Found] = {}
         self._input = self._opened(backend, record, overflow, period, learns=start)
         self._finalizer = weakref.finalize(self, _close, self._input, self._own_recorders)
         if start:
@@ -187,7 +183,7 @@ class Device(Closing):
     @property
     def info(self) -> dict[str, str]:
         """What the sensor has said of itself so far: of "serial", "firmware", "model" and "temperature" those that its frames have."""
-        return said(self.sensor, self._told.values())
+        return said(self.sensor, self._input.told.values())
 
     @property
     def state(self) -> str:
@@ -418,10 +414,6 @@ class Device(Closing):
     def _next(self, wait: float) -> Arrival | None:
         """What arrives next; the first frames are kept until somebody asks whether they are another sensor's."""
         arrival = self._input.next(wait)
-        for frames in arrival.found if arrival is not None and self._telling else ():
-            for name in self._telling.intersection(frames.names):
-                where = np.flatnonzero(np.equal(frames.kinds, frames.names.index(name)))
-                self._told.update((item.frame, item) for item in frames.only(where[-1:]).found())
         if self._another is None and arrival is not None and len(self._first) < EXAMINED:
             for frames in arrival.found:
                 self._first += frames.only(slice(0, EXAMINED)).found()

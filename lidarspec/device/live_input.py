@@ -354,18 +354,22 @@ class LiveInput(Input):
             self._ready.popleft()
 
     def _pump(self, wait: float) -> None:
-        """Take what has arrived within `wait` seconds, decode it, and let the session know."""
+        """Take what has arrived within `wait` seconds, decode it, and let the session know.
+
+        Nothing is given up before that is looked at; where this comes late, on a busy computer, those who read were held up as well.
+        """
         with self._talk:
-            self._session.tick(self._clock.now())
-            self._speak()
             deadline = self._session.deadline
-        if deadline is not None:
-            wait = min(wait, max(deadline - self._clock.now(), 0) / 1e9)
+        left = wait if deadline is None else (deadline - self._clock.now()) / 1e9
+        wait = wait if left < -TURN else min(wait, max(left, 0.0))
         events = self.queue.take(wait, until=self._due, chunks=TOGETHER)
         if events:
             self._due = time.monotonic() + self._period
         for link, run in _runs(events):
             self._take(link, run)
+        with self._talk:
+            self._session.tick(self._clock.now())
+            self._speak()
         if self._checked:
             self._compare()
         elif (silent := list(self._session.unanswered.values())) and silent != self._silent:
@@ -429,6 +433,7 @@ class LiveInput(Input):
         return self._captures["data"].transport.peer() or next(iter(answered), None)
 
     def _hand_on(self, link: str, found: list[Frames], *, interrupted: bool = False) -> None:
+        self.note(found)
         with self._talk:
             awaited = self._session.awaited(link)
             for item in answers(found, awaited) if awaited else ():

@@ -127,10 +127,12 @@ class Expected:
     Attributes:
         tables: for each type of frame its fields.
         values: what its fields must be, those of them that the type has.
+        refusal: the type of the frame that refuses; None where there is none.
     """
 
     tables: Mapping[str, Mapping[str, FieldInfo]]
     values: Mapping[str, Any]
+    refusal: str | None = None
 
     def differs(self, frame: str, values: Any) -> list[str]:
         """What is wrong with a frame as the reply, field by field; empty where it is the reply."""
@@ -275,7 +277,7 @@ class Session:
         values = {**command.matches, **{path: found_at(sent, path) for path in command.echoes}}
         wait = _ns(command.timeout) * (1 + command.retries) if timeout is None else _ns(timeout)
         pending = Pending(f"{self.sensor.id} {name}")
-        expected = Expected(tables, values) if tables else None
+        expected = Expected(tables, values, command.refusal) if tables else None
         self._lines.setdefault(command.link, _Line()).queue.append(_Request(name, command, data, expected, wait, pending))
         if command.every:
             self._beats[name] = _Beat(arguments, now + _ns(command.every), pending)
@@ -293,7 +295,7 @@ class Session:
         if line is None:
             return frozenset()
         expected = [owed.expected for owed in line.owed] + ([line.current.expected] if line.current and line.current.expected else [])
-        return frozenset(name for one in expected for name in one.tables)
+        return frozenset(name for one in expected for name in (*one.tables, one.refusal) if name)
 
     def receive(self, found: Iterable[Found], now: int, *, link: str = "data") -> None:
         """Take frames that arrived on a link at the time `now`."""
@@ -388,6 +390,8 @@ class Session:
         """The reply to the current request, an answer that is owed, or neither."""
         values = self.sensor.parse(item.data, item.frame)
         current = line.current
+        if self._is_refusal(line, item, values, now):
+            return
         differs = ["not asked for"] if current is None or current.expected is None else current.expected.differs(item.frame, values)
         if current is not None and not differs and now >= current.sent[0]:
             reply = Reply(current.name, item.frame, values, True, now, item.data, self._table(item.frame))
@@ -402,6 +406,23 @@ class Session:
                 return
         if current is not None and current.expected is not None and item.frame in current.expected.tables and now >= current.sent[0]:
             current.wrong = f"{item.frame} with {', '.join(differs)}"
+
+    def _is_refusal(self, line: _Line, item: Found, values: Any, now: int) -> bool:
+        """Whether a frame refuses the oldest request that waits or is owed an answer: it says of none which it means."""
+        owed = next((owed for owed in line.owed if owed.expected.refusal == item.frame), None)
+        current = line.current
+        if owed is not None:
+            line.owed.remove(owed)
+            self.late += 1
+        elif current is not None and current.expected is not None and current.expected.refusal == item.frame and now >= current.sent[0]:
+            self._close(line, current, answers=1, since=now)
+            why = _reasons(self._table(item.frame), values) or repr(
+                Reply(current.name, item.frame, values, True, now, fields=self._table(item.frame))
+            )
+            current.pending.settle(CommandError(f"{self.sensor.id} {current.name}: the sensor refuses it: {why}"))
+        else:
+            return False
+        return True
 
     def _give_up(self, line: _Line, request: _Request, error: CommandError) -> None:
         self._close(line, request, answers=0, since=request.sent[-1])
@@ -433,6 +454,17 @@ def learned(sensor: Sensor, reply: Reply) -> dict[str, Any]:
         if not isinstance(value, bytes | int | float):
             raise CommandError(f"{place}: {name} is learned as a number, bytes or a text, not as {type(value).__name__}")
     return {name: Learned(value) if isinstance(value, bytes) else value for name, value in told.items()}
+
+
+def _reasons(fields: Mapping[str, FieldInfo], values: Any) -> str:
+    """What the fields of a frame say that have words for it, with their numbers; "" where none has."""
+    told = [
+        f"{path} {name} ({number})"
+        for path, info in fields.items()
+        for number, name in info.labels.items()
+        if found_at(values, path) == name
+    ]
+    return ", ".join(told)
 
 
 def _silence(sensor: Sensor, request: _Request) -> CommandError:

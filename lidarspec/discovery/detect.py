@@ -187,7 +187,9 @@ def said(sensor: Sensor, found: Iterable[Found]) -> dict[str, str]:
         frame, _, field = path.partition(".")
         if frame in last:
             value, info = _field(sensor, last[frame], field)
-            if isinstance(value, bytes):
+            if isinstance(value, list):
+                told[role] = ".".join(map(str, value))  # a version
+            elif isinstance(value, bytes):
                 text = value.rstrip(b"\0 ")
                 told[role] = text.decode("ascii") if text.isascii() and text.decode("ascii").isprintable() else value.hex()
             else:
@@ -198,9 +200,15 @@ def said(sensor: Sensor, found: Iterable[Found]) -> dict[str, str]:
 
 
 def _field(sensor: Sensor, item: Found, path: str) -> tuple[Any, FieldInfo]:
-    """The raw value of a field of a frame, and what is known of the field."""
-    value = functools.reduce(lambda parsed, name: parsed[name], path.split("."), sensor.parse(item.data, item.frame))
-    return value, schema(sensor.frames[item.frame].tree).fields[path]
+    """The raw value of a field of a frame, or of the first of its parts that has it ("" where none has), and what is known of the field."""
+    fields, parsed = schema(sensor.frames[item.frame].tree), sensor.parse(item.data, item.frame)
+    axis, _, rest = fields.within(path) or ("", "", path)
+    wholes = [part for part in _at(parsed, axis) if rest.partition(".")[0] in part] if axis else [parsed]
+    return next((_at(whole, rest) for whole in wholes), ""), fields.named[path]
+
+
+def _at(parsed: Any, path: str) -> Any:
+    return functools.reduce(lambda above, name: above[name], path.split("."), parsed)
 
 
 def _text(value: Any, info: FieldInfo) -> str:

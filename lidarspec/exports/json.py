@@ -105,6 +105,7 @@ def _command(command: Command) -> dict[str, Any]:
             "replies",
             "matches",
             "echoes",
+            "refusal",
             "timeout",
             "retries",
             "settle",

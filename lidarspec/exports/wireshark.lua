@@ -1,7 +1,7 @@
 local listed = {}
 for _, field in pairs(fields) do table.insert(listed, field) end
 proto.fields = listed
-proto.experts = {marks.checksum, marks.constant, marks.length, marks.short, marks.skipped}
+proto.experts = {marks.checksum, marks.constant, marks.length, marks.short, marks.skipped, marks.unsure}
 
 -- From here on nothing depends on the sensor: `sensor`, above, says what its frames are made of.
 
@@ -423,6 +423,23 @@ local function exact(tvb, at, stop, last)
   end
 end
 
+-- The types behind its own that a frame may be as well, where Python decides that, or what announces it was not seen.
+local function others(found, tvb, at, size, last)
+  local names, first, is_behind = {}, found, false
+  for _, frame in ipairs(sensor.frames) do
+    if not first.judged and (last or not first.after) then break end
+    if is_behind and frame.sent == found.sent and awaited(frame, last) then
+      local verdict, length = measured(frame, tvb, at, at + size)
+      if verdict == "valid" and length == size then
+        table.insert(names, frame.name)
+        first = frame
+      end
+    end
+    is_behind = is_behind or frame == found
+  end
+  return names
+end
+
 -- The leftmost valid frame from a place on: place, frame, size. Frames without constants are found at that place only.
 local function leftmost(tvb, at, stop, last)
   for place = at, stop - 1 do
@@ -447,15 +464,20 @@ local function likely(tvb, at, stop, last)
 end
 
 -- What is sound and asked for by nobody, neither a tree on the screen nor a filter, is not taken apart.
-local function show(frame, tvb, at, size, root, told, is_sound)
+local function show(frame, tvb, at, size, root, told, is_sound, doubts)
   local item = root:add(proto, tvb(at, size), string.format("%s, %s, %d bytes", sensor.title, frame.name, size))
-  item:add(kind, tvb(at, size), frame.name):set_generated(true)
-  if is_sound and not root:referenced(Dissector.get(proto.name:lower())) then return table.insert(told, frame.name) end
+  local shown = item:add(kind, tvb(at, size), frame.name):set_generated(true)
+  local named = frame.name
+  for _, other in ipairs(doubts or {}) do named = named .. " or " .. other end
+  if named ~= frame.name then
+    shown:add_proto_expert_info(marks.unsure, named .. ": what tells them is not in these bytes, or is Python code")
+  end
+  if is_sound and not root:referenced(Dissector.get(proto.name:lower())) then return table.insert(told, named) end
   local begun = walk(frame, tvb, at, at + size)
   local done, problem = pcall(begun.visit, begun, frame.root, item)
   if not done and type(problem) ~= "table" then error(problem, 0) end
   if not done then item:add_proto_expert_info(marks.short, "the frame ends before its last field") end
-  table.insert(told, frame.name .. (not done and " (cut off)" or begun.wrong and " (" .. begun.wrong .. " wrong)" or ""))
+  table.insert(told, named .. (not done and " (cut off)" or begun.wrong and " (" .. begun.wrong .. " wrong)" or ""))
 end
 
 -- Shows bytes that hold no valid frame; false where nothing in them looks like one.
@@ -491,7 +513,7 @@ local function dissected(tvb, pinfo, root, is_datagram)
       pinfo.desegment_offset, pinfo.desegment_len = at, DESEGMENT_ONE_MORE_SEGMENT
     end
     if frame then
-      show(frame, tvb, place, size, root, told, true)
+      show(frame, tvb, place, size, root, told, true, others(frame, tvb, place, size, last))
       if sensor.announcing[frame.name] then last = frame.name end
     end
     at = frame and place + size or stop

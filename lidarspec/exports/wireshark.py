@@ -338,6 +338,7 @@ local marks = {{
   length = ProtoExpert.new({name} .. ".length.bad", "not the length of its part", expert.group.MALFORMED, expert.severity.ERROR),
   short = ProtoExpert.new({name} .. ".cut_off", "the frame ends before its last field", expert.group.MALFORMED, expert.severity.ERROR),
   skipped = ProtoExpert.new({name} .. ".skipped", "bytes of no frame", expert.group.UNDECODED, expert.severity.WARN),
+  unsure = ProtoExpert.new({name} .. ".frame.unsure", "it may be of another type", expert.group.ASSUMPTION, expert.severity.NOTE),
 }}
 """
 
@@ -371,6 +372,8 @@ def _frame(message: Message, name: str) -> dict[str, Any]:
         "name": message.name,
         "longest": message.frame.max_length,
         "after": message.frame.after,
+        "judged": True if message.frame.plausible else None,
+        "sent": None if message.frame.direction == "in" else True,
         "magic": [[offset, mask, value] for offset, (mask, value) in sorted(prefix.items())],
         "root": _Writer(message, f"{name}.{message.name}").node(message.root),
     }

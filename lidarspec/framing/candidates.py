@@ -116,9 +116,9 @@ class Framing:
         """Whether a frame of each type changes what is looked for, (types + 1,), by its index; the last, for -1, is False."""
         return np.array([*(self.switches(kind, mode) for kind in range(len(self.names))), False])
 
-    def survey(self, kind: int, buffer: Bytes1D, offsets: Offsets, *, gathered: bool = True) -> Frames:
+    def survey(self, kind: int, buffer: Bytes1D, offsets: Offsets, stops: Offsets | None = None, *, gathered: bool = True) -> Frames:
         """The candidates of a type at these offsets, which have its constants, each with its layout and whether it is a frame."""
-        return self.codecs[kind].survey(buffer, offsets, kind=kind, gathered=gathered, sums=self.sums)
+        return self.codecs[kind].survey(buffer, offsets, stops, kind=kind, gathered=gathered, sums=self.sums)
 
 
 def matches(buffer: Bytes1D, constants: Marks) -> Offsets:

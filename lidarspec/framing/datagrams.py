@@ -16,8 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.framing.candidates import Bytes1D, Framing, Mode, Piece
-from lidarspec.framing.frame_engine import CompiledCodec
-from lidarspec.framing.results import CONSTANT, LENGTH, PLUGIN, SHORT, VALID, Frames, Indices, Numbers, array_of
+from lidarspec.framing.results import CONSTANT, LENGTH, PLUGIN, SHORT, VALID, Frames, Indices, Numbers, Status, array_of
 from lidarspec.framing.steady import steady_datagrams, step_between
 from lidarspec.wire.arrays import alike, repeated
 from lidarspec.wire.layout import Layout, equal
@@ -49,7 +48,7 @@ class _Batch:
 
     def __init__(self, framing: Framing, buffer: Bytes1D, starts: Indices, sizes: Indices, steady: Frames | None) -> None:
         self._framing, self._buffer, self._starts, self._sizes, self._steady = framing, buffer, starts, sizes, steady
-        self._known: dict[str | None, tuple[int, Frames, list[int]]] = {}
+        self._known: dict[str | None, tuple[int, Frames, Status, list[int]]] = {}
         self._piece = Piece(Frames.none(buffer), len(buffer))
 
     def sorted(self, mode: Mode) -> Piece:
@@ -66,62 +65,67 @@ class _Batch:
     def _from(self, position: int, mode: Mode) -> Frames:
         """The types from here up to the datagram that changes what is looked for."""
         if mode.after not in self._known:
-            frames = self._judged(self._starts[position:], self._sizes[position:], mode)
+            frames, reasons = self._judged(self._starts[position:], self._sizes[position:], mode)
             spots = (np.flatnonzero(self._framing.switching(mode)[frames.kinds]) + position).tolist() if self._framing.named else []
-            self._known[mode.after] = position, frames, spots
-        first, frames, spots = self._known[mode.after]
+            self._known[mode.after] = position, frames, reasons, spots
+        first, frames, reasons, spots = self._known[mode.after]
         index = bisect.bisect_left(spots, position)
         stop = spots[index] + 1 if index < len(spots) else len(self._starts)
         frames = frames.only(slice(position - first, stop - first))
         lost = np.flatnonzero(frames.kinds < 0)
-        frames = self._rejected(frames, lost, mode) if len(lost) else frames
+        frames = self._rejected(frames, lost, reasons[position - first :][lost], mode) if len(lost) else frames
         if len(frames) and frames.kinds[-1] >= 0 and self._framing.switches(int(frames.kinds[-1]), mode):
             mode.after = self._framing.names[int(frames.kinds[-1])]
         return frames
 
-    def _judged(self, starts: Indices, sizes: Indices, mode: Mode) -> Frames:
-        """The type and layout of each datagram while nothing changes what is looked for."""
+    def _judged(self, starts: Indices, sizes: Indices, mode: Mode) -> tuple[Frames, Status]:
+        """The type and layout of each datagram while nothing changes what is looked for.
+
+        Returns:
+            They, and why those that are no frames are none, 0 where they resemble none; `PLUGIN` where each is to be judged alone.
+        """
         number, known = len(starts), alike(sizes)
         least, most = (known, known) if known is not None else (int(sizes.min()), int(sizes.max())) if number else (0, 0)
-        kinds, forms, left = repeated(-1, number), repeated(-1, number), None if least else np.flatnonzero(sizes)
+        kinds, forms, reasons, left = repeated(-1, number), repeated(-1, number), np.zeros(number, np.uint8), np.arange(number)
         layouts: tuple[Layout, ...] = ()
-        for kind in self._framing.active(mode):
-            if left is not None and not len(left):
+        fixed = [(kind, self._framing.codecs[kind].size) for kind in self._framing.active(mode)]
+        others = [kind for kind, size in fixed if size is not None and not least <= size <= most]  # they can only say why not
+        for kind in (*(kind for kind, _ in fixed if kind not in others), *others):
+            if not len(left):
                 break
-            size = self._framing.codecs[kind].size
-            if size is not None and not least <= size <= most:
+            own, lengths = (starts, sizes) if len(left) == number else (starts[left], sizes[left])
+            marked = self._marked(kind, own, lengths)
+            if not np.count_nonzero(marked):
                 continue
-            own, lengths = (starts, sizes) if left is None else (starts[left], sizes[left])
-            marked = np.flatnonzero(self._marked(kind, own, lengths))
-            if not len(marked):
-                continue
-            if len(marked) < len(own):
-                own, lengths = own[marked], lengths[marked]
-            frames = self._survey(kind, own)
-            fits = frames.sizes == lengths
+            if not marked.all():
+                own, lengths, which = own[marked], lengths[marked], left[marked]
+            else:
+                which = left
+            frames = self._survey(kind, own, lengths)
+            fits = (frames.sizes == lengths) & (lengths > 0)
             if not frames.is_sound:
                 fits &= frames.status == VALID
             elif len(own) == number and fits.all():
-                return frames
+                return frames, reasons
             if alike(kinds) is not None:
                 kinds, forms = np.full((2, number), -1, np.intp)
-            which = marked[fits] if left is None else left[marked[fits]]
-            kinds[which] = kind
-            forms[which] = np.where(frames.forms < 0, -1, frames.forms + len(layouts))[fits]
+            kinds[which[fits]] = kind
+            forms[which[fits]] = np.where(frames.forms < 0, -1, frames.forms + len(layouts))[fits]
             layouts += frames.layouts
-            left = np.flatnonzero((kinds < 0) & (sizes > 0))
-        return Frames(self._buffer, kinds, starts, sizes, layouts=layouts, forms=forms)
+            status = np.where(frames.sizes > lengths, np.uint8(SHORT), np.where(frames.status == VALID, LENGTH, frames.status))
+            reasons[which] = np.maximum(reasons[which], status)
+            left = np.flatnonzero(kinds < 0)
+        return Frames(self._buffer, kinds, starts, sizes, layouts=layouts, forms=forms), reasons
 
-    def _survey(self, kind: int, starts: Indices) -> Frames:
+    def _survey(self, kind: int, starts: Indices, sizes: Indices) -> Frames:
         """What datagrams are, if they are of a type."""
         steady, self._steady = self._steady, None
         if steady is not None and steady.kinds[0] == kind and len(starts) == len(steady):
             return steady
-        return self._framing.survey(kind, self._buffer, starts, gathered=False)
+        return self._framing.survey(kind, self._buffer, starts, starts + sizes, gathered=False)
 
-    def _rejected(self, frames: Frames, lost: Indices, mode: Mode) -> Frames:
+    def _rejected(self, frames: Frames, lost: Indices, reasons: Status, mode: Mode) -> Frames:
         """Count those that are no frames; the types again, up to one that turns out to be a frame that changes what is looked for."""
-        reasons = self._refused(frames.starts[lost], frames.sizes[lost], mode)
         parts, begun = list[Frames](), 0
         for index in lost[reasons == PLUGIN].tolist():
             alone = self._judged_alone(frames.only(slice(index, index + 1)), mode)
@@ -135,20 +139,6 @@ class _Batch:
         counted = (reasons != PLUGIN) & (lost < len(frames))
         self._count(reasons[counted], frames.sizes[lost[counted]], mode)
         return Frames.joined([*parts, frames.only(slice(begun, None))]) if parts else frames
-
-    def _refused(self, starts: Indices, sizes: Indices, mode: Mode) -> NDArray[np.uint8]:
-        """Why datagrams that are no frames are none, (n,), 0 where they resemble none; `PLUGIN` where each is to be judged alone."""
-        reasons = np.zeros(len(starts), np.uint8)
-        for kind in self._framing.active(mode):
-            if not isinstance(self._framing.codecs[kind], CompiledCodec):
-                return np.full(len(starts), PLUGIN, np.uint8)
-            marked = np.flatnonzero(self._marked(kind, starts, sizes))
-            if len(marked):
-                frames, own = self._framing.survey(kind, self._buffer, starts[marked], gathered=False), sizes[marked]
-                status = np.where(frames.sizes > own, np.uint8(SHORT), frames.status)
-                status[status == VALID] = np.where(frames.sizes == own, PLUGIN, LENGTH)[status == VALID]
-                reasons[marked] = np.maximum(reasons[marked], status)
-        return reasons
 
     def _judged_alone(self, datagram: Frames, mode: Mode) -> Frames | None:
         """One datagram as a frame, None where it is none; counts why."""

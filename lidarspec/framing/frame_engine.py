@@ -58,12 +58,20 @@ class Codec:
         self.marks = marks(self.prefix)
 
     def survey(
-        self, buffer: NDArray[np.uint8], offsets: NDArray[np.intp], *, kind: int = 0, gathered: bool = True, sums: Sums | None = None
+        self,
+        buffer: NDArray[np.uint8],
+        offsets: NDArray[np.intp],
+        stops: NDArray[np.intp] | None = None,
+        *,
+        kind: int = 0,
+        gathered: bool = True,
+        sums: Sums | None = None,
     ) -> Frames:
         """The candidates at these offsets, each with its layout and whether it is a frame.
 
         Args:
             offsets: those whose prefix does not match must be left out.
+            stops: where their bytes end, and no more will come; by default with those of the buffer.
             kind: index of this type.
             gathered: whether their bytes are wanted too, as `Frames.rows`.
             sums: what computes checksums; by default their algorithms.
@@ -104,12 +112,19 @@ class CompiledCodec(Codec):
         return self
 
     def survey(
-        self, buffer: NDArray[np.uint8], offsets: NDArray[np.intp], *, kind: int = 0, gathered: bool = True, sums: Sums | None = None
+        self,
+        buffer: NDArray[np.uint8],
+        offsets: NDArray[np.intp],
+        stops: NDArray[np.intp] | None = None,
+        *,
+        kind: int = 0,
+        gathered: bool = True,
+        sums: Sums | None = None,
     ) -> Frames:
-        groups = [(self.layout, counted(len(offsets)))] if self.layout is not None else self.tree.classify(buffer, offsets)
+        groups = [(self.layout, counted(len(offsets)))] if self.layout is not None else self.tree.classify(buffer, offsets, stops)
         kinds, errors = repeated(kind, len(offsets)), list[PluginError]()
         if len(groups) == 1 and len(groups[0][1]) == len(offsets) and isinstance(only := groups[0][0], Layout):
-            status, sizes, rows = self._judged(buffer, offsets, only, errors, gathered=gathered, sums=sums)
+            status, sizes, rows = self._judged(buffer, offsets, stops, only, errors, gathered=gathered, sums=sums)
             return Frames(buffer, kinds, offsets, sizes, layouts=(only,), status=status, rows=rows, errors=tuple(errors))
         status, forms = np.full(len(offsets), SHORT, np.uint8), np.full(len(offsets), -1, np.intp)
         layouts, short = list[Layout](), list[tuple[NDArray[np.intp], NDArray[np.intp]]]()
@@ -118,7 +133,9 @@ class CompiledCodec(Codec):
                 status[which] = PLUGIN if layout.error else CONSTANT if layout.by_constant else LENGTH
                 errors += [layout.error] if layout.error else []
                 continue
-            status[which], own, _ = self._judged(buffer, offsets[which], layout, errors, gathered=gathered, sums=sums)
+            status[which], own, _ = self._judged(
+                buffer, offsets[which], None if stops is None else stops[which], layout, errors, gathered=gathered, sums=sums
+            )
             forms[which] = len(layouts)
             layouts.append(layout)
             short += [(which, own)] if alike(own) is None else []
@@ -138,6 +155,7 @@ class CompiledCodec(Codec):
         self,
         buffer: NDArray[np.uint8],
         offsets: NDArray[np.intp],
+        stops: NDArray[np.intp] | None,
         layout: Layout,
         errors: list[PluginError],
         *,
@@ -150,7 +168,7 @@ class CompiledCodec(Codec):
             The status of each; how many bytes it has, or how many tell more; and the bytes of those that are whole, one a row, if
             these are wanted, are in front, and are not too many.
         """
-        whole = offsets <= len(buffer) - layout.size
+        whole = offsets <= (len(buffer) if stops is None else stops) - layout.size
         count, number = int(np.count_nonzero(whole)), len(offsets)
         own = offsets if count == number else offsets[whole]
         gathered = gathered and (count == number or bool(whole[:count].all()))
@@ -165,7 +183,7 @@ class CompiledCodec(Codec):
             return judged, repeated(layout.size, number), kept
         status, sizes = np.empty(number, np.uint8), np.full(number, layout.size)
         status[whole] = judged
-        status[~whole], sizes[~whole] = _partial(buffer, offsets[~whole], layout)
+        status[~whole], sizes[~whole] = _partial(buffer, offsets[~whole], len(buffer) if stops is None else stops[~whole], layout)
         return status, sizes, kept
 
     def table(self, frames: Iterable[bytes]) -> Rows:
@@ -209,13 +227,21 @@ class InterpretedCodec(Codec):
         self._levels = ["constants", *lengths, *(["checksums"] if has_conditions(frame.prepared) else []), True]
 
     def survey(
-        self, buffer: NDArray[np.uint8], offsets: NDArray[np.intp], *, kind: int = 0, gathered: bool = True, sums: Sums | None = None
+        self,
+        buffer: NDArray[np.uint8],
+        offsets: NDArray[np.intp],
+        stops: NDArray[np.intp] | None = None,
+        *,
+        kind: int = 0,
+        gathered: bool = True,
+        sums: Sums | None = None,
     ) -> Frames:
         status = np.zeros(len(offsets), np.uint8)
         sizes = np.zeros(len(offsets), np.intp)
         errors: list[PluginError] = []
-        for index, offset in enumerate(offsets):
-            data = buffer[offset : offset + self.frame.room].tobytes()
+        ends = offsets + self.frame.room if stops is None else np.minimum(offsets + self.frame.room, stops)
+        for index, (offset, end) in enumerate(zip(offsets.tolist(), ends.tolist(), strict=True)):
+            data = buffer[offset:end].tobytes()
             status[index], sizes[index] = self._judge(data, errors)
         return Frames(buffer, repeated(kind, len(offsets)), offsets, sizes, status=status, errors=tuple(errors))
 
@@ -267,7 +293,14 @@ class RecodedCodec(Codec):
         return self.engine.compiled
 
     def survey(
-        self, buffer: NDArray[np.uint8], offsets: NDArray[np.intp], *, kind: int = 0, gathered: bool = True, sums: Sums | None = None
+        self,
+        buffer: NDArray[np.uint8],
+        offsets: NDArray[np.intp],
+        stops: NDArray[np.intp] | None = None,
+        *,
+        kind: int = 0,
+        gathered: bool = True,
+        sums: Sums | None = None,
     ) -> Frames:
         reading = self.recoder.reading(buffer, offsets)
         status, errors = np.where(reading.sizes == 0, SHORT, LENGTH).astype(np.uint8), list[PluginError]()
@@ -321,14 +354,16 @@ class RecodedCodec(Codec):
         return self.engine.table(rows[spot] for spot in sorted(rows))
 
 
-def _partial(buffer: NDArray[np.uint8], offsets: NDArray[np.intp], layout: Layout) -> tuple[NDArray[np.uint8], NDArray[np.intp]]:
+def _partial(
+    buffer: NDArray[np.uint8], offsets: NDArray[np.intp], stops: NDArray[np.intp] | int, layout: Layout
+) -> tuple[NDArray[np.uint8], NDArray[np.intp]]:
     """Candidates whose end is not there yet: still possible, or already refuted by a constant or a length; and how many bytes tell more."""
     status = np.full(len(offsets), SHORT, np.uint8)
     sizes = np.full(len(offsets), layout.size, np.intp)
     for verdict, known in ((LENGTH, layout.held), (CONSTANT, layout.constants)):
         for spot in sorted(known, reverse=True):
             mask, value = known[spot]
-            there = offsets + spot < len(buffer)
+            there = offsets + spot < stops
             status[there] = np.where(buffer[offsets[there] + spot] & mask == value, status[there], verdict)
             sizes[~there] = np.minimum(sizes[~there], spot + 1)
     return status, sizes

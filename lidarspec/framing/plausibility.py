@@ -221,9 +221,8 @@ class _Table:
     def holds(self, values: NDArray[Any]) -> NDArray[np.bool_]:
         """Whether the condition holds for each of the values, of their shape."""
         if self.limits is not None:
-            low, high = self.limits
-            held = values <= high
-            return np.asarray(held & (values >= low) if low else held)
+            low, high = map(values.dtype.type, self.limits)
+            return np.asarray(values - low <= high - low if low else values <= high)  # what is below wraps round
         if self.bits is not None:
             mask, allowed = self.bits
             left = values & values.dtype.type(mask)
@@ -243,7 +242,9 @@ def _looked_up(table: _Table, spot: int, shape: tuple[int, ...], strides: tuple[
     view = elements(rows, table.dtype, spot, shape, strides)
     values = view if view.itemsize == 1 else view.astype(table.dtype.newbyteorder("="))
     held = table.holds(values)
-    return np.asarray(held.all(axis=tuple(range(1, held.ndim)))) if shape else held
+    if not shape:
+        return held
+    return np.ones(len(held), np.bool_) if held.all() else np.asarray(held.all(axis=tuple(range(1, held.ndim))))
 
 
 def _table(part: Test, leaves: Mapping[str, Leaf], size: int) -> _Table:

@@ -59,8 +59,13 @@ def coordinates(distance: Any, azimuth: Any, elevation: Any, origin: Sequence[An
         azimuth, elevation: radians.
         origin: x, y and z of where the beam starts.
     """
-    level = _product(distance, np.cos(elevation))
-    places = _product(level, np.cos(azimuth)), _product(level, np.sin(azimuth)), distance * np.sin(elevation)
+    level: Any = np.cos(elevation)
+    sides = [np.cos(azimuth), np.sin(azimuth)]
+    if _is_row(azimuth) or _is_row(elevation):
+        known = [_product(level, side) for side in sides]
+        level, sides = (1, known) if all(map(_is_row, known)) else (level, sides)
+    level = _product(distance, level)
+    places = *(_product(level, side) for side in sides), distance * np.sin(elevation)
     x, y, z = (place if is_zero(start) else place + start for place, start in zip(places, origin, strict=True))
     return x, y, z
 
@@ -86,6 +91,11 @@ def direction_of(x: Any, y: Any, z: Any) -> tuple[Any, Any, Any]:
 
 def _product(first: Any, second: Any) -> Any:
     return first if not isinstance(second, Traced) and np.size(second) == 1 and np.all(second == 1) else first * second
+
+
+def _is_row(value: Any) -> bool:
+    """Whether a value is a row of a table: what is computed with such rows is computed once, for the table."""
+    return isinstance(value, Traced) and value.node.kind == "rows"
 
 
 def is_zero(value: Any) -> bool:

@@ -181,6 +181,13 @@ class Computed(ColumnSource):
     def holds(self, name: str) -> bool:
         return name in self._made
 
+    def prepare(self, names: Sequence[str]) -> None:
+        plans = [share.plan for share in self._shares]
+        sent = [name for name in names if name not in self._made and all(name in plan.sent for plan in plans)]
+        main = self._main_names if set(_MAIN).intersection(names) - self._made.keys() else ()
+        if sent and len(sent) + len(main) > 1 and self._turn is None:
+            self._made |= self._compiled((*main, *sent))
+
     def _columns(self, name: str) -> dict[str, NDArray[Any]]:
         if name == "intensity" and name not in self._shares[0].plan.parts:
             return {}
@@ -188,7 +195,7 @@ class Computed(ColumnSource):
             return self._main(name)
         if name == "valid":
             return {name: ~np.isnan(self._x())}
-        if name in self._shares[0].plan.expressions:
+        if name in self._shares[0].plan.expressions and name not in self._shares[0].plan.sent:
             columns = self._compiled(("range", "azimuth") if name in ("range", "azimuth") and self._packets.backend == "jit" else (name,))
             return columns | {"azimuth": self._azimuth(columns["azimuth"])} if "azimuth" in columns else columns
         if name == "time":
@@ -205,11 +212,10 @@ class Computed(ColumnSource):
 
     def _main(self, name: str) -> dict[str, NDArray[Any]]:
         """The columns that are made together; where all points are level, the height only when it is asked for."""
-        level = self._turn is None and all(share.plan.level for share in self._shares)
-        if level and name == "z":
+        if name not in self._main_names and name == "z":
             x = self._x()
             return {"z": np.where(np.isnan(x), x, np.float32(0))}
-        columns = self._compiled(tuple(n for n in _MAIN if n in self._shares[0].plan.expressions and not (n == "z" and level)))
+        columns = self._compiled(self._main_names)
         if self._turn is None:
             return columns
         turned = dict(columns)
@@ -217,6 +223,12 @@ class Computed(ColumnSource):
             source = int(np.flatnonzero(row)[0])
             turned[axis] = columns["xyz"[source]] * np.float32(row[source])
         return turned
+
+    @property
+    def _main_names(self) -> tuple[str, ...]:
+        """The columns that are made together, whichever of them is asked for."""
+        level = self._turn is None and all(share.plan.level for share in self._shares)
+        return tuple(n for n in _MAIN if n in self._shares[0].plan.expressions and not (n == "z" and level))
 
     def _x(self) -> NDArray[Any]:
         return cast("NDArray[Any]", self.column("x"))
@@ -327,6 +339,9 @@ class BatchColumns(ColumnSource):
 
     def holds(self, name: str) -> bool:
         return name in self._made
+
+    def prepare(self, names: Sequence[str]) -> None:
+        Computed([(self, 0, self.size)], self._made).prepare(names)
 
     def part(self, name: str, start: int, stop: int) -> NDArray[Any] | None:
         """A column of some points; those behind them have it made too, for whoever asks for them next."""

@@ -136,7 +136,7 @@ def _grids(inside: NDArray[np.bool_], axes: tuple[str | None, ...]) -> conventio
     """How the points of packets are organised, by which elements of their arrays, (n, ...), are not padding."""
     inner = range(1, inside.ndim)
     lengths = np.stack([inside.any(axis=tuple(other for other in inner if other != axis)).sum(axis=1) for axis in inner], axis=1)
-    counts = inside.reshape(len(inside), -1).sum(axis=1)
+    counts = inside.sum(axis=tuple(inner))
     lengths[lengths.prod(axis=1) != counts] = 0  # rows of several lengths in one packet are no grid
     shapes, which = np.unique(lengths, axis=0, return_inverse=True)
     grids = [conventions.grid_of(shape, axes) for shape in shapes.tolist()]

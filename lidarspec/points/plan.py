@@ -7,7 +7,8 @@ a batch before they are computed. It computes nothing: a `Maker` does, which a b
 Points by coordinates are three expressions and a mask (`conventions.placed`), their range and angles further ones. They are exact:
 computed in float64 as they are written, whatever floating-point fields hold. Points by direction are computed in another order and partly
 in float32: their plan holds where what a batch has in floating-point fields is of moderate size (`MODERATE`). Columns under names of a
-sensor's own are further expressions where they are float32, exact too; others are what `points` says, in their type.
+sensor's own are further expressions where they are float32, exact too, or whole numbers of a field as it was sent; others are what `points`
+says, in their type.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ from lidarspec.points.windows import is_number
 from lidarspec.spec.results import Cartesian, Polar
 from lidarspec.spec.vocabulary import Along, row_numbers
 from lidarspec.wire.frame_table import Group
-from lidarspec.wire.layout import Bytes2D, Layout
+from lidarspec.wire.layout import Bytes2D, Layout, Leaf
 
 PointsFunction = Callable[[Any], Any]
 
@@ -71,6 +72,7 @@ class Plan:
         shape: of the points of a packet, one length for each axis in `axes`.
         expressions: the columns that back ends make, by name, as nodes or as what no data decides.
         extra: what the columns under names of the sensor's own hold, by name.
+        sent: those of `extra` that are whole numbers of a field as they were sent, and the field's place.
         exact: whether coordinates and range are computed in float64 as they are written, as all other columns are.
         positive: nodes whose values have to be positive numbers, or the plan does not hold.
         nominal: whether a default calibration stands in for the sensor's own.
@@ -111,6 +113,8 @@ class Plan:
         if intensity is not None:
             expressions["intensity"] = np.nan_to_num(intensity) if self._may_be_nan(intensity) else intensity
         expressions |= {name: self.parts[name] for name, kind in self.extra.items() if kind.dtype == np.float32}
+        self.sent = {name: leaf for name, kind in self.extra.items() if (leaf := self._sent(self.parts[name], kind.dtype)) is not None}
+        expressions |= {name: self.parts[name] for name in self.sent}
         self.expressions = {name: graph.node_of(value) for name, value in expressions.items()}
 
     @cached_property
@@ -132,6 +136,13 @@ class Plan:
     def is_exact(self, name: str) -> bool:
         """Whether a column is computed in float64 as it is written, and rounded then."""
         return self.exact or name == "intensity" or name in self.extra
+
+    def _sent(self, part: Any, dtype: np.dtype[Any]) -> Leaf | None:
+        """The place of the field that a further column is, where each point has its own; None where it is none, or of another type."""
+        leaf = self.layout.leaves.get(part.path) if isinstance(part, Node) and part.kind == "field" else None
+        if leaf is None or not is_full(part, self.width) or leaf.info.scaled or leaf.info.kind != "int":
+            return None
+        return leaf if leaf.info.dtype == dtype and len(leaf.shape) == len(leaf.strides) and dtype.itemsize <= 4 else None
 
     def _floats_of(self, *values: Any) -> list[Node]:
         """The floating-point fields that values are made of."""

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.columns.graph import Expression, Node, only_field
-from lidarspec.wire.layout import Leaf
+from lidarspec.wire.layout import Layout, Leaf
 
 #: what costs hardly more than looking its result up; with these, whatever is made of numbers stays a number.
 CHEAP: set[Any] = {np.add, np.subtract, np.multiply, np.negative, np.positive, np.absolute, np.deg2rad, np.radians, np.minimum, np.maximum}
@@ -67,6 +67,29 @@ def shift_of(leaf: Leaf, seen: Window) -> tuple[int, int] | None:
         return None
     shift, mask = int(ones[0]), int(raw[-1])
     return (shift, mask) if np.array_equal(np.arange(len(raw)) >> shift & mask, raw) else None
+
+
+def run_of(leaf: Leaf) -> tuple[str, int, int, int] | None:
+    """Byte order, first byte, number of bytes, and lowest bit of a field of unsigned bits in a row of up to four bytes; None for others."""
+    if len(leaf.shape) > len(leaf.strides):
+        return None
+    if leaf.wire is not None:
+        is_whole = leaf.wire.kind == "u" and leaf.size <= 4
+        return (">" if leaf.wire.byteorder == ">" else "<", leaf.offset, leaf.size, 0) if is_whole else None
+    run = None if len(leaf.elements) != 1 or leaf.elements[0].signed else leaf.elements[0].run
+    return None if run is None or run[2] > 4 else (run[0], leaf.offset + run[1], run[2], run[3])
+
+
+def word_of(leaf: Leaf, layout: Layout) -> tuple[int, int, int] | None:
+    """Which four bytes of its element a field stands in, as a little-endian word: place, shift and mask; None where there are no such."""
+    run = run_of(leaf)
+    if run is None or (run[0] == ">" and run[2] > 1) or not leaf.strides or leaf.strides[-1] % 4:
+        return None
+    beside = [other for other in layout.leaves.values() if (other.info.axes, other.shape) == (leaf.info.axes, leaf.shape)]
+    _, first, count, lowest = run
+    start = first - (first - min(other.offset for other in beside)) % 4
+    last = start + sum((length - 1) * stride for length, stride in zip(leaf.shape, leaf.strides, strict=True)) + 4
+    return (start, 8 * (first - start) + lowest, (1 << leaf.info.bits) - 1) if first + count <= start + 4 and last <= layout.size else None
 
 
 def every_value(node: Node, leaf: Leaf) -> NDArray[Any] | None:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
+import itertools
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -76,14 +77,22 @@ class Turning:
         return True
 
 
-class Cutter:
-    """The cuts of one stream of points.
+class End(NamedTuple):
+    """Where a scan ends.
 
     Attributes:
-        leaps: those of the last batch's at which the angle leaps by more than `AWAY`, and twice as far as at the one before: something is
-            missing there, or no angle.
-        edges: the packets that those of the last batch begin at, where it is packets that say so, of which some may be without points.
+        point: the index in its batch of the point before which it ends.
+        packet: the one that says so, which may be without points; None where it is the point that does.
+        leaps: whether the angle leaps by more than `AWAY`, and twice as far as at the end before: something is missing there, or no angle.
     """
+
+    point: int
+    packet: int | None
+    leaps: bool
+
+
+class Cutter:
+    """Finds where the scans of one stream of points end."""
 
     def __init__(self, rule: Split) -> None:
         self._rule = rule
@@ -91,35 +100,36 @@ class Cutter:
         self._armed, self._turning = True, Turning()
         self._start: int | None = None
         self._leap = 0.0  # by how much of a turn the angle went on at the last cut
-        self.leaps = set[int]()
-        self.edges: list[int] | None = None
 
-    def cuts(self, packets: Packets, found: Evaluated) -> list[int]:
-        """Indices of the points of this batch before which to cut, ascending."""
-        rule, self.leaps, self.edges = self._rule, set(), None
+    def ends(self, packets: Packets, found: Evaluated) -> list[End]:
+        """The ends in this batch, ascending."""
+        rule, steps = self._rule, None
         if isinstance(rule, Every):
-            return self._periods(rule, packets, found)
+            which = self._periods(rule, packets, found)
+            return self._ends(first_points(found)[which], which)
         if isinstance(rule, OnWrap) and rule.name in COLUMNS:
-            angles = np.asarray(getattr(found.cloud, rule.name), np.float64)
-            return self._points(*self._wraps(angles, 2 * np.pi, rule.at))
+            points, steps = self._wraps(np.asarray(getattr(found.cloud, rule.name), np.float64), 2 * np.pi, rule.at)
+            return self._ends(points, steps=steps)
         path = _own_path(packets, rule.name)
         column = _field(found, path)
         values, starts = _rows(column, found)
-        is_of_packets = all(name is None for name in column.axes)
         if isinstance(rule, OnWrap):
             rows, steps = self._wraps(values, _turn(packets, path) or 2 * np.pi, rule.at)
         else:
-            rows, steps = self._changes(rule, values, _turn(packets, path) if isinstance(rule, OnJump) else None), np.empty(0)
-        self.edges = rows.tolist() if is_of_packets else None
-        return self._points(starts[rows], steps) if isinstance(rule, OnWrap) else starts[rows].tolist()
+            rows = self._changes(rule, values, _turn(packets, path) if isinstance(rule, OnJump) else None)
+        return self._ends(starts[rows], rows if all(name is None for name in column.axes) else None, steps)
 
-    def _points(self, cuts: NDArray[np.intp], steps: NDArray[np.float64]) -> list[int]:
-        """The cuts, of which `leaps` keeps those where the angle goes on by an odd part of a turn; `steps`: by how much at each."""
-        for cut, step in zip(cuts.tolist(), steps.tolist(), strict=True):
-            if self._leap and step > max(AWAY, 2 * self._leap):
-                self.leaps.add(cut)
-            self._leap = step
-        return cuts.tolist()  # type: ignore[no-any-return]
+    def _ends(
+        self, points: NDArray[np.intp], packets: NDArray[np.intp] | None = None, steps: NDArray[np.float64] | None = None
+    ) -> list[End]:
+        """The ends at some points; `steps`: by how much of a turn the angle goes on at each."""
+        which = itertools.repeat(None) if packets is None else packets.tolist()
+        leaps = itertools.repeat(False) if steps is None else map(self._is_leap, steps.tolist())
+        return list(map(End, points.tolist(), which, leaps))
+
+    def _is_leap(self, step: float) -> bool:
+        before, self._leap = self._leap, step
+        return before > 0 and step > max(AWAY, 2 * before)
 
     def _changes(self, rule: OnFlag | OnChange | OnJump | OnRewind, values: NDArray[np.float64], full: float | None) -> NDArray[np.intp]:
         if isinstance(rule, OnFlag):
@@ -163,16 +173,16 @@ class Cutter:
         self._armed = self._armed or _was_far(turned[since:], full)
         return found
 
-    def _periods(self, rule: Every, packets: Packets, found: Evaluated) -> list[int]:
+    def _periods(self, rule: Every, packets: Packets, found: Evaluated) -> NDArray[np.intp]:
+        """The packets with which a period begins."""
         times = packets.time_ns[: found.ready]
         if not len(times):
-            return []
+            return np.empty(0, np.intp)
         self._start = int(times[0]) if self._start is None else self._start
         period = (times - self._start) // int(rule.seconds * 1e9)
         before = _before(period.astype(np.float64), self._before)
         self._before = float(period[-1])
-        self.edges = np.flatnonzero(period > before).tolist()
-        return first_points(found)[self.edges].tolist()  # type: ignore[no-any-return]
+        return np.flatnonzero(period > before)
 
 
 def _turn(packets: Packets, path: str) -> float | None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -19,7 +19,7 @@ from lidarspec.packets.packets import Packets, joined as joined_packets
 from lidarspec.points.cloud import ColumnSource, LazyCloud, Mount, PointCloud, Stretch, Stretches, source_of
 from lidarspec.points.evaluate import guarded
 from lidarspec.points.plain import Evaluated
-from lidarspec.scans.cutter import Cutter, first_points
+from lidarspec.scans.cutter import Cutter, End, first_points
 from lidarspec.spec.description import Spec
 from lidarspec.spec.links import Serial
 from lidarspec.spec.timing import Every, OnFlag, OnRewind, OnWrap, Split
@@ -187,27 +187,19 @@ class Progress:
         self._last: tuple[int, int] | None = None  # time and index of the last packet
         self._turn = math.inf  # packets of the last whole scan, at first of the first piece
 
-    def cuts(
-        self, packets: Packets, points: Evaluated, ends: Sequence[int], leaps: Collection[int], edges: Sequence[int] | None = None
-    ) -> list[Cut]:
-        """The cuts of a batch in order: at the ends, which are between points, and where none came in time.
-
-        Args:
-            leaps: the ends at which the angle leaps as it does at no other, so that they may be none.
-            edges: the packets that the ends are in; None where each is in the one that has its point.
-        """
+    def cuts(self, packets: Packets, points: Evaluated, ends: Sequence[End]) -> list[Cut]:
+        """The cuts of a batch in order: at the ends, of which those that leap may be none, and where none came in time."""
         number, found, start = points.ready, list[Cut](), 0
         if not number:
             return found
         first = first_points(points) if len(ends) or self._by_points else np.empty(0, np.intp)
         batch = self._batch(packets, number, np.diff(first, append=source_of(points.cloud).size) if self._by_points else None)
-        if edges is None:
-            edges = (np.searchsorted(first, ends, side="right") - 1).tolist()
-        for edge, end in zip(edges, ends, strict=True):
+        for end, packet, leaps in ends:
+            edge = int(np.searchsorted(first, end, side="right")) - 1 if packet is None else packet
             begins = bool(first[edge] == end)
             found += self._without_end(packets, batch, start, edge + (not begins), points)
             is_shared = begins and not self._shows_start(packets, edge)
-            found.append(self._ended(batch, edge, end, begins=begins, is_shared=is_shared, is_seen=end not in leaps))
+            found.append(self._ended(batch, edge, end, begins=begins, is_shared=is_shared, is_seen=not leaps))
             if not self._has_ended:  # a rotor that spun up
                 packets.stats.unended, self._has_ended = "", True
             start = edge
@@ -403,8 +395,7 @@ class ScanStream:
 
     def _cut(self, packets: Packets, points: Evaluated) -> Iterator[Scan]:
         start, source = 0, source_of(points.cloud)
-        ends = self._cutter.cuts(packets, points)
-        cuts = self._progress.cuts(packets, points, ends, self._cutter.leaps, self._cutter.edges)
+        cuts = self._progress.cuts(packets, points, self._cutter.ends(packets, points))
         first, *times = _times_ns(source, [0, *(cut.point for cut in cuts)])
         self._begins = first if self._begins is None else self._begins
         for cut, time in zip(cuts, times, strict=True):

@@ -160,6 +160,7 @@ class Command:
         matches: values that fields of the reply must have for it to be the answer to this command; of several frames, each is
             asked for the fields that it has.
         echoes: fields of the reply that repeat the field of the same path in the request.
+        refusal: the frame that comes in place of any reply where the sensor refuses; what it says is told, names of an `Enum` in words.
         timeout: seconds to wait for the reply, each time that it is sent.
         retries: how often it is sent again when no reply comes; only for what does no harm when it arrives twice.
         settle: seconds that the sensor needs after it before the next command.
@@ -178,6 +179,7 @@ class Command:
     reply: str | tuple[str, ...] | None = None
     matches: Mapping[str, Any] = field(default_factory=dict)
     echoes: tuple[str, ...] = ()
+    refusal: str | None = None
     timeout: float = 1.0
     retries: int = 0
     settle: float = 0.0
@@ -374,7 +376,7 @@ def _check_spec(sensor: Spec) -> None:
     for name, frame in sensor.frames.items():
         _known(sensor, f"frames.{name}.after", [frame.after], sensor.frames)
     for name, command in sensor.commands.items():
-        _known(sensor, f"commands.{name}", [command.frame, *command.replies], sensor.frames)
+        _known(sensor, f"commands.{name}", [command.frame, *command.replies, command.refusal], sensor.frames)
         _known(sensor, f"commands.{name}.link", [command.link], sensor.links)
         if command.only_stopped and not any(other.starts or other.stops for other in sensor.commands.values()):
             raise SpecError("it is answered only while the sensor is stopped, and no command starts or stops it", path=f"commands.{name}")

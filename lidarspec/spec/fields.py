@@ -400,7 +400,7 @@ class Parts(layer.Partition):
             except (layer.Mismatch, ConstError) as fault:
                 if getattr(fault, "reason", "constant") == "constant":
                     continue
-            except Exception:  # whatever an expression raises: it is of this kind, and fails again when it is parsed
+            except Exception:  # an expression may raise anything: the part is of this kind, and fails again when it is parsed
                 pass
             finally:
                 stream.seek(spot)

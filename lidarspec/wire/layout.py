@@ -103,9 +103,15 @@ class Leaf:
         order: Literal["big", "little"] = "big" if self.wire.byteorder == ">" else "little"
         return int.from_bytes(frame[self.offset : self.offset + self.size], order, signed=self.wire.kind == "i")
 
-    def read(self, buffer: NDArray[np.uint8], offsets: NDArray[np.intp]) -> tuple[NDArray[np.intp] | None, NDArray[Any]]:
-        """An integer outside arrays in the candidates at these offsets: the indices of those that have it, None for all; its values."""
-        there = offsets + (self.offset + self.size) <= len(buffer)
+    def read(
+        self, buffer: NDArray[np.uint8], offsets: NDArray[np.intp], stops: NDArray[np.intp] | None = None
+    ) -> tuple[NDArray[np.intp] | None, NDArray[Any]]:
+        """An integer outside arrays in the candidates at these offsets: the indices of those that have it, None for all; its values.
+
+        Args:
+            stops: where the candidates end; by default with the buffer.
+        """
+        there = offsets + (self.offset + self.size) <= (len(buffer) if stops is None else stops)
         which = None if there.all() else np.flatnonzero(there)
         spots = (offsets if which is None else offsets[which]) + self.offset
         return which, self.at(self.offset).load(rows_at(buffer, spots, self.size))
@@ -359,11 +365,11 @@ def holding(test: Test, leaves: Mapping[str, Leaf], rows: Bytes2D) -> NDArray[np
 
 @dataclass(frozen=True, eq=False)
 class Refused:
-    """A header that leads to no frame: too long (its `values`), a constant is wrong, or an expression of the plugin failed (`error`)."""
+    """A header that leads to no frame: too long (after these `constants`), a constant is wrong, or an expression of the plugin failed."""
 
     error: PluginError | None = None
     by_constant: bool = False
-    values: Mapping[str, int] | None = None
+    constants: Mapping[int, tuple[int, int]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)

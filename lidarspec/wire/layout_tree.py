@@ -47,11 +47,10 @@ class Unknown(Exception):
 
     Attributes:
         leaf: where it stands.
-        before: all fields up to there.
     """
 
-    def __init__(self, leaf: Leaf | Measure, before: Mapping[str, Leaf]) -> None:
-        self.leaf, self.before = leaf, before
+    def __init__(self, leaf: Leaf | Measure) -> None:
+        self.leaf = leaf
         super().__init__(leaf.info.path)
 
 
@@ -61,6 +60,10 @@ class TooLong(Exception):
 
 class Unlike(Exception):
     """A part has the constants of no kind."""
+
+
+class CutOff(Exception):
+    """A frame is longer than the bytes that there are of it, and there will be no more."""
 
 
 def layout_of(root: tree.Node, values: Mapping[str, int], limit: int, given: Mapping[str, int] | None = None) -> Layout:
@@ -78,7 +81,10 @@ def layout_of(root: tree.Node, values: Mapping[str, int], limit: int, given: Map
         NotCompilable: where construct alone can tell what comes next.
         Exception: whatever a formula raises on these values.
     """
-    walk = _Walk(values, limit, given or {})
+    return _walked(_Walk(values, limit, given or {}), root)
+
+
+def _walked(walk: _Walk, root: tree.Node) -> Layout:
     walk.visit(root, "")
     if not walk.cursor:
         raise TooLong("")
@@ -153,6 +159,13 @@ def check_control(info: tree.FieldInfo) -> None:
         raise NotCompilable(info.path, "the layout depends on a field that is not one integer")
 
 
+def _unknown(leaf: Leaf | Measure, _: _Walk) -> int:
+    raise Unknown(leaf)
+
+
+Asked = Callable[[Leaf | Measure, "_Walk"], int]
+
+
 @dataclass
 class _Walk:
     """One walk through a tree: the values of header fields, how far it came, and what it found."""
@@ -160,6 +173,10 @@ class _Walk:
     values: Mapping[str, int]
     limit: int
     given: Mapping[str, int] = field(default_factory=dict)
+    #: gives the value of a field that is not among them, and may set `values`.
+    asked: Asked = _unknown
+    #: the bytes that there are, where there will be no more.
+    room: int | None = None
     cursor: int = 0
     leaves: dict[str, Leaf] = field(default_factory=dict)
     constants: dict[int, tuple[int, int]] = field(default_factory=dict)
@@ -177,10 +194,11 @@ class _Walk:
 
     def layout(self) -> Layout:
         """What was found, as a value."""
+        held, self.asked = self._held(), _unknown  # what follows from the header asks for no more of it
         seals, following = tuple(_in_order(self.seals)), tuple(self._following())
         leaves = ByPath(self.leaves, Leaf.element)
         found = (self.cursor, leaves, self.constants, seals, self.places, self.branches, following, self.lengths, self.regions)
-        return Layout(*found, self._held(), tuple(self.conditions.values()))
+        return Layout(*found, held, tuple(self.conditions.values()))
 
     def read(self, path: str) -> tuple[tree.FieldInfo, int] | str | None:
         """What a formula reads by a path: a field and its raw value, the path of a struct, or None for what the header leaves out.
@@ -203,7 +221,7 @@ class _Walk:
             return part.info, part.region.size
         if path not in self.values:
             check_control(part.info)
-            raise Unknown(part, self.leaves)
+            return part.info, self.asked(part, self)
         return part.info, self.values[path]
 
     def _element(self, path: str) -> tuple[tree.FieldInfo, int]:
@@ -212,9 +230,7 @@ class _Walk:
         leaf = self.leaves[base].element(path, indices) if base in self.leaves else None
         if leaf is None:
             raise IndexError(f"{base} has no such element")
-        if path not in self.values:
-            raise Unknown(leaf, self.leaves)
-        return leaf.info, self.values[path]
+        return leaf.info, self.values[path] if path in self.values else self.asked(leaf, self)
 
     def visit(self, node: tree.Node, path: str, shape: tuple[int, ...] = (), strides: tuple[int, ...] = ()) -> None:
         """Go through a part; `shape` and `strides` of the arrays that it is in."""
@@ -245,6 +261,8 @@ class _Walk:
                 raise NotCompilable(node.info.path, node.reason)
         if self.cursor > self.limit:
             raise TooLong(path)
+        if self.room is not None and self.cursor > self.room:
+            raise CutOff(path)
         if path and not shape:
             self.places[path] = (start, self.cursor)
 
@@ -450,6 +468,8 @@ class HeaderNode:
         values: those, raw, by path.
         above: the node that they lead from; None for the first.
         leaf, before: the field, and all fields up to it.
+        constants: those that stand before it, without those that all frames begin with; where a frame is cut off, those up to there.
+        least: the bytes that a frame with these values has at least, as far as is known.
         told: which of its values are told apart.
         result: what the values lead to, where no further field decides.
     """
@@ -458,6 +478,8 @@ class HeaderNode:
     above: HeaderNode | None = None
     leaf: Leaf | Measure | None = None
     before: Mapping[str, Leaf] = field(default_factory=dict)
+    constants: Mapping[int, tuple[int, int]] = field(default_factory=dict)
+    least: int = 0
     told: _Told | None = None
     children: dict[int, HeaderNode] = field(default_factory=dict)
     result: Layout | Refused | None = None
@@ -562,6 +584,48 @@ def _with_value(formula: tree.Formula, value: int) -> int:
     return int(tree.evaluated(formula, lambda _: (ref.info, value)))
 
 
+class _Places:
+    """Candidates in a buffer, as `HeaderTree.classify` gets them, of frames of at most `limit` bytes.
+
+    Attributes:
+        refuted: those whose header is cut off, or that are too long, and have a wrong constant before.
+    """
+
+    def __init__(self, buffer: NDArray[np.uint8], offsets: NDArray[np.intp], stops: NDArray[np.intp] | None, limit: int) -> None:
+        self._buffer, self._offsets, self.stops, self._limit = buffer, offsets, stops, limit
+        self.refuted: list[NDArray[np.intp]] = []
+
+    def longest(self, which: NDArray[np.intp]) -> bytes:
+        """What there is of the one that has the most bytes, up to the longest frame."""
+        first = which.item(0)
+        if self.stops is not None and len(which) > 1:
+            first = which.item((self.stops[which] - self._offsets[which]).argmax())
+        start = self._offsets.item(first)
+        return self._buffer[start : min(start + self._limit, len(self._buffer) if self.stops is None else self.stops.item(first))].tobytes()
+
+    def read(self, node: HeaderNode, which: NDArray[np.intp]) -> tuple[NDArray[np.intp] | None, NDArray[Any]]:
+        """As `Reader`; those whose field is cut off are looked at here."""
+        assert node.leaf is not None
+        there, values = node.leaf.read(self._buffer, self._offsets[which], None if self.stops is None else self.stops[which])
+        if there is not None:
+            self.cut_off(node, np.delete(which, there))
+        return there, values
+
+    def cut_off(self, node: HeaderNode, which: NDArray[np.intp]) -> None:
+        """Look whether some that are cut off at a node can still be frames."""
+        if node.constants:
+            self.refuted.append(which[self.wrong(node.constants, which)])
+
+    def wrong(self, constants: Mapping[int, tuple[int, int]], which: NDArray[np.intp]) -> NDArray[np.bool_]:
+        """Which candidates have a wrong constant, as far as their bytes go, (n,)."""
+        offsets, stops = self._offsets[which], len(self._buffer) if self.stops is None else self.stops[which]
+        wrong = np.zeros(len(which), np.bool_)
+        for spot, (mask, value) in constants.items() if len(which) else ():
+            there = offsets + spot < stops
+            wrong[there] |= self._buffer[offsets[there] + spot] & mask != value
+        return wrong
+
+
 class HeaderTree:
     """All layouts of one frame type, or of a kind of parts, with the values of fields around them."""
 
@@ -570,49 +634,48 @@ class HeaderTree:
         self._root, self._size = HeaderNode(), 0
         self._told: dict[str, _Told] = {}
 
-    def classify(self, buffer: NDArray[np.uint8], offsets: NDArray[np.intp]) -> list[Group]:
-        """The candidates at `offsets`, sorted by layout: (layout or refusal, indices) for each, without those whose header is cut off."""
-        refuted: list[NDArray[np.intp]] = []
+    @functools.cached_property
+    def _prefix(self) -> dict[int, tuple[int, int]]:
+        return prefix_of(self._frame, self._limit)
 
-        def read(node: HeaderNode, which: NDArray[np.intp]) -> tuple[NDArray[np.intp] | None, NDArray[Any]]:
-            assert node.leaf is not None
-            there, values = node.leaf.read(buffer, offsets[which])
-            if there is not None:
-                cut = np.delete(which, there)
-                refuted.append(cut[self._refuted(node.values, buffer, offsets[cut])])
-            return there, values
+    def classify(self, buffer: NDArray[np.uint8], offsets: NDArray[np.intp], stops: NDArray[np.intp] | None = None) -> list[Group]:
+        """The candidates at `offsets`, sorted by layout: (layout or refusal, indices) for each, without those whose header is cut off.
 
+        Args:
+            stops: where their bytes end, and no more will come; by default with those of the buffer, and more may come.
+        """
+        places = _Places(buffer, offsets, stops, self._limit)
         groups: list[Group] = []
-        for result, which in self.sorted(len(offsets), read):
-            if not isinstance(result, Refused) or result.values is None:
-                groups.append((result, which))
-                continue
-            wrong = self._refuted(result.values, buffer, offsets[which])
-            refuted.append(which[wrong])
-            groups.append((result, which[~wrong]))
-        return groups + [(Refused(by_constant=True), which) for which in refuted if len(which)]
+        for result, which in self.sorted(len(offsets), places.read, places):
+            groups.append((result, which))
+            if isinstance(result, Refused) and result.constants:
+                wrong = places.wrong(result.constants, which)
+                groups[-1] = result, which[~wrong]
+                places.refuted.append(which[wrong])
+        return groups + [(Refused(by_constant=True), which) for which in places.refuted if len(which)]
 
-    def _refuted(self, values: Mapping[str, int], buffer: NDArray[np.uint8], offsets: NDArray[np.intp]) -> NDArray[np.bool_]:
-        """Which candidates with these header fields have a wrong constant before the field that is cut off, or before they are too long."""
-        walk, wrong = _Walk(values, self._limit, self._given), np.zeros(len(offsets), np.bool_)
-        with contextlib.suppress(Exception):  # whatever an expression raises at such values: what comes before counts
-            walk.visit(self._frame, "")
-        for spot, (mask, value) in walk.constants.items() if len(offsets) else ():
-            there = offsets + spot < len(buffer)
-            wrong[there] |= buffer[offsets[there] + spot] & mask != value
-        return wrong
+    def sorted(self, number: int, read: Reader, places: _Places | None = None) -> list[Group]:
+        """So many candidates by layout, as `classify` has them, whose header fields `read` reads.
 
-    def sorted(self, number: int, read: Reader) -> list[Group]:
-        """So many candidates by layout, as `classify` has them, whose header fields `read` reads."""
+        Args:
+            places: where they are, if their fields can be read one by one as well.
+        """
         if self._size > REMEMBERED:
             self._root, self._size = HeaderNode(), 0
         groups: list[Group] = []
         stack = [(self._root, np.arange(number))] if number else []
         while stack:
             node, which = stack.pop()
-            self._explore(node)
+            if len(which) == 1 and places is not None:
+                node = self._end(places.longest(which), node, is_all=places.stops is not None)
+            elif node.leaf is None and node.result is None:
+                data = b"" if places is None else places.longest(which)
+                self._explore(node, data, is_all=places is not None and places.stops is not None)
             if node.result is not None:
                 groups.append((node.result, which))
+                continue
+            if places is not None and (len(which) == 1 or node.leaf is None):
+                places.cut_off(node, which)
                 continue
             there, values = read(node, which)
             which = which if there is None else which[there]
@@ -642,13 +705,7 @@ class HeaderTree:
 
     def layout(self, frame: bytes) -> Layout | Refused | None:
         """The layout of one frame, or None where its header is not all there."""
-        node: HeaderNode | None = self._root
-        while node is not None and node.leaf is not None and (value := node.leaf.of(frame)) is not None:
-            node = node.children.get(node.meant(value))
-        if node is not None and node.result is not None:
-            return node.result
-        groups = self.classify(np.frombuffer(frame, np.uint8), np.zeros(1, np.intp))
-        return groups[0][0] if groups else None
+        return self._end(frame, self._root).result
 
     def _asked(self, frame: bytes) -> Iterator[tuple[Leaf | Measure, int]]:
         """The fields that decided the layout of this frame, and their values, in the order in which they were asked for."""
@@ -683,18 +740,48 @@ class HeaderTree:
                 own = drawn.get(unknown.leaf.info.path)
                 values[unknown.leaf.info.path] = own(source) if own else _some_value(source, unknown.leaf, keys)
 
-    def _explore(self, node: HeaderNode) -> None:
-        """Find out which field decides next, or what the values so far lead to, where nobody has yet."""
-        if node.leaf is not None or node.result is not None:
-            return
+    def _end(self, data: bytes, node: HeaderNode, *, is_all: bool = False) -> HeaderNode:
+        """Where the header of a frame leads from a node, as `_explore` has it."""
+        while node.leaf is not None:
+            value = node.leaf.of(data)
+            if value is None:
+                return node
+            node = node.child(node.meant(value))
+        return node if node.result is not None else self._explore(node, data, is_all=is_all)
+
+    def _explore(self, node: HeaderNode, data: bytes = b"", *, is_all: bool = False) -> HeaderNode:
+        """Find out, where nobody has yet, which fields decide next, as far as the header of a frame tells, in one walk.
+
+        Returns:
+            The last node: with a result, with a field that the bytes end before, or with neither where the frame is longer than these.
+
+        Args:
+            is_all: there are no more bytes of this frame.
+        """
+
+        def asked(leaf: Leaf | Measure, walk: _Walk) -> int:
+            nonlocal node
+            node.leaf, node.before, node.told, node.constants = leaf, dict(walk.leaves), self._telling(leaf), self._behind(walk)
+            value = leaf.of(data)
+            if value is None:
+                raise Unknown(leaf)
+            node = node.child(node.meant(value))
+            self._size += 1
+            walk.values = node.values
+            return node.values[leaf.info.path]
+
+        if is_all and len(data) < node.least:
+            return node
         self._size += 1
+        walk = _Walk(node.values, self._limit, self._given, asked, len(data) if is_all else None)
         try:
-            node.result = layout_of(self._frame, node.values, self._limit, self._given)
-        except Unknown as unknown:
-            node.leaf, node.before = unknown.leaf, unknown.before
-            node.told = self._telling(node.leaf)
+            node.result = _walked(walk, self._frame)
+        except Unknown:
+            pass
+        except CutOff:
+            node.constants, node.least = self._behind(walk), walk.cursor
         except TooLong:
-            node.result = Refused(values=node.values)
+            node.result = Refused(constants=self._behind(walk))
         except Unlike:
             node.result = Refused(by_constant=True)
         except SpecError:
@@ -704,6 +791,11 @@ class HeaderTree:
         above = node.above
         if above is not None and above.told is not None and isinstance(node.result, Refused) and not node.result.error:
             above.told = above.told.refused([*node.values.values()][-1])
+        return node
+
+    def _behind(self, walk: _Walk) -> dict[int, tuple[int, int]]:
+        """The constants found by a walk, without those that all frames begin with, which candidates are known to have."""
+        return {spot: known for spot, known in walk.constants.items() if self._prefix.get(spot) != known}
 
     def _telling(self, leaf: Leaf | Measure) -> _Told | None:
         if not isinstance(leaf, Leaf):

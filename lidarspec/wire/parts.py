@@ -30,8 +30,8 @@ ANY = -1
 class Layouts(Protocol):
     """The layouts of a kind of parts, as a `HeaderTree` has them."""
 
-    def classify(self, buffer: NDArray[np.uint8], offsets: Offsets) -> list[tuple[Layout | Refused, Offsets]]:
-        """The candidates at these offsets by layout, without those whose header is cut off."""
+    def classify(self, buffer: NDArray[np.uint8], offsets: Offsets, stops: Offsets | None = None) -> list[tuple[Layout | Refused, Offsets]]:
+        """The candidates at these offsets by layout, without those whose header is cut off; `stops` where their bytes end."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,9 +123,9 @@ class Region:
         """Whether any part has a checksum or conditions of its own."""
         return any(kind.is_checked for kind in self.kinds)
 
-    def walked(self, buffer: NDArray[np.uint8], offsets: Offsets) -> Walked:
-        """The parts of the frames at these offsets."""
-        return _Walk(self, buffer, offsets + self.start).walked()
+    def walked(self, buffer: NDArray[np.uint8], offsets: Offsets, stops: Offsets | None = None) -> Walked:
+        """The parts of the frames at these offsets; `stops` where their bytes end, by default with the buffer."""
+        return _Walk(self, buffer, offsets + self.start, stops).walked()
 
     def in_rows(self, rows: Bytes2D) -> tuple[NDArray[np.uint8], Walked]:
         """The parts of whole frames, given as rows of bytes, and the buffer that they stand in."""
@@ -146,8 +146,8 @@ class Region:
 class _Walk:
     """One walk through the parts of frames that begin at `starts` of a buffer."""
 
-    def __init__(self, region: Region, buffer: NDArray[np.uint8], starts: Offsets) -> None:
-        self._region, self._buffer, self._starts, self._ends = region, buffer, starts, starts.copy()
+    def __init__(self, region: Region, buffer: NDArray[np.uint8], starts: Offsets, stops: Offsets | None) -> None:
+        self._region, self._buffer, self._starts, self._ends, self._stops = region, buffer, starts, starts.copy(), stops
         rule, room = region.rule, region.limit - region.start
         self._rule, self._room = rule, room if rule.within is None else min(room, rule.within)
         self._announced = np.full(len(starts), ANY if rule.size is None else rule.size)
@@ -178,19 +178,18 @@ class _Walk:
         for number, kind in enumerate(self._region.kinds):
             if not len(active):
                 break
-            spots = self._ends[active]
-            held = right_at(self._buffer, spots, kind.start)
+            held = self._right(active, kind.start)
             if held is not None and not np.count_nonzero(held):
                 continue  # one of many kinds, that none of these parts is of
             own, others = (active, [active[:0]]) if held is None else (active[held], [active[~held]])
             seen = np.zeros(len(own), np.bool_)
-            for layout, which in kind.layouts.classify(self._buffer, self._ends[own]):
+            for layout, which in kind.layouts.classify(self._buffer, self._ends[own], self._stops_of(own)):
                 seen[which] = True
                 if isinstance(layout, Refused):
                     self._refused(layout, own[which])
                     continue
                 theirs = own[which]
-                held = right_at(self._buffer, self._ends[theirs], kind.further(layout))
+                held = self._right(theirs, kind.further(layout))
                 if held is not None:
                     others.append(theirs[~held])
                     theirs = theirs[held]
@@ -203,13 +202,20 @@ class _Walk:
         self._status[active] = CONSTANT
         return pieces
 
+    def _stops_of(self, which: Offsets) -> Offsets | None:
+        return None if self._stops is None else self._stops[which]
+
+    def _right(self, which: Offsets, constants: tuple[Word, ...]) -> NDArray[np.bool_] | None:
+        """In which frames constants of the next part are right, as `right_at` has it."""
+        return right_at(self._buffer, self._ends[which], constants, self._stops_of(which)) if constants else None
+
     def _refused(self, refused: Refused, which: Offsets) -> None:
         self._status[which] = FAILED if refused.error else CONSTANT if refused.by_constant else LENGTH
         self._errors += [refused.error] if refused.error else []
 
     def _measured(self, layout: Layout, which: Offsets) -> Offsets:
         """Those whose lengths are right, as far as the bytes go; the status of the others."""
-        held = right_at(self._buffer, self._ends[which], words(marks(layout.held))) if layout.held else None
+        held = self._right(which, words(marks(layout.held))) if layout.held else None
         if held is None:
             return which
         self._status[which[~held]] = LENGTH
@@ -219,7 +225,7 @@ class _Walk:
         """Those that have their part whole, and as long as was said; the status of the others."""
         ends, announced = self._ends[which] + layout.size, self._announced[which]
         wrong = (ends - self._starts[which] > self._room) | (layout.size == 0)
-        cut_off = ends > len(self._buffer)
+        cut_off = ends > (len(self._buffer) if self._stops is None else self._stops[which])
         other = (announced != ANY) & (announced != layout.size)
         if not (np.count_nonzero(wrong) or np.count_nonzero(cut_off) or np.count_nonzero(other)):
             return which
@@ -257,18 +263,21 @@ class _Walk:
             return -1
 
 
-def right_at(buffer: NDArray[np.uint8], spots: Offsets, constants: tuple[Word, ...]) -> NDArray[np.bool_] | None:
-    """Where constants are right, as far as the bytes go, (n,); None where all are."""
+def right_at(
+    buffer: NDArray[np.uint8], spots: Offsets, constants: tuple[Word, ...], stops: Offsets | None = None
+) -> NDArray[np.bool_] | None:
+    """Where constants are right, as far as the bytes go, up to these `stops` or to the end of the buffer, (n,); None where all are."""
     held: NDArray[np.bool_] | None = None
     for word in constants:
         spot, dtype, _, _ = word
         room = len(buffer) - spot - dtype.itemsize
-        there = spots <= room
-        if there.all():
+        if bool((spots <= (room if stops is None else stops - spot - dtype.itemsize)).all()):
             windows: NDArray[Any] = np.ndarray((room + 1,), dtype, buffer.data, spot, (1,))
             each = equal(windows[spots], word)
         else:
-            each = np.array([_begins(buffer[at + spot : at + spot + dtype.itemsize].tobytes(), word) for at in spots.tolist()], np.bool_)
+            ends = [len(buffer)] * len(spots) if stops is None else stops.tolist()
+            parts = (buffer[at + spot : min(at + spot + dtype.itemsize, end)] for at, end in zip(spots.tolist(), ends, strict=True))
+            each = np.array([_begins(part.tobytes(), word) for part in parts], np.bool_)
         if np.count_nonzero(each) < len(each):
             held = each if held is None else held & each
     return held
@@ -288,13 +297,15 @@ class Measure:
     info: tree.FieldInfo
     region: Region
 
-    def read(self, buffer: NDArray[np.uint8], offsets: Offsets) -> tuple[Offsets | None, NDArray[Any]]:
+    def read(self, buffer: NDArray[np.uint8], offsets: Offsets, stops: Offsets | None = None) -> tuple[Offsets | None, NDArray[Any]]:
         """As `Leaf.read`; a negative number, of the status, for what cannot be a frame."""
-        walked = self.region.walked(buffer, offsets)
+        walked = self.region.walked(buffer, offsets, stops)
         values, cut_off = np.where(walked.status == FOUND, walked.sizes, -walked.status.astype(np.int64)), walked.status == CUT_OFF
         if not np.count_nonzero(cut_off):
             return None, values
-        is_all = cut_off & (offsets + self.region.limit <= len(buffer))  # no frame is so long that more bytes would help
+        is_all = cut_off & (
+            offsets + self.region.limit <= (len(buffer) if stops is None else stops)
+        )  # no frame is so long that more bytes would help
         values[is_all] = -LENGTH
         there = np.flatnonzero(~cut_off | is_all)
         return there, values[there]

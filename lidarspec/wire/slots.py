@@ -116,7 +116,7 @@ class Recoder:
 
     def _classified(self, reading: Reading, heads: _Heads, stops: Indices) -> list[tuple[Layout | Refused, Indices]]:
         if isinstance(reading, Unescaped) and reading.numbers is None:
-            return self.tree.classify(reading.values, reading.places.searchsorted(heads.at))
+            return self.tree.classify(reading.values, reading.places.searchsorted(heads.at), reading.places.searchsorted(stops))
 
         def read(node: HeaderNode, which: Indices) -> tuple[Indices, NDArray[Any]]:
             leaf = node.leaf

@@ -116,6 +116,21 @@ def test_a_reply_among_data_and_the_data_go_on(line: Port, tmp_path: Path) -> No
     assert [SENSOR.parse(data, "order").code for data in sent] == [START, SPEED, STOP]
 
 
+def test_an_answer_that_has_come_is_taken_before_the_command_is_given_up(line: Port, monkeypatch: pytest.MonkeyPatch) -> None:
+    with working(Obedient(line).work), ls.open(f"serial://{line.name}", SENSOR, start=False) as opened:
+        clock, calls = opened._input._clock, itertools.count()  # type: ignore[attr-defined]
+        now = clock.now
+
+        def held_up() -> int:
+            call = next(calls)
+            if call == 1:
+                until(lambda: opened.queued)
+            return now() + (60_000_000_000 if call else 0)
+
+        monkeypatch.setattr(clock, "now", held_up)
+        assert opened.send("speed", rate=10.0, trim=1.0).confirmed
+
+
 def test_bytes_by_hand_go_out_as_they_are(line: Port, tmp_path: Path) -> None:
     device = Obedient(line)
     with working(device.work), ls.open(f"serial://{line.name}", SENSOR, start=False, record=tmp_path / "all.lsr") as opened:

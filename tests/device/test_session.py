@@ -405,3 +405,24 @@ def test_what_is_found_out_can_be_given() -> None:
     assert (given.head.number, list(given.host)) == (9, [1, 2, 3, 4])
     with pytest.raises(UsageError, match="host is an IPv4 address, not '::1'"):
         CONVERSATION.command("hello", host="::1")
+
+
+def test_a_refusal_is_told_in_words_and_a_late_one_is_not_the_next_commands() -> None:
+    refused = Command("order", {"code": 3, "motor.speed": 0, "motor.trim": 0}, reply="data", refusal="ack", timeout=1.0, retries=1)
+    session = Session(with_commands(ask=refused))
+    first = session.request("ask", 0)
+    session.receive([ack(1, result=2)], 1)
+    assert (str(first.failure), session.late) == (
+        "shape-commands ask: the sensor refuses it: Reply(ask, ack: code 1, result 2, check 101)",
+        0,
+    )
+    second = session.request("ask", 2)
+    session.tick(2 + SECOND)  # sent once more
+    session.receive([ack(1)], 3 + SECOND)
+    third = session.request("ask", 4 + SECOND)
+    session.tick(4 + SECOND)
+    assert (second.failure is not None, third.done) == (True, False)
+    session.receive([ack(1)], 5 + SECOND)  # of what was sent once more
+    assert (third.done, session.late) == (False, 1)
+    session.receive([ack(1)], 6 + SECOND)
+    assert third.failure is not None

@@ -27,8 +27,6 @@ REFUSED = {
 }
 #: what every run tries; the other shapes, and sensors that share the frames of one of these, are for the long one.
 FEW = {*lidarspec.sensors(), "shape-oddities", "shape-options", "shape-segments", "shape-tags", "shape-channels"} & set(DISTINCT)
-#: its frames are told apart by what was announced before them, which is not before each of these.
-FEW -= {"slamtec-rplidar-t1"}
 SENSORS = [
     pytest.param(sensor, id=name, marks=() if name in FEW else pytest.mark.soak) for name, sensor in EVERY.items() if name not in REFUSED
 ]
@@ -42,6 +40,9 @@ CAPTURES = [
 ]
 
 LATER, LONG = {"velodyne-hdl32e", "hesai-xt32", "hesai-qt64"}, pytest.mark.soak
+
+#: what is said of a frame that may be of another type, too.
+UNSURE = "what tells them is not in these bytes"
 
 pytestmark = needs_tshark
 
@@ -63,11 +64,12 @@ def test_every_field_reads_as_lidarspec_reads_it(sensor: Sensor, tmp_path: Path)
 
 def _answer(sensor: Sensor, name: str, data: bytes) -> str:
     """What a dissector takes bytes for: the answer that has the very bytes of a command; of frames that only `plausible` tells apart, which
-    is Python, the first; else the frame's own name."""
+    is Python, the first that what was announced leaves; else the frame's own name."""
     if name not in sensor.incoming:
         return next((other for other in sensor.incoming if _reads(sensor, other, data)), name)
     in_turn = sorted(sensor.incoming, key=lambda other: -len(codec(sensor.frames[other]).prefix))  # as the dissector tries them
-    untold = (other for other in in_turn if other == name or (sensor.frames[other].plausible and _reads(sensor, other, data)))
+    awaited = [other for other in in_turn if sensor.frames[other].after in (None, sensor.frames[name].after)]
+    untold = (other for other in awaited if other == name or (sensor.frames[other].plausible and _reads(sensor, other, data)))
     return next(untold, name)
 
 
@@ -86,7 +88,7 @@ def assert_shown(sensor: Sensor, capture: Path, script: Path, frames: Sequence[t
     wanted_names = ["_ws.expert.message", f"{prefix}.frame", *(f"{prefix}.{name}.{path}" for name, path in paths)]
     shown = list(columns(capture, script, wanted_names, *arguments))
     assert [kind for _, kind, *_ in shown] == [[name] for name, _ in frames]
-    assert not any(message for message, *_ in shown)
+    assert not any(message for messages, *_ in shown for message in messages if UNSURE not in message)
     for (name, data), (_, _, *found) in zip(frames, shown, strict=True):
         parsed = values(sensor.parse(data, frame=name, verify=False))
         for (other, path), printed in zip(paths, found, strict=True):
@@ -165,6 +167,24 @@ def test_a_frame_that_waits_for_another_is_told_by_it(tmp_path: Path) -> None:
     run = captured(sensor, [b"".join(data for _, data in frames)], tmp_path / "run.pcap")
     ((kinds,),) = columns(run, script, ["shape_modes.frame"])
     assert kinds == [name for name, _ in frames]
+
+
+def test_frames_that_nothing_announced_are_said_to_be_unsure(tmp_path: Path) -> None:
+    sensor = lidarspec.sensor("slamtec-rplidar-t1")
+    capsule, announcement = sensor.example("dense", seed=1), sensor.example("dense_descriptor", seed=1)
+    capture = captured(sensor, [capsule, announcement, capsule], tmp_path / "it.pcap")
+    before, _, behind = columns(capture, written(sensor, tmp_path), ["slamtec_rplidar_t1.frame", "_ws.expert.message"])
+    assert before[0] == ["express"]
+    assert [message.partition(":")[0] for message in before[1]] == ["express or dense"]
+    assert behind == [["dense"], []]
+
+
+def test_frames_of_one_size_are_told_by_their_conditions(tmp_path: Path) -> None:
+    sensor = lidarspec.sensor("robosense-m1")
+    names = ["difop_guide", "difop", "difop_other", "difop_fov"]
+    capture = captured(sensor, [sensor.example(name, seed=2) for name in names], tmp_path / "it.pcap")
+    shown = columns(capture, written(sensor, tmp_path), ["robosense_m1.frame", "_ws.expert.message"])
+    assert list(shown) == [[[name], []] for name in names]
 
 
 def test_two_dissectors_share_ports_and_link_types(tmp_path: Path) -> None:

@@ -4,13 +4,18 @@ from __future__ import annotations
 
 import random
 from concurrent.futures import ThreadPoolExecutor
+from typing import Any
 
 import pytest
+from construct import Array, Byte, Const, Int8ub, Struct, this
 
 import lidarspec as ls
 import lidarspec.spec
 from lidarspec import Sensor
+from lidarspec.framing.frame_engine import CompiledCodec, codec
 from lidarspec.simulation.simulator import simulate
+from lidarspec.spec import Frame
+from lidarspec.testing import hostile
 from lidarspec.testing.agreement import assert_backends_agree
 from lidarspec.testing.subject import Subject
 from tests.all_sensors import streams
@@ -41,6 +46,33 @@ def test_datagrams_of_any_size_raise_on_nothing(sensor: Sensor) -> None:
     assert stats.bytes_in == sum(map(len, data)) == sum(len(item.data) for item in found) + stats.bytes_skipped
     if sensor.frames[sensor.data_frame].after is None and sensor.frames[sensor.data_frame].confirm == 1:
         assert [item.data for item in found].count(frame) == 2
+
+
+@pytest.mark.parametrize("sensor", [sensor for sensor in SHAPES.values() if sensor.datagrams], ids=lambda sensor: sensor.id)
+def test_each_datagram_is_judged_by_its_own_bytes_alone(sensor: Sensor) -> None:
+    streams = hostile.streams(Subject(sensor), length=3000)
+    datagrams = [*streams["heads of frames"], *streams["random headers"], *streams["damaged frames"]]
+    together, each = sensor.decoder(stream=False), sensor.decoder(stream=False)
+    found = together.datagrams(datagrams)
+    alone = [each.datagrams([datagram]) for datagram in datagrams]
+    assert found.kinds.tolist() == [kind for frames in alone for kind in frames.kinds.tolist()]
+    assert together.stats == each.stats
+
+
+def test_a_new_header_is_gone_through_once() -> None:
+    asked = list[int]()
+
+    def first(context: Any) -> int:
+        asked.append(1)
+        return int(context.n)
+
+    counts = Struct("sync" / Const(b"\x5a\xa5"), "n" / Int8ub, "a" / Array(first, Byte), *(f"n{i}" / Int8ub for i in range(4)))
+    frame = counts + Struct(*(f"a{i}" / Array(getattr(this, f"n{i}"), Byte) for i in range(4)))
+    engine = codec(Frame(frame, max_length=2000))
+    assert isinstance(engine, CompiledCodec)
+    asked.clear()
+    assert engine.tree.layout(bytes.fromhex("5aa50100 01020304".replace(" ", "")) + bytes(20)) is not None
+    assert len(asked) == 1
 
 
 @each_stream

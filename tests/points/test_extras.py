@@ -8,15 +8,19 @@ from importlib.util import find_spec
 
 import numpy as np
 import pytest
+from construct import Array, BitsInteger, BitStruct, ByteSwapped, Const, Int16sl, Int16ul, Int32ub, Struct
 
 import lidarspec
-from lidarspec import PointCloud, SpecError
+from lidarspec import PointCloud, Sensor, SpecError
+from lidarspec.errors import UnknownName
 from lidarspec.packets.packets import Packets
 from lidarspec.points.cloud import LazyCloud, Mount
 from lidarspec.points.evaluate import evaluated
+from lidarspec.points.numpy_plan import describe
 from lidarspec.points.plain import evaluate
+from lidarspec.points.plan import Plan, plan_for
 from lidarspec.simulation.simulator import simulate
-from lidarspec.spec import Cartesian, Extra, Fields, Polar
+from lidarspec.spec import Cartesian, Extra, Fields, Frame, Polar, Scaled, along, take
 from lidarspec.testing.agreement import assert_same_points, assert_well_formed
 from tests.shapes import SHAPES
 
@@ -151,3 +155,68 @@ def test_points_in_parts_have_them_too() -> None:
     assert dict(cloud.units) == {"signal": "", "step": "deg", "share": ""}
     np.testing.assert_array_equal(cloud.extra["signal"], cloud.extra["share"] * np.float32(255))
     assert (cloud.extra["step"] == np.float32(1.5)).all()
+
+
+#: 12 bytes an element, three words of four: bits, whole bytes and numbers in them, and one that stands across two.
+PIXEL = ByteSwapped(
+    BitStruct(
+        *("window" / BitsInteger(8), "across" / BitsInteger(16), "near_ir" / BitsInteger(16), "signal" / BitsInteger(16)),
+        *("unused" / BitsInteger(8), "reflectivity" / BitsInteger(8), "rest" / BitsInteger(5), "flags" / BitsInteger(3)),
+        "distance" / Scaled(BitsInteger(16), 0.002, "m"),
+    )
+)
+
+
+def words() -> Sensor:
+    """A sensor whose pixels share words, in directions that are looked up; two fields beside them stand in none."""
+    columns = Array(4, Struct("number" / Int16ul, "pixels" / Array(8, PIXEL)))
+    struct = Struct("head" / Const(b"\xa5\x5a"), "columns" / columns, "ends" / Array(8, Struct("whole" / Int32ub, "sign" / Int16sl)))
+    table, level = np.linspace(-3, 3, 640).reshape(80, 8), np.linspace(-0.4, 0.4, 8)
+    names = ("signal", "near_ir", "across", "window", "flags", "rest")
+
+    def points(f: Fields) -> Polar:
+        pixels, number = f.columns.pixels, f.columns.number % 80
+        place = (take(table, number), along("pixels", level), 0.1)
+        extra = {name: getattr(pixels, name) for name in names}
+        return Polar(pixels.distance, take(table, number), along("pixels", level), origin=place, intensity=pixels.reflectivity, extra=extra)
+
+    return dataclasses.replace(SENSOR, frames={"data": Frame(struct, data=True)}, points=points, clock=None, sequence=None, simulation=None)
+
+
+@pytest.mark.parametrize("backend", ["numpy", pytest.param("jit", marks=COMPILED)])
+@pytest.mark.parametrize("sensor", [words(), SENSOR, SHAPES["shape-segments"], SHAPES["shape-bits"]], ids=lambda sensor: sensor.id)
+def test_columns_that_are_read_together_are_those_that_are_read_one_by_one(sensor: Sensor, backend: str) -> None:
+    read = sensor.decode([sensor.example(sensor.data_frame, seed=seed) for seed in range(30)], backend=backend).with_points
+    plain = evaluate(read).cloud
+    names = [*plain.columns, "valid"]
+    for which in (slice(None), slice(len(plain) // 2), slice(5, len(plain) - 5)):
+        cloud = read.points()[which]
+        assert list(cloud.read(*names)) == names
+        assert_same_points(cloud, plain[which], ulps=6)
+    one = read.points()
+    assert all(column is one.read(*names)[name] for name, column in one.read(*names).items())
+
+
+def test_what_is_asked_for_by_a_wrong_name_is_said() -> None:
+    cloud = packets().points()
+    with pytest.raises(UnknownName, match="unknown name 'velocty'; did you mean 'velocity'"):
+        cloud.read("x", "velocty")
+    with pytest.raises(UnknownName, match="column"):
+        dataclasses.replace(cloud[[0, 1]], intensity=None).read("intensity")
+
+
+def test_asking_whether_there_is_a_column_makes_none() -> None:
+    cloud = packets().points()
+    assert isinstance(cloud, LazyCloud)
+    assert "velocity" in cloud.extra
+    assert "speed" not in cloud.extra
+    assert not any(cloud.source.holds(name) for name in cloud.extra)
+
+
+def test_directions_and_places_that_are_looked_up_are_multiplied_in_their_tables() -> None:
+    read = words().decode([words().example("data", seed=seed) for seed in range(3)])
+    plan = plan_for(read.sensor.points_of("data"), read.batch(), read.table.groups[0])  # type: ignore[attr-defined]
+    assert isinstance(plan, Plan)
+    steps = describe(plan)
+    assert sum("rows of a table of 80 x 8" in step for step in steps) == 3  # of x, of y, and where x begins
+    assert not any("the same in every packet" in step for step in steps[: next(at for at, step in enumerate(steps) if "-> x" in step)])

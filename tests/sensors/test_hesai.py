@@ -525,3 +525,21 @@ def test_a_scan_of_an_at128_is_what_one_face_of_the_mirror_sees() -> None:
     assert [(len(scan), scan.complete) for scan in scans[:2]] == [(600 * 256, False), (600 * 256, True)]
     assert np.rad2deg(scans[1].points.azimuth).min() == pytest.approx(-62.3, abs=0.1)
     assert scans[1].points.x.min() > 0
+
+
+def test_a_jt16_is_read_from_its_line_and_a_broken_byte_costs_one_packet(tmp_path: Path) -> None:
+    """Packets of 80 bytes and samples of 34 in one stream; the CRC of those is over two zeros more."""
+    sensor = ls.sensor("hesai-jt16")
+    own = json.loads((Path(at128.__file__).parent / "vectors.json").read_text(encoding="utf-8"))
+    data, felt = (bytes.fromhex(vector["hex"]) for vector in own if vector.get("sensor") == "hesai-jt16")
+    broken = felt[:20] + bytes([felt[20] ^ 1]) + felt[21:]
+    packets = decoded(sensor, data + felt + broken + b"\xee\xff" + data)
+    assert (len(data), len(felt), dict(packets.stats.frames)) == (80, 34, {"data": 2, "imu": 1})
+    assert packets.stats.bad_checksum == 1
+    assert packets.points().nominal
+    moment = datetime.datetime(2024, 1, 2, 3, 4, 5, 123456, datetime.UTC)
+    assert packets.time_ns[0] == int(moment.timestamp()) * 10**9 + 123_456_000
+    file = angles(tmp_path / "own.csv", 16, rows="".join(f"{i},{2 * i},{180 + i}\n" for i in range(1, 17)))
+    cloud = sensor.configure(calibration=file).decode(data).points()
+    assert np.rad2deg((cloud.elevation[15], cloud.azimuth[15])).tolist() == pytest.approx([32, 84])
+    assert [len(scan) for scan in sensor.scans(b"".join(simulate(sensor, 1300))) if scan.complete] == [9600]

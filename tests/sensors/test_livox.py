@@ -159,10 +159,22 @@ def test_what_it_broadcasts_names_the_model(name: str) -> None:
     assert [one.sensor.id for one in found.alike] == [name]
 
 
-@pytest.mark.parametrize("name", [MID360.id, MID40.id])
+@pytest.mark.parametrize("name", [MID360.id, HAP.id, MID40.id])
 def test_a_simulated_one_is_opened_started_and_read(name: str) -> None:
     with ls.open(f"sim:{name}") as device:
         scan = device.latest(timeout=30)
         assert len(scan.points)
+        told = {
+            "serial": "SIMULATED",
+            "model": {MID360.id: "MID-360"}.get(name, "HAP"),
+            "firmware": "13.18.2.40",
+            "temperature": "41.5 degC",
+        }
+        if name == MID40.id:
+            told = {"serial": "0TFSIMULATED001", "model": "Mid-40", "firmware": "4.11.0.6"}
+        assert device.info == told
         reply = device.send("set_detect_mode", timeout=30, number=1) if name != MID40.id else device.send("get_information", timeout=30)
         assert reply.confirmed
+        if name != MID40.id:
+            assert device.send("get", timeout=30, key=0).confirmed
+            assert device.info == told, "an answer that leaves it out takes nothing back"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ import pytest
 import lidarspec as ls
 from lidarspec.discovery.detect import verdict
 from lidarspec.discovery.listen import Heard
+from lidarspec.errors import CommandError
 from tests.sensors.evidence import capture, decoded, vector_bytes, vectors
 
 TIM871S, TIM551 = ls.sensor("sick-tim871s"), ls.sensor("sick-tim551")
@@ -61,6 +63,19 @@ def test_a_telegram_without_strengths_beside_one_that_has_them() -> None:
     np.testing.assert_array_equal(cloud.range[271:], cloud.range[:271])
 
 
+@pytest.mark.parametrize("cola", ["A", "B"])
+def test_a_refusal_is_told_at_once_and_in_words(cola: str) -> None:
+    sensor = TIM551.configure(cola=cola)
+    if cola == "A":
+        assert sensor.parse(b"\x02sFA 3\x03", "refused").error == "variable_unknown"
+    refused = (("refused", {"error": 4}),)
+    sensor = replace(sensor, simulation=replace(sensor.simulation, answers={**sensor.simulation.answers, "set_range": refused}))
+    with ls.open("sim:", sensor) as device:
+        with pytest.raises(CommandError, match=r"set_range: the sensor refuses it: error value_not_allowed \(4\)$"):
+            device.send("set_range", timeout=60, step=0.5, start=0, stop=90)
+        assert device.send("get_state", timeout=60).confirmed
+
+
 def test_every_telegram_of_a_multiscan_is_read() -> None:
     data = telegrams()
     packets = MULTISCAN.decode(data)
@@ -68,6 +83,15 @@ def test_every_telegram_of_a_multiscan_is_read() -> None:
     assert (dict(packets.stats.frames), len(cloud)) == ({"scan": 66, "imu": 28}, 59_400)
     assert [len(scan) for scan in MULTISCAN.scans(data) if scan.complete] == [10_800] * 5
     assert 9.5 < np.median(np.linalg.norm(MULTISCAN.decode(data, "imu").imu().linear_acceleration, axis=1)) < 10.1
+
+
+def test_what_the_imu_of_a_multiscan_felt_is_that_published() -> None:
+    expected = vectors("vectors_udp3d.json")["sick_imu"]["expected"]
+    packets = MULTISCAN.decode([vector_bytes("vectors_udp3d.json", "sick_imu")], "imu")
+    samples, orientation = packets.imu(), [packets[f"orientation_{axis}"][0] for axis in "wxyz"]
+    assert samples.linear_acceleration[0].tolist() == pytest.approx(expected["acc"])
+    assert samples.angular_velocity[0].tolist() == pytest.approx([0.01, 0.02, 0.03])
+    assert (orientation, packets.time_ns.tolist()) == (expected["quat_wxyz"], [expected["ts_us"] * 1000])
 
 
 @pytest.mark.parametrize("name", ["sick_compact_estmultiscan2layerscompactv4", "sick_compact_unittestcompactv4"])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pickle
 import struct
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -394,3 +395,42 @@ def test_dual_return_of_an_hdl64e_has_four_blocks_of_one_azimuth() -> None:
     assert cloud.return_index is not None
     assert cloud.return_index[::32].tolist() == [0, 0, 1, 1] * 3
     np.testing.assert_allclose(cloud.time[::128], np.arange(3) * 57.6e-6, atol=1e-12)
+
+
+def db_xml(path: Path, lasers: int = 64, **values: str) -> Path:
+    """The calibration file of a unit whose lasers differ by their number; degrees and centimetres."""
+    names = ("rotCorrection_", "vertCorrection_", "distCorrection_", "vertOffsetCorrection_", "horizOffsetCorrection_")
+    items = "".join(
+        f"<item><px><id_>{laser}</id_>"
+        + "".join(f"<{name}>{values.get(name, laser * step)}</{name}>" for name, step in zip(names, (0.1, -0.2, 2, 0.3, 0.05), strict=True))
+        + "</px></item>"
+        for laser in range(lasers)
+    )
+    head = "<?xml version='1.0'?><!DOCTYPE boost_serialization><boost_serialization><DB><distLSB_>0.2</distLSB_>"
+    path.write_text(f"{head}<points_><count>{lasers}</count>{items}</points_></DB></boost_serialization>")
+    return path
+
+
+def test_an_hdl64e_has_the_corrections_of_its_file(tmp_path: Path) -> None:
+    """Laser 34 (id 33): 3.3 degrees to the left, -6.6 up, 0.66 m farther, 9.9 cm up and 1.65 cm to the left across its beam."""
+    sensor = ls.sensor("velodyne-hdl64e-s2").configure(calibration=db_xml(tmp_path / "db.xml"))
+    data = packet(steps(0, 20, each=2), {(1, 1): (2000, 9)}, flags=[b"\xff\xee", b"\xff\xdd"] * 6)
+    cloud = decoded(sensor, [data]).points()
+    assert not cloud.nominal
+    assert ls.sensor("velodyne-hdl64e-s2").decode([data]).points().nominal
+    assert cloud.range[33] == pytest.approx(4.66)
+    # 1.26 us after the shot A = 0.005 - 3.3 = -3.295: cos .998347, sin -.057473; cosE .993373, sinE -.114937
+    #   out = 4.66 * .993373 + .099 * .114937 = 4.64050; x = 4.63283 - .0165 * .057473 = 4.63188; y = .26670 + .0165 * .998347 = .28318
+    #   z = -4.66 * .114937 + .099 * .993373 = -.43726
+    assert_points(cloud, [(33, (4.63188, 0.28318, -0.43726))], atol=5e-5)
+
+
+def test_a_file_that_is_none_of_an_hdl64e_is_refused(tmp_path: Path) -> None:
+    sensor, text = ls.sensor("velodyne-hdl64e-s3"), tmp_path / "text.xml"
+    text.write_text("lasers: 64")
+    with pytest.raises(ls.UsageError, match=r"text\.xml: not the calibration of an HDL-64E \(db\.xml\): syntax error"):
+        sensor.configure(calibration=text)
+    with pytest.raises(ls.UsageError, match="lists 32 lasers of 32, and an HDL-64E has 0 to 63, each once"):
+        sensor.configure(calibration=db_xml(tmp_path / "vlp32.xml", 32))
+    with pytest.raises(ls.UsageError, match="rotCorrection_ of a laser is 'nan'"):
+        sensor.configure(calibration=db_xml(tmp_path / "nan.xml", rotCorrection_="nan"))

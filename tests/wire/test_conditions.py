@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -29,7 +30,7 @@ from construct import (
 
 from lidarspec import UsageError, WireError
 from lidarspec.framing.frame_engine import CompiledCodec, InterpretedCodec, codec
-from lidarspec.spec import Parts
+from lidarspec.spec import Frame, Parts, Simulation
 from tests.engine.against_construct import BACKENDS, agree, sensor
 
 ANY = [bytes([first, second, third]) for first in range(0, 256, 5) for second in (0, 1, 2, 9, 128, 255) for third in (0, 3, 200)]
@@ -69,6 +70,12 @@ def test_what_is_not_allowed_is_counted_shown_and_not_built(backend: str) -> Non
     for values in (dict(a=3, b=1), dict(a=1, b=9)):
         with pytest.raises(UsageError, match=r"a: expected 1, 2, got 3|ok: check failed"):
             ours.build("data", **values)
+
+
+def test_an_example_along_the_sweep_has_values_that_are_allowed() -> None:
+    frame = Frame(Struct("a" / OneOf(Int32ub, [7, 9]), "b" / Int32ub), data=True, plausible=lambda f: f.b == 1000)
+    ours = replace(sensor(frame.struct), frames={"data": frame}, simulation=Simulation(lambda i: {"b": 1000}))
+    assert {ours.parse(ours.example("data", seed=seed)).a for seed in range(20)} == {7, 9}
 
 
 def test_a_mapping_is_names_of_all_values_that_there_are() -> None:

@@ -24,6 +24,8 @@ PLACES = types.Array(types.int64, 1, "C", readonly=True)
 WORDS = types.Array(types.uint16, 1, "C", readonly=True)
 MADE_SINGLES = types.Array(types.float32, 1, "C")
 MADE_PLACES = types.Array(types.int64, 1, "C")
+#: columns of whole numbers, by the name of their type.
+MADE = {f"{sign}int{bits}": types.Array(getattr(types, f"{sign}int{bits}"), 1, "C") for sign in ("", "u") for bits in (8, 16, 32)}
 INTEGER = types.int64
 
 #: added to a float64 and taken off again, it leaves a whole number, whose lowest bit is the sum's.
@@ -70,6 +72,32 @@ def word_at(context, array, index):
         return builder.call(builder.module.declare_intrinsic("llvm.bswap", [ir.IntType(64)]), [word]) if _IS_BIG else word
 
     return types.int64(array, types.int64), make
+
+
+@intrinsic
+def four_at(context, array, index):
+    """Four bytes from an index on, the first one lowest."""
+
+    def make(target, builder, signature, args):
+        held = target.make_array(signature.args[0])(target, builder, args[0])
+        place = cgutils.gep_inbounds(builder, held.data, args[1])
+        word = builder.load(builder.bitcast(place, ir.IntType(32).as_pointer()), align=1)
+        return builder.call(builder.module.declare_intrinsic("llvm.bswap", [ir.IntType(32)]), [word]) if _IS_BIG else word
+
+    return types.uint32(array, types.int64), make
+
+
+@intrinsic
+def apart(context):
+    """Say of the arrays that the kernel is called with that none is a part of another, so that several points are computed at a time."""
+
+    def make(target, builder, signature, args):
+        for argument in builder.function.args[2:]:
+            if isinstance(argument.type, ir.PointerType):
+                argument.add_attribute("noalias")
+        return target.get_dummy_value()
+
+    return types.void(), make
 
 
 def _float_at(bits, kind):

@@ -72,7 +72,7 @@ class Kernel(Maker):
         self._function = self._function or function_of(self._text.source)
 
     def columns(self, number: int) -> dict[str, NDArray[Any]]:
-        return {name: np.empty(number * self._width, np.float32) for name in self._text.names}
+        return {name: np.empty(number * self._width, dtype) for name, dtype in self._text.columns.items()}
 
     def run(self, rows: Bytes2D, values: Values, columns: Mapping[str, NDArray[Any]]) -> None:
         self.compile()
@@ -80,7 +80,7 @@ class Kernel(Maker):
         given: list[Any] = []
         for node in self._text.wanted.nodes:
             given += _flat(values(node), node.shape)
-        rest = (self._numbers, *self._text.wanted.arrays, *given, *(columns[name] for name in self._text.names))
+        rest = (self._numbers, *self._text.wanted.arrays, *given, *(columns[name] for name in self._text.columns))
         data = span(rows)
         self._shared(count, lambda first, number: self._function(data, stride, first, number, *rest))
 

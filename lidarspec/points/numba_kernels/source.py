@@ -15,7 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from lidarspec.columns.graph import FACTORS, Node, is_full, last_axis, only_field, traverse
+from lidarspec.columns.graph import FACTORS, Node, is_full, is_nan_where, last_axis, only_field, traverse
+from lidarspec.points.conventions import returned_range
 from lidarspec.points.numba_kernels.writer import TEMPLATES, Value, Wanted, Writer, is_cheap, line
 from lidarspec.points.plan import Plan
 from lidarspec.points.windows import every_value, is_number, possible, window
@@ -146,6 +147,9 @@ class Expressions(Writer):
         found = self._of_field(node, exact=exact)
         if found is not None:
             return found
+        found = None if exact else self._marked(node)
+        if found is not None:
+            return found
         if is_full(node, self.width) and node.kind == "call" and not exact:
             if node.function is np.multiply or (root and node.function in (np.add, np.subtract)):
                 sign = {np.multiply: "*", np.add: "+", np.subtract: "-"}[node.function]
@@ -156,6 +160,26 @@ class Expressions(Writer):
             return self._row(node, "float32")
         made = self.double(node)
         return self.let(made.level, f"np.float32({made.text if not exact else f'number({made.text})'})")
+
+    def _marked(self, node: Node) -> Value | None:
+        """A distance in float32, nan where nothing came back or a condition says so; None for what is none, or has to be float64 first."""
+        if not is_full(node, self.width):
+            return None
+        if node.kind == "field":
+            leaf = self.layout.leaves.get(node.path)
+            is_short = leaf is not None and leaf.info.kind == "int" and leaf.info.bits < 32 and not leaf.info.offset
+            raw = self.raw(leaf) if leaf is not None and is_short else None
+            scale = f" * np.float32({float(leaf.info.scale)!r})" if leaf is not None and leaf.info.scaled else ""
+            return None if raw is None else self.let(self.inner, f"np.float32(np.int32({raw.text})){scale}")
+        if node.kind != "call" or not isinstance(node.args[-1], Node):
+            return None
+        if node.function is not returned_range and not is_nan_where(node):
+            return None
+        made = self.once(("marked", node.args[-1]), lambda: self._marked(node.args[-1]))
+        if made is None or node.function is returned_range:
+            return None if made is None else self.let(self.inner, f"{made.text} if np.float32(0) < {made.text} else np.float32(nan)")
+        flag = self.double(node.args[0], len(node.shape))
+        return self.let(self.inner, f"np.float32(nan) if {flag.text} else {made.text}")
 
     def combined(self, sign: str, first: Any, second: Any) -> Any:
         """A product or sum; in the loops where both parts are there."""
@@ -239,8 +263,8 @@ import numpy as np
 
 from lidarspec.points.numba_kernels.arithmetic import (
     BYTES, DOUBLES, INTEGER, MADE_PLACES, MADE_SINGLES, PLACES, SINGLES, WORDS,
-    at, byte_at, compiled, cos_sin, float4_big, float4_little, float8_big, float8_little, larger, looked_up, modulo, narrowed, number, put,
-    returned, row_at, smaller, word_at,
+    MADE, apart, at, byte_at, compiled, cos_sin, float4_big, float4_little, float8_big, float8_little, four_at, larger, looked_up,
+    modulo, narrowed, number, put, returned, row_at, smaller, word_at,
 )
 
 nan, inf = np.nan, np.inf
@@ -258,12 +282,12 @@ class Text:
     Attributes:
         source: of a module with the function `kernel`.
         wanted: what it is called with.
-        names: of the columns it makes, float32 all of them.
+        columns: that it makes, by name, and their types.
     """
 
     source: str
     wanted: Wanted
-    names: tuple[str, ...]
+    columns: Mapping[str, np.dtype[Any]]
 
 
 class Assembly:
@@ -325,7 +349,8 @@ def written(plan: Plan, names: tuple[str, ...], varying: Set[str]) -> Text:
     writer = Expressions(plan.layout, plan.shape, plan.tables, varying)
     assembly = Assembly(writer)
     writer.both = _both(expressions.values())
-    made = {name: _made(writer, name, value, exact=plan.is_exact(name)) for name, value in expressions.items()}
+    made = {name: _made(writer, plan, name, value) for name, value in expressions.items()}
+    columns = {name: plan.extra[name].dtype if name in plan.sent else np.dtype(np.float32) for name in made}
     directed = [] if plan.exact else [*plan.directed, *(plan.parts[name] for name in ("ox", "oy", "oz"))]
     places = {}
     if not all(is_number(value, plan.layout.leaves) for value in directed):  # where one coordinate is nan, all are
@@ -336,7 +361,7 @@ def written(plan: Plan, names: tuple[str, ...], varying: Set[str]) -> Text:
         if name not in places:
             assembly.column(name, value)
     turns = assembly.turns()
-    return Text(HEAD + _function(writer, assembly, turns, tuple(made)), writer.wanted, tuple(made))
+    return Text(HEAD + _function(writer, assembly, turns, columns), writer.wanted, columns)
 
 
 def _both(expressions: Iterable[Any]) -> set[Node]:
@@ -346,14 +371,18 @@ def _both(expressions: Iterable[Any]) -> set[Node]:
     return {node for node in cosines & sines if isinstance(node, Node)}
 
 
-def _made(writer: Expressions, name: str, value: Any, *, exact: bool) -> Any:
+def _made(writer: Expressions, plan: Plan, name: str, value: Any) -> Any:
+    exact, raw = plan.is_exact(name), writer.raw(plan.sent[name]) if name in plan.sent else None
+    if name in plan.sent:
+        made = raw or writer.double(value, len(writer.shape))
+        return writer.let(made.level, f"np.{plan.extra[name].dtype}({made.text})")
     if name == "azimuth" or (exact and name != "intensity"):
         made = writer.double(value, len(writer.shape))
         return writer.let(made.level, f"{'narrowed' if name == 'azimuth' else 'np.float32'}({made.text})")
     return writer.single(value, exact=name == "intensity", root=True)
 
 
-def _function(writer: Writer, assembly: Assembly, turns: list[str], names: tuple[str, ...]) -> str:
+def _function(writer: Writer, assembly: Assembly, turns: list[str], columns: Mapping[str, np.dtype[Any]]) -> str:
     """The signature and the loops."""
     width = writer.number(writer.width)
     held = writer.number(max(CHUNK // writer.width, 1)) if turns else "count"
@@ -363,9 +392,9 @@ def _function(writer: Writer, assembly: Assembly, turns: list[str], names: tuple
     parameters += [(f"c{index}", _TYPES[array.dtype.name]) for index, array in enumerate(wanted.arrays)]
     for index in range(len(wanted.nodes)):
         parameters += [(f"g{index}", "DOUBLES"), (f"s{index}", "INTEGER")]
-    parameters += [(f"out_{name}", "MADE_SINGLES") for name in names]
+    parameters += [(f"out_{name}", "MADE_SINGLES" if dtype.kind == "f" else f"MADE['{dtype}']") for name, dtype in columns.items()]
     arguments, types = ", ".join(name for name, _ in parameters), ", ".join(kind for _, kind in parameters)
-    body = [f"n{index} = at(numbers, {index})" for index in range(len(wanted.numbers))]
+    body = ["apart()"] + [f"n{index} = at(numbers, {index})" for index in range(len(wanted.numbers))]
     body += [f"step = {held}", f"held = step * {width}", *assembly.scratch, *writer.lines[0]]
     body += [
         "for begin in range(first, first + count, step):",

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from lidarspec.columns.graph import FACTORS, Node, key, last_axis, traverse
 from lidarspec.points.conventions import returned_range
-from lidarspec.points.windows import CHEAP, every_value, raw_values, window
+from lidarspec.points.windows import CHEAP, every_value, raw_values, window, word_of
 from lidarspec.spec.bits import whole_bytes
 from lidarspec.wire.layout import Layout, Leaf
 
@@ -234,6 +234,12 @@ class Writer:
         return self._known[leaf.info.path]  # type: ignore[no-any-return]
 
     def _integer(self, leaf: Leaf) -> Value | None:
+        word = None if self.varying else word_of(leaf, self.layout)
+        if word is not None:
+            place, shift, mask = word
+            four = self._read(leaf, place, "four_at").text
+            kind = "int32" if mask >> 31 == 0 else "int64"
+            return self.let(1 + last_axis(leaf.shape), f"np.{kind}({four}{f' >> np.uint32({shift})' if shift else ''} & np.uint32({mask}))")
         text = integer(leaf, lambda offset: self.byte(leaf, offset).text)
         return None if text is None else self.let(1 + last_axis(leaf.shape), text)
 

@@ -15,6 +15,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
+from lidarspec.columns.graph import traverse
 from lidarspec.points.numpy_plan.compiler import Compiler
 from lidarspec.points.plan import Maker, Plan
 
@@ -28,7 +29,13 @@ def compile(plan: Plan, names: tuple[str, ...]) -> Maker:
 
 def _compiled(plan: Plan, names: tuple[str, ...], tables: dict[Any, NDArray[Any]]) -> Compiler:
     compiler = Compiler(plan, tables)
+    if plan.sent.keys() & set(names):
+        read = {node.path: None for node in traverse(*(plan.expressions[name] for name in names)) if node.kind == "field"}
+        compiler.share(plan.layout.leaves[path] for path in read if path in plan.layout.leaves)
     for name in names:
+        if name in plan.sent:
+            compiler.want_sent(name, plan.sent[name])
+            continue
         kind = "double" if name == "azimuth" else "single"
         compiler.want(name, plan.expressions[name], kind, exact=plan.is_exact(name))
     return compiler

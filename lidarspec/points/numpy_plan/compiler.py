@@ -8,20 +8,21 @@ full, angles reduced to half a turn before they become float32. Everything else 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Iterable
 from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.columns.graph import Node, Term, chosen, is_full, key, last_axis, only_field
+from lidarspec.columns.graph import Node, Term, chosen, is_full, is_nan_where, key, last_axis, only_field
 from lidarspec.points.conventions import returned_range
 from lidarspec.points.numpy_plan import products
 from lidarspec.points.numpy_plan.blocks import Blocks
 from lidarspec.points.numpy_plan.program import Program, Read, Run
 from lidarspec.points.numpy_plan.registers import TYPES
 from lidarspec.points.plan import Plan
-from lidarspec.points.windows import CHEAP, Window, every_value, shift_of, window
+from lidarspec.points.windows import CHEAP, Window, every_value, run_of, shift_of, window, word_of
 from lidarspec.spec.tree import FieldInfo
 from lidarspec.spec.vocabulary import row_numbers
 from lidarspec.wire.arrays import deep
@@ -48,7 +49,7 @@ class Compiler:
         self.program, self.low = Program(plan.width, plan.safe), list[Node]()
         self._layout, self._shape, self._width, self._tables = plan.layout, plan.shape, plan.width, tables
         self._known: dict[Any, Any] = {}
-        self._exact = False
+        self._exact, self._shared = False, set[int]()
 
     def want(self, name: str, value: Any, kind: str, *, exact: bool = False) -> None:
         """Make a column of this name.
@@ -59,6 +60,30 @@ class Compiler:
         """
         self._exact = exact
         self.program.outputs[name] = self._single(value) if kind == "single" else self._double(value)
+
+    def want_sent(self, name: str, leaf: Leaf) -> None:
+        """Make a column of whole numbers of a field, as they were sent."""
+        assert leaf.info.dtype is not None
+        kind = f"{leaf.info.dtype.kind}{leaf.info.dtype.itemsize}"
+        register = self._cut_out(leaf, kind) if leaf.wire is None or self._is_shared(leaf) else None
+        if register is None and leaf.wire is not None:
+            register = self._load(leaf, Window(leaf.offset, leaf.size), leaf.wire, kind)
+        if register is None:
+            register = self.program.step(
+                f"{leaf.info.path} as it was sent",
+                kind,
+                lambda run, out: np.copyto(out.reshape(-1, *leaf.shape), leaf.load(run.rows[run.start : run.stop])),
+            )
+        self.program.outputs[name] = register
+
+    def share(self, leaves: Iterable[Leaf]) -> None:
+        """Load words once that several of these fields stand in, each to be cut out of its word."""
+        words = Counter(word[0] for leaf in leaves if (word := word_of(leaf, self._layout)) is not None)
+        self._shared = {word for word, count in words.items() if count > 1}
+
+    def _is_shared(self, leaf: Leaf) -> bool:
+        word = word_of(leaf, self._layout)
+        return word is not None and word[0] in self._shared
 
     def _once(self, name: Any, make: Callable[[], _Made]) -> _Made:
         """What was made under this name: a register, or what says how to make one."""
@@ -115,10 +140,8 @@ class Compiler:
             return None
         if node.function is returned_range:
             return self._returned(value, kind, None)
-        condition, first, *_ = (*node.args, None)
-        if node.function is not np.where or isinstance(first, Node) or np.size(first) > 1 or not np.isnan(first).all():
-            return None
-        if not isinstance(condition, Node) or condition.sample.array.dtype.kind != "b":
+        condition = node.args[0]
+        if not is_nan_where(node) or not isinstance(condition, Node) or condition.sample.array.dtype.kind != "b":
             return None
         if value.function is returned_range and not is_full(condition, self._width):
             return self._returned(value.args[0], kind, condition)
@@ -188,6 +211,8 @@ class Compiler:
             return None
         shift = self._shift(leaf, seen)
         if node is source and factor == 1 and not leaf.info.scaled:
+            if self._is_shared(leaf) and (register := self._cut_out(leaf, kind)) is not None:
+                return register
             if shift == (0, (1 << 8 * seen.size) - 1):
                 return self._load(leaf, seen, seen.dtype, kind)
             if shift is not None:
@@ -215,17 +240,21 @@ class Compiler:
 
     def _cut_out(self, leaf: Leaf, kind: str) -> int | None:
         """A field of bits that stand in a row in four bytes, cut out of these; None where they do not, or it has to be float64 first."""
-        run = None if len(leaf.elements) != 1 or leaf.elements[0].signed else leaf.elements[0].run
-        if run is None or len(leaf.shape) > len(leaf.strides) or run[2] > 4 or (kind == "single" and not self._is_short(leaf)):
+        if kind == "single" and not self._is_short(leaf):
+            return None
+        word = word_of(leaf, self._layout)
+        if word is not None and word[0] in self._shared:
+            return self._shifted(leaf, Window(word[0], 4), *word[1:], kind)
+        run = run_of(leaf)
+        if run is None:
             return None
         order, first, count, lowest = run
-        first += leaf.offset
         last = self._layout.size - sum((length - 1) * stride for length, stride in zip(leaf.shape, leaf.strides, strict=True)) - 4
         blocks = self._blocks(leaf, Window(first, count))
         for start in (first, first + count - 4):
             if 0 <= start <= last and blocks.holds(Window(start, 4)):
                 shift = lowest + 8 * (first - start if order == "<" else start + 4 - first - count)
-                mask = (1 << leaf.elements[0].width) - 1
+                mask = (1 << leaf.info.bits) - 1
                 return self._shifted(leaf, Window(start, 4), shift, mask, kind, np.dtype(f"{order}u4"))
         return None
 
@@ -262,7 +291,8 @@ class Compiler:
         """Some bits of a window of every element, in its unit; `dtype`: of the window's word, where that is not little-endian."""
         words, dtype = f"u{seen.size}", dtype or seen.dtype
         word = Read(self._once((dtype, seen), lambda: self._load(leaf, seen, dtype, words)))
-        read = Read(self._cut(leaf, seen, shift, mask, word))
+        is_whole = kind in TYPES and TYPES[kind].kind in "iu" and mask == (1 << 8 * TYPES[kind].itemsize) - 1  # which leaves off the rest
+        read = Read(self._cut(leaf, seen, shift, (1 << 8 * seen.size) - 1 >> shift if is_whole else mask, word))
         quick = np.dtype(f"i{seen.size}" if mask >> 8 * seen.size - 1 == 0 else words)  # signed ones become floats several at a time
 
         def run(execution: Run, out: NDArray[Any]) -> None:
@@ -275,11 +305,13 @@ class Compiler:
     def _cut(self, leaf: Leaf, seen: Window, shift: int, mask: int, word: Read) -> int:
         """Some bits of words, as words."""
         is_masked = mask < (1 << 8 * seen.size) - 1 >> shift
+        if not is_masked and not shift:
+            return word.register
 
         def run(execution: Run, out: NDArray[Any]) -> None:
-            np.right_shift(word(execution), shift, out=out)
+            bits = np.right_shift(word(execution), shift, out=out) if shift else word(execution)
             if is_masked:
-                np.bitwise_and(out, mask, out=out)
+                np.bitwise_and(bits, mask, out=out)
 
         text = f"{leaf.info.path}: {mask.bit_length()} bits from bit {shift} on"
         return self.program.step(text, self.program.kinds[word.register], run, word)
@@ -357,12 +389,13 @@ class Compiler:
         register, place = len(self.program.kinds), ("rows", index, number)
 
         def run(execution: Run, out: NDArray[Any]) -> None:
-            known = execution.prepared.get(place)
-            if known is None or known[0] != execution.start:
-                known = execution.prepared[place] = execution.start, *_in_a_row(_numbers(execution, index, number), number)
-            _, numbers, first = known
+            if place not in execution.prepared:
+                execution.prepared[place] = _numbers(execution, index, number)
+            every, breaks = execution.prepared[place]
+            each = _rows(execution, every[None])
+            numbers, first = every[each], int(every[each.start])
             last = first + len(numbers)
-            if first >= 0 and last < len(rows):  # they are looked at where they are
+            if first < number and last < len(rows) and not breaks[each.start : each.stop - 1].any():  # they are looked at where they are
                 execution.views[register] = rows[first:last].reshape(-1)
             else:
                 rows[(times - 1) * number :].take(numbers, axis=0, out=out.reshape(-1, inner), mode="clip")
@@ -532,16 +565,14 @@ def _rows(run: Run, numbers: NDArray[Any]) -> slice:
     return slice(run.start * each, run.stop * each)
 
 
-def _numbers(run: Run, index: Node, rows: int) -> NDArray[np.intp]:
-    """The rows of a table of so many, for the packets or blocks of the chunk, (k,)."""
-    numbers = row_numbers(run.part(run.values(index)), rows + 1)
-    return np.broadcast_to(numbers, (run.stop - run.start, *index.shape)).reshape(-1)
+def _numbers(run: Run, index: Node, rows: int) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
+    """The rows of a table of so many, for all packets or blocks, (k,); and after which of them another than the next one comes.
 
-
-def _in_a_row(numbers: NDArray[np.intp], turn: int) -> tuple[NDArray[np.intp], int]:
-    """Numbers, and the first of them if they follow one another, 0 after the last of a turn; -1 if they do not."""
-    first = int(numbers[0])
-    return numbers, first if (numbers == np.arange(first, first + len(numbers)) % turn).all() else -1
+    After the last one comes the first; the row of nan behind them is nobody's next.
+    """
+    numbers = np.broadcast_to(row_numbers(run.values(index), rows + 1), (len(run.rows), *index.shape)).reshape(-1)
+    step = numbers[1:] - numbers[:-1]
+    return numbers, (step != 1) & (step != 1 - rows) | (numbers[1:] == rows)
 
 
 def _shared_by(angles: products.Angles, run: Run) -> NDArray[np.float32]:

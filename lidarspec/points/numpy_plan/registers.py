@@ -75,7 +75,13 @@ def given_back(scratch: Scratch) -> None:
         _KEPT.append(scratch)
 
 
-_CODES = {"single": "f4", "double": "f8", "index": "intp", "flag": "?", "u1": "u1", "u2": "u2", "u4": "u4"}
+_CODES = {
+    "single": "f4",
+    "double": "f8",
+    "index": "intp",
+    "flag": "?",
+    **{f"{sign}{size}": f"{sign}{size}" for sign in "iu" for size in (1, 2, 4)},
+}
 TYPES: dict[str, np.dtype[Any]] = {kind: np.dtype(code) for kind, code in _CODES.items()}
 
 

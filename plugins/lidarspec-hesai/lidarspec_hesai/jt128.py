@@ -90,6 +90,6 @@ JT128 = spinning(
     aliases=("jt128",),
     relatives=relatives("hesai-jt128"),
     status="manual",
-    acknowledged={"LS711": UNSEEN, "LS416": "headers of random blocks and channels each make a layout of their own"},
+    acknowledged={"LS711": UNSEEN},
     source=f"HesaiLidar_SDK_2.0 (udp_protocol_v1_4.h, JT128 correction files); {UNSEEN}",
 )

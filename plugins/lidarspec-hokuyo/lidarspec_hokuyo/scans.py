@@ -12,7 +12,7 @@ from functools import cache, partial
 from typing import Any
 
 import numpy as np
-from construct import Array, Const, Int8ub, Int16ub, Int24ub, Int32ub, Struct, this
+from construct import Array, Const, Int8ub, Int16ub, Int24ub, Int32ub, OneOf, Struct, this
 
 from lidarspec.spec import Fields, Frame, Lines, Polar, Scaled, Scip, SixBits, steps
 
@@ -64,9 +64,12 @@ class Asked:
         return f"{self.first:04}{self.last:04}{self.cluster:02}".encode()
 
 
-def decimal(name: str, places: int) -> Any:
-    """A number of so many decimal digits."""
-    return name / Struct(*(place / Scaled(Int8ub, 1, "") for place in DIGITS[places]))
+def decimal(name: str, places: int, most: int = 9999) -> Any:
+    """A number of so many decimal digits, the first of them no larger than that of the largest number."""
+    first = most // 10 ** (places - 1) if places == 4 else 9
+    largest = (first, *[9] * (places - 1))
+    digits = zip(DIGITS[places], largest, strict=True)
+    return name / Struct(*(place / Scaled(OneOf(Int8ub, range(high + 1)), 1, "") for place, high in digits))
 
 
 def number(digits: Any) -> Any:
@@ -95,12 +98,8 @@ def count(f: Any) -> Any:
 
 
 def plausible(f: Fields, end: int) -> Any:
-    """All digits are digits, and the steps those of the scanner."""
-    held = (number(f.last) <= end) & (number(f.first) <= number(f.last))
-    for places, name in ((4, "first"), (4, "last"), (2, "cluster")):
-        for place in DIGITS[places]:
-            held = held & (getattr(getattr(f, name), place) <= 9)
-    return held
+    """The steps are those of the scanner."""
+    return (number(f.last) <= end) & (number(f.first) <= number(f.last))
 
 
 def points(f: Fields, geometry: Geometry) -> Polar:
@@ -122,24 +121,21 @@ def scan(command: str, geometry: Geometry) -> Frame:
     rest = ("skip" / Int8ub * "turns left out between scans", decimal("left", 2) * "scans to come; 0: on and on") if goes_on else ()
     struct = Struct(
         "command" / Const(command.encode()),
-        decimal("first", 4) * "step",
-        decimal("last", 4) * "step",
+        decimal("first", 4, geometry.end) * "step",
+        decimal("last", 4, geometry.end) * "step",
         decimal("cluster", 2) * "steps that come as one distance",
         *rest,
         "status" / Const(b"99" if goes_on else b"00"),
         "time" / Scaled(Int32ub, 0.001, "s") * "when the turn was at step 0; 24 bits",
         "points" / Array(count(this), FIELDS[command[1]]),
     )
-    acknowledged = {"LS508": "two characters end at 4.1 m: configure(content='short') looks no farther"} if command[1] == "S" else {}
-    if geometry.end < 1000:
-        acknowledged["LS711"] = "it has no step of four digits"
     return Frame(
         struct,
         data=True,
         max_length=LONGEST,
         plausible=partial(plausible, end=geometry.end),
         points=partial(points, geometry=geometry),
-        acknowledged=acknowledged,
+        acknowledged={"LS711": "it has no step of four digits"} if geometry.end < 1000 else {},
         wire=Lines(WIDTH, head=(15 if goes_on else 12, 2, 4), bare=1, check=Scip()) | SixBits(),
     )
 

@@ -208,7 +208,7 @@ CONTROL: dict[str, Frame] = {
     "abnormal": Frame(message(TELL, (0, 7), STATUS)),
     "ack": Frame(message(ANSWER, None, RESULT)),
     "number": Frame(message(ANSWER, None, RESULT, "number" / Int8ul)),
-    "firmware": Frame(message(ANSWER, INFORMATION, RESULT, "firmware" / Bytes(4))),
+    "firmware": Frame(message(ANSWER, INFORMATION, RESULT, "firmware" / Array(4, Int8ul))),
     "heartbeat_ack": Frame(
         message(ANSWER, (0, 3), RESULT, "work_state" / Int8ul * STATES, "feature" / Int8ul * "bit 0: rain and fog", STATUS)
     ),
@@ -296,6 +296,7 @@ def frames(rate: int, first: str) -> Mapping[str, Frame]:
     )
 
 
+ANSWERS = {"get_information": (("firmware", {**DONE, "firmware": [4, 11, 0, 6]}),)}  # of a simulated one
 #: shots a second -> what a simulated one of these sees with types of data that it does not usually send: a Mid-40's view, an Avia's.
 WIDEST: dict[int, View] = {100_000: (-19.2, 19.2, -19.2, 19.2), 240_000: (-35.2, 35.2, -38.6, 38.6)}
 #: id -> model, device type, shots a second, usual type of data, view, ranges, other ids.
@@ -322,8 +323,8 @@ def lidar(name: str) -> Sensor:
         links={"data": Udp(DATA_PORT, IMU_PORT, 55_000), "control": Udp(65_000, local=COMMAND_PORT)},
         commands=COMMANDS,
         clock=Clock(clock),
-        simulation=simulation(first, rate, view, answers={"handshake": (("ack", DONE), ("broadcast", who))}),
-        on_open=("handshake", "heartbeat", "start"),
+        simulation=simulation(first, rate, view, answers={"handshake": (("ack", DONE), ("broadcast", who)), **ANSWERS}),
+        on_open=("handshake", "heartbeat", "get_information", "start"),
         on_close=("stop", "disconnect"),
         range_limits=limits,
         vendor_axes=("forward", "left", "up"),

@@ -152,9 +152,9 @@ PARAMETERS: dict[str, tuple[int, Any]] = {
     "work_mode": (0x001A, NUMBER * "1 sampling, 2 idle, 9 ready"),
     "imu_enabled": (0x001C, NUMBER),
     "serial": (0x8000, Bytes(16)),
-    "app_version": (0x8002, Bytes(4)),
-    "loader_version": (0x8003, Bytes(4)),
-    "hardware_version": (0x8004, Bytes(4)),
+    "app_version": (0x8002, Array(4, Int8ul)),
+    "loader_version": (0x8003, Array(4, Int8ul)),
+    "hardware_version": (0x8004, Array(4, Int8ul)),
     "mac": (0x8005, Bytes(6)),
     "work_state": (0x8006, NUMBER * "1 sampling, 2 idle, 4 error, 5 self-check, 6 motor starts, 8 upgrade, 9 ready"),
     "core_temperature": (0x8007, Scaled(Int32sl, 0.01, "degC")),
@@ -225,7 +225,7 @@ def inertia(i: int) -> dict[str, Any]:
 
 def state(i: int) -> dict[str, Any]:
     """What a simulated Lidar says of itself once a second."""
-    values = {"serial": b"SIMULATED", "app_version": bytes([13, 18, 2, 40]), "work_state": 1, "core_temperature": 41.5}
+    values = {"serial": b"SIMULATED", "app_version": [13, 18, 2, 40], "work_state": 1, "core_temperature": 41.5}
     parameters = [{"key": PARAMETERS[name][0], "length": PARAMETERS[name][1].sizeof(), name: value} for name, value in values.items()]
     return {"head.seq": i, "parameters": parameters}
 
@@ -403,12 +403,17 @@ def lidar(name: str) -> Sensor:
         clock=Clock("timestamp"),
         sequence=Sequence("udp_cnt"),
         simulation=simulation(rate, view, answers={"discover": (("discovery", found),), "get_state": told}),
-        on_open=("discover", *(f"set_{what}_host" for what in ports), "start"),
+        on_open=("discover", "get_state", *(f"set_{what}_host" for what in ports), "start"),
         on_close=("stop",),
         range_limits=limits,
         vendor_axes=("forward", "left", "up"),
         relatives={other: RELATIVES[other] for other in RELATIVES if other != name},
-        info={"serial": "discovery.serial", "model": "discovery.device_type"},
+        info={
+            "serial": "discovery.serial",
+            "model": "discovery.device_type",
+            "firmware": "parameters.parameters.app_version.app_version",
+            "temperature": "parameters.parameters.core_temperature.core_temperature",
+        },
         aliases=aliases,
         status="manual",
         source="Livox Mid-360 protocol document 1.4.10; HAP protocol document 1.4.8; Livox-SDK2 08f523c; user manuals",

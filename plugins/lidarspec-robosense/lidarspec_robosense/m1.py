@@ -21,7 +21,7 @@ import functools
 from typing import Any
 
 import numpy as np
-from construct import Array, Bytes, Const, Construct, Int8ub, Int16ub, Int24ub, Struct
+from construct import Array, Bytes, Check, Const, Construct, Int8ub, Int16ub, Int24ub, OneOf, Struct, this
 
 from lidarspec.spec import Clock, Fields, Frame, OnRewind, Polar, Scaled, Sensor, Sequence, Simulation, Udp
 from lidarspec_robosense.rotor import TIME
@@ -81,10 +81,11 @@ DIFOP_HEAD: tuple[Construct, ...] = (
 )
 FIRMWARE = ("pl_firmware" / Bytes(5), "ps_firmware" / Bytes(5))
 MODES: tuple[Construct, ...] = (
-    "return_mode" / Int8ub * "0 dual, 4 strongest, 5 last, 6 first",
-    "time_sync_mode" / Int8ub * "0 internal, 1 PPS, 2 PTP, 3 gPTP",
-    "time_sync_status" / Int8ub * "0 none, 1 locked, 2 timeout",
+    "return_mode" / OneOf(Int8ub, [0, 4, 5, 6]) * "0 dual, 4 strongest, 5 last, 6 first",
+    "time_sync_mode" / OneOf(Int8ub, range(4)) * "0 internal, 1 PPS, 2 PTP, 3 gPTP",
+    "time_sync_status" / OneOf(Int8ub, range(3)) * "0 none, 1 locked, 2 timeout",
     *TIME,
+    "in_range" / Check((this.microseconds < 1_000_000) & (this.seconds < 2**36)),
 )
 VIEW = tuple(f"{way}_{end}" / Scaled(Int16ub, 0.01, "deg") for way in ("horizontal", "vertical") for end in ("start", "end"))
 POWER = ("currents" / Array(2, Int24ub), "voltages" / Array(2, Int16ub), "reserved_power" / Bytes(50))
@@ -108,12 +109,6 @@ DIFOP_OTHER = Struct(*DIFOP_HEAD, "rest" / Bytes(228))
 def plausible(f: Fields) -> Any:
     """The counter starts at 1 (M1P user guide, header)."""
     return f.pkt_psn >= 1
-
-
-def plausible_difop(f: Fields) -> Any:
-    """Modes that there are, and less than a second of microseconds, before the year 4000."""
-    known = (f.return_mode == 0) | ((f.return_mode >= 4) & (f.return_mode <= 6))
-    return known & (f.time_sync_mode <= 3) & (f.time_sync_status <= 2) & (f.microseconds < 1) & (f.seconds < 2**36)
 
 
 def packets_per_frame(f: Fields) -> Any:
@@ -182,9 +177,9 @@ M1 = Sensor(
     frames={
         "data": Frame(DATA, data=True, plausible=plausible),
         # one a second (M1 user guide); an M1P sends 10
-        "difop": Frame(DIFOP, plausible=plausible_difop, simulation=Simulation(sweep_difop, rate=1)),
-        "difop_fov": Frame(DIFOP_FOV, plausible=plausible_difop, simulation=Simulation(sweep_difop)),
-        "difop_guide": Frame(DIFOP_GUIDE, plausible=plausible_difop, simulation=Simulation(sweep_difop)),
+        "difop": Frame(DIFOP, simulation=Simulation(sweep_difop, rate=1)),
+        "difop_fov": Frame(DIFOP_FOV, simulation=Simulation(sweep_difop)),
+        "difop_guide": Frame(DIFOP_GUIDE, simulation=Simulation(sweep_difop)),
         "difop_other": Frame(DIFOP_OTHER),
     },
     points=points,

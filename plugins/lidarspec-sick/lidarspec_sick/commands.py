@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from functools import cache
 from typing import Any
 
-from construct import Bytes, Const, Construct, Int8ub, Int16ub, Int32sb, Int32ub, this
+from construct import Bytes, Const, Construct, Enum, Int8ub, Int16ub, Int32sb, Int32ub, this
 
 from lidarspec.spec import Command, Frame, Scaled
 from lidarspec_sick.telegrams import binary, text
@@ -33,6 +33,35 @@ CONTENT = (
     "encoders" / Int16ub,
     *(name / Int8ub for name in ("position", "name", "comment", "time")),
     "interval" / Int16ub * "1: each scan, 2: every other one",
+)
+#: what a scanner may refuse a command for, from 1 on (8014631, error codes).
+ERRORS = (
+    "access_denied",
+    "method_unknown",
+    "variable_unknown",
+    "value_not_allowed",
+    "data_invalid",
+    "unknown",
+    "buffer_overflow",
+    "buffer_underflow",
+    "type_unknown",
+    "write_denied",
+    "name_server_command_unknown",
+    "command_unknown",
+    "busy",
+    "array_out_of_bounds",
+    "event_unknown",
+    "value_overflow",
+    "character_invalid",
+    "no_message",
+    "no_answer",
+    "internal",
+    "hub_address_corrupted",
+    "hub_address_undecodable",
+    "hub_address_exceeded",
+    "hub_address_blank_expected",
+    "asynchronous_methods_off",
+    "complex_arrays_unsupported",
 )
 #: frame -> kind, method, content. What is asked is called ask_ or set_.
 MESSAGES: dict[str, tuple[str, str, tuple[Construct, ...]]] = {
@@ -61,7 +90,7 @@ MESSAGES: dict[str, tuple[str, str, tuple[Construct, ...]]] = {
     "content_set": ("sWA", "LMDscandatacfg", ()),
     "save": ("sMN", "mEEwriteall", ()),
     "saved": ("sAN", "mEEwriteall", ("done" / Int8ub,)),
-    "refused": ("sFA", "", ("error" / Int16ub,)),
+    "refused": ("sFA", "", ("error" / Enum(Int16ub, **{name: number for number, name in enumerate(ERRORS, 1)}),)),
 }
 ASKED = ("sMN", "sRN", "sWN", "sEN")
 
@@ -87,7 +116,7 @@ def messages(cola: str) -> Mapping[str, Frame]:
 
 def asking(frame: str, reply: str, values: Mapping[str, Any] | None = None, **more: Any) -> Command:
     """What may be asked twice, and what answers it."""
-    return Command(frame, values or {}, reply=reply, retries=1, **more)
+    return Command(frame, values or {}, reply=reply, refusal="refused", retries=1, **more)
 
 
 def commands(scan: str) -> dict[str, Command]:

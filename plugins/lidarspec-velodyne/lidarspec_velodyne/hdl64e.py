@@ -1,29 +1,37 @@
 """Velodyne HDL-64E, series S2 and S3: 64 lasers in two banks, blocks of which take turns, each laser with corrections of its own.
 
 Source: velodyne_decoder (calibration files of an example unit of each series, packet_decoder.cpp: firing times) and ros-drivers/velodyne
-(rawdata.cc: corrections), which cite the vendor's manuals. Blocks with 0xFFEE hold lasers 1 to 32, those with 0xFFDD lasers 33 to 64 of
-the same firing; with dual return, four blocks in a row share an azimuth (velodyne_decoder), the two of the strongest return first.
+(rawdata.cc: corrections; gen_calibration.py: names and units in db.xml), which cite the vendor's manuals. Blocks with 0xFFEE hold lasers 1
+to 32, those with 0xFFDD lasers 33 to 64 of the same firing; with dual return, four blocks in a row share an azimuth (velodyne_decoder), the
+two of the strongest return first.
 
-Every unit has corrections of its own, which it sends a byte at a time in `status_value`: those of an example unit stand here, and clouds
-say that they are nominal. Not expressed: the second correction of near distances (below 25 m), intensity by focal distance, and the
-calibration in the status bytes. No packet of this model was seen; points of simulated ones lie within 8 cm of those of velodyne_decoder,
-which makes that second correction. Nothing completes its clock: the date is in the status bytes.
+Every unit has corrections of its own, in the file that comes with it (db.xml), and a byte at a time in `status_value`: those of an example
+unit stand here, and clouds say that they are nominal, until `configure(calibration=...)` names the file. Not expressed: the second
+correction of near distances (below 25 m), intensity by focal distance, and the calibration in the status bytes. No packet of this model
+was seen; points of simulated ones lie within 8 cm of those of velodyne_decoder, which makes that second correction. Nothing completes its
+clock: the date is in the status bytes.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 from functools import partial
+from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 from construct import Array, Int8ul, Int16ub, Int16ul, Int32ul, Struct
 
+from lidarspec import UsageError
 from lidarspec.spec import Clock, Fields, Frame, OnWrap, Polar, Scaled, Sensor, Simulation, Udp, following, previous
 from lidarspec_velodyne.firings import FASTEST, JITTER, difference
 from lidarspec_velodyne.frames import BLOCKS, HOUR, SLOTS, TURN
 
 UPPER, LOWER = 0xFFEE, 0xFFDD
+LARGEST = 1 << 20  # bytes of a calibration file at most
+NAMES = ("rotCorrection_", "vertCorrection_", "distCorrection_", "vertOffsetCorrection_", "horizOffsetCorrection_")
 FLAGS = np.tile([[UPPER], [LOWER]], (BLOCKS // 2, 1))
 TURNS = 10
 
@@ -40,6 +48,8 @@ class Unit:
         offset: degrees by which they look to the left of the azimuth.
         height: metres above the origin from which they look, across their beams.
         distance: metres that are added to what is measured.
+        aside: metres to the left of the axis from which they look, across their beams.
+        nominal: whether these are the example's.
     """
 
     period: float
@@ -49,6 +59,8 @@ class Unit:
     offset: tuple[float, ...]
     height: tuple[float, ...]
     distance: tuple[float, ...]
+    aside: tuple[float, ...] = (0.026, -0.026) * SLOTS
+    nominal: bool = True
 
     def of_blocks(self, values: Any) -> Any:
         """Numbers of the lasers as those of the slots of each block, (blocks, slots)."""
@@ -61,7 +73,6 @@ class Unit:
         return (slot // 4 * self.firing + np.take(self.within, slot % 4)) * 1e-6
 
 
-ASIDE = 0.026  # metres by which lasers look from the left and from the right of the axis by turns
 # fmt: off
 S2 = Unit(
     period=48e-6,
@@ -156,7 +167,7 @@ def points(f: Fields, unit: Unit) -> Polar:
     step = np.where(np.abs(ahead) < FASTEST * unit.period * JITTER, ahead, behind)
     turned = np.deg2rad(azimuth + step * (unit.delay / unit.period) - unit.of_blocks(unit.offset))
     elevation = np.deg2rad(unit.of_blocks(unit.vertical))
-    height, aside = unit.of_blocks(unit.height), unit.of_blocks(np.tile([ASIDE, -ASIDE], SLOTS))
+    height, aside = unit.of_blocks(unit.height), unit.of_blocks(unit.aside)
     back, cos, sin = -height * np.sin(elevation), np.cos(turned), np.sin(turned)
     distance = f.blocks.channels.distance
     return Polar(
@@ -168,8 +179,39 @@ def points(f: Fields, unit: Unit) -> Polar:
         ring=unit.of_blocks(np.argsort(np.argsort(unit.vertical))),
         return_index=np.where(twice, block // 2 % 2, 0),
         origin=(back * cos + aside * sin, aside * cos - back * sin, height * np.cos(elevation)),
-        nominal=True,
+        nominal=unit.nominal,
     )
+
+
+def configure(unit: Unit, sensor: Sensor, /, *, calibration: str | Path) -> Sensor:
+    """The sensor with the corrections of one unit.
+
+    Args:
+        calibration: its db.xml; degrees and centimetres.
+
+    Raises:
+        UsageError: for a file that cannot be read, or does not have all of the 64 lasers once.
+    """
+    try:
+        with open(calibration, "rb") as file:
+            lasers = ElementTree.fromstring(file.read(LARGEST)).findall("DB/points_/item/px")
+        table = {int(_number(laser, "id_")): [_number(laser, name) for name in NAMES] for laser in lasers}
+    except (OSError, ElementTree.ParseError, ValueError) as error:
+        raise UsageError(f"{calibration!s}: not the calibration of an HDL-64E (db.xml): {error}") from None
+    if len(lasers) != 2 * SLOTS or set(table) != set(range(2 * SLOTS)):
+        raise UsageError(f"{calibration!s}: lists {len(table)} lasers of {len(lasers)}, and an HDL-64E has 0 to {2 * SLOTS - 1}, each once")
+    offset, vertical, *metres = (tuple(column) for column in np.array([table[laser] for laser in sorted(table)]).T)
+    distance, height, aside = (tuple(value / 100 for value in column) for column in metres)
+    own = replace(unit, vertical=vertical, offset=offset, distance=distance, height=height, aside=aside, nominal=False)
+    return replace(sensor, points=partial(points, unit=own))
+
+
+def _number(laser: ElementTree.Element, name: str) -> float:
+    text = laser.findtext(name)
+    value = float(text) if text is not None else math.nan
+    if not math.isfinite(value):
+        raise ValueError(f"{name} of a laser is {text!r}")
+    return value
 
 
 def pace(f: Fields, unit: Unit) -> Any:
@@ -199,6 +241,7 @@ def model(series: str, unit: Unit, other: str) -> Sensor:
         links={"data": Udp(2368)},
         clock=Clock("timestamp", wraps_at=HOUR, pace=partial(pace, unit=unit)),
         simulation=Simulation(partial(sweep, unit=unit)),
+        configure=partial(configure, unit),
         range_limits=(0.9, 120.0),  # data sheet
         vendor_axes=("right", "forward", "up"),
         turn=TURN,

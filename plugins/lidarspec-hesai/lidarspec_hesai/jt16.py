@@ -1,0 +1,132 @@
+"""Hesai JT16: 16 channels over a serial line, 80 bytes for each azimuth, and 34 for each sample of the IMU.
+
+    EE FF 01 08  time_version  00 | date, microseconds | azimuth, 16 x (distance, reflectivity), dirt, state, sequence | CRC
+    EE FF 01 08  time_version  01 | date, microseconds | acceleration, rate, sequence | CRC
+
+No packet of this model was seen. How many azimuths there are in a turn, and how fast it turns, stands in no source at hand: 600 by 5 Hz are
+simulated, as fine as the grid of the vendor's code, and as many as the line carries. The axes of the IMU are not documented, so its samples
+are fields alone.
+
+Left out: commands, which go over a second line (RS232, 9600 baud) and bear random numbers; with them a unit would say its angles.
+
+Source: HesaiLidar_SDK_2.0 (udp_protocol_v1_8.h, udp1_8_parser.cc: fields, steps of 4 mm, angles, CRC; serial_source.cc: lengths;
+parameter_introduction.md: 3,125,000 baud; JT16 correction file).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+from construct import Array, Const, Int8ul, Int16sl, Int16ul, Int32ul, Struct
+
+from lidarspec.spec import Checksum, Checksummed, Clock, Fields, Frame, OnWrap, Polar, Scaled, Sensor, Sequence, Serial, Simulation
+from lidarspec_hesai.calibration import Calibration, configure, nominal
+from lidarspec_hesai.parts import UTC, clock, turning
+from lidarspec_hesai.sealed import CRC
+
+CHANNELS, PER_TURN, RATE_HZ = 16, 600, 5.0
+
+ELEVATION = (
+    0.60366, 3.32389, 6.01037, 8.64237, 11.27961, 13.92824, 16.57279, 19.21504,
+    21.918, 24.56885, 27.21406, 29.88939, 32.52066, 35.22156, 37.91053, 40.66427,
+)  # fmt: skip
+AZIMUTH = (
+    193.33747, 193.36131, 193.34482, 193.41829, 193.47669, 193.46605, 193.60451, 193.77519,
+    187.86962, 187.84975, 187.85431, 187.85183, 187.65341, 187.80239, 187.84902, 187.77156,
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class WholeWords(Checksum):
+    """The CRC of the family over bytes that zeros fill up to a multiple of four."""
+
+    width: int = 32
+
+    def __call__(self, data: bytes | bytearray | memoryview) -> int:
+        return CRC(bytes(data) + bytes(-len(data) % 4))
+
+    def describe(self) -> str:
+        return f"{CRC.describe()}, over bytes filled up with zeros to a multiple of 4"
+
+
+def packet(data_type: int, *body: Any) -> Struct:
+    """A packet of this type: its head, and the body with the CRC."""
+    return Struct(
+        "sync" / Const(b"\xee\xff\x01\x08"),
+        "time_version" / Int8ul,
+        "data_type" / Const(data_type, Int8ul),
+        "utc" / UTC,
+        "timestamp" / Scaled(Int32ul, 1e-6, "s") * "within the second of utc",
+        *body,
+        "crc" / Int32ul,
+    )
+
+
+DATA = Checksummed(
+    packet(
+        0,
+        "azimuth" / Scaled(Int16ul, 0.01, "deg"),
+        "channels" / Array(CHANNELS, Struct("distance" / Scaled(Int16ul, 0.004, "m") * "0: no return", "reflectivity" / Int8ul)),
+        "dirt" / Int32ul * "on the window, two bits for each channel, those of the first in the lowest",
+        "unit_state" / Int8ul,
+        "reserved_id" / Int8ul * "what the next field is: 12 to 15 the version of the software, 16 to 19 of the hardware",
+        "reserved_info" / Int16ul,
+        "sequence" / Int16ul,
+    ),
+    "crc",
+    CRC,
+)
+IMU = Checksummed(
+    packet(
+        1,
+        "acceleration" / Array(3, Scaled(Int16sl, 1 / 8192, "g")) * "x, y, z of the unit's IMU, whose axes are not documented",
+        "rate" / Array(3, Scaled(Int16sl, 1 / 32.8, "deg/s")),
+        "sequence" / Int16ul,
+    ),
+    "crc",
+    WholeWords(),
+)
+
+
+def points(f: Fields, channels: Calibration) -> Polar:
+    """The shots of one azimuth, all at the packet's time."""
+    return Polar(
+        range=f.channels.distance,
+        azimuth=-np.deg2rad(f.azimuth + channels.azimuth),
+        elevation=np.deg2rad(channels.elevation),
+        intensity=f.channels.reflectivity,
+        ring=np.arange(CHANNELS),
+        nominal=channels.nominal,
+    )
+
+
+def sweep(i: int) -> dict[str, Any]:
+    """Packet i."""
+    values = turning(i, 1, PER_TURN, RATE_HZ)
+    kept = {name: value for name, value in values.items() if name == "timestamp" or name.startswith("utc.")}
+    return {**kept, "azimuth": float(values["blocks.azimuth"][0]), "sequence": i % (1 << 16)}
+
+
+TABLE = nominal(ELEVATION, AZIMUTH, np.zeros(CHANNELS))
+
+JT16 = Sensor(
+    "hesai-jt16",
+    vendor="Hesai",
+    model="JT16",
+    frames={"data": Frame(DATA, data=True, plausible=lambda f: f.azimuth < 360), "imu": Frame(IMU, simulation=Simulation(rate=100))},
+    points=partial(points, channels=TABLE),
+    scan=OnWrap("azimuth"),
+    links={"data": Serial(3_125_000)},
+    clock=Clock(clock),
+    sequence=Sequence("sequence"),
+    simulation=Simulation(sweep),
+    configure=partial(configure, points, TABLE),
+    range_limits=(0.0, 262.14),  # what packets can say
+    vendor_axes=("right", "forward", "up"),
+    aliases=("jt16",),
+    status="manual",
+    source="HesaiLidar_SDK_2.0 (udp_protocol_v1_8.h, udp1_8_parser.cc, JT16 correction file); no packet of this model was seen",
+)
