@@ -14,6 +14,7 @@ from __future__ import annotations
 import bisect
 import contextlib
 import functools
+import itertools
 import math
 import operator
 import random
@@ -595,13 +596,13 @@ class _Places:
         self._buffer, self._offsets, self.stops, self._limit = buffer, offsets, stops, limit
         self.refuted: list[NDArray[np.intp]] = []
 
-    def longest(self, which: NDArray[np.intp]) -> bytes:
+    def longest(self, which: NDArray[np.intp]) -> bytes | memoryview:
         """What there is of the one that has the most bytes, up to the longest frame."""
         first = which.item(0)
         if self.stops is not None and len(which) > 1:
             first = which.item((self.stops[which] - self._offsets[which]).argmax())
         start = self._offsets.item(first)
-        return self._buffer[start : min(start + self._limit, len(self._buffer) if self.stops is None else self.stops.item(first))].tobytes()
+        return self._buffer.data[start : min(start + self._limit, len(self._buffer) if self.stops is None else self.stops.item(first))]
 
     def read(self, node: HeaderNode, which: NDArray[np.intp]) -> tuple[NDArray[np.intp] | None, NDArray[Any]]:
         """As `Reader`; those whose field is cut off are looked at here."""
@@ -669,7 +670,7 @@ class HeaderTree:
             if len(which) == 1 and places is not None:
                 node = self._end(places.longest(which), node, is_all=places.stops is not None)
             elif node.leaf is None and node.result is None:
-                data = b"" if places is None else places.longest(which)
+                data: bytes | memoryview = b"" if places is None else places.longest(which)
                 self._explore(node, data, is_all=places is not None and places.stops is not None)
             if node.result is not None:
                 groups.append((node.result, which))
@@ -695,24 +696,24 @@ class HeaderTree:
         return tuple(known.values()), prefix_of(self._frame, self._limit)
 
     def common(self, rows: NDArray[np.uint8]) -> Layout | None:
-        """The layout of candidates, one a row, if they have one and the fields that decide it are the same in all; else None."""
-        first = rows[0].tobytes()
-        layout = self.layout(first)
-        if not isinstance(layout, Layout):
+        """The layout of candidates, one a row, if they have one and the fields that decide it mean the same in all; else None."""
+        end = self._end(rows[0].tobytes(), self._root)
+        above = [end]
+        while above[0].above is not None:
+            above.insert(0, above[0].above)
+        if not isinstance(end.result, Layout):
             return None
-        same = (np.count_nonzero(leaf.load(rows) == value) == len(rows) for leaf, value in self._asked(first))
-        return layout if all(same) else None
+        for node, following in itertools.pairwise(above):
+            assert node.leaf is not None
+            values = node.leaf.load(rows)
+            values = values if node.told is None else node.told.all(values)
+            if np.count_nonzero(values == following.values[node.leaf.info.path]) < len(rows):
+                return None
+        return end.result
 
     def layout(self, frame: bytes) -> Layout | Refused | None:
         """The layout of one frame, or None where its header is not all there."""
         return self._end(frame, self._root).result
-
-    def _asked(self, frame: bytes) -> Iterator[tuple[Leaf | Measure, int]]:
-        """The fields that decided the layout of this frame, and their values, in the order in which they were asked for."""
-        node = self._root
-        while node.leaf is not None and (value := node.leaf.of(frame)) is not None:
-            yield node.leaf, value
-            node = node.children[node.meant(value)]
 
     def choose(self, source: random.Random, drawn: Mapping[str, Draw] | None = None) -> tuple[Layout, dict[str, int]]:
         """A layout of a header chosen at random, with the values of the fields it depends on, by path.
@@ -740,7 +741,7 @@ class HeaderTree:
                 own = drawn.get(unknown.leaf.info.path)
                 values[unknown.leaf.info.path] = own(source) if own else _some_value(source, unknown.leaf, keys)
 
-    def _end(self, data: bytes, node: HeaderNode, *, is_all: bool = False) -> HeaderNode:
+    def _end(self, data: bytes | memoryview, node: HeaderNode, *, is_all: bool = False) -> HeaderNode:
         """Where the header of a frame leads from a node, as `_explore` has it."""
         while node.leaf is not None:
             value = node.leaf.of(data)
@@ -749,7 +750,7 @@ class HeaderTree:
             node = node.child(node.meant(value))
         return node if node.result is not None else self._explore(node, data, is_all=is_all)
 
-    def _explore(self, node: HeaderNode, data: bytes = b"", *, is_all: bool = False) -> HeaderNode:
+    def _explore(self, node: HeaderNode, data: bytes | memoryview = b"", *, is_all: bool = False) -> HeaderNode:
         """Find out, where nobody has yet, which fields decide next, as far as the header of a frame tells, in one walk.
 
         Returns:
