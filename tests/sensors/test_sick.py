@@ -11,7 +11,7 @@ import pytest
 import lidarspec as ls
 from lidarspec.discovery.detect import verdict
 from lidarspec.discovery.listen import Heard
-from lidarspec.errors import CommandError
+from lidarspec.errors import CommandError, UsageError
 from tests.sensors.evidence import capture, decoded, vector_bytes, vectors
 
 TIM871S, TIM551 = ls.sensor("sick-tim871s"), ls.sensor("sick-tim551")
@@ -66,8 +66,8 @@ def test_a_telegram_without_strengths_beside_one_that_has_them() -> None:
 @pytest.mark.parametrize("cola", ["A", "B"])
 @pytest.mark.parametrize(("name", "echoes"), [("sick-lms111", 2), ("sick-lms511", 3), ("sick-lms511", 5), ("sick-mrs1104", 3)])
 def test_any_number_of_echoes_is_read_with_their_strengths(name: str, echoes: int, cola: str) -> None:
-    sensor = ls.sensor(name).configure(cola=cola)
-    frame = ("text" if cola == "A" else "scan") + str(echoes)
+    sensor = ls.sensor(name).configure(cola=cola, echoes=echoes)
+    frame = "echoes_text" if cola == "A" else "echoes"
     values = sensor.parse(ls.simulate(sensor, 1)[0])
     first, beams = dict(values.dist1), values.dist1.count
     for number in range(1, echoes + 1):
@@ -82,6 +82,8 @@ def test_any_number_of_echoes_is_read_with_their_strengths(name: str, echoes: in
     assert cloud.range[:echoes].tolist() == list(range(1, echoes + 1))
     assert cloud.intensity[:echoes].tolist() == [10 * number for number in range(1, echoes + 1)]
     assert cloud.return_index[:echoes].tolist() == list(range(echoes))
+    with pytest.raises(UsageError, match="echoes is a number from 1 to"):
+        sensor.configure(echoes=6)
 
 
 @pytest.mark.parametrize("cola", ["A", "B"])

@@ -100,24 +100,27 @@ def sweep(i: int, kind: Kind, echoes: int = 1) -> dict[str, Any]:
 
 
 def frames(kind: Kind, cola: str) -> dict[str, Frame]:
-    """Scans with any number of echoes, first those in this form; messages in this form alone."""
-    forms = sorted([("A", "text"), ("B", "scan")], key=lambda form: form[0] != cola)
-    own = {name: scans(form, 1) for form, name in forms}
-    for count in range(2, kind.echoes + 1):
-        simulation = Simulation(partial(sweep, kind=kind, echoes=count))
-        own |= {f"{name}{count}": dataclasses.replace(scans(form, count), simulation=simulation) for form, name in forms}
+    """Scans with one echo and with all, first those in this form; messages in this form alone."""
+    forms = sorted("AB", key=lambda form: form != cola)
+    own = {{"A": "text", "B": "scan"}[form]: scans(form, 1) for form in forms}
+    if kind.echoes > 1:
+        names, simulation = {"A": "echoes_text", "B": "echoes"}, Simulation(partial(sweep, kind=kind, echoes=kind.echoes))
+        own |= {names[form]: dataclasses.replace(scans(form, kind.echoes), simulation=simulation) for form in forms}
     return own | dict(messages(cola))
 
 
-def configure(sensor: Sensor, *, cola: str) -> Sensor:
-    """The scanner that is spoken to in CoLa "A" or "B"; scans are read in either form.
+def configure(sensor: Sensor, *, cola: str = "B", echoes: int = 0) -> Sensor:
+    """The scanner that is spoken to in CoLa "A" or "B"; scans are read in either form, with one echo and with so many, by default all.
 
     Raises:
-        UsageError: for another form.
+        UsageError: for another form, or more echoes than the scanner has.
     """
+    kind = MODELS[sensor.id][1]
     if cola not in ("A", "B"):
         raise UsageError(f"{sensor.id}: cola is 'A' or 'B', not {cola!r}")
-    own = frames(MODELS[sensor.id][1], cola)
+    if echoes not in range(kind.echoes + 1):
+        raise UsageError(f"{sensor.id}: echoes is a number from 1 to {kind.echoes}, not {echoes!r}")
+    own = frames(dataclasses.replace(kind, echoes=echoes or kind.echoes), cola)
     return dataclasses.replace(sensor, frames=own, commands=commands("text" if cola == "A" else "scan"))
 
 
