@@ -773,7 +773,7 @@ class HeaderTree:
 
         if is_all and len(data) < node.least:
             return node
-        self._size += 1
+        self._size += not node.least  # it is known, where it was cut off before
         walk = _Walk(node.values, self._limit, self._given, asked, len(data) if is_all else None)
         try:
             node.result = _walked(walk, self._frame)
