@@ -319,8 +319,9 @@ class Condition:
     formula: Formula | None
 
     @classmethod
+    @lru_cache(maxsize=4096)
     def of(cls, what: FieldInfo | Check) -> Condition:
-        """That a field has one of the values that it may have, or a check."""
+        """That a field has one of the values that it may have, or a check; the same in all layouts."""
         if isinstance(what, FieldInfo):
             return cls((what,), None)
         return cls(tuple(ref.info for ref in refs(what.condition)), what.condition)

@@ -3,10 +3,7 @@
 Counts, conditions and keys make the layout of a frame depend on some of its own header fields. `layout_of` walks the frame's tree with
 a cursor, for given values of these fields, and says with `Unknown` which further one it needs. A `HeaderTree` keeps what it found: each
 node of it is one field, each branch one of its values, each end a `Layout`, or the reason why there is none. Candidates are sorted
-through it in bulk, by value, so that the frame's tree is walked once for each distinct header. Headers for examples are drawn by chance.
-
-What has no computable place, whatever the header, is told by `check_compilable` before any bytes arrive (`NotCompilable`), and the
-frame is then interpreted by construct.
+through it in bulk, by value, so that the frame's tree is walked once for each distinct header.
 """
 
 from __future__ import annotations
@@ -17,7 +14,6 @@ import functools
 import itertools
 import math
 import operator
-import random
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -30,17 +26,10 @@ from lidarspec.spec import tree
 from lidarspec.spec.bits import BitField, whole_bytes
 from lidarspec.spec.description import Frame
 from lidarspec.wire.arrays import by_value
+from lidarspec.wire.compilability import NotCompilable, check_compilable, check_control
 from lidarspec.wire.layout import Condition, Layout, Leaf, Refused, Seal
 from lidarspec.wire.parts import CONSTANT, FAILED, Kind, Measure, Region, Rule
-from lidarspec.wire.schema import ByPath, schema, without_indices
-
-
-class NotCompilable(Exception):
-    """A part of a struct that has no computable place; attributes `path` and `reason`."""
-
-    def __init__(self, path: str, reason: str) -> None:
-        self.path, self.reason = path, reason
-        super().__init__(f"{path}: {reason}" if path else reason)
+from lidarspec.wire.schema import ByPath, without_indices
 
 
 class Unknown(Exception):
@@ -98,66 +87,6 @@ def prefix_of(root: tree.Node, limit: int) -> dict[int, tuple[int, int]]:
     with contextlib.suppress(Exception):  # whatever an expression of the struct raises: what comes before counts
         walk.visit(root, "")
     return walk.constants
-
-
-def check_compilable(root: tree.Node) -> None:
-    """Raise `NotCompilable` if any part of a tree has no computable place, whatever the header."""
-    _check(root, "", in_array=False)
-
-
-def _check(node: tree.Node, path: str, *, in_array: bool) -> None:
-    match node:
-        case tree.Opaque():
-            raise NotCompilable(node.info.path, node.reason)
-        case tree.Sealed():
-            if in_array:
-                raise NotCompilable(path, "a checksum inside an array")
-            _ = node.algorithm
-        case tree.Parts() if in_array:
-            raise NotCompilable(path, "parts inside an array")
-        case tree.Block():
-            for part in node.parts:
-                if len(part.indices) > 1:
-                    raise NotCompilable(part.info.path, "an array of arrays of bits")
-    for formula in tree.formulas(node):
-        if isinstance(formula, tree.Code) and formula.blind:
-            raise NotCompilable(path, formula.reason.partition(": ")[2])
-        for ref in tree.refs(formula):
-            check_control(ref.info)
-    if isinstance(node, tree.Parts):
-        for kind in node.kinds:
-            _check_part(kind, path)
-        return
-    for child in tree.children(node):
-        below = f"{path}.{child.name}".strip(".") if isinstance(node, tree.Struct) else path
-        _check(child, below, in_array=in_array or isinstance(node, tree.Repeat))
-
-
-def _check_part(kind: tree.Kind, path: str) -> None:
-    """Hold a part, as a frame in itself, to what holds for frames."""
-    try:
-        _check(kind.root, "", in_array=False)
-        for ref in () if kind.following is None else tree.refs(kind.following):
-            check_control(ref.info)
-        check_columns(kind.root)
-    except NotCompilable as reason:
-        raise NotCompilable(f"{path}.{reason.path}".rstrip("."), reason.reason) from None
-
-
-def check_columns(root: tree.Node) -> None:
-    """Raise `NotCompilable` if a field of a tree has values that no column holds."""
-    for info in schema(root).fields.values():
-        if info.dtype is None:
-            wide = f"its {info.bits} bits are more than a column holds"
-            raise NotCompilable(info.path, wide if info.bits > 64 else "its values are not all plain numbers of one kind")
-
-
-def check_control(info: tree.FieldInfo) -> None:
-    """Raise `NotCompilable` if a layout cannot be made to depend on a field."""
-    if info.kind == "int" and info.axes and info.axes[-1].strip("[]") != info.path:
-        raise NotCompilable(info.path, "elements of one array differ in layout: Parts(struct, count) reads such in bulk")
-    if info.axes or info.kind != "int":
-        raise NotCompilable(info.path, "the layout depends on a field that is not one integer")
 
 
 def _unknown(leaf: Leaf | Measure, _: _Walk) -> int:
@@ -255,7 +184,7 @@ class _Walk:
                 self.branches[node] = dict(node.cases).get(self._value(node.key), node.default)
                 self.visit(self.branches[node], path, shape, strides)
             case tree.Check() if 0 not in shape:
-                self.conditions[node] = condition_of(node)
+                self.conditions[node] = Condition.of(node)
             case tree.Never():
                 raise TooLong(path)
             case tree.Opaque():
@@ -372,7 +301,7 @@ class _Walk:
 
     def _add(self, leaf: Leaf) -> None:
         if leaf.info.allowed is not None:
-            self.conditions[leaf.info] = condition_of(leaf.info)
+            self.conditions[leaf.info] = Condition.of(leaf.info)
         self.leaves[leaf.info.path] = self.parts[leaf.info.path] = leaf
         if leaf.shape and len(leaf.shape) > len(leaf.strides) - (leaf.info.kind == "bytes"):  # bytes, or an array within a bit block
             self.lengths[leaf.info.axes[-1]] = 0 if 0 in leaf.shape[:-1] else leaf.shape[-1]
@@ -430,28 +359,6 @@ def _in_order(seals: list[Seal]) -> Iterator[Seal]:
         free = (seal for seal in left if not any(seal.covers(other) for other in left if other is not seal))
         left.remove(first := next(free, left[0]))
         yield first
-
-
-Draw = Callable[[random.Random], int]
-
-
-def _switch_keys(root: tree.Node) -> Iterator[int]:
-    """The values of keys that have no name: fields are known to have those with one."""
-    for node in tree.nodes(root):
-        if isinstance(node, tree.Select):
-            labels = node.key.info.labels if isinstance(node.key, tree.Ref) else ()
-            yield from (key for key, _ in node.cases if isinstance(key, int) and key not in labels)
-
-
-def _some_value(source: random.Random, leaf: Leaf, keys: list[int]) -> int:
-    if leaf.info.const is not None or leaf.info.allowed:
-        return int(leaf.info.const) if leaf.info.const is not None else source.choice(leaf.info.allowed or ())
-    top = (1 << leaf.info.bits) - 1
-    kinds = [source.randint(0, top), source.randint(0, min(top, 8)), source.randint(0, min(top, 40))]
-    named = [key for key in (*leaf.info.labels, *keys) if key <= top]
-    value = source.choice(kinds + named[:16] * (1 if source.random() < 0.7 else 0))
-    is_negative = leaf.info.dtype is not None and leaf.info.dtype.kind == "i" and value >> (leaf.info.bits - 1)
-    return value - (1 << leaf.info.bits) if is_negative else value
 
 
 #: distinct headers remembered; garbage must not fill the memory with their layouts.
@@ -715,32 +622,6 @@ class HeaderTree:
         """The layout of one frame, or None where its header is not all there."""
         return self._end(frame, self._root).result
 
-    def choose(self, source: random.Random, drawn: Mapping[str, Draw] | None = None) -> tuple[Layout, dict[str, int]]:
-        """A layout of a header chosen at random, with the values of the fields it depends on, by path.
-
-        Args:
-            drawn: field path -> what draws its value in place of chance.
-
-        Raises:
-            SpecError: where hundreds of headers give no frame.
-        """
-        keys = sorted(_switch_keys(self._frame))
-        for _ in range(400):
-            with contextlib.suppress(TooLong, ArithmeticError, LookupError, TypeError, ValueError):
-                return self._chosen(source, drawn or {}, keys)
-        raise SpecError("no header was found that gives a frame within its longest length")
-
-    def _chosen(self, source: random.Random, drawn: Mapping[str, Draw], keys: list[int]) -> tuple[Layout, dict[str, int]]:
-        values: dict[str, int] = {}
-        while True:
-            try:
-                return layout_of(self._frame, values, self._limit), values
-            except Unknown as unknown:
-                if isinstance(unknown.leaf, Measure):
-                    raise SpecError("a header alone does not make a frame of parts", path=unknown.leaf.info.path) from None
-                own = drawn.get(unknown.leaf.info.path)
-                values[unknown.leaf.info.path] = own(source) if own else _some_value(source, unknown.leaf, keys)
-
     def _end(self, data: bytes | memoryview, node: HeaderNode, *, is_all: bool = False) -> HeaderNode:
         """Where the header of a frame leads from a node, as `_explore` has it."""
         while node.leaf is not None:
@@ -806,12 +687,6 @@ class HeaderTree:
         return self._told[leaf.info.path]
 
 
-@functools.lru_cache(maxsize=4096)
-def condition_of(what: tree.FieldInfo | tree.Check) -> Condition:
-    """The condition that a field or a check makes, the same in all layouts."""
-    return Condition.of(what)
-
-
 @functools.lru_cache(maxsize=256)
 def kinds_of(node: tree.Parts, given: tuple[tuple[str, int], ...], limit: int) -> tuple[Kind, ...]:
     """What the parts of frames can be in which fields around them have these values."""
@@ -824,7 +699,6 @@ def frame_layouts(frame: Frame) -> HeaderTree | NotCompilable:
     """The layouts of a frame type, or why they cannot be computed."""
     try:
         check_compilable(frame.tree)
-        check_columns(frame.tree)
         return HeaderTree(frame.tree, frame.room)
     except NotCompilable as reason:
         return reason
