@@ -33,6 +33,8 @@ from lidarspec.wire.slots import recoder
 
 #: random frames made at once, and how often, before a sensor's own `sweep` has to help.
 BATCH, TRIES = 64, 40
+#: those of a wire form, which are written one slot after another.
+WRITTEN = 8
 #: random headers of which one at least gives a frame.
 HEADERS = 400
 #: field path -> what draws a raw value of it.
@@ -61,14 +63,15 @@ def examples(sensor: Spec, frame: str, source: random.Random, drawn: Drawn = NOT
     engine = known.compiled
     if engine is None or engine.schema.parts:
         return [_interpreted(sensor, frame, known, source, drawn)]
+    number = BATCH if recoder(engine.frame) is None else WRITTEN
     for _ in range(TRIES):
         layout, chosen = header(engine, source, drawn)
-        rows = _random(engine, layout, BATCH, source)
+        rows = _random(engine, layout, number, source)
         for path, draw in drawn.items():
             if path in layout.leaves and path not in chosen:
                 leaf = layout.leaves[path]
-                count = BATCH * math.prod(leaf.shape)
-                leaf.store(rows, np.array([draw(source) for _ in range(count)]).reshape(BATCH, *leaf.shape))
+                count = number * math.prod(leaf.shape)
+                leaf.store(rows, np.array([draw(source) for _ in range(count)]).reshape(number, *leaf.shape))
         found = _plausible(sensor, frame, layout, _headed(rows, layout, chosen))
         if found:
             return found
