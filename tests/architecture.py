@@ -230,9 +230,11 @@ def word(name: str) -> re.Pattern[str]:
 
 def named_sensors(modules: Mapping[str, Module], names: Collection[str]) -> list[str]:
     """Mentions of a sensor, by its id, vendor or model."""
-    complaints = []
+    complaints, letters = [], re.compile(r"[\W_]+")
+    sought = {name: letters.sub("", name).lower() for name in names}
     for module in modules.values():
-        for name in names:
+        run = letters.sub("", module.text).lower()  # where a name is missing whatever joins it, nothing has to be searched
+        for name in (name for name, joined in sought.items() if joined in run):
             if found := word(name).search(module.text):
                 complaints.append(f"{module.name}:{module.text.count(chr(10), 0, found.start()) + 1} names {name}")
     return complaints

@@ -7,6 +7,7 @@ by chance: where they are many, what happened is told, and not where.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import NamedTuple
 
@@ -17,11 +18,13 @@ from lidarspec.explaining.wording import Value
 from lidarspec.framing.frame_engine import Codec, CompiledCodec, codec
 from lidarspec.framing.results import VALID
 from lidarspec.spec import Frame
+from lidarspec.spec.tree import formulas, nodes, refs
 from lidarspec.wire.arrays import counted
 
-#: bytes of candidates that are tried in one go, the longest frame that construct alone has to read so often, and the longest in
-#: which lost bytes are looked for, of which there are 256 for each place.
-BLOCK, INTERPRETED, SEARCHED = 1 << 20, 128, 512
+#: bytes of candidates that are tried in one go, the longest frame that construct alone has to read so often, and the longest in which
+#: lost bytes are looked for, of which there are 256 for each place; and on how many fields its layout may depend for that, since where
+#: they are many nearly each candidate has a layout of its own.
+BLOCK, INTERPRETED, SEARCHED, HEADED = 1 << 20, 128, 512, 4
 #: most changes that are told one by one.
 TOLD = 3
 #: what may have happened, the likeliest first: by how many bytes it made the frame longer, and how many candidates there are for a place.
@@ -65,8 +68,17 @@ def changes(frame: Frame, data: bytes, kinds: Iterable[str] = KINDS) -> list[Cha
 
 def _most(engine: Codec, values: int) -> int:
     """The longest frame of which every candidate is tried, so many for a place."""
-    is_compiled, is_many = isinstance(engine, CompiledCodec), values > 8
-    return (SEARCHED if is_compiled else 0) if is_many else engine.frame.max_length if is_compiled else INTERPRETED
+    is_compiled = isinstance(engine, CompiledCodec)
+    if values > 8:
+        return SEARCHED if is_compiled and _deciding(engine.frame) <= HEADED else 0
+    return engine.frame.max_length if is_compiled else INTERPRETED
+
+
+@functools.cache
+def _deciding(frame: Frame) -> int:
+    """How many fields decide on the layout of a frame."""
+    asked = (formula for node in nodes(frame.tree) for formula in formulas(node))
+    return len({ref.path for formula in asked for ref in refs(formula)})
 
 
 def _found(kind: str, values: int, data: bytes, size: int, engine: Codec) -> Iterator[Change]:

@@ -102,7 +102,7 @@ class _Batch:
             else:
                 which = left
             frames = self._survey(kind, own, lengths)
-            fits = (frames.sizes == lengths) & (lengths > 0)
+            fits = frames.sizes == lengths
             if not frames.is_sound:
                 fits &= frames.status == VALID
             elif len(own) == number and fits.all():
@@ -112,8 +112,9 @@ class _Batch:
             kinds[which[fits]] = kind
             forms[which[fits]] = np.where(frames.forms < 0, -1, frames.forms + len(layouts))[fits]
             layouts += frames.layouts
-            status = np.where(frames.sizes > lengths, np.uint8(SHORT), np.where(frames.status == VALID, LENGTH, frames.status))
-            reasons[which] = np.maximum(reasons[which], status)
+            if np.count_nonzero(fits) < len(fits):
+                status = np.where(frames.sizes > lengths, np.uint8(SHORT), np.where(frames.status == VALID, LENGTH, frames.status))
+                reasons[which] = np.maximum(reasons[which], status)
             left = np.flatnonzero(kinds < 0)
         return Frames(self._buffer, kinds, starts, sizes, layouts=layouts, forms=forms), reasons
 

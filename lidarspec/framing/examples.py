@@ -6,10 +6,11 @@ plausible is drawn again, in the end around the values that the sensor's `sweep`
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import math
 import random
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -20,16 +21,22 @@ from lidarspec.framing.frame_engine import Codec, CompiledCodec, codec
 from lidarspec.framing.plausibility import plausibility
 from lidarspec.framing.results import VALID
 from lidarspec.spec.construct_layer import Fault, member, random_value
-from lidarspec.spec.description import Spec
-from lidarspec.spec.tree import Node, refs
+from lidarspec.spec.description import Frame, Spec
+from lidarspec.spec.tree import Node, Ref, Select, nodes, refs
 from lidarspec.wire.build import build
 from lidarspec.wire.frame_table import Group, Rows
-from lidarspec.wire.layout import Layout
+from lidarspec.wire.layout import Layout, Leaf
+from lidarspec.wire.layout_tree import TooLong, Unknown, layout_of
+from lidarspec.wire.parts import Measure
 from lidarspec.wire.schema import schema
 from lidarspec.wire.slots import recoder
 
 #: random frames made at once, and how often, before a sensor's own `sweep` has to help.
 BATCH, TRIES = 64, 40
+#: those of a wire form, which are written one slot after another.
+WRITTEN = 8
+#: random headers of which one at least gives a frame.
+HEADERS = 400
 #: field path -> what draws a raw value of it.
 Drawn = Mapping[str, Callable[[random.Random], Any]]
 NOTHING: Drawn = {}
@@ -56,18 +63,66 @@ def examples(sensor: Spec, frame: str, source: random.Random, drawn: Drawn = NOT
     engine = known.compiled
     if engine is None or engine.schema.parts:
         return [_interpreted(sensor, frame, known, source, drawn)]
+    number = BATCH if recoder(engine.frame) is None else WRITTEN
     for _ in range(TRIES):
-        layout, chosen = engine.tree.choose(source, drawn)
-        rows = _random(engine, layout, BATCH, source)
+        layout, chosen = header(engine, source, drawn)
+        rows = _random(engine, layout, number, source)
         for path, draw in drawn.items():
             if path in layout.leaves and path not in chosen:
                 leaf = layout.leaves[path]
-                count = BATCH * math.prod(leaf.shape)
-                leaf.store(rows, np.array([draw(source) for _ in range(count)]).reshape(BATCH, *leaf.shape))
+                count = number * math.prod(leaf.shape)
+                leaf.store(rows, np.array([draw(source) for _ in range(count)]).reshape(number, *leaf.shape))
         found = _plausible(sensor, frame, layout, _headed(rows, layout, chosen))
         if found:
             return found
     return [_swept(sensor, frame, engine, source)]
+
+
+def header(engine: CompiledCodec, source: random.Random, drawn: Drawn = NOTHING) -> tuple[Layout, dict[str, int]]:
+    """A layout of a header chosen at random, with the values of the fields it depends on, by path.
+
+    Args:
+        drawn: field path -> what draws its value in place of chance.
+
+    Raises:
+        SpecError: where hundreds of headers give no frame.
+    """
+    keys = sorted(_switch_keys(engine.frame.tree))
+    for _ in range(HEADERS):
+        with contextlib.suppress(TooLong, ArithmeticError, LookupError, TypeError, ValueError):
+            return _header(engine.frame, source, drawn, keys)
+    raise SpecError("no header was found that gives a frame within its longest length")
+
+
+def _header(frame: Frame, source: random.Random, drawn: Drawn, keys: list[int]) -> tuple[Layout, dict[str, int]]:
+    values: dict[str, int] = {}
+    while True:
+        try:
+            return layout_of(frame.tree, values, frame.room), values
+        except Unknown as unknown:
+            if isinstance(unknown.leaf, Measure):
+                raise SpecError("a header alone does not make a frame of parts", path=unknown.leaf.info.path) from None
+            own = drawn.get(unknown.leaf.info.path)
+            values[unknown.leaf.info.path] = own(source) if own else _some_value(source, unknown.leaf, keys)
+
+
+def _switch_keys(root: Node) -> Iterator[int]:
+    """The values of keys that have no name: fields are known to have those with one."""
+    for node in nodes(root):
+        if isinstance(node, Select):
+            labels = node.key.info.labels if isinstance(node.key, Ref) else ()
+            yield from (key for key, _ in node.cases if isinstance(key, int) and key not in labels)
+
+
+def _some_value(source: random.Random, leaf: Leaf, keys: list[int]) -> int:
+    if leaf.info.const is not None or leaf.info.allowed:
+        return int(leaf.info.const) if leaf.info.const is not None else source.choice(leaf.info.allowed or ())
+    top = (1 << leaf.info.bits) - 1
+    kinds = [source.randint(0, top), source.randint(0, min(top, 8)), source.randint(0, min(top, 40))]
+    named = [key for key in (*leaf.info.labels, *keys) if key <= top]
+    value = source.choice(kinds + named[:16] * (1 if source.random() < 0.7 else 0))
+    is_negative = leaf.info.dtype is not None and leaf.info.dtype.kind == "i" and value >> (leaf.info.bits - 1)
+    return value - (1 << leaf.info.bits) if is_negative else value
 
 
 def _random(engine: CompiledCodec, layout: Layout, number: int, source: random.Random) -> NDArray[np.uint8]:
@@ -151,7 +206,7 @@ def _swept(sensor: Spec, frame: str, engine: CompiledCodec, source: random.Rando
         raise SpecError("no random frame passes `plausible`, and there is no `sweep` to start from", path=frame, sensor=sensor.id)
     for _ in range(TRIES):
         values = sweep(source.randrange(10_000))
-        layout, chosen = engine.tree.choose(source, _stated(engine, values))
+        layout, chosen = header(engine, source, _stated(engine, values))
         rows = _random(engine, layout, 1, source)
         for path, value in values.items():
             leaf = layout.leaves.get(path)

@@ -25,9 +25,10 @@ from lidarspec.framing.results import CHECKSUM, CONSTANT, IMPLAUSIBLE, LENGTH, P
 from lidarspec.spec.construct_layer import Mismatch, fixed_size, has_conditions
 from lidarspec.spec.description import Frame
 from lidarspec.wire.arrays import alike, counted, repeated
+from lidarspec.wire.compilability import NotCompilable
 from lidarspec.wire.frame_table import Group, Records, Rows, Table
 from lidarspec.wire.layout import Layout, Refused, Sums, marks, right, rows_at, words
-from lidarspec.wire.layout_tree import NotCompilable, frame_layouts, prefix_of
+from lidarspec.wire.layout_tree import frame_layouts, prefix_of
 from lidarspec.wire.schema import schema
 from lidarspec.wire.slots import Recoder, recoder
 

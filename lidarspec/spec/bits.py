@@ -60,7 +60,7 @@ class BitField:
         """Whether it is whole bytes in a row."""
         return self.run is not None and (self.run[2] * 8, self.run[3]) == (self.width, 0)
 
-    def value(self, block: bytes) -> int:
+    def value(self, block: bytes | memoryview) -> int:
         """The value in one block of bytes."""
         total = sum((block[s.byte] & s.mask) >> s.low << s.target for s in self.segments)
         return total - (1 << self.width) if self.signed and total >> (self.width - 1) else total

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from lidarspec.columns.columns import Fields, aligned, unpadded
 from lidarspec.columns.graph import Node, sample_of, trace, traverse
 from lidarspec.errors import LidarSpecError, SpecError, UsageError
-from lidarspec.framing.examples import examples
+from lidarspec.framing.examples import examples, header
 from lidarspec.framing.frame_engine import CompiledCodec, codec
 from lidarspec.packets.packets import Packets
 from lidarspec.points.cloud import PointCloud
@@ -172,7 +172,7 @@ def a_single_point_has_a_direction(subject: Subject, name: str) -> None:
     engine, source = codec(subject.sensor.frames[name]), random.Random(subject.sensor.id)
     if not isinstance(engine, CompiledCodec) or engine.schema.parts:
         return
-    counts = [path for path in engine.tree.choose(source)[1] if engine.schema.fields[path].const is None]
+    counts = [path for path in header(engine, source)[1] if engine.schema.fields[path].const is None]
     for path in counts:
         try:
             single = examples(subject.sensor, name, source, {**subject.drawers(name), path: lambda _: 1})

@@ -4,6 +4,7 @@ In: the tree of a frame type (`spec.tree`), and bytes or values. Out: layouts, s
 Modules in reading order:
 
 * `schema`: the fields of a frame type as a table, without bytes.
+* `compilability`: what has no computable place, whatever the header.
 * `layout`: where each field of one kind of header is, as data; loading by it.
 * `parts`: frames within a frame, found from part to part, in many frames at once.
 * `layout_tree`: the layouts of a frame type, by the fields of the header that decide.

@@ -155,13 +155,16 @@ class Rows:
             region = group.layout.regions.get(axis)
             if region is not None:
                 buffer, walked = region.in_rows(group.rows)
-                rounds = ((number, piece) for number, pieces in enumerate(walked.rounds) for piece in pieces if piece.kind == wanted)
-                found += [_Piece(buffer, piece.layout, piece.spots, group.where[piece.owners], number) for number, piece in rounds]
-        frames = np.concatenate([np.empty(0, np.intp), *(piece.frames for piece in found)])
-        order = np.lexsort((np.repeat([piece.number for piece in found], [len(piece.frames) for piece in found]), frames))
-        ranks = np.empty(len(order), np.intp)
-        ranks[order] = np.arange(len(order))
-        return Rows(schema(node.kinds[wanted].root), _by_layout(found, ranks)), frames[order]
+                rounds = (piece for pieces in walked.rounds for piece in pieces if piece.kind == wanted)
+                found += [_Piece(buffer, piece.layout, piece.spots, group.where[piece.owners]) for piece in rounds]
+        counts = np.zeros(len(self), np.intp)
+        for piece in found:
+            counts[piece.frames] += 1
+        ranks, following = list[NDArray[np.intp]](), np.cumsum(counts) - counts
+        for piece in found:  # round after round: in each a frame has one part at most
+            ranks.append(following[piece.frames])
+            following[piece.frames] += 1
+        return Rows(schema(node.kinds[wanted].root), _by_layout(found, ranks)), np.repeat(np.arange(len(self)), counts)
 
     @staticmethod
     def joined(tables: Sequence[Rows]) -> Rows:
@@ -189,30 +192,30 @@ def _loaded(leaf: Leaf, around: Sequence[str], rows: Bytes2D) -> NDArray[Any]:
 
 @dataclass(frozen=True, eq=False)
 class _Piece:
-    """Parts of one layout that are the n-th of their frames: the bytes around them, where in these they begin, and their frames, (k,)."""
+    """Parts of one layout that were found in one round: the bytes around them, where in these they begin, and their frames, (k,)."""
 
     buffer: NDArray[np.uint8]
     layout: Layout
     spots: NDArray[np.intp]
     frames: NDArray[np.intp]
-    number: int
 
 
-def _by_layout(pieces: Sequence[_Piece], ranks: NDArray[np.intp]) -> list[Group]:
-    """Parts as groups, their rows in stream order; `ranks`: the place of each in that, piece after piece."""
+def _by_layout(pieces: Sequence[_Piece], ranks: Sequence[NDArray[np.intp]]) -> list[Group]:
+    """Parts as groups, their rows in stream order; `ranks`: the places of those of each piece in that."""
     members: dict[int, dict[int, list[tuple[_Piece, NDArray[np.intp]]]]] = {}
-    start = 0
-    for piece in pieces:
-        own = ranks[start : start + len(piece.spots)]
+    for piece, own in zip(pieces, ranks, strict=True):
         members.setdefault(id(piece.layout), {}).setdefault(id(piece.buffer), []).append((piece, own))
-        start += len(piece.spots)
     return [_merged([_gathered(parts) for parts in buffers.values()]) for buffers in members.values()]
 
 
 def _gathered(parts: Sequence[tuple[_Piece, NDArray[np.intp]]]) -> Group:
     """Parts of one layout in one buffer as a group."""
     where, spots = (np.concatenate(arrays) for arrays in zip(*((own, piece.spots) for piece, own in parts), strict=True))
-    order, (first, _) = np.argsort(where), parts[0]
+    order, (first, _) = np.empty(len(where), np.intp), parts[0]
+    if len(where) and where.max() == len(where) - 1:  # these are all: no need to sort
+        order[where] = np.arange(len(where))
+    else:
+        order = np.argsort(where)
     return Group(first.layout, where[order], rows_at(first.buffer, spots[order], first.layout.size, gathered=False))
 
 

@@ -95,7 +95,7 @@ class Leaf:
         columns = [self._bits(rows, element) for element in self.elements]
         return np.stack(columns, axis=-1)
 
-    def scalar(self, frame: bytes) -> int:
+    def scalar(self, frame: bytes | memoryview) -> int:
         """The raw value of an integer field outside arrays, in the bytes of one frame."""
         if self.elements:
             return self.elements[0].value(frame[self.offset : self.offset + self.size])
@@ -116,7 +116,7 @@ class Leaf:
         spots = (offsets if which is None else offsets[which]) + self.offset
         return which, self.at(self.offset).load(rows_at(buffer, spots, self.size))
 
-    def of(self, frame: bytes) -> int | None:
+    def of(self, frame: bytes | memoryview) -> int | None:
         """Its value in the first bytes of a frame; None where they end before it does."""
         return self.scalar(frame) if self.offset + self.size <= len(frame) else None
 
@@ -319,8 +319,9 @@ class Condition:
     formula: Formula | None
 
     @classmethod
+    @lru_cache(maxsize=4096)
     def of(cls, what: FieldInfo | Check) -> Condition:
-        """That a field has one of the values that it may have, or a check."""
+        """That a field has one of the values that it may have, or a check; the same in all layouts."""
         if isinstance(what, FieldInfo):
             return cls((what,), None)
         return cls(tuple(ref.info for ref in refs(what.condition)), what.condition)

@@ -3,10 +3,7 @@
 Counts, conditions and keys make the layout of a frame depend on some of its own header fields. `layout_of` walks the frame's tree with
 a cursor, for given values of these fields, and says with `Unknown` which further one it needs. A `HeaderTree` keeps what it found: each
 node of it is one field, each branch one of its values, each end a `Layout`, or the reason why there is none. Candidates are sorted
-through it in bulk, by value, so that the frame's tree is walked once for each distinct header. Headers for examples are drawn by chance.
-
-What has no computable place, whatever the header, is told by `check_compilable` before any bytes arrive (`NotCompilable`), and the
-frame is then interpreted by construct.
+through it in bulk, by value, so that the frame's tree is walked once for each distinct header.
 """
 
 from __future__ import annotations
@@ -14,9 +11,9 @@ from __future__ import annotations
 import bisect
 import contextlib
 import functools
+import itertools
 import math
 import operator
-import random
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -29,17 +26,10 @@ from lidarspec.spec import tree
 from lidarspec.spec.bits import BitField, whole_bytes
 from lidarspec.spec.description import Frame
 from lidarspec.wire.arrays import by_value
+from lidarspec.wire.compilability import NotCompilable, check_compilable, check_control
 from lidarspec.wire.layout import Condition, Layout, Leaf, Refused, Seal
 from lidarspec.wire.parts import CONSTANT, FAILED, Kind, Measure, Region, Rule
-from lidarspec.wire.schema import ByPath, schema, without_indices
-
-
-class NotCompilable(Exception):
-    """A part of a struct that has no computable place; attributes `path` and `reason`."""
-
-    def __init__(self, path: str, reason: str) -> None:
-        self.path, self.reason = path, reason
-        super().__init__(f"{path}: {reason}" if path else reason)
+from lidarspec.wire.schema import ByPath, without_indices
 
 
 class Unknown(Exception):
@@ -97,66 +87,6 @@ def prefix_of(root: tree.Node, limit: int) -> dict[int, tuple[int, int]]:
     with contextlib.suppress(Exception):  # whatever an expression of the struct raises: what comes before counts
         walk.visit(root, "")
     return walk.constants
-
-
-def check_compilable(root: tree.Node) -> None:
-    """Raise `NotCompilable` if any part of a tree has no computable place, whatever the header."""
-    _check(root, "", in_array=False)
-
-
-def _check(node: tree.Node, path: str, *, in_array: bool) -> None:
-    match node:
-        case tree.Opaque():
-            raise NotCompilable(node.info.path, node.reason)
-        case tree.Sealed():
-            if in_array:
-                raise NotCompilable(path, "a checksum inside an array")
-            _ = node.algorithm
-        case tree.Parts() if in_array:
-            raise NotCompilable(path, "parts inside an array")
-        case tree.Block():
-            for part in node.parts:
-                if len(part.indices) > 1:
-                    raise NotCompilable(part.info.path, "an array of arrays of bits")
-    for formula in tree.formulas(node):
-        if isinstance(formula, tree.Code) and formula.blind:
-            raise NotCompilable(path, formula.reason.partition(": ")[2])
-        for ref in tree.refs(formula):
-            check_control(ref.info)
-    if isinstance(node, tree.Parts):
-        for kind in node.kinds:
-            _check_part(kind, path)
-        return
-    for child in tree.children(node):
-        below = f"{path}.{child.name}".strip(".") if isinstance(node, tree.Struct) else path
-        _check(child, below, in_array=in_array or isinstance(node, tree.Repeat))
-
-
-def _check_part(kind: tree.Kind, path: str) -> None:
-    """Hold a part, as a frame in itself, to what holds for frames."""
-    try:
-        _check(kind.root, "", in_array=False)
-        for ref in () if kind.following is None else tree.refs(kind.following):
-            check_control(ref.info)
-        check_columns(kind.root)
-    except NotCompilable as reason:
-        raise NotCompilable(f"{path}.{reason.path}".rstrip("."), reason.reason) from None
-
-
-def check_columns(root: tree.Node) -> None:
-    """Raise `NotCompilable` if a field of a tree has values that no column holds."""
-    for info in schema(root).fields.values():
-        if info.dtype is None:
-            wide = f"its {info.bits} bits are more than a column holds"
-            raise NotCompilable(info.path, wide if info.bits > 64 else "its values are not all plain numbers of one kind")
-
-
-def check_control(info: tree.FieldInfo) -> None:
-    """Raise `NotCompilable` if a layout cannot be made to depend on a field."""
-    if info.kind == "int" and info.axes and info.axes[-1].strip("[]") != info.path:
-        raise NotCompilable(info.path, "elements of one array differ in layout: Parts(struct, count) reads such in bulk")
-    if info.axes or info.kind != "int":
-        raise NotCompilable(info.path, "the layout depends on a field that is not one integer")
 
 
 def _unknown(leaf: Leaf | Measure, _: _Walk) -> int:
@@ -254,7 +184,7 @@ class _Walk:
                 self.branches[node] = dict(node.cases).get(self._value(node.key), node.default)
                 self.visit(self.branches[node], path, shape, strides)
             case tree.Check() if 0 not in shape:
-                self.conditions[node] = condition_of(node)
+                self.conditions[node] = Condition.of(node)
             case tree.Never():
                 raise TooLong(path)
             case tree.Opaque():
@@ -371,7 +301,7 @@ class _Walk:
 
     def _add(self, leaf: Leaf) -> None:
         if leaf.info.allowed is not None:
-            self.conditions[leaf.info] = condition_of(leaf.info)
+            self.conditions[leaf.info] = Condition.of(leaf.info)
         self.leaves[leaf.info.path] = self.parts[leaf.info.path] = leaf
         if leaf.shape and len(leaf.shape) > len(leaf.strides) - (leaf.info.kind == "bytes"):  # bytes, or an array within a bit block
             self.lengths[leaf.info.axes[-1]] = 0 if 0 in leaf.shape[:-1] else leaf.shape[-1]
@@ -429,28 +359,6 @@ def _in_order(seals: list[Seal]) -> Iterator[Seal]:
         free = (seal for seal in left if not any(seal.covers(other) for other in left if other is not seal))
         left.remove(first := next(free, left[0]))
         yield first
-
-
-Draw = Callable[[random.Random], int]
-
-
-def _switch_keys(root: tree.Node) -> Iterator[int]:
-    """The values of keys that have no name: fields are known to have those with one."""
-    for node in tree.nodes(root):
-        if isinstance(node, tree.Select):
-            labels = node.key.info.labels if isinstance(node.key, tree.Ref) else ()
-            yield from (key for key, _ in node.cases if isinstance(key, int) and key not in labels)
-
-
-def _some_value(source: random.Random, leaf: Leaf, keys: list[int]) -> int:
-    if leaf.info.const is not None or leaf.info.allowed:
-        return int(leaf.info.const) if leaf.info.const is not None else source.choice(leaf.info.allowed or ())
-    top = (1 << leaf.info.bits) - 1
-    kinds = [source.randint(0, top), source.randint(0, min(top, 8)), source.randint(0, min(top, 40))]
-    named = [key for key in (*leaf.info.labels, *keys) if key <= top]
-    value = source.choice(kinds + named[:16] * (1 if source.random() < 0.7 else 0))
-    is_negative = leaf.info.dtype is not None and leaf.info.dtype.kind == "i" and value >> (leaf.info.bits - 1)
-    return value - (1 << leaf.info.bits) if is_negative else value
 
 
 #: distinct headers remembered; garbage must not fill the memory with their layouts.
@@ -595,13 +503,13 @@ class _Places:
         self._buffer, self._offsets, self.stops, self._limit = buffer, offsets, stops, limit
         self.refuted: list[NDArray[np.intp]] = []
 
-    def longest(self, which: NDArray[np.intp]) -> bytes:
+    def longest(self, which: NDArray[np.intp]) -> bytes | memoryview:
         """What there is of the one that has the most bytes, up to the longest frame."""
         first = which.item(0)
         if self.stops is not None and len(which) > 1:
             first = which.item((self.stops[which] - self._offsets[which]).argmax())
         start = self._offsets.item(first)
-        return self._buffer[start : min(start + self._limit, len(self._buffer) if self.stops is None else self.stops.item(first))].tobytes()
+        return self._buffer.data[start : min(start + self._limit, len(self._buffer) if self.stops is None else self.stops.item(first))]
 
     def read(self, node: HeaderNode, which: NDArray[np.intp]) -> tuple[NDArray[np.intp] | None, NDArray[Any]]:
         """As `Reader`; those whose field is cut off are looked at here."""
@@ -669,7 +577,7 @@ class HeaderTree:
             if len(which) == 1 and places is not None:
                 node = self._end(places.longest(which), node, is_all=places.stops is not None)
             elif node.leaf is None and node.result is None:
-                data = b"" if places is None else places.longest(which)
+                data: bytes | memoryview = b"" if places is None else places.longest(which)
                 self._explore(node, data, is_all=places is not None and places.stops is not None)
             if node.result is not None:
                 groups.append((node.result, which))
@@ -695,52 +603,26 @@ class HeaderTree:
         return tuple(known.values()), prefix_of(self._frame, self._limit)
 
     def common(self, rows: NDArray[np.uint8]) -> Layout | None:
-        """The layout of candidates, one a row, if they have one and the fields that decide it are the same in all; else None."""
-        first = rows[0].tobytes()
-        layout = self.layout(first)
-        if not isinstance(layout, Layout):
+        """The layout of candidates, one a row, if they have one and the fields that decide it mean the same in all; else None."""
+        end = self._end(rows[0].tobytes(), self._root)
+        above = [end]
+        while above[0].above is not None:
+            above.insert(0, above[0].above)
+        if not isinstance(end.result, Layout):
             return None
-        same = (np.count_nonzero(leaf.load(rows) == value) == len(rows) for leaf, value in self._asked(first))
-        return layout if all(same) else None
+        for node, following in itertools.pairwise(above):
+            assert node.leaf is not None
+            values = node.leaf.load(rows)
+            values = values if node.told is None else node.told.all(values)
+            if np.count_nonzero(values == following.values[node.leaf.info.path]) < len(rows):
+                return None
+        return end.result
 
     def layout(self, frame: bytes) -> Layout | Refused | None:
         """The layout of one frame, or None where its header is not all there."""
         return self._end(frame, self._root).result
 
-    def _asked(self, frame: bytes) -> Iterator[tuple[Leaf | Measure, int]]:
-        """The fields that decided the layout of this frame, and their values, in the order in which they were asked for."""
-        node = self._root
-        while node.leaf is not None and (value := node.leaf.of(frame)) is not None:
-            yield node.leaf, value
-            node = node.children[node.meant(value)]
-
-    def choose(self, source: random.Random, drawn: Mapping[str, Draw] | None = None) -> tuple[Layout, dict[str, int]]:
-        """A layout of a header chosen at random, with the values of the fields it depends on, by path.
-
-        Args:
-            drawn: field path -> what draws its value in place of chance.
-
-        Raises:
-            SpecError: where hundreds of headers give no frame.
-        """
-        keys = sorted(_switch_keys(self._frame))
-        for _ in range(400):
-            with contextlib.suppress(TooLong, ArithmeticError, LookupError, TypeError, ValueError):
-                return self._chosen(source, drawn or {}, keys)
-        raise SpecError("no header was found that gives a frame within its longest length")
-
-    def _chosen(self, source: random.Random, drawn: Mapping[str, Draw], keys: list[int]) -> tuple[Layout, dict[str, int]]:
-        values: dict[str, int] = {}
-        while True:
-            try:
-                return layout_of(self._frame, values, self._limit), values
-            except Unknown as unknown:
-                if isinstance(unknown.leaf, Measure):
-                    raise SpecError("a header alone does not make a frame of parts", path=unknown.leaf.info.path) from None
-                own = drawn.get(unknown.leaf.info.path)
-                values[unknown.leaf.info.path] = own(source) if own else _some_value(source, unknown.leaf, keys)
-
-    def _end(self, data: bytes, node: HeaderNode, *, is_all: bool = False) -> HeaderNode:
+    def _end(self, data: bytes | memoryview, node: HeaderNode, *, is_all: bool = False) -> HeaderNode:
         """Where the header of a frame leads from a node, as `_explore` has it."""
         while node.leaf is not None:
             value = node.leaf.of(data)
@@ -749,7 +631,7 @@ class HeaderTree:
             node = node.child(node.meant(value))
         return node if node.result is not None else self._explore(node, data, is_all=is_all)
 
-    def _explore(self, node: HeaderNode, data: bytes = b"", *, is_all: bool = False) -> HeaderNode:
+    def _explore(self, node: HeaderNode, data: bytes | memoryview = b"", *, is_all: bool = False) -> HeaderNode:
         """Find out, where nobody has yet, which fields decide next, as far as the header of a frame tells, in one walk.
 
         Returns:
@@ -772,7 +654,7 @@ class HeaderTree:
 
         if is_all and len(data) < node.least:
             return node
-        self._size += 1
+        self._size += not node.least  # it is known, where it was cut off before
         walk = _Walk(node.values, self._limit, self._given, asked, len(data) if is_all else None)
         try:
             node.result = _walked(walk, self._frame)
@@ -805,12 +687,6 @@ class HeaderTree:
         return self._told[leaf.info.path]
 
 
-@functools.lru_cache(maxsize=4096)
-def condition_of(what: tree.FieldInfo | tree.Check) -> Condition:
-    """The condition that a field or a check makes, the same in all layouts."""
-    return Condition.of(what)
-
-
 @functools.lru_cache(maxsize=256)
 def kinds_of(node: tree.Parts, given: tuple[tuple[str, int], ...], limit: int) -> tuple[Kind, ...]:
     """What the parts of frames can be in which fields around them have these values."""
@@ -823,7 +699,6 @@ def frame_layouts(frame: Frame) -> HeaderTree | NotCompilable:
     """The layouts of a frame type, or why they cannot be computed."""
     try:
         check_compilable(frame.tree)
-        check_columns(frame.tree)
         return HeaderTree(frame.tree, frame.room)
     except NotCompilable as reason:
         return reason

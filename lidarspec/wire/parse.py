@@ -22,8 +22,9 @@ from lidarspec.spec.bits import BitField
 from lidarspec.spec.construct_layer import Mismatch, WireNaN, clean, field_path, seen, unnamed
 from lidarspec.spec.description import Spec
 from lidarspec.spec.tree import Blob, Block, FieldInfo, Node, Number, Parts, Repeat, Sealed, Select, Struct, When
+from lidarspec.wire.compilability import NotCompilable
 from lidarspec.wire.layout import Layout, Leaf, Refused
-from lidarspec.wire.layout_tree import NotCompilable, frame_layouts, prefix_of
+from lidarspec.wire.layout_tree import frame_layouts, prefix_of
 from lidarspec.wire.parts import Region
 from lidarspec.wire.schema import schema
 from lidarspec.wire.slots import SPELLING, Recoder, recoder

@@ -310,7 +310,7 @@ class Measure:
         there = np.flatnonzero(~cut_off | is_all)
         return there, values[there]
 
-    def of(self, frame: bytes) -> int | None:
+    def of(self, frame: bytes | memoryview) -> int | None:
         """As `Leaf.of`."""
         values = self.read(np.frombuffer(frame, np.uint8), np.zeros(1, np.intp))[1]
         return int(values[0]) if len(values) else None

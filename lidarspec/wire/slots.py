@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 from lidarspec.errors import SpecError
 from lidarspec.spec.description import Frame
 from lidarspec.spec.wire_forms import NONE, Reading, Slot, Unescaped, WireForm
+from lidarspec.wire.compilability import NotCompilable
 from lidarspec.wire.layout import Bytes2D, Layout, Leaf, Refused
-from lidarspec.wire.layout_tree import HeaderNode, HeaderTree, NotCompilable, frame_layouts
+from lidarspec.wire.layout_tree import HeaderNode, HeaderTree, frame_layouts
 from lidarspec.wire.parts import Measure
 
 Indices = NDArray[np.intp]

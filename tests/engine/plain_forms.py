@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from construct import Array, Bytes, Const, Construct, Container, FormatField, IfThenElse, Pass, Renamed, Struct, evaluate
+from construct import Array, Bytes, BytesInteger, Const, Construct, Container, FormatField, IfThenElse, Pass, Renamed, Struct, evaluate
 
 from lidarspec.spec import Escaped, Lines, Tokens
 
@@ -13,7 +13,7 @@ def plain_row(form: Any, struct: Construct, data: bytes) -> tuple[bytes, int] | 
     """The row of the frame that some bytes begin with, and its bytes on the wire; None where they begin with none."""
     if isinstance(form, Tokens):
         return _tokens(form, struct, data)
-    return _escaped(form, data) if isinstance(form, Escaped) else _lines(form, data)
+    return _escaped(form, data) if isinstance(form, Escaped) else _lines(form, struct, data)
 
 
 def _escaped(form: Escaped, data: bytes) -> tuple[bytes, int] | None:
@@ -32,7 +32,7 @@ def _escaped(form: Escaped, data: bytes) -> tuple[bytes, int] | None:
     return bytes(row), end + 1
 
 
-def _lines(form: Lines, data: bytes) -> tuple[bytes, int] | None:
+def _lines(form: Lines, struct: Construct, data: bytes) -> tuple[bytes, int] | None:
     end = data.find(b"\n\n")
     if end < 0:
         return None
@@ -50,21 +50,12 @@ def _lines(form: Lines, data: bytes) -> tuple[bytes, int] | None:
         row += line
     if len(lines) < len(form.head):
         return None
-    return _six_bits(row), end + 2
-
-
-def _six_bits(row: bytes) -> bytes:
-    """Of the shape with lines: what is text, and what is a number of how many characters."""
-    if len(row) < 11 or any(not 48 <= character < 112 for character in row):
-        return b""
-    sizes = [1] * 2 + [0, 0] + [4, 1] + [3] * ((len(row) - 11) // 3)
-    found, left = bytearray(row[:2]), list(row[2:])
-    for size in sizes:
-        value, characters = 0, [left.pop(0) for _ in range(size or 1)]
-        for character in characters:
-            value = value * 64 + character - 48
-        found += value.to_bytes(size, "big") if size else bytes(characters)
-    return bytes(found) + bytes(left)
+    reader = _SixBitReader(row, form)
+    try:
+        reader.read(struct, Container(), "")
+    except ValueError:
+        return b"", end + 2
+    return bytes(reader.row) + reader.left, end + 2
 
 
 def _tokens(form: Tokens, struct: Construct, data: bytes) -> tuple[bytes, int] | None:
@@ -82,7 +73,7 @@ def _tokens(form: Tokens, struct: Construct, data: bytes) -> tuple[bytes, int] |
 class _Reader:
     """Goes through a struct and the characters of a frame side by side."""
 
-    def __init__(self, left: bytes, form: Tokens) -> None:
+    def __init__(self, left: bytes, form: Any) -> None:
         self.left, self.row, self._form = left, bytearray(), form
 
     def read(self, part: Construct, context: Container, name: str) -> None:
@@ -103,7 +94,7 @@ class _Reader:
             self._text(len(part.value))
         elif isinstance(part, Bytes):
             self._text(evaluate(part.length, context))
-        elif isinstance(part, FormatField):
+        elif isinstance(part, FormatField | BytesInteger):
             context[name] = self._number(part)
         elif hasattr(part, "subcon"):  # a unit, a name
             self.read(part.subcon, context, name)
@@ -137,4 +128,23 @@ class _Reader:
             raise ValueError(token)
         value = int(token) if signed else value
         self.row += (value % 2**bits).to_bytes(field.length, "big")
+        return value
+
+
+class _SixBitReader(_Reader):
+    """Numbers of as many characters as the field has bytes, of which each is six bits; anything else is text."""
+
+    def _text(self, size: int) -> None:
+        self.row += self.left[:size]
+        self.left = self.left[size:]
+
+    def _number(self, field: Construct) -> int:
+        size = field.sizeof()
+        characters, self.left = self.left[:size], self.left[size:]
+        if len(characters) < size or any(not 48 <= character < 112 for character in characters):
+            raise ValueError(characters)
+        value = 0
+        for character in characters:
+            value = value * 64 + character - 48
+        self.row += value.to_bytes(size, "big")
         return value

@@ -9,7 +9,7 @@ import tracemalloc
 from collections.abc import Callable
 
 from lidarspec import Counters, Sensor, SpecError
-from lidarspec.framing.examples import examples
+from lidarspec.framing.examples import examples, header
 from lidarspec.framing.frame_engine import CompiledCodec, codec
 from lidarspec.testing import subject as material
 from lidarspec.testing.agreement import cuts
@@ -61,8 +61,8 @@ def longest_example(subject: Subject, name: str) -> bytes:
     engine, source = codec(subject.sensor.frames[name]), subject.source(f"longest {name}")
     if isinstance(engine, CompiledCodec) and engine.size is None:
         with contextlib.suppress(SpecError):
-            _, header = max((engine.tree.choose(source, subject.drawers(name)) for _ in range(200)), key=lambda chosen: chosen[0].size)
-            drawn = {path: (lambda _, value=value: value) for path, value in header.items()}
+            _, longest = max((header(engine, source, subject.drawers(name)) for _ in range(200)), key=lambda chosen: chosen[0].size)
+            drawn = {path: (lambda _, value=value: value) for path, value in longest.items()}
             found += examples(subject.sensor, name, source, subject.drawers(name) | drawn)
     return max(found, key=len)
 

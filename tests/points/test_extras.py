@@ -189,10 +189,10 @@ def test_columns_that_are_read_together_are_those_that_are_read_one_by_one(senso
     read = sensor.decode([sensor.example(sensor.data_frame, seed=seed) for seed in range(30)], backend=backend).with_points
     plain = evaluate(read).cloud
     names = [*plain.columns, "valid"]
-    for which in (slice(None), slice(len(plain) // 2), slice(5, len(plain) - 5)):
-        cloud = read.points()[which]
+    for which in (..., slice(5, len(plain) - 5)):
+        cloud = read.points() if which is ... else read.points()[which]
         assert list(cloud.read(*names)) == names
-        assert_same_points(cloud, plain[which], ulps=6)
+        assert_same_points(cloud, plain if which is ... else plain[which], ulps=6)
     one = read.points()
     assert all(column is one.read(*names)[name] for name, column in one.read(*names).items())
 

@@ -11,7 +11,7 @@ import pytest
 import lidarspec as ls
 from lidarspec.discovery.detect import verdict
 from lidarspec.discovery.listen import Heard
-from lidarspec.errors import CommandError
+from lidarspec.errors import CommandError, UsageError
 from tests.sensors.evidence import capture, decoded, vector_bytes, vectors
 
 TIM871S, TIM551 = ls.sensor("sick-tim871s"), ls.sensor("sick-tim551")
@@ -61,6 +61,29 @@ def test_a_telegram_without_strengths_beside_one_that_has_them() -> None:
     assert cloud.intensity is not None
     assert cloud.intensity[271:].tolist() == [0] * 271
     np.testing.assert_array_equal(cloud.range[271:], cloud.range[:271])
+
+
+@pytest.mark.parametrize("cola", ["A", "B"])
+@pytest.mark.parametrize(("name", "echoes"), [("sick-lms111", 2), ("sick-lms511", 3), ("sick-lms511", 5), ("sick-mrs1104", 3)])
+def test_any_number_of_echoes_is_read_with_their_strengths(name: str, echoes: int, cola: str) -> None:
+    sensor = ls.sensor(name).configure(cola=cola, echoes=echoes)
+    frame = "echoes_text" if cola == "A" else "echoes"
+    values = sensor.parse(ls.simulate(sensor, 1)[0])
+    first, beams = dict(values.dist1), values.dist1.count
+    for number in range(1, echoes + 1):
+        values[f"dist{number}"] = {**first, "content": f"DIST{number}".encode(), "samples": [1000 * number] * beams}
+        values[f"rssi{number}"] = {**first, "content": f"RSSI{number}".encode(), "samples": [10 * number] * beams}
+    data = sensor.build(frame, {**values, "channels": 2 * echoes})
+    packets = sensor.decode(data * 2)
+    cloud = packets.points()
+    assert dict(packets.stats.frames) == {frame: 2}
+    assert cloud.intensity is not None
+    assert cloud.return_index is not None
+    assert cloud.range[:echoes].tolist() == list(range(1, echoes + 1))
+    assert cloud.intensity[:echoes].tolist() == [10 * number for number in range(1, echoes + 1)]
+    assert cloud.return_index[:echoes].tolist() == list(range(echoes))
+    with pytest.raises(UsageError, match="echoes is a number from 1 to"):
+        sensor.configure(echoes=6)
 
 
 @pytest.mark.parametrize("cola", ["A", "B"])

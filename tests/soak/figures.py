@@ -128,7 +128,7 @@ def linear(share: float) -> Figure:
 def delay(share: float) -> Figure:
     """P6: bytes that come after a frame's last one before it is out, by the longest frame."""
     worst_share = 0.0
-    for sensor in STREAMS.values():
+    for _, sensor in few(STREAMS, share):
         data = Subject(sensor).stream(rounds=3)[: int(20_000 * share) + 3000]
         bound = max(frame.max_length * frame.confirm for frame in sensor.frames.values() if frame.direction == "in")
         decoder = sensor.decoder()

@@ -15,14 +15,13 @@ parameter_introduction.md: 3,125,000 baud; JT16 correction file).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
 import numpy as np
 from construct import Array, Const, Int8ul, Int16sl, Int16ul, Int32ul, Struct
 
-from lidarspec.spec import Checksum, Checksummed, Clock, Fields, Frame, OnWrap, Polar, Scaled, Sensor, Sequence, Serial, Simulation
+from lidarspec.spec import Checksummed, Clock, Fields, Frame, OnWrap, Polar, Scaled, Sensor, Sequence, Serial, Simulation, ZeroPadded
 from lidarspec_hesai.calibration import Calibration, configure, nominal
 from lidarspec_hesai.parts import UTC, clock, turning
 from lidarspec_hesai.sealed import CRC
@@ -37,19 +36,6 @@ AZIMUTH = (
     193.33747, 193.36131, 193.34482, 193.41829, 193.47669, 193.46605, 193.60451, 193.77519,
     187.86962, 187.84975, 187.85431, 187.85183, 187.65341, 187.80239, 187.84902, 187.77156,
 )  # fmt: skip
-
-
-@dataclass(frozen=True)
-class WholeWords(Checksum):
-    """The CRC of the family over bytes that zeros fill up to a multiple of four."""
-
-    width: int = 32
-
-    def __call__(self, data: bytes | bytearray | memoryview) -> int:
-        return CRC(bytes(data) + bytes(-len(data) % 4))
-
-    def describe(self) -> str:
-        return f"{CRC.describe()}, over bytes filled up with zeros to a multiple of 4"
 
 
 def packet(data_type: int, *body: Any) -> Struct:
@@ -87,7 +73,7 @@ IMU = Checksummed(
         "sequence" / Int16ul,
     ),
     "crc",
-    WholeWords(),
+    ZeroPadded(CRC, 4),
 )
 
 

@@ -59,7 +59,7 @@ def any_of(conditions: list[Any]) -> Any:
 COARSE = Kind((15,), (1,), -45, 271)
 TIM5 = Kind((15,), (0.3333,), -45, 811)
 TIM7 = Kind((15,), (0.3333,), -45, 811)
-LMS1 = Kind((50, 25), (0.5, 0.25), -45, 541)
+LMS1 = Kind((50, 25), (0.5, 0.25), -45, 541, echoes=2)
 LMS5 = Kind((50, 25, 35, 75, 100), (0.5, 0.1667, 0.25, 0.3333, 0.6667, 1), -5, 381, echoes=5)
 MRS1 = Kind((50,), (0.25,), -47.5, 1101, echoes=3, layers=(0, -2.5, 2.5, -5))  # 8020494, 3.5.10
 
@@ -78,10 +78,10 @@ MODELS: dict[str, tuple[str, Kind, tuple[float, float], str]] = {
 }
 
 
-def sweep(i: int, kind: Kind) -> dict[str, Any]:
-    """Telegram i of a scanner of this kind, with all echoes and their strengths."""
+def sweep(i: int, kind: Kind, echoes: int = 1) -> dict[str, Any]:
+    """Telegram i of a scanner of this kind, with so many echoes and their strengths."""
     rate, step = kind.rates[0], kind.steps[0]
-    channels = [f"{name}{number}" for number in range(1, kind.echoes + 1) for name in ("dist", "rssi")]
+    channels = [f"{name}{number}" for number in range(1, echoes + 1) for name in ("dist", "rssi")]
     each = {"start": kind.start, "step": step, "count": kind.beams, "scale": 1.0, "offset": 0.0}
     return {
         **{f"{channel}.{name}": value for channel in channels for name, value in each.items()},
@@ -102,20 +102,25 @@ def sweep(i: int, kind: Kind) -> dict[str, Any]:
 def frames(kind: Kind, cola: str) -> dict[str, Frame]:
     """Scans with one echo and with all, first those in this form; messages in this form alone."""
     forms = sorted("AB", key=lambda form: form != cola)
-    names = {("B", kind.echoes): "echoes", ("A", kind.echoes): "echoes_text", ("B", 1): "scan", ("A", 1): "text"}
-    counts = (1, kind.echoes) if kind.echoes > 1 else (1,)
-    return {names[form, count]: scans(form, count) for count in counts for form in forms} | dict(messages(cola))
+    own = {{"A": "text", "B": "scan"}[form]: scans(form, 1) for form in forms}
+    if kind.echoes > 1:
+        names, simulation = {"A": "echoes_text", "B": "echoes"}, Simulation(partial(sweep, kind=kind, echoes=kind.echoes))
+        own |= {names[form]: dataclasses.replace(scans(form, kind.echoes), simulation=simulation) for form in forms}
+    return own | dict(messages(cola))
 
 
-def configure(sensor: Sensor, *, cola: str) -> Sensor:
-    """The scanner that is spoken to in CoLa "A" or "B"; scans are read in either form.
+def configure(sensor: Sensor, *, cola: str = "B", echoes: int = 0) -> Sensor:
+    """The scanner that is spoken to in CoLa "A" or "B"; scans are read in either form, with one echo and with so many, by default all.
 
     Raises:
-        UsageError: for another form.
+        UsageError: for another form, or more echoes than the scanner has.
     """
+    kind = MODELS[sensor.id][1]
     if cola not in ("A", "B"):
         raise UsageError(f"{sensor.id}: cola is 'A' or 'B', not {cola!r}")
-    own = frames(MODELS[sensor.id][1], cola)
+    if echoes not in range(kind.echoes + 1):
+        raise UsageError(f"{sensor.id}: echoes is a number from 1 to {kind.echoes}, not {echoes!r}")
+    own = frames(dataclasses.replace(kind, echoes=echoes or kind.echoes), cola)
     return dataclasses.replace(sensor, frames=own, commands=commands("text" if cola == "A" else "scan"))
 
 
