@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lidarspec.formats.writing import kept
 from lidarspec.points.cloud import STRUCTURED, grid_of, source_of
 from lidarspec.scans.scans import Scan, handed_out
 
@@ -17,6 +18,8 @@ from lidarspec.scans.scans import Scan, handed_out
 NAMES = STRUCTURED.names or ()
 #: figures that there is room for where a header says how many rows follow.
 FIGURES = 20
+#: bytes written at once: what a processor's cache holds is copied three times as fast.
+PIECE = 1 << 20
 
 
 class Rows:
@@ -70,8 +73,8 @@ class Rows:
         source_of(cloud).prepare((*names, "valid"))
         columns = {name: getattr(cloud, name) if name in NAMES else cloud.extra.get(name) for name in names}
         columns |= {"scan": np.full(len(cloud), number, np.int32)} if "scan" in names else {}
-        kept = slice(None) if self._every_point or cloud.valid.all() else cloud.valid
-        return {name: column[kept] for name, column in columns.items() if column is not None}
+        which = kept(cloud, every_point=self._every_point)
+        return {name: column if which is None else column[which] for name, column in columns.items() if column is not None}
 
 
 def write_rows(path: Path, rows: Rows, header: Callable[[Rows], bytes]) -> None:
@@ -79,7 +82,9 @@ def write_rows(path: Path, rows: Rows, header: Callable[[Rows], bytes]) -> None:
     with path.open("wb") as file:
         file.write(header(rows))
         for block in rows:
-            file.write(block.view(np.uint8).data)
+            data = block.view(np.uint8).data
+            for start in range(0, len(data), PIECE):
+                file.write(data[start : start + PIECE])
         file.seek(0)
         file.write(header(rows))
 

@@ -13,7 +13,7 @@ from typing import Any, TextIO
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.formats.writing import written
+from lidarspec.formats.writing import kept, written
 from lidarspec.scans.scans import Scan
 from lidarspec.transports.protocol import Format
 
@@ -57,9 +57,9 @@ def write_xyz(path: Path, scans: Iterable[Scan], *, every_point: bool) -> None:
     """Write x y z in metres, nothing else; missing points as nan."""
     with text_file(path) as file:
         for scan in scans:
-            columns = scan.points.read("x", "y", "z", "valid")
-            valid = columns.pop("valid")
-            file.writelines(_lines("%.7g %.7g %.7g\n", [column if every_point else column[valid] for column in columns.values()]))
+            which = kept(scan.points, every_point=every_point)
+            columns = scan.points.read("x", "y", "z").values()
+            file.writelines(_lines("%.7g %.7g %.7g\n", [column if which is None else column[which] for column in columns]))
 
 
 def write_columns(path: Path, columns: Mapping[str, NDArray[Any]]) -> None:
