@@ -17,7 +17,7 @@ from lidarspec.cli.terminal import note
 from lidarspec.device.device import Device, open as open_device
 from lidarspec.discovery.detect import detected
 from lidarspec.errors import UsageError, WireError, suggest, suggestion
-from lidarspec.formats import format_of, write, write_imu
+from lidarspec.formats import format_of, targets, write, write_imu
 from lidarspec.packets.imu import joined
 from lidarspec.plugins import sensor as named_sensor
 from lidarspec.scans.scans import Scan
@@ -65,10 +65,12 @@ def convert(
     """Write the points of a capture or raw file to a file, in the format of its suffix.
 
     .csv and .npz hold x y z range azimuth elevation intensity time ring return_index column, those that the sensor has, its further
-    columns, and the number of the scan; metres, radians, and seconds since the scan's stamp.
+    columns, and the number of the scan; metres, radians, and seconds since the scan's stamp. .npy, .ply, .pcd and .lzf.pcd, which is
+    compressed, hold x y z intensity ring time, further columns and, of several scans, their number; .bin, as KITTI has it, x y z intensity;
+    .xyz x y z. For a file each scan put the place of a number into the name: scans/%05d.pcd.
     """
     format_of(target)
-    refuse_overwriting(target, source, sensor_id, force=force)
+    refuse_overwriting(targets(target), source, sensor_id, force=force)
     sensor = _detected(source, target) if sensor_id is None else named_sensor(sensor_id)
     with open_device(source, sensor) as device, Progress() as progress:
         written = Written(device, target)

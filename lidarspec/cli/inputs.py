@@ -136,23 +136,25 @@ def _no_bytes(words: Sequence[str], error: ValueError) -> LidarSpecError:
     return UsageError(f"{text[:QUOTED]!r} is no file, and not hexadecimal: {error}")
 
 
-def refuse_overwriting(target: str | None, *inputs: str | Path | Sensor | None, force: bool = True) -> None:
+def refuse_overwriting(target: str | Sequence[str] | None, *inputs: str | Path | Sensor | None, force: bool = True) -> None:
     """Nothing, where a file is written to that is none of those that are read, by whatever name, and with `force` off is new.
 
     Args:
+        target: the file, or files.
         inputs: words that may be a SOURCE or a file; sensors, whose options may be.
 
     Raises:
         UsageError: where it is not.
     """
-    if target is None or not os.path.exists(target):
-        return
-    for path in [path for given in inputs for path in _read_for(given)] if os.path.isfile(target) else ():
-        if os.path.exists(path) and os.path.samefile(path, target):
-            name = "standard input" if path == 0 else f"read as {path}" if path != target else "read"
-            raise UsageError(f"{target} is {name}: it would be overwritten")
-    if not force:
-        error = UsageError(f"{target} exists already; it is not overwritten unless asked for")
+    existing = [file for file in ([target] if isinstance(target, str) else target or ()) if os.path.exists(file)]
+    files = [file for file in existing if os.path.isfile(file)]
+    for path in [path for given in inputs for path in _read_for(given)] if files else ():
+        same = next((file for file in files if os.path.samefile(path, file)), None) if os.path.exists(path) else None
+        if same is not None:
+            name = "standard input" if path == 0 else f"read as {path}" if path != same else "read"
+            raise UsageError(f"{same} is {name}: it would be overwritten")
+    if existing and not force:
+        error = UsageError(f"{existing[0]} exists already; it is not overwritten unless asked for")
         raise suggest(error, "the same with --force, or with another file")
 
 

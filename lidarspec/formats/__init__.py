@@ -4,8 +4,10 @@ In: scans. Out: a file, which appears under its name only when it is whole. `wri
 formats, too. Modules in reading order:
 
 * `writing`: what formats have in common.
-* `text`: .csv, a row a point.
-* `arrays`: .npz, an array a column.
+* `text`: .csv, .csv.gz and .xyz, a row a point.
+* `arrays`: .npz, an array a column; .npy, a structured array.
+* `rows`: points as rows of bytes behind a header.
+* `clouds`: .pcd, .lzf.pcd, .ply and KITTI's .bin.
 """
 
 from __future__ import annotations
@@ -18,8 +20,9 @@ from typing import NoReturn
 import numpy as np
 
 from lidarspec.errors import LidarSpecError, SpecError, UnknownFormat, system_errors
-from lidarspec.formats.arrays import NPZ
-from lidarspec.formats.text import CSV, write_columns
+from lidarspec.formats.arrays import NPY, NPZ
+from lidarspec.formats.clouds import KITTI, LZF_PCD, PCD, PLY
+from lidarspec.formats.text import CSV, CSV_GZ, XYZ, write_columns
 from lidarspec.formats.writing import replacing
 from lidarspec.packets.imu import ImuSamples
 from lidarspec.plugins import registry
@@ -27,8 +30,8 @@ from lidarspec.scans.scans import Scan
 from lidarspec.transports.protocol import Format
 
 #: the place of a number in the name of a file.
-NUMBERED = re.compile(r"%0?\d*d")
-BUILT_IN = {known.suffix: known for known in (CSV, NPZ)}
+NUMBERED = re.compile(r"%0?\d?d")
+BUILT_IN = {known.suffix: known for known in (CSV, CSV_GZ, XYZ, NPZ, NPY, PCD, LZF_PCD, PLY, KITTI)}
 
 
 def formats() -> dict[str, Format]:
@@ -72,14 +75,22 @@ def write_imu(path: str | Path, samples: ImuSamples) -> None:
         UnknownFormat: for another suffix.
         SourceError: where the file cannot be written.
     """
-    path = Path(path)
-    if path.suffix.lower() not in BUILT_IN:
-        raise UnknownFormat(path.suffix or str(path), BUILT_IN, place=str(path))
+    path, known = Path(path), {format.suffix: format for format in (CSV, NPZ)}
+    chosen = _longest(path, known) or _unknown(path, known)
     with replacing(path) as part:
-        if path.suffix.lower() == CSV.suffix:
+        if chosen is CSV:
             write_columns(part, samples.columns)
         else:
             np.savez(part, **samples.columns)  # type: ignore[arg-type]  # no column is called allow_pickle
+
+
+def targets(path: str | Path) -> list[str]:
+    """The files that `write` may replace: that of the path, or those that there are already under such a name with a number."""
+    path = Path(path)
+    if not NUMBERED.search(path.name):
+        return [str(path)]
+    named = re.compile(r" *\d+".join(map(re.escape, NUMBERED.split(path.name))))
+    return sorted(str(file) for file in path.parent.glob("*") if named.fullmatch(file.name))
 
 
 def write(path: str | Path, scans: Iterable[Scan], *, every_point: bool = False) -> None:
@@ -106,4 +117,9 @@ def _each(path: Path, scans: Iterable[Scan]) -> Iterator[tuple[Path, list[Scan]]
     with system_errors(path):
         path.parent.mkdir(parents=True, exist_ok=True)
     for number, scan in enumerate(scans):
-        yield path.with_name(path.name % number), [scan]
+        yield path.with_name(_numbered(path.name, number)), [scan]
+
+
+def _numbered(name: str, number: int) -> str:
+    """A name with a number in its place; another percent sign stays."""
+    return NUMBERED.sub(lambda place: place[0] % number, name)

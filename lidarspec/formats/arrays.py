@@ -1,20 +1,24 @@
-"""NumPy's .npz: one array a column, and one entry a scan for the stamps; written scan by scan, so memory stays small.
+"""NumPy's .npz: one array a column, and one entry a scan for the stamps; and .npy: one structured array. Memory stays small.
 
-How long an array is stands before it, and is known at the end alone: until then each column grows in a file of its own, without a
-name, in the same folder.
+How long an array is stands before it, and is known at the end alone: until then each column of an .npz grows in a file of its own,
+without a name, in the same folder.
 """
 
 from __future__ import annotations
 
 import contextlib
+import io
 import zipfile
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import DTypeLike
 
+from lidarspec.formats.rows import NAMES, Rows, write_rows
 from lidarspec.formats.writing import Spool, written
+from lidarspec.points.cloud import structured_type
 from lidarspec.scans.scans import Scan
 from lidarspec.transports.protocol import Format
 
@@ -58,4 +62,25 @@ def write(path: Path, scans: Iterable[Scan], *, every_point: bool) -> None:
                 put(archive, name, kept)
 
 
+def write_npy(path: Path, scans: Iterable[Scan], *, every_point: bool) -> None:
+    """Write one structured array with PCL's layout, as `PointCloud.to_structured` makes it: what the sensor lacks is 0.
+
+    Where there are several scans, their number is a further column, `scan`. Such a file can be mapped: ``np.load(path, mmap_mode="r")``.
+    """
+    write_rows(path, Rows(scans, _structured, every_point=every_point), _npy_header)
+
+
+def _structured(types: Mapping[str, Any]) -> np.dtype[Any]:
+    return structured_type({name: np.dtype(dtype) for name, dtype in types.items() if name not in NAMES})
+
+
+def _npy_header(rows: Rows) -> bytes:
+    """As long for any number of rows, since NumPy leaves room for it."""
+    header = io.BytesIO()
+    shape = {"descr": np.lib.format.dtype_to_descr(rows.dtype), "fortran_order": False, "shape": (rows.length,)}
+    np.lib.format.write_array_header_1_0(header, shape)
+    return header.getvalue()
+
+
 NPZ = Format(".npz", "NumPy arrays, one a column", write)
+NPY = Format(".npy", "a structured NumPy array with PCL's layout", write_npy)

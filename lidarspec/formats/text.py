@@ -1,15 +1,19 @@
-"""Comma-separated values: a header row, then one row a point; written scan by scan, so memory stays small."""
+"""Text, a row a point: comma-separated values behind a row of names, also compressed, and .xyz; memory stays small."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+import contextlib
+import functools
+import gzip
+import io
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.formats.writing import written
+from lidarspec.formats.writing import kept, written
 from lidarspec.scans.scans import Scan
 from lidarspec.transports.protocol import Format
 
@@ -18,12 +22,24 @@ _WRITTEN = {"f2": "%.7g", "f4": "%.7g", "f8": "%.15g"}
 _TIME = "%.9f"
 #: rows turned into text at once.
 ROWS = 1 << 14
+#: of gzip: numbers take 0.34 of their size then, and 0.27 at the usual 6, in five times the time.
+_LEVEL = 1
 
 
-def write(path: Path, scans: Iterable[Scan], *, every_point: bool) -> None:
+@contextlib.contextmanager
+def text_file(path: Path, *, is_zipped: bool = False) -> Iterator[TextIO]:
+    """A file for text, which may be compressed; neither a name nor a time stands in it."""
+    with contextlib.ExitStack() as files:
+        file: Any = files.enter_context(path.open("wb"))
+        if is_zipped:
+            file = files.enter_context(gzip.GzipFile("", "wb", _LEVEL, file, mtime=0))
+        yield files.enter_context(io.TextIOWrapper(file, encoding="ascii", newline=""))
+
+
+def write(path: Path, scans: Iterable[Scan], *, every_point: bool, is_zipped: bool = False) -> None:
     """Write the columns that the first scan has, and the number of the scan."""
     names: tuple[str, ...] = ()
-    with path.open("w", encoding="ascii", newline="") as file:
+    with text_file(path, is_zipped=is_zipped) as file:
         for number, scan in enumerate(scans):
             cloud = written(scan, every_point=every_point)
             if not names:
@@ -34,17 +50,30 @@ def write(path: Path, scans: Iterable[Scan], *, every_point: bool) -> None:
             cells = [
                 _TIME if name == "time" else _WRITTEN.get(column.dtype.str[1:], "%d") for name, column in zip(names, columns, strict=True)
             ]
-            template = ",".join([*cells, f"{number}\n"])
-            for start in range(0, len(cloud), ROWS):
-                file.write("".join(map(template.__mod__, zip(*(c[start : start + ROWS].tolist() for c in columns), strict=True))))
+            file.writelines(_lines(",".join([*cells, f"{number}\n"]), columns))
+
+
+def write_xyz(path: Path, scans: Iterable[Scan], *, every_point: bool) -> None:
+    """Write x y z in metres, nothing else; missing points as nan."""
+    with text_file(path) as file:
+        for scan in scans:
+            which = kept(scan.points, every_point=every_point)
+            columns = scan.points.read("x", "y", "z").values()
+            file.writelines(_lines("%.7g %.7g %.7g\n", [column if which is None else column[which] for column in columns]))
 
 
 def write_columns(path: Path, columns: Mapping[str, NDArray[Any]]) -> None:
     """Write columns of one length, whole numbers and float64, with their names above."""
     template = ",".join("%d" if column.dtype.kind == "i" else "%.15g" for column in columns.values()) + "\n"
-    with path.open("w", encoding="ascii", newline="") as file:
+    with text_file(path) as file:
         file.write(",".join(columns) + "\n")
-        file.writelines(template % row for row in zip(*(column.tolist() for column in columns.values()), strict=True))
+        file.writelines(_lines(template, [*columns.values()]))
+
+
+def _lines(template: str, columns: Sequence[NDArray[Any]]) -> Iterator[str]:
+    """The rows of columns as text, many at once."""
+    for start in range(0, len(columns[0]), ROWS):
+        yield "".join(map(template.__mod__, zip(*(column[start : start + ROWS].tolist() for column in columns), strict=True)))
 
 
 def _column(values: NDArray[Any] | None, length: int) -> NDArray[Any]:
@@ -52,3 +81,5 @@ def _column(values: NDArray[Any] | None, length: int) -> NDArray[Any]:
 
 
 CSV = Format(".csv", "comma-separated values, one row a point", write)
+CSV_GZ = Format(".csv.gz", "comma-separated values, compressed", functools.partial(write, is_zipped=True))
+XYZ = Format(".xyz", "x y z as text, one row a point", write_xyz)

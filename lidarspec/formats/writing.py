@@ -65,7 +65,13 @@ def library(name: str, extra: str) -> Any:
 
 def written(scan: Scan, *, every_point: bool) -> PointCloud:
     """The points of a scan that are written: those with a valid return, or all."""
-    return scan.points if every_point else scan.points[scan.points.valid]
+    which = kept(scan.points, every_point=every_point)
+    return scan.points if which is None else scan.points[which]
+
+
+def kept(cloud: PointCloud, *, every_point: bool) -> NDArray[np.intp] | None:
+    """The indices of the points that are written, which pick columns several times as fast as a mask; None for all."""
+    return None if every_point or cloud.valid.all() else np.flatnonzero(cloud.valid)
 
 
 class Spool:

@@ -178,15 +178,15 @@ class PointCloud:
         """
         source_of(self).prepare((*(STRUCTURED.names or ()), *self.extra))
         columns = {name: getattr(self, name) for name in STRUCTURED.names or ()} | dict(self.extra)
-        structured = np.zeros(len(self), _structured({name: column.dtype for name, column in self.extra.items()}))
+        structured = np.zeros(len(self), structured_type({name: column.dtype for name, column in self.extra.items()}))
         for name, column in columns.items():
             if column is not None:
                 structured[name] = column
         return structured
 
 
-def _structured(extra: Mapping[str, np.dtype[Any]]) -> np.dtype[Any]:
-    """PCL's layout with further columns behind it."""
+def structured_type(extra: Mapping[str, np.dtype[Any]]) -> np.dtype[Any]:
+    """PCL's layout with further columns behind it, each where its type allows."""
     places, end = {name: place[:2] for name, place in (STRUCTURED.fields or {}).items()}, STRUCTURED.itemsize
     for name, dtype in extra.items():
         start = end + -end % dtype.itemsize

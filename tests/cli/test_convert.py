@@ -213,6 +213,22 @@ def test_a_file_is_overwritten_when_it_is_asked_for_alone(tmp_path: Path, suffix
     assert target.stat().st_size > 100
 
 
+def test_files_for_each_scan_are_overwritten_when_it_is_asked_for_alone(tmp_path: Path) -> None:
+    source, target = tmp_path / "00001.bin", tmp_path / "%05d.bin"
+    source.write_bytes(b"".join(simulate(ls.sensor("ldrobot-stl27l"), 300)))
+    before = source.read_bytes()
+    assert f"{source} is read: it would be overwritten" in ran("convert", "--force", source, target, "-s", "ldrobot-stl27l", code=2).stderr
+    assert source.read_bytes() == before
+    ran("convert", source, tmp_path / "points" / "%05d.bin", "-s", "ldrobot-stl27l")
+    files = sorted((tmp_path / "points").iterdir())
+    assert [file.name for file in files] == ["00000.bin", "00001.bin"]
+    files[0].unlink()
+    said = ran("convert", source, tmp_path / "points" / "%05d.bin", "-s", "ldrobot-stl27l", code=2).stderr
+    assert f"{files[1]} exists already" in said
+    ran("convert", source, tmp_path / "points" / "%05d.bin", "--force", "-s", "ldrobot-stl27l")
+    assert files[0].exists()
+
+
 @pytest.mark.skipif(not hasattr(os, "openpty"), reason="needs pseudo terminals")
 def test_a_terminal_shows_how_far_it_is(tmp_path: Path) -> None:
     from tests.view.terminal import Terminal
@@ -254,6 +270,7 @@ def test_what_an_imu_felt_is_written_in_place_of_the_points(tmp_path: Path) -> N
     assert printed("convert", bytes_, tmp_path / "imu.npz", "-s", plugin, "--imu", "-n", 10)["samples"] == 10
     with np.load(tmp_path / "imu.npz") as arrays:
         assert arrays["time_ns"].tolist() == rows["time_ns"][:10].tolist()
+    assert "unknown format '.pcd' (known: .csv, .npz)" in ran("convert", bytes_, tmp_path / "imu.pcd", "-s", plugin, "--imu", code=2).stderr
     assert (
         "no frame says what an IMU felt"
         in ran("convert", capture(COIN_D4), tmp_path / "b.csv", "-s", "cspc-coin-d4", "--imu", code=2).stderr

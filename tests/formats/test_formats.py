@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import subprocess
 import sys
 import tracemalloc
@@ -19,6 +20,7 @@ from lidarspec.formats import format_of, formats, write
 from lidarspec.simulation.simulator import simulate
 from tests.shapes import SHAPES
 
+BUILT_IN = sorted(f"a{suffix}" for suffix in formats())
 COLUMNS = ["x", "y", "z", "range", "azimuth", "elevation", "intensity", "time"]
 
 
@@ -59,6 +61,13 @@ def test_csv_holds_the_columns_of_the_clouds(tmp_path: Path, every_point: bool) 
     np.testing.assert_array_equal(values[:, -1], np.repeat([0, 1, 2], [len(cloud) for cloud in clouds]))
 
 
+def test_compressed_text_is_the_same_text_and_always_the_same_bytes(tmp_path: Path) -> None:
+    for name in ("a.csv", "a.csv.gz", "b.csv.gz"):
+        write(tmp_path / name, [scan(0), scan(1, points=20_000)])
+    assert gzip.decompress((tmp_path / "a.csv.gz").read_bytes()) == (tmp_path / "a.csv").read_bytes()
+    assert (tmp_path / "a.csv.gz").read_bytes() == (tmp_path / "b.csv.gz").read_bytes()
+
+
 @pytest.mark.parametrize("every_point", [False, True])
 def test_npz_holds_the_columns_of_the_clouds_and_the_stamps(tmp_path: Path, every_point: bool) -> None:
     scans = [scan(0), scan(1)]
@@ -88,7 +97,7 @@ def test_a_column_that_a_sensor_lacks_is_left_out(tmp_path: Path) -> None:
     assert np.isnan(values[-4:, header.index("intensity")]).all()
 
 
-@pytest.mark.parametrize("name", ["a.csv", "a.npz"])
+@pytest.mark.parametrize("name", [*BUILT_IN, "a%d.pcd"])
 def test_one_scan_is_held_at_a_time(tmp_path: Path, name: str) -> None:
     clouds: list[weakref.ref[PointCloud]] = []
     most = 0
@@ -106,18 +115,21 @@ def test_one_scan_is_held_at_a_time(tmp_path: Path, name: str) -> None:
     assert most <= 2
 
 
-@pytest.mark.parametrize("every_point", [False, True])
-def test_the_memory_of_npz_does_not_grow_with_the_number_of_scans(tmp_path: Path, every_point: bool) -> None:
+@pytest.mark.parametrize(
+    ("name", "every_point"),
+    [*((name, True) for name in BUILT_IN if name not in ("a.csv", "a.csv.gz", "a.xyz")), ("a.npz", False), ("a.ply", False)],
+)
+def test_the_memory_does_not_grow_with_the_number_of_scans(tmp_path: Path, name: str, every_point: bool) -> None:
     peaks = []
     for number in (20, 200):
         tracemalloc.start()
-        write(tmp_path / "a.npz", (scan(index, points=2000) for index in range(number)), every_point=every_point)
+        write(tmp_path / name, (scan(index, points=2000) for index in range(number)), every_point=every_point)
         peaks.append(tracemalloc.get_traced_memory()[1])
         tracemalloc.stop()
-    assert peaks[1] < peaks[0] + 300_000, peaks  # bytes; the file has 15 MB
+    assert peaks[1] < peaks[0] + 300_000, peaks  # bytes; the files have up to 15 MB
 
 
-@pytest.mark.parametrize("name", ["a.csv", "a.npz"])
+@pytest.mark.parametrize("name", BUILT_IN)
 def test_a_failure_leaves_the_old_file_and_nothing_else(tmp_path: Path, name: str) -> None:
     (tmp_path / name).write_text("old", encoding="ascii")
 
@@ -141,8 +153,9 @@ def test_a_folder_that_is_not_there_is_a_source_error(tmp_path: Path) -> None:
     [
         ("a.cvs", "did you mean '.csv'"),
         ("a", "unknown format 'a'"),
-        ("a.np", "did you mean '.npz'"),
-        ("a.pcd", r"unknown format '.pcd' \(known: "),
+        ("a.np", "did you mean '.npy' or '.npz'"),
+        ("a.csv.g", "did you mean '.csv.gz'"),
+        ("a.dxf", r"unknown format '.dxf' \(known: "),
     ],
 )
 def test_an_unknown_suffix_gets_a_suggestion(name: str, told: str) -> None:

@@ -1,0 +1,142 @@
+"""Files of point clouds: PCD of the Point Cloud Library, PLY, and the .bin of KITTI.
+
+They have no place for more than one scan: the rows of several follow one another, with the number of the scan in a field of its own.
+`time` counts from the stamp of the scan; that of the first one, the sensor and the units stand in comments of the header.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import IO, Any, cast
+
+import numpy as np
+
+from lidarspec.errors import UsageError, suggest
+from lidarspec.formats.rows import Rows, room, write_rows
+from lidarspec.formats.writing import Spool, library
+from lidarspec.scans.scans import Scan
+from lidarspec.transports.protocol import Format
+
+#: types that a format, or a common reader of it, does not know, and those that hold their numbers: whole ones of 64 bits up to 2**53.
+_PCD_TYPES = {"f2": "f4", "b1": "u1"}
+_PLY_TYPES = {**_PCD_TYPES, **dict.fromkeys(("i1", "i2", "u2"), "i4"), **dict.fromkeys(("u4", "i8", "u8"), "f8")}
+_PLY_NAMES = {"f4": "float", "f8": "double", "u1": "uchar", "i4": "int"}
+#: how many bytes the sizes before compressed points can tell.
+_MOST_COMPRESSED = (1 << 32) - 1
+
+
+def write_pcd(path: Path, scans: Iterable[Scan], *, every_point: bool) -> None:
+    """Write a binary PCD 0.7 file: x y z intensity ring time, as far as the sensor has them, and its further columns in their types.
+
+    WIDTH and HEIGHT are those of a single organised scan whose every point is written, missing ones as nan; else HEIGHT is 1.
+    """
+    write_rows(path, _pcd_rows(scans, every_point=every_point), _pcd_header)
+
+
+def write_lzf_pcd(path: Path, scans: Iterable[Scan], *, every_point: bool) -> None:
+    """Write the same as `write_pcd` as DATA binary_compressed: field by field, with LZF.
+
+    Raises:
+        UsageError: where the points take 4 GiB or more, which the format cannot say.
+    """
+    compress = library("lzf", "pcd").compress
+    rows = _pcd_rows(scans, every_point=every_point)
+    with contextlib.ExitStack() as files, path.open("wb") as target:
+        names = rows.dtype.names or ()
+        fields = {name: files.enter_context(contextlib.closing(Spool(path.parent, rows.dtype[name]))) for name in names}
+        for block in rows:
+            _refuse_size(rows.length * rows.dtype.itemsize)
+            for name, field in fields.items():
+                field.add(block[name])
+        compressed = cast(IO[bytes], _Compressed(target, compress))
+        start = target.write(_pcd_header(rows, "binary_compressed")) + 8
+        target.seek(start)
+        for field in fields.values():
+            field.copy_to(compressed)
+        sizes = [target.tell() - start, rows.length * rows.dtype.itemsize]
+        _refuse_size(max(sizes))
+        target.seek(start - 8)
+        target.write(np.array(sizes, "<u4").tobytes())
+
+
+class _Compressed:
+    """Bytes compressed piece by piece; pieces of LZF that follow one another are one."""
+
+    def __init__(self, target: IO[bytes], compress: Any) -> None:
+        self._target, self._compress = target, compress
+
+    def write(self, data: bytes) -> int:
+        return self._target.write(self._compress(data, len(data) + len(data) // 16 + 64))  # the most that noise grows to
+
+
+def _refuse_size(size: int) -> None:
+    if size > _MOST_COMPRESSED:
+        reason = "a compressed PCD file holds 4 GiB of points at the most"
+        raise suggest(UsageError(reason), "the same to a .pcd file, or to one for each scan: %05d.lzf.pcd")
+
+
+def _pcd_rows(scans: Iterable[Scan], *, every_point: bool) -> Rows:
+    return Rows(scans, lambda types: _packed(types, _PCD_TYPES), every_point=every_point, is_picture=True)
+
+
+def _pcd_header(rows: Rows, data: str = "binary") -> bytes:
+    width, height = rows.shape or (rows.length, 1)
+    types = [rows.dtype[name] for name in rows.dtype.names or ()]
+    lines = [
+        "# .PCD v0.7 - Point Cloud Data file format" + room(width, rows.length),
+        *(f"# {fact}" for fact in rows.facts),
+        "VERSION 0.7",
+        f"FIELDS {' '.join(rows.dtype.names or ())}",
+        f"SIZE {' '.join(str(dtype.itemsize) for dtype in types)}",
+        f"TYPE {' '.join(dtype.kind.upper() for dtype in types)}",
+        f"COUNT {' '.join('1' for _ in types)}",
+        f"WIDTH {width}",
+        f"HEIGHT {height}",
+        "VIEWPOINT 0 0 0 1 0 0 0",
+        f"POINTS {rows.length}",
+        f"DATA {data}",
+    ]
+    return "".join(f"{line}\n" for line in lines).encode("ascii", "replace")
+
+
+def write_ply(path: Path, scans: Iterable[Scan], *, every_point: bool) -> None:
+    """Write a binary little-endian PLY file: x y z intensity ring time, as far as the sensor has them, and its further columns.
+
+    Properties are float, double, uchar or int, since Open3D skips the other types: int for `ring`, double for longer whole numbers.
+    """
+    write_rows(path, Rows(scans, lambda types: _packed(types, _PLY_TYPES), every_point=every_point), _ply_header)
+
+
+def _ply_header(rows: Rows) -> bytes:
+    lines = [
+        "ply",
+        "format binary_little_endian 1.0",
+        *(f"comment {fact}" for fact in ["made by lidarspec" + room(rows.length), *rows.facts]),
+        f"element vertex {rows.length}",
+        *(f"property {_PLY_NAMES[rows.dtype[name].str[1:]]} {name}" for name in rows.dtype.names or ()),
+        "end_header",
+    ]
+    return "".join(f"{line}\n" for line in lines).encode("ascii", "replace")
+
+
+def _packed(types: Mapping[str, Any], known: Mapping[str, str]) -> np.dtype[Any]:
+    """A row of columns without gaps, in types that a format knows."""
+    codes = {name: np.dtype(dtype).str[1:] for name, dtype in types.items()}
+    return np.dtype([(name, "<" + known.get(code, code)) for name, code in codes.items()])
+
+
+def write_kitti(path: Path, scans: Iterable[Scan], *, every_point: bool) -> None:
+    """Write x y z intensity as float32, little endian, nothing else; 0 is the intensity of a sensor that has none.
+
+    A file of KITTI is one scan: ``out/%06d.bin``. Intensities are the wire's numbers, not scaled to 1.
+    """
+    row = np.dtype([(name, "<f4") for name in ("x", "y", "z", "intensity")])
+    write_rows(path, Rows(scans, lambda types: row, every_point=every_point), lambda rows: b"")
+
+
+PCD = Format(".pcd", "a point cloud of PCL, binary", write_pcd)
+LZF_PCD = Format(".lzf.pcd", "a point cloud of PCL, compressed", write_lzf_pcd)
+PLY = Format(".ply", "a point cloud, binary", write_ply)
+KITTI = Format(".bin", "x y z intensity as KITTI has them, float32", write_kitti)
