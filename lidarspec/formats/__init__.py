@@ -6,6 +6,7 @@ formats, too. Modules in reading order:
 * `writing`: what formats have in common.
 * `text`: .csv, a row a point.
 * `arrays`: .npz, an array a column.
+* `bags`: .mcap, .bag, .rosbag2 and .db3, a message a scan.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ import numpy as np
 
 from lidarspec.errors import LidarSpecError, SpecError, UnknownFormat, system_errors
 from lidarspec.formats.arrays import NPZ
+from lidarspec.formats.bags import BAG, DB3, MCAP, ROSBAG2
 from lidarspec.formats.text import CSV, write_columns
 from lidarspec.formats.writing import replacing
 from lidarspec.packets.imu import ImuSamples
@@ -28,7 +30,7 @@ from lidarspec.transports.protocol import Format
 
 #: the place of a number in the name of a file.
 NUMBERED = re.compile(r"%0?\d*d")
-BUILT_IN = {known.suffix: known for known in (CSV, NPZ)}
+BUILT_IN = {known.suffix: known for known in (CSV, NPZ, MCAP, BAG, ROSBAG2, DB3)}
 
 
 def formats() -> dict[str, Format]:
@@ -73,8 +75,8 @@ def write_imu(path: str | Path, samples: ImuSamples) -> None:
         SourceError: where the file cannot be written.
     """
     path = Path(path)
-    if path.suffix.lower() not in BUILT_IN:
-        raise UnknownFormat(path.suffix or str(path), BUILT_IN, place=str(path))
+    if path.suffix.lower() not in (known := (CSV.suffix, NPZ.suffix)):
+        raise UnknownFormat(path.suffix or str(path), known, place=str(path))
     with replacing(path) as part:
         if path.suffix.lower() == CSV.suffix:
             write_columns(part, samples.columns)

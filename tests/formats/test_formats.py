@@ -88,7 +88,7 @@ def test_a_column_that_a_sensor_lacks_is_left_out(tmp_path: Path) -> None:
     assert np.isnan(values[-4:, header.index("intensity")]).all()
 
 
-@pytest.mark.parametrize("name", ["a.csv", "a.npz"])
+@pytest.mark.parametrize("name", ["a.csv", "a.npz", "a.mcap", "a.bag", "a.rosbag2", "a.db3"])
 def test_one_scan_is_held_at_a_time(tmp_path: Path, name: str) -> None:
     clouds: list[weakref.ref[PointCloud]] = []
     most = 0
