@@ -8,6 +8,7 @@ formats, too. Modules in reading order:
 * `arrays`: .npz, an array a column; .npy, a structured array.
 * `rows`: points as rows of bytes behind a header.
 * `clouds`: .pcd, .lzf.pcd, .ply and KITTI's .bin.
+* `bags`: .mcap, .bag, .rosbag2 and .db3, a message a scan.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ import numpy as np
 
 from lidarspec.errors import LidarSpecError, SpecError, UnknownFormat, system_errors
 from lidarspec.formats.arrays import NPY, NPZ
+from lidarspec.formats.bags import BAG, DB3, MCAP, ROSBAG2
 from lidarspec.formats.clouds import KITTI, LZF_PCD, PCD, PLY
 from lidarspec.formats.text import CSV, CSV_GZ, XYZ, write_columns
 from lidarspec.formats.writing import replacing
@@ -31,7 +33,9 @@ from lidarspec.transports.protocol import Format
 
 #: the place of a number in the name of a file.
 NUMBERED = re.compile(r"%0?\d?d")
-BUILT_IN = {known.suffix: known for known in (CSV, CSV_GZ, XYZ, NPZ, NPY, PCD, LZF_PCD, PLY, KITTI)}
+BUILT_IN = {
+    known.suffix: known for known in (CSV, CSV_GZ, XYZ, NPZ, NPY, PCD, LZF_PCD, PLY, KITTI, MCAP, BAG, ROSBAG2, DB3)
+}
 
 
 def formats() -> dict[str, Format]:

@@ -1,0 +1,188 @@
+"""Robotics logs: each scan as ROS's messages, in an MCAP file, a ROS 1 bag or a ROS 2 bag.
+
+On /points stands each scan as sensor_msgs/PointCloud2, and on /scan, where the sensor has one plane, as sensor_msgs/LaserScan on an even
+grid of angles. The stamps are those of the scans, in the frame "laser"; messages of them are in the log at these times. Points have PCL's
+layout: x y z intensity time as float32, ring as uint16, then the further columns; a column that the sensor lacks is no field. What no
+message can say, the units of further columns, stands in the log's metadata; ROS 1 bags have none.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterable, Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarspec.errors import UsageError
+from lidarspec.formats.writing import library
+from lidarspec.points.cloud import PointCloud
+from lidarspec.scans.scans import Scan
+from lidarspec.transports.protocol import Format
+
+#: the frame that the points are in, by its usual name: x forward, y left, z up (REP-103).
+FRAME = "laser"
+#: the kinds of messages, and where they are published.
+TOPICS = {"sensor_msgs/msg/PointCloud2": "/points", "sensor_msgs/msg/LaserScan": "/scan"}
+#: the numbers by which PointField names types; anything else is written as float64.
+FIELD_TYPES = {"i1": 1, "u1": 2, "b1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
+#: bytes of a chunk of an MCAP file, which a reader holds at once: a scan or some.
+CHUNK = 1 << 20
+_SECOND = 1_000_000_000
+
+
+class Message(NamedTuple):
+    """A message as it stands in a log: its type, its time in ns, its bytes."""
+
+    kind: str
+    at: int
+    data: memoryview
+
+
+class Messages:
+    """The messages of scans.
+
+    Args:
+        release: whose definitions they follow, as rosbags names them: "ROS1_NOETIC".
+
+    Attributes:
+        types: the definitions.
+        units: of the further columns, by name, as far as scans have come.
+    """
+
+    def __init__(self, release: str) -> None:
+        typesys = library("rosbags.typesys", "ros")
+        self.types = typesys.get_typestore(typesys.Stores[release])
+        self.units: dict[str, str] = {}
+        self._serialized = self.types.serialize_ros1 if release.startswith("ROS1") else self.types.serialize_cdr
+        self._is_flat: bool | None = None
+
+    def of(self, scans: Iterable[Scan], *, every_point: bool) -> Iterator[Message]:
+        """The messages of each scan, in order.
+
+        Raises:
+            UsageError: for a stamp that no message can hold.
+        """
+        for number, scan in enumerate(scans):
+            self.units |= {name: unit for name, unit in scan.points.units.items() if unit}
+            header = self._header(number, scan.stamp_ns)
+            for message in [self._cloud(scan.points, header, every_point=every_point), *self._laserscan(scan, header)]:
+                kind = message.__msgtype__
+                yield Message(kind, scan.stamp_ns, self._serialized(message, kind))
+
+    def _header(self, number: int, stamp_ns: int) -> Any:
+        if not 0 <= stamp_ns < _SECOND << 31:
+            raise UsageError(f"a scan at {stamp_ns} ns: stamps of ROS hold the years 1970 to 2038")
+        kind = self.types.types["std_msgs/msg/Header"]
+        counted = {"seq": number} if "seq" in kind.__dataclass_fields__ else {}
+        return kind(**counted, stamp=self.types.types["builtin_interfaces/msg/Time"](*divmod(stamp_ns, _SECOND)), frame_id=FRAME)
+
+    def _cloud(self, cloud: PointCloud, header: Any, *, every_point: bool) -> Any:
+        """Organised points have a row for each row of the sensor, several returns side by side; of others, and valid ones, there is one."""
+        points = _records(cloud)
+        lacking = {name for name in ("intensity", "ring") if getattr(cloud, name) is None}
+        if not every_point:
+            points = np.compress(cloud.valid, points)  # ten times as quick as an index
+        elif cloud.shape and len(cloud):
+            points = points.reshape(*cloud.shape, -1).swapaxes(0, 1).reshape(cloud.shape[1], -1)
+        height, width = np.atleast_2d(points).shape
+        field = self.types.types["sensor_msgs/msg/PointField"]
+        return self.types.types["sensor_msgs/msg/PointCloud2"](
+            header=header,
+            height=height,
+            width=width,
+            fields=[
+                field(name, offset, FIELD_TYPES[dtype.str[1:]], 1)
+                for name, (dtype, offset, *_) in (points.dtype.fields or {}).items()
+                if name not in lacking
+            ],
+            is_bigendian=False,
+            point_step=points.itemsize,
+            row_step=points.itemsize * width,
+            data=np.ascontiguousarray(points).view(np.uint8).reshape(-1),
+            is_dense=not every_point or bool(cloud.valid.all()),
+        )
+
+    def _laserscan(self, scan: Scan, header: Any) -> Iterator[Any]:
+        """The scan of a sensor of one plane, which its first valid points show."""
+        if self._is_flat is None and (valid := scan.points.valid).any():
+            self._is_flat = not scan.points.elevation[valid].any()
+        if self._is_flat:
+            planar = scan.to_laserscan()
+            kind = self.types.types["sensor_msgs/msg/LaserScan"]
+            values = {name: getattr(planar, name) for name in kind.__dataclass_fields__ if hasattr(planar, name)}
+            if scan.points.intensity is None:
+                values["intensities"] = np.empty(0, np.float32)
+            yield kind(**values, header=header)
+
+
+def _records(cloud: PointCloud) -> NDArray[Any]:
+    """The points in PCL's layout, all columns of types that a PointField has."""
+    points = cloud.to_structured()
+    kinds = {name: points.dtype[name] for name in points.dtype.names or ()}
+    if all(kind.str[1:] in FIELD_TYPES for kind in kinds.values()):
+        return points
+    known = [(name, kind if kind.str[1:] in FIELD_TYPES else np.dtype(np.float64)) for name, kind in kinds.items()]
+    return points.astype(np.dtype(known, align=True))
+
+
+def write_mcap(path: Path, scans: Iterable[Scan], *, every_point: bool) -> None:
+    """Write an MCAP file as ROS 2 records it, which Foxglove, `ros2 bag` and PlotJuggler read."""
+    mcap = library("mcap.writer", "ros")
+    messages, channels = Messages("ROS2_HUMBLE"), dict[str, int]()
+    with path.open("wb") as file:
+        log = mcap.Writer(file, chunk_size=CHUNK, compression=mcap.CompressionType.NONE)
+        log.start(profile="ros2", library="lidarspec")
+        for kind, at, data in messages.of(scans, every_point=every_point):
+            if kind not in channels:
+                text, _ = messages.types.generate_msgdef(kind, ros_version=2)
+                channels[kind] = log.register_channel(TOPICS[kind], "cdr", log.register_schema(kind, "ros2msg", text.encode()))
+            log.add_message(channels[kind], log_time=at, publish_time=at, data=data)
+        if messages.units:
+            log.add_metadata("units", messages.units)
+        log.finish()
+
+
+def write_ros1(path: Path, scans: Iterable[Scan], *, every_point: bool) -> None:
+    """Write a bag as `rosbag record` does."""
+    _record(library("rosbags.rosbag1", "ros").Writer(path), Messages("ROS1_NOETIC"), scans, every_point=every_point)
+
+
+def write_ros2(path: Path, scans: Iterable[Scan], storage: str, *, every_point: bool) -> None:
+    """Write a ROS 2 bag of metadata version 8, which releases from Foxy on read.
+
+    Args:
+        storage: "mcap" for a folder with metadata.yaml and an MCAP file; "sqlite3" for a database file alone, as `ros2 bag` reads it, too.
+    """
+    import sqlite3  # which the whole module would otherwise wait for
+
+    rosbag2 = library("rosbags.rosbag2", "ros")
+    with tempfile.TemporaryDirectory(prefix=".", dir=path.parent) as folder:
+        bag = Path(folder) / "scans"
+        log = rosbag2.Writer(bag, version=8, storage_plugin=rosbag2.StoragePlugin[storage.upper()])
+        try:
+            _record(log, Messages("ROS2_HUMBLE"), scans, every_point=every_point)
+        except sqlite3.Error as error:
+            raise OSError(str(error)) from None
+        (bag if storage == "mcap" else bag / "scans.db3").rename(path)
+
+
+def _record(log: Any, messages: Messages, scans: Iterable[Scan], *, every_point: bool) -> None:
+    """Write messages by a writer of rosbags."""
+    connections = dict[str, Any]()
+    with log:
+        for kind, at, data in messages.of(scans, every_point=every_point):
+            if kind not in connections:
+                connections[kind] = log.add_connection(TOPICS[kind], kind, typestore=messages.types)
+            log.write(connections[kind], at, data)
+        for name, unit in messages.units.items() if hasattr(log, "set_custom_data") else ():
+            log.set_custom_data(f"unit of {name}", unit)
+
+
+MCAP = Format(".mcap", "an MCAP file with ROS 2 messages", write_mcap)
+BAG = Format(".bag", "a ROS 1 bag", write_ros1)
+ROSBAG2 = Format(".rosbag2", "a ROS 2 bag: a folder with an MCAP file", partial(write_ros2, storage="mcap"))
+DB3 = Format(".db3", "a ROS 2 bag: an SQLite file", partial(write_ros2, storage="sqlite3"))
