@@ -7,6 +7,7 @@ own text from typed arguments, so that the place of a fault can be read from the
 
 from __future__ import annotations
 
+import importlib
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -186,6 +187,19 @@ def suggestion(error: BaseException) -> str:
     """The next command to type that an error was given, "" where it has none."""
     notes: Sequence[str] = getattr(error, "__notes__", ())
     return next((note.removeprefix(_NEXT) for note in notes if note.startswith(_NEXT)), "")
+
+
+def library(name: str, extra: str) -> Any:
+    """A module of an optional library.
+
+    Raises:
+        UsageError: where it is not installed, with what to type.
+    """
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:
+        reason = f"it takes {name.partition('.')[0]}, which is not installed ({error})"
+        raise suggest(UsageError(reason), f"pip install 'lidarspec[{extra}]'") from error
 
 
 def refuse_text(data: object) -> None:

@@ -225,7 +225,8 @@ class FileInput(Input):
     def first_state(self) -> dict[str, bytes]:
         """The first frame of each type that `points` takes its state from: a file is read as if it stood at the start."""
         wanted = set(self.sensor.state)
-        if not wanted or not Path(str(self._source).partition("?")[0]).is_file():
+        path = Path(str(self._source).partition("?")[0])
+        if not wanted or not (path.is_file() or path.is_dir()):
             return {}
         first: dict[str, bytes] = {}
         with contextlib.closing(transport(self._source)) as source:

@@ -17,8 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.errors import UsageError
-from lidarspec.formats.writing import library
+from lidarspec.errors import UsageError, library
 from lidarspec.points.cloud import PointCloud
 from lidarspec.scans.scans import Scan
 from lidarspec.transports.protocol import Format

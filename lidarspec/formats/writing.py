@@ -7,7 +7,6 @@ known at the end alone: they write it there and come back, or let their columns 
 from __future__ import annotations
 
 import contextlib
-import importlib
 import os
 import shutil
 import tempfile
@@ -18,7 +17,7 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from lidarspec.errors import UsageError, suggest, system_errors
+from lidarspec.errors import system_errors
 from lidarspec.points.cloud import PointCloud
 from lidarspec.scans.scans import Scan
 
@@ -48,19 +47,6 @@ def _remove(path: Path) -> None:
         shutil.rmtree(path)
     else:
         path.unlink(missing_ok=True)
-
-
-def library(name: str, extra: str) -> Any:
-    """A module of an optional library.
-
-    Raises:
-        UsageError: where it is not installed, with what to type.
-    """
-    try:
-        return importlib.import_module(name)
-    except ImportError as error:
-        reason = f"it takes {name.partition('.')[0]}, which is not installed ({error})"
-        raise suggest(UsageError(reason), f"pip install 'lidarspec[{extra}]'") from error
 
 
 def written(scan: Scan, *, every_point: bool) -> PointCloud:

@@ -8,6 +8,7 @@ In: a SOURCE as text. Out: an open `Transport`, which gives `Chunk`s and takes b
 * `serial`, `udp`, `tcp`: live sources.
 * `http`: the web server of a sensor, and that of a simulated one.
 * `simulated`: `sim:`, a sensor that is not there.
+* `bags`: robotics logs, which hold packets as ROS's messages.
 * `files`: recordings, captures, raw bytes, standard input.
 * `ports`: which serial and UDP ports this computer has, and who holds them.
 

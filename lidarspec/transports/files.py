@@ -1,4 +1,4 @@
-"""Files and standard input as transports: recordings, captures, raw bytes, hexadecimal text.
+"""Files and standard input as transports: recordings, captures, logs (see `bags`), raw bytes, hexadecimal text.
 
 A file ends, and is read as fast as it is asked for. Recordings and captures give what was received at the times of then, and count
 what they leave out; bytes alone have no times. `open_file` tells them apart by what they hold.
@@ -23,6 +23,7 @@ from lidarspec.captures.records import is_capture
 from lidarspec.errors import SourceError, UnknownSensor, UsageError, WireError, suggest, system_errors
 from lidarspec.recording.format import MAGIC, Header, Record, Recording
 from lidarspec.spec.sensor import Sensor
+from lidarspec.transports.bags import BagTransport, log_of
 from lidarspec.transports.base import origin
 from lidarspec.transports.protocol import Chunk, Transport
 
@@ -46,9 +47,6 @@ CONTAINERS = {
     rb"PK\x03\x04": ("a zip archive, as .npz files are too", "unzip -l {}"),
     rb"7z\xbc\xaf\x27\x1c": ("a 7z archive", "7z l {}"),
     rb".{257}ustar": ("a tar archive", "tar -tf {}"),
-    rb"SQLite format 3\x00": ("an SQLite database, as ROS 2 bags are", ""),
-    rb"#ROSBAG V": ("a ROS 1 bag", ""),
-    rb"\x89MCAP0\r\n": ("an MCAP file, as ROS 2 bags are", ""),
     rb"\x89HDF\r\n": ("an HDF5 file", ""),
     rb"PAR1": ("a Parquet file", ""),
     rb"\x93NUMPY": ("a NumPy array", ""),
@@ -309,17 +307,25 @@ def refuse_container(path: str, head: bytes) -> None:
             raise suggest(error, command.format(quote(path))) if command and os.path.exists(path) else error
 
 
-def open_file(path: str, *, sender: str | None = None) -> FileTransport | RecordingTransport:
-    """The transport for a file, by what it holds; "-" is standard input, which is told by its beginning too.
+def open_file(path: str, *, sender: str | None = None) -> FileTransport | RecordingTransport | BagTransport:
+    """The transport for a file, by what it holds; "-" is standard input, which is told by its beginning too; a folder is a bag's.
 
     Raises:
-        SourceError: where it cannot be opened, or is a file of another kind, such as an archive or a bag.
+        SourceError: where it cannot be opened, or is a file of another kind, such as an archive.
+        UsageError: where a library is missing that reads it.
     """
+    if (log := log_of(path)) is not None:
+        return BagTransport(path, log, sender=sender)
     with system_errors(path), contextlib.ExitStack() as undo:
         file = sys.stdin.buffer if path == "-" else undo.enter_context(open(path, "rb"))
         head = _head(file)
         path = "standard input" if path == "-" else path
+        log = log_of(path, head)
+        if log is not None and file is sys.stdin.buffer:
+            raise SourceError(f"{path} is {log.what}, and is not read: give its file")
         refuse_container(path, head)
+        if log is not None:
+            return BagTransport(path, log, sender=sender)
         undo.pop_all()  # the transport closes it
     if head.startswith(MAGIC):
         if file is not sys.stdin.buffer:

@@ -9,6 +9,7 @@ import json
 import random
 import re
 import struct
+import tempfile
 import zlib
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
@@ -35,6 +36,7 @@ from tests import made_captures as made
 from tests.all_sensors import DISTINCT, EVERY, FRAMES
 from tests.fuzz.words import HOSTILE, commanded, spoken
 from tests.shapes import SHAPES
+from tests.transports import test_bags
 
 #: longest input.
 LONGEST = 1 << 16
@@ -260,7 +262,11 @@ def _file(folder: Path) -> Target:
     def examples() -> list[bytes]:
         velodyne = [ls.sensor(VLP).example("data", seed=seed) for seed in range(3)]
         frames = [ls.sensor(STL).example("data", seed=seed) for seed in range(3)]
+        with tempfile.TemporaryDirectory() as place:
+            topics = {"/p": ("nebula_msgs/msg/NebulaPackets", velodyne)}
+            logs = [test_bags.recorded(Path(place), kind, topics).read_bytes() for kind in ("bag", "mcap")]
         return [
+            *logs,
             made.pcap(*map(made.frame, velodyne)),
             recorded(STL, frames),
             recorded(VLP, velodyne),
