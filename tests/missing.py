@@ -12,7 +12,11 @@ MISSING = (
     (r"g\+\+ is not", "g++", "apt-get install g++"),
     (r"gcc", "gcc", "apt-get install gcc"),
     (r"Kaitai compiler", "Kaitai's compiler", "npm install kaitai-struct-compiler js-yaml, with NODE_PATH as its node_modules"),
-    (r"kaitaistruct|crccheck|velodyne.decoder|[Nn]umba", "Python packages", "pip install -e '.[dev]'"),
+    (
+        r"kaitaistruct|crccheck|velodyne.decoder|[Nn]umba|pyarrow|duckdb|laspy|pye57|zarr",
+        "Python packages",
+        "pip install -e '.[dev]'",
+    ),
     (
         r"LIDARSPEC_CAPTURES|protocol vectors",
         "captures and vectors",

@@ -98,7 +98,7 @@ def emit_parts(parts: Iterable[str | bytes], output: str | None, *, colour: bool
         for part in parts:
             say(part, nl=isinstance(part, str), colour=colour)
         return
-    from lidarspec.formats import replacing  # and all that scans are made of, for the verbs that write a file
+    from lidarspec.formats.writing import replacing  # and all that scans are made of, for the verbs that write a file
 
     path = Path(output)
     is_replaced = path.is_file() or not path.exists()  # and not a device or a pipe

@@ -6,6 +6,8 @@ formats, too. Modules in reading order:
 * `writing`: what formats have in common.
 * `text`: .csv, a row a point.
 * `arrays`: .npz, an array a column.
+* `tables`: .parquet, .arrow and .feather, for data tools.
+* `las`: .las and .laz, for surveyors' tools.
 """
 
 from __future__ import annotations
@@ -19,6 +21,8 @@ import numpy as np
 
 from lidarspec.errors import LidarSpecError, SpecError, UnknownFormat, system_errors
 from lidarspec.formats.arrays import NPZ
+from lidarspec.formats.las import LAS, LAZ
+from lidarspec.formats.tables import ARROW, FEATHER, PARQUET
 from lidarspec.formats.text import CSV, write_columns
 from lidarspec.formats.writing import replacing
 from lidarspec.packets.imu import ImuSamples
@@ -28,7 +32,7 @@ from lidarspec.transports.protocol import Format
 
 #: the place of a number in the name of a file.
 NUMBERED = re.compile(r"%0?\d*d")
-BUILT_IN = {known.suffix: known for known in (CSV, NPZ)}
+BUILT_IN = {known.suffix: known for known in (CSV, NPZ, PARQUET, ARROW, FEATHER, LAS, LAZ)}
 
 
 def formats() -> dict[str, Format]:
@@ -72,11 +76,10 @@ def write_imu(path: str | Path, samples: ImuSamples) -> None:
         UnknownFormat: for another suffix.
         SourceError: where the file cannot be written.
     """
-    path = Path(path)
-    if path.suffix.lower() not in BUILT_IN:
-        raise UnknownFormat(path.suffix or str(path), BUILT_IN, place=str(path))
+    path, known = Path(path), {format.suffix: format for format in (CSV, NPZ)}
+    chosen = _longest(path, known) or _unknown(path, known)
     with replacing(path) as part:
-        if path.suffix.lower() == CSV.suffix:
+        if chosen is CSV:
             write_columns(part, samples.columns)
         else:
             np.savez(part, **samples.columns)  # type: ignore[arg-type]  # no column is called allow_pickle

@@ -11,7 +11,7 @@ import importlib
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import IO, Any
 
@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from lidarspec.errors import UsageError, suggest, system_errors
-from lidarspec.points.cloud import PointCloud
+from lidarspec.points.cloud import PointCloud, source_of
 from lidarspec.scans.scans import Scan
 
 
@@ -65,7 +65,15 @@ def library(name: str, extra: str) -> Any:
 
 def written(scan: Scan, *, every_point: bool) -> PointCloud:
     """The points of a scan that are written: those with a valid return, or all."""
-    return scan.points if every_point else scan.points[scan.points.valid]
+    return scan.points if every_point or scan.points.valid.all() else scan.points[scan.points.valid]
+
+
+def columns_of(scan: Scan, names: Iterable[str], *, every_point: bool) -> dict[str, NDArray[Any]]:
+    """Some columns of the points that are written, those that the scan has, "valid" too, and behind them its further ones."""
+    cloud = scan.points
+    source_of(cloud).prepare((*names, "valid", *cloud.extra))
+    own = {name: column for name in names if (column := getattr(cloud, name)) is not None} | dict(cloud.extra)
+    return own if every_point or cloud.valid.all() else {name: column[cloud.valid] for name, column in own.items()}
 
 
 class Spool:

@@ -14,11 +14,15 @@ import pytest
 
 import lidarspec as ls
 from lidarspec import PointCloud, Scan, SourceError
-from lidarspec.errors import UnknownFormat
-from lidarspec.formats import format_of, formats, write
+from lidarspec.errors import UnknownFormat, UsageError, suggestion
+from lidarspec.formats import format_of, formats, tables, write
 from lidarspec.simulation.simulator import simulate
+from tests.recording.test_recordings import file_size_limit
 from tests.shapes import SHAPES
 
+BUILT_IN = sorted(f"a{suffix}" for suffix in formats())
+#: the extra that a format takes.
+EXTRAS = {"a.parquet": "arrow", "a.arrow": "arrow", "a.feather": "arrow", "a.las": "las", "a.laz": "las"}
 COLUMNS = ["x", "y", "z", "range", "azimuth", "elevation", "intensity", "time"]
 
 
@@ -88,7 +92,7 @@ def test_a_column_that_a_sensor_lacks_is_left_out(tmp_path: Path) -> None:
     assert np.isnan(values[-4:, header.index("intensity")]).all()
 
 
-@pytest.mark.parametrize("name", ["a.csv", "a.npz"])
+@pytest.mark.parametrize("name", BUILT_IN)
 def test_one_scan_is_held_at_a_time(tmp_path: Path, name: str) -> None:
     clouds: list[weakref.ref[PointCloud]] = []
     most = 0
@@ -106,18 +110,21 @@ def test_one_scan_is_held_at_a_time(tmp_path: Path, name: str) -> None:
     assert most <= 2
 
 
-@pytest.mark.parametrize("every_point", [False, True])
-def test_the_memory_of_npz_does_not_grow_with_the_number_of_scans(tmp_path: Path, every_point: bool) -> None:
+@pytest.mark.parametrize(("name", "every_point"), [*((name, True) for name in BUILT_IN if ".csv" not in name), ("a.npz", False)])
+def test_the_memory_does_not_grow_with_the_number_of_scans(
+    tmp_path: Path, name: str, every_point: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tables, "ROWS", 10_000)
     peaks = []
     for number in (20, 200):
         tracemalloc.start()
-        write(tmp_path / "a.npz", (scan(index, points=2000) for index in range(number)), every_point=every_point)
+        write(tmp_path / name, (scan(index, points=2000) for index in range(number)), every_point=every_point)
         peaks.append(tracemalloc.get_traced_memory()[1])
         tracemalloc.stop()
-    assert peaks[1] < peaks[0] + 300_000, peaks  # bytes; the file has 15 MB
+    assert peaks[1] < peaks[0] + 300_000, peaks  # bytes; the files have up to 15 MB
 
 
-@pytest.mark.parametrize("name", ["a.csv", "a.npz"])
+@pytest.mark.parametrize("name", BUILT_IN)
 def test_a_failure_leaves_the_old_file_and_nothing_else(tmp_path: Path, name: str) -> None:
     (tmp_path / name).write_text("old", encoding="ascii")
 
@@ -129,6 +136,25 @@ def test_a_failure_leaves_the_old_file_and_nothing_else(tmp_path: Path, name: st
         write(tmp_path / name, scans())
     assert [path.name for path in tmp_path.iterdir()] == [name]
     assert (tmp_path / name).read_text(encoding="ascii") == "old"
+
+
+@pytest.mark.parametrize("name", BUILT_IN)
+def test_a_full_disk_is_a_source_error_and_leaves_nothing(tmp_path: Path, name: str) -> None:
+    with file_size_limit(4096), pytest.raises(SourceError, match=name):
+        write(tmp_path / name, (scan(number, points=5000) for number in range(40)))
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(("name", "extra"), EXTRAS.items())
+def test_a_library_that_is_missing_is_named_with_what_to_type(
+    tmp_path: Path, name: str, extra: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for module in ("pyarrow", "laspy", "lazrs"):
+        monkeypatch.setitem(sys.modules, module, None)
+    with pytest.raises(UsageError, match="which is not installed") as caught:
+        write(tmp_path / name, [scan(0)])
+    assert suggestion(caught.value) == f"pip install 'lidarspec[{extra}]'"
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_folder_that_is_not_there_is_a_source_error(tmp_path: Path) -> None:
