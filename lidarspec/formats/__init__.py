@@ -8,6 +8,7 @@ formats, too. Modules in reading order:
 * `arrays`: .npz, an array a column.
 * `tables`: .parquet, .arrow and .feather, for data tools.
 * `las`: .las and .laz, for surveyors' tools.
+* `e57`: .e57, a header and points for each scan.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ import numpy as np
 
 from lidarspec.errors import LidarSpecError, SpecError, UnknownFormat, system_errors
 from lidarspec.formats.arrays import NPZ
+from lidarspec.formats.e57 import E57
 from lidarspec.formats.las import LAS, LAZ
 from lidarspec.formats.tables import ARROW, FEATHER, PARQUET
 from lidarspec.formats.text import CSV, write_columns
@@ -32,7 +34,7 @@ from lidarspec.transports.protocol import Format
 
 #: the place of a number in the name of a file.
 NUMBERED = re.compile(r"%0?\d*d")
-BUILT_IN = {known.suffix: known for known in (CSV, NPZ, PARQUET, ARROW, FEATHER, LAS, LAZ)}
+BUILT_IN = {known.suffix: known for known in (CSV, NPZ, PARQUET, ARROW, FEATHER, LAS, LAZ, E57)}
 
 
 def formats() -> dict[str, Format]:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.errors import UsageError, suggest
-from lidarspec.formats.writing import columns_of, library
+from lidarspec.formats.writing import GPS_EPOCH, columns_of, library
 from lidarspec.scans.scans import Scan
 from lidarspec.transports.protocol import Format
 
@@ -22,8 +22,8 @@ PLACED, EXTRA = ("x", "y", "z", "intensity", "time", "return_index", "valid"), (
 WIDER = {"f2": np.dtype(np.float32), "b1": np.dtype(np.uint8)}
 #: metres a step, and metres from 0 up to which places count from there; farther away they count from whole metres nearby.
 STEP, NEAR = 1e-4, 1e5
-#: ns since 1970 at what adjusted standard GPS time counts from, 10^9 s after 1980-01-06, with the leap seconds that there are since 2017.
-EPOCH = (315_964_800 + 10**9 - 18) * 10**9
+#: ns since 1970 at what adjusted standard GPS time counts from.
+EPOCH = GPS_EPOCH + 10**18
 #: points put together at once; the farthest step, the largest intensity, the last number of a return, and the flag of what is withheld.
 ROWS, FARTHEST, BRIGHTEST, LAST, WITHHELD = 1 << 15, (1 << 31) - 1, 0xFFFF, 15, 1 << 2
 

@@ -22,6 +22,9 @@ from lidarspec.errors import UsageError, suggest, system_errors
 from lidarspec.points.cloud import PointCloud, source_of
 from lidarspec.scans.scans import Scan
 
+#: ns since 1970 of the GPS epoch, 1980-01-06, for a clock that leaves out leap seconds, with those that there are since 2017.
+GPS_EPOCH = (315_964_800 - 18) * 10**9
+
 
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[Path]:

@@ -21,8 +21,12 @@ from tests.recording.test_recordings import file_size_limit
 from tests.shapes import SHAPES
 
 BUILT_IN = sorted(f"a{suffix}" for suffix in formats())
-#: the extra that a format takes.
-EXTRAS = {"a.parquet": "arrow", "a.arrow": "arrow", "a.feather": "arrow", "a.las": "las", "a.laz": "las"}
+#: the library and the extra that a format takes.
+EXTRAS = {
+    **dict.fromkeys(("a.parquet", "a.arrow", "a.feather"), ("pyarrow", "arrow")),
+    **dict.fromkeys(("a.las", "a.laz"), ("laspy", "las")),
+    "a.e57": ("pye57", "e57"),
+}
 COLUMNS = ["x", "y", "z", "range", "azimuth", "elevation", "intensity", "time"]
 
 
@@ -43,6 +47,12 @@ def scan(number: int, points: int = 5, *, intensity: bool = True) -> Scan:
         stamp_ns=10**18 + number,
     )
     return Scan(cloud, 10.0 + number, number > 0, ls.sensor("ldrobot-stl27l"))
+
+
+@pytest.fixture(autouse=True)
+def _needs_its_library(request: pytest.FixtureRequest) -> None:
+    if request.node.name.partition("[")[2] and (needed := EXTRAS.get(request.node.callspec.params.get("name"))):
+        pytest.importorskip(needed[0])
 
 
 def rows(path: Path) -> tuple[list[str], np.ndarray]:
@@ -145,15 +155,12 @@ def test_a_full_disk_is_a_source_error_and_leaves_nothing(tmp_path: Path, name: 
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize(("name", "extra"), EXTRAS.items())
-def test_a_library_that_is_missing_is_named_with_what_to_type(
-    tmp_path: Path, name: str, extra: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    for module in ("pyarrow", "laspy", "lazrs"):
-        monkeypatch.setitem(sys.modules, module, None)
-    with pytest.raises(UsageError, match="which is not installed") as caught:
+@pytest.mark.parametrize("name", EXTRAS)
+def test_a_library_that_is_missing_is_named_with_what_to_type(tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, EXTRAS[name][0], None)
+    with pytest.raises(UsageError, match=f"it takes {EXTRAS[name][0]}, which is not installed") as caught:
         write(tmp_path / name, [scan(0)])
-    assert suggestion(caught.value) == f"pip install 'lidarspec[{extra}]'"
+    assert suggestion(caught.value) == f"pip install 'lidarspec[{EXTRAS[name][1]}]'"
     assert not list(tmp_path.iterdir())
 
 

@@ -20,7 +20,7 @@ pytest.importorskip("lazrs")
 
 
 def with_points(one: Scan, **columns: object) -> Scan:
-    return dataclasses.replace(one, points=dataclasses.replace(one.points, **columns))
+    return dataclasses.replace(one, points=dataclasses.replace(one.points[np.arange(len(one))], **columns))
 
 
 @pytest.mark.parametrize("name", ["a.las", "a.laz"])
