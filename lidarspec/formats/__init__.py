@@ -9,6 +9,7 @@ formats, too. Modules in reading order:
 * `tables`: .parquet, .arrow and .feather, for data tools.
 * `las`: .las and .laz, for surveyors' tools.
 * `e57`: .e57, a header and points for each scan.
+* `zarr`: .zarr, a folder with an array a column.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ from lidarspec.formats.las import LAS, LAZ
 from lidarspec.formats.tables import ARROW, FEATHER, PARQUET
 from lidarspec.formats.text import CSV, write_columns
 from lidarspec.formats.writing import replacing
+from lidarspec.formats.zarr import ZARR
 from lidarspec.packets.imu import ImuSamples
 from lidarspec.plugins import registry
 from lidarspec.scans.scans import Scan
@@ -34,7 +36,7 @@ from lidarspec.transports.protocol import Format
 
 #: the place of a number in the name of a file.
 NUMBERED = re.compile(r"%0?\d*d")
-BUILT_IN = {known.suffix: known for known in (CSV, NPZ, PARQUET, ARROW, FEATHER, LAS, LAZ, E57)}
+BUILT_IN = {known.suffix: known for known in (CSV, NPZ, PARQUET, ARROW, FEATHER, LAS, LAZ, E57, ZARR)}
 
 
 def formats() -> dict[str, Format]:

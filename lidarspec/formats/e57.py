@@ -58,15 +58,12 @@ def _write(path: Path, scans: Iterable[Scan], *, every_point: bool) -> None:
 def _add(libe57: Any, file: Any, header: Mapping[str, Any], columns: Mapping[str, NDArray[Any]]) -> None:
     """Add a scan to a file."""
     image, length = file.image_file, len(columns["cartesianX"])
-    scan, prototype, buffers = (
-        _node(libe57, image, {**header, **_limits(columns)}),
-        libe57.StructureNode(image),
-        libe57.VectorSourceDestBuffer(),
-    )
+    prototype, buffers = libe57.StructureNode(image), libe57.VectorSourceDestBuffer()
     for name, column in columns.items():
         prototype.set(name, _kind(libe57, image, column))
         buffers.append(libe57.SourceDestBuffer(image, name, column, max(length, 1), True, True))
     points = libe57.CompressedVectorNode(image, prototype, libe57.VectorNode(image, True))
+    scan = _node(libe57, image, {**header, **_limits(columns)})
     scan.set("points", points)
     file.data3d.append(scan)
     writer = points.writer(buffers)

@@ -7,16 +7,15 @@ from __future__ import annotations
 
 import itertools
 import json
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from lidarspec.formats.writing import library, written
+from lidarspec.formats.writing import facts, library, units_of, written
 from lidarspec.points.cloud import PointCloud
-from lidarspec.points.conventions import UNITS, axes_of
 from lidarspec.scans.scans import Scan
 from lidarspec.transports.protocol import Format
 
@@ -47,7 +46,7 @@ def _tables(scans: Iterable[Scan], *, every_point: bool) -> Iterator[Any]:
     schema, gathered, rows = None, list[Any](), 0
     for number, scan in enumerate(scans):
         cloud = written(scan, every_point=every_point)
-        schema = schema or _schema(arrow, scan, cloud.columns, cloud.units)
+        schema = schema or _schema(arrow, scan, cloud)
         gathered.append(_batch(arrow, schema, cloud, number, scan))
         rows += len(cloud)
         if rows >= ROWS:
@@ -69,21 +68,14 @@ def _of_scans(arrow: Any) -> list[Any]:
     return [arrow.field(name, kind, nullable=False) for name, kind in types.items()]
 
 
-def _schema(arrow: Any, scan: Scan, columns: Mapping[str, Any], further: Mapping[str, str]) -> Any:
+def _schema(arrow: Any, scan: Scan, cloud: PointCloud) -> Any:
     """The fields of a scan. Those that cannot be null are written faster; of a float nan says that there is none."""
-    units = {name: UNITS.get(name) or further.get(name, "") for name in columns}
+    units = units_of(cloud)
     fields = [
-        arrow.field(name, arrow.from_numpy_dtype(column.dtype), column.dtype.kind != "f", {"unit": units[name]})
-        for name, column in columns.items()
+        arrow.field(name, arrow.from_numpy_dtype(column.dtype), column.dtype.kind != "f", {"unit": units.get(name, "")})
+        for name, column in cloud.columns.items()
     ]
-    told = {
-        "sensor": scan.sensor.id,
-        "source": scan.sensor.source,
-        "frame": ", ".join(f"{name} {way}" for name, way in zip("xyz", axes_of(scan.sensor), strict=True)),
-        "units": json.dumps({name: unit for name, unit in units.items() if unit}),
-        "calibration": "nominal" if scan.points.nominal else "own",
-    }
-    return arrow.schema([*fields, *_of_scans(arrow)], told)
+    return arrow.schema([*fields, *_of_scans(arrow)], facts(scan) | {"units": json.dumps(units)})
 
 
 def _batch(arrow: Any, schema: Any, cloud: PointCloud, number: int, scan: Scan) -> Any:

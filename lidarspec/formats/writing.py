@@ -20,6 +20,7 @@ from numpy.typing import DTypeLike, NDArray
 
 from lidarspec.errors import UsageError, suggest, system_errors
 from lidarspec.points.cloud import PointCloud, source_of
+from lidarspec.points.conventions import UNITS, axes_of
 from lidarspec.scans.scans import Scan
 
 #: ns since 1970 of the GPS epoch, 1980-01-06, for a clock that leaves out leap seconds, with those that there are since 2017.
@@ -77,6 +78,21 @@ def columns_of(scan: Scan, names: Iterable[str], *, every_point: bool) -> dict[s
     source_of(cloud).prepare((*names, "valid", *cloud.extra))
     own = {name: column for name in names if (column := getattr(cloud, name)) is not None} | dict(cloud.extra)
     return own if every_point or cloud.valid.all() else {name: column[cloud.valid] for name, column in own.items()}
+
+
+def units_of(cloud: PointCloud) -> dict[str, str]:
+    """The units of the columns that a cloud has, by name, those that are plain numbers left out."""
+    return {name: unit for name in cloud.columns if (unit := UNITS.get(name) or cloud.units.get(name))}
+
+
+def facts(scan: Scan) -> dict[str, str]:
+    """What a file says of where its points are from: whose they are, what is known of its format, its axes and calibration."""
+    return {
+        "sensor": scan.sensor.id,
+        "source": scan.sensor.source,
+        "frame": ", ".join(f"{name} {way}" for name, way in zip("xyz", axes_of(scan.sensor), strict=True)),
+        "calibration": "nominal" if scan.points.nominal else "own",
+    }
 
 
 class Spool:

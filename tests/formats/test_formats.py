@@ -15,7 +15,7 @@ import pytest
 import lidarspec as ls
 from lidarspec import PointCloud, Scan, SourceError
 from lidarspec.errors import UnknownFormat, UsageError, suggestion
-from lidarspec.formats import format_of, formats, tables, write
+from lidarspec.formats import format_of, formats, tables, write, zarr
 from lidarspec.simulation.simulator import simulate
 from tests.recording.test_recordings import file_size_limit
 from tests.shapes import SHAPES
@@ -26,6 +26,7 @@ EXTRAS = {
     **dict.fromkeys(("a.parquet", "a.arrow", "a.feather"), ("pyarrow", "arrow")),
     **dict.fromkeys(("a.las", "a.laz"), ("laspy", "las")),
     "a.e57": ("pye57", "e57"),
+    "a.zarr": ("zarr", "zarr"),
 }
 COLUMNS = ["x", "y", "z", "range", "azimuth", "elevation", "intensity", "time"]
 
@@ -124,7 +125,8 @@ def test_one_scan_is_held_at_a_time(tmp_path: Path, name: str) -> None:
 def test_the_memory_does_not_grow_with_the_number_of_scans(
     tmp_path: Path, name: str, every_point: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(tables, "ROWS", 10_000)
+    for module in (tables, zarr):
+        monkeypatch.setattr(module, "ROWS", 10_000)
     peaks = []
     for number in (20, 200):
         tracemalloc.start()
