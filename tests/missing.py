@@ -12,7 +12,11 @@ MISSING = (
     (r"g\+\+ is not", "g++", "apt-get install g++"),
     (r"gcc", "gcc", "apt-get install gcc"),
     (r"Kaitai compiler", "Kaitai's compiler", "npm install kaitai-struct-compiler js-yaml, with NODE_PATH as its node_modules"),
-    (r"kaitaistruct|crccheck|velodyne.decoder|[Nn]umba|rosbags|mcap", "Python packages", "pip install -e '.[dev]'"),
+    (
+        r"kaitaistruct|crccheck|velodyne.decoder|[Nn]umba|rosbags|mcap|pyarrow|duckdb|laspy|pye57|zarr",
+        "Python packages",
+        "pip install -e '.[dev]'",
+    ),
     (r"open3d", "Open3D", "pip install open3d, and pytest with -p no:dash"),
     (
         r"LIDARSPEC_CAPTURES|protocol vectors",

@@ -20,23 +20,16 @@ from lidarspec.cli.options import DURATION, SHARE, count_option, sensor_option
 from lidarspec.cli.terminal import note, say
 from lidarspec.device.device import Device, open as open_device
 from lidarspec.errors import UnknownFrame
+from lidarspec.points.conventions import UNITS
 from lidarspec.scans.scans import Scan
 from lidarspec.spec.sensor import Sensor
 from lidarspec.view.feed import LOOK, Feed, Reading, told
 
-#: unit, width and decimals of the columns of points.
+#: width and decimals of the columns of points.
 POINTS = {
-    "x": ("m", 9, 3),
-    "y": ("m", 9, 3),
-    "z": ("m", 9, 3),
-    "range": ("m", 9, 3),
-    "azimuth": ("rad", 9, 4),
-    "elevation": ("rad", 9, 4),
-    "intensity": ("", 9, 0),
-    "time": ("s", 10, 6),
-    "ring": ("", 5, 0),
-    "return_index": ("", 12, 0),
-    "column": ("", 6, 0),
+    **dict.fromkeys(("x", "y", "z", "range"), (9, 3)),
+    **dict.fromkeys(("azimuth", "elevation"), (9, 4)),
+    **{"intensity": (9, 0), "time": (10, 6), "ring": (5, 0), "return_index": (12, 0), "column": (6, 0)},
 }
 #: digits of a packet's field, of a further column of points in float32, and the width of a column at least.
 DIGITS, SINGLE, NARROWEST = 10, 7, 8
@@ -108,10 +101,10 @@ def _lines(rows: Iterable[tuple[Units, Row]], *, as_json: bool) -> Iterator[str]
 
 def _points(device: Device, until: float, patience: Patience, *, every_point: bool) -> Iterator[tuple[Units, Row]]:
     """The points of each scan, when it is complete; of the pieces at the beginning and end too."""
-    units = {name: unit for name, (unit, _, _) in POINTS.items()}
+    units: Units = UNITS
     for number, scan in enumerate(_scans(device, until, patience)):
         cloud = scan.points if every_point else scan.points[scan.points.valid]
-        columns, units = dict(cloud.columns), units | dict(cloud.units)
+        columns, units = dict(cloud.columns), {**units, **cloud.units}
         for values in zip(*columns.values(), strict=True):
             yield units, {"scan": number, **dict(zip(columns, values, strict=True))}
 
@@ -143,7 +136,7 @@ def _scalar(value: Any) -> Any:
 
 
 def _width(name: str) -> int:
-    return POINTS[name][1] if name in POINTS else 20 if name.endswith("_ns") else NARROWEST
+    return POINTS[name][0] if name in POINTS else 20 if name.endswith("_ns") else NARROWEST
 
 
 def _text(name: str, value: Any) -> str:
@@ -152,7 +145,7 @@ def _text(name: str, value: Any) -> str:
     if not math.isfinite(value):
         return "-" if math.isnan(value) else "inf"
     digits = SINGLE if isinstance(value, np.float32) else DIGITS
-    return f"{value:.{POINTS[name][2]}f}" if name in POINTS else f"{value:.{digits}g}"
+    return f"{value:.{POINTS[name][1]}f}" if name in POINTS else f"{value:.{digits}g}"
 
 
 def _row(cells: Sequence[str], widths: Sequence[int]) -> str:

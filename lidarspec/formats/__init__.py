@@ -6,8 +6,12 @@ formats, too. Modules in reading order:
 * `writing`: what formats have in common.
 * `text`: .csv, .csv.gz and .xyz, a row a point.
 * `arrays`: .npz, an array a column; .npy, a structured array.
+* `zarr`: .zarr, a folder with an array a column.
+* `tables`: .parquet, .arrow and .feather, for data tools.
 * `rows`: points as rows of bytes behind a header.
 * `clouds`: .pcd, .lzf.pcd, .ply and KITTI's .bin.
+* `las`: .las and .laz, for surveyors' tools.
+* `e57`: .e57, a header and points for each scan.
 * `bags`: .mcap, .bag, .rosbag2 and .db3, a message a scan.
 """
 
@@ -24,8 +28,12 @@ from lidarspec.errors import LidarSpecError, SpecError, UnknownFormat, system_er
 from lidarspec.formats.arrays import NPY, NPZ
 from lidarspec.formats.bags import BAG, DB3, MCAP, ROSBAG2
 from lidarspec.formats.clouds import KITTI, LZF_PCD, PCD, PLY
+from lidarspec.formats.e57 import E57
+from lidarspec.formats.las import LAS, LAZ
+from lidarspec.formats.tables import ARROW, FEATHER, PARQUET
 from lidarspec.formats.text import CSV, CSV_GZ, XYZ, write_columns
 from lidarspec.formats.writing import replacing
+from lidarspec.formats.zarr import ZARR
 from lidarspec.packets.imu import ImuSamples
 from lidarspec.plugins import registry
 from lidarspec.scans.scans import Scan
@@ -33,9 +41,9 @@ from lidarspec.transports.protocol import Format
 
 #: the place of a number in the name of a file.
 NUMBERED = re.compile(r"%0?\d?d")
-BUILT_IN = {
-    known.suffix: known for known in (CSV, CSV_GZ, XYZ, NPZ, NPY, PCD, LZF_PCD, PLY, KITTI, MCAP, BAG, ROSBAG2, DB3)
-}
+ARRAYS, TABLES = (CSV, CSV_GZ, XYZ, NPZ, NPY, ZARR), (PARQUET, ARROW, FEATHER)
+CLOUDS, BAGS = (PCD, LZF_PCD, PLY, KITTI, LAS, LAZ, E57), (MCAP, BAG, ROSBAG2, DB3)
+BUILT_IN = {known.suffix: known for known in (*ARRAYS, *TABLES, *CLOUDS, *BAGS)}
 
 
 def formats() -> dict[str, Format]:

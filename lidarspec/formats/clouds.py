@@ -13,9 +13,9 @@ from typing import IO, Any, cast
 
 import numpy as np
 
-from lidarspec.errors import UsageError, suggest
+from lidarspec.errors import UsageError, library, suggest
 from lidarspec.formats.rows import Rows, room, write_rows
-from lidarspec.formats.writing import Spool, library
+from lidarspec.formats.writing import Spool
 from lidarspec.scans.scans import Scan
 from lidarspec.transports.protocol import Format
 

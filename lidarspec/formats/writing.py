@@ -10,7 +10,7 @@ import contextlib
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import IO, Any
 
@@ -18,8 +18,12 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from lidarspec.errors import system_errors
-from lidarspec.points.cloud import PointCloud
+from lidarspec.points.cloud import PointCloud, source_of
+from lidarspec.points.conventions import UNITS, axes_of
 from lidarspec.scans.scans import Scan
+
+#: ns since 1970 of the GPS epoch, 1980-01-06, for a clock that leaves out leap seconds, with those that there are since 2017.
+GPS_EPOCH = (315_964_800 - 18) * 10**9
 
 
 @contextlib.contextmanager
@@ -58,6 +62,30 @@ def written(scan: Scan, *, every_point: bool) -> PointCloud:
 def kept(cloud: PointCloud, *, every_point: bool) -> NDArray[np.intp] | None:
     """The indices of the points that are written, which pick columns several times as fast as a mask; None for all."""
     return None if every_point or cloud.valid.all() else np.flatnonzero(cloud.valid)
+
+
+def columns_of(scan: Scan, names: Iterable[str], *, every_point: bool) -> dict[str, NDArray[Any]]:
+    """Some columns of the points that are written, those that the scan has, "valid" too, and behind them its further ones."""
+    cloud = scan.points
+    source_of(cloud).prepare((*names, "valid", *cloud.extra))
+    own = {name: column for name in names if (column := getattr(cloud, name)) is not None} | dict(cloud.extra)
+    which = kept(cloud, every_point=every_point)
+    return own if which is None else {name: column[which] for name, column in own.items()}
+
+
+def units_of(cloud: PointCloud) -> dict[str, str]:
+    """The units of the columns that a cloud has, by name, those that are plain numbers left out."""
+    return {name: unit for name in cloud.columns if (unit := UNITS.get(name) or cloud.units.get(name))}
+
+
+def facts(scan: Scan) -> dict[str, str]:
+    """What a file says of where its points are from: whose they are, what is known of its format, its axes and calibration."""
+    return {
+        "sensor": scan.sensor.id,
+        "source": scan.sensor.source,
+        "frame": ", ".join(f"{name} {way}" for name, way in zip("xyz", axes_of(scan.sensor), strict=True)),
+        "calibration": "nominal" if scan.points.nominal else "own",
+    }
 
 
 class Spool:

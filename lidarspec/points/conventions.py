@@ -24,6 +24,12 @@ TYPES: Mapping[str, Any] = {
     **{"time": np.float64, "ring": np.uint16, "return_index": np.uint8, "column": np.uint16},
 }
 
+#: their units, by name; those that are not here are plain numbers.
+UNITS: Mapping[str, str] = {**dict.fromkeys(("x", "y", "z", "range"), "m"), **dict.fromkeys(("azimuth", "elevation"), "rad"), "time": "s"}
+
+#: where x, y and z point by REP-103.
+REP_103 = ("forward", "left", "up")
+
 #: largest float32 below pi: azimuths stay in [-pi, pi) in either precision.
 _PI = np.nextafter(np.float32(np.pi), np.float32(0))
 
@@ -191,10 +197,16 @@ def axis_matrix(axes: Sequence[str]) -> NDArray[np.float64]:
     return matrix
 
 
+def axes_of(sensor: Spec) -> tuple[str, str, str]:
+    """Where x, y and z of a sensor's points point: as REP-103 has it, or as its vendor does, where that was asked for."""
+    wanted = sensor.vendor_axes if sensor.options.get("frame") == "vendor" else None
+    return wanted or REP_103
+
+
 def vendor_turn(sensor: Spec) -> NDArray[np.float64] | None:
     """The (3, 3) matrix that turns REP-103 coordinates into the axes that were asked for; None where these are REP-103's own."""
-    wanted = sensor.options.get("frame") == "vendor" and sensor.vendor_axes is not None
-    return axis_matrix(sensor.vendor_axes) if wanted and sensor.vendor_axes is not None else None
+    axes = axes_of(sensor)
+    return None if axes == REP_103 else axis_matrix(axes)
 
 
 def turned_azimuth(angles: NDArray[Any], turn: NDArray[np.float64]) -> NDArray[np.float64]:

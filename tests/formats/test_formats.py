@@ -15,12 +15,20 @@ import pytest
 
 import lidarspec as ls
 from lidarspec import PointCloud, Scan, SourceError
-from lidarspec.errors import UnknownFormat
-from lidarspec.formats import format_of, formats, write
+from lidarspec.errors import UnknownFormat, UsageError, suggestion
+from lidarspec.formats import format_of, formats, tables, write, zarr
 from lidarspec.simulation.simulator import simulate
+from tests.recording.test_recordings import file_size_limit
 from tests.shapes import SHAPES
 
 BUILT_IN = sorted(f"a{suffix}" for suffix in formats())
+#: the library and the extra that a format takes.
+EXTRAS = {
+    **dict.fromkeys(("a.parquet", "a.arrow", "a.feather"), ("pyarrow", "arrow")),
+    **dict.fromkeys(("a.las", "a.laz"), ("laspy", "las")),
+    "a.e57": ("pye57", "e57"),
+    "a.zarr": ("zarr", "zarr"),
+}
 COLUMNS = ["x", "y", "z", "range", "azimuth", "elevation", "intensity", "time"]
 
 
@@ -41,6 +49,12 @@ def scan(number: int, points: int = 5, *, intensity: bool = True) -> Scan:
         stamp_ns=10**18 + number,
     )
     return Scan(cloud, 10.0 + number, number > 0, ls.sensor("ldrobot-stl27l"))
+
+
+@pytest.fixture(autouse=True)
+def _needs_its_library(request: pytest.FixtureRequest) -> None:
+    if request.node.name.partition("[")[2] and (needed := EXTRAS.get(request.node.callspec.params.get("name"))):
+        pytest.importorskip(needed[0])
 
 
 def rows(path: Path) -> tuple[list[str], np.ndarray]:
@@ -119,7 +133,11 @@ def test_one_scan_is_held_at_a_time(tmp_path: Path, name: str) -> None:
     ("name", "every_point"),
     [*((name, True) for name in BUILT_IN if name not in ("a.csv", "a.csv.gz", "a.xyz")), ("a.npz", False), ("a.ply", False)],
 )
-def test_the_memory_does_not_grow_with_the_number_of_scans(tmp_path: Path, name: str, every_point: bool) -> None:
+def test_the_memory_does_not_grow_with_the_number_of_scans(
+    tmp_path: Path, name: str, every_point: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for module in (tables, zarr):
+        monkeypatch.setattr(module, "ROWS", 10_000)
     peaks = []
     for number in (20, 200):
         tracemalloc.start()
@@ -141,6 +159,22 @@ def test_a_failure_leaves_the_old_file_and_nothing_else(tmp_path: Path, name: st
         write(tmp_path / name, scans())
     assert [path.name for path in tmp_path.iterdir()] == [name]
     assert (tmp_path / name).read_text(encoding="ascii") == "old"
+
+
+@pytest.mark.parametrize("name", BUILT_IN)
+def test_a_full_disk_is_a_source_error_and_leaves_nothing(tmp_path: Path, name: str) -> None:
+    with file_size_limit(4096), pytest.raises(SourceError, match=name):
+        write(tmp_path / name, (scan(number, points=5000) for number in range(40)))
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("name", EXTRAS)
+def test_a_library_that_is_missing_is_named_with_what_to_type(tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, EXTRAS[name][0], None)
+    with pytest.raises(UsageError, match=f"it takes {EXTRAS[name][0]}, which is not installed") as caught:
+        write(tmp_path / name, [scan(0)])
+    assert suggestion(caught.value) == f"pip install 'lidarspec[{EXTRAS[name][1]}]'"
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_folder_that_is_not_there_is_a_source_error(tmp_path: Path) -> None:

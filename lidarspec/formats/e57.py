@@ -1,0 +1,143 @@
+"""ASTM E57, by libE57Format (pye57): a header and a section of points for each scan."""
+
+from __future__ import annotations
+
+import contextlib
+import uuid
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarspec.errors import library
+from lidarspec.formats.writing import GPS_EPOCH, columns_of
+from lidarspec.scans.scans import Scan
+from lidarspec.transports.protocol import Format
+
+#: our columns, and the standard's names of them.
+NAMES = {
+    **{"x": "cartesianX", "y": "cartesianY", "z": "cartesianZ", "valid": "cartesianInvalidState", "intensity": "intensity"},
+    **{"time": "timeStamp", "ring": "rowIndex", "column": "columnIndex", "return_index": "returnIndex"},
+}
+#: fields whose smallest and largest number the header has, by the group that these stand in and what they are called there.
+LIMITS = {
+    "cartesianBounds": {"x": "cartesianX", "y": "cartesianY", "z": "cartesianZ"},
+    "intensityLimits": {"intensity": "intensity"},
+    "indexBounds": {"row": "rowIndex", "column": "columnIndex", "return": "returnIndex"},
+}
+#: what the standard calls a point whose coordinates mean nothing.
+INVALID = 2
+#: prefix of the further columns, which are an extension, and what declares it.
+PREFIX, EXTENSION = "lidarspec", "urn:lidarspec:columns"
+#: types that libE57Format does not take, and those that hold their numbers.
+TAKEN_AS = {"f2": np.float32, "b1": np.uint8, **dict.fromkeys(("i4", "u4", "i8", "u8"), np.longlong)}
+
+
+def _write(path: Path, scans: Iterable[Scan], *, every_point: bool) -> None:
+    """Write a scan with a header for each: places, intensity, time, ring as the row, column and return, and the further columns.
+
+    `timeStamp` counts from the scan's acquisitionStart, its stamp as GPS time with 18 leap seconds; `returnCount` is the most of the scan.
+    Further columns are an extension, lidarspec:NAME, which readers pass over that do not know it; their units stand in the scan's
+    description. With `every_point`, a point without a return is at 0 with cartesianInvalidState 2. Headers are in memory until the file
+    is closed, as the library has it.
+    """
+    pye57, libe57 = library("pye57", "e57"), library("pye57.libe57", "e57")
+    with contextlib.ExitStack() as files:
+        try:
+            file = pye57.E57(str(path), mode="w")
+            files.callback(file.image_file.cancel)
+            file.image_file.extensionsAdd(PREFIX, EXTENSION)
+            for number, scan in enumerate(scans):
+                _add(libe57, file, _header(number, scan), _columns(columns_of(scan, NAMES, every_point=every_point)))
+            file.close()
+        except libe57.E57Exception as error:  # of the system's errors alone, without its words
+            raise OSError(f"{str(error).splitlines()[0]}; is the disk full?") from None
+
+
+def _add(libe57: Any, file: Any, header: Mapping[str, Any], columns: Mapping[str, NDArray[Any]]) -> None:
+    """Add a scan to a file."""
+    image, length = file.image_file, len(columns["cartesianX"])
+    prototype, buffers = libe57.StructureNode(image), libe57.VectorSourceDestBuffer()
+    for name, column in columns.items():
+        prototype.set(name, _kind(libe57, image, column))
+        buffers.append(libe57.SourceDestBuffer(image, name, column, max(length, 1), True, True))
+    points = libe57.CompressedVectorNode(image, prototype, libe57.VectorNode(image, True))
+    scan = _node(libe57, image, {**header, **_limits(columns)})
+    scan.set("points", points)
+    file.data3d.append(scan)
+    writer = points.writer(buffers)
+    try:
+        writer.write(length)
+        writer.close()
+    finally:
+        del writer  # before the file is closed, which it writes to when it goes
+
+
+def _columns(own: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+    """The columns of points by the names of the standard, in types that libE57Format takes."""
+    invalid = ~own["valid"]
+    columns = {NAMES.get(name, f"{PREFIX}:{name}"): column for name, column in own.items()}
+    columns["cartesianInvalidState"] = invalid * np.uint8(INVALID)
+    if invalid.any():
+        columns |= {name: np.where(invalid, 0, columns[name]) for name in (NAMES[axis] for axis in "xyz")}
+    if "returnIndex" in columns:
+        columns["returnCount"] = np.full(len(invalid), columns["returnIndex"].max(initial=0) + 1, np.uint8)
+    return {name: np.ascontiguousarray(column, TAKEN_AS.get(column.dtype.str[1:])) for name, column in columns.items()}
+
+
+def _header(number: int, scan: Scan) -> dict[str, Any]:
+    """What is said of a scan."""
+    units = ", ".join(f"{name} [{unit}]" for name, unit in scan.points.units.items() if unit)
+    start = (scan.stamp_ns - GPS_EPOCH) * 1e-9
+    return {
+        "guid": f"{{{uuid.uuid4()}}}",
+        "name": f"scan {number}",
+        "description": units,
+        "sensorVendor": scan.sensor.vendor,
+        "sensorModel": scan.sensor.model,
+        "acquisitionStart": {"dateTimeValue": start, "isAtomicClockReferenced": 0},
+        "acquisitionEnd": {"dateTimeValue": start + float(scan.points.time.max(initial=0)), "isAtomicClockReferenced": 0},
+    }
+
+
+def _limits(columns: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
+    """Between what numbers the valid points of a scan lie."""
+    valid = columns["cartesianInvalidState"] == 0
+    if not valid.any():
+        return {}
+    return {
+        group: {
+            f"{name}{end}": extreme.reduce(columns[field][valid]).item()
+            for name, field in names.items()
+            if field in columns
+            for end, extreme in (("Minimum", np.fmin), ("Maximum", np.fmax))
+        }
+        for group, names in LIMITS.items()
+        if columns.keys() & names.values()
+    }
+
+
+def _node(libe57: Any, image: Any, value: Any) -> Any:
+    """A value of a header, mappings as structures."""
+    if not isinstance(value, Mapping):
+        kinds = {str: libe57.StringNode, int: libe57.IntegerNode, float: libe57.FloatNode}
+        return kinds[type(value)](image, value)
+    structure = libe57.StructureNode(image)
+    for name, part in value.items():
+        structure.set(name, _node(libe57, image, part))
+    return structure
+
+
+def _kind(libe57: Any, image: Any, column: NDArray[Any]) -> Any:
+    """What a column holds: whole numbers take as many bits as those that come need."""
+    if column.dtype.kind != "f":
+        low, high = (int(column.min()), int(column.max())) if len(column) else (0, 0)
+        return libe57.IntegerNode(image, low, low, high)
+    if column.dtype == np.float64:
+        return libe57.FloatNode(image, 0.0, libe57.E57_DOUBLE)
+    return libe57.FloatNode(image, 0.0, libe57.E57_SINGLE, libe57.E57_FLOAT_MIN, libe57.E57_FLOAT_MAX)
+
+
+E57 = Format(".e57", "ASTM E57, a header a scan (pye57)", _write)
