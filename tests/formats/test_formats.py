@@ -189,7 +189,7 @@ def test_a_folder_that_is_not_there_is_a_source_error(tmp_path: Path) -> None:
         ("a", "unknown format 'a'"),
         ("a.np", "did you mean '.npy' or '.npz'"),
         ("a.csv.g", "did you mean '.csv.gz'"),
-        ("a.dxf", r"unknown format '.dxf' \(known: "),
+        ("a.dxf", "unknown format '.dxf'"),
     ],
 )
 def test_an_unknown_suffix_gets_a_suggestion(name: str, told: str) -> None:
