@@ -32,9 +32,11 @@ from lidarspec.testing.vectors import vectors_hold
 from lidarspec.transports.files import unhexed
 from lidarspec.transports.open_url import is_port, live_address
 from lidarspec.wire.layout import Layout
+from lidarspec_hesai import at128
 from tests import made_captures as made
 from tests.all_sensors import DISTINCT, EVERY, FRAMES
 from tests.fuzz.words import HOSTILE, commanded, spoken
+from tests.sensors.test_velodyne import db_xml
 from tests.shapes import SHAPES
 from tests.transports import test_bags
 
@@ -417,6 +419,10 @@ def _calibration(sensor: Sensor, option: str, folder: Path) -> Target:
     def examples() -> list[bytes]:
         if option == "metadata":
             return [_metadata(rows) for rows in (16, 32)]
+        if sensor.id == "hesai-at128" and option == "calibration":
+            return [at128.TABLE.told()]
+        if sensor.id.startswith("velodyne-hdl64e"):
+            return [db_xml(folder / "db.xml").read_bytes()]
         heading = "Channel,Elevation,Azimuth" if option == "calibration" else "Channel,fire time(us)"
         rows = [f"{channel},{20.5 - channel / 2}{f',{channel % 5 * 15 - 30}' * heading.count('Azimuth')}" for channel in range(1, 129)]
         return ["\n".join([heading, *rows[:number]]).encode() for number in (16, 32, 40, 64, 128)]
@@ -425,7 +431,9 @@ def _calibration(sensor: Sensor, option: str, folder: Path) -> Target:
         word.encode()
         for word in ("nan", "inf", "-inf", "1e999", ",", "\n", '"', "\x00", "1_0", "\u0661", "EEFF", "414", "0", "-0", ",,,,", "9" * 5000)
     ]
-    return Target(f"calibration {sensor.id} {option}", run, examples, (ls.UsageError, ls.SourceError), words, is_text=True)
+    return Target(
+        f"calibration {sensor.id} {option}", run, examples, (ls.UsageError, ls.SourceError), words, is_text=sensor.id != "hesai-at128"
+    )
 
 
 def _metadata(rows: int) -> bytes:
