@@ -62,7 +62,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         (("convert", "whole.bin", "nowhere/o.csv", *SENSOR), 3, ["nowhere/o.csv: No such file"]),
         (("convert", ".", "o.csv", *SENSOR), 3, ["directory"]),
         (("convert", "whole.bin", "o.cvs", *SENSOR), 2, ["unknown format '.cvs'", "did you mean '.csv'?"]),
-        (("convert", "whole.bin", "whole.bin", *SENSOR), 2, ["unknown format '.bin'"]),
+        (("convert", "whole.bin", "whole.bin", *SENSOR), 2, ["whole.bin is read: it would be overwritten"]),
         (
             ("convert", "whole.bin", "o.csv", "-s", "ldrobot-stl27"),
             2,
