@@ -19,10 +19,21 @@ from tests.fuzz.targets import SHARES, Target, targets
 FEW = 12
 
 
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("fuzz")
+
+
+@pytest.fixture(scope="module")
+def every(folder: Path) -> dict[str, Target]:
+    """All targets, which take most of the time of these tests to make."""
+    return targets(folder)
+
+
 @pytest.fixture
-def known(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Target]:
-    monkeypatch.chdir(tmp_path)
-    return targets(tmp_path)
+def known(folder: Path, every: dict[str, Target], monkeypatch: pytest.MonkeyPatch) -> dict[str, Target]:
+    monkeypatch.chdir(folder)
+    return every
 
 
 @pytest.mark.parametrize("group", SHARES)
