@@ -151,6 +151,8 @@ def container(name: str, path: Path) -> Path:
 
 @pytest.mark.parametrize("name", ["SQLite", "zip", "tar", "NumPy", "gzip", "bzip2", "xz", "zstd", "ROS 1 bag", "MCAP", "points"])
 def test_files_of_other_kinds_are_named_and_not_taken_for_bytes(name: str, tmp_path: Path) -> None:
+    if name in ("SQLite", "ROS 1 bag", "MCAP"):  # which is looked into for packets
+        pytest.importorskip("rosbags")
     path = container(name, tmp_path / "other.bin")
     said = ran("convert", path, tmp_path / "out.csv", "-s", M1, code=3).stderr
     assert f"{path} is " in said
