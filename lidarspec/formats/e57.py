@@ -50,7 +50,8 @@ def _write(path: Path, scans: Iterable[Scan], *, every_point: bool) -> None:
             files.callback(file.image_file.cancel)
             file.image_file.extensionsAdd(PREFIX, EXTENSION)
             for number, scan in enumerate(scans):
-                _add(libe57, file, _header(number, scan), _columns(columns_of(scan, NAMES, every_point=every_point)))
+                own = columns_of(scan, (*NAMES, *scan.points.extra), every_point=every_point)
+                _add(libe57, file, _header(number, scan), _columns(own))
             file.close()
         except libe57.E57Exception as error:  # of the system's errors alone, without its words
             raise OSError(f"{str(error).splitlines()[0]}; is the disk full?") from None

@@ -45,7 +45,7 @@ def _write(path: Path, scans: Iterable[Scan], *, every_point: bool, is_compresse
         header, writer = laspy.LasHeader(point_format=6, version="1.4"), None
         opened = partial(laspy.open, files.enter_context(path.open("wb")), "w", header=header, do_compress=is_compressed, closefd=False)
         for number, scan in enumerate(scans):
-            own = columns_of(scan, (*PLACED, *EXTRA), every_point=every_point)
+            own = columns_of(scan, (*PLACED, *EXTRA, *scan.points.extra), every_point=every_point)
             own["scan"] = np.full(len(own["x"]), number, np.uint32)
             if writer is None:
                 further = _describe(laspy, header, own, scan)

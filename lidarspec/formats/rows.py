@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.formats.writing import kept
-from lidarspec.points.cloud import STRUCTURED, grid_of, source_of
+from lidarspec.formats.writing import columns_of
+from lidarspec.points.cloud import STRUCTURED, grid_of
 from lidarspec.scans.scans import Scan, handed_out
 
 #: columns that rows begin with; a sensor's further ones follow.
@@ -68,13 +68,9 @@ class Rows:
             yield rows.reshape(self.shape).T.reshape(-1) if self.shape else rows
 
     def _columns(self, scan: Scan, number: int, names: Sequence[str]) -> dict[str, NDArray[Any]]:
-        """Those of some columns that the scan has, of the points that are written."""
-        cloud = scan.points
-        source_of(cloud).prepare((*names, "valid"))
-        columns = {name: getattr(cloud, name) if name in NAMES else cloud.extra.get(name) for name in names}
-        columns |= {"scan": np.full(len(cloud), number, np.int32)} if "scan" in names else {}
-        which = kept(cloud, every_point=self._every_point)
-        return {name: column if which is None else column[which] for name, column in columns.items() if column is not None}
+        """Those of some columns that the scan has, and its number, of the points that are written."""
+        columns = columns_of(scan, names, every_point=self._every_point)
+        return columns | ({"scan": np.full(len(columns["x"]), number, np.int32)} if "scan" in names else {})
 
 
 def write_rows(path: Path, rows: Rows, header: Callable[[Rows], bytes]) -> None:

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from lidarspec.errors import system_errors
-from lidarspec.points.cloud import PointCloud, source_of
+from lidarspec.points.cloud import COLUMNS, PointCloud, source_of
 from lidarspec.points.conventions import UNITS, axes_of
 from lidarspec.scans.scans import Scan
 
@@ -65,12 +65,12 @@ def kept(cloud: PointCloud, *, every_point: bool) -> NDArray[np.intp] | None:
 
 
 def columns_of(scan: Scan, names: Iterable[str], *, every_point: bool) -> dict[str, NDArray[Any]]:
-    """Some columns of the points that are written, those that the scan has, "valid" too, and behind them its further ones."""
-    cloud = scan.points
-    source_of(cloud).prepare((*names, "valid", *cloud.extra))
-    own = {name: column for name in names if (column := getattr(cloud, name)) is not None} | dict(cloud.extra)
+    """Those of some columns that a scan has, "valid" and its further ones too, of the points that are written."""
+    cloud, named = scan.points, tuple(names)
+    source_of(cloud).prepare((*named, "valid"))
+    columns = {name: getattr(cloud, name) if name in (*COLUMNS, "valid") else cloud.extra.get(name) for name in named}
     which = kept(cloud, every_point=every_point)
-    return own if which is None else {name: column[which] for name, column in own.items()}
+    return {name: column if which is None else column[which] for name, column in columns.items() if column is not None}
 
 
 def units_of(cloud: PointCloud) -> dict[str, str]:

@@ -151,7 +151,7 @@ def test_what_fails_leaves_nothing_behind(tmp_path: Path, suffix: str, monkeypat
     with pytest.raises(SourceError, match=f"none.a.{suffix}: No such file"):
         write(tmp_path / "none" / f"a.{suffix}", [scan(0)])
     monkeypatch.setitem(sys.modules, "rosbags.typesys", None)
-    with pytest.raises(UsageError, match="it takes rosbags, which is not installed") as caught:
+    with pytest.raises(UsageError, match="takes rosbags, which is not installed") as caught:
         write(tmp_path / f"a.{suffix}", [scan(0)])
     assert suggestion(caught.value) == "pip install 'lidarspec[ros]'"
     assert not list(tmp_path.iterdir())

@@ -179,7 +179,7 @@ def test_compressed_points_of_more_than_the_format_can_say_are_refused(tmp_path:
 
 def test_without_its_library_a_compressed_file_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "lzf", None)
-    with pytest.raises(UsageError, match="it takes lzf, which is not installed") as caught:
+    with pytest.raises(UsageError, match="takes lzf, which is not installed") as caught:
         write(tmp_path / "a.lzf.pcd", [scan(0)])
     assert caught.value.__notes__ == ["next: pip install 'lidarspec[pcd]'"]
     assert not list(tmp_path.iterdir())
