@@ -5,8 +5,7 @@ formats, too. Modules in reading order:
 
 * `writing`: what formats have in common.
 * `text`: .csv, .csv.gz and .xyz, a row a point.
-* `arrays`: .npz, an array a column; .npy, a structured array.
-* `zarr`: .zarr, a folder with an array a column.
+* `arrays`: .npz, an array a column; .npy, a structured array; .zarr, a folder with an array a column.
 * `tables`: .parquet, .arrow and .feather, for data tools.
 * `rows`: points as rows of bytes behind a header.
 * `clouds`: .pcd, .lzf.pcd, .ply and KITTI's .bin.
@@ -25,7 +24,7 @@ from typing import NoReturn
 import numpy as np
 
 from lidarspec.errors import LidarSpecError, SpecError, UnknownFormat, system_errors
-from lidarspec.formats.arrays import NPY, NPZ
+from lidarspec.formats.arrays import NPY, NPZ, ZARR
 from lidarspec.formats.bags import BAG, DB3, MCAP, ROSBAG2
 from lidarspec.formats.clouds import KITTI, LZF_PCD, PCD, PLY
 from lidarspec.formats.e57 import E57
@@ -33,7 +32,6 @@ from lidarspec.formats.las import LAS, LAZ
 from lidarspec.formats.tables import ARROW, FEATHER, PARQUET
 from lidarspec.formats.text import CSV, CSV_GZ, XYZ, write_columns
 from lidarspec.formats.writing import replacing
-from lidarspec.formats.zarr import ZARR
 from lidarspec.packets.imu import ImuSamples
 from lidarspec.plugins import registry
 from lidarspec.scans.scans import Scan

@@ -1,7 +1,7 @@
-"""NumPy's .npz: one array a column, and one entry a scan for the stamps; and .npy: one structured array. Memory stays small.
+"""Arrays: NumPy's .npz, one a column, with a stamp a scan; .npy, one structured array; and Zarr, a folder of compressed ones.
 
 How long an array is stands before it, and is known at the end alone: until then each column of an .npz grows in a file of its own,
-without a name, in the same folder.
+without a name, in the same folder. Those of Zarr, as xarray and Dask open them, grow by whole chunks.
 """
 
 from __future__ import annotations
@@ -14,13 +14,23 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import DTypeLike
+from numpy.typing import DTypeLike, NDArray
 
+from lidarspec.errors import library
 from lidarspec.formats.rows import NAMES, Rows, write_rows
-from lidarspec.formats.writing import Spool, written
+from lidarspec.formats.writing import Spool, facts, units_of, written
 from lidarspec.points.cloud import structured_type
 from lidarspec.scans.scans import Scan
 from lidarspec.transports.protocol import Format
+
+#: numbers of a chunk of Zarr, and of one of those that have a number a scan.
+ROWS, SCANS = 1 << 18, 1 << 12
+#: what there is of each scan: type and unit, as xarray reads it.
+OF_SCANS: dict[str, tuple[DTypeLike, str]] = {
+    "stamp_ns": (np.int64, "nanoseconds since 1970-01-01"),
+    "rate_hz": (np.float64, "Hz"),
+    "complete": (np.bool_, ""),
+}
 
 
 def put(archive: zipfile.ZipFile, name: str, column: Spool) -> None:
@@ -41,7 +51,7 @@ def write(path: Path, scans: Iterable[Scan], *, every_point: bool) -> None:
         def column(dtype: DTypeLike) -> Spool:
             return files.enter_context(contextlib.closing(Spool(path.parent, dtype)))
 
-        facts = {"stamp_ns": column(np.int64), "rate_hz": column(np.float64), "complete": column(np.bool_)}
+        of_scans = {"stamp_ns": column(np.int64), "rate_hz": column(np.float64), "complete": column(np.bool_)}
         numbers, columns, units = column(np.int32), dict[str, Spool](), dict[str, str]()
         for number, scan in enumerate(scans):
             cloud = written(scan, every_point=every_point)
@@ -52,13 +62,13 @@ def write(path: Path, scans: Iterable[Scan], *, every_point: bool) -> None:
             for name, kept in columns.items():
                 kept.add(own[name])
             numbers.add(np.full(len(cloud), number))
-            for name, kept in facts.items():
+            for name, kept in of_scans.items():
                 kept.add(np.array([getattr(scan, name)]))
         told = {f"{name}.unit": column(f"<U{len(unit)}") for name, unit in units.items()}
         for unit, kept in zip(units.values(), told.values(), strict=True):
             kept.add(np.array([unit]))
         with zipfile.ZipFile(path, "w") as archive:
-            for name, kept in {**columns, "scan": numbers, **facts, **told}.items():
+            for name, kept in {**columns, "scan": numbers, **of_scans, **told}.items():
                 put(archive, name, kept)
 
 
@@ -82,5 +92,64 @@ def _npy_header(rows: Rows) -> bytes:
     return header.getvalue()
 
 
+class _ZarrColumn:
+    """An array that grows by whole chunks, so that none is compressed twice."""
+
+    def __init__(self, group: Any, name: str, dtype: DTypeLike, *, unit: str = "", along: str = "points") -> None:
+        self._chunk = {"points": ROWS, "scans": SCANS}[along]
+        self._array = group.create_array(
+            name,
+            shape=(0,),
+            chunks=(self._chunk,),
+            dtype=np.dtype(dtype),
+            dimension_names=(along,),
+            attributes={"units": unit} if unit else {},
+        )
+        self._waiting, self._length = list[NDArray[Any]](), 0
+
+    def add(self, values: NDArray[Any] | None, length: int) -> None:
+        """Append values; without any, nan or 0 as often as `length` says."""
+        dtype = self._array.dtype
+        self._waiting.append(np.full(length, np.nan if dtype.kind == "f" else 0, dtype) if values is None else values)
+        self._length += length
+        if self._length >= self._chunk:
+            self.write(self._length - self._length % self._chunk)
+
+    def write(self, number: int) -> None:
+        """Write so many of the values that wait."""
+        waiting = np.concatenate([np.empty(0, self._array.dtype), *self._waiting])
+        self._array.append(waiting[:number])
+        self._waiting, self._length = [waiting[number:].copy()], len(waiting) - number
+
+    def finish(self) -> None:
+        """Write all that wait."""
+        self.write(self._length)
+
+
+def write_zarr(path: Path, scans: Iterable[Scan], *, every_point: bool) -> None:
+    """Write the columns that the first scan has, and `scan`, along "points", `stamp_ns`, `rate_hz` and `complete` along "scans".
+
+    Arrays have their `units`; the group has `sensor`, `source`, `frame` (where x, y and z point) and `calibration`. A column that a later
+    scan lacks is nan there, or 0 where it holds whole numbers.
+    """
+    group = library("zarr", "zarr").open_group(str(path), mode="w")
+    of_scans = {name: _ZarrColumn(group, name, dtype, unit=unit, along="scans") for name, (dtype, unit) in OF_SCANS.items()}
+    columns = {"scan": _ZarrColumn(group, "scan", np.int32)}
+    for number, scan in enumerate(scans):
+        cloud = written(scan, every_point=every_point)
+        own = {**cloud.columns, "scan": np.full(len(cloud), number, np.int32)}
+        if not number:
+            units = units_of(cloud)
+            group.attrs.update(facts(scan))
+            columns |= {name: _ZarrColumn(group, name, own[name].dtype, unit=units.get(name, "")) for name in cloud.columns}
+        for name, column in columns.items():
+            column.add(own.get(name), len(cloud))
+        for name, column in of_scans.items():
+            column.add(np.array([getattr(scan, name)]), 1)
+    for column in (*columns.values(), *of_scans.values()):
+        column.finish()
+
+
 NPZ = Format(".npz", "NumPy arrays, one a column", write)
 NPY = Format(".npy", "a structured NumPy array with PCL's layout", write_npy)
+ZARR = Format(".zarr", "Zarr, a folder with an array a column (zarr)", write_zarr)

@@ -16,7 +16,7 @@ import pytest
 import lidarspec as ls
 from lidarspec import PointCloud, Scan, SourceError
 from lidarspec.errors import UnknownFormat, UsageError, suggestion
-from lidarspec.formats import format_of, formats, tables, write, zarr
+from lidarspec.formats import arrays, format_of, formats, tables, write
 from lidarspec.simulation.simulator import simulate
 from tests.recording.test_recordings import file_size_limit
 from tests.shapes import SHAPES
@@ -136,7 +136,7 @@ def test_one_scan_is_held_at_a_time(tmp_path: Path, name: str) -> None:
 def test_the_memory_does_not_grow_with_the_number_of_scans(
     tmp_path: Path, name: str, every_point: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for module in (tables, zarr):
+    for module in (tables, arrays):
         monkeypatch.setattr(module, "ROWS", 10_000)
     peaks = []
     for number in (20, 200):

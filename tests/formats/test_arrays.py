@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lidarspec.formats import write, zarr as ours
+from lidarspec.formats import arrays as ours, write
 from lidarspec.simulation.simulator import simulate
 from tests.formats.test_formats import COLUMNS, scan
 from tests.shapes import SHAPES
