@@ -17,7 +17,7 @@ MISSING = (
         "Python packages",
         "pip install -e '.[dev]'",
     ),
-    (r"open3d", "Open3D", "pip install open3d, and pytest with -p no:dash"),
+    (r"open3d", "Open3D", "pip install open3d"),
     (
         r"LIDARSPEC_CAPTURES|protocol vectors",
         "captures and vectors",
