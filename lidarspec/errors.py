@@ -198,7 +198,7 @@ def library(name: str, extra: str) -> Any:
     try:
         return importlib.import_module(name)
     except ImportError as error:
-        reason = f"this kind of file takes {name.partition('.')[0]}, which is not installed ({error})"
+        reason = f"this takes {name.partition('.')[0]}, which is not installed ({error})"
         raise suggest(UsageError(reason), f"pip install 'lidarspec[{extra}]'") from error
 
 
@@ -288,11 +288,15 @@ class SourceError(LidarSpecError):
     """A port, socket or file that cannot be opened, read or written: the system's fault."""
 
 
+class SourceTimeout(SourceError, TimeoutError):
+    """A source that gave nothing, or took nothing, within its time."""
+
+
 class CommandError(LidarSpecError):
     """The device refused a command, or answered with something else."""
 
 
-class ReplyTimeout(CommandError):
+class ReplyTimeout(CommandError, TimeoutError):
     """The device gave no answer to a command within its time."""
 
 
@@ -303,5 +307,7 @@ def system_errors(place: object) -> Iterator[None]:
         raise SourceError(f"{str(place)!r}: no path has a zero byte in it")
     try:
         yield
+    except LidarSpecError:  # what took too long is an OSError as well
+        raise
     except OSError as error:
         raise SourceError(f"{place}: {error.strerror or error}") from None

@@ -18,9 +18,9 @@ CODES: tuple[tuple[type[Exception] | tuple[type[Exception], ...], int, str], ...
     (errors.UnknownSensor, USAGE, "lidarspec sensors"),
     ((errors.UnknownFrame, errors.UnknownField, errors.MissingField, errors.OutOfRange), USAGE, "lidarspec show {sensor}"),
     ((errors.UsageError, click.ClickException), USAGE, "lidarspec {verb} --help"),
+    (errors.CommandError, DEVICE, "lidarspec show {sensor}"),
     ((errors.SourceError, OSError), SOURCE, "lidarspec {verb} --help"),
     (errors.WireError, NO_DATA, "lidarspec show {sensor}"),
-    (errors.CommandError, DEVICE, "lidarspec show {sensor}"),
     (errors.SpecError, FINDINGS, "lidarspec check {sensor}"),
     (errors.LidarSpecError, FINDINGS, "lidarspec plugins"),
 )

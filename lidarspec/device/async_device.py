@@ -117,7 +117,7 @@ class AsyncDevice:
             timeout: seconds to wait.
 
         Raises:
-            SourceError: where none comes in time, the input has ended or the device was closed.
+            SourceTimeout: where none comes in time; SourceError where the input has ended or the device was closed.
         """
         deadline = None if timeout is None else time.monotonic() + timeout
         while True:

@@ -20,7 +20,7 @@ from lidarspec.device.live_input import PERIOD, LiveInput
 from lidarspec.device.session import Reply
 from lidarspec.device.settings import named
 from lidarspec.discovery.detect import contradiction, detected, said
-from lidarspec.errors import SourceError, UsageError, suggest
+from lidarspec.errors import SourceError, SourceTimeout, UsageError, suggest
 from lidarspec.framing.decoder import Decoder
 from lidarspec.framing.results import Counters, Found, Frames
 from lidarspec.packets.imu import ImuSamples, joined
@@ -292,7 +292,7 @@ class Device(Closing):
             timeout: seconds to wait.
 
         Raises:
-            SourceError: where none comes in time, the input has ended or the device was closed.
+            SourceTimeout: where none comes in time; SourceError where the input has ended or the device was closed.
         """
         deadline = None if timeout is None else time.monotonic() + timeout
         while (found := self.newest(LONG if deadline is None else max(deadline - time.monotonic(), 0.0))) is None:
@@ -325,9 +325,9 @@ class Device(Closing):
         self._unseen.clear()
         return newest
 
-    def overdue(self) -> SourceError:
+    def overdue(self) -> SourceTimeout:
         """What to say when a scan did not come in time."""
-        error = SourceError(f"{self._source}: no scan in time; the source is {self.state}")
+        error = SourceTimeout(f"{self._source}: no scan in time; the source is {self.state}")
         return suggest(error, f"lidarspec doctor {quote(str(self._source))} -s {self.sensor.id}")
 
     def send(self, name: str, /, *, timeout: float | None = None, **arguments: Any) -> Reply:

@@ -18,8 +18,8 @@ from numpy.typing import DTypeLike, NDArray
 
 from lidarspec.errors import library
 from lidarspec.formats.rows import NAMES, Rows, write_rows
-from lidarspec.formats.writing import Spool, facts, units_of, written
-from lidarspec.points.cloud import structured_type
+from lidarspec.formats.writing import Spool, written
+from lidarspec.points.cloud import structured_type, units_of
 from lidarspec.scans.scans import Scan
 from lidarspec.transports.protocol import Format
 
@@ -140,7 +140,7 @@ def write_zarr(path: Path, scans: Iterable[Scan], *, every_point: bool) -> None:
         own = {**cloud.columns, "scan": np.full(len(cloud), number, np.int32)}
         if not number:
             units = units_of(cloud)
-            group.attrs.update(facts(scan))
+            group.attrs.update(scan.facts)
             columns |= {name: _ZarrColumn(group, name, own[name].dtype, unit=units.get(name, "")) for name in cloud.columns}
         for name, column in columns.items():
             column.add(own.get(name), len(cloud))

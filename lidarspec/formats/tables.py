@@ -6,7 +6,6 @@ Scans are gathered until there are `ROWS`, which are a row group or a record bat
 from __future__ import annotations
 
 import itertools
-import json
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
@@ -15,8 +14,8 @@ from typing import Any
 import numpy as np
 
 from lidarspec.errors import library
-from lidarspec.formats.writing import facts, units_of, written
-from lidarspec.points.cloud import PointCloud
+from lidarspec.formats.writing import written
+from lidarspec.points.cloud import PointCloud, arrow_schema
 from lidarspec.scans.scans import Scan
 from lidarspec.transports.protocol import Format
 
@@ -70,13 +69,9 @@ def _of_scans(arrow: Any) -> list[Any]:
 
 
 def _schema(arrow: Any, scan: Scan, cloud: PointCloud) -> Any:
-    """The fields of a scan. Those that cannot be null are written faster; of a float nan says that there is none."""
-    units = units_of(cloud)
-    fields = [
-        arrow.field(name, arrow.from_numpy_dtype(column.dtype), column.dtype.kind != "f", {"unit": units.get(name, "")})
-        for name, column in cloud.columns.items()
-    ]
-    return arrow.schema([*fields, *_of_scans(arrow)], facts(scan) | {"units": json.dumps(units)})
+    """The fields of a scan."""
+    known = arrow_schema(cloud, scan.facts)
+    return arrow.schema([*known, *_of_scans(arrow)], known.metadata)
 
 
 def _batch(arrow: Any, schema: Any, cloud: PointCloud, number: int, scan: Scan) -> Any:

@@ -19,7 +19,6 @@ from numpy.typing import DTypeLike, NDArray
 
 from lidarspec.errors import system_errors
 from lidarspec.points.cloud import COLUMNS, PointCloud, source_of
-from lidarspec.points.conventions import UNITS, axes_of
 from lidarspec.scans.scans import Scan
 
 #: ns since 1970 of the GPS epoch, 1980-01-06, for a clock that leaves out leap seconds, with those that there are since 2017.
@@ -71,21 +70,6 @@ def columns_of(scan: Scan, names: Iterable[str], *, every_point: bool) -> dict[s
     columns = {name: getattr(cloud, name) if name in (*COLUMNS, "valid") else cloud.extra.get(name) for name in named}
     which = kept(cloud, every_point=every_point)
     return {name: column if which is None else column[which] for name, column in columns.items() if column is not None}
-
-
-def units_of(cloud: PointCloud) -> dict[str, str]:
-    """The units of the columns that a cloud has, by name, those that are plain numbers left out."""
-    return {name: unit for name in cloud.columns if (unit := UNITS.get(name) or cloud.units.get(name))}
-
-
-def facts(scan: Scan) -> dict[str, str]:
-    """What a file says of where its points are from: whose they are, what is known of its format, its axes and calibration."""
-    return {
-        "sensor": scan.sensor.id,
-        "source": scan.sensor.source,
-        "frame": ", ".join(f"{name} {way}" for name, way in zip("xyz", axes_of(scan.sensor), strict=True)),
-        "calibration": "nominal" if scan.points.nominal else "own",
-    }
 
 
 class Spool:

@@ -11,15 +11,16 @@ Columns under names of a sensor's own are in `extra`, each made when it is first
 from __future__ import annotations
 
 import functools
+import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
-from lidarspec.errors import UnknownName, UsageError
-from lidarspec.points.conventions import TYPES, Floats, Grid, Grids, Kind, narrowed, whole_columns
+from lidarspec.errors import UnknownName, UsageError, library
+from lidarspec.points.conventions import TYPES, UNITS, Floats, Grid, Grids, Kind, narrowed, whole_columns
 
 #: names of the columns that a cloud can have, in the order in which files list them.
 COLUMNS = tuple(TYPES)
@@ -79,9 +80,13 @@ class PointCloud:
     units: Mapping[str, str] = field(default_factory=dict)
 
     def __len__(self) -> int:
-        return len(self.x)
+        return np.size(self.x)  # 1 of `cloud[0]`
 
     def __repr__(self) -> str:
+        if not np.ndim(self.x):
+            units = units_of(self)
+            values = [f"{name}={value:.6g} {units.get(name, '')}".rstrip() for name, value in self.columns.items()]
+            return f"Point({', '.join(values)}{'' if self.valid else ', not valid'})"
         near, far = (f(self.range[self.valid], initial=start) for f, start in ((np.min, np.inf), (np.max, 0)))
         span = f", {near:.2f}..{far:.2f} m" if self.valid.any() else ""
         return f"PointCloud({len(self)} points, {int(self.valid.sum())} valid{span}{', nominal calibration' if self.nominal else ''})"
@@ -107,12 +112,27 @@ class PointCloud:
         return {name: found[name] for name in names}
 
     @property
+    def calibration(self) -> str:
+        """Whose calibration it is: "own", or "nominal" where a default stood in for the sensor's own."""
+        return "nominal" if self.nominal else "own"
+
+    @property
     def xyz(self) -> Floats:
         """(N, 3) float32 metres."""
-        return np.stack([self.x, self.y, self.z], axis=1)
+        return np.stack([self.x, self.y, self.z], axis=-1)
+
+    def __array__(self, dtype: DTypeLike | None = None, copy: bool | None = None) -> NDArray[Any]:
+        """`xyz`, which NumPy, SciPy and Open3D understand as points; `to_structured` has the other columns too.
+
+        Raises:
+            ValueError: with ``copy=False``, since x, y and z are columns of their own.
+        """
+        if copy is False:
+            raise ValueError("x, y and z of a PointCloud are columns of their own, of which (N, 3) is a copy")
+        return self.xyz if dtype is None else self.xyz.astype(dtype, copy=False)
 
     def __getitem__(self, which: Any) -> PointCloud:
-        """The points that a mask, indices or a slice pick; organised only if a slice holds whole columns."""
+        """The points that a mask, indices or a slice pick; organised only if a slice holds whole columns; of one index the scalars."""
         picked = {f.name: _pick(getattr(self, f.name), which) for f in fields(self)}
         picked["extra"] = {name: column[which] for name, column in self.extra.items()}
         shape = None
@@ -183,6 +203,58 @@ class PointCloud:
             if column is not None:
                 structured[name] = column
         return structured
+
+    def to_arrow(self, facts: Mapping[str, str] | None = None) -> Any:
+        """A `pyarrow.Table` with the columns of `columns`, which are not copied, but for bools; each has its unit in its field's metadata.
+
+        Args:
+            facts: further metadata of the schema, beside `units` as JSON, `calibration` ("nominal" or "own") and `stamp_ns`.
+
+        Raises:
+            UsageError: where pyarrow is not installed.
+        """
+        return library("pyarrow", "arrow").table(dict(self.columns), arrow_schema(self, {"stamp_ns": str(self.stamp_ns), **(facts or {})}))
+
+    def __arrow_c_stream__(self, requested_schema: object = None) -> object:
+        """The table of `to_arrow`, as DuckDB, Polars and pandas take it from the object itself."""
+        return self.to_arrow().__arrow_c_stream__(requested_schema)
+
+    def to_pandas(self) -> Any:
+        """A `pandas.DataFrame` with the columns of `columns`, which are not copied; `attrs` has "units" and "stamp_ns".
+
+        Raises:
+            UsageError: where pandas is not installed.
+        """
+        frame = library("pandas", "pandas").DataFrame(dict(self.columns), copy=False)
+        frame.attrs.update(units=units_of(self), stamp_ns=self.stamp_ns)
+        return frame
+
+    def to_polars(self) -> Any:
+        """A `polars.DataFrame` with the columns of `columns`, which are not copied.
+
+        Raises:
+            UsageError: where Polars is not installed.
+        """
+        return library("polars", "polars").DataFrame(dict(self.columns))
+
+
+def units_of(cloud: PointCloud) -> dict[str, str]:
+    """The units of the columns that a cloud has, by name, those that are plain numbers left out."""
+    return {name: unit for name in cloud.columns if (unit := UNITS.get(name) or cloud.units.get(name))}
+
+
+def arrow_schema(cloud: PointCloud, facts: Mapping[str, str]) -> Any:
+    """The `pyarrow.Schema` of a cloud. Fields that cannot be null are written faster; of a float nan says that there is none.
+
+    Args:
+        facts: metadata of the schema, beside `units` as JSON and `calibration`: "nominal" or "own".
+    """
+    arrow, units = library("pyarrow", "arrow"), units_of(cloud)
+    fields = [
+        arrow.field(name, arrow.from_numpy_dtype(column.dtype), column.dtype.kind != "f", {"unit": units.get(name, "")})
+        for name, column in cloud.columns.items()
+    ]
+    return arrow.schema(fields, {**facts, "calibration": cloud.calibration, "units": json.dumps(units)})
 
 
 def structured_type(extra: Mapping[str, np.dtype[Any]]) -> np.dtype[Any]:

@@ -19,7 +19,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal, Protocol, Self
 
-from lidarspec.errors import SourceError, UsageError
+from lidarspec.errors import SourceError, SourceTimeout, UsageError
 from lidarspec.transports.protocol import Chunk
 
 #: when what was put in is written out, and when the disk is asked to keep it.
@@ -182,7 +182,7 @@ class Appender:
             target = self._asked = self._taken
             self._changed.notify_all()
             if not self._changed.wait_for(lambda: self._kept >= target or self.error or not self._thread.is_alive(), PATIENCE):
-                raise SourceError(f"{self.path}: the disk has not taken the recording within {PATIENCE:.0f} s")
+                raise SourceTimeout(f"{self.path}: the disk has not taken the recording within {PATIENCE:.0f} s")
         self._complain()
 
     def keep_up(self) -> None:

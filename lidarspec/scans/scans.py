@@ -17,6 +17,7 @@ from lidarspec.packets.continuity import Reorder
 from lidarspec.packets.imu import ImuSamples, Waiting
 from lidarspec.packets.packets import Packets, joined as joined_packets
 from lidarspec.points.cloud import ColumnSource, LazyCloud, Mount, PointCloud, Stretch, Stretches, source_of
+from lidarspec.points.conventions import axes_of
 from lidarspec.points.evaluate import guarded
 from lidarspec.points.plain import Evaluated
 from lidarspec.scans.cutter import Cutter, End, first_points
@@ -93,6 +94,25 @@ class Scan:
         nominal = ", nominal calibration" if self.points.nominal else ""
         state = "complete" if self.complete else "with gaps" if self.whole else "partial"
         return f"Scan({len(self)} points, {rate}{span}, {state}{nominal})"
+
+    @property
+    def facts(self) -> dict[str, str]:
+        """What files say of where points are from: `sensor`, `source` (what is known of its format), `frame` (where x, y and z point),
+        `calibration` ("nominal" or "own")."""
+        frame = ", ".join(f"{name} {way}" for name, way in zip("xyz", axes_of(self.sensor), strict=True))
+        return {"sensor": self.sensor.id, "source": self.sensor.source, "frame": frame, "calibration": self.points.calibration}
+
+    def to_arrow(self) -> Any:
+        """The `pyarrow.Table` of the points (see `PointCloud.to_arrow`) with `facts` in the schema's metadata.
+
+        Raises:
+            UsageError: where pyarrow is not installed.
+        """
+        return self.points.to_arrow(self.facts)
+
+    def __arrow_c_stream__(self, requested_schema: object = None) -> object:
+        """The table of `to_arrow`, as DuckDB, Polars and pandas take it from the object itself."""
+        return self.to_arrow().__arrow_c_stream__(requested_schema)
 
     def to_bins(self, n: int) -> NDArray[np.float32]:
         """The nearest return in each of n equal sectors from -pi on: (n,) float32 metres, inf where there is none.

@@ -7,7 +7,7 @@ import errno
 import socket
 from shlex import quote
 
-from lidarspec.errors import SourceError, UsageError
+from lidarspec.errors import SourceError, SourceTimeout, UsageError, suggest
 from lidarspec.spec.links import Tcp
 from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.base import Address, StreamTransport, data_link, failure, lost, named, readable, reason
@@ -79,7 +79,7 @@ class TcpTransport(StreamTransport):
         if error.errno == errno.ECONNREFUSED:
             return failure(f"{self.label}: {host} refuses connections to TCP port {port}", doctor)
         if isinstance(error, TimeoutError) or error.errno in (errno.ETIMEDOUT, errno.EHOSTUNREACH):
-            return failure(f"{self.label}: {host} does not answer on TCP port {port}", f"ping {host}")
+            return suggest(SourceTimeout(f"{self.label}: {host} does not answer on TCP port {port}"), f"ping {host}")
         return failure(f"{self.label}: TCP port {port} of {host}: {reason(error)}", doctor)
 
 

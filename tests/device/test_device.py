@@ -583,7 +583,7 @@ def test_the_caller_has_its_turn_though_something_else_comes_all_the_time(given:
         came = (device.scans if given == "scans" else lambda wait: device.packets("health", wait=wait))(wait=0.05)
         assert all(item is None or not len(item) for item in itertools.takewhile(lambda _: device.stats.frames.get("node", 0) < 500, came))
         assert not next(came)
-        with pytest.raises(SourceError, match="no scan in time"):
+        with pytest.raises(TimeoutError, match="no scan in time"):
             device.latest(0.05)
 
 
