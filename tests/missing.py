@@ -13,7 +13,7 @@ MISSING = (
     (r"gcc", "gcc", "apt-get install gcc"),
     (r"Kaitai compiler", "Kaitai's compiler", "npm install kaitai-struct-compiler js-yaml, with NODE_PATH as its node_modules"),
     (
-        r"kaitaistruct|crccheck|velodyne.decoder|[Nn]umba|rosbags|mcap|pyarrow|duckdb|laspy|pandas|polars|pye57|zarr",
+        r"kaitaistruct|crccheck|velodyne.decoder|[Nn]umba|rosbags|mcap|foxglove|pyarrow|duckdb|laspy|pandas|polars|pye57|zarr",
         "Python packages",
         "pip install -e '.[dev]'",
     ),

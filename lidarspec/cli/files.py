@@ -69,8 +69,8 @@ def convert(
     compressed, hold x y z intensity ring time, further columns and, of several scans, their number; .bin, as KITTI has it, x y z intensity;
     .xyz x y z. For a file each scan put the place of a number into the name: scans/%05d.pcd.
 
-    Tables (.parquet, .arrow, .feather), surveys (.las, .laz, .e57), .zarr and logs of ROS (.mcap, .bag, .rosbag2, .db3) take libraries
-    that are not installed by default: lidarspec[arrow,las,e57,zarr,ros].
+    Tables (.parquet, .arrow, .feather), surveys (.las, .laz, .e57), .zarr, logs of ROS (.mcap, .bag, .rosbag2, .db3) and of Foxglove
+    (.foxglove.mcap) take libraries that are not installed by default: lidarspec[arrow,las,e57,zarr,ros,foxglove].
     """
     format_of(target)
     refuse_overwriting(targets(target), source, sensor_id, force=force)

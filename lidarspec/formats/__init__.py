@@ -12,6 +12,7 @@ formats, too. Modules in reading order:
 * `las`: .las and .laz, for surveyors' tools.
 * `e57`: .e57, a header and points for each scan.
 * `bags`: .mcap, .bag, .rosbag2 and .db3, a message a scan.
+* `foxglove`: .foxglove.mcap, with Foxglove's messages.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ from lidarspec.formats.arrays import NPY, NPZ, ZARR
 from lidarspec.formats.bags import BAG, DB3, MCAP, ROSBAG2
 from lidarspec.formats.clouds import KITTI, LZF_PCD, PCD, PLY
 from lidarspec.formats.e57 import E57
+from lidarspec.formats.foxglove import FOXGLOVE
 from lidarspec.formats.las import LAS, LAZ
 from lidarspec.formats.tables import ARROW, FEATHER, PARQUET
 from lidarspec.formats.text import CSV, CSV_GZ, XYZ, write_columns
@@ -40,7 +42,7 @@ from lidarspec.transports.protocol import Format
 #: the place of a number in the name of a file.
 NUMBERED = re.compile(r"%0?\d?d")
 ARRAYS, TABLES = (CSV, CSV_GZ, XYZ, NPZ, NPY, ZARR), (PARQUET, ARROW, FEATHER)
-CLOUDS, BAGS = (PCD, LZF_PCD, PLY, KITTI, LAS, LAZ, E57), (MCAP, BAG, ROSBAG2, DB3)
+CLOUDS, BAGS = (PCD, LZF_PCD, PLY, KITTI, LAS, LAZ, E57), (MCAP, FOXGLOVE, BAG, ROSBAG2, DB3)
 BUILT_IN = {known.suffix: known for known in (*ARRAYS, *TABLES, *CLOUDS, *BAGS)}
 
 

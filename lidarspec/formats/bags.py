@@ -19,13 +19,14 @@ from numpy.typing import NDArray
 
 from lidarspec.errors import UsageError, library
 from lidarspec.points.cloud import PointCloud
-from lidarspec.scans.scans import Scan
+from lidarspec.scans.scans import LaserScan, Scan
 from lidarspec.transports.protocol import Format
 
 #: the frame that the points are in, by its usual name: x forward, y left, z up (REP-103).
 FRAME = "laser"
-#: the kinds of messages, and where they are published.
-TOPICS = {"sensor_msgs/msg/PointCloud2": "/points", "sensor_msgs/msg/LaserScan": "/scan"}
+#: where messages are published, and the kinds of them.
+POINTS, SCAN = "/points", "/scan"
+TOPICS = {"sensor_msgs/msg/PointCloud2": POINTS, "sensor_msgs/msg/LaserScan": SCAN}
 #: the numbers by which PointField names types; anything else is written as float64.
 FIELD_TYPES = {"i1": 1, "u1": 2, "b1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
 #: bytes of a chunk of an MCAP file, which a reader holds at once: a scan or some.
@@ -57,7 +58,7 @@ class Messages:
         self.types = typesys.get_typestore(typesys.Stores[release])
         self.units: dict[str, str] = {}
         self._serialized = self.types.serialize_ros1 if release.startswith("ROS1") else self.types.serialize_cdr
-        self._is_flat: bool | None = None
+        self._planes = Planes()
 
     def of(self, scans: Iterable[Scan], *, every_point: bool) -> Iterator[Message]:
         """The messages of each scan, in order.
@@ -81,11 +82,8 @@ class Messages:
 
     def _cloud(self, cloud: PointCloud, header: Any, *, every_point: bool) -> Any:
         """Organised points have a row for each row of the sensor, several returns side by side; of others, and valid ones, there is one."""
-        points = _records(cloud)
-        lacking = {name for name in ("intensity", "ring") if getattr(cloud, name) is None}
-        if not every_point:
-            points = np.compress(cloud.valid, points)  # ten times as quick as an index
-        elif cloud.shape and len(cloud):
+        points = records(cloud, every_point=every_point)
+        if every_point and cloud.shape and len(cloud):
             points = points.reshape(*cloud.shape, -1).swapaxes(0, 1).reshape(cloud.shape[1], -1)
         height, width = np.atleast_2d(points).shape
         field = self.types.types["sensor_msgs/msg/PointField"]
@@ -93,11 +91,7 @@ class Messages:
             header=header,
             height=height,
             width=width,
-            fields=[
-                field(name, offset, FIELD_TYPES[dtype.str[1:]], 1)
-                for name, (dtype, offset, *_) in (points.dtype.fields or {}).items()
-                if name not in lacking
-            ],
+            fields=[field(name, offset, FIELD_TYPES[kind], 1) for name, offset, kind in fields_of(cloud, points)],
             is_bigendian=False,
             point_step=points.itemsize,
             row_step=points.itemsize * width,
@@ -106,11 +100,8 @@ class Messages:
         )
 
     def _laserscan(self, scan: Scan, header: Any) -> Iterator[Any]:
-        """The scan of a sensor of one plane, which its first valid points show."""
-        if self._is_flat is None and (valid := scan.points.valid).any():
-            self._is_flat = not scan.points.elevation[valid].any()
-        if self._is_flat:
-            planar = scan.to_laserscan()
+        planar = self._planes.scan(scan)
+        if planar is not None:
             kind = self.types.types["sensor_msgs/msg/LaserScan"]
             values = {name: getattr(planar, name) for name in kind.__dataclass_fields__ if hasattr(planar, name)}
             if scan.points.intensity is None:
@@ -118,9 +109,30 @@ class Messages:
             yield kind(**values, header=header)
 
 
-def _records(cloud: PointCloud) -> NDArray[Any]:
-    """The points in PCL's layout, all columns of types that a PointField has."""
+class Planes:
+    """Whether scans are of a sensor of one plane, which the first valid points show."""
+
+    def __init__(self) -> None:
+        self._is_flat: bool | None = None
+
+    def scan(self, scan: Scan) -> LaserScan | None:
+        """The scan on an even grid of angles; None of other sensors."""
+        if self._is_flat is None and (valid := scan.points.valid).any():
+            self._is_flat = not scan.points.elevation[valid].any()
+        return scan.to_laserscan() if self._is_flat else None
+
+
+def fields_of(cloud: PointCloud, points: NDArray[Any]) -> list[tuple[str, int, str]]:
+    """Name, offset and type ("f4") of each field of the records of a cloud; a column that it lacks is none."""
+    lacking = {name for name in ("intensity", "ring") if getattr(cloud, name) is None}
+    return [(name, place[1], place[0].str[1:]) for name, place in (points.dtype.fields or {}).items() if name not in lacking]
+
+
+def records(cloud: PointCloud, *, every_point: bool) -> NDArray[Any]:
+    """The points that are written, in PCL's layout, all columns of types that messages have."""
     points = cloud.to_structured()
+    if not every_point:
+        points = np.compress(cloud.valid, points)  # ten times as quick as an index
     kinds = {name: points.dtype[name] for name in points.dtype.names or ()}
     if all(kind.str[1:] in FIELD_TYPES for kind in kinds.values()):
         return points

@@ -67,6 +67,36 @@ def test_a_log_has_a_cloud_for_each_scan_at_its_time(tmp_path: Path, suffix: str
     assert [path.name for path in tmp_path.iterdir()] == [f"a.{suffix}"]
 
 
+@pytest.mark.parametrize("name", ["ldrobot-stl27l", "shape-extras"])
+def test_foxglove_has_its_own_messages(tmp_path: Path, name: str) -> None:
+    decoding = pytest.importorskip("mcap_protobuf.decoder", reason="mcap-protobuf-support is not installed")
+    pytest.importorskip("foxglove_schemas_protobuf", reason="foxglove-schemas-protobuf is not installed")
+    scans = simulated(name, 120)
+    write(tmp_path / "a.foxglove.mcap", scans)
+    with (tmp_path / "a.foxglove.mcap").open("rb") as file:
+        log = mcap.make_reader(file, decoder_factories=[decoding.DecoderFactory()])
+        found = [(schema.name, record.log_time, message) for schema, _, record, message in log.iter_decoded_messages()]
+        told = [record.metadata for record in log.iter_metadata()]
+    assert told == ([{"velocity": "m/s", "signal": "photons", "confidence": "1"}] if name == "shape-extras" else [])
+    clouds = [(at, message) for kind, at, message in found if kind == "foxglove.PointCloud"]
+    assert [at for at, _ in clouds] == [message.timestamp.ToNanoseconds() for _, message in clouds] == [one.stamp_ns for one in scans]
+    for one, (_, message) in zip(scans, clouds, strict=True):
+        kinds = ["", "u1", "i1", "<u2", "<i2", "<u4", "<i4", "<f4", "<f8"]
+        fields = {field.name: (np.dtype(kinds[field.type]), field.offset) for field in message.fields}
+        rows = np.frombuffer(message.data, np.dtype({"names": list(fields), "formats": [kind for kind, _ in fields.values()],
+            "offsets": [at for _, at in fields.values()], "itemsize": message.point_stride}))  # fmt: skip
+        for column in {"x", "y", "z", *one.points.extra}:
+            np.testing.assert_array_equal(rows[column], one.points.read(column)[column][one.points.valid])
+        assert (message.frame_id, message.pose.orientation.w) == ("laser", 1)
+    planar = [message for kind, _, message in found if kind == "foxglove.LaserScan"]
+    assert len(planar) == (len(scans) if name == "ldrobot-stl27l" else 0)
+    for one, message in zip(scans, planar, strict=False):
+        same = one.to_laserscan()
+        assert (message.start_angle, message.end_angle) == (same.angle_min, same.angle_max)
+        np.testing.assert_array_equal(np.array(message.ranges, np.float32), same.ranges)
+        np.testing.assert_array_equal(np.array(message.intensities, np.float32), same.intensities)
+
+
 def test_a_folder_is_one_that_ros_2_knows(tmp_path: Path) -> None:
     write(tmp_path / "a.rosbag2", [scan(0)])
     assert {path.name for path in (tmp_path / "a.rosbag2").iterdir()} == {"metadata.yaml", "scans.mcap"}

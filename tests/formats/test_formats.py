@@ -27,6 +27,7 @@ EXTRAS = {
     **dict.fromkeys(("a.parquet", "a.arrow", "a.feather"), ("pyarrow", "arrow")),
     **dict.fromkeys(("a.las", "a.laz"), ("laspy", "las")),
     "a.e57": ("pye57", "e57"),
+    "a.foxglove.mcap": ("mcap_protobuf.writer", "foxglove"),
     "a.zarr": ("zarr", "zarr"),
 }
 COLUMNS = ["x", "y", "z", "range", "azimuth", "elevation", "intensity", "time"]
@@ -171,7 +172,7 @@ def test_a_full_disk_is_a_source_error_and_leaves_nothing(tmp_path: Path, name: 
 @pytest.mark.parametrize("name", EXTRAS)
 def test_a_library_that_is_missing_is_named_with_what_to_type(tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, EXTRAS[name][0], None)
-    with pytest.raises(UsageError, match=f"takes {EXTRAS[name][0]}, which is not installed") as caught:
+    with pytest.raises(UsageError, match=f"takes {EXTRAS[name][0].partition('.')[0]}, which is not installed") as caught:
         write(tmp_path / name, [scan(0)])
     assert suggestion(caught.value) == f"pip install 'lidarspec[{EXTRAS[name][1]}]'"
     assert not list(tmp_path.iterdir())

@@ -1,0 +1,62 @@
+"""Logs for Foxglove: each scan as Foxglove's own messages in Protobuf, in an MCAP file, which say nothing of ROS.
+
+On /points stands each scan as foxglove.PointCloud, and on /scan, where the sensor has one plane, as foxglove.LaserScan; stamps, frame,
+layout of the points and the units in the metadata are those of the logs of ROS (see `bags`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from lidarspec.errors import UsageError, library
+from lidarspec.formats.bags import CHUNK, FRAME, POINTS, SCAN, Planes, fields_of, records
+from lidarspec.points.cloud import PointCloud
+from lidarspec.scans.scans import LaserScan, Scan
+from lidarspec.transports.protocol import Format
+
+#: the numbers by which foxglove.PackedElementField names types.
+FIELD_TYPES = {"u1": 1, "b1": 1, "i1": 2, "u2": 3, "i2": 4, "u4": 5, "i4": 6, "f4": 7, "f8": 8}
+
+
+def write_foxglove(path: Path, scans: Iterable[Scan], *, every_point: bool) -> None:
+    """Write an MCAP file.
+
+    Raises:
+        UsageError: for a stamp before 1970.
+    """
+    mcap, support = library("mcap.writer", "foxglove"), library("mcap_protobuf.writer", "foxglove")
+    planes, units = Planes(), dict[str, str]()
+    with path.open("wb") as file:
+        log = support.Writer(file, chunk_size=CHUNK, compression=mcap.CompressionType.NONE)
+        for scan in scans:
+            if scan.stamp_ns < 0:
+                raise UsageError(f"a scan at {scan.stamp_ns} ns: logs begin in 1970")
+            units |= {name: unit for name, unit in scan.points.units.items() if unit}
+            messages = {POINTS: _cloud(scan.points, every_point=every_point)}
+            if (planar := planes.scan(scan)) is not None:
+                messages[SCAN] = _planar(planar, is_graded=scan.points.intensity is not None)
+            for topic, message in messages.items():
+                message.timestamp.FromNanoseconds(scan.stamp_ns)
+                message.frame_id, message.pose.orientation.w = FRAME, 1
+                log.write_message(topic, message, scan.stamp_ns, scan.stamp_ns)
+        if units:
+            log.add_metadata("units", units)
+        log.finish()
+
+
+def _cloud(cloud: PointCloud, *, every_point: bool) -> Any:
+    points = records(cloud, every_point=every_point)
+    fields = [{"name": name, "offset": offset, "type": FIELD_TYPES[kind]} for name, offset, kind in fields_of(cloud, points)]
+    message = library("foxglove_schemas_protobuf.PointCloud_pb2", "foxglove").PointCloud
+    return message(point_stride=points.itemsize, fields=fields, data=points.tobytes())
+
+
+def _planar(scan: LaserScan, *, is_graded: bool) -> Any:
+    message = library("foxglove_schemas_protobuf.LaserScan_pb2", "foxglove").LaserScan
+    intensities = scan.intensities if is_graded else ()
+    return message(start_angle=scan.angle_min, end_angle=scan.angle_max, ranges=scan.ranges, intensities=intensities)
+
+
+FOXGLOVE = Format(".foxglove.mcap", "an MCAP file with Foxglove's messages", write_foxglove)
