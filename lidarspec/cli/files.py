@@ -67,7 +67,8 @@ def convert(
     .csv and .npz hold x y z range azimuth elevation intensity time ring return_index column, those that the sensor has, its further
     columns, and the number of the scan; metres, radians, and seconds since the scan's stamp. .npy, .ply, .pcd and .lzf.pcd, which is
     compressed, hold x y z intensity ring time, further columns and, of several scans, their number; .bin, as KITTI has it, x y z intensity;
-    .xyz x y z. For a file each scan put the place of a number into the name: scans/%05d.pcd.
+    .xyz x y z. For a file each scan put the place of a number into the name, scans/%05d.pcd; %F, %H, %M and %S
+    stand for date, hour, minute and second of the scans that share a file.
 
     Tables (.parquet, .arrow, .feather), surveys (.las, .laz, .e57), .zarr, logs of ROS (.mcap, .bag, .rosbag2, .db3) and of Foxglove
     (.foxglove.mcap) take libraries that are not installed by default: lidarspec[arrow,las,e57,zarr,ros,foxglove].

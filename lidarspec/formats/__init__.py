@@ -17,6 +17,7 @@ formats, too. Modules in reading order:
 
 from __future__ import annotations
 
+import itertools
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
@@ -24,7 +25,7 @@ from typing import NoReturn
 
 import numpy as np
 
-from lidarspec.errors import LidarSpecError, SpecError, UnknownFormat, system_errors
+from lidarspec.errors import LidarSpecError, SpecError, UnknownFormat, UsageError, system_errors
 from lidarspec.formats.arrays import NPY, NPZ, ZARR
 from lidarspec.formats.bags import BAG, DB3, MCAP, ROSBAG2
 from lidarspec.formats.clouds import KITTI, LZF_PCD, PCD, PLY
@@ -39,8 +40,9 @@ from lidarspec.plugins import registry
 from lidarspec.scans.scans import Scan
 from lidarspec.transports.protocol import Format
 
-#: the place of a number in the name of a file.
-NUMBERED = re.compile(r"%0?\d?d")
+#: the places in a path of a scan's number, and of its stamp's date, hour, minute and second, of which these are the letters of an ISO text.
+MOMENT = {"%F": slice(10), "%H": slice(11, 13), "%M": slice(14, 16), "%S": slice(17, 19)}
+PLACE = re.compile(rf"%0?\d?d|{'|'.join(MOMENT)}")
 ARRAYS, TABLES = (CSV, CSV_GZ, XYZ, NPZ, NPY, ZARR), (PARQUET, ARROW, FEATHER)
 CLOUDS, BAGS = (PCD, LZF_PCD, PLY, KITTI, LAS, LAZ, E57), (MCAP, FOXGLOVE, BAG, ROSBAG2, DB3)
 BUILT_IN = {known.suffix: known for known in (*ARRAYS, *TABLES, *CLOUDS, *BAGS)}
@@ -97,41 +99,53 @@ def write_imu(path: str | Path, samples: ImuSamples) -> None:
 
 
 def targets(path: str | Path) -> list[str]:
-    """The files that `write` may replace: that of the path, or those that there are already under such a name with a number."""
+    """The files that `write` may replace: that of the path, or those that there are already under such names with numbers and times."""
     path = Path(path)
-    if not NUMBERED.search(path.name):
+    if not PLACE.search(str(path)):
         return [str(path)]
-    named = re.compile(r" *\d+".join(map(re.escape, NUMBERED.split(path.name))))
-    return sorted(str(file) for file in path.parent.glob("*") if named.fullmatch(file.name))
+    fixed = list(itertools.takewhile(lambda part: not PLACE.search(part), path.parts[:-1]))
+    named = re.compile(r" *[-\d]+".join(map(re.escape, PLACE.split(str(path)))))
+    files = Path(*fixed).glob("/".join("*" for _ in path.parts[len(fixed) :]))
+    return sorted(str(file) for file in files if named.fullmatch(str(file)))
 
 
 def write(path: str | Path, scans: Iterable[Scan], *, every_point: bool = False) -> None:
-    """Write scans to a file in the format of its suffix, or each to one of its own.
+    """Write scans to a file in the format of its suffix, or to several.
 
     Args:
-        path: the file; what it held is replaced once the new content is whole, and stays if that fails. With the place of a number in
-            its name, such as "scans/%05d.pcd", each scan has a file of its own, from 0 on; the folder is made where there is none.
+        path: the file; what it held is replaced once the new content is whole, and stays if that fails. With places in it, consecutive
+            scans for which it is the same share a file, and folders are made where there are none: "scans/%05d.pcd", the number of the
+            scan from 0 on, has a file for each; "drive/date=%F/hour=%H/%M.parquet" one for each minute, by the stamp, in UTC; %S is the
+            second.
         every_point: also the points without a valid return.
 
     Raises:
         UnknownFormat: for a suffix that is none.
+        UsageError: where a file that is written would be begun again, since the time in its name came again.
         SourceError: where the file cannot be written.
     """
     path = Path(path)
     chosen = format_of(path)
-    for target, held in _each(path, scans) if NUMBERED.search(path.name) else [(path, scans)]:
+    for target, held in _each(path, scans) if PLACE.search(str(path)) else [(path, scans)]:
         with replacing(target) as part:
             chosen(part, held, every_point=every_point)
 
 
-def _each(path: Path, scans: Iterable[Scan]) -> Iterator[tuple[Path, list[Scan]]]:
-    """A file for each scan."""
-    with system_errors(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
-    for number, scan in enumerate(scans):
-        yield path.with_name(_numbered(path.name, number)), [scan]
+def _each(path: Path, scans: Iterable[Scan]) -> Iterator[tuple[Path, Iterator[Scan]]]:
+    """Each file, and the scans that go into it."""
+    begun = set[str]()
+    for name, group in itertools.groupby(enumerate(scans), lambda numbered: _placed(str(path), *numbered)):
+        if name in begun:
+            raise UsageError(
+                f"{name}: its time comes again after that of other files; %F, %H, %M and %S in the name together tell them apart"
+            )
+        begun.add(name)
+        with system_errors(path):
+            Path(name).parent.mkdir(parents=True, exist_ok=True)
+        yield Path(name), (scan for _, scan in group)
 
 
-def _numbered(name: str, number: int) -> str:
-    """A name with a number in its place; another percent sign stays."""
-    return NUMBERED.sub(lambda place: place[0] % number, name)
+def _placed(path: str, number: int, scan: Scan) -> str:
+    """A path with number and time in their places; another percent sign stays."""
+    moment = str(np.datetime64(scan.stamp_ns, "ns"))
+    return PLACE.sub(lambda place: moment[MOMENT[place[0]]] if place[0] in MOMENT else place[0] % number, path)

@@ -33,27 +33,31 @@ def _write(path: Path, scans: Iterable[Scan], *, every_point: bool, open_writer:
     `every_point` x, y and z of a point without a return are nan. Each field has its unit in its metadata, and the schema's has `sensor`,
     `source` (what is known of its format), `frame` (where x, y and z point), `units` as JSON, and `calibration`: "nominal" or "own".
     """
-    tables = _tables(scans, every_point=every_point)
+    tables = _tables(scans, _of_scans(path), every_point=every_point)
     first = next(tables)
     with open_writer(path, first.schema) as writer:
         for table in itertools.chain([first], tables):
             writer.write_table(table)
 
 
-def _tables(scans: Iterable[Scan], *, every_point: bool) -> Iterator[Any]:
-    """The points of scans as tables of `ROWS` rows and more, at least one."""
+def _tables(scans: Iterable[Scan], of_scans: Sequence[Any], *, every_point: bool) -> Iterator[Any]:
+    """The points of scans as tables of `ROWS` rows and more, at least one.
+
+    Args:
+        of_scans: the fields that say of each point which scan it is from.
+    """
     arrow = library("pyarrow", "arrow")
     schema, gathered, rows = None, list[Any](), 0
     for number, scan in enumerate(scans):
         cloud = written(scan, every_point=every_point)
-        schema = schema or _schema(arrow, scan, cloud)
+        schema = schema or _schema(arrow, scan, cloud, of_scans)
         gathered.append(_batch(arrow, schema, cloud, number, scan))
         rows += len(cloud)
         if rows >= ROWS:
             yield _table(arrow, gathered, schema)
             gathered, rows = [], 0
     if gathered or schema is None:
-        yield _table(arrow, gathered, schema or arrow.schema(_of_scans(arrow)))
+        yield _table(arrow, gathered, schema or arrow.schema(of_scans))
 
 
 def _table(arrow: Any, batches: Sequence[Any], schema: Any) -> Any:
@@ -62,25 +66,27 @@ def _table(arrow: Any, batches: Sequence[Any], schema: Any) -> Any:
     return table.combine_chunks() if len(batches) > MANY else table
 
 
-def _of_scans(arrow: Any) -> list[Any]:
-    """The fields that say of each point which scan it is from."""
+def _of_scans(path: Path) -> list[Any]:
+    """The fields that say of each point which scan it is from; not what a folder says already, such as scan=7, as Hive has it."""
+    arrow, said = library("pyarrow", "arrow"), {part.partition("=")[0] for part in path.parent.parts if "=" in part}
     types = {"scan": arrow.int32(), "stamp": arrow.timestamp("ns"), "complete": arrow.bool_()}
-    return [arrow.field(name, kind, nullable=False) for name, kind in types.items()]
+    return [arrow.field(name, kind, nullable=False) for name, kind in types.items() if name not in said]
 
 
-def _schema(arrow: Any, scan: Scan, cloud: PointCloud) -> Any:
+def _schema(arrow: Any, scan: Scan, cloud: PointCloud, of_scans: Sequence[Any]) -> Any:
     """The fields of a scan."""
     known = arrow_schema(cloud, scan.facts)
-    return arrow.schema([*known, *_of_scans(arrow)], known.metadata)
+    return arrow.schema([*known, *of_scans], known.metadata)
 
 
 def _batch(arrow: Any, schema: Any, cloud: PointCloud, number: int, scan: Scan) -> Any:
     """The points of a scan as a record batch."""
     own: dict[str, Any] = {**cloud.columns}
-    for name, value in (("scan", number), ("stamp", scan.stamp_ns), ("complete", scan.complete)):
-        own[name] = arrow.repeat(arrow.scalar(value, schema.field(name).type), len(cloud))
+    of_scan = {"scan": number, "stamp": scan.stamp_ns, "complete": scan.complete}
     for field in schema:
-        if field.name not in own:
+        if field.name in of_scan:
+            own[field.name] = arrow.repeat(arrow.scalar(of_scan[field.name], field.type), len(cloud))
+        elif field.name not in own:
             own[field.name] = np.full(len(cloud), np.nan) if not field.nullable else arrow.nulls(len(cloud), field.type)
     return arrow.record_batch([arrow.array(own[field.name], field.type) for field in schema], schema=schema)
 
@@ -88,8 +94,9 @@ def _batch(arrow: Any, schema: Any, cloud: PointCloud, number: int, scan: Scan) 
 def _parquet(path: Path, schema: Any) -> Any:
     """A writer of Parquet, not compressed, which takes longer than all else; numbers of few values take few bits, as in a dictionary."""
     few = [field.name for field in schema if str(field.type) not in ("float", "double", "bool")]
+    timed = [name for name in ("scan", "stamp") if name in schema.names]
     parquet = library("pyarrow.parquet", "arrow")
-    return parquet.ParquetWriter(path, schema, compression="none", use_dictionary=few, write_statistics=["scan", "stamp"])
+    return parquet.ParquetWriter(path, schema, compression="none", use_dictionary=few, write_statistics=timed)
 
 
 def _batches(path: Path, schema: Any, compression: str | None) -> Any:

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from lidarspec.formats import tables, write
+from lidarspec.errors import UsageError
+from lidarspec.formats import tables, targets, write
 from lidarspec.simulation.simulator import simulate
 from tests.formats.test_formats import COLUMNS, scan
 from tests.shapes import SHAPES
@@ -82,6 +84,37 @@ def test_row_groups_are_of_many_scans_and_bounded(tmp_path: Path) -> None:
     sizes = [file.metadata.row_group(number).num_rows for number in range(file.num_row_groups)]
     assert sizes == [132_000, 132_000, 36_000]
     assert file.metadata.row_group(1).column(file.schema.names.index("scan")).statistics.min == 132
+
+
+def test_folders_of_scans_are_partitions_for_others(tmp_path: Path) -> None:
+    duckdb, pandas, datasets = (pytest.importorskip(name) for name in ("duckdb", "pandas", "pyarrow.dataset"))
+    scans = [scan(number, points=50) for number in range(12)]
+    write(tmp_path / "out" / "scan=%d" / "points.parquet", scans)
+    assert sorted(folder.name for folder in (tmp_path / "out").iterdir()) == sorted(f"scan={number}" for number in range(12))
+    expected = [(number, one.points.x[one.points.valid].sum(dtype=np.float64)) for number, one in enumerate(scans)]
+    query = f"select scan, sum(x::double) from '{tmp_path}/out/*/*.parquet' where scan > 3 group by 1 order by 1"
+    assert duckdb.sql(query).fetchall() == [(number, pytest.approx(total)) for number, total in expected[4:]]
+    table = datasets.dataset(tmp_path / "out", partitioning="hive").to_table(filter=datasets.field("scan") == 7)
+    assert (table.num_rows, set(table["scan"].to_pylist())) == (49, {7})
+    frame = pandas.read_parquet(tmp_path / "out")
+    assert {int(number): float(part.x.sum()) for number, part in frame.groupby("scan", observed=True)} == pytest.approx(
+        dict(expected), rel=1e-5
+    )
+
+
+def test_times_in_the_name_share_scans_out(tmp_path: Path) -> None:
+    def at(number: int, seconds: int) -> Any:
+        one = scan(number)
+        return replace(one, points=replace(one.points, stamp_ns=seconds * 10**9 + 5))
+
+    name = tmp_path / "date=%F" / "hour=%H" / "%M.parquet"
+    write(name, [at(number, seconds) for number, seconds in enumerate([0, 59, 60, 3 * 3600, 86_400])])
+    files = [path.relative_to(tmp_path).as_posix() for path in sorted(tmp_path.rglob("*.parquet"))]
+    assert files == [f"date=1970-01-{place}.parquet" for place in ("01/hour=00/00", "01/hour=00/01", "01/hour=03/00", "02/hour=00/00")]
+    assert [len(set(parquet.ParquetFile(tmp_path / file).read()["scan"].to_pylist())) for file in files] == [2, 1, 1, 1]
+    assert targets(name) == [str(tmp_path / file) for file in files]
+    with pytest.raises(UsageError, match=r"00\.parquet: its time comes again"):
+        write(tmp_path / "%H.parquet", [at(0, 0), at(1, 3600), at(2, 86_400)])
 
 
 def test_duckdb_and_pandas_read_times_to_the_nanosecond(tmp_path: Path) -> None:
