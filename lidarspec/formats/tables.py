@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from lidarspec.errors import library
-from lidarspec.formats.writing import written
+from lidarspec.formats.writing import behind, written
 from lidarspec.points.cloud import PointCloud, arrow_schema
 from lidarspec.scans.scans import Scan
 from lidarspec.transports.protocol import Format
@@ -35,9 +35,9 @@ def _write(path: Path, scans: Iterable[Scan], *, every_point: bool, open_writer:
     """
     tables = _tables(scans, _of_scans(path), every_point=every_point)
     first = next(tables)
-    with open_writer(path, first.schema) as writer:
+    with open_writer(path, first.schema) as writer, behind(writer.write_table) as write:
         for table in itertools.chain([first], tables):
-            writer.write_table(table)
+            write(table)
 
 
 def _tables(scans: Iterable[Scan], of_scans: Sequence[Any], *, every_point: bool) -> Iterator[Any]:

@@ -6,74 +6,78 @@ import contextlib
 import functools
 import gzip
 import io
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+import itertools
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.formats.writing import kept, written
+from lidarspec.formats.writing import behind, kept, written
 from lidarspec.scans.scans import Scan
 from lidarspec.transports.protocol import Format
 
 #: how a number of each type is written: seven figures are half a micrometre at a metre; times keep their nanoseconds.
 _WRITTEN = {"f2": "%.7g", "f4": "%.7g", "f8": "%.15g"}
 _TIME = "%.9f"
-#: rows turned into text at once.
-ROWS = 1 << 14
+#: rows turned into text at once, by one template: a third quicker than row by row.
+ROWS = 1 << 10
 #: of gzip: numbers take 0.34 of their size then, and 0.27 at the usual 6, in five times the time.
 _LEVEL = 1
 
 
 @contextlib.contextmanager
-def text_file(path: Path, *, is_zipped: bool = False) -> Iterator[TextIO]:
-    """A file for text, which may be compressed; neither a name nor a time stands in it."""
+def text_file(path: Path, *, is_zipped: bool = False) -> Iterator[Callable[[str], None]]:
+    """What writes a file of text, which may be compressed, while the next text is made; neither a name nor a time stands in it."""
     with contextlib.ExitStack() as files:
         file: Any = files.enter_context(path.open("wb"))
         if is_zipped:
             file = files.enter_context(gzip.GzipFile("", "wb", _LEVEL, file, mtime=0))
-        yield files.enter_context(io.TextIOWrapper(file, encoding="ascii", newline=""))
+        text = files.enter_context(io.TextIOWrapper(file, encoding="ascii", newline=""))
+        yield files.enter_context(behind(text.write))
 
 
 def write(path: Path, scans: Iterable[Scan], *, every_point: bool, is_zipped: bool = False) -> None:
     """Write the columns that the first scan has, and the number of the scan."""
     names: tuple[str, ...] = ()
-    with text_file(path, is_zipped=is_zipped) as file:
+    with text_file(path, is_zipped=is_zipped) as put:
         for number, scan in enumerate(scans):
             cloud = written(scan, every_point=every_point)
             if not names:
                 names = tuple(cloud.columns)
-                file.write(",".join([*names, "scan"]) + "\n")
+                put(",".join([*names, "scan"]) + "\n")
             own = cloud.columns
             columns = [_column(own.get(name), len(cloud)) for name in names]
             cells = [
                 _TIME if name == "time" else _WRITTEN.get(column.dtype.str[1:], "%d") for name, column in zip(names, columns, strict=True)
             ]
-            file.writelines(_lines(",".join([*cells, f"{number}\n"]), columns))
+            _put_rows(put, ",".join([*cells, f"{number}\n"]), columns)
 
 
 def write_xyz(path: Path, scans: Iterable[Scan], *, every_point: bool) -> None:
     """Write x y z in metres, nothing else; missing points as nan."""
-    with text_file(path) as file:
+    with text_file(path) as put:
         for scan in scans:
             which = kept(scan.points, every_point=every_point)
             columns = scan.points.read("x", "y", "z").values()
-            file.writelines(_lines("%.7g %.7g %.7g\n", [column if which is None else column[which] for column in columns]))
+            _put_rows(put, "%.7g %.7g %.7g\n", [column if which is None else column[which] for column in columns])
 
 
 def write_columns(path: Path, columns: Mapping[str, NDArray[Any]]) -> None:
     """Write columns of one length, whole numbers and float64, with their names above."""
     template = ",".join("%d" if column.dtype.kind == "i" else "%.15g" for column in columns.values()) + "\n"
-    with text_file(path) as file:
-        file.write(",".join(columns) + "\n")
-        file.writelines(_lines(template, [*columns.values()]))
+    with text_file(path) as put:
+        put(",".join(columns) + "\n")
+        _put_rows(put, template, [*columns.values()])
 
 
-def _lines(template: str, columns: Sequence[NDArray[Any]]) -> Iterator[str]:
-    """The rows of columns as text, many at once."""
+def _put_rows(put: Callable[[str], None], template: str, columns: Sequence[NDArray[Any]]) -> None:
+    """Write the rows of columns, each by the template."""
     for start in range(0, len(columns[0]), ROWS):
-        yield "".join(map(template.__mod__, zip(*(column[start : start + ROWS].tolist() for column in columns), strict=True)))
+        rows = zip(*(column[start : start + ROWS].tolist() for column in columns), strict=True)
+        values = tuple(itertools.chain.from_iterable(rows))
+        put(template * (len(values) // len(columns)) % values)
 
 
 def _column(values: NDArray[Any] | None, length: int) -> NDArray[Any]:

@@ -10,9 +10,10 @@ import contextlib
 import os
 import shutil
 import tempfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, TypeVar
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
@@ -23,6 +24,7 @@ from lidarspec.scans.scans import Scan
 
 #: ns since 1970 of the GPS epoch, 1980-01-06, for a clock that leaves out leap seconds, with those that there are since 2017.
 GPS_EPOCH = (315_964_800 - 18) * 10**9
+_Piece = TypeVar("_Piece")
 
 
 @contextlib.contextmanager
@@ -43,6 +45,24 @@ def replacing(path: Path) -> Iterator[Path]:
     finally:
         with contextlib.suppress(OSError):
             _remove(part)
+
+
+@contextlib.contextmanager
+def behind(write: Callable[[_Piece], object]) -> Iterator[Callable[[_Piece], None]]:
+    """A function that hands what it is given over to another one, which writes it while the next piece is made; at the end all is written.
+
+    What fails there is raised with the next piece, or at the end.
+    """
+    with ThreadPoolExecutor(1) as thread:
+        last: Future[object] = thread.submit(lambda: None)
+
+        def hand_over(piece: _Piece) -> None:
+            nonlocal last
+            last.result()
+            last = thread.submit(write, piece)
+
+        yield hand_over
+        last.result()
 
 
 def _remove(path: Path) -> None:
