@@ -2,13 +2,16 @@
 
 A block with ``title="NAME"`` is the file of that name; a second one with the same name is added below the first. A block with
 ``title="Output"`` is what the block before it prints, with ``...`` for whatever is there. Of the others, ``sh`` and ``python`` are run in
-the order of the page, all Python of a page as one session; other languages (``text``, ``console``) are for reading.
+the order of the page, all Python of a page as one session; other languages (``text``, ``console``) are for reading. Python that imports a
+library which is not installed is left out, and what it prints, and said.
 """
 
 from __future__ import annotations
 
+import ast
 import contextlib
 import doctest
+import importlib.util
 import io
 import os
 import re
@@ -50,18 +53,20 @@ def blocks(page: str) -> list[Block]:
     ]
 
 
-def follow(page: str, place: Path, environment: Mapping[str, str] | None = None) -> int:
-    """The number of blocks that ran, of a page followed in an empty folder.
+def follow(page: str, place: Path, environment: Mapping[str, str] | None = None) -> tuple[int, list[str]]:
+    """The number of blocks that ran, of a page followed in an empty folder, and why others did not.
 
     Raises:
         AssertionError: where a block fails, or prints something else than the page says.
     """
     session: dict[str, Any] = {"__name__": "__main__"}
     written: set[str] = set()
-    printed, ran = "", 0
+    printed: str | None = ""
+    ran, left_out = 0, list[str]()
     for block in blocks(page):
         if block.title == OUTPUT:
-            assert_printed(block, printed)
+            if printed is not None:
+                assert_printed(block, printed)
         elif block.title:
             path = place / block.title
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -70,9 +75,20 @@ def follow(page: str, place: Path, environment: Mapping[str, str] | None = None)
             written.add(block.title)
         elif block.language == "sh":
             printed, ran = shell(block, place, environment), ran + 1
+        elif block.language == "python" and (missing := lacking(block)):
+            printed, left_out = None, [*left_out, f"{', '.join(missing)} is not installed ({block.place}:{block.line})"]
         elif block.language == "python":
             printed, ran = python(block, place, session), ran + 1
-    return ran
+    return ran, left_out
+
+
+def lacking(block: Block) -> list[str]:
+    """The libraries that a Python block imports and that are not installed."""
+    imports = [node for node in ast.walk(ast.parse(block.text)) if isinstance(node, ast.Import | ast.ImportFrom)]
+    names = [
+        name for node in imports for name in ([node.module or ""] if isinstance(node, ast.ImportFrom) else [one.name for one in node.names])
+    ]
+    return [name for name in names if importlib.util.find_spec(name.partition(".")[0]) is None]
 
 
 def shell(block: Block, place: Path, environment: Mapping[str, str] | None = None) -> str:

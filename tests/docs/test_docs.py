@@ -45,7 +45,10 @@ def test_a_page_can_be_followed_to_its_end(page: str, tmp_path: Path) -> None:
     (tmp_path / "here").mkdir()
     shells = any(block.language == "sh" for block in pages.blocks(page))
     environment = pages.clean_environment(tmp_path / "environment") if shells else {}
-    assert pages.follow(page, tmp_path / "here", {**environment, "LIDARSPEC_EXAMPLES": "8"})
+    ran, left_out = pages.follow(page, tmp_path / "here", {**environment, "LIDARSPEC_EXAMPLES": "8"})
+    assert ran
+    if left_out:
+        pytest.skip("; ".join(left_out))
 
 
 def test_a_page_that_is_wrong_is_found(tmp_path: Path) -> None:
