@@ -122,7 +122,7 @@ class PointCloud:
         return np.stack([self.x, self.y, self.z], axis=-1)
 
     def __array__(self, dtype: DTypeLike | None = None, copy: bool | None = None) -> NDArray[Any]:
-        """`xyz`, which NumPy, SciPy and Open3D understand as points; `to_structured` has the other columns too.
+        """`xyz`, which is what NumPy, SciPy and Open3D take for points; `to_structured` has the other columns too.
 
         Raises:
             ValueError: with ``copy=False``, since x, y and z are columns of their own.

@@ -11,7 +11,7 @@ from __future__ import annotations
 import ast
 import contextlib
 import doctest
-import importlib.util
+import importlib
 import io
 import os
 import re
@@ -83,12 +83,20 @@ def follow(page: str, place: Path, environment: Mapping[str, str] | None = None)
 
 
 def lacking(block: Block) -> list[str]:
-    """The libraries that a Python block imports and that are not installed."""
+    """The libraries that a Python block imports and that are not installed, or do not load."""
     imports = [node for node in ast.walk(ast.parse(block.text)) if isinstance(node, ast.Import | ast.ImportFrom)]
     names = [
         name for node in imports for name in ([node.module or ""] if isinstance(node, ast.ImportFrom) else [one.name for one in node.names])
     ]
-    return [name for name in names if importlib.util.find_spec(name.partition(".")[0]) is None]
+    return [name for name in (name.partition(".")[0] for name in names) if not _loads(name)]
+
+
+def _loads(name: str) -> bool:
+    try:
+        importlib.import_module(name)
+    except ImportError:
+        return False
+    return True
 
 
 def shell(block: Block, place: Path, environment: Mapping[str, str] | None = None) -> str:
