@@ -9,9 +9,10 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import IO, Any, cast
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lidarspec.errors import UsageError, library, suggest
 from lidarspec.formats.rows import Rows, room, write_rows
@@ -45,30 +46,24 @@ def write_lzf_pcd(path: Path, scans: Iterable[Scan], *, every_point: bool) -> No
     rows = _pcd_rows(scans, every_point=every_point)
     with contextlib.ExitStack() as files, path.open("wb") as target:
         names = rows.dtype.names or ()
-        fields = {name: files.enter_context(contextlib.closing(Spool(path.parent, rows.dtype[name]))) for name in names}
+        fields = {name: files.enter_context(contextlib.closing(Spool(path.parent, np.uint8))) for name in names}
         for block in rows:
             _refuse_size(rows.length * rows.dtype.itemsize)
             for name, field in fields.items():
-                field.add(block[name])
-        compressed = cast(IO[bytes], _Compressed(target, compress))
+                field.add(_compressed(block[name], compress))  # what is compressed piece by piece is one, one piece after another
         start = target.write(_pcd_header(rows, "binary_compressed")) + 8
         target.seek(start)
         for field in fields.values():
-            field.copy_to(compressed)
+            field.copy_to(target)
         sizes = [target.tell() - start, rows.length * rows.dtype.itemsize]
         _refuse_size(max(sizes))
         target.seek(start - 8)
         target.write(np.array(sizes, "<u4").tobytes())
 
 
-class _Compressed:
-    """Bytes compressed piece by piece; pieces of LZF that follow one another are one."""
-
-    def __init__(self, target: IO[bytes], compress: Any) -> None:
-        self._target, self._compress = target, compress
-
-    def write(self, data: bytes) -> int:
-        return self._target.write(self._compress(data, len(data) + len(data) // 16 + 64))  # the most that noise grows to
+def _compressed(values: NDArray[Any], compress: Any) -> NDArray[np.uint8]:
+    data = values.tobytes()
+    return np.frombuffer(compress(data, len(data) + len(data) // 16 + 64) if data else b"", np.uint8)  # the most that noise grows to
 
 
 def _refuse_size(size: int) -> None:
