@@ -12,8 +12,8 @@ from lidarspec.testing.conformance import PROPERTIES
 from tests.all_sensors import DISTINCT, EVERY, FRAMES
 from tests.shapes import SHAPES
 
-#: half of what the kit takes where nothing is said: `make test-long` tries as many as one has time for.
-EXAMPLES = int(os.environ.get("LIDARSPEC_EXAMPLES", "20"))
+#: a third of what the kit takes where nothing is said: `make test-long` tries as many as one has time for.
+EXAMPLES = int(os.environ.get("LIDARSPEC_EXAMPLES", "12"))
 #: frames that construct alone can read.
 REFUSED = {"shape-text data"} | {
     f"{name} {told}" for name in EVERY if name.startswith("hokuyo-") for told in ("version", "parameters", "state")
