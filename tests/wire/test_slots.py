@@ -81,7 +81,7 @@ def test_a_step_has_as_many_echoes_as_are_sent() -> None:
     values = JOINED.parse(data)
     echoes = [[(echo.range, echo.strength) for echo in step.echoes] for step in values.steps]
     assert echoes == [[(5432, 5), (0, 0), (0, 0)], [(21816, 5), (5432, 7), (0, 0)], [(0, 0)] * 3, [(0, 1), (0, 0), (0, 2)]]
-    assert JOINED.build("data", {**values}) == data
+    assert JOINED.build("data", tens=0, ones=4, time=0, sector=0, steps=values.steps) == data
     spelled = joined(1, b"1Dh05&00000")  # an echo of nothing, which would not be sent
     assert JOINED.build("data", JOINED.parse(spelled)) == spelled
     shown = str(explain(data, JOINED)).splitlines()
