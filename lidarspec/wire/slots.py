@@ -6,6 +6,7 @@ that decide a layout are read first, and then the rest of the row, which has to 
 
 from __future__ import annotations
 
+import bisect
 import functools
 import itertools
 from collections.abc import Iterable, Iterator, Sequence
@@ -17,7 +18,7 @@ from numpy.typing import NDArray
 
 from lidarspec.errors import SpecError
 from lidarspec.spec.description import Frame
-from lidarspec.spec.wire_forms import NONE, Reading, Slot, Unescaped, WireForm
+from lidarspec.spec.wire_forms import NONE, Lines, Reading, Slot, Unescaped, WireForm
 from lidarspec.wire.compilability import NotCompilable
 from lidarspec.wire.layout import Bytes2D, Layout, Leaf, Refused
 from lidarspec.wire.layout_tree import HeaderNode, HeaderTree, frame_layouts
@@ -94,6 +95,16 @@ class Recoder:
                 break
             texts.append(bytes(value for _, value in known))
         return self.form.begins(texts)
+
+    @property
+    def constants(self) -> dict[int, int]:
+        """The bytes on the wire that all frames have in the same places: those they begin with, and the end of a first line."""
+        ends = (
+            {self.form.head[0] + (self.form.check is not None and not self.form.bare): 0x0A}
+            if isinstance(self.form, Lines) and self.form.head
+            else {}
+        )
+        return dict(enumerate(self.begins)) | ends
 
     def reading(self, buffer: NDArray[np.uint8], starts: Indices) -> Reading:
         """Candidates at these places, ascending."""
@@ -187,7 +198,8 @@ class Recoder:
             inside = reading.places[(reading.places >= len(self.form.start)) & (reading.places < (size if size > 0 else len(data)))]
             row = row if reading.numbers is not None else reading.values[reading.places.searchsorted(inside)].tobytes()
             at = inside[: len(row)].tolist()
-            follows = inside[len(row)] if len(row) < len(inside) else size - 1 if size > 0 and self.form.start else at[-1] + 1 if at else 0
+            has_mark = size > 0 and (self.form.start or reading.numbers is not None)
+            follows = inside[len(row)] if len(row) < len(inside) else size - 1 if has_mark else at[-1] + 1 if at else 0
             return row, [*at, int(follows)]
         starts = reading.starts(start.item(0), _joined(legible.slots))
         at = np.repeat(starts, [slot.size for slot in legible.slots]).tolist()
@@ -198,14 +210,15 @@ class Recoder:
         if not data:
             return Legible((), b"", 0, "", "a frame")
         reading, at, stop = self._alone(data)
-        elements, row, number = list(_elements(*self._leaves(reading, np.zeros(1, np.intp), stop))), b"", 0
-        step = len(elements)
-        while step:  # halved where one of so many cannot be read
-            part, ends = reading.rows(at, stop, _joined(slot for _, _, slot in elements[number : number + step]))
-            if number + step <= len(elements) and ends[0] != NONE:
-                row, at, number = row + part[0].tobytes(), ends, number + step
-            else:
-                step //= 2
+        elements, row = list(_elements(*self._leaves(reading, np.zeros(1, np.intp), stop))), b""
+
+        def read(number: int) -> tuple[Bytes2D, Indices]:
+            return reading.rows(at, stop, _joined(slot for _, _, slot in elements[:number]))
+
+        number = bisect.bisect_left(range(1, len(elements) + 1), True, key=lambda count: read(count)[1].item(0) == NONE)
+        if number:
+            rows, at = read(number)
+            row = rows.tobytes()
         path, _, slot = elements[number] if number < len(elements) else ("", 0, None)
         seen = tuple(slot for _, _, slot in elements[:number])
         return Legible(seen, row, at.item(0), path, "the end of the frame" if slot is None else _in_words(slot))
