@@ -8,34 +8,30 @@ from __future__ import annotations
 
 import contextlib
 import json
-import re
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from shlex import quote
 from typing import BinaryIO
 
 from lidarspec.captures.bulk import Batch, CaptureBatches
-from lidarspec.captures.containers import damage, head, opened, refuse_container, unpacked
+from lidarspec.captures.containers import HEAD, damage, head, opened, refuse_container, unpacked
 from lidarspec.captures.pcap import CaptureReader, CaptureStats, StreamReader, is_stream_capture
 from lidarspec.captures.records import is_capture
-from lidarspec.errors import SourceError, UnknownSensor, UsageError, WireError, system_errors
+from lidarspec.errors import SourceError, UnknownSensor, UsageError, system_errors
 from lidarspec.recording.format import MAGIC, Header, Record, Recording
 from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.bags import BagTransport, log_of
 from lidarspec.transports.base import origin
+from lidarspec.transports.hexadecimal import hex_chunks, is_hexadecimal
 from lidarspec.transports.protocol import Chunk, Transport
 
 #: events behind which a frame begun earlier does not go on.
 INTERRUPTIONS = frozenset({"disconnect", "reconnect", "dropped"})
-#: in hexadecimal text: offsets and comments, what may stand between bytes, and what may not stand anywhere else.
-_BESIDE = re.compile(r"^\s*(?:0[xX])?[0-9a-fA-F]{3,}:(?=\s)|(?:#|//).*", re.MULTILINE)
-_COMMENT = re.compile("#|//")
-_BETWEEN, _NO_DIGIT = re.compile(r"[\s,;:{}]+"), re.compile(r"[^0-9a-fA-F]")
 #: bytes read at once.
 BLOCK = 1 << 18
-#: digits of a word that a message shows.
-QUOTED = 64
+#: suffixes of text: of hexadecimal digits, and of what may be that or not.
+HEX_SUFFIXES, TEXT_SUFFIXES = {".hex", ".txt"}, {".log", ".csv", ".asc"}
 
 
 class RecordingTransport(Transport):
@@ -186,63 +182,11 @@ class FileTransport(Transport):
 
 
 class HexTransport(FileTransport):
-    """Bytes written as hexadecimal text, in any way that `unhexed` reads; lines without digits are passed over."""
+    """Bytes written as hexadecimal text, at the times that it tells; lines without digits are passed over."""
 
     def chunks(self) -> Iterator[Chunk]:
-        return hex_chunks(self._path, self._file.readline)
-
-
-def hex_chunks(name: str, readline: Callable[[int], bytes]) -> Iterator[Chunk]:
-    """The bytes of hexadecimal text, a chunk for each line; one that is longer than a block comes in several.
-
-    Args:
-        name: of the file, for messages.
-        readline: the next line, or so many bytes of it.
-
-    Raises:
-        WireError: where something else is in it.
-    """
-    text, goes_on, number = "", "", 1
-    while (block := readline(BLOCK)) or text:
-        text += block.decode("ascii", "replace")
-        end = len(text) if len(block) < BLOCK or block.endswith(b"\n") else between(text)
-        try:
-            yield Chunk(unhexed(goes_on + text[:end]))
-        except ValueError as error:
-            raise WireError(f"{name}, line {number}: not hexadecimal: {error}") from None
-        if block.endswith(b"\n"):
-            goes_on, number = "", number + 1
-        else:  # so does a comment in the line; an offset is at its beginning alone
-            goes_on = "#" if _COMMENT.search(goes_on + text[:end]) else ","
-        text = text[end:]
-
-
-def between(text: str) -> int:
-    """Where hexadecimal text can be cut: behind or before its last mark, else between two bytes."""
-    return max(*(text.rfind(mark) + 1 for mark in " \t\n,;:{}"), *(text.rfind(mark) for mark in "\\/#")) or len(text) // 2 * 2
-
-
-def unhexed(text: str) -> bytes:
-    """The bytes that hexadecimal text stands for, as people print it: "54 2c", "542c", "54:2c", "0x54, 0x2C", "{0x54,0x2c};", "\\x54".
-
-    "#" and "//" begin a comment, which goes to the end of the line; a first column of three digits or more and ":" is an offset.
-
-    Raises:
-        ValueError: where something else is in it, or a word makes no whole bytes.
-    """
-    words = _BETWEEN.split(_BESIDE.sub("", text).replace("\\x", " "))
-    return b"".join(_whole_bytes(word) for word in words if word)
-
-
-def _whole_bytes(word: str) -> bytes:
-    digits = word.removeprefix("0x").removeprefix("0X")
-    if bad := _NO_DIGIT.search(digits):
-        raise ValueError(f"{bad[0]!r} is no digit of it")
-    if len(digits) == 1 and digits != word:
-        digits = f"0{digits}"
-    if not digits or len(digits) % 2:
-        raise ValueError(f"{word[:QUOTED]!r}{' ...' * (len(word) > QUOTED)} makes no whole bytes")
-    return bytes.fromhex(digits)
+        yield from hex_chunks(self._path, self._file.readline)
+        _is_whole(self, self._file)
 
 
 class CaptureTransport(FileTransport):
@@ -318,4 +262,6 @@ def open_file(path: str, *, sender: str | None = None, member: str = "") -> File
         return StreamCaptureTransport(name, file)
     if is_capture(start):
         return CaptureTransport(name, file, sender=sender)
-    return HexTransport(name, file) if Path(path).suffix in (".hex", ".txt") else FileTransport(name, file)
+    suffixes = set(Path(path.lower()).suffixes[-2:])  # that of a compressed file is behind it
+    is_text = suffixes & HEX_SUFFIXES or (suffixes & TEXT_SUFFIXES and is_hexadecimal(start, whole=len(start) < HEAD))
+    return HexTransport(name, file) if is_text else FileTransport(name, file)
