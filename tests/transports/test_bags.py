@@ -33,6 +33,7 @@ LAYOUTS = {
     "pandar_msgs/msg/PandarScan": f"{STAMPED}uint8[1500] data\nuint32 size".format("pandar_msgs", "PandarPacket"),
     "nebula_msgs/msg/NebulaPackets": f"{STAMPED}uint8[] data".format("nebula_msgs", "NebulaPacket"),
     "hesai_ros_driver/msg/UdpFrame": f"{LIST}uint8[] data\nuint32 size".format("hesai_ros_driver", "UdpPacket"),
+    "rslidar_msgs/msg/rslidarScan": f"{STAMPED}uint8[1248] data".format("rslidar_msgs", "rslidarPacket"),
     "rslidar_msg/msg/RslidarPacket": "std_msgs/Header header\nuint8 is_difop\nuint8 is_frame_begin\nuint8[] data",
     "ouster_sensor_msgs/msg/PacketMsg": "uint8[] buf",
 }
@@ -81,7 +82,9 @@ def messages(store: Any, msgtype: str, data: Sequence[bytes]) -> Iterator[tuple[
 
 def made(store: Any, name: str, data: bytes, at: int) -> Any:
     values: dict[str, Any] = {"stamp": time(store, at), "header": header(store, at), "size": len(data), "is_difop": 0, "is_frame_begin": 0}
-    fixed = {"velodyne_msgs/msg/VelodynePacket": 1206, "pandar_msgs/msg/PandarPacket": 1500}.get(name, len(data))
+    fixed = {"velodyne_msgs/msg/VelodynePacket": 1206, "rslidar_msgs/msg/rslidarPacket": 1248, "pandar_msgs/msg/PandarPacket": 1500}.get(
+        name, len(data)
+    )
     values["data"] = values["buf"] = np.frombuffer(data.ljust(fixed, b"\0"), np.uint8)
     kind = store.types[name]
     return kind(**{field: values[field] for field in kind.__dataclass_fields__ if field != "__msgtype__"})
@@ -105,7 +108,7 @@ def read(source: Path | str) -> list[Chunk]:
 @pytest.mark.parametrize("msgtype", LAYOUTS)
 @pytest.mark.parametrize("kind", KINDS)
 def test_packets_come_back_as_they_were_recorded(tmp_path: Path, kind: str, msgtype: str) -> None:
-    sent = packets(25)
+    sent = packets(25, "robosense-rs16" if msgtype == "rslidar_msgs/msg/rslidarScan" else "velodyne-vlp16")
     chunks = read(recorded(tmp_path, kind, {"/lidar/packets": (msgtype, sent)}))
     assert [chunk.data for chunk in chunks] == sent
     assert {chunk.sender for chunk in chunks} == {None}
