@@ -196,7 +196,8 @@ def _of_archive(name: str, file: BinaryIO, member: str) -> Any:
     except (UsageError, SourceError):
         raise
     except Exception as error:  # of a damaged one, too, zipfile raises what it will
-        raise suggest(SourceError(f"{name} is a zip archive, and is not read: {error}"), f"unzip {quote(name)}") from error
+        command = f"zip -FF {quote(name)} --out mended.zip" if isinstance(error, zipfile.BadZipFile) else f"unzip {quote(name)}"
+        raise suggest(SourceError(f"{name} is a zip archive, and is not read: {error}"), command) from error
 
 
 def _chosen(name: str, archive: zipfile.ZipFile, names: list[str], member: str) -> str:

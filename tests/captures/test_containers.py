@@ -123,7 +123,15 @@ def test_one_file_of_an_archive_is_named_where_several_are_captures() -> None:
     said = ran("read", "none.zip", "-s", SENSOR, code=3).stderr
     assert "none.zip is a zip archive, and is not read: there is no capture in it, but read.md, notes.md" in said
     Path("cut.zip").write_bytes(zipped(capture())[:3000])
-    assert "cut.zip is a zip archive, and is not read: File is not a zip file" in ran("read", "cut.zip", "-s", SENSOR, code=3).stderr
+    said = ran("read", "cut.zip", "-s", SENSOR, code=3).stderr
+    assert "cut.zip is a zip archive, and is not read: File is not a zip file\n  next: zip -FF cut.zip --out mended.zip" in said
+    locked = bytearray(zipped(capture()))
+    for place in (locked.rindex(b"PK\x03\x04") + 6, locked.rindex(b"PK\x01\x02") + 8):
+        locked[place] |= 1  # the flag of a file with a password
+    Path("locked.zip").write_bytes(locked)
+    said = ran("read", "locked.zip", "-s", SENSOR, code=3).stderr
+    assert "is encrypted, password required" in said
+    assert "next: unzip locked.zip" in said
     Path("it.pcap").write_bytes(capture())
     assert "it.pcap is no zip archive: there is no a.pcap in it" in ran("read", "it.pcap?file=a.pcap", "-s", SENSOR, code=2).stderr
 
