@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
@@ -22,7 +23,8 @@ from lidarspec.packets.imu import joined
 from lidarspec.plugins import sensor as named_sensor
 from lidarspec.scans.scans import Scan
 from lidarspec.spec.sensor import Sensor
-from lidarspec.transports.protocol import no_bytes
+from lidarspec.transports.open_url import is_live, transport
+from lidarspec.transports.protocol import Chunk, no_bytes
 from lidarspec.view.polar import look
 from lidarspec.view.svg import svg
 
@@ -56,11 +58,20 @@ class Written:
 @sensor_option
 @count_option("scans")
 @click.option("--all", "every_point", is_flag=True, help="Keep points without a valid return.")
+@click.option("--packets", "with_packets", is_flag=True, help="The packets of IN as well, in a log of ROS, which is a SOURCE then.")
 @click.option("--imu", "is_imu", is_flag=True, help="What the sensor's IMU felt, in place of the points.")
 @click.option("--force", is_flag=True, help="Overwrite OUT.")
 @click.option("--json", "as_json", is_flag=True, help="Print a summary as JSON.")
 def convert(
-    source: str, target: str, sensor_id: str | Sensor | None, count: int | None, every_point: bool, is_imu: bool, force: bool, as_json: bool
+    source: str,
+    target: str,
+    sensor_id: str | Sensor | None,
+    count: int | None,
+    every_point: bool,
+    with_packets: bool,
+    is_imu: bool,
+    force: bool,
+    as_json: bool,
 ) -> None:
     """Write the points of a capture or raw file to a file, in the format of its suffix.
 
@@ -75,7 +86,7 @@ def convert(
     format_of(target)
     refuse_overwriting(targets(target), source, sensor_id, force=force)
     sensor = _detected(source, target) if sensor_id is None else named_sensor(sensor_id)
-    with open_device(source, sensor) as device, Progress() as progress:
+    with open_device(source, sensor) as device, Progress() as progress, _packets(source, wanted=with_packets) as packets:
         written = Written(device, target)
         if is_imu:
             samples = joined(list(device.imu()))[:count]
@@ -92,9 +103,23 @@ def convert(
         if first is None:
             raise _no_data(device, source, target)
         counted = written.counting(itertools.chain([first], scans), progress, every_point=every_point)
-        write(target, counted, every_point=every_point)
+        write(target, counted, every_point=every_point, packets=packets)
         progress.clear()
         _sum_up(device, target, written, as_json=as_json)
+
+
+@contextlib.contextmanager
+def _packets(source: str, *, wanted: bool) -> Iterator[Iterator[Chunk] | None]:
+    """The packets of a file, which is read a second time for them; None where they are not wanted."""
+    if not wanted:
+        yield None
+        return
+    if is_live(source) or source == "-":
+        raise UsageError(f"--packets reads IN twice, and {source} can be read only once: record it first")
+    with contextlib.closing(transport(source)) as opened:
+        if not opened.datagrams:
+            raise UsageError(f"{source} is a stream of bytes: packets are those of datagrams")
+        yield opened.chunks()
 
 
 def _detected(source: str, target: str) -> Sensor:

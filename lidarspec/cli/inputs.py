@@ -26,7 +26,8 @@ from lidarspec.errors import CommandError, LidarSpecError, SourceError, UsageErr
 from lidarspec.plugins import sensors
 from lidarspec.scans.scans import Scan
 from lidarspec.spec.sensor import Sensor
-from lidarspec.transports.files import FileTransport, between, hex_chunks, unhexed
+from lidarspec.transports.files import FileTransport
+from lidarspec.transports.hexadecimal import hex_chunks, is_hexadecimal, unhexed
 from lidarspec.transports.open_url import is_port, live_address, transport
 from lidarspec.transports.protocol import Chunk, no_bytes
 from lidarspec.wire.parse import parse_typed
@@ -93,7 +94,7 @@ def _rest(source: str, chunks: Iterator[Chunk]) -> Iterator[Chunk]:
 def _standard_input(file: FileTransport) -> Iterator[Chunk]:
     """What comes over standard input, as it comes; hexadecimal text as the bytes that it stands for."""
     head, stdin = sys.stdin.buffer.read(LOOKED_AT), sys.stdin.buffer
-    if not _is_hexadecimal(head):
+    if not is_hexadecimal(head, whole=len(head) < LOOKED_AT):
         yield Chunk(head)
         yield from file.chunks()
         return
@@ -104,15 +105,6 @@ def _standard_input(file: FileTransport) -> Iterator[Chunk]:
         return line if line.endswith(b"\n") or len(line) == size else line + stdin.readline(size - len(line))
 
     yield from hex_chunks("standard input", readline)
-
-
-def _is_hexadecimal(head: bytes) -> bool:
-    """Whether input begins as hexadecimal text."""
-    try:
-        text = head.decode("ascii")
-        return bool(unhexed(text[: between(text)] if len(head) == LOOKED_AT else text))
-    except ValueError:
-        return False
 
 
 def read(words: Sequence[str]) -> Heard:

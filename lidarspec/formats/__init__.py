@@ -23,7 +23,7 @@ from typing import NoReturn
 
 import numpy as np
 
-from lidarspec.errors import LidarSpecError, SpecError, UnknownFormat, system_errors
+from lidarspec.errors import LidarSpecError, SpecError, UnknownFormat, UsageError, system_errors
 from lidarspec.formats.arrays import NPY, NPZ, ZARR
 from lidarspec.formats.bags import BAG, DB3, MCAP, ROSBAG2
 from lidarspec.formats.clouds import KITTI, LZF_PCD, PCD, PLY
@@ -35,7 +35,7 @@ from lidarspec.formats.writing import replacing
 from lidarspec.packets.imu import ImuSamples
 from lidarspec.plugins import registry
 from lidarspec.scans.scans import Scan
-from lidarspec.transports.protocol import Format
+from lidarspec.transports.protocol import Chunk, Format
 
 #: the place of a number in the name of a file.
 NUMBERED = re.compile(r"%0?\d?d")
@@ -103,23 +103,28 @@ def targets(path: str | Path) -> list[str]:
     return sorted(str(file) for file in path.parent.glob("*") if named.fullmatch(file.name))
 
 
-def write(path: str | Path, scans: Iterable[Scan], *, every_point: bool = False) -> None:
+def write(path: str | Path, scans: Iterable[Scan], *, every_point: bool = False, packets: Iterable[Chunk] | None = None) -> None:
     """Write scans to a file in the format of its suffix, or each to one of its own.
 
     Args:
         path: the file; what it held is replaced once the new content is whole, and stays if that fails. With the place of a number in
             its name, such as "scans/%05d.pcd", each scan has a file of its own, from 0 on; the folder is made where there is none.
         every_point: also the points without a valid return.
+        packets: what the sensor sent, to stand beside the points in a log of ROS.
 
     Raises:
         UnknownFormat: for a suffix that is none.
+        UsageError: for packets where the format has no place for them.
         SourceError: where the file cannot be written.
     """
     path = Path(path)
     chosen = format_of(path)
+    beside = {} if packets is None else {"packets": packets}
+    if beside and (chosen not in BAGS or NUMBERED.search(path.name)):
+        raise UsageError(f"{path} has no place for packets: {', '.join(log.suffix for log in BAGS)} have, in one file")
     for target, held in _each(path, scans) if NUMBERED.search(path.name) else [(path, scans)]:
         with replacing(target) as part:
-            chosen(part, held, every_point=every_point)
+            chosen.write(part, held, every_point=every_point, **beside)
 
 
 def _each(path: Path, scans: Iterable[Scan]) -> Iterator[tuple[Path, list[Scan]]]:

@@ -35,7 +35,7 @@ from functools import lru_cache
 from pathlib import Path
 from reprlib import repr as shown
 from shlex import quote
-from typing import Any, Literal
+from typing import Any, BinaryIO, Literal
 
 from lidarspec.errors import SourceError, UsageError, WireError, suggest, system_errors
 from lidarspec.plugins import sensor as named_sensor
@@ -195,6 +195,7 @@ class Recording(Closing):
 
     Args:
         path: the file; "-" is standard input.
+        file: it, where it is open already, or is read in another way than as it stands; closed with this one.
         salvage: look for the next good record behind a damaged place, even the header, instead of stopping there.
 
     Attributes:
@@ -210,13 +211,13 @@ class Recording(Closing):
         WireError: where its header is damaged, and `salvage` is not asked for.
     """
 
-    def __init__(self, path: str | Path, *, salvage: bool = False) -> None:
+    def __init__(self, path: str | Path, file: BinaryIO | None = None, *, salvage: bool = False) -> None:
         self.path, self.salvage = str(path), salvage
         self._window, self._place = b"", 0
         self.records = self.damaged = self.leftover = 0
         self.is_cut, self.offset = False, len(MAGIC)
         with system_errors(path):
-            self._file = sys.stdin.buffer if self.path == "-" else open(path, "rb")  # noqa: SIM115  closed by `close`
+            self._file = file or (sys.stdin.buffer if self.path == "-" else open(path, "rb"))  # noqa: SIM115  closed by `close`
         try:
             self._records = self._begin()
         except BaseException:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import gzip
 import io
 import json
+import lzma
 import random
 import re
 import struct
@@ -29,7 +31,7 @@ from lidarspec.testing import subject as material
 from lidarspec.testing.findings import Violation
 from lidarspec.testing.subject import Subject
 from lidarspec.testing.vectors import vectors_hold
-from lidarspec.transports.files import unhexed
+from lidarspec.transports.hexadecimal import unhexed
 from lidarspec.transports.open_url import is_port, live_address
 from lidarspec.wire.layout import Layout
 from lidarspec_hesai import at128
@@ -123,11 +125,9 @@ def targets(folder: Path) -> dict[str, Target]:
     found += [_capture(), _file(folder), _recording(folder), _settings(folder), _scene(folder), _vectors(folder)]
     found += [_calibration(sensor, option, folder) for sensor in ls.sensors().values() for option in sensor.configure.files]
     text = [word.encode() for word in HOSTILE]
-    found.append(
-        Target(
-            "hex", lambda data: unhexed(data.decode("latin-1")), lambda: [b"54 2c", b"0: {0x54, 0x2C}; // one"], (ValueError,), lambda: text
-        )
-    )
+    printed = [b"54 2c", b"0: {0x54, 0x2C}; // one", b"0000  54 2c  T,\n0002", b"[12:00:01.5] 54 /* */"]
+    printed += [b"(1.5) can0 044#1122", b"time,value\n1,0x54"]
+    found.append(Target("hex", lambda data: unhexed(data.decode("latin-1")), lambda: printed, (ValueError,), lambda: text))
     found.append(
         Target(
             "source",
@@ -279,6 +279,8 @@ def _file(folder: Path) -> Target:
             recorded(VLP, velodyne),
             b"".join(frames),
             frames[0].hex(" ").encode(),
+            gzip.compress(made.pcap(*map(made.frame, velodyne))),
+            lzma.compress(recorded(VLP, velodyne)),
         ]
 
     return Target("file", run, examples, (ls.LidarSpecError,), lambda: [*EDGES, *(word.encode() for word in HOSTILE)])
