@@ -33,6 +33,9 @@ _Made = TypeVar("_Made")
 #: how often a table is repeated at most, so that rows that follow one another round its end follow one another in it.
 TURNS = 8
 
+#: metres up to which a few roundings of float32 leave coordinates within 0.01 mm.
+FINE = 64
+
 #: what is computed faster than looked up in a table of 65,536 float64 numbers.
 _QUICK = {function for function in CHEAP if isinstance(function, np.ufunc)}
 
@@ -116,7 +119,52 @@ class Compiler:
         if node.kind == "call" and (node.function is np.multiply or is_offset):
             first, second = (self._factor(arg) for arg in node.args)
             return self.program.call(node.function.__name__, "single", node.function, first, second)
-        return None
+        return self._along_beams(node) if node.kind == "call" and node.function is np.add else None
+
+    def _along_beams(self, node: Node) -> int | None:
+        """Measured distances along rows of a table, from rows on where beams start; None for other sums.
+
+        Points up to `FINE` metres away are float32 throughout. Rows that reach farther are computed again in float64.
+        """
+        product, start = node.args
+        distance, direction = product.args if product.kind == "call" and product.function is np.multiply else (product, product)
+        info = self._measured(distance) if direction.kind == start.kind == "rows" else None
+        parts = [self._gathered(rows, "single") for rows in (direction, start)] if info is not None else [None]
+        if info is None or None in parts:
+            return None
+        measured, toward, begin = Read(self._single(distance)), *(Read(part) for part in parts if part is not None)
+        inner, scale, place = direction.args[1].shape[1], info.scale, ("far", distance)
+
+        def far(run: Run) -> tuple[int, NDArray[np.intp], NDArray[np.float64]]:
+            """Where the chunk begins, which of its rows reach too far, and their distances as they were sent."""
+            if run.prepared.get(place, (-1,))[0] != run.start:
+                rows = measured(run).reshape(-1, inner)
+                which = np.flatnonzero(np.fmax.reduce(rows, axis=1) > FINE) if np.fmax.reduce(rows, axis=None) > FINE else _NOWHERE
+                run.prepared[place] = run.start, which, np.rint(rows[which].astype(np.float64) / scale) * scale
+            found: tuple[int, NDArray[np.intp], NDArray[np.float64]] = run.prepared[place]
+            return found
+
+        def row(rows: Node, run: Run, which: NDArray[np.intp]) -> NDArray[np.float64]:
+            index, table = rows.args
+            numbers = run.prepared["rows", index, len(table) - 1][0]
+            chosen: NDArray[np.float64] = table[numbers[_rows(run, numbers[None])][which]]
+            return chosen
+
+        def run(execution: Run, out: NDArray[Any]) -> None:
+            np.multiply(measured(execution), toward(execution), out=out)
+            np.add(out, begin(execution), out=out)
+            _, which, distances = far(execution)
+            if len(which):
+                out.reshape(-1, inner)[which] = distances * row(direction, execution, which) + row(start, execution, which)
+
+        return self.program.step("along beams, float64 where they are long", "single", run, measured, toward, begin)
+
+    def _measured(self, distance: Node) -> FieldInfo | None:
+        """The field that distances are, or nan in some places; None where float32 does not hold its numbers, or they are another expression."""
+        while is_nan_where(distance) or distance.function is returned_range:
+            distance = distance.args[-1]
+        leaf = self._layout.leaves.get(distance.path) if distance.kind == "field" else None
+        return leaf.info if leaf is not None and leaf.info.kind == "int" and leaf.info.bits <= 22 and not leaf.info.offset else None
 
     def _double(self, value: Any) -> int:
         """An expression in float64, or a condition."""
@@ -545,7 +593,7 @@ class Compiler:
         return self.program.step(f"times {factor:.6g}", "double", lambda run, out: np.multiply(read(run), factor, out=out), read)
 
 
-_NONE = np.zeros(0, np.bool_)
+_NONE, _NOWHERE = np.zeros(0, np.bool_), np.zeros(0, np.intp)
 
 
 def _scale(out: NDArray[Any], info: FieldInfo) -> None:
