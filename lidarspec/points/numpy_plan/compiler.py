@@ -140,14 +140,16 @@ class Compiler:
             if run.prepared.get(place, (-1,))[0] != run.start:
                 rows = measured(run).reshape(-1, inner)
                 which = np.flatnonzero(np.fmax.reduce(rows, axis=1) > FINE) if np.fmax.reduce(rows, axis=None) > FINE else _NOWHERE
-                run.prepared[place] = run.start, which, np.rint(rows[which].astype(np.float64) / scale) * scale
+                distances = np.multiply(rows[which], 1 / scale, dtype=np.float64)
+                np.multiply(np.rint(distances, out=distances), scale, out=distances)
+                run.prepared[place] = run.start, which, distances
             found: tuple[int, NDArray[np.intp], NDArray[np.float64]] = run.prepared[place]
             return found
 
         def row(rows: Node, run: Run, which: NDArray[np.intp]) -> NDArray[np.float64]:
             index, table = rows.args
             numbers = run.prepared["rows", index, len(table) - 1][0]
-            chosen: NDArray[np.float64] = table[numbers[_rows(run, numbers[None])][which]]
+            chosen: NDArray[np.float64] = table.take(numbers[_rows(run, numbers[None])][which], axis=0)
             return chosen
 
         def run(execution: Run, out: NDArray[Any]) -> None:
@@ -155,16 +157,19 @@ class Compiler:
             np.add(out, begin(execution), out=out)
             _, which, distances = far(execution)
             if len(which):
-                out.reshape(-1, inner)[which] = distances * row(direction, execution, which) + row(start, execution, which)
+                exact = row(direction, execution, which)
+                exact *= distances
+                exact += row(start, execution, which)
+                out.reshape(-1, inner)[which] = exact
 
         return self.program.step("along beams, float64 where they are long", "single", run, measured, toward, begin)
 
     def _measured(self, distance: Node) -> FieldInfo | None:
-        """The field that distances are, or nan in some places; None where float32 does not hold its numbers, or they are another expression."""
+        """The field that distances are, or nan; None where they are another expression, or float32 does not hold its numbers."""
         while is_nan_where(distance) or distance.function is returned_range:
             distance = distance.args[-1]
         leaf = self._layout.leaves.get(distance.path) if distance.kind == "field" else None
-        return leaf.info if leaf is not None and leaf.info.kind == "int" and leaf.info.bits <= 22 and not leaf.info.offset else None
+        return leaf.info if leaf is not None and leaf.info.kind == "int" and leaf.info.bits <= 21 and not leaf.info.offset else None
 
     def _double(self, value: Any) -> int:
         """An expression in float64, or a condition."""
